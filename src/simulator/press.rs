@@ -451,7 +451,10 @@ mod tests {
                 let f = super::super::sensor::taxel_forces(&q, w.width, w.corner);
                 let area = f.iter().filter(|&&f| f > 0.07).count();
                 let peak = f.iter().copied().fold(0.0, f32::max);
-                line += &format!("  {force} N: a {:.2} d {:.2} area {area} peak {peak:.2};", c.radius_mm, c.approach_mm);
+                line += &format!(
+                    "  {force} N: a {:.2} d {:.2} area {area} peak {peak:.2};",
+                    c.radius_mm, c.approach_mm
+                );
             }
             println!("{material}: E {:.3} {line}", p.young_mpa(p.shore.mean));
         }
