@@ -20,7 +20,9 @@ pub struct RawFrame {
 
 impl Default for RawFrame {
     fn default() -> Self {
-        Self { counts: [0; TAXELS] }
+        Self {
+            counts: [0; TAXELS],
+        }
     }
 }
 
@@ -33,18 +35,68 @@ pub struct Frame {
 
 impl Default for Frame {
     fn default() -> Self {
-        Self { newtons: [0.0; TAXELS] }
+        Self {
+            newtons: [0.0; TAXELS],
+        }
     }
 }
 
 impl Frame {
     /// Contact area in taxels: those at or above `threshold_n`.
     pub fn contact_area_taxels(&self, threshold_n: f32) -> u32 {
-        self.newtons.iter().map(|&n| u32::from(n >= threshold_n)).sum()
+        self.newtons
+            .iter()
+            .map(|&n| u32::from(n >= threshold_n))
+            .sum()
     }
 
     /// Total force in newtons, summed in f64 so that the order of taxels does not show.
     pub fn force_n(&self) -> f64 {
         self.newtons.iter().map(|&n| f64::from(n)).sum()
     }
+}
+
+/// The sensor's own array and where it sits in a frame: at offset floor((28 - n) / 2).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Array {
+    /// Rows of the array, 1 to [`ROWS`].
+    pub rows: usize,
+    /// Columns of the array, 1 to [`COLS`].
+    pub cols: usize,
+}
+
+impl Array {
+    /// The array that fills a frame.
+    pub const FULL: Array = Array {
+        rows: ROWS,
+        cols: COLS,
+    };
+
+    /// Place in the frame of the array's own `row` and `col`.
+    pub fn place(self, row: usize, col: usize) -> usize {
+        (row + (ROWS - self.rows) / 2) * COLS + col + (COLS - self.cols) / 2
+    }
+
+    /// The array's own row and column of a place in the frame; `None` outside the array.
+    pub fn position(self, place: usize) -> Option<(usize, usize)> {
+        let row = (place / COLS).checked_sub((ROWS - self.rows) / 2)?;
+        let col = (place % COLS).checked_sub((COLS - self.cols) / 2)?;
+        (row < self.rows && col < self.cols).then_some((row, col))
+    }
+
+    /// The places of the array, row-major.
+    pub fn places(self) -> impl Iterator<Item = usize> {
+        (0..self.rows * self.cols)
+            .map(move |index| self.place(index / self.cols, index % self.cols))
+    }
+}
+
+/// When something came, on the two clocks that matter: one that never jumps, for durations, and
+/// the calendar, for people.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Stamp {
+    /// CLOCK_MONOTONIC.
+    pub mono: std::time::Duration,
+    /// UTC.
+    pub wall: jiff::Timestamp,
 }
