@@ -9,6 +9,9 @@ pub mod frame;
 pub mod wire;
 pub mod tare;
 pub mod press;
+pub mod verdict;
+pub mod event;
+pub mod pipeline;
 
 pub mod random;
 pub mod simulator;

@@ -1,6 +1,6 @@
 //! Bytes in, whole frames and damage out.
 
-use super::{Framing, Layout, fixed, text, zero_run};
+use super::{Framing, Layout, text, zero_run};
 use crate::frame::RawFrame;
 
 /// Why a candidate frame was dropped.
