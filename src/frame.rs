@@ -12,7 +12,7 @@ pub const COLS: usize = 28;
 pub const TAXELS: usize = ROWS * COLS;
 
 /// A frame in sensor counts. Taxels outside a smaller array are 0.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Clone, Copy, PartialEq, Eq)]
 pub struct RawFrame {
     /// `[ROWS, COLS]` flattened, row-major, in counts.
     pub counts: [u16; TAXELS],
@@ -26,8 +26,20 @@ impl Default for RawFrame {
     }
 }
 
+/// The sum and the peak: 784 numbers in a log or a failed assertion help nobody.
+impl std::fmt::Debug for RawFrame {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let sum: u32 = self.counts.iter().map(|&count| u32::from(count)).sum();
+        let peak = self.counts.iter().max();
+        f.debug_struct("RawFrame")
+            .field("sum", &sum)
+            .field("peak", &peak)
+            .finish()
+    }
+}
+
 /// A frame in newtons.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Clone, Copy, PartialEq)]
 pub struct Frame {
     /// `[ROWS, COLS]` flattened, row-major, in newtons a taxel; finite and not negative.
     pub newtons: [f32; TAXELS],
@@ -38,6 +50,16 @@ impl Default for Frame {
         Self {
             newtons: [0.0; TAXELS],
         }
+    }
+}
+
+impl std::fmt::Debug for Frame {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let peak = self.newtons.iter().copied().fold(0.0, f32::max);
+        f.debug_struct("Frame")
+            .field("force_n", &self.force_n())
+            .field("peak_n", &peak)
+            .finish()
     }
 }
 
