@@ -8,3 +8,4 @@
 pub mod frame;
 pub mod random;
 pub mod simulator;
+pub mod verdict;
