@@ -20,7 +20,9 @@ pub struct RawFrame {
 
 impl Default for RawFrame {
     fn default() -> Self {
-        Self { counts: [0; TAXELS] }
+        Self {
+            counts: [0; TAXELS],
+        }
     }
 }
 
@@ -33,14 +35,19 @@ pub struct Frame {
 
 impl Default for Frame {
     fn default() -> Self {
-        Self { newtons: [0.0; TAXELS] }
+        Self {
+            newtons: [0.0; TAXELS],
+        }
     }
 }
 
 impl Frame {
     /// Contact area in taxels: those at or above `threshold_n`.
     pub fn contact_area_taxels(&self, threshold_n: f32) -> u32 {
-        self.newtons.iter().map(|&n| u32::from(n >= threshold_n)).sum()
+        self.newtons
+            .iter()
+            .map(|&n| u32::from(n >= threshold_n))
+            .sum()
     }
 
     /// Total force in newtons, summed in f64 so that the order of taxels does not show.

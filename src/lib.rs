@@ -8,4 +8,6 @@
 pub mod frame;
 pub mod random;
 pub mod simulator;
+#[cfg(feature = "train")]
+pub mod train;
 pub mod verdict;

@@ -22,16 +22,21 @@ fn mix(mut z: u64) -> u64 {
 impl Stream {
     /// The stream called `name` under `seed`, from its start.
     pub fn new(seed: u64, name: &str) -> Self {
-        let key = name.bytes().fold(mix(seed.wrapping_add(GOLDEN_GAMMA)), |key, byte| {
-            mix(key.wrapping_add(GOLDEN_GAMMA) ^ u64::from(byte))
-        });
+        let key = name
+            .bytes()
+            .fold(mix(seed.wrapping_add(GOLDEN_GAMMA)), |key, byte| {
+                mix(key.wrapping_add(GOLDEN_GAMMA) ^ u64::from(byte))
+            });
         Self { key, position: 0 }
     }
 
     /// The independent sub-stream number `index`: one an object, a press, an epoch.
     #[must_use]
     pub fn child(&self, index: u64) -> Self {
-        Self { key: mix(self.key ^ mix(index.wrapping_add(GOLDEN_GAMMA))), position: 0 }
+        Self {
+            key: mix(self.key ^ mix(index.wrapping_add(GOLDEN_GAMMA))),
+            position: 0,
+        }
     }
 
     /// How many words have been drawn; with the name and the seed, the whole state.
@@ -48,7 +53,9 @@ impl Stream {
     /// 64 random bits.
     pub fn next_u64(&mut self) -> u64 {
         self.position += 1;
-        mix(self.key.wrapping_add(self.position.wrapping_mul(GOLDEN_GAMMA)))
+        mix(self
+            .key
+            .wrapping_add(self.position.wrapping_mul(GOLDEN_GAMMA)))
     }
 
     /// Uniform in `[0, 1)`, 53 bits.
@@ -105,7 +112,10 @@ mod tests {
         assert_ne!(base, first(Stream::new(2, "a")));
         assert_ne!(base, first(Stream::new(1, "b")));
         assert_ne!(base, first(Stream::new(1, "a").child(0)));
-        assert_ne!(first(Stream::new(1, "a").child(0)), first(Stream::new(1, "a").child(1)));
+        assert_ne!(
+            first(Stream::new(1, "a").child(0)),
+            first(Stream::new(1, "a").child(1))
+        );
     }
 
     #[test]
@@ -122,6 +132,10 @@ mod tests {
         let n = f64::from(n);
         assert!((sum / n).abs() < 0.015, "mean {}", sum / n);
         assert!((square / n - 1.0).abs() < 0.02, "variance {}", square / n);
-        assert!((uniform / n - 0.5).abs() < 0.005, "uniform mean {}", uniform / n);
+        assert!(
+            (uniform / n - 0.5).abs() < 0.005,
+            "uniform mean {}",
+            uniform / n
+        );
     }
 }

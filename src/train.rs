@@ -1,0 +1,8 @@
+//! The method.
+
+pub mod augment;
+pub mod hrn;
+pub mod metrics;
+pub mod network;
+pub mod onnx;
+pub mod optimiser;
