@@ -14,6 +14,9 @@ use tract_onnx::prelude::*;
 
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 
+/// The default model, built into the binary; `models/README.md` is its card.
+pub const BUILT_IN: &[u8] = include_bytes!("../models/hrn.onnx");
+
 /// Largest model file accepted, in bytes: 64 MB.
 pub const MAX_FILE_BYTES: usize = 64_000_000;
 /// Oldest ONNX operator set accepted.

@@ -24,7 +24,11 @@ pub struct Settings {
 
 /// Draws one variant of `frame`.
 pub fn vary(frame: &Frame, settings: Settings, stream: &mut Stream) -> Frame {
-    let symmetry = if settings.symmetries { stream.below(SYMMETRIES) } else { 0 };
+    let symmetry = if settings.symmetries {
+        stream.below(SYMMETRIES)
+    } else {
+        0
+    };
     let reach = isize::from(settings.shift_taxels);
     let mut shift = || stream.below(2 * settings.shift_taxels as usize + 1) as isize - reach;
     let (rows, columns) = (shift(), shift());
@@ -37,7 +41,11 @@ fn turned(frame: &Frame, symmetry: usize) -> Frame {
     let mut image = Frame::default();
     for row in 0..ROWS {
         for column in 0..COLS {
-            let (r, c) = if symmetry & 4 == 0 { (row, column) } else { (column, row) };
+            let (r, c) = if symmetry & 4 == 0 {
+                (row, column)
+            } else {
+                (column, row)
+            };
             let r = if symmetry & 1 == 0 { r } else { ROWS - 1 - r };
             let c = if symmetry & 2 == 0 { c } else { COLS - 1 - c };
             image.newtons[row * COLS + column] = frame.newtons[r * COLS + c];
@@ -51,7 +59,10 @@ fn shifted(frame: &Frame, rows: isize, columns: isize) -> Frame {
     let mut image = Frame::default();
     for row in 0..ROWS {
         for column in 0..COLS {
-            let from = (row.checked_add_signed(-rows), column.checked_add_signed(-columns));
+            let from = (
+                row.checked_add_signed(-rows),
+                column.checked_add_signed(-columns),
+            );
             if let (Some(r @ 0..ROWS), Some(c @ 0..COLS)) = from {
                 image.newtons[row * COLS + column] = frame.newtons[r * COLS + c];
             }
@@ -76,7 +87,10 @@ mod tests {
         assert_eq!(images[0], corner());
         for (index, image) in images.iter().enumerate() {
             assert_eq!(image.force_n(), 1.0);
-            assert!(images[..index].iter().all(|earlier| earlier != image), "symmetry {index}");
+            assert!(
+                images[..index].iter().all(|earlier| earlier != image),
+                "symmetry {index}"
+            );
         }
     }
 

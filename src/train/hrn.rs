@@ -31,7 +31,12 @@ pub fn images<'a>(
     let batch = frames.len();
     let mut values = Vec::with_capacity(batch * TAXELS);
     for frame in frames {
-        values.extend(frame.newtons.iter().map(|newtons| 2.0 * newtons / full_scale_n - 1.0));
+        values.extend(
+            frame
+                .newtons
+                .iter()
+                .map(|newtons| 2.0 * newtons / full_scale_n - 1.0),
+        );
     }
     Tensor::from_data(TensorData::new(values, [batch, 1, ROWS, COLS]), device)
 }
@@ -50,7 +55,11 @@ pub fn logits(
 /// `targets` is `[batch, L]` with a 1 at each sample's level.
 pub fn cross_entropy(logits: Tensor<2>, targets: Tensor<2>) -> Tensor<1> {
     let batch = logits.dims()[0] as f32;
-    activation::log_softmax(logits, 1).mul(targets).sum().neg().div_scalar(batch)
+    activation::log_softmax(logits, 1)
+        .mul(targets)
+        .sum()
+        .neg()
+        .div_scalar(batch)
 }
 
 /// Levels 1..=L as rows with a 1 at the level: `[batch, L]`.
@@ -85,12 +94,22 @@ pub fn graph(weights: &Weights, statistics: &Statistics, full_scale_n: f32) -> (
             onnx::integers("strides", &[STRIDE as i64; 2]),
             onnx::integers("pads", &[before, before, after, after]),
         ];
-        x = graph.node("Conv", &[&x, &kernel, &bias], &format!("{name}.sum"), attributes);
+        x = graph.node(
+            "Conv",
+            &[&x, &kernel, &bias],
+            &format!("{name}.sum"),
+            attributes,
+        );
         let slope = vec![onnx::number("alpha", LEAKY_SLOPE)];
         x = graph.node("LeakyRelu", &[&x], &format!("{name}.out"), slope);
     }
     let pooled = graph.node("GlobalMaxPool", &[&x], "pooled", Vec::new());
-    let flat = graph.node("Flatten", &[&pooled], "features", vec![onnx::integer("axis", 1)]);
+    let flat = graph.node(
+        "Flatten",
+        &[&pooled],
+        "features",
+        vec![onnx::integer("axis", 1)],
+    );
     let bias = weights.numbers("head.bias");
     let matrix = weights.numbers("head.matrix");
     let matrix = graph.constant("head.matrix", &[FEATURES, bias.len()], &matrix);
@@ -132,16 +151,25 @@ mod tests {
         let gradients = loss.backward();
         for weight in &weights.entries {
             let gradient = weight.values.grad(&gradients).expect(&weight.name);
-            let size = network::numbers(&gradient).iter().map(|g| g.abs()).fold(0.0, f32::max);
+            let size = network::numbers(&gradient)
+                .iter()
+                .map(|g| g.abs())
+                .fold(0.0, f32::max);
             // A bias before batch normalisation is taken away again with the mean.
             let cancelled = matches!(weight.name.as_str(), "conv2.bias" | "conv3.bias");
-            assert!(size.is_finite() && (cancelled || size > 1e-9), "{}: {size}", weight.name);
+            assert!(
+                size.is_finite() && (cancelled || size > 1e-9),
+                "{}: {size}",
+                weight.name
+            );
         }
     }
 
     #[test]
     fn gradients_agree_with_finite_differences() {
-        let frames: Vec<Frame> = (0..6).map(|n| blob(8.0 + 2.0 * n as f32, 13.0, 2.5)).collect();
+        let frames: Vec<Frame> = (0..6)
+            .map(|n| blob(8.0 + 2.0 * n as f32, 13.0, 2.5))
+            .collect();
         let mut weights = initial(4, 5, &device());
         let x = images(frames.iter(), 2.0, &device());
         let y = targets((0..6).map(|n| n % 4 + 1), 4, &device());
@@ -169,7 +197,10 @@ mod tests {
             let numeric = (at(step) - at(-step)) / f64::from(2.0 * step);
             at(0.0);
             let difference = (numeric - f64::from(analytic)).abs();
-            assert!(difference < 2e-3 * numeric.abs().max(1e-2), "{name}: {analytic} {numeric}");
+            assert!(
+                difference < 2e-3 * numeric.abs().max(1e-2),
+                "{name}: {analytic} {numeric}"
+            );
         }
     }
 
@@ -180,11 +211,18 @@ mod tests {
         let weights = initial(4, 9, &device());
         let x = images(frames.iter(), 10.2, &device());
         let mut statistics = Statistics::default();
-        let in_batch =
-            logits(&weights, x.clone(), &mut Normalisation::Collect(&mut statistics));
+        let in_batch = logits(
+            &weights,
+            x.clone(),
+            &mut Normalisation::Collect(&mut statistics),
+        );
         let fixed = logits(&weights, x, &mut Normalisation::Fixed(&statistics));
         let (left, right) = (network::numbers(&in_batch), network::numbers(&fixed));
-        let largest = left.iter().zip(&right).map(|(l, r)| (l - r).abs()).fold(0.0, f32::max);
+        let largest = left
+            .iter()
+            .zip(&right)
+            .map(|(l, r)| (l - r).abs())
+            .fold(0.0, f32::max);
         assert!(largest < 1e-5, "{largest}");
     }
 }

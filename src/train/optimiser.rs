@@ -97,7 +97,11 @@ impl Optimiser {
                 .map(|weight| (zeros(&weight.values), zeros(&weight.values)))
                 .collect(),
         };
-        Self { settings, step: 0, moments }
+        Self {
+            settings,
+            step: 0,
+            moments,
+        }
     }
 
     /// Takes one step at `rate`. `tracked` are the leaves that `gradients` belong to, in the
@@ -110,7 +114,13 @@ impl Optimiser {
         rate: f32,
     ) {
         self.step += 1;
-        let Settings { rule, beta1, beta2, weight_decay, .. } = self.settings;
+        let Settings {
+            rule,
+            beta1,
+            beta2,
+            weight_decay,
+            ..
+        } = self.settings;
         let correction = |beta: f32| 1.0 - f64::from(beta).powf(self.step as f64) as f32;
         for (index, weight) in weights.entries.iter_mut().enumerate() {
             let Some(gradient) = tracked.entries[index].values.grad_remove(gradients) else {
@@ -120,13 +130,16 @@ impl Optimiser {
                 Rule::Sgd => gradient,
                 Rule::Adam => {
                     let (mean, square) = self.moments[index].clone();
-                    let mean = mean.mul_scalar(beta1).add(gradient.clone().mul_scalar(1.0 - beta1));
+                    let mean = mean
+                        .mul_scalar(beta1)
+                        .add(gradient.clone().mul_scalar(1.0 - beta1));
                     let square = square
                         .mul_scalar(beta2)
                         .add(gradient.clone().mul(gradient).mul_scalar(1.0 - beta2));
                     self.moments[index] = (mean.clone(), square.clone());
                     let deviation = square.div_scalar(correction(beta2)).sqrt();
-                    mean.div_scalar(correction(beta1)).div(deviation.add_scalar(ADAM_EPSILON))
+                    mean.div_scalar(correction(beta1))
+                        .div(deviation.add_scalar(ADAM_EPSILON))
                 }
             };
             let mut values = weight.values.clone();
@@ -150,6 +163,10 @@ impl Optimiser {
     /// The optimiser as it was after `step` steps with these moments.
     #[must_use]
     pub fn resumed(settings: Settings, step: u64, moments: Vec<(Tensor<1>, Tensor<1>)>) -> Self {
-        Self { settings, step, moments }
+        Self {
+            settings,
+            step,
+            moments,
+        }
     }
 }
