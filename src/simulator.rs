@@ -1,1 +1,23 @@
-//! The press simulator.
+//! A film array pressed on objects, simulated: labelled samples and whole press sequences.
+//!
+//! In: settings and a seed. Out: [`dataset`], the labelled samples of the paper's Table 1 (force
+//! prescribed), and [`Sequence`], raw frames as a sensor would send them (motion prescribed).
+//! Everything follows from the seed; nothing here reads a clock, does I/O or keeps global state.
+//! What is modelled and what is not stands at the head of each part.
+
+mod contact;
+mod dataset;
+#[cfg(test)]
+mod durometer;
+mod fourier;
+mod kernel;
+mod material;
+mod object;
+mod press;
+mod sensor;
+mod texture;
+
+pub use dataset::{DatasetSettings, LabelledSample, dataset};
+pub use material::{Material, Split, UnknownMaterial};
+pub use object::{Shapes, UnknownShapes};
+pub use sensor::{NEWTONS_PER_COUNT, SensorProfile, Threshold, UnknownProfile};

@@ -1,0 +1,316 @@
+//! The whole simulated data set: objects, postures, forces, labels.
+//!
+//! Threads share the objects out; every number depends on the seed and on what is pressed, never
+//! on who pressed it.
+
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use super::material::{Material, Split};
+use super::object::{Object, POSTURES, Pose, Shapes};
+use super::press::{Bench, Specimen};
+use super::sensor::{Film, NEWTONS_PER_COUNT, Sensor, SensorProfile, Threshold, taxel_forces};
+use super::texture::Patch;
+use crate::frame::{Frame, RawFrame};
+use crate::random::Stream;
+
+/// What to simulate.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DatasetSettings {
+    /// Everything random follows from it.
+    pub seed: u64,
+    /// Objects of each training material.
+    pub objects: u32,
+    /// Objects of each test material.
+    pub test_objects: u32,
+    /// Presses of each object.
+    pub presses: u32,
+    /// The least of the eight nominal forces; the greatest is 25 N (paper).
+    pub lowest_force_n: f32,
+    /// Distribution of shapes.
+    pub shapes: Shapes,
+    /// Spread of the sensors.
+    pub profile: SensorProfile,
+    /// Activation of their taxels.
+    pub threshold: Threshold,
+}
+
+impl Default for DatasetSettings {
+    /// The paper's data set: 10,000 + 1,000 samples.
+    fn default() -> Self {
+        Self {
+            seed: 0,
+            objects: 50,
+            test_objects: 5,
+            presses: 50,
+            lowest_force_n: 1.0,
+            shapes: Shapes::Matched,
+            profile: SensorProfile::Clean,
+            threshold: Threshold::Spread,
+        }
+    }
+}
+
+/// One press and what is known of it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LabelledSample {
+    /// The frame after an ideal tare, in newtons.
+    pub frame: Frame,
+    /// Hardness level, 1 to 4.
+    pub level: u8,
+    /// Number of the object, unique in the data set.
+    pub object: u32,
+    /// Index of the material in [`Material::ALL`].
+    pub material: u8,
+    /// Force the sensor was pressed with.
+    pub force_n: f32,
+    /// Split of the material, hence of the object.
+    pub split: Split,
+    /// The object's Shore hardness.
+    pub shore: f32,
+}
+
+/// A taxel at this many counts is in contact (contract: 0.07 N at 0.04 N a count).
+pub(super) const CONTACT_COUNTS: u16 = 2;
+/// Taxels in contact that begin a press (contract).
+pub(super) const BEGIN_AREA_TAXELS: usize = 3;
+
+pub(super) const HIGHEST_FORCE_N: f64 = 25.0;
+const FORCES: usize = 8;
+const FORCE_JITTER: f64 = 0.08;
+/// Sensors that each split's objects are shared over.
+const SENSORS: u32 = 8;
+/// How much harder a press is made anew that was too light to be one.
+pub(super) const HARDER: f64 = 1.5;
+/// Times a press is made harder before it is taken as it is.
+pub(super) const TRIES: usize = 8;
+
+/// Simulates the data set on `threads` threads, with `progress` told the number of samples done.
+/// Samples stand by material (as in [`Material::ALL`]), object and press. The result is the same
+/// for any number of threads.
+pub fn dataset(
+    settings: &DatasetSettings,
+    threads: usize,
+    progress: impl Fn(usize) + Sync,
+) -> Vec<LabelledSample> {
+    let mut units = Vec::new();
+    for material in Material::ALL {
+        let count = match material.split() {
+            Split::Train => settings.objects,
+            Split::Test => settings.test_objects,
+        };
+        units.extend((0..count).map(|number| (material, number)));
+    }
+    let (next, done) = (AtomicUsize::new(0), AtomicUsize::new(0));
+    let parts: Mutex<Vec<Vec<LabelledSample>>> = Mutex::new(vec![Vec::new(); units.len()]);
+    std::thread::scope(|scope| {
+        for _ in 0..threads.max(1) {
+            scope.spawn(|| {
+                let mut bench = Bench::default();
+                loop {
+                    let index = next.fetch_add(1, Ordering::Relaxed);
+                    let Some(&(material, number)) = units.get(index) else {
+                        break;
+                    };
+                    let mut samples = Vec::with_capacity(settings.presses as usize);
+                    let subject = Subject::draw(settings, material, number);
+                    subject.press_all(settings, &mut bench, |sample| {
+                        samples.push(LabelledSample {
+                            object: index as u32,
+                            ..sample
+                        });
+                        progress(done.fetch_add(1, Ordering::Relaxed) + 1);
+                    });
+                    parts
+                        .lock()
+                        .expect("no thread panics while it holds the lock")[index] = samples;
+                }
+            });
+        }
+    });
+    let parts = parts
+        .into_inner()
+        .expect("no thread panics while it holds the lock");
+    parts.into_iter().flatten().collect()
+}
+
+/// The streams of one object. Geometry, postures and forces of matched test objects do not depend
+/// on the material: that is what pairs them.
+pub(super) struct Draws {
+    pub(super) geometry: Stream,
+    pub(super) body: Stream,
+}
+
+impl Draws {
+    pub(super) fn new(seed: u64, shapes: Shapes, material: Material, number: u32) -> Self {
+        let own = u64::from(material.index());
+        let (split, geometry) = match (material.split(), shapes) {
+            (Split::Train, _) => ("train", own),
+            (Split::Test, Shapes::Paper) => ("test", own),
+            (Split::Test, Shapes::Matched) => ("test", Material::ALL.len() as u64),
+        };
+        let root = Stream::new(seed, split).child(u64::from(number));
+        Self {
+            geometry: root.child(0).child(geometry),
+            body: root.child(1).child(own),
+        }
+    }
+}
+
+/// An object with its hardness and the sensor it is pressed on.
+struct Subject {
+    material: Material,
+    object: Object,
+    shore: f64,
+    sensor: Sensor,
+    draws: Draws,
+}
+
+/// Shore hardness of an object: normal, redrawn until it lies in the material's range.
+pub(super) fn draw_shore(material: Material, stream: &mut Stream) -> f64 {
+    let shore = material.properties().shore;
+    loop {
+        let drawn = shore.mean + shore.sd * stream.normal();
+        if (shore.low..=shore.high).contains(&drawn) {
+            return drawn;
+        }
+    }
+}
+
+/// Roughness of one posture's face.
+pub(super) fn draw_patch(material: Material, roughness: f64, stream: &mut Stream) -> Patch {
+    let factor = roughness * (0.35 * stream.normal()).exp();
+    let texture = &material.properties().texture;
+    Patch::new(texture, factor, super::sensor::CELL_MM, stream)
+}
+
+/// Sensor number `number` of a split: the two splits share none.
+pub(super) fn draw_sensor(
+    seed: u64,
+    split: Split,
+    number: u32,
+    profile: SensorProfile,
+    threshold: Threshold,
+) -> Sensor {
+    let name = match split {
+        Split::Train => "train sensor",
+        Split::Test => "test sensor",
+    };
+    Sensor::new(
+        profile,
+        threshold,
+        &Stream::new(seed, name).child(u64::from(number)),
+    )
+}
+
+impl Subject {
+    fn draw(settings: &DatasetSettings, material: Material, number: u32) -> Self {
+        let draws = Draws::new(settings.seed, settings.shapes, material, number);
+        let object = Object::draw(settings.shapes, material, &mut draws.geometry.child(0));
+        let shore = draw_shore(material, &mut draws.body.child(0));
+        let sensor = draw_sensor(
+            settings.seed,
+            material.split(),
+            number % SENSORS,
+            settings.profile,
+            settings.threshold,
+        );
+        Self {
+            material,
+            object,
+            shore,
+            sensor,
+            draws,
+        }
+    }
+
+    /// Every press of the object, in order; postures in the outer loop, so that a face's texture
+    /// and kernels serve all its presses.
+    fn press_all(
+        &self,
+        settings: &DatasetSettings,
+        bench: &mut Bench,
+        mut take: impl FnMut(LabelledSample),
+    ) {
+        let properties = self.material.properties();
+        let young_mpa = properties.young_mpa(self.shore);
+        for posture in 0..POSTURES {
+            let face = self.object.face(posture);
+            let mut roughness = self.draws.body.child(1).child(posture as u64);
+            let patch = draw_patch(self.material, face.roughness, &mut roughness);
+            for press in (posture..settings.presses as usize).step_by(POSTURES) {
+                let mut paired = self.draws.geometry.child(1).child(press as u64);
+                let pose = Pose::draw(&face, &mut paired);
+                let nominal = nominal_force_n(settings.lowest_force_n, press / POSTURES % FORCES);
+                let force_n = nominal * (1.0 + FORCE_JITTER * paired.normal()).clamp(0.7, 1.3);
+                let hold_s = paired.range(0.8, 1.5);
+                let specimen = Specimen::new(properties, young_mpa, &face, &pose, &patch);
+                let mut noise = self.draws.body.child(2).child(press as u64);
+                let (force_n, raw) = self.press(bench, &specimen, force_n, hold_s, &mut noise);
+                take(LabelledSample {
+                    frame: ideal_tare(&raw),
+                    level: self.material.level(),
+                    object: 0,
+                    material: self.material.index(),
+                    force_n: force_n as f32,
+                    split: self.material.split(),
+                    shore: self.shore as f32,
+                });
+            }
+        }
+    }
+
+    /// One press, made harder until it reaches the begin area: the force and the frame.
+    fn press(
+        &self,
+        bench: &mut Bench,
+        specimen: &Specimen,
+        mut force_n: f64,
+        hold_s: f64,
+        noise: &mut Stream,
+    ) -> (f64, RawFrame) {
+        let gain = self.sensor.press_gain(noise);
+        let mut tries = 0;
+        loop {
+            let ramp_s = (force_n / ARM_N_MM + TYPICAL_DEPTH_MM) / SPEED_MM_S;
+            let (window, pressure, _) = bench.press(specimen, force_n, ramp_s, hold_s);
+            let forces = taxel_forces(&pressure, window.width, window.corner);
+            let crept = Film::new().advance(&forces, hold_s + 0.5 * ramp_s);
+            let raw = self.sensor.read(&crept, gain, noise);
+            tries += 1;
+            if contact_taxels(&raw) >= BEGIN_AREA_TAXELS || tries == TRIES {
+                return (force_n, raw);
+            }
+            force_n *= HARDER;
+        }
+    }
+}
+
+/// Stiffness of the arm, N/mm (assumed), and its speed (paper).
+pub(super) const ARM_N_MM: f64 = 10.0;
+pub(super) const SPEED_MM_S: f64 = 5.0;
+/// Indentation that a sample's ramp is reckoned with; sequences compute theirs.
+const TYPICAL_DEPTH_MM: f64 = 2.0;
+
+/// Number `step` (0 to 7) of eight forces, evenly from `lowest_n` to 25 N.
+fn nominal_force_n(lowest_n: f32, step: usize) -> f64 {
+    let lowest = f64::from(lowest_n);
+    lowest + (HIGHEST_FORCE_N - lowest) * step as f64 / (FORCES - 1) as f64
+}
+
+/// Taxels in contact under a zero baseline.
+pub(super) fn contact_taxels(raw: &RawFrame) -> usize {
+    raw.counts
+        .iter()
+        .filter(|&&counts| counts >= CONTACT_COUNTS)
+        .count()
+}
+
+/// What tare makes of counts whose baseline is 0.
+fn ideal_tare(raw: &RawFrame) -> Frame {
+    Frame {
+        newtons: raw
+            .counts
+            .map(|counts| f32::from(counts) * NEWTONS_PER_COUNT),
+    }
+}

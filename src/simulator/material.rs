@@ -1,0 +1,355 @@
+//! The eight materials of the paper's Table 1: stiffness, laws, creep, texture.
+//!
+//! E of levels 2 to 4 follows from the Shore OO hardness by simulating the durometer with the same
+//! laws ([`super::durometer`]); the moduli it gave are held here, and a test repeats it.
+
+use std::str::FromStr;
+
+/// A reference material (paper, Table 1).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Material {
+    /// Level 1, training.
+    Wood,
+    /// Level 2, training.
+    Rubber,
+    /// Level 3, training.
+    Plasticine,
+    /// Level 4, training.
+    Sponge,
+    /// Level 1, test.
+    HardPlastic,
+    /// Level 2, test.
+    Foam,
+    /// Level 3, test.
+    SoftCandy,
+    /// Level 4, test.
+    YogaMat,
+}
+
+/// Which part of a data set a sample belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[repr(u8)]
+pub enum Split {
+    /// 0 in the data set's file.
+    Train = 0,
+    /// 1 in the data set's file.
+    Test = 1,
+}
+
+/// A name that is no material's.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "no material \"{0}\"; there are wood, rubber, plasticine, sponge, hard-plastic, foam, soft-candy, yoga-mat"
+)]
+pub struct UnknownMaterial(pub String);
+
+impl Material {
+    /// All eight; a material's index is its place here.
+    pub const ALL: [Material; 8] = [
+        Material::Wood,
+        Material::Rubber,
+        Material::Plasticine,
+        Material::Sponge,
+        Material::HardPlastic,
+        Material::Foam,
+        Material::SoftCandy,
+        Material::YogaMat,
+    ];
+
+    /// Hardness level, 1 (hardest) to 4.
+    pub fn level(self) -> u8 {
+        self.index() % 4 + 1
+    }
+
+    /// Training or test material: the paper keeps them apart.
+    pub fn split(self) -> Split {
+        if self.index() < 4 {
+            Split::Train
+        } else {
+            Split::Test
+        }
+    }
+
+    /// The name used in commands and files.
+    pub fn name(self) -> &'static str {
+        match self {
+            Material::Wood => "wood",
+            Material::Rubber => "rubber",
+            Material::Plasticine => "plasticine",
+            Material::Sponge => "sponge",
+            Material::HardPlastic => "hard-plastic",
+            Material::Foam => "foam",
+            Material::SoftCandy => "soft-candy",
+            Material::YogaMat => "yoga-mat",
+        }
+    }
+
+    /// Place in [`Material::ALL`].
+    pub fn index(self) -> u8 {
+        self as u8
+    }
+
+    pub(super) fn properties(self) -> &'static Properties {
+        &PROPERTIES[usize::from(self.index())]
+    }
+}
+
+impl FromStr for Material {
+    type Err = UnknownMaterial;
+
+    fn from_str(name: &str) -> Result<Self, Self::Err> {
+        Self::ALL
+            .into_iter()
+            .find(|material| material.name() == name)
+            .ok_or_else(|| UnknownMaterial(name.to_owned()))
+    }
+}
+
+impl std::fmt::Display for Material {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// How the bulk answers beyond linear elasticity; stresses relative to E.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Law {
+    /// Elastic half-space.
+    Solid,
+    /// Elastic half-space that flows: p_H relative to E.
+    Plastic { hardness: f64 },
+    /// Bonded layer of the object's height, with a plateau: m, s_p relative to E, e_D.
+    Foam {
+        exponent: f64,
+        plateau: f64,
+        strain: f64,
+    },
+}
+
+/// One term of the creep compliance, `j (1 - exp(-t / tau))`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Creep {
+    pub(super) j: f64,
+    pub(super) tau_s: f64,
+}
+
+/// Roughness of a face.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Texture {
+    pub(super) rms_um: f64,
+    pub(super) shortest_mm: f64,
+    pub(super) longest_mm: f64,
+    pub(super) hurst: f64,
+    pub(super) anisotropy: f64,
+}
+
+/// A row of the table.
+#[derive(Debug)]
+pub(super) struct Properties {
+    pub(super) shore: Shore,
+    pub(super) nu: f64,
+    modulus: Modulus,
+    pub(super) law: Law,
+    pub(super) creep: &'static [Creep],
+    pub(super) texture: Texture,
+}
+
+/// Shore hardness over a material's objects.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Shore {
+    pub(super) mean: f64,
+    pub(super) sd: f64,
+    pub(super) low: f64,
+    pub(super) high: f64,
+}
+
+/// Young's modulus in MPa.
+#[derive(Debug, Clone, Copy)]
+enum Modulus {
+    /// Too hard for the Shore OO scale to tell.
+    Fixed(f64),
+    /// By the durometer, at the lowest, the mean and the highest hardness.
+    Durometer([f64; 3]),
+}
+
+impl Properties {
+    /// Young's modulus in MPa of an object of this Shore OO hardness.
+    pub(super) fn young_mpa(&self, shore: f64) -> f64 {
+        let at = match self.modulus {
+            Modulus::Fixed(young) => return young,
+            Modulus::Durometer(at) => at.map(f64::ln),
+        };
+        // ln E is nearly straight in the hardness: a parabola through three points.
+        let Shore {
+            mean, low, high, ..
+        } = self.shore;
+        let basis = |x: f64, y: f64, z: f64| (shore - y) * (shore - z) / ((x - y) * (x - z));
+        let ln = at[0] * basis(low, mean, high)
+            + at[1] * basis(mean, low, high)
+            + at[2] * basis(high, low, mean);
+        ln.exp()
+    }
+
+    /// J(t) / J0 = 1 + sum j (1 - exp(-t / tau)).
+    pub(super) fn compliance_ratio(&self, time_s: f64) -> f64 {
+        1.0 + self
+            .creep
+            .iter()
+            .map(|c| c.j * -(-time_s / c.tau_s).exp_m1())
+            .sum::<f64>()
+    }
+}
+
+const fn shore(mean: f64, sd: f64, low: f64, high: f64) -> Shore {
+    Shore {
+        mean,
+        sd,
+        low,
+        high,
+    }
+}
+
+const fn creep(j: f64, tau_s: f64) -> Creep {
+    Creep { j, tau_s }
+}
+
+const fn texture(
+    rms_um: f64,
+    shortest_mm: f64,
+    longest_mm: f64,
+    hurst: f64,
+    anisotropy: f64,
+) -> Texture {
+    Texture {
+        rms_um,
+        shortest_mm,
+        longest_mm,
+        hurst,
+        anisotropy,
+    }
+}
+
+const PROPERTIES: [Properties; 8] = [
+    Properties {
+        shore: shore(87.0, 1.5, 82.0, 95.0),
+        nu: 0.35,
+        modulus: Modulus::Fixed(600.0),
+        law: Law::Solid,
+        creep: &[creep(0.03, 1.0)],
+        texture: texture(55.0, 2.5, 18.0, 0.4, 2.0),
+    },
+    Properties {
+        shore: shore(66.0, 1.2, 61.5, 69.5),
+        nu: 0.49,
+        modulus: Modulus::Durometer([0.4673, 0.5870, 0.7126]),
+        law: Law::Solid,
+        creep: &[creep(0.10, 0.3), creep(0.06, 3.0)],
+        texture: texture(35.0, 3.0, 40.0, 0.9, 1.0),
+    },
+    Properties {
+        shore: shore(52.0, 1.0, 51.0, 56.0),
+        nu: 0.45,
+        modulus: Modulus::Durometer([1.1336, 1.1638, 1.3005]),
+        law: Law::Plastic {
+            hardness: 1.0 / 12.0,
+        },
+        creep: &[creep(0.10, 0.5)],
+        texture: texture(90.0, 4.0, 30.0, 0.9, 1.0),
+    },
+    Properties {
+        shore: shore(32.0, 2.0, 25.0, 40.0),
+        nu: 0.10,
+        modulus: Modulus::Durometer([0.1947, 0.2661, 0.3823]),
+        law: Law::Foam {
+            exponent: 2.5,
+            plateau: 0.12,
+            strain: 0.50,
+        },
+        creep: &[creep(0.12, 0.3), creep(0.08, 3.0)],
+        texture: texture(160.0, 2.0, 10.0, 0.5, 1.0),
+    },
+    Properties {
+        shore: shore(88.0, 1.5, 82.0, 95.0),
+        nu: 0.38,
+        modulus: Modulus::Fixed(2200.0),
+        law: Law::Solid,
+        creep: &[creep(0.03, 1.0)],
+        texture: texture(55.0, 4.0, 22.0, 0.6, 1.0),
+    },
+    Properties {
+        shore: shore(63.0, 1.2, 61.2, 67.0),
+        nu: 0.25,
+        modulus: Modulus::Durometer([0.6735, 0.7348, 0.9018]),
+        law: Law::Foam {
+            exponent: 2.5,
+            plateau: 0.35,
+            strain: 0.35,
+        },
+        creep: &[creep(0.12, 0.3), creep(0.06, 3.0)],
+        texture: texture(50.0, 3.0, 30.0, 0.7, 1.0),
+    },
+    Properties {
+        shore: shore(55.0, 1.2, 51.5, 59.0),
+        nu: 0.48,
+        modulus: Modulus::Durometer([0.3417, 0.3971, 0.4757]),
+        law: Law::Solid,
+        creep: &[creep(0.30, 0.2), creep(0.30, 2.0)],
+        texture: texture(80.0, 5.0, 30.0, 0.9, 1.0),
+    },
+    Properties {
+        shore: shore(38.0, 2.0, 32.0, 44.0),
+        nu: 0.15,
+        modulus: Modulus::Durometer([0.2353, 0.3043, 0.3957]),
+        law: Law::Foam {
+            exponent: 2.0,
+            plateau: 0.15,
+            strain: 0.42,
+        },
+        creep: &[creep(0.12, 0.3), creep(0.06, 3.0)],
+        texture: texture(110.0, 3.0, 8.0, 0.5, 1.0),
+    },
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_round_trip_and_a_wrong_one_lists_them() {
+        for (index, material) in Material::ALL.into_iter().enumerate() {
+            assert_eq!(material.name().parse(), Ok(material));
+            assert_eq!(usize::from(material.index()), index);
+        }
+        let error = "steel".parse::<Material>().unwrap_err().to_string();
+        assert!(
+            Material::ALL
+                .iter()
+                .all(|material| error.contains(material.name())),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn levels_and_splits_are_those_of_the_papers_table_1() {
+        let levels = Material::ALL.map(Material::level);
+        assert_eq!(levels, [1, 2, 3, 4, 1, 2, 3, 4]);
+        assert_eq!(Material::Sponge.split(), Split::Train);
+        assert_eq!(Material::HardPlastic.split(), Split::Test);
+    }
+
+    #[test]
+    fn hardness_ranges_stay_inside_their_level() {
+        // Table 1: above 70, 61 to 70, 51 to 60, at most 50.
+        let bounds = [(70.0, 100.0), (61.0, 70.0), (51.0, 60.0), (0.0, 50.0)];
+        for material in Material::ALL {
+            let Shore {
+                mean, low, high, ..
+            } = material.properties().shore;
+            let (least, most) = bounds[usize::from(material.level()) - 1];
+            assert!(
+                least <= low && low < mean && mean < high && high <= most,
+                "{material}"
+            );
+        }
+    }
+}

@@ -1,0 +1,384 @@
+//! Objects and how they lie under the sensor: families, sizes, faces, postures.
+//!
+//! Lengths in mm; x and y in the sensor's plane from its centre, heights measured downwards from
+//! the highest point of the face.
+
+use super::material::Material;
+use super::texture::Patch;
+use crate::random::Stream;
+
+/// Which distribution of shapes the objects are drawn from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Shapes {
+    /// One distribution for all materials, and test objects of the same geometry, posture and
+    /// force in every test material: shape cannot carry the label.
+    Matched,
+    /// As the paper's pictures suggest: rigid objects mostly flat boxes, soft ones round. Part
+    /// of any accuracy on these is shape.
+    Paper,
+}
+
+impl std::str::FromStr for Shapes {
+    type Err = UnknownShapes;
+
+    fn from_str(name: &str) -> Result<Self, Self::Err> {
+        match name {
+            "matched" => Ok(Shapes::Matched),
+            "paper" => Ok(Shapes::Paper),
+            _ => Err(UnknownShapes(name.to_owned())),
+        }
+    }
+}
+
+/// A name that is no set of shapes.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("no shapes \"{0}\"; there are matched, paper")]
+pub struct UnknownShapes(pub String);
+
+/// Postures an object is pressed in (paper: "at least six").
+pub(super) const POSTURES: usize = 6;
+/// Where the object is not: no press reaches this depth.
+const NOTHING_MM: f64 = 1e3;
+
+/// An object's outline, the same in every material.
+#[derive(Debug, Clone)]
+pub(super) struct Object {
+    solid: Solid,
+    edge_mm: f64,
+    /// Radius of curvature of the three pairs of faces; negative: hollow.
+    crown_mm: [f64; 3],
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Solid {
+    Ball {
+        radius: f64,
+    },
+    Cylinder {
+        radius: f64,
+        length: f64,
+    },
+    Block {
+        sides: [f64; 3],
+    },
+    Wedge {
+        length: f64,
+        tip: f64,
+        flank_deg: f64,
+    },
+    Pebble {
+        axes: [f64; 3],
+    },
+}
+
+/// What the sensor meets in one posture.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Face {
+    outline: Outline,
+    /// From the table to the highest point.
+    pub(super) height_mm: f64,
+    /// Standard deviation of the tilt, degrees: round objects roll, flat ones lie.
+    pub(super) tilt_sd_deg: f64,
+    /// Factor on the texture's rms.
+    pub(super) roughness: f64,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Outline {
+    Ellipsoid {
+        x: f64,
+        y: f64,
+        z: f64,
+    },
+    Ridge {
+        radius: f64,
+        half_length: f64,
+        edge: f64,
+        flank_deg: f64,
+    },
+    Disc {
+        radius: f64,
+        edge: f64,
+        crown: f64,
+    },
+    Rectangle {
+        half_x: f64,
+        half_y: f64,
+        edge: f64,
+        crown: f64,
+    },
+}
+
+/// How the face lies under the sensor in one press.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Pose {
+    turn_rad: f64,
+    shift_mm: [f64; 2],
+    /// Slopes along x and y.
+    tilt: [f64; 2],
+}
+
+impl Pose {
+    /// Turn uniform, shift uniform within 6 mm, tilt normal.
+    pub(super) fn draw(face: &Face, stream: &mut Stream) -> Self {
+        let turn_rad = stream.range(0.0, std::f64::consts::TAU);
+        let shift_mm = [stream.range(-6.0, 6.0), stream.range(-6.0, 6.0)];
+        let mut tilt = || (face.tilt_sd_deg * stream.normal()).to_radians().tan();
+        Self {
+            turn_rad,
+            shift_mm,
+            tilt: [tilt(), tilt()],
+        }
+    }
+}
+
+/// Weights of ball, cylinder, box, wedge, pebble.
+const RIGID_STYLE: [f64; 5] = [0.05, 0.15, 0.62, 0.08, 0.10];
+const SOFT_STYLE: [f64; 5] = [0.42, 0.18, 0.12, 0.03, 0.25];
+
+impl Object {
+    /// Draws an object; `material` matters for the paper's shapes only.
+    ///
+    /// The matched distribution is the even mixture of the paper's two: every shape that either
+    /// kind of material can have, in every material.
+    pub(super) fn draw(shapes: Shapes, material: Material, stream: &mut Stream) -> Self {
+        let coin = stream.uniform() < 0.5;
+        let flat = match shapes {
+            Shapes::Matched => coin,
+            Shapes::Paper => material.level() == 1,
+        };
+        let weights = if flat { RIGID_STYLE } else { SOFT_STYLE };
+        let mut rest = stream.uniform();
+        let family = weights
+            .iter()
+            .position(|&weight| {
+                rest -= weight;
+                rest < 0.0
+            })
+            .unwrap_or(4);
+        let mut pick = |low, high| stream.range(low, high);
+        let solid = match family {
+            0 => Solid::Ball {
+                radius: pick(24.0, 30.0),
+            },
+            1 => Solid::Cylinder {
+                radius: pick(16.0, 22.0),
+                length: pick(30.0, 60.0),
+            },
+            2 => Solid::Block {
+                sides: [pick(25.0, 60.0), pick(25.0, 60.0), pick(18.0, 45.0)],
+            },
+            3 => Solid::Wedge {
+                length: pick(25.0, 50.0),
+                tip: pick(4.0, 10.0),
+                flank_deg: pick(30.0, 45.0),
+            },
+            _ => Solid::Pebble {
+                axes: [pick(23.0, 29.0), pick(23.0, 29.0), pick(23.0, 29.0)],
+            },
+        };
+        let edge_mm = pick(1.0, 4.0);
+        let crown_mm = std::array::from_fn(|_| {
+            if !flat {
+                return stream.range(31.0, 42.0);
+            }
+            let radius = stream.range(800.0, 6000.0);
+            if stream.uniform() < 0.3 {
+                -radius
+            } else {
+                radius
+            }
+        });
+        Self {
+            solid,
+            edge_mm,
+            crown_mm,
+        }
+    }
+
+    /// The face that posture `posture` (0 to 5) turns up.
+    pub(super) fn face(&self, posture: usize) -> Face {
+        let edge = self.edge_mm;
+        let flat = |outline, height_mm| Face {
+            outline,
+            height_mm,
+            tilt_sd_deg: 0.1,
+            roughness: 1.0,
+        };
+        match self.solid {
+            Solid::Ball { radius } => Face {
+                outline: Outline::Ellipsoid {
+                    x: radius,
+                    y: radius,
+                    z: radius,
+                },
+                height_mm: 2.0 * radius,
+                tilt_sd_deg: 1.5,
+                roughness: 1.0,
+            },
+            Solid::Pebble { axes } => {
+                let up = posture % 3;
+                let (x, y, z) = (axes[(up + 1) % 3], axes[(up + 2) % 3], axes[up]);
+                Face {
+                    outline: Outline::Ellipsoid { x, y, z },
+                    height_mm: 2.0 * z,
+                    tilt_sd_deg: 1.5,
+                    roughness: 2.0,
+                }
+            }
+            // Four times on its side, once on each end.
+            Solid::Cylinder { radius, length } if posture < 4 => flat(
+                Outline::Ridge {
+                    radius,
+                    half_length: 0.5 * length,
+                    edge,
+                    flank_deg: 90.0,
+                },
+                2.0 * radius,
+            ),
+            Solid::Cylinder { radius, length } => flat(
+                Outline::Disc {
+                    radius,
+                    edge,
+                    crown: self.crown_mm[posture - 4],
+                },
+                length,
+            ),
+            Solid::Block { sides } => {
+                let up = (posture + 2) % 3;
+                let (a, b) = (sides[(up + 1) % 3], sides[(up + 2) % 3]);
+                let outline = Outline::Rectangle {
+                    half_x: 0.5 * a,
+                    half_y: 0.5 * b,
+                    edge,
+                    crown: self.crown_mm[up],
+                };
+                flat(outline, sides[up])
+            }
+            Solid::Wedge {
+                length,
+                tip,
+                flank_deg,
+            } => flat(
+                Outline::Ridge {
+                    radius: tip,
+                    half_length: 0.5 * length,
+                    edge,
+                    flank_deg,
+                },
+                WEDGE_HEIGHT_MM,
+            ),
+        }
+    }
+}
+
+/// A wedge stands on its base, tip up.
+const WEDGE_HEIGHT_MM: f64 = 30.0;
+
+impl Face {
+    /// Gap h in mm under a level sensor at `width` x `width` cells around the centre, least 0.
+    pub(super) fn gap_mm(
+        &self,
+        pose: &Pose,
+        patch: &Patch,
+        width: usize,
+        cell_mm: f64,
+    ) -> Vec<f32> {
+        let (sin, cos) = pose.turn_rad.sin_cos();
+        let middle = 0.5 * width as f64;
+        let mut gap = vec![NOTHING_MM as f32; width * width];
+        for (k, gap) in gap.iter_mut().enumerate() {
+            let at = |i: usize| (i as f64 + 0.5 - middle) * cell_mm;
+            let (x, y) = (
+                at(k % width) - pose.shift_mm[0],
+                at(k / width) - pose.shift_mm[1],
+            );
+            let (u, v) = (cos * x + sin * y, cos * y - sin * x);
+            let drop = self.outline.drop_mm(u, v);
+            if drop < NOTHING_MM {
+                let level = drop + pose.tilt[0] * x + pose.tilt[1] * y;
+                *gap = level as f32 - patch.height_mm(u, v);
+            }
+        }
+        let least = gap.iter().copied().fold(f32::INFINITY, f32::min);
+        gap.iter_mut().for_each(|gap| *gap -= least);
+        gap
+    }
+}
+
+impl Outline {
+    /// Depth below the face's level at (`u`, `v`); [`NOTHING_MM`] beside the object.
+    fn drop_mm(&self, u: f64, v: f64) -> f64 {
+        match *self {
+            Outline::Ellipsoid { x, y, z } => {
+                let rest = 1.0 - (u / x).powi(2) - (v / y).powi(2);
+                // Near the equator the slope is endless; no contact gets there.
+                if rest > 0.01 {
+                    z * (1.0 - rest.sqrt())
+                } else {
+                    NOTHING_MM
+                }
+            }
+            Outline::Ridge {
+                radius,
+                half_length,
+                edge,
+                flank_deg,
+            } => {
+                let end = rounded(u.abs() - (half_length - edge), 0.0, edge);
+                let turn = flank_deg.to_radians();
+                let v = v.abs();
+                let side = if v < 0.99 * radius * turn.sin() {
+                    cap(radius, v)
+                } else if flank_deg < 89.0 {
+                    let at = 0.99 * radius * turn.sin();
+                    cap(radius, at) + (v - at) * turn.tan()
+                } else {
+                    NOTHING_MM
+                };
+                end + side
+            }
+            Outline::Disc {
+                radius,
+                edge,
+                crown,
+            } => {
+                let r = u.hypot(v);
+                rounded(r - (radius - edge), 0.0, edge) + crowned(crown, r)
+            }
+            Outline::Rectangle {
+                half_x,
+                half_y,
+                edge,
+                crown,
+            } => {
+                rounded(u.abs() - (half_x - edge), v.abs() - (half_y - edge), edge)
+                    + crowned(crown, u.hypot(v))
+            }
+        }
+        .min(NOTHING_MM)
+    }
+}
+
+/// Drop of an edge rounded with radius `edge`, at these distances past where the rounding starts.
+fn rounded(past_u: f64, past_v: f64, edge: f64) -> f64 {
+    let past = past_u.max(0.0).hypot(past_v.max(0.0));
+    if past < 0.99 * edge {
+        cap(edge, past)
+    } else {
+        NOTHING_MM
+    }
+}
+
+/// Drop of a sphere of this radius; hollow if negative.
+fn crowned(crown: f64, r: f64) -> f64 {
+    if r >= 0.99 * crown.abs() {
+        NOTHING_MM
+    } else {
+        crown.signum() * cap(crown.abs(), r)
+    }
+}
+
+fn cap(radius: f64, r: f64) -> f64 {
+    radius - (radius * radius - r * r).sqrt()
+}

@@ -1,0 +1,363 @@
+//! One specimen under the sensor: from gap and force to pressure and taxel forces.
+//!
+//! A [`Bench`] holds what is costly to make and shared by presses: FFT plans, kernels, work
+//! fields. It never changes a result: a fresh bench gives the same bytes.
+
+use std::collections::BTreeMap;
+use std::rc::Rc;
+
+use super::contact::{self, Contact, Fields, Local, Problem, TOLERANCE};
+use super::fourier::Convolver;
+use super::kernel::{self, Layer};
+use super::material::{Law, Properties};
+use super::object::{Face, Pose};
+use super::sensor::{CELL_MM, CELLS};
+use super::texture::Patch;
+
+/// Windows in cells: their doubles are sizes that FFTs like.
+const WIDTHS: [usize; 6] = [24, 32, 48, 64, 96, CELLS];
+
+/// The sensor's cover: E in MPa, Poisson's ratio, thickness in mm (assumed: soft silicone).
+const COVER_YOUNG_MPA: f64 = 3.0;
+const COVER_NU: f64 = 0.45;
+const COVER_MM: f64 = 1.0;
+
+/// A face of an object in its pose.
+pub(super) struct Specimen {
+    pub(super) properties: &'static Properties,
+    pub(super) young_mpa: f64,
+    height_mm: f64,
+    /// Undeformed gap over the whole sensor, `[CELLS, CELLS]`.
+    gap_mm: Vec<f32>,
+}
+
+/// The part of the sensor that a press is solved on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Window {
+    /// First row and column, in cells of the sensor.
+    pub(super) corner: (usize, usize),
+    pub(super) width: usize,
+}
+
+/// Plans, kernels and fields, kept between presses.
+#[derive(Default)]
+pub(super) struct Bench {
+    widths: BTreeMap<usize, Width>,
+    layers: Vec<(u64, Layer)>,
+    fields: Fields,
+    combined: Vec<f32>,
+}
+
+struct Width {
+    convolver: Convolver,
+    half_space: Rc<Vec<f32>>,
+    cover: Vec<f32>,
+    /// The last few layers' spectra by (nu, height): one posture's presses follow each other.
+    recent: Vec<((u64, u64), Rc<Vec<f32>>)>,
+}
+
+/// Layer spectra held a width; an object has up to three heights.
+const RECENT: usize = 4;
+
+impl Specimen {
+    pub(super) fn new(
+        properties: &'static Properties,
+        young_mpa: f64,
+        face: &Face,
+        pose: &Pose,
+        patch: &Patch,
+    ) -> Self {
+        let gap_mm = face.gap_mm(pose, patch, CELLS, CELL_MM);
+        Self {
+            properties,
+            young_mpa,
+            height_mm: face.height_mm,
+            gap_mm,
+        }
+    }
+
+    /// E / (1 - nu^2), MPa.
+    fn plane_strain_mpa(&self) -> f64 {
+        self.young_mpa / (1.0 - self.properties.nu * self.properties.nu)
+    }
+
+    /// The local law at one step: `factor` and `history` from creep, `time_s` for flow.
+    fn local<'a>(&self, factor: f64, history_mpa: &'a [f32], time_s: f64) -> Local<'a> {
+        match self.properties.law {
+            Law::Solid => Local::None,
+            Law::Plastic { hardness } => Local::Flow {
+                hardness_mpa: hardness * self.young_mpa,
+                time_s,
+            },
+            Law::Foam {
+                exponent,
+                plateau,
+                strain,
+            } => Local::Foam {
+                plateau_mpa: plateau * self.young_mpa,
+                exponent,
+                strain,
+                height_mm: self.height_mm,
+                factor,
+                history_mpa,
+            },
+        }
+    }
+
+    /// The gap on a window, `[width, width]`.
+    pub(super) fn gap_on(&self, window: Window) -> Vec<f32> {
+        let mut gap = Vec::with_capacity(window.width * window.width);
+        for i in 0..window.width {
+            let at = (window.corner.0 + i) * CELLS + window.corner.1;
+            gap.extend_from_slice(&self.gap_mm[at..at + window.width]);
+        }
+        gap
+    }
+
+    /// A guess at the contact under `force_n`: the depth below which the gap closes.
+    ///
+    /// With overlap volume V at depth d and radius a of half the overlap's area, a sphere and a
+    /// flat punch both obey `F = 0.42 E* V / a` within 7 %; the cover adds its own compliance.
+    fn closing_depth_mm(&self, force_n: f64) -> f64 {
+        let soft = match self.properties.law {
+            Law::Foam { .. } => 0.4,
+            Law::Solid | Law::Plastic { .. } => 0.9,
+        };
+        let stiffness = 0.42 * self.plane_strain_mpa() * soft;
+        let cover = cover_compliance();
+        let (mut low, mut high) = (0.0_f32, 16.0_f32);
+        for _ in 0..16 {
+            let depth = 0.5 * (low + high);
+            let (mut sum, mut count) = (0.0_f32, 0.0_f32);
+            for &gap in &self.gap_mm {
+                let overlap = (depth - gap).max(0.0);
+                sum += overlap;
+                count += if overlap > 0.0 { 1.0 } else { 0.0 };
+            }
+            let area = CELL_MM * CELL_MM;
+            let (volume, covered) = (f64::from(sum) * area, f64::from(count) * area);
+            let radius = (0.5 * covered / std::f64::consts::PI).sqrt();
+            let force = volume / (radius / stiffness + cover);
+            if force < force_n {
+                low = depth;
+            } else {
+                high = depth;
+            }
+        }
+        // A sphere touches where the undeformed gap is under half the depth; a stiff rough face
+        // touches nearly as a mattress, where it is under all of it.
+        let share = if self.young_mpa > 20.0 { 1.0 } else { 0.6 };
+        share * f64::from(high)
+    }
+
+    /// The smallest window around the cells closer than `depth_mm`, with a margin.
+    fn window_around(&self, depth_mm: f64, least_width: usize) -> Window {
+        const MARGIN: usize = 2;
+        let depth = depth_mm as f32;
+        let (mut first, mut last) = ((CELLS, CELLS), (0, 0));
+        for (k, &gap) in self.gap_mm.iter().enumerate() {
+            if gap <= depth {
+                let (i, j) = (k / CELLS, k % CELLS);
+                first = (first.0.min(i), first.1.min(j));
+                last = (last.0.max(i), last.1.max(j));
+            }
+        }
+        let extent = (last.0 - first.0).max(last.1 - first.1) + 1 + 2 * MARGIN;
+        let width = WIDTHS
+            .into_iter()
+            .find(|&width| width >= extent.max(least_width))
+            .unwrap_or(CELLS);
+        let corner = |first: usize, last: usize| {
+            ((first + last).div_ceil(2))
+                .saturating_sub(width / 2)
+                .min(CELLS - width)
+        };
+        Window {
+            corner: (corner(first.0, last.0), corner(first.1, last.1)),
+            width,
+        }
+    }
+}
+
+/// H / M of the cover, mm per MPa.
+fn cover_compliance() -> f64 {
+    let plane_strain = COVER_YOUNG_MPA / (1.0 - COVER_NU * COVER_NU);
+    COVER_MM * kernel::confined_compliance(COVER_NU) / plane_strain
+}
+
+/// Creep and flow of one solve.
+#[derive(Clone, Copy)]
+pub(super) struct Step<'a> {
+    pub(super) force_n: f64,
+    /// Object's compliance per its instantaneous compliance.
+    pub(super) factor: f64,
+    /// What earlier steps left of the effective pressure; empty: nothing.
+    pub(super) history_mpa: &'a [f32],
+    /// Time over which flow acts.
+    pub(super) time_s: f64,
+}
+
+impl Bench {
+    /// Presses with a force held for `hold_s` after a ramp of `ramp_s`; returns the window and the
+    /// pressure (MPa) on it. The window grows until the contact fits.
+    pub(super) fn press(
+        &mut self,
+        specimen: &Specimen,
+        force_n: f64,
+        ramp_s: f64,
+        hold_s: f64,
+    ) -> (Window, Vec<f32>, Contact) {
+        let depth_mm = specimen.closing_depth_mm(force_n);
+        let mut window = specimen.window_around(depth_mm, 0);
+        loop {
+            let gap = specimen.gap_on(window);
+            let mut pressure: Vec<f32> = gap
+                .iter()
+                .map(|&gap| (depth_mm as f32 - gap).max(0.0))
+                .collect();
+            let step = Step {
+                force_n,
+                // Under a linear ramp the load is, on average, half the ramp old; flow at the
+                // fourth power of the pressure counts a fifth of it.
+                factor: specimen.properties.compliance_ratio(hold_s + 0.5 * ramp_s),
+                history_mpa: &[],
+                time_s: hold_s + 0.2 * ramp_s,
+            };
+            let contact = self.solve(specimen, window.width, &gap, step, &mut pressure);
+            if window.width == CELLS || !touches_border(&pressure, window.width) {
+                return (window, pressure, contact);
+            }
+            window = specimen.window_around(depth_mm, window.width + 1);
+        }
+    }
+
+    /// Solves one step on a window from the guess in `pressure`.
+    pub(super) fn solve(
+        &mut self,
+        specimen: &Specimen,
+        width: usize,
+        gap_mm: &[f32],
+        step: Step,
+        pressure_mpa: &mut [f32],
+    ) -> Contact {
+        let object = self.object_spectrum(specimen, width);
+        let held = self
+            .widths
+            .get_mut(&width)
+            .expect("object_spectrum has made the width");
+        let unit = (step.factor * CELL_MM / specimen.plane_strain_mpa()) as f32;
+        self.combined.clear();
+        self.combined.extend(
+            object
+                .iter()
+                .zip(&held.cover)
+                .map(|(&o, &cover)| unit * o + cover),
+        );
+        let problem = Problem {
+            gap_mm,
+            spectrum: &self.combined,
+            local: specimen.local(step.factor, step.history_mpa, step.time_s),
+            force_n: step.force_n,
+            cell_mm: CELL_MM,
+            tolerance: TOLERANCE,
+        };
+        contact::solve(
+            &mut held.convolver,
+            &mut self.fields,
+            &problem,
+            pressure_mpa,
+        )
+    }
+
+    /// Displacement in mm of the object alone under an effective pressure.
+    pub(super) fn displacement(
+        &mut self,
+        specimen: &Specimen,
+        width: usize,
+        pressure_mpa: &[f32],
+    ) -> Vec<f32> {
+        let object = self.object_spectrum(specimen, width);
+        let held = self
+            .widths
+            .get_mut(&width)
+            .expect("object_spectrum has made the width");
+        let mut displacement = vec![0.0; pressure_mpa.len()];
+        held.convolver
+            .convolve(&object, pressure_mpa, &mut displacement);
+        let unit = (CELL_MM / specimen.plane_strain_mpa()) as f32;
+        displacement.iter_mut().for_each(|u| *u *= unit);
+        displacement
+    }
+
+    /// The object's spectrum for E* = 1 and lengths in cells.
+    fn object_spectrum(&mut self, specimen: &Specimen, width: usize) -> Rc<Vec<f32>> {
+        if !self.widths.contains_key(&width) {
+            let made = Width::new(width, self.layer(COVER_NU));
+            self.widths.insert(width, made);
+        }
+        let Law::Foam { .. } = specimen.properties.law else {
+            return Rc::clone(&self.widths[&width].half_space);
+        };
+        let height = specimen.height_mm / CELL_MM;
+        let key = (specimen.properties.nu.to_bits(), height.to_bits());
+        let recent = &self.widths[&width].recent;
+        if let Some((_, spectrum)) = recent.iter().find(|(held, _)| *held == key) {
+            return Rc::clone(spectrum);
+        }
+        self.layer(specimen.properties.nu);
+        let layer = &self
+            .layers
+            .iter()
+            .find(|(nu, _)| *nu == key.0)
+            .expect("just made")
+            .1;
+        let held = self.widths.get_mut(&width).expect("made above");
+        let spectrum = Rc::new(
+            held.convolver
+                .spectrum(|i, j| layer.influence(i as f64, j as f64, height)),
+        );
+        if held.recent.len() == RECENT {
+            held.recent.remove(0);
+        }
+        held.recent.push((key, Rc::clone(&spectrum)));
+        spectrum
+    }
+
+    fn layer(&mut self, nu: f64) -> &Layer {
+        let key = nu.to_bits();
+        let at = self
+            .layers
+            .iter()
+            .position(|(held, _)| *held == key)
+            .unwrap_or_else(|| {
+                self.layers.push((key, Layer::new(nu)));
+                self.layers.len() - 1
+            });
+        &self.layers[at].1
+    }
+}
+
+impl Width {
+    fn new(width: usize, cover: &Layer) -> Self {
+        let mut convolver = Convolver::new(width);
+        let half_space = Rc::new(convolver.spectrum(|i, j| kernel::half_space(i as f64, j as f64)));
+        let unit = CELL_MM * (1.0 - COVER_NU * COVER_NU) / COVER_YOUNG_MPA;
+        let height = COVER_MM / CELL_MM;
+        let cover = convolver.spectrum(|i, j| unit * cover.influence(i as f64, j as f64, height));
+        Self {
+            convolver,
+            half_space,
+            cover,
+            recent: Vec::new(),
+        }
+    }
+}
+
+pub(super) fn touches_border(pressure_mpa: &[f32], width: usize) -> bool {
+    let last = width - 1;
+    (0..width).any(|k| {
+        [k, last * width + k, k * width, k * width + last]
+            .into_iter()
+            .any(|at| pressure_mpa[at] > 0.0)
+    })
+}
