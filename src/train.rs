@@ -1,6 +1,7 @@
 //! The method.
 
 pub mod augment;
+pub mod dataset;
 pub mod hrn;
 pub mod metrics;
 pub mod network;
