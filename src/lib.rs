@@ -15,3 +15,5 @@ pub mod pipeline;
 
 pub mod random;
 pub mod simulator;
+#[cfg(feature = "train")]
+pub mod train;

@@ -14,6 +14,9 @@ use tract_onnx::prelude::*;
 
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 
+/// The default model, built into the binary; `models/README.md` is its card.
+pub const BUILT_IN: &[u8] = include_bytes!("../models/hrn.onnx");
+
 /// Largest model file accepted, in bytes: 64 MB.
 pub const MAX_FILE_BYTES: usize = 64_000_000;
 /// Oldest ONNX operator set accepted.
@@ -342,7 +345,8 @@ fn largest_difference(left: &[f32], right: &[f32]) -> f32 {
         .fold(0.0, f32::max)
 }
 
-fn sha256_hex(bytes: &[u8]) -> String {
+/// SHA-256 of `bytes` as 64 hexadecimal digits.
+pub fn sha256_hex(bytes: &[u8]) -> String {
     let mut hex = String::with_capacity(64);
     for byte in Sha256::digest(bytes) {
         write!(hex, "{byte:02x}").expect("a String grows without failing");
