@@ -6,6 +6,7 @@
 //! What is modelled and what is not stands at the head of each part.
 
 mod contact;
+mod course;
 mod dataset;
 #[cfg(test)]
 mod durometer;
@@ -15,9 +16,11 @@ mod material;
 mod object;
 mod press;
 mod sensor;
+mod sequence;
 mod texture;
 
 pub use dataset::{DatasetSettings, LabelledSample, dataset};
 pub use material::{Material, Split, UnknownMaterial};
 pub use object::{Shapes, UnknownShapes};
 pub use sensor::{NEWTONS_PER_COUNT, SensorProfile, Threshold, UnknownProfile};
+pub use sequence::{Sequence, SequenceFrame, SequenceSettings};

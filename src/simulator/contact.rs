@@ -267,6 +267,11 @@ fn contact_radius(pressure_mpa: &[f32], cell_area: f64) -> f64 {
 }
 
 impl Local<'_> {
+    /// Displacement in mm of a cell without history.
+    pub(super) fn displacement_mm(&self, pressure_mpa: f32, radius_mm: f64) -> f32 {
+        self.at(usize::MAX, pressure_mpa, radius_mm).0
+    }
+
     /// Displacement (mm) and a slope (mm/MPa) that is safe to step with, at cell `i`.
     fn at(&self, i: usize, pressure_mpa: f32, radius_mm: f64) -> (f32, f32) {
         match *self {

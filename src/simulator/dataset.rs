@@ -70,7 +70,7 @@ pub struct LabelledSample {
     pub shore: f32,
 }
 
-/// A taxel at this many counts is in contact (contract: 0.07 N at 0.04 N a count).
+/// A taxel with this many counts is in contact (contract: 0.07 N at 0.04 N a count).
 pub(super) const CONTACT_COUNTS: u16 = 2;
 /// Taxels in contact that begin a press (contract).
 pub(super) const BEGIN_AREA_TAXELS: usize = 3;
@@ -134,15 +134,16 @@ pub fn dataset(
     parts.into_iter().flatten().collect()
 }
 
-/// The streams of one object. Geometry, postures and forces of matched test objects do not depend
-/// on the material: that is what pairs them.
+/// The streams of one object: its geometry, poses and forces, and what its material adds.
 pub(super) struct Draws {
     pub(super) geometry: Stream,
     pub(super) body: Stream,
 }
 
 impl Draws {
-    pub(super) fn new(seed: u64, shapes: Shapes, material: Material, number: u32) -> Self {
+    /// Object number `number` of a material in a data set. Geometry, poses and forces of matched
+    /// test objects do not depend on the material: that is what pairs them.
+    fn new(seed: u64, shapes: Shapes, material: Material, number: u32) -> Self {
         let own = u64::from(material.index());
         let (split, geometry) = match (material.split(), shapes) {
             (Split::Train, _) => ("train", own),
@@ -184,36 +185,20 @@ pub(super) fn draw_patch(material: Material, roughness: f64, stream: &mut Stream
     Patch::new(texture, factor, super::sensor::CELL_MM, stream)
 }
 
-/// Sensor number `number` of a split: the two splits share none.
-pub(super) fn draw_sensor(
-    seed: u64,
-    split: Split,
-    number: u32,
-    profile: SensorProfile,
-    threshold: Threshold,
-) -> Sensor {
-    let name = match split {
-        Split::Train => "train sensor",
-        Split::Test => "test sensor",
-    };
-    Sensor::new(
-        profile,
-        threshold,
-        &Stream::new(seed, name).child(u64::from(number)),
-    )
-}
-
 impl Subject {
     fn draw(settings: &DatasetSettings, material: Material, number: u32) -> Self {
         let draws = Draws::new(settings.seed, settings.shapes, material, number);
         let object = Object::draw(settings.shapes, material, &mut draws.geometry.child(0));
         let shore = draw_shore(material, &mut draws.body.child(0));
-        let sensor = draw_sensor(
-            settings.seed,
-            material.split(),
-            number % SENSORS,
+        // The splits share no sensor: the streams have different names.
+        let sensors = match material.split() {
+            Split::Train => "train sensor",
+            Split::Test => "test sensor",
+        };
+        let sensor = Sensor::new(
             settings.profile,
             settings.threshold,
+            &Stream::new(settings.seed, sensors).child(u64::from(number % SENSORS)),
         );
         Self {
             material,

@@ -104,6 +104,17 @@ impl Specimen {
         }
     }
 
+    /// Flow over a step of `time_s`, for a plastic specimen; else nothing.
+    pub(super) fn flow(&self, time_s: f64) -> Local<'static> {
+        match self.properties.law {
+            Law::Plastic { hardness } => Local::Flow {
+                hardness_mpa: hardness * self.young_mpa,
+                time_s,
+            },
+            Law::Solid | Law::Foam { .. } => Local::None,
+        }
+    }
+
     /// The gap on a window, `[width, width]`.
     pub(super) fn gap_on(&self, window: Window) -> Vec<f32> {
         let mut gap = Vec::with_capacity(window.width * window.width);
@@ -179,6 +190,19 @@ impl Specimen {
     }
 }
 
+impl Window {
+    /// Whether it is the whole sensor.
+    pub(super) fn is_whole(self) -> bool {
+        self.width == CELLS
+    }
+
+    /// The next wider window for the same contact, if there is one.
+    pub(super) fn wider(self, specimen: &Specimen, force_n: f64) -> Option<Self> {
+        let depth_mm = specimen.closing_depth_mm(force_n);
+        (!self.is_whole()).then(|| specimen.window_around(depth_mm, self.width + 1))
+    }
+}
+
 /// H / M of the cover, mm per MPa.
 fn cover_compliance() -> f64 {
     let plane_strain = COVER_YOUNG_MPA / (1.0 - COVER_NU * COVER_NU);
@@ -224,7 +248,7 @@ impl Bench {
                 time_s: hold_s + 0.2 * ramp_s,
             };
             let contact = self.solve(specimen, window.width, &gap, step, &mut pressure);
-            if window.width == CELLS || !touches_border(&pressure, window.width) {
+            if window.is_whole() || !touches_border(&pressure, window.width) {
                 return (window, pressure, contact);
             }
             window = specimen.window_around(depth_mm, window.width + 1);
@@ -368,6 +392,7 @@ mod tests {
     use super::super::material::Material;
     use super::super::object::*;
     use super::*;
+    use crate::random::Stream;
 
     #[test]
     #[ignore = "prints figures"]
@@ -377,11 +402,11 @@ mod tests {
             let (mut iters, mut bad, mut most, mut n, mut solves) = (0, 0, 0, 0, 0);
             let t = std::time::Instant::now();
             for number in 0..20 {
-                let draws = Draws::new(1, Shapes::Matched, material, number);
-                let object = Object::draw(Shapes::Matched, material, &mut draws.geometry.child(0));
+                let root = Stream::new(1, "stats").child(number as u64);
+                let object = Object::draw(Shapes::Matched, material, &mut root.child(0));
                 let face = object.face(number as usize % 6);
-                let patch = draw_patch(material, face.roughness, &mut draws.body.child(1));
-                let pose = Pose::draw(&face, &mut draws.geometry.child(1));
+                let patch = draw_patch(material, face.roughness, &mut root.child(1));
+                let pose = Pose::draw(&face, &mut root.child(2));
                 let p = material.properties();
                 let s = Specimen::new(p, p.young_mpa(p.shore.mean), &face, &pose, &patch);
                 for force in [1.0, 4.0, 10.0, 25.0] {

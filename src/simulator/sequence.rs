@@ -1,0 +1,240 @@
+//! Press after press as a sensor would send them: raw frames at a steady rate.
+//!
+//! Frames come out one at a time, but a press is computed whole when its first frame is due (0.05
+//! to 0.5 s of work): who plays a sequence in real time runs it some frames ahead.
+
+use std::collections::VecDeque;
+
+use super::course::Course;
+use super::dataset::{
+    BEGIN_AREA_TAXELS, HARDER, HIGHEST_FORCE_N, TRIES, contact_taxels, draw_patch, draw_shore,
+};
+use super::material::Material;
+use super::object::{Object, POSTURES, Pose, Shapes};
+use super::press::{Bench, Specimen};
+use super::sensor::{Film, Sensor, SensorProfile, Threshold};
+use crate::frame::{RawFrame, TAXELS};
+use crate::random::Stream;
+
+/// What to press, how often and how hard.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SequenceSettings {
+    /// Everything random follows from it.
+    pub seed: u64,
+    /// Frames a second.
+    pub frame_rate_hz: f64,
+    /// Press k is of `materials[(k - 1) % n]`, each time another object.
+    pub materials: Vec<Material>,
+    /// Greatest force of every press; `None`: drawn from 5 to 25 N.
+    pub force_n: Option<f32>,
+    /// Presses to make; `None`: without end.
+    pub presses: Option<u32>,
+    /// Distribution of shapes.
+    pub shapes: Shapes,
+    /// Spread of the sensor.
+    pub profile: SensorProfile,
+    /// Activation of its taxels.
+    pub threshold: Threshold,
+}
+
+impl Default for SequenceSettings {
+    /// The four test materials without end, at the paper's 5 frames/s.
+    fn default() -> Self {
+        Self {
+            seed: 0,
+            frame_rate_hz: 5.0,
+            materials: Material::ALL[4..].to_vec(),
+            force_n: None,
+            presses: None,
+            shapes: Shapes::Matched,
+            profile: SensorProfile::Clean,
+            threshold: Threshold::Spread,
+        }
+    }
+}
+
+/// One frame and what is going on in it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SequenceFrame {
+    /// What the sensor sends.
+    pub raw: RawFrame,
+    /// Number of the press, from 1; the rest after it is counted to it. 0 before the first.
+    pub press: u32,
+    /// What is or was pressed; `None` before the first press.
+    pub material: Option<Material>,
+    /// Whether the object is being touched.
+    pub loaded: bool,
+}
+
+/// An iterator over the frames of a sequence; see [`SequenceSettings`].
+///
+/// It begins with at least 2 s without load, so that tare has its frames at any rate, and rests
+/// 1 s after each press. A press too light to begin one (contract: 3 taxels) is made anew with
+/// more force, so that `presses` is the number that a press tracker sees.
+pub struct Sequence {
+    settings: SequenceSettings,
+    root: Stream,
+    sensor: Sensor,
+    bench: Bench,
+    film: Film,
+    ready: VecDeque<SequenceFrame>,
+    /// Presses made so far.
+    made: u32,
+    /// Frames made so far; frame n is taken at n / frame rate.
+    frames: u64,
+    /// When the rest after the last press ends, s.
+    free_s: f64,
+}
+
+/// Rest before the first press, s.
+const FIRST_REST_S: f64 = 2.0;
+/// Rest after a press, s.
+const REST_S: f64 = 1.0;
+/// Presses do not keep step with the frames: each is up to this much late, s.
+const DELAY_S: f64 = 0.25;
+
+impl Sequence {
+    /// The sequence that follows from `settings`.
+    ///
+    /// # Panics
+    ///
+    /// If there are no materials, or the frame rate is not a positive finite number.
+    pub fn new(settings: SequenceSettings) -> Self {
+        assert!(
+            !settings.materials.is_empty(),
+            "a sequence needs a material to press"
+        );
+        let rate = settings.frame_rate_hz;
+        assert!(
+            rate.is_finite() && rate > 0.0,
+            "frame rate {rate} is not a positive number"
+        );
+        // A name of its own: a sequence meets no object and no sensor of any data set.
+        let root = Stream::new(settings.seed, "sequence");
+        let sensor = Sensor::new(settings.profile, settings.threshold, &root.child(0));
+        let mut sequence = Self {
+            settings,
+            root,
+            sensor,
+            bench: Bench::default(),
+            film: Film::new(),
+            ready: VecDeque::new(),
+            made: 0,
+            frames: 0,
+            free_s: FIRST_REST_S,
+        };
+        sequence.rest(None);
+        sequence
+    }
+
+    /// Frames without load until `free_s`.
+    fn rest(&mut self, material: Option<Material>) {
+        while self.frames as f64 / self.settings.frame_rate_hz <= self.free_s {
+            self.film
+                .advance(&[0.0; TAXELS], 1.0 / self.settings.frame_rate_hz);
+            let raw = RawFrame::default();
+            self.ready.push_back(SequenceFrame {
+                raw,
+                press: self.made,
+                material,
+                loaded: false,
+            });
+            self.frames += 1;
+        }
+    }
+
+    /// Makes the next press and the rest after it.
+    fn press(&mut self) {
+        let index = self.made;
+        let material = self.settings.materials[index as usize % self.settings.materials.len()];
+        self.made += 1;
+        let mut draws = self.root.child(1).child(u64::from(index));
+        let delay_s = draws.range(0.0, DELAY_S);
+        let drawn = draws.range(5.0, HIGHEST_FORCE_N);
+        let mut force_n = self.settings.force_n.map_or(drawn, f64::from);
+        let object = Object::draw(self.settings.shapes, material, &mut draws.child(0));
+        let face = object.face(draws.below(POSTURES));
+        let patch = draw_patch(material, face.roughness, &mut draws.child(1));
+        let pose = Pose::draw(&face, &mut draws.child(2));
+        let hold_s = draws.range(0.8, 1.5);
+        let properties = material.properties();
+        let young_mpa = properties.young_mpa(draw_shore(material, &mut draws.child(3)));
+        let specimen = Specimen::new(properties, young_mpa, &face, &pose, &patch);
+        let touch_s = self.free_s + delay_s;
+        for attempt in 1.. {
+            let course = Course::new(&mut self.bench, &specimen, force_n, hold_s);
+            let mut noise = draws.child(4).child(attempt);
+            let mut film = self.film.clone();
+            let (frames, next) = self.play(&course, touch_s, &mut film, &mut noise);
+            if attempt as usize == TRIES || is_one_press(&frames) {
+                self.ready
+                    .extend(frames.into_iter().map(|(raw, loaded)| SequenceFrame {
+                        raw,
+                        press: self.made,
+                        material: Some(material),
+                        loaded,
+                    }));
+                self.film = film;
+                self.frames = next;
+                self.free_s = touch_s + course.duration_s() + REST_S;
+                return self.rest(Some(material));
+            }
+            force_n *= HARDER;
+        }
+    }
+
+    /// The frames from now until the end of `course`, and the number of the one after.
+    fn play(
+        &self,
+        course: &Course,
+        touch_s: f64,
+        film: &mut Film,
+        noise: &mut Stream,
+    ) -> (Vec<(RawFrame, bool)>, u64) {
+        let period_s = 1.0 / self.settings.frame_rate_hz;
+        let gain = self.sensor.press_gain(noise);
+        let mut frames = Vec::new();
+        for number in self.frames.. {
+            let time_s = number as f64 * period_s - touch_s;
+            if time_s >= course.duration_s() {
+                return (frames, number);
+            }
+            let forces = course.taxels_n(time_s);
+            let crept = film.advance(&forces, period_s);
+            frames.push((self.sensor.read(&crept, gain, noise), time_s > 0.0));
+        }
+        unreachable!("frame numbers do not run out before a press of seconds ends")
+    }
+}
+
+impl Iterator for Sequence {
+    type Item = SequenceFrame;
+
+    fn next(&mut self) -> Option<SequenceFrame> {
+        if self.ready.is_empty()
+            && self
+                .settings
+                .presses
+                .is_none_or(|presses| self.made < presses)
+        {
+            self.press();
+        }
+        self.ready.pop_front()
+    }
+}
+
+/// Whether a press tracker sees exactly one press in these frames (contract, section 4): it
+/// begins at 3 taxels, lasts 2 frames and is not interrupted by 2 frames without contact.
+fn is_one_press(frames: &[(RawFrame, bool)]) -> bool {
+    let areas: Vec<usize> = frames.iter().map(|(raw, _)| contact_taxels(raw)).collect();
+    let Some(begin) = areas.iter().position(|&area| area >= BEGIN_AREA_TAXELS) else {
+        return false;
+    };
+    let end = areas
+        .iter()
+        .rposition(|&area| area > 0)
+        .expect("the frame of `begin` has contact");
+    let held = &areas[begin..=end];
+    held.iter().filter(|&&area| area > 0).count() >= 2
+        && !held.windows(2).any(|pair| pair == [0, 0])
+}
