@@ -15,5 +15,8 @@ pub mod pipeline;
 
 pub mod random;
 pub mod simulator;
+
+pub mod daemon;
+pub mod tools;
 #[cfg(feature = "train")]
 pub mod train;
