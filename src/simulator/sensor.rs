@@ -319,11 +319,11 @@ mod tests {
     use super::*;
 
     fn smooth_load() -> (Vec<f32>, f64) {
-        let width = 48;
+        let width = 48_usize;
         let pressure: Vec<f32> = (0..width * width)
-            .map(|k| {
+            .map(|k: usize| {
                 let r2 = (k / width).abs_diff(24).pow(2) + (k % width).abs_diff(21).pow(2);
-                (1.0 - r2 as f32 / 256.0).max(0.0).sqrt()
+                (1.0_f32 - r2 as f32 / 256.0).max(0.0).sqrt()
             })
             .collect();
         let force = pressure
