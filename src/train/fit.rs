@@ -61,7 +61,7 @@ impl Trained {
     pub fn logits<'a>(
         &self,
         frames: impl Iterator<Item = &'a Frame>,
-        full_scale_n: f32,
+        full_scale_n: f64,
         device: &Device,
     ) -> Vec<Vec<f32>> {
         let frames: Vec<&Frame> = frames.collect();
@@ -237,7 +237,7 @@ impl State {
     }
 
     /// One step on the samples `indices`; gives the batch's mean loss.
-    fn step(&mut self, task: &Task, indices: &[usize], rate: f32) -> f64 {
+    fn step(&mut self, task: &Task, indices: &[usize], rate: f64) -> f64 {
         let (images, targets) = task.batch(indices, self.progress.step);
         let tracked = self.weights.tracked();
         let logits = hrn::logits(&tracked, images, &mut Normalisation::Batch);
@@ -262,9 +262,9 @@ impl State {
         let Some(average) = &self.average else {
             return self.weights.clone();
         };
-        let total = 1.0 - f64::from(settings.averaging).powf(self.progress.step as f64);
+        let total = 1.0 - settings.averaging.powf(self.progress.step as f64);
         let divided = |weight: &Weight| Weight {
-            values: weight.values.clone().div_scalar(total as f32),
+            values: weight.values.clone().div_scalar(total),
             ..weight.clone()
         };
         Weights {

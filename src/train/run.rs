@@ -192,7 +192,7 @@ pub struct Row {
     /// Mean training loss of the epoch.
     pub loss: f64,
     /// Of the epoch's last step.
-    pub learning_rate: f32,
+    pub learning_rate: f64,
     /// Loss and accuracy on the validation objects, where they were judged.
     pub validation: Option<(f64, f64)>,
     /// Of this process.

@@ -34,7 +34,7 @@ pub enum Keep {
 #[serde(default, deny_unknown_fields)]
 pub struct Validation {
     /// Share of the training objects of each level, 0 to 0.5; 0: none, as the paper.
-    pub share: f32,
+    pub share: f64,
     /// Judged after every so many epochs.
     pub every_epochs: u32,
     /// `last` or `best`.
@@ -57,14 +57,14 @@ impl Default for Validation {
 pub struct Settings {
     /// Newtons a taxel that become 1 in the network's image; 0 N becomes -1. 10.2 N is what
     /// 8 bits of 0.04 N hold.
-    pub full_scale_n: f32,
+    pub full_scale_n: f64,
     /// Samples a step. The last batch of an epoch may be smaller.
     pub batch: usize,
     /// Passes over the training samples: what the paper calls iterations.
     pub epochs: u32,
     /// Decay a step of the running average of the weights that is evaluated and exported;
     /// 0: the weights themselves.
-    pub averaging: f32,
+    pub averaging: f64,
     /// A checkpoint is written after every so many epochs, and after the last.
     pub checkpoint_every_epochs: u32,
     /// The rule of the steps.
@@ -142,11 +142,11 @@ impl Settings {
     /// If one is not.
     pub fn checked(self) -> Result<Self, SettingsError> {
         let (optimiser, validation) = (&self.optimiser, &self.validation);
-        let share = f64::from(validation.share);
-        let rate = f64::from(optimiser.learning_rate);
-        let decay = f64::from(optimiser.weight_decay);
-        let scale = f64::from(self.full_scale_n);
-        let within_0_1 = |value: f32| (0.0..1.0).contains(&value);
+        let share = validation.share;
+        let rate = optimiser.learning_rate;
+        let decay = optimiser.weight_decay;
+        let scale = self.full_scale_n;
+        let within_0_1 = |value: f64| (0.0..1.0).contains(&value);
         let above_0 = |value: f64| value > 0.0 && value.is_finite();
         let checks = [
             ("full_scale_n", scale, above_0(scale), "above 0"),
@@ -155,7 +155,7 @@ impl Settings {
             ("epochs", self.epochs.into(), self.epochs > 0, "1 or more"),
             (
                 "averaging",
-                self.averaging.into(),
+                self.averaging,
                 within_0_1(self.averaging),
                 "0 to below 1",
             ),
@@ -168,13 +168,13 @@ impl Settings {
             ("optimiser.learning_rate", rate, above_0(rate), "above 0"),
             (
                 "optimiser.beta1",
-                optimiser.beta1.into(),
+                optimiser.beta1,
                 within_0_1(optimiser.beta1),
                 "0 to below 1",
             ),
             (
                 "optimiser.beta2",
-                optimiser.beta2.into(),
+                optimiser.beta2,
                 within_0_1(optimiser.beta2),
                 "0 to below 1",
             ),
