@@ -361,3 +361,50 @@ pub(super) fn touches_border(pressure_mpa: &[f32], width: usize) -> bool {
             .any(|at| pressure_mpa[at] > 0.0)
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::dataset::*;
+    use super::super::material::Material;
+    use super::super::object::*;
+    use super::*;
+
+    #[test]
+    #[ignore = "prints figures"]
+    fn stats() {
+        for material in Material::ALL {
+            let mut bench = Bench::default();
+            let (mut iters, mut bad, mut most, mut n, mut solves) = (0, 0, 0, 0, 0);
+            let t = std::time::Instant::now();
+            for number in 0..20 {
+                let draws = Draws::new(1, Shapes::Matched, material, number);
+                let object = Object::draw(Shapes::Matched, material, &mut draws.geometry.child(0));
+                let face = object.face(number as usize % 6);
+                let patch = draw_patch(material, face.roughness, &mut draws.body.child(1));
+                let pose = Pose::draw(&face, &mut draws.geometry.child(1));
+                let p = material.properties();
+                let s = Specimen::new(p, p.young_mpa(p.shore.mean), &face, &pose, &patch);
+                for force in [1.0, 4.0, 10.0, 25.0] {
+                    let (w, _, c) = bench.press(&s, force, 0.5, 1.0);
+                    iters += c.iterations;
+                    most = most.max(c.iterations);
+                    bad += u32::from(!c.converged);
+                    n += 1;
+                    solves += w.width;
+                    if !c.converged {
+                        println!(
+                            "  {material} {number} {force} N: {face:?} width {} {c:?}",
+                            w.width
+                        )
+                    }
+                }
+            }
+            println!(
+                "{material}: {} iterations a press, most {most}, {bad} of {n} not converged, mean width {}, {:.2} ms",
+                iters / n,
+                solves / n as usize,
+                t.elapsed().as_secs_f64() * 1e3 / n as f64
+            );
+        }
+    }
+}
