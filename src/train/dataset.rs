@@ -86,6 +86,20 @@ pub struct Source {
     pub seed: Option<u64>,
     /// SHA-256 of the file.
     pub sha256: String,
+    /// What made it, where the file tells.
+    pub generator: Option<String>,
+}
+
+/// What our simulator calls itself in `meta.generator`.
+pub const SIMULATOR: &str = "hardnessd simulator";
+
+impl Source {
+    /// Whether our simulator made it.
+    pub fn is_simulated(&self) -> bool {
+        self.generator
+            .as_deref()
+            .is_some_and(|generator| generator.starts_with(SIMULATOR))
+    }
 }
 
 /// Samples of one or several files.
@@ -200,15 +214,11 @@ impl Dataset {
             1,
             "0 (train) or 1 (test)",
         )?;
-        let seed = match meta {
-            None => None,
-            Some(text) => match serde_json::from_slice::<serde_json::Value>(&text) {
-                Ok(meta) => meta["seed"].as_u64(),
-                Err(error) => {
-                    let expected = "JSON in UTF-8".to_owned();
-                    return Err(file.error("meta", error.to_string(), expected));
-                }
-            },
+        let meta: serde_json::Value = match meta {
+            None => serde_json::Value::Null,
+            Some(text) => serde_json::from_slice(&text).map_err(|error| {
+                file.error("meta", error.to_string(), "JSON in UTF-8".to_owned())
+            })?,
         };
         let sample = |index: usize| {
             let mut frame = Frame::default();
@@ -231,8 +241,9 @@ impl Dataset {
         };
         let source = Source {
             name,
-            seed,
+            seed: meta["seed"].as_u64(),
             sha256: sha256_hex(bytes),
+            generator: meta["generator"].as_str().map(str::to_owned),
         };
         Ok(Self {
             samples: (0..n).map(sample).collect(),
@@ -316,13 +327,13 @@ impl Dataset {
 
     /// Takes `share` of the objects of every source and level out of `indices`: what is kept,
     /// and what is held out, each in the data set's order.
-    pub fn hold_out(&self, indices: &[usize], share: f32, seed: u64) -> (Vec<usize>, Vec<usize>) {
+    pub fn hold_out(&self, indices: &[usize], share: f64, seed: u64) -> (Vec<usize>, Vec<usize>) {
         let (mut kept, mut held) = (Vec::new(), Vec::new());
         for objects in self
             .objects(indices, &Stream::new(seed, "held out objects"))
             .values()
         {
-            let count = (objects.len() as f32 * share).round() as usize;
+            let count = (objects.len() as f64 * share).round() as usize;
             held.extend(objects[..count].iter().flatten());
             kept.extend(objects[count..].iter().flatten());
         }

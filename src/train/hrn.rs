@@ -25,18 +25,14 @@ pub fn initial(levels: usize, seed: u64, device: &Device) -> Weights {
 /// for all frames, because force carries hardness.
 pub fn images<'a>(
     frames: impl ExactSizeIterator<Item = &'a Frame>,
-    full_scale_n: f32,
+    full_scale_n: f64,
     device: &Device,
 ) -> Tensor<4> {
     let batch = frames.len();
+    let scale = (2.0 / full_scale_n) as f32;
     let mut values = Vec::with_capacity(batch * TAXELS);
     for frame in frames {
-        values.extend(
-            frame
-                .newtons
-                .iter()
-                .map(|newtons| 2.0 * newtons / full_scale_n - 1.0),
-        );
+        values.extend(frame.newtons.iter().map(|newtons| newtons * scale - 1.0));
     }
     Tensor::from_data(TensorData::new(values, [batch, 1, ROWS, COLS]), device)
 }
@@ -78,10 +74,10 @@ pub fn targets(
 
 /// The graph from newtons to logits, and the logits' name. Batch normalisation is folded into
 /// the convolutions.
-pub fn graph(weights: &Weights, statistics: &Statistics, full_scale_n: f32) -> (Graph, String) {
+pub fn graph(weights: &Weights, statistics: &Statistics, full_scale_n: f64) -> (Graph, String) {
     let mut graph = Graph::default();
     // 2 x / full scale is the image raised by 1, which the trunk's first line makes.
-    let scale = graph.constant("scale", &[], &[2.0 / full_scale_n]);
+    let scale = graph.constant("scale", &[], &[(2.0 / full_scale_n) as f32]);
     let mut x = graph.node("Mul", &[onnx::INPUT, &scale], "image", Vec::new());
     for (layer, folded) in TRUNK.iter().zip(network::fold(weights, statistics)) {
         let name = layer.name;

@@ -8,8 +8,9 @@
 use anyhow::{Context as _, ensure};
 use prost::Message as _;
 use tract_onnx::pb;
+use tract_onnx::prelude::*;
 
-use crate::frame::{COLS, ROWS};
+use crate::frame::{COLS, Frame, ROWS};
 use crate::verdict::{Card, Check, Hrn, MIN_OPSET};
 
 /// The name of the graph's input: newtons a taxel, `[1, 1, 28, 28]`.
@@ -18,7 +19,7 @@ pub const INPUT: &str = "frame";
 const IR_VERSION: i64 = 8;
 
 /// The nodes and constants of a graph under construction. A value is known by its name.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default)]
 pub struct Graph {
     nodes: Vec<pb::NodeProto>,
     constants: Vec<pb::TensorProto>,
@@ -139,7 +140,58 @@ pub fn write(
     );
 
     let levels = card.levels.len();
-    let proto = pb::ModelProto {
+    let output = vec![
+        value_info("logits", &[1, levels]),
+        value_info("probabilities", &[1, levels]),
+    ];
+    let proto = model(graph, output, metadata(card, check)?);
+    let bytes = proto.encode_to_vec();
+    let read_back = Hrn::load(&bytes).context("the exported model does not pass the daemon's")?;
+    ensure!(
+        read_back.card() == card,
+        "the exported model's card does not read back the same"
+    );
+    Ok(bytes)
+}
+
+/// A graph that runs here and now, for what training itself needs from it.
+#[derive(Debug)]
+pub struct Plan(Arc<TypedRunnableModel>);
+
+impl Plan {
+    /// Prepares `graph` to compute `output`, an f32 of shape `dims`.
+    ///
+    /// # Errors
+    ///
+    /// If the inference library cannot run it.
+    pub fn new(graph: Graph, output: &str, dims: &[usize]) -> anyhow::Result<Self> {
+        let proto = model(graph, vec![value_info(output, dims)], Vec::new());
+        let plan = tract_onnx::onnx()
+            .model_for_proto_model(&proto)?
+            .with_input_fact(0, f32::fact([1, 1, ROWS, COLS]).into())?
+            .into_optimized()?
+            .into_runnable()?;
+        Ok(Self(plan))
+    }
+
+    /// The output for one frame, row-major.
+    ///
+    /// # Errors
+    ///
+    /// If the inference library fails.
+    pub fn run(&self, frame: &Frame) -> anyhow::Result<Vec<f32>> {
+        let input = Tensor::from_shape(&[1, 1, ROWS, COLS], &frame.newtons)?;
+        let outputs = self.0.run(tvec!(input.into()))?;
+        Ok(outputs[0].try_as_plain_ram()?.as_slice::<f32>()?.to_vec())
+    }
+}
+
+fn model(
+    graph: Graph,
+    output: Vec<pb::ValueInfoProto>,
+    metadata_props: Vec<pb::StringStringEntryProto>,
+) -> pb::ModelProto {
+    pb::ModelProto {
         ir_version: IR_VERSION,
         opset_import: vec![pb::OperatorSetIdProto {
             domain: String::new(),
@@ -152,22 +204,12 @@ pub fn write(
             node: graph.nodes,
             initializer: graph.constants,
             input: vec![value_info(INPUT, &[1, 1, ROWS, COLS])],
-            output: vec![
-                value_info("logits", &[1, levels]),
-                value_info("probabilities", &[1, levels]),
-            ],
+            output,
             ..Default::default()
         }),
-        metadata_props: metadata(card, check)?,
+        metadata_props,
         ..Default::default()
-    };
-    let bytes = proto.encode_to_vec();
-    let read_back = Hrn::load(&bytes).context("the exported model does not pass the daemon's")?;
-    ensure!(
-        read_back.card() == card,
-        "the exported model's card does not read back the same"
-    );
-    Ok(bytes)
+    }
 }
 
 fn value_info(name: &str, dims: &[usize]) -> pb::ValueInfoProto {

@@ -38,15 +38,15 @@ pub struct Settings {
     /// `sgd` or `adam`.
     pub rule: Rule,
     /// At the first step.
-    pub learning_rate: f32,
+    pub learning_rate: f64,
     /// `constant` or `cosine`.
     pub schedule: Schedule,
     /// Adam's decay of the gradient's mean.
-    pub beta1: f32,
+    pub beta1: f64,
     /// Adam's decay of the gradient's square. (Below Eq. 8 the paper has the two swapped.)
-    pub beta2: f32,
+    pub beta2: f64,
     /// Share of a kernel taken away a step, times the learning rate; not of biases.
-    pub weight_decay: f32,
+    pub weight_decay: f64,
 }
 
 impl Default for Settings {
@@ -64,12 +64,12 @@ impl Default for Settings {
 
 impl Settings {
     /// The learning rate of step `step` of `steps`, both counted from 0.
-    pub fn rate_at(&self, step: u64, steps: u64) -> f32 {
+    pub fn rate_at(&self, step: u64, steps: u64) -> f64 {
         match self.schedule {
             Schedule::Constant => self.learning_rate,
             Schedule::Cosine => {
                 let part = step as f64 / steps.max(1) as f64;
-                self.learning_rate * (0.5 * (1.0 + (std::f64::consts::PI * part).cos())) as f32
+                self.learning_rate * 0.5 * (1.0 + (std::f64::consts::PI * part).cos())
             }
         }
     }
@@ -111,7 +111,7 @@ impl Optimiser {
         weights: &mut Weights,
         tracked: &Weights,
         gradients: &mut Gradients,
-        rate: f32,
+        rate: f64,
     ) {
         self.step += 1;
         let Settings {
@@ -121,7 +121,7 @@ impl Optimiser {
             weight_decay,
             ..
         } = self.settings;
-        let correction = |beta: f32| 1.0 - f64::from(beta).powf(self.step as f64) as f32;
+        let correction = |beta: f64| 1.0 - beta.powf(self.step as f64);
         for (index, weight) in weights.entries.iter_mut().enumerate() {
             let Some(gradient) = tracked.entries[index].values.grad_remove(gradients) else {
                 continue;
