@@ -12,7 +12,7 @@ pub const COLS: usize = 28;
 pub const TAXELS: usize = ROWS * COLS;
 
 /// A frame in sensor counts. Taxels outside a smaller array are 0.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Clone, Copy, PartialEq, Eq)]
 pub struct RawFrame {
     /// `[ROWS, COLS]` flattened, row-major, in counts.
     pub counts: [u16; TAXELS],
@@ -26,8 +26,20 @@ impl Default for RawFrame {
     }
 }
 
+/// The sum and the peak: 784 numbers in a log or a failed assertion help nobody.
+impl std::fmt::Debug for RawFrame {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let sum: u32 = self.counts.iter().map(|&count| u32::from(count)).sum();
+        let peak = self.counts.iter().max();
+        f.debug_struct("RawFrame")
+            .field("sum", &sum)
+            .field("peak", &peak)
+            .finish()
+    }
+}
+
 /// A frame in newtons.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Clone, Copy, PartialEq)]
 pub struct Frame {
     /// `[ROWS, COLS]` flattened, row-major, in newtons a taxel; finite and not negative.
     pub newtons: [f32; TAXELS],
@@ -38,6 +50,16 @@ impl Default for Frame {
         Self {
             newtons: [0.0; TAXELS],
         }
+    }
+}
+
+impl std::fmt::Debug for Frame {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let peak = self.newtons.iter().copied().fold(0.0, f32::max);
+        f.debug_struct("Frame")
+            .field("force_n", &self.force_n())
+            .field("peak_n", &peak)
+            .finish()
     }
 }
 
@@ -54,4 +76,49 @@ impl Frame {
     pub fn force_n(&self) -> f64 {
         self.newtons.iter().map(|&n| f64::from(n)).sum()
     }
+}
+
+/// The sensor's own array and where it sits in a frame: at offset floor((28 - n) / 2).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Array {
+    /// Rows of the array, 1 to [`ROWS`].
+    pub rows: usize,
+    /// Columns of the array, 1 to [`COLS`].
+    pub cols: usize,
+}
+
+impl Array {
+    /// The array that fills a frame.
+    pub const FULL: Array = Array {
+        rows: ROWS,
+        cols: COLS,
+    };
+
+    /// Place in the frame of the array's own `row` and `col`.
+    pub fn place(self, row: usize, col: usize) -> usize {
+        (row + (ROWS - self.rows) / 2) * COLS + col + (COLS - self.cols) / 2
+    }
+
+    /// The array's own row and column of a place in the frame; `None` outside the array.
+    pub fn position(self, place: usize) -> Option<(usize, usize)> {
+        let row = (place / COLS).checked_sub((ROWS - self.rows) / 2)?;
+        let col = (place % COLS).checked_sub((COLS - self.cols) / 2)?;
+        (row < self.rows && col < self.cols).then_some((row, col))
+    }
+
+    /// The places of the array, row-major.
+    pub fn places(self) -> impl Iterator<Item = usize> {
+        (0..self.rows * self.cols)
+            .map(move |index| self.place(index / self.cols, index % self.cols))
+    }
+}
+
+/// When something came, on the two clocks that matter: one that never jumps, for durations, and
+/// the calendar, for people.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Stamp {
+    /// CLOCK_MONOTONIC.
+    pub mono: std::time::Duration,
+    /// UTC.
+    pub wall: jiff::Timestamp,
 }

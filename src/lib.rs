@@ -1,10 +1,22 @@
 //! Bytes become frames, frames become presses, presses become verdicts, verdicts reach
 //! subscribers, and only the two ends touch the world.
 //!
-//! The modules below stand in reading order. Each from [`frame`] to [`pipeline`] uses only those
+//! The modules below stand in reading order. Each from [`frame`] to [`random`] uses only those
 //! above it and does no I/O, waits for nothing and asks no clock: it is given bytes and the
 //! moment they came. `daemon`, `tools` and `train` are the ends.
 
 pub mod frame;
+pub mod wire;
+pub mod tare;
+pub mod press;
+pub mod verdict;
+pub mod event;
+pub mod pipeline;
+
 pub mod random;
 pub mod simulator;
+
+pub mod daemon;
+pub mod tools;
+#[cfg(feature = "train")]
+pub mod train;

@@ -1,2 +1,187 @@
-//! The daemon.
-fn main() {}
+//! The daemon's binary: arguments, log, runtime, signals, exit codes.
+
+use std::future::Future;
+use std::io;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Context;
+use clap::{Parser, Subcommand};
+use hardnessd::daemon::config::{Error as ConfigError, Setup};
+use hardnessd::daemon::log::{Log, Settings as LogSettings};
+use hardnessd::daemon::socket::Error as SocketError;
+use hardnessd::daemon::{Daemon, Error as DaemonError, Reload};
+use hardnessd::tools::{check, demo, replay, simulate};
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::mpsc;
+
+/// Hardness events from a tactile array on a serial port
+#[derive(Debug, Parser)]
+#[command(version, about, max_term_width = 100)]
+struct Args {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Serve: sensors in, events out, until SIGTERM; SIGHUP reads the configuration again
+    Run {
+        /// Configuration
+        #[arg(long, value_name = "F")]
+        config: PathBuf,
+    },
+    /// Show it all on a simulated sensor: events on stdout as JSON lines
+    Demo(demo::Args),
+    /// Play a simulated sensor at a pty
+    Simulate(simulate::Args),
+    /// Play a recording through the same pipeline: events on stdout as JSON lines
+    Replay(replay::Args),
+    /// Check a configuration and say what would run
+    Check(check::Args),
+}
+
+/// What an operator's script may rely on (docs: exit codes).
+mod exit {
+    pub(super) const FAILED: u8 = 1;
+    pub(super) const USAGE: u8 = 2;
+    pub(super) const NO_INPUT: u8 = 66;
+    pub(super) const IO: u8 = 74;
+    pub(super) const CONFIG: u8 = 78;
+}
+
+fn main() -> ExitCode {
+    let args = Args::parse();
+    let runtime = match tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+    {
+        Ok(runtime) => runtime,
+        Err(error) => {
+            eprintln!("hardnessd: no runtime: {error}");
+            return ExitCode::from(exit::IO);
+        }
+    };
+    let done = runtime.block_on(dispatch(args.command));
+    // A port may be stuck in its driver on a thread of its own: not worth waiting for.
+    runtime.shutdown_background();
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("hardnessd: {error:#}");
+            ExitCode::from(exit_code(&error))
+        }
+    }
+}
+
+async fn dispatch(command: Command) -> anyhow::Result<()> {
+    match command {
+        Command::Run { config } => run(config).await,
+        Command::Demo(args) => {
+            // The events are what is shown: the log would say each again.
+            Log::start(LogSettings::default(), "warn")?;
+            Ok(demo::run(args, shutdown()?).await?)
+        }
+        Command::Simulate(args) => Ok(simulate::run(args, shutdown()?).await?),
+        Command::Replay(args) => Ok(replay::run(args, shutdown()?).await?),
+        Command::Check(args) => Ok(check::run(&args)?),
+    }
+}
+
+async fn run(path: PathBuf) -> anyhow::Result<()> {
+    // Before all else: a signal that comes early must not kill.
+    let shutdown = shutdown()?;
+    let mut hangup = signal(SignalKind::hangup()).context("SIGHUP")?;
+    let setup = Setup::load(&path)?;
+    let log = Log::start(setup.config.log, "info")?;
+    let daemon = Daemon::bind(setup)?;
+    let (request, requests) = mpsc::channel(1);
+    tokio::spawn(async move {
+        while hangup.recv().await.is_some() {
+            // A request that waits already will see this change too.
+            let _ = request.try_send(());
+        }
+    });
+    Ok(daemon
+        .run(
+            shutdown,
+            Some(Reload {
+                requests,
+                path,
+                log,
+            }),
+        )
+        .await?)
+}
+
+/// SIGINT or SIGTERM.
+fn shutdown() -> io::Result<impl Future<Output = ()>> {
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let mut terminate = signal(SignalKind::terminate())?;
+    Ok(async move {
+        tokio::select! {
+            _ = interrupt.recv() => {}
+            _ = terminate.recv() => {}
+        }
+    })
+}
+
+fn exit_code(error: &anyhow::Error) -> u8 {
+    let of_config = |error: &ConfigError| match error {
+        ConfigError::Unreadable { .. } => exit::NO_INPUT,
+        _ => exit::CONFIG,
+    };
+    let of_daemon = |error: &DaemonError| match error {
+        // The configuration names a file that it must not.
+        DaemonError::Socket(SocketError::NoSocket { .. } | SocketError::TooLong { .. }) => {
+            exit::CONFIG
+        }
+        // In use or refused: another time it may work.
+        DaemonError::Socket(_) | DaemonError::Random(_) => exit::IO,
+        DaemonError::Stopped(_) => exit::FAILED,
+    };
+    if let Some(error) = error.downcast_ref::<ConfigError>() {
+        return of_config(error);
+    }
+    if let Some(error) = error.downcast_ref::<DaemonError>() {
+        return of_daemon(error);
+    }
+    if let Some(error) = error.downcast_ref::<check::Error>() {
+        return match error {
+            check::Error::Config(error) => of_config(error),
+            check::Error::FrameRate { .. } => exit::CONFIG,
+            check::Error::Print(_) => exit::IO,
+        };
+    }
+    if let Some(error) = error.downcast_ref::<demo::Error>() {
+        return match error {
+            demo::Error::Config(error) => of_config(error),
+            demo::Error::Daemon(error) => of_daemon(error),
+            demo::Error::Layout(_) => exit::CONFIG,
+            demo::Error::Io { .. } => exit::IO,
+            demo::Error::Missed { .. } | demo::Error::Closed => exit::FAILED,
+        };
+    }
+    if let Some(error) = error.downcast_ref::<simulate::Error>() {
+        return match error {
+            simulate::Error::Faults(error) if error.is_unreadable() => exit::NO_INPUT,
+            simulate::Error::Faults(_) => exit::FAILED,
+            simulate::Error::Layout(_) | simulate::Error::Baud { .. } => exit::USAGE,
+            simulate::Error::Pty { .. } => exit::IO,
+        };
+    }
+    if let Some(error) = error.downcast_ref::<replay::Error>() {
+        return match error {
+            replay::Error::Config(error) => of_config(error),
+            replay::Error::Unreadable { .. } | replay::Error::Format { .. } => exit::NO_INPUT,
+            replay::Error::Broken { .. } | replay::Error::Print(_) => exit::IO,
+        };
+    }
+    if error.is::<hardnessd::daemon::log::Error>() {
+        return exit::CONFIG;
+    }
+    if error.is::<io::Error>() {
+        return exit::IO;
+    }
+    exit::FAILED
+}

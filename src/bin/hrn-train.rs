@@ -1,2 +1,354 @@
-//! The trainer.
-fn main() {}
+//! The trainer: one subcommand a stage, from simulated presses to the file the daemon loads.
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::Instant;
+
+use anyhow::Context as _;
+use burn::tensor::Device;
+use clap::{Parser, Subcommand, ValueEnum};
+use hardnessd::simulator::{self, DatasetSettings, Material, SensorProfile, Shapes, Split};
+use hardnessd::train::dataset::{self, Dataset, DatasetError, SIMULATOR, Sample};
+use hardnessd::train::export;
+use hardnessd::train::methods::{self, Method};
+use hardnessd::train::metrics::Evaluation;
+use hardnessd::train::run::{Description, Run, write_whole};
+use hardnessd::train::settings::{Profile, Settings, SettingsError};
+use hardnessd::verdict::{Hrn, ModelError};
+use indicatif::{ProgressBar, ProgressStyle};
+use serde_json::json;
+
+/// Trains and evaluates the hardness recognition network.
+#[derive(Debug, Parser)]
+#[command(name = "hrn-train", version)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Simulate a labelled data set (default: the paper's 10,000 + 1,000 samples)
+    Simulate(Simulate),
+    /// Train one method
+    Train(Train),
+    /// Run an exported model on a data set
+    Evaluate(Evaluate),
+    /// Write the model of a finished run to a file of its own
+    Export {
+        /// Directory of the run
+        run: PathBuf,
+        /// The model file to write
+        #[arg(long, value_name = "M.onnx")]
+        out: PathBuf,
+    },
+    /// Check a model file as the daemon does and print its card
+    Inspect {
+        /// The model file
+        model: PathBuf,
+    },
+}
+
+#[derive(Debug, clap::Args)]
+struct Simulate {
+    /// The data set to write
+    #[arg(long, value_name = "D.npz")]
+    out: PathBuf,
+    /// Everything random follows from it
+    #[arg(long, default_value_t = DatasetSettings::default().seed)]
+    seed: u64,
+    /// Objects of each training material
+    #[arg(long, default_value_t = DatasetSettings::default().objects)]
+    objects: u32,
+    /// Objects of each test material
+    #[arg(long, default_value_t = DatasetSettings::default().test_objects)]
+    test_objects: u32,
+    /// Presses of each object
+    #[arg(long, default_value_t = DatasetSettings::default().presses)]
+    presses: u32,
+    /// The least nominal force, in newtons
+    #[arg(long, value_name = "N", default_value_t = DatasetSettings::default().lowest_force_n)]
+    lowest_force: f32,
+    /// Distribution of shapes: matched (the same for all materials) or paper
+    #[arg(long, default_value = "matched")]
+    shapes: Shapes,
+    /// Spread of the sensor's taxels: clean or raw
+    #[arg(long, default_value = "clean")]
+    sensor_profile: SensorProfile,
+}
+
+#[derive(Debug, clap::Args)]
+struct Train {
+    /// What to train
+    #[arg(long)]
+    method: Method,
+    /// Data to learn from; several files are joined
+    #[arg(long, value_name = "D.npz", required = true)]
+    data: Vec<PathBuf>,
+    /// Directory of the run
+    #[arg(long, value_name = "RUN")]
+    out: PathBuf,
+    /// Everything random follows from it
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// How long it may take
+    #[arg(long, default_value = "paper")]
+    profile: Profile,
+    /// Settings that override the profile's (see config/hrn-train.toml)
+    #[arg(long, value_name = "F.toml")]
+    config: Option<PathBuf>,
+    /// Go on with a run that was stopped
+    #[arg(long)]
+    resume: bool,
+    /// Use only so many labels, chosen by whole objects
+    #[arg(long, value_name = "N")]
+    labels: Option<usize>,
+    /// Where to compute
+    #[arg(long, default_value = "cpu")]
+    device: DeviceName,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum DeviceName {
+    Cpu,
+}
+
+#[derive(Debug, clap::Args)]
+struct Evaluate {
+    /// The model file
+    #[arg(long, value_name = "M.onnx")]
+    model: PathBuf,
+    /// The data set
+    #[arg(long, value_name = "D.npz")]
+    data: PathBuf,
+    /// Which of its samples
+    #[arg(long, default_value = "test")]
+    split: SplitName,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum SplitName {
+    Train,
+    Test,
+}
+
+fn main() -> ExitCode {
+    let done = match Arguments::parse().command {
+        Command::Simulate(arguments) => simulate(&arguments),
+        Command::Train(arguments) => train(&arguments),
+        Command::Evaluate(arguments) => evaluate(&arguments),
+        Command::Export { run, out } => export_run(&run, &out),
+        Command::Inspect { model } => inspect(&model),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("hrn-train: {error:#}");
+            ExitCode::from(exit_code(&error))
+        }
+    }
+}
+
+/// A file named on the command line that cannot be read.
+#[derive(Debug, thiserror::Error)]
+#[error("{}: {source}", path.display())]
+struct Unreadable {
+    path: PathBuf,
+    source: std::io::Error,
+}
+
+/// 66 unreadable input, 78 bad configuration or model, 74 other I/O, else 1.
+fn exit_code(error: &anyhow::Error) -> u8 {
+    let has = |test: fn(&(dyn std::error::Error + 'static)) -> bool| error.chain().any(test);
+    if has(|e| {
+        e.is::<Unreadable>() || matches!(e.downcast_ref(), Some(DatasetError::Unreadable { .. }))
+    }) {
+        66
+    } else if has(|e| e.is::<ModelError>() || e.is::<SettingsError>()) {
+        78
+    } else if has(<dyn std::error::Error>::is::<std::io::Error>) {
+        74
+    } else {
+        1
+    }
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, Unreadable> {
+    std::fs::read(path).map_err(|source| Unreadable {
+        path: path.to_owned(),
+        source,
+    })
+}
+
+fn load(path: &Path) -> anyhow::Result<Hrn> {
+    Hrn::load(&read(path)?).with_context(|| path.display().to_string())
+}
+
+fn simulate(arguments: &Simulate) -> anyhow::Result<()> {
+    let settings = DatasetSettings {
+        seed: arguments.seed,
+        objects: arguments.objects,
+        test_objects: arguments.test_objects,
+        presses: arguments.presses,
+        lowest_force_n: arguments.lowest_force,
+        shapes: arguments.shapes,
+        profile: arguments.sensor_profile,
+        ..DatasetSettings::default()
+    };
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let total = 4 * (settings.objects + settings.test_objects) * settings.presses;
+    let style =
+        ProgressStyle::with_template("{bar:30} {pos}/{len} samples, {per_sec}, {eta} left")?;
+    let bar = ProgressBar::new(total.into()).with_style(style);
+    let begun = Instant::now();
+    let samples = simulator::dataset(&settings, threads, |done| bar.set_position(done as u64));
+    bar.finish_and_clear();
+    let seconds = begun.elapsed().as_secs_f64();
+
+    let meta = json!({
+        "materials": Material::ALL.map(Material::name),
+        "levels": dataset::levels(),
+        "seed": settings.seed,
+        "generator": format!("{SIMULATOR} {}", env!("CARGO_PKG_VERSION")),
+        "settings": format!("{settings:?}"),
+    });
+    let samples: Vec<Sample> = samples.into_iter().map(Sample::from).collect();
+    let bytes = dataset::write(std::io::Cursor::new(Vec::new()), &samples, &meta)?.into_inner();
+    write_whole(&arguments.out, &bytes)?;
+    println!(
+        "{}: {} samples in {seconds:.1} s on {threads} threads, {:.0} a second",
+        arguments.out.display(),
+        samples.len(),
+        samples.len() as f64 / seconds
+    );
+    Ok(())
+}
+
+fn train(arguments: &Train) -> anyhow::Result<()> {
+    let mut settings = Settings::of(arguments.profile);
+    if let Some(path) = &arguments.config {
+        let text = String::from_utf8_lossy(&read(path)?).into_owned();
+        settings = settings
+            .overridden(&text)
+            .with_context(|| path.display().to_string())?;
+    }
+    let parts: Result<Vec<Dataset>, DatasetError> = arguments
+        .data
+        .iter()
+        .map(|path| Dataset::read(path))
+        .collect();
+    let dataset = Dataset::joined(parts?);
+    let description = Description {
+        method: arguments.method.name().to_owned(),
+        profile: arguments.profile,
+        seed: arguments.seed,
+        labels: arguments.labels,
+        settings,
+        data: dataset.sources.clone(),
+    };
+    let DeviceName::Cpu = arguments.device;
+    let device = Device::flex();
+    let run = Run::open(&arguments.out, &description, arguments.resume)?;
+    let begun = Instant::now();
+    let evaluation = methods::train(arguments.method, &dataset, &description, &run, &device)?;
+    println!(
+        "trained in {:.1} s: {}",
+        begun.elapsed().as_secs_f64(),
+        run.path("hrn.onnx").display()
+    );
+    match evaluation {
+        Some(evaluation) => print_evaluation(&evaluation),
+        None => println!("not evaluated: the data has no labelled test samples"),
+    }
+    Ok(())
+}
+
+fn evaluate(arguments: &Evaluate) -> anyhow::Result<()> {
+    let hrn = load(&arguments.model)?;
+    let dataset = Dataset::read(&arguments.data)?;
+    let indices = dataset.labelled(match arguments.split {
+        SplitName::Train => Split::Train,
+        SplitName::Test => Split::Test,
+    })?;
+    let evaluation = export::evaluate(&hrn, &dataset, &indices)?;
+    if arguments.json {
+        println!("{}", serde_json::to_string(&evaluation)?);
+    } else {
+        print_evaluation(&evaluation);
+    }
+    Ok(())
+}
+
+fn export_run(run: &Path, out: &Path) -> anyhow::Result<()> {
+    let model = run.join("hrn.onnx");
+    let hrn = load(&model).context("the run has no model yet; train --resume finishes it")?;
+    write_whole(out, &read(&model)?)?;
+    println!("{}: sha256 {}", out.display(), hrn.sha256());
+    Ok(())
+}
+
+fn inspect(path: &Path) -> anyhow::Result<()> {
+    let hrn = load(path)?;
+    let card = hrn.card();
+    println!("{}", path.display());
+    println!("sha256        {}", hrn.sha256());
+    println!("format        {}", card.format);
+    println!("method        {}", card.method);
+    println!("validation    {}", card.validation);
+    for level in &card.levels {
+        println!(
+            "level {}       {}, Shore {}",
+            level.level, level.label, level.shore
+        );
+    }
+    println!("pitch         {} mm", card.pitch_mm);
+    let [least, most] = card.range.force_n;
+    println!("force         {least:.2} to {most:.2} N in training");
+    let [least, most] = card.range.contact_area_taxels;
+    println!("contact area  {least} to {most} taxels in training");
+    println!("data          {}", card.data);
+    println!("metrics       {}", card.metrics);
+    println!("check frames  {}, all reproduced", hrn.check().frames.len());
+    Ok(())
+}
+
+fn print_evaluation(evaluation: &Evaluation) {
+    let interval = evaluation.accuracy_interval_by_object.map_or_else(
+        || "no objects given, so no interval".to_owned(),
+        |[low, high]| {
+            format!(
+                "95 % by object: {:.1} to {:.1} %",
+                low * 100.0,
+                high * 100.0
+            )
+        },
+    );
+    println!("samples            {}", evaluation.n);
+    println!(
+        "accuracy           {:.1} % ({interval})",
+        evaluation.accuracy * 100.0
+    );
+    let number = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.4}"));
+    println!("kappa              {}", number(evaluation.kappa));
+    println!("kappa, quadratic   {}", number(evaluation.kappa_quadratic));
+    println!("calibration error  {:.4}", evaluation.ece);
+    println!(
+        "log-likelihood     {:.4} nats lost a sample",
+        evaluation.nll
+    );
+    println!(
+        "truth \\ said  {}",
+        (1..=evaluation.confusion.len())
+            .map(|w| format!("{w:>7}"))
+            .collect::<String>()
+    );
+    for (level, row) in evaluation.confusion.iter().enumerate() {
+        let counts: String = row.iter().map(|count| format!("{count:>7}")).collect();
+        let right = evaluation.category_accuracy[level];
+        let right = right.map_or("-".to_owned(), |right| format!("{:.1} %", right * 100.0));
+        println!("level {}       {counts}   {right}", level + 1);
+    }
+}

@@ -1,0 +1,301 @@
+//! The daemon: sensors at one end, subscribers at the other, the core between.
+//!
+//! In: a checked [`Setup`], a future that ends when the daemon shall, and requests to read the
+//! configuration again. Out: events on the sockets. One thread runs it all, one task a sensor, one
+//! for the hub, one a connection; nothing is shared between them but lines ready to be sent.
+//! It starts without its hardware and waits for it inside.
+
+pub mod config;
+mod hub;
+pub mod log;
+mod request;
+mod sensor;
+mod serial;
+pub mod socket;
+mod systemd;
+
+use std::fs::File;
+use std::future::Future;
+use std::io::Read;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::{JoinHandle, JoinSet};
+use tokio::time::MissedTickBehavior;
+use tracing::{error, info, warn};
+
+use self::config::Setup;
+use self::log::Log;
+use self::sensor::{Command, Sensors};
+use self::serial::Link;
+use self::socket::Socket;
+use crate::event::{Hello, ModelCard, PROTOCOL, SensorCard};
+use crate::frame::Stamp;
+use crate::pipeline::{Clock, Pipeline};
+
+/// How long subscribers may take to fetch their last lines: the daemon must be gone within 1 s.
+const FAREWELL: Duration = Duration::from_millis(300);
+
+/// Questions waiting for a sensor; more askers than that wait themselves.
+const QUESTIONS: usize = 16;
+
+/// Why the daemon cannot start, or has stopped by itself.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The Unix socket cannot be had.
+    #[error(transparent)]
+    Socket(#[from] socket::Error),
+    /// No random numbers, without which a run cannot be told from another.
+    #[error("/dev/urandom: {0}")]
+    Random(#[source] std::io::Error),
+    /// A fault of this program.
+    #[error("{0} stopped by itself")]
+    Stopped(&'static str),
+}
+
+/// How a running daemon is asked to read its configuration again.
+pub struct Reload {
+    /// One item a request.
+    pub requests: mpsc::Receiver<()>,
+    /// The file.
+    pub path: PathBuf,
+    /// The log, whose format may change.
+    pub log: Log,
+}
+
+/// A daemon whose sockets are bound: whoever connects from now on is served once it runs.
+pub struct Daemon {
+    setup: Setup,
+    hello: Hello,
+    socket: Option<Socket>,
+}
+
+/// The moment, on both clocks.
+pub(crate) fn now() -> Stamp {
+    let mono = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    Stamp {
+        mono: Duration::try_from(mono).expect("CLOCK_MONOTONIC counts from 0 at boot"),
+        wall: jiff::Timestamp::now(),
+    }
+}
+
+impl Daemon {
+    /// Binds the sockets. Needs a runtime to be there.
+    ///
+    /// # Errors
+    ///
+    /// If a socket cannot be had: its path is in use, is no socket, or the system refuses.
+    pub fn bind(setup: Setup) -> Result<Self, Error> {
+        let hello = hello(&setup, run_token().map_err(Error::Random)?);
+        let unix = &setup.config.publish.unix;
+        let socket = unix
+            .enabled
+            .then(|| Socket::bind(&unix.path(), unix.mode.0))
+            .transpose()?;
+        Ok(Self {
+            setup,
+            hello,
+            socket,
+        })
+    }
+
+    /// Serves until `shutdown` comes, then finishes the event in hand: presses are aborted,
+    /// subscribers get their last lines.
+    ///
+    /// # Errors
+    ///
+    /// If a part stops by itself, which is a fault of this program.
+    pub async fn run(
+        self,
+        shutdown: impl Future<Output = ()>,
+        mut reload: Option<Reload>,
+    ) -> Result<(), Error> {
+        let Self {
+            mut setup,
+            hello,
+            socket,
+        } = self;
+        let run = hello.run.clone();
+        let hub = hub::start(hello);
+
+        let mut tasks = JoinSet::new();
+        let mut commands = Vec::new();
+        for (settings, sensor) in setup.pipelines().zip(&setup.config.sensors) {
+            let (sender, inbox) = mpsc::channel(QUESTIONS);
+            let pipeline = Pipeline::new(settings, Clock::Arrival);
+            let link = Link::new(&sensor.port, sensor.baud);
+            tasks.spawn(sensor::serve(pipeline, link, hub.clone(), inbox));
+            commands.push(sender);
+        }
+        let sensors = Sensors(commands);
+
+        let (stop, stopped) = oneshot::channel();
+        let mut publishers = JoinSet::new();
+        if let Some(socket) = socket {
+            let max_clients = setup.config.publish.unix.max_clients;
+            publishers.spawn(socket.serve(max_clients, hub.clone(), sensors.clone(), stopped));
+        }
+        announce(&setup, &run);
+        systemd::ready();
+
+        let mut heartbeat = tokio::time::interval(systemd::heartbeat());
+        heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut loading: Option<JoinHandle<Result<Setup, config::Error>>> = None;
+        let mut shutdown = std::pin::pin!(shutdown);
+        let outcome = loop {
+            tokio::select! {
+                () = &mut shutdown => break Ok(()),
+                Some(_) = tasks.join_next() => break Err(Error::Stopped("a sensor")),
+                Some(_) = publishers.join_next() => break Err(Error::Stopped("the socket")),
+                _ = heartbeat.tick() => {
+                    let statuses = sensors.statuses().await;
+                    if hub.finals().await.is_ok() {
+                        systemd::alive(&statuses);
+                    }
+                }
+                path = requested(&mut reload), if loading.is_none() => {
+                    systemd::reloading();
+                    // On a thread of its own: a model takes long to load beside a frame.
+                    loading = Some(tokio::task::spawn_blocking(move || Setup::load(&path)));
+                }
+                loaded = finished(&mut loading) => {
+                    loading = None;
+                    match change(&setup, loaded, reload.as_ref().map(|reload| &reload.log)) {
+                        Ok(changed) => {
+                            setup = changed;
+                            hub.describe(self::hello(&setup, run.clone())).await;
+                            for (commands, sensor) in sensors.0.iter().zip(&setup.config.sensors) {
+                                let judgement = Box::new(setup.judgement(sensor));
+                                // A sensor that has ended is noticed above.
+                                let _ = commands.send(Command::Reload(judgement)).await;
+                            }
+                            info!(model = short(&setup), "reloaded");
+                        }
+                        Err(reason) => error!(%reason, "reload refused, all stays as it was"),
+                    }
+                    systemd::ready();
+                }
+            }
+        };
+
+        systemd::stopping();
+        info!("stopping");
+        for commands in &sensors.0 {
+            // One that has ended needs no telling.
+            let _ = commands.send(Command::Finish).await;
+        }
+        while tasks.join_next().await.is_some() {}
+        hub.close().await;
+        let _ = stop.send(());
+        let farewell = async { while publishers.join_next().await.is_some() {} };
+        if tokio::time::timeout(FAREWELL, farewell).await.is_err() {
+            warn!("a subscriber did not fetch its last lines");
+        }
+        outcome
+    }
+}
+
+/// Why a reload was refused.
+#[derive(Debug, thiserror::Error)]
+enum Refusal {
+    #[error(transparent)]
+    Config(#[from] config::Error),
+    #[error("{key}: found another value, expected the one it started with: restart to change it")]
+    Fixed { key: String },
+    #[error(transparent)]
+    Log(#[from] log::Error),
+    #[error("reading it failed: {0}")]
+    Task(#[from] tokio::task::JoinError),
+}
+
+/// The next request to reload; for ever none, if none can come.
+async fn requested(reload: &mut Option<Reload>) -> PathBuf {
+    if let Some(reload) = reload
+        && reload.requests.recv().await.is_some()
+    {
+        return reload.path.clone();
+    }
+    std::future::pending().await
+}
+
+type Loaded = Result<Result<Setup, config::Error>, tokio::task::JoinError>;
+
+async fn finished(loading: &mut Option<JoinHandle<Result<Setup, config::Error>>>) -> Loaded {
+    match loading {
+        Some(loading) => loading.await,
+        None => std::future::pending().await,
+    }
+}
+
+/// All or nothing: the new setup if every part of it can be had without a restart.
+fn change(setup: &Setup, loaded: Loaded, log: Option<&Log>) -> Result<Setup, Refusal> {
+    let changed = loaded??;
+    if let Some(key) = setup.config.fixed_difference(&changed.config) {
+        return Err(Refusal::Fixed { key });
+    }
+    if let Some(log) = log
+        && changed.config.log != setup.config.log
+    {
+        log.change(changed.config.log)?;
+    }
+    Ok(changed)
+}
+
+fn announce(setup: &Setup, run: &str) {
+    let unix = &setup.config.publish.unix;
+    let socket = unix.enabled.then(|| unix.path().display().to_string());
+    info!(
+        version = env!("CARGO_PKG_VERSION"),
+        robot = setup.config.robot.as_str(),
+        run,
+        model = short(setup),
+        validation = setup.hrn.card().validation.as_str(),
+        socket,
+        "started"
+    );
+    for sensor in &setup.config.sensors {
+        info!(sensor = sensor.name.as_str(), port = %sensor.port.display(), "sensor");
+    }
+}
+
+/// The model as events name it.
+fn short(setup: &Setup) -> &str {
+    &setup.hrn.sha256()[..12]
+}
+
+fn hello(setup: &Setup, run: String) -> Hello {
+    // Where /proc is hidden there is no boot id; the run token still tells starts apart.
+    let boot_id = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
+    let card = setup.hrn.card();
+    Hello {
+        protocol: PROTOCOL,
+        server: "hardnessd",
+        version: env!("CARGO_PKG_VERSION"),
+        robot: setup.config.robot.clone(),
+        run,
+        boot_id: boot_id.trim_end().to_owned(),
+        seq: 0,
+        sensors: setup
+            .pipelines()
+            .map(|settings| SensorCard {
+                rows: settings.layout.array().rows,
+                cols: settings.layout.array().cols,
+                pitch_mm: settings.judgement.calibration.pitch_mm,
+                name: settings.sensor,
+            })
+            .collect(),
+        model: ModelCard {
+            sha256: setup.hrn.sha256().to_owned(),
+            validation: card.validation.clone(),
+            levels: card.levels.clone(),
+        },
+    }
+}
+
+/// 64 random bits in hex: no two starts of all robots are likely to share one.
+fn run_token() -> std::io::Result<String> {
+    let mut bytes = [0; 8];
+    File::open("/dev/urandom")?.read_exact(&mut bytes)?;
+    Ok(format!("{:016x}", u64::from_be_bytes(bytes)))
+}

@@ -1,0 +1,335 @@
+//! The configuration file: every table composed, every value checked once, at the door.
+//!
+//! In: a TOML file. Out: a [`Config`] whose values can all be used as they are, and a [`Setup`]
+//! with the model beside it. A key that is unknown, or of a part this version does not have, is an
+//! error that names file and key, what was found and what was expected. Paths in the file are
+//! relative to its directory.
+
+mod parse;
+
+use std::env;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+
+pub use self::parse::Error;
+use super::log;
+use crate::pipeline::{self, Judgement};
+use crate::verdict::Hrn;
+use crate::{press, tare, wire};
+
+/// The whole file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Name of the robot; by default the host's.
+    #[serde(default = "host")]
+    pub robot: String,
+    /// The sensors served.
+    #[serde(default, rename = "sensor")]
+    pub sensors: Vec<Sensor>,
+    /// What a press is.
+    #[serde(default)]
+    pub press: press::Settings,
+    /// Who judges.
+    #[serde(default)]
+    pub model: Model,
+    /// Ways out.
+    #[serde(default)]
+    pub publish: Publish,
+    /// Not in this version.
+    #[serde(default, skip_serializing)]
+    http: Option<toml::Value>,
+    /// Not in this version.
+    #[serde(default, skip_serializing)]
+    record: Option<toml::Value>,
+    /// How the log is written.
+    #[serde(default)]
+    pub log: log::Settings,
+}
+
+/// A `[[sensor]]` table.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Sensor {
+    /// Its name, unique, `[a-z][a-z0-9_]*`.
+    #[serde(default = "default_name")]
+    pub name: String,
+    /// Its device file.
+    pub port: PathBuf,
+    /// Bits a second on the line; a pty and USB CDC ignore it.
+    #[serde(default = "default_baud")]
+    pub baud: u32,
+    /// Expected rate.
+    #[serde(default = "default_frame_rate_hz")]
+    pub frame_rate_hz: f64,
+    /// How a frame is written.
+    #[serde(default)]
+    pub frame: wire::Settings,
+    /// Counts to newtons.
+    #[serde(default)]
+    pub calibration: tare::Settings,
+}
+
+fn default_name() -> String {
+    "sensor".to_owned()
+}
+
+fn default_baud() -> u32 {
+    115_200
+}
+
+/// The JX255N's (paper, "Tactile sensor").
+fn default_frame_rate_hz() -> f64 {
+    5.0
+}
+
+impl Sensor {
+    /// A sensor at `port`, all else by default.
+    pub fn new(port: PathBuf) -> Self {
+        Self {
+            name: default_name(),
+            port,
+            baud: default_baud(),
+            frame_rate_hz: default_frame_rate_hz(),
+            frame: wire::Settings::default(),
+            calibration: tare::Settings::default(),
+        }
+    }
+}
+
+/// The `[model]` table.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Model {
+    /// ONNX file; by default the one built in.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub path: Option<PathBuf>,
+    /// Hash that the file must have.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sha256: Option<String>,
+    /// A verdict below this confidence is rejected.
+    pub min_confidence: f32,
+    /// A verdict on less force is rejected.
+    pub min_force_n: f64,
+}
+
+/// The `[publish]` tables.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Publish {
+    /// The Unix socket.
+    pub unix: Unix,
+    /// Not in this version.
+    #[serde(skip_serializing)]
+    tcp: Option<toml::Value>,
+    /// Not in this version.
+    #[serde(skip_serializing)]
+    zenoh: Option<toml::Value>,
+    /// Not in this version.
+    #[serde(skip_serializing)]
+    ros2: Option<toml::Value>,
+}
+
+/// The `[publish.unix]` table.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Unix {
+    /// Whether there is one.
+    pub enabled: bool,
+    /// Where; by default as [`Unix::path`] says.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    path: Option<PathBuf>,
+    /// Permissions of its file.
+    pub mode: Mode,
+    /// Not in this version.
+    #[serde(skip_serializing)]
+    control_path: Option<toml::Value>,
+    /// Subscribers at a time.
+    pub max_clients: usize,
+}
+
+impl Default for Unix {
+    fn default() -> Self {
+        Self {
+            enabled: true,
+            path: None,
+            mode: Mode(0o660),
+            control_path: None,
+            max_clients: 256,
+        }
+    }
+}
+
+impl Unix {
+    /// Where the socket is: as configured, else in the service's runtime directory, else in the
+    /// user's, else in `/run/hardnessd`.
+    pub fn path(&self) -> PathBuf {
+        if let Some(path) = &self.path {
+            return path.clone();
+        }
+        let named = |variable| env::var(variable).ok().filter(|value| !value.is_empty());
+        if let Some(directories) = named("RUNTIME_DIRECTORY") {
+            // systemd separates several by colons.
+            let first = directories.split(':').next().unwrap_or_default();
+            return Path::new(first).join("events.sock");
+        }
+        let directory = named("XDG_RUNTIME_DIR").unwrap_or_else(|| "/run".to_owned());
+        Path::new(&directory).join("hardnessd/events.sock")
+    }
+
+    /// The same, at `path`.
+    #[must_use]
+    pub fn at(self, path: PathBuf) -> Self {
+        Self {
+            path: Some(path),
+            ..self
+        }
+    }
+}
+
+/// Permissions of a file, written in octal.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct Mode(pub u32);
+
+impl TryFrom<String> for Mode {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        u32::from_str_radix(&text, 8)
+            .ok()
+            .filter(|mode| *mode <= 0o777)
+            .map(Self)
+            .ok_or_else(|| format!("found {text:?}, expected octal permissions such as \"0660\""))
+    }
+}
+
+impl From<Mode> for String {
+    fn from(mode: Mode) -> Self {
+        format!("{:04o}", mode.0)
+    }
+}
+
+fn host() -> String {
+    rustix::system::uname()
+        .nodename()
+        .to_string_lossy()
+        .into_owned()
+}
+
+impl Config {
+    /// The defaults, for these sensors.
+    pub fn new(sensors: Vec<Sensor>) -> Self {
+        Self {
+            robot: host(),
+            sensors,
+            press: press::Settings::default(),
+            model: Model::default(),
+            publish: Publish::default(),
+            http: None,
+            record: None,
+            log: log::Settings::default(),
+        }
+    }
+
+    /// Reads and checks a file.
+    ///
+    /// # Errors
+    ///
+    /// [`Error`], if the file cannot be read, is no TOML, or has a key or value that cannot be
+    /// used.
+    pub fn load(path: &Path) -> Result<Self, Error> {
+        parse::load(path)
+    }
+
+    /// The first key by which `self` and `other` differ that only a restart can change.
+    pub fn fixed_difference(&self, other: &Self) -> Option<String> {
+        if self.robot != other.robot {
+            return Some("robot".to_owned());
+        }
+        if self.sensors.len() != other.sensors.len() {
+            return Some("sensor".to_owned());
+        }
+        for (ours, theirs) in self.sensors.iter().zip(&other.sensors) {
+            let differs = [
+                ("name", ours.name != theirs.name),
+                ("port", ours.port != theirs.port),
+                ("baud", ours.baud != theirs.baud),
+                ("frame_rate_hz", ours.frame_rate_hz != theirs.frame_rate_hz),
+                ("frame", ours.frame != theirs.frame),
+            ];
+            if let Some((key, _)) = differs.iter().find(|(_, differs)| *differs) {
+                return Some(format!("sensor.{key} of \"{}\"", ours.name));
+            }
+        }
+        let (ours, theirs) = (&self.publish.unix, &other.publish.unix);
+        let differs = [
+            ("enabled", ours.enabled != theirs.enabled),
+            ("path", ours.path() != theirs.path()),
+            ("mode", ours.mode != theirs.mode),
+            ("max_clients", ours.max_clients != theirs.max_clients),
+        ];
+        differs
+            .iter()
+            .find(|(_, differs)| *differs)
+            .map(|(key, _)| format!("publish.unix.{key}"))
+    }
+}
+
+/// A configuration and its model, ready to run.
+#[derive(Debug, Clone)]
+pub struct Setup {
+    /// As read.
+    pub config: Config,
+    /// The model it names.
+    pub hrn: Arc<Hrn>,
+}
+
+impl Setup {
+    /// Reads a configuration and its model.
+    ///
+    /// # Errors
+    ///
+    /// As [`Config::load`], and if the model cannot be read or is refused.
+    pub fn load(path: &Path) -> Result<Self, Error> {
+        let config = Config::load(path)?;
+        Self::of(config, path)
+    }
+
+    /// Loads the model of `config`; `path` is for messages.
+    ///
+    /// # Errors
+    ///
+    /// If the model cannot be read or is refused.
+    pub fn of(config: Config, path: &Path) -> Result<Self, Error> {
+        let hrn = Arc::new(parse::model(&config.model, path)?);
+        Ok(Self { config, hrn })
+    }
+
+    /// Settings of every sensor's pipeline, in order.
+    pub fn pipelines(&self) -> impl Iterator<Item = pipeline::Settings> {
+        self.config.sensors.iter().map(|sensor| pipeline::Settings {
+            sensor: sensor.name.clone(),
+            frame_rate_hz: sensor.frame_rate_hz,
+            layout: wire::Layout::new(&sensor.frame)
+                .expect("a layout was checked when its configuration was read"),
+            judgement: self.judgement(sensor),
+        })
+    }
+
+    /// What a reload may change of a sensor.
+    pub fn judgement(&self, sensor: &Sensor) -> Judgement {
+        Judgement {
+            calibration: sensor.calibration.clone(),
+            press: self.config.press.clone(),
+            min_confidence: self.config.model.min_confidence,
+            min_force_n: self.config.model.min_force_n,
+            hrn: self.hrn.clone(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,388 @@
+//! Where events are numbered, kept and handed to subscribers.
+//!
+//! In: events of the sensors, in the order of their happening. Out: lines, each serialised once
+//! and shared by all who want it. One task owns all of it. Subscribers come and fetch, so one that
+//! does not come costs a bounded queue and delays nobody: when the queue is full its oldest event
+//! goes, and is counted, and a `gap` says so before the next one it does get.
+
+mod subscriber;
+
+use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::{mpsc, oneshot};
+
+use self::subscriber::Subscriber;
+use super::log;
+use super::request::{Kinds, Subscription};
+use crate::event::{Event, Hello, Kind, Reply};
+
+/// A line to be sent, newline included.
+pub(crate) type Line = Arc<str>;
+
+/// Numbered events held for `since` (contract, section 5: at least 4,096).
+const HELD: usize = 4096;
+
+/// A numbered event as it was sent.
+#[derive(Debug, Clone)]
+struct Held {
+    kind: Kind,
+    line: Line,
+}
+
+/// The state; all of it, and no clock.
+struct Hub {
+    hello: Hello,
+    /// The last [`HELD`] events; the newest has number `hello.seq`.
+    held: VecDeque<Held>,
+    /// Events no longer held, by kind.
+    forgotten: [u64; Kinds::NUMBERED.len()],
+    /// Last final verdict, by sensor.
+    finals: BTreeMap<String, Line>,
+    subscribers: BTreeMap<u64, Subscriber>,
+    joined: u64,
+}
+
+impl Hub {
+    fn new(hello: Hello) -> Self {
+        Self {
+            hello,
+            held: VecDeque::new(),
+            forgotten: [0; Kinds::NUMBERED.len()],
+            finals: BTreeMap::new(),
+            subscribers: BTreeMap::new(),
+            joined: 0,
+        }
+    }
+
+    /// Numbers `event` and offers it to every subscriber that wants it. `arrival` is when the
+    /// byte came that made it possible, `now` when it is published; both CLOCK_MONOTONIC.
+    fn publish(&mut self, mut event: Event, arrival: Duration, now: Duration) {
+        let kind = event.kind();
+        let wanted = self
+            .subscribers
+            .values()
+            .any(|subscriber| subscriber.wants(kind));
+        if kind == Kind::Frame && !wanted {
+            return;
+        }
+        if let Event::Hardness(verdict) = &mut event {
+            // Rounded: more digits than the clock is good for would only be noise.
+            verdict.age_at_publish_ms = verdict.mono_ns.map(|at| {
+                let age = now.saturating_sub(Duration::from_nanos(at));
+                (age.as_secs_f64() * 1e6).round() / 1e3
+            });
+            verdict.latency_us =
+                Some(u64::try_from(now.saturating_sub(arrival).as_micros()).unwrap_or(u64::MAX));
+        }
+        let seq = (kind != Kind::Frame).then(|| {
+            self.hello.seq += 1;
+            event.number(self.hello.seq);
+            self.hello.seq
+        });
+        let line: Line = event.to_line().into();
+        if seq.is_some() {
+            log::event(&event);
+            self.keep(Held {
+                kind,
+                line: line.clone(),
+            });
+        }
+        if let Event::Hardness(verdict) = &event
+            && verdict.phase == crate::event::Phase::Final
+        {
+            self.finals.insert(verdict.sensor.clone(), line.clone());
+        }
+        for subscriber in self.subscribers.values_mut() {
+            subscriber.offer(kind, event.sensor(), seq, &line);
+        }
+    }
+
+    fn keep(&mut self, held: Held) {
+        if self.held.len() == HELD {
+            let oldest = self.held.pop_front().expect("HELD is not 0");
+            self.forgotten[oldest.kind as usize] += 1;
+        }
+        self.held.push_back(held);
+    }
+
+    /// Number of the oldest event held.
+    fn oldest(&self) -> u64 {
+        self.hello.seq + 1 - self.held.len() as u64
+    }
+
+    fn at(&self, seq: u64) -> Option<&Held> {
+        let place = seq.checked_sub(self.oldest())?;
+        self.held.get(usize::try_from(place).ok()?)
+    }
+
+    /// A new subscriber, with the default subscription from now on.
+    fn join(&mut self) -> (u64, Line) {
+        self.joined += 1;
+        self.subscribers.insert(self.joined, Subscriber::default());
+        (
+            self.joined,
+            Reply::Hello(self.hello.clone()).to_line().into(),
+        )
+    }
+
+    /// Changes what a subscriber gets from now on.
+    fn subscribe(&mut self, id: u64, wanted: &Subscription) -> Result<(), String> {
+        let (latest, oldest) = (self.hello.seq, self.oldest());
+        let Some(subscriber) = self.subscribers.get_mut(&id) else {
+            return Ok(());
+        };
+        let Some(since) = &wanted.since else {
+            subscriber.change(wanted.kinds, wanted.policy);
+            return Ok(());
+        };
+        let known = since.run == self.hello.run;
+        if known && since.seq > latest {
+            return Err(format!(
+                "since: found {}, expected at most {latest}",
+                since.seq
+            ));
+        }
+        subscriber.change(wanted.kinds, wanted.policy);
+        let first = if known { since.seq + 1 } else { oldest };
+        let missing = match first.max(oldest) - first {
+            0 if known => Some(0),
+            // Every numbered event is wanted, so each number gone is an event missed.
+            gone if known && Kinds::NUMBERED.iter().all(|&k| wanted.kinds.contains(k)) => {
+                Some(gone)
+            }
+            // From the very start, what was forgotten is what was missed.
+            _ if known && since.seq == 0 => {
+                let wanted = Kinds::NUMBERED
+                    .into_iter()
+                    .filter(|&k| wanted.kinds.contains(k));
+                Some(wanted.map(|kind| self.forgotten[kind as usize]).sum())
+            }
+            // Of the events forgotten nobody knows the kind any more.
+            _ => None,
+        };
+        let held = (first.max(oldest)..=latest).zip(
+            self.held
+                .iter()
+                .skip(usize::try_from(first.max(oldest) - oldest).expect("HELD fits in a usize")),
+        );
+        subscriber.replay(held.map(|(seq, held)| (seq, held.kind)), missing);
+        Ok(())
+    }
+
+    /// What a subscriber gets next; empty if there is nothing for it.
+    fn take(&mut self, id: u64) -> Vec<Line> {
+        let Some(mut subscriber) = self.subscribers.remove(&id) else {
+            return Vec::new();
+        };
+        let lines = subscriber.take(|seq| self.at(seq).map(|held| held.line.clone()));
+        self.subscribers.insert(id, subscriber);
+        lines
+    }
+}
+
+/// What the hub's task is asked to do.
+enum Command {
+    Publish {
+        events: Vec<Event>,
+        arrival: Duration,
+    },
+    Describe {
+        hello: Box<Hello>,
+    },
+    Join {
+        reply: oneshot::Sender<(u64, Line)>,
+    },
+    Take {
+        id: u64,
+        reply: oneshot::Sender<Vec<Line>>,
+    },
+    Subscribe {
+        id: u64,
+        subscription: Subscription,
+        reply: oneshot::Sender<Result<(), String>>,
+    },
+    Finals {
+        reply: oneshot::Sender<Vec<Line>>,
+    },
+    Leave {
+        id: u64,
+    },
+    Close,
+}
+
+/// The way to the hub.
+#[derive(Debug, Clone)]
+pub(crate) struct Handle {
+    commands: mpsc::Sender<Command>,
+}
+
+/// The hub has ended: the daemon is stopping.
+#[derive(Debug, thiserror::Error)]
+#[error("the daemon is stopping")]
+pub(crate) struct Closed;
+
+impl Handle {
+    /// Publishes events of one sensor, which became possible at `arrival`.
+    pub(crate) async fn publish(&self, events: Vec<Event>, arrival: Duration) {
+        if !events.is_empty() {
+            let _ = self
+                .commands
+                .send(Command::Publish { events, arrival })
+                .await;
+        }
+    }
+
+    /// Changes what newcomers are told; run and numbers stay.
+    pub(crate) async fn describe(&self, hello: Hello) {
+        let _ = self
+            .commands
+            .send(Command::Describe {
+                hello: Box::new(hello),
+            })
+            .await;
+    }
+
+    /// A new subscriber: its number, and the `hello` for it.
+    pub(crate) async fn join(&self) -> Result<(u64, Line), Closed> {
+        self.ask(|reply| Command::Join { reply }).await
+    }
+
+    /// The next lines of a subscriber, as soon as there are any. At most one call of a subscriber
+    /// may be under way; lines in the receiver are its own to send.
+    pub(crate) async fn take(&self, id: u64) -> Result<oneshot::Receiver<Vec<Line>>, Closed> {
+        let (reply, lines) = oneshot::channel();
+        self.commands
+            .send(Command::Take { id, reply })
+            .await
+            .map_err(|_| Closed)?;
+        Ok(lines)
+    }
+
+    /// Changes a subscription; the error is for the subscriber.
+    pub(crate) async fn subscribe(
+        &self,
+        id: u64,
+        subscription: Subscription,
+    ) -> Result<Result<(), String>, Closed> {
+        self.ask(|reply| Command::Subscribe {
+            id,
+            subscription,
+            reply,
+        })
+        .await
+    }
+
+    /// Every sensor's last final verdict, as it was sent.
+    pub(crate) async fn finals(&self) -> Result<Vec<Line>, Closed> {
+        self.ask(|reply| Command::Finals { reply }).await
+    }
+
+    /// Forgets a subscriber.
+    pub(crate) async fn leave(&self, id: u64) {
+        let _ = self.commands.send(Command::Leave { id }).await;
+    }
+
+    /// No event comes any more: subscribers get what is left, then their end.
+    pub(crate) async fn close(&self) {
+        let _ = self.commands.send(Command::Close).await;
+    }
+
+    async fn ask<T>(
+        &self,
+        command: impl FnOnce(oneshot::Sender<T>) -> Command,
+    ) -> Result<T, Closed> {
+        let (reply, answer) = oneshot::channel();
+        self.commands
+            .send(command(reply))
+            .await
+            .map_err(|_| Closed)?;
+        answer.await.map_err(|_| Closed)
+    }
+}
+
+/// Commands under way; the hub never waits, so the queue is short unless the machine is.
+const COMMANDS: usize = 256;
+
+/// Starts the hub. It ends when every handle is gone.
+pub(crate) fn start(hello: Hello) -> Handle {
+    let (commands, inbox) = mpsc::channel(COMMANDS);
+    tokio::spawn(serve(Hub::new(hello), inbox));
+    Handle { commands }
+}
+
+async fn serve(mut hub: Hub, mut inbox: mpsc::Receiver<Command>) {
+    // Subscribers that have fetched everything and wait for more.
+    let mut waiting: HashMap<u64, oneshot::Sender<Vec<Line>>> = HashMap::new();
+    let mut closing = false;
+    while let Some(command) = inbox.recv().await {
+        // An answer nobody waits for is a subscriber that has just gone.
+        match command {
+            Command::Publish { events, arrival } => {
+                for event in events {
+                    hub.publish(event, arrival, super::now().mono);
+                }
+                for id in waiting.keys().copied().collect::<Vec<_>>() {
+                    let lines = hub.take(id);
+                    if !lines.is_empty()
+                        && let Some(reply) = waiting.remove(&id)
+                    {
+                        let _ = reply.send(lines);
+                    }
+                }
+            }
+            Command::Describe { hello } => {
+                hub.hello = Hello {
+                    seq: hub.hello.seq,
+                    run: hub.hello.run,
+                    ..*hello
+                };
+            }
+            Command::Join { reply } => {
+                let (id, hello) = hub.join();
+                if reply.send((id, hello)).is_err() {
+                    hub.subscribers.remove(&id);
+                }
+            }
+            Command::Take { id, reply } => {
+                let lines = hub.take(id);
+                if !lines.is_empty() {
+                    let _ = reply.send(lines);
+                } else if !closing {
+                    waiting.insert(id, reply);
+                }
+            }
+            Command::Subscribe {
+                id,
+                subscription,
+                reply,
+            } => {
+                let _ = reply.send(hub.subscribe(id, &subscription));
+                // What was held may be due at once.
+                if waiting.contains_key(&id) {
+                    let lines = hub.take(id);
+                    if !lines.is_empty()
+                        && let Some(reply) = waiting.remove(&id)
+                    {
+                        let _ = reply.send(lines);
+                    }
+                }
+            }
+            Command::Finals { reply } => {
+                let _ = reply.send(hub.finals.values().cloned().collect());
+            }
+            Command::Leave { id } => {
+                hub.subscribers.remove(&id);
+                waiting.remove(&id);
+            }
+            Command::Close => {
+                closing = true;
+                waiting.clear();
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,176 @@
+//! One subscriber as the hub sees it: what it wants, what waits for it, what it has missed.
+
+use std::collections::VecDeque;
+
+use super::{HELD, Line};
+use crate::daemon::request::{Kinds, Policy, Subscription};
+use crate::event::{Kind, Reply};
+
+/// Events waiting for a subscriber (contract, section 5).
+const QUEUE: usize = 1024;
+
+/// Lines handed out at a time: enough that a write carries many, few enough that a stalled
+/// subscriber holds little beyond its queue.
+const BATCH: usize = 64;
+
+/// An event waiting.
+struct Waiting {
+    kind: Kind,
+    sensor: String,
+    seq: Option<u64>,
+    line: Line,
+}
+
+/// A subscriber's state.
+pub(super) struct Subscriber {
+    kinds: Kinds,
+    policy: Policy,
+    /// A `gap` that is due before all else: `since` reached back too far.
+    missing: Option<Reply>,
+    /// Numbers of held events that `since` asked for, oldest first.
+    replay: VecDeque<u64>,
+    queue: VecDeque<Waiting>,
+    /// Events of its kinds dropped since the last line it got.
+    lost: u64,
+    handed: Handed,
+}
+
+impl Default for Subscriber {
+    fn default() -> Self {
+        let Subscription { kinds, policy, .. } = Subscription::default();
+        Self {
+            kinds,
+            policy,
+            missing: None,
+            replay: VecDeque::new(),
+            queue: VecDeque::new(),
+            lost: 0,
+            handed: Handed([0; HELD / 64]),
+        }
+    }
+}
+
+impl Subscriber {
+    pub(super) fn wants(&self, kind: Kind) -> bool {
+        self.kinds.contains(kind)
+    }
+
+    /// Another subscription: what waits and is no longer wanted goes without a `gap`.
+    pub(super) fn change(&mut self, kinds: Kinds, policy: Policy) {
+        (self.kinds, self.policy) = (kinds, policy);
+        self.queue.retain(|event| kinds.contains(event.kind));
+        if policy == Policy::Latest {
+            for event in std::mem::take(&mut self.queue) {
+                self.enqueue(event);
+            }
+        }
+    }
+
+    /// Sends `held` again but for what this subscriber has had, before anything live. `missing`
+    /// says how many of its events are held no more; `None`: unknown.
+    pub(super) fn replay(&mut self, held: impl Iterator<Item = (u64, Kind)>, missing: Option<u64>) {
+        self.missing = (missing != Some(0)).then_some(Reply::Gap { lost: missing });
+        // What waits is held too, and comes with the rest.
+        self.queue.retain(|event| event.seq.is_none());
+        self.lost = 0;
+        self.replay = held
+            .filter(|&(seq, kind)| self.kinds.contains(kind) && !self.handed.contains(seq))
+            .map(|(seq, _)| seq)
+            .collect();
+    }
+
+    /// A new event, wanted or not.
+    pub(super) fn offer(&mut self, kind: Kind, sensor: &str, seq: Option<u64>, line: &Line) {
+        if let Some(seq) = seq {
+            self.handed.remove(seq);
+        }
+        if !self.wants(kind) {
+            return;
+        }
+        self.enqueue(Waiting {
+            kind,
+            sensor: sensor.to_owned(),
+            seq,
+            line: line.clone(),
+        });
+    }
+
+    fn enqueue(&mut self, event: Waiting) {
+        let superseded = match self.policy {
+            Policy::Queue => (self.queue.len() == QUEUE).then_some(0),
+            Policy::Latest => self
+                .queue
+                .iter()
+                .position(|e| e.kind == event.kind && e.sensor == event.sensor),
+        };
+        if let Some(place) = superseded
+            && let Some(dropped) = self.queue.remove(place)
+        {
+            // A newer frame stands for the older ones: that is what `latest` is for.
+            let silent = self.policy == Policy::Latest && dropped.kind == Kind::Frame;
+            self.lost += u64::from(!silent);
+        }
+        self.queue.push_back(event);
+    }
+
+    /// What it gets next; `held` looks a numbered event up.
+    pub(super) fn take(&mut self, held: impl Fn(u64) -> Option<Line>) -> Vec<Line> {
+        let mut lines = Vec::new();
+        lines.extend(self.missing.take().map(|gap| Line::from(gap.to_line())));
+        while lines.len() < BATCH
+            && let Some(seq) = self.replay.pop_front()
+        {
+            match held(seq) {
+                Some(line) => {
+                    lines.extend(self.gap());
+                    self.handed.insert(seq);
+                    lines.push(line);
+                }
+                // Forgotten while the subscriber took its time.
+                None => self.lost += 1,
+            }
+        }
+        while lines.len() < BATCH
+            && let Some(event) = self.queue.pop_front()
+        {
+            lines.extend(self.gap());
+            if let Some(seq) = event.seq
+                && held(seq).is_some()
+            {
+                self.handed.insert(seq);
+            }
+            lines.push(event.line);
+        }
+        lines
+    }
+
+    fn gap(&mut self) -> Option<Line> {
+        let lost = std::mem::take(&mut self.lost);
+        (lost > 0).then(|| Reply::Gap { lost: Some(lost) }.to_line().into())
+    }
+}
+
+/// Which of the events held this subscriber has had: one bit each.
+struct Handed([u64; HELD / 64]);
+
+impl Handed {
+    fn place(seq: u64) -> (usize, u64) {
+        let bit = usize::try_from(seq % HELD as u64).expect("below HELD");
+        (bit / 64, 1 << (bit % 64))
+    }
+
+    fn contains(&self, seq: u64) -> bool {
+        let (word, bit) = Self::place(seq);
+        self.0[word] & bit != 0
+    }
+
+    fn insert(&mut self, seq: u64) {
+        let (word, bit) = Self::place(seq);
+        self.0[word] |= bit;
+    }
+
+    fn remove(&mut self, seq: u64) {
+        let (word, bit) = Self::place(seq);
+        self.0[word] &= !bit;
+    }
+}

@@ -1,0 +1,189 @@
+//! What the operator reads: one line an event, on stderr or in the journal.
+//!
+//! Field names are stable: they are those of the published events. The level comes from
+//! `RUST_LOG`, else it is `info` for the daemon. Nothing here goes to stdout, which belongs to events.
+
+use std::io::IsTerminal;
+
+use serde::{Deserialize, Serialize};
+use tracing::{info, warn};
+use tracing_subscriber::layer::{Layer, SubscriberExt};
+use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{EnvFilter, Registry, reload};
+
+use crate::event::{Event, LinkState, PressState};
+
+/// The `[log]` table.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Settings {
+    /// How a line is written.
+    pub format: Format,
+}
+
+/// How a line is written.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Format {
+    /// For people, on stderr.
+    #[default]
+    Text,
+    /// One JSON object a line, on stderr.
+    Json,
+    /// Fields of the journal, prefixed `HARDNESSD_`.
+    Journald,
+}
+
+type Output = Box<dyn Layer<Registry> + Send + Sync>;
+
+/// The log of this process; its format may change while it runs.
+#[derive(Clone)]
+pub struct Log {
+    output: reload::Handle<Output, Registry>,
+    level: &'static str,
+}
+
+/// Why a format cannot be had.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// No journal to write to.
+    #[error("log.format: found \"journald\", but the journal cannot be reached")]
+    Journal(#[source] std::io::Error),
+    /// `RUST_LOG` cannot be read.
+    #[error("RUST_LOG: {0}")]
+    Filter(#[source] tracing_subscriber::filter::ParseError),
+    /// There is a log already.
+    #[error("the log was started twice")]
+    Twice,
+}
+
+impl Log {
+    /// Starts the process's log, once; `level` is what is said where `RUST_LOG` is not set.
+    ///
+    /// # Errors
+    ///
+    /// If `RUST_LOG` is malformed, the journal is asked for and cannot be reached, or a log has
+    /// been started before.
+    pub fn start(settings: Settings, level: &'static str) -> Result<Self, Error> {
+        let (layer, output) = reload::Layer::new(output(settings, level)?);
+        let log = Self { output, level };
+        tracing_subscriber::registry()
+            .with(layer)
+            .try_init()
+            .map_err(|_| Error::Twice)?;
+        Ok(log)
+    }
+
+    /// Writes as `settings` say from now on.
+    ///
+    /// # Errors
+    ///
+    /// As [`Log::start`]; the log then stays as it is.
+    pub fn change(&self, settings: Settings) -> Result<(), Error> {
+        self.output
+            .reload(output(settings, self.level)?)
+            .map_err(|_| Error::Twice)
+    }
+}
+
+fn output(settings: Settings, level: &str) -> Result<Output, Error> {
+    // The filter belongs to the layer, so that a change of format keeps it.
+    let filter = match std::env::var(EnvFilter::DEFAULT_ENV) {
+        Ok(directives) if !directives.is_empty() => {
+            EnvFilter::try_new(directives).map_err(Error::Filter)?
+        }
+        _ => EnvFilter::new(level),
+    };
+    let lines = tracing_subscriber::fmt::layer()
+        .with_writer(std::io::stderr)
+        .with_target(false);
+    Ok(match settings.format {
+        Format::Text => lines
+            .with_ansi(std::io::stderr().is_terminal())
+            .with_filter(filter)
+            .boxed(),
+        Format::Json => lines.json().flatten_event(true).with_filter(filter).boxed(),
+        Format::Journald => tracing_journald::layer()
+            .map_err(Error::Journal)?
+            .with_field_prefix(Some("HARDNESSD".to_owned()))
+            .with_syslog_identifier("hardnessd".to_owned())
+            .with_filter(filter)
+            .boxed(),
+    })
+}
+
+/// One line for a numbered event.
+pub(crate) fn event(event: &Event) {
+    match event {
+        Event::Status(status) => {
+            let state = name(&status.state);
+            let reason = status.reason.as_deref();
+            let (sensor, frames) = (status.sensor.as_str(), status.frames);
+            let (frames_damaged, bytes_skipped) = (status.frames_damaged, status.bytes_skipped);
+            let seq = status.seq;
+            if matches!(status.state, LinkState::Lost | LinkState::Stale) || reason.is_some() {
+                warn!(
+                    seq,
+                    sensor, state, reason, frames, frames_damaged, bytes_skipped, "status"
+                );
+            } else {
+                info!(
+                    seq,
+                    sensor, state, frames, frames_damaged, bytes_skipped, "status"
+                );
+            }
+        }
+        Event::Press(press) => {
+            let state = name(&press.state);
+            let (sensor, number, reason) = (press.sensor.as_str(), press.press, press.reason);
+            let (seq, frame, frames) = (press.seq, press.frame, press.frames);
+            if press.state == PressState::Aborted {
+                warn!(
+                    seq,
+                    sensor,
+                    press = number,
+                    state,
+                    reason,
+                    frame,
+                    frames,
+                    "press"
+                );
+            } else {
+                info!(
+                    seq,
+                    sensor,
+                    press = number,
+                    state,
+                    reason,
+                    frame,
+                    frames,
+                    "press"
+                );
+            }
+        }
+        Event::Hardness(verdict) => info!(
+            seq = verdict.seq,
+            sensor = verdict.sensor.as_str(),
+            press = verdict.press,
+            phase = name(&verdict.phase),
+            level = verdict.level,
+            label = verdict.label.as_deref(),
+            rejected = verdict.rejected.as_ref().map(name),
+            confidence = f64::from(verdict.confidence),
+            frame = verdict.frame,
+            force_n = verdict.force_n,
+            contact_area_taxels = verdict.contact_area_taxels,
+            model = verdict.model.as_str(),
+            "hardness"
+        ),
+        Event::Frame(_) => {}
+    }
+}
+
+/// The name under which a state is published, so that log and event agree.
+fn name(state: &impl Serialize) -> String {
+    match serde_json::to_value(state) {
+        Ok(serde_json::Value::String(name)) => name,
+        other => unreachable!("a state without data is published as its name, not {other:?}"),
+    }
+}

@@ -1,0 +1,266 @@
+//! What a subscriber may say: one JSON object a line.
+//!
+//! In: a line as it came. Out: a [`Request`], or a message saying what was found and what was
+//! expected; in both cases with the `id` to echo. Nothing here changes the daemon: commands that
+//! do are refused by name.
+
+use serde::Serialize;
+use serde_json::{Map, Value};
+
+use crate::event::Kind;
+
+/// A usable line.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Request {
+    /// What to be sent from now on.
+    Subscribe(Subscription),
+    /// Every sensor's status now.
+    Status,
+    /// Every sensor's last final verdict.
+    Last,
+}
+
+/// What a subscriber wants, and what is to happen when it is slow.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Subscription {
+    pub(crate) kinds: Kinds,
+    pub(crate) policy: Policy,
+    /// Where in an earlier connection it stopped.
+    pub(crate) since: Option<Since>,
+}
+
+impl Default for Subscription {
+    fn default() -> Self {
+        let kinds = [Kind::Hardness, Kind::Press, Kind::Status]
+            .into_iter()
+            .collect();
+        Self {
+            kinds,
+            policy: Policy::Queue,
+            since: None,
+        }
+    }
+}
+
+/// What is kept for a subscriber that does not keep up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Policy {
+    /// Every event, the oldest dropped when the queue is full.
+    Queue,
+    /// The newest event a kind and sensor.
+    Latest,
+}
+
+/// A place in a run: `RUN:SEQ`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Since {
+    pub(crate) run: String,
+    pub(crate) seq: u64,
+}
+
+/// A set of event kinds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Kinds(u8);
+
+impl Kinds {
+    /// The kinds that carry a `seq`.
+    pub(crate) const NUMBERED: [Kind; 3] = [Kind::Status, Kind::Press, Kind::Hardness];
+
+    pub(crate) fn contains(self, kind: Kind) -> bool {
+        self.0 & Self::bit(kind) != 0
+    }
+
+    fn bit(kind: Kind) -> u8 {
+        1 << kind as u8
+    }
+}
+
+impl FromIterator<Kind> for Kinds {
+    fn from_iter<I: IntoIterator<Item = Kind>>(kinds: I) -> Self {
+        Self(
+            kinds
+                .into_iter()
+                .map(Self::bit)
+                .fold(0, |set, bit| set | bit),
+        )
+    }
+}
+
+/// A line, read.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Line {
+    /// To be echoed in the answer.
+    pub(crate) id: Option<Value>,
+    /// What it asks for, or why it cannot be used.
+    pub(crate) request: Result<Request, String>,
+}
+
+/// Reads one line, without its newline.
+pub(crate) fn parse(line: &[u8]) -> Line {
+    let unusable = |message: String| Line {
+        id: None,
+        request: Err(message),
+    };
+    let mut fields: Map<String, Value> = match serde_json::from_slice(line) {
+        Ok(Value::Object(fields)) => fields,
+        Ok(_) => return unusable("found JSON of another type, expected an object".to_owned()),
+        Err(error) => return unusable(format!("found no JSON ({error}), expected an object")),
+    };
+    let id = fields.remove("id");
+    Line {
+        id,
+        request: request(fields),
+    }
+}
+
+fn request(mut fields: Map<String, Value>) -> Result<Request, String> {
+    let request = if let Some(kinds) = fields.remove("subscribe") {
+        Request::Subscribe(Subscription {
+            kinds: self::kinds(&kinds)?,
+            policy: fields
+                .remove("policy")
+                .map_or(Ok(Policy::Queue), |value| policy(&value))?,
+            since: fields
+                .remove("since")
+                .map(|value| since(&value))
+                .transpose()?,
+        })
+    } else if let Some(what) = fields.remove("get") {
+        match what.as_str() {
+            Some("status") => Request::Status,
+            Some("last") => Request::Last,
+            _ => {
+                return Err(format!(
+                    "get: found {}, expected \"status\" or \"last\"",
+                    short(&what)
+                ));
+            }
+        }
+    } else {
+        let found = fields
+            .keys()
+            .next()
+            .map_or("no key".to_owned(), |key| short(key));
+        return Err(
+            match fields.keys().find(|key| CHANGING.contains(&key.as_str())) {
+                Some(key) => format!("{key}: this socket takes no command that changes anything"),
+                None => format!("found {found}, expected \"subscribe\" or \"get\""),
+            },
+        );
+    };
+    match fields.keys().next() {
+        Some(key) => Err(format!(
+            "found {}, which this request does not take",
+            short(key)
+        )),
+        None => Ok(request),
+    }
+}
+
+/// Commands of the control socket (contract, section 5).
+const CHANGING: [&str; 3] = ["tare", "context", "blackbox"];
+
+/// What was found, as JSON, short enough for a message.
+fn short(found: &(impl Serialize + ?Sized)) -> String {
+    const CHARS: usize = 60;
+    let text = serde_json::to_string(found).expect("what was read as JSON can be written as JSON");
+    match text.char_indices().nth(CHARS) {
+        Some((end, _)) => format!("{}...", &text[..end]),
+        None => text,
+    }
+}
+
+fn kinds(value: &Value) -> Result<Kinds, String> {
+    let expected = "expected a list of \"hardness\", \"press\", \"status\", \"frame\"";
+    let Value::Array(names) = value else {
+        return Err(format!("subscribe: found {}, {expected}", short(value)));
+    };
+    names
+        .iter()
+        .map(|name| match name.as_str() {
+            Some("hardness") => Ok(Kind::Hardness),
+            Some("press") => Ok(Kind::Press),
+            Some("status") => Ok(Kind::Status),
+            Some("frame") => Ok(Kind::Frame),
+            _ => Err(format!("subscribe: found {}, {expected}", short(name))),
+        })
+        .collect()
+}
+
+fn policy(value: &Value) -> Result<Policy, String> {
+    match value.as_str() {
+        Some("queue") => Ok(Policy::Queue),
+        Some("latest") => Ok(Policy::Latest),
+        _ => Err(format!(
+            "policy: found {}, expected \"queue\" or \"latest\"",
+            short(value)
+        )),
+    }
+}
+
+fn since(value: &Value) -> Result<Since, String> {
+    value
+        .as_str()
+        .and_then(|token| token.rsplit_once(':'))
+        .and_then(|(run, seq)| {
+            Some(Since {
+                run: run.to_owned(),
+                seq: seq.parse().ok()?,
+            })
+        })
+        .ok_or_else(|| format!("since: found {}, expected \"RUN:SEQ\"", short(value)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_request_of_the_protocol_is_understood() {
+        let subscription = |text: &str| match parse(text.as_bytes()).request {
+            Ok(Request::Subscribe(subscription)) => subscription,
+            other => panic!("{text}: {other:?}"),
+        };
+        let all = subscription(r#"{"subscribe":["hardness","press","status","frame"]}"#);
+        assert!(all.kinds.contains(Kind::Frame) && all.kinds.contains(Kind::Status));
+        assert_eq!(all.policy, Policy::Queue);
+        let resumed = subscription(r#"{"subscribe":["press"],"policy":"latest","since":"ab:7"}"#);
+        assert!(!resumed.kinds.contains(Kind::Hardness));
+        assert_eq!(resumed.policy, Policy::Latest);
+        assert_eq!(
+            resumed.since,
+            Some(Since {
+                run: "ab".to_owned(),
+                seq: 7
+            })
+        );
+        assert_eq!(parse(br#"{"get":"status"}"#).request, Ok(Request::Status));
+        assert_eq!(
+            parse(br#"{"get":"last","id":4}"#).request,
+            Ok(Request::Last)
+        );
+    }
+
+    #[test]
+    fn an_unusable_line_says_what_was_found_and_echoes_its_id() {
+        for (line, found) in [
+            (&br#"{"subscribe":["touch"],"id":"a"}"#[..], "\"touch\""),
+            (br#"{"subscribe":"press","id":"a"}"#, "\"press\""),
+            (br#"{"subscribe":[],"policy":"all","id":"a"}"#, "\"all\""),
+            (br#"{"subscribe":[],"since":"7","id":"a"}"#, "\"7\""),
+            (br#"{"subscribe":[],"since":"ab:-7","id":"a"}"#, "\"ab:-7\""),
+            (br#"{"subscribe":[],"sinse":"ab:7","id":"a"}"#, "\"sinse\""),
+            (br#"{"get":"frames","id":"a"}"#, "\"frames\""),
+            (br#"{"tare":"forearm","id":"a"}"#, "tare"),
+            (br#"{"id":"a"}"#, "no key"),
+        ] {
+            let read = parse(line);
+            let message = read.request.unwrap_err();
+            assert!(message.contains(found), "{message}");
+            assert_eq!(read.id, Some(Value::from("a")));
+        }
+        for line in [&b"{\"get\":"[..], b"[1]", b"\xff\xfe", b""] {
+            assert!(parse(line).request.is_err());
+        }
+    }
+}

@@ -1,0 +1,382 @@
+//! What subscribers read: one JSON object a line, protocol 1.
+//!
+//! The published format has its one home here. Fields may be added within a protocol version but
+//! never change meaning, and the order of fields is part of the golden bytes. Nothing here
+//! decides anything: the pipeline fills these in, the hub numbers and publishes them.
+
+use jiff::Timestamp;
+use serde::{Serialize, Serializer};
+
+use crate::frame::{COLS, ROWS};
+
+/// Version of the format, announced in `hello`.
+pub const PROTOCOL: u32 = 1;
+
+/// A numbered or live event of one sensor.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(tag = "type", rename_all = "lowercase")]
+pub enum Event {
+    /// The link changed, or was asked for.
+    Status(Status),
+    /// A press began, ended or was aborted.
+    Press(Press),
+    /// A press was judged.
+    Hardness(Hardness),
+    /// One tared frame; never numbered.
+    Frame(FrameEvent),
+}
+
+/// The kinds of [`Event`] a subscriber may ask for.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, serde::Deserialize, Serialize,
+)]
+#[serde(rename_all = "lowercase")]
+pub enum Kind {
+    /// [`Event::Status`]
+    Status,
+    /// [`Event::Press`]
+    Press,
+    /// [`Event::Hardness`]
+    Hardness,
+    /// [`Event::Frame`]
+    Frame,
+}
+
+impl Event {
+    /// Which kind this is.
+    pub fn kind(&self) -> Kind {
+        match self {
+            Event::Status(_) => Kind::Status,
+            Event::Press(_) => Kind::Press,
+            Event::Hardness(_) => Kind::Hardness,
+            Event::Frame(_) => Kind::Frame,
+        }
+    }
+
+    /// The sensor it speaks of.
+    pub fn sensor(&self) -> &str {
+        match self {
+            Event::Status(event) => &event.sensor,
+            Event::Press(event) => &event.sensor,
+            Event::Hardness(event) => &event.sensor,
+            Event::Frame(event) => &event.sensor,
+        }
+    }
+
+    /// Gives the event its place in the run. A `frame` has none and is left as it is.
+    pub fn number(&mut self, seq: u64) {
+        match self {
+            Event::Status(event) => event.seq = Some(seq),
+            Event::Press(event) => event.seq = Some(seq),
+            Event::Hardness(event) => event.seq = Some(seq),
+            Event::Frame(_) => {}
+        }
+    }
+
+    /// The event as one line, newline included.
+    pub fn to_line(&self) -> String {
+        line(self)
+    }
+}
+
+/// State of a sensor's link.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum LinkState {
+    /// Never opened, or open without a frame for under 2.5 periods.
+    Connecting,
+    /// Frames arrive.
+    Live,
+    /// Open, and 2.5 periods without a frame.
+    Stale,
+    /// Was open and is gone.
+    Lost,
+}
+
+/// A sensor's link and its counters.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Status {
+    /// Place in the run; absent in a status sent on request or after `hello`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub seq: Option<u64>,
+    /// Sensor's name.
+    pub sensor: String,
+    /// Of the frame concerned, else of now.
+    #[serde(serialize_with = "rfc3339")]
+    pub time: Timestamp,
+    /// State of the link.
+    pub state: LinkState,
+    /// Why, where there is something to say.
+    pub reason: Option<String>,
+    /// Whole frames since start.
+    pub frames: u64,
+    /// Damaged frames since start.
+    pub frames_damaged: u64,
+    /// Bytes since start that belonged to no whole frame.
+    pub bytes_skipped: u64,
+    /// Measured over the last frames; null before two.
+    #[serde(serialize_with = "rounded_hz")]
+    pub frame_rate_hz: Option<f64>,
+}
+
+/// What happened to a press.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PressState {
+    /// First frame at or above the begin area.
+    Begin,
+    /// Released, or timed out.
+    End,
+    /// Over without a verdict.
+    Aborted,
+}
+
+/// A change of a press.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Press {
+    /// Place in the run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub seq: Option<u64>,
+    /// Sensor's name.
+    pub sensor: String,
+    /// Of `frame`.
+    #[serde(serialize_with = "rfc3339")]
+    pub time: Timestamp,
+    /// Number of the press, from 1, per sensor.
+    pub press: u64,
+    /// What happened.
+    pub state: PressState,
+    /// The frame it began with, or its last frame in contact.
+    pub frame: u64,
+    /// `timeout`, `short`, `lost`, `shutdown`, `end of recording`, or null.
+    pub reason: Option<&'static str>,
+    /// Frames in contact so far.
+    pub frames: u64,
+    /// What the controller last said it is doing.
+    pub context: Option<serde_json::Value>,
+}
+
+/// When in the press it was judged.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Phase {
+    /// The contact has settled; the press goes on.
+    Early,
+    /// The press is over.
+    Final,
+}
+
+/// Why a verdict was withheld.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Rejection {
+    /// Confidence below `model.min_confidence`.
+    LowConfidence,
+    /// Force below `model.min_force_n`.
+    LowForce,
+}
+
+/// What a user should know of the chosen frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Note {
+    /// The contact touches the border of the array.
+    AtEdge,
+    /// A taxel reads full scale.
+    Saturated,
+    /// Force or area lies outside what the model was trained on.
+    OutsideTraining,
+}
+
+/// A verdict.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Hardness {
+    /// Place in the run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub seq: Option<u64>,
+    /// Sensor's name.
+    pub sensor: String,
+    /// Of the chosen frame.
+    #[serde(serialize_with = "rfc3339")]
+    pub time: Timestamp,
+    /// Number of the press.
+    pub press: u64,
+    /// Early or final.
+    pub phase: Phase,
+    /// 1..L, or null when rejected.
+    pub level: Option<u8>,
+    /// The model's label of the level, or null when rejected.
+    pub label: Option<String>,
+    /// Why there is no level.
+    pub rejected: Option<Rejection>,
+    /// What to know of the chosen frame.
+    pub notes: Vec<Note>,
+    /// One a level; they sum to 1.
+    pub probabilities: Vec<f32>,
+    /// The largest probability.
+    pub confidence: f32,
+    /// The chosen frame: maximal contact area.
+    pub frame: u64,
+    /// Contact area of the chosen frame in taxels.
+    pub contact_area_taxels: u32,
+    /// The same in mm2.
+    #[serde(serialize_with = "rounded_3")]
+    pub contact_area_mm2: f64,
+    /// Total force of the chosen frame in newtons.
+    #[serde(serialize_with = "rounded_3")]
+    pub force_n: f64,
+    /// First 12 hex digits of the model file's SHA-256.
+    pub model: String,
+    /// State of the link.
+    pub state: LinkState,
+    /// What the controller last said it is doing.
+    pub context: Option<serde_json::Value>,
+    /// CLOCK_MONOTONIC at the chosen frame's last byte; null in a replay.
+    pub mono_ns: Option<u64>,
+    /// Age of the chosen frame at publication; null in a replay.
+    pub age_at_publish_ms: Option<f64>,
+    /// From the arrival of the byte that made the decision possible; null in a replay.
+    pub latency_us: Option<u64>,
+}
+
+/// One tared frame.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct FrameEvent {
+    /// Sensor's name.
+    pub sensor: String,
+    /// Of the frame's last byte.
+    #[serde(serialize_with = "rfc3339")]
+    pub time: Timestamp,
+    /// Number of the frame, from 0, per sensor.
+    pub frame: u64,
+    /// Always 28.
+    pub rows: usize,
+    /// Always 28.
+    pub cols: usize,
+    /// `[rows, cols]` flattened, row-major, rounded to 0.001 N.
+    #[serde(serialize_with = "millinewtons")]
+    pub newtons: Vec<f32>,
+}
+
+impl FrameEvent {
+    /// The event of one frame.
+    pub fn new(sensor: String, time: Timestamp, frame: u64, newtons: Vec<f32>) -> Self {
+        Self {
+            sensor,
+            time,
+            frame,
+            rows: ROWS,
+            cols: COLS,
+            newtons,
+        }
+    }
+}
+
+/// What is not an event of a sensor: `hello`, `gap`, `error` and `ok`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(tag = "type", rename_all = "lowercase")]
+pub enum Reply {
+    /// First line of every connection.
+    Hello(Hello),
+    /// Events this subscriber will not get.
+    Gap {
+        /// How many of its subscribed kinds; null: unknown.
+        lost: Option<u64>,
+    },
+    /// A line could not be used, or there is no room.
+    Error {
+        /// What was found and what was expected.
+        message: String,
+        /// The `id` of the line, echoed.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        id: Option<serde_json::Value>,
+    },
+    /// A command was carried out.
+    Ok {
+        /// The `id` of the line, echoed.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        id: Option<serde_json::Value>,
+    },
+}
+
+impl Reply {
+    /// The reply as one line, newline included.
+    pub fn to_line(&self) -> String {
+        line(self)
+    }
+}
+
+/// Who is speaking, and of what.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Hello {
+    /// [`PROTOCOL`].
+    pub protocol: u32,
+    /// `hardnessd`.
+    pub server: &'static str,
+    /// Version of the daemon.
+    pub version: &'static str,
+    /// Name of the robot.
+    pub robot: String,
+    /// Random, of this start of the daemon.
+    pub run: String,
+    /// The kernel's boot id.
+    pub boot_id: String,
+    /// Latest number given.
+    pub seq: u64,
+    /// The sensors served.
+    pub sensors: Vec<SensorCard>,
+    /// The model in use.
+    pub model: ModelCard,
+}
+
+/// A sensor as announced in `hello`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SensorCard {
+    /// Its name.
+    pub name: String,
+    /// Rows of the array itself.
+    pub rows: usize,
+    /// Columns of the array itself.
+    pub cols: usize,
+    /// Distance of taxel centres.
+    pub pitch_mm: f64,
+}
+
+/// The model as announced in `hello`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ModelCard {
+    /// Of the file.
+    pub sha256: String,
+    /// What it was validated on, such as "simulated data only".
+    pub validation: String,
+    /// Its levels.
+    pub levels: Vec<crate::verdict::Level>,
+}
+
+fn line<T: Serialize>(value: &T) -> String {
+    let mut text = serde_json::to_string(value)
+        .expect("plain structs of numbers and strings always serialise");
+    text.push('\n');
+    text
+}
+
+/// RFC 3339 in UTC with microseconds, so that every time has one width.
+fn rfc3339<S: Serializer>(time: &Timestamp, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(&format_args!("{time:.6}"))
+}
+
+fn rounded_3<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_f64(round_3(*value))
+}
+
+fn rounded_hz<S: Serializer>(value: &Option<f64>, serializer: S) -> Result<S::Ok, S::Error> {
+    value.map(round_3).serialize(serializer)
+}
+
+fn millinewtons<S: Serializer>(newtons: &[f32], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(newtons.iter().map(|&n| round_3(f64::from(n))))
+}
+
+fn round_3(value: f64) -> f64 {
+    (value * 1000.0).round() / 1000.0
+}

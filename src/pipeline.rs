@@ -1,0 +1,802 @@
+//! All of the core in a row, for one sensor: bytes and the moment they came go in, events come
+//! out.
+//!
+//! It owns the sensor's numbers (frames, presses, damage) and its link state, which go on over
+//! reconnects. It never waits, never logs and never asks the time: [`Pipeline::deadline`] says
+//! when it wants to be told that time has passed.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::Timestamp;
+
+use crate::event::{
+    Event, FrameEvent, Hardness, LinkState, Note, Phase, Press, PressState, Rejection, Status,
+};
+use crate::frame::{Frame, RawFrame, Stamp};
+use crate::press::{self, Abort, Change, End, Moment, Peak, PressTracker};
+use crate::tare::{self, Contact, Progress, Tare};
+use crate::verdict::Hrn;
+use crate::wire::{Decoded, Decoder, Layout};
+
+/// What a pipeline is made for.
+#[derive(Debug, Clone)]
+pub struct Settings {
+    /// Name of the sensor.
+    pub sensor: String,
+    /// Expected rate.
+    pub frame_rate_hz: f64,
+    /// How its frames are written.
+    pub layout: Layout,
+    /// The parts that may change while it runs.
+    pub judgement: Judgement,
+}
+
+/// The part of the settings that a reload may change.
+#[derive(Debug, Clone)]
+pub struct Judgement {
+    /// Counts to newtons.
+    pub calibration: tare::Settings,
+    /// What a press is.
+    pub press: press::Settings,
+    /// A verdict below this confidence is rejected.
+    pub min_confidence: f32,
+    /// A verdict on less force is rejected.
+    pub min_force_n: f64,
+    /// Who judges.
+    pub hrn: Arc<Hrn>,
+}
+
+/// Where the times of frames come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Clock {
+    /// The moment the frame's last byte came.
+    Arrival,
+    /// Frame n comes n periods after 1970-01-01T00:00:00Z: bytes without times.
+    FrameRate,
+}
+
+/// A frame is late after so many periods.
+const STALE_PERIODS: f64 = 2.5;
+/// A silence of so many periods ends what came before it.
+const PAUSE_PERIODS: f64 = 0.5;
+/// The measured rate is that over so many frames.
+const RATE_FRAMES: usize = 32;
+
+/// The state of one sensor.
+#[derive(Debug)]
+pub struct Pipeline {
+    sensor: String,
+    period: Duration,
+    frame_rate_hz: f64,
+    clock: Clock,
+    decoder: Decoder,
+    tare: Tare,
+    tracker: PressTracker,
+    judgement: Judgement,
+    link: Link,
+    tare_met_contact: bool,
+    frames: u64,
+    frames_damaged: u64,
+    /// Ends of recent chunks in the stream, and when they came.
+    chunks: VecDeque<(u64, Stamp)>,
+    /// When the latest frames came.
+    recent: VecDeque<Duration>,
+    last_bytes: Option<Duration>,
+    last_frame: Option<Stamp>,
+    /// State and reason of the last status published.
+    told: (LinkState, Option<String>),
+}
+
+#[derive(Debug)]
+enum Link {
+    /// Never opened; why the last try failed.
+    Closed { reason: Option<String> },
+    /// Open since then, and no frame yet.
+    Opened { since: Duration },
+    /// The last frame came then.
+    Live { since: Duration },
+    /// Open and silent.
+    Stale,
+    /// Was open and is gone, or is open again without a frame.
+    Lost { reason: String },
+}
+
+impl Pipeline {
+    /// A pipeline whose port has not been opened.
+    pub fn new(settings: Settings, clock: Clock) -> Self {
+        let Settings {
+            sensor,
+            frame_rate_hz,
+            layout,
+            judgement,
+        } = settings;
+        Self {
+            sensor,
+            period: Duration::from_secs_f64(1.0 / frame_rate_hz),
+            frame_rate_hz,
+            clock,
+            tare: Tare::new(
+                &judgement.calibration,
+                layout.array(),
+                contact(&judgement.press),
+            ),
+            tracker: PressTracker::new(judgement.press.clone()),
+            decoder: Decoder::new(layout),
+            judgement,
+            link: Link::Closed { reason: None },
+            tare_met_contact: false,
+            frames: 0,
+            frames_damaged: 0,
+            chunks: VecDeque::new(),
+            recent: VecDeque::with_capacity(RATE_FRAMES),
+            last_bytes: None,
+            last_frame: None,
+            told: (LinkState::Connecting, None),
+        }
+    }
+
+    /// Takes over changed settings at once. The baseline and a press under way stay.
+    pub fn reload(&mut self, judgement: Judgement) {
+        self.tare
+            .reload(&judgement.calibration, contact(&judgement.press));
+        self.tracker.reload(judgement.press.clone());
+        self.judgement = judgement;
+    }
+
+    /// The port is open: what comes next does not continue what came before.
+    pub fn opened(&mut self, at: Stamp) -> Vec<Event> {
+        self.decoder.restart();
+        self.chunks.clear();
+        self.last_bytes = None;
+        if matches!(self.link, Link::Closed { .. }) {
+            self.link = Link::Opened { since: at.mono };
+        }
+        self.status_if_changed(at)
+    }
+
+    /// The port could not be opened. Once it has been open, the loss already says so.
+    pub fn unavailable(&mut self, reason: String, at: Stamp) -> Vec<Event> {
+        if let Link::Closed { reason: known } = &mut self.link {
+            *known = Some(reason);
+        }
+        self.status_if_changed(at)
+    }
+
+    /// Bytes came.
+    pub fn push(&mut self, bytes: &[u8], at: Stamp) -> Vec<Event> {
+        let mut events = self.tick(at);
+        self.decoder.push(bytes);
+        self.last_bytes = Some(at.mono);
+        if self.clock == Clock::Arrival {
+            self.chunks.push_back((self.decoder.received(), at));
+        }
+        self.drain(&mut events);
+        events
+    }
+
+    /// Time has passed: a silence settles a pending frame, and a longer one is stale.
+    pub fn tick(&mut self, at: Stamp) -> Vec<Event> {
+        let mut events = Vec::new();
+        if self.clock == Clock::FrameRate {
+            return events;
+        }
+        if self
+            .pause_deadline()
+            .is_some_and(|deadline| at.mono >= deadline)
+        {
+            self.decoder.settle();
+            self.last_bytes = None;
+            self.drain(&mut events);
+        }
+        if let Some(deadline) = self.stale_deadline()
+            && at.mono >= deadline
+        {
+            self.link = Link::Stale;
+            let late = at.mono.saturating_sub(deadline);
+            let wall = at.wall.checked_sub(late).unwrap_or(at.wall);
+            events.extend(self.status_if_changed(Stamp {
+                mono: deadline,
+                wall,
+            }));
+        }
+        events
+    }
+
+    /// When [`Self::tick`] is next due, on CLOCK_MONOTONIC.
+    pub fn deadline(&self) -> Option<Duration> {
+        match (self.pause_deadline(), self.stale_deadline()) {
+            (Some(pause), Some(stale)) => Some(pause.min(stale)),
+            (pause, stale) => pause.or(stale),
+        }
+    }
+
+    /// The device is gone: a press under way is aborted.
+    pub fn lost(&mut self, reason: String, at: Stamp) -> Vec<Event> {
+        let mut events = Vec::new();
+        self.decoder.settle();
+        self.drain(&mut events);
+        self.decoder.restart();
+        self.last_bytes = None;
+        self.recent.clear();
+        self.link = Link::Lost { reason };
+        events.extend(self.status_if_changed(at));
+        self.abort(Abort::Lost, &mut events);
+        events
+    }
+
+    /// The daemon stops: a press under way is aborted.
+    pub fn shutdown(&mut self) -> Vec<Event> {
+        let mut events = Vec::new();
+        self.abort(Abort::Shutdown, &mut events);
+        events
+    }
+
+    /// The recording ended: what is pending is settled, and the last status carries the totals.
+    /// `at` is the recording's own last moment; without one, that of the last frame.
+    pub fn end_of_recording(&mut self, at: Option<Stamp>) -> Vec<Event> {
+        let mut events = Vec::new();
+        self.decoder.settle();
+        self.drain(&mut events);
+        self.abort(Abort::EndOfRecording, &mut events);
+        self.link = Link::Lost {
+            reason: Abort::EndOfRecording.reason().to_owned(),
+        };
+        let at = at.or(self.last_frame).unwrap_or(EPOCH);
+        // What is left over never became a frame.
+        self.decoder.restart();
+        events.push(Event::Status(self.status(at)));
+        events
+    }
+
+    /// The link and its counters, now.
+    pub fn status(&self, at: Stamp) -> Status {
+        let (state, reason) = self.state();
+        Status {
+            seq: None,
+            sensor: self.sensor.clone(),
+            time: at.wall,
+            state,
+            reason,
+            frames: self.frames,
+            frames_damaged: self.frames_damaged,
+            bytes_skipped: self.decoder.skipped(),
+            frame_rate_hz: self.measured_rate_hz(),
+        }
+    }
+
+    fn state(&self) -> (LinkState, Option<String>) {
+        let tare = || self.tare_met_contact.then(|| "tare: contact".to_owned());
+        match &self.link {
+            Link::Closed { reason } => (LinkState::Connecting, reason.clone()),
+            Link::Opened { .. } => (LinkState::Connecting, None),
+            Link::Live { .. } => (LinkState::Live, tare()),
+            Link::Stale => (
+                LinkState::Stale,
+                Some("no frame for 2.5 periods".to_owned()),
+            ),
+            Link::Lost { reason } => (LinkState::Lost, Some(reason.clone())),
+        }
+    }
+
+    fn status_if_changed(&mut self, at: Stamp) -> Vec<Event> {
+        let state = self.state();
+        if self.told == state {
+            return Vec::new();
+        }
+        self.told = state;
+        vec![Event::Status(self.status(at))]
+    }
+
+    fn measured_rate_hz(&self) -> Option<f64> {
+        let span = self
+            .recent
+            .back()?
+            .checked_sub(*self.recent.front()?)?
+            .as_secs_f64();
+        match self.clock {
+            _ if self.recent.len() < 2 => None,
+            Clock::FrameRate => Some(self.frame_rate_hz),
+            Clock::Arrival => (span > 0.0).then(|| (self.recent.len() - 1) as f64 / span),
+        }
+    }
+
+    fn pause_deadline(&self) -> Option<Duration> {
+        let last_bytes = self.last_bytes.filter(|_| self.decoder.pending() > 0)?;
+        Some(last_bytes + self.period.mul_f64(PAUSE_PERIODS))
+    }
+
+    fn stale_deadline(&self) -> Option<Duration> {
+        match self.link {
+            Link::Opened { since } | Link::Live { since } if self.clock == Clock::Arrival => {
+                Some(since + self.period.mul_f64(STALE_PERIODS))
+            }
+            _ => None,
+        }
+    }
+
+    fn drain(&mut self, events: &mut Vec<Event>) {
+        while let Some(found) = self.decoder.next_frame() {
+            match found {
+                Ok(Decoded { frame, end }) => {
+                    let stamp = self.stamp_of(end);
+                    self.take(&frame, stamp, events);
+                }
+                Err(_damage) => self.frames_damaged += 1,
+            }
+        }
+        let settled = self.decoder.received() - self.decoder.pending() as u64;
+        while self.chunks.front().is_some_and(|&(end, _)| end <= settled) {
+            self.chunks.pop_front();
+        }
+    }
+
+    /// When the byte before `end` came.
+    fn stamp_of(&self, end: u64) -> Stamp {
+        match self.clock {
+            Clock::Arrival => self
+                .chunks
+                .iter()
+                .find(|&&(chunk_end, _)| chunk_end >= end)
+                .map_or(EPOCH, |&(_, stamp)| stamp),
+            Clock::FrameRate => {
+                let mono = Duration::from_secs_f64(self.frames as f64 / self.frame_rate_hz);
+                Stamp {
+                    mono,
+                    wall: EPOCH.wall.checked_add(mono).unwrap_or(Timestamp::MAX),
+                }
+            }
+        }
+    }
+
+    /// A whole frame.
+    fn take(&mut self, raw: &RawFrame, stamp: Stamp, events: &mut Vec<Event>) {
+        let at = Moment {
+            frame: self.frames,
+            stamp,
+        };
+        self.frames += 1;
+        self.last_frame = Some(stamp);
+        if self.recent.len() == RATE_FRAMES {
+            self.recent.pop_front();
+        }
+        self.recent.push_back(stamp.mono);
+        self.link = Link::Live { since: stamp.mono };
+
+        let frame = self.tare.apply(raw);
+        let progress = self.tare.observe(raw);
+        match progress {
+            Progress::Contact => self.tare_met_contact = true,
+            Progress::Taken => self.tare_met_contact = false,
+            Progress::Ready | Progress::Taking => {}
+        }
+        events.extend(self.status_if_changed(stamp));
+        events.push(Event::Frame(FrameEvent::new(
+            self.sensor.clone(),
+            stamp.wall,
+            at.frame,
+            frame.newtons.to_vec(),
+        )));
+        if progress == Progress::Ready {
+            for change in self.tracker.push(&frame, at) {
+                self.publish(change, events);
+            }
+        }
+    }
+
+    fn abort(&mut self, reason: Abort, events: &mut Vec<Event>) {
+        if let Some(change) = self.tracker.abort(reason) {
+            self.publish(change, events);
+        }
+    }
+
+    fn publish(&self, change: Change, events: &mut Vec<Event>) {
+        match change {
+            Change::Begin { press, at } => {
+                events.push(self.press(press, PressState::Begin, at, 1, None));
+            }
+            Change::Settled { press, peak } => {
+                events.extend(self.judge(press, Phase::Early, &peak));
+            }
+            Change::End {
+                press,
+                last,
+                frames,
+                end,
+                peak,
+            } => {
+                let reason = match end {
+                    End::Release => None,
+                    End::Timeout => Some("timeout"),
+                };
+                events.push(self.press(press, PressState::End, last, frames, reason));
+                events.extend(self.judge(press, Phase::Final, &peak));
+            }
+            Change::Aborted {
+                press,
+                last,
+                frames,
+                reason,
+            } => {
+                let reason = Some(reason.reason());
+                events.push(self.press(press, PressState::Aborted, last, frames, reason));
+            }
+        }
+    }
+
+    fn press(
+        &self,
+        press: u64,
+        state: PressState,
+        at: Moment,
+        frames: u64,
+        reason: Option<&'static str>,
+    ) -> Event {
+        Event::Press(Press {
+            seq: None,
+            sensor: self.sensor.clone(),
+            time: at.stamp.wall,
+            press,
+            state,
+            frame: at.frame,
+            reason,
+            frames,
+            context: None,
+        })
+    }
+
+    /// The verdict on a press. A model that cannot judge a finite frame was refused at its load;
+    /// should one fail all the same, the press has no verdict rather than a made-up one.
+    fn judge(&self, press: u64, phase: Phase, peak: &Peak) -> Option<Event> {
+        let Judgement {
+            min_confidence,
+            min_force_n,
+            hrn,
+            ..
+        } = &self.judgement;
+        let verdict = hrn.judge(&peak.frame).ok()?;
+        let rejected = if peak.force_n < *min_force_n {
+            Some(Rejection::LowForce)
+        } else if verdict.confidence < *min_confidence {
+            Some(Rejection::LowConfidence)
+        } else {
+            None
+        };
+        let level = rejected.is_none().then_some(verdict.level);
+        let label = level.and_then(|level| {
+            let known = hrn
+                .card()
+                .levels
+                .iter()
+                .find(|known| known.level == level)?;
+            Some(known.label.clone())
+        });
+        let pitch_mm = self.judgement.calibration.pitch_mm;
+        let Moment { frame, stamp } = peak.moment;
+        Some(Event::Hardness(Hardness {
+            seq: None,
+            sensor: self.sensor.clone(),
+            time: stamp.wall,
+            press,
+            phase,
+            level,
+            label,
+            rejected,
+            notes: self.notes(peak),
+            probabilities: verdict.probabilities,
+            confidence: verdict.confidence,
+            frame,
+            contact_area_taxels: peak.contact_area_taxels,
+            contact_area_mm2: f64::from(peak.contact_area_taxels) * pitch_mm * pitch_mm,
+            force_n: peak.force_n,
+            model: hrn.sha256()[..12].to_owned(),
+            state: self.state().0,
+            context: None,
+            mono_ns: (self.clock == Clock::Arrival).then_some(stamp.mono.as_nanos() as u64),
+            age_at_publish_ms: None,
+            latency_us: None,
+        }))
+    }
+
+    fn notes(&self, peak: &Peak) -> Vec<Note> {
+        let layout = self.decoder.layout();
+        let full_scale = layout.full_scale();
+        let range = &self.judgement.hrn.card().range;
+        let [least_n, most_n] = range.force_n.map(f64::from);
+        let [least_taxels, most_taxels] = range.contact_area_taxels;
+        let trained = (least_n..=most_n).contains(&peak.force_n)
+            && (least_taxels..=most_taxels).contains(&peak.contact_area_taxels);
+        [
+            (Note::AtEdge, self.is_at_edge(&peak.frame)),
+            (
+                Note::Saturated,
+                full_scale.is_some_and(|f| self.tare.is_saturated(&peak.frame, f)),
+            ),
+            (Note::OutsideTraining, !trained),
+        ]
+        .into_iter()
+        .filter_map(|(note, applies)| applies.then_some(note))
+        .collect()
+    }
+
+    fn is_at_edge(&self, frame: &Frame) -> bool {
+        let array = self.decoder.layout().array();
+        let threshold_n = self.judgement.press.contact_threshold_n;
+        array.places().any(|place| {
+            frame.newtons[place] >= threshold_n
+                && array.position(place).is_some_and(|(row, col)| {
+                    row == 0 || col == 0 || row + 1 == array.rows || col + 1 == array.cols
+                })
+        })
+    }
+}
+
+/// Before any frame of a recording without times.
+const EPOCH: Stamp = Stamp {
+    mono: Duration::ZERO,
+    wall: Timestamp::UNIX_EPOCH,
+};
+
+fn contact(press: &press::Settings) -> Contact {
+    Contact {
+        threshold_n: press.contact_threshold_n,
+        area_taxels: press.begin_area_taxels,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::verdict::BUILT_IN;
+    use crate::wire::{self, Preset};
+
+    const PERIOD: Duration = Duration::from_millis(200);
+
+    fn pipeline(preset: Preset) -> Pipeline {
+        let settings = Settings {
+            sensor: "forearm".to_owned(),
+            frame_rate_hz: 5.0,
+            layout: Layout::new(&wire::Settings {
+                preset,
+                ..wire::Settings::default()
+            })
+            .unwrap(),
+            judgement: Judgement {
+                calibration: tare::Settings::default(),
+                press: press::Settings::default(),
+                min_confidence: 0.0,
+                min_force_n: 0.0,
+                hrn: Arc::new(Hrn::load(BUILT_IN).unwrap()),
+            },
+        };
+        Pipeline::new(settings, Clock::Arrival)
+    }
+
+    fn at(millis: u64) -> Stamp {
+        let mono = Duration::from_millis(1000 + millis);
+        Stamp {
+            mono,
+            wall: EPOCH.wall.checked_add(mono).unwrap(),
+        }
+    }
+
+    /// `taxels` taxels at `counts` in the middle of the array.
+    fn raw(taxels: usize, counts: u16) -> RawFrame {
+        let mut raw = RawFrame::default();
+        raw.counts[400..400 + taxels].fill(counts);
+        raw
+    }
+
+    fn bytes(pipeline: &Pipeline, raw: &RawFrame) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        pipeline.decoder.layout().encode(raw, &mut bytes);
+        bytes
+    }
+
+    /// Events without their `frame`s, one word each.
+    fn words(events: &[Event]) -> Vec<String> {
+        let word = |event: &Event| match event {
+            Event::Frame(_) => None,
+            Event::Status(status) => Some(match &status.reason {
+                Some(reason) => format!("{:?} ({reason})", status.state),
+                None => format!("{:?}", status.state),
+            }),
+            Event::Press(press) => Some(match press.reason {
+                Some(reason) => format!("{:?} {} ({reason})", press.state, press.press),
+                None => format!("{:?} {}", press.state, press.press),
+            }),
+            Event::Hardness(verdict) => Some(format!("{:?} of {}", verdict.phase, verdict.frame)),
+        };
+        events.iter().filter_map(word).collect()
+    }
+
+    /// Pushes one frame a period, from `first` on.
+    fn play(pipeline: &mut Pipeline, first: u64, frames: &[RawFrame]) -> Vec<String> {
+        let mut events = Vec::new();
+        for (number, raw) in (first..).zip(frames) {
+            let bytes = bytes(pipeline, raw);
+            events.extend(pipeline.push(&bytes, at(number * 200)));
+        }
+        words(&events)
+    }
+
+    #[test]
+    fn a_press_gives_begin_end_and_a_final_verdict() {
+        let mut pipeline = pipeline(Preset::Jx255n);
+        assert!(pipeline.opened(at(0)).is_empty(), "still connecting");
+        assert_eq!(play(&mut pipeline, 1, &[raw(0, 0); 5]), ["Live"]);
+        let press = [raw(4, 10), raw(9, 20), raw(5, 30), raw(0, 0), raw(0, 0)];
+        assert_eq!(
+            play(&mut pipeline, 6, &press),
+            ["Begin 1", "End 1", "Final of 6"]
+        );
+    }
+
+    #[test]
+    fn a_load_during_tare_is_said_and_tracked_as_no_press() {
+        let mut pipeline = pipeline(Preset::Jx255n);
+        let loaded = [raw(9, 50); 5];
+        assert_eq!(
+            play(&mut pipeline, 0, &loaded),
+            ["Live", "Live (tare: contact)"]
+        );
+        assert!(play(&mut pipeline, 5, &loaded).is_empty(), "said once");
+        assert_eq!(play(&mut pipeline, 10, &[raw(0, 0); 5]), ["Live"]);
+        assert_eq!(play(&mut pipeline, 15, &loaded[..1]), ["Begin 1"]);
+    }
+
+    #[test]
+    fn silence_is_stale_after_two_and_a_half_periods_and_ends_no_press() {
+        let mut pipeline = pipeline(Preset::Jx255n);
+        play(&mut pipeline, 0, &[raw(0, 0); 5]);
+        play(&mut pipeline, 5, &[raw(5, 50); 1]);
+        let deadline = pipeline.deadline().unwrap();
+        assert_eq!(deadline, at(1000).mono + PERIOD.mul_f64(2.5));
+        assert!(pipeline.tick(at(1499)).is_empty());
+        assert_eq!(
+            words(&pipeline.tick(at(1500))),
+            ["Stale (no frame for 2.5 periods)"]
+        );
+        assert_eq!(pipeline.deadline(), None);
+        let back = [raw(5, 50), raw(0, 0), raw(0, 0)];
+        assert_eq!(
+            play(&mut pipeline, 20, &back),
+            ["Live", "End 1", "Final of 5"]
+        );
+    }
+
+    #[test]
+    fn a_port_open_without_frames_is_stale_too() {
+        let mut pipeline = pipeline(Preset::Jx255n);
+        let said = pipeline.unavailable("no such device".to_owned(), at(0));
+        assert_eq!(words(&said), ["Connecting (no such device)"]);
+        assert!(
+            pipeline
+                .unavailable("no such device".to_owned(), at(100))
+                .is_empty()
+        );
+        assert_eq!(words(&pipeline.opened(at(200))), ["Connecting"]);
+        assert_eq!(
+            words(&pipeline.tick(at(700))),
+            ["Stale (no frame for 2.5 periods)"]
+        );
+    }
+
+    #[test]
+    fn a_lost_device_aborts_the_press_and_numbers_go_on() {
+        let mut pipeline = pipeline(Preset::Jx255n);
+        play(&mut pipeline, 0, &[raw(0, 0); 5]);
+        play(&mut pipeline, 5, &[raw(5, 50); 2]);
+        let lost = pipeline.lost("end of file".to_owned(), at(1300));
+        assert_eq!(words(&lost), ["Lost (end of file)", "Aborted 1 (lost)"]);
+        assert!(
+            pipeline
+                .unavailable("no such device".to_owned(), at(1400))
+                .is_empty()
+        );
+        assert!(
+            pipeline.opened(at(2000)).is_empty(),
+            "lost until a frame arrives"
+        );
+        assert!(pipeline.tick(at(9000)).is_empty());
+        assert_eq!(
+            play(&mut pipeline, 50, &[raw(5, 50); 1]),
+            ["Live", "Begin 2"]
+        );
+        assert_eq!(pipeline.status(at(0)).frames, 8);
+    }
+
+    #[test]
+    fn half_a_period_of_silence_makes_a_jq_frame_whole_at_its_own_time() {
+        let mut pipeline = pipeline(Preset::Jq);
+        let bytes = bytes(&pipeline, &raw(0, 0));
+        assert!(pipeline.push(&bytes, at(0)).is_empty());
+        assert_eq!(pipeline.deadline(), Some(at(100).mono));
+        let events = pipeline.tick(at(103));
+        assert_eq!(words(&events), ["Live"]);
+        let Event::Status(status) = &events[0] else {
+            panic!("{events:?}")
+        };
+        assert_eq!(status.time, at(0).wall, "the frame's last byte came then");
+    }
+
+    #[test]
+    fn a_frame_sent_in_pieces_has_the_time_of_its_last_byte() {
+        let mut pipeline = pipeline(Preset::Jx255n);
+        let bytes = bytes(&pipeline, &raw(0, 0));
+        assert!(pipeline.push(&bytes[..500], at(0)).is_empty());
+        let events = pipeline.push(&[&bytes[500..], &bytes[..300]].concat(), at(40));
+        let Event::Frame(frame) = &events[1] else {
+            panic!("{events:?}")
+        };
+        assert_eq!(frame.time, at(40).wall);
+        let events = pipeline.push(&bytes[300..], at(90));
+        let Event::Frame(frame) = &events[0] else {
+            panic!("{events:?}")
+        };
+        assert_eq!(frame.time, at(90).wall);
+    }
+
+    #[test]
+    fn totals_balance_with_damage() {
+        let mut pipeline = pipeline(Preset::Jx255n);
+        let mut stream = vec![1, 2, 3];
+        let mut broken = bytes(&pipeline, &raw(1, 1));
+        broken[400] ^= 1;
+        stream.extend(broken);
+        stream.extend(bytes(&pipeline, &raw(0, 0)));
+        stream.extend([0xBB, 0xAA, 0x10]);
+        pipeline.push(&stream, at(0));
+        let status = pipeline.status(at(0));
+        assert_eq!(
+            (status.frames, status.frames_damaged, status.bytes_skipped),
+            (1, 1, 793)
+        );
+        let events = pipeline.end_of_recording(None);
+        assert_eq!(words(&events), ["Lost (end of recording)"]);
+        assert_eq!(pipeline.status(at(0)).bytes_skipped, 796);
+    }
+
+    #[test]
+    fn verdicts_below_the_thresholds_are_rejected() {
+        let check = |min_force_n: f64, min_confidence: f32, expected: Option<Rejection>| {
+            let mut pipeline = pipeline(Preset::Jx255n);
+            pipeline.judgement.min_force_n = min_force_n;
+            pipeline.judgement.min_confidence = min_confidence;
+            play(&mut pipeline, 0, &[raw(0, 0); 5]);
+            let mut events = Vec::new();
+            for (number, raw) in (5..).zip([raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)]) {
+                let bytes = bytes(&pipeline, &raw);
+                events.extend(pipeline.push(&bytes, at(number * 200)));
+            }
+            let Some(Event::Hardness(verdict)) = events.last() else {
+                panic!("{events:?}")
+            };
+            assert_eq!(verdict.rejected, expected);
+            assert_eq!(verdict.level.is_some(), expected.is_none());
+            assert_eq!(verdict.label.is_some(), expected.is_none());
+            assert!((verdict.probabilities.iter().sum::<f32>() - 1.0).abs() < 1e-5);
+        };
+        check(0.0, 0.0, None);
+        check(100.0, 0.0, Some(Rejection::LowForce));
+        check(0.0, 1.1, Some(Rejection::LowConfidence));
+    }
+
+    #[test]
+    fn notes_name_the_edge_and_saturation() {
+        let mut pipeline = pipeline(Preset::Jx255n);
+        play(&mut pipeline, 0, &[raw(0, 0); 5]);
+        let mut held = raw(9, 255);
+        held.counts[0] = 10;
+        let mut events = Vec::new();
+        for (number, raw) in (5..).zip([held, held, raw(0, 0), raw(0, 0)]) {
+            let bytes = bytes(&pipeline, &raw);
+            events.extend(pipeline.push(&bytes, at(number * 200)));
+        }
+        let Some(Event::Hardness(verdict)) = events.last() else {
+            panic!("{events:?}")
+        };
+        assert!(verdict.notes.contains(&Note::AtEdge) && verdict.notes.contains(&Note::Saturated));
+    }
+}

@@ -1,0 +1,383 @@
+//! Tare: the unloaded baseline, and subtracting it.
+//!
+//! In: [`RawFrame`]s in counts. Out: [`Frame`]s in newtons, dead taxels replaced, and what became
+//! of the tare. A tare under load would zero a press away, so one is refused while the sensor is
+//! touched and tried again.
+
+use serde::{Deserialize, Serialize};
+
+use crate::frame::{Array, COLS, Frame, ROWS, RawFrame, TAXELS};
+
+/// The `[sensor.calibration]` table.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Settings {
+    /// Force of one count.
+    pub newtons_per_count: f32,
+    /// Distance of taxel centres.
+    pub pitch_mm: f64,
+    /// Frames averaged at start; 0: no tare.
+    pub tare_frames: u32,
+    /// How far above the array's median a taxel may rest.
+    pub tare_max_n: f32,
+    /// `[[row, col], ...]` in the sensor's own rows and columns.
+    pub dead_taxels: Vec<[usize; 2]>,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            newtons_per_count: 0.04,
+            pitch_mm: 3.5,
+            tare_frames: 5,
+            tare_max_n: 0.5,
+            dead_taxels: Vec::new(),
+        }
+    }
+}
+
+/// A value of [`Settings`] that cannot be used.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum SettingsError {
+    /// A quantity that must be positive and finite.
+    #[error("{key}: found {found}, expected a number above 0")]
+    NotPositive {
+        /// Its key.
+        key: &'static str,
+        /// As given.
+        found: f64,
+    },
+    /// More frames than a sum of counts can hold.
+    #[error("tare_frames: found {found}, expected 0 to {max}")]
+    TareFrames {
+        /// As given.
+        found: u32,
+        /// Largest.
+        max: u32,
+    },
+    /// A dead taxel outside the array.
+    #[error(
+        "dead_taxels: found [{row}, {col}], expected a row below {} and a column below {}",
+        array.rows,
+        array.cols
+    )]
+    DeadTaxel {
+        /// As given.
+        row: usize,
+        /// As given.
+        col: usize,
+        /// The array.
+        array: Array,
+    },
+}
+
+/// 65535 counts x 65536 frames stay below 2^32.
+const MOST_TARE_FRAMES: u32 = 65_536;
+
+impl Settings {
+    /// Checks the values against the sensor's array.
+    ///
+    /// # Errors
+    ///
+    /// If `newtons_per_count`, `pitch_mm` or `tare_max_n` is not above 0 and finite, `tare_frames`
+    /// is above 65,536, or a dead taxel lies outside `array`.
+    pub fn check(&self, array: Array) -> Result<(), SettingsError> {
+        for (key, found) in [
+            ("newtons_per_count", f64::from(self.newtons_per_count)),
+            ("pitch_mm", self.pitch_mm),
+            ("tare_max_n", f64::from(self.tare_max_n)),
+        ] {
+            if !(found.is_finite() && found > 0.0) {
+                return Err(SettingsError::NotPositive { key, found });
+            }
+        }
+        if self.tare_frames > MOST_TARE_FRAMES {
+            return Err(SettingsError::TareFrames {
+                found: self.tare_frames,
+                max: MOST_TARE_FRAMES,
+            });
+        }
+        match self
+            .dead_taxels
+            .iter()
+            .find(|[row, col]| *row >= array.rows || *col >= array.cols)
+        {
+            Some(&[row, col]) => Err(SettingsError::DeadTaxel { row, col, array }),
+            None => Ok(()),
+        }
+    }
+}
+
+/// When a frame counts as touched while a tare is taken.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Contact {
+    /// A taxel that varies by so much is being touched.
+    pub threshold_n: f32,
+    /// So many touched taxels are a contact.
+    pub area_taxels: u32,
+}
+
+/// What a frame did to the tare.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Progress {
+    /// None is being taken: presses may be tracked.
+    Ready,
+    /// This frame is one of those averaged.
+    Taking,
+    /// It was the last of them: the baseline stands from the next frame on.
+    Taken,
+    /// The sensor is touched: the frames were thrown away and another try begins.
+    Contact,
+}
+
+/// The baseline of one sensor and the tare being taken, if one is.
+#[derive(Debug, Clone)]
+pub struct Tare {
+    newtons_per_count: f32,
+    /// `[ROWS, COLS]` in counts; zeros until a tare is taken.
+    baseline: Box<[f32; TAXELS]>,
+    taking: Option<Taking>,
+    contact: Contact,
+    max_n: f32,
+    array: Array,
+    /// Each dead taxel's place and those of its live neighbours.
+    dead: Vec<(usize, Vec<usize>)>,
+}
+
+/// Sums over the frames of a tare.
+#[derive(Debug, Clone)]
+struct Taking {
+    wanted: u32,
+    seen: u32,
+    sum: Box<[u32; TAXELS]>,
+    least: Box<[u16; TAXELS]>,
+    most: Box<[u16; TAXELS]>,
+}
+
+impl Taking {
+    fn new(wanted: u32) -> Self {
+        Self {
+            wanted,
+            seen: 0,
+            sum: Box::new([0; TAXELS]),
+            least: Box::new([u16::MAX; TAXELS]),
+            most: Box::new([0; TAXELS]),
+        }
+    }
+
+    fn add(&mut self, raw: &RawFrame) {
+        self.seen += 1;
+        for (place, &count) in raw.counts.iter().enumerate() {
+            self.sum[place] += u32::from(count);
+            self.least[place] = self.least[place].min(count);
+            self.most[place] = self.most[place].max(count);
+        }
+    }
+}
+
+impl Tare {
+    /// A tare about to be taken, or a zero baseline for good where `tare_frames` is 0.
+    ///
+    /// `settings` have passed [`Settings::check`] for `array`.
+    pub fn new(settings: &Settings, array: Array, contact: Contact) -> Self {
+        Self {
+            newtons_per_count: settings.newtons_per_count,
+            baseline: Box::new([0.0; TAXELS]),
+            taking: (settings.tare_frames > 0).then(|| Taking::new(settings.tare_frames)),
+            contact,
+            max_n: settings.tare_max_n,
+            array,
+            dead: dead(settings, array),
+        }
+    }
+
+    /// Takes over changed settings; the baseline in force stays.
+    pub fn reload(&mut self, settings: &Settings, contact: Contact) {
+        self.newtons_per_count = settings.newtons_per_count;
+        self.max_n = settings.tare_max_n;
+        self.contact = contact;
+        self.dead = dead(settings, self.array);
+    }
+
+    /// Whether a tare is being taken.
+    pub fn is_taking(&self) -> bool {
+        self.taking.is_some()
+    }
+
+    /// Counts to newtons: `max(0, counts - baseline) x newtons_per_count`, dead taxels replaced
+    /// by the mean of their live neighbours.
+    pub fn apply(&self, raw: &RawFrame) -> Frame {
+        let mut frame = Frame::default();
+        for (place, newtons) in frame.newtons.iter_mut().enumerate() {
+            let counts = f32::from(raw.counts[place]) - self.baseline[place];
+            *newtons = counts.max(0.0) * self.newtons_per_count;
+        }
+        for (place, neighbours) in &self.dead {
+            let sum: f32 = neighbours
+                .iter()
+                .map(|&neighbour| frame.newtons[neighbour])
+                .sum();
+            frame.newtons[*place] = sum / neighbours.len().max(1) as f32;
+        }
+        frame
+    }
+
+    /// Whether a live taxel of `frame`, made by [`Self::apply`], read `full_scale` counts.
+    pub fn is_saturated(&self, frame: &Frame, full_scale: u16) -> bool {
+        self.array.places().any(|place| {
+            let most = (f32::from(full_scale) - self.baseline[place]) * self.newtons_per_count;
+            frame.newtons[place] >= most && !self.dead.iter().any(|(dead, _)| *dead == place)
+        })
+    }
+
+    /// Shows the tare a frame.
+    pub fn observe(&mut self, raw: &RawFrame) -> Progress {
+        let Some(taking) = &mut self.taking else {
+            return Progress::Ready;
+        };
+        taking.add(raw);
+        if taking.seen < taking.wanted {
+            return Progress::Taking;
+        }
+        let mean = Box::new(std::array::from_fn(|place| {
+            taking.sum[place] as f32 / taking.seen as f32
+        }));
+        let wanted = taking.wanted;
+        if self.is_touched(&mean) {
+            self.taking = Some(Taking::new(wanted));
+            return Progress::Contact;
+        }
+        self.baseline = mean;
+        self.taking = None;
+        Progress::Taken
+    }
+
+    fn is_touched(&self, mean: &[f32; TAXELS]) -> bool {
+        let Some(taking) = &self.taking else {
+            return false;
+        };
+        let live: Vec<usize> = self
+            .array
+            .places()
+            .filter(|place| !self.dead.iter().any(|(dead, _)| dead == place))
+            .collect();
+        let mut sorted: Vec<f32> = live.iter().map(|&place| mean[place]).collect();
+        sorted.sort_by(f32::total_cmp);
+        let median = sorted.get(sorted.len() / 2).copied().unwrap_or(0.0);
+        let varying = live.iter().filter(|&&place| {
+            let spread = f32::from(taking.most[place] - taking.least[place]);
+            spread * self.newtons_per_count >= self.contact.threshold_n
+        });
+        let high = live
+            .iter()
+            .filter(|&&place| (mean[place] - median) * self.newtons_per_count > self.max_n);
+        let limit = self.contact.area_taxels as usize;
+        varying.count() >= limit || high.count() >= limit
+    }
+}
+
+fn dead(settings: &Settings, array: Array) -> Vec<(usize, Vec<usize>)> {
+    let mut is_dead = [false; TAXELS];
+    for &[row, col] in &settings.dead_taxels {
+        is_dead[array.place(row, col)] = true;
+    }
+    let live_neighbours = |place: usize| {
+        let (row, col) = (place / COLS, place % COLS);
+        let rows = row.saturating_sub(1)..=(row + 1).min(ROWS - 1);
+        rows.flat_map(|r| {
+            (col.saturating_sub(1)..=(col + 1).min(COLS - 1)).map(move |c| r * COLS + c)
+        })
+        .filter(|&at| at != place && !is_dead[at] && array.position(at).is_some())
+        .collect()
+    };
+    (0..TAXELS)
+        .filter(|&place| is_dead[place])
+        .map(|place| (place, live_neighbours(place)))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CONTACT: Contact = Contact {
+        threshold_n: 0.07,
+        area_taxels: 3,
+    };
+
+    fn raw(counts: &[(usize, u16)]) -> RawFrame {
+        let mut frame = RawFrame {
+            counts: [2; TAXELS],
+        };
+        for &(place, count) in counts {
+            frame.counts[place] = count;
+        }
+        frame
+    }
+
+    fn settings(dead_taxels: &[[usize; 2]]) -> Settings {
+        Settings {
+            dead_taxels: dead_taxels.to_vec(),
+            ..Settings::default()
+        }
+    }
+
+    #[test]
+    fn baseline_is_the_mean_and_frames_before_it_are_untared() {
+        let mut tare = Tare::new(&settings(&[]), Array::FULL, CONTACT);
+        for count in [2, 3, 2, 3] {
+            assert_eq!(tare.observe(&raw(&[(0, count)])), Progress::Taking);
+        }
+        assert_eq!(tare.apply(&raw(&[])).newtons[5], 2.0 * 0.04);
+        assert_eq!(tare.observe(&raw(&[(0, 3)])), Progress::Taken);
+        let frame = tare.apply(&raw(&[(0, 12), (1, 1)]));
+        assert_eq!(frame.newtons[0], (12.0 - 13.0 / 5.0) * 0.04);
+        assert_eq!(frame.newtons[1], 0.0, "below the baseline is zero");
+        assert_eq!(tare.observe(&raw(&[])), Progress::Ready);
+    }
+
+    #[test]
+    fn a_moving_or_a_resting_load_is_contact() {
+        let moving = [[2, 4], [2, 4], [2, 4]];
+        let check = |touch: &dyn Fn(usize) -> Vec<(usize, u16)>, expected| {
+            let mut tare = Tare::new(&settings(&[]), Array::FULL, CONTACT);
+            let last = (0..5).map(|frame| tare.observe(&raw(&touch(frame)))).last();
+            assert_eq!(last, Some(expected));
+            assert_eq!(tare.is_taking(), expected == Progress::Contact);
+        };
+        check(
+            &|frame| (0..3).map(|i| (i, moving[i][frame % 2])).collect(),
+            Progress::Contact,
+        );
+        check(
+            &|frame| (0..2).map(|i| (i, moving[i][frame % 2])).collect(),
+            Progress::Taken,
+        );
+        check(
+            &|_| (0..3).map(|i| (i, 2 + 13)).collect(),
+            Progress::Contact,
+        );
+        check(&|_| (0..3).map(|i| (i, 2 + 12)).collect(), Progress::Taken);
+    }
+
+    #[test]
+    fn a_dead_taxel_is_the_mean_of_its_live_neighbours() {
+        let mut settings = settings(&[[0, 0], [0, 1]]);
+        settings.tare_frames = 0;
+        let tare = Tare::new(&settings, Array::FULL, CONTACT);
+        let frame = tare.apply(&raw(&[(0, 255), (1, 255), (COLS, 10), (COLS + 1, 20)]));
+        assert!((frame.newtons[0] - 15.0 * 0.04).abs() < 1e-6);
+        let expected = (2.0 + 10.0 + 20.0 + 2.0) / 4.0 * 0.04;
+        assert!((frame.newtons[1] - expected).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_small_array_ignores_what_lies_outside_it() {
+        let array = Array { rows: 1, cols: 2 };
+        let mut settings = settings(&[[0, 0]]);
+        settings.tare_frames = 0;
+        let tare = Tare::new(&settings, array, CONTACT);
+        let frame = tare.apply(&raw(&[(array.place(0, 1), 50)]));
+        assert_eq!(frame.newtons[array.place(0, 0)], 50.0 * 0.04);
+    }
+}

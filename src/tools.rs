@@ -1,0 +1,20 @@
+//! What stands around the daemon: a sensor to try it on, and recordings played again.
+
+pub mod check;
+pub mod demo;
+mod faults;
+mod player;
+mod pty;
+pub mod replay;
+pub mod simulate;
+
+use std::io::{ErrorKind, Write};
+
+/// Writes lines to stdout at once. `Ok(false)`: nobody reads any more, which ends a tool quietly.
+fn print(lines: &[u8]) -> std::io::Result<bool> {
+    let mut out = std::io::stdout().lock();
+    match out.write_all(lines).and_then(|()| out.flush()) {
+        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(false),
+        written => written.map(|()| true),
+    }
+}

@@ -1,0 +1,151 @@
+//! `hardnessd check`: what would run, without opening a device.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use clap::Args as ClapArgs;
+
+use super::player::BITS_A_BYTE;
+use crate::daemon::config::{self, Sensor, Setup};
+use crate::wire::Layout;
+
+/// Arguments of `check`.
+#[derive(Debug, Clone, ClapArgs)]
+pub struct Args {
+    /// Configuration to be checked
+    #[arg(long, value_name = "F")]
+    config: PathBuf,
+}
+
+/// What is wrong with a configuration.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// It cannot be used.
+    #[error(transparent)]
+    Config(#[from] config::Error),
+    /// More frames than the line carries.
+    #[error(
+        "{path}: sensor.frame_rate_hz of {sensor:?}: found {frame_rate_hz} frames/s of \
+         {frame_bytes} bytes, expected at most {most:.2} over {baud} baud at 10 bits a byte \
+         (a pty or USB CDC port has no such limit)"
+    )]
+    FrameRate {
+        /// Of the configuration.
+        path: PathBuf,
+        /// Its name.
+        sensor: String,
+        /// As given.
+        frame_rate_hz: f64,
+        /// Of its layout.
+        frame_bytes: usize,
+        /// What the line carries.
+        most: f64,
+        /// As given.
+        baud: u32,
+    },
+    /// Stdout fails.
+    #[error("stdout: {0}")]
+    Print(#[source] io::Error),
+}
+
+/// Prints what would run, warnings on stderr.
+///
+/// # Errors
+///
+/// [`Error`], if the configuration or its model cannot be used, or a line cannot carry its frames.
+pub fn run(args: &Args) -> Result<(), Error> {
+    let setup = Setup::load(&args.config)?;
+    let mut lines = format!("robot {}\n", setup.config.robot);
+    for sensor in &setup.config.sensors {
+        let layout = Layout::new(&sensor.frame)
+            .expect("a layout was checked when its configuration was read");
+        lines += &line_of(sensor, &layout, &args.config)?;
+        let (ours, models) = (sensor.calibration.pitch_mm, setup.hrn.card().pitch_mm);
+        if (ours - f64::from(models)).abs() > PITCH_TOLERANCE_MM {
+            eprintln!(
+                "warning: {}: sensor.calibration.pitch_mm of {:?}: found {ours}, \
+                 expected the model's {models}",
+                args.config.display(),
+                sensor.name
+            );
+        }
+    }
+    lines += &model(&setup);
+    let unix = &setup.config.publish.unix;
+    lines += &if unix.enabled {
+        let (path, mode) = (unix.path(), String::from(unix.mode));
+        format!(
+            "socket {}, mode {mode}, {} subscribers\n",
+            path.display(),
+            unix.max_clients
+        )
+    } else {
+        "no socket\n".to_owned()
+    };
+    super::print(lines.as_bytes())
+        .map(drop)
+        .map_err(Error::Print)
+}
+
+/// Pitches closer than this are the same: datasheets give two digits.
+const PITCH_TOLERANCE_MM: f64 = 0.005;
+
+fn line_of(sensor: &Sensor, layout: &Layout, path: &Path) -> Result<String, Error> {
+    let frame_bytes = layout.max_frame_bytes();
+    let bytes_per_s = sensor.frame_rate_hz * frame_bytes as f64;
+    let capacity = f64::from(sensor.baud) / BITS_A_BYTE;
+    let paced = is_paced(&sensor.port);
+    if paced && bytes_per_s > capacity {
+        return Err(Error::FrameRate {
+            path: path.to_owned(),
+            sensor: sensor.name.clone(),
+            frame_rate_hz: sensor.frame_rate_hz,
+            frame_bytes,
+            most: capacity / frame_bytes as f64,
+            baud: sensor.baud,
+        });
+    }
+    let array = layout.array();
+    let load = if paced {
+        format!(
+            "{bytes_per_s:.0} of {capacity:.0} bytes/s at {} baud",
+            sensor.baud
+        )
+    } else {
+        format!("{bytes_per_s:.0} bytes/s, whatever the baud rate")
+    };
+    Ok(format!(
+        "sensor {}: {}, {}x{} taxels in {frame_bytes} bytes, {} frames/s: {load}\n",
+        sensor.name,
+        sensor.port.display(),
+        array.rows,
+        array.cols,
+        sensor.frame_rate_hz
+    ))
+}
+
+/// Whether the baud rate limits what the port carries: not on a pty, nor on USB CDC, where it is a
+/// word without consequence. A port that is not there is taken at its name.
+fn is_paced(port: &Path) -> bool {
+    let device = port.canonicalize().unwrap_or_else(|_| port.to_owned());
+    let name = device.file_name().unwrap_or_default().to_string_lossy();
+    !(device.starts_with("/dev/pts") || name.starts_with("ttyACM"))
+}
+
+fn model(setup: &Setup) -> String {
+    let card = setup.hrn.card();
+    let path = setup.config.model.path.as_ref();
+    let levels: Vec<String> = card
+        .levels
+        .iter()
+        .map(|level| format!("{} {}", level.level, level.label))
+        .collect();
+    format!(
+        "model {}, sha256 {}, validated on {}, pitch {} mm, levels: {}\n",
+        path.map_or("built in".to_owned(), |path| path.display().to_string()),
+        setup.hrn.sha256(),
+        card.validation,
+        card.pitch_mm,
+        levels.join(", ")
+    )
+}

@@ -1,0 +1,352 @@
+//! Faults of a simulated line, as a script that plays the same each time.
+//!
+//! In: a TOML file of `[[fault]]` tables. Out: what becomes of each frame. Times are in seconds of
+//! the sensor since it started; which bytes and bits are hit follows from the seed.
+
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use crate::random::Stream;
+
+/// The file format, for `--help`.
+pub(crate) const FORMAT: &str = r#"The faults of --faults FILE, a TOML file; times in the sensor's seconds from the start:
+
+  [[fault]]
+  at_s = 12.0            # from the first frame at or after this
+  kind = "unplug"        # the pty and its link go, and come back after `for_s`
+  for_s = 1.5
+
+  kind = "silence"       # frames stay unsent for `for_s`; the port stays open
+  kind = "noise"         # `bytes` random bytes before each of `frames` frames
+  kind = "drop-bytes"    # `bytes` of each of `frames` frames are not sent
+  kind = "flip"          # `bits` of each of `frames` frames are inverted
+
+`for_s` is needed where it applies; `bytes`, `bits` and `frames` are 1 unless given."#;
+
+/// Why a script cannot be played.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The file cannot be read.
+    #[error("{path}: cannot read: {source}")]
+    Unreadable {
+        /// Of the script.
+        path: PathBuf,
+        /// Why not.
+        source: std::io::Error,
+    },
+    /// No TOML, or a key or value that cannot be used.
+    #[error("{path}: {problem}")]
+    Malformed {
+        /// Of the script.
+        path: PathBuf,
+        /// What was found and expected.
+        problem: String,
+    },
+}
+
+impl Error {
+    /// Whether the file itself is what fails.
+    pub fn is_unreadable(&self) -> bool {
+        matches!(self, Error::Unreadable { .. })
+    }
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Script {
+    #[serde(default, rename = "fault")]
+    faults: Vec<Table>,
+}
+
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Table {
+    at_s: f64,
+    kind: Kind,
+    for_s: Option<f64>,
+    bytes: Option<usize>,
+    bits: Option<usize>,
+    frames: Option<u64>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum Kind {
+    Unplug,
+    Silence,
+    Noise,
+    DropBytes,
+    Flip,
+}
+
+/// What becomes of the line for a time, or of frames.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Fault {
+    Unplug {
+        from_s: f64,
+        to_s: f64,
+    },
+    Silence {
+        from_s: f64,
+        to_s: f64,
+    },
+    Noise {
+        from_s: f64,
+        bytes: usize,
+        frames: u64,
+    },
+    DropBytes {
+        from_s: f64,
+        bytes: usize,
+        frames: u64,
+    },
+    Flip {
+        from_s: f64,
+        bits: usize,
+        frames: u64,
+    },
+}
+
+/// What is to be done with a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Line {
+    /// Send it, as it is now.
+    Up,
+    /// Keep it.
+    Silent,
+    /// Keep it, and the port is gone.
+    Unplugged,
+}
+
+/// A script being played.
+#[derive(Debug)]
+pub(crate) struct Faults {
+    faults: Vec<Fault>,
+    stream: Stream,
+}
+
+impl Faults {
+    /// No faults.
+    pub(crate) fn none() -> Self {
+        Self {
+            faults: Vec::new(),
+            stream: Stream::new(0, "faults"),
+        }
+    }
+
+    /// Reads a script.
+    ///
+    /// # Errors
+    ///
+    /// If it cannot be read, or has a key or value that cannot be used.
+    pub(crate) fn load(path: &Path, seed: u64) -> Result<Self, Error> {
+        let text = std::fs::read_to_string(path).map_err(|source| Error::Unreadable {
+            path: path.to_owned(),
+            source,
+        })?;
+        Self::parse(&text, seed).map_err(|problem| Error::Malformed {
+            path: path.to_owned(),
+            problem,
+        })
+    }
+
+    fn parse(text: &str, seed: u64) -> Result<Self, String> {
+        let script: Script = toml::from_str(text).map_err(|error| {
+            let before = &text[..error.span().map_or(0, |span| span.start).min(text.len())];
+            let line = before.matches('\n').count() + 1;
+            format!("line {line}: {}", error.message().replace('\n', ": "))
+        })?;
+        let faults = script
+            .faults
+            .iter()
+            .enumerate()
+            .map(|(index, table)| {
+                table
+                    .fault()
+                    .map_err(|problem| format!("fault {}: {problem}", index + 1))
+            })
+            .collect::<Result<_, _>>()?;
+        Ok(Self {
+            faults,
+            stream: Stream::new(seed, "faults"),
+        })
+    }
+
+    /// Damages the frame due at `time_s` as the script says, and says whether it is to be sent.
+    /// Frames are asked for in order.
+    pub(crate) fn strike(&mut self, time_s: f64, frame: &mut Vec<u8>) -> Line {
+        let mut line = Line::Up;
+        let stream = &mut self.stream;
+        for fault in &mut self.faults {
+            match fault {
+                Fault::Unplug { from_s, to_s } if (*from_s..*to_s).contains(&time_s) => {
+                    line = Line::Unplugged;
+                }
+                Fault::Silence { from_s, to_s }
+                    if (*from_s..*to_s).contains(&time_s) && line == Line::Up =>
+                {
+                    line = Line::Silent;
+                }
+                Fault::Noise {
+                    from_s,
+                    bytes,
+                    frames,
+                } if time_s >= *from_s && *frames > 0 => {
+                    *frames -= 1;
+                    let noise = (0..*bytes).map(|_| (stream.next_u64() >> 56) as u8);
+                    let noise: Vec<u8> = noise.collect();
+                    frame.splice(0..0, noise);
+                }
+                Fault::DropBytes {
+                    from_s,
+                    bytes,
+                    frames,
+                } if time_s >= *from_s && *frames > 0 => {
+                    *frames -= 1;
+                    for _ in 0..(*bytes).min(frame.len()) {
+                        frame.remove(stream.below(frame.len()));
+                    }
+                }
+                Fault::Flip {
+                    from_s,
+                    bits,
+                    frames,
+                } if time_s >= *from_s && *frames > 0 => {
+                    *frames -= 1;
+                    for _ in 0..*bits {
+                        let bit = stream.below(frame.len() * 8);
+                        frame[bit / 8] ^= 1 << (bit % 8);
+                    }
+                }
+                _ => {}
+            }
+        }
+        line
+    }
+}
+
+impl Table {
+    fn fault(&self) -> Result<Fault, String> {
+        if !(self.at_s.is_finite() && self.at_s >= 0.0) {
+            return Err(format!(
+                "at_s: found {}, expected seconds from 0",
+                self.at_s
+            ));
+        }
+        let of_time = matches!(self.kind, Kind::Unplug | Kind::Silence);
+        let misplaced = [
+            ("for_s", self.for_s.is_some() && !of_time),
+            ("frames", self.frames.is_some() && of_time),
+            ("bits", self.bits.is_some() && self.kind != Kind::Flip),
+            (
+                "bytes",
+                self.bytes.is_some() && !matches!(self.kind, Kind::Noise | Kind::DropBytes),
+            ),
+        ];
+        if let Some((key, _)) = misplaced.iter().find(|(_, misplaced)| *misplaced) {
+            return Err(format!("{key}: found a value, expected none for this kind"));
+        }
+        let from_s = self.at_s;
+        let (bytes, bits) = (self.bytes.unwrap_or(1), self.bits.unwrap_or(1));
+        let frames = self.frames.unwrap_or(1);
+        let to_s = || match self.for_s {
+            Some(for_s) if for_s.is_finite() && for_s > 0.0 => Ok(from_s + for_s),
+            Some(for_s) => Err(format!("for_s: found {for_s}, expected seconds above 0")),
+            None => Err("for_s: found none, expected seconds above 0".to_owned()),
+        };
+        Ok(match self.kind {
+            Kind::Unplug => Fault::Unplug {
+                from_s,
+                to_s: to_s()?,
+            },
+            Kind::Silence => Fault::Silence {
+                from_s,
+                to_s: to_s()?,
+            },
+            Kind::Noise => Fault::Noise {
+                from_s,
+                bytes,
+                frames,
+            },
+            Kind::DropBytes => Fault::DropBytes {
+                from_s,
+                bytes,
+                frames,
+            },
+            Kind::Flip => Fault::Flip {
+                from_s,
+                bits,
+                frames,
+            },
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_kind_does_to_the_line_what_it_says() {
+        let script = r#"
+            [[fault]]
+            at_s = 1.0
+            kind = "unplug"
+            for_s = 0.5
+            [[fault]]
+            at_s = 2.0
+            kind = "silence"
+            for_s = 0.5
+            [[fault]]
+            at_s = 3.0
+            kind = "noise"
+            bytes = 7
+            [[fault]]
+            at_s = 4.0
+            kind = "drop-bytes"
+            bytes = 3
+            frames = 2
+            [[fault]]
+            at_s = 5.0
+            kind = "flip"
+        "#;
+        let mut faults = Faults::parse(script, 1).unwrap();
+        let whole = vec![0_u8; 100];
+        let mut struck = |time_s| {
+            let mut frame = whole.clone();
+            let line = faults.strike(time_s, &mut frame);
+            let flipped: u32 = frame.iter().map(|byte| byte.count_ones()).sum();
+            (line, frame.len(), flipped)
+        };
+        assert_eq!(struck(0.9), (Line::Up, 100, 0));
+        assert_eq!(struck(1.0), (Line::Unplugged, 100, 0));
+        assert_eq!(struck(1.5), (Line::Up, 100, 0));
+        assert_eq!(struck(2.2), (Line::Silent, 100, 0));
+        assert_eq!(struck(3.1).1, 107);
+        assert_eq!(struck(3.2), (Line::Up, 100, 0));
+        assert_eq!(struck(4.0), (Line::Up, 97, 0));
+        assert_eq!(struck(4.2), (Line::Up, 97, 0));
+        assert_eq!(struck(4.4), (Line::Up, 100, 0));
+        assert_eq!(struck(5.0), (Line::Up, 100, 1));
+        assert_eq!(struck(5.2), (Line::Up, 100, 0));
+    }
+
+    #[test]
+    fn a_script_that_cannot_be_played_says_why() {
+        for (script, expected) in [
+            ("[[fault]]\nat_s = 1.0\nkind = \"melt\"", "line 3"),
+            ("[[fault]]\nat_s = 1.0\nkind = \"flip\"\nbit = 3", "bit"),
+            ("[[fault]]\nat_s = 1.0\nkind = \"unplug\"", "for_s"),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"flip\"\nfor_s = 1.0",
+                "for_s",
+            ),
+            ("[[fault]]\nat_s = -1.0\nkind = \"flip\"", "at_s"),
+            ("[[fault]]\nkind = \"flip\"", "at_s"),
+        ] {
+            let problem = Faults::parse(script, 1).unwrap_err();
+            assert!(problem.contains(expected), "{problem}");
+        }
+    }
+}

@@ -1,0 +1,152 @@
+//! A simulated sensor at a pty: presses in real time, bytes at the pace of the line.
+//!
+//! Frames are computed on a thread of their own, a little ahead, so that the physics never delays
+//! a byte. Nobody reading is no reason to wait: the sensor does not know.
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use tokio::sync::mpsc;
+use tokio::time::Instant;
+
+use super::faults::{Faults, Line};
+use super::pty::Pty;
+use crate::simulator::{Sequence, SequenceFrame, SequenceSettings};
+use crate::wire::Layout;
+
+/// Bits of a byte on the line: start, eight, stop.
+pub(crate) const BITS_A_BYTE: f64 = 10.0;
+
+/// How often bytes are passed on: finer than a UART's FIFO is emptied, coarse enough to be cheap.
+const SLICE: Duration = Duration::from_millis(4);
+
+/// Frames computed ahead.
+const AHEAD: usize = 32;
+
+/// How a sensor plays.
+#[derive(Debug, Clone)]
+pub(crate) struct Pace {
+    /// Time between frames.
+    pub(crate) period: Duration,
+    /// The line's.
+    pub(crate) bytes_per_s: f64,
+    /// Sensor seconds a second.
+    pub(crate) speed: f64,
+}
+
+impl Pace {
+    /// Frames at `frame_rate_hz` over a line of `baud`, all of it `speed` times as fast.
+    pub(crate) fn new(frame_rate_hz: f64, baud: u32, speed: f64) -> Self {
+        Self {
+            period: Duration::from_secs_f64(1.0 / (frame_rate_hz * speed)),
+            bytes_per_s: f64::from(baud) / BITS_A_BYTE * speed,
+            speed,
+        }
+    }
+}
+
+/// A sensor at a pty.
+#[derive(Debug)]
+pub(crate) struct Player {
+    pty: Option<Pty>,
+    link: Option<PathBuf>,
+    layout: Layout,
+    pace: Pace,
+    faults: Faults,
+}
+
+impl Player {
+    /// Makes the pty.
+    ///
+    /// # Errors
+    ///
+    /// As [`Pty::open`].
+    pub(crate) fn new(
+        link: Option<&Path>,
+        layout: Layout,
+        pace: Pace,
+        faults: Faults,
+    ) -> io::Result<Self> {
+        let pty = Some(Pty::open(link)?);
+        Ok(Self {
+            pty,
+            link: link.map(Path::to_owned),
+            layout,
+            pace,
+            faults,
+        })
+    }
+
+    /// The device to be opened.
+    pub(crate) fn path(&self) -> &Path {
+        self.pty
+            .as_ref()
+            .expect("a player starts with its pty")
+            .path()
+    }
+
+    /// Plays to the end of the sequence; the port is gone afterwards.
+    ///
+    /// # Errors
+    ///
+    /// If the pty fails, or cannot be had again after an unplug.
+    pub(crate) async fn play(mut self, settings: SequenceSettings) -> io::Result<()> {
+        let mut frames = compute(settings);
+        let start = Instant::now();
+        let mut bytes = Vec::with_capacity(self.layout.max_frame_bytes());
+        let mut index = 0_u32;
+        while let Some(frame) = frames.recv().await {
+            let due = start + self.pace.period * index;
+            tokio::time::sleep_until(due).await;
+            bytes.clear();
+            self.layout.encode(&frame.raw, &mut bytes);
+            let time_s = (self.pace.period * index).as_secs_f64() * self.pace.speed;
+            match self.faults.strike(time_s, &mut bytes) {
+                Line::Up => {
+                    if self.pty.is_none() {
+                        self.pty = Some(Pty::open(self.link.as_deref())?);
+                    }
+                    self.send(&bytes, due).await?;
+                }
+                Line::Silent => {}
+                Line::Unplugged => self.pty = None,
+            }
+            index += 1;
+        }
+        match &self.pty {
+            Some(pty) => pty.linger().await,
+            None => Ok(()),
+        }
+    }
+
+    async fn send(&mut self, bytes: &[u8], from: Instant) -> io::Result<()> {
+        let Some(pty) = &mut self.pty else {
+            return Ok(());
+        };
+        let slice = (self.pace.bytes_per_s * SLICE.as_secs_f64())
+            .ceil()
+            .max(1.0);
+        let mut sent = 0.0;
+        for slice in bytes.chunks(slice as usize) {
+            sent += slice.len() as f64;
+            // A byte is there when its last bit is.
+            let at = from + Duration::from_secs_f64(sent / self.pace.bytes_per_s);
+            tokio::time::sleep_until(at).await;
+            pty.write(slice)?;
+        }
+        Ok(())
+    }
+}
+
+fn compute(settings: SequenceSettings) -> mpsc::Receiver<SequenceFrame> {
+    let (frames, played) = mpsc::channel(AHEAD);
+    std::thread::spawn(move || {
+        for frame in Sequence::new(settings) {
+            if frames.blocking_send(frame).is_err() {
+                return;
+            }
+        }
+    });
+    played
+}

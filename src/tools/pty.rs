@@ -1,0 +1,144 @@
+//! A pseudo-terminal that behaves like a sensor's port: it never blocks, and what nobody reads is
+//! gone.
+//!
+//! It keeps its own descriptor of the device side, so that the pair lives while readers come and
+//! go. Dropped, it plays an unplug: both sides are closed and the link is removed.
+
+use std::ffi::OsStr;
+use std::fs;
+use std::io::{self, ErrorKind};
+use std::os::fd::OwnedFd;
+use std::os::unix::ffi::OsStrExt;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use rustix::fs::{Mode, OFlags};
+use rustix::io::Errno;
+use rustix::pty::OpenptFlags;
+use rustix::termios::{OptionalActions, QueueSelector};
+use tokio::time::Instant;
+
+/// Bytes unread for so long have no reader: what waits is thrown away, and a lock that a killed
+/// reader left (TIOCEXCL outlives it here) is opened.
+const ABSENT: Duration = Duration::from_millis(500);
+
+/// How long the last bytes may wait for their reader.
+const LINGER: Duration = Duration::from_millis(500);
+
+/// The pair.
+#[derive(Debug)]
+pub(crate) struct Pty {
+    master: OwnedFd,
+    device: OwnedFd,
+    path: PathBuf,
+    link: Option<PathBuf>,
+    written: u64,
+    /// Bytes that had been read when it was last seen to be more, and when that was.
+    read: (u64, Instant),
+}
+
+impl Pty {
+    /// Makes a pair, and `link` to its device; a link that stands there is replaced, nothing else
+    /// is.
+    ///
+    /// # Errors
+    ///
+    /// If the system has no pair to give, or something that is no link stands at `link`.
+    pub(crate) fn open(link: Option<&Path>) -> io::Result<Self> {
+        let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
+        let master = rustix::pty::openpt(flags)?;
+        rustix::pty::grantpt(&master)?;
+        rustix::pty::unlockpt(&master)?;
+        rustix::io::ioctl_fionbio(&master, true)?;
+        let name = rustix::pty::ptsname(&master, Vec::new())?;
+        let path = PathBuf::from(OsStr::from_bytes(name.as_bytes()));
+        let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC;
+        let device = rustix::fs::open(&path, flags, Mode::empty())?;
+        // A fresh tty echoes and edits lines: not what a sensor does.
+        let mut settings = rustix::termios::tcgetattr(&device)?;
+        settings.make_raw();
+        rustix::termios::tcsetattr(&device, OptionalActions::Now, &settings)?;
+        if let Some(link) = link {
+            place(&path, link)?;
+        }
+        let link = link.map(Path::to_owned);
+        Ok(Self {
+            master,
+            device,
+            path,
+            link,
+            written: 0,
+            read: (0, Instant::now()),
+        })
+    }
+
+    /// The device to be opened.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Writes what there is room for; the rest is lost, as on a line that nobody listens to.
+    ///
+    /// # Errors
+    ///
+    /// If the system fails otherwise.
+    pub(crate) fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
+        self.forget_unread()?;
+        match rustix::io::write(&self.master, bytes) {
+            Ok(written) => self.written += written as u64,
+            Err(Errno::AGAIN) => {}
+            Err(error) => return Err(error.into()),
+        }
+        Ok(())
+    }
+
+    fn forget_unread(&mut self) -> io::Result<()> {
+        let unread = rustix::io::ioctl_fionread(&self.device)?;
+        let read = self.written.saturating_sub(unread);
+        if read > self.read.0 || unread == 0 {
+            self.read = (read, Instant::now());
+        } else if self.read.1.elapsed() > ABSENT {
+            rustix::termios::tcflush(&self.device, QueueSelector::IFlush)?;
+            rustix::termios::ioctl_tiocnxcl(&self.device)?;
+            self.read = (self.written, Instant::now());
+        }
+        Ok(())
+    }
+
+    /// Waits until the last bytes are read, but not for ever.
+    pub(crate) async fn linger(&self) -> io::Result<()> {
+        let end = Instant::now() + LINGER;
+        while rustix::io::ioctl_fionread(&self.device)? > 0 && Instant::now() < end {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        Ok(())
+    }
+}
+
+impl Drop for Pty {
+    fn drop(&mut self) {
+        // Another may have put its own link there meanwhile.
+        if let Some(link) = &self.link
+            && fs::read_link(link).is_ok_and(|target| target == self.path)
+        {
+            let _ = fs::remove_file(link);
+        }
+    }
+}
+
+/// Points `link` at `device`, at one stroke.
+fn place(device: &Path, link: &Path) -> io::Result<()> {
+    match fs::symlink_metadata(link) {
+        Ok(file) if !file.file_type().is_symlink() => {
+            let found = "found a file that is no link, expected a link or nothing";
+            return Err(io::Error::new(ErrorKind::AlreadyExists, found));
+        }
+        Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
+        _ => {}
+    }
+    let mut born = link.as_os_str().to_owned();
+    born.push(format!(".{}", std::process::id()));
+    let _ = fs::remove_file(&born);
+    std::os::unix::fs::symlink(device, &born)?;
+    fs::rename(&born, link)
+}

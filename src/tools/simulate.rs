@@ -1,0 +1,173 @@
+//! `hardnessd simulate`: only the sensor, at a pty.
+
+use std::future::Future;
+use std::path::PathBuf;
+
+use clap::Args as ClapArgs;
+use serde::Deserialize;
+use serde::de::IntoDeserializer;
+use serde::de::value::Error as NameError;
+
+use super::faults::{self, Faults};
+use super::player::{BITS_A_BYTE, Pace, Player};
+use crate::simulator::{Material, SequenceSettings};
+use crate::wire::{Layout, LayoutError, Preset, Settings as Frame};
+
+/// Arguments of `simulate`.
+#[derive(Debug, Clone, ClapArgs)]
+#[command(after_long_help = faults::FORMAT)]
+pub struct Args {
+    /// Symbolic link to keep at the pty; an old link is replaced
+    #[arg(long, value_name = "PATH")]
+    link: Option<PathBuf>,
+    /// Layout of a frame
+    #[arg(long, value_name = "P", default_value = "jx255n", value_parser = preset)]
+    preset: Preset,
+    /// Frames a second
+    #[arg(long, value_name = "F", default_value_t = 5.0, value_parser = positive)]
+    fps: f64,
+    /// Material pressed, in turn; several may be given [default: all eight]
+    #[arg(long = "material", value_name = "M")]
+    materials: Vec<Material>,
+    /// Peak force of a press in newtons [default: drawn from 5 to 25]
+    #[arg(long, value_name = "N", value_parser = positive)]
+    force: Option<f64>,
+    /// Seed of everything random
+    #[arg(long, value_name = "S", default_value_t = 1)]
+    seed: u64,
+    /// End after so many presses [default: never]
+    #[arg(long, value_name = "N")]
+    presses: Option<u32>,
+    /// Play so many times as fast
+    #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = positive)]
+    speed: f64,
+    /// Bits a second on the line [default: 115200, or the first usual rate that carries the frames]
+    #[arg(long, value_name = "B", value_parser = clap::value_parser!(u32).range(1..))]
+    baud: Option<u32>,
+    /// Script of faults; its format is in --help
+    #[arg(long, value_name = "FILE")]
+    faults: Option<PathBuf>,
+}
+
+/// Why there is no simulated sensor.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The script of faults.
+    #[error(transparent)]
+    Faults(#[from] faults::Error),
+    /// A layout that needs more than its preset.
+    #[error("--preset: {0}")]
+    Layout(#[from] LayoutError),
+    /// More bytes than the line carries.
+    #[error(
+        "--baud: found {baud}, expected at least {needed} to carry {fps} frames/s of {bytes} bytes"
+    )]
+    Baud {
+        /// As given.
+        baud: u32,
+        /// Least that would do.
+        needed: u32,
+        /// As given.
+        fps: f64,
+        /// Of a frame.
+        bytes: usize,
+    },
+    /// The pty, or its link.
+    #[error("{what}: {source}")]
+    Pty {
+        /// Path of the link, or that it is the pty.
+        what: String,
+        /// Why not.
+        source: std::io::Error,
+    },
+}
+
+/// Plays until the presses are over or `shutdown` comes.
+///
+/// # Errors
+///
+/// [`Error`], if the arguments do not fit together or the pty fails.
+pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
+    let layout = Layout::new(&Frame {
+        preset: args.preset,
+        ..Frame::default()
+    })?;
+    let baud = baud(&args, layout.max_frame_bytes())?;
+    let faults = match &args.faults {
+        Some(path) => Faults::load(path, args.seed)?,
+        None => Faults::none(),
+    };
+    let what = args
+        .link
+        .as_ref()
+        .map_or("pty".to_owned(), |link| link.display().to_string());
+    let failed = |source| Error::Pty {
+        what: what.clone(),
+        source,
+    };
+    let pace = Pace::new(args.fps, baud, args.speed);
+    let player = Player::new(args.link.as_deref(), layout, pace, faults).map_err(failed)?;
+    let line = format!("{}\n", player.path().display());
+    // Nobody may want to know the path: the link says it too.
+    super::print(line.as_bytes()).map_err(failed)?;
+    let settings = SequenceSettings {
+        seed: args.seed,
+        frame_rate_hz: args.fps,
+        materials: if args.materials.is_empty() {
+            Material::ALL.to_vec()
+        } else {
+            args.materials
+        },
+        force_n: args.force.map(|force| force as f32),
+        presses: args.presses,
+        ..SequenceSettings::default()
+    };
+    tokio::select! {
+        played = player.play(settings) => played.map_err(failed),
+        () = shutdown => Ok(()),
+    }
+}
+
+/// The rate of the line: as given, if it carries the frames; else the first usual one that does,
+/// from 115,200 on.
+fn baud(args: &Args, bytes: usize) -> Result<u32, Error> {
+    const USUAL: [u32; 7] = [
+        115_200, 230_400, 460_800, 921_600, 1_000_000, 2_000_000, 4_000_000,
+    ];
+    let needed = (args.fps * bytes as f64 * BITS_A_BYTE).ceil() as u32;
+    match args.baud {
+        Some(baud) if baud < needed => Err(Error::Baud {
+            baud,
+            needed,
+            fps: args.fps,
+            bytes,
+        }),
+        Some(baud) => Ok(baud),
+        None => {
+            let baud = USUAL
+                .into_iter()
+                .find(|&usual| usual >= needed)
+                .unwrap_or(needed);
+            if baud != USUAL[0] {
+                eprintln!(
+                    "{} baud cannot carry {} frames/s of {bytes} bytes: played at {baud}",
+                    USUAL[0], args.fps
+                );
+            }
+            Ok(baud)
+        }
+    }
+}
+
+/// A preset by the name it has in the configuration.
+fn preset(name: &str) -> Result<Preset, NameError> {
+    Preset::deserialize(name.into_deserializer())
+}
+
+/// A number above 0.
+pub(super) fn positive(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(number) if number.is_finite() && number > 0.0 => Ok(number),
+        _ => Err("expected a number above 0".to_owned()),
+    }
+}

@@ -1,0 +1,267 @@
+//! A run's directory: settings, revision, metrics, checkpoints, the model and its evaluation.
+//!
+//! Every file is written beside its place, flushed to the disk and renamed, so that whatever
+//! stands there is whole, also after SIGKILL or a full disk.
+
+use std::fs::{self, File};
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, bail, ensure};
+use burn::tensor::Device;
+use serde::{Deserialize, Serialize};
+
+use super::checkpoint::Checkpoint;
+use super::dataset::Source;
+use super::settings::{Profile, Settings};
+
+/// Checkpoints kept of a stage: the newest, and one before it.
+const CHECKPOINTS_KEPT: usize = 2;
+
+/// What a run was told: `settings.toml`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Description {
+    /// Such as `hrn100`.
+    pub method: String,
+    /// How long it may take.
+    pub profile: Profile,
+    /// Everything random follows from it.
+    pub seed: u64,
+    /// Labelled samples it may use; all if not given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub labels: Option<usize>,
+    /// Of the method.
+    pub settings: Settings,
+    /// The files it learns from.
+    pub data: Vec<Source>,
+}
+
+/// A run's directory.
+#[derive(Debug)]
+pub struct Run {
+    directory: PathBuf,
+}
+
+impl Run {
+    /// Makes the directory, or with `resume` takes up a run that was told the same.
+    ///
+    /// # Errors
+    ///
+    /// If a run stands there and `resume` is not asked for, if it was told otherwise, or if the
+    /// directory cannot be written.
+    pub fn open(directory: &Path, description: &Description, resume: bool) -> anyhow::Result<Self> {
+        let run = Self {
+            directory: directory.to_owned(),
+        };
+        let told = run.path("settings.toml");
+        match fs::read_to_string(&told) {
+            Ok(text) if resume => {
+                let before: Description =
+                    toml::from_str(&text).with_context(|| told.display().to_string())?;
+                ensure!(
+                    before == *description,
+                    "{}: this run was started with other settings or data; found {}, expected {}",
+                    told.display(),
+                    toml::to_string(description)?.replace('\n', "; "),
+                    text.replace('\n', "; ")
+                );
+                return Ok(run);
+            }
+            Ok(_) => bail!(
+                "{}: holds a run already; --resume goes on with it",
+                directory.display()
+            ),
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
+            Err(error) => return Err(error).with_context(|| told.display().to_string()),
+        }
+        let checkpoints = run.path("checkpoints");
+        fs::create_dir_all(&checkpoints).with_context(|| checkpoints.display().to_string())?;
+        run.write("revision", format!("{}\n", revision()).as_bytes())?;
+        run.write("settings.toml", toml::to_string(description)?.as_bytes())?;
+        Ok(run)
+    }
+
+    /// The path of a file in the directory.
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.directory.join(name)
+    }
+
+    /// Writes a file, whole or not at all.
+    ///
+    /// # Errors
+    ///
+    /// Those of writing; what stood there before then still stands.
+    pub fn write(&self, name: &str, bytes: &[u8]) -> anyhow::Result<()> {
+        write_whole(&self.path(name), bytes)
+    }
+
+    /// Writes a stage's checkpoint and removes all but the last two.
+    ///
+    /// # Errors
+    ///
+    /// Those of writing.
+    pub fn save(&self, stage: &str, checkpoint: &Checkpoint) -> anyhow::Result<()> {
+        let name = format!("checkpoints/{stage}-{:010}.npz", checkpoint.progress.step);
+        self.write(&name, &checkpoint.to_bytes()?)?;
+        let all = self.checkpoints(stage)?;
+        for old in &all[..all.len().saturating_sub(CHECKPOINTS_KEPT)] {
+            fs::remove_file(old).with_context(|| old.display().to_string())?;
+        }
+        Ok(())
+    }
+
+    /// A stage's newest checkpoint that can be read, if there is one.
+    ///
+    /// # Errors
+    ///
+    /// If there are some and none can be read.
+    pub fn latest(&self, stage: &str, device: &Device) -> anyhow::Result<Option<Checkpoint>> {
+        let mut failure = None;
+        for path in self.checkpoints(stage)?.iter().rev() {
+            match Checkpoint::read(path, device) {
+                Ok(checkpoint) => return Ok(Some(checkpoint)),
+                Err(error) => failure = Some(error.context(path.display().to_string())),
+            }
+        }
+        failure.map_or(Ok(None), Err)
+    }
+
+    /// Paths of a stage's checkpoints, oldest first.
+    fn checkpoints(&self, stage: &str) -> anyhow::Result<Vec<PathBuf>> {
+        let directory = self.path("checkpoints");
+        let prefix = format!("{stage}-");
+        let mut paths = Vec::new();
+        for entry in fs::read_dir(&directory).with_context(|| directory.display().to_string())? {
+            let path = entry?.path();
+            let name = path
+                .file_name()
+                .unwrap_or_default()
+                .to_string_lossy()
+                .into_owned();
+            if name.starts_with(&prefix) && name.ends_with(".npz") {
+                paths.push(path);
+            }
+        }
+        paths.sort();
+        Ok(paths)
+    }
+
+    /// Opens `metrics.csv` and cuts off the rows of `stage` after `step`: a resumed run writes
+    /// them again.
+    ///
+    /// # Errors
+    ///
+    /// Those of reading and writing.
+    pub fn metrics(&self, stage: &'static str, step: u64) -> anyhow::Result<Metrics> {
+        let path = self.path("metrics.csv");
+        let before = fs::read_to_string(&path).unwrap_or_default();
+        let mut text = format!("{METRICS_COLUMNS}\n");
+        for row in before.lines().skip(1) {
+            let mut cells = row.split(',');
+            let of_stage = cells.next() == Some(stage);
+            let row_step = cells.next().and_then(|cell| cell.parse::<u64>().ok());
+            if !of_stage || row_step.is_some_and(|row_step| row_step <= step) {
+                text.push_str(row);
+                text.push('\n');
+            }
+        }
+        self.write("metrics.csv", text.as_bytes())?;
+        let file = File::options().append(true).open(&path)?;
+        Ok(Metrics { file, stage })
+    }
+}
+
+const METRICS_COLUMNS: &str =
+    "stage,step,epoch,loss,learning_rate,validation_loss,validation_accuracy,seconds";
+
+/// `metrics.csv`, open for one stage.
+#[derive(Debug)]
+pub struct Metrics {
+    file: File,
+    stage: &'static str,
+}
+
+/// One row of `metrics.csv`.
+#[derive(Debug, Clone, Copy)]
+pub struct Row {
+    /// Steps done.
+    pub step: u64,
+    /// Epochs done.
+    pub epoch: u32,
+    /// Mean training loss of the epoch.
+    pub loss: f64,
+    /// Of the epoch's last step.
+    pub learning_rate: f64,
+    /// Loss and accuracy on the validation objects, where they were judged.
+    pub validation: Option<(f64, f64)>,
+    /// Of this process.
+    pub seconds: f64,
+}
+
+impl Metrics {
+    /// Adds a row.
+    ///
+    /// # Errors
+    ///
+    /// Those of writing.
+    pub fn add(&mut self, row: &Row) -> anyhow::Result<()> {
+        let Row {
+            step,
+            epoch,
+            loss,
+            learning_rate,
+            seconds,
+            ..
+        } = row;
+        let stage = self.stage;
+        let validation = match row.validation {
+            Some((loss, accuracy)) => format!("{loss:.6},{accuracy:.4}"),
+            None => ",".to_owned(),
+        };
+        writeln!(
+            self.file,
+            "{stage},{step},{epoch},{loss:.6},{learning_rate},{validation},{seconds:.1}"
+        )
+        .context("metrics.csv")
+    }
+}
+
+/// Writes a file beside its place, flushes it and renames it.
+///
+/// # Errors
+///
+/// Those of writing; what stood there before then still stands.
+pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".part");
+    let part = path.with_file_name(name);
+    let attempt = || -> std::io::Result<()> {
+        let mut file = File::create(&part)?;
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        fs::rename(&part, path)?;
+        // The rename itself reaches the disk with the directory.
+        let directory = path
+            .parent()
+            .filter(|parent| !parent.as_os_str().is_empty());
+        File::open(directory.unwrap_or(Path::new(".")))?.sync_all()
+    };
+    attempt().map_err(|error| {
+        // A part left behind would fill the disk further; its removal may fail like the rest.
+        let _ = fs::remove_file(&part);
+        anyhow::Error::new(error).context(path.display().to_string())
+    })
+}
+
+/// This package's version, and the commit where it is run from a checkout.
+fn revision() -> String {
+    let described = std::process::Command::new("git")
+        .args(["describe", "--always", "--dirty", "--abbrev=12"])
+        .output()
+        .ok()
+        .filter(|output| output.status.success())
+        .and_then(|output| String::from_utf8(output.stdout).ok());
+    let commit = described.as_deref().map_or("no checkout", str::trim);
+    format!("hardnessd {} ({commit})", env!("CARGO_PKG_VERSION"))
+}

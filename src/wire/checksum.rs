@@ -1,0 +1,101 @@
+//! Checksums of serial sensors.
+
+use serde::{Deserialize, Serialize};
+
+/// A checksum over all bytes of the frame before it, sent little-endian.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Checksum {
+    /// None.
+    None,
+    /// Sum of the bytes, modulo 256.
+    Sum8,
+    /// Exclusive or of the bytes.
+    Xor8,
+    /// CRC-16/MODBUS: polynomial 0x8005 reflected, start 0xFFFF.
+    Crc16Modbus,
+    /// CRC-16/CCITT-FALSE (IBM-3740): polynomial 0x1021, start 0xFFFF, not reflected.
+    Crc16Ccitt,
+}
+
+impl Checksum {
+    /// Bytes it takes on the wire.
+    pub fn bytes(self) -> usize {
+        match self {
+            Checksum::None => 0,
+            Checksum::Sum8 | Checksum::Xor8 => 1,
+            Checksum::Crc16Modbus | Checksum::Crc16Ccitt => 2,
+        }
+    }
+
+    /// The checksum of `bytes`.
+    pub fn of(self, bytes: &[u8]) -> u16 {
+        match self {
+            Checksum::None => 0,
+            Checksum::Sum8 => {
+                u16::from(bytes.iter().fold(0_u8, |sum, &byte| sum.wrapping_add(byte)))
+            }
+            Checksum::Xor8 => u16::from(bytes.iter().fold(0_u8, |sum, &byte| sum ^ byte)),
+            Checksum::Crc16Modbus => bytes.iter().fold(0xFFFF, |crc, &byte| {
+                (crc >> 8) ^ MODBUS[usize::from((crc ^ u16::from(byte)) & 0xFF)]
+            }),
+            Checksum::Crc16Ccitt => bytes.iter().fold(0xFFFF, |crc: u16, &byte| {
+                (crc << 8) ^ CCITT[usize::from((crc >> 8) ^ u16::from(byte))]
+            }),
+        }
+    }
+}
+
+const MODBUS: [u16; 256] = {
+    let mut table = [0; 256];
+    let mut index = 0;
+    while index < 256 {
+        let mut crc = index as u16;
+        let mut bit = 0;
+        while bit < 8 {
+            crc = if crc & 1 == 1 {
+                (crc >> 1) ^ 0xA001
+            } else {
+                crc >> 1
+            };
+            bit += 1;
+        }
+        table[index] = crc;
+        index += 1;
+    }
+    table
+};
+
+const CCITT: [u16; 256] = {
+    let mut table = [0; 256];
+    let mut index = 0;
+    while index < 256 {
+        let mut crc = (index as u16) << 8;
+        let mut bit = 0;
+        while bit < 8 {
+            crc = if crc & 0x8000 != 0 {
+                (crc << 1) ^ 0x1021
+            } else {
+                crc << 1
+            };
+            bit += 1;
+        }
+        table[index] = crc;
+        index += 1;
+    }
+    table
+};
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn check_values_are_those_of_the_crc_catalogue() {
+        let check = b"123456789";
+        assert_eq!(Checksum::Crc16Modbus.of(check), 0x4B37);
+        assert_eq!(Checksum::Crc16Ccitt.of(check), 0x29B1);
+        assert_eq!(Checksum::Sum8.of(check), 0xDD);
+        assert_eq!(Checksum::Xor8.of(check), 0x31);
+    }
+}

@@ -1,0 +1,287 @@
+//! Frames of one length: `sync, length, cells, checksum, tail`.
+//!
+//! What a candidate needs to be whole depends on what the layout has. A length, checksum or tail
+//! is checked at its place; after a failure the search goes on one byte further, *inside* the
+//! rejected candidate. A layout with none but its header (`jq`) is whole when another header
+//! follows, because the header can stand in the data. A layout with a tail alone is whole when
+//! the tail stands at its place.
+
+use super::decoder::{Context, Damage, Scan};
+use super::{Cell, Checksum, Layout, LayoutError, LengthField};
+use crate::frame::RawFrame;
+
+/// What a layout is made of.
+#[derive(Debug)]
+pub(super) struct Parts {
+    pub(super) sync: Vec<u8>,
+    pub(super) tail: Vec<u8>,
+    pub(super) length: LengthField,
+    pub(super) cell: Cell,
+    pub(super) checksum: Checksum,
+    /// Whether a cell never holds the (one-byte) tail.
+    pub(super) tail_not_in_cells: bool,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Fixed {
+    sync: Vec<u8>,
+    /// `sync` and the length field, both constant.
+    header: Vec<u8>,
+    tail: Vec<u8>,
+    cell: Cell,
+    payload_bytes: usize,
+    checksum: Checksum,
+    tail_not_in_cells: bool,
+}
+
+impl Cell {
+    fn bytes(self) -> usize {
+        match self {
+            Cell::U8 => 1,
+            Cell::U16le | Cell::U16be => 2,
+        }
+    }
+}
+
+impl Fixed {
+    pub(super) fn new(parts: Parts, cells: usize) -> Result<Self, LayoutError> {
+        let payload_bytes = cells * parts.cell.bytes();
+        if parts.sync.is_empty() && parts.tail.is_empty() {
+            return Err(LayoutError::Unmarked);
+        }
+        if parts.sync.is_empty() && parts.length != LengthField::None {
+            return Err(LayoutError::LengthWithoutSync);
+        }
+        let (length, max): (Vec<u8>, usize) = match parts.length {
+            LengthField::None => (Vec::new(), usize::MAX),
+            LengthField::U8 => (vec![payload_bytes as u8], 0xFF),
+            LengthField::U16le => ((payload_bytes as u16).to_le_bytes().to_vec(), 0xFFFF),
+            LengthField::U16be => ((payload_bytes as u16).to_be_bytes().to_vec(), 0xFFFF),
+        };
+        if payload_bytes > max {
+            return Err(LayoutError::LengthField {
+                found: payload_bytes,
+                max,
+            });
+        }
+        Ok(Self {
+            header: [parts.sync.as_slice(), &length].concat(),
+            sync: parts.sync,
+            tail: parts.tail,
+            cell: parts.cell,
+            payload_bytes,
+            checksum: parts.checksum,
+            tail_not_in_cells: parts.tail_not_in_cells,
+        })
+    }
+
+    pub(super) fn has_sync(&self) -> bool {
+        !self.sync.is_empty()
+    }
+
+    pub(super) fn largest_cell(&self) -> u16 {
+        match self.cell {
+            Cell::U8 => 0xFF,
+            Cell::U16le | Cell::U16be => 0xFFFF,
+        }
+    }
+
+    pub(super) fn frame_bytes(&self, cells: usize) -> usize {
+        self.header.len() + cells * self.cell.bytes() + self.checksum.bytes() + self.tail.len()
+    }
+
+    fn total(&self) -> usize {
+        self.header.len() + self.payload_bytes + self.checksum.bytes() + self.tail.len()
+    }
+
+    pub(super) fn encode(&self, cells: impl Iterator<Item = u16>, count: usize, out: &mut Vec<u8>) {
+        let start = out.len();
+        out.reserve(self.frame_bytes(count));
+        out.extend_from_slice(&self.header);
+        for cell in cells {
+            match self.cell {
+                Cell::U8 => out.push(cell as u8),
+                Cell::U16le => out.extend_from_slice(&cell.to_le_bytes()),
+                Cell::U16be => out.extend_from_slice(&cell.to_be_bytes()),
+            }
+        }
+        let checksum = self.checksum.of(&out[start..]).to_le_bytes();
+        out.extend_from_slice(&checksum[..self.checksum.bytes()]);
+        out.extend_from_slice(&self.tail);
+    }
+
+    pub(super) fn scan(&self, layout: &Layout, bytes: &[u8], context: Context) -> Scan {
+        if self.sync.is_empty() {
+            return self.scan_for_tail(layout, bytes, context);
+        }
+        match find(bytes, &self.sync) {
+            0 => {}
+            skip => return Scan::Skip(skip),
+        }
+        if bytes.len() < self.header.len() {
+            return Scan::Wait;
+        }
+        if bytes[..self.header.len()] != self.header {
+            return Scan::Damaged(1, self.wrong_length(bytes));
+        }
+        if bytes.len() < self.total() {
+            return Scan::Wait;
+        }
+        if self.checksum == Checksum::None && self.tail.is_empty() {
+            return self.scan_for_follower(layout, bytes, context);
+        }
+        match self.check_end(bytes) {
+            Ok(()) => self.whole(layout, bytes),
+            Err(damage) => Scan::Damaged(1, damage),
+        }
+    }
+
+    fn wrong_length(&self, bytes: &[u8]) -> Damage {
+        let field = |header: &[u8]| match header[self.sync.len()..] {
+            [value] => usize::from(value),
+            [first, second] => usize::from(u16::from_le_bytes([first, second])),
+            _ => 0,
+        };
+        Damage::Length {
+            found: field(&bytes[..self.header.len()]),
+            expected: field(&self.header),
+        }
+    }
+
+    /// Checksum and tail of a candidate of full length.
+    fn check_end(&self, bytes: &[u8]) -> Result<(), Damage> {
+        let at = self.header.len() + self.payload_bytes;
+        let expected = self.checksum.of(&bytes[..at]);
+        let found = match bytes[at..at + self.checksum.bytes()] {
+            [low, high] => u16::from_le_bytes([low, high]),
+            [value] => u16::from(value),
+            _ => expected,
+        };
+        if bytes[at + self.checksum.bytes()..self.total()] != self.tail {
+            return Err(Damage::Tail);
+        }
+        if found != expected {
+            return Err(Damage::Checksum { found, expected });
+        }
+        Ok(())
+    }
+
+    fn whole(&self, layout: &Layout, bytes: &[u8]) -> Scan {
+        let mut frame = RawFrame::default();
+        let payload = &bytes[self.header.len()..self.header.len() + self.payload_bytes];
+        match self.cell {
+            Cell::U8 => {
+                for (index, &cell) in payload.iter().enumerate() {
+                    layout.place(&mut frame, index, u16::from(cell));
+                }
+            }
+            Cell::U16le | Cell::U16be => {
+                for (index, pair) in payload.chunks_exact(2).enumerate() {
+                    let pair = [pair[0], pair[1]];
+                    let cell = if self.cell == Cell::U16le {
+                        u16::from_le_bytes(pair)
+                    } else {
+                        u16::from_be_bytes(pair)
+                    };
+                    layout.place(&mut frame, index, cell);
+                }
+            }
+        }
+        Scan::Frame(self.total(), frame)
+    }
+
+    /// A header and nothing else: whole when another header follows.
+    fn scan_for_follower(&self, layout: &Layout, bytes: &[u8], context: Context) -> Scan {
+        match self.is_followed(bytes, context.settled) {
+            None => Scan::Wait,
+            Some(false) => Scan::Damaged(1, Damage::NotFollowed),
+            Some(true) if context.locked => self.whole(layout, bytes),
+            Some(true) => match self.nearest_in_phase(bytes, context) {
+                None => Scan::Wait,
+                Some(0) => self.whole(layout, bytes),
+                Some(skip) => Scan::Skip(skip),
+            },
+        }
+    }
+
+    /// Whether a header, or the settled end of input, stands where the candidate at the front of
+    /// `bytes` ends. `None`: not known yet.
+    fn is_followed(&self, bytes: &[u8], settled: bool) -> Option<bool> {
+        let Some(rest) = bytes.get(self.total()..) else {
+            return if settled { Some(false) } else { None };
+        };
+        let shared = rest.len().min(self.header.len());
+        if rest[..shared] != self.header[..shared] {
+            return Some(false);
+        }
+        (shared == self.header.len() || settled).then_some(true)
+    }
+
+    /// After damage, several candidates may be followed by what looks like a header, as in a
+    /// press held still, where a header in the data repeats in every frame. Damage mostly loses
+    /// or adds few bytes, so the one nearest to the phase before it is taken: its place in
+    /// `bytes`. `None`: more bytes are needed.
+    fn nearest_in_phase(&self, bytes: &[u8], context: Context) -> Option<usize> {
+        let period = self.total() as u64;
+        let distance = |at: usize| {
+            let phase = (context.offset + at as u64 - context.anchor) % period;
+            phase.min(period - phase)
+        };
+        let mut best = 0;
+        let mut at = 1;
+        while at < self.total() {
+            at += find(&bytes[at..], &self.header);
+            if at >= self.total() || at + self.header.len() > bytes.len() {
+                break;
+            }
+            if self.is_followed(&bytes[at..], context.settled)? && distance(at) < distance(best) {
+                best = at;
+            }
+            at += 1;
+        }
+        Some(best)
+    }
+
+    /// A tail and no sync: whole when the tail stands at its place.
+    fn scan_for_tail(&self, layout: &Layout, bytes: &[u8], context: Context) -> Scan {
+        let total = self.total();
+        let tail_at = total - self.tail.len();
+        if self.tail_not_in_cells
+            && let Some(end) = bytes
+                .iter()
+                .take(tail_at)
+                .position(|byte| *byte == self.tail[0])
+        {
+            return lost(end + 1, context);
+        }
+        if bytes.len() < total {
+            return Scan::Wait;
+        }
+        if self.check_end(bytes).is_ok() {
+            return self.whole(layout, bytes);
+        }
+        // The next place whose tail may stand right.
+        lost(1 + find(&bytes[tail_at + 1..], &self.tail), context)
+    }
+}
+
+/// Only the first candidate after a whole frame counts as damaged; the rest is a search.
+fn lost(skip: usize, context: Context) -> Scan {
+    if context.locked {
+        Scan::Damaged(skip, Damage::Tail)
+    } else {
+        Scan::Skip(skip)
+    }
+}
+
+/// Where `mark` first stands in `bytes`, or may yet stand once more bytes come; `bytes.len()`
+/// when nowhere.
+fn find(bytes: &[u8], mark: &[u8]) -> usize {
+    (0..bytes.len())
+        .find(|&at| {
+            let rest = &bytes[at..];
+            let shared = rest.len().min(mark.len());
+            rest[..shared] == mark[..shared]
+        })
+        .unwrap_or(bytes.len())
+}

@@ -1,0 +1,106 @@
+//! Frames as text: a row a line, decimals separated by spaces, tabs or commas, LF or CRLF; a
+//! blank line ends the frame.
+
+use super::Layout;
+use super::decoder::{Context, Damage, Scan};
+use crate::frame::{Array, RawFrame};
+
+/// Bytes of the longest frame looked for: every value at its widest with two separators, CRLF
+/// after each row and the blank line.
+pub(super) fn max_frame_bytes(array: Array, mask: u16) -> usize {
+    let digits = mask.to_string().len();
+    array.rows * (array.cols * (digits + 2) + 2) + 2
+}
+
+pub(super) fn encode(cells: impl Iterator<Item = u16>, cols: usize, out: &mut Vec<u8>) {
+    for (index, cell) in cells.enumerate() {
+        out.extend_from_slice(cell.to_string().as_bytes());
+        out.push(if (index + 1).is_multiple_of(cols) {
+            b'\n'
+        } else {
+            b' '
+        });
+    }
+    out.push(b'\n');
+}
+
+pub(super) fn scan(layout: &Layout, bytes: &[u8], context: Context) -> Scan {
+    let Array { rows, cols } = layout.array();
+    let mut lines = Lines { bytes, at: 0 };
+    // Where the last `rows` lines began, newest last.
+    let mut starts = [0; crate::frame::ROWS];
+    let mut count = 0;
+    loop {
+        let start = lines.at;
+        let Some(line) = lines.next() else { break };
+        if !line.iter().all(|byte| matches!(byte, b' ' | b'\t' | b'\r')) {
+            starts[count % rows] = start;
+            count += 1;
+            continue;
+        }
+        if count == 0 {
+            return Scan::Skip(lines.at);
+        }
+        let first = if count >= rows {
+            starts[count % rows]
+        } else {
+            0
+        };
+        return match parse(layout, &bytes[first..start], rows, cols) {
+            Some(_) if first > 0 => Scan::Skip(first),
+            Some(frame) => Scan::Frame(lines.at, frame),
+            None if context.locked => Scan::Damaged(lines.at, Damage::Cells),
+            None => Scan::Skip(lines.at),
+        };
+    }
+    match bytes.len().checked_sub(2 * layout.max_frame_bytes()) {
+        Some(excess) if excess > 0 => Scan::Skip(excess),
+        _ => Scan::Wait,
+    }
+}
+
+fn parse(layout: &Layout, text: &[u8], rows: usize, cols: usize) -> Option<RawFrame> {
+    let mut frame = RawFrame::default();
+    let mut index = 0;
+    for line in (Lines { bytes: text, at: 0 }) {
+        let row_end = index + cols;
+        for token in line.split(|byte| matches!(byte, b' ' | b'\t' | b',' | b'\r')) {
+            if token.is_empty() {
+                continue;
+            }
+            if index == row_end || index == rows * cols {
+                return None;
+            }
+            layout.place(&mut frame, index, decimal(token)?);
+            index += 1;
+        }
+        if index != row_end {
+            return None;
+        }
+    }
+    (index == rows * cols).then_some(frame)
+}
+
+fn decimal(token: &[u8]) -> Option<u16> {
+    token.iter().try_fold(0_u16, |value, digit| {
+        let digit = digit.is_ascii_digit().then(|| digit - b'0')?;
+        value.checked_mul(10)?.checked_add(u16::from(digit))
+    })
+}
+
+/// Complete lines, without their LF.
+struct Lines<'a> {
+    bytes: &'a [u8],
+    at: usize,
+}
+
+impl<'a> Iterator for Lines<'a> {
+    type Item = &'a [u8];
+
+    fn next(&mut self) -> Option<&'a [u8]> {
+        let rest = &self.bytes[self.at..];
+        let end = rest.iter().position(|&byte| byte == b'\n')?;
+        self.at += end + 1;
+        Some(&rest[..end])
+    }
+}

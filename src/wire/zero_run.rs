@@ -1,0 +1,85 @@
+//! Frames with their zeros packed: 1..254 is a value, `00 n` a run of n = 1..254 zeros, `FF`
+//! ends the frame.
+
+use super::Layout;
+use super::decoder::{Context, Damage, Scan};
+use crate::frame::RawFrame;
+
+const END: u8 = 0xFF;
+
+/// Bytes of the longest frame: single zeros, two bytes each, and the end.
+pub(super) fn max_frame_bytes(cells: usize) -> usize {
+    2 * cells + 1
+}
+
+pub(super) fn encode(cells: impl Iterator<Item = u16>, out: &mut Vec<u8>) {
+    let mut zeros = 0_u8;
+    for cell in cells {
+        if cell == 0 && zeros < 254 {
+            zeros += 1;
+            continue;
+        }
+        if zeros > 0 {
+            out.extend_from_slice(&[0, zeros]);
+            zeros = 0;
+        }
+        if cell == 0 {
+            zeros = 1;
+        } else {
+            out.push(cell as u8);
+        }
+    }
+    if zeros > 0 {
+        out.extend_from_slice(&[0, zeros]);
+    }
+    out.push(END);
+}
+
+pub(super) fn scan(layout: &Layout, bytes: &[u8], context: Context) -> Scan {
+    let longest = layout.max_frame_bytes();
+    let Some(end) = bytes.iter().position(|&byte| byte == END) else {
+        return match bytes.len().checked_sub(longest) {
+            Some(excess) if excess > 0 => Scan::Skip(excess),
+            _ => Scan::Wait,
+        };
+    };
+    // Noise may stand right before a whole frame: the frame is the longest run of bytes before
+    // the end that unpacks to exactly its cells.
+    let first = (end + 1).saturating_sub(longest);
+    for start in first..end {
+        if let Some(frame) = unpack(layout, &bytes[start..end]) {
+            return if start == 0 {
+                Scan::Frame(end + 1, frame)
+            } else {
+                Scan::Skip(start)
+            };
+        }
+    }
+    if context.locked && end > 0 {
+        Scan::Damaged(end + 1, Damage::Cells)
+    } else {
+        Scan::Skip(end + 1)
+    }
+}
+
+fn unpack(layout: &Layout, packed: &[u8]) -> Option<RawFrame> {
+    let cells = layout.places.len();
+    let mut frame = RawFrame::default();
+    let mut index = 0;
+    let mut bytes = packed.iter();
+    while let Some(&byte) = bytes.next() {
+        let run = if byte == 0 {
+            usize::from(*bytes.next()?)
+        } else {
+            1
+        };
+        if run == 0 || index + run > cells {
+            return None;
+        }
+        for _ in 0..run {
+            layout.place(&mut frame, index, u16::from(byte));
+            index += 1;
+        }
+    }
+    (index == cells).then_some(frame)
+}
