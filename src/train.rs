@@ -20,3 +20,4 @@ pub mod methods;
 pub mod onnx;
 pub mod metrics;
 pub mod export;
+pub mod sheet;

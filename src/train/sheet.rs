@@ -1,0 +1,302 @@
+//! A picture of simulated presses, to be looked at before the data is believed.
+//!
+//! In: labelled samples and one sequence a level. Out: the bytes of a PNG, all taxels on one
+//! logarithmic colour scale in newtons. Writes no file.
+
+use anyhow::Context as _;
+use font8x8::legacy::BASIC_LEGACY;
+
+use crate::frame::{COLS, Frame, ROWS, RawFrame};
+use crate::simulator::{LabelledSample, Material, NEWTONS_PER_COUNT};
+
+/// Frames in a row of the sheet.
+const TILES: usize = 12;
+/// Pixels a taxel.
+const ZOOM: usize = 4;
+const TILE: usize = COLS * ZOOM;
+const GAP: usize = 8;
+/// Height of a line of text.
+const TEXT: usize = 12;
+/// Width of the names to the left.
+const MARGIN: usize = 112;
+const ROW: usize = ROWS * ZOOM + TEXT + GAP;
+const HEAD: usize = 2 * TEXT + GAP;
+const FOOT: usize = 56;
+/// Ends of the colour scale, N: below a count, and an 8-bit taxel's full scale.
+const SCALE_N: (f32, f32) = (0.04, 10.2);
+const BACKGROUND: [u8; 3] = [250, 250, 250];
+const INK: [u8; 3] = [30, 30, 30];
+
+/// Draws up to twelve samples of each material, spread over its presses, and up to twelve frames
+/// of each sequence, spread over its first press. Frames of a sequence are taken as of a zero
+/// baseline.
+///
+/// # Errors
+///
+/// If the PNG encoder fails.
+pub fn sheet(
+    samples: &[LabelledSample],
+    sequences: &[(Material, Vec<RawFrame>)],
+) -> anyhow::Result<Vec<u8>> {
+    let width = MARGIN + TILES * (TILE + GAP);
+    let height = HEAD + 8 * ROW + HEAD + sequences.len() * ROW + FOOT;
+    let mut canvas = Canvas::new(width, height);
+    canvas.text(
+        GAP,
+        GAP,
+        "samples: force pressed with, contact area at 0.07 N, greatest taxel",
+    );
+    let mut top = HEAD;
+    for material in Material::ALL {
+        let of_material: Vec<&LabelledSample> = samples
+            .iter()
+            .filter(|sample| sample.material == material.index())
+            .collect();
+        canvas.name(top, material);
+        for (tile, sample) in spread(&of_material).enumerate() {
+            let peak = sample.frame.newtons.iter().copied().fold(0.0, f32::max);
+            let area = sample.frame.contact_area_taxels(0.07);
+            let caption = format!("{:.0}N {area} {peak:.1}N", sample.force_n);
+            canvas.tile(tile, top, &sample.frame, &caption);
+        }
+        top += ROW;
+    }
+    canvas.text(
+        GAP,
+        top + GAP,
+        "sequences: one press from touch to release, frame number, force read",
+    );
+    top += HEAD;
+    for (material, frames) in sequences {
+        canvas.name(top, *material);
+        let press = first_press(frames);
+        for (tile, &(number, raw)) in spread(&press).enumerate() {
+            let newtons = raw
+                .counts
+                .map(|counts| f32::from(counts) * NEWTONS_PER_COUNT);
+            let frame = Frame { newtons };
+            canvas.tile(
+                tile,
+                top,
+                &frame,
+                &format!("{number}: {:.1}N", frame.force_n()),
+            );
+        }
+        top += ROW;
+    }
+    canvas.colour_bar(top + GAP);
+    canvas.png()
+}
+
+/// Up to [`TILES`] of `items`, from the first to the last at even distances.
+fn spread<T>(items: &[T]) -> impl Iterator<Item = &T> {
+    let count = items.len().min(TILES);
+    (0..count).map(move |k| &items[k * (items.len() - 1) / (count - 1).max(1)])
+}
+
+/// The frames of the first press with their numbers, one empty frame on each side.
+fn first_press(frames: &[RawFrame]) -> Vec<(usize, &RawFrame)> {
+    let loaded = |raw: &RawFrame| raw.counts.iter().any(|&counts| counts > 0);
+    let Some(first) = frames.iter().position(loaded) else {
+        return Vec::new();
+    };
+    // Two empty frames end it: a single one is a light touch that flickers.
+    let length = frames[first..]
+        .windows(2)
+        .position(|pair| !pair.iter().any(loaded))
+        .unwrap_or(frames.len() - first);
+    let end = (first + length + 1).min(frames.len());
+    frames
+        .iter()
+        .enumerate()
+        .take(end)
+        .skip(first.saturating_sub(1))
+        .collect()
+}
+
+/// Pixels, `[height, width, 3]`.
+struct Canvas {
+    width: usize,
+    height: usize,
+    pixels: Vec<u8>,
+}
+
+impl Canvas {
+    fn new(width: usize, height: usize) -> Self {
+        Self {
+            width,
+            height,
+            pixels: BACKGROUND.repeat(width * height),
+        }
+    }
+
+    fn fill(&mut self, x: usize, y: usize, width: usize, height: usize, colour: [u8; 3]) {
+        for y in y..y + height {
+            let at = 3 * (y * self.width + x);
+            self.pixels[at..at + 3 * width].copy_from_slice(&colour.repeat(width));
+        }
+    }
+
+    fn text(&mut self, x: usize, y: usize, text: &str) {
+        for (k, letter) in text.chars().enumerate() {
+            let glyph = BASIC_LEGACY
+                .get(letter as usize)
+                .copied()
+                .unwrap_or_default();
+            for (i, line) in glyph.into_iter().enumerate() {
+                for j in (0..8).filter(|j| line >> j & 1 == 1) {
+                    self.fill(x + 8 * k + j, y + i, 1, 1, INK);
+                }
+            }
+        }
+    }
+
+    fn name(&mut self, top: usize, material: Material) {
+        self.text(GAP, top + TILE / 2 - TEXT, material.name());
+        self.text(GAP, top + TILE / 2, &format!("level {}", material.level()));
+    }
+
+    fn tile(&mut self, tile: usize, top: usize, frame: &Frame, caption: &str) {
+        let left = MARGIN + tile * (TILE + GAP);
+        for (k, &newtons) in frame.newtons.iter().enumerate() {
+            let (x, y) = (left + k % COLS * ZOOM, top + k / COLS * ZOOM);
+            self.fill(x, y, ZOOM, ZOOM, colour_of(newtons));
+        }
+        self.text(left, top + ROWS * ZOOM + 2, caption);
+    }
+
+    fn colour_bar(&mut self, top: usize) {
+        let (left, length) = (MARGIN, 6 * (TILE + GAP));
+        let (low, high) = SCALE_N;
+        let place = |newtons: f32| (newtons / low).ln() / (high / low).ln() * length as f32;
+        for x in 0..length {
+            let newtons = low * (high / low).powf(x as f32 / length as f32);
+            self.fill(left + x, top, 1, 16, colour_of(newtons));
+        }
+        for newtons in [0.04, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0] {
+            let x = left + place(newtons) as usize;
+            self.fill(x, top + 16, 1, 4, INK);
+            self.text(x.saturating_sub(8), top + 22, &format!("{newtons}"));
+        }
+        self.text(left + length + 2 * GAP, top + 4, "N a taxel (0: darkest)");
+    }
+
+    fn png(&self) -> anyhow::Result<Vec<u8>> {
+        let mut bytes = Vec::new();
+        let mut encoder = png::Encoder::new(&mut bytes, self.width as u32, self.height as u32);
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_depth(png::BitDepth::Eight);
+        let mut writer = encoder.write_header().context("sheet: PNG header")?;
+        writer
+            .write_image_data(&self.pixels)
+            .context("sheet: PNG pixels")?;
+        writer.finish().context("sheet: PNG end")?;
+        Ok(bytes)
+    }
+}
+
+/// The colour of a taxel: viridis over the logarithm of the force.
+fn colour_of(newtons: f32) -> [u8; 3] {
+    let (low, high) = SCALE_N;
+    let part = ((newtons.max(low) / low).ln() / (high / low).ln()).min(1.0);
+    let at = part * (VIRIDIS.len() - 1) as f32;
+    let k = (at as usize).min(VIRIDIS.len() - 2);
+    let rest = at - k as f32;
+    std::array::from_fn(|c| {
+        let (a, b) = (f32::from(VIRIDIS[k][c]), f32::from(VIRIDIS[k + 1][c]));
+        (a + rest * (b - a)).round() as u8
+    })
+}
+
+/// Ten colours of matplotlib's viridis (CC0) at even distances.
+const VIRIDIS: [[u8; 3]; 10] = [
+    [68, 1, 84],
+    [72, 40, 120],
+    [62, 74, 137],
+    [49, 104, 142],
+    [38, 130, 142],
+    [31, 158, 137],
+    [53, 183, 121],
+    [109, 205, 89],
+    [180, 222, 44],
+    [253, 231, 37],
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simulator::{DatasetSettings, Sequence, SequenceSettings, Shapes, dataset};
+
+    fn small(shapes: Shapes, objects: u32, presses: u32) -> Vec<LabelledSample> {
+        let settings = DatasetSettings {
+            seed: 1,
+            objects,
+            test_objects: objects,
+            presses,
+            shapes,
+            ..DatasetSettings::default()
+        };
+        dataset(&settings, 2, |_| ())
+    }
+
+    fn sequence(material: Material) -> (Material, Vec<RawFrame>) {
+        let settings = SequenceSettings {
+            seed: 1,
+            materials: vec![material],
+            presses: Some(1),
+            ..SequenceSettings::default()
+        };
+        (
+            material,
+            Sequence::new(settings).map(|frame| frame.raw).collect(),
+        )
+    }
+
+    #[test]
+    fn a_sheet_shows_every_material_and_sequence() {
+        let samples = small(Shapes::Matched, 1, 2);
+        let sequences = [sequence(Material::SoftCandy)];
+        let bytes = sheet(&samples, &sequences).unwrap();
+        let mut reader = png::Decoder::new(std::io::Cursor::new(&bytes))
+            .read_info()
+            .unwrap();
+        let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+        let size = reader.next_frame(&mut pixels).unwrap();
+        assert_eq!(size.width as usize, MARGIN + TILES * (TILE + GAP));
+        // Each row's first tile holds something brighter than the darkest colour.
+        let tops = (0..8).map(|k| HEAD + k * ROW).chain([2 * HEAD + 8 * ROW]);
+        for top in tops {
+            let bright = (top..top + ROWS * ZOOM)
+                .flat_map(|y| (MARGIN..MARGIN + 4 * (TILE + GAP)).map(move |x| (x, y)))
+                .filter(|&(x, y)| {
+                    let at = 3 * (y * size.width as usize + x);
+                    pixels[at + 1] > 60 && pixels[at..at + 3] != BACKGROUND
+                })
+                .count();
+            assert!(bright >= ZOOM * ZOOM, "nothing to be seen at {top}");
+        }
+        assert!(sheet(&[], &[]).is_ok());
+    }
+
+    #[test]
+    fn colours_rise_with_the_force() {
+        let green = |newtons| colour_of(newtons)[1];
+        assert!(green(0.0) < green(0.1) && green(0.1) < green(1.0) && green(1.0) < green(10.0));
+        assert_eq!(colour_of(0.0), VIRIDIS[0]);
+        assert_eq!(colour_of(99.0), VIRIDIS[9]);
+    }
+
+    #[test]
+    #[ignore = "writes pictures to the directory SHEETS, to be looked at"]
+    fn write_sheets() {
+        let directory = std::path::PathBuf::from(std::env::var("SHEETS").unwrap());
+        let sequences: Vec<_> = Material::ALL[4..].iter().map(|&m| sequence(m)).collect();
+        for (name, shapes) in [
+            ("matched.png", Shapes::Matched),
+            ("paper.png", Shapes::Paper),
+        ] {
+            let bytes = sheet(&small(shapes, 12, 7), &sequences).unwrap();
+            std::fs::write(directory.join(name), bytes).unwrap();
+        }
+    }
+}
