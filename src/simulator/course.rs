@@ -36,13 +36,23 @@ const HOLD_TOLERANCE: f64 = 1e-3;
 impl Course {
     /// Presses to `force_n`, holds the position for `hold_s` and withdraws.
     pub(super) fn new(bench: &mut Bench, specimen: &Specimen, force_n: f64, hold_s: f64) -> Self {
+        Self::in_levels(bench, specimen, force_n, hold_s, LEVELS)
+    }
+
+    fn in_levels(
+        bench: &mut Bench,
+        specimen: &Specimen,
+        force_n: f64,
+        hold_s: f64,
+        levels: u32,
+    ) -> Self {
         // The contact is largest at the end of the hold, when everything has crept.
         let (mut window, _, _) = bench.press(specimen, force_n, 1.0, hold_s);
         loop {
             let mut run = Run::new(bench, specimen, window);
-            run.load(force_n);
+            run.load(force_n, levels);
             run.hold(hold_s);
-            run.unload();
+            run.unload(levels);
             let Run { moments, fits, .. } = run;
             match window.wider(specimen, force_n) {
                 Some(wider) if !fits => window = wider,
@@ -127,22 +137,22 @@ impl<'a> Run<'a> {
         }
     }
 
-    fn load(&mut self, force_n: f64) {
+    fn load(&mut self, force_n: f64, levels: u32) {
         // Of the first step only that it is short; afterwards the speed so far tells.
         let mut guess_s = 0.05;
-        for level in 1..=LEVELS {
-            let goal = force_n * (f64::from(level) / f64::from(LEVELS)).powf(SPACING);
+        for level in 1..=levels {
+            let goal = force_n * (f64::from(level) / f64::from(levels)).powf(SPACING);
             let before_s = self.time_s;
             self.step_to_force(goal, guess_s, 1.0);
             guess_s = self.time_s - before_s;
         }
     }
 
-    fn unload(&mut self) {
+    fn unload(&mut self, levels: u32) {
         let top = self.force_n;
         let mut guess_s = 0.05;
-        for level in (1..LEVELS).rev() {
-            let goal = top * (f64::from(level) / f64::from(LEVELS)).powf(SPACING);
+        for level in (1..levels).rev() {
+            let goal = top * (f64::from(level) / f64::from(levels)).powf(SPACING);
             let before_s = self.time_s;
             self.step_to_force(goal, guess_s, -1.0);
             guess_s = self.time_s - before_s;
@@ -313,4 +323,143 @@ fn share(time_s: f64, tau_s: f64) -> f64 {
 fn left(time_s: f64, tau_s: f64) -> (f64, f64) {
     let kept = (-time_s / tau_s).exp();
     (kept, 1.0 - kept - share(time_s, tau_s))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::material::Material;
+    use super::super::object::{Face, Pose};
+    use super::super::press::Specimen;
+    use super::super::texture::Patch;
+    use super::*;
+    use crate::random::Stream;
+
+    fn specimen(material: Material, face: &Face) -> Specimen {
+        let properties = material.properties();
+        let mut stream = Stream::new(4, "course");
+        let pose = Pose::draw(face, &mut stream.child(0));
+        let patch = Patch::new(&properties.texture, 1.0, 0.875, &mut stream);
+        Specimen::new(
+            properties,
+            properties.young_mpa(properties.shore.mean),
+            face,
+            &pose,
+            &patch,
+        )
+    }
+
+    fn total(taxels: &[f32; TAXELS]) -> f64 {
+        taxels.iter().map(|&force| f64::from(force)).sum()
+    }
+
+    #[test]
+    fn an_element_keeps_to_its_closed_form_at_50_hz() {
+        // z held by a spring 1/k in series with c (p + sum j s): with one element,
+        // c (p + j s) + p / k = z, s' = (p - s) / tau gives
+        // p = p0 (1 + b exp(-(1 + b) t / tau)) / (1 + b), p0 = z / (c + 1/k), b = j c / (c + 1/k).
+        let (c, arm, j, tau, z) = (0.12, 0.1, 0.30, 0.2, 2.0);
+        let b = j * c / (c + arm);
+        let start = z / (c + arm);
+        let (mut s, mut before, mut time) = (0.0, start, 0.0);
+        let mut worst = 0.0_f64;
+        for _ in 0..75 {
+            let step = 0.02;
+            let (kept, old) = left(step, tau);
+            let history = kept * s + old * before;
+            let now = (z - c * j * history) / (c + arm + c * j * share(step, tau));
+            s = history + share(step, tau) * now;
+            before = now;
+            time += step;
+            let expected = start * (1.0 + b * (-(1.0 + b) * time / tau).exp()) / (1.0 + b);
+            worst = worst.max((now / expected - 1.0).abs());
+        }
+        assert!(worst < 1e-2, "relaxation off by {worst}");
+    }
+
+    #[test]
+    fn force_relaxes_in_the_hold_as_creep_and_arm_say() {
+        // Soft candy's compliance grows by up to 60 %; arm and growing contact share that out.
+        let specimen = specimen(Material::SoftCandy, &Face::ball(27.0));
+        let course = Course::new(&mut Bench::default(), &specimen, 12.0, 1.5);
+        let top = course
+            .moments
+            .iter()
+            .map(|moment| moment.force_n)
+            .fold(0.0, f64::max);
+        let hold: Vec<&Moment> = course
+            .moments
+            .iter()
+            .skip_while(|moment| moment.force_n < top)
+            .take(10)
+            .collect();
+        assert!((top - 12.0).abs() < 1e-9);
+        assert!(
+            hold.windows(2)
+                .all(|pair| pair[1].force_n < pair[0].force_n)
+        );
+        let kept = hold[9].force_n / top;
+        assert!((0.75..0.97).contains(&kept), "{kept} of the force is left");
+    }
+
+    #[test]
+    fn carriage_moves_at_5_mm_a_second_and_taxels_carry_the_force() {
+        for material in [Material::Rubber, Material::Plasticine, Material::YogaMat] {
+            let specimen = specimen(material, &Face::ball(27.0));
+            let course = Course::new(&mut Bench::default(), &specimen, 15.0, 1.0);
+            let mut last = -1.0;
+            for moment in &course.moments {
+                assert!(moment.time_s > last, "{material}: time stands still");
+                last = moment.time_s;
+                let sum = total(&moment.taxels_n);
+                assert!(
+                    (sum - moment.force_n).abs() < 0.03 * moment.force_n + 1e-6,
+                    "{material}: taxels carry {sum} N of {} N",
+                    moment.force_n
+                );
+            }
+            // Loading ends when z = d + F / k: the arm alone takes 15 N / 10 N/mm / 5 mm/s.
+            let top = course
+                .moments
+                .iter()
+                .find(|moment| moment.force_n > 14.99)
+                .unwrap();
+            assert!(
+                top.time_s > 0.3 && top.time_s < 2.5,
+                "{material}: {} s",
+                top.time_s
+            );
+        }
+    }
+
+    #[test]
+    fn twice_the_levels_change_the_taxels_less_than_their_noise() {
+        for material in [
+            Material::Rubber,
+            Material::Plasticine,
+            Material::Foam,
+            Material::Wood,
+        ] {
+            let specimen = specimen(material, &Face::ball(27.0));
+            let mut bench = Bench::default();
+            let [coarse, fine] = [LEVELS, 2 * LEVELS]
+                .map(|levels| Course::in_levels(&mut bench, &specimen, 15.0, 1.0, levels));
+            let (mut off, mut sum) = (0.0, 0.0);
+            for frame in 0..200 {
+                let time_s = f64::from(frame) * 0.01;
+                let (a, b) = (coarse.taxels_n(time_s), fine.taxels_n(time_s));
+                off += a
+                    .iter()
+                    .zip(&b)
+                    .map(|(&a, &b)| f64::from((a - b).abs()))
+                    .sum::<f64>();
+                sum += total(&b);
+            }
+            // Against 1.5 % of noise and 0.04 N of rounding a taxel.
+            assert!(
+                off < 0.015 * sum,
+                "{material}: {} of the force is elsewhere",
+                off / sum
+            );
+        }
+    }
 }

@@ -299,3 +299,88 @@ fn ideal_tare(raw: &RawFrame) -> Frame {
             .map(|counts| f32::from(counts) * NEWTONS_PER_COUNT),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn small(shapes: Shapes) -> DatasetSettings {
+        DatasetSettings {
+            seed: 3,
+            objects: 1,
+            test_objects: 2,
+            presses: 9,
+            shapes,
+            ..Default::default()
+        }
+    }
+
+    #[test]
+    fn threads_do_not_show_in_the_result() {
+        let settings = small(Shapes::Paper);
+        let most = AtomicUsize::new(0);
+        let one = dataset(&settings, 1, |_| ());
+        let three = dataset(&settings, 3, |done| {
+            most.fetch_max(done, Ordering::Relaxed);
+        });
+        assert!(one == three, "one thread and three give different samples");
+        assert_eq!(most.into_inner(), one.len());
+    }
+
+    #[test]
+    fn samples_are_labelled_as_their_material() {
+        let samples = dataset(&small(Shapes::Matched), 2, |_| ());
+        assert_eq!(samples.len(), (4 + 4 * 2) * 9);
+        for sample in &samples {
+            let material = Material::ALL[usize::from(sample.material)];
+            assert_eq!(
+                (sample.level, sample.split),
+                (material.level(), material.split())
+            );
+            let shore = material.properties().shore;
+            assert!((shore.low..=shore.high).contains(&f64::from(sample.shore)));
+            assert!(sample.frame.contact_area_taxels(0.07) as usize >= BEGIN_AREA_TAXELS);
+            // Gains, crosstalk and film creep add, thresholds take away.
+            let ratio = sample.frame.force_n() / f64::from(sample.force_n);
+            assert!(
+                (0.2..1.5).contains(&ratio),
+                "{material}: reads {ratio} of the force"
+            );
+        }
+        let objects: std::collections::BTreeSet<u32> = samples.iter().map(|s| s.object).collect();
+        assert_eq!(objects.len(), 12);
+    }
+
+    #[test]
+    fn matched_test_objects_are_paired_over_materials_and_papers_are_not() {
+        for (shapes, paired) in [(Shapes::Matched, true), (Shapes::Paper, false)] {
+            let settings = small(shapes);
+            let draw = |material, number| {
+                let draws = Draws::new(settings.seed, shapes, material, number);
+                format!(
+                    "{:?}",
+                    Object::draw(shapes, material, &mut draws.geometry.child(0))
+                )
+            };
+            let foam = draw(Material::Foam, 1);
+            assert_eq!(foam == draw(Material::YogaMat, 1), paired);
+            assert_ne!(foam, draw(Material::Foam, 0));
+        }
+    }
+
+    #[test]
+    #[ignore = "measures speed: cargo test --release"]
+    fn print_rate() {
+        let began = std::time::Instant::now();
+        let settings = DatasetSettings {
+            objects: 10,
+            test_objects: 1,
+            ..Default::default()
+        };
+        let count = dataset(&settings, 2, |_| ()).len();
+        println!(
+            "{:.0} samples a second on 2 threads",
+            count as f64 / began.elapsed().as_secs_f64()
+        );
+    }
+}

@@ -12,8 +12,8 @@ use super::material::{Law, Properties};
 const RADIUS_MM: f64 = 1.19;
 /// The reading is taken after this, s.
 const READ_S: f64 = 0.15;
-/// Thickness of the test piece, mm: twice the standard's least, so that a solid is a half-space.
-const PIECE_MM: f64 = 12.0;
+/// Height of what is tested, mm: an object like those the sensor is pressed on.
+const PIECE_MM: f64 = 40.0;
 const CELL_MM: f64 = 0.04;
 const WIDTH: usize = 64;
 

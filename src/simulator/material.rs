@@ -259,7 +259,7 @@ const PROPERTIES: [Properties; 8] = [
     Properties {
         shore: shore(32.0, 2.0, 25.0, 40.0),
         nu: 0.10,
-        modulus: Modulus::Durometer([0.1947, 0.2661, 0.3823]),
+        modulus: Modulus::Durometer([0.2041, 0.2784, 0.3985]),
         law: Law::Foam {
             exponent: 2.5,
             plateau: 0.12,
@@ -279,7 +279,7 @@ const PROPERTIES: [Properties; 8] = [
     Properties {
         shore: shore(63.0, 1.2, 61.2, 67.0),
         nu: 0.25,
-        modulus: Modulus::Durometer([0.6735, 0.7348, 0.9018]),
+        modulus: Modulus::Durometer([0.6990, 0.7628, 0.9340]),
         law: Law::Foam {
             exponent: 2.5,
             plateau: 0.35,
@@ -299,7 +299,7 @@ const PROPERTIES: [Properties; 8] = [
     Properties {
         shore: shore(38.0, 2.0, 32.0, 44.0),
         nu: 0.15,
-        modulus: Modulus::Durometer([0.2353, 0.3043, 0.3957]),
+        modulus: Modulus::Durometer([0.2464, 0.3179, 0.4121]),
         law: Law::Foam {
             exponent: 2.0,
             plateau: 0.15,

@@ -276,6 +276,22 @@ impl Object {
 const WEDGE_HEIGHT_MM: f64 = 30.0;
 
 impl Face {
+    /// A ball's top.
+    #[cfg(test)]
+    pub(super) fn ball(radius: f64) -> Self {
+        let outline = Outline::Ellipsoid {
+            x: radius,
+            y: radius,
+            z: radius,
+        };
+        Face {
+            outline,
+            height_mm: 2.0 * radius,
+            tilt_sd_deg: 0.0,
+            roughness: 1.0,
+        }
+    }
+
     /// Gap h in mm under a level sensor at `width` x `width` cells around the centre, least 0.
     pub(super) fn gap_mm(
         &self,

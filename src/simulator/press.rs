@@ -432,4 +432,31 @@ mod tests {
             );
         }
     }
+
+    #[test]
+    #[ignore = "prints figures"]
+    fn ball_areas() {
+        for material in Material::ALL {
+            let mut bench = Bench::default();
+            let p = material.properties();
+            let mut line = String::new();
+            for force in [1.0, 4.0, 8.0, 15.0, 25.0] {
+                let mut smooth = p.texture;
+                smooth.rms_um = 1.0;
+                let patch = Patch::new(&smooth, 1.0, CELL_MM, &mut Stream::new(1, "x"));
+                let face = Face::ball(27.0);
+                let pose = Pose::draw(&face, &mut Stream::new(2, "x"));
+                let s = Specimen::new(p, p.young_mpa(p.shore.mean), &face, &pose, &patch);
+                let (w, q, c) = bench.press(&s, force, 0.5, 1.15);
+                let f = super::super::sensor::taxel_forces(&q, w.width, w.corner);
+                let area = f.iter().filter(|&&f| f > 0.07).count();
+                let peak = f.iter().copied().fold(0.0, f32::max);
+                line += &format!(
+                    "  {force} N: a {:.2} d {:.2} area {area} peak {peak:.2};",
+                    c.radius_mm, c.approach_mm
+                );
+            }
+            println!("{material}: E {:.3} {line}", p.young_mpa(p.shore.mean));
+        }
+    }
 }

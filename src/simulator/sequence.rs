@@ -238,3 +238,155 @@ fn is_one_press(frames: &[(RawFrame, bool)]) -> bool {
     held.iter().filter(|&&area| area > 0).count() >= 2
         && !held.windows(2).any(|pair| pair == [0, 0])
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Presses that a tracker with the contract's settings sees.
+    fn tracked(frames: &[SequenceFrame]) -> Vec<(u32, usize)> {
+        let mut seen = Vec::new();
+        let mut held: Option<(u32, usize, u32)> = None;
+        for frame in frames {
+            let area = contact_taxels(&frame.raw);
+            held = match held {
+                None if area >= BEGIN_AREA_TAXELS => Some((frame.press, 1, 0)),
+                Some((press, length, 1)) if area == 0 => {
+                    seen.push((press, length));
+                    None
+                }
+                Some((press, length, empty)) if area == 0 => Some((press, length, empty + 1)),
+                Some((press, length, _)) => Some((press, length + 1, 0)),
+                None => None,
+            };
+        }
+        assert!(held.is_none(), "the last press never ends");
+        seen
+    }
+
+    fn check(settings: SequenceSettings) {
+        let rate = settings.frame_rate_hz;
+        let presses = settings.presses.unwrap();
+        let materials = settings.materials.clone();
+        let frames: Vec<SequenceFrame> = Sequence::new(settings.clone()).collect();
+        let expected: Vec<u32> = (1..=presses).collect();
+        let seen = tracked(&frames);
+        let numbers: Vec<u32> = seen.iter().map(|&(press, _)| press).collect();
+        assert_eq!(numbers, expected, "{settings:?}");
+        // The daemon gives a press up after 30 s and wants 2 frames.
+        assert!(
+            seen.iter()
+                .all(|&(_, length)| length >= 2 && (length as f64) < 15.0 * rate)
+        );
+        let first = frames.iter().position(|frame| frame.loaded).unwrap();
+        assert!(
+            first as f64 >= 2.0 * rate,
+            "{first} frames of rest at {rate} Hz"
+        );
+        for frame in &frames {
+            assert!(
+                frame.loaded || frame.raw == RawFrame::default(),
+                "a count without load"
+            );
+            let material = frame
+                .press
+                .checked_sub(1)
+                .map(|k| materials[k as usize % materials.len()]);
+            assert_eq!(frame.material, material);
+        }
+        for press in 1..=presses {
+            let rest = frames
+                .iter()
+                .filter(|frame| frame.press == press && !frame.loaded)
+                .count();
+            assert!(
+                rest as f64 > 0.9 * rate,
+                "press {press} rests {rest} frames"
+            );
+        }
+    }
+
+    #[test]
+    fn a_tracker_sees_every_press_once() {
+        for (seed, frame_rate_hz, profile) in [
+            (1, 5.0, SensorProfile::Clean),
+            (2, 20.0, SensorProfile::Raw),
+            (3, 100.0, SensorProfile::Clean),
+        ] {
+            check(SequenceSettings {
+                seed,
+                frame_rate_hz,
+                materials: Material::ALL.to_vec(),
+                presses: Some(8),
+                profile,
+                ..SequenceSettings::default()
+            });
+        }
+    }
+
+    #[test]
+    fn a_press_too_light_is_made_anew_with_more_force() {
+        check(SequenceSettings {
+            seed: 4,
+            materials: vec![Material::Sponge, Material::Wood, Material::YogaMat],
+            force_n: Some(0.3),
+            presses: Some(3),
+            ..SequenceSettings::default()
+        });
+    }
+
+    #[test]
+    fn the_same_seed_gives_the_same_frames() {
+        let settings = |seed| SequenceSettings {
+            seed,
+            presses: Some(2),
+            ..Default::default()
+        };
+        let run = |seed| Sequence::new(settings(seed)).collect::<Vec<_>>();
+        assert_eq!(run(5), run(5));
+        assert_ne!(run(5), run(6));
+    }
+
+    #[test]
+    #[ignore = "many presses, some 60 s: run it after a change of physics or sensor"]
+    fn a_tracker_sees_every_one_of_many_presses_once() {
+        for seed in 0..6 {
+            for frame_rate_hz in [5.0, 100.0] {
+                for (force_n, profile, shapes) in [
+                    (None, SensorProfile::Clean, Shapes::Matched),
+                    (Some(1.0), SensorProfile::Raw, Shapes::Paper),
+                ] {
+                    check(SequenceSettings {
+                        seed,
+                        frame_rate_hz,
+                        materials: Material::ALL.to_vec(),
+                        force_n,
+                        presses: Some(40),
+                        shapes,
+                        profile,
+                        ..SequenceSettings::default()
+                    });
+                }
+            }
+        }
+    }
+
+    #[test]
+    #[ignore = "measures speed: cargo test --release"]
+    fn print_speed() {
+        for material in Material::ALL {
+            let began = std::time::Instant::now();
+            let settings = SequenceSettings {
+                frame_rate_hz: 100.0,
+                materials: vec![material],
+                presses: Some(8),
+                ..SequenceSettings::default()
+            };
+            let seconds = Sequence::new(settings).count() as f64 / 100.0;
+            println!(
+                "{material}: {:.0} times real time",
+                seconds / began.elapsed().as_secs_f64()
+            );
+        }
+    }
+}
