@@ -1,1 +1,269 @@
+use std::time::Duration;
 
+use serde_json::Value;
+
+use super::*;
+use crate::daemon::request::{Policy, Since};
+use crate::event::{FrameEvent, LinkState, ModelCard, PressState, Status};
+
+const RUN: &str = "5eed";
+
+fn hub() -> Hub {
+    Hub::new(Hello {
+        protocol: crate::event::PROTOCOL,
+        server: "hardnessd",
+        version: "0",
+        robot: "arm-7".to_owned(),
+        run: RUN.to_owned(),
+        boot_id: String::new(),
+        seq: 0,
+        sensors: Vec::new(),
+        model: ModelCard {
+            sha256: String::new(),
+            validation: String::new(),
+            levels: Vec::new(),
+        },
+    })
+}
+
+fn status(sensor: &str) -> Event {
+    Event::Status(Status {
+        seq: None,
+        sensor: sensor.to_owned(),
+        time: jiff::Timestamp::UNIX_EPOCH,
+        state: LinkState::Live,
+        reason: None,
+        frames: 0,
+        frames_damaged: 0,
+        bytes_skipped: 0,
+        frame_rate_hz: None,
+    })
+}
+
+fn press(sensor: &str) -> Event {
+    Event::Press(crate::event::Press {
+        seq: None,
+        sensor: sensor.to_owned(),
+        time: jiff::Timestamp::UNIX_EPOCH,
+        press: 1,
+        state: PressState::Begin,
+        frame: 0,
+        reason: None,
+        frames: 1,
+        context: None,
+    })
+}
+
+fn frame(sensor: &str, number: u64) -> Event {
+    let newtons = vec![0.0; crate::frame::TAXELS];
+    Event::Frame(FrameEvent::new(
+        sensor.to_owned(),
+        jiff::Timestamp::UNIX_EPOCH,
+        number,
+        newtons,
+    ))
+}
+
+impl Hub {
+    fn tell(&mut self, event: Event) {
+        self.publish(event, Duration::ZERO, Duration::ZERO);
+    }
+
+    /// All a subscriber gets now, each line as `TYPE:SEQ`, `gap:LOST` or `frame:NUMBER`.
+    fn drain(&mut self, id: u64) -> Vec<String> {
+        let mut told = Vec::new();
+        loop {
+            let lines = self.take(id);
+            if lines.is_empty() {
+                return told;
+            }
+            told.extend(lines.iter().map(|line| {
+                let event: Value = serde_json::from_str(line).unwrap();
+                let number = match event["type"].as_str().unwrap() {
+                    "gap" => &event["lost"],
+                    "frame" => &event["frame"],
+                    _ => &event["seq"],
+                };
+                format!("{}:{number}", event["type"].as_str().unwrap())
+            }));
+        }
+    }
+}
+
+fn wanting(kinds: &[Kind], policy: Policy, since: Option<u64>) -> Subscription {
+    let since = since.map(|seq| Since {
+        run: RUN.to_owned(),
+        seq,
+    });
+    Subscription {
+        kinds: kinds.iter().copied().collect(),
+        policy,
+        since,
+    }
+}
+
+fn numbers(kind: &str, seqs: impl Iterator<Item = u64>) -> Vec<String> {
+    seqs.map(|seq| format!("{kind}:{seq}")).collect()
+}
+
+#[test]
+fn events_are_numbered_over_all_sensors_and_frames_are_not() {
+    let mut hub = hub();
+    let (id, _) = hub.join();
+    let every = [Kind::Status, Kind::Press, Kind::Hardness, Kind::Frame];
+    hub.subscribe(id, &wanting(&every, Policy::Queue, None))
+        .unwrap();
+    hub.tell(status("a"));
+    hub.tell(frame("a", 7));
+    hub.tell(press("b"));
+    assert_eq!(hub.drain(id), ["status:1", "frame:7", "press:2"]);
+}
+
+#[test]
+fn a_subscriber_gets_the_kinds_it_asked_for_and_by_default_no_frames() {
+    let mut hub = hub();
+    let (usual, _) = hub.join();
+    let (presses, _) = hub.join();
+    hub.subscribe(presses, &wanting(&[Kind::Press], Policy::Queue, None))
+        .unwrap();
+    hub.tell(status("a"));
+    hub.tell(frame("a", 0));
+    hub.tell(press("a"));
+    assert_eq!(hub.drain(usual), ["status:1", "press:2"]);
+    assert_eq!(hub.drain(presses), ["press:2"]);
+}
+
+#[test]
+fn a_stalled_subscriber_loses_the_oldest_and_learns_exactly_how_many() {
+    let mut hub = hub();
+    let (stalled, _) = hub.join();
+    let (awake, _) = hub.join();
+    let mut told = Vec::new();
+    for _ in 0..3000 {
+        hub.tell(status("a"));
+        told.extend(hub.drain(awake));
+    }
+    assert_eq!(told, numbers("status", 1..=3000));
+    let mut expected = vec!["gap:1976".to_owned()];
+    expected.extend(numbers("status", 1977..=3000));
+    assert_eq!(hub.drain(stalled), expected);
+    hub.tell(status("a"));
+    assert_eq!(hub.drain(stalled), ["status:3001"]);
+}
+
+#[test]
+fn latest_keeps_the_newest_of_each_kind_and_sensor_and_counts_all_but_frames() {
+    let mut hub = hub();
+    let (id, _) = hub.join();
+    let kinds = [Kind::Status, Kind::Press, Kind::Frame];
+    hub.subscribe(id, &wanting(&kinds, Policy::Latest, None))
+        .unwrap();
+    for number in 0..5 {
+        hub.tell(status("a"));
+        hub.tell(frame("a", number));
+    }
+    hub.tell(status("b"));
+    hub.tell(press("a"));
+    assert_eq!(
+        hub.drain(id),
+        ["gap:4", "status:5", "frame:4", "status:6", "press:7"]
+    );
+}
+
+#[test]
+fn since_gives_what_is_held_then_what_comes_and_nothing_twice() {
+    let mut hub = hub();
+    for _ in 0..10 {
+        hub.tell(press("a"));
+    }
+    let (id, _) = hub.join();
+    hub.tell(press("a"));
+    // The default subscription has handed number 11 out before the request came.
+    assert_eq!(hub.drain(id), ["press:11"]);
+    hub.tell(press("a"));
+    hub.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(7)))
+        .unwrap();
+    hub.tell(press("a"));
+    assert_eq!(
+        hub.drain(id),
+        ["press:8", "press:9", "press:10", "press:12", "press:13"]
+    );
+}
+
+#[test]
+fn since_older_than_what_is_held_says_how_much_is_gone() {
+    let mut hub = hub();
+    for _ in 0..HELD + 100 {
+        hub.tell(press("a"));
+    }
+    let held = numbers("press", 101..=HELD as u64 + 100);
+    let mut check = |kinds: &[Kind], since, lost: &str| {
+        let (id, _) = hub.join();
+        hub.subscribe(id, &wanting(kinds, Policy::Queue, Some(since)))
+            .unwrap();
+        let told = hub.drain(id);
+        assert_eq!(told[0], format!("gap:{lost}"));
+        assert_eq!(told[1..], held);
+    };
+    check(&Kinds::NUMBERED, 40, "60");
+    // Which of the 60 were presses is not known any more.
+    check(&[Kind::Press], 40, "null");
+    check(&[Kind::Press], 0, "100");
+}
+
+#[test]
+fn since_of_another_run_gives_an_unknown_gap_and_all_that_is_held() {
+    let mut hub = hub();
+    hub.tell(press("a"));
+    let (id, _) = hub.join();
+    let since = Since {
+        run: "0ther".to_owned(),
+        seq: 900,
+    };
+    let subscription = Subscription {
+        since: Some(since),
+        ..Subscription::default()
+    };
+    hub.subscribe(id, &subscription).unwrap();
+    assert_eq!(hub.drain(id), ["gap:null", "press:1"]);
+}
+
+#[test]
+fn since_beyond_the_latest_number_is_refused() {
+    let mut hub = hub();
+    let (id, _) = hub.join();
+    let refused = hub.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(1)));
+    assert!(refused.unwrap_err().contains("at most 0"));
+}
+
+#[test]
+fn what_is_forgotten_during_a_slow_replay_is_counted() {
+    let mut hub = hub();
+    for _ in 0..HELD {
+        hub.tell(press("a"));
+    }
+    let (id, _) = hub.join();
+    hub.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(0)))
+        .unwrap();
+    assert_eq!(hub.take(id).len(), 64);
+    for _ in 0..74 {
+        hub.tell(press("a"));
+    }
+    let told = hub.drain(id);
+    assert_eq!(told[0], "gap:10");
+    assert_eq!(told[1..], numbers("press", 75..=HELD as u64 + 74));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_subscriber_that_waits_gets_a_line_without_asking_again() {
+    let hub = start(hub().hello);
+    let (id, hello) = hub.join().await.unwrap();
+    assert!(hello.starts_with(r#"{"type":"hello""#));
+    let lines = hub.take(id).await.unwrap();
+    hub.publish(vec![status("a"), press("a")], Duration::ZERO)
+        .await;
+    assert_eq!(lines.await.unwrap().len(), 2);
+    let last = hub.take(id).await.unwrap();
+    hub.close().await;
+    assert!(last.await.is_err());
+}

@@ -1,0 +1,473 @@
+//! The real binary on a real pty: readiness, verdicts, unplug and replug, signals, bad input.
+//!
+//! Bounds are those of the contract, taken from the daemon's own stamps where it has one. A busy
+//! machine may delay a process by more than a bound, so what is bounded is tried three times and
+//! must be kept once.
+
+use std::fs;
+use std::io::{BufRead, BufReader, Write};
+use std::os::unix::fs::PermissionsExt;
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::mpsc;
+use std::time::{Duration, Instant, SystemTime};
+
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::{Value, json};
+
+const BINARY: &str = env!("CARGO_BIN_EXE_hardnessd");
+
+/// How long anything may take before a test has failed: long, for a busy machine.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A directory with a port, a socket and a configuration.
+struct Bench {
+    directory: tempfile::TempDir,
+}
+
+impl Bench {
+    fn new() -> Self {
+        Self { directory: tempfile::tempdir().unwrap() }
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.directory.path().join(name)
+    }
+
+    /// Writes a configuration of one sensor at 20 frames/s, with `more` tables.
+    fn configure(&self, name: &str, socket: &str, more: &str) -> PathBuf {
+        let path = self.path(name);
+        let text = format!(
+            "robot = \"arm-7\"\n[[sensor]]\nname = \"forearm\"\nport = \"port\"\n\
+             frame_rate_hz = 20.0\n[publish.unix]\npath = \"{socket}\"\n{more}"
+        );
+        fs::write(&path, text).unwrap();
+        path
+    }
+
+    fn daemon(&self) -> Daemon {
+        Daemon::start(&self.configure("hardnessd.toml", "events.sock", ""))
+    }
+
+    fn subscriber(&self) -> Subscriber {
+        Subscriber::connect(&self.path("events.sock"))
+    }
+
+    /// A sensor at the port, hard enough to press that every press is one.
+    fn sensor(&self, more: &[&str]) -> Process {
+        let link = self.path("port");
+        // One that was killed has left its link, which tells nothing of the new one.
+        let _ = fs::remove_file(&link);
+        let mut command = Command::new(BINARY);
+        command.args(["simulate", "--fps", "20", "--force", "15", "--material", "hard-plastic"]);
+        command.arg("--link").arg(&link).args(more).stdout(Stdio::null()).stderr(Stdio::null());
+        let sensor = Process(command.spawn().unwrap());
+        wait_for("the port", || fs::read_link(&link).is_ok_and(|pty| pty.exists()));
+        sensor
+    }
+}
+
+/// A process that does not outlive its test.
+struct Process(Child);
+
+impl Process {
+    fn signal(&self, signal: Signal) {
+        let pid = Pid::from_raw(i32::try_from(self.0.id()).unwrap()).unwrap();
+        kill_process(pid, signal).unwrap();
+    }
+
+    fn exit_code(&mut self) -> Option<i32> {
+        let start = Instant::now();
+        loop {
+            if let Some(status) = self.0.try_wait().unwrap() {
+                return status.code();
+            }
+            assert!(start.elapsed() < PATIENCE, "the process does not end");
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// A running daemon and its log.
+struct Daemon {
+    process: Process,
+    log: mpsc::Receiver<String>,
+    heard: Vec<String>,
+}
+
+impl Daemon {
+    /// Starts one and waits until it serves.
+    fn start(config: &Path) -> Self {
+        let mut process = Process(
+            Command::new(BINARY)
+                .args(["run", "--config"])
+                .arg(config)
+                .env("RUST_LOG", "info")
+                .stderr(Stdio::piped())
+                .spawn()
+                .unwrap(),
+        );
+        let lines = BufReader::new(process.0.stderr.take().unwrap()).lines();
+        let (sender, log) = mpsc::channel();
+        std::thread::spawn(move || {
+            for line in lines.map_while(Result::ok) {
+                if sender.send(line).is_err() {
+                    return;
+                }
+            }
+        });
+        let mut daemon = Self { process, log, heard: Vec::new() };
+        daemon.logged("started");
+        daemon
+    }
+
+    /// Waits for a log line that contains `part`.
+    fn logged(&mut self, part: &str) -> String {
+        loop {
+            let line = self.log.recv_timeout(PATIENCE).unwrap_or_else(|_| {
+                panic!("{part:?} was not logged, but {:#?}", self.heard);
+            });
+            self.heard.push(line.clone());
+            if line.contains(part) {
+                return line;
+            }
+        }
+    }
+}
+
+/// A connection to the socket.
+struct Subscriber {
+    lines: BufReader<UnixStream>,
+}
+
+impl Subscriber {
+    fn connect(socket: &Path) -> Self {
+        let stream = UnixStream::connect(socket).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        Self { lines: BufReader::new(stream) }
+    }
+
+    fn say(&mut self, line: &str) {
+        self.lines.get_mut().write_all(format!("{line}\n").as_bytes()).unwrap();
+    }
+
+    /// The next line; `None`: closed.
+    fn next(&mut self) -> Option<Value> {
+        let mut line = String::new();
+        (self.lines.read_line(&mut line).unwrap() > 0)
+            .then(|| serde_json::from_str(&line).unwrap())
+    }
+
+    /// Reads until a line has all of `fields`.
+    fn until(&mut self, fields: &Value) -> Value {
+        let fields = fields.as_object().unwrap();
+        loop {
+            let line = self.next().unwrap_or_else(|| panic!("closed before {fields:?}"));
+            if fields.iter().all(|(key, value)| &line[key] == value) {
+                return line;
+            }
+        }
+    }
+}
+
+fn wait_for(what: &str, mut there: impl FnMut() -> bool) {
+    let start = Instant::now();
+    while !there() {
+        assert!(start.elapsed() < PATIENCE, "{what} does not come");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+fn time(event: &Value) -> jiff::Timestamp {
+    event["time"].as_str().unwrap().parse().unwrap()
+}
+
+fn hardnessd(arguments: &[&str]) -> Output {
+    Command::new(BINARY).args(arguments).output().unwrap()
+}
+
+/// The binary must fail so: this code, one line that has all these parts.
+fn fails(arguments: &[&str], code: i32, parts: &[&str]) {
+    let output = hardnessd(arguments);
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(code), "{arguments:?}: {stderr}");
+    assert_eq!(stderr.lines().count(), 1, "{stderr}");
+    for part in parts {
+        assert!(stderr.contains(part), "{part:?} not in {stderr:?}");
+    }
+}
+
+#[test]
+fn a_press_on_the_port_becomes_a_verdict_on_the_socket() {
+    let bench = Bench::new();
+    let mut daemon = bench.daemon();
+    let mut subscriber = bench.subscriber();
+    let hello = subscriber.next().unwrap();
+    assert_eq!(hello["type"], "hello");
+    assert_eq!(hello["protocol"], 1);
+    assert_eq!(hello["robot"], "arm-7");
+    assert_eq!(hello["sensors"][0]["name"], "forearm");
+    assert_eq!(hello["model"]["levels"].as_array().unwrap().len(), 4);
+    let status = subscriber.next().unwrap();
+    assert_eq!((&status["state"], &status["seq"]), (&json!("connecting"), &Value::Null));
+
+    let _sensor = bench.sensor(&["--presses", "1"]);
+    let begin = subscriber.until(&json!({"type": "press", "state": "begin"}));
+    let end = subscriber.until(&json!({"type": "press", "state": "end"}));
+    let verdict = subscriber.next().unwrap();
+    assert_eq!(verdict["type"], "hardness");
+    assert_eq!(verdict["phase"], "final");
+    assert_eq!((&begin["press"], &verdict["press"]), (&json!(1), &json!(1)));
+    assert_eq!(verdict["seq"].as_u64().unwrap(), end["seq"].as_u64().unwrap() + 1);
+    assert_eq!(verdict["state"], "live");
+    assert!(verdict["mono_ns"].as_u64().unwrap() > 0);
+    assert!(verdict["latency_us"].as_u64().unwrap() < 1_000_000);
+    // The chosen frame is older than the release that decided.
+    assert!(verdict["age_at_publish_ms"].as_f64().unwrap() > 50.0);
+    let line = daemon.logged("phase=\"final\"");
+    for field in ["sensor=", "press=1", "level=", "label=", "confidence=", "force_n=", "model="] {
+        assert!(line.contains(field), "{field} not in {line}");
+    }
+    subscriber.say(r#"{"get":"last","id":1}"#);
+    assert_eq!(subscriber.until(&json!({"phase": "final"})), verdict);
+    subscriber.until(&json!({"type": "ok", "id": 1}));
+}
+
+#[test]
+fn an_unplugged_sensor_is_lost_at_once_and_goes_on_counting_when_it_is_back() {
+    let bench = Bench::new();
+    let _daemon = bench.daemon();
+    let mut subscriber = bench.subscriber();
+    subscriber.say(r#"{"subscribe":["status","press","frame"]}"#);
+    let mut delays = Vec::new();
+    let mut frames = 0;
+    let mut presses = 0;
+    for _ in 0..3 {
+        let mut sensor = bench.sensor(&["--presses", "2"]);
+        let live = subscriber.until(&json!({"type": "status", "state": "live"}));
+        assert!(live["frames"].as_u64().unwrap() >= frames);
+        let press = subscriber.until(&json!({"type": "press", "state": "begin"}));
+        assert_eq!(press["press"], presses + 1);
+        assert!(press["frame"].as_u64().unwrap() > frames);
+        let unplugged = SystemTime::now();
+        sensor.0.kill().unwrap();
+        let lost = subscriber.until(&json!({"type": "status", "state": "lost"}));
+        subscriber.until(&json!({"type": "press", "state": "aborted", "reason": "lost"}));
+        delays.push(SystemTime::from(time(&lost)).duration_since(unplugged).unwrap());
+        frames = lost["frames"].as_u64().unwrap();
+        presses = press["press"].as_u64().unwrap();
+        sensor.exit_code();
+    }
+    let shortest = *delays.iter().min().unwrap();
+    assert!(shortest < Duration::from_millis(100), "lost after {delays:?}");
+}
+
+#[test]
+fn a_silent_sensor_is_stale_after_two_and_a_half_periods() {
+    let bench = Bench::new();
+    let script = bench.path("faults.toml");
+    let silence = |at_s: f64| format!("[[fault]]\nat_s = {at_s}\nkind = \"silence\"\nfor_s = 0.5\n");
+    fs::write(&script, [1.0, 2.0, 3.0].map(silence).concat()).unwrap();
+    let _daemon = bench.daemon();
+    let mut subscriber = bench.subscriber();
+    subscriber.say(r#"{"subscribe":["status","frame"]}"#);
+    let _sensor = bench.sensor(&["--faults", script.to_str().unwrap()]);
+    let mut last_frame = None;
+    let mut silences = Vec::new();
+    while silences.len() < 3 {
+        let event = subscriber.next().unwrap();
+        match (event["type"].as_str(), event["state"].as_str()) {
+            (Some("frame"), _) => last_frame = Some(time(&event)),
+            (_, Some("stale")) => {
+                let silence = time(&event).duration_since(last_frame.unwrap());
+                silences.push(Duration::try_from(silence).unwrap());
+            }
+            _ => {}
+        }
+    }
+    assert!(silences.iter().all(|silence| *silence >= Duration::from_millis(125)), "{silences:?}");
+    let shortest = *silences.iter().min().unwrap();
+    assert!(shortest <= Duration::from_millis(175), "stale after {silences:?}");
+}
+
+#[test]
+fn sigterm_aborts_the_press_in_hand_and_ends_within_a_second() {
+    let bench = Bench::new();
+    let _sensor = bench.sensor(&[]);
+    let mut shortest = PATIENCE;
+    for signal in [Signal::TERM, Signal::INT, Signal::TERM] {
+        let mut daemon = bench.daemon();
+        let mut subscriber = bench.subscriber();
+        // One that never reads must not keep the daemon.
+        let _deaf = bench.subscriber();
+        subscriber.until(&json!({"type": "press", "state": "begin"}));
+        let start = Instant::now();
+        daemon.process.signal(signal);
+        let aborted = subscriber.until(&json!({"type": "press", "state": "aborted"}));
+        assert_eq!(aborted["reason"], "shutdown");
+        while subscriber.next().is_some() {}
+        assert_eq!(daemon.process.exit_code(), Some(0));
+        shortest = shortest.min(start.elapsed());
+        assert!(!bench.path("events.sock").exists(), "the socket's file stayed behind");
+    }
+    assert!(shortest < Duration::from_secs(1), "took {shortest:?}");
+}
+
+#[test]
+fn sighup_changes_all_or_nothing() {
+    let bench = Bench::new();
+    let mut daemon = bench.daemon();
+    let _sensor = bench.sensor(&[]);
+    let mut subscriber = bench.subscriber();
+    let reload = |daemon: &mut Daemon, more: &str, answer: &str| {
+        bench.configure("hardnessd.toml", "events.sock", more);
+        daemon.process.signal(Signal::HUP);
+        daemon.logged(answer)
+    };
+    let rejected = |subscriber: &mut Subscriber| {
+        subscriber.until(&json!({"phase": "final"}))["rejected"].clone()
+    };
+    assert_eq!(rejected(&mut subscriber), Value::Null);
+    let low = "[model]\nmin_force_n = 900.0\n";
+    reload(&mut daemon, low, "reloaded");
+    subscriber.until(&json!({"state": "begin"}));
+    assert_eq!(rejected(&mut subscriber), "low_force");
+    // Neither of these may take effect, not even in part.
+    let line = reload(&mut daemon, "[model]\nmin_force = 0.0\n", "refused");
+    assert!(line.contains("min_force") && line.contains("ERROR"), "{line}");
+    let line = reload(&mut daemon, "max_clients = 7\n[model]\nmin_force_n = 0.0\n", "refused");
+    assert!(line.contains("publish.unix.max_clients"), "{line}");
+    subscriber.until(&json!({"state": "begin"}));
+    assert_eq!(rejected(&mut subscriber), "low_force");
+    reload(&mut daemon, "[log]\nformat = \"json\"\n", "reloaded");
+    subscriber.until(&json!({"state": "begin"}));
+    assert_eq!(rejected(&mut subscriber), Value::Null);
+    let line = daemon.logged("\"phase\":\"final\"");
+    let line: Value = serde_json::from_str(&line).unwrap();
+    assert_eq!(line["sensor"], "forearm");
+}
+
+#[test]
+fn a_stale_socket_is_replaced_and_a_live_one_is_not_stolen() {
+    let bench = Bench::new();
+    let socket = bench.path("events.sock");
+    drop(UnixListener::bind(&socket).unwrap());
+    let _daemon = bench.daemon();
+    assert_eq!(fs::metadata(&socket).unwrap().permissions().mode() & 0o777, 0o660);
+    let config = bench.path("hardnessd.toml");
+    let arguments = ["run", "--config", config.to_str().unwrap()];
+    fails(&arguments, 74, &["events.sock", "in use"]);
+    assert_eq!(bench.subscriber().next().unwrap()["type"], "hello");
+
+    let file = bench.path("precious");
+    fs::write(&file, "kept").unwrap();
+    let config = bench.configure("other.toml", "precious", "");
+    fails(&["run", "--config", config.to_str().unwrap()], 78, &["precious", "no socket"]);
+    assert_eq!(fs::read_to_string(file).unwrap(), "kept");
+}
+
+#[test]
+fn a_port_held_by_another_process_is_named_as_such_and_logged_once() {
+    let bench = Bench::new();
+    let _sensor = bench.sensor(&[]);
+    let _holder = bench.daemon();
+    bench.subscriber().until(&json!({"state": "live"}));
+    let mut second = Daemon::start(&bench.configure("second.toml", "second.sock", ""));
+    let mut subscriber = Subscriber::connect(&bench.path("second.sock"));
+    let held = json!({"state": "connecting", "reason": "port held by another process"});
+    subscriber.until(&held);
+    // Some tries later nothing has been added.
+    std::thread::sleep(Duration::from_millis(700));
+    second.process.signal(Signal::TERM);
+    second.logged("stopping");
+    let lines = second.heard.iter().filter(|line| line.contains("held by another")).count();
+    assert_eq!(lines, 1, "{:#?}", second.heard);
+}
+
+#[test]
+fn a_subscriber_is_told_what_is_wrong_and_harms_nobody() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "events.sock", "max_clients = 3\n");
+    let _daemon = Daemon::start(&config);
+    let mut first = bench.subscriber();
+    first.until(&json!({"type": "status"}));
+    for line in [r#"{"subscribe":["touch"],"id":7}"#, r#"{"tare":"forearm","id":7}"#] {
+        first.say(line);
+        assert_eq!(first.next().unwrap()["type"], "error");
+    }
+    first.say("\u{0}\u{1}{{{");
+    assert_eq!(first.next().unwrap()["id"], Value::Null);
+    first.say(r#"{"get":"status","id":{"mine":1}}"#);
+    assert_eq!(first.next().unwrap()["state"], "connecting");
+    assert_eq!(first.next().unwrap(), json!({"type": "ok", "id": {"mine": 1}}));
+
+    let mut long = bench.subscriber();
+    long.until(&json!({"type": "status"}));
+    long.say(&"x".repeat(70_000));
+    assert_eq!(long.next().unwrap()["type"], "error");
+    // Closed, perhaps with a reset: what it sent last was never read.
+    assert!(long.lines.read_line(&mut String::new()).unwrap_or(0) == 0);
+
+    let mut half = bench.subscriber();
+    half.until(&json!({"type": "status"}));
+    half.lines.get_mut().write_all(br#"{"subscribe":["#).unwrap();
+    wait_for("room for a third", || {
+        bench.subscriber().next().is_some_and(|line| line["type"] == "hello")
+    });
+    let _third = bench.subscriber();
+    wait_for("a refusal", || {
+        let mut fourth = bench.subscriber();
+        fourth.next().is_some_and(|line| line["type"] == "error") && fourth.next().is_none()
+    });
+    first.say(r#"{"get":"last"}"#);
+    assert_eq!(first.next().unwrap(), json!({"type": "ok"}));
+}
+
+#[test]
+fn bad_input_ends_with_its_exit_code_and_one_line() {
+    let bench = Bench::new();
+    let written = |more: &str| {
+        let path = bench.configure("bad.toml", "bad.sock", more);
+        path.to_str().unwrap().to_owned()
+    };
+    fails(&["run", "--config", "/no/such.toml"], 66, &["/no/such.toml"]);
+    let config = written("[press]\nend_framse = 2\n");
+    fails(&["run", "--config", &config], 78, &["bad.toml", "end_framse", "end_frames"]);
+    let config = written("[model]\npath = \"none.onnx\"\n");
+    fails(&["run", "--config", &config], 78, &["none.onnx", "model.path"]);
+    fs::write(bench.path("junk.onnx"), "no model").unwrap();
+    let config = written("[model]\npath = \"junk.onnx\"\n");
+    fails(&["run", "--config", &config], 78, &["junk.onnx"]);
+    let config = written("[http]\nlisten = \"127.0.0.1:8256\"\n");
+    fails(&["check", "--config", &config], 78, &["http", "not in this version"]);
+    // 20 frames/s of 790 bytes are more than 115,200 baud, and nothing is known of this port.
+    let config = written("");
+    fails(&["check", "--config", &config], 78, &["frame_rate_hz", "14.58"]);
+    fails(&["replay", "/no/such.bin"], 66, &["/no/such.bin"]);
+    fails(&["simulate", "--fps", "20", "--baud", "115200"], 2, &["--baud", "158000"]);
+    assert_eq!(hardnessd(&["run"]).status.code(), Some(2));
+    assert_eq!(hardnessd(&["--version"]).status.code(), Some(0));
+}
+
+#[test]
+fn a_demonstration_shows_each_press_and_ends() {
+    let output = hardnessd(&["demo", "--presses", "2", "--seed", "1", "--speed", "4"]);
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(0), "{stderr}");
+    let lines = String::from_utf8(output.stdout).unwrap();
+    let events: Vec<Value> =
+        lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(events[0]["type"], "hello");
+    let finals = events.iter().filter(|event| event["phase"] == "final").count();
+    assert_eq!(finals, 2, "{lines}");
+    let numbers: Vec<u64> = events.iter().filter_map(|event| event["seq"].as_u64()).collect();
+    assert!(numbers.windows(2).all(|pair| pair[1] == pair[0] + 1));
+}
