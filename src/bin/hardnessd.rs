@@ -167,7 +167,7 @@ fn exit_code(error: &anyhow::Error) -> u8 {
             simulate::Error::Faults(error) if error.is_unreadable() => exit::NO_INPUT,
             simulate::Error::Faults(_) => exit::FAILED,
             simulate::Error::Layout(_) | simulate::Error::Baud { .. } => exit::USAGE,
-            simulate::Error::Pty { .. } => exit::IO,
+            simulate::Error::Recording { .. } | simulate::Error::Pty { .. } => exit::IO,
         };
     }
     if let Some(error) = error.downcast_ref::<replay::Error>() {

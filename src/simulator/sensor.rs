@@ -168,9 +168,6 @@ impl Sensor {
         for (k, counts) in raw.counts.iter_mut().enumerate() {
             let (row, column) = (k / COLS, k % COLS);
             let own = forces_n[k];
-            if rows[row] == 0.0 && columns[column] == 0.0 {
-                continue;
-            }
             let mut near = 0.0;
             if row > 0 {
                 near += forces_n[k - COLS];
@@ -184,11 +181,14 @@ impl Sensor {
             if column + 1 < COLS {
                 near += forces_n[k + 1];
             }
-            let line = rows[row] + columns[column] - 2.0 * own;
-            let felt = own + CROSSTALK_NEIGHBOUR * near + CROSSTALK_LINE * line;
-            if felt <= self.threshold_n[k] {
+            // What comes through the cover can close a taxel; what comes along the lines cannot,
+            // and an open taxel reads nothing. Else 25 N on one point would draw a cross.
+            let pressed = own + CROSSTALK_NEIGHBOUR * near;
+            if pressed <= self.threshold_n[k] {
                 continue;
             }
+            let line = rows[row] + columns[column] - 2.0 * own;
+            let felt = pressed + CROSSTALK_LINE * line;
             let ratio = 1.0 + (NOISE_RATIO * noise.normal()) as f32;
             let read = felt * self.gain[k] * press_gain * ratio
                 + if self.gain[k] > 0.0 {
@@ -361,6 +361,23 @@ mod tests {
             (0.97..1.25).contains(&(read / (0.1 * force))),
             "{read} N of {} N",
             0.1 * force
+        );
+    }
+
+    #[test]
+    fn a_point_load_draws_no_cross() {
+        let mut forces = [0.0; TAXELS];
+        forces[14 * COLS + 14] = 25.0;
+        let sensor = Sensor::new(
+            SensorProfile::Raw,
+            Threshold::None,
+            &Stream::new(6, "sensor"),
+        );
+        let raw = sensor.read(&forces, 1.0, &mut Stream::new(6, "noise"));
+        assert_eq!(
+            raw.counts.iter().filter(|&&counts| counts > 0).count(),
+            5,
+            "itself and four"
         );
     }
 

@@ -1,16 +1,18 @@
-//! `hardnessd simulate`: only the sensor, at a pty.
+//! `hardnessd simulate`: only the sensor, at a pty or into a recording.
 
+use std::fs::File;
 use std::future::Future;
-use std::path::PathBuf;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
 use serde::Deserialize;
 use serde::de::IntoDeserializer;
 use serde::de::value::Error as NameError;
 
-use super::faults::{self, Faults};
+use super::faults::{self, Faults, Line};
 use super::player::{BITS_A_BYTE, Pace, Player};
-use crate::simulator::{Material, SequenceSettings};
+use crate::simulator::{Material, Sequence, SequenceSettings};
 use crate::wire::{Layout, LayoutError, Preset, Settings as Frame};
 
 /// Arguments of `simulate`.
@@ -20,6 +22,9 @@ pub struct Args {
     /// Symbolic link to keep at the pty; an old link is replaced
     #[arg(long, value_name = "PATH")]
     link: Option<PathBuf>,
+    /// Write what the sensor sends to this .bin file instead, as fast as it goes
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["link", "speed", "baud"], requires = "presses")]
+    to: Option<PathBuf>,
     /// Layout of a frame
     #[arg(long, value_name = "P", default_value = "jx255n", value_parser = preset)]
     preset: Preset,
@@ -72,6 +77,14 @@ pub enum Error {
         /// Of a frame.
         bytes: usize,
     },
+    /// The recording cannot be written.
+    #[error("{path}: {source}")]
+    Recording {
+        /// Of the recording.
+        path: PathBuf,
+        /// Why not.
+        source: std::io::Error,
+    },
     /// The pty, or its link.
     #[error("{what}: {source}")]
     Pty {
@@ -92,11 +105,17 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         preset: args.preset,
         ..Frame::default()
     })?;
-    let baud = baud(&args, layout.max_frame_bytes())?;
     let faults = match &args.faults {
         Some(path) => Faults::load(path, args.seed)?,
         None => Faults::none(),
     };
+    if let Some(path) = &args.to {
+        return record(path, &layout, sequence(&args), faults).map_err(|source| Error::Recording {
+            path: path.clone(),
+            source,
+        });
+    }
+    let baud = baud(&args, layout.max_frame_bytes())?;
     let what = args
         .link
         .as_ref()
@@ -110,22 +129,46 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let line = format!("{}\n", player.path().display());
     // Nobody may want to know the path: the link says it too.
     super::print(line.as_bytes()).map_err(failed)?;
-    let settings = SequenceSettings {
+    let settings = sequence(&args);
+    tokio::select! {
+        played = player.play(settings) => played.map_err(failed),
+        () = shutdown => Ok(()),
+    }
+}
+
+fn sequence(args: &Args) -> SequenceSettings {
+    SequenceSettings {
         seed: args.seed,
         frame_rate_hz: args.fps,
         materials: if args.materials.is_empty() {
             Material::ALL.to_vec()
         } else {
-            args.materials
+            args.materials.clone()
         },
         force_n: args.force.map(|force| force as f32),
         presses: args.presses,
         ..SequenceSettings::default()
-    };
-    tokio::select! {
-        played = player.play(settings) => played.map_err(failed),
-        () = shutdown => Ok(()),
     }
+}
+
+/// The bytes a sensor sends, back to back. While it is silent or unplugged it sends none.
+fn record(
+    path: &Path,
+    layout: &Layout,
+    settings: SequenceSettings,
+    mut faults: Faults,
+) -> std::io::Result<()> {
+    let mut recording = BufWriter::new(File::create(path)?);
+    let frame_rate_hz = settings.frame_rate_hz;
+    let mut bytes = Vec::with_capacity(layout.max_frame_bytes());
+    for (index, frame) in (0_u32..).zip(Sequence::new(settings)) {
+        bytes.clear();
+        layout.encode(&frame.raw, &mut bytes);
+        if faults.strike(f64::from(index) / frame_rate_hz, &mut bytes) == Line::Up {
+            recording.write_all(&bytes)?;
+        }
+    }
+    recording.into_inner()?.sync_all()
 }
 
 /// The rate of the line: as given, if it carries the frames; else the first usual one that does,

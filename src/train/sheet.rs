@@ -27,7 +27,7 @@ const SCALE_N: (f32, f32) = (0.04, 10.2);
 const BACKGROUND: [u8; 3] = [250, 250, 250];
 const INK: [u8; 3] = [30, 30, 30];
 
-/// Draws up to twelve samples of each material, spread over its presses, and up to twelve frames
+/// Draws up to twelve samples of each material, from the lightest press to the hardest, and up to twelve frames
 /// of each sequence, spread over its first press. Frames of a sequence are taken as of a zero
 /// baseline.
 ///
@@ -48,11 +48,12 @@ pub fn sheet(
     );
     let mut top = HEAD;
     for material in Material::ALL {
-        let of_material: Vec<&LabelledSample> = samples
+        let mut of_material: Vec<&LabelledSample> = samples
             .iter()
             .filter(|sample| sample.material == material.index())
             .collect();
         canvas.name(top, material);
+        of_material.sort_by(|a, b| a.force_n.total_cmp(&b.force_n));
         for (tile, sample) in spread(&of_material).enumerate() {
             let peak = sample.frame.newtons.iter().copied().fold(0.0, f32::max);
             let area = sample.frame.contact_area_taxels(0.07);
@@ -295,7 +296,7 @@ mod tests {
             ("matched.png", Shapes::Matched),
             ("paper.png", Shapes::Paper),
         ] {
-            let bytes = sheet(&small(shapes, 12, 7), &sequences).unwrap();
+            let bytes = sheet(&small(shapes, 4, 48), &sequences).unwrap();
             std::fs::write(directory.join(name), bytes).unwrap();
         }
     }

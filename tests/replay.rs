@@ -1,0 +1,160 @@
+//! Recorded bytes give exactly the expected events, whatever the pace and the chunks.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::Arc;
+
+use hardnessd::event::Event;
+use hardnessd::frame::Stamp;
+use hardnessd::pipeline::{Clock, Judgement, Pipeline, Settings};
+use hardnessd::verdict::{BUILT_IN, Hrn};
+use hardnessd::{press, tare, wire};
+use serde_json::Value;
+
+fn fixtures() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures")
+}
+
+/// Every recording, with the configuration named by its rate and its golden events.
+fn recordings() -> Vec<(PathBuf, PathBuf, PathBuf)> {
+    let mut found: Vec<_> = std::fs::read_dir(fixtures())
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.extension().is_some_and(|extension| extension == "bin"))
+        .map(|path| {
+            let rate = Path::new(path.file_stem().unwrap()).extension().unwrap();
+            let config = fixtures().join(rate).with_extension("toml");
+            let golden = path.with_extension("jsonl");
+            (path, config, golden)
+        })
+        .collect();
+    found.sort();
+    found
+}
+
+fn replay(recording: &Path, more: &[&str]) -> String {
+    let output = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
+        .arg("replay")
+        .arg(recording)
+        .args(more)
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{recording:?}: {output:?}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// Equal but for probabilities, which another machine may give 1e-4 apart.
+fn assert_same(found: &str, golden: &str, recording: &Path) {
+    let events = |text: &str| -> Vec<Value> {
+        text.lines()
+            .map(|line| serde_json::from_str(line).unwrap())
+            .collect()
+    };
+    let (mut found, mut golden) = (events(found), events(golden));
+    assert_eq!(found.len(), golden.len(), "{recording:?}");
+    for (found, golden) in found.iter_mut().zip(&mut golden) {
+        for key in ["probabilities", "confidence"] {
+            let numbers = |event: &mut Value| -> Vec<f64> {
+                match event.as_object_mut().unwrap().remove(key) {
+                    Some(Value::Array(numbers)) => numbers
+                        .iter()
+                        .map(|number| number.as_f64().unwrap())
+                        .collect(),
+                    Some(number) => vec![number.as_f64().unwrap()],
+                    None => vec![],
+                }
+            };
+            let (found, golden) = (numbers(found), numbers(golden));
+            assert_eq!(found.len(), golden.len());
+            for (found, golden) in found.iter().zip(golden) {
+                assert!(
+                    (found - golden).abs() <= 1e-4,
+                    "{recording:?}: {found} for {golden}"
+                );
+            }
+        }
+        assert_eq!(found, golden, "{recording:?}");
+    }
+}
+
+#[test]
+fn recordings_give_their_golden_events_twice_the_same() {
+    let recordings = recordings();
+    assert!(
+        recordings.len() >= 13,
+        "found {} recordings",
+        recordings.len()
+    );
+    for (recording, config, golden) in recordings {
+        let config = config.to_str().unwrap();
+        let events = replay(&recording, &["--config", config]);
+        assert_eq!(
+            events,
+            replay(&recording, &["--config", config]),
+            "{recording:?}"
+        );
+        assert_same(
+            &events,
+            &std::fs::read_to_string(golden).unwrap(),
+            &recording,
+        );
+    }
+}
+
+#[test]
+fn the_pace_of_a_replay_does_not_show() {
+    let recording = fixtures().join("flip.5hz.bin");
+    assert_eq!(
+        replay(&recording, &[]),
+        replay(&recording, &["--speed", "50"])
+    );
+}
+
+fn pipeline() -> Pipeline {
+    Pipeline::new(
+        Settings {
+            sensor: "sensor".to_owned(),
+            frame_rate_hz: 5.0,
+            layout: wire::Layout::new(&wire::Settings::default()).unwrap(),
+            judgement: Judgement {
+                calibration: tare::Settings::default(),
+                press: press::Settings::default(),
+                min_confidence: 0.0,
+                min_force_n: 0.0,
+                hrn: Arc::new(Hrn::load(BUILT_IN).unwrap()),
+            },
+        },
+        Clock::FrameRate,
+    )
+}
+
+fn events<'a>(chunks: impl Iterator<Item = &'a [u8]>) -> Vec<Event> {
+    let at = Stamp {
+        mono: std::time::Duration::ZERO,
+        wall: jiff::Timestamp::UNIX_EPOCH,
+    };
+    let mut pipeline = pipeline();
+    let mut events = Vec::new();
+    for chunk in chunks {
+        events.extend(pipeline.push(chunk, at));
+    }
+    events.extend(pipeline.end_of_recording(None));
+    events
+}
+
+#[test]
+fn bytes_one_at_a_time_or_split_anywhere_give_the_same_events() {
+    let bytes = std::fs::read(fixtures().join("drop-bytes.5hz.bin")).unwrap();
+    let expected = events(std::iter::once(bytes.as_slice()));
+    assert!(
+        expected
+            .iter()
+            .any(|event| matches!(event, Event::Hardness(_)))
+    );
+    assert_eq!(events(bytes.chunks(1)), expected);
+    // One frame and a bit around the damage, cut at every byte.
+    for at in 790 * 17..790 * 18 + 20 {
+        let (head, tail) = bytes.split_at(at);
+        assert_eq!(events([head, tail].into_iter()), expected, "split at {at}");
+    }
+}
