@@ -7,13 +7,17 @@ use std::time::Instant;
 use anyhow::Context as _;
 use burn::tensor::Device;
 use clap::{Parser, Subcommand, ValueEnum};
-use hardnessd::simulator::{self, DatasetSettings, Material, SensorProfile, Shapes, Split};
+use hardnessd::frame::RawFrame;
+use hardnessd::simulator::{
+    self, DatasetSettings, Material, SensorProfile, Sequence, SequenceSettings, Shapes, Split,
+};
 use hardnessd::train::dataset::{self, Dataset, DatasetError, SIMULATOR, Sample};
 use hardnessd::train::export;
 use hardnessd::train::methods::{self, Method};
 use hardnessd::train::metrics::Evaluation;
 use hardnessd::train::run::{Description, Run, write_whole};
 use hardnessd::train::settings::{Profile, Settings, SettingsError};
+use hardnessd::train::sheet;
 use hardnessd::verdict::{Hrn, ModelError};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
@@ -75,6 +79,9 @@ struct Simulate {
     /// Spread of the sensor's taxels: clean or raw
     #[arg(long, default_value = "clean")]
     sensor_profile: SensorProfile,
+    /// Also draw samples of every material and a press of every level
+    #[arg(long, value_name = "S.png")]
+    sheet: Option<PathBuf>,
 }
 
 #[derive(Debug, clap::Args)]
@@ -208,6 +215,12 @@ fn simulate(arguments: &Simulate) -> anyhow::Result<()> {
     bar.finish_and_clear();
     let seconds = begun.elapsed().as_secs_f64();
 
+    if let Some(path) = &arguments.sheet {
+        write_whole(
+            path,
+            &sheet::sheet(&samples, &one_press_a_level(&settings))?,
+        )?;
+    }
     let meta = json!({
         "materials": Material::ALL.map(Material::name),
         "levels": dataset::levels(),
@@ -225,6 +238,22 @@ fn simulate(arguments: &Simulate) -> anyhow::Result<()> {
         samples.len() as f64 / seconds
     );
     Ok(())
+}
+
+/// The training materials' presses as the sensor sees them over time.
+fn one_press_a_level(settings: &DatasetSettings) -> Vec<(Material, Vec<RawFrame>)> {
+    let press_of = |material| {
+        let sequence = Sequence::new(SequenceSettings {
+            seed: settings.seed,
+            materials: vec![material],
+            presses: Some(1),
+            shapes: settings.shapes,
+            profile: settings.profile,
+            ..SequenceSettings::default()
+        });
+        (material, sequence.map(|frame| frame.raw).collect())
+    };
+    Material::ALL[..4].iter().copied().map(press_of).collect()
 }
 
 fn train(arguments: &Train) -> anyhow::Result<()> {

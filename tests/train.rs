@@ -1,0 +1,308 @@
+//! The trainer's binary on tiny data: it learns, resumes exactly, and its files are usable.
+#![cfg(feature = "train")]
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::OnceLock;
+
+use hardnessd::verdict::Hrn;
+use serde_json::Value;
+
+fn hrn_train(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_hrn-train"))
+        .args(arguments)
+        .output()
+        .expect("cargo built the binary")
+}
+
+fn succeed(arguments: &[&str]) -> String {
+    let output = hrn_train(arguments);
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{arguments:?}: {errors}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// A directory for the whole process, and a small data set of rigid and soft objects in it.
+fn data() -> &'static (tempfile::TempDir, PathBuf) {
+    static DATA: OnceLock<(tempfile::TempDir, PathBuf)> = OnceLock::new();
+    DATA.get_or_init(|| {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("tiny.npz");
+        let out = path.to_str().unwrap();
+        succeed(&[
+            "simulate",
+            "--out",
+            out,
+            "--seed",
+            "5",
+            "--objects",
+            "4",
+            "--test-objects",
+            "1",
+            "--presses",
+            "10",
+            "--lowest-force",
+            "5",
+            "--shapes",
+            "paper",
+        ]);
+        (directory, path)
+    })
+}
+
+/// Adam on small batches: enough steps in two epochs to learn something.
+const SETTINGS: &str = "
+    epochs = 6
+    batch = 16
+    averaging = 0.9
+    checkpoint_every_epochs = 1
+    [optimiser]
+    rule = \"adam\"
+    learning_rate = 0.005
+    schedule = \"cosine\"
+    [augmentation]
+    symmetries = true
+    shift_taxels = 2
+    [validation]
+    share = 0.25
+    every_epochs = 2
+    keep = \"best\"
+";
+
+struct Trial {
+    out: PathBuf,
+    config: PathBuf,
+}
+
+impl Trial {
+    fn new(name: &str) -> Self {
+        let directory = data().0.path();
+        let config = directory.join("settings.toml");
+        std::fs::write(&config, SETTINGS).unwrap();
+        Self {
+            out: directory.join(name),
+            config,
+        }
+    }
+
+    fn arguments(&self, seed: &'static str) -> Vec<String> {
+        let mut arguments: Vec<String> = [
+            "train",
+            "--method",
+            "hrn100",
+            "--profile",
+            "smoke",
+            "--seed",
+            seed,
+        ]
+        .map(str::to_owned)
+        .to_vec();
+        for (flag, path) in [
+            ("--data", &data().1),
+            ("--out", &self.out),
+            ("--config", &self.config),
+        ] {
+            arguments.extend([flag.to_owned(), path.to_str().unwrap().to_owned()]);
+        }
+        arguments
+    }
+
+    fn train(&self, seed: &'static str, more: &[&str]) -> String {
+        let arguments = self.arguments(seed);
+        let all: Vec<&str> = arguments
+            .iter()
+            .map(String::as_str)
+            .chain(more.iter().copied())
+            .collect();
+        succeed(&all)
+    }
+
+    fn read(&self, name: &str) -> Vec<u8> {
+        std::fs::read(self.out.join(name)).unwrap()
+    }
+
+    fn newest_checkpoint(&self) -> Vec<u8> {
+        let mut paths: Vec<PathBuf> = std::fs::read_dir(self.out.join("checkpoints"))
+            .unwrap()
+            .map(|entry| entry.unwrap().path())
+            .collect();
+        paths.sort();
+        std::fs::read(paths.last().unwrap()).unwrap()
+    }
+}
+
+#[test]
+fn a_run_learns_and_leaves_what_it_promises() {
+    let trial = Trial::new("whole");
+    trial.train("1", &[]);
+
+    let metrics = String::from_utf8(trial.read("metrics.csv")).unwrap();
+    let losses: Vec<f64> = metrics
+        .lines()
+        .skip(1)
+        .map(|row| row.split(',').nth(3).unwrap().parse().unwrap())
+        .collect();
+    assert_eq!(losses.len(), 6, "{metrics}");
+    assert!(
+        losses[5] < 0.8 * losses[0],
+        "the loss should fall: {losses:?}"
+    );
+
+    let hrn = Hrn::load(&trial.read("hrn.onnx")).unwrap();
+    assert_eq!(hrn.card().method, "hrn100");
+    assert_eq!(hrn.card().validation, "simulated data only");
+    assert!(
+        hrn.card().data.contains("\"seed\":5"),
+        "{}",
+        hrn.card().data
+    );
+    for name in ["settings.toml", "revision", "evaluation.json"] {
+        assert!(!trial.read(name).is_empty(), "{name}");
+    }
+
+    // What `evaluate` measures on an exported copy is what the run wrote down.
+    let (copy, data) = (trial.out.join("copy.onnx"), data().1.to_str().unwrap());
+    let copy = copy.to_str().unwrap();
+    succeed(&["export", trial.out.to_str().unwrap(), "--out", copy]);
+    assert_eq!(std::fs::read(copy).unwrap(), trial.read("hrn.onnx"));
+    let printed = succeed(&["evaluate", "--model", copy, "--data", data, "--json"]);
+    let printed: Value = serde_json::from_str(&printed).unwrap();
+    let written: Value = serde_json::from_slice(&trial.read("evaluation.json")).unwrap();
+    assert_eq!(printed, written);
+    assert_eq!(printed["n"], 40);
+    assert!(succeed(&["inspect", copy]).contains("simulated data only"));
+}
+
+#[test]
+fn a_killed_run_resumes_to_the_same_weights_bit_for_bit() {
+    let whole = Trial::new("uninterrupted");
+    whole.train("2", &[]);
+
+    let killed = Trial::new("killed");
+    let mut process = Command::new(env!("CARGO_BIN_EXE_hrn-train"))
+        .args(killed.arguments("2"))
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    // As soon as the second checkpoint stands, wherever the process then is.
+    let second = |directory: &Path| std::fs::read_dir(directory).is_ok_and(|all| all.count() >= 2);
+    while !second(&killed.out.join("checkpoints")) {
+        assert!(
+            process.try_wait().unwrap().is_none(),
+            "ended before it could be killed"
+        );
+        std::thread::yield_now();
+    }
+    process.kill().unwrap();
+    process.wait().unwrap();
+    assert!(!killed.out.join("hrn.onnx").exists());
+
+    killed.train("2", &["--resume"]);
+    assert!(
+        killed.newest_checkpoint() == whole.newest_checkpoint(),
+        "checkpoints differ"
+    );
+    assert!(
+        killed.read("hrn.onnx") == whole.read("hrn.onnx"),
+        "models differ"
+    );
+}
+
+#[test]
+fn another_seed_gives_other_weights_and_a_run_is_not_overwritten() {
+    let (first, other) = (Trial::new("seed 3"), Trial::new("seed 4"));
+    first.train("3", &[]);
+    other.train("4", &[]);
+    assert!(first.read("hrn.onnx") != other.read("hrn.onnx"));
+
+    let again = hrn_train(
+        &first
+            .arguments("3")
+            .iter()
+            .map(String::as_str)
+            .collect::<Vec<_>>(),
+    );
+    assert_eq!(again.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&again.stderr).contains("--resume goes on with it"));
+    let mut otherwise = first.arguments("5");
+    otherwise.push("--resume".to_owned());
+    let otherwise = hrn_train(&otherwise.iter().map(String::as_str).collect::<Vec<_>>());
+    assert_eq!(
+        otherwise.status.code(),
+        Some(1),
+        "resumed with another seed"
+    );
+}
+
+#[test]
+fn the_baseline_is_a_model_like_any_other() {
+    let out = data().0.path().join("features");
+    let (out, data) = (out.to_str().unwrap(), data().1.to_str().unwrap());
+    succeed(&[
+        "train", "--method", "features", "--data", data, "--out", out,
+    ]);
+    let model = Path::new(out).join("hrn.onnx");
+    assert_eq!(
+        Hrn::load(&std::fs::read(&model).unwrap())
+            .unwrap()
+            .card()
+            .method,
+        "features"
+    );
+    let model = model.to_str().unwrap();
+    let train = [
+        "evaluate", "--model", model, "--data", data, "--split", "train", "--json",
+    ];
+    let evaluation: Value = serde_json::from_str(&succeed(&train)).unwrap();
+    let accuracy = evaluation["accuracy"].as_f64().unwrap();
+    assert!(accuracy > 0.7, "on what it was fitted to: {accuracy}");
+}
+
+#[test]
+fn bad_input_has_its_exit_code_and_one_line() {
+    let path = |name: &str| data().0.path().join(name).to_str().unwrap().to_owned();
+    let (data, missing, text, out) = (
+        path("tiny.npz"),
+        path("missing"),
+        path("text.toml"),
+        path("refused"),
+    );
+    std::fs::write(&text, "epoch = 3\n").unwrap();
+    let train = |more: &[&str]| {
+        let mut arguments = vec!["train", "--method", "hrn100", "--out", &out];
+        arguments.extend(more);
+        hrn_train(&arguments)
+    };
+    let cases = [
+        (train(&["--data", &missing]), 66, "missing"),
+        (train(&["--data", &text]), 1, "not an .npz file"),
+        (
+            train(&["--data", &data, "--config", &missing]),
+            66,
+            "missing",
+        ),
+        (
+            train(&["--data", &data, "--config", &text]),
+            78,
+            "unknown field `epoch`",
+        ),
+        (hrn_train(&["inspect", &text]), 78, "not an ONNX model"),
+        (hrn_train(&["inspect", &missing]), 66, "missing"),
+        (
+            hrn_train(&["evaluate", "--model", &text, "--data", &data]),
+            78,
+            "not an ONNX model",
+        ),
+        (hrn_train(&["train", "--method", "alchemy"]), 2, "alchemy"),
+        (
+            hrn_train(&["simulate", "--presses", "1", "--out", "/dev/null/no"]),
+            74,
+            "/dev/null/no",
+        ),
+    ];
+    for (output, code, expected) in cases {
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(code), "{error}");
+        assert!(error.contains(expected), "{error}");
+    }
+}
