@@ -28,7 +28,9 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
-        Self { directory: tempfile::tempdir().unwrap() }
+        Self {
+            directory: tempfile::tempdir().unwrap(),
+        }
     }
 
     fn path(&self, name: &str) -> PathBuf {
@@ -60,10 +62,25 @@ impl Bench {
         // One that was killed has left its link, which tells nothing of the new one.
         let _ = fs::remove_file(&link);
         let mut command = Command::new(BINARY);
-        command.args(["simulate", "--fps", "20", "--force", "15", "--material", "hard-plastic"]);
-        command.arg("--link").arg(&link).args(more).stdout(Stdio::null()).stderr(Stdio::null());
+        command.args([
+            "simulate",
+            "--fps",
+            "20",
+            "--force",
+            "15",
+            "--material",
+            "hard-plastic",
+        ]);
+        command
+            .arg("--link")
+            .arg(&link)
+            .args(more)
+            .stdout(Stdio::null())
+            .stderr(Stdio::null());
         let sensor = Process(command.spawn().unwrap());
-        wait_for("the port", || fs::read_link(&link).is_ok_and(|pty| pty.exists()));
+        wait_for("the port", || {
+            fs::read_link(&link).is_ok_and(|pty| pty.exists())
+        });
         sensor
     }
 }
@@ -124,7 +141,11 @@ impl Daemon {
                 }
             }
         });
-        let mut daemon = Self { process, log, heard: Vec::new() };
+        let mut daemon = Self {
+            process,
+            log,
+            heard: Vec::new(),
+        };
         daemon.logged("started");
         daemon
     }
@@ -152,25 +173,31 @@ impl Subscriber {
     fn connect(socket: &Path) -> Self {
         let stream = UnixStream::connect(socket).unwrap();
         stream.set_read_timeout(Some(PATIENCE)).unwrap();
-        Self { lines: BufReader::new(stream) }
+        Self {
+            lines: BufReader::new(stream),
+        }
     }
 
     fn say(&mut self, line: &str) {
-        self.lines.get_mut().write_all(format!("{line}\n").as_bytes()).unwrap();
+        self.lines
+            .get_mut()
+            .write_all(format!("{line}\n").as_bytes())
+            .unwrap();
     }
 
     /// The next line; `None`: closed.
     fn next(&mut self) -> Option<Value> {
         let mut line = String::new();
-        (self.lines.read_line(&mut line).unwrap() > 0)
-            .then(|| serde_json::from_str(&line).unwrap())
+        (self.lines.read_line(&mut line).unwrap() > 0).then(|| serde_json::from_str(&line).unwrap())
     }
 
     /// Reads until a line has all of `fields`.
     fn until(&mut self, fields: &Value) -> Value {
         let fields = fields.as_object().unwrap();
         loop {
-            let line = self.next().unwrap_or_else(|| panic!("closed before {fields:?}"));
+            let line = self
+                .next()
+                .unwrap_or_else(|| panic!("closed before {fields:?}"));
             if fields.iter().all(|(key, value)| &line[key] == value) {
                 return line;
             }
@@ -217,7 +244,10 @@ fn a_press_on_the_port_becomes_a_verdict_on_the_socket() {
     assert_eq!(hello["sensors"][0]["name"], "forearm");
     assert_eq!(hello["model"]["levels"].as_array().unwrap().len(), 4);
     let status = subscriber.next().unwrap();
-    assert_eq!((&status["state"], &status["seq"]), (&json!("connecting"), &Value::Null));
+    assert_eq!(
+        (&status["state"], &status["seq"]),
+        (&json!("connecting"), &Value::Null)
+    );
 
     let _sensor = bench.sensor(&["--presses", "1"]);
     let begin = subscriber.until(&json!({"type": "press", "state": "begin"}));
@@ -226,14 +256,25 @@ fn a_press_on_the_port_becomes_a_verdict_on_the_socket() {
     assert_eq!(verdict["type"], "hardness");
     assert_eq!(verdict["phase"], "final");
     assert_eq!((&begin["press"], &verdict["press"]), (&json!(1), &json!(1)));
-    assert_eq!(verdict["seq"].as_u64().unwrap(), end["seq"].as_u64().unwrap() + 1);
+    assert_eq!(
+        verdict["seq"].as_u64().unwrap(),
+        end["seq"].as_u64().unwrap() + 1
+    );
     assert_eq!(verdict["state"], "live");
     assert!(verdict["mono_ns"].as_u64().unwrap() > 0);
     assert!(verdict["latency_us"].as_u64().unwrap() < 1_000_000);
     // The chosen frame is older than the release that decided.
     assert!(verdict["age_at_publish_ms"].as_f64().unwrap() > 50.0);
     let line = daemon.logged("phase=\"final\"");
-    for field in ["sensor=", "press=1", "level=", "label=", "confidence=", "force_n=", "model="] {
+    for field in [
+        "sensor=",
+        "press=1",
+        "level=",
+        "label=",
+        "confidence=",
+        "force_n=",
+        "model=",
+    ] {
         assert!(line.contains(field), "{field} not in {line}");
     }
     subscriber.say(r#"{"get":"last","id":1}"#);
@@ -261,20 +302,28 @@ fn an_unplugged_sensor_is_lost_at_once_and_goes_on_counting_when_it_is_back() {
         sensor.0.kill().unwrap();
         let lost = subscriber.until(&json!({"type": "status", "state": "lost"}));
         subscriber.until(&json!({"type": "press", "state": "aborted", "reason": "lost"}));
-        delays.push(SystemTime::from(time(&lost)).duration_since(unplugged).unwrap());
+        delays.push(
+            SystemTime::from(time(&lost))
+                .duration_since(unplugged)
+                .unwrap(),
+        );
         frames = lost["frames"].as_u64().unwrap();
         presses = press["press"].as_u64().unwrap();
         sensor.exit_code();
     }
     let shortest = *delays.iter().min().unwrap();
-    assert!(shortest < Duration::from_millis(100), "lost after {delays:?}");
+    assert!(
+        shortest < Duration::from_millis(100),
+        "lost after {delays:?}"
+    );
 }
 
 #[test]
 fn a_silent_sensor_is_stale_after_two_and_a_half_periods() {
     let bench = Bench::new();
     let script = bench.path("faults.toml");
-    let silence = |at_s: f64| format!("[[fault]]\nat_s = {at_s}\nkind = \"silence\"\nfor_s = 0.5\n");
+    let silence =
+        |at_s: f64| format!("[[fault]]\nat_s = {at_s}\nkind = \"silence\"\nfor_s = 0.5\n");
     fs::write(&script, [1.0, 2.0, 3.0].map(silence).concat()).unwrap();
     let _daemon = bench.daemon();
     let mut subscriber = bench.subscriber();
@@ -293,9 +342,17 @@ fn a_silent_sensor_is_stale_after_two_and_a_half_periods() {
             _ => {}
         }
     }
-    assert!(silences.iter().all(|silence| *silence >= Duration::from_millis(125)), "{silences:?}");
+    assert!(
+        silences
+            .iter()
+            .all(|silence| *silence >= Duration::from_millis(125)),
+        "{silences:?}"
+    );
     let shortest = *silences.iter().min().unwrap();
-    assert!(shortest <= Duration::from_millis(175), "stale after {silences:?}");
+    assert!(
+        shortest <= Duration::from_millis(175),
+        "stale after {silences:?}"
+    );
 }
 
 #[test]
@@ -316,7 +373,10 @@ fn sigterm_aborts_the_press_in_hand_and_ends_within_a_second() {
         while subscriber.next().is_some() {}
         assert_eq!(daemon.process.exit_code(), Some(0));
         shortest = shortest.min(start.elapsed());
-        assert!(!bench.path("events.sock").exists(), "the socket's file stayed behind");
+        assert!(
+            !bench.path("events.sock").exists(),
+            "the socket's file stayed behind"
+        );
     }
     assert!(shortest < Duration::from_secs(1), "took {shortest:?}");
 }
@@ -342,8 +402,15 @@ fn sighup_changes_all_or_nothing() {
     assert_eq!(rejected(&mut subscriber), "low_force");
     // Neither of these may take effect, not even in part.
     let line = reload(&mut daemon, "[model]\nmin_force = 0.0\n", "refused");
-    assert!(line.contains("min_force") && line.contains("ERROR"), "{line}");
-    let line = reload(&mut daemon, "max_clients = 7\n[model]\nmin_force_n = 0.0\n", "refused");
+    assert!(
+        line.contains("min_force") && line.contains("ERROR"),
+        "{line}"
+    );
+    let line = reload(
+        &mut daemon,
+        "max_clients = 7\n[model]\nmin_force_n = 0.0\n",
+        "refused",
+    );
     assert!(line.contains("publish.unix.max_clients"), "{line}");
     subscriber.until(&json!({"state": "begin"}));
     assert_eq!(rejected(&mut subscriber), "low_force");
@@ -361,7 +428,10 @@ fn a_stale_socket_is_replaced_and_a_live_one_is_not_stolen() {
     let socket = bench.path("events.sock");
     drop(UnixListener::bind(&socket).unwrap());
     let _daemon = bench.daemon();
-    assert_eq!(fs::metadata(&socket).unwrap().permissions().mode() & 0o777, 0o660);
+    assert_eq!(
+        fs::metadata(&socket).unwrap().permissions().mode() & 0o777,
+        0o660
+    );
     let config = bench.path("hardnessd.toml");
     let arguments = ["run", "--config", config.to_str().unwrap()];
     fails(&arguments, 74, &["events.sock", "in use"]);
@@ -370,7 +440,11 @@ fn a_stale_socket_is_replaced_and_a_live_one_is_not_stolen() {
     let file = bench.path("precious");
     fs::write(&file, "kept").unwrap();
     let config = bench.configure("other.toml", "precious", "");
-    fails(&["run", "--config", config.to_str().unwrap()], 78, &["precious", "no socket"]);
+    fails(
+        &["run", "--config", config.to_str().unwrap()],
+        78,
+        &["precious", "no socket"],
+    );
     assert_eq!(fs::read_to_string(file).unwrap(), "kept");
 }
 
@@ -388,7 +462,11 @@ fn a_port_held_by_another_process_is_named_as_such_and_logged_once() {
     std::thread::sleep(Duration::from_millis(700));
     second.process.signal(Signal::TERM);
     second.logged("stopping");
-    let lines = second.heard.iter().filter(|line| line.contains("held by another")).count();
+    let lines = second
+        .heard
+        .iter()
+        .filter(|line| line.contains("held by another"))
+        .count();
     assert_eq!(lines, 1, "{:#?}", second.heard);
 }
 
@@ -399,7 +477,10 @@ fn a_subscriber_is_told_what_is_wrong_and_harms_nobody() {
     let _daemon = Daemon::start(&config);
     let mut first = bench.subscriber();
     first.until(&json!({"type": "status"}));
-    for line in [r#"{"subscribe":["touch"],"id":7}"#, r#"{"tare":"forearm","id":7}"#] {
+    for line in [
+        r#"{"subscribe":["touch"],"id":7}"#,
+        r#"{"tare":"forearm","id":7}"#,
+    ] {
         first.say(line);
         assert_eq!(first.next().unwrap()["type"], "error");
     }
@@ -407,7 +488,10 @@ fn a_subscriber_is_told_what_is_wrong_and_harms_nobody() {
     assert_eq!(first.next().unwrap()["id"], Value::Null);
     first.say(r#"{"get":"status","id":{"mine":1}}"#);
     assert_eq!(first.next().unwrap()["state"], "connecting");
-    assert_eq!(first.next().unwrap(), json!({"type": "ok", "id": {"mine": 1}}));
+    assert_eq!(
+        first.next().unwrap(),
+        json!({"type": "ok", "id": {"mine": 1}})
+    );
 
     let mut long = bench.subscriber();
     long.until(&json!({"type": "status"}));
@@ -418,9 +502,15 @@ fn a_subscriber_is_told_what_is_wrong_and_harms_nobody() {
 
     let mut half = bench.subscriber();
     half.until(&json!({"type": "status"}));
-    half.lines.get_mut().write_all(br#"{"subscribe":["#).unwrap();
+    half.lines
+        .get_mut()
+        .write_all(br#"{"subscribe":["#)
+        .unwrap();
     wait_for("room for a third", || {
-        bench.subscriber().next().is_some_and(|line| line["type"] == "hello")
+        bench
+            .subscriber()
+            .next()
+            .is_some_and(|line| line["type"] == "hello")
     });
     let _third = bench.subscriber();
     wait_for("a refusal", || {
@@ -438,21 +528,45 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         let path = bench.configure("bad.toml", "bad.sock", more);
         path.to_str().unwrap().to_owned()
     };
-    fails(&["run", "--config", "/no/such.toml"], 66, &["/no/such.toml"]);
+    fails(
+        &["run", "--config", "/no/such.toml"],
+        66,
+        &["/no/such.toml"],
+    );
     let config = written("[press]\nend_framse = 2\n");
-    fails(&["run", "--config", &config], 78, &["bad.toml", "end_framse", "end_frames"]);
+    fails(
+        &["run", "--config", &config],
+        78,
+        &["bad.toml", "end_framse", "end_frames"],
+    );
     let config = written("[model]\npath = \"none.onnx\"\n");
-    fails(&["run", "--config", &config], 78, &["none.onnx", "model.path"]);
+    fails(
+        &["run", "--config", &config],
+        78,
+        &["none.onnx", "model.path"],
+    );
     fs::write(bench.path("junk.onnx"), "no model").unwrap();
     let config = written("[model]\npath = \"junk.onnx\"\n");
     fails(&["run", "--config", &config], 78, &["junk.onnx"]);
     let config = written("[http]\nlisten = \"127.0.0.1:8256\"\n");
-    fails(&["check", "--config", &config], 78, &["http", "not in this version"]);
+    fails(
+        &["check", "--config", &config],
+        78,
+        &["http", "not in this version"],
+    );
     // 20 frames/s of 790 bytes are more than 115,200 baud, and nothing is known of this port.
     let config = written("");
-    fails(&["check", "--config", &config], 78, &["frame_rate_hz", "14.58"]);
+    fails(
+        &["check", "--config", &config],
+        78,
+        &["frame_rate_hz", "14.58"],
+    );
     fails(&["replay", "/no/such.bin"], 66, &["/no/such.bin"]);
-    fails(&["simulate", "--fps", "20", "--baud", "115200"], 2, &["--baud", "158000"]);
+    fails(
+        &["simulate", "--fps", "20", "--baud", "115200"],
+        2,
+        &["--baud", "158000"],
+    );
     assert_eq!(hardnessd(&["run"]).status.code(), Some(2));
     assert_eq!(hardnessd(&["--version"]).status.code(), Some(0));
 }
@@ -463,11 +577,19 @@ fn a_demonstration_shows_each_press_and_ends() {
     let stderr = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(0), "{stderr}");
     let lines = String::from_utf8(output.stdout).unwrap();
-    let events: Vec<Value> =
-        lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let events: Vec<Value> = lines
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect();
     assert_eq!(events[0]["type"], "hello");
-    let finals = events.iter().filter(|event| event["phase"] == "final").count();
+    let finals = events
+        .iter()
+        .filter(|event| event["phase"] == "final")
+        .count();
     assert_eq!(finals, 2, "{lines}");
-    let numbers: Vec<u64> = events.iter().filter_map(|event| event["seq"].as_u64()).collect();
+    let numbers: Vec<u64> = events
+        .iter()
+        .filter_map(|event| event["seq"].as_u64())
+        .collect();
     assert!(numbers.windows(2).all(|pair| pair[1] == pair[0] + 1));
 }

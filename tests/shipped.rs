@@ -18,7 +18,11 @@ fn the_shipped_configuration_passes_check_and_equals_the_defaults() {
         .arg(&path)
         .output()
         .unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     let config = Config::load(&path).unwrap();
     let port = config.sensors[0].port.clone();
     assert_eq!(config, Config::new(vec![Sensor::new(port)]));
@@ -39,7 +43,10 @@ fn the_shipped_configuration_names_every_key() {
     let silent = "sync tail length cell mask invert checksum rows cols order path sha256";
     keys.extend(silent.split(' ').map(str::to_owned));
     for key in keys {
-        assert!(named.contains(&key.as_str()), "{key} is not in config/hardnessd.toml");
+        assert!(
+            named.contains(&key.as_str()),
+            "{key} is not in config/hardnessd.toml"
+        );
     }
 }
 
