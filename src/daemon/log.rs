@@ -157,6 +157,7 @@ pub(crate) fn event(event: &Event) {
                 );
             }
         }
+        // Rounded for the eye; the event itself carries every digit.
         Event::Hardness(verdict) => info!(
             seq = verdict.seq,
             sensor = verdict.sensor.as_str(),
@@ -165,9 +166,8 @@ pub(crate) fn event(event: &Event) {
             level = verdict.level,
             label = verdict.label.as_deref(),
             rejected = verdict.rejected.as_ref().map(name),
-            confidence = f64::from(verdict.confidence),
+            confidence = (f64::from(verdict.confidence) * 1e4).round() / 1e4,
             frame = verdict.frame,
-            // To the digits that are published.
             force_n = (verdict.force_n * 1e3).round() / 1e3,
             contact_area_taxels = verdict.contact_area_taxels,
             model = verdict.model.as_str(),
