@@ -171,7 +171,8 @@ pub(crate) fn event(event: &Event) {
             rejected = verdict.rejected.as_ref().map(name),
             confidence = f64::from(verdict.confidence),
             frame = verdict.frame,
-            force_n = verdict.force_n,
+            // To the digits that are published.
+            force_n = (verdict.force_n * 1e3).round() / 1e3,
             contact_area_taxels = verdict.contact_area_taxels,
             model = verdict.model.as_str(),
             "hardness"

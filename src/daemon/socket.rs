@@ -5,7 +5,7 @@
 //! them, and reads requests between.
 
 use std::fs::{self, DirBuilder, File, Permissions};
-use std::io::ErrorKind;
+use std::io::{ErrorKind, Write};
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::{DirBuilderExt, FileTypeExt, MetadataExt, PermissionsExt};
 use std::os::unix::net::UnixListener as StdListener;
@@ -157,14 +157,14 @@ impl Socket {
         let mut refusing = false;
         loop {
             let accepted = tokio::select! {
-                accepted = self.listener.accept() => accepted,
-                Some(_) = clients.join_next() => continue,
+                // Those that have gone make room before the next is looked at.
+                biased;
                 _ = &mut stop => break,
+                Some(_) = clients.join_next() => continue,
+                accepted = self.listener.accept() => accepted,
             };
             match accepted {
-                Ok((stream, _)) if clients.len() >= max_clients => {
-                    refuse(&stream, max_clients);
-                }
+                Ok((stream, _)) if clients.len() >= max_clients => refuse(stream, max_clients),
                 Ok((stream, _)) => {
                     refusing = false;
                     let (hub, sensors) = (hub.clone(), sensors.clone());
@@ -261,9 +261,13 @@ fn place(nursery: &Path, path: &Path, mode: u32) -> std::io::Result<UnixListener
 }
 
 /// One too many: told so if there is room to tell, and closed.
-fn refuse(stream: &UnixStream, max_clients: usize) {
+fn refuse(stream: UnixStream, max_clients: usize) {
     let message = format!("found {max_clients} subscribers already, expected fewer: try later");
-    let _ = stream.try_write(Reply::Error { message, id: None }.to_line().as_bytes());
+    let line = Reply::Error { message, id: None }.to_line();
+    // Asked of the system itself: the runtime does not know yet that the stream is writable.
+    let _ = stream
+        .into_std()
+        .and_then(|mut stream| stream.write_all(line.as_bytes()));
 }
 
 /// Why a connection ended.
@@ -356,14 +360,23 @@ impl Client {
                         self.send(&[error(message, None)]).await?;
                         return Err(End::TooLong);
                     }
-                    Heard::End => hearing = false,
-                },
-                () = tokio::time::sleep(HALF_CLOSED_CHECK), if !hearing => {
-                    if self.output.as_ref().ready(Interest::WRITABLE).await?.is_write_closed() {
-                        return Err(End::HungUp);
+                    Heard::End => {
+                        hearing = false;
+                        self.stay().await?;
                     }
-                }
+                },
+                () = tokio::time::sleep(HALF_CLOSED_CHECK), if !hearing => self.stay().await?,
             }
+        }
+    }
+
+    /// Goes on only if the other end still reads.
+    async fn stay(&self) -> Result<(), End> {
+        let ready = self.output.as_ref().ready(Interest::WRITABLE).await?;
+        if ready.is_write_closed() {
+            Err(End::HungUp)
+        } else {
+            Ok(())
         }
     }
 

@@ -103,6 +103,10 @@ impl Fields {
 
 /// Solves `problem` from the pressure given (a guess; any non-negative field) and leaves the
 /// solution there.
+#[expect(
+    clippy::needless_range_loop,
+    reason = "one cell of seven fields at a time"
+)]
 pub(super) fn solve(
     convolver: &mut Convolver,
     fields: &mut Fields,
@@ -230,7 +234,7 @@ pub(super) fn solve(
             }
             sum += f64::from(pressure_mpa[i]);
         }
-        fresh = !(clipped || restart) && contact.iterations % 25 != 0;
+        fresh = !(clipped || restart || contact.iterations.is_multiple_of(25));
         if fresh {
             for (u, &response) in fields.displacement.iter_mut().zip(&fields.response) {
                 *u -= step * response;

@@ -53,8 +53,11 @@ struct Width {
     half_space: Rc<Vec<f32>>,
     cover: Vec<f32>,
     /// The last few layers' spectra by (nu, height): one posture's presses follow each other.
-    recent: Vec<((u64, u64), Rc<Vec<f32>>)>,
+    recent: Vec<(LayerKey, Rc<Vec<f32>>)>,
 }
+
+/// Bits of Poisson's ratio and height in cells.
+type LayerKey = (u64, u64);
 
 /// Layer spectra held a width; an object has up to three heights.
 const RECENT: usize = 4;

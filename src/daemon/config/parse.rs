@@ -2,6 +2,7 @@
 
 use std::fmt;
 use std::fs;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use super::{Config, Model, Sensor};
@@ -305,11 +306,18 @@ pub(super) fn model(model: &Model, path: &Path) -> Result<Hrn, Error> {
     let hrn = match &model.path {
         None => Hrn::load(verdict::BUILT_IN),
         Some(file) => {
-            let bytes = fs::read(file).map_err(|source| Error::ModelUnreadable {
-                path: path.to_owned(),
-                model: file.clone(),
-                source,
-            })?;
+            // A byte more than is accepted is enough to be refused.
+            let mut bytes = Vec::new();
+            fs::File::open(file)
+                .and_then(|open| {
+                    open.take(verdict::MAX_FILE_BYTES as u64 + 1)
+                        .read_to_end(&mut bytes)
+                })
+                .map_err(|source| Error::ModelUnreadable {
+                    path: path.to_owned(),
+                    model: file.clone(),
+                    source,
+                })?;
             Hrn::load(&bytes)
         }
     };

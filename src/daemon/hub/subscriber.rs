@@ -9,9 +9,9 @@ use crate::event::{Kind, Reply};
 /// Events waiting for a subscriber (contract, section 5).
 const QUEUE: usize = 1024;
 
-/// Lines handed out at a time: enough that a write carries many, few enough that a stalled
-/// subscriber holds little beyond its queue.
-const BATCH: usize = 64;
+/// Bytes handed out at a time, and a line more: enough that a write carries many events, few
+/// enough that a stalled subscriber holds little beyond its queue.
+const BATCH_BYTES: usize = 32 * 1024;
 
 /// An event waiting.
 struct Waiting {
@@ -116,21 +116,23 @@ impl Subscriber {
     /// What it gets next; `held` looks a numbered event up.
     pub(super) fn take(&mut self, held: impl Fn(u64) -> Option<Line>) -> Vec<Line> {
         let mut lines = Vec::new();
+        let mut bytes = 0;
         lines.extend(self.missing.take().map(|gap| Line::from(gap.to_line())));
-        while lines.len() < BATCH
+        while bytes < BATCH_BYTES
             && let Some(seq) = self.replay.pop_front()
         {
             match held(seq) {
                 Some(line) => {
                     lines.extend(self.gap());
                     self.handed.insert(seq);
+                    bytes += line.len();
                     lines.push(line);
                 }
                 // Forgotten while the subscriber took its time.
                 None => self.lost += 1,
             }
         }
-        while lines.len() < BATCH
+        while bytes < BATCH_BYTES
             && let Some(event) = self.queue.pop_front()
         {
             lines.extend(self.gap());
@@ -139,6 +141,7 @@ impl Subscriber {
             {
                 self.handed.insert(seq);
             }
+            bytes += event.line.len();
             lines.push(event.line);
         }
         lines
