@@ -476,7 +476,8 @@ fn a_subscriber_is_told_what_is_wrong_and_harms_nobody() {
     let config = bench.configure("hardnessd.toml", "events.sock", "max_clients = 3\n");
     let _daemon = Daemon::start(&config);
     let mut first = bench.subscriber();
-    first.until(&json!({"type": "status"}));
+    first.say(r#"{"subscribe":["hardness"]}"#);
+    first.until(&json!({"type": "ok"}));
     for line in [
         r#"{"subscribe":["touch"],"id":7}"#,
         r#"{"tare":"forearm","id":7}"#,

@@ -40,7 +40,6 @@ type Output = Box<dyn Layer<Registry> + Send + Sync>;
 #[derive(Clone)]
 pub struct Log {
     output: reload::Handle<Output, Registry>,
-    level: &'static str,
 }
 
 /// Why a format cannot be had.
@@ -64,14 +63,22 @@ impl Log {
     ///
     /// If `RUST_LOG` is malformed, the journal is asked for and cannot be reached, or a log has
     /// been started before.
-    pub fn start(settings: Settings, level: &'static str) -> Result<Self, Error> {
-        let (layer, output) = reload::Layer::new(output(settings, level)?);
-        let log = Self { output, level };
+    pub fn start(settings: Settings, level: &str) -> Result<Self, Error> {
+        let filter = match std::env::var(EnvFilter::DEFAULT_ENV) {
+            Ok(directives) if !directives.is_empty() => {
+                EnvFilter::try_new(directives).map_err(Error::Filter)?
+            }
+            _ => EnvFilter::new(level),
+        };
+        // The filter stands beside the output, not in it: a filter of a layer's own does not
+        // survive the layer's exchange.
+        let (layer, output) = reload::Layer::new(output(settings)?);
         tracing_subscriber::registry()
             .with(layer)
+            .with(filter)
             .try_init()
             .map_err(|_| Error::Twice)?;
-        Ok(log)
+        Ok(Self { output })
     }
 
     /// Writes as `settings` say from now on.
@@ -81,33 +88,22 @@ impl Log {
     /// As [`Log::start`]; the log then stays as it is.
     pub fn change(&self, settings: Settings) -> Result<(), Error> {
         self.output
-            .reload(output(settings, self.level)?)
+            .reload(output(settings)?)
             .map_err(|_| Error::Twice)
     }
 }
 
-fn output(settings: Settings, level: &str) -> Result<Output, Error> {
-    // The filter belongs to the layer, so that a change of format keeps it.
-    let filter = match std::env::var(EnvFilter::DEFAULT_ENV) {
-        Ok(directives) if !directives.is_empty() => {
-            EnvFilter::try_new(directives).map_err(Error::Filter)?
-        }
-        _ => EnvFilter::new(level),
-    };
+fn output(settings: Settings) -> Result<Output, Error> {
     let lines = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         .with_target(false);
     Ok(match settings.format {
-        Format::Text => lines
-            .with_ansi(std::io::stderr().is_terminal())
-            .with_filter(filter)
-            .boxed(),
-        Format::Json => lines.json().flatten_event(true).with_filter(filter).boxed(),
+        Format::Text => lines.with_ansi(std::io::stderr().is_terminal()).boxed(),
+        Format::Json => lines.json().flatten_event(true).boxed(),
         Format::Journald => tracing_journald::layer()
             .map_err(Error::Journal)?
             .with_field_prefix(Some("HARDNESSD".to_owned()))
             .with_syslog_identifier("hardnessd".to_owned())
-            .with_filter(filter)
             .boxed(),
     })
 }
@@ -161,6 +157,7 @@ pub(crate) fn event(event: &Event) {
                 );
             }
         }
+        // Rounded for the eye; the event itself carries every digit.
         Event::Hardness(verdict) => info!(
             seq = verdict.seq,
             sensor = verdict.sensor.as_str(),
@@ -169,9 +166,8 @@ pub(crate) fn event(event: &Event) {
             level = verdict.level,
             label = verdict.label.as_deref(),
             rejected = verdict.rejected.as_ref().map(name),
-            confidence = f64::from(verdict.confidence),
+            confidence = (f64::from(verdict.confidence) * 1e4).round() / 1e4,
             frame = verdict.frame,
-            // To the digits that are published.
             force_n = (verdict.force_n * 1e3).round() / 1e3,
             contact_area_taxels = verdict.contact_area_taxels,
             model = verdict.model.as_str(),
