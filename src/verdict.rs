@@ -708,7 +708,7 @@ mod tests {
             );
         }
         check("ONNX opset 16: expected 17 or newer", |p| {
-            p.opset_import[0].version = 16
+            p.opset_import[0].version = 16;
         });
         check("ONNX opset missing", |p| p.opset_import.clear());
         check("not an ONNX model: no graph in it", |p| p.graph = None);

@@ -1,5 +1,9 @@
 //! The trainer's binary on tiny data: it learns, resumes exactly, and its files are usable.
 #![cfg(feature = "train")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy knows no helper of a test as a test"
+)]
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

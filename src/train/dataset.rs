@@ -580,14 +580,14 @@ mod tests {
         check(
             |npz| {
                 npz.add_array("frames", &Array3::<f64>::zeros((2, ROWS, COLS)))
-                    .unwrap()
+                    .unwrap();
             },
             "array `frames`: found dtype '<f8', expected f32 [N,28,28]",
         );
         check(
             |npz| {
                 npz.add_array("frames", &Array3::<f32>::zeros((2, 27, COLS)))
-                    .unwrap()
+                    .unwrap();
             },
             "array `frames`: found f32 [2, 27, 28], expected f32 [N,28,28]",
         );
@@ -598,7 +598,7 @@ mod tests {
         check(
             |npz| {
                 npz.add_array("frames", &frames(2).mapv(|_| f32::NAN))
-                    .unwrap()
+                    .unwrap();
             },
             "array `frames`: found NaN in frame 0, expected newtons",
         );
