@@ -3,6 +3,10 @@
 //! Bounds are those of the contract, taken from the daemon's own stamps where it has one. A busy
 //! machine may delay a process by more than a bound, so what is bounded is tried three times and
 //! must be kept once.
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy knows no helper of a test as a test"
+)]
 
 use std::fs;
 use std::io::{BufRead, BufReader, Write};

@@ -1,4 +1,8 @@
 //! Recorded bytes give exactly the expected events, whatever the pace and the chunks.
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy knows no helper of a test as a test"
+)]
 
 use std::path::{Path, PathBuf};
 use std::process::Command;

@@ -1,4 +1,8 @@
 //! The files that are shipped: the real binary takes them, and they say what the code does.
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy knows no helper of a test as a test"
+)]
 
 use std::fs;
 use std::path::{Path, PathBuf};

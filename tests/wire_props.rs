@@ -1,4 +1,8 @@
 //! Any chunking gives the same frames; noise never panics; damage costs the damaged frame.
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy knows no helper of a test as a test"
+)]
 
 use hardnessd::frame::{RawFrame, TAXELS};
 use hardnessd::random::Stream;

@@ -137,10 +137,7 @@ fn request(mut fields: Map<String, Value>) -> Result<Request, String> {
             }
         }
     } else {
-        let found = fields
-            .keys()
-            .next()
-            .map_or("no key".to_owned(), |key| short(key));
+        let found = fields.keys().next().map_or("no key".to_owned(), short);
         return Err(
             match fields.keys().find(|key| CHANGING.contains(&key.as_str())) {
                 Some(key) => format!("{key}: this socket takes no command that changes anything"),

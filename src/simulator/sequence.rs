@@ -264,7 +264,7 @@ mod tests {
         seen
     }
 
-    fn check(settings: SequenceSettings) {
+    fn check(settings: &SequenceSettings) {
         let rate = settings.frame_rate_hz;
         let presses = settings.presses.unwrap();
         let materials = settings.materials.clone();
@@ -313,7 +313,7 @@ mod tests {
             (2, 20.0, SensorProfile::Raw),
             (3, 100.0, SensorProfile::Clean),
         ] {
-            check(SequenceSettings {
+            check(&SequenceSettings {
                 seed,
                 frame_rate_hz,
                 materials: Material::ALL.to_vec(),
@@ -326,7 +326,7 @@ mod tests {
 
     #[test]
     fn a_press_too_light_is_made_anew_with_more_force() {
-        check(SequenceSettings {
+        check(&SequenceSettings {
             seed: 4,
             materials: vec![Material::Sponge, Material::Wood, Material::YogaMat],
             force_n: Some(0.3),
@@ -356,7 +356,7 @@ mod tests {
                     (None, SensorProfile::Clean, Shapes::Matched),
                     (Some(1.0), SensorProfile::Raw, Shapes::Paper),
                 ] {
-                    check(SequenceSettings {
+                    check(&SequenceSettings {
                         seed,
                         frame_rate_hz,
                         materials: Material::ALL.to_vec(),

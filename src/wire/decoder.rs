@@ -43,6 +43,10 @@ pub struct Decoded {
 }
 
 /// What the bytes at hand amount to.
+#[expect(
+    clippy::large_enum_variant,
+    reason = "a frame is handed on by value: boxing it would allocate each one"
+)]
 pub(super) enum Scan {
     /// More bytes are needed.
     Wait,
