@@ -333,7 +333,9 @@ impl Dataset {
             .objects(indices, &Stream::new(seed, "held out objects"))
             .values()
         {
+            // At least one object stays to learn from.
             let count = (objects.len() as f64 * share).round() as usize;
+            let count = count.min(objects.len() - 1);
             held.extend(objects[..count].iter().flatten());
             kept.extend(objects[count..].iter().flatten());
         }
@@ -661,6 +663,11 @@ mod tests {
         let (kept, held) = (objects_of(&dataset, &kept), objects_of(&dataset, &held));
         assert_eq!((kept.len(), held.len()), (32, 8));
         assert!(held.iter().all(|object| !kept.contains(object)));
+        let first_object: Vec<usize> = (0..5).collect();
+        assert_eq!(
+            dataset.hold_out(&first_object, 0.5, 1),
+            (first_object, vec![])
+        );
         assert_ne!(
             held,
             objects_of(&dataset, &dataset.hold_out(&indices, 0.2, 2).1)

@@ -1,6 +1,6 @@
 //! The methods of the table, as recipes over the same parts.
 
-use anyhow::Context as _;
+use anyhow::{Context as _, ensure};
 use burn::tensor::Device;
 
 use super::dataset::Dataset;
@@ -47,7 +47,16 @@ pub fn train(
 ) -> anyhow::Result<Option<Evaluation>> {
     let labelled = dataset.labelled(Split::Train)?;
     let labelled = match description.labels {
-        Some(labels) => dataset.choose_labelled(&labelled, labels, description.seed),
+        Some(labels) => {
+            let least = super::dataset::levels().len() * dataset.sources.len();
+            ensure!(
+                (least..=labelled.len()).contains(&labels),
+                "{labels} labels asked for: the data has {}, and one of each level and file is \
+                 needed",
+                labelled.len()
+            );
+            dataset.choose_labelled(&labelled, labels, description.seed)
+        }
         None => labelled,
     };
     match method {
