@@ -11,7 +11,7 @@
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::fs::PermissionsExt;
-use std::os::unix::net::{UnixListener, UnixStream};
+use std::os::unix::net::{UnixDatagram, UnixListener, UnixStream};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::mpsc;
@@ -524,6 +524,41 @@ fn a_subscriber_is_told_what_is_wrong_and_harms_nobody() {
     });
     first.say(r#"{"get":"last"}"#);
     assert_eq!(first.next().unwrap(), json!({"type": "ok"}));
+}
+
+#[test]
+fn the_service_manager_hears_of_readiness_life_and_stopping_without_any_hardware() {
+    let bench = Bench::new();
+    let manager = UnixDatagram::bind(bench.path("notify")).unwrap();
+    manager.set_read_timeout(Some(PATIENCE)).unwrap();
+    let told = |state: &str| {
+        let mut message = [0; 1024];
+        loop {
+            let length = manager.recv(&mut message).unwrap();
+            let message = String::from_utf8_lossy(&message[..length]);
+            if message.lines().any(|line| line == state) {
+                return;
+            }
+        }
+    };
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let mut command = Command::new(BINARY);
+    command
+        .args(["run", "--config"])
+        .arg(config)
+        .stderr(Stdio::null());
+    command
+        .env("NOTIFY_SOCKET", bench.path("notify"))
+        .env("WATCHDOG_USEC", "200000");
+    let mut daemon = Process(command.spawn().unwrap());
+    told("READY=1");
+    assert_eq!(bench.subscriber().next().unwrap()["type"], "hello");
+    for _ in 0..3 {
+        told("WATCHDOG=1");
+    }
+    daemon.signal(Signal::TERM);
+    told("STOPPING=1");
+    assert_eq!(daemon.exit_code(), Some(0));
 }
 
 #[test]
