@@ -194,8 +194,10 @@ impl Pipeline {
             && at.mono >= deadline
         {
             self.link = Link::Stale;
-            let late = at.mono.saturating_sub(deadline);
-            let wall = at.wall.checked_sub(late).unwrap_or(at.wall);
+            // From the last frame on, so that its time and this one are of one clock reading.
+            let since = self.last_frame.unwrap_or(at);
+            let wait = deadline.saturating_sub(since.mono);
+            let wall = since.wall.checked_add(wait).unwrap_or(at.wall);
             events.extend(self.status_if_changed(Stamp {
                 mono: deadline,
                 wall,
