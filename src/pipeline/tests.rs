@@ -1,0 +1,252 @@
+use super::*;
+use crate::verdict::BUILT_IN;
+use crate::wire::{self, Preset};
+
+const PERIOD: Duration = Duration::from_millis(200);
+
+fn pipeline(preset: Preset) -> Pipeline {
+    let settings = Settings {
+        sensor: "forearm".to_owned(),
+        frame_rate_hz: 5.0,
+        layout: Layout::new(&wire::Settings {
+            preset,
+            ..wire::Settings::default()
+        })
+        .unwrap(),
+        judgement: Judgement {
+            calibration: tare::Settings::default(),
+            press: press::Settings::default(),
+            min_confidence: 0.0,
+            min_force_n: 0.0,
+            hrn: Arc::new(Hrn::load(BUILT_IN).unwrap()),
+        },
+    };
+    Pipeline::new(settings, Clock::Arrival)
+}
+
+fn at(millis: u64) -> Stamp {
+    let mono = Duration::from_millis(1000 + millis);
+    Stamp {
+        mono,
+        wall: EPOCH.wall.checked_add(mono).unwrap(),
+    }
+}
+
+/// `taxels` taxels at `counts` in the middle of the array.
+fn raw(taxels: usize, counts: u16) -> RawFrame {
+    let mut raw = RawFrame::default();
+    raw.counts[400..400 + taxels].fill(counts);
+    raw
+}
+
+fn bytes(pipeline: &Pipeline, raw: &RawFrame) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    pipeline.decoder.layout().encode(raw, &mut bytes);
+    bytes
+}
+
+/// Events without their `frame`s, one word each.
+fn words(events: &[Event]) -> Vec<String> {
+    let word = |event: &Event| match event {
+        Event::Frame(_) => None,
+        Event::Status(status) => Some(match &status.reason {
+            Some(reason) => format!("{:?} ({reason})", status.state),
+            None => format!("{:?}", status.state),
+        }),
+        Event::Press(press) => Some(match press.reason {
+            Some(reason) => format!("{:?} {} ({reason})", press.state, press.press),
+            None => format!("{:?} {}", press.state, press.press),
+        }),
+        Event::Hardness(verdict) => Some(format!("{:?} of {}", verdict.phase, verdict.frame)),
+    };
+    events.iter().filter_map(word).collect()
+}
+
+/// Pushes one frame a period, from `first` on.
+fn play(pipeline: &mut Pipeline, first: u64, frames: &[RawFrame]) -> Vec<String> {
+    let mut events = Vec::new();
+    for (number, raw) in (first..).zip(frames) {
+        let bytes = bytes(pipeline, raw);
+        events.extend(pipeline.push(&bytes, at(number * 200)));
+    }
+    words(&events)
+}
+
+#[test]
+fn a_press_gives_begin_end_and_a_final_verdict() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    assert!(pipeline.opened(at(0)).is_empty(), "still connecting");
+    assert_eq!(play(&mut pipeline, 1, &[raw(0, 0); 5]), ["Live"]);
+    let press = [raw(4, 10), raw(9, 20), raw(5, 30), raw(0, 0), raw(0, 0)];
+    assert_eq!(
+        play(&mut pipeline, 6, &press),
+        ["Begin 1", "End 1", "Final of 6"]
+    );
+}
+
+#[test]
+fn a_load_during_tare_is_said_and_tracked_as_no_press() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    let loaded = [raw(9, 50); 5];
+    assert_eq!(
+        play(&mut pipeline, 0, &loaded),
+        ["Live", "Live (tare: contact)"]
+    );
+    assert!(play(&mut pipeline, 5, &loaded).is_empty(), "said once");
+    assert_eq!(play(&mut pipeline, 10, &[raw(0, 0); 5]), ["Live"]);
+    assert_eq!(play(&mut pipeline, 15, &loaded[..1]), ["Begin 1"]);
+}
+
+#[test]
+fn silence_is_stale_after_two_and_a_half_periods_and_ends_no_press() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    play(&mut pipeline, 0, &[raw(0, 0); 5]);
+    play(&mut pipeline, 5, &[raw(5, 50); 1]);
+    let deadline = pipeline.deadline().unwrap();
+    assert_eq!(deadline, at(1000).mono + PERIOD.mul_f64(2.5));
+    assert!(pipeline.tick(at(1499)).is_empty());
+    assert_eq!(
+        words(&pipeline.tick(at(1500))),
+        ["Stale (no frame for 2.5 periods)"]
+    );
+    assert_eq!(pipeline.deadline(), None);
+    let back = [raw(5, 50), raw(0, 0), raw(0, 0)];
+    assert_eq!(
+        play(&mut pipeline, 20, &back),
+        ["Live", "End 1", "Final of 5"]
+    );
+}
+
+#[test]
+fn a_port_open_without_frames_is_stale_too() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    let said = pipeline.unavailable("no such device".to_owned(), at(0));
+    assert_eq!(words(&said), ["Connecting (no such device)"]);
+    assert!(
+        pipeline
+            .unavailable("no such device".to_owned(), at(100))
+            .is_empty()
+    );
+    assert_eq!(words(&pipeline.opened(at(200))), ["Connecting"]);
+    assert_eq!(
+        words(&pipeline.tick(at(700))),
+        ["Stale (no frame for 2.5 periods)"]
+    );
+}
+
+#[test]
+fn a_lost_device_aborts_the_press_and_numbers_go_on() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    play(&mut pipeline, 0, &[raw(0, 0); 5]);
+    play(&mut pipeline, 5, &[raw(5, 50); 2]);
+    let lost = pipeline.lost("end of file".to_owned(), at(1300));
+    assert_eq!(words(&lost), ["Lost (end of file)", "Aborted 1 (lost)"]);
+    assert!(
+        pipeline
+            .unavailable("no such device".to_owned(), at(1400))
+            .is_empty()
+    );
+    assert!(
+        pipeline.opened(at(2000)).is_empty(),
+        "lost until a frame arrives"
+    );
+    assert!(pipeline.tick(at(9000)).is_empty());
+    assert_eq!(
+        play(&mut pipeline, 50, &[raw(5, 50); 1]),
+        ["Live", "Begin 2"]
+    );
+    assert_eq!(pipeline.status(at(0)).frames, 8);
+}
+
+#[test]
+fn half_a_period_of_silence_makes_a_jq_frame_whole_at_its_own_time() {
+    let mut pipeline = pipeline(Preset::Jq);
+    let bytes = bytes(&pipeline, &raw(0, 0));
+    assert!(pipeline.push(&bytes, at(0)).is_empty());
+    assert_eq!(pipeline.deadline(), Some(at(100).mono));
+    let events = pipeline.tick(at(103));
+    assert_eq!(words(&events), ["Live"]);
+    let Event::Status(status) = &events[0] else {
+        panic!("{events:?}")
+    };
+    assert_eq!(status.time, at(0).wall, "the frame's last byte came then");
+}
+
+#[test]
+fn a_frame_sent_in_pieces_has_the_time_of_its_last_byte() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    let bytes = bytes(&pipeline, &raw(0, 0));
+    assert!(pipeline.push(&bytes[..500], at(0)).is_empty());
+    let events = pipeline.push(&[&bytes[500..], &bytes[..300]].concat(), at(40));
+    let Event::Frame(frame) = &events[1] else {
+        panic!("{events:?}")
+    };
+    assert_eq!(frame.time, at(40).wall);
+    let events = pipeline.push(&bytes[300..], at(90));
+    let Event::Frame(frame) = &events[0] else {
+        panic!("{events:?}")
+    };
+    assert_eq!(frame.time, at(90).wall);
+}
+
+#[test]
+fn totals_balance_with_damage() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    let mut stream = vec![1, 2, 3];
+    let mut broken = bytes(&pipeline, &raw(1, 1));
+    broken[400] ^= 1;
+    stream.extend(broken);
+    stream.extend(bytes(&pipeline, &raw(0, 0)));
+    stream.extend([0xBB, 0xAA, 0x10]);
+    pipeline.push(&stream, at(0));
+    let status = pipeline.status(at(0));
+    assert_eq!(
+        (status.frames, status.frames_damaged, status.bytes_skipped),
+        (1, 1, 793)
+    );
+    let events = pipeline.end_of_recording(None);
+    assert_eq!(words(&events), ["Lost (end of recording)"]);
+    assert_eq!(pipeline.status(at(0)).bytes_skipped, 796);
+}
+
+#[test]
+fn verdicts_below_the_thresholds_are_rejected() {
+    let check = |min_force_n: f64, min_confidence: f32, expected: Option<Rejection>| {
+        let mut pipeline = pipeline(Preset::Jx255n);
+        pipeline.judgement.min_force_n = min_force_n;
+        pipeline.judgement.min_confidence = min_confidence;
+        play(&mut pipeline, 0, &[raw(0, 0); 5]);
+        let mut events = Vec::new();
+        for (number, raw) in (5..).zip([raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)]) {
+            let bytes = bytes(&pipeline, &raw);
+            events.extend(pipeline.push(&bytes, at(number * 200)));
+        }
+        let Some(Event::Hardness(verdict)) = events.last() else {
+            panic!("{events:?}")
+        };
+        assert_eq!(verdict.rejected, expected);
+        assert_eq!(verdict.level.is_some(), expected.is_none());
+        assert_eq!(verdict.label.is_some(), expected.is_none());
+        assert!((verdict.probabilities.iter().sum::<f32>() - 1.0).abs() < 1e-5);
+    };
+    check(0.0, 0.0, None);
+    check(100.0, 0.0, Some(Rejection::LowForce));
+    check(0.0, 1.1, Some(Rejection::LowConfidence));
+}
+
+#[test]
+fn notes_name_the_edge_and_saturation() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    play(&mut pipeline, 0, &[raw(0, 0); 5]);
+    let mut held = raw(9, 255);
+    held.counts[0] = 10;
+    let mut events = Vec::new();
+    for (number, raw) in (5..).zip([held, held, raw(0, 0), raw(0, 0)]) {
+        let bytes = bytes(&pipeline, &raw);
+        events.extend(pipeline.push(&bytes, at(number * 200)));
+    }
+    let Some(Event::Hardness(verdict)) = events.last() else {
+        panic!("{events:?}")
+    };
+    assert!(verdict.notes.contains(&Note::AtEdge) && verdict.notes.contains(&Note::Saturated));
+}

@@ -1,0 +1,298 @@
+//! What a model file must be before its graph is built (contract, section 6).
+//!
+//! In: the file as ONNX's own messages. Out: what it says of itself, or what in it is not as
+//! agreed. Nothing here runs the model.
+
+use serde::Deserialize;
+use tract_onnx::pb;
+
+use super::{Card, Check, Level, MIN_OPSET, ModelError, Range};
+use crate::frame::{COLS, ROWS, TAXELS};
+
+pub(super) fn check_opset(proto: &pb::ModelProto) -> Result<(), ModelError> {
+    let found = proto
+        .opset_import
+        .iter()
+        .find(|import| import.domain.is_empty() || import.domain == "ai.onnx")
+        .map(|import| import.version);
+    match found {
+        Some(version) if version >= MIN_OPSET => Ok(()),
+        _ => Err(ModelError::Opset { found }),
+    }
+}
+
+/// Refuses data that lies outside the file, in subgraphs and attributes too.
+pub(super) fn check_tensors_inside(graph: &pb::GraphProto) -> Result<(), ModelError> {
+    let inside = |tensor: &pb::TensorProto| {
+        let external = pb::tensor_proto::DataLocation::External as i32;
+        if tensor.data_location == Some(external) || !tensor.external_data.is_empty() {
+            return Err(ModelError::ExternalData {
+                tensor: tensor.name.clone(),
+            });
+        }
+        Ok(())
+    };
+    let sparse_inside = |sparse: &pb::SparseTensorProto| {
+        sparse
+            .values
+            .iter()
+            .chain(&sparse.indices)
+            .try_for_each(inside)
+    };
+    graph.initializer.iter().try_for_each(inside)?;
+    graph
+        .sparse_initializer
+        .iter()
+        .try_for_each(sparse_inside)?;
+    for attribute in graph.node.iter().flat_map(|node| &node.attribute) {
+        attribute
+            .t
+            .iter()
+            .chain(&attribute.tensors)
+            .try_for_each(inside)?;
+        attribute
+            .sparse_tensor
+            .iter()
+            .chain(&attribute.sparse_tensors)
+            .try_for_each(sparse_inside)?;
+        attribute
+            .g
+            .iter()
+            .chain(&attribute.graphs)
+            .try_for_each(check_tensors_inside)?;
+    }
+    Ok(())
+}
+
+/// Refuses other inputs and outputs than the agreed ones.
+pub(super) fn check_signature(graph: &pb::GraphProto, levels: usize) -> Result<(), ModelError> {
+    let describe = |values: &[&pb::ValueInfoProto]| {
+        values
+            .iter()
+            .map(|value| describe_value(value))
+            .collect::<Vec<_>>()
+            .join(", ")
+    };
+    // Before ONNX IR 4 every initialiser is listed among the inputs too.
+    let inputs: Vec<&pb::ValueInfoProto> = graph
+        .input
+        .iter()
+        .filter(|input| {
+            graph
+                .initializer
+                .iter()
+                .all(|tensor| tensor.name != input.name)
+        })
+        .collect();
+    let (found, expected) = (describe(&inputs), format!("frame f32 [1,1,{ROWS},{COLS}]"));
+    if found != expected {
+        return Err(ModelError::Signature {
+            what: "input",
+            found,
+            expected,
+        });
+    }
+    let mut outputs: Vec<&pb::ValueInfoProto> = graph.output.iter().collect();
+    outputs.sort_by(|left, right| left.name.cmp(&right.name));
+    let found = describe(&outputs);
+    let expected = format!("logits f32 [1,{levels}], probabilities f32 [1,{levels}]");
+    if found != expected {
+        return Err(ModelError::Signature {
+            what: "outputs",
+            found,
+            expected,
+        });
+    }
+    // The inference library takes it for granted that somebody computes the outputs.
+    for output in outputs {
+        if !graph
+            .node
+            .iter()
+            .any(|node| node.output.contains(&output.name))
+        {
+            return Err(ModelError::Graph(format!(
+                "no node computes `{}`",
+                output.name
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// A graph input or output as `name type [shape]`.
+fn describe_value(value: &pb::ValueInfoProto) -> String {
+    use pb::tensor_shape_proto::dimension::Value as Dimension;
+    use pb::type_proto::Value;
+    let Some(Value::TensorType(tensor)) = value.r#type.as_ref().and_then(|t| t.value.as_ref())
+    else {
+        return format!("{} of no tensor type", value.name);
+    };
+    let datum = match pb::tensor_proto::DataType::try_from(tensor.elem_type) {
+        Ok(pb::tensor_proto::DataType::Float) => "f32".to_owned(),
+        Ok(other) => format!("{other:?}").to_lowercase(),
+        Err(_) => format!("type {}", tensor.elem_type),
+    };
+    let dimensions: Vec<String> = tensor
+        .shape
+        .iter()
+        .flat_map(|shape| &shape.dim)
+        .map(|dimension| match &dimension.value {
+            Some(Dimension::DimValue(length)) => length.to_string(),
+            Some(Dimension::DimParam(name)) => name.clone(),
+            None => "?".to_owned(),
+        })
+        .collect();
+    format!("{} {datum} [{}]", value.name, dimensions.join(","))
+}
+
+/// Reads and checks all `hrn.*` keys.
+pub(super) fn read_metadata(proto: &pb::ModelProto) -> Result<(Card, Check), ModelError> {
+    let text = |key: &'static str| {
+        proto
+            .metadata_props
+            .iter()
+            .find(|entry| entry.key == key)
+            .map(|entry| entry.value.as_str())
+            .ok_or(ModelError::KeyMissing { key })
+    };
+    let line = |key: &'static str| {
+        let value = text(key)?;
+        if value.trim().is_empty() || value.chars().any(char::is_control) {
+            let expected = "text without control characters".to_owned();
+            return Err(ModelError::KeyInvalid {
+                key,
+                found: format!("{value:?}"),
+                expected,
+            });
+        }
+        Ok(value.to_owned())
+    };
+
+    let format = text("hrn.format")?.to_owned();
+    if format != "1" {
+        let (found, expected) = (format!("{format:?}"), "\"1\"".to_owned());
+        return Err(ModelError::KeyInvalid {
+            key: "hrn.format",
+            found,
+            expected,
+        });
+    }
+    let levels: Vec<Level> = json("hrn.levels", text("hrn.levels")?, "the levels as in hello")?;
+    check_levels(&levels)?;
+    let pitch = text("hrn.pitch_mm")?;
+    let pitch_mm = match pitch.trim().parse::<f32>() {
+        Ok(value) if value.is_finite() && value > 0.0 => value,
+        _ => {
+            let expected = "millimetres above 0".to_owned();
+            let found = format!("{pitch:?}");
+            return Err(ModelError::KeyInvalid {
+                key: "hrn.pitch_mm",
+                found,
+                expected,
+            });
+        }
+    };
+    let range: Range = json("hrn.range", text("hrn.range")?, "trained force and area")?;
+    check_range(&range)?;
+    let check: Check = json("hrn.check", text("hrn.check")?, "frames and probabilities")?;
+    check_check(&check, levels.len())?;
+    let card = Card {
+        format,
+        levels,
+        pitch_mm,
+        method: line("hrn.method")?,
+        data: line("hrn.data")?,
+        metrics: json("hrn.metrics", text("hrn.metrics")?, "JSON")?,
+        validation: line("hrn.validation")?,
+        range,
+    };
+    Ok((card, check))
+}
+
+fn json<T: for<'a> Deserialize<'a>>(
+    key: &'static str,
+    value: &str,
+    expected: &str,
+) -> Result<T, ModelError> {
+    serde_json::from_str(value).map_err(|error| ModelError::KeyInvalid {
+        key,
+        found: error.to_string(),
+        expected: expected.to_owned(),
+    })
+}
+
+fn check_levels(levels: &[Level]) -> Result<(), ModelError> {
+    let key = "hrn.levels";
+    let numbers: Vec<u8> = levels.iter().map(|level| level.level).collect();
+    let consecutive = numbers
+        .iter()
+        .zip(1..=u8::MAX)
+        .all(|(&number, wanted)| number == wanted);
+    if levels.len() < 2 || levels.len() > usize::from(u8::MAX) || !consecutive {
+        let expected = "levels 1, 2, ... in order, at least two".to_owned();
+        return Err(ModelError::KeyInvalid {
+            key,
+            found: format!("{numbers:?}"),
+            expected,
+        });
+    }
+    for text in levels.iter().flat_map(|level| [&level.label, &level.shore]) {
+        if text.is_empty() || text.chars().any(char::is_control) {
+            let expected = "labels without control characters".to_owned();
+            return Err(ModelError::KeyInvalid {
+                key,
+                found: format!("{text:?}"),
+                expected,
+            });
+        }
+    }
+    Ok(())
+}
+
+fn check_range(range: &Range) -> Result<(), ModelError> {
+    let [force_low, force_high] = range.force_n;
+    let [area_low, area_high] = range.contact_area_taxels;
+    let force_ordered = force_low.is_finite() && force_high.is_finite() && force_low <= force_high;
+    if force_ordered && area_low <= area_high {
+        return Ok(());
+    }
+    let expected = "[least, greatest] of finite numbers".to_owned();
+    Err(ModelError::KeyInvalid {
+        key: "hrn.range",
+        found: format!("{range:?}"),
+        expected,
+    })
+}
+
+fn check_check(check: &Check, levels: usize) -> Result<(), ModelError> {
+    let usable = |newtons: &Vec<f32>| {
+        newtons.len() == TAXELS && newtons.iter().all(|n| n.is_finite() && *n >= 0.0)
+    };
+    // Two frames a level; a model of more than four levels may keep to eight.
+    let least = 8.min(2 * levels);
+    if check.frames.len() >= least
+        && check.frames.len() == check.probabilities.len()
+        && check.frames.iter().all(usable)
+        && check.probabilities.iter().all(|row| row.len() == levels)
+    {
+        return Ok(());
+    }
+    let lengths = |rows: &[Vec<f32>]| {
+        let mut lengths: Vec<usize> = rows.iter().map(Vec::len).collect();
+        lengths.dedup();
+        lengths
+    };
+    let found = format!(
+        "{} frames of lengths {:?}, {} rows of probabilities of lengths {:?}",
+        check.frames.len(),
+        lengths(&check.frames),
+        check.probabilities.len(),
+        lengths(&check.probabilities)
+    );
+    let expected = format!("at least {least} frames of {TAXELS} newtons, as many rows of {levels}");
+    Err(ModelError::KeyInvalid {
+        key: "hrn.check",
+        found,
+        expected,
+    })
+}
