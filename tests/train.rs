@@ -10,6 +10,7 @@ use std::process::{Command, Output};
 use std::sync::OnceLock;
 
 use hardnessd::verdict::Hrn;
+use rustix::process::{Pid, Signal};
 use serde_json::Value;
 
 fn hrn_train(arguments: &[&str]) -> Output {
@@ -177,39 +178,46 @@ fn a_run_learns_and_leaves_what_it_promises() {
     assert!(succeed(&["inspect", copy]).contains("simulated data only"));
 }
 
-#[test]
-fn a_killed_run_resumes_to_the_same_weights_bit_for_bit() {
-    let whole = Trial::new("uninterrupted");
-    whole.train("2", &[]);
-
-    let killed = Trial::new("killed");
+/// Sends `signal` as soon as the second checkpoint stands, wherever the run then is; gives its
+/// exit code, if it had one.
+fn interrupted(trial: &Trial, seed: &'static str, signal: Signal) -> Option<i32> {
     let mut process = Command::new(env!("CARGO_BIN_EXE_hrn-train"))
-        .args(killed.arguments("2"))
+        .args(trial.arguments(seed))
         .stderr(std::process::Stdio::null())
         .spawn()
         .unwrap();
-    // As soon as the second checkpoint stands, wherever the process then is.
     let second = |directory: &Path| std::fs::read_dir(directory).is_ok_and(|all| all.count() >= 2);
-    while !second(&killed.out.join("checkpoints")) {
-        assert!(
-            process.try_wait().unwrap().is_none(),
-            "ended before it could be killed"
-        );
+    while !second(&trial.out.join("checkpoints")) {
+        let ended = process.try_wait().unwrap();
+        assert!(ended.is_none(), "ended before it could be interrupted");
         std::thread::yield_now();
     }
-    process.kill().unwrap();
-    process.wait().unwrap();
-    assert!(!killed.out.join("hrn.onnx").exists());
+    rustix::process::kill_process(Pid::from_child(&process), signal).unwrap();
+    process.wait().unwrap().code()
+}
 
-    killed.train("2", &["--resume"]);
-    assert!(
-        killed.newest_checkpoint() == whole.newest_checkpoint(),
-        "checkpoints differ"
-    );
-    assert!(
-        killed.read("hrn.onnx") == whole.read("hrn.onnx"),
-        "models differ"
-    );
+#[test]
+fn an_interrupted_run_resumes_to_the_same_weights_bit_for_bit() {
+    let whole = Trial::new("uninterrupted");
+    whole.train("2", &[]);
+    for (name, signal, code) in [
+        ("killed", Signal::KILL, None),
+        ("terminated", Signal::TERM, Some(0)),
+        ("interrupted", Signal::INT, Some(0)),
+    ] {
+        let trial = Trial::new(name);
+        assert_eq!(interrupted(&trial, "2", signal), code, "{name}");
+        assert!(!trial.out.join("hrn.onnx").exists(), "{name}");
+        trial.train("2", &["--resume"]);
+        assert!(
+            trial.newest_checkpoint() == whole.newest_checkpoint(),
+            "{name}: checkpoints differ"
+        );
+        assert!(
+            trial.read("hrn.onnx") == whole.read("hrn.onnx"),
+            "{name}: models differ"
+        );
+    }
 }
 
 #[test]
