@@ -6,16 +6,19 @@
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use serde::{Deserialize, Serialize};
+
 use super::material::{Material, Split};
 use super::object::{Object, POSTURES, Pose, Shapes};
-use super::press::{Bench, Specimen};
+use super::press::{Bench, COVER_YOUNG_MPA, Specimen};
 use super::sensor::{Film, NEWTONS_PER_COUNT, Sensor, SensorProfile, Threshold, taxel_forces};
 use super::texture::Patch;
 use crate::frame::{Frame, RawFrame};
 use crate::random::Stream;
 
 /// What to simulate.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 pub struct DatasetSettings {
     /// Everything random follows from it.
     pub seed: u64,
@@ -33,6 +36,12 @@ pub struct DatasetSettings {
     pub profile: SensorProfile,
     /// Activation of their taxels.
     pub threshold: Threshold,
+    /// Of the sensors' gains, thresholds and dead taxels; `None`: `seed`.
+    pub sensor_seed: Option<u64>,
+    /// Young's modulus of the sensors' cover, MPa.
+    pub cover_young_mpa: f64,
+    /// Levels, from 1, whose two materials change roles: the paper's test material trains.
+    pub swapped_levels: [bool; 4],
 }
 
 impl Default for DatasetSettings {
@@ -47,6 +56,22 @@ impl Default for DatasetSettings {
             shapes: Shapes::Matched,
             profile: SensorProfile::Clean,
             threshold: Threshold::Spread,
+            sensor_seed: None,
+            cover_young_mpa: COVER_YOUNG_MPA,
+            swapped_levels: [false; 4],
+        }
+    }
+}
+
+impl DatasetSettings {
+    /// What a material is for: the paper's split, or the other one where its level is swapped. An
+    /// object's draws follow from the seed, its split, material and number, so that the same
+    /// objects stand in every data set of a seed in which their material has the same role.
+    pub fn split(&self, material: Material) -> Split {
+        let swapped = self.swapped_levels[usize::from(material.level()) - 1];
+        match (material.split(), swapped) {
+            (Split::Train, false) | (Split::Test, true) => Split::Train,
+            (Split::Test, false) | (Split::Train, true) => Split::Test,
         }
     }
 }
@@ -64,7 +89,7 @@ pub struct LabelledSample {
     pub material: u8,
     /// Force the sensor was pressed with.
     pub force_n: f32,
-    /// Split of the material, hence of the object.
+    /// What the material is for, hence the object.
     pub split: Split,
     /// The object's Shore hardness.
     pub shore: f32,
@@ -95,7 +120,7 @@ pub fn dataset(
 ) -> Vec<LabelledSample> {
     let mut units = Vec::new();
     for material in Material::ALL {
-        let count = match material.split() {
+        let count = match settings.split(material) {
             Split::Train => settings.objects,
             Split::Test => settings.test_objects,
         };
@@ -106,7 +131,7 @@ pub fn dataset(
     std::thread::scope(|scope| {
         for _ in 0..threads.max(1) {
             scope.spawn(|| {
-                let mut bench = Bench::default();
+                let mut bench = Bench::under(settings.cover_young_mpa);
                 loop {
                     let index = next.fetch_add(1, Ordering::Relaxed);
                     let Some(&(material, number)) = units.get(index) else {
@@ -143,14 +168,14 @@ pub(super) struct Draws {
 impl Draws {
     /// Object number `number` of a material in a data set. Geometry, poses and forces of matched
     /// test objects do not depend on the material: that is what pairs them.
-    fn new(seed: u64, shapes: Shapes, material: Material, number: u32) -> Self {
+    fn new(settings: &DatasetSettings, material: Material, number: u32) -> Self {
         let own = u64::from(material.index());
-        let (split, geometry) = match (material.split(), shapes) {
+        let (split, geometry) = match (settings.split(material), settings.shapes) {
             (Split::Train, _) => ("train", own),
             (Split::Test, Shapes::Paper) => ("test", own),
             (Split::Test, Shapes::Matched) => ("test", Material::ALL.len() as u64),
         };
-        let root = Stream::new(seed, split).child(u64::from(number));
+        let root = Stream::new(settings.seed, split).child(u64::from(number));
         Self {
             geometry: root.child(0).child(geometry),
             body: root.child(1).child(own),
@@ -161,6 +186,7 @@ impl Draws {
 /// An object with its hardness and the sensor it is pressed on.
 struct Subject {
     material: Material,
+    split: Split,
     object: Object,
     shore: f64,
     sensor: Sensor,
@@ -187,21 +213,24 @@ pub(super) fn draw_patch(material: Material, roughness: f64, stream: &mut Stream
 
 impl Subject {
     fn draw(settings: &DatasetSettings, material: Material, number: u32) -> Self {
-        let draws = Draws::new(settings.seed, settings.shapes, material, number);
+        let draws = Draws::new(settings, material, number);
         let object = Object::draw(settings.shapes, material, &mut draws.geometry.child(0));
         let shore = draw_shore(material, &mut draws.body.child(0));
         // The splits share no sensor: the streams have different names.
-        let sensors = match material.split() {
+        let split = settings.split(material);
+        let sensors = match split {
             Split::Train => "train sensor",
             Split::Test => "test sensor",
         };
         let sensor = Sensor::new(
             settings.profile,
             settings.threshold,
-            &Stream::new(settings.seed, sensors).child(u64::from(number % SENSORS)),
+            &Stream::new(settings.sensor_seed.unwrap_or(settings.seed), sensors)
+                .child(u64::from(number % SENSORS)),
         );
         Self {
             material,
+            split,
             object,
             shore,
             sensor,
@@ -238,7 +267,7 @@ impl Subject {
                     object: 0,
                     material: self.material.index(),
                     force_n: force_n as f32,
-                    split: self.material.split(),
+                    split: self.split,
                     shore: self.shore as f32,
                 });
             }
@@ -356,7 +385,7 @@ mod tests {
         for (shapes, paired) in [(Shapes::Matched, true), (Shapes::Paper, false)] {
             let settings = small(shapes);
             let draw = |material, number| {
-                let draws = Draws::new(settings.seed, shapes, material, number);
+                let draws = Draws::new(&settings, material, number);
                 format!(
                     "{:?}",
                     Object::draw(shapes, material, &mut draws.geometry.child(0))
@@ -366,6 +395,70 @@ mod tests {
             assert_eq!(foam == draw(Material::YogaMat, 1), paired);
             assert_ne!(foam, draw(Material::Foam, 0));
         }
+    }
+
+    #[test]
+    fn a_material_presses_the_same_objects_in_its_role_whatever_the_others_roles() {
+        let swapped = |swapped_levels| DatasetSettings {
+            swapped_levels,
+            ..small(Shapes::Matched)
+        };
+        let of = |settings: &DatasetSettings, material: Material, split| -> Vec<_> {
+            let samples = dataset(settings, 2, |_| ());
+            let wanted = |s: &LabelledSample| (s.material, s.split) == (material.index(), split);
+            let known = |s: LabelledSample| (s.frame, s.level, s.force_n, s.shore);
+            samples.into_iter().filter(wanted).map(known).collect()
+        };
+        let (none, two, all) = (
+            swapped([false; 4]),
+            swapped([false, true, true, false]),
+            swapped([true; 4]),
+        );
+        // Rubber and foam, level 2: one object trains, two test.
+        for (material, split, count) in [
+            (Material::Rubber, Split::Test, 2 * 9),
+            (Material::Foam, Split::Train, 9),
+        ] {
+            let (here, there) = (of(&two, material, split), of(&all, material, split));
+            assert_eq!(here.len(), count, "{material}");
+            assert!(here == there, "{material}: other objects");
+            assert!(of(&none, material, split).is_empty(), "{material}");
+        }
+        assert!(of(&two, Material::Wood, Split::Train) == of(&none, Material::Wood, Split::Train));
+    }
+
+    #[test]
+    fn another_sensor_changes_readings_and_nothing_else() {
+        let usual = DatasetSettings {
+            lowest_force_n: 15.0,
+            ..small(Shapes::Paper)
+        };
+        let other_gains = DatasetSettings {
+            sensor_seed: Some(77),
+            ..usual
+        };
+        let softer = DatasetSettings {
+            cover_young_mpa: 0.5 * COVER_YOUNG_MPA,
+            ..usual
+        };
+        let [before, other_gains, softer] =
+            [usual, other_gains, softer].map(|settings| dataset(&settings, 2, |_| ()));
+        let plain = |s: &LabelledSample| (s.object, s.material, s.shore.to_bits());
+        for after in [&other_gains, &softer] {
+            assert!(before.iter().map(plain).eq(after.iter().map(plain)));
+        }
+        let pairs = before.iter().zip(&other_gains);
+        assert!(pairs.into_iter().all(|(a, b)| a.frame != b.frame));
+        // Under a softer cover a rigid object touches more; a soft one yields itself.
+        let area = |samples: &[LabelledSample], level| -> f64 {
+            let of_level = samples.iter().filter(|sample| sample.level == level);
+            of_level
+                .map(|s| f64::from(s.frame.contact_area_taxels(0.07)))
+                .sum()
+        };
+        let ratio = |level| area(&softer, level) / area(&before, level);
+        assert!(ratio(1) > 1.1, "{}", ratio(1));
+        assert!((0.98..1.05).contains(&ratio(4)), "{}", ratio(4));
     }
 
     #[test]

@@ -3,12 +3,15 @@
 //! Lengths in mm; x and y in the sensor's plane from its centre, heights measured downwards from
 //! the highest point of the face.
 
+use serde::{Deserialize, Serialize};
+
 use super::material::Material;
 use super::texture::Patch;
 use crate::random::Stream;
 
 /// Which distribution of shapes the objects are drawn from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Shapes {
     /// One distribution for all materials, and test objects of the same geometry, posture and
     /// force in every test material: shape cannot carry the label.

@@ -18,7 +18,7 @@ use super::texture::Patch;
 const WIDTHS: [usize; 6] = [24, 32, 48, 64, 96, CELLS];
 
 /// The sensor's cover: E in MPa, Poisson's ratio, thickness in mm (assumed: soft silicone).
-const COVER_YOUNG_MPA: f64 = 3.0;
+pub(super) const COVER_YOUNG_MPA: f64 = 3.0;
 const COVER_NU: f64 = 0.45;
 const COVER_MM: f64 = 1.0;
 
@@ -40,8 +40,8 @@ pub(super) struct Window {
 }
 
 /// Plans, kernels and fields, kept between presses.
-#[derive(Default)]
 pub(super) struct Bench {
+    cover_young_mpa: f64,
     widths: BTreeMap<usize, Width>,
     layers: Vec<(u64, Layer)>,
     fields: Fields,
@@ -206,7 +206,7 @@ impl Window {
     }
 }
 
-/// H / M of the cover, mm per MPa.
+/// H / M of the usual cover, mm per MPa: what is made of it is a guess, under any cover.
 fn cover_compliance() -> f64 {
     let plane_strain = COVER_YOUNG_MPA / (1.0 - COVER_NU * COVER_NU);
     COVER_MM * kernel::confined_compliance(COVER_NU) / plane_strain
@@ -224,7 +224,25 @@ pub(super) struct Step<'a> {
     pub(super) time_s: f64,
 }
 
+impl Default for Bench {
+    /// Under the usual cover.
+    fn default() -> Self {
+        Self::under(COVER_YOUNG_MPA)
+    }
+}
+
 impl Bench {
+    /// For a sensor under a cover of this Young's modulus.
+    pub(super) fn under(cover_young_mpa: f64) -> Self {
+        Self {
+            cover_young_mpa,
+            widths: BTreeMap::new(),
+            layers: Vec::new(),
+            fields: Fields::default(),
+            combined: Vec::new(),
+        }
+    }
+
     /// Presses with a force held for `hold_s` after a ramp of `ramp_s`; returns the window and the
     /// pressure (MPa) on it. The window grows until the contact fits.
     pub(super) fn press(
@@ -319,7 +337,8 @@ impl Bench {
     /// The object's spectrum for E* = 1 and lengths in cells.
     fn object_spectrum(&mut self, specimen: &Specimen, width: usize) -> Rc<Vec<f32>> {
         if !self.widths.contains_key(&width) {
-            let made = Width::new(width, self.layer(COVER_NU));
+            let cover_young_mpa = self.cover_young_mpa;
+            let made = Width::new(width, self.layer(COVER_NU), cover_young_mpa);
             self.widths.insert(width, made);
         }
         let Law::Foam { .. } = specimen.properties.law else {
@@ -365,10 +384,10 @@ impl Bench {
 }
 
 impl Width {
-    fn new(width: usize, cover: &Layer) -> Self {
+    fn new(width: usize, cover: &Layer, cover_young_mpa: f64) -> Self {
         let mut convolver = Convolver::new(width);
         let half_space = Rc::new(convolver.spectrum(|i, j| kernel::half_space(i as f64, j as f64)));
-        let unit = CELL_MM * (1.0 - COVER_NU * COVER_NU) / COVER_YOUNG_MPA;
+        let unit = CELL_MM * (1.0 - COVER_NU * COVER_NU) / cover_young_mpa;
         let height = COVER_MM / CELL_MM;
         let cover = convolver.spectrum(|i, j| unit * cover.influence(i as f64, j as f64, height));
         Self {

@@ -6,6 +6,8 @@
 
 use std::sync::OnceLock;
 
+use serde::{Deserialize, Serialize};
+
 use crate::frame::{COLS, ROWS, RawFrame, TAXELS};
 use crate::random::Stream;
 
@@ -37,7 +39,8 @@ const THRESHOLD_MEDIAN_N: f64 = 0.05;
 const THRESHOLD_BOUND_N: f64 = 0.2;
 
 /// How alike the taxels of a sensor are.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum SensorProfile {
     /// As after a taxel-wise calibration.
     Clean,
@@ -63,7 +66,8 @@ impl std::str::FromStr for SensorProfile {
 pub struct UnknownProfile(pub String);
 
 /// What the paper's "minimum discrimination of 0.2 N" means for a taxel.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Threshold {
     /// Thresholds scatter, and 0.2 N is what every taxel is sure to feel.
     Spread,
