@@ -12,6 +12,7 @@
 
 pub mod settings;
 pub mod dataset;
+pub mod simulated;
 pub mod augment;
 pub mod network;
 pub mod hrn;
@@ -23,5 +24,7 @@ pub mod features;
 pub mod methods;
 pub mod onnx;
 pub mod metrics;
+pub mod paper;
+pub mod history;
 pub mod export;
 pub mod sheet;

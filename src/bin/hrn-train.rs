@@ -9,18 +9,16 @@ use burn::tensor::Device;
 use clap::{Parser, Subcommand, ValueEnum};
 use hardnessd::frame::RawFrame;
 use hardnessd::simulator::{
-    self, DatasetSettings, Material, SensorProfile, Sequence, SequenceSettings, Shapes, Split,
+    DatasetSettings, Material, SensorProfile, Sequence, SequenceSettings, Shapes, Split,
 };
-use hardnessd::train::dataset::{self, Dataset, DatasetError, SIMULATOR, Sample};
+use hardnessd::train::dataset::{Dataset, DatasetError};
 use hardnessd::train::export;
 use hardnessd::train::methods::{self, Method};
 use hardnessd::train::metrics::Evaluation;
 use hardnessd::train::run::{Description, Run, write_whole};
 use hardnessd::train::settings::{Profile, Settings, SettingsError};
-use hardnessd::train::sheet;
+use hardnessd::train::{sheet, simulated};
 use hardnessd::verdict::{Hrn, ModelError};
-use indicatif::{ProgressBar, ProgressStyle};
-use serde_json::json;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 
@@ -226,14 +224,8 @@ fn simulate(arguments: &Simulate) -> anyhow::Result<()> {
         profile: arguments.sensor_profile,
         ..DatasetSettings::default()
     };
-    let threads = std::thread::available_parallelism().map_or(1, usize::from);
-    let total = 4 * (settings.objects + settings.test_objects) * settings.presses;
-    let style =
-        ProgressStyle::with_template("{bar:30} {pos}/{len} samples, {per_sec}, {eta} left")?;
-    let bar = ProgressBar::new(total.into()).with_style(style);
     let begun = Instant::now();
-    let samples = simulator::dataset(&settings, threads, |done| bar.set_position(done as u64));
-    bar.finish_and_clear();
+    let samples = simulated::simulate(&settings);
     let seconds = begun.elapsed().as_secs_f64();
 
     if let Some(path) = &arguments.sheet {
@@ -242,21 +234,12 @@ fn simulate(arguments: &Simulate) -> anyhow::Result<()> {
             &sheet::sheet(&samples, &one_press_a_level(&settings))?,
         )?;
     }
-    let meta = json!({
-        "materials": Material::ALL.map(Material::name),
-        "levels": dataset::levels(),
-        "seed": settings.seed,
-        "generator": format!("{SIMULATOR} {}", env!("CARGO_PKG_VERSION")),
-        "settings": format!("{settings:?}"),
-    });
-    let samples: Vec<Sample> = samples.into_iter().map(Sample::from).collect();
-    let bytes = dataset::write(std::io::Cursor::new(Vec::new()), &samples, &meta)?.into_inner();
-    write_whole(&arguments.out, &bytes)?;
+    let count = samples.len();
+    write_whole(&arguments.out, &simulated::to_bytes(&settings, samples)?)?;
     println!(
-        "{}: {} samples in {seconds:.1} s on {threads} threads, {:.0} a second",
+        "{}: {count} samples in {seconds:.1} s, {:.0} a second",
         arguments.out.display(),
-        samples.len(),
-        samples.len() as f64 / seconds
+        count as f64 / seconds
     );
     Ok(())
 }

@@ -163,10 +163,7 @@ impl Dataset {
     /// than agreed. `object`, `material`, `force`, `shore`, `split` (then all 0) and `meta` may
     /// be missing.
     pub fn read(path: &Path) -> Result<Self, DatasetError> {
-        let bytes = std::fs::read(path).map_err(|source| DatasetError::Unreadable {
-            path: path.to_owned(),
-            source,
-        })?;
+        let bytes = read(path)?;
         let name = path
             .file_name()
             .unwrap_or_default()
@@ -204,8 +201,6 @@ impl Dataset {
         let force: Option<Vec<f32>> = file.read("force", &[], Some(n))?;
         let split: Option<Vec<u8>> = file.read("split", &[], Some(n))?;
         let shore: Option<Vec<f32>> = file.read("shore", &[], Some(n))?;
-        let meta: Option<Vec<u8>> = file.read("meta", &[], None)?;
-
         let levels = levels().len();
         file.within("level", &level, levels as u8, "0 (unlabelled) to 4")?;
         file.within(
@@ -214,12 +209,7 @@ impl Dataset {
             1,
             "0 (train) or 1 (test)",
         )?;
-        let meta: serde_json::Value = match meta {
-            None => serde_json::Value::Null,
-            Some(text) => serde_json::from_slice(&text).map_err(|error| {
-                file.error("meta", error.to_string(), "JSON in UTF-8".to_owned())
-            })?,
-        };
+        let meta = file.meta()?;
         let sample = |index: usize| {
             let mut frame = Frame::default();
             frame
@@ -360,7 +350,23 @@ impl Dataset {
     }
 }
 
-/// Writes samples as an `.npz` file.
+fn read(path: &Path) -> Result<Vec<u8>, DatasetError> {
+    std::fs::read(path).map_err(|source| DatasetError::Unreadable {
+        path: path.to_owned(),
+        source,
+    })
+}
+
+/// What an `.npz` file says of itself; null if it says nothing.
+///
+/// # Errors
+///
+/// If the file cannot be read, or it is no JSON.
+pub fn meta(path: &Path) -> Result<serde_json::Value, DatasetError> {
+    File::open(&read(path)?, path)?.meta()
+}
+
+/// Writes samples as an `.npz` file, compressed: most taxels of a frame are 0.
 ///
 /// # Errors
 ///
@@ -370,7 +376,7 @@ pub fn write<W: Write + Seek>(
     samples: &[Sample],
     meta: &serde_json::Value,
 ) -> Result<W, WriteNpzError> {
-    let mut npz = NpzWriter::new(out);
+    let mut npz = NpzWriter::new_compressed(out);
     let n = samples.len();
     let frames: Vec<f32> = samples
         .iter()
@@ -476,6 +482,15 @@ impl<'a> File<'a> {
         }
         // Row-major whatever the file's order.
         Ok(Some(values.iter().cloned().collect()))
+    }
+
+    /// The array `meta`; null if it is not there.
+    fn meta(&mut self) -> Result<serde_json::Value, DatasetError> {
+        let Some(text) = self.read::<u8>("meta", &[], None)? else {
+            return Ok(serde_json::Value::Null);
+        };
+        serde_json::from_slice(&text)
+            .map_err(|error| self.error("meta", error.to_string(), "JSON in UTF-8".to_owned()))
     }
 
     fn within(

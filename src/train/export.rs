@@ -94,6 +94,16 @@ pub fn finish(
 ///
 /// If the model has fewer levels than the data, or fails to judge a frame.
 pub fn evaluate(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Evaluation> {
+    let judged = judge(hrn, dataset, indices)?;
+    Ok(Evaluation::of(&judged, hrn.card().levels.len()))
+}
+
+/// Judges labelled samples with a model.
+///
+/// # Errors
+///
+/// If the model has fewer levels than the data, or fails to judge a frame.
+pub fn judge(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Vec<Judged>> {
     let levels = hrn.card().levels.len();
     let mut judged = Vec::with_capacity(indices.len());
     for &index in indices {
@@ -110,7 +120,7 @@ pub fn evaluate(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Resu
             object: sample.object,
         });
     }
-    Ok(Evaluation::of(&judged, levels))
+    Ok(judged)
 }
 
 fn evaluations_by_source(hrn: &Hrn, dataset: &Dataset) -> anyhow::Result<serde_json::Value> {

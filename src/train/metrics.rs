@@ -92,7 +92,9 @@ impl Evaluation {
             confusion,
             ece: calibration_error(judged),
             nll: negative_log_likelihood(judged),
-            accuracy_interval_by_object: interval_by_object(judged, levels),
+            accuracy_interval_by_object: by_object(judged)
+                .and_then(|objects| accuracy_by_object(&[&objects]))
+                .map(|estimate| estimate.interval),
         }
     }
 }
@@ -153,20 +155,36 @@ fn kappa_quadratic(confusion: &[Vec<u64>]) -> Option<f64> {
     weighted_kappa(confusion, |h, w| (h as f64 - w as f64).powi(2))
 }
 
-/// Mean over the samples of |accuracy - mean confidence| of their bin.
-fn calibration_error(judged: &[Judged]) -> f64 {
-    // Of each bin: samples, right ones, sum of confidences.
-    let mut bins = [(0.0, 0.0, 0.0); CALIBRATION_BINS];
+/// What one bin of the calibration error holds.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Bin {
+    /// Samples whose largest probability falls into it.
+    pub samples: u64,
+    /// Right ones among them.
+    pub right: u64,
+    /// Sum of their largest probabilities.
+    pub confidence: f64,
+}
+
+/// The bins of the expected calibration error: as many, equally wide, from 0 to 1.
+pub fn calibration(judged: &[Judged]) -> Vec<Bin> {
+    let mut bins = vec![Bin::default(); CALIBRATION_BINS];
     for one in judged {
         let prediction = one.prediction();
         let confidence = f64::from(one.probabilities[prediction]);
         let bin = ((confidence * CALIBRATION_BINS as f64) as usize).min(CALIBRATION_BINS - 1);
-        bins[bin].0 += 1.0;
-        bins[bin].1 += f64::from(u8::from(prediction == one.truth()));
-        bins[bin].2 += confidence;
+        bins[bin].samples += 1;
+        bins[bin].right += u64::from(prediction == one.truth());
+        bins[bin].confidence += confidence;
     }
-    bins.iter()
-        .map(|(_, right, confidence)| (right - confidence).abs())
+    bins
+}
+
+/// Mean over the samples of |accuracy - mean confidence| of their bin.
+fn calibration_error(judged: &[Judged]) -> f64 {
+    calibration(judged)
+        .iter()
+        .map(|bin| (bin.right as f64 - bin.confidence).abs())
         .sum::<f64>()
         / judged.len() as f64
 }
@@ -180,35 +198,101 @@ fn negative_log_likelihood(judged: &[Judged]) -> f64 {
     judged.iter().map(of_one).sum::<f64>() / judged.len() as f64
 }
 
-/// Draws whole objects, with replacement, as many as each level has; seed 0.
-fn interval_by_object(judged: &[Judged], levels: usize) -> Option<[f64; 2]> {
-    // Of each level's objects: right ones, samples.
-    let mut objects: Vec<BTreeMap<u32, (u64, u64)>> = vec![BTreeMap::new(); levels];
+/// How an object was judged.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ObjectCount {
+    /// Its true level, 1..=L.
+    pub level: u8,
+    /// Its number.
+    pub object: u32,
+    /// Samples judged rightly.
+    pub right: u64,
+    /// Samples of it.
+    pub samples: u64,
+}
+
+/// The objects of `judged` in the order of level and number; `None` if a sample has no object.
+pub fn by_object(judged: &[Judged]) -> Option<Vec<ObjectCount>> {
+    let mut objects: BTreeMap<(u8, u32), (u64, u64)> = BTreeMap::new();
     for one in judged {
-        let counts = objects[one.truth()].entry(one.object?).or_default();
-        counts.0 += u64::from(one.prediction() == one.truth());
-        counts.1 += 1;
+        let (right, samples) = objects.entry((one.level, one.object?)).or_default();
+        *right += u64::from(one.prediction() == one.truth());
+        *samples += 1;
     }
-    let objects: Vec<Vec<(u64, u64)>> = objects
-        .into_iter()
-        .map(|level| level.into_values().collect())
+    let count = |((level, object), (right, samples))| ObjectCount {
+        level,
+        object,
+        right,
+        samples,
+    };
+    Some(objects.into_iter().map(count).collect())
+}
+
+/// A share of samples, or a difference of two, with its 95 % interval by a bootstrap over objects
+/// within each level.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Estimate {
+    /// Over all samples, and over the seeds if there are several.
+    pub mean: f64,
+    /// Low and high end.
+    pub interval: [f64; 2],
+}
+
+/// A method's accuracy over its seeds' judgements of the same samples; `None` if there are none.
+pub fn accuracy_by_object(seeds: &[&[ObjectCount]]) -> Option<Estimate> {
+    let counts = seeds.iter().copied().flatten();
+    bootstrap(counts.map(|count| (count, count.right as i64)))
+}
+
+/// A method's accuracy less another's, over `seeds`: both methods' judgements of the same samples
+/// under one seed, a pair each. An object is drawn with both, so that what makes it hard for both
+/// cancels out. `None` without pairs, or if two do not count the same samples.
+pub fn difference_by_object(seeds: &[(&[ObjectCount], &[ObjectCount])]) -> Option<Estimate> {
+    let samples = |count: &ObjectCount| (count.level, count.object, count.samples);
+    let mut differences = Vec::new();
+    for (method, other) in seeds {
+        if !method.iter().map(samples).eq(other.iter().map(samples)) {
+            return None;
+        }
+        let pairs = method.iter().zip(*other);
+        differences.extend(pairs.map(|(a, b)| (a, a.right as i64 - b.right as i64)));
+    }
+    bootstrap(differences.into_iter())
+}
+
+/// Estimates a sum over objects by their samples; an object that comes several times is added up.
+/// Draws whole objects, with replacement, as many as each level has; seed 0.
+fn bootstrap<'a>(counts: impl Iterator<Item = (&'a ObjectCount, i64)>) -> Option<Estimate> {
+    let mut levels: BTreeMap<u8, BTreeMap<u32, (i64, u64)>> = BTreeMap::new();
+    for (count, value) in counts {
+        let objects = levels.entry(count.level).or_default();
+        let (sum, samples) = objects.entry(count.object).or_default();
+        *sum += value;
+        *samples += count.samples;
+    }
+    let levels: Vec<Vec<(i64, u64)>> = levels
+        .into_values()
+        .map(|objects| objects.into_values().collect())
         .collect();
+    let ratio = |(sum, samples): (i64, u64)| sum as f64 / samples as f64;
+    let add = |(sum, samples), &(value, more): &(i64, u64)| (sum + value, samples + more);
     let mut stream = Stream::new(0, "bootstrap by object");
-    let mut accuracies: Vec<f64> = (0..BOOTSTRAP_DRAWS)
+    let mut draws: Vec<f64> = (0..BOOTSTRAP_DRAWS)
         .map(|_| {
-            let (mut right, mut samples) = (0, 0);
-            for level in &objects {
+            let mut total = (0, 0);
+            for level in &levels {
                 for _ in level {
-                    let drawn = level[stream.below(level.len())];
-                    right += drawn.0;
-                    samples += drawn.1;
+                    total = add(total, &level[stream.below(level.len())]);
                 }
             }
-            right as f64 / samples as f64
+            ratio(total)
         })
         .collect();
-    accuracies.sort_by(f64::total_cmp);
-    Some([quantile(&accuracies, 0.025), quantile(&accuracies, 0.975)])
+    draws.sort_by(f64::total_cmp);
+    (!levels.is_empty()).then(|| Estimate {
+        mean: ratio(levels.iter().flatten().fold((0, 0), add)),
+        interval: [quantile(&draws, 0.025), quantile(&draws, 0.975)],
+    })
 }
 
 /// Linear between the two nearest, as numpy's default.
@@ -222,134 +306,32 @@ fn quantile(sorted: &[f64], q: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    /// Table 3 of the paper as counts of 250 a level, with its kappas and Table 2's accuracies.
-    const TABLE_3: [(&str, [[u64; 4]; 4], f64, f64); 8] = [
-        (
-            "HRN15",
-            [
-                [168, 51, 19, 12],
-                [30, 153, 53, 14],
-                [19, 56, 142, 33],
-                [11, 25, 35, 179],
-            ],
-            0.5227,
-            0.642,
-        ),
-        (
-            "HRN50",
-            [
-                [224, 15, 7, 4],
-                [13, 211, 17, 9],
-                [11, 24, 202, 13],
-                [2, 5, 14, 229],
-            ],
-            0.8213,
-            0.866,
-        ),
-        (
-            "HRN100",
-            [
-                [244, 5, 1, 0],
-                [5, 236, 7, 2],
-                [6, 10, 231, 3],
-                [0, 0, 2, 248],
-            ],
-            0.9453,
-            0.959,
-        ),
-        (
-            "SGAN",
-            [
-                [223, 19, 5, 3],
-                [12, 210, 18, 10],
-                [11, 26, 201, 12],
-                [2, 7, 13, 228],
-            ],
-            0.8160,
-            0.862,
-        ),
-        (
-            "IGAN",
-            [
-                [229, 14, 5, 2],
-                [12, 213, 16, 9],
-                [10, 24, 204, 12],
-                [2, 5, 11, 232],
-            ],
-            0.8373,
-            0.878,
-        ),
-        (
-            "NAHRN",
-            [
-                [223, 17, 7, 3],
-                [13, 208, 19, 10],
-                [12, 27, 197, 14],
-                [3, 5, 13, 229],
-            ],
-            0.8093,
-            0.857,
-        ),
-        (
-            "NIHRN",
-            [
-                [231, 11, 6, 2],
-                [9, 221, 15, 5],
-                [9, 21, 212, 8],
-                [1, 5, 7, 237],
-            ],
-            0.8680,
-            0.901,
-        ),
-        (
-            "Ours",
-            [
-                [241, 6, 3, 0],
-                [5, 232, 10, 3],
-                [6, 18, 225, 1],
-                [0, 0, 4, 246],
-            ],
-            0.9253,
-            0.944,
-        ),
-    ];
-
-    fn rows(counts: &[[u64; 4]; 4]) -> Vec<Vec<u64>> {
-        counts.iter().map(|row| row.to_vec()).collect()
-    }
+    use crate::train::paper;
 
     #[test]
     fn every_kappa_of_table_3_follows_from_its_counts() {
-        for (name, counts, expected_kappa, expected_accuracy) in &TABLE_3 {
-            let confusion = rows(counts);
+        for row in &paper::TABLES {
+            let kappa = kappa(&row.counts()).unwrap();
             assert!(
-                counts.iter().all(|row| row.iter().sum::<u64>() == 250),
-                "{name}"
+                (kappa - row.kappa).abs() < 0.5e-4,
+                "{}: {kappa}",
+                row.method
             );
-            let kappa = kappa(&confusion).unwrap();
+            let percent = accuracy(&row.counts()) * 100.0;
             assert!(
-                (kappa - expected_kappa).abs() < 0.5e-4,
-                "{name}: kappa {kappa}"
-            );
-            let accuracy = accuracy(&confusion);
-            assert!(
-                (accuracy - expected_accuracy).abs() < 0.5e-3,
-                "{name}: accuracy {accuracy}"
+                (percent - row.accuracy_percent).abs() < 0.051,
+                "{}: {percent}",
+                row.method
             );
         }
     }
 
     #[test]
     fn quadratic_kappa_forgives_the_neighbouring_level() {
-        // HRN15 and HRN100 by hand from Table 3's counts.
-        for (index, expected) in [(0, 0.682), (2, 0.973), (7, 0.963)] {
-            let kappa = kappa_quadratic(&rows(&TABLE_3[index].1)).unwrap();
-            assert!(
-                (kappa - expected).abs() < 0.5e-3,
-                "{}: {kappa}",
-                TABLE_3[index].0
-            );
+        // By hand from Table 3's counts; the paper does not print it.
+        for (method, expected) in [("hrn15", 0.682), ("hrn100", 0.973), ("ours", 0.963)] {
+            let kappa = kappa_quadratic(&paper::row(method).unwrap().counts()).unwrap();
+            assert!((kappa - expected).abs() < 0.5e-3, "{method}: {kappa}");
         }
     }
 
@@ -430,5 +412,45 @@ mod tests {
         let evaluation = Evaluation::of(&[sample], 4);
         assert_eq!(evaluation.accuracy_interval_by_object, None);
         assert_eq!(evaluation.kappa, None);
+    }
+
+    /// Objects of 50 samples of one level: how many each method judged rightly.
+    fn counts(right: &[u64]) -> Vec<ObjectCount> {
+        (0..)
+            .zip(right)
+            .map(|(object, &right)| ObjectCount {
+                level: 1,
+                object,
+                right,
+                samples: 50,
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_difference_that_is_the_same_on_every_object_is_certain() {
+        // The objects differ widely, but the second method is two samples better on each.
+        let (first, second) = (counts(&[0, 10, 48, 30]), counts(&[2, 12, 50, 32]));
+        let difference = difference_by_object(&[(&first, &second)]).unwrap();
+        assert_eq!(difference.mean, -0.04);
+        assert_eq!(difference.interval, [-0.04, -0.04]);
+        assert_eq!(difference_by_object(&[(&first, &second[..3])]), None);
+        assert_eq!(difference_by_object(&[]), None);
+    }
+
+    #[test]
+    fn the_interval_of_a_difference_is_the_normal_one_for_many_objects() {
+        // Half of 400 objects 10 samples better, half 10 worse, each seed the same way: the mean's
+        // standard deviation is 0.2 / sqrt(400) = 0.01, whatever the number of seeds.
+        let first = counts(&[30; 400]);
+        let second = counts(&[[20; 200], [40; 200]].concat());
+        let pair = (&first[..], &second[..]);
+        for pairs in [&[pair][..], &[pair, pair]] {
+            let Estimate { mean, interval } = difference_by_object(pairs).unwrap();
+            assert_eq!(mean, 0.0);
+            for (end, expected) in interval.into_iter().zip([-0.0196, 0.0196]) {
+                assert!((end - expected).abs() < 0.0012, "{interval:?}");
+            }
+        }
     }
 }

@@ -157,6 +157,7 @@ impl Run {
         let path = self.path("metrics.csv");
         let before = fs::read_to_string(&path).unwrap_or_default();
         let mut text = format!("{METRICS_COLUMNS}\n");
+        let mut seconds_before = 0.0;
         for row in before.lines().skip(1) {
             let mut cells = row.split(',');
             let of_stage = cells.next() == Some(stage);
@@ -164,11 +165,19 @@ impl Run {
             if !of_stage || row_step.is_some_and(|row_step| row_step <= step) {
                 text.push_str(row);
                 text.push('\n');
+                let seconds = row.rsplit(',').next().and_then(|cell| cell.parse().ok());
+                if let (true, Some(seconds)) = (of_stage, seconds) {
+                    seconds_before = seconds;
+                }
             }
         }
         self.write("metrics.csv", text.as_bytes())?;
         let file = File::options().append(true).open(&path)?;
-        Ok(Metrics { file, stage })
+        Ok(Metrics {
+            file,
+            stage,
+            seconds_before,
+        })
     }
 }
 
@@ -180,6 +189,8 @@ const METRICS_COLUMNS: &str =
 pub struct Metrics {
     file: File,
     stage: &'static str,
+    /// What the stage had taken at the checkpoint it goes on from.
+    seconds_before: f64,
 }
 
 /// One row of `metrics.csv`.
@@ -195,7 +206,8 @@ pub struct Row {
     pub learning_rate: f64,
     /// Loss and accuracy on the validation objects, where they were judged.
     pub validation: Option<(f64, f64)>,
-    /// Of this process.
+    /// Since this process took the stage up. The file has the sum over processes; what was done
+    /// after the last checkpoint of a killed one is not in it, and is done again.
     pub seconds: f64,
 }
 
@@ -214,7 +226,7 @@ impl Metrics {
             seconds,
             ..
         } = row;
-        let stage = self.stage;
+        let (stage, seconds) = (self.stage, self.seconds_before + seconds);
         let validation = match row.validation {
             Some((loss, accuracy)) => format!("{loss:.6},{accuracy:.4}"),
             None => ",".to_owned(),
@@ -264,4 +276,42 @@ fn revision() -> String {
         .and_then(|output| String::from_utf8(output.stdout).ok());
     let commit = described.as_deref().map_or("no checkout", str::trim);
     format!("hardnessd {} ({commit})", env!("CARGO_PKG_VERSION"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seconds_go_on_from_the_row_of_the_checkpoint() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = Run {
+            directory: directory.path().to_owned(),
+        };
+        let row = |step, seconds| Row {
+            step,
+            epoch: 1,
+            loss: 1.0,
+            learning_rate: 0.1,
+            validation: None,
+            seconds,
+        };
+        let mut metrics = run.metrics("first", 0).unwrap();
+        metrics.add(&row(10, 2.0)).unwrap();
+        metrics.add(&row(20, 4.0)).unwrap();
+        metrics.add(&row(30, 9.0)).unwrap();
+        run.metrics("second", 0).unwrap().add(&row(5, 1.0)).unwrap();
+        // Killed after step 30, taken up from the checkpoint of step 20.
+        let mut metrics = run.metrics("first", 20).unwrap();
+        metrics.add(&row(30, 3.5)).unwrap();
+        let text = fs::read_to_string(run.path("metrics.csv")).unwrap();
+        let seconds: Vec<&str> = text
+            .lines()
+            .skip(1)
+            .filter(|row| row.starts_with("first"))
+            .map(|row| row.rsplit(',').next().unwrap())
+            .collect();
+        assert_eq!(seconds, ["2.0", "4.0", "7.5"], "{text}");
+        assert!(text.contains("second,5,"), "{text}");
+    }
 }
