@@ -82,7 +82,8 @@ struct Trial {
 impl Trial {
     fn new(name: &str) -> Self {
         let directory = data().0.path();
-        let config = directory.join("settings.toml");
+        // Tests run side by side: a file of its own, so that none is read half written.
+        let config = directory.join(format!("{name}.toml"));
         std::fs::write(&config, SETTINGS).unwrap();
         Self {
             out: directory.join(name),
