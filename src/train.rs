@@ -5,10 +5,11 @@
 //! thread of a busy machine (2026-11-21; `models/README.md`).
 //!
 //! In: labelled and unlabelled frames. Out: a run's directory with the model that the daemon loads
-//! and what it is worth. In reading order: [`dataset`] and [`augment`] make batches, [`network`]
-//! and [`hrn`] judge them, [`optimiser`] and [`fit`] learn from them, [`features`] is the trivial
-//! baseline, [`methods`] are the table's rows, [`onnx`] and [`export`] write the file, [`metrics`]
-//! say how good it is. Nothing here draws from a global random state.
+//! and what it is worth. In reading order: [`dataset`] and [`augment`] make batches, [`generator`]
+//! makes frames, [`network`] and [`hrn`] judge them, [`losses`] and [`gan`] set one against the
+//! other, [`optimiser`] and [`fit`] learn, [`features`] is the trivial baseline, [`methods`] are
+//! the table's rows, [`onnx`] and [`export`] write the file, [`metrics`] and [`likeness`] say how
+//! good it is. Nothing here draws from a global random state.
 
 pub mod settings;
 pub mod dataset;
@@ -16,11 +17,16 @@ pub mod simulated;
 pub mod augment;
 pub mod network;
 pub mod hrn;
+pub mod generator;
+pub mod losses;
 pub mod optimiser;
+pub mod learner;
 pub mod checkpoint;
 pub mod run;
 pub mod fit;
+pub mod gan;
 pub mod features;
+pub mod likeness;
 pub mod methods;
 pub mod onnx;
 pub mod metrics;

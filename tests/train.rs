@@ -57,15 +57,16 @@ fn data() -> &'static (tempfile::TempDir, PathBuf) {
 
 /// Adam on small batches: enough steps in two epochs to learn something.
 const SETTINGS: &str = "
+    [training]
     epochs = 6
     batch = 16
     averaging = 0.9
     checkpoint_every_epochs = 1
-    [optimiser]
+    [training.optimiser]
     rule = \"adam\"
     learning_rate = 0.005
     schedule = \"cosine\"
-    [augmentation]
+    [training.augmentation]
     symmetries = true
     shift_taxels = 2
     [validation]

@@ -11,12 +11,12 @@ use hardnessd::frame::RawFrame;
 use hardnessd::simulator::{
     DatasetSettings, Material, SensorProfile, Sequence, SequenceSettings, Shapes, Split,
 };
-use hardnessd::train::dataset::{Dataset, DatasetError};
+use hardnessd::train::dataset::{Dataset, DatasetError, LabelChoice};
 use hardnessd::train::export;
 use hardnessd::train::methods::{self, Method};
 use hardnessd::train::metrics::Evaluation;
 use hardnessd::train::run::{Description, Run, write_whole};
-use hardnessd::train::settings::{Profile, Settings, SettingsError};
+use hardnessd::train::settings::{Profile, SettingsError};
 use hardnessd::train::{sheet, simulated};
 use hardnessd::verdict::{Hrn, ModelError};
 use signal_hook::consts::{SIGINT, SIGTERM};
@@ -107,9 +107,12 @@ struct Train {
     /// Go on with a run that was stopped
     #[arg(long)]
     resume: bool,
-    /// Use only so many labels, chosen by whole objects
+    /// Use so many labels instead of the method's share
     #[arg(long, value_name = "N")]
     labels: Option<usize>,
+    /// Whether they are those of whole objects
+    #[arg(long, default_value = "object")]
+    label_choice: LabelChoice,
     /// Where to compute
     #[arg(long, default_value = "cpu")]
     device: DeviceName,
@@ -261,7 +264,7 @@ fn one_press_a_level(settings: &DatasetSettings) -> Vec<(Material, Vec<RawFrame>
 }
 
 fn train(arguments: &Train) -> anyhow::Result<()> {
-    let mut settings = Settings::of(arguments.profile);
+    let mut settings = arguments.method.settings(arguments.profile);
     if let Some(path) = &arguments.config {
         let text = String::from_utf8_lossy(&read(path)?).into_owned();
         settings = settings
@@ -278,7 +281,8 @@ fn train(arguments: &Train) -> anyhow::Result<()> {
         method: arguments.method.name().to_owned(),
         profile: arguments.profile,
         seed: arguments.seed,
-        labels: arguments.labels,
+        labels: methods::labels(arguments.method, &dataset, arguments.labels)?,
+        label_choice: arguments.label_choice,
         settings,
         data: dataset.sources.clone(),
     };

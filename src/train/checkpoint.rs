@@ -25,7 +25,7 @@ pub struct Checkpoint {
 }
 
 /// How far a stage is.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Progress {
     /// Epochs done.

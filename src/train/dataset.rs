@@ -41,6 +41,28 @@ pub fn levels() -> Vec<Level> {
     .collect()
 }
 
+/// How the samples are chosen whose labels may be used.
+#[derive(
+    Debug,
+    Clone,
+    Copy,
+    Default,
+    PartialEq,
+    Eq,
+    clap::ValueEnum,
+    serde::Serialize,
+    serde::Deserialize,
+)]
+#[serde(rename_all = "lowercase")]
+pub enum LabelChoice {
+    /// By whole objects: what labelling some objects gives.
+    #[default]
+    Object,
+    /// Each by itself, so that near-copies of most unlabelled ones are labelled: probably the
+    /// paper's way.
+    Random,
+}
+
 /// One press's chosen frame and what is known of it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
@@ -76,6 +98,9 @@ impl From<LabelledSample> for Sample {
         }
     }
 }
+
+/// By source and level: a list of objects, each a list of samples.
+type Groups = BTreeMap<(usize, u8), Vec<Vec<usize>>>;
 
 /// A file that samples came from.
 #[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -295,15 +320,20 @@ impl Dataset {
 
     /// The objects of `indices` by source and level, in a random order of `stream`'s. A sample of
     /// no known object stands for itself.
-    fn objects(
+    fn objects(&self, indices: &[usize], stream: &Stream) -> Groups {
+        self.groups(indices, stream, |sample| sample.object)
+    }
+
+    fn groups(
         &self,
         indices: &[usize],
         stream: &Stream,
-    ) -> BTreeMap<(usize, u8), Vec<Vec<usize>>> {
+        object_of: impl Fn(&Sample) -> Option<u32>,
+    ) -> Groups {
         let mut groups: BTreeMap<(usize, u8), BTreeMap<u64, Vec<usize>>> = BTreeMap::new();
         for &index in indices {
             let sample = &self.samples[index];
-            let object = sample.object.map_or(u64::MAX - index as u64, u64::from);
+            let object = object_of(sample).map_or(u64::MAX - index as u64, u64::from);
             let group = groups.entry((sample.source, sample.level)).or_default();
             group.entry(object).or_default().push(index);
         }
@@ -334,10 +364,20 @@ impl Dataset {
         (kept, held)
     }
 
-    /// Chooses `labels` of `indices`, equally many a level (and source), by whole objects; of
-    /// the last object of each only as many presses as are still wanted.
-    pub fn choose_labelled(&self, indices: &[usize], labels: usize, seed: u64) -> Vec<usize> {
-        let groups = self.objects(indices, &Stream::new(seed, "labelled objects"));
+    /// Chooses `labels` of `indices`, equally many a level (and source). By object, whole ones
+    /// are taken, and of the last of each level only as many presses as are still wanted.
+    pub fn choose_labelled(
+        &self,
+        indices: &[usize],
+        labels: usize,
+        choice: LabelChoice,
+        seed: u64,
+    ) -> Vec<usize> {
+        let stream = Stream::new(seed, "labelled objects");
+        let groups = match choice {
+            LabelChoice::Object => self.objects(indices, &stream),
+            LabelChoice::Random => self.groups(indices, &stream, |_| None),
+        };
         let group_count = groups.len();
         let mut chosen = Vec::with_capacity(labels);
         for (number, objects) in groups.into_values().enumerate() {
@@ -693,7 +733,7 @@ mod tests {
     fn labels_are_chosen_by_object_and_equally_from_each_level() {
         let dataset = parse(&bytes_of(&samples())).unwrap();
         let indices = dataset.labelled(Split::Train).unwrap();
-        let chosen = dataset.choose_labelled(&indices, 48, 1);
+        let chosen = dataset.choose_labelled(&indices, 48, LabelChoice::Object, 1);
         for level in 1..=4 {
             let of_level = chosen
                 .iter()
@@ -703,6 +743,14 @@ mod tests {
         }
         // Two whole objects and two presses of a third, of each level.
         assert_eq!(objects_of(&dataset, &chosen).len(), 12);
+        // More labels are those and further ones: methods of one seed share what they can.
+        let more = dataset.choose_labelled(&indices, 100, LabelChoice::Object, 1);
+        assert!(chosen.iter().all(|index| more.contains(index)));
+
+        let random = dataset.choose_labelled(&indices, 48, LabelChoice::Random, 1);
+        assert_eq!(random.len(), 48);
+        let objects = objects_of(&dataset, &random).len();
+        assert!(objects > 24, "{objects} of 40 objects");
     }
 
     #[test]

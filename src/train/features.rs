@@ -258,23 +258,27 @@ pub fn features<'a>(frames: impl Iterator<Item = &'a Frame>) -> anyhow::Result<V
     frames.map(|frame| plan.run(frame)).collect()
 }
 
+/// Mean and standard deviation of each feature over `rows`.
+pub fn moments(rows: &[Vec<f32>]) -> (Vec<f64>, Vec<f64>) {
+    let n = rows.len() as f64;
+    let column = |index: usize| rows.iter().map(move |row| f64::from(row[index]));
+    let mean: Vec<f64> = (0..FEATURES)
+        .map(|index| column(index).sum::<f64>() / n)
+        .collect();
+    let deviation: Vec<f64> = (0..FEATURES)
+        .map(|index| {
+            let squares = column(index).map(|x| (x - mean[index]).powi(2));
+            // A feature that never varies is no divisor.
+            (squares.sum::<f64>() / n).sqrt().max(1e-6)
+        })
+        .collect();
+    (mean, deviation)
+}
+
 impl Baseline {
     /// Fits by Newton's method: rows of features with their level, from 0.
     pub fn fit(rows: &[Vec<f32>], level_of: &[usize], levels: usize) -> Self {
-        let n = rows.len() as f64;
-        let column = |index: usize| rows.iter().map(move |row| f64::from(row[index]));
-        let mean: Vec<f64> = (0..FEATURES)
-            .map(|index| column(index).sum::<f64>() / n)
-            .collect();
-        let deviation: Vec<f64> = (0..FEATURES)
-            .map(|index| {
-                let variance = column(index)
-                    .map(|x| (x - mean[index]).powi(2))
-                    .sum::<f64>()
-                    / n;
-                variance.sqrt().max(1e-6)
-            })
-            .collect();
+        let (mean, deviation) = moments(rows);
         let coefficients = vec![vec![0.0; FEATURES + 1]; levels];
         let mut baseline = Self {
             mean,

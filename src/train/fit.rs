@@ -14,10 +14,10 @@ use super::augment;
 use super::checkpoint::{Checkpoint, Progress};
 use super::dataset::Dataset;
 use super::hrn;
-use super::network::{Normalisation, Statistics, Weight, Weights, numbers};
-use super::optimiser::{Optimiser, Rule};
+use super::learner::Learner;
+use super::network::{Normalisation, Statistics, Weights, numbers};
 use super::run::{Row, Run};
-use super::settings::{Keep, Settings};
+use super::settings::{Keep, Training, Validation};
 use crate::frame::Frame;
 use crate::random::Stream;
 
@@ -33,12 +33,14 @@ pub struct Task<'a> {
     pub dataset: &'a Dataset,
     /// Labelled samples to learn from.
     pub train: &'a [usize],
-    /// Samples of held-out training objects; may be empty.
-    pub validation: &'a [usize],
+    /// Samples of held-out training objects, and how they are used; may be empty.
+    pub validation: (&'a [usize], Validation),
     /// Levels there are.
     pub levels: usize,
+    /// Newtons a taxel that become 1 in the image.
+    pub full_scale_n: f64,
     /// How.
-    pub settings: &'a Settings,
+    pub settings: &'a Training,
     /// Of the order of the samples and their augmentation.
     pub seed: u64,
     /// Where.
@@ -83,7 +85,8 @@ impl Trained {
 ///
 /// If the run's directory cannot be read or written.
 pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> {
-    let Settings { batch, epochs, .. } = *task.settings;
+    let Training { batch, epochs, .. } = *task.settings;
+    let (validation_samples, validation_settings) = task.validation;
     let steps_an_epoch = task.train.len().div_ceil(batch) as u64;
     let steps = u64::from(epochs) * steps_an_epoch;
     let mut state = match run.latest(task.stage, task.device)? {
@@ -108,7 +111,7 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
 
         let loss = loss_sum / task.train.len() as f64;
         let mut validation = None;
-        if !task.validation.is_empty() && due(task.settings.validation.every_epochs) {
+        if !validation_samples.is_empty() && due(validation_settings.every_epochs) {
             validation = Some(state.validate(task));
         }
         let seconds = begun.elapsed().as_secs_f64();
@@ -119,25 +122,27 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
             learning_rate: rate,
             validation,
             seconds,
+            adversarial: None,
         })?;
-        report(&bar, task.stage, epoch, epochs, loss, validation);
+        let mut message = format!("loss {loss:.4}");
+        if let Some((loss, accuracy)) = validation {
+            let accuracy = accuracy * 100.0;
+            message += &format!(", validation loss {loss:.4}, accuracy {accuracy:.1} %");
+        }
+        report(&bar, task.stage, epoch, epochs, message);
         if due(task.settings.checkpoint_every_epochs) {
             run.save(task.stage, &state.checkpoint())?;
         }
     }
     bar.finish_and_clear();
 
-    let weights = match task.settings.validation.keep {
-        Keep::Best => state.best.unwrap_or(state.weights),
-        Keep::Last => state.evaluated(task.settings),
+    let weights = match validation_settings.keep {
+        Keep::Best => state.best.unwrap_or(state.learner.weights),
+        Keep::Last => state.learner.evaluated(),
     };
-    let mut trained = Trained {
-        statistics: task.statistics(&weights),
-        weights,
-        temperature: 1.0,
-    };
-    if !task.validation.is_empty() {
-        trained.temperature = temperature(&task.judge(&trained, task.validation));
+    let mut trained = task.with_statistics(weights);
+    if !validation_samples.is_empty() {
+        trained.temperature = temperature(&task.judge(&trained, validation_samples));
     }
     Ok(trained)
 }
@@ -146,85 +151,35 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
 #[derive(Debug)]
 struct State {
     progress: Progress,
-    weights: Weights,
-    optimiser: Optimiser,
-    /// Sum of decayed weights, if they are averaged.
-    average: Option<Weights>,
+    learner: Learner,
     /// Of the least validation loss, if those are kept.
     best: Option<Weights>,
 }
 
 impl State {
-    fn fresh(weights: Weights, settings: &Settings) -> Self {
-        let zeros = |weight: &Weight| Weight {
-            values: weight.values.zeros_like(),
-            ..weight.clone()
-        };
-        let average = Weights {
-            entries: weights.entries.iter().map(zeros).collect(),
-        };
+    fn fresh(weights: Weights, settings: &Training) -> Self {
         Self {
-            progress: Progress {
-                epoch: 0,
-                step: 0,
-                best_loss: None,
-            },
-            optimiser: Optimiser::new(settings.optimiser, &weights),
-            average: (settings.averaging > 0.0).then_some(average),
+            progress: Progress::default(),
+            learner: Learner::fresh(weights, settings.optimiser, settings.averaging),
             best: None,
-            weights,
         }
     }
 
-    fn resumed(checkpoint: &Checkpoint, settings: &Settings) -> anyhow::Result<Self> {
-        let moments = match settings.optimiser.rule {
-            Rule::Sgd => Vec::new(),
-            Rule::Adam => {
-                let (means, squares) = (checkpoint.list("mean")?, checkpoint.list("square")?);
-                let pair = |(mean, square): (&Weight, &Weight)| {
-                    (mean.values.clone(), square.values.clone())
-                };
-                means
-                    .entries
-                    .iter()
-                    .zip(&squares.entries)
-                    .map(pair)
-                    .collect()
-            }
-        };
-        let step = checkpoint.progress.step;
+    fn resumed(checkpoint: &Checkpoint, settings: &Training) -> anyhow::Result<Self> {
+        let Training {
+            optimiser,
+            averaging,
+            ..
+        } = *settings;
         Ok(Self {
             progress: checkpoint.progress,
-            weights: checkpoint.list("weights")?.clone(),
-            optimiser: Optimiser::resumed(settings.optimiser, step, moments),
-            average: checkpoint.list("average").ok().cloned(),
+            learner: Learner::resumed(checkpoint, "", optimiser, averaging)?,
             best: checkpoint.list("best").ok().cloned(),
         })
     }
 
     fn checkpoint(&self) -> Checkpoint {
-        let mut lists = vec![("weights".to_owned(), self.weights.clone())];
-        let moments = self.optimiser.moments();
-        let like_weights = |values: Vec<Tensor<1>>| {
-            let with = |(weight, values): (&Weight, Tensor<1>)| Weight {
-                values,
-                ..weight.clone()
-            };
-            Weights {
-                entries: self.weights.entries.iter().zip(values).map(with).collect(),
-            }
-        };
-        if !moments.is_empty() {
-            let means = moments.iter().map(|(mean, _)| mean.clone()).collect();
-            let squares = moments.iter().map(|(_, square)| square.clone()).collect();
-            lists.push(("mean".to_owned(), like_weights(means)));
-            lists.push(("square".to_owned(), like_weights(squares)));
-        }
-        lists.extend(
-            self.average
-                .iter()
-                .map(|list| ("average".to_owned(), list.clone())),
-        );
+        let mut lists = self.learner.lists("");
         lists.extend(
             self.best
                 .iter()
@@ -238,56 +193,31 @@ impl State {
 
     /// One step on the samples `indices`; gives the batch's mean loss.
     fn step(&mut self, task: &Task, indices: &[usize], rate: f64) -> f64 {
-        let (images, targets) = task.batch(indices, self.progress.step);
-        let tracked = self.weights.tracked();
+        let (images, targets) = (
+            task.images(indices, self.progress.step),
+            task.targets(indices),
+        );
+        let tracked = self.learner.weights.tracked();
         let logits = hrn::logits(&tracked, images, &mut Normalisation::Batch);
         let loss = hrn::cross_entropy(logits, targets);
         let mut gradients = loss.backward();
-        self.optimiser
-            .step(&mut self.weights, &tracked, &mut gradients, rate);
-        if let Some(average) = &mut self.average {
-            let decay = task.settings.averaging;
-            for (sum, weight) in average.entries.iter_mut().zip(&self.weights.entries) {
-                let new = weight.values.clone().mul_scalar(1.0 - decay);
-                sum.values = sum.values.clone().mul_scalar(decay).add(new);
-            }
-        }
+        self.learner.step(&tracked, &mut gradients, rate);
         self.progress.step += 1;
         f64::from(numbers(&loss)[0])
     }
 
-    /// The weights to judge with: averaged ones if they are averaged. The average began at 0,
-    /// which is divided out.
-    fn evaluated(&self, settings: &Settings) -> Weights {
-        let Some(average) = &self.average else {
-            return self.weights.clone();
-        };
-        let total = 1.0 - settings.averaging.powf(self.progress.step as f64);
-        let divided = |weight: &Weight| Weight {
-            values: weight.values.clone().div_scalar(total),
-            ..weight.clone()
-        };
-        Weights {
-            entries: average.entries.iter().map(divided).collect(),
-        }
-    }
-
     /// Loss and accuracy on the validation samples; keeps the weights if they are the best.
     fn validate(&mut self, task: &Task) -> (f64, f64) {
-        let weights = self.evaluated(task.settings);
-        let trained = Trained {
-            statistics: task.statistics(&weights),
-            weights,
-            temperature: 1.0,
-        };
-        let judged = task.judge(&trained, task.validation);
+        let trained = task.with_statistics(self.learner.evaluated());
+        let (samples, settings) = task.validation;
+        let judged = task.judge(&trained, samples);
         let loss = mean_loss(&judged, 1.0);
         let right = judged
             .iter()
             .filter(|(level, logits)| largest(logits) == *level)
             .count();
         let better = self.progress.best_loss.is_none_or(|best| loss < best);
-        if task.settings.validation.keep == Keep::Best && better {
+        if settings.keep == Keep::Best && better {
             self.progress.best_loss = Some(loss);
             self.best = Some(trained.weights);
         }
@@ -307,8 +237,8 @@ impl Task<'_> {
         Stream::new(self.seed, &format!("{} {name}", self.stage))
     }
 
-    /// Images and targets of one batch, augmented for step `step`.
-    fn batch(&self, indices: &[usize], step: u64) -> (Tensor<4>, Tensor<2>) {
+    /// Images of one batch, augmented for step `step`.
+    fn images(&self, indices: &[usize], step: u64) -> Tensor<4> {
         let mut stream = self.stream("augmentation").child(step);
         let frames: Vec<Frame> = indices
             .iter()
@@ -317,11 +247,23 @@ impl Task<'_> {
                 augment::vary(frame, self.settings.augmentation, &mut stream)
             })
             .collect();
+        hrn::images(frames.iter(), self.full_scale_n, self.device)
+    }
+
+    fn targets(&self, indices: &[usize]) -> Tensor<2> {
         let levels_of = indices
             .iter()
             .map(|&index| self.dataset.samples[index].level);
-        let images = hrn::images(frames.iter(), self.settings.full_scale_n, self.device);
-        (images, hrn::targets(levels_of, self.levels, self.device))
+        hrn::targets(levels_of, self.levels, self.device)
+    }
+
+    /// A recogniser of `weights` with statistics over the training samples and no temperature.
+    pub fn with_statistics(&self, weights: Weights) -> Trained {
+        Trained {
+            statistics: self.statistics(&weights),
+            weights,
+            temperature: 1.0,
+        }
     }
 
     /// Statistics of the normalised layers over all training samples, augmented as in training,
@@ -335,7 +277,7 @@ impl Task<'_> {
             .zip(0..)
         {
             // Steps count from 0, so no step shares a batch's sub-stream counted from the end.
-            let (images, _) = self.batch(indices, u64::MAX - number);
+            let images = self.images(indices, u64::MAX - number);
             hrn::logits(
                 weights,
                 images,
@@ -350,13 +292,14 @@ impl Task<'_> {
         let frames = indices
             .iter()
             .map(|&index| &self.dataset.samples[index].frame);
-        let rows = trained.logits(frames, self.settings.full_scale_n, self.device);
+        let rows = trained.logits(frames, self.full_scale_n, self.device);
         let level = |&index: &usize| usize::from(self.dataset.samples[index].level) - 1;
         indices.iter().map(level).zip(rows).collect()
     }
 }
 
-fn largest(logits: &[f32]) -> usize {
+/// The place of the largest number, the first of equal ones.
+pub(super) fn largest(logits: &[f32]) -> usize {
     (1..logits.len()).fold(0, |best, index| {
         if logits[index] > logits[best] {
             index
@@ -400,7 +343,8 @@ pub fn probabilities(logits: &[Vec<f32>], temperature: f32, device: &Device) -> 
     logits.iter().map(one).collect()
 }
 
-fn progress_bar(stage: &str, steps: u64, done: u64) -> ProgressBar {
+/// A bar over a stage's steps.
+pub(super) fn progress_bar(stage: &str, steps: u64, done: u64) -> ProgressBar {
     let template = "{prefix} {bar:30} {pos}/{len} steps, {per_sec}, {eta} left {msg}";
     let style = ProgressStyle::with_template(template).expect("the template is right");
     // indicatif draws on a terminal only; elsewhere `report` prints lines.
@@ -413,21 +357,7 @@ fn progress_bar(stage: &str, steps: u64, done: u64) -> ProgressBar {
 }
 
 /// The state of a stage after an epoch: beside the bar on a terminal, a line elsewhere.
-fn report(
-    bar: &ProgressBar,
-    stage: &str,
-    epoch: u32,
-    epochs: u32,
-    loss: f64,
-    validation: Option<(f64, f64)>,
-) {
-    let validation = validation.map_or_else(String::new, |(loss, accuracy)| {
-        format!(
-            ", validation loss {loss:.4}, accuracy {:.1} %",
-            accuracy * 100.0
-        )
-    });
-    let message = format!("loss {loss:.4}{validation}");
+pub(super) fn report(bar: &ProgressBar, stage: &str, epoch: u32, epochs: u32, message: String) {
     if bar.is_hidden() {
         eprintln!("{stage}: epoch {epoch} of {epochs}: {message}");
     } else {

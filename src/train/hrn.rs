@@ -21,6 +21,36 @@ pub fn initial(levels: usize, seed: u64, device: &Device) -> Weights {
     weights
 }
 
+/// HRN before pretraining or fine-tuning: a USTGAN's discriminator with a head for `levels` levels
+/// in place of its own, which told real from generated.
+pub fn inherited(discriminator: &Weights, levels: usize, seed: u64, device: &Device) -> Weights {
+    let mut weights = discriminator.clone();
+    weights
+        .entries
+        .retain(|weight| !weight.name.starts_with("head."));
+    let stream = Stream::new(seed, "hrn weights");
+    network::add_head(&mut weights, levels, &stream, device);
+    weights
+}
+
+/// HRN of a discriminator whose first `levels` logits are the levels: further ones are cut off.
+pub fn of_levels(discriminator: &Weights, levels: usize, device: &Device) -> Weights {
+    let mut weights = discriminator.clone();
+    weights
+        .entries
+        .retain(|weight| !weight.name.starts_with("head."));
+    let outputs = discriminator.numbers("head.bias").len();
+    for (name, dims) in [
+        ("head.matrix", vec![FEATURES, levels]),
+        ("head.bias", vec![levels]),
+    ] {
+        let rows = discriminator.numbers(name);
+        let rows = rows.chunks(outputs).flat_map(|row| &row[..levels]);
+        weights.add(name, &dims, rows.copied().collect(), device);
+    }
+    weights
+}
+
 /// Frames to images `[batch, 1, 28, 28]` in [-1, 1]: 0 N is -1, `full_scale_n` is 1. One scale
 /// for all frames, because force carries hardness.
 pub fn images<'a>(
@@ -29,12 +59,16 @@ pub fn images<'a>(
     device: &Device,
 ) -> Tensor<4> {
     let batch = frames.len();
-    let scale = (2.0 / full_scale_n) as f32;
     let mut values = Vec::with_capacity(batch * TAXELS);
     for frame in frames {
-        values.extend(frame.newtons.iter().map(|newtons| newtons * scale - 1.0));
+        values.extend(frame.newtons.map(|newtons| pixel(newtons, full_scale_n)));
     }
     Tensor::from_data(TensorData::new(values, [batch, 1, ROWS, COLS]), device)
+}
+
+/// A taxel of the image.
+pub fn pixel(newtons: f32, full_scale_n: f64) -> f32 {
+    newtons * (2.0 / full_scale_n) as f32 - 1.0
 }
 
 /// Logits `[batch, L]` of images `[batch, 1, 28, 28]`.

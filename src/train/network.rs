@@ -227,6 +227,11 @@ impl Statistics {
         (mean.div_scalar(batches), variance.div_scalar(batches))
     }
 
+    /// Counts a batch whose layers were all collected.
+    pub(super) fn batch_collected(&mut self) {
+        self.batches += 1;
+    }
+
     fn collect(&mut self, index: usize, mean: Tensor<1>, variance: Tensor<1>) {
         match self.layers.get_mut(index) {
             None => self.layers.push((mean, variance)),
@@ -283,13 +288,20 @@ pub fn trunk(weights: &Weights, images: Tensor<4>, normalisation: &mut Normalisa
         if layer.normalised {
             let gamma = weights.tensor::<1>(&format!("{name}.gamma"));
             let beta = weights.tensor::<1>(&format!("{name}.beta"));
-            x = batch_norm(x, gamma, beta, normalised_index, normalisation);
+            x = batch_norm(
+                x,
+                gamma,
+                beta,
+                BATCH_NORM_EPSILON,
+                normalised_index,
+                normalisation,
+            );
             normalised_index += 1;
         }
         x = leaky_relu(x);
     }
     if let Normalisation::Collect(statistics) = normalisation {
-        statistics.batches += 1;
+        statistics.batch_collected();
     }
     // [batch, 64, 4, 4] -> [batch, 64]
     let pixels = x.dims()[2] * x.dims()[3];
@@ -298,10 +310,13 @@ pub fn trunk(weights: &Weights, images: Tensor<4>, normalisation: &mut Normalisa
         .reshape([batch, FEATURES])
 }
 
-fn batch_norm(
+/// Batch normalisation of `[batch, channels, rows, columns]` over all axes but the channels;
+/// `index` counts the network's normalised layers.
+pub(super) fn batch_norm(
     x: Tensor<4>,
     gamma: Tensor<1>,
     beta: Tensor<1>,
+    epsilon: f32,
     index: usize,
     normalisation: &mut Normalisation,
 ) -> Tensor<4> {
@@ -325,7 +340,7 @@ fn batch_norm(
     };
     let scale = gamma
         .reshape(along)
-        .div(variance.add_scalar(BATCH_NORM_EPSILON).sqrt());
+        .div(variance.add_scalar(epsilon).sqrt());
     centred.mul(scale).add(beta.reshape(along))
 }
 

@@ -6,6 +6,7 @@ use burn::tensor::{Gradients, Tensor};
 use serde::{Deserialize, Serialize};
 
 use super::network::Weights;
+use super::settings::{SettingsError, check};
 
 /// Adam's epsilon, of its authors. burn's default of 1e-5 is not negligible beside the gradients
 /// here.
@@ -63,6 +64,20 @@ impl Default for Settings {
 }
 
 impl Settings {
+    /// Refuses what lies outside its range; `table` is where these settings stand.
+    pub(super) fn check(&self, table: &str) -> Result<(), SettingsError> {
+        let table = format!("{table}optimiser.");
+        let check = |key, found, fits, expected| check(&table, key, found, fits, expected);
+        let within_0_1 = |value: f64| (0.0..1.0).contains(&value);
+        let rate = self.learning_rate;
+        check("learning_rate", rate, rate > 0.0, "above 0")?;
+        for (key, beta) in [("beta1", self.beta1), ("beta2", self.beta2)] {
+            check(key, beta, within_0_1(beta), "0 to below 1")?;
+        }
+        let decay = self.weight_decay;
+        check("weight_decay", decay, decay >= 0.0, "0 or more")
+    }
+
     /// The learning rate of step `step` of `steps`, both counted from 0.
     pub fn rate_at(&self, step: u64, steps: u64) -> f64 {
         match self.schedule {

@@ -12,7 +12,8 @@ use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 
 use super::checkpoint::Checkpoint;
-use super::dataset::Source;
+use super::dataset::{LabelChoice, Source};
+use super::likeness::Likeness;
 use super::settings::{Profile, Settings};
 
 /// Checkpoints kept of a stage: the newest, and one before it.
@@ -28,9 +29,10 @@ pub struct Description {
     pub profile: Profile,
     /// Everything random follows from it.
     pub seed: u64,
-    /// Labelled samples it may use; all if not given.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub labels: Option<usize>,
+    /// Labelled samples it may use.
+    pub labels: usize,
+    /// How they are chosen.
+    pub label_choice: LabelChoice,
     /// Of the method.
     pub settings: Settings,
     /// The files it learns from.
@@ -75,8 +77,10 @@ impl Run {
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
             Err(error) => return Err(error).with_context(|| told.display().to_string()),
         }
-        let checkpoints = run.path("checkpoints");
-        fs::create_dir_all(&checkpoints).with_context(|| checkpoints.display().to_string())?;
+        for part in ["checkpoints", "samples"] {
+            let part = run.path(part);
+            fs::create_dir_all(&part).with_context(|| part.display().to_string())?;
+        }
         run.write("revision", format!("{}\n", revision()).as_bytes())?;
         run.write("settings.toml", toml::to_string(description)?.as_bytes())?;
         Ok(run)
@@ -181,8 +185,10 @@ impl Run {
     }
 }
 
-const METRICS_COLUMNS: &str =
-    "stage,step,epoch,loss,learning_rate,validation_loss,validation_accuracy,seconds";
+/// Of a GAN's stage, `loss` is the discriminator's; what a stage does not have stays empty.
+const METRICS_COLUMNS: &str = "stage,step,epoch,loss,learning_rate,validation_loss,\
+    validation_accuracy,generator_loss,sigma_min,sigma_mean,sigma_max,pixel_std,pixel_std_real,\
+    feature_distance,seconds";
 
 /// `metrics.csv`, open for one stage.
 #[derive(Debug)]
@@ -209,6 +215,19 @@ pub struct Row {
     /// Since this process took the stage up. The file has the sum over processes; what was done
     /// after the last checkpoint of a killed one is not in it, and is done again.
     pub seconds: f64,
+    /// Of a GAN's stage.
+    pub adversarial: Option<Adversarial>,
+}
+
+/// What a GAN's row has beside.
+#[derive(Debug, Clone, Copy)]
+pub struct Adversarial {
+    /// Mean of the epoch.
+    pub generator_loss: f64,
+    /// Least, mean and greatest deviation of the mixture.
+    pub sigma: [f64; 3],
+    /// Generated frames beside real ones, where they were compared.
+    pub likeness: Option<Likeness>,
 }
 
 impl Metrics {
@@ -231,11 +250,26 @@ impl Metrics {
             Some((loss, accuracy)) => format!("{loss:.6},{accuracy:.4}"),
             None => ",".to_owned(),
         };
-        writeln!(
-            self.file,
-            "{stage},{step},{epoch},{loss:.6},{learning_rate},{validation},{seconds:.1}"
-        )
-        .context("metrics.csv")
+        let mut line = format!("{stage},{step},{epoch},{loss:.6},{learning_rate},{validation}");
+        match row.adversarial {
+            Some(Adversarial {
+                generator_loss,
+                sigma: [least, mean, greatest],
+                ..
+            }) => line += &format!(",{generator_loss:.6},{least:.5},{mean:.5},{greatest:.5}"),
+            None => line += ",,,,",
+        }
+        match row.adversarial.and_then(|adversarial| adversarial.likeness) {
+            Some(Likeness {
+                pixel_std,
+                pixel_std_real,
+                feature_distance,
+            }) => line += &format!(",{pixel_std:.5},{pixel_std_real:.5},{feature_distance:.5}"),
+            None => line += ",,,",
+        }
+        line += &format!(",{seconds:.1}\n");
+        // One write a row: a full disk leaves whole rows.
+        self.file.write_all(line.as_bytes()).context("metrics.csv")
     }
 }
 
@@ -295,6 +329,7 @@ mod tests {
             learning_rate: 0.1,
             validation: None,
             seconds,
+            adversarial: None,
         };
         let mut metrics = run.metrics("first", 0).unwrap();
         metrics.add(&row(10, 2.0)).unwrap();

@@ -5,7 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{augment, optimiser};
+use super::{augment, gan, optimiser};
 
 /// How long a run may take.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -51,13 +51,10 @@ impl Default for Validation {
     }
 }
 
-/// Settings of a supervised run; the defaults are the paper's HRN ("Training of HRN").
+/// How a recogniser learns from labelled frames; the defaults are the paper's ("Training of HRN").
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Settings {
-    /// Newtons a taxel that become 1 in the network's image; 0 N becomes -1. 10.2 N is what
-    /// 8 bits of 0.04 N hold.
-    pub full_scale_n: f64,
+pub struct Training {
     /// Samples a step. The last batch of an epoch may be smaller.
     pub batch: usize,
     /// Passes over the training samples: what the paper calls iterations.
@@ -71,7 +68,57 @@ pub struct Settings {
     pub optimiser: optimiser::Settings,
     /// What is done to a frame before each use.
     pub augmentation: augment::Settings,
-    /// Held-out training objects.
+}
+
+impl Default for Training {
+    fn default() -> Self {
+        Self {
+            batch: 100,
+            epochs: 200,
+            averaging: 0.0,
+            checkpoint_every_epochs: 5,
+            optimiser: optimiser::Settings::default(),
+            augmentation: augment::Settings::default(),
+        }
+    }
+}
+
+/// What the STGANs' generators are asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Generation {
+    /// Samples of each component of each level's mixture: 225 x 50 = 11,250 a level, thirty for
+    /// each of the paper's 375 labelled ones.
+    pub samples_a_component: u32,
+}
+
+impl Default for Generation {
+    fn default() -> Self {
+        Self {
+            samples_a_component: 225,
+        }
+    }
+}
+
+/// Settings of a run; the defaults are the paper's. A stage that a method does not have leaves
+/// its table unused.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Settings {
+    /// Newtons a taxel that become 1 in the network's image; 0 N becomes -1. 10.2 N is what
+    /// 8 bits of 0.04 N hold.
+    pub full_scale_n: f64,
+    /// The GAN over unlabelled samples: USTGAN, or that of SGAN and IGAN.
+    pub ustgan: gan::Settings,
+    /// Each of the STGANs.
+    pub stgan: gan::Settings,
+    /// What the STGANs' generators are asked for.
+    pub generation: Generation,
+    /// HRN on the generated samples.
+    pub pretraining: Training,
+    /// HRN on the labelled samples: from random weights, or the fine-tuning of others.
+    pub training: Training,
+    /// Held-out objects of the labelled ones.
     pub validation: Validation,
 }
 
@@ -79,12 +126,16 @@ impl Default for Settings {
     fn default() -> Self {
         Self {
             full_scale_n: 10.2,
-            batch: 100,
-            epochs: 200,
-            averaging: 0.0,
-            checkpoint_every_epochs: 5,
-            optimiser: optimiser::Settings::default(),
-            augmentation: augment::Settings::default(),
+            ustgan: gan::Settings::default(),
+            stgan: gan::Settings {
+                // An epoch has 4 steps there and 85 here.
+                checkpoint_every_epochs: 50,
+                picture_every_epochs: 100,
+                ..gan::Settings::default()
+            },
+            generation: Generation::default(),
+            pretraining: Training::default(),
+            training: Training::default(),
             validation: Validation::default(),
         }
     }
@@ -100,7 +151,7 @@ pub enum SettingsError {
     #[error("`{key}`: found {found}, expected {expected}")]
     Range {
         /// Path of the key.
-        key: &'static str,
+        key: String,
         /// Its value.
         found: f64,
         /// What is accepted.
@@ -109,16 +160,39 @@ pub enum SettingsError {
 }
 
 impl Settings {
-    /// The defaults of a profile.
+    /// The defaults of a profile. A method may have others: [`super::methods::Method::settings`].
     pub fn of(profile: Profile) -> Self {
-        let epochs = match profile {
-            Profile::Paper => 200,
-            Profile::Quick => 20,
-            Profile::Smoke => 2,
+        let paper = Self::default();
+        match profile {
+            Profile::Paper => paper,
+            // A tenth of the paper's steps everywhere: all methods take about an hour of one core.
+            Profile::Quick => paper.with_epochs(50, 20),
+            Profile::Smoke => Self {
+                generation: Generation {
+                    samples_a_component: 2,
+                },
+                ..paper.with_epochs(2, 2)
+            },
+        }
+    }
+
+    fn with_epochs(self, gan_epochs: u32, training_epochs: u32) -> Self {
+        let gan = |settings: gan::Settings| gan::Settings {
+            epochs: gan_epochs,
+            checkpoint_every_epochs: settings.checkpoint_every_epochs.min(gan_epochs / 2),
+            picture_every_epochs: settings.picture_every_epochs.min(gan_epochs / 2),
+            ..settings
+        };
+        let training = |settings: Training| Training {
+            epochs: training_epochs,
+            ..settings
         };
         Self {
-            epochs,
-            ..Self::default()
+            ustgan: gan(self.ustgan),
+            stgan: gan(self.stgan),
+            pretraining: training(self.pretraining),
+            training: training(self.training),
+            ..self
         }
     }
 
@@ -141,83 +215,84 @@ impl Settings {
     ///
     /// If one is not.
     pub fn checked(self) -> Result<Self, SettingsError> {
-        let (optimiser, validation) = (&self.optimiser, &self.validation);
-        let share = validation.share;
-        let rate = optimiser.learning_rate;
-        let decay = optimiser.weight_decay;
         let scale = self.full_scale_n;
-        let within_0_1 = |value: f64| (0.0..1.0).contains(&value);
-        let above_0 = |value: f64| value > 0.0 && value.is_finite();
-        let checks = [
-            ("full_scale_n", scale, above_0(scale), "above 0"),
-            // Batch normalisation needs two samples.
-            ("batch", self.batch as f64, self.batch > 1, "2 or more"),
-            ("epochs", self.epochs.into(), self.epochs > 0, "1 or more"),
-            (
-                "averaging",
-                self.averaging,
-                within_0_1(self.averaging),
-                "0 to below 1",
-            ),
-            (
-                "checkpoint_every_epochs",
-                self.checkpoint_every_epochs.into(),
-                self.checkpoint_every_epochs > 0,
-                "1 or more",
-            ),
-            ("optimiser.learning_rate", rate, above_0(rate), "above 0"),
-            (
-                "optimiser.beta1",
-                optimiser.beta1,
-                within_0_1(optimiser.beta1),
-                "0 to below 1",
-            ),
-            (
-                "optimiser.beta2",
-                optimiser.beta2,
-                within_0_1(optimiser.beta2),
-                "0 to below 1",
-            ),
-            (
-                "optimiser.weight_decay",
-                decay,
-                decay >= 0.0 && decay.is_finite(),
-                "0 or more",
-            ),
-            (
-                "augmentation.shift_taxels",
-                self.augmentation.shift_taxels.into(),
-                self.augmentation.shift_taxels <= 4,
-                "0 to 4",
-            ),
-            (
-                "validation.share",
-                share,
-                (0.0..=0.5).contains(&share),
-                "0 to 0.5",
-            ),
-            (
-                "validation.every_epochs",
-                validation.every_epochs.into(),
-                validation.every_epochs > 0,
-                "1 or more",
-            ),
-            (
-                "validation.share",
-                share,
-                validation.keep == Keep::Last || share > 0.0,
-                "above 0 with `validation.keep` best",
-            ),
-        ];
-        match checks.into_iter().find(|(_, _, fits, _)| !fits) {
-            None => Ok(self),
-            Some((key, found, _, expected)) => Err(SettingsError::Range {
-                key,
-                found,
-                expected,
-            }),
-        }
+        check("", "full_scale_n", scale, scale > 0.0, "above 0")?;
+        self.ustgan.check("ustgan.")?;
+        self.stgan.check("stgan.")?;
+        let generated = self.generation.samples_a_component;
+        let key = "samples_a_component";
+        check("generation.", key, generated, generated > 0, "1 or more")?;
+        self.pretraining.check("pretraining.")?;
+        self.training.check("training.")?;
+        let Validation {
+            share,
+            every_epochs,
+            keep,
+        } = self.validation;
+        let check = |key, found, fits, expected| check("validation.", key, found, fits, expected);
+        check("share", share, (0.0..=0.5).contains(&share), "0 to 0.5")?;
+        let expected = "above 0 with `validation.keep` best";
+        check("share", share, keep == Keep::Last || share > 0.0, expected)?;
+        check(
+            "every_epochs",
+            every_epochs.into(),
+            every_epochs > 0,
+            "1 or more",
+        )?;
+        Ok(self)
     }
+}
+
+impl Training {
+    fn check(&self, table: &str) -> Result<(), SettingsError> {
+        check_loop(
+            table,
+            self.batch,
+            self.epochs,
+            self.averaging,
+            self.checkpoint_every_epochs,
+        )?;
+        self.optimiser.check(table)?;
+        let shift = self.augmentation.shift_taxels;
+        let key = "augmentation.shift_taxels";
+        check(table, key, shift, shift <= 4, "0 to 4")
+    }
+}
+
+/// Checks what every loop has.
+pub(super) fn check_loop(
+    table: &str,
+    batch: usize,
+    epochs: u32,
+    averaging: f64,
+    checkpoint_every_epochs: u32,
+) -> Result<(), SettingsError> {
+    // Batch normalisation needs two samples.
+    check(table, "batch", batch as f64, batch > 1, "2 or more")?;
+    check(table, "epochs", epochs, epochs > 0, "1 or more")?;
+    let fits = (0.0..1.0).contains(&averaging);
+    check(table, "averaging", averaging, fits, "0 to below 1")?;
+    let (key, every) = ("checkpoint_every_epochs", checkpoint_every_epochs);
+    check(table, key, every, every > 0, "1 or more")
+}
+
+/// Refuses a value of `table` and `key` unless it `fits`.
+pub(super) fn check(
+    table: &str,
+    key: &str,
+    found: impl Into<f64>,
+    fits: bool,
+    expected: &'static str,
+) -> Result<(), SettingsError> {
+    let found = found.into();
+    if fits && found.is_finite() {
+        return Ok(());
+    }
+    Err(SettingsError::Range {
+        key: format!("{table}{key}"),
+        found,
+        expected,
+    })
 }
 
 fn merged(mut under: toml::Table, over: toml::Table) -> toml::Table {
@@ -262,35 +337,38 @@ mod tests {
     fn a_file_overrides_only_what_it_names() {
         let smoke = Settings::of(Profile::Smoke);
         let settings = smoke
-            .overridden("batch = 50\n[optimiser]\nrule = \"adam\"")
+            .overridden("[training]\nbatch = 50\noptimiser.rule = \"adam\"")
             .unwrap();
-        let optimiser = optimiser::Settings {
-            rule: optimiser::Rule::Adam,
-            ..smoke.optimiser
-        };
-        assert_eq!(
-            settings,
-            Settings {
-                batch: 50,
-                optimiser,
-                ..smoke
-            }
-        );
+        let mut expected = smoke;
+        expected.training.batch = 50;
+        expected.training.optimiser.rule = optimiser::Rule::Adam;
+        assert_eq!(settings, expected);
     }
 
     #[test]
     fn unusable_settings_are_refused_by_name() {
         for (text, expected) in [
             ("epoch = 3", "unknown field `epoch`"),
-            ("epochs = \"3\"", "expected u32"),
-            ("epochs = 0", "`epochs`: found 0, expected 1 or more"),
+            ("[training]\nepochs = \"3\"", "expected u32"),
+            (
+                "[training]\nepochs = 0",
+                "`training.epochs`: found 0, expected 1 or more",
+            ),
+            (
+                "[stgan]\noptimiser.beta1 = 1",
+                "`stgan.optimiser.beta1`: found 1",
+            ),
+            (
+                "[generation]\nsamples_a_component = 0",
+                "`generation.samples_a_component`: found 0",
+            ),
             (
                 "[validation]\nkeep = \"best\"",
                 "`validation.share`: found 0",
             ),
             (
-                "[augmentation]\nshift_taxels = 5",
-                "`augmentation.shift_taxels`: found 5",
+                "[pretraining]\naugmentation.shift_taxels = 5",
+                "`pretraining.augmentation.shift_taxels`: found 5",
             ),
         ] {
             let error = Settings::default()

@@ -10,7 +10,7 @@ use crate::frame::{COLS, Frame, ROWS, RawFrame};
 use crate::simulator::{LabelledSample, Material, NEWTONS_PER_COUNT};
 
 /// Frames in a row of the sheet.
-const TILES: usize = 12;
+pub const TILES: usize = 12;
 /// Pixels a taxel.
 const ZOOM: usize = 4;
 const TILE: usize = COLS * ZOOM;
@@ -82,6 +82,52 @@ pub fn sheet(
                 &frame,
                 &format!("{number}: {:.1}N", frame.force_n()),
             );
+        }
+        top += ROW;
+    }
+    canvas.colour_bar(top + GAP);
+    canvas.png()
+}
+
+/// A named row of frames, each with what is said of it.
+#[derive(Debug)]
+pub struct Strip<'a> {
+    /// To the left of the frames.
+    pub name: String,
+    /// At most twelve are drawn.
+    pub tiles: Vec<(&'a Frame, String)>,
+}
+
+impl<'a> Strip<'a> {
+    /// Frames with their contact area, force and greatest taxel.
+    pub fn of(name: &str, frames: impl Iterator<Item = &'a Frame>) -> Self {
+        let tile = |frame: &'a Frame| {
+            let peak = frame.newtons.iter().copied().fold(0.0, f32::max);
+            let area = frame.contact_area_taxels(0.07);
+            let force = frame.force_n();
+            (frame, format!("{area} {force:.0}N {peak:.1}N"))
+        };
+        Self {
+            name: name.to_owned(),
+            tiles: frames.map(tile).collect(),
+        }
+    }
+}
+
+/// Draws rows of frames under a title.
+///
+/// # Errors
+///
+/// If the PNG encoder fails.
+pub fn strips(title: &str, strips: &[Strip]) -> anyhow::Result<Vec<u8>> {
+    let width = MARGIN + TILES * (TILE + GAP);
+    let mut canvas = Canvas::new(width, HEAD + strips.len() * ROW + FOOT);
+    canvas.text(GAP, GAP, title);
+    let mut top = HEAD;
+    for strip in strips {
+        canvas.text(GAP, top + TILE / 2, &strip.name);
+        for (tile, (frame, caption)) in strip.tiles.iter().take(TILES).enumerate() {
+            canvas.tile(tile, top, frame, caption);
         }
         top += ROW;
     }

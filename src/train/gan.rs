@@ -1,0 +1,652 @@
+//! Generator and discriminator against each other: one loop for USTGAN, the STGANs, SGAN and
+//! IGAN.
+//!
+//! In: real frames, the game that is played (see [`losses`]) and the weights both start from.
+//! Out: both sides' weights. USTGAN and an STGAN differ in their frames and starting weights
+//! alone; SGAN and IGAN also see labelled frames. Written to the run's directory on the way:
+//! metrics, checkpoints and pictures of what fixed noise becomes.
+
+use std::time::Instant;
+
+use anyhow::Context as _;
+use burn::tensor::{Device, Tensor};
+use serde::{Deserialize, Serialize};
+
+use super::checkpoint::{Checkpoint, Progress};
+use super::dataset::Dataset;
+use super::fit::{progress_bar, report};
+use super::generator;
+use super::hrn;
+use super::learner::Learner;
+use super::likeness::{Likeness, Reference};
+use super::losses::{self, Game, Judged};
+use super::network::{self, Normalisation, Weights, numbers};
+use super::optimiser;
+use super::run::{Adversarial, Row, Run};
+use super::settings::{SettingsError, check, check_loop};
+use super::sheet::{self, Strip};
+use crate::frame::Frame;
+use crate::random::Stream;
+
+/// Real frames, at most, that generated ones are measured against; they are measured pair by pair.
+const COMPARED: usize = 500;
+/// Strips of generated frames in a picture.
+const STRIPS: usize = 4;
+
+/// How both sides learn; the defaults are the paper's ("Training of STGAN and USTGAN").
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Settings {
+    /// Real samples a step. The last batch of an epoch may be smaller.
+    pub batch: usize,
+    /// Generated samples of each component a step.
+    pub samples_a_component: usize,
+    /// Passes over the real samples: what the paper calls iterations. Counted in steps, its 500
+    /// would be six passes over the unlabelled samples; DeLiGAN's code calls an epoch so.
+    pub epochs: u32,
+    /// Lambda of Eq. (7), on a mean.
+    pub sigma_penalty: f64,
+    /// Decay a step of the running average of the discriminator's weights that is kept at the
+    /// end; 0: the weights themselves.
+    pub averaging: f64,
+    /// A checkpoint is written after every so many epochs, and after the last.
+    pub checkpoint_every_epochs: u32,
+    /// A picture is drawn, and generated samples are measured, after every so many epochs and
+    /// after the last.
+    pub picture_every_epochs: u32,
+    /// Of both sides.
+    pub optimiser: optimiser::Settings,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            batch: 100,
+            samples_a_component: 2,
+            epochs: 500,
+            sigma_penalty: 0.1,
+            averaging: 0.0,
+            checkpoint_every_epochs: 5,
+            picture_every_epochs: 25,
+            optimiser: optimiser::Settings {
+                rule: optimiser::Rule::Adam,
+                // The paper gives no betas; DeLiGAN's code has 0.5.
+                beta1: 0.5,
+                ..optimiser::Settings::default()
+            },
+        }
+    }
+}
+
+impl Settings {
+    /// Refuses what lies outside its range; `table` is where these settings stand.
+    pub(super) fn check(&self, table: &str) -> Result<(), SettingsError> {
+        check_loop(
+            table,
+            self.batch,
+            self.epochs,
+            self.averaging,
+            self.checkpoint_every_epochs,
+        )?;
+        let samples = self.samples_a_component;
+        let key = "samples_a_component";
+        check(table, key, samples as f64, samples > 0, "1 or more")?;
+        let (key, penalty) = ("sigma_penalty", self.sigma_penalty);
+        check(table, key, penalty, penalty >= 0.0, "0 or more")?;
+        let (key, every) = ("picture_every_epochs", self.picture_every_epochs);
+        check(table, key, every, every > 0, "1 or more")?;
+        self.optimiser.check(table)
+    }
+}
+
+/// Both sides.
+#[derive(Debug, Clone)]
+pub struct Gan {
+    /// Of the generator and its mixture.
+    pub generator: Weights,
+    /// Of trunk and head.
+    pub discriminator: Weights,
+}
+
+/// Both sides before training; the head is that of the game.
+pub fn initial(game: Game, levels: usize, seed: u64, device: &Device) -> Gan {
+    let stream = Stream::new(seed, "discriminator weights");
+    let mut discriminator = Weights::default();
+    network::add_trunk(&mut discriminator, &stream, device);
+    network::add_head(&mut discriminator, game.outputs(levels), &stream, device);
+    Gan {
+        generator: generator::initial(seed, device),
+        discriminator,
+    }
+}
+
+/// What is to be learnt, and from what.
+#[derive(Debug)]
+pub struct Task<'a> {
+    /// Name of the stage: of its checkpoints, pictures and rows in `metrics.csv`.
+    pub stage: &'static str,
+    /// What the discriminator tells apart.
+    pub game: Game,
+    /// Where the samples are.
+    pub dataset: &'a Dataset,
+    /// Samples taken as real, without their levels.
+    pub real: &'a [usize],
+    /// Samples whose levels the discriminator learns; empty where the game has no levels.
+    pub labelled: &'a [usize],
+    /// Newtons a taxel that become 1 in the image.
+    pub full_scale_n: f64,
+    /// How.
+    pub settings: &'a Settings,
+    /// Of noise and orders.
+    pub seed: u64,
+    /// Where.
+    pub device: &'a Device,
+}
+
+/// Trains from `initial` with fresh optimisers, or from the stage's last checkpoint in `run`.
+///
+/// # Errors
+///
+/// If the run's directory cannot be read or written.
+pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
+    let Settings { batch, epochs, .. } = *task.settings;
+    let steps = u64::from(epochs) * task.real.len().div_ceil(batch) as u64;
+    let mut state = match run.latest(task.stage, task.device)? {
+        Some(checkpoint) => State::resumed(&checkpoint, task.settings)?,
+        None => State::fresh(initial, task.settings),
+    };
+    let mut metrics = run.metrics(task.stage, state.progress.step)?;
+    let mut reference = None;
+    let bar = progress_bar(task.stage, steps, state.progress.step);
+    let begun = Instant::now();
+
+    while state.progress.epoch < epochs {
+        let (mut discriminator_sum, mut generator_sum, mut rate) = (0.0, 0.0, 0.0);
+        let order = task.order("order", task.real, state.progress.epoch.into());
+        for indices in order.chunks(batch) {
+            rate = task.settings.optimiser.rate_at(state.progress.step, steps);
+            let losses = state.step(task, indices, rate);
+            discriminator_sum += losses.0 * indices.len() as f64;
+            generator_sum += losses.1 * indices.len() as f64;
+            bar.inc(1);
+        }
+        state.progress.epoch += 1;
+        let Progress { epoch, step, .. } = state.progress;
+        let due = |every: u32| epoch == epochs || epoch.is_multiple_of(every);
+
+        let n = task.real.len() as f64;
+        let (loss, generator_loss) = (discriminator_sum / n, generator_sum / n);
+        let sigma = sigma_range(&state.generator.weights);
+        let mut likeness = None;
+        if due(task.settings.picture_every_epochs) {
+            if reference.is_none() {
+                reference = Some(task.reference()?);
+            }
+            let real = reference.as_ref().expect("set just now");
+            likeness = Some(task.likeness(real, &state.generator.weights)?);
+            task.picture(&state.generator.weights, epoch, run)?;
+        }
+        metrics.add(&Row {
+            step,
+            epoch,
+            loss,
+            learning_rate: rate,
+            validation: None,
+            seconds: begun.elapsed().as_secs_f64(),
+            adversarial: Some(Adversarial {
+                generator_loss,
+                sigma,
+                likeness,
+            }),
+        })?;
+        let mut message = format!(
+            "losses {loss:.3} {generator_loss:.3}, sigma {:.3}",
+            sigma[1]
+        );
+        if let Some(likeness) = likeness {
+            let (distance, std) = (likeness.feature_distance, likeness.pixel_std);
+            message += &format!(", distance {distance:.3}, pixel std {std:.3}");
+        }
+        report(&bar, task.stage, epoch, epochs, message);
+        if due(task.settings.checkpoint_every_epochs) {
+            run.save(task.stage, &state.checkpoint())?;
+        }
+    }
+    bar.finish_and_clear();
+    Ok(Gan {
+        discriminator: state.discriminator.evaluated(),
+        generator: state.generator.weights,
+    })
+}
+
+/// All that changes from step to step.
+#[derive(Debug)]
+struct State {
+    progress: Progress,
+    generator: Learner,
+    discriminator: Learner,
+}
+
+/// Prefixes of the two sides' lists in a checkpoint.
+const SIDES: [&str; 2] = ["generator ", "discriminator "];
+
+impl State {
+    fn fresh(initial: Gan, settings: &Settings) -> Self {
+        let Settings {
+            optimiser,
+            averaging,
+            ..
+        } = *settings;
+        Self {
+            progress: Progress::default(),
+            generator: Learner::fresh(initial.generator, optimiser, 0.0),
+            discriminator: Learner::fresh(initial.discriminator, optimiser, averaging),
+        }
+    }
+
+    fn resumed(checkpoint: &Checkpoint, settings: &Settings) -> anyhow::Result<Self> {
+        let resumed =
+            |side, averaging| Learner::resumed(checkpoint, side, settings.optimiser, averaging);
+        Ok(Self {
+            progress: checkpoint.progress,
+            generator: resumed(SIDES[0], 0.0)?,
+            discriminator: resumed(SIDES[1], settings.averaging)?,
+        })
+    }
+
+    fn checkpoint(&self) -> Checkpoint {
+        let mut lists = self.generator.lists(SIDES[0]);
+        lists.extend(self.discriminator.lists(SIDES[1]));
+        Checkpoint {
+            progress: self.progress,
+            lists,
+        }
+    }
+
+    /// A step of the discriminator, then one of the generator, on the real samples `indices`;
+    /// gives the losses of both.
+    fn step(&mut self, task: &Task, indices: &[usize], rate: f64) -> (f64, f64) {
+        let step = self.progress.step;
+        let batch = task.batch(indices, step);
+        let mut stream = task.stream("noise").child(step);
+        let samples = task.settings.samples_a_component;
+        let eta = generator::noise(samples, &mut stream, task.device);
+
+        // The generator does not change while the discriminator takes its step, so both use the
+        // same images, which the first takes as constants.
+        let tracked_generator = self.generator.weights.tracked();
+        let images = generator::images(&tracked_generator, eta, &mut Normalisation::Batch);
+
+        let tracked = self.discriminator.weights.tracked();
+        let loss = discriminator_loss(task.game, &tracked, &batch, images.clone().inner());
+        let mut gradients = loss.backward();
+        self.discriminator.step(&tracked, &mut gradients, rate);
+
+        let discriminator = &self.discriminator.weights;
+        let sigma = tracked_generator.tensor::<2>("mixture.sigma");
+        let penalty = task.settings.sigma_penalty;
+        let of_generator = generator_loss(task.game, discriminator, &batch, images, sigma, penalty);
+        let mut gradients = of_generator.backward();
+        self.generator
+            .step(&tracked_generator, &mut gradients, rate);
+        self.progress.step += 1;
+        let number = |loss: &Tensor<1>| f64::from(numbers(loss)[0]);
+        (number(&loss), number(&of_generator))
+    }
+}
+
+/// What the discriminator is shown in a step beside generated images.
+#[derive(Debug)]
+struct Batch {
+    /// `[batch, 1, 28, 28]`.
+    real: Tensor<4>,
+    /// Images and targets `[batch, L]`.
+    labelled: Option<(Tensor<4>, Tensor<2>)>,
+}
+
+/// Every batch goes through the discriminator by itself and is normalised by its own statistics:
+/// mixed, a batch of real and generated frames would tell the layers what it is made of.
+fn judge(discriminator: &Weights, images: Tensor<4>) -> Judged {
+    let features = network::trunk(discriminator, images, &mut Normalisation::Batch);
+    Judged {
+        logits: network::head(discriminator, features.clone()),
+        features,
+    }
+}
+
+fn discriminator_loss(
+    game: Game,
+    discriminator: &Weights,
+    batch: &Batch,
+    generated: Tensor<4>,
+) -> Tensor<1> {
+    let labelled = batch.labelled.as_ref().map(|(images, targets)| {
+        let judged = judge(discriminator, images.clone());
+        (judged.logits, targets.clone())
+    });
+    let real = judge(discriminator, batch.real.clone());
+    let generated = judge(discriminator, generated);
+    losses::discriminator(game, real, generated, labelled)
+}
+
+fn generator_loss(
+    game: Game,
+    discriminator: &Weights,
+    batch: &Batch,
+    generated: Tensor<4>,
+    sigma: Tensor<2>,
+    sigma_penalty: f64,
+) -> Tensor<1> {
+    let generated = judge(discriminator, generated);
+    let real = || judge(discriminator, batch.real.clone());
+    losses::generator(game, real, generated)
+        .add(losses::sigma_penalty(sigma).mul_scalar(sigma_penalty))
+}
+
+/// Least, mean and greatest size of the mixture's deviations; their sign means nothing.
+fn sigma_range(generator: &Weights) -> [f64; 3] {
+    let sizes: Vec<f64> = generator
+        .numbers("mixture.sigma")
+        .iter()
+        .map(|sigma| f64::from(sigma.abs()))
+        .collect();
+    [
+        sizes.iter().copied().fold(f64::INFINITY, f64::min),
+        sizes.iter().sum::<f64>() / sizes.len() as f64,
+        sizes.iter().copied().fold(0.0, f64::max),
+    ]
+}
+
+impl Task<'_> {
+    fn stream(&self, name: &str) -> Stream {
+        Stream::new(self.seed, &format!("{} {name}", self.stage))
+    }
+
+    /// `samples` in the order of pass `pass`.
+    fn order(&self, name: &str, samples: &[usize], pass: u64) -> Vec<usize> {
+        let mut order = samples.to_vec();
+        self.stream(name).child(pass).shuffle(&mut order);
+        order
+    }
+
+    fn frames(&self, indices: &[usize]) -> Vec<&Frame> {
+        let frame = |&index: &usize| &self.dataset.samples[index].frame;
+        indices.iter().map(frame).collect()
+    }
+
+    /// The images of step `step`. The labelled samples are fewer than the real ones and come
+    /// again and again.
+    fn batch(&self, real: &[usize], step: u64) -> Batch {
+        let images = |indices: &[usize]| {
+            hrn::images(
+                self.frames(indices).into_iter(),
+                self.full_scale_n,
+                self.device,
+            )
+        };
+        let batches = self.labelled.len().div_ceil(self.settings.batch) as u64;
+        let labelled = (batches > 0).then(|| {
+            let order = self.order("labelled order", self.labelled, step / batches);
+            let mut parts = order.chunks(self.settings.batch);
+            let indices = parts
+                .nth((step % batches) as usize)
+                .expect("so many there are");
+            let levels_of = indices
+                .iter()
+                .map(|&index| self.dataset.samples[index].level);
+            let levels = super::dataset::levels().len();
+            (
+                images(indices),
+                hrn::targets(levels_of, levels, self.device),
+            )
+        });
+        Batch {
+            real: images(real),
+            labelled,
+        }
+    }
+
+    /// Real samples to measure generated ones by.
+    fn reference(&self) -> anyhow::Result<Reference> {
+        let order = self.order("compared", self.real, 0);
+        let frames = self.frames(&order[..order.len().min(COMPARED)]);
+        Reference::of(&frames, self.full_scale_n).context("real samples")
+    }
+
+    fn likeness(&self, real: &Reference, generator: &Weights) -> anyhow::Result<Likeness> {
+        let samples = self.settings.samples_a_component;
+        let statistics = generator::statistics(generator, samples, self.seed, self.device);
+        let frames = generator::generate(
+            generator,
+            &statistics,
+            COMPARED / generator::COMPONENTS,
+            self.full_scale_n,
+            &mut self.stream("compared noise"),
+            self.device,
+        );
+        real.compare(&frames).context("generated samples")
+    }
+
+    /// Draws what fixed noise becomes, one frame a component, beside real frames.
+    fn picture(&self, generator: &Weights, epoch: u32, run: &Run) -> anyhow::Result<()> {
+        let samples = self.settings.samples_a_component;
+        let eta = generator::noise(samples, &mut self.stream("picture"), self.device);
+        let images = generator::images(generator, eta, &mut Normalisation::Batch);
+        let generated = generator::frames(&images, self.full_scale_n);
+        let order = self.order("compared", self.real, 0);
+        let real = self.frames(&order);
+        let mut rows = vec![Strip::of("real", real.into_iter().take(sheet::TILES))];
+        let parts = generated.chunks(sheet::TILES).take(STRIPS);
+        rows.extend(parts.map(|part| Strip::of("generated", part.iter())));
+        let stage = self.stage;
+        let title = format!("{stage} after {epoch} epochs: contact area at 0.07 N, force, peak");
+        let name = format!("samples/{stage}-{epoch:06}.png");
+        run.write(&name, &sheet::strips(&title, &rows)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frame::{COLS, ROWS};
+    use burn::tensor::{DType, FloatDType, TensorData};
+
+    const GAMES: [Game; 3] = [Game::RealOrFake, Game::FakeLevel, Game::FeatureMatching];
+    const LEVELS: usize = 4;
+
+    fn device() -> Device {
+        Device::flex()
+    }
+
+    /// In double precision, so that differences of the loss over a small step are exact enough.
+    fn double<const D: usize>(tensor: &Tensor<D>) -> Tensor<D> {
+        tensor.clone().cast(FloatDType::F64)
+    }
+
+    fn in_double(weights: &Weights) -> Weights {
+        let mut weights = weights.clone();
+        for weight in &mut weights.entries {
+            weight.values = double(&weight.values);
+        }
+        weights
+    }
+
+    fn doubles<const D: usize>(tensor: &Tensor<D>) -> Vec<f64> {
+        assert_eq!(tensor.dtype(), DType::F64);
+        tensor.to_data().try_to_vec::<f64>().unwrap()
+    }
+
+    /// One step's inputs, and weights as after some training: the start's are so small that
+    /// hardly anything reaches the logits.
+    struct Case {
+        gan: Gan,
+        batch: Batch,
+        eta: Tensor<2>,
+    }
+
+    fn case(game: Game) -> Case {
+        let mut stream = Stream::new(8, "images");
+        let mut random = |dims: [usize; 4]| -> Tensor<4> {
+            let values: Vec<f32> = (0..dims.iter().product())
+                .map(|_| (stream.uniform() * 2.0 - 1.0) as f32)
+                .collect();
+            Tensor::from_data(TensorData::new(values, dims), &device())
+        };
+        let real = random([7, 1, ROWS, COLS]);
+        let images = random([5, 1, ROWS, COLS]);
+        let targets = hrn::targets([1, 2, 3, 4, 2].into_iter(), LEVELS, &device());
+        let mut gan = initial(game, LEVELS, 3, &device());
+        for weights in [&mut gan.generator, &mut gan.discriminator] {
+            for (weight, number) in weights.entries.iter_mut().zip(0..) {
+                let mut stream = Stream::new(9, &weight.name).child(number);
+                let noise: Vec<f32> = (0..weight.dims.iter().product())
+                    .map(|_| 0.1 * stream.normal() as f32)
+                    .collect();
+                let length = noise.len();
+                let noise = Tensor::from_data(TensorData::new(noise, [length]), &device());
+                weight.values = weight.values.clone().add(noise);
+            }
+        }
+        Case {
+            gan,
+            batch: Batch {
+                real,
+                labelled: (game != Game::RealOrFake).then_some((images, targets)),
+            },
+            eta: generator::noise(1, &mut stream, &device()),
+        }
+    }
+
+    impl Case {
+        fn in_double(&self) -> Self {
+            Self {
+                gan: Gan {
+                    generator: in_double(&self.gan.generator),
+                    discriminator: in_double(&self.gan.discriminator),
+                },
+                batch: Batch {
+                    real: double(&self.batch.real),
+                    labelled: self
+                        .batch
+                        .labelled
+                        .as_ref()
+                        .map(|(images, targets)| (double(images), double(targets))),
+                },
+                eta: double(&self.eta),
+            }
+        }
+
+        fn discriminator_loss(&self, game: Game, discriminator: &Weights) -> Tensor<1> {
+            let images = generator::images(
+                &self.gan.generator,
+                self.eta.clone(),
+                &mut Normalisation::Batch,
+            );
+            discriminator_loss(game, discriminator, &self.batch, images)
+        }
+
+        fn generator_loss(&self, game: Game, generator: &Weights) -> Tensor<1> {
+            let images = generator::images(generator, self.eta.clone(), &mut Normalisation::Batch);
+            let sigma = generator.tensor::<2>("mixture.sigma");
+            generator_loss(
+                game,
+                &self.gan.discriminator,
+                &self.batch,
+                images,
+                sigma,
+                0.1,
+            )
+        }
+    }
+
+    /// Compares the gradients of `loss` in single precision with differences of `exact`, the same
+    /// in double precision, along the gradient of each weight.
+    fn check(
+        weights: &Weights,
+        loss: impl Fn(&Weights) -> Tensor<1>,
+        exact: impl Fn(&Weights) -> Tensor<1>,
+    ) {
+        let tracked = weights.tracked();
+        let gradients = loss(&tracked).backward();
+        let exact_weights = in_double(weights);
+        let gradient_of = |index: usize| {
+            let values = &tracked.entries[index].values;
+            let gradient = values.grad(&gradients);
+            gradient.unwrap_or_else(|| panic!("no gradient: {}", weights.entries[index].name))
+        };
+        let size = |gradient: &Tensor<1>| -> f64 {
+            let squares = numbers(gradient).into_iter().map(|g| f64::from(g).powi(2));
+            squares.sum::<f64>().sqrt()
+        };
+        for (index, weight) in weights.entries.iter().enumerate() {
+            let gradient = gradient_of(index);
+            let size = size(&gradient);
+            // A bias before batch normalisation is taken away again with the mean.
+            let cancelled = [
+                "conv2.bias",
+                "conv3.bias",
+                "linear.bias",
+                "deconv1.bias",
+                "deconv2.bias",
+            ];
+            if cancelled.contains(&weight.name.as_str()) {
+                assert!(size < 1e-5, "{}: {size}", weight.name);
+                continue;
+            }
+            assert!(size > 1e-7, "{}: {size}", weight.name);
+            let direction = double(&gradient).div_scalar(size);
+            let at = |step: f64| {
+                let mut moved = exact_weights.clone();
+                let values = &mut moved.entries[index].values;
+                *values = values.clone().add(direction.clone().mul_scalar(step));
+                doubles(&exact(&moved))[0]
+            };
+            // Small enough to cross no kink of the leaky ReLU or of the pool.
+            let step = 1e-6;
+            let numeric = (at(step) - at(-step)) / (2.0 * step);
+            assert!(
+                (numeric - size).abs() < 1e-3 * size,
+                "{}: {size} by backpropagation, {numeric} by differences",
+                weight.name
+            );
+        }
+    }
+
+    #[test]
+    fn gradients_of_a_whole_step_agree_with_finite_differences() {
+        for game in GAMES {
+            let case = case(game);
+            let exact = case.in_double();
+            check(
+                &case.gan.discriminator,
+                |weights| case.discriminator_loss(game, weights),
+                |weights| exact.discriminator_loss(game, weights),
+            );
+            check(
+                &case.gan.generator,
+                |weights| case.generator_loss(game, weights),
+                |weights| exact.generator_loss(game, weights),
+            );
+        }
+    }
+
+    #[test]
+    fn a_new_stage_starts_from_the_given_weights_with_fresh_moments() {
+        let gan = initial(Game::RealOrFake, LEVELS, 5, &device());
+        let state = State::fresh(gan.clone(), &Settings::default());
+        let checkpoint = state.checkpoint();
+        assert_eq!(checkpoint.progress, Progress::default());
+        for (side, weights) in SIDES.iter().zip([gan.generator, gan.discriminator]) {
+            for given in &weights.entries {
+                let stored = |list: &str| {
+                    let list = checkpoint.list(&format!("{side}{list}")).unwrap();
+                    list.numbers(&given.name)
+                };
+                assert_eq!(stored("weights"), numbers(&given.values));
+                for moments in ["mean", "square"] {
+                    assert!(stored(moments).iter().all(|moment| *moment == 0.0));
+                }
+            }
+        }
+    }
+}

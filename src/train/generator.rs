@@ -1,0 +1,361 @@
+//! The generator G of a DeLiGAN and the mixture that its noise is drawn from.
+//!
+//! In: standard normal noise. Out: images in [-1, 1] as the discriminator sees real frames, or
+//! frames in newtons. 65,569 parameters and the mixture's 3,000, all in one list, because the
+//! mixture is trained by the generator's optimiser.
+
+use burn::tensor::ops::ConvTransposeOptions;
+use burn::tensor::{Device, Tensor, TensorData, activation, module};
+
+use super::network::{
+    FEATURES, Normalisation, STRIDE, Statistics, Weights, batch_norm, numbers, truncated_normal,
+};
+use crate::frame::{COLS, Frame, ROWS, TAXELS};
+use crate::random::Stream;
+
+/// n: numbers of noise an image (paper, "Training of STGAN and USTGAN").
+pub const NOISE: usize = 30;
+/// K: components of the mixture, all of weight 1/K (ditto).
+pub const COMPONENTS: usize = 50;
+/// sigma before training (ditto). DeLiGAN's code has 0.2.
+const INITIAL_SIGMA: f32 = 0.15;
+/// The first layer starts at U(-0.316, 0.316), of variance 1/30: one over its inputs (DeLiGAN's
+/// code).
+const INITIAL_LIMIT: f64 = 0.316;
+/// Batch normalisation's epsilon in the generator (DeLiGAN's code; the discriminator has 1e-3).
+const BATCH_NORM_EPSILON: f32 = 1e-5;
+/// Rows and columns of the first image.
+const FIRST_SIDE: usize = 4;
+/// Batches of generated samples that statistics are taken over.
+const STATISTICS_BATCHES: u64 = 50;
+/// Samples of each component a pass without gradients.
+const GENERATED_AT_ONCE: usize = 5;
+
+/// A transposed convolution: square kernel, stride 2, cropped as TF's SAME padding is.
+#[derive(Debug, Clone, Copy)]
+struct Layer {
+    /// Prefix of its weights' names.
+    name: &'static str,
+    /// Channels in.
+    inputs: usize,
+    /// Channels out.
+    outputs: usize,
+    /// Rows and columns of the kernel.
+    kernel: usize,
+    /// Rows and columns of the image out; of the full one, one is cropped before and the rest
+    /// after.
+    side: usize,
+}
+
+/// 4 -> 7 -> 14 -> 28.
+const LAYERS: [Layer; 3] = [
+    Layer {
+        name: "deconv1",
+        inputs: FEATURES,
+        outputs: 32,
+        kernel: 3,
+        side: 7,
+    },
+    Layer {
+        name: "deconv2",
+        inputs: 32,
+        outputs: 16,
+        kernel: 5,
+        side: 14,
+    },
+    Layer {
+        name: "deconv3",
+        inputs: 16,
+        outputs: 1,
+        kernel: 5,
+        side: ROWS,
+    },
+];
+
+/// Initial weights, the mixture's included; each layer draws from its own sub-stream.
+pub fn initial(seed: u64, device: &Device) -> Weights {
+    const { assert!(ROWS == COLS, "images are square") };
+    let stream = Stream::new(seed, "generator weights");
+    let uniform = |index: u64, count: usize, limit: f64| -> Vec<f32> {
+        let mut stream = stream.child(index);
+        (0..count)
+            .map(|_| stream.range(-limit, limit) as f32)
+            .collect()
+    };
+    let mut weights = Weights::default();
+    let width = FEATURES * FIRST_SIDE * FIRST_SIDE;
+    let matrix = uniform(0, NOISE * width, INITIAL_LIMIT);
+    weights.add("linear.matrix", &[NOISE, width], matrix, device);
+    weights.add("linear.bias", &[width], vec![0.0; width], device);
+    weights.add("linear.gamma", &[width], vec![1.0; width], device);
+    weights.add("linear.beta", &[width], vec![0.0; width], device);
+    for (layer, index) in LAYERS.iter().zip(1..) {
+        let Layer {
+            name,
+            inputs,
+            outputs,
+            kernel,
+            ..
+        } = *layer;
+        let mut add = |part: &str, dims: &[usize], values: Vec<f32>| {
+            weights.add(&format!("{name}.{part}"), dims, values, device);
+        };
+        let dims = [inputs, outputs, kernel, kernel];
+        let values = truncated_normal(dims.iter().product(), &mut stream.child(index));
+        add("kernel", &dims, values);
+        add("bias", &[outputs], vec![0.0; outputs]);
+        if !layer.is_last() {
+            add("gamma", &[outputs], vec![1.0; outputs]);
+            add("beta", &[outputs], vec![0.0; outputs]);
+        }
+    }
+    let dims = [COMPONENTS, NOISE];
+    let count = COMPONENTS * NOISE;
+    // mu ~ U(-1, 1), sigma = 0.15.
+    let mu = uniform(LAYERS.len() as u64 + 1, count, 1.0);
+    weights.add("mixture.mu", &dims, mu, device);
+    weights.add("mixture.sigma", &dims, vec![INITIAL_SIGMA; count], device);
+    weights
+}
+
+impl Layer {
+    fn is_last(&self) -> bool {
+        self.side == ROWS
+    }
+}
+
+/// eta ~ N(0, 1) for `samples` of each component: `[samples x 50, 30]`. Row r is of component
+/// r mod 50, so that every batch has equally many of each (all weights of Eq. 1 are 1/K).
+pub fn noise(samples: usize, stream: &mut Stream, device: &Device) -> Tensor<2> {
+    let rows = samples * COMPONENTS;
+    let values = (0..rows * NOISE).map(|_| stream.normal() as f32).collect();
+    Tensor::from_data(TensorData::new(values, [rows, NOISE]), device)
+}
+
+/// Images `[batch, 1, 28, 28]` in [-1, 1] of the noise `eta` `[batch, 30]`.
+pub fn images(weights: &Weights, eta: Tensor<2>, normalisation: &mut Normalisation) -> Tensor<4> {
+    let [batch, _] = eta.dims();
+    // Eq. (2): z^k = mu^k + sigma^k eta
+    let of_component = |name| {
+        weights
+            .tensor::<2>(name)
+            .reshape([1, COMPONENTS, NOISE])
+            .expand([batch / COMPONENTS, COMPONENTS, NOISE])
+            .reshape([batch, NOISE])
+    };
+    let z = of_component("mixture.mu").add(of_component("mixture.sigma").mul(eta));
+
+    let vector = |name: &str| weights.tensor::<1>(name);
+    let bias = vector("linear.bias");
+    let width = bias.dims()[0];
+    let x = z
+        .matmul(weights.tensor::<2>("linear.matrix"))
+        .add(bias.reshape([1, width]));
+    let x = batch_norm(
+        x.reshape([batch, width, 1, 1]),
+        vector("linear.gamma"),
+        vector("linear.beta"),
+        BATCH_NORM_EPSILON,
+        0,
+        normalisation,
+    );
+    // [batch, 64, 4, 4]
+    let mut x = activation::relu(x).reshape([batch, FEATURES, FIRST_SIDE, FIRST_SIDE]);
+    for (layer, index) in LAYERS.iter().zip(1..) {
+        let part = |part: &str| format!("{}.{part}", layer.name);
+        let kernel = weights.tensor::<4>(&part("kernel"));
+        x = transposed(x, kernel, vector(&part("bias")), layer.side);
+        if !layer.is_last() {
+            x = batch_norm(
+                x,
+                vector(&part("gamma")),
+                vector(&part("beta")),
+                BATCH_NORM_EPSILON,
+                index,
+                normalisation,
+            );
+            x = activation::relu(x);
+        }
+    }
+    if let Normalisation::Collect(statistics) = normalisation {
+        statistics.batch_collected();
+    }
+    x.tanh()
+}
+
+/// The transposed convolution of stride 2 to an image of `side` rows and columns: the adjoint of
+/// the convolution that pads one zero before and as many after as that side needs.
+fn transposed(x: Tensor<4>, kernel: Tensor<4>, bias: Tensor<1>, side: usize) -> Tensor<4> {
+    let options = ConvTransposeOptions::new([STRIDE; 2], [1; 2], [0; 2], [1; 2], 1);
+    let x = module::conv_transpose2d(x, kernel, Some(bias), options);
+    let [batch, channels, rows, _] = x.dims();
+    if rows == side {
+        return x;
+    }
+    // One was cropped on each side; of a kernel of 5, one more goes after.
+    x.slice([0..batch, 0..channels, 0..side, 0..side])
+}
+
+/// Mean and variance of each normalised layer over generated samples, in batches as in training:
+/// taken anew from the weights as they are (see [`super::network`]).
+pub fn statistics(
+    weights: &Weights,
+    samples_a_component: usize,
+    seed: u64,
+    device: &Device,
+) -> Statistics {
+    let stream = Stream::new(seed, "statistics of generated samples");
+    let mut statistics = Statistics::default();
+    for batch in 0..STATISTICS_BATCHES {
+        let eta = noise(samples_a_component, &mut stream.child(batch), device);
+        let mut normalisation = Normalisation::Collect(&mut statistics);
+        images(weights, eta, &mut normalisation);
+    }
+    statistics
+}
+
+/// Exactly `samples_a_component` frames of every component; frame r is of component r mod 50.
+pub fn generate(
+    weights: &Weights,
+    statistics: &Statistics,
+    samples_a_component: usize,
+    full_scale_n: f64,
+    stream: &mut Stream,
+    device: &Device,
+) -> Vec<Frame> {
+    let mut frames = Vec::with_capacity(samples_a_component * COMPONENTS);
+    let mut left = samples_a_component;
+    while left > 0 {
+        let samples = left.min(GENERATED_AT_ONCE);
+        let eta = noise(samples, stream, device);
+        let images = images(weights, eta, &mut Normalisation::Fixed(statistics));
+        frames.extend(self::frames(&images, full_scale_n));
+        left -= samples;
+    }
+    frames
+}
+
+/// Images `[batch, 1, 28, 28]` in [-1, 1] as frames in newtons.
+pub fn frames(images: &Tensor<4>, full_scale_n: f64) -> Vec<Frame> {
+    let scale = (full_scale_n / 2.0) as f32;
+    let frame = |values: &[f32]| {
+        let mut frame = Frame::default();
+        for (newtons, value) in frame.newtons.iter_mut().zip(values) {
+            *newtons = (value + 1.0) * scale;
+        }
+        frame
+    };
+    numbers(images).chunks(TAXELS).map(frame).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::tensor::ops::ConvOptions;
+
+    fn device() -> Device {
+        Device::flex()
+    }
+
+    #[test]
+    fn the_network_has_the_papers_number_of_parameters() {
+        let weights = initial(1, &device());
+        let count = |mixture: bool| -> usize {
+            let of = |name: &str| name.starts_with("mixture.") == mixture;
+            let entries = weights.entries.iter().filter(|weight| of(&weight.name));
+            entries
+                .map(|weight| weight.dims.iter().product::<usize>())
+                .sum()
+        };
+        assert_eq!((count(false), count(true)), (65_569, 3_000));
+    }
+
+    #[test]
+    fn the_transposed_convolution_is_the_adjoint_of_the_convolution() {
+        // <conv(x), y> = <x, transposed(y)> for every x and y.
+        let mut stream = Stream::new(4, "adjoint");
+        let mut random = |dims: [usize; 4]| -> Tensor<4> {
+            let values: Vec<f32> = (0..dims.iter().product())
+                .map(|_| stream.normal() as f32)
+                .collect();
+            Tensor::from_data(TensorData::new(values, dims), &device())
+        };
+        let product = |a: Tensor<4>, b: Tensor<4>| -> f64 {
+            let (a, b) = (numbers(&a), numbers(&b));
+            a.iter()
+                .zip(&b)
+                .map(|(a, b)| f64::from(*a) * f64::from(*b))
+                .sum()
+        };
+        for layer in LAYERS {
+            let Layer {
+                inputs,
+                outputs,
+                kernel,
+                side,
+                ..
+            } = layer;
+            let small = side.div_ceil(STRIDE);
+            let x = random([3, outputs, side, side]);
+            let y = random([3, inputs, small, small]);
+            let kernel = random([inputs, outputs, kernel, kernel]);
+            // What SAME pads for this side: one before, the rest after.
+            let after = (small - 1) * STRIDE + layer.kernel - side - 1;
+            let options = ConvOptions::new_with_padding([STRIDE; 2], [(1, after); 2], [1; 2], 1);
+            let convolved = module::conv2d(x.clone(), kernel.clone(), None, options);
+            let bias = Tensor::zeros([outputs], &device());
+            let back = transposed(y.clone(), kernel, bias, side);
+            let (left, right) = (product(convolved, y.clone()), product(x, back));
+            assert!(
+                (left - right).abs() < 1e-4 * left.abs().max(1.0),
+                "{}: {left} {right}",
+                layer.name
+            );
+        }
+    }
+
+    #[test]
+    fn generated_frames_are_equally_many_of_each_component() {
+        // Components far apart and without spread: each gives one picture, whatever eta is.
+        let mut weights = initial(1, &device());
+        let sigma = weights
+            .entries
+            .iter_mut()
+            .find(|w| w.name == "mixture.sigma");
+        let sigma = &mut sigma.unwrap().values;
+        *sigma = sigma.zeros_like();
+        let statistics = statistics(&weights, 2, 1, &device());
+        let mut stream = Stream::new(1, "generated");
+        let frames = generate(&weights, &statistics, 7, 10.2, &mut stream, &device());
+        assert_eq!(frames.len(), 7 * COMPONENTS);
+        for component in 0..COMPONENTS {
+            for sample in 1..7 {
+                let frame = &frames[sample * COMPONENTS + component];
+                let distance = |other: &Frame| -> f32 {
+                    let pairs = frame.newtons.iter().zip(&other.newtons);
+                    pairs.map(|(a, b)| (a - b).abs()).sum()
+                };
+                assert!(distance(&frames[component]) < 1e-2, "component {component}");
+                let next = &frames[(component + 1) % COMPONENTS];
+                assert!(distance(next) > 1.0, "component {component} and the next");
+            }
+        }
+    }
+
+    #[test]
+    fn statistics_fixed_give_what_training_saw() {
+        let weights = initial(2, &device());
+        let eta = noise(2, &mut Stream::new(3, "noise"), &device());
+        let mut statistics = Statistics::default();
+        let mut collect = Normalisation::Collect(&mut statistics);
+        let in_batch = numbers(&images(&weights, eta.clone(), &mut collect));
+        let fixed = numbers(&images(
+            &weights,
+            eta,
+            &mut Normalisation::Fixed(&statistics),
+        ));
+        let pairs = in_batch.iter().zip(&fixed);
+        let largest = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(largest < 1e-4, "{largest}");
+    }
+}
