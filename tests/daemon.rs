@@ -501,7 +501,8 @@ fn a_subscriber_is_told_what_is_wrong_and_harms_nobody() {
     let mut long = bench.subscriber();
     long.until(&json!({"type": "status"}));
     long.say(&"x".repeat(70_000));
-    assert_eq!(long.next().unwrap()["type"], "error");
+    // Another status may come first: why the port cannot be opened.
+    long.until(&json!({"type": "error"}));
     // Closed, perhaps with a reset: what it sent last was never read.
     assert!(long.lines.read_line(&mut String::new()).unwrap_or(0) == 0);
 
