@@ -8,6 +8,7 @@ use jiff::Timestamp;
 use serde::{Serialize, Serializer};
 
 use crate::frame::{COLS, ROWS};
+use crate::tare::Offsets;
 
 /// Version of the format, announced in `hello`.
 pub const PROTOCOL: u32 = 1;
@@ -91,6 +92,11 @@ pub enum LinkState {
     Stale,
     /// Was open and is gone.
     Lost,
+}
+
+impl LinkState {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::Connecting, Self::Live, Self::Stale, Self::Lost];
 }
 
 /// A sensor's link and its counters.
@@ -296,7 +302,21 @@ pub enum Reply {
         /// The `id` of the line, echoed.
         #[serde(skip_serializing_if = "Option::is_none")]
         id: Option<serde_json::Value>,
+        /// What a `tare` did.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        tare: Option<Tared>,
     },
+}
+
+/// A tare taken on request.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Tared {
+    /// Sensor's name.
+    pub sensor: String,
+    /// The offsets before.
+    pub old: Offsets,
+    /// The offsets from the next frame on.
+    pub new: Offsets,
 }
 
 impl Reply {

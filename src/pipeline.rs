@@ -12,11 +12,11 @@ use std::time::Duration;
 use jiff::Timestamp;
 
 use crate::event::{
-    Event, FrameEvent, Hardness, LinkState, Note, Phase, Press, PressState, Rejection, Status,
+    Event, FrameEvent, Hardness, LinkState, Note, Phase, Press, PressState, Rejection, Status, Tared,
 };
 use crate::frame::{Frame, RawFrame, Stamp};
 use crate::press::{self, Abort, Change, End, Moment, Peak, PressTracker};
-use crate::tare::{self, Contact, Progress, Tare};
+use crate::tare::{self, Contact, Offsets, Progress, Tare};
 use crate::verdict::Hrn;
 use crate::wire::{Decoded, Decoder, Layout};
 
@@ -57,6 +57,26 @@ pub enum Clock {
     FrameRate,
 }
 
+/// Why a tare was not taken on request; the offsets stay as they were.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum RetareError {
+    /// What is pressed now would be zeroed away.
+    #[error("found a press, expected none")]
+    Pressed,
+    /// What rests on the sensor would be.
+    #[error("found the sensor touched, expected it free")]
+    Touched,
+    /// No frames to average.
+    #[error("found a sensor that is not live, expected frames")]
+    NotLive,
+    /// Its outcome has to come first.
+    #[error("found a tare under way, expected none")]
+    UnderWay,
+    /// `tare_frames` is 0.
+    #[error("found calibration.tare_frames = 0, expected 1 or more")]
+    NoFrames,
+}
+
 /// A frame is late after so many periods.
 const STALE_PERIODS: f64 = 2.5;
 /// A silence of so many periods ends what came before it.
@@ -77,6 +97,11 @@ pub struct Pipeline {
     judgement: Judgement,
     link: Link,
     tare_met_contact: bool,
+    /// The offsets before the tare that was asked for and is being taken.
+    retaring: Option<Offsets>,
+    /// What became of it, until it is fetched.
+    retared: Option<Result<Tared, RetareError>>,
+    context: Option<serde_json::Value>,
     frames: u64,
     frames_damaged: u64,
     /// Ends of recent chunks in the stream, and when they came.
@@ -127,6 +152,9 @@ impl Pipeline {
             judgement,
             link: Link::Closed { reason: None },
             tare_met_contact: false,
+            retaring: None,
+            retared: None,
+            context: None,
             frames: 0,
             frames_damaged: 0,
             chunks: VecDeque::new(),
@@ -143,6 +171,53 @@ impl Pipeline {
             .reload(&judgement.calibration, contact(&judgement.press));
         self.tracker.reload(judgement.press.clone());
         self.judgement = judgement;
+    }
+
+    /// Takes another tare from the next frames on; [`Self::retared`] tells what became of it.
+    ///
+    /// # Errors
+    ///
+    /// If one cannot be taken now: see [`RetareError`]. Nothing has changed then.
+    pub fn retare(&mut self) -> Result<(), RetareError> {
+        if self.tracker.is_pressed() {
+            return Err(RetareError::Pressed);
+        }
+        if !matches!(self.link, Link::Live { .. }) {
+            return Err(RetareError::NotLive);
+        }
+        if self.tare.is_taking() {
+            return Err(RetareError::UnderWay);
+        }
+        if !self.tare.retake() {
+            return Err(RetareError::NoFrames);
+        }
+        self.retaring = Some(self.tare.offsets());
+        Ok(())
+    }
+
+    /// What became of a tare that was asked for, once.
+    pub fn retared(&mut self) -> Option<Result<Tared, RetareError>> {
+        self.retared.take()
+    }
+
+    /// What the controller says it is doing: echoed in presses and verdicts until it changes.
+    pub fn set_context(&mut self, context: Option<serde_json::Value>) {
+        self.context = context;
+    }
+
+    /// Name of the sensor.
+    pub fn sensor(&self) -> &str {
+        &self.sensor
+    }
+
+    /// When the last whole frame came.
+    pub fn last_frame(&self) -> Option<Stamp> {
+        self.last_frame
+    }
+
+    /// What may change while it runs, as it is now.
+    pub fn judgement(&self) -> &Judgement {
+        &self.judgement
     }
 
     /// The port is open: what comes next does not continue what came before.
@@ -194,6 +269,7 @@ impl Pipeline {
             && at.mono >= deadline
         {
             self.link = Link::Stale;
+            self.abandon_retare(RetareError::NotLive);
             // From the last frame on, so that its time and this one are of one clock reading.
             let since = self.last_frame.unwrap_or(at);
             let wait = deadline.saturating_sub(since.mono);
@@ -223,6 +299,7 @@ impl Pipeline {
         self.last_bytes = None;
         self.recent.clear();
         self.link = Link::Lost { reason };
+        self.abandon_retare(RetareError::NotLive);
         events.extend(self.status_if_changed(at));
         self.abort(Abort::Lost, &mut events);
         events
@@ -367,12 +444,17 @@ impl Pipeline {
         self.link = Link::Live { since: stamp.mono };
 
         let frame = self.tare.apply(raw);
-        let progress = self.tare.observe(raw);
-        match progress {
-            Progress::Contact => self.tare_met_contact = true,
-            Progress::Taken => self.tare_met_contact = false,
-            Progress::Ready | Progress::Taking => {}
+        // A baseline stands, be it that another is being taken.
+        let tared = !self.tare.is_taking() || self.retaring.is_some();
+        let changes = if tared {
+            self.tracker.push(&frame, at)
+        } else {
+            Vec::new()
+        };
+        if self.tracker.is_pressed() {
+            self.abandon_retare(RetareError::Pressed);
         }
+        self.observe(raw);
         events.extend(self.status_if_changed(stamp));
         events.push(Event::Frame(FrameEvent::new(
             self.sensor.clone(),
@@ -380,10 +462,37 @@ impl Pipeline {
             at.frame,
             frame.newtons.to_vec(),
         )));
-        if progress == Progress::Ready {
-            for change in self.tracker.push(&frame, at) {
-                self.publish(change, events);
+        for change in changes {
+            self.publish(change, events);
+        }
+    }
+
+    /// Shows the tare a frame. A first tare is tried until it is taken; one that was asked for is
+    /// given up when the sensor is touched, for a baseline stands.
+    fn observe(&mut self, raw: &RawFrame) {
+        match self.tare.observe(raw) {
+            Progress::Ready | Progress::Taking => {}
+            Progress::Contact if self.retaring.is_some() => {
+                self.abandon_retare(RetareError::Touched);
             }
+            Progress::Contact => self.tare_met_contact = true,
+            Progress::Taken => {
+                self.tare_met_contact = false;
+                if let Some(old) = self.retaring.take() {
+                    self.retared = Some(Ok(Tared {
+                        sensor: self.sensor.clone(),
+                        old,
+                        new: self.tare.offsets(),
+                    }));
+                }
+            }
+        }
+    }
+
+    fn abandon_retare(&mut self, reason: RetareError) {
+        if self.retaring.take().is_some() {
+            self.tare.give_up();
+            self.retared = Some(Err(reason));
         }
     }
 
@@ -444,7 +553,7 @@ impl Pipeline {
             frame: at.frame,
             reason,
             frames,
-            context: None,
+            context: self.context.clone(),
         })
     }
 
@@ -494,7 +603,7 @@ impl Pipeline {
             force_n: peak.force_n,
             model: hrn.sha256()[..12].to_owned(),
             state: self.state().0,
-            context: None,
+            context: self.context.clone(),
             mono_ns: (self.clock == Clock::Arrival).then_some(stamp.mono.as_nanos() as u64),
             age_at_publish_ms: None,
             latency_us: None,

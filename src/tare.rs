@@ -130,10 +130,23 @@ pub enum Progress {
     Contact,
 }
 
+/// A baseline, summed up over the array's live taxels.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Offsets {
+    /// Mean over the taxels.
+    pub mean_counts: f32,
+    /// Smallest of a taxel.
+    pub least_counts: f32,
+    /// Largest of a taxel.
+    pub most_counts: f32,
+}
+
 /// The baseline of one sensor and the tare being taken, if one is.
 #[derive(Debug, Clone)]
 pub struct Tare {
     newtons_per_count: f32,
+    /// Frames of a tare.
+    frames: u32,
     /// `[ROWS, COLS]` in counts; zeros until a tare is taken.
     baseline: Box<[f32; TAXELS]>,
     taking: Option<Taking>,
@@ -182,6 +195,7 @@ impl Tare {
     pub fn new(settings: &Settings, array: Array, contact: Contact) -> Self {
         Self {
             newtons_per_count: settings.newtons_per_count,
+            frames: settings.tare_frames,
             baseline: Box::new([0.0; TAXELS]),
             taking: (settings.tare_frames > 0).then(|| Taking::new(settings.tare_frames)),
             contact,
@@ -194,6 +208,7 @@ impl Tare {
     /// Takes over changed settings; the baseline in force stays.
     pub fn reload(&mut self, settings: &Settings, contact: Contact) {
         self.newtons_per_count = settings.newtons_per_count;
+        self.frames = settings.tare_frames;
         self.max_n = settings.tare_max_n;
         self.contact = contact;
         self.dead = dead(settings, self.array);
@@ -202,6 +217,31 @@ impl Tare {
     /// Whether a tare is being taken.
     pub fn is_taking(&self) -> bool {
         self.taking.is_some()
+    }
+
+    /// Begins another tare; the baseline in force stays until it is taken. `false`: the settings
+    /// say that none is to be taken.
+    pub fn retake(&mut self) -> bool {
+        if self.frames > 0 {
+            self.taking = Some(Taking::new(self.frames));
+        }
+        self.frames > 0
+    }
+
+    /// Keeps the baseline in force and stops taking another.
+    pub fn give_up(&mut self) {
+        self.taking = None;
+    }
+
+    /// The baseline in force.
+    pub fn offsets(&self) -> Offsets {
+        let live = self.live();
+        let counts = || live.iter().map(|&place| self.baseline[place]);
+        Offsets {
+            mean_counts: counts().sum::<f32>() / live.len().max(1) as f32,
+            least_counts: counts().reduce(f32::min).unwrap_or(0.0),
+            most_counts: counts().reduce(f32::max).unwrap_or(0.0),
+        }
     }
 
     /// Counts to newtons: `max(0, counts - baseline) x newtons_per_count`, dead taxels replaced
@@ -256,11 +296,7 @@ impl Tare {
         let Some(taking) = &self.taking else {
             return false;
         };
-        let live: Vec<usize> = self
-            .array
-            .places()
-            .filter(|place| !self.dead.iter().any(|(dead, _)| dead == place))
-            .collect();
+        let live = self.live();
         let mut sorted: Vec<f32> = live.iter().map(|&place| mean[place]).collect();
         sorted.sort_by(f32::total_cmp);
         let median = sorted.get(sorted.len() / 2).copied().unwrap_or(0.0);
@@ -273,6 +309,14 @@ impl Tare {
             .filter(|&&place| (mean[place] - median) * self.newtons_per_count > self.max_n);
         let limit = self.contact.area_taxels as usize;
         varying.count() >= limit || high.count() >= limit
+    }
+
+    /// Places of the array's live taxels.
+    fn live(&self) -> Vec<usize> {
+        self.array
+            .places()
+            .filter(|place| !self.dead.iter().any(|(dead, _)| dead == place))
+            .collect()
     }
 }
 
@@ -358,6 +402,33 @@ mod tests {
             Progress::Contact,
         );
         check(&|_| (0..3).map(|i| (i, 2 + 12)).collect(), Progress::Taken);
+    }
+
+    #[test]
+    fn another_tare_leaves_the_baseline_until_it_is_taken_or_given_up() {
+        let mut settings = settings(&[[0, 1]]);
+        settings.tare_frames = 2;
+        let mut tare = Tare::new(&settings, Array::FULL, CONTACT);
+        let frames = |tare: &mut Tare, count| -> Vec<Progress> {
+            let drifted = raw(&[(0, count), (1, 900)]);
+            (0..2).map(|_| tare.observe(&drifted)).collect()
+        };
+        frames(&mut tare, 2);
+        let old = tare.offsets();
+        assert_eq!((old.least_counts, old.most_counts), (2.0, 2.0));
+        assert!(tare.retake());
+        assert_eq!(tare.observe(&raw(&[(0, 9)])), Progress::Taking);
+        assert_eq!(tare.offsets(), old);
+        tare.give_up();
+        assert_eq!((tare.is_taking(), tare.offsets()), (false, old));
+        assert!(tare.retake());
+        assert_eq!(frames(&mut tare, 9), [Progress::Taking, Progress::Taken]);
+        let new = tare.offsets();
+        assert_eq!((new.least_counts, new.most_counts), (2.0, 9.0));
+        assert!((new.mean_counts - (2.0 * 782.0 + 9.0) / 783.0).abs() < 1e-4);
+        settings.tare_frames = 0;
+        tare.reload(&settings, CONTACT);
+        assert!(!tare.retake());
     }
 
     #[test]

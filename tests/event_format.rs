@@ -7,6 +7,7 @@
 )]
 
 use hardnessd::event::*;
+use hardnessd::tare::Offsets;
 use hardnessd::verdict::Level;
 use jiff::Timestamp;
 use serde_json::json;
@@ -158,9 +159,27 @@ fn replies_are_frozen() {
     check(
         &Reply::Ok {
             id: Some(json!("a")),
+            tare: None,
         }
         .to_line(),
         r#"{"type":"ok","id":"a"}"#,
+    );
+    let offsets = |mean_counts| Offsets {
+        mean_counts,
+        least_counts: 1.5,
+        most_counts: 9.0,
+    };
+    check(
+        &Reply::Ok {
+            id: None,
+            tare: Some(Tared {
+                sensor: "forearm".to_owned(),
+                old: offsets(2.25),
+                new: offsets(2.5),
+            }),
+        }
+        .to_line(),
+        r#"{"type":"ok","tare":{"sensor":"forearm","old":{"mean_counts":2.25,"least_counts":1.5,"most_counts":9.0},"new":{"mean_counts":2.5,"least_counts":1.5,"most_counts":9.0}}}"#,
     );
     let hello = Hello {
         protocol: PROTOCOL,

@@ -393,7 +393,7 @@ impl Client {
             Ok(Request::Last) => self.hub.finals().await?,
             Err(message) => return Ok(vec![error(message, line.id)]),
         };
-        answer.push(Reply::Ok { id: line.id }.to_line().into());
+        answer.push(Reply::Ok { id: line.id, tare: None }.to_line().into());
         Ok(answer)
     }
 

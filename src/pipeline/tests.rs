@@ -98,6 +98,67 @@ fn a_load_during_tare_is_said_and_tracked_as_no_press() {
 }
 
 #[test]
+fn a_tare_on_request_zeroes_drift_and_is_refused_or_given_up_under_load() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    assert_eq!(pipeline.retare(), Err(RetareError::NotLive));
+    play(&mut pipeline, 0, &[raw(0, 0); 4]);
+    assert_eq!(pipeline.retare(), Err(RetareError::UnderWay));
+    play(&mut pipeline, 4, &[raw(0, 0); 1]);
+    let drift = raw(784 - 400, 1);
+
+    assert_eq!(pipeline.retare(), Ok(()));
+    play(&mut pipeline, 5, &[drift; 4]);
+    assert_eq!(pipeline.retared(), None);
+    assert_eq!(pipeline.retare(), Err(RetareError::UnderWay));
+    play(&mut pipeline, 9, &[drift; 1]);
+    let tared = pipeline.retared().unwrap().unwrap();
+    assert_eq!((tared.old.most_counts, tared.new.most_counts), (0.0, 1.0));
+    assert_eq!(pipeline.retared(), None, "told once");
+
+    // A press that begins meanwhile is followed, and the offsets stay.
+    assert_eq!(pipeline.retare(), Ok(()));
+    let begun = play(&mut pipeline, 10, &[raw(9, 50)]);
+    assert_eq!(begun, ["Begin 1"]);
+    assert_eq!(pipeline.retared(), Some(Err(RetareError::Pressed)));
+    assert_eq!(pipeline.retare(), Err(RetareError::Pressed));
+    assert_eq!(pipeline.tare.offsets(), tared.new);
+    assert_eq!(
+        play(&mut pipeline, 11, &[raw(9, 50), raw(0, 0), raw(0, 0)]),
+        ["End 1", "Final of 10"]
+    );
+
+    // So it is with a touch too small to be a press, and with a loss.
+    assert_eq!(pipeline.retare(), Ok(()));
+    let touch = [raw(0, 0), raw(4, 2), raw(0, 0), raw(0, 0), raw(0, 0)];
+    assert!(play(&mut pipeline, 14, &touch).is_empty());
+    assert_eq!(pipeline.retared(), Some(Err(RetareError::Touched)));
+    assert_eq!(pipeline.retare(), Ok(()));
+    pipeline.lost("end of file".to_owned(), at(3900));
+    assert_eq!(pipeline.retared(), Some(Err(RetareError::NotLive)));
+    assert!(!pipeline.tare.is_taking());
+}
+
+#[test]
+fn the_context_stays_until_it_changes() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    play(&mut pipeline, 0, &[raw(0, 0); 5]);
+    let context = serde_json::json!({"tag": "pick-17"});
+    pipeline.set_context(Some(context.clone()));
+    let mut told = Vec::new();
+    for (number, raw) in (5..).zip([raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)]) {
+        let bytes = bytes(&pipeline, &raw);
+        for event in pipeline.push(&bytes, at(number * 200)) {
+            match event {
+                Event::Press(press) => told.push(press.context),
+                Event::Hardness(verdict) => told.push(verdict.context),
+                _ => {}
+            }
+        }
+    }
+    assert_eq!(told, vec![Some(context); 3]);
+}
+
+#[test]
 fn silence_is_stale_after_two_and_a_half_periods_and_ends_no_press() {
     let mut pipeline = pipeline(Preset::Jx255n);
     play(&mut pipeline, 0, &[raw(0, 0); 5]);
