@@ -5,32 +5,38 @@
 //! for the hub, one a connection; nothing is shared between them but lines ready to be sent.
 //! It starts without its hardware and waits for it inside.
 
+mod accept;
+mod client;
 pub mod config;
+mod http;
 mod hub;
 pub mod log;
+pub mod publish;
 mod request;
 mod sensor;
 mod serial;
 pub mod socket;
 mod systemd;
+pub mod tcp;
 
 use std::fs::File;
 use std::future::Future;
 use std::io::Read;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, watch};
 use tokio::task::{JoinHandle, JoinSet};
 use tokio::time::MissedTickBehavior;
 use tracing::{error, info, warn};
 
 use self::config::Setup;
 use self::log::Log;
-use self::sensor::{Command, Sensors};
+use self::publish::Publishers;
+use self::sensor::{Command, Sensor, Sensors};
 use self::serial::Link;
-use self::socket::Socket;
-use crate::event::{Hello, ModelCard, PROTOCOL, SensorCard};
+use crate::event::{Hello, ModelCard, PROTOCOL, SensorCard, Status};
 use crate::frame::Stamp;
 use crate::pipeline::{Clock, Pipeline};
 
@@ -43,9 +49,9 @@ const QUESTIONS: usize = 16;
 /// Why the daemon cannot start, or has stopped by itself.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The Unix socket cannot be had.
+    /// A way out cannot be had.
     #[error(transparent)]
-    Socket(#[from] socket::Error),
+    Publish(#[from] publish::Error),
     /// No random numbers, without which a run cannot be told from another.
     #[error("/dev/urandom: {0}")]
     Random(#[source] std::io::Error),
@@ -68,7 +74,7 @@ pub struct Reload {
 pub struct Daemon {
     setup: Setup,
     hello: Hello,
-    socket: Option<Socket>,
+    publishers: Publishers,
 }
 
 /// The moment, on both clocks.
@@ -85,19 +91,22 @@ impl Daemon {
     ///
     /// # Errors
     ///
-    /// If a socket cannot be had: its path is in use, is no socket, or the system refuses.
+    /// If a socket cannot be had: its path or address is in use, is no socket, or the system
+    /// refuses.
     pub fn bind(setup: Setup) -> Result<Self, Error> {
         let hello = hello(&setup, run_token().map_err(Error::Random)?);
-        let unix = &setup.config.publish.unix;
-        let socket = unix
-            .enabled
-            .then(|| Socket::bind(&unix.path(), unix.mode.0))
-            .transpose()?;
+        let http = setup.config.http.as_ref().map(|http| http.listen);
+        let publishers = Publishers::bind(&setup.config.publish, http)?;
         Ok(Self {
             setup,
             hello,
-            socket,
+            publishers,
         })
+    }
+
+    /// Where the live page is, if there is one.
+    pub fn http_address(&self) -> Option<SocketAddr> {
+        self.publishers.http_address()
     }
 
     /// Serves until `shutdown` comes, then finishes the event in hand: presses are aborted,
@@ -114,7 +123,7 @@ impl Daemon {
         let Self {
             mut setup,
             hello,
-            socket,
+            publishers,
         } = self;
         let run = hello.run.clone();
         let hub = hub::start(hello);
@@ -126,16 +135,16 @@ impl Daemon {
             let pipeline = Pipeline::new(settings, Clock::Arrival);
             let link = Link::new(&sensor.port, sensor.baud);
             tasks.spawn(sensor::serve(pipeline, link, hub.clone(), inbox));
-            commands.push(sender);
+            commands.push(Sensor {
+                name: sensor.name.clone(),
+                commands: sender,
+            });
         }
         let sensors = Sensors(commands);
 
-        let (stop, stopped) = oneshot::channel();
-        let mut publishers = JoinSet::new();
-        if let Some(socket) = socket {
-            let max_clients = setup.config.publish.unix.max_clients;
-            publishers.spawn(socket.serve(max_clients, hub.clone(), sensors.clone(), stopped));
-        }
+        let (stop, stopped) = watch::channel(());
+        publishers.announce();
+        let mut publishers = publishers.serve(&hub, &sensors, &stopped);
         announce(&setup, &run);
         systemd::ready();
 
@@ -147,10 +156,9 @@ impl Daemon {
             tokio::select! {
                 () = &mut shutdown => break Ok(()),
                 Some(_) = tasks.join_next() => break Err(Error::Stopped("a sensor")),
-                Some(_) = publishers.join_next() => break Err(Error::Stopped("the socket")),
+                Some(_) = publishers.join_next() => break Err(Error::Stopped("a listener")),
                 _ = heartbeat.tick() => {
-                    let statuses = sensors.statuses().await;
-                    if hub.finals().await.is_ok() {
+                    if let Some(statuses) = alive(&hub, &sensors).await {
                         systemd::alive(&statuses);
                     }
                 }
@@ -165,10 +173,10 @@ impl Daemon {
                         Ok(changed) => {
                             setup = changed;
                             hub.describe(self::hello(&setup, run.clone())).await;
-                            for (commands, sensor) in sensors.0.iter().zip(&setup.config.sensors) {
-                                let judgement = Box::new(setup.judgement(sensor));
+                            for (sensor, settings) in sensors.0.iter().zip(&setup.config.sensors) {
+                                let judgement = Box::new(setup.judgement(settings));
                                 // A sensor that has ended is noticed above.
-                                let _ = commands.send(Command::Reload(judgement)).await;
+                                let _ = sensor.commands.send(Command::Reload(judgement)).await;
                             }
                             info!(model = short(&setup), "reloaded");
                         }
@@ -181,19 +189,26 @@ impl Daemon {
 
         systemd::stopping();
         info!("stopping");
-        for commands in &sensors.0 {
+        for sensor in &sensors.0 {
             // One that has ended needs no telling.
-            let _ = commands.send(Command::Finish).await;
+            let _ = sensor.commands.send(Command::Finish).await;
         }
         while tasks.join_next().await.is_some() {}
         hub.close().await;
-        let _ = stop.send(());
+        drop(stop);
         let farewell = async { while publishers.join_next().await.is_some() {} };
         if tokio::time::timeout(FAREWELL, farewell).await.is_err() {
             warn!("a subscriber did not fetch its last lines");
         }
         outcome
     }
+}
+
+/// Whether the pipelines turn: every sensor's task and the hub answer. What feeds the watchdog.
+async fn alive(hub: &hub::Handle, sensors: &Sensors) -> Option<Vec<Status>> {
+    let statuses = sensors.statuses().await;
+    let all = statuses.len() == sensors.0.len();
+    (all && hub.finals().await.is_ok()).then_some(statuses)
 }
 
 /// Why a reload was refused.
@@ -243,15 +258,12 @@ fn change(setup: &Setup, loaded: Loaded, log: Option<&Log>) -> Result<Setup, Ref
 }
 
 fn announce(setup: &Setup, run: &str) {
-    let unix = &setup.config.publish.unix;
-    let socket = unix.enabled.then(|| unix.path().display().to_string());
     info!(
         version = env!("CARGO_PKG_VERSION"),
         robot = setup.config.robot.as_str(),
         run,
         model = short(setup),
         validation = setup.hrn.card().validation.as_str(),
-        socket,
         "started"
     );
     for sensor in &setup.config.sensors {

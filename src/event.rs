@@ -74,6 +74,16 @@ impl Event {
         }
     }
 
+    /// Its place in the run, once it has one.
+    pub fn seq(&self) -> Option<u64> {
+        match self {
+            Event::Status(event) => event.seq,
+            Event::Press(event) => event.seq,
+            Event::Hardness(event) => event.seq,
+            Event::Frame(_) => None,
+        }
+    }
+
     /// The event as one line, newline included.
     pub fn to_line(&self) -> String {
         line(self)

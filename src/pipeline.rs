@@ -12,7 +12,8 @@ use std::time::Duration;
 use jiff::Timestamp;
 
 use crate::event::{
-    Event, FrameEvent, Hardness, LinkState, Note, Phase, Press, PressState, Rejection, Status, Tared,
+    Event, FrameEvent, Hardness, LinkState, Note, Phase, Press, PressState, Rejection, Status,
+    Tared,
 };
 use crate::frame::{Frame, RawFrame, Stamp};
 use crate::press::{self, Abort, Change, End, Moment, Peak, PressTracker};

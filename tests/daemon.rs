@@ -8,221 +8,22 @@
     reason = "clippy knows no helper of a test as a test"
 )]
 
+mod bench;
+
 use std::fs;
-use std::io::{BufRead, BufReader, Write};
+use std::io::{BufRead, Write};
+use std::net::TcpListener;
 use std::os::unix::fs::PermissionsExt;
-use std::os::unix::net::{UnixDatagram, UnixListener, UnixStream};
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
-use std::sync::mpsc;
+use std::os::unix::net::{UnixDatagram, UnixListener};
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant, SystemTime};
 
-use rustix::process::{Pid, Signal, kill_process};
+use bench::{BINARY, Bench, Daemon, PATIENCE, Process, Subscriber, hardnessd, wait_for};
+use rustix::process::Signal;
 use serde_json::{Value, json};
-
-const BINARY: &str = env!("CARGO_BIN_EXE_hardnessd");
-
-/// How long anything may take before a test has failed: long, for a busy machine.
-const PATIENCE: Duration = Duration::from_secs(60);
-
-/// A directory with a port, a socket and a configuration.
-struct Bench {
-    directory: tempfile::TempDir,
-}
-
-impl Bench {
-    fn new() -> Self {
-        Self {
-            directory: tempfile::tempdir().unwrap(),
-        }
-    }
-
-    fn path(&self, name: &str) -> PathBuf {
-        self.directory.path().join(name)
-    }
-
-    /// Writes a configuration of one sensor at 20 frames/s, with `more` tables.
-    fn configure(&self, name: &str, socket: &str, more: &str) -> PathBuf {
-        let path = self.path(name);
-        let text = format!(
-            "robot = \"arm-7\"\n[[sensor]]\nname = \"forearm\"\nport = \"port\"\n\
-             frame_rate_hz = 20.0\n[publish.unix]\npath = \"{socket}\"\n{more}"
-        );
-        fs::write(&path, text).unwrap();
-        path
-    }
-
-    fn daemon(&self) -> Daemon {
-        Daemon::start(&self.configure("hardnessd.toml", "events.sock", ""))
-    }
-
-    fn subscriber(&self) -> Subscriber {
-        Subscriber::connect(&self.path("events.sock"))
-    }
-
-    /// A sensor at the port, hard enough to press that every press is one.
-    fn sensor(&self, more: &[&str]) -> Process {
-        let link = self.path("port");
-        // One that was killed has left its link, which tells nothing of the new one.
-        let _ = fs::remove_file(&link);
-        let mut command = Command::new(BINARY);
-        command.args([
-            "simulate",
-            "--fps",
-            "20",
-            "--force",
-            "15",
-            "--material",
-            "hard-plastic",
-        ]);
-        command
-            .arg("--link")
-            .arg(&link)
-            .args(more)
-            .stdout(Stdio::null())
-            .stderr(Stdio::null());
-        let sensor = Process(command.spawn().unwrap());
-        wait_for("the port", || {
-            fs::read_link(&link).is_ok_and(|pty| pty.exists())
-        });
-        sensor
-    }
-}
-
-/// A process that does not outlive its test.
-struct Process(Child);
-
-impl Process {
-    fn signal(&self, signal: Signal) {
-        let pid = Pid::from_raw(i32::try_from(self.0.id()).unwrap()).unwrap();
-        kill_process(pid, signal).unwrap();
-    }
-
-    fn exit_code(&mut self) -> Option<i32> {
-        let start = Instant::now();
-        loop {
-            if let Some(status) = self.0.try_wait().unwrap() {
-                return status.code();
-            }
-            assert!(start.elapsed() < PATIENCE, "the process does not end");
-            std::thread::sleep(Duration::from_millis(2));
-        }
-    }
-}
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-/// A running daemon and its log.
-struct Daemon {
-    process: Process,
-    log: mpsc::Receiver<String>,
-    heard: Vec<String>,
-}
-
-impl Daemon {
-    /// Starts one and waits until it serves.
-    fn start(config: &Path) -> Self {
-        let mut process = Process(
-            Command::new(BINARY)
-                .args(["run", "--config"])
-                .arg(config)
-                .env("RUST_LOG", "info")
-                .stderr(Stdio::piped())
-                .spawn()
-                .unwrap(),
-        );
-        let lines = BufReader::new(process.0.stderr.take().unwrap()).lines();
-        let (sender, log) = mpsc::channel();
-        std::thread::spawn(move || {
-            for line in lines.map_while(Result::ok) {
-                if sender.send(line).is_err() {
-                    return;
-                }
-            }
-        });
-        let mut daemon = Self {
-            process,
-            log,
-            heard: Vec::new(),
-        };
-        daemon.logged("started");
-        daemon
-    }
-
-    /// Waits for a log line that contains `part`.
-    fn logged(&mut self, part: &str) -> String {
-        loop {
-            let line = self.log.recv_timeout(PATIENCE).unwrap_or_else(|_| {
-                panic!("{part:?} was not logged, but {:#?}", self.heard);
-            });
-            self.heard.push(line.clone());
-            if line.contains(part) {
-                return line;
-            }
-        }
-    }
-}
-
-/// A connection to the socket.
-struct Subscriber {
-    lines: BufReader<UnixStream>,
-}
-
-impl Subscriber {
-    fn connect(socket: &Path) -> Self {
-        let stream = UnixStream::connect(socket).unwrap();
-        stream.set_read_timeout(Some(PATIENCE)).unwrap();
-        Self {
-            lines: BufReader::new(stream),
-        }
-    }
-
-    fn say(&mut self, line: &str) {
-        self.lines
-            .get_mut()
-            .write_all(format!("{line}\n").as_bytes())
-            .unwrap();
-    }
-
-    /// The next line; `None`: closed.
-    fn next(&mut self) -> Option<Value> {
-        let mut line = String::new();
-        (self.lines.read_line(&mut line).unwrap() > 0).then(|| serde_json::from_str(&line).unwrap())
-    }
-
-    /// Reads until a line has all of `fields`.
-    fn until(&mut self, fields: &Value) -> Value {
-        let fields = fields.as_object().unwrap();
-        loop {
-            let line = self
-                .next()
-                .unwrap_or_else(|| panic!("closed before {fields:?}"));
-            if fields.iter().all(|(key, value)| &line[key] == value) {
-                return line;
-            }
-        }
-    }
-}
-
-fn wait_for(what: &str, mut there: impl FnMut() -> bool) {
-    let start = Instant::now();
-    while !there() {
-        assert!(start.elapsed() < PATIENCE, "{what} does not come");
-        std::thread::sleep(Duration::from_millis(2));
-    }
-}
 
 fn time(event: &Value) -> jiff::Timestamp {
     event["time"].as_str().unwrap().parse().unwrap()
-}
-
-fn hardnessd(arguments: &[&str]) -> Output {
-    Command::new(BINARY).args(arguments).output().unwrap()
 }
 
 /// The binary must fail so: this code, one line that has all these parts.
@@ -458,7 +259,11 @@ fn a_port_held_by_another_process_is_named_as_such_and_logged_once() {
     let _sensor = bench.sensor(&[]);
     let _holder = bench.daemon();
     bench.subscriber().until(&json!({"state": "live"}));
-    let mut second = Daemon::start(&bench.configure("second.toml", "second.sock", ""));
+    let mut second = Daemon::start(&bench.configure(
+        "second.toml",
+        "second.sock",
+        "control_path = \"second-control.sock\"\n",
+    ));
     let mut subscriber = Subscriber::connect(&bench.path("second.sock"));
     let held = json!({"state": "connecting", "reason": "port held by another process"});
     subscriber.until(&held);
@@ -589,11 +394,19 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
     fs::write(bench.path("junk.onnx"), "no model").unwrap();
     let config = written("[model]\npath = \"junk.onnx\"\n");
     fails(&["run", "--config", &config], 78, &["junk.onnx"]);
-    let config = written("[http]\nlisten = \"127.0.0.1:8256\"\n");
+    let config = written("[publish.ros2]\n");
     fails(
         &["check", "--config", &config],
         78,
-        &["http", "not in this version"],
+        &["publish.ros2", "not in this version"],
+    );
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = taken.local_addr().unwrap();
+    let config = written(&format!("[http]\nlisten = \"{address}\"\n"));
+    fails(
+        &["run", "--config", &config],
+        74,
+        &["http.listen", &address.to_string(), "in use"],
     );
     // 20 frames/s of 790 bytes are more than 115,200 baud, and nothing is known of this port.
     let config = written("");

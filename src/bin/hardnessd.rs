@@ -9,6 +9,7 @@ use anyhow::Context;
 use clap::{Parser, Subcommand};
 use hardnessd::daemon::config::{Error as ConfigError, Setup};
 use hardnessd::daemon::log::{Log, Settings as LogSettings};
+use hardnessd::daemon::publish::Error as PublishError;
 use hardnessd::daemon::socket::Error as SocketError;
 use hardnessd::daemon::{Daemon, Error as DaemonError, Reload};
 use hardnessd::tools::{check, demo, replay, simulate};
@@ -133,11 +134,11 @@ fn exit_code(error: &anyhow::Error) -> u8 {
     };
     let of_daemon = |error: &DaemonError| match error {
         // The configuration names a file that it must not.
-        DaemonError::Socket(SocketError::NoSocket { .. } | SocketError::TooLong { .. }) => {
-            exit::CONFIG
-        }
+        DaemonError::Publish(PublishError::Socket(
+            SocketError::NoSocket { .. } | SocketError::TooLong { .. },
+        )) => exit::CONFIG,
         // In use or refused: another time it may work.
-        DaemonError::Socket(_) | DaemonError::Random(_) => exit::IO,
+        DaemonError::Publish(_) | DaemonError::Random(_) => exit::IO,
         DaemonError::Stopped(_) => exit::FAILED,
     };
     if let Some(error) = error.downcast_ref::<ConfigError>() {

@@ -8,6 +8,7 @@
 mod parse;
 
 use std::env;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -38,9 +39,9 @@ pub struct Config {
     /// Ways out.
     #[serde(default)]
     pub publish: Publish,
-    /// Not in this version.
-    #[serde(default, skip_serializing)]
-    http: Option<toml::Value>,
+    /// The live page and what stands beside it; off unless given.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub http: Option<Http>,
     /// Not in this version.
     #[serde(default, skip_serializing)]
     record: Option<toml::Value>,
@@ -121,15 +122,47 @@ pub struct Model {
 pub struct Publish {
     /// The Unix socket.
     pub unix: Unix,
-    /// Not in this version.
-    #[serde(skip_serializing)]
-    tcp: Option<toml::Value>,
+    /// The same protocol over TCP; off unless given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tcp: Option<Tcp>,
     /// Not in this version.
     #[serde(skip_serializing)]
     zenoh: Option<toml::Value>,
     /// Not in this version.
     #[serde(skip_serializing)]
     ros2: Option<toml::Value>,
+}
+
+/// The `[publish.tcp]` table.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Tcp {
+    /// Address and port.
+    pub listen: SocketAddr,
+}
+
+impl Default for Tcp {
+    fn default() -> Self {
+        Self {
+            listen: SocketAddr::from(([127, 0, 0, 1], 8255)),
+        }
+    }
+}
+
+/// The `[http]` table.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Http {
+    /// Address and port.
+    pub listen: SocketAddr,
+}
+
+impl Default for Http {
+    fn default() -> Self {
+        Self {
+            listen: SocketAddr::from(([127, 0, 0, 1], 8256)),
+        }
+    }
 }
 
 /// The `[publish.unix]` table.
@@ -143,10 +176,10 @@ pub struct Unix {
     path: Option<PathBuf>,
     /// Permissions of its file.
     pub mode: Mode,
-    /// Not in this version.
-    #[serde(skip_serializing)]
-    control_path: Option<toml::Value>,
-    /// Subscribers at a time.
+    /// Where the control socket is; by default `control.sock` beside the other.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    control_path: Option<PathBuf>,
+    /// Subscribers at a time, on each socket and on TCP.
     pub max_clients: usize,
 }
 
@@ -177,6 +210,12 @@ impl Unix {
         }
         let directory = named("XDG_RUNTIME_DIR").unwrap_or_else(|| "/run".to_owned());
         Path::new(&directory).join("hardnessd/events.sock")
+    }
+
+    /// Where the control socket is.
+    pub fn control_path(&self) -> PathBuf {
+        let beside = || self.path().with_file_name("control.sock");
+        self.control_path.clone().unwrap_or_else(beside)
     }
 
     /// The same, at `path`.
@@ -264,17 +303,25 @@ impl Config {
                 return Some(format!("sensor.{key} of \"{}\"", ours.name));
             }
         }
-        let (ours, theirs) = (&self.publish.unix, &other.publish.unix);
+        let (ours, theirs) = (&self.publish, &other.publish);
+        let (unix, their_unix) = (&ours.unix, &theirs.unix);
+        let control_differs = unix.control_path() != their_unix.control_path();
         let differs = [
-            ("enabled", ours.enabled != theirs.enabled),
-            ("path", ours.path() != theirs.path()),
-            ("mode", ours.mode != theirs.mode),
-            ("max_clients", ours.max_clients != theirs.max_clients),
+            ("publish.unix.enabled", unix.enabled != their_unix.enabled),
+            ("publish.unix.path", unix.path() != their_unix.path()),
+            ("publish.unix.mode", unix.mode != their_unix.mode),
+            ("publish.unix.control_path", control_differs),
+            (
+                "publish.unix.max_clients",
+                unix.max_clients != their_unix.max_clients,
+            ),
+            ("publish.tcp.listen", ours.tcp != theirs.tcp),
+            ("http.listen", self.http != other.http),
         ];
         differs
             .iter()
             .find(|(_, differs)| *differs)
-            .map(|(key, _)| format!("publish.unix.{key}"))
+            .map(|(key, _)| (*key).to_owned())
     }
 }
 

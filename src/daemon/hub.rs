@@ -6,6 +6,7 @@
 //! goes, and is counted, and a `gap` says so before the next one it does get.
 
 mod subscriber;
+mod tally;
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::Arc;
@@ -14,12 +15,37 @@ use std::time::Duration;
 use tokio::sync::{mpsc, oneshot};
 
 use self::subscriber::Subscriber;
+pub(crate) use self::tally::{Counts, Tally, Verdicts};
 use super::log;
 use super::request::{Kinds, Subscription};
 use crate::event::{Event, Hello, Kind, Reply};
 
-/// A line to be sent, newline included.
-pub(crate) type Line = Arc<str>;
+/// A line to be sent.
+#[derive(Debug, Clone)]
+pub(crate) struct Line {
+    /// Number of the event, if it has one; of a `hello`, the latest number given.
+    pub(crate) seq: Option<u64>,
+    /// Its JSON, newline included.
+    pub(crate) json: Arc<str>,
+}
+
+impl From<Reply> for Line {
+    fn from(reply: Reply) -> Self {
+        Self {
+            seq: None,
+            json: reply.to_line().into(),
+        }
+    }
+}
+
+impl From<&Event> for Line {
+    fn from(event: &Event) -> Self {
+        Self {
+            seq: event.seq(),
+            json: event.to_line().into(),
+        }
+    }
+}
 
 /// Numbered events held for `since` (contract, section 5: at least 4,096).
 const HELD: usize = 4096;
@@ -40,6 +66,7 @@ struct Hub {
     forgotten: [u64; Kinds::NUMBERED.len()],
     /// Last final verdict, by sensor.
     finals: BTreeMap<String, Line>,
+    tally: Tally,
     subscribers: BTreeMap<u64, Subscriber>,
     joined: u64,
 }
@@ -51,6 +78,7 @@ impl Hub {
             held: VecDeque::new(),
             forgotten: [0; Kinds::NUMBERED.len()],
             finals: BTreeMap::new(),
+            tally: Tally::default(),
             subscribers: BTreeMap::new(),
             joined: 0,
         }
@@ -76,14 +104,14 @@ impl Hub {
             verdict.latency_us =
                 Some(u64::try_from(now.saturating_sub(arrival).as_micros()).unwrap_or(u64::MAX));
         }
-        let seq = (kind != Kind::Frame).then(|| {
+        if kind != Kind::Frame {
             self.hello.seq += 1;
             event.number(self.hello.seq);
-            self.hello.seq
-        });
-        let line: Line = event.to_line().into();
-        if seq.is_some() {
+        }
+        let line = Line::from(&event);
+        if line.seq.is_some() {
             log::event(&event);
+            self.tally.count(&event);
             self.keep(Held {
                 kind,
                 line: line.clone(),
@@ -95,7 +123,7 @@ impl Hub {
             self.finals.insert(verdict.sensor.clone(), line.clone());
         }
         for subscriber in self.subscribers.values_mut() {
-            subscriber.offer(kind, event.sensor(), seq, &line);
+            self.tally.dropped += subscriber.offer(kind, event.sensor(), &line);
         }
     }
 
@@ -121,10 +149,11 @@ impl Hub {
     fn join(&mut self) -> (u64, Line) {
         self.joined += 1;
         self.subscribers.insert(self.joined, Subscriber::default());
-        (
-            self.joined,
-            Reply::Hello(self.hello.clone()).to_line().into(),
-        )
+        let hello = Line {
+            seq: Some(self.hello.seq),
+            ..Reply::Hello(self.hello.clone()).into()
+        };
+        (self.joined, hello)
     }
 
     /// Changes what a subscriber gets from now on.
@@ -177,6 +206,7 @@ impl Hub {
             return Vec::new();
         };
         let lines = subscriber.take(|seq| self.at(seq).map(|held| held.line.clone()));
+        self.tally.gaps += std::mem::take(&mut subscriber.gaps);
         self.subscribers.insert(id, subscriber);
         lines
     }
@@ -206,10 +236,24 @@ enum Command {
     Finals {
         reply: oneshot::Sender<Vec<Line>>,
     },
+    Survey {
+        reply: oneshot::Sender<Survey>,
+    },
     Leave {
         id: u64,
     },
     Close,
+}
+
+/// The hub as it is now.
+#[derive(Debug)]
+pub(crate) struct Survey {
+    /// With the latest number.
+    pub(crate) hello: Hello,
+    /// Last final verdict, by sensor.
+    pub(crate) finals: BTreeMap<String, Line>,
+    pub(crate) tally: Tally,
+    pub(crate) subscribers: usize,
 }
 
 /// The way to the hub.
@@ -277,6 +321,11 @@ impl Handle {
     /// Every sensor's last final verdict, as it was sent.
     pub(crate) async fn finals(&self) -> Result<Vec<Line>, Closed> {
         self.ask(|reply| Command::Finals { reply }).await
+    }
+
+    /// All there is to know without subscribing.
+    pub(crate) async fn survey(&self) -> Result<Survey, Closed> {
+        self.ask(|reply| Command::Survey { reply }).await
     }
 
     /// Forgets a subscriber.
@@ -371,6 +420,14 @@ async fn serve(mut hub: Hub, mut inbox: mpsc::Receiver<Command>) {
             }
             Command::Finals { reply } => {
                 let _ = reply.send(hub.finals.values().cloned().collect());
+            }
+            Command::Survey { reply } => {
+                let _ = reply.send(Survey {
+                    hello: hub.hello.clone(),
+                    finals: hub.finals.clone(),
+                    tally: hub.tally.clone(),
+                    subscribers: hub.subscribers.len(),
+                });
             }
             Command::Leave { id } => {
                 hub.subscribers.remove(&id);

@@ -11,7 +11,8 @@ use tracing_subscriber::layer::{Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Registry, reload};
 
-use crate::event::{Event, LinkState, PressState};
+use crate::event::{Event, LinkState, PressState, Tared};
+use crate::pipeline::RetareError;
 
 /// The `[log]` table.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -177,8 +178,34 @@ pub(crate) fn event(event: &Event) {
     }
 }
 
+/// What became of a tare that was asked for.
+pub(crate) fn tare(sensor: &str, outcome: &Result<Tared, RetareError>) {
+    match outcome {
+        Ok(Tared { old, new, .. }) => info!(
+            sensor,
+            old_mean_counts = old.mean_counts,
+            old_least_counts = old.least_counts,
+            old_most_counts = old.most_counts,
+            new_mean_counts = new.mean_counts,
+            new_least_counts = new.least_counts,
+            new_most_counts = new.most_counts,
+            "tare"
+        ),
+        Err(refusal) => warn!(sensor, reason = %refusal, "tare refused"),
+    }
+}
+
+/// What a controller says it is doing.
+pub(crate) fn context(sensor: &str, context: Option<&serde_json::Value>) {
+    info!(
+        sensor,
+        context = context.map(tracing::field::display),
+        "context"
+    );
+}
+
 /// The name under which a state is published, so that log and event agree.
-fn name(state: &impl Serialize) -> String {
+pub(crate) fn name(state: &impl Serialize) -> String {
     match serde_json::to_value(state) {
         Ok(serde_json::Value::String(name)) => name,
         other => unreachable!("a state without data is published as its name, not {other:?}"),

@@ -1,8 +1,8 @@
 //! What a subscriber may say: one JSON object a line.
 //!
 //! In: a line as it came. Out: a [`Request`], or a message saying what was found and what was
-//! expected; in both cases with the `id` to echo. Nothing here changes the daemon: commands that
-//! do are refused by name.
+//! expected; in both cases with the `id` to echo. Whether a [`Change`] may be asked for here is
+//! not known here: that depends on the way in.
 
 use serde::Serialize;
 use serde_json::{Map, Value};
@@ -18,6 +18,33 @@ pub(crate) enum Request {
     Status,
     /// Every sensor's last final verdict.
     Last,
+    /// To change something: for the control socket alone.
+    Change(Change),
+}
+
+/// A command of the control socket (contract, section 5).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Change {
+    /// Take another tare.
+    Tare { sensor: String },
+    /// What the controller says it is doing; `None`: nothing any more.
+    Context {
+        sensor: String,
+        context: Option<Value>,
+    },
+    /// Keep the last bytes of this sensor.
+    Blackbox { sensor: String },
+}
+
+impl Change {
+    /// As in the request.
+    pub(crate) fn key(&self) -> &'static str {
+        match self {
+            Change::Tare { .. } => "tare",
+            Change::Context { .. } => "context",
+            Change::Blackbox { .. } => "blackbox",
+        }
+    }
 }
 
 /// What a subscriber wants, and what is to happen when it is slow.
@@ -49,6 +76,8 @@ pub(crate) enum Policy {
     Queue,
     /// The newest event a kind and sensor.
     Latest,
+    /// The newest frame a sensor, every other event: for those who look on (`/events`).
+    LatestFrames,
 }
 
 /// A place in a run: `RUN:SEQ`.
@@ -56,6 +85,17 @@ pub(crate) enum Policy {
 pub(crate) struct Since {
     pub(crate) run: String,
     pub(crate) seq: u64,
+}
+
+impl Since {
+    /// Reads `RUN:SEQ`.
+    pub(crate) fn parse(token: &str) -> Option<Self> {
+        let (run, seq) = token.rsplit_once(':')?;
+        Some(Self {
+            run: run.to_owned(),
+            seq: seq.parse().ok()?,
+        })
+    }
 }
 
 /// A set of event kinds.
@@ -136,14 +176,17 @@ fn request(mut fields: Map<String, Value>) -> Result<Request, String> {
                 ));
             }
         }
+    } else if let Some(sensor) = fields.remove("tare") {
+        let sensor = name("tare", &sensor)?;
+        Request::Change(Change::Tare { sensor })
+    } else if let Some(context) = fields.remove("context") {
+        Request::Change(self::context(context)?)
+    } else if let Some(sensor) = fields.remove("blackbox") {
+        let sensor = name("blackbox", &sensor)?;
+        Request::Change(Change::Blackbox { sensor })
     } else {
         let found = fields.keys().next().map_or("no key".to_owned(), short);
-        return Err(
-            match fields.keys().find(|key| CHANGING.contains(&key.as_str())) {
-                Some(key) => format!("{key}: this socket takes no command that changes anything"),
-                None => format!("found {found}, expected \"subscribe\" or \"get\""),
-            },
-        );
+        return Err(format!("found {found}, expected \"subscribe\" or \"get\""));
     };
     match fields.keys().next() {
         Some(key) => Err(format!(
@@ -154,8 +197,39 @@ fn request(mut fields: Map<String, Value>) -> Result<Request, String> {
     }
 }
 
-/// Commands of the control socket (contract, section 5).
-const CHANGING: [&str; 3] = ["tare", "context", "blackbox"];
+/// A context is shorter, written as JSON without spaces (contract, section 5).
+const CONTEXT_BYTES: usize = 1024;
+
+fn name(key: &str, value: &Value) -> Result<String, String> {
+    value
+        .as_str()
+        .map(str::to_owned)
+        .ok_or_else(|| format!("{key}: found {}, expected a sensor's name", short(value)))
+}
+
+fn context(value: Value) -> Result<Change, String> {
+    let Value::Object(fields) = &value else {
+        return Err(format!(
+            "context: found {}, expected an object",
+            short(&value)
+        ));
+    };
+    let sensor = match fields.get("sensor") {
+        Some(sensor) => name("context.sensor", sensor)?,
+        None => return Err("context.sensor: found none, expected a sensor's name".to_owned()),
+    };
+    let bytes = value.to_string().len();
+    if bytes >= CONTEXT_BYTES {
+        return Err(format!(
+            "context: found {bytes} bytes, expected fewer than {CONTEXT_BYTES}"
+        ));
+    }
+    let says_something = fields.len() > 1;
+    Ok(Change::Context {
+        sensor,
+        context: says_something.then_some(value),
+    })
+}
 
 /// What was found, as JSON, short enough for a message.
 fn short(found: &(impl Serialize + ?Sized)) -> String {
@@ -174,14 +248,22 @@ fn kinds(value: &Value) -> Result<Kinds, String> {
     };
     names
         .iter()
-        .map(|name| match name.as_str() {
-            Some("hardness") => Ok(Kind::Hardness),
-            Some("press") => Ok(Kind::Press),
-            Some("status") => Ok(Kind::Status),
-            Some("frame") => Ok(Kind::Frame),
-            _ => Err(format!("subscribe: found {}, {expected}", short(name))),
+        .map(|name| {
+            let named = name.as_str().and_then(kind_named);
+            named.ok_or_else(|| format!("subscribe: found {}, {expected}", short(name)))
         })
         .collect()
+}
+
+/// The kind of event of that name.
+pub(crate) fn kind_named(name: &str) -> Option<Kind> {
+    match name {
+        "hardness" => Some(Kind::Hardness),
+        "press" => Some(Kind::Press),
+        "status" => Some(Kind::Status),
+        "frame" => Some(Kind::Frame),
+        _ => None,
+    }
 }
 
 fn policy(value: &Value) -> Result<Policy, String> {
@@ -198,13 +280,7 @@ fn policy(value: &Value) -> Result<Policy, String> {
 fn since(value: &Value) -> Result<Since, String> {
     value
         .as_str()
-        .and_then(|token| token.rsplit_once(':'))
-        .and_then(|(run, seq)| {
-            Some(Since {
-                run: run.to_owned(),
-                seq: seq.parse().ok()?,
-            })
-        })
+        .and_then(Since::parse)
         .ok_or_else(|| format!("since: found {}, expected \"RUN:SEQ\"", short(value)))
 }
 
@@ -236,6 +312,31 @@ mod tests {
             parse(br#"{"get":"last","id":4}"#).request,
             Ok(Request::Last)
         );
+        let sensor = "forearm".to_owned();
+        assert_eq!(
+            parse(br#"{"tare":"forearm"}"#).request,
+            Ok(Request::Change(Change::Tare { sensor }))
+        );
+    }
+
+    #[test]
+    fn a_context_is_kept_as_it_came_and_below_a_kibibyte() {
+        let context = |more: &str| {
+            let line = format!(r#"{{"context":{{"sensor":"forearm"{more}}}}}"#);
+            match parse(line.as_bytes()).request {
+                Ok(Request::Change(Change::Context { context, .. })) => Ok(context),
+                other => Err(other.unwrap_err()),
+            }
+        };
+        assert_eq!(context("").unwrap(), None);
+        let expected = serde_json::json!({"sensor": "forearm", "tag": "x"});
+        assert_eq!(context(r#","tag":"x""#).unwrap(), Some(expected));
+        let long = |bytes: usize| {
+            let around = r#"{"sensor":"forearm","tag":""}"#.len();
+            context(&format!(r#","tag":"{}""#, "x".repeat(bytes - around)))
+        };
+        assert!(long(1023).is_ok());
+        assert!(long(1024).unwrap_err().contains("1024"));
     }
 
     #[test]
@@ -248,7 +349,10 @@ mod tests {
             (br#"{"subscribe":[],"since":"ab:-7","id":"a"}"#, "\"ab:-7\""),
             (br#"{"subscribe":[],"sinse":"ab:7","id":"a"}"#, "\"sinse\""),
             (br#"{"get":"frames","id":"a"}"#, "\"frames\""),
-            (br#"{"tare":"forearm","id":"a"}"#, "tare"),
+            (br#"{"tare":7,"id":"a"}"#, "tare"),
+            (br#"{"tare":"a","context":{},"id":"a"}"#, "\"context\""),
+            (br#"{"context":"pick","id":"a"}"#, "\"pick\""),
+            (br#"{"context":{"tag":"x"},"id":"a"}"#, "context.sensor"),
             (br#"{"id":"a"}"#, "no key"),
         ] {
             let read = parse(line);

@@ -6,42 +6,70 @@
 
 use std::time::Duration;
 
+use serde_json::Value;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
 
 use super::hub;
+use super::log;
 use super::serial::{Link, Turn};
-use crate::event::{Event, Kind, Status};
-use crate::pipeline::{Judgement, Pipeline};
+use crate::event::{Event, Kind, Status, Tared};
+use crate::pipeline::{Judgement, Pipeline, RetareError};
 
 /// What a sensor can be asked.
 #[derive(Debug)]
 pub(crate) enum Command {
     /// How it is now.
-    Status(oneshot::Sender<Status>),
+    Status(oneshot::Sender<Vitals>),
+    /// To take another tare; the answer comes once it is taken or given up.
+    Tare(oneshot::Sender<Result<Tared, RetareError>>),
+    /// What the controller says it is doing.
+    Context(Option<Value>),
     /// To judge otherwise from now on.
     Reload(Box<Judgement>),
     /// To end: a press is aborted, then nothing comes any more.
     Finish,
 }
 
+/// A sensor as it is now.
+#[derive(Debug, Clone)]
+pub(crate) struct Vitals {
+    pub(crate) status: Status,
+    /// Age of its last whole frame.
+    pub(crate) last_frame_age: Option<Duration>,
+    pub(crate) contact_threshold_n: f32,
+}
+
+/// A way to one sensor.
+#[derive(Debug, Clone)]
+pub(crate) struct Sensor {
+    pub(crate) name: String,
+    pub(crate) commands: mpsc::Sender<Command>,
+}
+
 /// Ways to all sensors, in the order of the configuration.
 #[derive(Debug, Clone)]
-pub(crate) struct Sensors(pub(crate) Vec<mpsc::Sender<Command>>);
+pub(crate) struct Sensors(pub(crate) Vec<Sensor>);
 
 impl Sensors {
-    /// Every sensor's status now; those that have ended are left out.
-    pub(crate) async fn statuses(&self) -> Vec<Status> {
-        let mut statuses = Vec::with_capacity(self.0.len());
+    /// Every sensor now; those that have ended are left out.
+    pub(crate) async fn vitals(&self) -> Vec<Vitals> {
+        let mut all = Vec::with_capacity(self.0.len());
         for sensor in &self.0 {
-            let (reply, status) = oneshot::channel();
-            if sensor.send(Command::Status(reply)).await.is_ok()
-                && let Ok(status) = status.await
+            let (reply, vitals) = oneshot::channel();
+            if sensor.commands.send(Command::Status(reply)).await.is_ok()
+                && let Ok(vitals) = vitals.await
             {
-                statuses.push(status);
+                all.push(vitals);
             }
         }
-        statuses
+        all
+    }
+
+    /// Every sensor's status now.
+    pub(crate) async fn statuses(&self) -> Vec<Status> {
+        let vitals = self.vitals().await;
+        vitals.into_iter().map(|vitals| vitals.status).collect()
     }
 }
 
@@ -52,15 +80,32 @@ pub(crate) async fn serve(
     hub: hub::Handle,
     mut commands: mpsc::Receiver<Command>,
 ) {
+    // Who waits for a tare.
+    let mut taring: Option<oneshot::Sender<Result<Tared, RetareError>>> = None;
     loop {
         let deadline = pipeline.deadline();
         let (events, at) = tokio::select! {
-            // Commands first: a sensor that never pauses must still stop when told.
-            biased;
+            // In no order: a sensor that never pauses must still stop when told, and questions
+            // that never pause must not keep it from its port.
             command = commands.recv() => match command {
                 Some(Command::Status(reply)) => {
                     // The asker may have gone.
-                    let _ = reply.send(pipeline.status(super::now()));
+                    let _ = reply.send(vitals(&pipeline));
+                    continue;
+                }
+                Some(Command::Tare(reply)) => {
+                    match pipeline.retare() {
+                        Ok(()) => taring = Some(reply),
+                        Err(refusal) => {
+                            log::tare(pipeline.sensor(), &Err(refusal));
+                            let _ = reply.send(Err(refusal));
+                        }
+                    }
+                    continue;
+                }
+                Some(Command::Context(context)) => {
+                    log::context(pipeline.sensor(), context.as_ref());
+                    pipeline.set_context(context);
                     continue;
                 }
                 Some(Command::Reload(judgement)) => {
@@ -93,7 +138,24 @@ pub(crate) async fn serve(
         {
             link.proven();
         }
+        if let Some(outcome) = pipeline.retared() {
+            log::tare(pipeline.sensor(), &outcome);
+            if let Some(reply) = taring.take() {
+                let _ = reply.send(outcome);
+            }
+        }
         hub.publish(events, at.mono).await;
+    }
+}
+
+fn vitals(pipeline: &Pipeline) -> Vitals {
+    let now = super::now();
+    Vitals {
+        status: pipeline.status(now),
+        last_frame_age: pipeline
+            .last_frame()
+            .map(|frame| now.mono.saturating_sub(frame.mono)),
+        contact_threshold_n: pipeline.judgement().press.contact_threshold_n,
     }
 }
 

@@ -75,13 +75,31 @@ pub fn run(args: &Args) -> Result<(), Error> {
     lines += &if unix.enabled {
         let (path, mode) = (unix.path(), String::from(unix.mode));
         format!(
-            "socket {}, mode {mode}, {} subscribers\n",
+            "socket {}, mode {mode}, {} subscribers\ncontrol {}\n",
             path.display(),
-            unix.max_clients
+            unix.max_clients,
+            unix.control_path().display()
         )
     } else {
         "no socket\n".to_owned()
     };
+    let tcp = setup.config.publish.tcp.as_ref().map(|tcp| tcp.listen);
+    let http = setup.config.http.as_ref().map(|http| http.listen);
+    for (key, way, listen) in [
+        ("publish.tcp.listen", "tcp ", tcp),
+        ("http.listen", "page http://", http),
+    ] {
+        if let Some(listen) = listen {
+            lines += &format!("{way}{listen}\n");
+            if !listen.ip().is_loopback() {
+                eprintln!(
+                    "warning: {}: {key}: found {listen}, open to whoever reaches this machine, \
+                     expected a loopback address unless that is meant",
+                    args.config.display()
+                );
+            }
+        }
+    }
     super::print(lines.as_bytes())
         .map(drop)
         .map_err(Error::Print)

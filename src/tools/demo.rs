@@ -2,11 +2,12 @@
 //! prints what it gets.
 //!
 //! Nothing is short-circuited: bytes go through the tty, events through the socket. What stands on
-//! stdout is what a subscriber reads, `hello` first.
+//! stdout is what a subscriber reads, `hello` first; the live page's address stands on stderr.
 
 use std::fs::{self, DirBuilder};
 use std::future::Future;
 use std::io;
+use std::net::SocketAddr;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -20,7 +21,7 @@ use tokio::time::Instant;
 use super::faults::Faults;
 use super::player::{Pace, Player};
 use super::simulate::positive;
-use crate::daemon::config::{Config, Sensor, Setup};
+use crate::daemon::config::{Config, Http, Sensor, Setup};
 use crate::daemon::{self, Daemon};
 use crate::simulator::SequenceSettings;
 use crate::wire::{Layout, LayoutError};
@@ -34,6 +35,9 @@ pub struct Args {
     /// Seed of everything random
     #[arg(long, value_name = "S", default_value_t = 1)]
     seed: u64,
+    /// Address of the live page
+    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0")]
+    http: SocketAddr,
     /// Play so many times as fast
     #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = positive)]
     speed: f64,
@@ -99,8 +103,12 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let player = Player::new(Some(&port), layout, pace, Faults::none()).map_err(io("pty"))?;
 
     let socket = place.0.join("events.sock");
-    let config = hastened(sensor, &socket, args.speed);
+    let mut config = hastened(sensor, &socket, args.speed);
+    config.http = Some(Http { listen: args.http });
     let daemon = Daemon::bind(Setup::of(config, Path::new("demo"))?)?;
+    if let Some(address) = daemon.http_address() {
+        eprintln!("live page: http://{address}/");
+    }
     let subscriber = UnixStream::connect(&socket).await.map_err(io("socket"))?;
     let (stop, stopped) = oneshot::channel::<()>();
     let daemon = daemon.run(

@@ -141,7 +141,12 @@ pub(super) fn load(path: &Path) -> Result<Config, Error> {
     for sensor in &mut config.sensors {
         sensor.port = directory.join(&sensor.port);
     }
-    let paths = [&mut config.model.path, &mut config.publish.unix.path];
+    let unix = &mut config.publish.unix;
+    let paths = [
+        &mut config.model.path,
+        &mut unix.path,
+        &mut unix.control_path,
+    ];
     for path in paths.into_iter().flatten() {
         *path = directory.join(&*path);
     }
@@ -176,14 +181,8 @@ fn check(config: &Config, path: &Path) -> Result<(), Error> {
         expected,
     };
     let absent = [
-        ("publish.tcp", config.publish.tcp.is_some()),
         ("publish.zenoh", config.publish.zenoh.is_some()),
         ("publish.ros2", config.publish.ros2.is_some()),
-        (
-            "publish.unix.control_path",
-            config.publish.unix.control_path.is_some(),
-        ),
-        ("http", config.http.is_some()),
         ("record", config.record.is_some()),
     ];
     if let Some((key, _)) = absent.iter().find(|(_, given)| *given) {
@@ -215,6 +214,12 @@ fn check(config: &Config, path: &Path) -> Result<(), Error> {
     if config.publish.unix.max_clients == 0 {
         let key = "publish.unix.max_clients".to_owned();
         return Err(value(key, "0".to_owned(), "1 or more"));
+    }
+    let unix = &config.publish.unix;
+    if unix.enabled && unix.control_path() == unix.path() {
+        let key = "publish.unix.control_path".to_owned();
+        let found = unix.control_path().display().to_string();
+        return Err(value(key, found, "another path than that of events"));
     }
     Ok(())
 }

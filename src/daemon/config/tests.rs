@@ -18,11 +18,19 @@ fn every_key_but_port_has_a_default() {
         config,
         Config::new(vec![Sensor::new(PathBuf::from("/dev/ttyUSB0"))])
     );
+    let config = load(&format!(
+        "{LEAST}[publish.tcp]\n[http]\n[publish.unix]\npath = \"/x/y.sock\""
+    ));
+    let config = config.unwrap();
+    assert_eq!(config.publish.tcp, Some(Tcp::default()));
+    assert_eq!(config.http, Some(Http::default()));
+    let control = config.publish.unix.control_path();
+    assert_eq!(control, Path::new("/x/control.sock"));
 }
 
 #[test]
 fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
-    let cases: [(&str, &[&str]); 22] = [
+    let cases: [(&str, &[&str]); 23] = [
         ("[[sensor]]\nname = \"a\"", &["1:1", "missing field `port`"]),
         ("bad", &["1:"]),
         ("[log]", &["sensor", "found none"]),
@@ -77,16 +85,20 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
             &["publish.unix.max_clients", "0"],
         ),
         (
-            "[[sensor]]\nport = \"p\"\n[publish.tcp]\nlisten = \"127.0.0.1:8255\"",
-            &["publish.tcp", "not in this version"],
+            "[[sensor]]\nport = \"p\"\n[publish.tcp]\nlisten = \"here:8255\"",
+            &["4:10", "listen", "socket address"],
         ),
         (
-            "[[sensor]]\nport = \"p\"\n[publish.unix]\ncontrol_path = \"/x\"",
-            &["publish.unix.control_path", "not in this version"],
+            "[[sensor]]\nport = \"p\"\n[http]\nlisten = 8256",
+            &["4:10", "listen", "8256"],
         ),
         (
-            "[[sensor]]\nport = \"p\"\n[http]",
-            &["http", "not in this version"],
+            "[[sensor]]\nport = \"p\"\n[publish.unix]\npath = \"/control.sock\"",
+            &["publish.unix.control_path", "/control.sock"],
+        ),
+        (
+            "[[sensor]]\nport = \"p\"\n[publish.zenoh]",
+            &["publish.zenoh", "not in this version"],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[record]\ndir = \"/x\"",
@@ -114,12 +126,14 @@ fn paths_are_relative_to_the_file() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("hardnessd.toml");
     let text = "[[sensor]]\nport = \"port\"\n[model]\npath = \"hrn.onnx\"\n\
-                [publish.unix]\npath = \"/run/events.sock\"";
+                [publish.unix]\npath = \"/run/events.sock\"\ncontrol_path = \"c\"";
     std::fs::write(&path, text).unwrap();
     let config = Config::load(&path).unwrap();
     assert_eq!(config.sensors[0].port, directory.path().join("port"));
     assert_eq!(config.model.path, Some(directory.path().join("hrn.onnx")));
-    assert_eq!(config.publish.unix.path(), Path::new("/run/events.sock"));
+    let unix = &config.publish.unix;
+    assert_eq!(unix.path(), Path::new("/run/events.sock"));
+    assert_eq!(unix.control_path(), directory.path().join("c"));
     let error = Setup::load(&path).unwrap_err().to_string();
     assert!(error.contains("model.path: cannot read"), "{error}");
 }
@@ -151,6 +165,18 @@ fn only_what_a_sensor_can_change_while_it_runs_may_differ_in_a_reload() {
         (
             "[[sensor]]\nport = \"/dev/ttyUSB0\"\n[publish.unix]\npath = \"/x\"",
             Some("publish.unix.path"),
+        ),
+        (
+            "[[sensor]]\nport = \"/dev/ttyUSB0\"\n[publish.unix]\ncontrol_path = \"/x\"",
+            Some("publish.unix.control_path"),
+        ),
+        (
+            "[[sensor]]\nport = \"/dev/ttyUSB0\"\n[publish.tcp]",
+            Some("publish.tcp.listen"),
+        ),
+        (
+            "[[sensor]]\nport = \"/dev/ttyUSB0\"\n[http]",
+            Some("http.listen"),
         ),
         (
             "[[sensor]]\nport = \"/dev/ttyUSB0\"\n[sensor.calibration]\npitch_mm = 2.0\n\

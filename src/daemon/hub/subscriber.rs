@@ -17,7 +17,6 @@ const BATCH_BYTES: usize = 32 * 1024;
 struct Waiting {
     kind: Kind,
     sensor: String,
-    seq: Option<u64>,
     line: Line,
 }
 
@@ -32,6 +31,8 @@ pub(super) struct Subscriber {
     queue: VecDeque<Waiting>,
     /// Events of its kinds dropped since the last line it got.
     lost: u64,
+    /// `gap` lines told since the hub last counted them.
+    pub(super) gaps: u64,
     handed: Handed,
 }
 
@@ -45,6 +46,7 @@ impl Default for Subscriber {
             replay: VecDeque::new(),
             queue: VecDeque::new(),
             lost: 0,
+            gaps: 0,
             handed: Handed([0; HELD / 64]),
         }
     }
@@ -59,7 +61,7 @@ impl Subscriber {
     pub(super) fn change(&mut self, kinds: Kinds, policy: Policy) {
         (self.kinds, self.policy) = (kinds, policy);
         self.queue.retain(|event| kinds.contains(event.kind));
-        if policy == Policy::Latest {
+        if policy != Policy::Queue {
             for event in std::mem::take(&mut self.queue) {
                 self.enqueue(event);
             }
@@ -71,7 +73,7 @@ impl Subscriber {
     pub(super) fn replay(&mut self, held: impl Iterator<Item = (u64, Kind)>, missing: Option<u64>) {
         self.missing = (missing != Some(0)).then_some(Reply::Gap { lost: missing });
         // What waits is held too, and comes with the rest.
-        self.queue.retain(|event| event.seq.is_none());
+        self.queue.retain(|event| event.line.seq.is_none());
         self.lost = 0;
         self.replay = held
             .filter(|&(seq, kind)| self.kinds.contains(kind) && !self.handed.contains(seq))
@@ -79,45 +81,55 @@ impl Subscriber {
             .collect();
     }
 
-    /// A new event, wanted or not.
-    pub(super) fn offer(&mut self, kind: Kind, sensor: &str, seq: Option<u64>, line: &Line) {
-        if let Some(seq) = seq {
+    /// A new event, wanted or not. Says how many it displaced that a `gap` will tell of.
+    pub(super) fn offer(&mut self, kind: Kind, sensor: &str, line: &Line) -> u64 {
+        if let Some(seq) = line.seq {
             self.handed.remove(seq);
         }
         if !self.wants(kind) {
-            return;
+            return 0;
         }
         self.enqueue(Waiting {
             kind,
             sensor: sensor.to_owned(),
-            seq,
             line: line.clone(),
-        });
+        })
     }
 
-    fn enqueue(&mut self, event: Waiting) {
-        let superseded = match self.policy {
-            Policy::Queue => (self.queue.len() == QUEUE).then_some(0),
-            Policy::Latest => self
-                .queue
-                .iter()
-                .position(|e| e.kind == event.kind && e.sensor == event.sensor),
+    fn enqueue(&mut self, event: Waiting) -> u64 {
+        let newest_counts = match self.policy {
+            Policy::Queue => false,
+            Policy::Latest => true,
+            Policy::LatestFrames => event.kind == Kind::Frame,
         };
+        let older = || {
+            self.queue
+                .iter()
+                .position(|e| e.kind == event.kind && e.sensor == event.sensor)
+        };
+        let superseded = if newest_counts { older() } else { None };
+        let superseded = superseded.or_else(|| (self.queue.len() == QUEUE).then_some(0));
+        let mut lost = 0;
         if let Some(place) = superseded
             && let Some(dropped) = self.queue.remove(place)
         {
             // A newer frame stands for the older ones: that is what `latest` is for.
-            let silent = self.policy == Policy::Latest && dropped.kind == Kind::Frame;
-            self.lost += u64::from(!silent);
+            let silent = self.policy != Policy::Queue && dropped.kind == Kind::Frame;
+            lost = u64::from(!silent);
         }
+        self.lost += lost;
         self.queue.push_back(event);
+        lost
     }
 
     /// What it gets next; `held` looks a numbered event up.
     pub(super) fn take(&mut self, held: impl Fn(u64) -> Option<Line>) -> Vec<Line> {
         let mut lines = Vec::new();
         let mut bytes = 0;
-        lines.extend(self.missing.take().map(|gap| Line::from(gap.to_line())));
+        if let Some(gap) = self.missing.take() {
+            self.gaps += 1;
+            lines.push(gap.into());
+        }
         while bytes < BATCH_BYTES
             && let Some(seq) = self.replay.pop_front()
         {
@@ -125,7 +137,7 @@ impl Subscriber {
                 Some(line) => {
                     lines.extend(self.gap());
                     self.handed.insert(seq);
-                    bytes += line.len();
+                    bytes += line.json.len();
                     lines.push(line);
                 }
                 // Forgotten while the subscriber took its time.
@@ -136,12 +148,12 @@ impl Subscriber {
             && let Some(event) = self.queue.pop_front()
         {
             lines.extend(self.gap());
-            if let Some(seq) = event.seq
+            if let Some(seq) = event.line.seq
                 && held(seq).is_some()
             {
                 self.handed.insert(seq);
             }
-            bytes += event.line.len();
+            bytes += event.line.json.len();
             lines.push(event.line);
         }
         lines
@@ -149,7 +161,10 @@ impl Subscriber {
 
     fn gap(&mut self) -> Option<Line> {
         let lost = std::mem::take(&mut self.lost);
-        (lost > 0).then(|| Reply::Gap { lost: Some(lost) }.to_line().into())
+        (lost > 0).then(|| {
+            self.gaps += 1;
+            Reply::Gap { lost: Some(lost) }.into()
+        })
     }
 }
 

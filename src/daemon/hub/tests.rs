@@ -78,7 +78,7 @@ impl Hub {
                 return told;
             }
             told.extend(lines.iter().map(|line| {
-                let event: Value = serde_json::from_str(line).unwrap();
+                let event: Value = serde_json::from_str(&line.json).unwrap();
                 let number = match event["type"].as_str().unwrap() {
                     "gap" => &event["lost"],
                     "frame" => &event["frame"],
@@ -149,6 +149,7 @@ fn a_stalled_subscriber_loses_the_oldest_and_learns_exactly_how_many() {
     assert_eq!(hub.drain(stalled), expected);
     hub.tell(status("a"));
     assert_eq!(hub.drain(stalled), ["status:3001"]);
+    assert_eq!((hub.tally.gaps, hub.tally.dropped), (1, 1976));
 }
 
 #[test]
@@ -168,6 +169,25 @@ fn latest_keeps_the_newest_of_each_kind_and_sensor_and_counts_all_but_frames() {
         hub.drain(id),
         ["gap:4", "status:5", "frame:4", "status:6", "press:7"]
     );
+}
+
+#[test]
+fn latest_frames_lets_frames_be_superseded_and_nothing_else() {
+    let mut hub = hub();
+    let (id, _) = hub.join();
+    let kinds = [Kind::Status, Kind::Frame];
+    hub.subscribe(id, &wanting(&kinds, Policy::LatestFrames, None))
+        .unwrap();
+    for number in 0..3 {
+        hub.tell(status("a"));
+        hub.tell(frame("a", number));
+        hub.tell(frame("b", number));
+    }
+    assert_eq!(
+        hub.drain(id),
+        ["status:1", "status:2", "status:3", "frame:2", "frame:2"]
+    );
+    assert_eq!((hub.tally.gaps, hub.tally.dropped), (0, 0));
 }
 
 #[test]
@@ -262,7 +282,7 @@ fn what_is_forgotten_during_a_slow_replay_is_counted() {
 async fn a_subscriber_that_waits_gets_a_line_without_asking_again() {
     let hub = start(hub().hello);
     let (id, hello) = hub.join().await.unwrap();
-    assert!(hello.starts_with(r#"{"type":"hello""#));
+    assert!(hello.json.starts_with(r#"{"type":"hello""#));
     let lines = hub.take(id).await.unwrap();
     hub.publish(vec![status("a"), press("a")], Duration::ZERO)
         .await;

@@ -1,0 +1,344 @@
+//! One subscriber's connection: events out, requests in.
+//!
+//! The protocol of lines, whatever they travel over: a task fetches lines from the hub and writes
+//! them, and reads requests between. Only a connection with [`Access::Control`] changes anything.
+
+use std::io;
+use std::time::Duration;
+
+use bytes::{Buf, BytesMut};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, Interest};
+use tokio::net::{TcpStream, UnixStream, tcp, unix};
+use tokio::sync::oneshot;
+use tokio::sync::oneshot::error::TryRecvError;
+use tracing::debug;
+
+use super::accept::Serve;
+use super::hub::{self, Closed, Line};
+use super::request::{self, Change, Request};
+use super::sensor::{Command, Sensors};
+use crate::event::{Event, Reply, Tared};
+
+/// Longest line a subscriber may send (contract, section 5).
+const LONGEST_LINE_BYTES: usize = 64 * 1024;
+
+/// How often a connection whose other end has stopped sending is looked after.
+const HALF_CLOSED_CHECK: Duration = Duration::from_secs(1);
+
+/// What a way in may ask for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Access {
+    /// Events and questions.
+    ReadOnly,
+    /// Commands that change something, too.
+    Control,
+}
+
+/// A connection that lines travel over.
+pub(crate) trait Stream: Send + 'static {
+    /// What it is read from.
+    type Input: AsyncRead + Unpin + Send + Sync;
+    /// What it is written to.
+    type Output: Output;
+
+    /// Its two directions.
+    fn split(self) -> (Self::Input, Self::Output);
+
+    /// Sends a line without waiting, if there is room for it.
+    fn say(self, line: &[u8]) -> io::Result<()>;
+}
+
+/// The writing direction.
+pub(crate) trait Output: AsyncWrite + Unpin + Send + Sync {
+    /// Whether nobody reads at the other end any more, as far as this end has heard.
+    fn is_closed(&self) -> impl Future<Output = io::Result<bool>> + Send;
+}
+
+impl Stream for UnixStream {
+    type Input = unix::OwnedReadHalf;
+    type Output = unix::OwnedWriteHalf;
+
+    fn split(self) -> (Self::Input, Self::Output) {
+        self.into_split()
+    }
+
+    fn say(self, line: &[u8]) -> io::Result<()> {
+        // Asked of the system itself: the runtime does not know yet that the stream is writable.
+        io::Write::write_all(&mut self.into_std()?, line)
+    }
+}
+
+impl Stream for TcpStream {
+    type Input = tcp::OwnedReadHalf;
+    type Output = tcp::OwnedWriteHalf;
+
+    fn split(self) -> (Self::Input, Self::Output) {
+        self.into_split()
+    }
+
+    fn say(self, line: &[u8]) -> io::Result<()> {
+        io::Write::write_all(&mut self.into_std()?, line)
+    }
+}
+
+impl Output for unix::OwnedWriteHalf {
+    async fn is_closed(&self) -> io::Result<bool> {
+        Ok(self.ready(Interest::WRITABLE).await?.is_write_closed())
+    }
+}
+
+impl Output for tcp::OwnedWriteHalf {
+    async fn is_closed(&self) -> io::Result<bool> {
+        Ok(self.ready(Interest::WRITABLE).await?.is_write_closed())
+    }
+}
+
+/// What connections of one way in are served with.
+#[derive(Debug, Clone)]
+pub(crate) struct Service {
+    pub(crate) access: Access,
+    pub(crate) max_clients: usize,
+    pub(crate) hub: hub::Handle,
+    pub(crate) sensors: Sensors,
+}
+
+impl<S: Stream> Serve<S> for Service {
+    fn serve(&self, stream: S) -> impl Future<Output = ()> + Send + 'static {
+        let client = Client::new(stream, self.clone());
+        async move {
+            if let Err(end) = client.serve().await {
+                debug!(%end, "subscriber gone");
+            }
+        }
+    }
+
+    fn refuse(&self, stream: S) {
+        let found = self.max_clients;
+        let message = format!("found {found} subscribers already, expected fewer: try later");
+        // One that does not take it learns of it by the end of the connection.
+        let _ = stream.say(Reply::Error { message, id: None }.to_line().as_bytes());
+    }
+}
+
+/// Why a connection ended.
+#[derive(Debug, thiserror::Error)]
+enum End {
+    #[error(transparent)]
+    Closed(#[from] Closed),
+    #[error("{0}")]
+    Io(#[from] io::Error),
+    #[error("hung up")]
+    HungUp,
+    #[error("a line over {LONGEST_LINE_BYTES} bytes")]
+    TooLong,
+}
+
+/// One connection.
+struct Client<S: Stream> {
+    input: S::Input,
+    output: S::Output,
+    /// What came after the last whole line.
+    unread: BytesMut,
+    /// What is being written: a batch goes out in one call.
+    outgoing: Vec<u8>,
+    service: Service,
+}
+
+/// What a subscriber did.
+enum Heard {
+    Line(BytesMut),
+    TooLong,
+    /// It sends no more; it may still read.
+    End,
+}
+
+impl<S: Stream> Client<S> {
+    fn new(stream: S, service: Service) -> Self {
+        let (input, output) = stream.split();
+        Self {
+            input,
+            output,
+            unread: BytesMut::new(),
+            outgoing: Vec::new(),
+            service,
+        }
+    }
+
+    async fn serve(mut self) -> Result<(), End> {
+        let (id, hello) = self.service.hub.join().await?;
+        let served = self.converse(id, hello).await;
+        self.service.hub.leave(id).await;
+        served
+    }
+
+    async fn converse(&mut self, id: u64, hello: Line) -> Result<(), End> {
+        let hub = self.service.hub.clone();
+        let mut lines = vec![hello];
+        lines.extend(statuses(&self.service.sensors).await);
+        self.send(&lines).await?;
+        let mut next = hub.take(id).await?;
+        let mut hearing = true;
+        loop {
+            tokio::select! {
+                biased;
+                lines = &mut next => {
+                    // Closed: all has been sent.
+                    let Ok(lines) = lines else { return Ok(()) };
+                    self.send(&lines).await?;
+                    next = hub.take(id).await?;
+                }
+                heard = hear(&mut self.input, &mut self.unread), if hearing => match heard? {
+                    Heard::Line(line) => {
+                        let answer = self.answer(id, &line).await?;
+                        // What the hub gave before it answered belongs before the answer.
+                        let ended = match next.try_recv() {
+                            Ok(lines) => {
+                                self.send(&lines).await?;
+                                next = hub.take(id).await?;
+                                false
+                            }
+                            Err(waiting) => waiting == TryRecvError::Closed,
+                        };
+                        self.send(&answer).await?;
+                        if ended {
+                            return Ok(());
+                        }
+                    }
+                    Heard::TooLong => {
+                        let message = format!(
+                            "found a line over {LONGEST_LINE_BYTES} bytes, expected a shorter one"
+                        );
+                        self.send(&[error(message, None)]).await?;
+                        return Err(End::TooLong);
+                    }
+                    Heard::End => {
+                        hearing = false;
+                        self.stay().await?;
+                    }
+                },
+                () = tokio::time::sleep(HALF_CLOSED_CHECK), if !hearing => self.stay().await?,
+            }
+        }
+    }
+
+    /// Goes on only if the other end still reads.
+    async fn stay(&self) -> Result<(), End> {
+        if self.output.is_closed().await? {
+            Err(End::HungUp)
+        } else {
+            Ok(())
+        }
+    }
+
+    async fn answer(&self, id: u64, line: &[u8]) -> Result<Vec<Line>, End> {
+        let Service { hub, sensors, .. } = &self.service;
+        let line = request::parse(line);
+        let answered = match line.request {
+            Ok(Request::Subscribe(subscription)) => {
+                let subscribed = hub.subscribe(id, subscription).await?;
+                subscribed.map(|()| (Vec::new(), None))
+            }
+            Ok(Request::Status) => Ok((statuses(sensors).await, None)),
+            Ok(Request::Last) => Ok((hub.finals().await?, None)),
+            Ok(Request::Change(change)) => {
+                let changed = self.change(change).await;
+                changed.map(|tare| (Vec::new(), tare))
+            }
+            Err(message) => Err(message),
+        };
+        Ok(match answered {
+            Ok((mut lines, tare)) => {
+                lines.push(Reply::Ok { id: line.id, tare }.into());
+                lines
+            }
+            Err(message) => vec![error(message, line.id)],
+        })
+    }
+
+    /// Carries a command out; what a tare did is told in the answer.
+    async fn change(&self, change: Change) -> Result<Option<Tared>, String> {
+        if self.service.access == Access::ReadOnly {
+            return Err(format!(
+                "{}: found a command that changes something, expected it on the control socket",
+                change.key()
+            ));
+        }
+        let sensors = &self.service.sensors;
+        match change {
+            Change::Tare { sensor } => {
+                let (reply, outcome) = oneshot::channel();
+                tell(sensors, "tare", &sensor, Command::Tare(reply)).await?;
+                match outcome.await {
+                    Ok(Ok(tared)) => Ok(Some(tared)),
+                    Ok(Err(refusal)) => Err(format!("tare: {refusal}")),
+                    Err(_) => Err("tare: the daemon is stopping".to_owned()),
+                }
+            }
+            Change::Context { sensor, context } => {
+                let command = Command::Context(context);
+                tell(sensors, "context.sensor", &sensor, command).await?;
+                Ok(None)
+            }
+            // The recorder that keeps the last bytes comes with recording.
+            Change::Blackbox { sensor } => Err(format!(
+                "blackbox: found no recorder for {sensor:?}: not in this version"
+            )),
+        }
+    }
+
+    async fn send(&mut self, lines: &[Line]) -> Result<(), End> {
+        self.outgoing.clear();
+        for line in lines {
+            self.outgoing.extend_from_slice(line.json.as_bytes());
+        }
+        Ok(self.output.write_all(&self.outgoing).await?)
+    }
+}
+
+/// Passes a command on to the sensor of that name; `key` names it in the request.
+async fn tell(sensors: &Sensors, key: &str, name: &str, command: Command) -> Result<(), String> {
+    let Some(sensor) = sensors.0.iter().find(|sensor| sensor.name == name) else {
+        let names: Vec<&str> = sensors.0.iter().map(|s| s.name.as_str()).collect();
+        return Err(format!(
+            "{key}: found {name:?}, expected one of {}",
+            names.join(", ")
+        ));
+    };
+    let stopping = |_| format!("{key}: the daemon is stopping");
+    sensor.commands.send(command).await.map_err(stopping)
+}
+
+async fn statuses(sensors: &Sensors) -> Vec<Line> {
+    let statuses = sensors.statuses().await;
+    statuses
+        .into_iter()
+        .map(|status| Line::from(&Event::Status(status)))
+        .collect()
+}
+
+fn error(message: String, id: Option<serde_json::Value>) -> Line {
+    Reply::Error { message, id }.into()
+}
+
+/// Waits for a whole line. Nothing is lost if the wait is given up.
+async fn hear(input: &mut (impl AsyncRead + Unpin), unread: &mut BytesMut) -> io::Result<Heard> {
+    let mut searched = 0;
+    loop {
+        if let Some(length) = unread[searched..].iter().position(|&byte| byte == b'\n') {
+            let length = searched + length;
+            if length > LONGEST_LINE_BYTES {
+                return Ok(Heard::TooLong);
+            }
+            let line = unread.split_to(length);
+            unread.advance(1);
+            return Ok(Heard::Line(line));
+        }
+        searched = unread.len();
+        if searched > LONGEST_LINE_BYTES {
+            return Ok(Heard::TooLong);
+        }
+        if input.read_buf(unread).await? == 0 {
+            return Ok(Heard::End);
+        }
+    }
+}

@@ -1,0 +1,195 @@
+//! `/events`: what a subscriber on a socket reads, as server-sent events.
+//!
+//! An event's id is `RUN:SEQ`, so that a browser that comes back names in `Last-Event-ID` where it
+//! stopped, which is the hub's `since`. Frames come only when asked for, and only the newest: who
+//! looks on wants the present.
+
+use std::time::Duration;
+
+use hyper::Request;
+use hyper::body::Bytes;
+use tokio::sync::mpsc;
+
+use crate::daemon::hub::{self, Closed, Line};
+use crate::daemon::request::{self, Kinds, Policy, Since, Subscription};
+use crate::daemon::sensor::Sensors;
+use crate::event::Event;
+
+pub(super) const CONTENT_TYPE: &str = "text/event-stream";
+
+/// A silence this long is broken by a comment: without it a lost connection would not be noticed.
+const HEARTBEAT: Duration = Duration::from_secs(15);
+
+/// How soon a browser that has lost the connection comes back.
+const RETRY: Duration = Duration::from_secs(1);
+
+/// Reads what a request asks for: `types` and `since` of its query, and `Last-Event-ID`, which is
+/// newer than the query when both are there.
+pub(super) fn wanted<B>(request: &Request<B>) -> Result<Subscription, String> {
+    let mut wanted = Subscription {
+        policy: Policy::LatestFrames,
+        ..Subscription::default()
+    };
+    let query = request.uri().query().unwrap_or_default();
+    for pair in query.split('&').filter(|pair| !pair.is_empty()) {
+        let (key, value) = pair.split_once('=').unwrap_or((pair, ""));
+        let value = decoded(value).ok_or_else(|| format!("{key}: found no UTF-8"))?;
+        match key {
+            "types" => wanted.kinds = kinds(&value)?,
+            "since" => wanted.since = Some(since(key, &value)?),
+            _ => {
+                return Err(format!("found {key:?}, expected \"types\" or \"since\""));
+            }
+        }
+    }
+    if let Some(last) = request.headers().get("last-event-id") {
+        let last = last.to_str().unwrap_or_default();
+        wanted.since = Some(since("Last-Event-ID", last)?);
+    }
+    Ok(wanted)
+}
+
+fn kinds(names: &str) -> Result<Kinds, String> {
+    let kind = |name| {
+        request::kind_named(name).ok_or_else(|| {
+            format!("types: found {name:?}, expected hardness, press, status or frame")
+        })
+    };
+    names.split(',').map(kind).collect()
+}
+
+fn since(key: &str, token: &str) -> Result<Since, String> {
+    Since::parse(token).ok_or_else(|| format!("{key}: found {token:?}, expected \"RUN:SEQ\""))
+}
+
+/// Undoes percent-encoding; `None`: no UTF-8.
+fn decoded(text: &str) -> Option<String> {
+    let mut bytes = Vec::with_capacity(text.len());
+    let mut rest = text.as_bytes();
+    while let Some((&byte, tail)) = rest.split_first() {
+        let hex = tail.get(..2).and_then(|hex| std::str::from_utf8(hex).ok());
+        let code = hex.and_then(|hex| u8::from_str_radix(hex, 16).ok());
+        match (byte, code) {
+            (b'%', Some(code)) => {
+                bytes.push(code);
+                rest = &tail[2..];
+            }
+            _ => {
+                bytes.push(byte);
+                rest = tail;
+            }
+        }
+    }
+    String::from_utf8(bytes).ok()
+}
+
+/// Subscribes; the inner error is for the asker.
+pub(super) async fn open(
+    hub: &hub::Handle,
+    sensors: &Sensors,
+    wanted: Subscription,
+) -> Result<Result<mpsc::Receiver<Bytes>, String>, Closed> {
+    let run = hub.survey().await?.hello.run;
+    let (id, hello) = hub.join().await?;
+    // Where a connection that breaks before its first event is to go on.
+    let from = match &wanted.since {
+        None => hello.seq,
+        Some(since) if since.run == run => None,
+        Some(_) => Some(0),
+    };
+    if let Err(message) = hub.subscribe(id, wanted).await? {
+        hub.leave(id).await;
+        return Ok(Err(message));
+    }
+    let mut first = format!("retry: {}\n", RETRY.as_millis()).into_bytes();
+    write(&mut first, &run, &Line { seq: from, ..hello });
+    for status in sensors.statuses().await {
+        write(&mut first, &run, &Line::from(&Event::Status(status)));
+    }
+    // What the connection does not take stays in the hub, whose queue is bounded.
+    let (sender, events) = mpsc::channel(1);
+    let hub = hub.clone();
+    tokio::spawn(async move {
+        // Either end of it is a reason to stop: the hub's, or the connection's.
+        let _ = pass_on(&hub, id, &run, first, &sender).await;
+        hub.leave(id).await;
+    });
+    Ok(Ok(events))
+}
+
+/// Hands events to the connection until it is gone or the hub has ended.
+async fn pass_on(
+    hub: &hub::Handle,
+    id: u64,
+    run: &str,
+    first: Vec<u8>,
+    connection: &mpsc::Sender<Bytes>,
+) -> Option<()> {
+    connection.send(first.into()).await.ok()?;
+    let mut next = hub.take(id).await.ok()?;
+    loop {
+        let mut chunk = Vec::new();
+        tokio::select! {
+            lines = &mut next => {
+                for line in lines.ok()? {
+                    write(&mut chunk, run, &line);
+                }
+                next = hub.take(id).await.ok()?;
+            }
+            () = connection.closed() => return None,
+            () = tokio::time::sleep(HEARTBEAT) => chunk.extend_from_slice(b":\n\n"),
+        }
+        connection.send(chunk.into()).await.ok()?;
+    }
+}
+
+/// One event, in the format of the HTML standard, section 9.2.6.
+fn write(out: &mut Vec<u8>, run: &str, line: &Line) {
+    if let Some(seq) = line.seq {
+        out.extend_from_slice(format!("id: {run}:{seq}\n").as_bytes());
+    }
+    out.extend_from_slice(b"data: ");
+    // It ends with its newline; another ends the event.
+    out.extend_from_slice(line.json.as_bytes());
+    out.push(b'\n');
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::event::Kind;
+
+    fn ask(uri: &str, last: Option<&str>) -> Result<Subscription, String> {
+        let mut request = Request::builder().uri(uri);
+        if let Some(last) = last {
+            request = request.header("Last-Event-ID", last);
+        }
+        wanted(&request.body(()).unwrap())
+    }
+
+    #[test]
+    fn a_query_names_types_and_a_place_and_the_header_is_newer() {
+        let plain = ask("/events", None).unwrap();
+        assert!(plain.kinds.contains(Kind::Hardness) && !plain.kinds.contains(Kind::Frame));
+        assert_eq!(plain.policy, Policy::LatestFrames);
+        let asked = ask("/events?types=press%2Cframe&since=ab%3A7", None).unwrap();
+        assert!(asked.kinds.contains(Kind::Frame) && !asked.kinds.contains(Kind::Status));
+        assert_eq!(asked.since.unwrap().seq, 7);
+        let newer = ask("/events?since=ab:7", Some("ab:9")).unwrap();
+        assert_eq!(newer.since.unwrap().seq, 9);
+    }
+
+    #[test]
+    fn a_query_that_cannot_be_meant_is_refused_by_name() {
+        for (uri, last, found) in [
+            ("/events?types=touch", None, "touch"),
+            ("/events?type=press", None, "type"),
+            ("/events?since=7", None, "since"),
+            ("/events", Some("7"), "Last-Event-ID"),
+            ("/events?types=%ff", None, "types"),
+        ] {
+            let message = ask(uri, last).unwrap_err();
+            assert!(message.contains(found), "{message}");
+        }
+    }
+}

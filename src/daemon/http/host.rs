@@ -1,0 +1,96 @@
+//! Against DNS rebinding: a page from elsewhere must not reach this server under its own name.
+//!
+//! A browser names in `Host` what stands in its address bar. An attacker's name that resolves to
+//! this machine is still a name; so only addresses are taken, and `localhost`, which resolves
+//! nowhere else. Their port is not looked at: an address with another port is a tunnel's
+//! (`ssh -L`), and no way around.
+
+use std::net::{IpAddr, SocketAddr};
+
+use hyper::Request;
+use hyper::header::HOST;
+use hyper::http::uri::Authority;
+
+/// Whether `request`, which came in at `local`, was meant for a server listening on `listen`.
+pub(super) fn is_ours<B>(request: &Request<B>, listen: SocketAddr, local: SocketAddr) -> bool {
+    let mut hosts = request.headers().get_all(HOST).iter();
+    let (Some(host), None) = (hosts.next(), hosts.next()) else {
+        return false;
+    };
+    // A request line may name a host as well: it counts by RFC 9112, section 3.2.2.
+    let named = request.uri().host();
+    let host = host.to_str().ok().and_then(host_of);
+    named.is_none_or(|named| accepts(named, listen, local))
+        && host.is_some_and(|host| accepts(&host, listen, local))
+}
+
+/// The host without its port.
+fn host_of(header: &str) -> Option<String> {
+    let authority: Authority = header.parse().ok()?;
+    // With a user's name before it, it is no Host.
+    (!header.contains('@')).then(|| authority.host().to_owned())
+}
+
+fn accepts(host: &str, listen: SocketAddr, local: SocketAddr) -> bool {
+    if host.eq_ignore_ascii_case("localhost") {
+        return true;
+    }
+    let literal = host
+        .strip_prefix('[')
+        .and_then(|host| host.strip_suffix(']'))
+        .unwrap_or(host);
+    literal.parse::<IpAddr>().is_ok_and(|address| {
+        let address = address.to_canonical();
+        address.is_loopback()
+            || address == listen.ip().to_canonical()
+            || address == local.ip().to_canonical()
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_addresses_of_this_machine_are_its_host() {
+        let listen = "0.0.0.0:8256".parse().unwrap();
+        let local = "192.168.7.2:8256".parse().unwrap();
+        let check = |host: &str, expected: bool| {
+            let request = Request::builder().uri("/").header(HOST, host);
+            let request = request.body(()).unwrap();
+            assert_eq!(is_ours(&request, listen, local), expected, "{host}");
+        };
+        for host in [
+            "localhost:8256",
+            "LocalHost",
+            "127.0.0.1:8256",
+            "127.0.0.1:9000",
+            "[::1]:8256",
+            "192.168.7.2:8256",
+            "192.168.7.2",
+            "0.0.0.0:8256",
+        ] {
+            check(host, true);
+        }
+        for host in [
+            "evil.example:8256",
+            "localhost.evil.example",
+            "127.0.0.1.evil.example:8256",
+            "192.168.7.3:8256",
+            "robot.local",
+            "evil@127.0.0.1",
+            "[::1",
+            "",
+        ] {
+            check(host, false);
+        }
+        let twice = Request::builder().header(HOST, "localhost");
+        let twice = twice.header(HOST, "evil.example").body(()).unwrap();
+        assert!(!is_ours(&twice, listen, local));
+        let none = Request::new(());
+        assert!(!is_ours(&none, listen, local));
+        let absolute = Request::builder().uri("http://evil.example/");
+        let absolute = absolute.header(HOST, "localhost").body(()).unwrap();
+        assert!(!is_ours(&absolute, listen, local));
+    }
+}

@@ -1,0 +1,154 @@
+//! `/metrics`: the state of the daemon as numbers, in the OpenMetrics text format that Prometheus
+//! reads.
+//!
+//! Every scrape asks the hub and the sensors and writes what they say: there is no second count of
+//! anything. A series is there from the start, at 0, so that its first change is seen.
+
+use prometheus_client::encoding::text;
+use prometheus_client::metrics::counter::Counter;
+use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::gauge::Gauge;
+use prometheus_client::metrics::info::Info;
+use prometheus_client::registry::{Registry, Unit};
+
+use crate::daemon::hub::{Counts, Survey, Verdicts};
+use crate::daemon::log;
+use crate::daemon::sensor::Vitals;
+use crate::event::LinkState;
+
+pub(super) const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+
+type Labels = Vec<(&'static str, String)>;
+type Counters = Family<Labels, Counter>;
+type Gauges = Family<Labels, Gauge<f64, std::sync::atomic::AtomicU64>>;
+
+/// The hub and the sensors in the text format. The label `robot` is on every series.
+pub(super) fn encode(survey: &Survey, vitals: &[Vitals]) -> String {
+    let hello = &survey.hello;
+    let robot = ("robot".into(), hello.robot.clone().into());
+    let mut registry = Registry::with_prefix_and_labels("hardnessd", [robot].into_iter());
+    registry.register(
+        "build",
+        "The daemon and its model",
+        Info::new(vec![
+            ("version", hello.version.to_owned()),
+            ("run", hello.run.clone()),
+            ("model", hello.model.sha256.clone()),
+        ]),
+    );
+    links(&mut registry, vitals);
+    presses(&mut registry, survey);
+    let subscribers: Gauge = Gauge::default();
+    subscribers.set(i64::try_from(survey.subscribers).unwrap_or(i64::MAX));
+    let help = "Subscribers there are, on sockets and pages";
+    registry.register("subscribers", help, subscribers);
+    for (name, help, count) in [
+        ("events", "Numbered events published", hello.seq),
+        (
+            "gaps",
+            "Gaps that subscribers were told of",
+            survey.tally.gaps,
+        ),
+        (
+            "events_dropped",
+            "Events dropped because a subscriber was too slow",
+            survey.tally.dropped,
+        ),
+    ] {
+        let counter: Counter = Counter::default();
+        counter.inc_by(count);
+        registry.register(name, help, counter);
+    }
+    let mut text = String::new();
+    text::encode(&mut text, &registry).expect("writing to a string cannot fail");
+    text
+}
+
+/// What the sensors say of themselves.
+fn links(registry: &mut Registry, vitals: &[Vitals]) {
+    let (frames, damaged, skipped) = <(Counters, Counters, Counters)>::default();
+    let (state, rate, age) = <(Gauges, Gauges, Gauges)>::default();
+    for Vitals {
+        status,
+        last_frame_age,
+        ..
+    } in vitals
+    {
+        let labels = vec![("sensor", status.sensor.clone())];
+        frames.get_or_create(&labels).inc_by(status.frames);
+        damaged.get_or_create(&labels).inc_by(status.frames_damaged);
+        skipped.get_or_create(&labels).inc_by(status.bytes_skipped);
+        if let Some(hz) = status.frame_rate_hz {
+            rate.get_or_create(&labels).set(hz);
+        }
+        if let Some(since) = last_frame_age {
+            age.get_or_create(&labels).set(since.as_secs_f64());
+        }
+        for known in LinkState::ALL {
+            let mut labels = labels.clone();
+            labels.push(("state", log::name(&known)));
+            let holds = f64::from(u8::from(status.state == known));
+            state.get_or_create(&labels).set(holds);
+        }
+    }
+    registry.register("frames", "Whole frames", frames);
+    registry.register("frames_damaged", "Damaged frames", damaged);
+    let help = "Bytes that belonged to no whole frame";
+    registry.register_with_unit("skipped", help, Unit::Bytes, skipped);
+    let help = "State of the link: 1 for the one that holds";
+    registry.register("link_state", help, state);
+    let hertz = Unit::Other("hertz".to_owned());
+    registry.register_with_unit("frame_rate", "Measured frame rate", hertz, rate);
+    let help = "Age of the last whole frame; absent before the first";
+    registry.register_with_unit("last_frame_age", help, Unit::Seconds, age);
+}
+
+/// What was published of presses and verdicts.
+fn presses(registry: &mut Registry, survey: &Survey) {
+    let (presses, verdicts, rejected) = <(Counters, Counters, Counters)>::default();
+    let none = Counts::default();
+    for card in &survey.hello.sensors {
+        let with = |more: &[(&'static str, &str)]| {
+            let mut labels = vec![("sensor", card.name.clone())];
+            labels.extend(more.iter().map(|&(key, value)| (key, value.to_owned())));
+            labels
+        };
+        let counts = survey.tally.sensors.get(&card.name).unwrap_or(&none);
+        for (state, count) in [
+            ("begin", counts.begun),
+            ("end", counts.ended),
+            ("aborted", counts.aborted),
+        ] {
+            let counter = presses.get_or_create_owned(&with(&[("state", state)]));
+            counter.inc_by(count);
+        }
+        for (phase, made) in [("early", &counts.early), ("final", &counts.finals)] {
+            // Levels of a model that a reload replaced are counted on.
+            let known = survey.hello.model.levels.iter().map(|level| level.level);
+            let mut levels: Vec<u8> = known.chain(made.levels.keys().copied()).collect();
+            levels.sort_unstable();
+            levels.dedup();
+            for level in levels {
+                let labels = with(&[("phase", phase), ("level", &level.to_string())]);
+                let count = made.levels.get(&level).copied().unwrap_or(0);
+                verdicts.get_or_create(&labels).inc_by(count);
+            }
+            let Verdicts {
+                low_confidence,
+                low_force,
+                ..
+            } = *made;
+            for (reason, count) in [("low_confidence", low_confidence), ("low_force", low_force)] {
+                let labels = with(&[("phase", phase), ("reason", reason)]);
+                rejected.get_or_create(&labels).inc_by(count);
+            }
+        }
+    }
+    registry.register("presses", "Presses, by what became of them", presses);
+    registry.register("verdicts", "Verdicts, by level", verdicts);
+    registry.register(
+        "verdicts_rejected",
+        "Verdicts withheld, by reason",
+        rejected,
+    );
+}

@@ -1,0 +1,123 @@
+//! Every way out of the daemon: bound together, served together.
+
+use std::net::SocketAddr;
+use std::path::Path;
+
+use tokio::task::JoinSet;
+use tracing::info;
+
+use super::accept::{Stop, accept};
+use super::client::{Access, Service};
+use super::config::Publish;
+use super::http::Http;
+use super::hub;
+use super::sensor::Sensors;
+use super::socket::{self, Socket};
+use super::tcp::{self, Tcp};
+
+/// Permissions of the control socket: for the daemon's own user (contract, section 3).
+const CONTROL_MODE: u32 = 0o600;
+
+/// Why a way out cannot be had.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A Unix socket.
+    #[error(transparent)]
+    Socket(#[from] socket::Error),
+    /// A TCP listener.
+    #[error(transparent)]
+    Tcp(#[from] tcp::Error),
+}
+
+/// Listeners: whoever connects is served once [`Publishers::serve`] runs.
+#[derive(Debug)]
+pub(crate) struct Publishers {
+    max_clients: usize,
+    socket: Option<Socket>,
+    control: Option<Socket>,
+    tcp: Option<Tcp>,
+    http: Option<Tcp>,
+}
+
+impl Publishers {
+    /// Binds all that are asked for, or none.
+    pub(crate) fn bind(publish: &Publish, http: Option<SocketAddr>) -> Result<Self, Error> {
+        let unix = &publish.unix;
+        let socket = |path: &Path, mode| {
+            let bound = unix.enabled.then(|| Socket::bind(path, mode));
+            bound.transpose()
+        };
+        Ok(Self {
+            max_clients: unix.max_clients,
+            socket: socket(&unix.path(), unix.mode.0)?,
+            control: socket(&unix.control_path(), CONTROL_MODE)?,
+            tcp: publish
+                .tcp
+                .as_ref()
+                .map(|tcp| Tcp::bind("publish.tcp.listen", tcp.listen))
+                .transpose()?,
+            http: http
+                .map(|listen| Tcp::bind("http.listen", listen))
+                .transpose()?,
+        })
+    }
+
+    /// Where the live page is.
+    pub(crate) fn http_address(&self) -> Option<SocketAddr> {
+        self.http.as_ref().map(Tcp::address)
+    }
+
+    /// Where subscribers find it, for the log.
+    pub(crate) fn announce(&self) {
+        for (way, socket) in [("events", &self.socket), ("control", &self.control)] {
+            if let Some(socket) = socket {
+                info!(way, path = %socket.path().display(), "listening");
+            }
+        }
+        for (way, tcp) in [("tcp", &self.tcp), ("http", &self.http)] {
+            if let Some(tcp) = tcp {
+                info!(way, address = %tcp.address(), "listening");
+            }
+        }
+    }
+
+    /// Serves until `stop` comes and subscribers have their last lines, a task a listener.
+    pub(crate) fn serve(self, hub: &hub::Handle, sensors: &Sensors, stop: &Stop) -> JoinSet<()> {
+        let Self {
+            max_clients,
+            socket,
+            control,
+            tcp,
+            http,
+        } = self;
+        let service = |access| Service {
+            access,
+            max_clients,
+            hub: hub.clone(),
+            sensors: sensors.clone(),
+        };
+        let mut tasks = JoinSet::new();
+        if let Some(socket) = socket {
+            let service = service(Access::ReadOnly);
+            tasks.spawn(accept(socket, max_clients, service, stop.clone()));
+        }
+        if let Some(control) = control {
+            let service = service(Access::Control);
+            tasks.spawn(accept(control, max_clients, service, stop.clone()));
+        }
+        if let Some(tcp) = tcp {
+            let service = service(Access::ReadOnly);
+            tasks.spawn(accept(tcp, max_clients, service, stop.clone()));
+        }
+        if let Some(listener) = http {
+            let http = Http::new(
+                listener.address(),
+                hub.clone(),
+                sensors.clone(),
+                stop.clone(),
+            );
+            tasks.spawn(accept(listener, Http::MOST_CONNECTIONS, http, stop.clone()));
+        }
+        tasks
+    }
+}

@@ -1,0 +1,269 @@
+//! The real binary on a real pty, and what stands around it: shared by the tests of the daemon.
+#![allow(
+    dead_code,
+    unreachable_pub,
+    clippy::unwrap_used,
+    reason = "every test file is a crate of its own and uses a part of this"
+)]
+
+use std::fs;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{SocketAddr, TcpStream};
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::mpsc;
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+
+pub const BINARY: &str = env!("CARGO_BIN_EXE_hardnessd");
+
+/// How long anything may take before a test has failed: long, for a busy machine.
+pub const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A directory with a port, a socket and a configuration.
+pub struct Bench {
+    directory: tempfile::TempDir,
+}
+
+impl Bench {
+    pub fn new() -> Self {
+        Self {
+            directory: tempfile::tempdir().unwrap(),
+        }
+    }
+
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.directory.path().join(name)
+    }
+
+    /// Writes a configuration of one sensor at 20 frames/s, with `more` tables.
+    pub fn configure(&self, name: &str, socket: &str, more: &str) -> PathBuf {
+        let path = self.path(name);
+        let text = format!(
+            "robot = \"arm-7\"\n[[sensor]]\nname = \"forearm\"\nport = \"port\"\n\
+             frame_rate_hz = 20.0\n[publish.unix]\npath = \"{socket}\"\n{more}"
+        );
+        fs::write(&path, text).unwrap();
+        path
+    }
+
+    pub fn daemon(&self) -> Daemon {
+        Daemon::start(&self.configure("hardnessd.toml", "events.sock", ""))
+    }
+
+    pub fn subscriber(&self) -> Subscriber {
+        Subscriber::connect(&self.path("events.sock"))
+    }
+
+    /// A sensor at the port, hard enough to press that every press is one.
+    pub fn sensor(&self, more: &[&str]) -> Process {
+        self.sensor_at("port", 20, more)
+    }
+
+    /// The same, at another port and rate.
+    pub fn sensor_at(&self, port: &str, fps: u32, more: &[&str]) -> Process {
+        let link = self.path(port);
+        // One that was killed has left its link, which tells nothing of the new one.
+        let _ = fs::remove_file(&link);
+        let mut command = Command::new(BINARY);
+        command.args(["simulate", "--force", "15", "--material", "hard-plastic"]);
+        command
+            .args(["--fps", &fps.to_string()])
+            .arg("--link")
+            .arg(&link)
+            .args(more)
+            .stdout(Stdio::null())
+            .stderr(Stdio::null());
+        let sensor = Process(command.spawn().unwrap());
+        wait_for("the port", || {
+            fs::read_link(&link).is_ok_and(|pty| pty.exists())
+        });
+        sensor
+    }
+}
+
+/// A process that does not outlive its test.
+pub struct Process(pub Child);
+
+impl Process {
+    pub fn signal(&self, signal: Signal) {
+        let pid = Pid::from_raw(i32::try_from(self.0.id()).unwrap()).unwrap();
+        kill_process(pid, signal).unwrap();
+    }
+
+    pub fn exit_code(&mut self) -> Option<i32> {
+        let start = Instant::now();
+        loop {
+            if let Some(status) = self.0.try_wait().unwrap() {
+                return status.code();
+            }
+            assert!(start.elapsed() < PATIENCE, "the process does not end");
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// A running daemon and its log.
+pub struct Daemon {
+    pub process: Process,
+    log: mpsc::Receiver<String>,
+    /// Lines waited for so far.
+    pub heard: Vec<String>,
+}
+
+impl Daemon {
+    /// Starts one and waits until it serves.
+    pub fn start(config: &Path) -> Self {
+        let mut process = Process(
+            Command::new(BINARY)
+                .args(["run", "--config"])
+                .arg(config)
+                .env("RUST_LOG", "info")
+                .stderr(Stdio::piped())
+                .spawn()
+                .unwrap(),
+        );
+        let lines = BufReader::new(process.0.stderr.take().unwrap()).lines();
+        let (sender, log) = mpsc::channel();
+        std::thread::spawn(move || {
+            for line in lines.map_while(Result::ok) {
+                if sender.send(line).is_err() {
+                    return;
+                }
+            }
+        });
+        let mut daemon = Self {
+            process,
+            log,
+            heard: Vec::new(),
+        };
+        daemon.logged("started");
+        daemon
+    }
+
+    /// The address that `way` listens on, port and all.
+    pub fn address(&mut self, way: &str) -> SocketAddr {
+        let part = format!("way=\"{way}\"");
+        // All are said before "started".
+        let line = self.heard.iter().find(|line| line.contains(&part));
+        let line = line.unwrap();
+        let (_, address) = line.split_once("address=").unwrap();
+        address.trim().parse().unwrap()
+    }
+
+    /// Kilobytes of memory it has in use.
+    pub fn resident_kb(&self) -> u64 {
+        let status = format!("/proc/{}/status", self.process.0.id());
+        let status = fs::read_to_string(status).unwrap();
+        let line = status
+            .lines()
+            .find(|line| line.starts_with("VmRSS"))
+            .unwrap();
+        line.split_whitespace().nth(1).unwrap().parse().unwrap()
+    }
+
+    /// All it has logged, once it has ended.
+    pub fn whole_log(&mut self) -> String {
+        self.heard.extend(self.log.iter());
+        self.heard.join("\n")
+    }
+
+    /// Waits for a log line that contains `part`.
+    pub fn logged(&mut self, part: &str) -> String {
+        loop {
+            let line = self.log.recv_timeout(PATIENCE).unwrap_or_else(|_| {
+                panic!("{part:?} was not logged, but {:#?}", self.heard);
+            });
+            self.heard.push(line.clone());
+            if line.contains(part) {
+                return line;
+            }
+        }
+    }
+}
+
+/// What a connection runs over.
+pub trait Stream: Read + Write {}
+impl<S: Read + Write> Stream for S {}
+
+/// A connection to a socket.
+pub struct Subscriber {
+    pub lines: BufReader<Box<dyn Stream>>,
+}
+
+impl Subscriber {
+    pub fn connect(socket: &Path) -> Self {
+        let stream = UnixStream::connect(socket).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        Self {
+            lines: BufReader::new(Box::new(stream)),
+        }
+    }
+
+    pub fn over_tcp(address: SocketAddr) -> Self {
+        let stream = TcpStream::connect(address).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        Self {
+            lines: BufReader::new(Box::new(stream)),
+        }
+    }
+
+    /// Asks, and waits for the answer.
+    pub fn ask(&mut self, line: &str) -> Value {
+        self.say(line);
+        loop {
+            let answer = self.next().unwrap();
+            if ["ok", "error"].contains(&answer["type"].as_str().unwrap()) {
+                return answer;
+            }
+        }
+    }
+
+    pub fn say(&mut self, line: &str) {
+        self.lines
+            .get_mut()
+            .write_all(format!("{line}\n").as_bytes())
+            .unwrap();
+    }
+
+    /// The next line; `None`: closed.
+    pub fn next(&mut self) -> Option<Value> {
+        let mut line = String::new();
+        (self.lines.read_line(&mut line).unwrap() > 0).then(|| serde_json::from_str(&line).unwrap())
+    }
+
+    /// Reads until a line has all of `fields`.
+    pub fn until(&mut self, fields: &Value) -> Value {
+        let fields = fields.as_object().unwrap();
+        loop {
+            let line = self
+                .next()
+                .unwrap_or_else(|| panic!("closed before {fields:?}"));
+            if fields.iter().all(|(key, value)| &line[key] == value) {
+                return line;
+            }
+        }
+    }
+}
+
+pub fn wait_for(what: &str, mut there: impl FnMut() -> bool) {
+    let start = Instant::now();
+    while !there() {
+        assert!(start.elapsed() < PATIENCE, "{what} does not come");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+pub fn hardnessd(arguments: &[&str]) -> Output {
+    Command::new(BINARY).args(arguments).output().unwrap()
+}
