@@ -245,6 +245,10 @@ pub struct Baseline {
     deviation: Vec<f64>,
     /// `[L][FEATURES + 1]`: a coefficient each, and the bias.
     coefficients: Vec<Vec<f64>>,
+    /// Newton steps that the fit took.
+    pub steps: u32,
+    /// Mean loss on the training samples, and the ridge.
+    pub loss: f64,
 }
 
 /// The features of every frame, a row each.
@@ -284,28 +288,31 @@ impl Baseline {
             mean,
             deviation,
             coefficients,
+            steps: 0,
+            loss: 0.0,
         };
         let rows: Vec<Vec<f64>> = rows.iter().map(|row| baseline.standardised(row)).collect();
 
-        let mut loss = baseline.loss(&rows, level_of);
+        baseline.loss = baseline.loss_on(&rows, level_of);
         for _ in 0..50 {
             let step = baseline.newton_step(&rows, level_of);
             // Halve until the loss falls: far from the optimum a whole step may overshoot.
             let mut share = 1.0;
             let next = loop {
-                let next = baseline.moved(&step, share);
-                let next_loss = next.loss(&rows, level_of);
-                if next_loss < loss {
-                    break Some((next, next_loss));
+                let mut next = baseline.moved(&step, share);
+                next.loss = next.loss_on(&rows, level_of);
+                if next.loss < baseline.loss {
+                    break Some(next);
                 }
                 share /= 2.0;
                 if share < 1e-6 {
                     break None;
                 }
             };
-            let Some((next, next_loss)) = next else { break };
-            let gain = loss - next_loss;
-            (baseline, loss) = (next, next_loss);
+            let Some(next) = next else { break };
+            let gain = baseline.loss - next.loss;
+            baseline = next;
+            baseline.steps += 1;
             if gain < 1e-9 {
                 break;
             }
@@ -343,7 +350,7 @@ impl Baseline {
     }
 
     /// Mean cross-entropy and the ridge.
-    fn loss(&self, rows: &[Vec<f64>], level_of: &[usize]) -> f64 {
+    fn loss_on(&self, rows: &[Vec<f64>], level_of: &[usize]) -> f64 {
         let losses = rows
             .iter()
             .zip(level_of)

@@ -98,10 +98,12 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
     let begun = Instant::now();
 
     while state.progress.epoch < epochs {
-        let (mut loss_sum, mut rate) = (0.0, 0.0);
+        let (mut loss_sum, mut right, mut rate) = (0.0, 0, 0.0);
         for indices in task.epoch_order(state.progress.epoch).chunks(batch) {
             rate = task.settings.optimiser.rate_at(state.progress.step, steps);
-            loss_sum += state.step(task, indices, rate) * indices.len() as f64;
+            let learnt = state.step(task, indices, rate);
+            loss_sum += learnt.0 * indices.len() as f64;
+            right += learnt.1;
             bar.inc(1);
         }
         state.progress.epoch += 1;
@@ -120,6 +122,7 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
             epoch,
             loss,
             learning_rate: rate,
+            accuracy: Some(right as f64 / task.train.len() as f64),
             validation,
             seconds,
             adversarial: None,
@@ -191,19 +194,26 @@ impl State {
         }
     }
 
-    /// One step on the samples `indices`; gives the batch's mean loss.
-    fn step(&mut self, task: &Task, indices: &[usize], rate: f64) -> f64 {
+    /// One step on the samples `indices`; gives the batch's mean loss, and how many of them were
+    /// judged rightly before it.
+    fn step(&mut self, task: &Task, indices: &[usize], rate: f64) -> (f64, usize) {
         let (images, targets) = (
             task.images(indices, self.progress.step),
             task.targets(indices),
         );
         let tracked = self.learner.weights.tracked();
         let logits = hrn::logits(&tracked, images, &mut Normalisation::Batch);
+        let judged = numbers(&logits);
         let loss = hrn::cross_entropy(logits, targets);
         let mut gradients = loss.backward();
         self.learner.step(&tracked, &mut gradients, rate);
         self.progress.step += 1;
-        f64::from(numbers(&loss)[0])
+        let right = indices
+            .iter()
+            .zip(judged.chunks(task.levels))
+            .filter(|(index, logits)| largest(logits) == task.level(**index))
+            .count();
+        (f64::from(numbers(&loss)[0]), right)
     }
 
     /// Loss and accuracy on the validation samples; keeps the weights if they are the best.
@@ -293,8 +303,13 @@ impl Task<'_> {
             .iter()
             .map(|&index| &self.dataset.samples[index].frame);
         let rows = trained.logits(frames, self.full_scale_n, self.device);
-        let level = |&index: &usize| usize::from(self.dataset.samples[index].level) - 1;
-        indices.iter().map(level).zip(rows).collect()
+        let levels = indices.iter().map(|&index| self.level(index));
+        levels.zip(rows).collect()
+    }
+
+    /// Of a labelled sample, from 0.
+    fn level(&self, index: usize) -> usize {
+        usize::from(self.dataset.samples[index].level) - 1
     }
 }
 

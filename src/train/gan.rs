@@ -191,6 +191,7 @@ pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
             epoch,
             loss,
             learning_rate: rate,
+            accuracy: None,
             validation: None,
             seconds: begun.elapsed().as_secs_f64(),
             adversarial: Some(Adversarial {

@@ -1,6 +1,7 @@
 //! The methods of the table, as recipes over the same parts.
 
 use std::collections::BTreeSet;
+use std::time::Instant;
 
 use anyhow::{Context as _, ensure};
 use burn::tensor::Device;
@@ -16,7 +17,7 @@ use super::losses::Game;
 use super::metrics::Evaluation;
 use super::network::Weights;
 use super::optimiser::{self, Rule};
-use super::run::{Description, Run};
+use super::run::{Description, Row, Run};
 use super::settings::{Keep, Profile, Settings, Training, Validation};
 use super::sheet::{self, Strip};
 use crate::frame::Frame;
@@ -471,6 +472,7 @@ fn baseline(
     description: &Description,
     run: &Run,
 ) -> anyhow::Result<Option<Evaluation>> {
+    let begun = Instant::now();
     let frames = labelled.iter().map(|&index| &dataset.samples[index].frame);
     let rows = features::features(frames).context("features")?;
     let level_of: Vec<usize> = labelled
@@ -478,6 +480,16 @@ fn baseline(
         .map(|&index| usize::from(dataset.samples[index].level) - 1)
         .collect();
     let baseline = Baseline::fit(&rows, &level_of, super::dataset::levels().len());
+    run.metrics("features", 0)?.add(&Row {
+        step: baseline.steps.into(),
+        epoch: baseline.steps,
+        loss: baseline.loss,
+        learning_rate: 1.0,
+        accuracy: None,
+        validation: None,
+        seconds: begun.elapsed().as_secs_f64(),
+        adversarial: None,
+    })?;
     let (graph, raw_logits) = baseline.graph();
     let recogniser = Recogniser {
         graph,

@@ -46,6 +46,23 @@ pub struct Run {
 }
 
 impl Run {
+    /// What the run in a directory was told; `None` if there is no run.
+    ///
+    /// # Errors
+    ///
+    /// If `settings.toml` is there and cannot be read.
+    pub fn told(directory: &Path) -> anyhow::Result<Option<Description>> {
+        let path = directory.join("settings.toml");
+        match fs::read_to_string(&path) {
+            Ok(text) => {
+                let told = toml::from_str(&text);
+                Ok(Some(told.with_context(|| path.display().to_string())?))
+            }
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(error).with_context(|| path.display().to_string()),
+        }
+    }
+
     /// Makes the directory, or with `resume` takes up a run that was told the same.
     ///
     /// # Errors
@@ -56,26 +73,22 @@ impl Run {
         let run = Self {
             directory: directory.to_owned(),
         };
-        let told = run.path("settings.toml");
-        match fs::read_to_string(&told) {
-            Ok(text) if resume => {
-                let before: Description =
-                    toml::from_str(&text).with_context(|| told.display().to_string())?;
+        match Self::told(directory)? {
+            Some(before) if resume => {
                 ensure!(
                     before == *description,
                     "{}: this run was started with other settings or data; found {}, expected {}",
-                    told.display(),
+                    run.path("settings.toml").display(),
                     toml::to_string(description)?.replace('\n', "; "),
-                    text.replace('\n', "; ")
+                    toml::to_string(&before)?.replace('\n', "; ")
                 );
                 return Ok(run);
             }
-            Ok(_) => bail!(
+            Some(_) => bail!(
                 "{}: holds a run already; --resume goes on with it",
                 directory.display()
             ),
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
-            Err(error) => return Err(error).with_context(|| told.display().to_string()),
+            None => {}
         }
         for part in ["checkpoints", "samples"] {
             let part = run.path(part);
@@ -186,9 +199,9 @@ impl Run {
 }
 
 /// Of a GAN's stage, `loss` is the discriminator's; what a stage does not have stays empty.
-const METRICS_COLUMNS: &str = "stage,step,epoch,loss,learning_rate,validation_loss,\
-    validation_accuracy,generator_loss,sigma_min,sigma_mean,sigma_max,pixel_std,pixel_std_real,\
-    feature_distance,seconds";
+const METRICS_COLUMNS: &str = "stage,step,epoch,loss,learning_rate,accuracy,\
+    validation_loss,validation_accuracy,generator_loss,sigma_min,sigma_mean,sigma_max,pixel_std,\
+    pixel_std_real,feature_distance,seconds";
 
 /// `metrics.csv`, open for one stage.
 #[derive(Debug)]
@@ -210,6 +223,9 @@ pub struct Row {
     pub loss: f64,
     /// Of the epoch's last step.
     pub learning_rate: f64,
+    /// Share of the epoch's samples judged rightly, each before the step that learnt from it; of a
+    /// recogniser's stage.
+    pub accuracy: Option<f64>,
     /// Loss and accuracy on the validation objects, where they were judged.
     pub validation: Option<(f64, f64)>,
     /// Since this process took the stage up. The file has the sum over processes; what was done
@@ -250,7 +266,11 @@ impl Metrics {
             Some((loss, accuracy)) => format!("{loss:.6},{accuracy:.4}"),
             None => ",".to_owned(),
         };
-        let mut line = format!("{stage},{step},{epoch},{loss:.6},{learning_rate},{validation}");
+        let accuracy = row
+            .accuracy
+            .map_or_else(String::new, |share| format!("{share:.4}"));
+        let mut line =
+            format!("{stage},{step},{epoch},{loss:.6},{learning_rate},{accuracy},{validation}");
         match row.adversarial {
             Some(Adversarial {
                 generator_loss,
@@ -327,6 +347,7 @@ mod tests {
             epoch: 1,
             loss: 1.0,
             learning_rate: 0.1,
+            accuracy: None,
             validation: None,
             seconds,
             adversarial: None,
