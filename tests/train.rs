@@ -75,18 +75,36 @@ const SETTINGS: &str = "
     keep = \"best\"
 ";
 
+/// All stages of the method in seconds: pictures and measures of generated samples take longest.
+const GAN_SETTINGS: &str = "
+    [ustgan]
+    epochs = 4
+    checkpoint_every_epochs = 1
+    picture_every_epochs = 1000
+    [stgan]
+    picture_every_epochs = 1000
+    [pretraining]
+    checkpoint_every_epochs = 1
+";
+
 struct Trial {
+    method: &'static str,
     out: PathBuf,
     config: PathBuf,
 }
 
 impl Trial {
     fn new(name: &str) -> Self {
+        Self::of("hrn100", name, SETTINGS)
+    }
+
+    fn of(method: &'static str, name: &str, settings: &str) -> Self {
         let directory = data().0.path();
         // Tests run side by side: a file of its own, so that none is read half written.
         let config = directory.join(format!("{name}.toml"));
-        std::fs::write(&config, SETTINGS).unwrap();
+        std::fs::write(&config, settings).unwrap();
         Self {
+            method,
             out: directory.join(name),
             config,
         }
@@ -96,7 +114,7 @@ impl Trial {
         let mut arguments: Vec<String> = [
             "train",
             "--method",
-            "hrn100",
+            self.method,
             "--profile",
             "smoke",
             "--seed",
@@ -128,13 +146,31 @@ impl Trial {
         std::fs::read(self.out.join(name)).unwrap()
     }
 
-    fn newest_checkpoint(&self) -> Vec<u8> {
-        let mut paths: Vec<PathBuf> = std::fs::read_dir(self.out.join("checkpoints"))
-            .unwrap()
-            .map(|entry| entry.unwrap().path())
+    /// Names of the checkpoints, sorted.
+    fn checkpoints(&self) -> Vec<String> {
+        let Ok(directory) = std::fs::read_dir(self.out.join("checkpoints")) else {
+            return Vec::new();
+        };
+        let mut names: Vec<String> = directory
+            .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+            .filter(|name| name.ends_with(".npz"))
             .collect();
-        paths.sort();
-        std::fs::read(paths.last().unwrap()).unwrap()
+        names.sort();
+        names
+    }
+
+    /// Whether both left the same checkpoints and model, byte for byte.
+    #[track_caller]
+    fn assert_same(&self, other: &Self) {
+        assert_eq!(self.checkpoints(), other.checkpoints());
+        for name in self.checkpoints() {
+            let name = format!("checkpoints/{name}");
+            assert!(self.read(&name) == other.read(&name), "{name} differs");
+        }
+        assert!(
+            self.read("hrn.onnx") == other.read("hrn.onnx"),
+            "models differ"
+        );
     }
 }
 
@@ -180,16 +216,28 @@ fn a_run_learns_and_leaves_what_it_promises() {
     assert!(succeed(&["inspect", copy]).contains("simulated data only"));
 }
 
-/// Sends `signal` as soon as the second checkpoint stands, wherever the run then is; gives its
-/// exit code, if it had one.
-fn interrupted(trial: &Trial, seed: &'static str, signal: Signal) -> Option<i32> {
+/// Starts or resumes a run and sends `signal` as soon as `count` checkpoints of `stage` stand,
+/// wherever the run then is; gives its exit code, if it had one.
+fn interrupted(
+    trial: &Trial,
+    seed: &'static str,
+    (stage, count): (&str, usize),
+    signal: Signal,
+) -> Option<i32> {
     let mut process = Command::new(env!("CARGO_BIN_EXE_hrn-train"))
         .args(trial.arguments(seed))
+        .arg("--resume")
         .stderr(std::process::Stdio::null())
         .spawn()
         .unwrap();
-    let second = |directory: &Path| std::fs::read_dir(directory).is_ok_and(|all| all.count() >= 2);
-    while !second(&trial.out.join("checkpoints")) {
+    let there = || {
+        trial
+            .checkpoints()
+            .iter()
+            .filter(|name| name.starts_with(stage))
+            .count()
+    };
+    while there() < count {
         let ended = process.try_wait().unwrap();
         assert!(ended.is_none(), "ended before it could be interrupted");
         std::thread::yield_now();
@@ -208,18 +256,127 @@ fn an_interrupted_run_resumes_to_the_same_weights_bit_for_bit() {
         ("interrupted", Signal::INT, Some(0)),
     ] {
         let trial = Trial::new(name);
-        assert_eq!(interrupted(&trial, "2", signal), code, "{name}");
+        assert_eq!(interrupted(&trial, "2", ("hrn", 2), signal), code, "{name}");
         assert!(!trial.out.join("hrn.onnx").exists(), "{name}");
         trial.train("2", &["--resume"]);
+        trial.assert_same(&whole);
+    }
+}
+
+#[test]
+fn the_whole_method_killed_in_any_stage_resumes_bit_for_bit_and_shares_its_stages() {
+    let whole = Trial::of("ours", "whole method", GAN_SETTINGS);
+    whole.train("6", &[]);
+    let killed = Trial::of("ours", "killed method", GAN_SETTINGS);
+    for stage in ["ustgan", "stgan2", "pretraining"] {
+        interrupted(&killed, "6", (stage, 1), Signal::KILL);
+        assert!(!killed.out.join("hrn.onnx").exists(), "{stage}");
+    }
+    killed.train("6", &["--resume"]);
+    killed.assert_same(&whole);
+
+    // A generator's and a discriminator's loss, sigma, and at the end the likeness of each stage.
+    let metrics = String::from_utf8(whole.read("metrics.csv")).unwrap();
+    let last = |stage: &str| -> Vec<String> {
+        let row = metrics.lines().rfind(|row| row.starts_with(stage)).unwrap();
+        row.split(',').map(str::to_owned).collect()
+    };
+    let columns: Vec<&str> = metrics.lines().next().unwrap().split(',').collect();
+    for stage in ["ustgan", "stgan1", "stgan4"] {
+        let row = last(stage);
+        for name in [
+            "loss",
+            "generator_loss",
+            "sigma_min",
+            "pixel_std",
+            "feature_distance",
+        ] {
+            let place = columns.iter().position(|column| *column == name).unwrap();
+            assert!(
+                row[place].parse::<f64>().unwrap().is_finite(),
+                "{stage} {name}"
+            );
+        }
+        let number: u32 = row[2].parse().unwrap();
         assert!(
-            trial.newest_checkpoint() == whole.newest_checkpoint(),
-            "{name}: checkpoints differ"
-        );
-        assert!(
-            trial.read("hrn.onnx") == whole.read("hrn.onnx"),
-            "{name}: models differ"
+            !whole
+                .read(&format!("samples/{stage}-{number:06}.png"))
+                .is_empty()
         );
     }
+    for name in ["samples/generated.png", "samples/mistakes.png"] {
+        assert!(!whole.read(name).is_empty(), "{name}");
+    }
+
+    // NAHRN has the same USTGAN, and takes it: nothing of it is trained again.
+    let sharing = Trial::of("nahrn", "sharing", GAN_SETTINGS);
+    sharing.train("6", &["--from", whole.out.to_str().unwrap()]);
+    let of_ustgan = |trial: &Trial| -> Vec<String> {
+        let text = String::from_utf8(trial.read("metrics.csv")).unwrap();
+        let rows = text.lines().filter(|row| row.starts_with("ustgan"));
+        rows.map(str::to_owned).collect()
+    };
+    assert_eq!(of_ustgan(&sharing), of_ustgan(&whole));
+    assert_eq!(of_ustgan(&sharing).len(), 4);
+    assert!(!sharing.out.join("samples/ustgan-000004.png").exists());
+    // Another seed has another USTGAN, and what is taken is what it would have trained itself.
+    let alone = Trial::of("nahrn", "alone", GAN_SETTINGS);
+    alone.train("6", &[]);
+    assert!(alone.read("hrn.onnx") == sharing.read("hrn.onnx"));
+    let other = Trial::of("nahrn", "other seed", GAN_SETTINGS);
+    other.train("7", &["--from", whole.out.to_str().unwrap()]);
+    assert!(other.out.join("samples/ustgan-000004.png").exists());
+}
+
+#[test]
+fn every_method_leaves_a_model() {
+    for method in [
+        "nihrn",
+        "sgan",
+        "igan",
+        "hrn15",
+        "hrn50",
+        "hrn15-long",
+        "hrn15-tuned",
+    ] {
+        let trial = Trial::of(method, method, GAN_SETTINGS);
+        trial.train("1", &["--label-choice", "random"]);
+        let card = Hrn::load(&trial.read("hrn.onnx")).unwrap().card().clone();
+        assert_eq!(card.method, method);
+        let settings = String::from_utf8(trial.read("settings.toml")).unwrap();
+        // 15 or 50 % of 160.
+        let labels = if method == "hrn50" { 80 } else { 24 };
+        assert!(
+            settings.contains(&format!("labels = {labels}\n")),
+            "{settings}"
+        );
+    }
+}
+
+#[test]
+fn a_full_disk_is_an_error_and_leaves_the_last_checkpoint_intact() {
+    let whole = Trial::new("ample disk");
+    whole.train("8", &[]);
+    let trial = Trial::new("full disk");
+    interrupted(&trial, "8", ("hrn", 1), Signal::KILL);
+    let before = trial.checkpoints();
+    // No file may grow beyond 64 blocks of 512 bytes, and a process that tries is not killed but
+    // told so, as on a full disk. A checkpoint is greater.
+    let output = Command::new("sh")
+        .args(["-c", "trap '' XFSZ; ulimit -f 64; exec \"$@\"", "sh"])
+        .arg(env!("CARGO_BIN_EXE_hrn-train"))
+        .args(trial.arguments("8"))
+        .arg("--resume")
+        .output()
+        .unwrap();
+    let error = String::from_utf8_lossy(&output.stderr);
+    let error = error.lines().last().unwrap();
+    assert_eq!(output.status.code(), Some(74), "{error}");
+    assert!(error.contains("checkpoints/hrn-"), "{error}");
+    assert!(error.contains("File too large"), "{error}");
+    assert_eq!(trial.checkpoints(), before);
+    trial.train("8", &["--resume"]);
+    trial.assert_same(&whole);
 }
 
 #[test]
@@ -282,11 +439,13 @@ fn bad_input_has_its_exit_code_and_one_line() {
         path("refused"),
     );
     std::fs::write(&text, "epoch = 3\n").unwrap();
-    let train = |more: &[&str]| {
-        let mut arguments = vec!["train", "--method", "hrn100", "--out", &out];
+    let method = |name: &str, more: &[&str]| {
+        let mut arguments = vec!["train", "--method", name];
         arguments.extend(more);
         hrn_train(&arguments)
     };
+    let train = |more: &[&str]| method("hrn100", &[&["--out", &out], more].concat());
+    let no_gan = path("no gan");
     let cases = [
         (train(&["--data", &missing]), 66, "missing"),
         (train(&["--data", &text]), 1, "not an .npz file"),
@@ -308,6 +467,19 @@ fn bad_input_has_its_exit_code_and_one_line() {
             "not an ONNX model",
         ),
         (hrn_train(&["train", "--method", "alchemy"]), 2, "alchemy"),
+        (
+            method("hrn15", &["--data", &data, "--out", "/dev/null/no"]),
+            74,
+            "/dev/null/no",
+        ),
+        (
+            method(
+                "ours",
+                &["--data", &data, "--out", &no_gan, "--labels", "160"],
+            ),
+            1,
+            "no unlabelled training samples are left",
+        ),
         (
             hrn_train(&["simulate", "--presses", "1", "--out", "/dev/null/no"]),
             74,

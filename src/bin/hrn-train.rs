@@ -107,6 +107,9 @@ struct Train {
     /// Go on with a run that was stopped
     #[arg(long)]
     resume: bool,
+    /// Take stages that another run finished, where they are the very same; may be repeated
+    #[arg(long, value_name = "RUN")]
+    from: Vec<PathBuf>,
     /// Use so many labels instead of the method's share
     #[arg(long, value_name = "N")]
     labels: Option<usize>,
@@ -288,7 +291,8 @@ fn train(arguments: &Train) -> anyhow::Result<()> {
     };
     let DeviceName::Cpu = arguments.device;
     let device = Device::flex();
-    let run = Run::open(&arguments.out, &description, arguments.resume)?;
+    let run = Run::open(&arguments.out, &description, arguments.resume)?
+        .taking_from(arguments.from.clone());
     let begun = Instant::now();
     let evaluation = methods::train(arguments.method, &dataset, &description, &run, &device)?;
     println!(

@@ -11,12 +11,16 @@ use burn::tensor::{Device, Tensor, TensorData};
 use ndarray::{Array1, ArrayD, ArrayView1, IxDyn};
 use ndarray_npy::{NpzReader, NpzWriter};
 use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
 
+use super::dataset::Dataset;
 use super::network::{Weight, Weights, numbers};
 
 /// What a stage needs to go on, beside its settings and data.
 #[derive(Debug, Clone)]
 pub struct Checkpoint {
+    /// What the stage follows from: see [`Origin`].
+    pub origin: String,
     /// The plain part.
     pub progress: Progress,
     /// The weights, and the same lists of whatever else goes with them, by name: Adam's moments,
@@ -34,6 +38,60 @@ pub struct Progress {
     pub step: u64,
     /// Least validation loss so far.
     pub best_loss: Option<f64>,
+}
+
+/// All that a stage's result follows from, as one hash: its settings, seed, frames in their order
+/// with their levels, and initial weights. Two runs whose stages have the same one need to run it
+/// once.
+#[derive(Debug)]
+pub struct Origin(Sha256);
+
+impl Origin {
+    /// Of a stage with these settings and seed.
+    pub fn new(stage: &str, settings: &impl Serialize, seed: u64) -> Self {
+        let settings = serde_json::to_vec(settings).expect("settings are plain numbers");
+        let mut hash = Sha256::new();
+        for part in [stage.as_bytes(), &seed.to_le_bytes(), &settings] {
+            hash.update((part.len() as u64).to_le_bytes());
+            hash.update(part);
+        }
+        Self(hash)
+    }
+
+    /// Adds samples.
+    #[must_use]
+    pub fn samples(mut self, dataset: &Dataset, indices: &[usize]) -> Self {
+        self.0.update((indices.len() as u64).to_le_bytes());
+        for &index in indices {
+            let sample = &dataset.samples[index];
+            self.0.update([sample.level]);
+            let newtons = sample.frame.newtons.iter();
+            let bytes: Vec<u8> = newtons.flat_map(|newtons| newtons.to_le_bytes()).collect();
+            self.0.update(bytes);
+        }
+        self
+    }
+
+    /// Adds weights.
+    #[must_use]
+    pub fn weights(mut self, weights: &Weights) -> Self {
+        for weight in &weights.entries {
+            self.0.update(&weight.name);
+            let values = numbers(&weight.values);
+            let bytes: Vec<u8> = values
+                .iter()
+                .flat_map(|value| value.to_le_bytes())
+                .collect();
+            self.0.update(bytes);
+        }
+        self
+    }
+
+    /// The hash in hexadecimal digits.
+    pub fn finish(self) -> String {
+        let bytes = self.0.finalize();
+        bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+    }
 }
 
 impl Checkpoint {
@@ -58,6 +116,7 @@ impl Checkpoint {
         let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
         let progress = serde_json::to_vec(&self.progress)?;
         npz.add_array("progress", &ArrayView1::from(&progress))?;
+        npz.add_array("origin", &ArrayView1::from(self.origin.as_bytes()))?;
         for (list, weights) in &self.lists {
             for weight in &weights.entries {
                 let array = ArrayD::from_shape_vec(IxDyn(&weight.dims), numbers(&weight.values))?;
@@ -77,9 +136,11 @@ impl Checkpoint {
         let mut npz = NpzReader::new(Cursor::new(bytes.as_slice()))?;
         let progress: Array1<u8> = npz.by_name("progress")?;
         let progress = serde_json::from_slice(&progress.to_vec())?;
+        let origin: Array1<u8> = npz.by_name("origin")?;
+        let origin = String::from_utf8(origin.to_vec())?;
         let mut lists: Vec<(String, Weights)> = Vec::new();
         for name in npz.names()? {
-            if name == "progress" {
+            if ["progress", "origin"].contains(&name.as_str()) {
                 continue;
             }
             let Some((list, weight)) = name.split_once('/') else {
@@ -97,7 +158,11 @@ impl Checkpoint {
             });
         }
         ensure!(!lists.is_empty(), "no weights in it");
-        Ok(Self { progress, lists })
+        Ok(Self {
+            origin,
+            progress,
+            lists,
+        })
     }
 }
 

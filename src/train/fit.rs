@@ -11,7 +11,7 @@ use burn::tensor::{Device, Tensor, activation};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::augment;
-use super::checkpoint::{Checkpoint, Progress};
+use super::checkpoint::{Checkpoint, Origin, Progress};
 use super::dataset::Dataset;
 use super::hrn;
 use super::learner::Learner;
@@ -89,7 +89,8 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
     let (validation_samples, validation_settings) = task.validation;
     let steps_an_epoch = task.train.len().div_ceil(batch) as u64;
     let steps = u64::from(epochs) * steps_an_epoch;
-    let mut state = match run.latest(task.stage, task.device)? {
+    let origin = task.origin(&initial);
+    let mut state = match run.latest(task.stage, &origin, epochs, task.device)? {
         Some(checkpoint) => State::resumed(&checkpoint, task.settings)?,
         None => State::fresh(initial, task.settings),
     };
@@ -134,7 +135,7 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
         }
         report(&bar, task.stage, epoch, epochs, message);
         if due(task.settings.checkpoint_every_epochs) {
-            run.save(task.stage, &state.checkpoint())?;
+            run.save(task.stage, &state.checkpoint(&origin))?;
         }
     }
     bar.finish_and_clear();
@@ -181,7 +182,7 @@ impl State {
         })
     }
 
-    fn checkpoint(&self) -> Checkpoint {
+    fn checkpoint(&self, origin: &str) -> Checkpoint {
         let mut lists = self.learner.lists("");
         lists.extend(
             self.best
@@ -189,6 +190,7 @@ impl State {
                 .map(|list| ("best".to_owned(), list.clone())),
         );
         Checkpoint {
+            origin: origin.to_owned(),
             progress: self.progress,
             lists,
         }
@@ -236,6 +238,15 @@ impl State {
 }
 
 impl Task<'_> {
+    fn origin(&self, initial: &Weights) -> String {
+        let settings = (self.settings, self.validation.1, self.full_scale_n);
+        Origin::new(self.stage, &settings, self.seed)
+            .samples(self.dataset, self.train)
+            .samples(self.dataset, self.validation.0)
+            .weights(initial)
+            .finish()
+    }
+
     /// The training samples in the order of epoch `epoch`.
     fn epoch_order(&self, epoch: u32) -> Vec<usize> {
         let mut order = self.train.to_vec();

@@ -12,7 +12,7 @@ use anyhow::Context as _;
 use burn::tensor::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 
-use super::checkpoint::{Checkpoint, Progress};
+use super::checkpoint::{Checkpoint, Origin, Progress};
 use super::dataset::Dataset;
 use super::fit::{progress_bar, report};
 use super::generator;
@@ -151,7 +151,8 @@ pub struct Task<'a> {
 pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
     let Settings { batch, epochs, .. } = *task.settings;
     let steps = u64::from(epochs) * task.real.len().div_ceil(batch) as u64;
-    let mut state = match run.latest(task.stage, task.device)? {
+    let origin = task.origin(&initial);
+    let mut state = match run.latest(task.stage, &origin, epochs, task.device)? {
         Some(checkpoint) => State::resumed(&checkpoint, task.settings)?,
         None => State::fresh(initial, task.settings),
     };
@@ -210,7 +211,7 @@ pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
         }
         report(&bar, task.stage, epoch, epochs, message);
         if due(task.settings.checkpoint_every_epochs) {
-            run.save(task.stage, &state.checkpoint())?;
+            run.save(task.stage, &state.checkpoint(&origin))?;
         }
     }
     bar.finish_and_clear();
@@ -255,10 +256,11 @@ impl State {
         })
     }
 
-    fn checkpoint(&self) -> Checkpoint {
+    fn checkpoint(&self, origin: &str) -> Checkpoint {
         let mut lists = self.generator.lists(SIDES[0]);
         lists.extend(self.discriminator.lists(SIDES[1]));
         Checkpoint {
+            origin: origin.to_owned(),
             progress: self.progress,
             lists,
         }
@@ -359,6 +361,16 @@ fn sigma_range(generator: &Weights) -> [f64; 3] {
 }
 
 impl Task<'_> {
+    fn origin(&self, initial: &Gan) -> String {
+        let settings = (self.settings, self.full_scale_n);
+        Origin::new(self.stage, &settings, self.seed)
+            .samples(self.dataset, self.real)
+            .samples(self.dataset, self.labelled)
+            .weights(&initial.generator)
+            .weights(&initial.discriminator)
+            .finish()
+    }
+
     fn stream(&self, name: &str) -> Stream {
         Stream::new(self.seed, &format!("{} {name}", self.stage))
     }
@@ -635,7 +647,7 @@ mod tests {
     fn a_new_stage_starts_from_the_given_weights_with_fresh_moments() {
         let gan = initial(Game::RealOrFake, LEVELS, 5, &device());
         let state = State::fresh(gan.clone(), &Settings::default());
-        let checkpoint = state.checkpoint();
+        let checkpoint = state.checkpoint("");
         assert_eq!(checkpoint.progress, Progress::default());
         for (side, weights) in SIDES.iter().zip([gan.generator, gan.discriminator]) {
             for given in &weights.entries {

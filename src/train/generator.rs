@@ -27,7 +27,7 @@ const BATCH_NORM_EPSILON: f32 = 1e-5;
 /// Rows and columns of the first image.
 const FIRST_SIDE: usize = 4;
 /// Batches of generated samples that statistics are taken over.
-const STATISTICS_BATCHES: u64 = 50;
+const STATISTICS_BATCHES: u64 = 20;
 /// Samples of each component a pass without gradients.
 const GENERATED_AT_ONCE: usize = 5;
 
@@ -251,6 +251,7 @@ pub fn frames(images: &Tensor<4>, full_scale_n: f64) -> Vec<Frame> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::train::settings::Generation;
     use burn::tensor::ops::ConvOptions;
 
     fn device() -> Device {
@@ -326,10 +327,12 @@ mod tests {
         *sigma = sigma.zeros_like();
         let statistics = statistics(&weights, 2, 1, &device());
         let mut stream = Stream::new(1, "generated");
-        let frames = generate(&weights, &statistics, 7, 10.2, &mut stream, &device());
-        assert_eq!(frames.len(), 7 * COMPONENTS);
+        let samples = Generation::default().samples_a_component as usize;
+        let frames = generate(&weights, &statistics, samples, 10.2, &mut stream, &device());
+        // The paper's 375 labelled samples a level, thirty for one.
+        assert_eq!((samples, frames.len()), (225, 30 * 375));
         for component in 0..COMPONENTS {
-            for sample in 1..7 {
+            for sample in 1..samples {
                 let frame = &frames[sample * COMPONENTS + component];
                 let distance = |other: &Frame| -> f32 {
                     let pairs = frame.newtons.iter().zip(&other.newtons);

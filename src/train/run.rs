@@ -43,6 +43,8 @@ pub struct Description {
 #[derive(Debug)]
 pub struct Run {
     directory: PathBuf,
+    /// Directories of other runs, whose finished stages may be taken.
+    others: Vec<PathBuf>,
 }
 
 impl Run {
@@ -72,6 +74,7 @@ impl Run {
     pub fn open(directory: &Path, description: &Description, resume: bool) -> anyhow::Result<Self> {
         let run = Self {
             directory: directory.to_owned(),
+            others: Vec::new(),
         };
         match Self::told(directory)? {
             Some(before) if resume => {
@@ -99,6 +102,13 @@ impl Run {
         Ok(run)
     }
 
+    /// The same run, which takes a stage that it has not begun from one of `others` where that
+    /// finished the very same stage.
+    #[must_use]
+    pub fn taking_from(self, others: Vec<PathBuf>) -> Self {
+        Self { others, ..self }
+    }
+
     /// The path of a file in the directory.
     pub fn path(&self, name: &str) -> PathBuf {
         self.directory.join(name)
@@ -121,47 +131,72 @@ impl Run {
     pub fn save(&self, stage: &str, checkpoint: &Checkpoint) -> anyhow::Result<()> {
         let name = format!("checkpoints/{stage}-{:010}.npz", checkpoint.progress.step);
         self.write(&name, &checkpoint.to_bytes()?)?;
-        let all = self.checkpoints(stage)?;
+        let all = checkpoints(&self.directory, stage)?;
         for old in &all[..all.len().saturating_sub(CHECKPOINTS_KEPT)] {
             fs::remove_file(old).with_context(|| old.display().to_string())?;
         }
         Ok(())
     }
 
-    /// A stage's newest checkpoint that can be read, if there is one.
+    /// A stage's newest checkpoint that can be read, if there is one; else that of another run
+    /// that did all `epochs` of a stage of the same `origin`, which then is this run's too.
     ///
     /// # Errors
     ///
-    /// If there are some and none can be read.
-    pub fn latest(&self, stage: &str, device: &Device) -> anyhow::Result<Option<Checkpoint>> {
+    /// If there are some and none can be read, or what was taken cannot be written.
+    pub fn latest(
+        &self,
+        stage: &str,
+        origin: &str,
+        epochs: u32,
+        device: &Device,
+    ) -> anyhow::Result<Option<Checkpoint>> {
         let mut failure = None;
-        for path in self.checkpoints(stage)?.iter().rev() {
+        for path in checkpoints(&self.directory, stage)?.iter().rev() {
             match Checkpoint::read(path, device) {
                 Ok(checkpoint) => return Ok(Some(checkpoint)),
                 Err(error) => failure = Some(error.context(path.display().to_string())),
             }
         }
-        failure.map_or(Ok(None), Err)
-    }
-
-    /// Paths of a stage's checkpoints, oldest first.
-    fn checkpoints(&self, stage: &str) -> anyhow::Result<Vec<PathBuf>> {
-        let directory = self.path("checkpoints");
-        let prefix = format!("{stage}-");
-        let mut paths = Vec::new();
-        for entry in fs::read_dir(&directory).with_context(|| directory.display().to_string())? {
-            let path = entry?.path();
-            let name = path
-                .file_name()
-                .unwrap_or_default()
-                .to_string_lossy()
-                .into_owned();
-            if name.starts_with(&prefix) && name.ends_with(".npz") {
-                paths.push(path);
+        if let Some(failure) = failure {
+            return Err(failure);
+        }
+        for other in &self.others {
+            // What cannot be read there is no failure of this run, which can do the stage itself.
+            let Some(path) = checkpoints(other, stage).unwrap_or_default().pop() else {
+                continue;
+            };
+            let Ok(checkpoint) = Checkpoint::read(&path, device) else {
+                continue;
+            };
+            if checkpoint.origin == origin && checkpoint.progress.epoch == epochs {
+                self.take_metrics(stage, other)?;
+                self.save(stage, &checkpoint)?;
+                return Ok(Some(checkpoint));
             }
         }
-        paths.sort();
-        Ok(paths)
+        Ok(None)
+    }
+
+    /// Adds another run's rows of `stage` to `metrics.csv`: they are part of what this run's
+    /// model cost.
+    fn take_metrics(&self, stage: &str, other: &Path) -> anyhow::Result<()> {
+        let path = other.join("metrics.csv");
+        let text = fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+        let mut own = fs::read_to_string(self.path("metrics.csv")).unwrap_or_default();
+        if own.is_empty() {
+            own = format!("{METRICS_COLUMNS}\n");
+        }
+        let of_stage = |row: &&str| row.split(',').next() == Some(stage);
+        own = own
+            .lines()
+            .filter(|row| !of_stage(row))
+            .fold(String::new(), |rows, row| rows + row + "\n");
+        for row in text.lines().filter(of_stage) {
+            own += row;
+            own.push('\n');
+        }
+        self.write("metrics.csv", own.as_bytes())
     }
 
     /// Opens `metrics.csv` and cuts off the rows of `stage` after `step`: a resumed run writes
@@ -196,6 +231,26 @@ impl Run {
             seconds_before,
         })
     }
+}
+
+/// Paths of a stage's checkpoints in a run's directory, oldest first.
+fn checkpoints(run: &Path, stage: &str) -> anyhow::Result<Vec<PathBuf>> {
+    let directory = run.join("checkpoints");
+    let prefix = format!("{stage}-");
+    let mut paths = Vec::new();
+    for entry in fs::read_dir(&directory).with_context(|| directory.display().to_string())? {
+        let path = entry?.path();
+        let name = path
+            .file_name()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned();
+        if name.starts_with(&prefix) && name.ends_with(".npz") {
+            paths.push(path);
+        }
+    }
+    paths.sort();
+    Ok(paths)
 }
 
 /// Of a GAN's stage, `loss` is the discriminator's; what a stage does not have stays empty.
@@ -341,6 +396,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let run = Run {
             directory: directory.path().to_owned(),
+            others: Vec::new(),
         };
         let row = |step, seconds| Row {
             step,
