@@ -8,8 +8,8 @@
 //! and what it is worth. In reading order: [`dataset`] and [`augment`] make batches, [`generator`]
 //! makes frames, [`network`] and [`hrn`] judge them, [`losses`] and [`gan`] set one against the
 //! other, [`optimiser`] and [`fit`] learn, [`features`] is the trivial baseline, [`methods`] are
-//! the table's rows, [`onnx`] and [`export`] write the file, [`metrics`] and [`likeness`] say how
-//! good it is. Nothing here draws from a global random state.
+//! the table's rows over the parts of [`stages`], [`onnx`] and [`export`] write the file,
+//! [`metrics`] and [`likeness`] say how good it is. Nothing here draws from a global random state.
 
 pub mod settings;
 pub mod dataset;
@@ -27,6 +27,7 @@ pub mod fit;
 pub mod gan;
 pub mod features;
 pub mod likeness;
+pub mod stages;
 pub mod methods;
 pub mod onnx;
 pub mod metrics;

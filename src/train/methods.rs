@@ -6,22 +6,17 @@ use std::time::Instant;
 use anyhow::{Context as _, ensure};
 use burn::tensor::Device;
 
-use super::dataset::{Dataset, Sample};
+use super::dataset::Dataset;
 use super::export::{self, Recogniser};
 use super::features::{self, Baseline};
-use super::fit::{self, Trained};
-use super::gan::{self, Gan};
-use super::generator::{self, COMPONENTS};
-use super::hrn;
+use super::generator::COMPONENTS;
 use super::losses::Game;
 use super::metrics::Evaluation;
-use super::network::Weights;
 use super::optimiser::{self, Rule};
 use super::run::{Description, Row, Run};
 use super::settings::{Keep, Profile, Settings, Training, Validation};
-use super::sheet::{self, Strip};
+use super::stages::Stages;
 use crate::frame::Frame;
-use crate::random::Stream;
 use crate::simulator::Split;
 
 /// A row of the table.
@@ -172,43 +167,38 @@ pub fn train(
     if method == Method::Features {
         return baseline(dataset, &labelled, description, run);
     }
-    let levels = super::dataset::levels().len();
-    let (train, validation) = dataset.hold_out(
-        &labelled,
-        description.settings.validation.share,
-        description.seed,
-    );
-    let recipe = Recipe {
+    let Description { settings, seed, .. } = description;
+    let (train, validation) = dataset.hold_out(&labelled, settings.validation.share, *seed);
+    let stages = Stages {
         dataset,
         train: &train,
         validation: &validation,
-        unlabelled: unlabelled(dataset, &labelled),
-        levels,
+        unlabelled: &unlabelled(dataset, &labelled),
         description,
         run,
         device,
     };
-    let seed = description.seed;
-    let random = || hrn::initial(levels, seed, device);
-    let inherited = |ustgan: &Gan| hrn::inherited(&ustgan.discriminator, levels, seed, device);
     let trained = match method {
         Method::Ours => {
-            let ustgan = recipe.ustgan()?;
-            let generated = recipe.generated(&ustgan)?;
-            let pretrained = recipe.pretrained(&generated, inherited(&ustgan))?;
-            recipe.trained("fine-tuning", pretrained)?
+            let ustgan = stages.ustgan()?;
+            let generated = stages.generated(&ustgan)?;
+            let pretrained = stages.pretrained(&generated, stages.inherited(&ustgan))?;
+            stages.trained("fine-tuning", pretrained)?
         }
-        Method::Nahrn => recipe.trained("fine-tuning", inherited(&recipe.ustgan()?))?,
+        Method::Nahrn => {
+            let ustgan = stages.ustgan()?;
+            stages.trained("fine-tuning", stages.inherited(&ustgan))?
+        }
         Method::Nihrn => {
-            let generated = recipe.generated(&recipe.ustgan()?)?;
-            let pretrained = recipe.pretrained(&generated, random())?;
-            recipe.trained("fine-tuning", pretrained)?
+            let generated = stages.generated(&stages.ustgan()?)?;
+            let pretrained = stages.pretrained(&generated, stages.random())?;
+            stages.trained("fine-tuning", pretrained)?
         }
-        Method::Sgan => recipe.semi_supervised("sgan", Game::FakeLevel)?,
-        Method::Igan => recipe.semi_supervised("igan", Game::FeatureMatching)?,
-        _ => recipe.trained("hrn", random())?,
+        Method::Sgan => stages.semi_supervised("sgan", Game::FakeLevel)?,
+        Method::Igan => stages.semi_supervised("igan", Game::FeatureMatching)?,
+        _ => stages.trained("hrn", stages.random())?,
     };
-    recipe.finish(&trained)
+    stages.finish(&trained)
 }
 
 /// Training samples whose level is not used: all but `labelled`.
@@ -219,252 +209,6 @@ fn unlabelled(dataset: &Dataset, labelled: &[usize]) -> Vec<usize> {
     (0..dataset.samples.len()).filter(wanted).collect()
 }
 
-/// Stages of the four STGANs.
-const STGANS: [&str; 4] = ["stgan1", "stgan2", "stgan3", "stgan4"];
-
-/// The parts that methods are made of. Each part is a stage in the run's directory, or several.
-struct Recipe<'a> {
-    dataset: &'a Dataset,
-    /// Labelled samples to learn from.
-    train: &'a [usize],
-    /// Labelled samples of held-out objects.
-    validation: &'a [usize],
-    unlabelled: Vec<usize>,
-    levels: usize,
-    description: &'a Description,
-    run: &'a Run,
-    device: &'a Device,
-}
-
-impl Recipe<'_> {
-    fn settings(&self) -> &Settings {
-        &self.description.settings
-    }
-
-    fn gan_task<'a>(
-        &'a self,
-        stage: &'static str,
-        game: Game,
-        settings: &'a gan::Settings,
-    ) -> gan::Task<'a> {
-        gan::Task {
-            stage,
-            game,
-            dataset: self.dataset,
-            real: &self.unlabelled,
-            labelled: &[],
-            full_scale_n: self.settings().full_scale_n,
-            settings,
-            seed: self.description.seed,
-            device: self.device,
-        }
-    }
-
-    fn ensure_unlabelled(&self) -> anyhow::Result<()> {
-        ensure!(
-            !self.unlabelled.is_empty(),
-            "no unlabelled training samples are left for the GAN: {} labels are used, found 0, \
-             expected 1 or more",
-            self.description.labels
-        );
-        Ok(())
-    }
-
-    /// Stage 1: the GAN trained without labels.
-    fn ustgan(&self) -> anyhow::Result<Gan> {
-        self.ensure_unlabelled()?;
-        let game = Game::RealOrFake;
-        let task = self.gan_task("ustgan", game, &self.settings().ustgan);
-        let initial = gan::initial(game, self.levels, self.description.seed, self.device);
-        gan::fit(&task, initial, self.run)
-    }
-
-    /// Stages 2 and 3: a GAN a level, started from USTGAN's weights and with fresh optimisers,
-    /// and equally many samples of each component of each. They are not stored: they follow from
-    /// the STGANs' last checkpoints.
-    fn generated(&self, ustgan: &Gan) -> anyhow::Result<Dataset> {
-        let settings = self.settings();
-        let (full_scale_n, seed) = (settings.full_scale_n, self.description.seed);
-        let mut samples = Vec::new();
-        let mut strips = Vec::new();
-        for level in 1..=self.levels as u8 {
-            let stage = STGANS[usize::from(level) - 1];
-            let real: Vec<usize> = self
-                .train
-                .iter()
-                .copied()
-                .filter(|&index| self.dataset.samples[index].level == level)
-                .collect();
-            ensure!(!real.is_empty(), "{stage}: no labelled sample of its level");
-            let task = gan::Task {
-                real: &real,
-                ..self.gan_task(stage, Game::RealOrFake, &settings.stgan)
-            };
-            let stgan = gan::fit(&task, ustgan.clone(), self.run)?;
-            let generator = &stgan.generator;
-            let batch = settings.stgan.samples_a_component;
-            let statistics = generator::statistics(generator, batch, seed, self.device);
-            let mut stream = Stream::new(seed, &format!("{stage} generated"));
-            let frames = generator::generate(
-                generator,
-                &statistics,
-                settings.generation.samples_a_component as usize,
-                full_scale_n,
-                &mut stream,
-                self.device,
-            );
-            let real = real.iter().map(|&index| &self.dataset.samples[index].frame);
-            let spread = real.len().div_ceil(sheet::TILES).max(1);
-            let real: Vec<&Frame> = real.step_by(spread).collect();
-            let generated: Vec<Frame> = frames.iter().take(2 * sheet::TILES).copied().collect();
-            strips.push((level, real, generated));
-            samples.extend(frames.into_iter().map(|frame| Sample {
-                frame,
-                level,
-                object: None,
-                material: None,
-                force_n: None,
-                split: Split::Train,
-                shore: None,
-                source: 0,
-            }));
-        }
-        let rows: Vec<Strip> = strips
-            .iter()
-            .flat_map(|(level, real, generated)| {
-                let (first, second) = generated.split_at(generated.len().min(sheet::TILES));
-                [
-                    Strip::of(&format!("{level} real"), real.iter().copied()),
-                    Strip::of(&format!("{level} generated"), first.iter()),
-                    Strip::of("", second.iter()),
-                ]
-            })
-            .collect();
-        let title = "levels, real and generated: contact area at 0.07 N, force, peak";
-        self.run
-            .write("samples/generated.png", &sheet::strips(title, &rows)?)?;
-        Ok(Dataset {
-            samples,
-            sources: Vec::new(),
-        })
-    }
-
-    /// Stage 4, first half: HRN on generated samples.
-    fn pretrained(&self, generated: &Dataset, initial: Weights) -> anyhow::Result<Weights> {
-        let train: Vec<usize> = (0..generated.samples.len()).collect();
-        let task = fit::Task {
-            dataset: generated,
-            train: &train,
-            validation: (&[], Validation::default()),
-            settings: &self.settings().pretraining,
-            ..self.fit_task("pretraining")
-        };
-        Ok(fit::fit(&task, initial, self.run)?.weights)
-    }
-
-    fn fit_task(&self, stage: &'static str) -> fit::Task<'_> {
-        fit::Task {
-            stage,
-            dataset: self.dataset,
-            train: self.train,
-            validation: (self.validation, self.settings().validation),
-            levels: self.levels,
-            full_scale_n: self.settings().full_scale_n,
-            settings: &self.settings().training,
-            seed: self.description.seed,
-            device: self.device,
-        }
-    }
-
-    /// HRN on the labelled samples.
-    fn trained(&self, stage: &'static str, initial: Weights) -> anyhow::Result<Trained> {
-        fit::fit(&self.fit_task(stage), initial, self.run)
-    }
-
-    /// A GAN whose discriminator learns the levels too, and then is the recogniser.
-    fn semi_supervised(&self, stage: &'static str, game: Game) -> anyhow::Result<Trained> {
-        self.ensure_unlabelled()?;
-        let task = gan::Task {
-            labelled: self.train,
-            ..self.gan_task(stage, game, &self.settings().ustgan)
-        };
-        let initial = gan::initial(game, self.levels, self.description.seed, self.device);
-        let gan = gan::fit(&task, initial, self.run)?;
-        let weights = hrn::of_levels(&gan.discriminator, self.levels, self.device);
-        // The layers' statistics over all real frames that the discriminator has seen.
-        let mut real = self.unlabelled.clone();
-        real.extend(self.train);
-        let task = fit::Task {
-            train: &real,
-            ..self.fit_task(stage)
-        };
-        Ok(task.with_statistics(weights))
-    }
-
-    /// Writes the model, what it is worth and what it still gets wrong.
-    fn finish(&self, trained: &Trained) -> anyhow::Result<Option<Evaluation>> {
-        let full_scale_n = self.settings().full_scale_n;
-        self.draw_mistakes(trained)?;
-        let (graph, raw_logits) = hrn::graph(&trained.weights, &trained.statistics, full_scale_n);
-        let recogniser = Recogniser {
-            graph,
-            raw_logits,
-            temperature: trained.temperature,
-        };
-        let probabilities = |frames: &[&Frame]| {
-            let logits = trained.logits(frames.iter().copied(), full_scale_n, self.device);
-            Ok(fit::probabilities(
-                &logits,
-                trained.temperature,
-                self.device,
-            ))
-        };
-        export::finish(
-            self.run,
-            self.description,
-            self.dataset,
-            self.train,
-            &recogniser,
-            probabilities,
-        )
-    }
-
-    /// Draws labelled samples that are judged wrongly: of held-out objects where there are some,
-    /// else of those learnt from.
-    fn draw_mistakes(&self, trained: &Trained) -> anyhow::Result<()> {
-        let (kind, indices) = if self.validation.is_empty() {
-            ("training", self.train)
-        } else {
-            ("held-out", self.validation)
-        };
-        let frames = indices
-            .iter()
-            .map(|&index| &self.dataset.samples[index].frame);
-        let logits = trained.logits(frames, self.settings().full_scale_n, self.device);
-        let probabilities = fit::probabilities(&logits, trained.temperature, self.device);
-        let mut rows: Vec<Strip> = (1..=self.levels)
-            .map(|level| Strip {
-                name: format!("level {level}"),
-                tiles: Vec::new(),
-            })
-            .collect();
-        let mut wrong = 0;
-        for (&index, row) in indices.iter().zip(&probabilities) {
-            let sample = &self.dataset.samples[index];
-            let said = fit::largest(row);
-            if said + 1 != usize::from(sample.level) {
-                wrong += 1;
-                let caption = format!("as {}, {:.0} %", said + 1, row[said] * 100.0);
-                rows[usize::from(sample.level) - 1]
-                    .tiles
-                    .push((&sample.frame, caption));
-            }
-        }
-        let title = format!("{wrong} of {} {kind} samples judged wrongly", indices.len());
-        self.run
-            .write("samples/mistakes.png", &sheet::strips(&title, &rows)?)
-    }
-}
 /// Logistic regression on features.
 fn baseline(
     dataset: &Dataset,

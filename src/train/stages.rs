@@ -1,0 +1,326 @@
+//! The parts that methods are made of: USTGAN, the STGANs and what they generate, pretraining,
+//! training.
+//!
+//! In: labelled and unlabelled samples, settings, a seed. Out: weights, and in the run's directory
+//! each part's checkpoints, metrics and pictures. What a stage has done is taken up, never done
+//! again.
+
+use anyhow::ensure;
+use burn::tensor::Device;
+
+use super::dataset::{Dataset, Sample};
+use super::export::{self, Recogniser};
+use super::fit::{self, Trained};
+use super::gan::{self, Gan};
+use super::generator;
+use super::hrn;
+use super::losses::Game;
+use super::metrics::Evaluation;
+use super::network::Weights;
+use super::run::{Description, Run};
+use super::settings::{Settings, Validation};
+use super::sheet::{self, Strip};
+use crate::frame::Frame;
+use crate::random::Stream;
+use crate::simulator::Split;
+
+/// Stages of the four STGANs.
+const STGANS: [&str; 4] = ["stgan1", "stgan2", "stgan3", "stgan4"];
+
+fn levels() -> usize {
+    super::dataset::levels().len()
+}
+
+/// What all stages of a run share.
+#[derive(Debug)]
+pub struct Stages<'a> {
+    /// Where the samples are.
+    pub dataset: &'a Dataset,
+    /// Labelled samples to learn from.
+    pub train: &'a [usize],
+    /// Labelled samples of held-out objects; may be empty.
+    pub validation: &'a [usize],
+    /// Training samples whose levels are not used.
+    pub unlabelled: &'a [usize],
+    /// Settings and seed.
+    pub description: &'a Description,
+    /// Where stages leave what they made.
+    pub run: &'a Run,
+    /// Where to compute.
+    pub device: &'a Device,
+}
+
+impl Stages<'_> {
+    fn settings(&self) -> &Settings {
+        &self.description.settings
+    }
+
+    fn gan_task<'a>(
+        &'a self,
+        stage: &'static str,
+        game: Game,
+        settings: &'a gan::Settings,
+    ) -> gan::Task<'a> {
+        gan::Task {
+            stage,
+            game,
+            dataset: self.dataset,
+            real: self.unlabelled,
+            labelled: &[],
+            full_scale_n: self.settings().full_scale_n,
+            settings,
+            seed: self.description.seed,
+            device: self.device,
+        }
+    }
+
+    fn ensure_unlabelled(&self) -> anyhow::Result<()> {
+        ensure!(
+            !self.unlabelled.is_empty(),
+            "no unlabelled training samples are left for the GAN: {} labels are used, found 0, \
+             expected 1 or more",
+            self.description.labels
+        );
+        Ok(())
+    }
+
+    /// HRN's random start.
+    pub fn random(&self) -> Weights {
+        hrn::initial(levels(), self.description.seed, self.device)
+    }
+
+    /// HRN's start from USTGAN's discriminator.
+    pub fn inherited(&self, ustgan: &Gan) -> Weights {
+        let seed = self.description.seed;
+        hrn::inherited(&ustgan.discriminator, levels(), seed, self.device)
+    }
+
+    /// The GAN trained without labels.
+    ///
+    /// # Errors
+    ///
+    /// If there are no unlabelled samples, or the run's directory cannot be read or written.
+    pub fn ustgan(&self) -> anyhow::Result<Gan> {
+        self.ensure_unlabelled()?;
+        let game = Game::RealOrFake;
+        let task = self.gan_task("ustgan", game, &self.settings().ustgan);
+        let initial = gan::initial(game, levels(), self.description.seed, self.device);
+        gan::fit(&task, initial, self.run)
+    }
+
+    /// A GAN a level, started from USTGAN's weights and with fresh optimisers, and equally many
+    /// samples of each component of each. They are not stored: they follow from the STGANs' last
+    /// checkpoints.
+    ///
+    /// # Errors
+    ///
+    /// If a level has no labelled samples, or the run's directory cannot be read or written.
+    pub fn generated(&self, ustgan: &Gan) -> anyhow::Result<Dataset> {
+        let mut samples = Vec::new();
+        for (stage, level) in STGANS.into_iter().zip(1..) {
+            let real = self.of_level(level);
+            ensure!(!real.is_empty(), "{stage}: no labelled sample of its level");
+            let frames = self.generated_of(stage, &real, ustgan)?;
+            samples.extend(frames.into_iter().map(|frame| Sample {
+                frame,
+                level,
+                object: None,
+                material: None,
+                force_n: None,
+                split: Split::Train,
+                shore: None,
+                source: 0,
+            }));
+        }
+        self.draw_generated(&samples)?;
+        Ok(Dataset {
+            samples,
+            sources: Vec::new(),
+        })
+    }
+
+    /// Samples of `level` to learn from.
+    fn of_level(&self, level: u8) -> Vec<usize> {
+        let wanted = |index: &usize| self.dataset.samples[*index].level == level;
+        self.train.iter().copied().filter(wanted).collect()
+    }
+
+    /// Draws real samples of each level over generated ones.
+    fn draw_generated(&self, generated: &[Sample]) -> anyhow::Result<()> {
+        let mut rows = Vec::new();
+        for level in 1..=levels() as u8 {
+            let real = self.of_level(level);
+            let spread = real.len().div_ceil(sheet::TILES);
+            let real = real.iter().step_by(spread);
+            let real = real.map(|&index| &self.dataset.samples[index].frame);
+            rows.push(Strip::of(&format!("{level} real"), real));
+            let frames = generated.iter().filter(|sample| sample.level == level);
+            let frames: Vec<&Frame> = frames.map(|sample| &sample.frame).collect();
+            for part in frames.chunks(sheet::TILES).take(2) {
+                let name = format!("{level} generated");
+                rows.push(Strip::of(&name, part.iter().copied()));
+            }
+        }
+        let title = "levels, real and generated: contact area at 0.07 N, force, peak";
+        let picture = sheet::strips(title, &rows)?;
+        self.run.write("samples/generated.png", &picture)
+    }
+
+    /// What the STGAN of the samples `real` generates.
+    fn generated_of(
+        &self,
+        stage: &'static str,
+        real: &[usize],
+        ustgan: &Gan,
+    ) -> anyhow::Result<Vec<Frame>> {
+        let settings = self.settings();
+        let seed = self.description.seed;
+        let task = gan::Task {
+            real,
+            ..self.gan_task(stage, Game::RealOrFake, &settings.stgan)
+        };
+        let generator = gan::fit(&task, ustgan.clone(), self.run)?.generator;
+        let batch = settings.stgan.samples_a_component;
+        let statistics = generator::statistics(&generator, batch, seed, self.device);
+        Ok(generator::generate(
+            &generator,
+            &statistics,
+            settings.generation.samples_a_component as usize,
+            settings.full_scale_n,
+            &mut Stream::new(seed, &format!("{stage} generated")),
+            self.device,
+        ))
+    }
+
+    /// HRN on generated samples.
+    ///
+    /// # Errors
+    ///
+    /// If the run's directory cannot be read or written.
+    pub fn pretrained(&self, generated: &Dataset, initial: Weights) -> anyhow::Result<Weights> {
+        let train: Vec<usize> = (0..generated.samples.len()).collect();
+        let task = fit::Task {
+            dataset: generated,
+            train: &train,
+            validation: (&[], Validation::default()),
+            settings: &self.settings().pretraining,
+            ..self.fit_task("pretraining")
+        };
+        Ok(fit::fit(&task, initial, self.run)?.weights)
+    }
+
+    fn fit_task(&self, stage: &'static str) -> fit::Task<'_> {
+        fit::Task {
+            stage,
+            dataset: self.dataset,
+            train: self.train,
+            validation: (self.validation, self.settings().validation),
+            levels: levels(),
+            full_scale_n: self.settings().full_scale_n,
+            settings: &self.settings().training,
+            seed: self.description.seed,
+            device: self.device,
+        }
+    }
+
+    /// HRN on the labelled samples.
+    ///
+    /// # Errors
+    ///
+    /// If the run's directory cannot be read or written.
+    pub fn trained(&self, stage: &'static str, initial: Weights) -> anyhow::Result<Trained> {
+        fit::fit(&self.fit_task(stage), initial, self.run)
+    }
+
+    /// A GAN whose discriminator learns the levels too, and then is the recogniser.
+    ///
+    /// # Errors
+    ///
+    /// If there are no unlabelled samples, or the run's directory cannot be read or written.
+    pub fn semi_supervised(&self, stage: &'static str, game: Game) -> anyhow::Result<Trained> {
+        self.ensure_unlabelled()?;
+        let task = gan::Task {
+            labelled: self.train,
+            ..self.gan_task(stage, game, &self.settings().ustgan)
+        };
+        let initial = gan::initial(game, levels(), self.description.seed, self.device);
+        let gan = gan::fit(&task, initial, self.run)?;
+        let weights = hrn::of_levels(&gan.discriminator, levels(), self.device);
+        // The layers' statistics over all real frames that the discriminator has seen.
+        let mut real = self.unlabelled.to_vec();
+        real.extend(self.train);
+        let task = fit::Task {
+            train: &real,
+            ..self.fit_task(stage)
+        };
+        Ok(task.with_statistics(weights))
+    }
+
+    /// Writes the model, what it is worth and what it still gets wrong.
+    ///
+    /// # Errors
+    ///
+    /// If the daemon's loader refuses the model, or the run's directory cannot be written.
+    pub fn finish(&self, trained: &Trained) -> anyhow::Result<Option<Evaluation>> {
+        let full_scale_n = self.settings().full_scale_n;
+        self.draw_mistakes(trained)?;
+        let (graph, raw_logits) = hrn::graph(&trained.weights, &trained.statistics, full_scale_n);
+        let recogniser = Recogniser {
+            graph,
+            raw_logits,
+            temperature: trained.temperature,
+        };
+        let probabilities = |frames: &[&Frame]| {
+            let logits = trained.logits(frames.iter().copied(), full_scale_n, self.device);
+            Ok(fit::probabilities(
+                &logits,
+                trained.temperature,
+                self.device,
+            ))
+        };
+        export::finish(
+            self.run,
+            self.description,
+            self.dataset,
+            self.train,
+            &recogniser,
+            probabilities,
+        )
+    }
+
+    /// Draws labelled samples that are judged wrongly: of held-out objects where there are some,
+    /// else of those learnt from.
+    fn draw_mistakes(&self, trained: &Trained) -> anyhow::Result<()> {
+        let (kind, indices) = if self.validation.is_empty() {
+            ("training", self.train)
+        } else {
+            ("held-out", self.validation)
+        };
+        let frames = indices
+            .iter()
+            .map(|&index| &self.dataset.samples[index].frame);
+        let logits = trained.logits(frames, self.settings().full_scale_n, self.device);
+        let probabilities = fit::probabilities(&logits, trained.temperature, self.device);
+        let mut rows: Vec<Strip> = (1..=levels())
+            .map(|level| Strip {
+                name: format!("level {level}"),
+                tiles: Vec::new(),
+            })
+            .collect();
+        let mut wrong = 0;
+        for (&index, row) in indices.iter().zip(&probabilities) {
+            let sample = &self.dataset.samples[index];
+            let said = fit::largest(row);
+            if said + 1 != usize::from(sample.level) {
+                wrong += 1;
+                let caption = format!("as {}, {:.0} %", said + 1, row[said] * 100.0);
+                rows[usize::from(sample.level) - 1]
+                    .tiles
+                    .push((&sample.frame, caption));
+            }
+        }
+        let title = format!("{wrong} of {} {kind} samples judged wrongly", indices.len());
+        self.run
+            .write("samples/mistakes.png", &sheet::strips(&title, &rows)?)
+    }
+}
