@@ -43,6 +43,19 @@ pub enum Kind {
     Frame,
 }
 
+impl Kind {
+    /// The kind whose events have this `type`.
+    pub fn named(name: &str) -> Option<Self> {
+        match name {
+            "status" => Some(Kind::Status),
+            "press" => Some(Kind::Press),
+            "hardness" => Some(Kind::Hardness),
+            "frame" => Some(Kind::Frame),
+            _ => None,
+        }
+    }
+}
+
 impl Event {
     /// Which kind this is.
     pub fn kind(&self) -> Kind {

@@ -12,7 +12,7 @@ use hardnessd::daemon::log::{Log, Settings as LogSettings};
 use hardnessd::daemon::publish::Error as PublishError;
 use hardnessd::daemon::socket::Error as SocketError;
 use hardnessd::daemon::{Daemon, Error as DaemonError, Reload};
-use hardnessd::tools::{check, demo, replay, simulate};
+use hardnessd::tools::{check, demo, replay, simulate, tail};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
@@ -38,6 +38,8 @@ enum Command {
     Simulate(simulate::Args),
     /// Play a recording through the same pipeline: events on stdout as JSON lines
     Replay(replay::Args),
+    /// Print events of a running daemon
+    Tail(tail::Args),
     /// Check a configuration and say what would run
     Check(check::Args),
 }
@@ -47,6 +49,7 @@ mod exit {
     pub(super) const FAILED: u8 = 1;
     pub(super) const USAGE: u8 = 2;
     pub(super) const NO_INPUT: u8 = 66;
+    pub(super) const UNAVAILABLE: u8 = 69;
     pub(super) const IO: u8 = 74;
     pub(super) const CONFIG: u8 = 78;
 }
@@ -85,6 +88,7 @@ async fn dispatch(command: Command) -> anyhow::Result<()> {
         }
         Command::Simulate(args) => Ok(simulate::run(args, shutdown()?).await?),
         Command::Replay(args) => Ok(replay::run(args, shutdown()?).await?),
+        Command::Tail(args) => Ok(tail::run(args, shutdown()?).await?),
         Command::Check(args) => Ok(check::run(&args)?),
     }
 }
@@ -176,6 +180,15 @@ fn exit_code(error: &anyhow::Error) -> u8 {
             replay::Error::Config(error) => of_config(error),
             replay::Error::Unreadable { .. } | replay::Error::Format { .. } => exit::NO_INPUT,
             replay::Error::Broken { .. } | replay::Error::Print(_) => exit::IO,
+        };
+    }
+    if let Some(error) = error.downcast_ref::<tail::Error>() {
+        return match error {
+            tail::Error::Timeout { .. } => exit::FAILED,
+            tail::Error::NoDaemon { .. }
+            | tail::Error::Refused { .. }
+            | tail::Error::Closed { .. } => exit::UNAVAILABLE,
+            tail::Error::Print(_) => exit::IO,
         };
     }
     if error.is::<hardnessd::daemon::log::Error>() {

@@ -249,21 +249,10 @@ fn kinds(value: &Value) -> Result<Kinds, String> {
     names
         .iter()
         .map(|name| {
-            let named = name.as_str().and_then(kind_named);
+            let named = name.as_str().and_then(Kind::named);
             named.ok_or_else(|| format!("subscribe: found {}, {expected}", short(name)))
         })
         .collect()
-}
-
-/// The kind of event of that name.
-pub(crate) fn kind_named(name: &str) -> Option<Kind> {
-    match name {
-        "hardness" => Some(Kind::Hardness),
-        "press" => Some(Kind::Press),
-        "status" => Some(Kind::Status),
-        "frame" => Some(Kind::Frame),
-        _ => None,
-    }
 }
 
 fn policy(value: &Value) -> Result<Policy, String> {

@@ -11,9 +11,9 @@ use hyper::body::Bytes;
 use tokio::sync::mpsc;
 
 use crate::daemon::hub::{self, Closed, Line};
-use crate::daemon::request::{self, Kinds, Policy, Since, Subscription};
+use crate::daemon::request::{Kinds, Policy, Since, Subscription};
 use crate::daemon::sensor::Sensors;
-use crate::event::Event;
+use crate::event::{Event, Kind};
 
 pub(super) const CONTENT_TYPE: &str = "text/event-stream";
 
@@ -51,7 +51,7 @@ pub(super) fn wanted<B>(request: &Request<B>) -> Result<Subscription, String> {
 
 fn kinds(names: &str) -> Result<Kinds, String> {
     let kind = |name| {
-        request::kind_named(name).ok_or_else(|| {
+        Kind::named(name).ok_or_else(|| {
             format!("types: found {name:?}, expected hardness, press, status or frame")
         })
     };
@@ -157,7 +157,6 @@ fn write(out: &mut Vec<u8>, run: &str, line: &Line) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::event::Kind;
 
     fn ask(uri: &str, last: Option<&str>) -> Result<Subscription, String> {
         let mut request = Request::builder().uri(uri);

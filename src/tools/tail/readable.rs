@@ -1,0 +1,181 @@
+//! An event as a line for people: aligned, one event a line, nothing that is not in the event.
+
+use std::fmt::Write;
+
+use serde_json::Value;
+
+/// The line of one event, without its newline.
+pub(super) fn line(event: &Value) -> String {
+    let text = |key: &str| event[key].as_str().unwrap_or_default();
+    let kind = text("type");
+    if kind == "gap" {
+        let lost = event["lost"].as_u64();
+        let lost = lost.map_or("an unknown number of".to_owned(), |lost| lost.to_string());
+        return format!("-- gap: {lost} events lost --");
+    }
+    // 2026-11-21T10:00:00.123456Z: the day is known, microseconds are not read by eye.
+    let time = text("time").get(11..23).unwrap_or_default();
+    let mut line = format!("{time}  {:<12}  {kind:<8}  ", text("sensor"));
+    match kind {
+        "status" => status(&mut line, event),
+        "press" => press(&mut line, event),
+        "hardness" => hardness(&mut line, event),
+        "frame" => frame(&mut line, event),
+        _ => line += &event.to_string(),
+    }
+    // A reason comes from the system, a label from a model file: neither may move the cursor.
+    line.retain(|c| !c.is_control());
+    line.truncate(line.trim_end().len());
+    line
+}
+
+fn number(event: &Value, key: &str) -> u64 {
+    event[key].as_u64().unwrap_or_default()
+}
+
+fn write(line: &mut String, arguments: std::fmt::Arguments) {
+    line.write_fmt(arguments)
+        .expect("writing to a string cannot fail");
+}
+
+fn status(line: &mut String, event: &Value) {
+    let state = event["state"].as_str().unwrap_or_default();
+    let (frames, damaged) = (number(event, "frames"), number(event, "frames_damaged"));
+    write(
+        line,
+        format_args!("{state:<10}  {frames} frames, {damaged} damaged"),
+    );
+    if let Some(hz) = event["frame_rate_hz"].as_f64() {
+        write(line, format_args!(", {hz:.1} frames/s"));
+    }
+    if let Some(reason) = event["reason"].as_str() {
+        write(line, format_args!("  ({reason})"));
+    }
+}
+
+fn press(line: &mut String, event: &Value) {
+    let state = event["state"].as_str().unwrap_or_default();
+    let (press, frame) = (number(event, "press"), number(event, "frame"));
+    write(line, format_args!("#{press:<4} {state:<8}  frame {frame}"));
+    if state != "begin" {
+        write(
+            line,
+            format_args!(", {} in contact", number(event, "frames")),
+        );
+    }
+    if let Some(reason) = event["reason"].as_str() {
+        write(line, format_args!("  ({reason})"));
+    }
+    context(line, event);
+}
+
+fn hardness(line: &mut String, event: &Value) {
+    let (press, phase) = (number(event, "press"), event["phase"].as_str());
+    let verdict = match (event["level"].as_u64(), event["rejected"].as_str()) {
+        (Some(level), _) => format!("{level} {}", event["label"].as_str().unwrap_or_default()),
+        (None, rejected) => format!("rejected: {}", rejected.unwrap_or_default()),
+    };
+    let percent = |value: &Value| format!("{:.0}", 100.0 * value.as_f64().unwrap_or_default());
+    let probabilities: Vec<String> = event["probabilities"]
+        .as_array()
+        .into_iter()
+        .flatten()
+        .map(percent)
+        .collect();
+    write(
+        line,
+        format_args!(
+            "#{press:<4} {:<8}  {verdict:<24} {:>3} % [{}]  {:>3} taxels  {:>6.2} N",
+            phase.unwrap_or_default(),
+            percent(&event["confidence"]),
+            probabilities.join(" "),
+            number(event, "contact_area_taxels"),
+            event["force_n"].as_f64().unwrap_or_default(),
+        ),
+    );
+    let notes: Vec<&str> = event["notes"]
+        .as_array()
+        .into_iter()
+        .flatten()
+        .filter_map(Value::as_str)
+        .collect();
+    if !notes.is_empty() {
+        write(line, format_args!("  ({})", notes.join(", ")));
+    }
+    context(line, event);
+}
+
+fn frame(line: &mut String, event: &Value) {
+    let newtons = || {
+        event["newtons"]
+            .as_array()
+            .into_iter()
+            .flatten()
+            .filter_map(Value::as_f64)
+    };
+    write(
+        line,
+        format_args!(
+            "#{:<13}  {:>6.2} N, highest taxel {:.2} N",
+            number(event, "frame"),
+            newtons().sum::<f64>(),
+            newtons().fold(0.0, f64::max)
+        ),
+    );
+}
+
+fn context(line: &mut String, event: &Value) {
+    if !event["context"].is_null() {
+        write(line, format_args!("  {}", event["context"]));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn events_are_one_aligned_line_each() {
+        let check = |event: Value, expected: &str| assert_eq!(line(&event), expected);
+        let time = "2026-11-21T10:00:00.123456Z";
+        check(
+            json!({"type": "status", "sensor": "forearm", "time": time, "state": "lost",
+                   "reason": "end\u{1b} of file", "frames": 120, "frames_damaged": 2,
+                   "frame_rate_hz": 4.96}),
+            "10:00:00.123  forearm       status    lost        120 frames, 2 damaged, \
+             5.0 frames/s  (end of file)",
+        );
+        check(
+            json!({"type": "press", "sensor": "forearm", "time": time, "press": 3,
+                   "state": "end", "frame": 44, "reason": null, "frames": 9, "context": null}),
+            "10:00:00.123  forearm       press     #3    end       frame 44, 9 in contact",
+        );
+        check(
+            json!({"type": "hardness", "sensor": "wrist", "time": time, "press": 3,
+                   "phase": "final", "level": 2, "label": "firm", "rejected": null,
+                   "notes": ["at_edge"], "probabilities": [0.01, 0.93, 0.05, 0.01],
+                   "confidence": 0.93, "contact_area_taxels": 52, "force_n": 12.345,
+                   "context": {"tag": "pick-17"}}),
+            "10:00:00.123  wrist         hardness  #3    final     2 firm                    \
+             93 % [1 93 5 1]   52 taxels   12.35 N  (at_edge)  {\"tag\":\"pick-17\"}",
+        );
+        check(
+            json!({"type": "hardness", "sensor": "wrist", "time": time, "press": 3,
+                   "phase": "early", "level": null, "rejected": "low_force", "notes": [],
+                   "probabilities": [1.0], "confidence": 1.0, "contact_area_taxels": 5,
+                   "force_n": 0.5, "context": null}),
+            "10:00:00.123  wrist         hardness  #3    early     rejected: low_force      \
+             100 % [100]    5 taxels    0.50 N",
+        );
+        check(
+            json!({"type": "frame", "sensor": "wrist", "time": time, "frame": 7,
+                   "newtons": [0.5, 0.25]}),
+            "10:00:00.123  wrist         frame     #7                0.75 N, highest taxel 0.50 N",
+        );
+        check(
+            json!({"type": "gap", "lost": 4}),
+            "-- gap: 4 events lost --",
+        );
+    }
+}
