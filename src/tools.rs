@@ -7,6 +7,7 @@ mod player;
 mod pty;
 pub mod replay;
 pub mod simulate;
+pub mod tail;
 
 use std::io::{ErrorKind, Write};
 

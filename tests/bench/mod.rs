@@ -193,8 +193,8 @@ impl Daemon {
 }
 
 /// What a connection runs over.
-pub trait Stream: Read + Write {}
-impl<S: Read + Write> Stream for S {}
+pub trait Stream: Read + Write + Send {}
+impl<S: Read + Write + Send> Stream for S {}
 
 /// A connection to a socket.
 pub struct Subscriber {
