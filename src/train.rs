@@ -15,6 +15,7 @@ pub mod settings;
 pub mod dataset;
 pub mod simulated;
 pub mod augment;
+pub mod layers;
 pub mod network;
 pub mod hrn;
 pub mod generator;

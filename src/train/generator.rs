@@ -4,11 +4,11 @@
 //! frames in newtons. 65,569 parameters and the mixture's 3,000, all in one list, because the
 //! mixture is trained by the generator's optimiser.
 
-use burn::tensor::ops::ConvTransposeOptions;
-use burn::tensor::{Device, Tensor, TensorData, activation, module};
+use burn::tensor::{Device, Tensor, TensorData};
 
+use super::layers::{Geometry, STRIDE, transposed_convolution};
 use super::network::{
-    FEATURES, Normalisation, STRIDE, Statistics, Weights, batch_norm, numbers, truncated_normal,
+    FEATURES, Normalisation, Statistics, Weights, batch_norm, numbers, truncated_normal,
 };
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::random::Stream;
@@ -122,6 +122,19 @@ impl Layer {
     fn is_last(&self) -> bool {
         self.side == ROWS
     }
+
+    /// Of the convolution that this one is the adjoint of: from an image of `side` rows back to
+    /// the smaller one, padded with one zero before and as many after as SAME needs.
+    fn geometry(&self) -> Geometry {
+        let small = self.side.div_ceil(STRIDE);
+        let after = (small - 1) * STRIDE + self.kernel - self.side - 1;
+        Geometry {
+            channels: self.outputs,
+            size: self.side,
+            kernel: self.kernel,
+            padding: (1, after),
+        }
+    }
 }
 
 /// eta ~ N(0, 1) for `samples` of each component: `[samples x 50, 30]`. Row r is of component
@@ -146,54 +159,48 @@ pub fn images(weights: &Weights, eta: Tensor<2>, normalisation: &mut Normalisati
     let z = of_component("mixture.mu").add(of_component("mixture.sigma").mul(eta));
 
     let vector = |name: &str| weights.tensor::<1>(name);
-    let bias = vector("linear.bias");
-    let width = bias.dims()[0];
-    let x = z
-        .matmul(weights.tensor::<2>("linear.matrix"))
-        .add(bias.reshape([1, width]));
-    let x = batch_norm(
-        x.reshape([batch, width, 1, 1]),
-        vector("linear.gamma"),
-        vector("linear.beta"),
-        BATCH_NORM_EPSILON,
-        0,
-        normalisation,
-    );
-    // [batch, 64, 4, 4]
-    let mut x = activation::relu(x).reshape([batch, FEATURES, FIRST_SIDE, FIRST_SIDE]);
+    let column = |name: &str| {
+        let values = vector(name);
+        let rows = values.dims()[0];
+        values.reshape([rows, 1])
+    };
+    let relu = (BATCH_NORM_EPSILON, 0.0);
+    // [1024, batch]
+    let x = weights
+        .tensor::<2>("linear.matrix")
+        .transpose()
+        .matmul(z.transpose())
+        .add(column("linear.bias"));
+    let (gamma, beta) = (vector("linear.gamma"), vector("linear.beta"));
+    // [64, 4, 4, batch]
+    let mut x = batch_norm(x, gamma, beta, relu, 0, normalisation)
+        .reshape([FEATURES, FIRST_SIDE, FIRST_SIDE, batch]);
     for (layer, index) in LAYERS.iter().zip(1..) {
         let part = |part: &str| format!("{}.{part}", layer.name);
-        let kernel = weights.tensor::<4>(&part("kernel"));
-        x = transposed(x, kernel, vector(&part("bias")), layer.side);
+        let Layer {
+            inputs,
+            outputs,
+            kernel,
+            side,
+            ..
+        } = *layer;
+        let kernels = weights
+            .tensor::<4>(&part("kernel"))
+            .reshape([inputs, outputs * kernel * kernel]);
+        let mut rows = transposed_convolution(x, kernels, layer.geometry())
+            .reshape([outputs, side * side * batch])
+            .add(column(&part("bias")));
         if !layer.is_last() {
-            x = batch_norm(
-                x,
-                vector(&part("gamma")),
-                vector(&part("beta")),
-                BATCH_NORM_EPSILON,
-                index,
-                normalisation,
-            );
-            x = activation::relu(x);
+            let (gamma, beta) = (vector(&part("gamma")), vector(&part("beta")));
+            rows = batch_norm(rows, gamma, beta, relu, index, normalisation);
         }
+        x = rows.reshape([outputs, side, side, batch]);
     }
     if let Normalisation::Collect(statistics) = normalisation {
         statistics.batch_collected();
     }
-    x.tanh()
-}
-
-/// The transposed convolution of stride 2 to an image of `side` rows and columns: the adjoint of
-/// the convolution that pads one zero before and as many after as that side needs.
-fn transposed(x: Tensor<4>, kernel: Tensor<4>, bias: Tensor<1>, side: usize) -> Tensor<4> {
-    let options = ConvTransposeOptions::new([STRIDE; 2], [1; 2], [0; 2], [1; 2], 1);
-    let x = module::conv_transpose2d(x, kernel, Some(bias), options);
-    let [batch, channels, rows, _] = x.dims();
-    if rows == side {
-        return x;
-    }
-    // One was cropped on each side; of a kernel of 5, one more goes after.
-    x.slice([0..batch, 0..channels, 0..side, 0..side])
+    // [1, 28, 28, batch] -> [batch, 1, 28, 28]
+    x.tanh().permute([3, 0, 1, 2])
 }
 
 /// Mean and variance of each normalised layer over generated samples, in batches as in training:
@@ -251,8 +258,8 @@ pub fn frames(images: &Tensor<4>, full_scale_n: f64) -> Vec<Frame> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::train::network::TRUNK;
     use crate::train::settings::Generation;
-    use burn::tensor::ops::ConvOptions;
 
     fn device() -> Device {
         Device::flex()
@@ -272,47 +279,15 @@ mod tests {
     }
 
     #[test]
-    fn the_transposed_convolution_is_the_adjoint_of_the_convolution() {
-        // <conv(x), y> = <x, transposed(y)> for every x and y.
-        let mut stream = Stream::new(4, "adjoint");
-        let mut random = |dims: [usize; 4]| -> Tensor<4> {
-            let values: Vec<f32> = (0..dims.iter().product())
-                .map(|_| stream.normal() as f32)
-                .collect();
-            Tensor::from_data(TensorData::new(values, dims), &device())
-        };
-        let product = |a: Tensor<4>, b: Tensor<4>| -> f64 {
-            let (a, b) = (numbers(&a), numbers(&b));
-            a.iter()
-                .zip(&b)
-                .map(|(a, b)| f64::from(*a) * f64::from(*b))
-                .sum()
-        };
-        for layer in LAYERS {
-            let Layer {
-                inputs,
-                outputs,
-                kernel,
-                side,
-                ..
-            } = layer;
-            let small = side.div_ceil(STRIDE);
-            let x = random([3, outputs, side, side]);
-            let y = random([3, inputs, small, small]);
-            let kernel = random([inputs, outputs, kernel, kernel]);
-            // What SAME pads for this side: one before, the rest after.
-            let after = (small - 1) * STRIDE + layer.kernel - side - 1;
-            let options = ConvOptions::new_with_padding([STRIDE; 2], [(1, after); 2], [1; 2], 1);
-            let convolved = module::conv2d(x.clone(), kernel.clone(), None, options);
-            let bias = Tensor::zeros([outputs], &device());
-            let back = transposed(y.clone(), kernel, bias, side);
-            let (left, right) = (product(convolved, y.clone()), product(x, back));
-            assert!(
-                (left - right).abs() < 1e-4 * left.abs().max(1.0),
-                "{}: {left} {right}",
-                layer.name
-            );
-        }
+    fn every_layer_mirrors_one_of_the_trunks() {
+        // So the adjoint's test of `layers`, on the trunk's geometries, covers the generator.
+        let sizes = [28, 14, 7];
+        let trunk = TRUNK
+            .iter()
+            .zip(sizes)
+            .map(|(layer, size)| layer.geometry(size));
+        let of_generator: Vec<Geometry> = LAYERS.iter().rev().map(Layer::geometry).collect();
+        assert_eq!(trunk.collect::<Vec<_>>(), of_generator);
     }
 
     #[test]

@@ -5,9 +5,8 @@
 
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
-use super::network::{
-    self, FEATURES, LEAKY_SLOPE, Normalisation, STRIDE, Statistics, TRUNK, Weights,
-};
+use super::layers::STRIDE;
+use super::network::{self, FEATURES, LEAKY_SLOPE, Normalisation, Statistics, TRUNK, Weights};
 use super::onnx::{self, Graph};
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::random::Stream;

@@ -7,9 +7,9 @@
 //! (method notes, pitfall 1), so [`Normalisation`] says where the statistics come from, and they
 //! are taken anew before every evaluation and export.
 
-use burn::tensor::ops::ConvOptions;
-use burn::tensor::{Device, Tensor, TensorData, activation, module};
+use burn::tensor::{Device, Tensor, TensorData, activation};
 
+use super::layers::{Geometry, convolution, normalised};
 use crate::frame::{COLS, ROWS};
 use crate::random::Stream;
 
@@ -40,8 +40,17 @@ pub struct Convolution {
     pub normalised: bool,
 }
 
-/// Stride of every convolution.
-pub const STRIDE: usize = 2;
+impl Convolution {
+    /// How it lies on images of `size` rows and columns.
+    pub fn geometry(&self, size: usize) -> Geometry {
+        Geometry {
+            channels: self.inputs,
+            size,
+            kernel: self.kernel,
+            padding: self.padding,
+        }
+    }
+}
 
 /// 28 -> 14 -> 7 -> 4, then a global max-pool to [`FEATURES`].
 pub const TRUNK: [Convolution; 3] = [
@@ -256,12 +265,12 @@ pub enum Normalisation<'a> {
 
 /// LeakyReLU as a product with a factor that autodiff holds constant. burn's own goes through
 /// `mask_where`, which took 17 % of a step.
-pub fn leaky_relu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
+pub fn leaky_relu<const D: usize>(x: Tensor<D>, slope: f32) -> Tensor<D> {
     if !x.is_autodiff() {
-        return activation::leaky_relu(x, f64::from(LEAKY_SLOPE));
+        return activation::leaky_relu(x, f64::from(slope));
     }
     // sign is -1, 0, 1, so the factor is the slope, the middle, or 1.
-    let half = (1.0 - LEAKY_SLOPE) / 2.0;
+    let half = (1.0 - slope) / 2.0;
     let factor = x
         .clone()
         .inner()
@@ -277,71 +286,81 @@ pub fn trunk(weights: &Weights, images: Tensor<4>, normalisation: &mut Normalisa
     debug_assert_eq!(images.dims(), [batch, 1, ROWS, COLS]);
     // The convolution pads with 0. Raised by 1 the background is 0 too, so that padding looks
     // like untouched sensor and not like a frame of half the full scale around every image.
-    let mut x = images.add_scalar(1.0);
+    // [batch, 1, 28, 28] -> [1, 28, 28, batch]
+    let mut x = images.add_scalar(1.0).permute([1, 2, 3, 0]);
     let mut normalised_index = 0;
     for layer in &TRUNK {
-        let name = layer.name;
-        let options = ConvOptions::new_with_padding([STRIDE; 2], [layer.padding; 2], [1, 1], 1);
-        let kernel = weights.tensor::<4>(&format!("{name}.kernel"));
-        let bias = weights.tensor::<1>(&format!("{name}.bias"));
-        x = module::conv2d(x, kernel, Some(bias), options);
-        if layer.normalised {
-            let gamma = weights.tensor::<1>(&format!("{name}.gamma"));
-            let beta = weights.tensor::<1>(&format!("{name}.beta"));
-            x = batch_norm(
-                x,
+        let part = |part: &str| format!("{}.{part}", layer.name);
+        let geometry = layer.geometry(x.dims()[1]);
+        let taps = layer.inputs * layer.kernel * layer.kernel;
+        let kernels = weights.tensor::<4>(&part("kernel"));
+        let bias = weights.tensor::<1>(&part("bias"));
+        // [inputs, size, size, batch] -> [outputs, numbers]
+        let small = geometry.small();
+        let sums = convolution(x, kernels.reshape([layer.outputs, taps]), geometry)
+            .reshape([layer.outputs, small * small * batch])
+            .add(bias.reshape([layer.outputs, 1]));
+        let rows = if layer.normalised {
+            let gamma = weights.tensor::<1>(&part("gamma"));
+            let beta = weights.tensor::<1>(&part("beta"));
+            normalised_index += 1;
+            batch_norm(
+                sums,
                 gamma,
                 beta,
-                BATCH_NORM_EPSILON,
-                normalised_index,
+                (BATCH_NORM_EPSILON, LEAKY_SLOPE),
+                normalised_index - 1,
                 normalisation,
-            );
-            normalised_index += 1;
-        }
-        x = leaky_relu(x);
+            )
+        } else {
+            leaky_relu(sums, LEAKY_SLOPE)
+        };
+        x = rows.reshape([layer.outputs, small, small, batch]);
     }
     if let Normalisation::Collect(statistics) = normalisation {
         statistics.batch_collected();
     }
-    // [batch, 64, 4, 4] -> [batch, 64]
-    let pixels = x.dims()[2] * x.dims()[3];
-    x.reshape([batch, FEATURES, pixels])
-        .max_dim(2)
-        .reshape([batch, FEATURES])
+    // [64, 4, 4, batch] -> [batch, 64]
+    let places = x.dims()[1] * x.dims()[2];
+    x.reshape([FEATURES, places, batch])
+        .max_dim(1)
+        .reshape([FEATURES, batch])
+        .transpose()
 }
 
-/// Batch normalisation of `[batch, channels, rows, columns]` over all axes but the channels;
+/// Batch normalisation of `x` `[channels, numbers]` by channel, then LeakyReLU of `slope`;
 /// `index` counts the network's normalised layers.
 pub(super) fn batch_norm(
-    x: Tensor<4>,
+    x: Tensor<2>,
     gamma: Tensor<1>,
     beta: Tensor<1>,
-    epsilon: f32,
+    (epsilon, slope): (f32, f32),
     index: usize,
     normalisation: &mut Normalisation,
-) -> Tensor<4> {
-    let channels = x.dims()[1];
-    let along = [1, channels, 1, 1];
-    let (centred, variance) = match normalisation {
+) -> Tensor<2> {
+    let channels = x.dims()[0];
+    match normalisation {
         Normalisation::Fixed(statistics) => {
             let (mean, variance) = statistics.layer(index);
-            (x.sub(mean.reshape(along)), variance.reshape(along))
+            let along = [channels, 1];
+            let scale = gamma.div(variance.add_scalar(epsilon).sqrt());
+            let centred = x.sub(mean.reshape(along));
+            leaky_relu(
+                centred.mul(scale.reshape(along)).add(beta.reshape(along)),
+                slope,
+            )
         }
-        Normalisation::Batch | Normalisation::Collect(_) => {
-            let mean = x.clone().mean_dims(&[0, 2, 3]);
-            let centred = x.sub(mean.clone());
-            let variance = centred.clone().mul(centred.clone()).mean_dims(&[0, 2, 3]);
-            if let Normalisation::Collect(statistics) = normalisation {
-                let flat = |tensor: &Tensor<4>| tensor.clone().inner().reshape([channels]);
-                statistics.collect(index, flat(&mean), flat(&variance));
-            }
-            (centred, variance)
+        Normalisation::Batch => normalised(x, gamma, beta, epsilon, slope),
+        Normalisation::Collect(statistics) => {
+            let (variance, mean) = x.clone().inner().var_mean_bias(1);
+            statistics.collect(
+                index,
+                mean.reshape([channels]),
+                variance.reshape([channels]),
+            );
+            normalised(x, gamma, beta, epsilon, slope)
         }
-    };
-    let scale = gamma
-        .reshape(along)
-        .div(variance.add_scalar(epsilon).sqrt());
-    centred.mul(scale).add(beta.reshape(along))
+    }
 }
 
 /// The linear layer after the trunk: features `[batch, 64]` to `[batch, outputs]`.

@@ -1,0 +1,109 @@
+//! What one press costs, bytes to verdict, and where it goes: `cargo bench --bench pipeline`.
+//!
+//! The bytes are a recording of two presses on foam at 100 frames/s. Compare lines of one run
+//! with each other, not with another day's.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use divan::Bencher;
+use divan::counter::{BytesCount, ItemsCount};
+use hardnessd::frame::{Frame, Stamp};
+use hardnessd::pipeline::{Clock, Judgement, Pipeline, Settings};
+use hardnessd::verdict::{BUILT_IN, Hrn};
+use hardnessd::wire::{Decoder, Layout};
+use hardnessd::{press, tare, wire};
+
+/// What a read of a serial port at 115,200 baud gives at a time, about.
+const CHUNK_BYTES: usize = 64;
+
+fn main() {
+    divan::main();
+}
+
+fn recording() -> Vec<u8> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/foam.100hz.bin");
+    std::fs::read(path).expect("the fixture lies in the repository")
+}
+
+fn layout() -> Layout {
+    Layout::new(&wire::Settings::default()).expect("the default is a layout")
+}
+
+fn hrn() -> Arc<Hrn> {
+    Arc::new(Hrn::load(BUILT_IN).expect("the model in the binary is one"))
+}
+
+fn pipeline(hrn: &Arc<Hrn>) -> Pipeline {
+    let judgement = Judgement {
+        calibration: tare::Settings::default(),
+        press: press::Settings::default(),
+        min_confidence: 0.0,
+        min_force_n: 0.0,
+        hrn: Arc::clone(hrn),
+    };
+    let settings = Settings {
+        sensor: "sensor".to_owned(),
+        frame_rate_hz: 100.0,
+        layout: layout(),
+        judgement,
+    };
+    Pipeline::new(settings, Clock::FrameRate)
+}
+
+/// Bytes to frames.
+#[divan::bench(args = [1, CHUNK_BYTES, 4096])]
+fn decode(bencher: Bencher, chunk_bytes: usize) {
+    let bytes = recording();
+    bencher
+        .counter(BytesCount::new(bytes.len()))
+        .with_inputs(|| Decoder::new(layout()))
+        .bench_local_refs(|decoder| {
+            let mut frames = 0;
+            for chunk in bytes.chunks(chunk_bytes) {
+                decoder.push(chunk);
+                while let Some(found) = decoder.next_frame() {
+                    frames += usize::from(found.is_ok());
+                }
+            }
+            frames
+        });
+}
+
+/// Bytes to events, with an early and a final verdict a press; an item is a press.
+#[divan::bench]
+fn bytes_to_events(bencher: Bencher) {
+    let (bytes, hrn) = (recording(), hrn());
+    let at = Stamp {
+        mono: std::time::Duration::ZERO,
+        wall: jiff::Timestamp::UNIX_EPOCH,
+    };
+    bencher
+        .counter(ItemsCount::new(2_usize))
+        .with_inputs(|| pipeline(&hrn))
+        .bench_local_refs(|pipeline| {
+            let mut events = pipeline.opened(at);
+            for chunk in bytes.chunks(CHUNK_BYTES) {
+                events.extend(pipeline.push(chunk, at));
+            }
+            events
+                .iter()
+                .map(|event| event.to_line().len())
+                .sum::<usize>()
+        });
+}
+
+/// A frame to a verdict.
+#[divan::bench]
+fn judge(bencher: Bencher) {
+    let hrn = hrn();
+    let mut frame = Frame::default();
+    frame.newtons.copy_from_slice(&hrn.check().frames[2]);
+    bencher.bench_local(|| hrn.judge(&frame));
+}
+
+/// A model file to something that judges, its check frames reproduced: start and reload.
+#[divan::bench]
+fn load_model() -> Arc<Hrn> {
+    hrn()
+}
