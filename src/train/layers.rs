@@ -20,7 +20,8 @@ use burn::backend::autodiff::ops::{Backward, Ops, OpsKind, unary};
 use burn::backend::flex::FlexTensor;
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, Backend, Dispatch, Flex, backend_extension};
-use burn::tensor::Tensor;
+use burn::tensor::ops::{ConvOptions, ConvTransposeOptions};
+use burn::tensor::{DType, Device, Tensor, activation, module};
 
 use cpu::Rows;
 
@@ -73,27 +74,58 @@ impl Geometry {
     }
 }
 
+/// Whether the operations below are made for `x`. Other devices, and the double precision that
+/// tests compare with, take burn's own.
+fn is_ours<const D: usize>(x: &Tensor<D>) -> bool {
+    x.dtype() == DType::F32 && x.device().without_autodiff() == Device::flex()
+}
+
 /// Images `[outputs, small, small, batch]` of `x` `[inputs, size, size, batch]` under `kernels`
 /// `[outputs, inputs k k]`.
 pub fn convolution(x: Tensor<4>, kernels: Tensor<2>, geometry: Geometry) -> Tensor<4> {
     let (outputs, small, batch) = (kernels.dims()[0], geometry.small(), x.dims()[3]);
-    debug_assert_eq!(
-        x.dims(),
-        [geometry.channels, geometry.size, geometry.size, batch]
-    );
-    kernels
-        .matmul(patches(x, geometry))
-        .reshape([outputs, small, small, batch])
+    let Geometry {
+        channels,
+        size,
+        kernel,
+        padding,
+    } = geometry;
+    debug_assert_eq!(x.dims(), [channels, size, size, batch]);
+    if is_ours(&x) {
+        let sums = kernels.matmul(patches(x, geometry));
+        return sums.reshape([outputs, small, small, batch]);
+    }
+    let options = ConvOptions::new_with_padding([STRIDE; 2], [padding; 2], [1; 2], 1);
+    let kernels = kernels.reshape([outputs, channels, kernel, kernel]);
+    module::conv2d(x.permute([3, 0, 1, 2]), kernels, None, options).permute([1, 2, 3, 0])
 }
 
 /// The adjoint of [`convolution`]: images `[inputs, size, size, batch]` of `x`
 /// `[outputs, small, small, batch]`. "Transposed convolution" to everybody.
 pub fn transposed_convolution(x: Tensor<4>, kernels: Tensor<2>, geometry: Geometry) -> Tensor<4> {
     let [outputs, small, _, batch] = x.dims();
-    let products = kernels
-        .transpose()
-        .matmul(x.reshape([outputs, small * small * batch]));
-    from_patches(products, geometry, batch)
+    let Geometry {
+        channels,
+        size,
+        kernel,
+        padding: (before, _),
+    } = geometry;
+    if is_ours(&x) {
+        let products = kernels
+            .transpose()
+            .matmul(x.reshape([outputs, small * small * batch]));
+        return from_patches(products, geometry, batch);
+    }
+    let kernels = kernels.reshape([outputs, channels, kernel, kernel]);
+    // burn crops as much after as before. What is missing then was one past the last patch and
+    // is 0; what is over is cut off.
+    let full = (small - 1) * STRIDE + kernel;
+    let missing = (size + before).saturating_sub(full);
+    let options =
+        ConvTransposeOptions::new([STRIDE; 2], [before; 2], [missing + before; 2], [1; 2], 1);
+    module::conv_transpose2d(x.permute([3, 0, 1, 2]), kernels, None, options)
+        .slice([0..batch, 0..channels, 0..size, 0..size])
+        .permute([1, 2, 3, 0])
 }
 
 /// What lies under the kernel at each of its places: `[inputs k k, small small batch]`.
@@ -119,13 +151,20 @@ pub fn normalised(
     epsilon: f32,
     slope: f32,
 ) -> Tensor<2> {
-    Tensor::from_dispatch(<Dispatch as Layers>::normalised(
-        x.into_dispatch(),
-        gamma.into_dispatch(),
-        beta.into_dispatch(),
-        epsilon,
-        slope,
-    ))
+    if is_ours(&x) {
+        return Tensor::from_dispatch(<Dispatch as Layers>::normalised(
+            x.into_dispatch(),
+            gamma.into_dispatch(),
+            beta.into_dispatch(),
+            epsilon,
+            slope,
+        ));
+    }
+    let along = [x.dims()[0], 1];
+    let (variance, mean) = x.clone().var_mean_bias(1);
+    let unit = x.sub(mean).div(variance.add_scalar(epsilon).sqrt());
+    let y = unit.mul(gamma.reshape(along)).add(beta.reshape(along));
+    activation::leaky_relu(y, f64::from(slope))
 }
 
 /// The operations that burn has not, for its dispatch.

@@ -91,7 +91,13 @@ struct Row {
 }
 
 impl Rows {
-    fn new(x: FlexTensor, gamma: FlexTensor, beta: FlexTensor, epsilon: f32, slope: f32) -> Self {
+    pub(super) fn new(
+        x: FlexTensor,
+        gamma: FlexTensor,
+        beta: FlexTensor,
+        epsilon: f32,
+        slope: f32,
+    ) -> Self {
         let [x, gamma, beta] = [x, gamma, beta].map(Contiguous::of);
         Self {
             x,

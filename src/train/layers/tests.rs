@@ -1,8 +1,7 @@
 use super::*;
 use crate::random::Stream;
 use crate::train::network::{TRUNK, numbers};
-use burn::tensor::ops::ConvOptions;
-use burn::tensor::{Device, activation, module};
+use burn::tensor::{FloatDType, TensorData};
 
 fn random<const D: usize>(shape: [usize; D], name: &str) -> Tensor<D> {
     let mut stream = Stream::new(11, name);
@@ -10,13 +9,6 @@ fn random<const D: usize>(shape: [usize; D], name: &str) -> Tensor<D> {
         .map(|_| stream.normal() as f32)
         .collect();
     Tensor::from_data(TensorData::new(values, shape), &Device::flex())
-}
-
-fn largest_difference<const D: usize>(left: &Tensor<D>, right: &Tensor<D>) -> f32 {
-    assert_eq!(left.dims(), right.dims());
-    let (left, right) = (numbers(left), numbers(right));
-    let differences = left.iter().zip(&right).map(|(l, r)| (l - r).abs());
-    differences.fold(0.0, f32::max)
 }
 
 fn dot<const D: usize>(left: &Tensor<D>, right: &Tensor<D>) -> f64 {
@@ -33,47 +25,63 @@ fn geometries() -> Vec<(Geometry, usize)> {
         .collect()
 }
 
+/// In double precision, which takes burn's own operations.
+fn double<const D: usize>(tensor: &Tensor<D>) -> Tensor<D> {
+    tensor.clone().cast(FloatDType::F64)
+}
+
+/// Checks `f` and its gradients in single precision against the same in double.
+#[allow(clippy::needless_pass_by_value, reason = "reads as a call of f")]
+fn check<const D: usize, const P: usize, const O: usize>(
+    x: Tensor<D>,
+    parameters: Tensor<P>,
+    f: impl Fn(Tensor<D>, Tensor<P>) -> Tensor<O>,
+) {
+    assert!(is_ours(&x) && !is_ours(&double(&x)));
+    let run = |x: Tensor<D>, parameters: Tensor<P>| {
+        let (x, parameters) = (
+            x.autodiff().require_grad(),
+            parameters.autodiff().require_grad(),
+        );
+        let y = f(x.clone(), parameters.clone());
+        let weight = random(y.dims(), "gradient").cast(y.dtype()).autodiff();
+        let gradients = y.clone().mul(weight).sum().backward();
+        let of_x = x.grad(&gradients).expect("a leaf");
+        let of_parameters = parameters.grad(&gradients).expect("a leaf");
+        (y.inner(), of_x, of_parameters)
+    };
+    let (y, of_x, of_parameters) = run(x.clone(), parameters.clone());
+    let (exact, exact_of_x, exact_of_parameters) = run(double(&x), double(&parameters));
+    assert_close(&y, &exact);
+    assert_close(&of_x, &exact_of_x);
+    assert_close(&of_parameters, &exact_of_parameters);
+}
+
+fn assert_close<const D: usize>(found: &Tensor<D>, exact: &Tensor<D>) {
+    assert_eq!(found.dims(), exact.dims());
+    let exact = numbers(&exact.clone().cast(FloatDType::F32));
+    let largest = exact.iter().map(|value| value.abs()).fold(0.0, f32::max);
+    for (found, exact) in numbers(found).iter().zip(&exact) {
+        assert!((found - exact).abs() < 1e-5 * largest, "{found} {exact}");
+    }
+}
+
 #[test]
-fn convolution_is_burns_in_another_order() {
+fn convolutions_both_ways_are_burns_with_their_gradients() {
     let batch = 3;
     for (geometry, outputs) in geometries() {
         let Geometry {
             channels,
             size,
             kernel,
-            padding,
+            ..
         } = geometry;
-        let x = random([channels, size, size, batch], "x")
-            .autodiff()
-            .require_grad();
-        let kernels = random([outputs, channels, kernel, kernel], "kernels");
-        let kernels = kernels.autodiff().require_grad();
-        let taps = channels * kernel * kernel;
-        let ours = convolution(
-            x.clone(),
-            kernels.clone().reshape([outputs, taps]),
-            geometry,
-        );
-        let options = ConvOptions::new_with_padding([STRIDE; 2], [padding; 2], [1, 1], 1);
-        let burns = module::conv2d(
-            x.clone().permute([3, 0, 1, 2]),
-            kernels.clone(),
-            None,
-            options,
-        )
-        .permute([1, 2, 3, 0]);
-        assert!(largest_difference(&ours, &burns) < 1e-3, "{geometry:?}");
-
-        let weight = random(ours.dims(), "gradient").autodiff();
-        let (ours, burns) = (
-            ours.mul(weight.clone()).sum().backward(),
-            burns.mul(weight).sum().backward(),
-        );
-        let of = |leaf: &Tensor<4>, gradients| leaf.grad(gradients).expect("a leaf");
-        for leaf in [&x, &kernels] {
-            let difference = largest_difference(&of(leaf, &ours), &of(leaf, &burns));
-            assert!(difference < 2e-3, "{geometry:?}: {difference}");
-        }
+        let kernels = random([outputs, channels * kernel * kernel], "kernels");
+        let x = random([channels, size, size, batch], "x");
+        check(x, kernels.clone(), |x, k| convolution(x, k, geometry));
+        let small = geometry.small();
+        let y = random([outputs, small, small, batch], "y");
+        check(y, kernels, |y, k| transposed_convolution(y, k, geometry));
     }
 }
 
@@ -102,34 +110,15 @@ fn transposed_convolution_is_the_adjoint_of_convolution() {
 #[test]
 fn normalisation_is_that_of_its_formula_with_its_gradients() {
     let (channels, count, epsilon) = (5, 83, 1e-3);
+    let x = random([channels, count], "x")
+        .mul_scalar(0.3)
+        .add_scalar(2.0);
     for slope in [0.0, 0.2] {
-        let leaf = |tensor: Tensor<2>| tensor.autodiff().require_grad();
-        let x = leaf(
-            random([channels, count], "x")
-                .mul_scalar(0.3)
-                .add_scalar(2.0),
-        );
-        let gamma = random([channels], "gamma").autodiff().require_grad();
-        let beta = random([channels], "beta").autodiff().require_grad();
-        let ours = normalised(x.clone(), gamma.clone(), beta.clone(), epsilon, slope);
-
-        let (variance, mean) = x.clone().var_mean_bias(1);
-        let unit = x.clone().sub(mean).div(variance.add_scalar(epsilon).sqrt());
-        let along = [channels, 1];
-        let plain = unit
-            .mul(gamma.clone().reshape(along))
-            .add(beta.clone().reshape(along));
-        let plain = activation::leaky_relu(plain, f64::from(slope));
-        assert!(largest_difference(&ours, &plain) < 1e-5);
-
-        let weight = random([channels, count], "gradient").autodiff();
-        let ours = ours.mul(weight.clone()).sum().backward();
-        let plain = plain.mul(weight).sum().backward();
-        let of_x = |gradients| x.grad(gradients).expect("a leaf");
-        assert!(largest_difference(&of_x(&ours), &of_x(&plain)) < 1e-3);
-        for leaf in [&gamma, &beta] {
-            let of = |gradients| leaf.grad(gradients).expect("a leaf");
-            assert!(largest_difference(&of(&ours), &of(&plain)) < 1e-3);
-        }
+        let other = random([2 * channels], "parameters");
+        check(x.clone(), other, |x, parameters| {
+            let gamma = parameters.clone().narrow(0, 0, channels);
+            let beta = parameters.narrow(0, channels, channels);
+            normalised(x, gamma, beta, epsilon, slope)
+        });
     }
 }
