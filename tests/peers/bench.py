@@ -1,0 +1,87 @@
+"""A daemon, its simulated sensors and its sockets in a directory of their own."""
+
+import os
+import signal
+import subprocess
+import tempfile
+import time
+
+PATIENCE_S = 60
+
+
+def wait_for(what, there):
+    """The first true value of `there()`."""
+    start = time.monotonic()
+    while time.monotonic() - start < PATIENCE_S:
+        found = there()
+        if found:
+            return found
+        time.sleep(0.01)
+    raise AssertionError(f"{what} does not come")
+
+
+class Bench:
+    """Use it with `with`: what it started ends with it."""
+
+    def __init__(self, binary, sensors=("forearm",), frame_rate_hz=20, more=""):
+        self.binary = binary
+        self.frame_rate_hz = frame_rate_hz
+        self.sensors = sensors
+        self.directory = tempfile.TemporaryDirectory()
+        self.processes = []
+        text = 'robot = "arm-7"\n'
+        for sensor in sensors:
+            text += f'[[sensor]]\nname = "{sensor}"\nport = "{sensor}"\nframe_rate_hz = {frame_rate_hz}\n'
+        text += f'[publish.unix]\npath = "events.sock"\n{more}'
+        with open(self.path("hardnessd.toml"), "w") as config:
+            config.write(text)
+
+    def path(self, name):
+        return os.path.join(self.directory.name, name)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        for process in self.processes:
+            if process.poll() is None:
+                process.send_signal(signal.SIGCONT)
+                process.kill()
+            process.wait()
+        self.directory.cleanup()
+
+    def _start(self, arguments, log):
+        with open(self.path(log), "ab") as output:
+            process = subprocess.Popen(
+                [self.binary, *arguments], stdout=subprocess.DEVNULL, stderr=output
+            )
+        self.processes.append(process)
+        return process
+
+    def daemon(self):
+        """Starts the daemon and waits until it answers."""
+        log = self.path("log")
+        before = os.path.getsize(log) if os.path.exists(log) else 0
+        process = self._start(["run", "--config", self.path("hardnessd.toml")], "log")
+        wait_for("the daemon", lambda: b" started " in self._log(before))
+        return process
+
+    def address(self, way):
+        """Where the daemon that was started last listens, such as 127.0.0.1:4711."""
+        lines = [line for line in self._log(0).splitlines() if f'way="{way}"'.encode() in line]
+        return lines[-1].decode().split("address=")[1].strip()
+
+    def _log(self, start):
+        with open(self.path("log"), "rb") as log:
+            log.seek(start)
+            return log.read()
+
+    def sensor(self, name="forearm", *more):
+        """Starts a simulated sensor and waits for its port."""
+        link = self.path(name)
+        if os.path.islink(link):
+            os.unlink(link)
+        rate = str(self.frame_rate_hz)
+        process = self._start(["simulate", "--link", link, "--fps", rate, *more], "sensors")
+        wait_for("the port", lambda: os.path.exists(link))
+        return process

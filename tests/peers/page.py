@@ -1,0 +1,230 @@
+#!/usr/bin/env python3
+"""The live page in a real Chromium.
+
+    apt-get install chromium chromium-driver
+    python -m venv venv && venv/bin/pip install selenium
+    venv/bin/python tests/peers/page.py target/debug/hardnessd [--pictures DIRECTORY]
+
+Claims: events arrive and are drawn; a silent and a lost sensor show within 1 s, and no old value
+stands as a current one; sensors can be chosen; nothing is wider than a phone of 360 px; no console
+error and no breach of the page's policy; a daemon that goes is said, and the page finds it again by
+itself. With --pictures it leaves one of each state, light, dark and narrow.
+"""
+
+import argparse
+import os
+import shutil
+import signal
+import socket
+import time
+
+from bench import Bench, wait_for
+from selenium import webdriver
+from selenium.webdriver.common.by import By
+
+SHOWS_WITHIN_S = 1.0
+
+# Writes down when a text first matched, on the page's own clock: no question of ours delays it.
+WATCH = """
+window.seen = {};
+new MutationObserver(() => {
+  for (const [id, text] of [["state", "live"], ["state", "stale"], ["state", "lost"]]) {
+    const key = id + text;
+    if (document.getElementById(id).textContent === text) { window.seen[key] ??= Date.now(); }
+    else { delete window.seen[key]; }
+  }
+}).observe(document.body, { subtree: true, childList: true, characterData: true });
+"""
+
+
+class Page:
+    def __init__(self, pictures):
+        options = webdriver.ChromeOptions()
+        for argument in [
+            "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-background-networking",
+            "--disable-component-update", "--disable-sync", "--hide-scrollbars",
+        ]:
+            options.add_argument(argument)
+        options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+        # Named, so that nothing is looked for on the network.
+        service = webdriver.ChromeService(shutil.which("chromedriver"))
+        self.driver = webdriver.Chrome(options=options, service=service)
+        self.pictures = pictures
+
+    def look(self, width=1180, height=1240, scheme="dark"):
+        """As wide and as dark as the reader has it."""
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+        media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+        time.sleep(0.3)
+
+    def picture(self, name):
+        if self.pictures:
+            self.driver.save_screenshot(os.path.join(self.pictures, f"{name}.png"))
+
+    def text(self, id):
+        return self.driver.find_element(By.ID, id).text
+
+    def shown(self, id):
+        return self.driver.find_element(By.ID, id).is_displayed()
+
+    def run(self, script):
+        return self.driver.execute_script(script)
+
+    def seen(self, id, text):
+        """When `id` came to say `text`, in seconds since the epoch."""
+        return wait_for(f"{id} {text}", lambda: self.run(f"return seen['{id}{text}']")) / 1000
+
+    def complaints(self):
+        """What stands in the console, but for what comes of this script's reading the map back."""
+        return [
+            entry
+            for entry in self.driver.get_log("browser")
+            if entry["level"] != "INFO" and "willReadFrequently" not in entry["message"]
+        ]
+
+    def colours(self):
+        """How many colours the map has."""
+        return self.run("""
+            const map = document.getElementById("heat");
+            const { data } = map.getContext("2d").getImageData(0, 0, map.width, map.height);
+            const found = new Set();
+            for (let at = 0; at < data.length; at += 4) {
+              found.add((data[at] << 16) | (data[at + 1] << 8) | data[at + 2]);
+            }
+            return found.size;""")
+
+    def is_grey(self):
+        """Whether the map has no colour at all."""
+        return self.run("""
+            const map = document.getElementById("heat");
+            const { data } = map.getContext("2d").getImageData(0, 0, map.width, map.height);
+            for (let at = 0; at < data.length; at += 4) {
+              const c = data.slice(at, at + 3);
+              if (Math.max(...c) - Math.min(...c) > 2) { return false; }
+            }
+            return true;""")
+
+
+def nothing_stands_as_current(page):
+    assert page.shown("veil")
+    for id in ["force", "area", "peak", "press", "rate"]:
+        assert page.text(id) == "–", f"{id} still says {page.text(id)}"
+    assert page.is_grey()
+    assert page.text("age").endswith("ago")
+
+
+def events_arrive(page, bench, sensors):
+    wait_for("live", lambda: page.text("state") == "live")
+    wait_for("a press", lambda: page.text("press").startswith("#"))
+    wait_for("colours", lambda: page.colours() > 6)
+    assert not page.shown("veil") and not page.shown("alarm")
+    wait_for("a verdict", lambda: page.text("label") not in ("", "none yet"))
+    wait_for("several verdicts", lambda: len(page.driver.find_elements(By.CSS_SELECTOR, "#rows tr")) > 1)
+    before = int(page.text("frames").replace("\u202f", ""))
+    wait_for("more frames", lambda: int(page.text("frames").replace("\u202f", "")) > before)
+    assert page.text("robot") == "arm-7" and "damaged" in page.driver.page_source
+    for scheme in ["light", "dark"]:
+        page.look(scheme=scheme)
+        page.picture(f"live-{scheme}")
+
+
+def fits_a_phone(page):
+    page.look(width=360, height=1500, scheme="light")
+    wide = page.run("return document.documentElement.scrollWidth")
+    assert wide <= 360, f"{wide} px wide"
+    page.picture("live-narrow")
+    page.look()
+
+
+def loss_shows_at_once(page, bench, sensors):
+    forearm = sensors["forearm"]
+    page.run(WATCH)
+    delays = {}
+    stopped = time.time()
+    forearm.send_signal(signal.SIGSTOP)
+    delays["stale"] = page.seen("state", "stale") - stopped
+    time.sleep(0.5)
+    nothing_stands_as_current(page)
+    page.picture("stale-dark")
+    forearm.send_signal(signal.SIGCONT)
+    wait_for("live again", lambda: page.text("state") == "live")
+    killed = time.time()
+    forearm.kill()
+    delays["lost"] = page.seen("state", "lost") - killed
+    time.sleep(1.5)
+    nothing_stands_as_current(page)
+    page.picture("lost-dark")
+    page.look(width=360, height=1500, scheme="light")
+    page.picture("lost-narrow")
+    page.look()
+    for state, delay in delays.items():
+        assert delay < SHOWS_WITHIN_S, f"{state} shows after {delay:.3f} s"
+    return {state: round(delay, 3) for state, delay in delays.items()}
+
+
+def sensors_can_be_chosen(page):
+    wrist = page.driver.find_element(By.XPATH, "//nav/button[text()='wrist']")
+    wrist.click()
+    wait_for("the wrist", lambda: page.text("state") == "live" and not page.shown("veil"))
+    chosen = page.driver.find_element(By.CSS_SELECTOR, "nav [aria-pressed=true]")
+    assert chosen.text == "wrist"
+    wait_for("its verdict", lambda: page.text("label") not in ("", "none yet"))
+
+
+def the_daemon_may_go_and_come(page, bench, daemon):
+    daemon.kill()
+    daemon.wait()
+    wait_for("the alarm", lambda: page.shown("alarm"))
+    wait_for("the veil", lambda: page.shown("veil"))
+    time.sleep(1)
+    nothing_stands_as_current(page)
+    assert page.text("daemon") == "daemon not reachable"
+    page.look(scheme="light")
+    page.picture("no-daemon-light")
+    page.look()
+    bench.daemon()
+    wait_for("the daemon", lambda: not page.shown("alarm") and page.text("daemon") == "daemon connected")
+    # What the reader chose stays chosen.
+    wait_for("the wrist", lambda: page.text("state") == "live" and "wrist" in page.text("name"))
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def main(binary, pictures):
+    if pictures:
+        os.makedirs(pictures, exist_ok=True)
+    # The same port after a restart, as in a configuration.
+    http = f'[http]\nlisten = "127.0.0.1:{free_port()}"\n'
+    page = Page(pictures)
+    try:
+        with Bench(binary, ("forearm", "wrist"), more=http) as bench:
+            sensors = {"forearm": bench.sensor("forearm"), "wrist": bench.sensor("wrist", "--seed", "4")}
+            daemon = bench.daemon()
+            page.look()
+            page.driver.get(f"http://{bench.address('http')}/")
+            events_arrive(page, bench, sensors)
+            fits_a_phone(page)
+            delays = loss_shows_at_once(page, bench, sensors)
+            sensors_can_be_chosen(page)
+            complaints = page.complaints()
+            assert not complaints, complaints
+            # From here on the browser itself complains that nobody answers.
+            the_daemon_may_go_and_come(page, bench, daemon)
+            policy = [entry for entry in page.complaints() if "Content Security" in entry["message"]]
+            assert not policy, policy
+            print(f"no complaint in the console; shown after {delays} s")
+    finally:
+        page.driver.quit()
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("binary")
+    parser.add_argument("--pictures")
+    main(**vars(parser.parse_args()))

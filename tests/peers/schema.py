@@ -1,0 +1,120 @@
+#!/usr/bin/env python3
+"""What the daemon sends, against docs/events.schema.json.
+
+    python -m venv venv && venv/bin/pip install jsonschema
+    venv/bin/python tests/peers/schema.py target/debug/hardnessd
+
+Claims: the frozen lines of tests/event_format.rs, all types of live lines and those of a replay are
+valid; the schema names every field there is; and it is not so loose that a wrong line passes.
+"""
+
+import json
+import pathlib
+import re
+import subprocess
+import sys
+
+from bench import Bench
+from jsonschema import Draft202012Validator
+
+ROOT = pathlib.Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "clients/python"))
+import hardnessd  # noqa: E402  (found by the line above)
+
+SCHEMA = json.loads((ROOT / "docs/events.schema.json").read_text())
+VALIDATOR = Draft202012Validator(SCHEMA)
+
+
+def check(line):
+    """Valid, and nothing in it is missing from the schema."""
+    event = json.loads(line) if isinstance(line, str) else line
+    VALIDATOR.validate(event)
+    unknown(event, SCHEMA["$defs"][event["type"]])
+    return event["type"]
+
+
+def unknown(value, schema):
+    if "$ref" in schema:
+        schema = SCHEMA["$defs"][schema["$ref"].rsplit("/", 1)[1]]
+    if isinstance(value, dict) and "properties" in schema:
+        more = set(value) - set(schema["properties"])
+        assert not more, f"the schema does not name {more}"
+        for key, inner in value.items():
+            unknown(inner, schema["properties"][key])
+    elif isinstance(value, list):
+        for inner in value:
+            unknown(inner, schema.get("items", {}))
+
+
+def frozen():
+    text = (ROOT / "tests/event_format.rs").read_text()
+    # A frame of three taxels and a hash of two digits are not meant to be real.
+    lines = [line for line in re.findall(r'r#"(\{"type".*?\})"#', text)]
+    real = [line for line in lines if '"newtons"' not in line and '"sha256":"00"' not in line]
+    types = {check(line) for line in real}
+    assert len(real) >= 8 and {"status", "press", "hardness", "gap", "error", "ok"} <= types, types
+    return len(real)
+
+
+def live(binary):
+    with Bench(binary) as bench:
+        bench.daemon()
+        client = hardnessd.Connection(bench.path("control.sock"), 60)
+        client.send({"subscribe": ["hardness", "press", "status", "frame"], "id": [1]})
+        client.send({"get": "touch"})
+        client.send({"context": {"sensor": "forearm", "tag": "x"}})
+        client.send({"get": "status"})
+        sensor = bench.sensor("forearm", "--force", "15", "--presses", "3")
+        seen = {}
+        finals = 0
+        while finals < 3:
+            event = client.receive()
+            kind = check(event)
+            seen[kind] = seen.get(kind, 0) + 1
+            if kind == "press" and event["state"] == "end":
+                client.send({"tare": "forearm"})
+            finals += event.get("phase") == "final"
+        sensor.kill()
+        while event.get("state") != "lost":
+            event = client.receive()
+            check(event)
+    missing = {"hello", "status", "press", "hardness", "frame", "error", "ok"} - set(seen)
+    assert not missing, f"no {missing} was seen"
+    return seen
+
+
+def replayed(binary):
+    lines = 0
+    for recording in sorted((ROOT / "fixtures").glob("*.5hz.bin")):
+        output = subprocess.run([binary, "replay", recording], check=True, capture_output=True)
+        for line in output.stdout.decode().splitlines():
+            check(line)
+            lines += 1
+    assert lines
+    return lines
+
+
+def refuses_what_is_wrong():
+    press = {
+        "type": "press", "seq": 1, "sensor": "a", "time": "2026-11-21T10:00:00.000000Z",
+        "press": 1, "state": "begin", "frame": 0, "reason": None, "frames": 1, "context": None,
+    }
+    check(press)
+    for wrong in [
+        {"type": "touch"}, {"sensor": "A"}, {"seq": 0}, {"time": "10:00"}, {"state": "over"},
+        {"press": 0}, {"reason": "bored"}, {"frames": -1}, {"frame": 0.5}, {"context": "x"},
+    ]:
+        assert not VALIDATOR.is_valid({**press, **wrong}), wrong
+    for key in press:
+        less = {k: v for k, v in press.items() if k != key}
+        assert key == "seq" or not VALIDATOR.is_valid(less), f"without {key}"
+
+
+def main(binary):
+    Draft202012Validator.check_schema(SCHEMA)
+    refuses_what_is_wrong()
+    print(f"{frozen()} frozen lines, {replayed(binary)} replayed lines, live: {live(binary)}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
