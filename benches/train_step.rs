@@ -10,9 +10,10 @@ use std::path::Path;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use hardnessd::random::Stream;
-use hardnessd::train::hrn;
-use hardnessd::train::network::{Normalisation, Weights, numbers};
-use hardnessd::train::optimiser::{self, Optimiser};
+use hardnessd::train::learner::Learner;
+use hardnessd::train::losses::Game;
+use hardnessd::train::network::{Normalisation, numbers};
+use hardnessd::train::{gan, generator, hrn, optimiser};
 use ndarray::{ArrayD, IxDyn};
 use ndarray_npy::NpzWriter;
 use rustix::time::{ClockId, clock_gettime};
@@ -21,10 +22,12 @@ use rustix::time::{ClockId, clock_gettime};
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
-/// Of the paper: a batch of 100, four levels, plain SGD at 1e-3.
+/// Of the paper: a batch of 100, four levels, a learning rate of 1e-3.
 const BATCH: usize = 100;
 const LEVELS: usize = 4;
 const RATE: f64 = 1e-3;
+/// USTGAN's.
+const GAME: Game = Game::RealOrFake;
 
 fn main() {
     let arguments: Vec<String> = std::env::args().collect();
@@ -32,47 +35,45 @@ fn main() {
         serve(Path::new(&arguments[place + 1]));
         return;
     }
-    let mut hrn = HrnStep::new();
-    hrn.run(10);
-    let mut seconds: Vec<f64> = (0..50).map(|_| hrn.run(1).0).collect();
-    seconds.sort_by(f64::total_cmp);
-    println!("hrn step of {BATCH}: median {:.2} ms", seconds[25] * 1e3);
+    let mut networks = Networks::new();
+    for name in ["hrn", "gan"] {
+        networks.run(name, 10);
+        let mut seconds: Vec<f64> = (0..50).map(|_| networks.run(name, 1).0).collect();
+        seconds.sort_by(f64::total_cmp);
+        println!("{name} step of {BATCH}: median {:.2} ms", seconds[25] * 1e3);
+    }
 }
 
-/// Of all threads of this process.
-fn processor_seconds() -> f64 {
-    let time = clock_gettime(ClockId::ProcessCPUTime);
-    time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
-}
-
-/// Writes images, targets and initial weights to `file`, then answers `NETWORK STEPS` with
+/// Writes images, targets, noise and initial weights to `file`, then answers `NETWORK STEPS` with
 /// `seconds loss loss ...`.
 fn serve(file: &Path) {
-    let mut hrn = HrnStep::new();
-    hrn.write(file);
+    let mut networks = Networks::new();
+    networks.write(file);
     println!("ready");
     for line in std::io::stdin().lock().lines() {
         let line = line.expect("the peer sends text");
-        let steps = match line.split_once(' ') {
-            Some(("hrn", steps)) => steps.parse().expect("a number of steps"),
-            _ => panic!("{line}: expected `hrn STEPS`"),
-        };
-        let (seconds, losses) = hrn.run(steps);
-        let losses: Vec<String> = losses.iter().map(f32::to_string).collect();
+        let (name, steps) = line.split_once(' ').expect("NETWORK STEPS");
+        let (seconds, losses) = networks.run(name, steps.parse().expect("a number of steps"));
+        let losses: Vec<String> = losses.iter().map(f64::to_string).collect();
         println!("{seconds} {}", losses.join(" "));
         std::io::stdout().flush().expect("the peer reads");
     }
 }
 
-/// The supervised step: forward, backward, update.
-struct HrnStep {
-    weights: Weights,
-    optimiser: Optimiser,
+/// What takes steps: the supervised HRN, and both sides of USTGAN; always on the same inputs.
+struct Networks {
+    hrn: Learner,
+    /// Generator and discriminator.
+    gan: [Learner; 2],
+    /// The same with plain SGD. Adam makes a step of the full rate of a gradient that is nothing
+    /// but rounding, so with it two exact computations part after three steps.
+    gan_sgd: [Learner; 2],
     images: Tensor<4>,
     targets: Tensor<2>,
+    eta: Tensor<2>,
 }
 
-impl HrnStep {
+impl Networks {
     fn new() -> Self {
         let device = Device::flex();
         let mut stream = Stream::new(1, "bench images");
@@ -81,30 +82,43 @@ impl HrnStep {
         let images: Vec<f32> = (0..BATCH * 28 * 28).map(pixel).collect();
         let images = Tensor::from_data(TensorData::new(images, [BATCH, 1, 28, 28]), &device);
         let levels_of = (0..BATCH).map(|n| (n % LEVELS) as u8 + 1);
-        let weights = hrn::initial(LEVELS, 1, &device);
-        let settings = optimiser::Settings::default();
+        let adversaries = gan::Settings::default();
+        let gan = gan::initial(GAME, LEVELS, 1, &device);
+        let sgd = optimiser::Settings::default();
+        let sides = |settings| {
+            let sides = [gan.generator.clone(), gan.discriminator.clone()];
+            sides.map(|weights| Learner::fresh(weights, settings, 0.0))
+        };
         Self {
-            optimiser: Optimiser::new(settings, &weights),
-            weights,
+            hrn: Learner::fresh(hrn::initial(LEVELS, 1, &device), sgd, 0.0),
+            gan: sides(adversaries.optimiser),
+            gan_sgd: sides(sgd),
             images,
             targets: hrn::targets(levels_of, LEVELS, &device),
+            eta: generator::noise(BATCH / generator::COMPONENTS, &mut stream, &device),
         }
     }
 
-    fn run(&mut self, steps: usize) -> (f64, Vec<f32>) {
+    /// Seconds of so many steps, and their losses; those of a GAN are the sum of both sides'.
+    fn run(&mut self, name: &str, steps: usize) -> (f64, Vec<f64>) {
         let begun = processor_seconds();
-        let losses = (0..steps).map(|_| self.step()).collect();
+        let step = |_| match name {
+            "hrn" => self.hrn_step(),
+            "gan" => gan_step(&mut self.gan, &self.images, &self.eta),
+            "gan-sgd" => gan_step(&mut self.gan_sgd, &self.images, &self.eta),
+            _ => panic!("{name}: expected hrn, gan or gan-sgd"),
+        };
+        let losses = (0..steps).map(step).collect();
         (processor_seconds() - begun, losses)
     }
 
-    fn step(&mut self) -> f32 {
-        let tracked = self.weights.tracked();
+    fn hrn_step(&mut self) -> f64 {
+        let tracked = self.hrn.weights.tracked();
         let logits = hrn::logits(&tracked, self.images.clone(), &mut Normalisation::Batch);
         let loss = hrn::cross_entropy(logits, self.targets.clone());
         let mut gradients = loss.backward();
-        self.optimiser
-            .step(&mut self.weights, &tracked, &mut gradients, RATE);
-        numbers(&loss)[0]
+        self.hrn.step(&tracked, &mut gradients, RATE);
+        f64::from(numbers(&loss)[0])
     }
 
     fn write(&self, path: &Path) {
@@ -115,11 +129,38 @@ impl HrnStep {
                 ArrayD::from_shape_vec(IxDyn(dims), values).expect("as many as the axes say");
             npz.add_array(name, &array).expect("room on the disk");
         };
-        for weight in &self.weights.entries {
-            add(&weight.name, &weight.dims, numbers(&weight.values));
+        let sides = [
+            ("hrn", &self.hrn),
+            ("generator", &self.gan[0]),
+            ("discriminator", &self.gan[1]),
+        ];
+        for (side, learner) in sides {
+            for weight in &learner.weights.entries {
+                let name = format!("{side}/{}", weight.name);
+                add(&name, &weight.dims, numbers(&weight.values));
+            }
         }
         add("images", &self.images.dims(), numbers(&self.images));
         add("targets", &self.targets.dims(), numbers(&self.targets));
+        add("eta", &self.eta.dims(), numbers(&self.eta));
         npz.finish().expect("room on the disk");
     }
+}
+
+/// Of all threads of this process.
+fn processor_seconds() -> f64 {
+    let time = clock_gettime(ClockId::ProcessCPUTime);
+    time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
+}
+
+/// The sum of both sides' losses.
+fn gan_step(gan: &mut [Learner; 2], images: &Tensor<4>, eta: &Tensor<2>) -> f64 {
+    let batch = gan::Batch {
+        real: images.clone(),
+        labelled: None,
+    };
+    let rules = (GAME, gan::Settings::default().sigma_penalty, RATE);
+    let [generator, discriminator] = gan;
+    let losses = gan::step(generator, discriminator, &batch, eta.clone(), rules);
+    losses.0 + losses.1
 }

@@ -266,45 +266,60 @@ impl State {
         }
     }
 
-    /// A step of the discriminator, then one of the generator, on the real samples `indices`;
-    /// gives the losses of both.
+    /// [`step`] on the real samples `indices`; gives the losses of discriminator and generator.
     fn step(&mut self, task: &Task, indices: &[usize], rate: f64) -> (f64, f64) {
-        let step = self.progress.step;
-        let batch = task.batch(indices, step);
-        let mut stream = task.stream("noise").child(step);
+        let number = self.progress.step;
+        let batch = task.batch(indices, number);
+        let mut stream = task.stream("noise").child(number);
         let samples = task.settings.samples_a_component;
         let eta = generator::noise(samples, &mut stream, task.device);
-
-        // The generator does not change while the discriminator takes its step, so both use the
-        // same images, which the first takes as constants.
-        let tracked_generator = self.generator.weights.tracked();
-        let images = generator::images(&tracked_generator, eta, &mut Normalisation::Batch);
-
-        let tracked = self.discriminator.weights.tracked();
-        let loss = discriminator_loss(task.game, &tracked, &batch, images.clone().inner());
-        let mut gradients = loss.backward();
-        self.discriminator.step(&tracked, &mut gradients, rate);
-
-        let discriminator = &self.discriminator.weights;
-        let sigma = tracked_generator.tensor::<2>("mixture.sigma");
-        let penalty = task.settings.sigma_penalty;
-        let of_generator = generator_loss(task.game, discriminator, &batch, images, sigma, penalty);
-        let mut gradients = of_generator.backward();
-        self.generator
-            .step(&tracked_generator, &mut gradients, rate);
         self.progress.step += 1;
-        let number = |loss: &Tensor<1>| f64::from(numbers(loss)[0]);
-        (number(&loss), number(&of_generator))
+        let rules = (task.game, task.settings.sigma_penalty, rate);
+        step(
+            &mut self.generator,
+            &mut self.discriminator,
+            &batch,
+            eta,
+            rules,
+        )
     }
+}
+
+/// A step of the discriminator, then one of the generator, by the rules of a game, with a penalty
+/// on sigma and a learning rate; gives the losses of both.
+pub fn step(
+    generator: &mut Learner,
+    discriminator: &mut Learner,
+    batch: &Batch,
+    eta: Tensor<2>,
+    (game, sigma_penalty, rate): (Game, f64, f64),
+) -> (f64, f64) {
+    // The generator does not change while the discriminator takes its step, so both use the
+    // same images, which the first takes as constants.
+    let tracked_generator = generator.weights.tracked();
+    let images = generator::images(&tracked_generator, eta, &mut Normalisation::Batch);
+
+    let tracked = discriminator.weights.tracked();
+    let loss = discriminator_loss(game, &tracked, batch, images.clone().inner());
+    let mut gradients = loss.backward();
+    discriminator.step(&tracked, &mut gradients, rate);
+
+    let sigma = tracked_generator.tensor::<2>("mixture.sigma");
+    let judge = &discriminator.weights;
+    let of_generator = generator_loss(game, judge, batch, images, sigma, sigma_penalty);
+    let mut gradients = of_generator.backward();
+    generator.step(&tracked_generator, &mut gradients, rate);
+    let number = |loss: &Tensor<1>| f64::from(numbers(loss)[0]);
+    (number(&loss), number(&of_generator))
 }
 
 /// What the discriminator is shown in a step beside generated images.
 #[derive(Debug)]
-struct Batch {
+pub struct Batch {
     /// `[batch, 1, 28, 28]`.
-    real: Tensor<4>,
+    pub real: Tensor<4>,
     /// Images and targets `[batch, L]`.
-    labelled: Option<(Tensor<4>, Tensor<2>)>,
+    pub labelled: Option<(Tensor<4>, Tensor<2>)>,
 }
 
 /// Every batch goes through the discriminator by itself and is normalised by its own statistics:
