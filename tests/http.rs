@@ -344,7 +344,7 @@ fn readiness_follows_the_sensors_and_liveness_does_not() {
 }
 
 #[test]
-fn connections_are_bounded_and_idle_ones_make_room() {
+fn connections_are_bounded_and_those_that_leave_make_room() {
     let bench = Bench::new();
     let (mut daemon, address) = serving(&bench);
     let idle: Vec<TcpStream> = (0..200)

@@ -437,7 +437,8 @@ fn fifty_subscribers_miss_nothing_beside_one_that_never_reads() {
     let bench = Bench::new();
     let config = bench.path("hardnessd.toml");
     let text = "[[sensor]]\nname = \"forearm\"\nport = \"port\"\nframe_rate_hz = 100.0\n\
-                [publish.unix]\npath = \"events.sock\"\n[publish.tcp]\nlisten = \"127.0.0.1:0\"\n";
+                [publish.unix]\npath = \"events.sock\"\n[publish.tcp]\nlisten = \"127.0.0.1:0\"\n\
+                [http]\nlisten = \"127.0.0.1:0\"\n";
     fs::write(&config, text).unwrap();
     let mut daemon = Daemon::start(&config);
     let address = daemon.address("tcp");
@@ -454,6 +455,13 @@ fn fifty_subscribers_miss_nothing_beside_one_that_never_reads() {
         subscribe(bench.subscriber()),
         subscribe(Subscriber::over_tcp(address)),
     ];
+    // A page that is asleep: of frames it is owed the newest, of all else everything.
+    let http = daemon.address("http");
+    let page =
+        format!("GET /events?types=status,press,hardness,frame HTTP/1.1\r\nHost: {http}\r\n\r\n");
+    let mut asleep_page = TcpStream::connect(http).unwrap();
+    asleep_page.set_read_timeout(Some(bench::PATIENCE)).unwrap();
+    asleep_page.write_all(page.as_bytes()).unwrap();
     let readers: Vec<Subscriber> = (0..50)
         .map(|number| match number % 2 {
             0 => subscribe(bench.subscriber()),
@@ -475,6 +483,22 @@ fn fifty_subscribers_miss_nothing_beside_one_that_never_reads() {
         .into_iter()
         .map(|stalled| std::thread::spawn(move || read_marks(stalled, end)))
         .collect();
+
+    let mut seqs = Vec::new();
+    let mut page_gaps = 0;
+    for line in std::io::BufReader::new(asleep_page).lines() {
+        let line = line.unwrap();
+        page_gaps += usize::from(line.contains("\"type\":\"gap\""));
+        // `hello` has the number before the first.
+        if let Some(id) = line.strip_prefix("id: ") {
+            seqs.push(id.rsplit_once(':').unwrap().1.parse::<u64>().unwrap());
+        }
+        if Instant::now() > end {
+            break;
+        }
+    }
+    assert_eq!(page_gaps, 0, "a page missed an event");
+    assert!(seqs.len() > 10 && seqs.windows(2).all(|pair| pair[1] == pair[0] + 1));
 
     let read: Vec<_> = reading.into_iter().map(|r| r.join().unwrap()).collect();
     let reference = &read[0].0;
@@ -501,7 +525,7 @@ fn fifty_subscribers_miss_nothing_beside_one_that_never_reads() {
     }
     println!(
         "{frames} frames to each of 50 readers; gaps told {told:?}; resident {alone_kb} kB alone, \
-         {crowded_kb} kB with 52 subscribers"
+         {crowded_kb} kB with 53 subscribers"
     );
     assert!(frames > 2500, "{frames} frames in 36 s");
     assert!(
