@@ -9,7 +9,8 @@
 //! makes frames, [`network`] and [`hrn`] judge them, [`losses`] and [`gan`] set one against the
 //! other, [`optimiser`] and [`fit`] learn, [`features`] is the trivial baseline, [`methods`] are
 //! the table's rows over the parts of [`stages`], [`onnx`] and [`export`] write the file,
-//! [`metrics`] and [`likeness`] say how good it is. Nothing here draws from a global random state.
+//! [`metrics`] and [`likeness`] say how good it is, and [`compare`] runs them all for the
+//! [`tables`] and the [`report`]. Nothing here draws from a global random state.
 
 pub mod settings;
 pub mod dataset;
@@ -34,5 +35,8 @@ pub mod onnx;
 pub mod metrics;
 pub mod paper;
 pub mod history;
+pub mod compare;
+pub mod tables;
+pub mod report;
 pub mod export;
 pub mod sheet;

@@ -11,13 +11,14 @@ use hardnessd::frame::RawFrame;
 use hardnessd::simulator::{
     DatasetSettings, Material, SensorProfile, Sequence, SequenceSettings, Shapes, Split,
 };
+use hardnessd::train::compare::{self, Plan};
 use hardnessd::train::dataset::{Dataset, DatasetError, LabelChoice};
 use hardnessd::train::export;
 use hardnessd::train::methods::{self, Method};
 use hardnessd::train::metrics::Evaluation;
 use hardnessd::train::run::{Description, Run, write_whole};
 use hardnessd::train::settings::{Profile, SettingsError};
-use hardnessd::train::{sheet, simulated};
+use hardnessd::train::{report, sheet, simulated};
 use hardnessd::verdict::{Hrn, ModelError};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
@@ -41,8 +42,18 @@ enum Command {
     Simulate(Simulate),
     /// Train one method
     Train(Train),
+    /// Train every method under several seeds and make the paper's tables; run again to go on
+    Compare(Compare),
     /// Run an exported model on a data set
     Evaluate(Evaluate),
+    /// Write one page that shows a run or a comparison
+    Report {
+        /// Directory of the run or the comparison
+        directory: PathBuf,
+        /// The page to write
+        #[arg(long, value_name = "R.html")]
+        out: PathBuf,
+    },
     /// Write the model of a finished run to a file of its own
     Export {
         /// Directory of the run
@@ -124,6 +135,34 @@ struct Train {
     /// Where to compute
     #[arg(long, default_value = "cpu")]
     device: DeviceName,
+    /// End when this process ends, the one that started this one
+    #[arg(long, hide = true, value_name = "PID")]
+    parent: Option<i32>,
+}
+
+#[derive(Debug, clap::Args)]
+struct Compare {
+    /// The data set to learn from
+    #[arg(long, value_name = "D.npz")]
+    data: PathBuf,
+    /// Directory of the comparison
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Which methods; all by default
+    #[arg(long, value_name = "M", value_delimiter = ',', num_args = 1..)]
+    methods: Vec<Method>,
+    /// Seeds 1 to N
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
+    seeds: u64,
+    /// How long each run may take
+    #[arg(long, default_value = "paper")]
+    profile: Profile,
+    /// Runs at a time, each on one thread; as many as there are cores by default
+    #[arg(long, value_name = "J")]
+    jobs: Option<std::num::NonZeroUsize>,
+    /// Also swap the two materials of each level: 16 times features and hrn15-tuned, 4 times ours
+    #[arg(long)]
+    swaps: bool,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -162,7 +201,9 @@ fn main() -> ExitCode {
     let done = match arguments.command {
         Command::Simulate(arguments) => simulate(&arguments),
         Command::Train(arguments) => train(&arguments),
+        Command::Compare(arguments) => compare(arguments),
         Command::Evaluate(arguments) => evaluate(&arguments),
+        Command::Report { directory, out } => report_of(&directory, &out),
         Command::Export { run, out } => export_run(&run, &out),
         Command::Inspect { model } => inspect(&model),
     };
@@ -182,7 +223,7 @@ fn end_at_signals() -> std::io::Result<()> {
     let mut signals = Signals::new([SIGINT, SIGTERM])?;
     std::thread::spawn(move || {
         if signals.forever().next().is_some() {
-            eprintln!("hrn-train: stopped by a signal; train --resume goes on from a checkpoint");
+            eprintln!("hrn-train: stopped by a signal; a run or comparison goes on when resumed");
             std::process::exit(0);
         }
     });
@@ -272,6 +313,9 @@ fn one_press_a_level(settings: &DatasetSettings) -> Vec<(Material, Vec<RawFrame>
 }
 
 fn train(arguments: &Train) -> anyhow::Result<()> {
+    if let Some(parent) = arguments.parent {
+        end_with(parent)?;
+    }
     let mut settings = arguments.method.settings(arguments.profile);
     if let Some(path) = &arguments.config {
         let text = String::from_utf8_lossy(&read(path)?).into_owned();
@@ -309,6 +353,49 @@ fn train(arguments: &Train) -> anyhow::Result<()> {
         Some(evaluation) => print_evaluation(&evaluation),
         None => println!("not evaluated: the data has no labelled test samples"),
     }
+    Ok(())
+}
+
+/// Has the system end this process when its parent does, whatever ends that.
+fn end_with(parent: i32) -> anyhow::Result<()> {
+    rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::TERM))
+        .map_err(std::io::Error::from)
+        .context("end with the parent process")?;
+    let actual = rustix::process::getppid().map(rustix::process::Pid::as_raw_nonzero);
+    anyhow::ensure!(
+        actual.is_some_and(|actual| actual.get() == parent),
+        "the process that started this one, {parent}, has ended"
+    );
+    Ok(())
+}
+
+fn compare(arguments: Compare) -> anyhow::Result<()> {
+    let methods = if arguments.methods.is_empty() {
+        Method::value_variants().to_vec()
+    } else {
+        arguments.methods
+    };
+    let jobs = arguments.jobs.map(std::num::NonZeroUsize::get);
+    compare::compare(&Plan {
+        data: arguments.data,
+        out: arguments.out.clone(),
+        methods,
+        seeds: arguments.seeds,
+        profile: arguments.profile,
+        jobs: jobs.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from)),
+        swaps: arguments.swaps,
+    })?;
+    println!("{}", arguments.out.join("report.html").display());
+    Ok(())
+}
+
+fn report_of(directory: &Path, out: &Path) -> anyhow::Result<()> {
+    std::fs::read_dir(directory).map_err(|source| Unreadable {
+        path: directory.to_owned(),
+        source,
+    })?;
+    write_whole(out, report::of(directory)?.as_bytes())?;
+    println!("{}", out.display());
     Ok(())
 }
 

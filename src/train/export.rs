@@ -55,7 +55,7 @@ pub fn finish(
         pitch_mm: dataset::PITCH_MM,
         method: description.method.clone(),
         data: data(&description.data)?,
-        metrics: json!({}),
+        metrics: json!({ "temperature": recogniser.temperature }),
         validation: validation(&description.data).to_owned(),
         range: range(dataset, train),
     };
@@ -74,15 +74,12 @@ pub fn finish(
         Err(_) => None,
     };
     if let Some(evaluation) = &evaluation {
-        let mut metrics = json!({ "test": evaluation });
+        card.metrics["test"] = json!(evaluation);
         if dataset.sources.len() > 1 {
-            metrics["test_by_source"] = evaluations_by_source(&hrn, dataset)?;
+            card.metrics["test_by_source"] = evaluations_by_source(&hrn, dataset)?;
         }
-        run.write(
-            "evaluation.json",
-            &serde_json::to_vec_pretty(&metrics["test"])?,
-        )?;
-        card.metrics = metrics;
+        let json = serde_json::to_vec_pretty(evaluation)?;
+        run.write("evaluation.json", &json)?;
     }
     run.write("hrn.onnx", &write(&card)?)?;
     Ok(evaluation)

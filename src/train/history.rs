@@ -72,11 +72,21 @@ impl History {
 
     /// Seconds of all stages, over restarts.
     pub fn seconds(&self) -> f64 {
-        self.stages.iter().map(|stage| stage.last("seconds")).sum()
+        self.stages.iter().map(Stage::seconds).sum()
     }
 }
 
 impl Stage {
+    /// Steps done.
+    pub fn steps(&self) -> u64 {
+        self.last("step") as u64
+    }
+
+    /// Seconds taken, over restarts.
+    pub fn seconds(&self) -> f64 {
+        self.last("seconds")
+    }
+
     /// A column's last value; 0 if it has none.
     fn last(&self, column: &str) -> f64 {
         let values = self.rows.iter().rev().filter_map(|row| row.get(column));

@@ -45,6 +45,21 @@ impl Judged {
     fn truth(&self) -> usize {
         usize::from(self.level) - 1
     }
+
+    /// What was said before the logits were divided by `temperature`: softmax(z) is softmax(z / T)
+    /// to the power of T, brought to a sum of 1.
+    #[must_use]
+    pub fn before_temperature(&self, temperature: f64) -> Self {
+        let powers = self
+            .probabilities
+            .iter()
+            .map(|&p| f64::from(p).powf(temperature));
+        let sum: f64 = powers.clone().sum();
+        Self {
+            probabilities: powers.map(|power| (power / sum) as f32).collect(),
+            ..*self
+        }
+    }
 }
 
 /// The fields of `evaluate --json`.
@@ -151,7 +166,8 @@ fn kappa(confusion: &[Vec<u64>]) -> Option<f64> {
     weighted_kappa(confusion, |h, w| if h == w { 0.0 } else { 1.0 })
 }
 
-fn kappa_quadratic(confusion: &[Vec<u64>]) -> Option<f64> {
+/// Cohen's kappa on counts with quadratic weights; `None` where chance alone would always agree.
+pub fn kappa_quadratic(confusion: &[Vec<u64>]) -> Option<f64> {
     weighted_kappa(confusion, |h, w| (h as f64 - w as f64).powi(2))
 }
 
@@ -181,7 +197,7 @@ pub fn calibration(judged: &[Judged]) -> Vec<Bin> {
 }
 
 /// Mean over the samples of |accuracy - mean confidence| of their bin.
-fn calibration_error(judged: &[Judged]) -> f64 {
+pub fn calibration_error(judged: &[Judged]) -> f64 {
     calibration(judged)
         .iter()
         .map(|bin| (bin.right as f64 - bin.confidence).abs())
@@ -370,6 +386,15 @@ mod tests {
             [Some(1.0), Some(0.5), None, None]
         );
         assert_eq!(evaluation.confusion[1], [1, 1, 0, 0]);
+    }
+
+    #[test]
+    fn temperature_can_be_taken_back() {
+        // Logits ln 8 and 0 twice, at temperature 3: 2, 1 and 1 of 4.
+        let said = judged(1, [0.5, 0.25, 0.25, 0.0], 0).before_temperature(3.0);
+        for (found, expected) in said.probabilities.iter().zip([0.8, 0.1, 0.1, 0.0]) {
+            assert!((found - expected).abs() < 1e-6, "{:?}", said.probabilities);
+        }
     }
 
     #[test]

@@ -1,0 +1,317 @@
+//! Every method under every seed, and the tables that follow: the paper's Tables 2 and 3.
+//!
+//! In: a data set. Out, in a directory: `data/`, what every model is judged on; `runs/`, a run's
+//! directory a method and seed; `logs/`; and `results.json`, `tables.md` and `report.html`, written
+//! anew whenever a run ends. Nothing is trained in this process: each run is one of its own, so
+//! that it can be stopped, resumed and spread as it likes, and what is finished is not done again.
+
+mod children;
+pub mod results;
+mod sets;
+mod swaps;
+
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, bail, ensure};
+use rustix::fs::FlockOperation;
+
+pub use sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS};
+
+use self::children::{Failure, Job};
+use self::results::{Comparison, Entry};
+use self::sets::TestSet;
+use super::dataset::{Dataset, LabelChoice, Source};
+use super::methods::{self, Method};
+use super::report;
+use super::run::{Run, write_whole};
+use super::settings::Profile;
+use super::tables;
+
+/// What to compare.
+#[derive(Debug, Clone)]
+pub struct Plan {
+    /// The data set to learn from.
+    pub data: PathBuf,
+    /// Directory of the comparison.
+    pub out: PathBuf,
+    /// Which methods.
+    pub methods: Vec<Method>,
+    /// Seeds 1 to this one.
+    pub seeds: u64,
+    /// How long each run may take.
+    pub profile: Profile,
+    /// Runs at a time.
+    pub jobs: usize,
+    /// Whether to swap the materials' roles as well.
+    pub swaps: bool,
+}
+
+/// Runs what is not finished, and writes results and tables of all that is.
+///
+/// # Errors
+///
+/// If the data cannot be read, the directory cannot be written, holds runs that were told otherwise
+/// or is being worked on by another process, or at the end if a run failed.
+pub fn compare(plan: &Plan) -> anyhow::Result<()> {
+    for part in ["data", "runs", "logs"] {
+        let part = plan.out.join(part);
+        std::fs::create_dir_all(&part).with_context(|| part.display().to_string())?;
+    }
+    let _lock = lock(&plan.out)?;
+    let dataset = Dataset::read(&plan.data)?;
+    let recipes = recipes(&plan.methods, &dataset)?;
+    let mut rounds = Vec::new();
+    for recipe in &recipes {
+        for seed in 1..=plan.seeds {
+            let directory = plan
+                .out
+                .join("runs")
+                .join(format!("{}-{seed}", recipe.name()));
+            rounds.push(Round {
+                recipe: *recipe,
+                seed,
+                profile: plan.profile,
+                data: plan.data.clone(),
+                sources: dataset.sources.clone(),
+                directory,
+                // USTGAN is the same, and what the STGANs generate.
+                shares_with: matches!(recipe.method, Method::Nahrn | Method::Nihrn)
+                    .then(|| format!("{}-{seed}", Method::Ours.name())),
+            });
+        }
+    }
+    let mut open = unfinished(&rounds, &plan.out)?;
+    let sets = sets::all(dataset, plan.profile, &plan.out.join("data"))?;
+    write_results(plan, &rounds, &sets)?;
+    // The longest first, but every method once before any method twice.
+    open.sort_by(|(a, first), (b, second)| {
+        a.seed
+            .cmp(&b.seed)
+            .then(second.effort.total_cmp(&first.effort))
+    });
+    let jobs = open.into_iter().map(|(_, job)| job).collect();
+    let mut failures = children::run(jobs, plan.jobs, |_| write_results(plan, &rounds, &sets))?;
+    if plan.swaps {
+        failures.extend(swaps::run(plan, &recipes)?);
+        write_tables(&plan.out)?;
+    }
+    report_failures(&failures, &plan.out)
+}
+
+/// Nobody else may work in the directory while the file is open.
+fn lock(out: &Path) -> anyhow::Result<File> {
+    let directory = File::open(out).with_context(|| out.display().to_string())?;
+    match rustix::fs::flock(&directory, FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => Ok(directory),
+        Err(rustix::io::Errno::WOULDBLOCK) => {
+            bail!("{}: another process is comparing here", out.display())
+        }
+        Err(error) => Err(std::io::Error::from(error)).with_context(|| out.display().to_string()),
+    }
+}
+
+fn report_failures(failures: &[Failure], out: &Path) -> anyhow::Result<()> {
+    ensure!(
+        failures.is_empty(),
+        "{} {} failed (logs in {}): {}",
+        failures.len(),
+        if failures.len() == 1 { "run" } else { "runs" },
+        out.join("logs").display(),
+        failures
+            .iter()
+            .map(|failure| format!("{}: {}", failure.name, failure.reason))
+            .collect::<Vec<_>>()
+            .join("; ")
+    );
+    Ok(())
+}
+
+/// A row of the tables, for any seed.
+#[derive(Debug, Clone, Copy)]
+struct Recipe {
+    method: Method,
+    /// Labels other than the method's own share.
+    labels: Option<usize>,
+    choice: LabelChoice,
+}
+
+/// The rows that `methods` have.
+fn recipes(methods: &[Method], dataset: &Dataset) -> anyhow::Result<Vec<Recipe>> {
+    let few = methods::labels(Method::Hrn15, dataset, None)?;
+    let mut recipes = Vec::new();
+    for &method in methods {
+        let own = Recipe {
+            method,
+            labels: None,
+            choice: LabelChoice::Object,
+        };
+        recipes.push(own);
+        match method {
+            // As few labels as the others have, and all of them.
+            Method::Features => recipes.push(Recipe {
+                labels: Some(few),
+                ..own
+            }),
+            // Labels by object, and as the paper probably chose them.
+            Method::Ours | Method::Hrn15 => recipes.push(Recipe {
+                choice: LabelChoice::Random,
+                ..own
+            }),
+            _ => {}
+        }
+    }
+    Ok(recipes)
+}
+
+impl Recipe {
+    /// Of its runs' directories.
+    fn name(&self) -> String {
+        let mut name = self.method.name().to_owned();
+        if let Some(labels) = self.labels {
+            name += &format!("-{labels}");
+        }
+        if self.choice == LabelChoice::Random {
+            name += "-random";
+        }
+        name
+    }
+
+    /// What a run costs, in TFLOP of the `paper` profile: 2.5 GFLOP a step of a GAN, 0.6 a step of
+    /// HRN, without the stages that it takes from ours. Other profiles keep the proportions.
+    fn effort(&self) -> f64 {
+        match self.method {
+            Method::Ours => 181.0,
+            Method::Sgan | Method::Igan => 107.0,
+            Method::Hrn15Long | Method::Nihrn => 56.0,
+            Method::Hrn100 => 12.0,
+            Method::Hrn15Tuned => 9.0,
+            Method::Hrn50 => 6.0,
+            Method::Hrn15 | Method::Nahrn => 2.0,
+            Method::Features => 0.5,
+        }
+    }
+}
+
+/// One training run.
+#[derive(Debug)]
+struct Round {
+    recipe: Recipe,
+    seed: u64,
+    profile: Profile,
+    data: PathBuf,
+    sources: Vec<Source>,
+    directory: PathBuf,
+    /// Name of a run that has stages in common with it.
+    shares_with: Option<String>,
+}
+
+impl Round {
+    /// Whether its model stands.
+    fn is_finished(&self) -> bool {
+        self.directory.join("hrn.onnx").exists()
+    }
+
+    /// Makes sure that what stands in the directory was told what this round is.
+    fn check(&self) -> anyhow::Result<()> {
+        let Some(told) = Run::told(&self.directory)? else {
+            return Ok(());
+        };
+        let hashes = |sources: &[Source]| -> Vec<String> {
+            sources.iter().map(|source| source.sha256.clone()).collect()
+        };
+        ensure!(
+            told.profile == self.profile && hashes(&told.data) == hashes(&self.sources),
+            "{}: a run of other data or of another profile; found {:?} of {}, expected {:?} of {}",
+            self.directory.display(),
+            told.profile,
+            hashes(&told.data).join(", "),
+            self.profile,
+            hashes(&self.sources).join(", ")
+        );
+        Ok(())
+    }
+
+    fn job(&self, out: &Path) -> Job {
+        let path = |path: &Path| path.to_string_lossy().into_owned();
+        let name = self
+            .directory
+            .file_name()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned();
+        let profile = clap::ValueEnum::to_possible_value(&self.profile);
+        let mut arguments: Vec<String> = [
+            "train",
+            "--resume",
+            "--method",
+            self.recipe.method.name(),
+            "--data",
+            &path(&self.data),
+            "--out",
+            &path(&self.directory),
+            "--seed",
+            &self.seed.to_string(),
+            "--profile",
+            profile
+                .as_ref()
+                .map_or("", clap::builder::PossibleValue::get_name),
+        ]
+        .map(str::to_owned)
+        .to_vec();
+        if let Some(labels) = self.recipe.labels {
+            arguments.extend(["--labels".to_owned(), labels.to_string()]);
+        }
+        if self.recipe.choice == LabelChoice::Random {
+            arguments.extend(["--label-choice", "random"].map(str::to_owned));
+        }
+        if let Some(other) = &self.shares_with {
+            let other = self.directory.with_file_name(other);
+            arguments.extend(["--from".to_owned(), path(&other)]);
+        }
+        Job {
+            after: self.shares_with.clone(),
+            log: out.join("logs").join(format!("{name}.log")),
+            product: self.directory.join("hrn.onnx"),
+            effort: self.recipe.effort(),
+            arguments,
+            name,
+        }
+    }
+}
+
+/// The rounds that are still to be run.
+fn unfinished<'a>(rounds: &'a [Round], out: &Path) -> anyhow::Result<Vec<(&'a Round, Job)>> {
+    let mut open = Vec::new();
+    for round in rounds {
+        round.check()?;
+        if !round.is_finished() {
+            open.push((round, round.job(out)));
+        }
+    }
+    Ok(open)
+}
+
+/// Writes `results.json` of the finished rounds, and the tables.
+fn write_results(plan: &Plan, rounds: &[Round], sets: &[TestSet]) -> anyhow::Result<()> {
+    let mut entries = Vec::new();
+    for round in rounds.iter().filter(|round| round.is_finished()) {
+        if let Some(told) = Run::told(&round.directory)? {
+            entries.push(Entry::of(&round.directory, &told, sets)?);
+        }
+    }
+    let json = serde_json::to_vec_pretty(&entries)?;
+    write_whole(&plan.out.join("results.json"), &json)?;
+    write_tables(&plan.out)
+}
+
+/// Writes `tables.md` and `report.html` from what stands in a comparison's directory.
+fn write_tables(out: &Path) -> anyhow::Result<()> {
+    let comparison = Comparison::read(out)?.context("results.json was written just now")?;
+    let markdown = tables::markdown(&comparison);
+    write_whole(&out.join("tables.md"), markdown.as_bytes())?;
+    write_whole(
+        &out.join("report.html"),
+        report::comparison(&comparison)?.as_bytes(),
+    )
+}

@@ -1,0 +1,230 @@
+//! Training runs as processes of their own, several at a time.
+//!
+//! In: what to run. Out: which of it failed. Each process computes on one thread, so that a run
+//! gives the same weights whatever runs beside it, and writes a log. When this process ends, for
+//! whatever reason, the system ends the others; what they have not finished goes on from its last
+//! checkpoint when it is run again.
+
+use std::fs::File;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus};
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+
+/// How often the processes are looked after.
+const LOOKED_AFTER_EVERY: Duration = Duration::from_millis(100);
+
+/// One run.
+#[derive(Debug, Clone)]
+pub(super) struct Job {
+    /// What people call it.
+    pub(super) name: String,
+    /// The subcommand and its arguments.
+    pub(super) arguments: Vec<String>,
+    /// Where standard output and standard error go.
+    pub(super) log: PathBuf,
+    /// The file that stands when it is done.
+    pub(super) product: PathBuf,
+    /// A run that it waits for, if that is to be run too: it takes finished stages from there.
+    pub(super) after: Option<String>,
+    /// What it costs beside others, in any unit.
+    pub(super) effort: f64,
+}
+
+/// A run that ended without its product.
+#[derive(Debug)]
+pub(super) struct Failure {
+    /// Of the run.
+    pub(super) name: String,
+    /// Its last words.
+    pub(super) reason: String,
+}
+
+struct Running {
+    job: Job,
+    process: Child,
+    since: Instant,
+    bar: ProgressBar,
+}
+
+/// Runs `jobs` in their order, `at_once` at a time, and tells `ended` of each that succeeded.
+///
+/// # Errors
+///
+/// If a process cannot be started or a log not be written, or those of `ended`.
+pub(super) fn run(
+    jobs: Vec<Job>,
+    at_once: usize,
+    mut ended: impl FnMut(&Job) -> anyhow::Result<()>,
+) -> anyhow::Result<Vec<Failure>> {
+    let board = Board::new(&jobs, at_once);
+    let mut progress = Progress::default();
+    let mut waiting = jobs;
+    let mut running: Vec<Running> = Vec::new();
+    let mut failures = Vec::new();
+    loop {
+        while running.len() < at_once {
+            let Some(next) = next(&waiting, &running) else {
+                break;
+            };
+            running.push(start(waiting.remove(next), &board)?);
+        }
+        if running.is_empty() {
+            break;
+        }
+        std::thread::sleep(LOOKED_AFTER_EVERY);
+        let mut still = Vec::with_capacity(running.len());
+        for mut child in running {
+            let Some(status) = child.process.try_wait().context("a run's process")? else {
+                child.bar.set_message(last_line(&child.job.log));
+                still.push(child);
+                continue;
+            };
+            child.bar.finish_and_clear();
+            let seconds = child.since.elapsed().as_secs_f64();
+            if status.success() && child.job.product.exists() {
+                progress.add(&child.job, seconds);
+                ended(&child.job)?;
+                board.say(&format!("{}: done in {seconds:.0} s", child.job.name));
+            } else {
+                let reason = last_words(status, &child.job.log);
+                board.say(&format!("{}: failed: {reason}", child.job.name));
+                failures.push(Failure {
+                    name: child.job.name,
+                    reason,
+                });
+            }
+            board.total.inc(1);
+        }
+        running = still;
+        let left = waiting.iter().chain(running.iter().map(|child| &child.job));
+        board.time_left(progress.seconds_left(left.map(|job| job.effort).sum(), at_once));
+    }
+    board.total.finish_and_clear();
+    Ok(failures)
+}
+
+/// The first run that waits for none that is still to end.
+fn next(waiting: &[Job], running: &[Running]) -> Option<usize> {
+    let to_end = |name: &String| {
+        let mut jobs = waiting.iter().chain(running.iter().map(|child| &child.job));
+        jobs.any(|job| job.name == *name)
+    };
+    waiting
+        .iter()
+        .position(|job| !job.after.as_ref().is_some_and(to_end))
+}
+
+fn start(job: Job, board: &Board) -> anyhow::Result<Running> {
+    let log = File::create(&job.log).with_context(|| job.log.display().to_string())?;
+    let program = std::env::current_exe().context("this program's own path")?;
+    let process = Command::new(program)
+        .args(&job.arguments)
+        .args(["--parent", &std::process::id().to_string()])
+        .env("RAYON_NUM_THREADS", "1")
+        .stdin(std::process::Stdio::null())
+        .stdout(log.try_clone().context("a run's log")?)
+        .stderr(log)
+        .spawn()
+        .with_context(|| format!("{}: cannot be started", job.name))?;
+    Ok(Running {
+        bar: board.child(&job.name),
+        process,
+        since: Instant::now(),
+        job,
+    })
+}
+
+/// Why a run ended without its product.
+fn last_words(status: ExitStatus, log: &Path) -> String {
+    if status.success() {
+        return "it was stopped; the same command goes on with it".to_owned();
+    }
+    let line = last_line(log);
+    if line.is_empty() {
+        status.to_string()
+    } else {
+        line
+    }
+}
+
+/// The last line of a log.
+fn last_line(log: &Path) -> String {
+    let text = std::fs::read(log).unwrap_or_default();
+    let tail = &text[text.len().saturating_sub(4096)..];
+    let text = String::from_utf8_lossy(tail);
+    text.trim_end()
+        .rsplit(['\n', '\r'])
+        .next()
+        .unwrap_or_default()
+        .to_owned()
+}
+
+/// How much has been done in what time.
+#[derive(Default)]
+struct Progress {
+    effort: f64,
+    seconds: f64,
+}
+
+impl Progress {
+    fn add(&mut self, job: &Job, seconds: f64) {
+        self.effort += job.effort;
+        self.seconds += seconds;
+    }
+
+    /// What `effort` takes at the rate so far; `None` before the first run has ended.
+    fn seconds_left(&self, effort: f64, at_once: usize) -> Option<f64> {
+        (self.effort > 0.0).then(|| effort * self.seconds / self.effort / at_once as f64)
+    }
+}
+
+/// Bars on a terminal, lines elsewhere.
+struct Board {
+    bars: MultiProgress,
+    total: ProgressBar,
+}
+
+impl Board {
+    fn new(jobs: &[Job], at_once: usize) -> Self {
+        let style = ProgressStyle::with_template("{bar:30} {pos}/{len} runs{msg}")
+            .expect("the template is right");
+        let bars = MultiProgress::new();
+        let total = bars.add(ProgressBar::new(jobs.len() as u64).with_style(style));
+        let board = Self { bars, total };
+        if !jobs.is_empty() {
+            board.say(&format!("{} runs, {at_once} at a time", jobs.len()));
+        }
+        board
+    }
+
+    fn child(&self, name: &str) -> ProgressBar {
+        let style = ProgressStyle::with_template("{prefix:16} {elapsed:>4} {wide_msg}")
+            .expect("the template is right");
+        let bar = ProgressBar::no_length()
+            .with_style(style)
+            .with_prefix(name.to_owned());
+        if self.total.is_hidden() {
+            eprintln!("{name}: started");
+        }
+        self.bars.insert_before(&self.total, bar)
+    }
+
+    fn say(&self, line: &str) {
+        if self.total.is_hidden() {
+            eprintln!("{line}");
+        } else {
+            // The only way past bars; a terminal that is gone needs no line.
+            let _ = self.bars.println(line);
+        }
+    }
+
+    fn time_left(&self, seconds: Option<f64>) {
+        if let Some(seconds) = seconds {
+            let left = indicatif::HumanDuration(Duration::from_secs_f64(seconds));
+            self.total.set_message(format!(", about {left} left"));
+        }
+    }
+}

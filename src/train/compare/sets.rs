@@ -1,0 +1,159 @@
+//! What every model of a comparison is judged on.
+//!
+//! In: the data set that the models learn from. Out: its own test split, 20 fresh objects of each
+//! test material, and the same objects under other sensors. The fresh ones are simulated once and
+//! kept; no model may ever learn from their seeds.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, ensure};
+
+use crate::simulator::{DatasetSettings, SensorProfile, Shapes, Split};
+use crate::train::dataset::Dataset;
+use crate::train::run::write_whole;
+use crate::train::settings::Profile;
+use crate::train::simulated;
+use crate::verdict::sha256_hex;
+
+/// Seeds of the fresh objects, of `paper` and of `matched` shapes.
+const FRESH_SEEDS: [u64; 2] = [2_019_001, 2_019_002];
+/// Seed of the other gain map.
+const OTHER_SENSORS_SEED: u64 = 2_019_003;
+/// Fresh objects of each test material (contract).
+pub(super) const FRESH_OBJECTS: u32 = 20;
+/// A softer cover has this part of the usual one's modulus.
+const SOFTER: f64 = 0.5;
+
+/// Labelled samples to judge.
+#[derive(Debug)]
+pub(super) struct TestSet {
+    /// Its key in results.
+    pub(super) name: &'static str,
+    /// Where the samples are.
+    pub(super) dataset: Dataset,
+    /// Which they are.
+    pub(super) indices: Vec<usize>,
+}
+
+impl TestSet {
+    /// SHA-256 of its file.
+    pub(super) fn sha256(&self) -> &str {
+        &self.dataset.sources[0].sha256
+    }
+}
+
+/// Key of the data set's own test split.
+pub const PAPER_SPLIT: &str = "paper_split";
+/// Key of the fresh objects of `paper` shapes.
+pub const FRESH: &str = "fresh";
+/// Key of the fresh objects of `matched` shapes.
+pub const MATCHED: &str = "matched";
+/// Keys of the fresh objects of `paper` shapes under another sensor, and what is other about it.
+pub const SHIFTS: [(&str, &str); 3] = [
+    ("gain_map", "other gains, thresholds and dead taxels"),
+    ("soft_cover", "a cover half as stiff"),
+    ("raw", "taxels as uneven as on a raw film array"),
+];
+
+/// All sets in order; those that are simulated lie in `directory`. The first is left out where
+/// `dataset` has no labelled test samples.
+///
+/// # Errors
+///
+/// If a file cannot be read or written, or the data has a seed of the fresh objects.
+pub(super) fn all(
+    dataset: Dataset,
+    profile: Profile,
+    directory: &Path,
+) -> anyhow::Result<Vec<TestSet>> {
+    let seed = dataset.sources[0].seed;
+    ensure!(
+        !FRESH_SEEDS.iter().any(|&fresh| seed == Some(fresh)),
+        "{}: found seed {}, expected another than the fresh test objects'",
+        dataset.sources[0].name,
+        seed.unwrap_or_default()
+    );
+    let mut sets = Vec::new();
+    if let Ok(indices) = dataset.labelled(Split::Test) {
+        sets.push(TestSet {
+            name: PAPER_SPLIT,
+            dataset,
+            indices,
+        });
+    }
+    for (name, settings) in simulations(profile) {
+        let dataset = Dataset::read(&simulated(directory, name, &settings)?)?;
+        let indices = dataset.labelled(Split::Test)?;
+        sets.push(TestSet {
+            name,
+            dataset,
+            indices,
+        });
+    }
+    Ok(sets)
+}
+
+/// What is simulated for all comparisons of a profile.
+fn simulations(profile: Profile) -> [(&'static str, DatasetSettings); 5] {
+    let fresh = |seed, shapes| DatasetSettings {
+        seed,
+        shapes,
+        objects: 0,
+        test_objects: FRESH_OBJECTS,
+        presses: match profile {
+            Profile::Smoke => 1,
+            Profile::Paper | Profile::Quick => DatasetSettings::default().presses,
+        },
+        ..DatasetSettings::default()
+    };
+    let [paper_seed, matched_seed] = FRESH_SEEDS;
+    let paper = fresh(paper_seed, Shapes::Paper);
+    let [(gain_map, _), (soft_cover, _), (raw, _)] = SHIFTS;
+    [
+        (FRESH, paper),
+        (MATCHED, fresh(matched_seed, Shapes::Matched)),
+        (
+            gain_map,
+            DatasetSettings {
+                sensor_seed: Some(OTHER_SENSORS_SEED),
+                ..paper
+            },
+        ),
+        (
+            soft_cover,
+            DatasetSettings {
+                cover_young_mpa: SOFTER * paper.cover_young_mpa,
+                ..paper
+            },
+        ),
+        (
+            raw,
+            DatasetSettings {
+                profile: SensorProfile::Raw,
+                ..paper
+            },
+        ),
+    ]
+}
+
+/// The file of what `settings` make, simulated unless it is there. Its name tells the settings.
+fn simulated(directory: &Path, name: &str, settings: &DatasetSettings) -> anyhow::Result<PathBuf> {
+    let path = file_of(directory, name, settings)?;
+    if !path.exists() {
+        eprintln!("simulating {}", path.display());
+        let samples = simulated::simulate(settings);
+        write_whole(&path, &simulated::to_bytes(settings, samples)?)?;
+    }
+    Ok(path)
+}
+
+/// Where the samples of `settings` are kept: another simulator or other settings, another file.
+pub(super) fn file_of(
+    directory: &Path,
+    name: &str,
+    settings: &DatasetSettings,
+) -> anyhow::Result<PathBuf> {
+    let told = serde_json::to_string(settings).context("the simulator's settings")?;
+    let hash = sha256_hex(format!("{} {told}", env!("CARGO_PKG_VERSION")).as_bytes());
+    Ok(directory.join(format!("{name}-{}.npz", &hash[..8])))
+}

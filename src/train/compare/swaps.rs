@@ -1,0 +1,195 @@
+//! The two materials of a level in each other's roles.
+//!
+//! A level is one material in training and another in the test, so an interval over objects says
+//! nothing of what other materials would have given. Here every assignment of the roles is a data
+//! set of its own, like the comparison's but for that: same seed, same numbers of objects to learn
+//! from, 20 objects a material to judge. What they share is simulated once.
+
+use std::path::PathBuf;
+
+use super::children::{self, Failure};
+use super::results::{SwapEntry, read_json};
+use super::{Plan, Recipe, Round, sets, unfinished};
+use crate::simulator::{DatasetSettings, LabelledSample, Material};
+use crate::train::dataset::{Dataset, LabelChoice};
+use crate::train::methods::Method;
+use crate::train::metrics::Evaluation;
+use crate::train::run::{Run, write_whole};
+use crate::train::settings::Profile;
+use crate::train::simulated;
+
+/// The seed of every run.
+const SEED: u64 = 1;
+/// Four assignments in which every level is swapped twice.
+const FEW: [[bool; 4]; 4] = [
+    [false, false, false, false],
+    [false, true, false, true],
+    [true, false, true, false],
+    [true, true, true, true],
+];
+
+/// The assignments that a recipe is run under; none for most.
+fn assignments(recipe: &Recipe, profile: Profile) -> Vec<[bool; 4]> {
+    let all = || (0..16).map(|bits| std::array::from_fn(|level| bits >> level & 1 == 1));
+    match (recipe.method, recipe.choice, profile) {
+        (_, LabelChoice::Random, _) => Vec::new(),
+        (Method::Features | Method::Hrn15Tuned, _, Profile::Paper | Profile::Quick) => {
+            all().collect()
+        }
+        (Method::Features | Method::Hrn15Tuned | Method::Ours, ..) => FEW.to_vec(),
+        _ => Vec::new(),
+    }
+}
+
+/// The levels that are swapped, such as `24`; `none` if none is.
+pub(super) fn name(swapped_levels: [bool; 4]) -> String {
+    let levels = (1..).zip(swapped_levels).filter(|(_, swapped)| *swapped);
+    let name: String = levels
+        .map(|(level, _): (u8, _)| level.to_string())
+        .collect();
+    if name.is_empty() {
+        "none".to_owned()
+    } else {
+        name
+    }
+}
+
+/// Runs what is not finished and writes `swaps.json`.
+pub(super) fn run(plan: &Plan, recipes: &[Recipe]) -> anyhow::Result<Vec<Failure>> {
+    let wanted: Vec<(Recipe, [bool; 4])> = recipes
+        .iter()
+        .flat_map(|recipe| {
+            assignments(recipe, plan.profile)
+                .into_iter()
+                .map(|swapped| (*recipe, swapped))
+        })
+        .collect();
+    if wanted.is_empty() {
+        return Ok(Vec::new());
+    }
+    let settings = DatasetSettings {
+        test_objects: sets::FRESH_OBJECTS,
+        ..simulated::settings_of(&plan.data)?
+    };
+    let mut parts = None;
+    let mut rounds = Vec::with_capacity(wanted.len());
+    for (recipe, swapped) in &wanted {
+        let file = file(plan, settings, *swapped, &mut parts)?;
+        let run = format!("{}-swapped-{}", recipe.name(), name(*swapped));
+        rounds.push(Round {
+            recipe: *recipe,
+            seed: SEED,
+            profile: plan.profile,
+            sources: Dataset::read(&file)?.sources,
+            data: file,
+            directory: plan.out.join("runs").join(run),
+            // With nobody swapped it is the comparison's own run, judged on more objects.
+            shares_with: (*swapped == [false; 4]).then(|| format!("{}-{SEED}", recipe.name())),
+        });
+    }
+    let open = unfinished(&rounds, &plan.out)?;
+    let jobs = open.into_iter().map(|(_, job)| job).collect();
+    let failures = children::run(jobs, plan.jobs, |_| Ok(()))?;
+    let mut entries = Vec::new();
+    for (round, (_, swapped_levels)) in rounds.iter().zip(&wanted) {
+        let told = Run::told(&round.directory)?;
+        let test: Option<Evaluation> = read_json(&round.directory.join("evaluation.json"))?;
+        if let (true, Some(told), Some(test)) = (round.is_finished(), told, test) {
+            entries.push(SwapEntry {
+                method: told.method,
+                seed: told.seed,
+                labels: told.labels,
+                swapped_levels: *swapped_levels,
+                test,
+            });
+        }
+    }
+    write_whole(
+        &plan.out.join("swaps.json"),
+        &serde_json::to_vec_pretty(&entries)?,
+    )?;
+    Ok(failures)
+}
+
+/// Samples without any swap, and with all.
+type Parts = [Vec<LabelledSample>; 2];
+
+/// The file of an assignment, made unless it is there. `parts` are simulated once it is needed.
+fn file(
+    plan: &Plan,
+    settings: DatasetSettings,
+    swapped_levels: [bool; 4],
+    parts: &mut Option<Parts>,
+) -> anyhow::Result<PathBuf> {
+    let under = |swapped_levels| DatasetSettings {
+        swapped_levels,
+        ..settings
+    };
+    let own = under(swapped_levels);
+    let label = format!("swapped-{}", name(swapped_levels));
+    let path = sets::file_of(&plan.out.join("data"), &label, &own)?;
+    if !path.exists() {
+        let parts = parts.get_or_insert_with(|| {
+            [false, true].map(|swapped| simulated::simulate(&under([swapped; 4])))
+        });
+        write_whole(
+            &path,
+            &simulated::to_bytes(&own, composed(parts, swapped_levels))?,
+        )?;
+    }
+    Ok(path)
+}
+
+/// What the simulator gives for an assignment: each material as in the part in which it has its
+/// role, objects numbered through.
+fn composed([none, all]: &Parts, swapped_levels: [bool; 4]) -> Vec<LabelledSample> {
+    let mut samples: Vec<LabelledSample> = Vec::new();
+    let mut objects = 0;
+    for material in Material::ALL {
+        let swapped = swapped_levels[usize::from(material.level()) - 1];
+        let part = if swapped { all } else { none };
+        let mut of_material = part
+            .iter()
+            .filter(|sample| sample.material == material.index())
+            .peekable();
+        while let Some(sample) = of_material.next() {
+            samples.push(LabelledSample {
+                object: objects,
+                ..sample.clone()
+            });
+            let next = of_material.peek();
+            objects += u32::from(next.is_none_or(|next| next.object != sample.object));
+        }
+    }
+    samples
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simulator::dataset;
+
+    #[test]
+    fn parts_compose_what_the_simulator_gives() {
+        let under = |swapped_levels| DatasetSettings {
+            objects: 2,
+            test_objects: 1,
+            presses: 2,
+            swapped_levels,
+            ..DatasetSettings::default()
+        };
+        let parts = [false, true].map(|swapped| dataset(&under([swapped; 4]), 2, |_| ()));
+        for swapped in [FEW[1], [true, false, false, false]] {
+            let expected = dataset(&under(swapped), 2, |_| ());
+            assert!(composed(&parts, swapped) == expected, "{swapped:?}");
+        }
+    }
+
+    #[test]
+    fn few_assignments_swap_every_level_twice_and_names_tell_them_apart() {
+        for level in 0..4 {
+            assert_eq!(FEW.iter().filter(|swapped| swapped[level]).count(), 2);
+        }
+        assert_eq!(FEW.map(name), ["none", "24", "13", "1234"]);
+    }
+}

@@ -1,0 +1,635 @@
+//! The paper's Tables 2 and 3 beside ours, and what they leave out.
+//!
+//! In: a comparison's results. Out: tables as rows of text, which `tables.md` and the report show
+//! alike.
+
+use std::fmt::Write as _;
+
+use super::compare::results::{Comparison, Details, Entry, Row, SwapEntry};
+use super::compare::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS};
+use super::history::History;
+use super::metrics::{self, Estimate, Evaluation, ObjectCount};
+use super::paper;
+
+/// The method that the others are compared with.
+pub const REFERENCE: &str = "ours";
+
+/// A table.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Table {
+    /// What it shows.
+    pub title: String,
+    /// How to read it.
+    pub note: String,
+    /// Names of the columns.
+    pub head: Vec<String>,
+    /// Its cells.
+    pub rows: Vec<Vec<String>>,
+}
+
+impl Table {
+    fn new(title: &str, note: &str, head: &[&str]) -> Self {
+        Self {
+            title: title.to_owned(),
+            note: note.to_owned(),
+            head: head.iter().map(|&name| name.to_owned()).collect(),
+            rows: Vec::new(),
+        }
+    }
+
+    fn markdown(&self) -> String {
+        let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
+        let rule: Vec<String> = (0..self.head.len())
+            .map(|column| if column == 0 { "---" } else { "---:" }.to_owned())
+            .collect();
+        let rows: String = self.rows.iter().map(|row| line(row)).collect();
+        format!("{}\n\n{}{}{rows}", self.note, line(&self.head), line(&rule))
+    }
+}
+
+/// `tables.md`.
+pub fn markdown(comparison: &Comparison) -> String {
+    let mut text = format!("# Comparison\n\n{}\n", provenance(comparison));
+    for table in all(comparison) {
+        let _ = write!(text, "\n## {}\n\n{}", table.title, table.markdown());
+    }
+    text
+}
+
+/// Where the figures come from, a line of text each.
+pub fn provenance(comparison: &Comparison) -> String {
+    let mut lines = Vec::new();
+    if let (Some(entry), Some(details)) = (comparison.entries.first(), comparison.details.first()) {
+        let seeds = comparison.entries.iter().map(|entry| entry.seed).max();
+        lines.push(format!(
+            "Made by hrn-train compare --profile {} --seeds {}, {}.",
+            format!("{:?}", entry.profile).to_lowercase(),
+            seeds.unwrap_or_default(),
+            details.revision
+        ));
+        for source in details.told.iter().flat_map(|told| &told.data) {
+            let seed = source
+                .seed
+                .map_or(String::new(), |seed| format!(" (seed {seed})"));
+            lines.push(format!(
+                "Learnt from {}{seed}, sha256 {}.",
+                source.name, source.sha256
+            ));
+        }
+    }
+    lines.push(
+        "Simulated data, unless you gave your own. Intervals are 95 %, by a bootstrap over objects \
+         within each level; ± is the standard deviation over seeds."
+            .to_owned(),
+    );
+    lines.join("\n")
+}
+
+/// Every table, in the order to read them.
+fn all(comparison: &Comparison) -> Vec<Table> {
+    let rows = comparison.rows();
+    let mut tables = vec![headline(&rows), table_2(&rows)];
+    tables.extend(fresh(&rows));
+    tables.extend([table_3(&rows), confusions(&rows)]);
+    tables.extend([calibration(&rows), shifts(&rows), price(&rows)]);
+    if !comparison.swaps.is_empty() {
+        tables.push(swaps(&comparison.swaps));
+    }
+    tables
+}
+
+/// The table to read first.
+pub fn headline(rows: &[Row]) -> Table {
+    let note = "20 fresh objects of each test material, shapes alike for all materials, so that \
+                shape says nothing of hardness. \"less ours\": difference of accuracies on the same \
+                frames under the same seeds, in points. Seconds are those of one thread; stages \
+                that a method shares with another are in the price of both.";
+    let head = [
+        "method",
+        "labels",
+        "accuracy, %",
+        "95 %",
+        "less ours",
+        "kappa, quadratic",
+        "steps",
+        "seconds",
+    ];
+    let mut table = Table::new("The whole of it", note, &head);
+    for row in rows {
+        table.rows.push(vec![
+            row.title.clone(),
+            thousands(row.runs[0].0.labels as u64),
+            with_spread(row, MATCHED, |e| Some(100.0 * e.accuracy), 1),
+            interval(row, MATCHED),
+            less_reference(row, rows, MATCHED),
+            with_spread(row, MATCHED, |e| e.kappa_quadratic, 3),
+            thousands(mean(&of_entries(row, |entry| entry.steps as f64)) as u64),
+            thousands(mean(&of_entries(row, |entry| entry.seconds)).round() as u64),
+        ]);
+    }
+    table
+}
+
+/// Table 2, the paper's figures in brackets.
+pub fn table_2(rows: &[Row]) -> Table {
+    let note = "Category accuracies and overall accuracy in per cent on the data set's own test \
+                split, of the paper's size; in brackets the paper's.";
+    let head = [
+        "method",
+        "labels",
+        "level 1",
+        "level 2",
+        "level 3",
+        "level 4",
+        "overall",
+        "95 %",
+        "less ours",
+    ];
+    let mut table = Table::new("Table 2: accuracy", note, &head);
+    for row in rows {
+        let paper = paper_row(row);
+        let mut cells = vec![row.title.clone(), thousands(row.runs[0].0.labels as u64)];
+        for level in 0..4 {
+            let here = mean_over_seeds(row, PAPER_SPLIT, |e| percent_of(e, level), 1);
+            let there = paper.map(|paper| paper.category_accuracy_percent[level]);
+            cells.push(beside(here, there, 1));
+        }
+        let here = with_spread(row, PAPER_SPLIT, |e| Some(100.0 * e.accuracy), 1);
+        cells.push(beside(here, paper.map(|paper| paper.accuracy_percent), 1));
+        cells.push(interval(row, PAPER_SPLIT));
+        cells.push(less_reference(row, rows, PAPER_SPLIT));
+        table.rows.push(cells);
+    }
+    table
+}
+
+/// Accuracies on the fresh objects of either shapes.
+pub fn fresh(rows: &[Row]) -> [Table; 2] {
+    [
+        (FRESH, "Fresh objects, shapes as the paper's pictures"),
+        (MATCHED, "Fresh objects, the same shapes for all materials"),
+    ]
+    .map(|(set, title)| accuracies(rows, set, title))
+}
+
+fn accuracies(rows: &[Row], set: &str, title: &str) -> Table {
+    let note = "Accuracy in per cent on 20 objects of each test material; \"less ours\" in points.";
+    let head = [
+        "method",
+        "level 1",
+        "level 2",
+        "level 3",
+        "level 4",
+        "overall",
+        "95 %",
+        "less ours",
+    ];
+    let mut table = Table::new(title, note, &head);
+    for row in rows {
+        let mut cells = vec![row.title.clone()];
+        cells.extend((0..4).map(|level| mean_over_seeds(row, set, |e| percent_of(e, level), 1)));
+        cells.push(with_spread(row, set, |e| Some(100.0 * e.accuracy), 1));
+        cells.push(interval(row, set));
+        cells.push(less_reference(row, rows, set));
+        table.rows.push(cells);
+    }
+    table
+}
+
+/// Table 3's kappas, the paper's in brackets.
+pub fn table_3(rows: &[Row]) -> Table {
+    let note = "Cohen's kappa on the counts, and the same with quadratic weights, because levels \
+                are ordinal; in brackets what the paper's counts give.";
+    let head = [
+        "method",
+        "test split: kappa",
+        "quadratic",
+        "fresh, paper's shapes: kappa",
+        "quadratic",
+        "fresh, matched shapes: kappa",
+        "quadratic",
+    ];
+    let mut table = Table::new("Table 3: kappa", note, &head);
+    for row in rows {
+        let paper = paper_row(row);
+        let quadratic = paper.and_then(|paper| metrics::kappa_quadratic(&paper.counts()));
+        let mut cells = vec![row.title.clone()];
+        for set in [PAPER_SPLIT, FRESH, MATCHED] {
+            let known = set == PAPER_SPLIT;
+            let there = |value: Option<f64>| value.filter(|_| known);
+            let kappa = with_spread(row, set, |e| e.kappa, 4);
+            cells.push(beside(kappa, there(paper.map(|paper| paper.kappa)), 4));
+            let kappa = with_spread(row, set, |e| e.kappa_quadratic, 4);
+            cells.push(beside(kappa, there(quadratic), 4));
+        }
+        table.rows.push(cells);
+    }
+    table
+}
+
+/// Table 3's confusion matrices as counts, the paper's to the right.
+fn confusions(rows: &[Row]) -> Table {
+    let note = "Samples of the test split, mean over seeds; the paper's are of 250 a level. Rows \
+                are the truth, columns what was said.";
+    let head = [
+        "method", "truth", "1", "2", "3", "4", "paper: 1", "2", "3", "4",
+    ];
+    let mut table = Table::new("Table 3: confusion", note, &head);
+    for row in rows {
+        let counts = mean_confusion(&evaluations(row, PAPER_SPLIT));
+        for (truth, counts) in counts.iter().enumerate() {
+            let title = if truth == 0 {
+                row.title.clone()
+            } else {
+                String::new()
+            };
+            let mut cells = vec![title, format!("level {}", truth + 1)];
+            cells.extend(counts.iter().map(|&count| number(count, 1)));
+            let paper = paper_row(row).map(|paper| paper.confusion[truth]);
+            cells.extend((0..4).map(|said| match paper {
+                Some(counts) => counts[said].to_string(),
+                None => "-".to_owned(),
+            }));
+            table.rows.push(cells);
+        }
+    }
+    table
+}
+
+/// Mean counts of some evaluations.
+pub fn mean_confusion(evaluations: &[&Evaluation]) -> Vec<Vec<f64>> {
+    let levels = evaluations.first().map_or(0, |first| first.confusion.len());
+    let cell = |truth: usize, said: usize| {
+        let counts = evaluations.iter().map(|e| e.confusion[truth][said] as f64);
+        mean(&counts.collect::<Vec<_>>())
+    };
+    (0..levels)
+        .map(|truth| (0..levels).map(|said| cell(truth, said)).collect())
+        .collect()
+}
+
+/// How sure the models are, beside how sure they should be.
+pub fn calibration(rows: &[Row]) -> Table {
+    let note = "Expected calibration error (15 bins of the largest probability) and mean negative \
+                log-likelihood in nats, on materials that no model has seen. \"Raw\": before the \
+                temperature that methods with held-out objects fit on them.";
+    let head = [
+        "method",
+        "test split: ECE",
+        "NLL",
+        "fresh, paper's shapes: ECE",
+        "raw",
+        "NLL",
+        "fresh, matched shapes: ECE",
+        "raw",
+        "NLL",
+    ];
+    let mut table = Table::new("Calibration", note, &head);
+    for row in rows {
+        let mut cells = vec![row.title.clone()];
+        for set in [PAPER_SPLIT, FRESH, MATCHED] {
+            cells.push(with_spread(row, set, |e| Some(e.ece), 3));
+            let raw = |(_, details): &(&Entry, &Details)| {
+                Some(details.worth.sets.get(set)?.ece_before_temperature)
+            };
+            let raw: Vec<f64> = row.runs.iter().filter_map(raw).collect();
+            if set != PAPER_SPLIT {
+                cells.push(if raw.is_empty() {
+                    "-".to_owned()
+                } else {
+                    format!("{:.3}", mean(&raw))
+                });
+            }
+            cells.push(with_spread(row, set, |e| Some(e.nll), 3));
+        }
+        table.rows.push(cells);
+    }
+    table
+}
+
+/// The same objects under other sensors.
+pub fn shifts(rows: &[Row]) -> Table {
+    let what: Vec<String> = SHIFTS
+        .iter()
+        .map(|(name, what)| format!("{}: {what}", name.replace('_', " ")))
+        .collect();
+    let note = format!(
+        "The fresh objects of the paper's shapes, pressed again on other sensors: accuracy in per \
+         cent and expected calibration error. {}.",
+        what.join("; ")
+    );
+    let mut head = vec![
+        "method".to_owned(),
+        "as before: accuracy".to_owned(),
+        "ECE".to_owned(),
+    ];
+    for (name, _) in SHIFTS {
+        head.extend([
+            format!("{}: accuracy", name.replace('_', " ")),
+            "ECE".to_owned(),
+        ]);
+    }
+    let mut table = Table {
+        head,
+        ..Table::new("Another sensor", &note, &[])
+    };
+    for row in rows {
+        let mut cells = vec![row.title.clone()];
+        for set in std::iter::once(FRESH).chain(SHIFTS.map(|(name, _)| name)) {
+            cells.push(with_spread(row, set, |e| Some(100.0 * e.accuracy), 1));
+            cells.push(with_spread(row, set, |e| Some(e.ece), 3));
+        }
+        table.rows.push(cells);
+    }
+    table
+}
+
+/// Labels, steps and seconds of each method, stage by stage.
+pub fn price(rows: &[Row]) -> Table {
+    let note = "Mean over seeds. A step is a batch of 100 of either network; one of a GAN costs \
+                about four of HRN.";
+    let head = [
+        "method",
+        "labels",
+        "steps",
+        "seconds",
+        "steps of each stage",
+    ];
+    let mut table = Table::new("Price", note, &head);
+    for row in rows {
+        let stages: Vec<String> = row.runs[0]
+            .1
+            .history
+            .stages
+            .iter()
+            .map(|stage| format!("{} {}", stage.name, thousands(stage.steps())))
+            .collect();
+        table.rows.push(vec![
+            row.title.clone(),
+            thousands(row.runs[0].0.labels as u64),
+            thousands(mean(&of_entries(row, |entry| entry.steps as f64)) as u64),
+            thousands(mean(&of_entries(row, |entry| entry.seconds)).round() as u64),
+            stages.join(", "),
+        ]);
+    }
+    table
+}
+
+/// The stages of one run.
+pub fn stages(history: &History) -> Table {
+    let mut table = Table::new("Stages", "", &["stage", "steps", "seconds"]);
+    for stage in &history.stages {
+        table.rows.push(vec![
+            stage.name.clone(),
+            thousands(stage.steps()),
+            number(stage.seconds(), 1),
+        ]);
+    }
+    table
+}
+
+/// One evaluation.
+pub fn evaluation(evaluation: &Evaluation) -> Table {
+    let mut table = Table::new("Evaluation", "", &["", "", ""]);
+    let interval = evaluation.accuracy_interval_by_object;
+    let optional = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.4}"));
+    let rows = [
+        ("samples", thousands(evaluation.n as u64), String::new()),
+        (
+            "accuracy, %",
+            format!("{:.1}", 100.0 * evaluation.accuracy),
+            interval.map_or(String::new(), interval_text),
+        ),
+        ("kappa", optional(evaluation.kappa), String::new()),
+        (
+            "kappa, quadratic",
+            optional(evaluation.kappa_quadratic),
+            String::new(),
+        ),
+        (
+            "calibration error",
+            format!("{:.4}", evaluation.ece),
+            String::new(),
+        ),
+        (
+            "negative log-likelihood",
+            format!("{:.4}", evaluation.nll),
+            String::new(),
+        ),
+    ];
+    table.rows = rows
+        .map(|(name, value, more)| vec![name.to_owned(), value, more])
+        .to_vec();
+    table
+}
+
+/// The roles of materials swapped.
+pub fn swaps(swaps: &[SwapEntry]) -> Table {
+    let note = "The two materials of some levels in each other's roles, each time learnt anew and \
+                judged on 20 objects a material: accuracy in per cent over the assignments. Its \
+                spread is what the choice of materials alone does.";
+    let head = [
+        "method",
+        "labels",
+        "assignments",
+        "as in the paper",
+        "mean",
+        "deviation",
+        "least",
+        "most",
+    ];
+    let mut table = Table::new("Materials swapped", note, &head);
+    for group in swap_groups(swaps) {
+        let percents: Vec<f64> = group
+            .iter()
+            .map(|swap| 100.0 * swap.test.accuracy)
+            .collect();
+        let unswapped = group.iter().find(|swap| swap.swapped_levels == [false; 4]);
+        table.rows.push(vec![
+            group[0].method.clone(),
+            thousands(group[0].labels as u64),
+            group.len().to_string(),
+            unswapped.map_or("-".to_owned(), |swap| number(100.0 * swap.test.accuracy, 1)),
+            number(mean(&percents), 1),
+            deviation(&percents).map_or("-".to_owned(), |sd| number(sd, 1)),
+            number(percents.iter().copied().fold(f64::INFINITY, f64::min), 1),
+            number(percents.iter().copied().fold(0.0, f64::max), 1),
+        ]);
+    }
+    table
+}
+
+/// The assignments of each method and number of labels.
+pub fn swap_groups(swaps: &[SwapEntry]) -> Vec<Vec<&SwapEntry>> {
+    let mut groups: Vec<Vec<&SwapEntry>> = Vec::new();
+    for swap in swaps {
+        let same = |group: &&mut Vec<&SwapEntry>| {
+            (&group[0].method, group[0].labels) == (&swap.method, swap.labels)
+        };
+        match groups.iter_mut().find(same) {
+            Some(group) => group.push(swap),
+            None => groups.push(vec![swap]),
+        }
+    }
+    groups
+}
+
+/// The paper's row of a row; ours has others beside, such as another choice of labels.
+pub fn paper_row(row: &Row) -> Option<&'static paper::Row> {
+    paper::row(&row.runs[0].0.method)
+}
+
+/// What a row's runs reached on a set, where it was measured.
+pub fn evaluations<'a>(row: &Row<'a>, set: &str) -> Vec<&'a Evaluation> {
+    let of_entry = |(entry, _): &(&'a Entry, _)| match set {
+        PAPER_SPLIT => entry.paper_split.as_ref(),
+        FRESH => Some(&entry.fresh),
+        MATCHED => Some(&entry.matched),
+        shift => entry.shifts.get(shift),
+    };
+    row.runs.iter().filter_map(of_entry).collect()
+}
+
+/// The objects of a row's runs on a set, with the runs' seeds.
+fn objects<'a>(row: &Row<'a>, set: &str) -> Vec<(u64, &'a [ObjectCount])> {
+    let of_run = |&(entry, details): &(&'a Entry, &'a Details)| {
+        let objects = details.worth.sets.get(set)?.objects.as_deref()?;
+        Some((entry.seed, objects))
+    };
+    row.runs.iter().filter_map(of_run).collect()
+}
+
+/// A row's accuracy over its seeds.
+pub fn accuracy(row: &Row, set: &str) -> Option<Estimate> {
+    let objects = objects(row, set);
+    let seeds: Vec<&[ObjectCount]> = objects.into_iter().map(|(_, objects)| objects).collect();
+    metrics::accuracy_by_object(&seeds)
+}
+
+fn interval(row: &Row, set: &str) -> String {
+    accuracy(row, set).map_or("-".to_owned(), |estimate| interval_text(estimate.interval))
+}
+
+fn interval_text([low, high]: [f64; 2]) -> String {
+    format!("{:.1} to {:.1}", 100.0 * low, 100.0 * high)
+}
+
+/// Paired with the reference's runs of the same seeds.
+fn less_reference(row: &Row, rows: &[Row], set: &str) -> String {
+    let Some(reference) = rows.iter().find(|row| row.title == REFERENCE) else {
+        return "-".to_owned();
+    };
+    if row.title == REFERENCE {
+        return String::new();
+    }
+    let (own, others) = (objects(row, set), objects(reference, set));
+    let pair = |&(seed, own): &(u64, _)| {
+        let other = others.iter().find(|(other, _)| *other == seed)?;
+        Some((own, other.1))
+    };
+    let pairs: Vec<(&[ObjectCount], &[ObjectCount])> = own.iter().filter_map(pair).collect();
+    metrics::difference_by_object(&pairs).map_or("-".to_owned(), |estimate| {
+        let [low, high] = estimate.interval.map(|end| 100.0 * end);
+        format!("{:+.1} ({low:+.1} to {high:+.1})", 100.0 * estimate.mean)
+    })
+}
+
+fn percent_of(evaluation: &Evaluation, level: usize) -> Option<f64> {
+    Some(100.0 * (*evaluation.category_accuracy.get(level)?)?)
+}
+
+fn of_entries(row: &Row, value: impl Fn(&Entry) -> f64) -> Vec<f64> {
+    row.runs.iter().map(|(entry, _)| value(entry)).collect()
+}
+
+/// Mean over the seeds, and their deviation if there are several.
+fn with_spread(
+    row: &Row,
+    set: &str,
+    value: impl Fn(&Evaluation) -> Option<f64>,
+    decimals: usize,
+) -> String {
+    let values: Vec<f64> = evaluations(row, set)
+        .into_iter()
+        .filter_map(&value)
+        .collect();
+    let mean = mean_over_seeds(row, set, value, decimals);
+    match deviation(&values) {
+        Some(deviation) => format!("{mean} ± {deviation:.decimals$}"),
+        None => mean,
+    }
+}
+
+fn mean_over_seeds(
+    row: &Row,
+    set: &str,
+    value: impl Fn(&Evaluation) -> Option<f64>,
+    decimals: usize,
+) -> String {
+    let values: Vec<f64> = evaluations(row, set)
+        .into_iter()
+        .filter_map(value)
+        .collect();
+    if values.is_empty() {
+        return "-".to_owned();
+    }
+    format!("{:.decimals$}", mean(&values))
+}
+
+fn beside(here: String, there: Option<f64>, decimals: usize) -> String {
+    match there {
+        Some(there) => format!("{here} ({there:.decimals$})"),
+        None => here,
+    }
+}
+
+/// Mean; 0 of nothing.
+pub fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len().max(1) as f64
+}
+
+/// Standard deviation of a sample; `None` of fewer than two.
+fn deviation(values: &[f64]) -> Option<f64> {
+    let mean = mean(values);
+    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+    (values.len() > 1).then(|| (squares / (values.len() - 1) as f64).sqrt())
+}
+
+/// A number without decimals that are all 0.
+fn number(value: f64, decimals: usize) -> String {
+    if value.fract() == 0.0 {
+        format!("{value:.0}")
+    } else {
+        format!("{value:.decimals$}")
+    }
+}
+
+/// An integer with its thousands apart.
+pub fn thousands(value: u64) -> String {
+    let digits = value.to_string();
+    let mut text = String::new();
+    for (place, digit) in digits.chars().enumerate() {
+        if place > 0 && (digits.len() - place).is_multiple_of(3) {
+            text.push(',');
+        }
+        text.push(digit);
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_readable() {
+        assert_eq!(thousands(93_000), "93,000");
+        assert_eq!(thousands(7), "7");
+        assert_eq!(deviation(&[1.0, 3.0]), Some(2.0_f64.sqrt()));
+        assert_eq!(deviation(&[1.0]), None);
+        assert_eq!(
+            (number(12.0, 1), number(12.25, 1)),
+            ("12".to_owned(), "12.2".to_owned())
+        );
+    }
+}

@@ -1,0 +1,338 @@
+//! `hrn-train compare` and `report` on tiny data: what they write, and what they do not do again.
+#![cfg(feature = "train")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy knows no helper of a test as a test"
+)]
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::OnceLock;
+use std::time::{Duration, Instant, SystemTime};
+
+use hardnessd::train::paper;
+use serde_json::Value;
+
+fn hrn_train(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_hrn-train"));
+    command.args(arguments);
+    command
+}
+
+fn succeed(arguments: &[&str]) -> Output {
+    let output = hrn_train(arguments).output().unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{arguments:?}: {errors}");
+    output
+}
+
+/// A directory for the whole process, and a small data set in it.
+fn data() -> &'static (tempfile::TempDir, PathBuf) {
+    static DATA: OnceLock<(tempfile::TempDir, PathBuf)> = OnceLock::new();
+    DATA.get_or_init(|| {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("tiny.npz");
+        let out = path.to_str().unwrap();
+        let size = ["--objects", "4", "--test-objects", "1", "--presses", "10"];
+        let rest = ["--lowest-force", "5", "--shapes", "paper", "--out", out];
+        succeed(&[&["simulate", "--seed", "5"][..], &size, &rest].concat());
+        (directory, path)
+    })
+}
+
+/// A comparison in a directory of its own.
+struct Comparison {
+    out: PathBuf,
+    methods: &'static str,
+    more: &'static [&'static str],
+}
+
+impl Comparison {
+    fn new(name: &str, methods: &'static str, more: &'static [&'static str]) -> Self {
+        let out = data().0.path().join(name);
+        Self { out, methods, more }
+    }
+
+    fn command(&self) -> Command {
+        let mut command = hrn_train(&["compare", "--profile", "smoke", "--seeds", "2"]);
+        command.args(["--methods", self.methods]).args(self.more);
+        command
+            .arg("--data")
+            .arg(&data().1)
+            .arg("--out")
+            .arg(&self.out);
+        command
+    }
+
+    /// Runs to the end and gives what it said.
+    fn run(&self) -> String {
+        let output = self.command().output().unwrap();
+        let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.success(), "{errors}");
+        errors
+    }
+
+    fn json(&self, name: &str) -> Vec<Value> {
+        serde_json::from_slice(&std::fs::read(self.out.join(name)).unwrap()).unwrap()
+    }
+
+    fn text(&self, name: &str) -> String {
+        std::fs::read_to_string(self.out.join(name)).unwrap()
+    }
+
+    /// When each run's model was written, by name.
+    fn models(&self) -> Vec<(String, SystemTime)> {
+        let mut models = Vec::new();
+        for entry in std::fs::read_dir(self.out.join("runs"))
+            .into_iter()
+            .flatten()
+        {
+            let entry = entry.unwrap();
+            if let Ok(model) = entry.path().join("hrn.onnx").metadata() {
+                let name = entry.file_name().to_string_lossy().into_owned();
+                models.push((name, model.modified().unwrap()));
+            }
+        }
+        models.sort();
+        models
+    }
+}
+
+/// One that several tests look at.
+fn whole() -> &'static Comparison {
+    static WHOLE: OnceLock<Comparison> = OnceLock::new();
+    WHOLE.get_or_init(|| {
+        let whole = Comparison::new("whole", "hrn100,features", &["--jobs", "2"]);
+        whole.run();
+        whole
+    })
+}
+
+#[test]
+fn results_have_the_contracts_fields_and_agree_with_evaluate() {
+    let results = whole().json("results.json");
+    let rows: Vec<(&str, u64, u64)> = results
+        .iter()
+        .map(|result| {
+            let number = |key: &str| result[key].as_u64().unwrap();
+            (
+                result["method"].as_str().unwrap(),
+                number("labels"),
+                number("seed"),
+            )
+        })
+        .collect();
+    let expected = [
+        ("hrn100", 160, 1),
+        ("hrn100", 160, 2),
+        ("features", 160, 1),
+        ("features", 160, 2),
+        ("features", 24, 1),
+        ("features", 24, 2),
+    ];
+    assert_eq!(rows, expected);
+    for result in &results {
+        assert_eq!(result["profile"], "smoke");
+        assert!(result["steps"].as_u64().unwrap() > 0, "{result}");
+        assert!(result["seconds"].as_f64().is_some(), "{result}");
+        // 20 fresh objects a material; one press each in this profile.
+        for (set, samples) in [("paper_split", 40), ("fresh", 80), ("matched", 80)] {
+            assert_eq!(result[set]["n"], samples, "{set}");
+            let interval = result[set]["accuracy_interval_by_object"].as_array();
+            assert_eq!(interval.map(Vec::len), Some(2), "{set}");
+        }
+    }
+    let model = whole().out.join("runs/hrn100-1/hrn.onnx");
+    let evaluated = succeed(&[
+        "evaluate",
+        "--json",
+        "--model",
+        model.to_str().unwrap(),
+        "--data",
+        data().1.to_str().unwrap(),
+    ]);
+    let evaluated: Value = serde_json::from_slice(&evaluated.stdout).unwrap();
+    assert_eq!(evaluated, results[0]["paper_split"]);
+}
+
+#[test]
+fn tables_stand_beside_the_papers() {
+    let tables = whole().text("tables.md");
+    let hrn100 = paper::row("hrn100").unwrap();
+    let line = |heading: &str, start: &str| {
+        let section = tables
+            .split("\n## ")
+            .find(|part| part.starts_with(heading))
+            .unwrap();
+        let line = section.lines().find(|line| line.starts_with(start));
+        line.unwrap_or_else(|| panic!("no {start} in {section}"))
+            .to_owned()
+    };
+    let accuracies = line("Table 2", "| hrn100 |");
+    for percent in hrn100.category_accuracy_percent {
+        assert!(
+            accuracies.contains(&format!("({percent:.1})")),
+            "{accuracies}"
+        );
+    }
+    assert!(accuracies.contains("(95.9)"), "{accuracies}");
+    assert!(line("Table 3: kappa", "| hrn100 |").contains("(0.9453)"));
+    let confusion = line("Table 3: confusion", "| hrn100 |");
+    assert!(confusion.ends_with("| 244 | 5 | 1 | 0 |"), "{confusion}");
+    assert!(tables.contains("| features, 24 labels |"), "{tables}");
+}
+
+#[test]
+fn a_finished_comparison_does_nothing_again() {
+    let comparison = Comparison::new("twice", "features", &["--swaps"]);
+    let first = comparison.run();
+    assert!(first.contains("features-1: done"), "{first}");
+    assert!(first.contains("features-24-swapped-13: done"), "{first}");
+    let (models, results) = (comparison.models(), comparison.text("results.json"));
+    // Two seeds and, in this profile, 4 assignments of the materials' roles, with many labels and
+    // with few.
+    assert_eq!(models.len(), 2 * (2 + 4));
+    let swaps = comparison.json("swaps.json");
+    assert_eq!(swaps.len(), 2 * 4);
+    assert!(swaps.iter().all(|swap| swap["test"]["n"] == 4 * 20 * 10));
+    let again = comparison.run();
+    assert!(!again.contains("done"), "{again}");
+    assert!(comparison.models() == models, "a run was done again");
+    assert_eq!(comparison.text("results.json"), results);
+}
+
+#[test]
+fn a_killed_comparison_takes_its_runs_with_it_and_goes_on() {
+    let comparison = Comparison::new("killed", "hrn100,features", &["--jobs", "1"]);
+    let mut process: Child = comparison.command().stderr(Stdio::null()).spawn().unwrap();
+    while comparison.models().is_empty() {
+        assert!(
+            process.try_wait().unwrap().is_none(),
+            "ended before it could be killed"
+        );
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    process.kill().unwrap();
+    process.wait().unwrap();
+    let began = Instant::now();
+    while at_work_in(&comparison.out) {
+        assert!(
+            began.elapsed() < Duration::from_secs(20),
+            "runs outlive the comparison"
+        );
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let finished = comparison.models();
+    assert!(finished.len() < 6, "killed too late");
+    let errors = comparison.run();
+    let models = comparison.models();
+    assert!(
+        finished.iter().all(|model| models.contains(model)),
+        "{errors}"
+    );
+    assert_eq!(comparison.json("results.json").len(), 6);
+    // Seconds apart, runs are the same.
+    let without_price = |results: Vec<Value>| -> Vec<Value> {
+        let without = |mut result: Value| {
+            result.as_object_mut().unwrap().remove("seconds");
+            result
+        };
+        results.into_iter().map(without).collect()
+    };
+    assert_eq!(
+        without_price(comparison.json("results.json")),
+        without_price(whole().json("results.json"))
+    );
+}
+
+/// Whether a process has this directory on its command line.
+fn at_work_in(directory: &Path) -> bool {
+    let directory = directory.to_str().unwrap();
+    let processes = std::fs::read_dir("/proc").unwrap().flatten();
+    let commands = processes.filter_map(|entry| std::fs::read(entry.path().join("cmdline")).ok());
+    commands
+        .map(|command| String::from_utf8_lossy(&command).into_owned())
+        .any(|command| command.contains(directory))
+}
+
+#[test]
+fn a_failing_run_is_named_and_the_others_go_on() {
+    let comparison = Comparison::new("failing", "hrn100,features", &["--jobs", "1"]);
+    // A file where a run wants a directory.
+    std::fs::create_dir_all(comparison.out.join("runs/hrn100-1")).unwrap();
+    std::fs::write(comparison.out.join("runs/hrn100-1/checkpoints"), "").unwrap();
+    let output = comparison.command().output().unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{errors}");
+    let last = errors.lines().last().unwrap();
+    assert!(
+        last.contains("1 run failed") && last.contains("hrn100-1"),
+        "{last}"
+    );
+    assert_eq!(comparison.json("results.json").len(), 5);
+}
+
+#[test]
+fn a_report_needs_no_network_and_has_all_its_sections() {
+    let directory = whole().out.to_str().unwrap();
+    let out = data().0.path().join("report.html");
+    succeed(&["report", directory, "--out", out.to_str().unwrap()]);
+    let page = std::fs::read_to_string(&out).unwrap();
+    assert_eq!(page, whole().text("report.html"), "compare writes the same");
+    let sections = [
+        "summary",
+        "table-2",
+        "table-3",
+        "steps",
+        "samples",
+        "calibration",
+        "price",
+    ];
+    check_page(&page, &sections);
+    assert!(page.contains("(95.9)") && page.contains("in the paper"));
+    assert!(page.contains("@media (prefers-color-scheme: dark)"));
+
+    let run = whole().out.join("runs/hrn100-1");
+    succeed(&[
+        "report",
+        run.to_str().unwrap(),
+        "--out",
+        out.to_str().unwrap(),
+    ]);
+    let page = std::fs::read_to_string(&out).unwrap();
+    check_page(&page, &["evaluation", "steps", "samples", "settings"]);
+    assert!(
+        page.contains("data:image/png;base64,"),
+        "its own pictures are in it"
+    );
+
+    let missing = data().0.path().join("nowhere");
+    let output = hrn_train(&["report", missing.to_str().unwrap(), "--out", "/dev/null"]);
+    assert_eq!({ output }.output().unwrap().status.code(), Some(66));
+}
+
+/// A page loads nothing, and links only to its own sections, which are these.
+fn check_page(page: &str, sections: &[&str]) {
+    for foreign in [
+        "http:", "https:", "//", "@import", "<script", "<link", "url(",
+    ] {
+        let inside = |line: &&str| line.contains(foreign) && !line.contains("data:image/png");
+        let line = page.lines().find(inside);
+        assert!(line.is_none(), "{foreign} in {line:?}");
+    }
+    for section in sections {
+        assert!(
+            page.contains(&format!("<h2 id=\"{section}\">")),
+            "no {section}"
+        );
+        assert!(
+            page.contains(&format!("href=\"#{section}\"")),
+            "no link to {section}"
+        );
+    }
+    assert_eq!(page.matches("<h2 id=").count(), sections.len());
+    assert_eq!(
+        page.matches("<figure>").count(),
+        page.matches("</figure>").count()
+    );
+}
