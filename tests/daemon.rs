@@ -368,6 +368,28 @@ fn the_service_manager_hears_of_readiness_life_and_stopping_without_any_hardware
 }
 
 #[test]
+fn a_log_that_nobody_reads_delays_nobody() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let mut daemon = Process(
+        Command::new(BINARY)
+            .args(["run", "--config"])
+            .arg(config)
+            .env("RUST_LOG", "debug")
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap(),
+    );
+    wait_for("the socket", || bench.path("events.sock").exists());
+    // Each leaves a line of 80 bytes: far more than a pipe holds and the daemon keeps.
+    for _ in 0..4_000 {
+        assert_eq!(bench.subscriber().next().unwrap()["type"], "hello");
+    }
+    daemon.signal(Signal::TERM);
+    assert_eq!(daemon.exit_code(), Some(0));
+}
+
+#[test]
 fn bad_input_ends_with_its_exit_code_and_one_line() {
     let bench = Bench::new();
     let written = |more: &str| {

@@ -83,7 +83,7 @@ async fn dispatch(command: Command) -> anyhow::Result<()> {
         Command::Run { config } => run(config).await,
         Command::Demo(args) => {
             // The events are what is shown: the log would say each again.
-            Log::start(LogSettings::default(), "warn")?;
+            let _log = Log::start(LogSettings::default(), "warn")?;
             Ok(demo::run(args, shutdown()?).await?)
         }
         Command::Simulate(args) => Ok(simulate::run(args, shutdown()?).await?),

@@ -22,8 +22,9 @@ use crate::event::{Event, Reply, Tared};
 /// Longest line a subscriber may send (contract, section 5).
 const LONGEST_LINE_BYTES: usize = 64 * 1024;
 
-/// How often a connection whose other end has stopped sending is looked after.
-const HALF_CLOSED_CHECK: Duration = Duration::from_secs(1);
+/// When a connection whose other end has stopped sending is looked after, first and at the least.
+/// Where it is closed altogether the runtime learns of it a moment after the last read.
+const HALF_CLOSED_CHECKS: (Duration, Duration) = (Duration::from_millis(1), Duration::from_secs(1));
 
 /// What a way in may ask for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -178,6 +179,7 @@ impl<S: Stream> Client<S> {
         self.send(&lines).await?;
         let mut next = hub.take(id).await?;
         let mut hearing = true;
+        let mut pause = HALF_CLOSED_CHECKS.0;
         loop {
             tokio::select! {
                 biased;
@@ -216,7 +218,10 @@ impl<S: Stream> Client<S> {
                         self.stay().await?;
                     }
                 },
-                () = tokio::time::sleep(HALF_CLOSED_CHECK), if !hearing => self.stay().await?,
+                () = tokio::time::sleep(pause), if !hearing => {
+                    pause = HALF_CLOSED_CHECKS.1.min(2 * pause);
+                    self.stay().await?;
+                }
             }
         }
     }

@@ -3,13 +3,18 @@
 //! Field names are stable: they are those of the published events. The level comes from
 //! `RUST_LOG`, else it is `info` for the daemon. Nothing here goes to stdout, which belongs to events.
 
+mod lines;
+
 use std::io::IsTerminal;
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use tracing::{info, warn};
 use tracing_subscriber::layer::{Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Registry, reload};
+
+use lines::Lines;
 
 use crate::event::{Event, LinkState, PressState, Tared};
 use crate::pipeline::RetareError;
@@ -35,12 +40,22 @@ pub enum Format {
     Journald,
 }
 
+/// How long the end of the process waits for the last lines.
+const LAST_LINES: Duration = Duration::from_millis(200);
+
 type Output = Box<dyn Layer<Registry> + Send + Sync>;
 
 /// The log of this process; its format may change while it runs.
-#[derive(Clone)]
 pub struct Log {
     output: reload::Handle<Output, Registry>,
+    lines: Lines,
+}
+
+/// The last lines are written before the process ends.
+impl Drop for Log {
+    fn drop(&mut self) {
+        self.lines.flush(LAST_LINES);
+    }
 }
 
 /// Why a format cannot be had.
@@ -52,6 +67,9 @@ pub enum Error {
     /// `RUST_LOG` cannot be read.
     #[error("RUST_LOG: {0}")]
     Filter(#[source] tracing_subscriber::filter::ParseError),
+    /// No thread for its lines.
+    #[error("log: cannot start a thread: {0}")]
+    Thread(#[source] std::io::Error),
     /// There is a log already.
     #[error("the log was started twice")]
     Twice,
@@ -73,13 +91,14 @@ impl Log {
         };
         // The filter stands beside the output, not in it: a filter of a layer's own does not
         // survive the layer's exchange.
-        let (layer, output) = reload::Layer::new(output(settings)?);
+        let lines = Lines::start().map_err(Error::Thread)?;
+        let (layer, output) = reload::Layer::new(output(settings, &lines)?);
         tracing_subscriber::registry()
             .with(layer)
             .with(filter)
             .try_init()
             .map_err(|_| Error::Twice)?;
-        Ok(Self { output })
+        Ok(Self { output, lines })
     }
 
     /// Writes as `settings` say from now on.
@@ -89,14 +108,14 @@ impl Log {
     /// As [`Log::start`]; the log then stays as it is.
     pub fn change(&self, settings: Settings) -> Result<(), Error> {
         self.output
-            .reload(output(settings)?)
+            .reload(output(settings, &self.lines)?)
             .map_err(|_| Error::Twice)
     }
 }
 
-fn output(settings: Settings) -> Result<Output, Error> {
+fn output(settings: Settings, lines: &Lines) -> Result<Output, Error> {
     let lines = tracing_subscriber::fmt::layer()
-        .with_writer(std::io::stderr)
+        .with_writer(lines.clone())
         .with_target(false);
     Ok(match settings.format {
         Format::Text => lines.with_ansi(std::io::stderr().is_terminal()).boxed(),

@@ -375,9 +375,11 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     })
 }
 
-/// This package's version, and the commit where it is run from a checkout.
+/// This package's version, and the commit of the checkout that it was built in, if that is still
+/// there.
 fn revision() -> String {
     let described = std::process::Command::new("git")
+        .args(["-C", env!("CARGO_MANIFEST_DIR")])
         .args(["describe", "--always", "--dirty", "--abbrev=12"])
         .output()
         .ok()

@@ -1,0 +1,97 @@
+//! Log lines on their way to stderr, through a thread of their own.
+//!
+//! Whoever reads the log may stop reading; the sensor must not wait for it. So a line that finds
+//! too many before it is dropped, and how many were is said as soon as there is room again.
+
+use std::io::{self, Write};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{self, Receiver, SyncSender, TrySendError};
+use std::time::Duration;
+
+use tracing_subscriber::fmt::MakeWriter;
+
+/// Lines that wait at most: some 150 kB.
+const WAITING: usize = 1024;
+
+enum Message {
+    Line(Vec<u8>),
+    /// To be answered when all before it is written.
+    Flush(SyncSender<()>),
+}
+
+/// The way to stderr; clones share it.
+#[derive(Clone)]
+pub(super) struct Lines {
+    thread: SyncSender<Message>,
+    lost: Arc<AtomicU64>,
+}
+
+impl Lines {
+    /// Starts the thread.
+    ///
+    /// # Errors
+    ///
+    /// If the system has no room for a thread.
+    pub(super) fn start() -> io::Result<Self> {
+        let (thread, messages) = mpsc::sync_channel(WAITING);
+        let lost = Arc::new(AtomicU64::new(0));
+        let lines = Self {
+            thread,
+            lost: Arc::clone(&lost),
+        };
+        std::thread::Builder::new()
+            .name("log".to_owned())
+            .spawn(move || write(&messages, &lost))?;
+        Ok(lines)
+    }
+
+    /// Waits until all lines are written, but not longer than `patience`.
+    pub(super) fn flush(&self, patience: Duration) {
+        let (written, answer) = mpsc::sync_channel(1);
+        // Full: nobody reads, so there is nothing to wait for.
+        if self.thread.try_send(Message::Flush(written)).is_ok() {
+            let _ = answer.recv_timeout(patience);
+        }
+    }
+}
+
+fn write(messages: &Receiver<Message>, lost: &AtomicU64) {
+    for message in messages {
+        // Where stderr is closed there is nobody to tell.
+        match message {
+            Message::Line(line) => {
+                let _ = io::stderr().write_all(&line);
+                let lines = lost.swap(0, Ordering::Relaxed);
+                if lines > 0 {
+                    let _ = writeln!(io::stderr(), "log: {lines} lines lost: read too slowly");
+                }
+            }
+            Message::Flush(written) => {
+                let _ = written.try_send(());
+            }
+        }
+    }
+}
+
+impl<'a> MakeWriter<'a> for Lines {
+    type Writer = &'a Self;
+
+    fn make_writer(&'a self) -> Self::Writer {
+        self
+    }
+}
+
+/// The formatter writes each event in one call.
+impl Write for &Lines {
+    fn write(&mut self, line: &[u8]) -> io::Result<usize> {
+        if let Err(TrySendError::Full(_)) = self.thread.try_send(Message::Line(line.to_vec())) {
+            self.lost.fetch_add(1, Ordering::Relaxed);
+        }
+        Ok(line.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
