@@ -8,7 +8,6 @@
 
 use std::time::Instant;
 
-use anyhow::Context as _;
 use burn::tensor::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 
@@ -18,20 +17,17 @@ use super::fit::{progress_bar, report};
 use super::generator;
 use super::hrn;
 use super::learner::Learner;
-use super::likeness::{Likeness, Reference};
 use super::losses::{self, Game, Judged};
 use super::network::{self, Normalisation, Weights, numbers};
 use super::optimiser;
 use super::run::{Adversarial, Row, Run};
 use super::settings::{SettingsError, check, check_loop};
-use super::sheet::{self, Strip};
 use crate::frame::Frame;
 use crate::random::Stream;
 
-/// Real frames, at most, that generated ones are measured against; they are measured pair by pair.
-const COMPARED: usize = 500;
-/// Strips of generated frames in a picture.
-const STRIPS: usize = 4;
+mod samples;
+#[cfg(test)]
+mod tests;
 
 /// How both sides learn; the defaults are the paper's ("Training of STGAN and USTGAN").
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -433,45 +429,4 @@ impl Task<'_> {
             labelled,
         }
     }
-
-    /// Real samples to measure generated ones by.
-    fn reference(&self) -> anyhow::Result<Reference> {
-        let order = self.order("compared", self.real, 0);
-        let frames = self.frames(&order[..order.len().min(COMPARED)]);
-        Reference::of(&frames, self.full_scale_n).context("real samples")
-    }
-
-    fn likeness(&self, real: &Reference, generator: &Weights) -> anyhow::Result<Likeness> {
-        let samples = self.settings.samples_a_component;
-        let statistics = generator::statistics(generator, samples, self.seed, self.device);
-        let frames = generator::generate(
-            generator,
-            &statistics,
-            COMPARED / generator::COMPONENTS,
-            self.full_scale_n,
-            &mut self.stream("compared noise"),
-            self.device,
-        );
-        real.compare(&frames).context("generated samples")
-    }
-
-    /// Draws what fixed noise becomes, one frame a component, beside real frames.
-    fn picture(&self, generator: &Weights, epoch: u32, run: &Run) -> anyhow::Result<()> {
-        let samples = self.settings.samples_a_component;
-        let eta = generator::noise(samples, &mut self.stream("picture"), self.device);
-        let images = generator::images(generator, eta, &mut Normalisation::Batch);
-        let generated = generator::frames(&images, self.full_scale_n);
-        let order = self.order("compared", self.real, 0);
-        let real = self.frames(&order);
-        let mut rows = vec![Strip::of("real", real.into_iter().take(sheet::TILES))];
-        let parts = generated.chunks(sheet::TILES).take(STRIPS);
-        rows.extend(parts.map(|part| Strip::of("generated", part.iter())));
-        let stage = self.stage;
-        let title = format!("{stage} after {epoch} epochs: contact area at 0.07 N, force, peak");
-        let name = format!("samples/{stage}-{epoch:06}.png");
-        run.write(&name, &sheet::strips(&title, &rows)?)
-    }
 }
-
-#[cfg(test)]
-mod tests;
