@@ -1,6 +1,6 @@
 //! What one press costs, bytes to verdict, and where it goes: `cargo bench --bench pipeline`.
 //!
-//! The bytes are a recording of two presses on foam at 100 frames/s. Compare lines of one run
+//! The bytes are a recording of two presses on foam at 5 frames/s, 41 frames. Compare lines of one run
 //! with each other, not with another day's.
 
 use std::path::Path;
@@ -8,6 +8,7 @@ use std::sync::Arc;
 
 use divan::Bencher;
 use divan::counter::{BytesCount, ItemsCount};
+use hardnessd::event::{Event, Phase};
 use hardnessd::frame::{Frame, Stamp};
 use hardnessd::pipeline::{Clock, Judgement, Pipeline, Settings};
 use hardnessd::verdict::{BUILT_IN, Hrn};
@@ -22,7 +23,7 @@ fn main() {
 }
 
 fn recording() -> Vec<u8> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/foam.100hz.bin");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/foam.5hz.bin");
     std::fs::read(path).expect("the fixture lies in the repository")
 }
 
@@ -44,7 +45,7 @@ fn pipeline(hrn: &Arc<Hrn>) -> Pipeline {
     };
     let settings = Settings {
         sensor: "sensor".to_owned(),
-        frame_rate_hz: 100.0,
+        frame_rate_hz: 5.0,
         layout: layout(),
         judgement,
     };
@@ -78,18 +79,29 @@ fn bytes_to_events(bencher: Bencher) {
         mono: std::time::Duration::ZERO,
         wall: jiff::Timestamp::UNIX_EPOCH,
     };
+    let events = |pipeline: &mut Pipeline| {
+        let mut events = pipeline.opened(at);
+        for chunk in bytes.chunks(CHUNK_BYTES) {
+            events.extend(pipeline.push(chunk, at));
+        }
+        events.extend(pipeline.end_of_recording(None));
+        events
+    };
+    let finals =
+        |event: &Event| matches!(event, Event::Hardness(verdict) if verdict.phase == Phase::Final);
+    let presses = events(&mut pipeline(&hrn))
+        .iter()
+        .filter(|event| finals(event))
+        .count();
+    assert_eq!(presses, 2, "the recording has two presses");
     bencher
-        .counter(ItemsCount::new(2_usize))
+        .counter(ItemsCount::new(presses))
         .with_inputs(|| pipeline(&hrn))
         .bench_local_refs(|pipeline| {
-            let mut events = pipeline.opened(at);
-            for chunk in bytes.chunks(CHUNK_BYTES) {
-                events.extend(pipeline.push(chunk, at));
-            }
-            events
-                .iter()
-                .map(|event| event.to_line().len())
-                .sum::<usize>()
+            let lines = events(pipeline)
+                .into_iter()
+                .map(|event| event.to_line().len());
+            lines.sum::<usize>()
         });
 }
 
