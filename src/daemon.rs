@@ -14,7 +14,7 @@ pub mod log;
 pub mod publish;
 mod request;
 mod sensor;
-mod serial;
+pub(crate) mod serial;
 pub mod socket;
 mod systemd;
 pub mod tcp;

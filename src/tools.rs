@@ -2,11 +2,13 @@
 
 pub mod check;
 pub mod demo;
+pub mod doctor;
 mod faults;
 mod player;
 mod pty;
 pub mod replay;
 pub mod simulate;
+pub mod sniff;
 pub mod tail;
 
 use std::io::{ErrorKind, Write};

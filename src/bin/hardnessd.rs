@@ -12,7 +12,7 @@ use hardnessd::daemon::log::{Log, Settings as LogSettings};
 use hardnessd::daemon::publish::Error as PublishError;
 use hardnessd::daemon::socket::Error as SocketError;
 use hardnessd::daemon::{Daemon, Error as DaemonError, Reload};
-use hardnessd::tools::{check, demo, replay, simulate, tail};
+use hardnessd::tools::{check, demo, doctor, replay, simulate, sniff, tail};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
@@ -42,6 +42,10 @@ enum Command {
     Tail(tail::Args),
     /// Check a configuration and say what would run
     Check(check::Args),
+    /// Say why a port will not work, and what mends it
+    Doctor(doctor::Args),
+    /// Look at raw bytes and propose a [sensor.frame]: TOML on stdout
+    Sniff(sniff::Args),
 }
 
 /// What an operator's script may rely on (docs: exit codes).
@@ -90,6 +94,8 @@ async fn dispatch(command: Command) -> anyhow::Result<()> {
         Command::Replay(args) => Ok(replay::run(args, shutdown()?).await?),
         Command::Tail(args) => Ok(tail::run(args, shutdown()?).await?),
         Command::Check(args) => Ok(check::run(&args)?),
+        Command::Doctor(args) => Ok(doctor::run(&args)?),
+        Command::Sniff(args) => Ok(sniff::run(args, shutdown()?).await?),
     }
 }
 
@@ -189,6 +195,20 @@ fn exit_code(error: &anyhow::Error) -> u8 {
             | tail::Error::Refused { .. }
             | tail::Error::Closed { .. } => exit::UNAVAILABLE,
             tail::Error::Print(_) => exit::IO,
+        };
+    }
+    if let Some(error) = error.downcast_ref::<doctor::Error>() {
+        return match error {
+            doctor::Error::Faults { .. } => exit::FAILED,
+            doctor::Error::Print(_) => exit::IO,
+        };
+    }
+    if let Some(error) = error.downcast_ref::<sniff::Error>() {
+        return match error {
+            sniff::Error::Unreadable { .. } | sniff::Error::Format { .. } => exit::NO_INPUT,
+            sniff::Error::Unavailable { .. } => exit::UNAVAILABLE,
+            sniff::Error::Unexplained { .. } => exit::FAILED,
+            sniff::Error::Print(_) => exit::IO,
         };
     }
     if error.is::<hardnessd::daemon::log::Error>() {

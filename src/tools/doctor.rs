@@ -1,0 +1,72 @@
+//! `hardnessd doctor`: why a port will not work, a line a finding, each with what mends it.
+//!
+//! It opens no device: opening resets boards in the manner of Arduino.
+
+mod checks;
+#[cfg(test)]
+mod tests;
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use clap::Args as ClapArgs;
+
+use self::checks::{User, examine, ports};
+
+/// Arguments of `doctor`.
+#[derive(Debug, Clone, ClapArgs)]
+pub struct Args {
+    /// Port to be examined [default: every USB serial port]
+    #[arg(long, value_name = "P")]
+    port: Option<PathBuf>,
+}
+
+/// How it ended.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// Said on stdout.
+    #[error("found {found} fault{}, expected none", if *.found == 1 { "" } else { "s" })]
+    Faults {
+        /// Lines printed.
+        found: usize,
+    },
+    /// Stdout fails.
+    #[error("stdout: {0}")]
+    Print(#[source] io::Error),
+}
+
+/// Prints what is wrong.
+///
+/// # Errors
+///
+/// [`Error::Faults`], if anything is; [`Error::Print`], if it cannot be said.
+pub fn run(args: &Args) -> Result<(), Error> {
+    let root = Path::new("/");
+    let user = User::of_this_process(root);
+    let ports = args
+        .port
+        .as_ref()
+        .map_or_else(|| ports(root), |port| vec![port.clone()]);
+    let mut lines = String::new();
+    let mut found = 0;
+    if ports.is_empty() {
+        found += 1;
+        lines += "no USB serial port: plug the sensor in, then see `sudo dmesg | grep tty`\n";
+    }
+    for port in ports {
+        let port = std::path::absolute(&port).unwrap_or(port);
+        let faults = examine(root, &port, &user);
+        found += faults.len();
+        if faults.is_empty() {
+            lines += &format!("{}: no fault found\n", port.display());
+        }
+        for fault in faults {
+            lines += &format!("{}: {fault}\n", port.display());
+        }
+    }
+    super::print(lines.as_bytes()).map_err(Error::Print)?;
+    match found {
+        0 => Ok(()),
+        found => Err(Error::Faults { found }),
+    }
+}

@@ -1,0 +1,248 @@
+//! The checks: what the trees under a root (`/`, but for tests) say of a port.
+
+use std::fmt;
+use std::fs;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+/// Something wrong, and what mends it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Fault {
+    what: String,
+    cure: String,
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: {}", self.what, self.cure)
+    }
+}
+
+/// Who wants to use the port.
+#[derive(Debug, Clone)]
+pub(super) struct User {
+    pub(super) name: String,
+    pub(super) uid: u32,
+    /// That the process has, not those of the files.
+    pub(super) gids: Vec<u32>,
+}
+
+impl User {
+    pub(super) fn of_this_process(root: &Path) -> Self {
+        let uid = rustix::process::geteuid().as_raw();
+        let groups = rustix::process::getgroups().unwrap_or_default();
+        let mut gids: Vec<u32> = groups.into_iter().map(rustix::fs::Gid::as_raw).collect();
+        gids.push(rustix::process::getegid().as_raw());
+        let name = entry(root, "etc/passwd", uid).map_or(uid.to_string(), |line| field(&line, 0));
+        Self { name, uid, gids }
+    }
+}
+
+/// Every USB serial port: by its lasting name where it has one.
+pub(super) fn ports(root: &Path) -> Vec<PathBuf> {
+    let lasting = names(root, "dev/serial/by-id");
+    let mut ports: Vec<PathBuf> = if lasting.is_empty() {
+        let of_usb = |name: &String| name.starts_with("ttyUSB") || name.starts_with("ttyACM");
+        let names = names(root, "dev").into_iter().filter(of_usb);
+        names.map(|name| Path::new("/dev").join(name)).collect()
+    } else {
+        let names = lasting.into_iter();
+        names
+            .map(|name| Path::new("/dev/serial/by-id").join(name))
+            .collect()
+    };
+    ports.sort();
+    ports
+}
+
+/// All that is wrong with `port`, an absolute path under `root`.
+pub(super) fn examine(root: &Path, port: &Path, user: &User) -> Vec<Fault> {
+    let Some(device) = device(root, port) else {
+        return vec![missing(&ports(root))];
+    };
+    denied(root, &device, user)
+        .into_iter()
+        .chain(held(root, &device, std::process::id()))
+        .chain(modem_manager(root, &device))
+        .chain(latency(root, &device))
+        .collect()
+}
+
+/// What `port` resolves to, without the root.
+fn device(root: &Path, port: &Path) -> Option<PathBuf> {
+    let device = under(root, port).canonicalize().ok()?;
+    let device = device.strip_prefix(root.canonicalize().ok()?).ok()?;
+    Some(Path::new("/").join(device))
+}
+
+fn missing(others: &[PathBuf]) -> Fault {
+    let cure = if others.is_empty() {
+        "no other is there either: plug the sensor in, then see `sudo dmesg | grep tty`".to_owned()
+    } else {
+        let keys = others.iter().map(|port| format!("port = {port:?}"));
+        format!("these are there: {}", keys.collect::<Vec<_>>().join(", "))
+    };
+    Fault {
+        what: "no such device".to_owned(),
+        cure,
+    }
+}
+
+fn denied(root: &Path, device: &Path, user: &User) -> Option<Fault> {
+    const READ_WRITE: u32 = 0o6;
+    let file = fs::metadata(under(root, device)).ok()?;
+    let (mode, gid) = (file.mode(), file.gid());
+    let allows = |shift: u32| (mode >> shift) & READ_WRITE == READ_WRITE;
+    let granted = if user.uid == 0 {
+        true
+    } else if user.uid == file.uid() {
+        allows(6)
+    } else if user.gids.contains(&gid) {
+        allows(3)
+    } else {
+        allows(0)
+    };
+    if granted {
+        return None;
+    }
+    let (line, name, shown) = (entry(root, "etc/group", gid), &user.name, device.display());
+    let group = line.as_ref().map_or(gid.to_string(), |line| field(line, 0));
+    let is_listed = line.is_some_and(|line| field(&line, 3).split(',').any(|one| one == name));
+    let cure = if gid == 0 || !allows(3) {
+        format!(
+            "sudo chgrp dialout {shown} && sudo chmod 660 {shown} && sudo usermod -aG dialout {name}"
+        )
+    } else if is_listed {
+        format!("{name} joined after login: log in again, or `newgrp {group}`")
+    } else {
+        format!("sudo usermod -aG {group} {name}, then log in again")
+    };
+    Some(Fault {
+        what: format!(
+            "permission denied to {name} (group {group}, mode {:03o})",
+            mode & 0o777
+        ),
+        cure,
+    })
+}
+
+/// Processes but `own` that have it open. Of other users' processes only root sees this.
+fn held(root: &Path, device: &Path, own: u32) -> Vec<Fault> {
+    let mut faults = Vec::new();
+    for pid in processes(root).filter(|&pid| pid != own) {
+        let files = root.join("proc").join(pid.to_string()).join("fd");
+        let Ok(files) = fs::read_dir(files) else {
+            continue;
+        };
+        let is_device =
+            |file: fs::DirEntry| fs::read_link(file.path()).is_ok_and(|target| target == device);
+        if files.flatten().any(is_device) {
+            faults.push(Fault {
+                what: format!("held by process {pid} ({})", command(root, pid)),
+                cure: format!("kill {pid}"),
+            });
+        }
+    }
+    faults
+}
+
+/// ModemManager writes to every new USB serial port, unless a udev rule tells it not to.
+fn modem_manager(root: &Path, device: &Path) -> Option<Fault> {
+    let is_told = [
+        "etc/udev/rules.d",
+        "run/udev/rules.d",
+        "usr/lib/udev/rules.d",
+        "lib/udev/rules.d",
+    ]
+    .iter()
+    .flat_map(|rules| {
+        names(root, rules)
+            .into_iter()
+            .map(move |name| root.join(rules).join(name))
+    })
+    // ModemManager's own rules exempt devices of its list by the same variable.
+    .filter(|rule| {
+        rule.file_name()
+            .is_some_and(|name| !name.to_string_lossy().starts_with("77-mm-"))
+    })
+    .filter_map(|rule| fs::read_to_string(rule).ok())
+    .any(|rule| {
+        rule.lines()
+            .any(|line| !line.starts_with('#') && line.contains(r#"ID_MM_DEVICE_IGNORE}="1""#))
+    });
+    let runs = || processes(root).find(|&pid| command(root, pid) == "ModemManager");
+    if is_told || !is_usb(device) {
+        return None;
+    }
+    runs().map(|pid| Fault {
+        what: format!("ModemManager (process {pid}) writes to it, and no udev rule forbids that"),
+        cure: UDEV_RULE.to_owned(),
+    })
+}
+
+/// An FTDI adapter holds bytes back for as long as its timer says.
+fn latency(root: &Path, device: &Path) -> Option<Fault> {
+    let timer = Path::new("sys/class/tty")
+        .join(device.file_name()?)
+        .join("device/latency_timer");
+    let ms: u32 = fs::read_to_string(root.join(&timer))
+        .ok()?
+        .trim()
+        .parse()
+        .ok()?;
+    (ms > 1).then(|| Fault {
+        what: format!("its latency timer holds bytes back for {ms} ms"),
+        cure: format!(
+            "echo 1 | sudo tee /{}; to last: {UDEV_RULE}",
+            timer.display()
+        ),
+    })
+}
+
+/// The shipped rule does for ModemManager and the latency timer.
+const UDEV_RULE: &str = "sudo cp systemd/99-hardnessd.rules /etc/udev/rules.d/ && \
+    sudo udevadm control --reload && sudo udevadm trigger";
+
+fn is_usb(device: &Path) -> bool {
+    let name = device.file_name().unwrap_or_default().to_string_lossy();
+    name.starts_with("ttyUSB") || name.starts_with("ttyACM")
+}
+
+fn processes(root: &Path) -> impl Iterator<Item = u32> {
+    let mut pids: Vec<u32> = names(root, "proc")
+        .iter()
+        .filter_map(|name| name.parse().ok())
+        .collect();
+    pids.sort_unstable();
+    pids.into_iter()
+}
+
+fn command(root: &Path, pid: u32) -> String {
+    let name = fs::read_to_string(root.join("proc").join(pid.to_string()).join("comm"));
+    name.map_or("?".to_owned(), |name| name.trim().to_owned())
+}
+
+fn names(root: &Path, folder: &str) -> Vec<String> {
+    let entries = fs::read_dir(root.join(folder))
+        .into_iter()
+        .flatten()
+        .flatten();
+    entries
+        .map(|entry| entry.file_name().to_string_lossy().into_owned())
+        .collect()
+}
+
+/// The line of `etc/passwd` or `etc/group` whose third field is `id`.
+fn entry(root: &Path, file: &str, id: u32) -> Option<String> {
+    let text = fs::read_to_string(root.join(file)).ok()?;
+    let line = text.lines().find(|line| field(line, 2) == id.to_string())?;
+    Some(line.to_owned())
+}
+
+fn field(line: &str, index: usize) -> String {
+    line.split(':').nth(index).unwrap_or_default().to_owned()
+}
+
+fn under(root: &Path, path: &Path) -> PathBuf {
+    root.join(path.strip_prefix("/").unwrap_or(path))
+}

@@ -1,0 +1,183 @@
+//! Each fault is found in a tree that has it, and in no other.
+
+use std::fs::{self, File};
+use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command};
+
+use tempfile::TempDir;
+
+use super::checks::{User, examine, ports};
+use crate::tools::pty::Pty;
+
+const PORT: &str = "/dev/serial/by-id/usb-film-if00";
+
+/// A machine without fault: an FTDI adapter that its user may use.
+struct Machine(TempDir);
+
+impl Machine {
+    fn new() -> Self {
+        let machine = Self(TempDir::new().unwrap());
+        machine.put("dev/ttyUSB0", "");
+        fs::set_permissions(
+            machine.path("dev/ttyUSB0"),
+            fs::Permissions::from_mode(0o660),
+        )
+        .unwrap();
+        fs::create_dir_all(machine.path("dev/serial/by-id")).unwrap();
+        symlink("../../ttyUSB0", machine.path(&PORT[1..])).unwrap();
+        machine.put("sys/class/tty/ttyUSB0/device/latency_timer", "1\n");
+        machine.put("proc/1/comm", "systemd\n");
+        machine.put("etc/group", "root:x:0:\n");
+        machine
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    fn put(&self, name: &str, text: &str) {
+        let path = self.path(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, text).unwrap();
+    }
+
+    /// As a user in the device's group.
+    fn faults(&self, port: &str) -> Vec<String> {
+        let gid = fs::metadata(self.path("dev/ttyUSB0")).unwrap().gid();
+        self.faults_of(port, vec![gid])
+    }
+
+    fn faults_of(&self, port: &str, gids: Vec<u32>) -> Vec<String> {
+        let user = User {
+            name: "ada".to_owned(),
+            uid: 12_345,
+            gids,
+        };
+        let faults = examine(self.0.path(), Path::new(port), &user);
+        faults.iter().map(ToString::to_string).collect()
+    }
+}
+
+fn one(faults: &[String], parts: &[&str]) {
+    assert_eq!(faults.len(), 1, "{faults:?}");
+    for part in parts {
+        assert!(faults[0].contains(part), "{part:?} not in {faults:?}");
+    }
+}
+
+#[test]
+fn a_sound_port_has_no_fault() {
+    let machine = Machine::new();
+    assert_eq!(machine.faults(PORT), Vec::<String>::new());
+    assert_eq!(ports(machine.0.path()), [Path::new(PORT)]);
+}
+
+#[test]
+fn a_missing_port_is_answered_by_those_that_are_there() {
+    let machine = Machine::new();
+    one(&machine.faults("/dev/ttyUSB7"), &["no such device", PORT]);
+    fs::remove_dir_all(machine.path("dev/serial")).unwrap();
+    one(&machine.faults(PORT), &["port = \"/dev/ttyUSB0\""]);
+}
+
+#[test]
+fn a_stranger_to_the_group_is_told_how_to_join() {
+    let machine = Machine::new();
+    let gid = fs::metadata(machine.path("dev/ttyUSB0")).unwrap().gid();
+    // Tests run as root too, whose files are root's: a group that nobody shall join.
+    let denied = machine.faults_of(PORT, vec![gid + 1]);
+    if gid == 0 {
+        return one(
+            &denied,
+            &[
+                "permission denied to ada (group root, mode 660)",
+                "chgrp dialout",
+            ],
+        );
+    }
+    one(&denied, &["usermod -aG"]);
+}
+
+#[test]
+fn the_group_of_the_device_is_the_one_to_join() {
+    let machine = Machine::new();
+    // Only root can give a file to another group.
+    if std::os::unix::fs::chown(machine.path("dev/ttyUSB0"), None, Some(20)).is_err() {
+        return;
+    }
+    machine.put("etc/group", "root:x:0:\ndialout:x:20:eve\n");
+    let join = "sudo usermod -aG dialout ada";
+    one(
+        &machine.faults_of(PORT, vec![1000]),
+        &["(group dialout, mode 660)", join],
+    );
+    machine.put("etc/group", "root:x:0:\ndialout:x:20:eve,ada\n");
+    one(
+        &machine.faults_of(PORT, vec![1000]),
+        &["log in again, or `newgrp dialout`"],
+    );
+    assert_eq!(machine.faults_of(PORT, vec![20]), Vec::<String>::new());
+}
+
+#[test]
+fn modem_manager_matters_without_a_rule() {
+    let machine = Machine::new();
+    machine.put("proc/77/comm", "ModemManager\n");
+    one(
+        &machine.faults(PORT),
+        &["ModemManager (process 77)", "99-hardnessd.rules"],
+    );
+    let rule = include_str!("../../../systemd/99-hardnessd.rules");
+    machine.put("etc/udev/rules.d/99-hardnessd.rules", rule);
+    assert_eq!(machine.faults(PORT), Vec::<String>::new());
+}
+
+#[test]
+fn a_slow_latency_timer_is_a_fault() {
+    let machine = Machine::new();
+    machine.put("sys/class/tty/ttyUSB0/device/latency_timer", "16\n");
+    let line = "echo 1 | sudo tee /sys/class/tty/ttyUSB0/device/latency_timer";
+    one(&machine.faults(PORT), &["16 ms", line]);
+}
+
+#[test]
+fn whoever_holds_the_port_is_named() {
+    let machine = Machine::new();
+    machine.put("proc/88/comm", "minicom\n");
+    fs::create_dir_all(machine.path("proc/88/fd")).unwrap();
+    symlink("/dev/ttyUSB0", machine.path("proc/88/fd/3")).unwrap();
+    one(
+        &machine.faults(PORT),
+        &["held by process 88 (minicom)", "kill 88"],
+    );
+}
+
+/// Ends with the test.
+struct Holder(Child);
+
+impl Drop for Holder {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[test]
+fn a_real_port_held_by_a_real_process_is_found() {
+    let pty = Pty::open(None).unwrap();
+    let root = Path::new("/");
+    let user = User::of_this_process(root);
+    assert_eq!(examine(root, pty.path(), &user), []);
+    let device = File::open(pty.path()).unwrap();
+    let holder = Holder(
+        Command::new("sleep")
+            .arg("60")
+            .stdin(device)
+            .spawn()
+            .unwrap(),
+    );
+    let faults = examine(root, pty.path(), &user);
+    let faults: Vec<String> = faults.iter().map(ToString::to_string).collect();
+    one(&faults, &[&format!("held by process {} (", holder.0.id())]);
+}

@@ -1,0 +1,200 @@
+//! Layouts that bytes may have, from what repeats in them.
+//!
+//! In: a sample of raw bytes. Out: free layouts worth decoding it with, every key given. What
+//! stands between the cells of two frames is `checksum, tail, sync, length`, of which all but the
+//! checksum is the same in every frame. So: which distances do pairs of bytes recur at; which
+//! square array fits such a distance; which bytes are constant there. Nothing is decoded here.
+
+use crate::frame::ROWS;
+use crate::wire::{Cell, Checksum, HexBytes, LengthField, Preset, Settings};
+
+/// Smallest side of an array looked for: below it, any short repetition would be one.
+const SMALLEST_SIDE: usize = 4;
+/// Most bytes of a frame beside its cells: `jq-u16` has 8.
+const MOST_OVERHEAD_BYTES: usize = 12;
+/// Distances looked into. Rows of a press recur too, so the frame's is not always the first.
+const PERIODS: usize = 8;
+/// Recurrences at a distance that are no accident.
+const LEAST_RECURRENCES: usize = 3;
+/// Share of frames in which a constant byte is undamaged.
+const CONSTANT_SHARE: f64 = 0.75;
+/// Constant stretches looked into for each distance.
+const BLOCKS: usize = 4;
+
+const CHECKSUMS: [Checksum; 5] = [
+    Checksum::None,
+    Checksum::Sum8,
+    Checksum::Xor8,
+    Checksum::Crc16Modbus,
+    Checksum::Crc16Ccitt,
+];
+
+/// What its constant bytes must tell, in bits: as much as one byte of noise. Zeros that stand where
+/// nothing ever presses tell next to nothing.
+const LEAST_BITS: f64 = 8.0;
+
+/// Layouts worth trying, each with the bits that its constant bytes tell. Cells of two bytes are
+/// taken as low byte first: which it is shows only in the frames.
+pub(super) fn candidates(bytes: &[u8]) -> Vec<(Settings, u32)> {
+    let rarity = rarity(bytes);
+    let mut found = Vec::new();
+    for (period, mark) in periods(bytes) {
+        let columns = columns(bytes, period, mark);
+        for (side, cell, overhead) in payloads(period) {
+            for checksum in CHECKSUMS {
+                let constant = overhead.saturating_sub(checksum.bytes());
+                for (bits, block) in constant_blocks(&columns, constant, &rarity) {
+                    // A header of zeros would be found in every frame at rest, again and again.
+                    let is_header =
+                        |header: &[u8]| header.is_empty() || told(header, &rarity) >= LEAST_BITS;
+                    found.extend(
+                        (0..=constant)
+                            .filter(|&tail| is_header(&block[tail..]))
+                            .map(|tail| {
+                                let settings = free(&block, tail, side, cell, checksum);
+                                (settings, bits.round() as u32)
+                            }),
+                    );
+                }
+            }
+        }
+    }
+    found
+}
+
+/// Distances at which a pair of bytes recurs, most frequent first, each with that pair.
+fn periods(bytes: &[u8]) -> Vec<(usize, u16)> {
+    let longest = 2 * ROWS * ROWS + MOST_OVERHEAD_BYTES;
+    let mut last = vec![None; 1 << 16];
+    let mut gaps: Vec<(usize, u16)> = Vec::new();
+    for (at, pair) in bytes.array_windows().enumerate() {
+        let pair = u16::from_be_bytes(*pair);
+        if let Some(before) = last[usize::from(pair)].replace(at)
+            && (SMALLEST_SIDE * SMALLEST_SIDE..=longest).contains(&(at - before))
+        {
+            gaps.push((at - before, pair));
+        }
+    }
+    gaps.sort_unstable();
+    let mut periods: Vec<(usize, (usize, u16))> = gaps
+        .chunk_by(|a, b| a.0 == b.0)
+        .filter_map(|of_period| {
+            of_period
+                .chunk_by(|a, b| a == b)
+                .map(|same| (same.len(), same[0]))
+                .max()
+        })
+        .filter(|&(recurrences, (period, _))| {
+            recurrences >= LEAST_RECURRENCES && !payloads(period).is_empty()
+        })
+        .collect();
+    periods.sort_unstable_by(|a, b| b.cmp(a));
+    periods.truncate(PERIODS);
+    periods.into_iter().map(|(_, found)| found).collect()
+}
+
+/// Square arrays that fit a frame of `period` bytes: side, cell, bytes beside the cells.
+fn payloads(period: usize) -> Vec<(usize, Cell, usize)> {
+    let mut payloads = Vec::new();
+    for side in (SMALLEST_SIDE..=ROWS).rev() {
+        for (cell, cell_bytes) in [(Cell::U8, 1), (Cell::U16le, 2)] {
+            let overhead = period.saturating_sub(side * side * cell_bytes);
+            if (1..=MOST_OVERHEAD_BYTES).contains(&overhead) {
+                payloads.push((side, cell, overhead));
+            }
+        }
+    }
+    payloads
+}
+
+/// For each byte of a frame, counted from `mark`: its value, if that is constant.
+fn columns(bytes: &[u8], period: usize, mark: u16) -> Vec<Option<u8>> {
+    let is_mark = |at: usize| bytes.get(at..at + 2) == Some(&mark.to_be_bytes()[..]);
+    let mut counts = vec![[0_u32; 256]; period];
+    let mut frames = 0;
+    for at in (0..bytes.len()).filter(|&at| is_mark(at) && is_mark(at + period)) {
+        frames += 1;
+        for (count, &byte) in counts.iter_mut().zip(&bytes[at..at + period]) {
+            count[usize::from(byte)] += 1;
+        }
+    }
+    let least = CONSTANT_SHARE * f64::from(frames);
+    counts
+        .iter()
+        .map(|count| (0..=u8::MAX).find(|&byte| f64::from(count[usize::from(byte)]) >= least))
+        .collect()
+}
+
+/// Stretches of `length` constant bytes and the bits they tell, most first: cells are constant too
+/// where nothing presses, but those are zeros, of which there are many.
+fn constant_blocks(
+    columns: &[Option<u8>],
+    length: usize,
+    rarity: &[f64; 256],
+) -> Vec<(f64, Vec<u8>)> {
+    if length == 0 {
+        return Vec::new();
+    }
+    let around: Vec<Option<u8>> = columns.iter().chain(columns).copied().collect();
+    let mut blocks: Vec<(f64, Vec<u8>)> = around
+        .windows(length)
+        .take(columns.len())
+        .filter_map(|block| block.iter().copied().collect::<Option<Vec<u8>>>())
+        .map(|block| (told(&block, rarity), block))
+        .filter(|&(bits, _)| bits >= LEAST_BITS)
+        .collect();
+    blocks.sort_by(|a, b| b.0.total_cmp(&a.0).then_with(|| a.1.cmp(&b.1)));
+    blocks.dedup();
+    blocks.truncate(BLOCKS);
+    blocks
+}
+
+/// Bits that `block` tells.
+fn told(block: &[u8], rarity: &[f64; 256]) -> f64 {
+    block.iter().map(|&byte| rarity[usize::from(byte)]).sum()
+}
+
+/// How much each byte tells, in bits: the rarer, the more.
+fn rarity(bytes: &[u8]) -> [f64; 256] {
+    let mut counts = [1_u32; 256];
+    for &byte in bytes {
+        counts[usize::from(byte)] += 1;
+    }
+    let total = (bytes.len() + 256) as f64;
+    counts.map(|count| (total / f64::from(count)).log2())
+}
+
+/// The layout whose constant bytes are `block`: first `tail` bytes of tail, then sync and, if the
+/// bytes say so, length.
+fn free(block: &[u8], tail: usize, side: usize, cell: Cell, checksum: Checksum) -> Settings {
+    let (tail, header) = block.split_at(tail);
+    let payload_bytes = side * side * if cell == Cell::U8 { 1 } else { 2 };
+    let little = (payload_bytes as u16).to_le_bytes();
+    let big = (payload_bytes as u16).to_be_bytes();
+    let fields: [(LengthField, &[u8]); 3] = [
+        (LengthField::U16le, &little),
+        (LengthField::U16be, &big),
+        (LengthField::U8, &little[..1]),
+    ];
+    let (length, sync) = fields
+        .into_iter()
+        .filter(|&(length, _)| length != LengthField::U8 || payload_bytes <= 0xFF)
+        .find_map(|(length, field)| {
+            let sync = header.strip_suffix(field)?;
+            (!sync.is_empty()).then_some((length, sync))
+        })
+        .unwrap_or((LengthField::None, header));
+    Settings {
+        preset: Preset::default(),
+        sync: Some(HexBytes(sync.to_vec())),
+        tail: Some(HexBytes(tail.to_vec())),
+        length: Some(length),
+        cell: Some(cell),
+        mask: None,
+        invert: None,
+        checksum: Some(checksum),
+        rows: Some(side),
+        cols: Some(side),
+        order: None,
+    }
+}

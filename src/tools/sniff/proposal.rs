@@ -1,0 +1,281 @@
+//! How well layouts explain bytes, and which does best.
+//!
+//! In: raw bytes. Out: [`Proposal`]s, best first, each decoded by the daemon's own decoder over
+//! all the bytes. The same bytes give the same proposals; the time is bounded by their number.
+
+use std::cmp::Reverse;
+
+use super::candidates::candidates;
+use crate::wire::{Cell, Checksum, Decoder, Layout, LengthField, Preset, Settings};
+
+/// What candidates are first tried on: so many pieces from all over the bytes, so that neither
+/// a bad beginning nor a long rest decides.
+const PIECES: usize = 8;
+/// Five of the longest frames, or ten of the JX255N's.
+const PIECE_BYTES: usize = 8 * 1024;
+/// Candidates tried on all the bytes.
+const FINALISTS: usize = 4;
+/// Share of the bytes below which nothing is explained: noise ends as `ff-tail` or `zero-run` by
+/// chance in some of them.
+const LEAST_SHARE: f64 = 0.5;
+/// Whole frames below which nothing is.
+const LEAST_FRAMES: u64 = 3;
+
+/// What marks tell where every byte of a frame must be in order, as good as a checksum.
+const ALL_IN_ORDER: u32 = u32::MAX;
+
+/// A layout and what it makes of the bytes.
+#[derive(Debug, Clone)]
+pub(super) struct Proposal {
+    /// With the fewest keys.
+    pub(super) settings: Settings,
+    /// Whole.
+    pub(super) frames: u64,
+    /// Whole, and not the same as the one before.
+    pub(super) frames_changed: u64,
+    pub(super) frames_damaged: u64,
+    /// In whole frames.
+    pub(super) bytes_explained: u64,
+    /// Of all bytes.
+    pub(super) share: f64,
+    /// Mean difference of neighbouring taxels, in counts.
+    roughness: f64,
+    /// Told by the constant bytes.
+    bits: u32,
+    is_checked: bool,
+    has_length: bool,
+    keys: usize,
+}
+
+/// Layouts that explain `bytes`, best first; none if nothing does.
+pub(super) fn propose(bytes: &[u8]) -> Vec<Proposal> {
+    let sample = sample(bytes);
+    let presets = [Preset::FfTail, Preset::Ascii, Preset::ZeroRun].map(|preset| {
+        let settings = Settings {
+            preset,
+            ..Settings::default()
+        };
+        (settings, ALL_IN_ORDER)
+    });
+    let mut proposals: Vec<Proposal> = candidates(&sample)
+        .iter()
+        .chain(&presets)
+        .filter_map(|(settings, bits)| Proposal::of(settings, *bits, &sample))
+        .collect();
+    rank(&mut proposals);
+    proposals.truncate(FINALISTS);
+    proposals = proposals
+        .iter()
+        .filter_map(|proposal| smoother(proposal, bytes))
+        .collect();
+    rank(&mut proposals);
+    proposals
+}
+
+impl Proposal {
+    /// `None`: it explains too little.
+    fn of(settings: &Settings, bits: u32, bytes: &[u8]) -> Option<Self> {
+        let layout = Layout::new(settings).ok()?;
+        let mut decoder = Decoder::new(layout);
+        let mut tally = Tally::default();
+        for chunk in bytes.chunks(PIECE_BYTES) {
+            decoder.push(chunk);
+            tally.take(&mut decoder);
+        }
+        decoder.settle();
+        tally.take(&mut decoder);
+        let bytes_explained = decoder.received() - decoder.skipped() - decoder.pending() as u64;
+        let share = bytes_explained as f64 / bytes.len() as f64;
+        if tally.frames < LEAST_FRAMES || share < LEAST_SHARE {
+            return None;
+        }
+        let settings = simplest(settings, decoder.layout());
+        Some(Self {
+            bits,
+            keys: keys(&settings),
+            is_checked: bits == ALL_IN_ORDER
+                || is_other(&settings, decoder.layout(), |settings| {
+                    settings.checksum = Some(Checksum::None);
+                }),
+            has_length: is_other(&settings, decoder.layout(), |settings| {
+                settings.length = Some(LengthField::None);
+            }),
+            settings,
+            frames: tally.frames,
+            frames_changed: tally.changed,
+            frames_damaged: tally.damaged,
+            bytes_explained,
+            share,
+            roughness: tally.roughness as f64 / tally.frames as f64,
+        })
+    }
+
+    /// In frames that are not the same as the one before.
+    fn bytes_changed(&self) -> u64 {
+        self.frames_changed * self.bytes_explained / self.frames
+    }
+}
+
+/// Counts over one decoding.
+#[derive(Default)]
+struct Tally {
+    frames: u64,
+    changed: u64,
+    damaged: u64,
+    roughness: u64,
+    last: Option<crate::frame::RawFrame>,
+}
+
+impl Tally {
+    fn take(&mut self, decoder: &mut Decoder) {
+        while let Some(item) = decoder.next_frame() {
+            let Ok(decoded) = item else {
+                self.damaged += 1;
+                continue;
+            };
+            let counts = &decoded.frame.counts;
+            self.frames += 1;
+            self.changed += u64::from(self.last.is_some_and(|last| last.counts != *counts));
+            self.roughness += counts
+                .array_windows()
+                .map(|[a, b]| u64::from(a.abs_diff(*b)))
+                .sum::<u64>();
+            self.last = Some(decoded.frame);
+        }
+    }
+}
+
+/// Best first. A checksum that fits frames which change is no accident, whatever more another
+/// layout makes of damaged ones. Else shares within two frames or a fiftieth of the best are equal
+/// (damage in a mark costs the longer mark more), and among equals the more telling marks go first,
+/// then a length field before a longer sync, then few keys, a preset most of all, before many.
+fn rank(proposals: &mut [Proposal]) {
+    let most = |of: fn(&Proposal) -> u64| proposals.iter().map(of).max().unwrap_or_default();
+    let changed = most(Proposal::bytes_changed);
+    let enough = most(|p| {
+        let slack = (p.bytes_explained / 50).max(2 * p.bytes_explained / p.frames);
+        p.bytes_explained - slack
+    });
+    proposals.sort_by_key(|p| {
+        (
+            Reverse(p.is_checked && 4 * p.bytes_changed() >= 3 * changed),
+            Reverse(p.bytes_explained.min(enough)),
+            Reverse(p.bits),
+            Reverse(p.has_length),
+            p.keys,
+            Reverse(p.bytes_explained),
+        )
+    });
+}
+
+/// The layout with two-byte cells the other way round, where that makes smoother frames.
+fn smoother(proposal: &Proposal, bytes: &[u8]) -> Option<Proposal> {
+    let (settings, bits) = (&proposal.settings, proposal.bits);
+    let proposal = Proposal::of(settings, bits, bytes)?;
+    let swapped = |cell| Settings {
+        cell: Some(cell),
+        ..settings.clone()
+    };
+    let as_is = Layout::new(settings);
+    // Only a layout of two-byte cells is the same with these.
+    if Layout::new(&swapped(Cell::U16le)) != as_is {
+        return Some(proposal);
+    }
+    match Proposal::of(&swapped(Cell::U16be), bits, bytes) {
+        Some(other) if other.roughness < proposal.roughness => Some(other),
+        _ => Some(proposal),
+    }
+}
+
+/// The same layout with the fewest keys.
+fn simplest(settings: &Settings, layout: &Layout) -> Settings {
+    let bases = [
+        Preset::Jx255n,
+        Preset::Jx255nU16,
+        Preset::Jq,
+        Preset::JqTail,
+        Preset::JqU16,
+    ];
+    bases
+        .into_iter()
+        .map(|preset| Settings {
+            preset,
+            ..settings.clone()
+        })
+        .filter(|other| Layout::new(other).as_ref() == Ok(layout))
+        .map(|other| shortened(other, layout))
+        .min_by_key(keys)
+        .unwrap_or_else(|| settings.clone())
+}
+
+/// Without the keys whose absence changes nothing.
+fn shortened(mut settings: Settings, layout: &Layout) -> Settings {
+    let forget: [fn(&mut Settings); 7] = [
+        |settings| settings.sync = None,
+        |settings| settings.tail = None,
+        |settings| settings.length = None,
+        |settings| settings.cell = None,
+        |settings| settings.checksum = None,
+        |settings| settings.rows = None,
+        |settings| settings.cols = None,
+    ];
+    for forget in forget {
+        let mut shorter = settings.clone();
+        forget(&mut shorter);
+        if Layout::new(&shorter).as_ref() == Ok(layout) {
+            settings = shorter;
+        }
+    }
+    settings
+}
+
+/// Whether the layout would be another one after `change`, and could be.
+fn is_other(settings: &Settings, layout: &Layout, change: impl Fn(&mut Settings)) -> bool {
+    let mut changed = settings.clone();
+    change(&mut changed);
+    Layout::new(&changed).is_ok_and(|other| other != *layout)
+}
+
+/// Keys beside the preset.
+fn keys(settings: &Settings) -> usize {
+    let Settings {
+        preset: _,
+        sync,
+        tail,
+        length,
+        cell,
+        mask,
+        invert,
+        checksum,
+        rows,
+        cols,
+        order,
+    } = settings;
+    [
+        sync.is_some(),
+        tail.is_some(),
+        length.is_some(),
+        cell.is_some(),
+        mask.is_some(),
+        invert.is_some(),
+        checksum.is_some(),
+        rows.is_some(),
+        cols.is_some(),
+        order.is_some(),
+    ]
+    .into_iter()
+    .filter(|&is_given| is_given)
+    .count()
+}
+
+/// Pieces from all over `bytes`; all of them if they are few.
+fn sample(bytes: &[u8]) -> Vec<u8> {
+    if bytes.len() <= PIECES * PIECE_BYTES {
+        return bytes.to_vec();
+    }
+    let step = (bytes.len() - PIECE_BYTES) / (PIECES - 1);
+    (0..PIECES)
+        .flat_map(|piece| &bytes[piece * step..][..PIECE_BYTES])
+        .copied()
+        .collect()
+}
