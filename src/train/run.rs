@@ -338,9 +338,15 @@ impl Metrics {
             Some(Likeness {
                 pixel_std,
                 pixel_std_real,
+                pixel_std_component,
                 feature_distance,
-            }) => line += &format!(",{pixel_std:.5},{pixel_std_real:.5},{feature_distance:.5}"),
-            None => line += ",,,",
+            }) => {
+                line += &format!(
+                    ",{pixel_std:.5},{pixel_std_real:.5},{pixel_std_component:.5},\
+                     {feature_distance:.5}"
+                );
+            }
+            None => line += ",,,,",
         }
         line += &format!(",{seconds:.1}\n");
         // One write a row: a full disk leaves whole rows.

@@ -12,8 +12,8 @@ use crate::train::sheet::{self, Strip};
 
 /// Real frames, at most, that generated ones are measured against; they are measured pair by pair.
 const COMPARED: usize = 500;
-/// Strips of generated frames in a picture.
-const STRIPS: usize = 4;
+/// Pairs of strips of generated frames in a picture.
+const STRIPS: usize = 3;
 
 impl Task<'_> {
     /// Real samples to measure generated ones by.
@@ -39,20 +39,26 @@ impl Task<'_> {
             &mut self.stream("compared noise"),
             self.device,
         );
-        real.compare(&frames).context("generated samples")
+        real.compare(&frames, generator::COMPONENTS)
+            .context("generated samples")
     }
 
-    /// Draws what fixed noise becomes, one frame a component, beside real frames.
+    /// Draws what fixed noise becomes beside real frames: of each component one frame, and under
+    /// it another.
     pub(super) fn picture(&self, generator: &Weights, epoch: u32, run: &Run) -> anyhow::Result<()> {
-        let samples = self.settings.samples_a_component;
+        let samples = self.settings.samples_a_component.max(2);
         let eta = generator::noise(samples, &mut self.stream("picture"), self.device);
         let images = generator::images(generator, eta, &mut Normalisation::Batch);
         let generated = generator::frames(&images, self.full_scale_n);
         let order = self.order("compared", self.real, 0);
         let real = self.frames(&order);
         let mut rows = vec![Strip::of("real", real.into_iter().take(sheet::TILES))];
-        let parts = generated.chunks(sheet::TILES).take(STRIPS);
-        rows.extend(parts.map(|part| Strip::of("generated", part.iter())));
+        let (first, second) = generated.split_at(generator::COMPONENTS);
+        let parts = first.chunks(sheet::TILES).zip(second.chunks(sheet::TILES));
+        for (first, second) in parts.take(STRIPS) {
+            rows.push(Strip::of("generated", first.iter()));
+            rows.push(Strip::of("  again", second.iter()));
+        }
         let stage = self.stage;
         let title = format!("{stage} after {epoch} epochs: contact area at 0.07 N, force, peak");
         let name = format!("samples/{stage}-{epoch:06}.png");
