@@ -14,7 +14,7 @@ use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;
 
 use self::plot::escaped;
-use super::compare::results::{Comparison, Details, Row};
+use super::compare::results::{Comparison, Details, Measured, Row};
 use super::compare::{MATCHED, PAPER_SPLIT};
 use super::metrics::{Bin, Evaluation};
 use super::tables::{self, REFERENCE, Table};
@@ -143,7 +143,19 @@ pub fn run(details: &Details) -> anyhow::Result<String> {
     }
     page.section("steps", "Training");
     page.table(&tables::stages(&details.history));
-    page.panels(figures::columns(&details.history));
+    page.note(
+        "Blue: loss and accuracy on what is learnt from (of a GAN, the discriminator's loss). \
+         Orange: on held-out objects, or the generator's loss. Dashed: real frames.",
+    );
+    page.panels(figures::stages(&details.history));
+    if !details.worth.sets.is_empty() {
+        page.section("calibration", "Calibration");
+        let sets = details.worth.sets.iter();
+        let picture = |(name, measured): (&String, &Measured)| {
+            figures::reliability(&measured.calibration, &name.replace('_', " "))
+        };
+        page.panels(sets.map(picture).collect());
+    }
     page.section("samples", "Frames");
     let pictures = pictures(&details.directory);
     if pictures.is_empty() {

@@ -3,16 +3,22 @@
 //! In: a comparison's results. Out: tables as rows of text, which `tables.md` and the report show
 //! alike.
 
+mod cells;
+
 use std::fmt::Write as _;
 
 use super::compare::results::{Comparison, Details, Entry, Row, SwapEntry};
 use super::compare::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS};
 use super::history::History;
-use super::metrics::{self, Estimate, Evaluation, ObjectCount};
-use super::paper;
+use super::metrics::{self, Evaluation};
+use cells::{
+    beside, deviation, interval, interval_text, less_reference, mean_over_seeds, number,
+    of_entries, percent_of, with_spread,
+};
 
-/// The method that the others are compared with.
-pub const REFERENCE: &str = "ours";
+pub use cells::{
+    REFERENCE, accuracy, evaluations, mean, mean_confusion, paper_row, swap_groups, thousands,
+};
 
 /// A table.
 #[derive(Debug, Clone, PartialEq)]
@@ -256,18 +262,6 @@ fn confusions(rows: &[Row]) -> Table {
     table
 }
 
-/// Mean counts of some evaluations.
-pub fn mean_confusion(evaluations: &[&Evaluation]) -> Vec<Vec<f64>> {
-    let levels = evaluations.first().map_or(0, |first| first.confusion.len());
-    let cell = |truth: usize, said: usize| {
-        let counts = evaluations.iter().map(|e| e.confusion[truth][said] as f64);
-        mean(&counts.collect::<Vec<_>>())
-    };
-    (0..levels)
-        .map(|truth| (0..levels).map(|said| cell(truth, said)).collect())
-        .collect()
-}
-
 /// How sure the models are, beside how sure they should be.
 pub fn calibration(rows: &[Row]) -> Table {
     let note = "Expected calibration error (15 bins of the largest probability) and mean negative \
@@ -457,179 +451,4 @@ pub fn swaps(swaps: &[SwapEntry]) -> Table {
         ]);
     }
     table
-}
-
-/// The assignments of each method and number of labels.
-pub fn swap_groups(swaps: &[SwapEntry]) -> Vec<Vec<&SwapEntry>> {
-    let mut groups: Vec<Vec<&SwapEntry>> = Vec::new();
-    for swap in swaps {
-        let same = |group: &&mut Vec<&SwapEntry>| {
-            (&group[0].method, group[0].labels) == (&swap.method, swap.labels)
-        };
-        match groups.iter_mut().find(same) {
-            Some(group) => group.push(swap),
-            None => groups.push(vec![swap]),
-        }
-    }
-    groups
-}
-
-/// The paper's row of a row; ours has others beside, such as another choice of labels.
-pub fn paper_row(row: &Row) -> Option<&'static paper::Row> {
-    paper::row(&row.runs[0].0.method)
-}
-
-/// What a row's runs reached on a set, where it was measured.
-pub fn evaluations<'a>(row: &Row<'a>, set: &str) -> Vec<&'a Evaluation> {
-    let of_entry = |(entry, _): &(&'a Entry, _)| match set {
-        PAPER_SPLIT => entry.paper_split.as_ref(),
-        FRESH => Some(&entry.fresh),
-        MATCHED => Some(&entry.matched),
-        shift => entry.shifts.get(shift),
-    };
-    row.runs.iter().filter_map(of_entry).collect()
-}
-
-/// The objects of a row's runs on a set, with the runs' seeds.
-fn objects<'a>(row: &Row<'a>, set: &str) -> Vec<(u64, &'a [ObjectCount])> {
-    let of_run = |&(entry, details): &(&'a Entry, &'a Details)| {
-        let objects = details.worth.sets.get(set)?.objects.as_deref()?;
-        Some((entry.seed, objects))
-    };
-    row.runs.iter().filter_map(of_run).collect()
-}
-
-/// A row's accuracy over its seeds.
-pub fn accuracy(row: &Row, set: &str) -> Option<Estimate> {
-    let objects = objects(row, set);
-    let seeds: Vec<&[ObjectCount]> = objects.into_iter().map(|(_, objects)| objects).collect();
-    metrics::accuracy_by_object(&seeds)
-}
-
-fn interval(row: &Row, set: &str) -> String {
-    accuracy(row, set).map_or("-".to_owned(), |estimate| interval_text(estimate.interval))
-}
-
-fn interval_text([low, high]: [f64; 2]) -> String {
-    format!("{:.1} to {:.1}", 100.0 * low, 100.0 * high)
-}
-
-/// Paired with the reference's runs of the same seeds.
-fn less_reference(row: &Row, rows: &[Row], set: &str) -> String {
-    let Some(reference) = rows.iter().find(|row| row.title == REFERENCE) else {
-        return "-".to_owned();
-    };
-    if row.title == REFERENCE {
-        return String::new();
-    }
-    let (own, others) = (objects(row, set), objects(reference, set));
-    let pair = |&(seed, own): &(u64, _)| {
-        let other = others.iter().find(|(other, _)| *other == seed)?;
-        Some((own, other.1))
-    };
-    let pairs: Vec<(&[ObjectCount], &[ObjectCount])> = own.iter().filter_map(pair).collect();
-    metrics::difference_by_object(&pairs).map_or("-".to_owned(), |estimate| {
-        let [low, high] = estimate.interval.map(|end| 100.0 * end);
-        format!("{:+.1} ({low:+.1} to {high:+.1})", 100.0 * estimate.mean)
-    })
-}
-
-fn percent_of(evaluation: &Evaluation, level: usize) -> Option<f64> {
-    Some(100.0 * (*evaluation.category_accuracy.get(level)?)?)
-}
-
-fn of_entries(row: &Row, value: impl Fn(&Entry) -> f64) -> Vec<f64> {
-    row.runs.iter().map(|(entry, _)| value(entry)).collect()
-}
-
-/// Mean over the seeds, and their deviation if there are several.
-fn with_spread(
-    row: &Row,
-    set: &str,
-    value: impl Fn(&Evaluation) -> Option<f64>,
-    decimals: usize,
-) -> String {
-    let values: Vec<f64> = evaluations(row, set)
-        .into_iter()
-        .filter_map(&value)
-        .collect();
-    let mean = mean_over_seeds(row, set, value, decimals);
-    match deviation(&values) {
-        Some(deviation) => format!("{mean} ± {deviation:.decimals$}"),
-        None => mean,
-    }
-}
-
-fn mean_over_seeds(
-    row: &Row,
-    set: &str,
-    value: impl Fn(&Evaluation) -> Option<f64>,
-    decimals: usize,
-) -> String {
-    let values: Vec<f64> = evaluations(row, set)
-        .into_iter()
-        .filter_map(value)
-        .collect();
-    if values.is_empty() {
-        return "-".to_owned();
-    }
-    format!("{:.decimals$}", mean(&values))
-}
-
-fn beside(here: String, there: Option<f64>, decimals: usize) -> String {
-    match there {
-        Some(there) => format!("{here} ({there:.decimals$})"),
-        None => here,
-    }
-}
-
-/// Mean; 0 of nothing.
-pub fn mean(values: &[f64]) -> f64 {
-    values.iter().sum::<f64>() / values.len().max(1) as f64
-}
-
-/// Standard deviation of a sample; `None` of fewer than two.
-fn deviation(values: &[f64]) -> Option<f64> {
-    let mean = mean(values);
-    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-    (values.len() > 1).then(|| (squares / (values.len() - 1) as f64).sqrt())
-}
-
-/// A number without decimals that are all 0.
-fn number(value: f64, decimals: usize) -> String {
-    if value.fract() == 0.0 {
-        format!("{value:.0}")
-    } else {
-        format!("{value:.decimals$}")
-    }
-}
-
-/// An integer with its thousands apart.
-pub fn thousands(value: u64) -> String {
-    let digits = value.to_string();
-    let mut text = String::new();
-    for (place, digit) in digits.chars().enumerate() {
-        if place > 0 && (digits.len() - place).is_multiple_of(3) {
-            text.push(',');
-        }
-        text.push(digit);
-    }
-    text
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn numbers_are_readable() {
-        assert_eq!(thousands(93_000), "93,000");
-        assert_eq!(thousands(7), "7");
-        assert_eq!(deviation(&[1.0, 3.0]), Some(2.0_f64.sqrt()));
-        assert_eq!(deviation(&[1.0]), None);
-        assert_eq!(
-            (number(12.0, 1), number(12.25, 1)),
-            ("12".to_owned(), "12.2".to_owned())
-        );
-    }
 }

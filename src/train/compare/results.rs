@@ -86,12 +86,18 @@ pub struct Worth {
 }
 
 impl Worth {
+    /// What a run's directory holds of it. What an older version wrote is as good as nothing: it
+    /// is only measured again.
+    fn read(run: &Path) -> Self {
+        let worth = read_json(&run.join("compared.json"));
+        worth.ok().flatten().unwrap_or_default()
+    }
+
     /// Judges every set with the run's model, but for what is known already.
     pub(super) fn measure(run: &Path, sets: &[TestSet]) -> anyhow::Result<Self> {
         let model = run.join("hrn.onnx");
         let bytes = std::fs::read(&model).with_context(|| model.display().to_string())?;
-        let path = run.join("compared.json");
-        let mut worth: Self = read_json(&path)?.unwrap_or_default();
+        let mut worth = Self::read(run);
         let model_sha256 = sha256_hex(&bytes);
         if worth.model_sha256 != model_sha256 {
             worth = Self {
@@ -123,7 +129,7 @@ impl Worth {
             };
             worth.sets.insert(set.name.to_owned(), measured);
         }
-        write_whole(&path, &serde_json::to_vec(&worth)?)?;
+        write_whole(&run.join("compared.json"), &serde_json::to_vec(&worth)?)?;
         Ok(worth)
     }
 
@@ -200,7 +206,7 @@ impl Details {
             directory: directory.to_owned(),
             told: Run::told(directory)?,
             revision: revision.trim().to_owned(),
-            worth: read_json(&directory.join("compared.json"))?.unwrap_or_default(),
+            worth: Worth::read(directory),
             history: History::read(directory)?,
         })
     }

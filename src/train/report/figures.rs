@@ -168,30 +168,64 @@ fn thinned(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     points.iter().step_by(every).chain(last).copied().collect()
 }
 
-/// Every column of one run's stage against its steps.
-pub(super) fn columns(history: &History) -> Vec<String> {
+/// What a run's page shows of each stage: a picture's name, and its columns with their classes.
+const PICTURES: [(&str, &[(&str, &str)]); 5] = [
+    (
+        "losses",
+        &[
+            ("loss", "train"),
+            ("validation_loss", "valid"),
+            ("generator_loss", "valid"),
+        ],
+    ),
+    (
+        "accuracy",
+        &[("accuracy", "train"), ("validation_accuracy", "valid")],
+    ),
+    (
+        "sigma: least, mean, greatest",
+        &[
+            ("sigma_min", "train"),
+            ("sigma_mean", "train"),
+            ("sigma_max", "train"),
+        ],
+    ),
+    (
+        "taxels' deviation",
+        &[("pixel_std", "train"), ("pixel_std_real", "diagonal")],
+    ),
+    ("distance of features", &[("feature_distance", "train")]),
+];
+
+/// What one run's stages kept, against the steps of each.
+pub(super) fn stages(history: &History) -> Vec<String> {
     let mut pictures = Vec::new();
     for stage in &history.stages {
-        let names = stage.rows.iter().flat_map(|row| row.keys());
-        let names: std::collections::BTreeSet<&String> = names.collect();
-        let plain = ["step", "epoch", "seconds", "learning_rate"];
-        for name in names
-            .into_iter()
-            .filter(|name| !plain.contains(&name.as_str()))
-        {
-            let values = stage.curve(name);
-            let fold = |f: fn(f64, f64) -> f64| values.iter().map(|v| v.1).reduce(f);
-            let (Some(low), Some(high)) = (fold(f64::min), fold(f64::max)) else {
+        for (name, columns) in PICTURES {
+            let curves: Vec<(&str, Vec<(f64, f64)>)> = columns
+                .iter()
+                .map(|(column, class)| (*class, stage.curve(column)))
+                .collect();
+            let values = curves
+                .iter()
+                .flat_map(|(_, curve)| curve)
+                .map(|point| point.1);
+            let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
+                (low.min(v), high.max(v))
+            });
+            if low > high {
                 continue;
-            };
-            let room = (0.05 * (high - low)).max(1e-6);
+            }
+            let room = (0.05 * (high - low)).max(0.02 * high.abs()).max(1e-3);
             let x = Scale::linear((0.0, (stage.steps() as f64).max(1.0)), (48.0, 244.0));
             let y = Scale::linear((low - room, high + room), (130.0, 24.0));
             let mut svg = Svg::new(260.0, 165.0);
-            let title = format!("{}: {}", stage.name, name.replace('_', " "));
+            let title = format!("{}: {name}", stage.name);
             axes(&mut svg, &x, &y, ("steps", &title), (3, 4));
-            let points: Vec<_> = values.iter().map(|v| (x.at(v.0), y.at(v.1))).collect();
-            svg.path("train", &thinned(&points));
+            for (class, curve) in curves {
+                let points: Vec<_> = curve.iter().map(|v| (x.at(v.0), y.at(v.1))).collect();
+                svg.path(class, &thinned(&points));
+            }
             pictures.push(svg.finish(&title));
         }
     }

@@ -1,0 +1,196 @@
+//! What stands in the tables' cells: a row's runs summed up, as text.
+
+use crate::train::compare::results::{Details, Entry, Row, SwapEntry};
+use crate::train::compare::{FRESH, MATCHED, PAPER_SPLIT};
+use crate::train::metrics::{self, Estimate, Evaluation, ObjectCount};
+use crate::train::paper;
+
+/// The method that the others are compared with.
+pub const REFERENCE: &str = "ours";
+
+/// Mean counts of some evaluations.
+pub fn mean_confusion(evaluations: &[&Evaluation]) -> Vec<Vec<f64>> {
+    let levels = evaluations.first().map_or(0, |first| first.confusion.len());
+    let cell = |truth: usize, said: usize| {
+        let counts = evaluations.iter().map(|e| e.confusion[truth][said] as f64);
+        mean(&counts.collect::<Vec<_>>())
+    };
+    (0..levels)
+        .map(|truth| (0..levels).map(|said| cell(truth, said)).collect())
+        .collect()
+}
+
+/// The assignments of each method and number of labels.
+pub fn swap_groups(swaps: &[SwapEntry]) -> Vec<Vec<&SwapEntry>> {
+    let mut groups: Vec<Vec<&SwapEntry>> = Vec::new();
+    for swap in swaps {
+        let same = |group: &&mut Vec<&SwapEntry>| {
+            (&group[0].method, group[0].labels) == (&swap.method, swap.labels)
+        };
+        match groups.iter_mut().find(same) {
+            Some(group) => group.push(swap),
+            None => groups.push(vec![swap]),
+        }
+    }
+    groups
+}
+
+/// The paper's row of a row; ours has others beside, such as another choice of labels.
+pub fn paper_row(row: &Row) -> Option<&'static paper::Row> {
+    paper::row(&row.runs[0].0.method)
+}
+
+/// What a row's runs reached on a set, where it was measured.
+pub fn evaluations<'a>(row: &Row<'a>, set: &str) -> Vec<&'a Evaluation> {
+    let of_entry = |(entry, _): &(&'a Entry, _)| match set {
+        PAPER_SPLIT => entry.paper_split.as_ref(),
+        FRESH => Some(&entry.fresh),
+        MATCHED => Some(&entry.matched),
+        shift => entry.shifts.get(shift),
+    };
+    row.runs.iter().filter_map(of_entry).collect()
+}
+
+/// The objects of a row's runs on a set, with the runs' seeds.
+fn objects<'a>(row: &Row<'a>, set: &str) -> Vec<(u64, &'a [ObjectCount])> {
+    let of_run = |&(entry, details): &(&'a Entry, &'a Details)| {
+        let objects = details.worth.sets.get(set)?.objects.as_deref()?;
+        Some((entry.seed, objects))
+    };
+    row.runs.iter().filter_map(of_run).collect()
+}
+
+/// A row's accuracy over its seeds.
+pub fn accuracy(row: &Row, set: &str) -> Option<Estimate> {
+    let objects = objects(row, set);
+    let seeds: Vec<&[ObjectCount]> = objects.into_iter().map(|(_, objects)| objects).collect();
+    metrics::accuracy_by_object(&seeds)
+}
+
+pub(super) fn interval(row: &Row, set: &str) -> String {
+    accuracy(row, set).map_or("-".to_owned(), |estimate| interval_text(estimate.interval))
+}
+
+pub(super) fn interval_text([low, high]: [f64; 2]) -> String {
+    format!("{:.1} to {:.1}", 100.0 * low, 100.0 * high)
+}
+
+/// Paired with the reference's runs of the same seeds.
+pub(super) fn less_reference(row: &Row, rows: &[Row], set: &str) -> String {
+    let Some(reference) = rows.iter().find(|row| row.title == REFERENCE) else {
+        return "-".to_owned();
+    };
+    if row.title == REFERENCE {
+        return String::new();
+    }
+    let (own, others) = (objects(row, set), objects(reference, set));
+    let pair = |&(seed, own): &(u64, _)| {
+        let other = others.iter().find(|(other, _)| *other == seed)?;
+        Some((own, other.1))
+    };
+    let pairs: Vec<(&[ObjectCount], &[ObjectCount])> = own.iter().filter_map(pair).collect();
+    metrics::difference_by_object(&pairs).map_or("-".to_owned(), |estimate| {
+        let [low, high] = estimate.interval.map(|end| 100.0 * end);
+        format!("{:+.1} ({low:+.1} to {high:+.1})", 100.0 * estimate.mean)
+    })
+}
+
+pub(super) fn percent_of(evaluation: &Evaluation, level: usize) -> Option<f64> {
+    Some(100.0 * (*evaluation.category_accuracy.get(level)?)?)
+}
+
+pub(super) fn of_entries(row: &Row, value: impl Fn(&Entry) -> f64) -> Vec<f64> {
+    row.runs.iter().map(|(entry, _)| value(entry)).collect()
+}
+
+/// Mean over the seeds, and their deviation if there are several.
+pub(super) fn with_spread(
+    row: &Row,
+    set: &str,
+    value: impl Fn(&Evaluation) -> Option<f64>,
+    decimals: usize,
+) -> String {
+    let values: Vec<f64> = evaluations(row, set)
+        .into_iter()
+        .filter_map(&value)
+        .collect();
+    let mean = mean_over_seeds(row, set, value, decimals);
+    match deviation(&values) {
+        Some(deviation) => format!("{mean} ± {deviation:.decimals$}"),
+        None => mean,
+    }
+}
+
+pub(super) fn mean_over_seeds(
+    row: &Row,
+    set: &str,
+    value: impl Fn(&Evaluation) -> Option<f64>,
+    decimals: usize,
+) -> String {
+    let values: Vec<f64> = evaluations(row, set)
+        .into_iter()
+        .filter_map(value)
+        .collect();
+    if values.is_empty() {
+        return "-".to_owned();
+    }
+    format!("{:.decimals$}", mean(&values))
+}
+
+pub(super) fn beside(here: String, there: Option<f64>, decimals: usize) -> String {
+    match there {
+        Some(there) => format!("{here} ({there:.decimals$})"),
+        None => here,
+    }
+}
+
+/// Mean; 0 of nothing.
+pub fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len().max(1) as f64
+}
+
+/// Standard deviation of a sample; `None` of fewer than two.
+pub(super) fn deviation(values: &[f64]) -> Option<f64> {
+    let mean = mean(values);
+    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+    (values.len() > 1).then(|| (squares / (values.len() - 1) as f64).sqrt())
+}
+
+/// A number without decimals that are all 0.
+pub(super) fn number(value: f64, decimals: usize) -> String {
+    if value.fract() == 0.0 {
+        format!("{value:.0}")
+    } else {
+        format!("{value:.decimals$}")
+    }
+}
+
+/// An integer with its thousands apart.
+pub fn thousands(value: u64) -> String {
+    let digits = value.to_string();
+    let mut text = String::new();
+    for (place, digit) in digits.chars().enumerate() {
+        if place > 0 && (digits.len() - place).is_multiple_of(3) {
+            text.push(',');
+        }
+        text.push(digit);
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_readable() {
+        assert_eq!(thousands(93_000), "93,000");
+        assert_eq!(thousands(7), "7");
+        assert_eq!(deviation(&[1.0, 3.0]), Some(2.0_f64.sqrt()));
+        assert_eq!(deviation(&[1.0]), None);
+        assert_eq!(
+            (number(12.0, 1), number(12.25, 1)),
+            ("12".to_owned(), "12.2".to_owned())
+        );
+    }
+}
