@@ -202,28 +202,31 @@ fn a_finished_comparison_does_nothing_again() {
 }
 
 #[test]
-fn a_killed_comparison_takes_its_runs_with_it_and_goes_on() {
+fn a_stopped_or_killed_comparison_takes_its_runs_with_it_and_goes_on() {
     let comparison = Comparison::new("killed", "hrn100,features", &["--jobs", "1"]);
-    let mut process: Child = comparison.command().stderr(Stdio::null()).spawn().unwrap();
-    while comparison.models().is_empty() {
-        assert!(
-            process.try_wait().unwrap().is_none(),
-            "ended before it could be killed"
-        );
-        std::thread::sleep(Duration::from_millis(10));
+    let mut finished = Vec::new();
+    for (signal, code) in [("-TERM", Some(0)), ("-KILL", None)] {
+        let mut process: Child = comparison.command().stderr(Stdio::null()).spawn().unwrap();
+        // As soon as one run more is done.
+        while comparison.models().len() == finished.len() {
+            assert!(process.try_wait().unwrap().is_none(), "ended by itself");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        let pid = process.id().to_string();
+        Command::new("kill").args([signal, &pid]).status().unwrap();
+        assert_eq!(process.wait().unwrap().code(), code, "{signal}");
+        let began = Instant::now();
+        while at_work_in(&comparison.out) {
+            let waited = began.elapsed();
+            assert!(
+                waited < Duration::from_secs(20),
+                "runs outlive it after {signal}"
+            );
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        finished = comparison.models();
+        assert!(finished.len() < 6, "{signal} came too late");
     }
-    process.kill().unwrap();
-    process.wait().unwrap();
-    let began = Instant::now();
-    while at_work_in(&comparison.out) {
-        assert!(
-            began.elapsed() < Duration::from_secs(20),
-            "runs outlive the comparison"
-        );
-        std::thread::sleep(Duration::from_millis(10));
-    }
-    let finished = comparison.models();
-    assert!(finished.len() < 6, "killed too late");
     let errors = comparison.run();
     let models = comparison.models();
     assert!(

@@ -66,10 +66,7 @@ pub fn comparison(comparison: &Comparison) -> anyhow::Result<String> {
         page.table(&table);
     }
 
-    page.section(
-        "table-3",
-        "Table 3: confusion and kappa, beside the paper's",
-    );
+    page.section("table-3", "Table 3");
     page.table(&tables::table_3(&rows));
     page.note("Samples of the test split, mean over seeds; in the paper 250 a level.");
     page.panels(confusions(&rows));

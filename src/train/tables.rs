@@ -12,8 +12,8 @@ use super::compare::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS};
 use super::history::History;
 use super::metrics::{self, Evaluation};
 use cells::{
-    beside, deviation, interval, interval_text, less_reference, mean_over_seeds, number,
-    of_entries, percent_of, with_spread,
+    before_temperature, beside, deviation, interval, interval_text, less_reference,
+    mean_over_seeds, number, of_entries, percent_of, with_spread,
 };
 
 pub use cells::{
@@ -283,16 +283,8 @@ pub fn calibration(rows: &[Row]) -> Table {
         let mut cells = vec![row.title.clone()];
         for set in [PAPER_SPLIT, FRESH, MATCHED] {
             cells.push(with_spread(row, set, |e| Some(e.ece), 3));
-            let raw = |(_, details): &(&Entry, &Details)| {
-                Some(details.worth.sets.get(set)?.ece_before_temperature)
-            };
-            let raw: Vec<f64> = row.runs.iter().filter_map(raw).collect();
             if set != PAPER_SPLIT {
-                cells.push(if raw.is_empty() {
-                    "-".to_owned()
-                } else {
-                    format!("{:.3}", mean(&raw))
-                });
+                cells.push(before_temperature(row, set));
             }
             cells.push(with_spread(row, set, |e| Some(e.nll), 3));
         }

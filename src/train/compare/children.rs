@@ -11,7 +11,7 @@ use std::process::{Child, Command, ExitStatus};
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+use indicatif::{HumanDuration, MultiProgress, ProgressBar, ProgressStyle};
 
 /// How often the processes are looked after.
 const LOOKED_AFTER_EVERY: Duration = Duration::from_millis(100);
@@ -75,6 +75,7 @@ pub(super) fn run(
             break;
         }
         std::thread::sleep(LOOKED_AFTER_EVERY);
+        let ended_before = board.total.position();
         let mut still = Vec::with_capacity(running.len());
         for mut child in running {
             let Some(status) = child.process.try_wait().context("a run's process")? else {
@@ -99,8 +100,8 @@ pub(super) fn run(
             board.total.inc(1);
         }
         running = still;
-        let left = waiting.iter().chain(running.iter().map(|child| &child.job));
-        board.time_left(progress.seconds_left(left.map(|job| job.effort).sum(), at_once));
+        let left = progress.seconds_left(&waiting, &running, at_once);
+        board.time_left(left, board.total.position() > ended_before);
     }
     board.total.finish_and_clear();
     Ok(failures)
@@ -175,9 +176,16 @@ impl Progress {
         self.seconds += seconds;
     }
 
-    /// What `effort` takes at the rate so far; `None` before the first run has ended.
-    fn seconds_left(&self, effort: f64, at_once: usize) -> Option<f64> {
-        (self.effort > 0.0).then(|| effort * self.seconds / self.effort / at_once as f64)
+    /// What is left at the rate so far; `None` before the first run has ended.
+    fn seconds_left(&self, waiting: &[Job], running: &[Running], at_once: usize) -> Option<f64> {
+        let rate = self.seconds / self.effort;
+        let begun = running.iter().map(|child| {
+            let whole = rate * child.job.effort;
+            (whole - child.since.elapsed().as_secs_f64()).max(0.0)
+        });
+        let not_begun = waiting.iter().map(|job| rate * job.effort);
+        let sum: f64 = begun.chain(not_begun).sum();
+        (self.effort > 0.0).then_some(sum / at_once as f64)
     }
 }
 
@@ -221,10 +229,16 @@ impl Board {
         }
     }
 
-    fn time_left(&self, seconds: Option<f64>) {
-        if let Some(seconds) = seconds {
-            let left = indicatif::HumanDuration(Duration::from_secs_f64(seconds));
-            self.total.set_message(format!(", about {left} left"));
+    /// Tells how long it still takes: always on a terminal, else where a run has just `ended`.
+    fn time_left(&self, seconds: Option<f64>, ended: bool) {
+        let left = seconds.map_or_else(String::new, |seconds| {
+            let left = HumanDuration(Duration::from_secs_f64(seconds));
+            format!(", about {left} left")
+        });
+        if self.total.is_hidden() && ended {
+            let (done, all) = (self.total.position(), self.total.length());
+            eprintln!("{done} of {} runs{left}", all.unwrap_or_default());
         }
+        self.total.set_message(left);
     }
 }

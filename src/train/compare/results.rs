@@ -71,8 +71,8 @@ pub struct Measured {
     pub evaluation: Evaluation,
     /// The bins of its calibration error.
     pub calibration: Vec<Bin>,
-    /// What the calibration error was before the fitted temperature; the same without one.
-    pub ece_before_temperature: f64,
+    /// What the calibration error was before the fitted temperature; null without one.
+    pub ece_before_temperature: Option<f64>,
     /// How each object was judged; null without objects.
     pub objects: Option<Vec<ObjectCount>>,
 }
@@ -116,15 +116,14 @@ impl Worth {
         let temperature = hrn.card().metrics["temperature"].as_f64().unwrap_or(1.0);
         for set in sets {
             let judged = export::judge(&hrn, &set.dataset, &set.indices)?;
-            let before: Vec<Judged> = judged
-                .iter()
-                .map(|one| one.before_temperature(temperature))
-                .collect();
+            let before = |one: &Judged| one.before_temperature(temperature);
+            let before: Vec<Judged> = judged.iter().map(before).collect();
             let measured = Measured {
                 data_sha256: set.sha256().to_owned(),
                 evaluation: Evaluation::of(&judged, hrn.card().levels.len()),
                 calibration: metrics::calibration(&judged),
-                ece_before_temperature: metrics::calibration_error(&before),
+                ece_before_temperature: (temperature != 1.0)
+                    .then(|| metrics::calibration_error(&before)),
                 objects: metrics::by_object(&judged),
             };
             worth.sets.insert(set.name.to_owned(), measured);

@@ -137,6 +137,17 @@ pub(super) fn mean_over_seeds(
     format!("{:.decimals$}", mean(&values))
 }
 
+/// The calibration error before the temperature, where one was fitted.
+pub(super) fn before_temperature(row: &Row, set: &str) -> String {
+    let measured =
+        |(_, details): &(&Entry, &Details)| details.worth.sets.get(set)?.ece_before_temperature;
+    let before: Vec<f64> = row.runs.iter().filter_map(measured).collect();
+    if before.is_empty() {
+        return "-".to_owned();
+    }
+    format!("{:.3}", mean(&before))
+}
+
 pub(super) fn beside(here: String, there: Option<f64>, decimals: usize) -> String {
     match there {
         Some(there) => format!("{here} ({there:.decimals$})"),
