@@ -7,7 +7,7 @@ mod cells;
 
 use std::fmt::Write as _;
 
-use super::compare::results::{Comparison, Details, Entry, Row, SwapEntry};
+use super::compare::results::{Comparison, Row, SwapEntry};
 use super::compare::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS};
 use super::history::History;
 use super::metrics::{self, Evaluation};
