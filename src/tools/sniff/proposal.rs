@@ -24,6 +24,9 @@ const LEAST_FRAMES: u64 = 3;
 /// What marks tell where every byte of a frame must be in order, as good as a checksum.
 const ALL_IN_ORDER: u32 = u32::MAX;
 
+/// What `ff-tail` tells: more than any one byte, as its cells have no FF, less than any two.
+const FF_TAIL_BITS: u32 = 16;
+
 /// A layout and what it makes of the bytes.
 #[derive(Debug, Clone)]
 pub(super) struct Proposal {
@@ -50,12 +53,17 @@ pub(super) struct Proposal {
 /// Layouts that explain `bytes`, best first; none if nothing does.
 pub(super) fn propose(bytes: &[u8]) -> Vec<Proposal> {
     let sample = sample(bytes);
-    let presets = [Preset::FfTail, Preset::Ascii, Preset::ZeroRun].map(|preset| {
+    let presets = [
+        (Preset::FfTail, FF_TAIL_BITS),
+        (Preset::Ascii, ALL_IN_ORDER),
+        (Preset::ZeroRun, ALL_IN_ORDER),
+    ]
+    .map(|(preset, bits)| {
         let settings = Settings {
             preset,
             ..Settings::default()
         };
-        (settings, ALL_IN_ORDER)
+        (settings, bits)
     });
     let mut proposals: Vec<Proposal> = candidates(&sample)
         .iter()
@@ -158,7 +166,7 @@ fn rank(proposals: &mut [Proposal]) {
     });
     proposals.sort_by_key(|p| {
         (
-            Reverse(p.is_checked && 4 * p.bytes_changed() >= 3 * changed),
+            Reverse(p.bits == ALL_IN_ORDER || p.is_checked && 4 * p.bytes_changed() >= 3 * changed),
             Reverse(p.bytes_explained.min(enough)),
             Reverse(p.bits),
             Reverse(p.has_length),
