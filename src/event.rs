@@ -285,11 +285,19 @@ pub struct FrameEvent {
     /// `[rows, cols]` flattened, row-major, rounded to 0.001 N.
     #[serde(serialize_with = "millinewtons")]
     pub newtons: Vec<f32>,
+    /// Taxels at or above the contact threshold then in force.
+    pub contact_area_taxels: u32,
 }
 
 impl FrameEvent {
     /// The event of one frame.
-    pub fn new(sensor: String, time: Timestamp, frame: u64, newtons: Vec<f32>) -> Self {
+    pub fn new(
+        sensor: String,
+        time: Timestamp,
+        frame: u64,
+        newtons: Vec<f32>,
+        contact_area_taxels: u32,
+    ) -> Self {
         Self {
             sensor,
             time,
@@ -297,6 +305,7 @@ impl FrameEvent {
             rows: ROWS,
             cols: COLS,
             newtons,
+            contact_area_taxels,
         }
     }
 }

@@ -462,6 +462,7 @@ impl Pipeline {
             stamp.wall,
             at.frame,
             frame.newtons.to_vec(),
+            frame.contact_area_taxels(self.judgement.press.contact_threshold_n),
         )));
         for change in changes {
             self.publish(change, events);

@@ -61,6 +61,7 @@ fn frame(sensor: &str, number: u64) -> Event {
         jiff::Timestamp::UNIX_EPOCH,
         number,
         newtons,
+        0,
     ))
 }
 
