@@ -10,6 +10,7 @@ pub mod replay;
 pub mod simulate;
 pub mod sniff;
 pub mod tail;
+pub mod watch;
 
 use std::io::{ErrorKind, Write};
 

@@ -12,7 +12,7 @@ use hardnessd::daemon::log::{Log, Settings as LogSettings};
 use hardnessd::daemon::publish::Error as PublishError;
 use hardnessd::daemon::socket::Error as SocketError;
 use hardnessd::daemon::{Daemon, Error as DaemonError, Reload};
-use hardnessd::tools::{check, demo, doctor, replay, simulate, sniff, tail};
+use hardnessd::tools::{check, demo, doctor, replay, simulate, sniff, tail, watch};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
@@ -40,6 +40,8 @@ enum Command {
     Replay(replay::Args),
     /// Print events of a running daemon
     Tail(tail::Args),
+    /// Show the sensors of a running daemon on the terminal
+    Watch(watch::Args),
     /// Check a configuration and say what would run
     Check(check::Args),
     /// Say why a port will not work, and what mends it
@@ -93,6 +95,7 @@ async fn dispatch(command: Command) -> anyhow::Result<()> {
         Command::Simulate(args) => Ok(simulate::run(args, shutdown()?).await?),
         Command::Replay(args) => Ok(replay::run(args, shutdown()?).await?),
         Command::Tail(args) => Ok(tail::run(args, shutdown()?).await?),
+        Command::Watch(args) => Ok(watch::run(args, shutdown()?).await?),
         Command::Check(args) => Ok(check::run(&args)?),
         Command::Doctor(args) => Ok(doctor::run(&args)?),
         Command::Sniff(args) => Ok(sniff::run(args, shutdown()?).await?),
@@ -195,6 +198,12 @@ fn exit_code(error: &anyhow::Error) -> u8 {
             | tail::Error::Refused { .. }
             | tail::Error::Closed { .. } => exit::UNAVAILABLE,
             tail::Error::Print(_) => exit::IO,
+        };
+    }
+    if let Some(error) = error.downcast_ref::<watch::Error>() {
+        return match error {
+            watch::Error::NoTerminal => exit::USAGE,
+            watch::Error::Terminal(_) => exit::IO,
         };
     }
     if let Some(error) = error.downcast_ref::<doctor::Error>() {

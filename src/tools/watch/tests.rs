@@ -1,0 +1,481 @@
+//! What is known, how old it is called, and what of it is drawn in which room.
+
+use std::fs::File;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use ratatui::Terminal;
+use ratatui::backend::{Backend, TestBackend};
+use ratatui::buffer::Buffer;
+use ratatui::layout::Size;
+use ratatui::style::Color;
+use rustix::pty::OpenptFlags;
+use rustix::termios::LocalModes;
+use serde_json::{Value, json};
+
+use super::ansi::Ansi;
+use super::draw::{Look, draw};
+use super::screen::{Screen, pressed};
+use super::view::{Key, Link, Loss, View};
+use crate::frame::{COLS, Stamp, TAXELS};
+
+const COLOURS: Look = Look {
+    colours: true,
+    attributes: true,
+    unicode: true,
+};
+const PLAIN: Look = Look {
+    colours: false,
+    attributes: false,
+    unicode: false,
+};
+
+/// Milliseconds after a moment at which the machine had been up for an hour.
+fn at(ms: u64) -> Stamp {
+    let since = Duration::from_millis(ms);
+    Stamp {
+        mono: Duration::from_secs(3600) + since,
+        wall: jiff::Timestamp::from_second(1_700_000_000).unwrap() + since,
+    }
+}
+
+/// A view, told `events`, each at its `ms`, without delay.
+fn told(events: &[(u64, Value)]) -> View {
+    let mut view = View::new();
+    for (ms, event) in events {
+        hear(&mut view, *ms, event.clone());
+    }
+    view
+}
+
+fn hear(view: &mut View, ms: u64, mut event: Value) {
+    if event["sensor"].is_string() && event["time"].is_null() {
+        event["time"] = json!(at(ms).wall.to_string());
+    }
+    view.hear(&event.to_string(), at(ms));
+}
+
+fn hello(run: &str, sensors: &[&str]) -> Value {
+    let sensors: Vec<Value> = sensors
+        .iter()
+        .map(|name| json!({"name": name, "rows": 28, "cols": 28, "pitch_mm": 3.5}))
+        .collect();
+    json!({"type": "hello", "protocol": 1, "robot": "arm-7", "version": "0.1.0", "run": run,
+        "sensors": sensors, "model": {"sha256": "0123456789abcdef", "validation": "simulated data only",
+        "levels": [{"level": 1, "label": "hard"}, {"level": 2, "label": "firm"}]}})
+}
+
+fn status(sensor: &str, state: &str) -> Value {
+    json!({"type": "status", "sensor": sensor, "state": state, "reason": null, "frames": 120,
+        "frames_damaged": 2, "bytes_skipped": 790, "frame_rate_hz": 5.0})
+}
+
+fn frame(sensor: &str, newtons: f32, taxels: usize) -> Value {
+    let mut all = vec![0.0; TAXELS];
+    for taxel in 0..taxels {
+        all[14 * COLS + 10 + taxel] = newtons;
+    }
+    json!({"type": "frame", "sensor": sensor, "frame": 7, "newtons": all,
+        "contact_area_taxels": taxels})
+}
+
+fn verdict(press: u64, level: Option<u8>, rejected: Option<&str>) -> Value {
+    json!({"type": "hardness", "sensor": "forearm", "press": press, "phase": "final",
+        "level": level, "label": "firm", "rejected": rejected, "probabilities": [0.07, 0.93],
+        "force_n": 12.34, "notes": []})
+}
+
+/// One sensor that is live and has been pressed.
+fn pressed_sensor() -> View {
+    told(&[
+        (0, hello("a", &["forearm"])),
+        (0, status("forearm", "live")),
+        (
+            0,
+            json!({"type": "press", "sensor": "forearm", "press": 3, "state": "begin"}),
+        ),
+        (100, frame("forearm", 1.5, 8)),
+        (200, verdict(3, Some(2), None)),
+    ])
+}
+
+fn picture(view: &View, ms: u64, (width, height): (u16, u16), look: Look) -> Buffer {
+    let mut terminal = Terminal::new(TestBackend::new(width, height)).unwrap();
+    terminal
+        .draw(|frame| draw(frame, view, at(ms).mono, look))
+        .unwrap();
+    terminal.backend().buffer().clone()
+}
+
+fn rows(buffer: &Buffer) -> Vec<String> {
+    let width = usize::from(buffer.area.width);
+    let cells = buffer.content.chunks(width);
+    cells
+        .map(|row| row.iter().map(ratatui::buffer::Cell::symbol).collect())
+        .collect()
+}
+
+fn shown(view: &View, ms: u64, size: (u16, u16), look: Look) -> String {
+    rows(&picture(view, ms, size, look)).join("\n")
+}
+
+#[test]
+fn a_value_is_as_old_as_its_event_however_late_it_is_read() {
+    let mut view = told(&[
+        (0, hello("a", &["forearm"])),
+        (0, status("forearm", "live")),
+    ]);
+    let mut late = frame("forearm", 1.0, 5);
+    late["time"] = json!(at(1_000).wall.to_string());
+    hear(&mut view, 3_500, late);
+    let frame = view.sensor().unwrap().frame.as_ref().unwrap();
+    assert_eq!(frame.at, at(1_000).mono);
+    let text = shown(&view, 3_600, (80, 24), PLAIN);
+    assert!(text.contains("frame 2.6 s old"), "{text}");
+}
+
+#[test]
+fn what_is_not_live_is_not_shown_as_present() {
+    let live = shown(&pressed_sensor(), 300, (80, 24), PLAIN);
+    for part in [
+        "LIVE",
+        "force 12.00 N",
+        "contact area 8 taxels",
+        "3 in contact",
+        "frame 0.2 s old",
+    ] {
+        assert!(live.contains(part), "{part:?} not in\n{live}");
+    }
+    let lost = |state: &str, word: &str| {
+        let mut view = pressed_sensor();
+        hear(&mut view, 2_000, status("forearm", state));
+        (view, word.to_owned())
+    };
+    let mut gone = pressed_sensor();
+    gone.lose(Loss::Closed);
+    let cases = [
+        lost("stale", "STALE"),
+        lost("lost", "LOST"),
+        lost("connecting", "CONNECTING"),
+        (gone, "NO DAEMON".to_owned()),
+        // Four seconds on, the daemon has answered none of three questions.
+        (pressed_sensor(), "DAEMON SILENT".to_owned()),
+    ];
+    for (view, word) in cases {
+        for size in [(80, 24), (40, 24), (120, 50)] {
+            let buffer = picture(&view, 4_100, size, COLOURS);
+            let text = rows(&buffer).join("\n");
+            // Once above all else, once across the map.
+            assert!(
+                text.matches(&word).count() >= 2,
+                "{word:?} not twice in\n{text}"
+            );
+            assert!(text.contains("last frame 4.0 s ago"), "{text}");
+            assert!(
+                text.contains("force not known") || !text.contains("force"),
+                "{text}"
+            );
+            for part in ["LIVE", "12.00 N", "8 taxels", "in contact for"] {
+                assert!(!text.contains(part), "{part:?} in\n{text}");
+            }
+            let warm = buffer
+                .content
+                .iter()
+                .any(|cell| cell.bg == Color::Indexed(230));
+            assert!(!warm, "pressure in colours, though {word}");
+        }
+    }
+}
+
+#[test]
+fn a_curve_has_holes_where_there_was_no_frame() {
+    let mut view = told(&[
+        (0, hello("a", &["forearm"])),
+        (0, status("forearm", "live")),
+    ]);
+    for (ms, newtons) in [(5_050, 1.0), (10_050, 2.0), (10_150, 3.0)] {
+        hear(&mut view, ms, frame("forearm", newtons, 1));
+    }
+    let sensor = view.sensor().unwrap();
+    // Spans of a second up to 30 s; a frame is current for 2.5 periods of 0.2 s.
+    let curve = sensor.curve(at(30_000).mono, 30, |load| load.force_n);
+    let there: Vec<(usize, f32)> = (0..)
+        .zip(&curve)
+        .filter_map(|(span, value)| value.map(|value| (span, value)))
+        .collect();
+    assert_eq!(there, [(5, 1.0), (10, 3.0)]);
+    // Finer spans than frames: each stands for its 2.5 periods, and no longer.
+    let curve = sensor.curve(at(30_000).mono, 300, |load| load.force_n);
+    let there: Vec<usize> = (0..300).filter(|&span| curve[span].is_some()).collect();
+    assert_eq!(there, (50..55).chain(100..106).collect::<Vec<_>>());
+    // Twenty seconds later the first is past.
+    let curve = sensor.curve(at(36_000).mono, 30, |load| load.force_n);
+    assert_eq!(curve.iter().flatten().count(), 1);
+}
+
+#[test]
+fn verdicts_stand_with_their_probabilities_newest_first_and_none_twice() {
+    let mut view = pressed_sensor();
+    hear(&mut view, 9_000, verdict(4, None, Some("low_force")));
+    // As `get last` repeats it after a break.
+    hear(&mut view, 9_100, verdict(4, None, Some("low_force")));
+    hear(&mut view, 9_100, status("forearm", "live"));
+    let text = shown(&view, 10_200, (80, 24), PLAIN);
+    let lines: Vec<&str> = text
+        .lines()
+        .map(|line| line.get(32..).unwrap_or("").trim_end())
+        .collect();
+    let first = lines
+        .iter()
+        .position(|line| line.starts_with("verdicts"))
+        .unwrap();
+    assert_eq!(lines[first], "verdicts % of hard, firm");
+    assert_eq!(
+        lines[first + 1],
+        "  4 final - low force   7  93  1.2 s   12.3 N"
+    );
+    assert_eq!(
+        lines[first + 2],
+        "  3 final 2 firm        7  93   10 s   12.3 N"
+    );
+    assert_eq!(lines[first + 3], "");
+}
+
+#[test]
+fn every_sensor_has_its_link_in_view_and_its_picture_by_a_key() {
+    let mut view = told(&[
+        (0, hello("a", &["forearm", "wrist", "palm"])),
+        (0, status("forearm", "live")),
+        (0, status("wrist", "lost")),
+        (0, status("palm", "live")),
+        (0, frame("palm", 2.0, 3)),
+    ]);
+    let text = shown(&view, 100, (80, 24), PLAIN);
+    assert!(
+        text.contains(">1 forearm LIVE   2 wrist LOST   3 palm LIVE"),
+        "{text}"
+    );
+    view.press(Key::Previous);
+    assert_eq!(view.sensor().unwrap().name, "palm");
+    let text = shown(&view, 100, (80, 24), PLAIN);
+    assert!(text.contains("force 6.00 N"), "{text}");
+    // Where not all have room, the chosen one has.
+    assert!(shown(&view, 100, (30, 24), PLAIN).contains(">3 palm LIVE"));
+    view.press(Key::Next);
+    assert_eq!(view.sensor().unwrap().name, "forearm");
+    view.press(Key::Sensor(1));
+    view.press(Key::Sensor(7));
+    assert_eq!(view.sensor().unwrap().name, "wrist");
+}
+
+#[test]
+fn another_run_begins_from_nothing_and_the_same_goes_on() {
+    let mut view = pressed_sensor();
+    view.lose(Loss::Unreachable("events.sock: no such file".to_owned()));
+    let text = shown(&view, 400, (80, 24), PLAIN);
+    assert!(
+        text.contains("NO DAEMON") && text.contains("no such file"),
+        "{text}"
+    );
+    hear(&mut view, 500, hello("a", &["forearm"]));
+    assert_eq!(view.sensor().unwrap().verdicts.len(), 1);
+    view.lose(Loss::Closed);
+    hear(&mut view, 600, hello("b", &["wrist", "forearm"]));
+    assert_eq!(
+        (view.sensors.len(), view.chosen),
+        (2, 1),
+        "the chosen one stays so"
+    );
+    let sensor = view.sensor().unwrap();
+    assert!(sensor.verdicts.is_empty() && sensor.frame.is_none());
+    assert_eq!(view.link(sensor, at(700).mono).0, Link::Connecting);
+}
+
+#[test]
+fn a_daemon_without_room_is_quoted() {
+    let mut view = View::new();
+    hear(
+        &mut view,
+        0,
+        json!({"type": "error", "message": "found 256 subscribers already"}),
+    );
+    view.lose(Loss::Closed);
+    let text = shown(&view, 100, (80, 24), PLAIN);
+    assert!(
+        text.contains("NO DAEMON  found 256 subscribers already"),
+        "{text}"
+    );
+}
+
+#[test]
+fn missed_events_are_counted_until_their_number_is_unknown() {
+    let mut view = pressed_sensor();
+    hear(&mut view, 300, json!({"type": "gap", "lost": 4}));
+    hear(&mut view, 300, json!({"type": "gap", "lost": 3}));
+    assert_eq!(view.missed, Some(7));
+    hear(&mut view, 300, json!({"type": "gap", "lost": null}));
+    hear(&mut view, 300, json!({"type": "gap", "lost": 1}));
+    assert_eq!(view.missed, None);
+}
+
+#[test]
+fn without_colours_pressure_is_told_by_characters_and_nothing_but_ascii_is_written() {
+    let buffer = picture(&pressed_sensor(), 300, (80, 24), PLAIN);
+    let text = rows(&buffer).join("\n");
+    assert!(text.is_ascii(), "{text}");
+    assert!(text.contains("@@@@@@@@"), "{text}");
+}
+
+#[test]
+fn a_picture_without_styles_is_written_without_them() {
+    let written = |look| {
+        let buffer = picture(&pressed_sensor(), 300, (80, 24), look);
+        let mut ansi = Ansi::new(Size::new(80, 24));
+        let cells = buffer.content.iter().zip(0_u16..);
+        ansi.draw(cells.map(|(cell, index)| (index % 80, index / 80, cell)))
+            .unwrap();
+        ansi.take()
+    };
+    let styles = |text: &str| {
+        text.split('\x1b')
+            .skip(1)
+            .filter(|sequence| {
+                sequence
+                    .trim_start_matches([
+                        '[', ';', '0', '1', '2', '3', '4', '5', '6', '7', '8', '9',
+                    ])
+                    .starts_with('m')
+            })
+            .count()
+    };
+    assert_eq!(styles(&written(PLAIN)), 0);
+    assert!(styles(&written(COLOURS)) > 10);
+}
+
+#[test]
+fn every_size_is_drawn_and_says_what_holds() {
+    let mut view = pressed_sensor();
+    hear(&mut view, 2_000, status("forearm", "stale"));
+    for width in 1..=130 {
+        for height in 1..=50 {
+            for look in [COLOURS, PLAIN] {
+                let text = shown(&view, 2_100, (width, height), look);
+                let is_readable = width >= 8 && height >= 3;
+                assert!(
+                    !is_readable || text.contains("STALE"),
+                    "{width}x{height}\n{text}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn a_small_array_is_drawn_alone() {
+    let mut hello = hello("a", &["forearm"]);
+    hello["sensors"][0]["rows"] = json!(4);
+    hello["sensors"][0]["cols"] = json!(6);
+    let mut newtons = vec![0.0; TAXELS];
+    // Its last row and column: 12 + 3 and 11 + 5 in the 28x28.
+    newtons[15 * COLS + 16] = 1.0;
+    let view = told(&[
+        (0, hello),
+        (0, status("forearm", "live")),
+        (
+            0,
+            json!({"type": "frame", "sensor": "forearm", "newtons": newtons}),
+        ),
+    ]);
+    let sensor = view.sensor().unwrap();
+    assert_eq!(sensor.newtons(3, 5), Some(1.0));
+    assert_eq!((sensor.newtons(4, 0), sensor.newtons(0, 6)), (None, None));
+}
+
+#[test]
+fn keys_are_told_from_what_a_terminal_sends() {
+    let check = |bytes: &[u8], keys: &[Key]| assert_eq!(pressed(bytes), keys, "{bytes:?}");
+    check(b"q", &[Key::Quit]);
+    check(b"\x03", &[Key::Quit]);
+    check(b"\t2x", &[Key::Next, Key::Sensor(1)]);
+    check(
+        b"\x1b[C\x1b[D\x1bOB\x1b[Z",
+        &[Key::Next, Key::Previous, Key::Next, Key::Previous],
+    );
+    check(b"\x0c", &[Key::Redraw]);
+    // Ctrl-arrow, a mouse report, a lone escape: nothing, and what follows is not misread.
+    check(b"\x1b[1;5C\x1b[<0;3;1Mq", &[Key::Quit]);
+    check(b"\x1b", &[]);
+}
+
+#[test]
+fn the_look_follows_the_terminal() {
+    let check = |term, no_color, locale, expected: (bool, bool, bool)| {
+        let look = Look::new(term, no_color, locale);
+        let found = (look.colours, look.attributes, look.unicode);
+        assert_eq!(found, expected, "{term} {no_color} {locale}");
+    };
+    check("xterm-256color", "", "en_US.UTF-8", (true, true, true));
+    check("xterm-256color", "1", "en_US.UTF-8", (false, true, true));
+    check("screen", "", "C", (true, true, false));
+    check("vt100", "", "C.UTF-8", (false, true, false));
+    check("dumb", "", "C.UTF-8", (false, false, false));
+    check("", "", "", (false, false, false));
+}
+
+#[test]
+#[ignore = "a part of the next, on a terminal of its own"]
+fn a_panic_with_the_screen_open() {
+    let _screen = Screen::open().unwrap();
+    panic!("on purpose");
+}
+
+#[test]
+fn a_panic_gives_the_terminal_back() {
+    let master = rustix::pty::openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
+    rustix::pty::grantpt(&master).unwrap();
+    rustix::pty::unlockpt(&master).unwrap();
+    let name = rustix::pty::ptsname(&master, Vec::new()).unwrap();
+    let device = File::options()
+        .read(true)
+        .write(true)
+        .open(name.to_str().unwrap())
+        .unwrap();
+    let end = || Stdio::from(device.try_clone().unwrap());
+    let ended = Command::new(std::env::current_exe().unwrap())
+        .args([
+            "a_panic_with_the_screen_open",
+            "--include-ignored",
+            "--nocapture",
+        ])
+        .stdin(end())
+        .stdout(end())
+        .stderr(end())
+        .status()
+        .unwrap();
+    assert!(!ended.success());
+    let mut written = [0; 16_384];
+    let length = rustix::io::read(&master, &mut written).unwrap();
+    let written = String::from_utf8_lossy(&written[..length]);
+    let given_back = written.find("\x1b[?1049l").unwrap();
+    let told = written.find("on purpose").unwrap();
+    assert!(
+        given_back < told,
+        "the message vanishes with the screen: {written:?}"
+    );
+    let modes = rustix::termios::tcgetattr(&device).unwrap();
+    assert!(
+        modes
+            .local_modes
+            .contains(LocalModes::ECHO | LocalModes::ICANON)
+    );
+}
+
+#[test]
+fn a_soft_touch_is_seen_after_a_hard_one() {
+    let mut view = pressed_sensor();
+    hear(&mut view, 200, frame("forearm", 4.6, 3));
+    // Little more than the usual contact threshold.
+    hear(&mut view, 300, frame("forearm", 0.08, 12));
+    let text = shown(&view, 400, (80, 24), PLAIN);
+    assert!(text.contains("::::::::::::"), "{text}");
+}
