@@ -150,6 +150,9 @@ fn exit_code(error: &anyhow::Error) -> u8 {
         DaemonError::Publish(PublishError::Socket(
             SocketError::NoSocket { .. } | SocketError::TooLong { .. },
         )) => exit::CONFIG,
+        DaemonError::Publish(PublishError::Unasked { .. } | PublishError::Passed(_)) => {
+            exit::CONFIG
+        }
         // In use or refused: another time it may work.
         DaemonError::Publish(_) | DaemonError::Random(_) => exit::IO,
         DaemonError::Stopped(_) => exit::FAILED,

@@ -3,6 +3,7 @@
 //! Field names are stable: they are those of the published events. The level comes from
 //! `RUST_LOG`, else it is `info` for the daemon. Nothing here goes to stdout, which belongs to events.
 
+mod journal;
 mod lines;
 
 use std::io::IsTerminal;
@@ -14,6 +15,7 @@ use tracing_subscriber::layer::{Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Registry, reload};
 
+use journal::Journal;
 use lines::Lines;
 
 use crate::event::{Event, LinkState, PressState, Tared};
@@ -62,7 +64,10 @@ impl Drop for Log {
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// No journal to write to.
-    #[error("log.format: found \"journald\", but the journal cannot be reached")]
+    #[error(
+        "log.format: found \"journald\", expected a journal at {}",
+        journal::SOCKET
+    )]
     Journal(#[source] std::io::Error),
     /// `RUST_LOG` cannot be read.
     #[error("RUST_LOG: {0}")]
@@ -114,17 +119,13 @@ impl Log {
 }
 
 fn output(settings: Settings, lines: &Lines) -> Result<Output, Error> {
-    let lines = tracing_subscriber::fmt::layer()
+    let text = tracing_subscriber::fmt::layer()
         .with_writer(lines.clone())
         .with_target(false);
     Ok(match settings.format {
-        Format::Text => lines.with_ansi(std::io::stderr().is_terminal()).boxed(),
-        Format::Json => lines.json().flatten_event(true).boxed(),
-        Format::Journald => tracing_journald::layer()
-            .map_err(Error::Journal)?
-            .with_field_prefix(Some("HARDNESSD".to_owned()))
-            .with_syslog_identifier("hardnessd".to_owned())
-            .boxed(),
+        Format::Text => text.with_ansi(std::io::stderr().is_terminal()).boxed(),
+        Format::Json => text.json().flatten_event(true).boxed(),
+        Format::Journald => Journal::find(lines).map_err(Error::Journal)?.boxed(),
     })
 }
 

@@ -1,7 +1,8 @@
 //! Every way out of the daemon: bound together, served together.
 
+use std::io;
 use std::net::SocketAddr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use tokio::task::JoinSet;
 use tracing::info;
@@ -13,6 +14,7 @@ use super::http::Http;
 use super::hub;
 use super::sensor::Sensors;
 use super::socket::{self, Socket};
+use super::systemd;
 use super::tcp::{self, Tcp};
 
 /// Permissions of the control socket: for the daemon's own user (contract, section 3).
@@ -27,6 +29,17 @@ pub enum Error {
     /// A TCP listener.
     #[error(transparent)]
     Tcp(#[from] tcp::Error),
+    /// The service manager listens where the configuration does not.
+    #[error(
+        "socket activation: found a socket at {found}, expected publish.unix.path or control_path"
+    )]
+    Unasked {
+        /// Where.
+        found: PathBuf,
+    },
+    /// The service manager hands over what is no Unix socket.
+    #[error("socket activation: {0}")]
+    Passed(#[source] io::Error),
 }
 
 /// Listeners: whoever connects is served once [`Publishers::serve`] runs.
@@ -43,14 +56,27 @@ impl Publishers {
     /// Binds all that are asked for, or none.
     pub(crate) fn bind(publish: &Publish, http: Option<SocketAddr>) -> Result<Self, Error> {
         let unix = &publish.unix;
-        let socket = |path: &Path, mode| {
-            let bound = unix.enabled.then(|| Socket::bind(path, mode));
-            bound.transpose()
+        let mut passed = systemd::sockets().map_err(Error::Passed)?;
+        let mut socket = |path: &Path, mode| {
+            let made = unix.enabled.then(|| {
+                let adopted = Socket::adopt(path, &mut passed);
+                adopted.unwrap_or_else(|| Socket::bind(path, mode))
+            });
+            made.transpose()
         };
+        let events = socket(&unix.path(), unix.mode.0)?;
+        let control = socket(&unix.control_path(), CONTROL_MODE)?;
+        if let Some(left) = passed.first() {
+            let address = left.local_addr().map_err(Error::Passed)?;
+            let found = address.as_pathname().unwrap_or(Path::new("(no path)"));
+            return Err(Error::Unasked {
+                found: found.to_owned(),
+            });
+        }
         Ok(Self {
             max_clients: unix.max_clients,
-            socket: socket(&unix.path(), unix.mode.0)?,
-            control: socket(&unix.control_path(), CONTROL_MODE)?,
+            socket: events,
+            control,
             tcp: publish
                 .tcp
                 .as_ref()

@@ -66,8 +66,9 @@ pub enum Error {
 pub(crate) struct Socket {
     listener: UnixListener,
     path: PathBuf,
-    /// Device and inode: a file that another put in its place is not ours to remove.
-    identity: (u64, u64),
+    /// Device and inode: a file that another put in its place is not ours to remove. `None`: it
+    /// belongs to the service manager.
+    identity: Option<(u64, u64)>,
 }
 
 impl Socket {
@@ -120,7 +121,35 @@ impl Socket {
         Ok(Self {
             listener,
             path: path.to_owned(),
-            identity: (file.dev(), file.ino()),
+            identity: Some((file.dev(), file.ino())),
+        })
+    }
+
+    /// That of `passed` which listens at `path`, if one does. Its file, and
+    /// the mode of that, stay the service manager's.
+    pub(crate) fn adopt(path: &Path, passed: &mut Vec<StdListener>) -> Option<Result<Self, Error>> {
+        // The same file may have several names: /run and /var/run.
+        let place = path.canonicalize().ok()?;
+        let is_there = |socket: &StdListener| {
+            let address = socket.local_addr().ok();
+            let found = address.as_ref().and_then(|address| address.as_pathname());
+            found.is_some_and(|found| found.canonicalize().is_ok_and(|found| found == place))
+        };
+        let index = passed.iter().position(is_there)?;
+        let listener = passed.swap_remove(index);
+        let adopted = listener.set_nonblocking(true);
+        let adopted = adopted.and_then(|()| UnixListener::from_std(listener));
+        Some(match adopted {
+            Ok(listener) => Ok(Self {
+                listener,
+                path: path.to_owned(),
+                identity: None,
+            }),
+            Err(source) => Err(Error::Io {
+                path: path.to_owned(),
+                what: "listen",
+                source,
+            }),
         })
     }
 }
@@ -143,7 +172,7 @@ impl Listener for Socket {
 impl Drop for Socket {
     fn drop(&mut self) {
         let ours = fs::symlink_metadata(&self.path)
-            .is_ok_and(|file| (file.dev(), file.ino()) == self.identity);
+            .is_ok_and(|file| Some((file.dev(), file.ino())) == self.identity);
         if ours {
             let _ = fs::remove_file(&self.path);
         }

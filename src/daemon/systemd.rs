@@ -1,10 +1,24 @@
-//! What the service manager is told, where there is one.
+//! What the service manager is told and what it hands over, where there is one.
 
+use std::io;
+use std::os::unix::net::UnixListener;
 use std::time::Duration;
 
+use listenfd::ListenFd;
 use sd_notify::NotifyState;
 
 use crate::event::{LinkState, Status};
+
+/// The Unix sockets that the manager listens on for us (sd_listen_fds(3)).
+///
+/// # Errors
+///
+/// If it hands over anything else.
+pub(crate) fn sockets() -> io::Result<Vec<UnixListener>> {
+    let mut passed = ListenFd::from_env();
+    let sockets = (0..passed.len()).map(|index| passed.take_unix_listener(index));
+    sockets.filter_map(Result::transpose).collect()
+}
 
 /// The daemon serves: sockets answer, ports are being opened.
 pub(crate) fn ready() {

@@ -1,9 +1,10 @@
-//! Log lines on their way to stderr, through a thread of their own.
+//! Log lines on their way to stderr or the journal, through a thread of their own.
 //!
 //! Whoever reads the log may stop reading; the sensor must not wait for it. So a line that finds
 //! too many before it is dropped, and how many were is said as soon as there is room again.
 
 use std::io::{self, Write};
+use std::os::unix::net::UnixDatagram;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{self, Receiver, SyncSender, TrySendError};
@@ -11,16 +12,21 @@ use std::time::Duration;
 
 use tracing_subscriber::fmt::MakeWriter;
 
+use super::journal;
+
 /// Lines that wait at most: some 150 kB.
 const WAITING: usize = 1024;
 
 enum Message {
+    /// To stderr.
     Line(Vec<u8>),
+    /// To the journal.
+    Entry(Vec<u8>),
     /// To be answered when all before it is written.
     Flush(SyncSender<()>),
 }
 
-/// The way to stderr; clones share it.
+/// The way out; clones share it.
 #[derive(Clone)]
 pub(super) struct Lines {
     thread: SyncSender<Message>,
@@ -35,6 +41,7 @@ impl Lines {
     /// If the system has no room for a thread.
     pub(super) fn start() -> io::Result<Self> {
         let (thread, messages) = mpsc::sync_channel(WAITING);
+        let journal = UnixDatagram::unbound()?;
         let lost = Arc::new(AtomicU64::new(0));
         let lines = Self {
             thread,
@@ -42,8 +49,19 @@ impl Lines {
         };
         std::thread::Builder::new()
             .name("log".to_owned())
-            .spawn(move || write(&messages, &lost))?;
+            .spawn(move || write(&messages, &journal, &lost))?;
         Ok(lines)
+    }
+
+    /// Sends an entry to the journal.
+    pub(super) fn enter(&self, entry: Vec<u8>) {
+        self.pass(Message::Entry(entry));
+    }
+
+    fn pass(&self, message: Message) {
+        if let Err(TrySendError::Full(_)) = self.thread.try_send(message) {
+            self.lost.fetch_add(1, Ordering::Relaxed);
+        }
     }
 
     /// Waits until all lines are written, but not longer than `patience`.
@@ -56,15 +74,22 @@ impl Lines {
     }
 }
 
-fn write(messages: &Receiver<Message>, lost: &AtomicU64) {
+fn write(messages: &Receiver<Message>, journal: &UnixDatagram, lost: &AtomicU64) {
     for message in messages {
-        // Where stderr is closed there is nobody to tell.
+        // Where stderr is closed or the journal gone there is nobody to tell.
         match message {
             Message::Line(line) => {
                 let _ = io::stderr().write_all(&line);
                 let lines = lost.swap(0, Ordering::Relaxed);
                 if lines > 0 {
                     let _ = writeln!(io::stderr(), "log: {lines} lines lost: read too slowly");
+                }
+            }
+            Message::Entry(entry) => {
+                let _ = journal.send_to(&entry, journal::SOCKET);
+                let lines = lost.swap(0, Ordering::Relaxed);
+                if lines > 0 {
+                    let _ = journal.send_to(&journal::lost(lines), journal::SOCKET);
                 }
             }
             Message::Flush(written) => {
@@ -85,9 +110,7 @@ impl<'a> MakeWriter<'a> for Lines {
 /// The formatter writes each event in one call.
 impl Write for &Lines {
     fn write(&mut self, line: &[u8]) -> io::Result<usize> {
-        if let Err(TrySendError::Full(_)) = self.thread.try_send(Message::Line(line.to_vec())) {
-            self.lost.fetch_add(1, Ordering::Relaxed);
-        }
+        self.pass(Message::Line(line.to_vec()));
         Ok(line.len())
     }
 

@@ -1,0 +1,79 @@
+//! What the service manager hands over: the socket that subscribers wait at.
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy knows no helper of a test as a test"
+)]
+
+mod bench;
+
+use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixListener;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+
+use bench::{BINARY, Bench, Process};
+use rustix::process::Signal;
+use serde_json::json;
+
+/// The daemon as the manager starts it: descriptor 3 is the socket, the variables are those of
+/// sd_listen_fds(3).
+fn activated(config: &Path, socket: &UnixListener) -> Command {
+    let mut command = Command::new("sh");
+    command
+        .args([
+            "-c",
+            "exec 3<&0 </dev/null; LISTEN_FDS=1 LISTEN_PID=$$ exec \"$0\" run --config \"$1\"",
+            BINARY,
+        ])
+        .arg(config)
+        .stdin(Stdio::from(OwnedFd::from(socket.try_clone().unwrap())))
+        .stderr(Stdio::piped());
+    command
+}
+
+#[test]
+fn a_socket_of_the_service_manager_is_served_and_stays() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let path = bench.path("events.sock");
+    let socket = UnixListener::bind(&path).unwrap();
+    for _ in 0..2 {
+        // Before there is a daemon: it waits instead of being refused.
+        let mut subscriber = bench.subscriber();
+        let mut daemon = Process(activated(&config, &socket).spawn().unwrap());
+        subscriber.until(&json!({"type": "hello", "robot": "arm-7"}));
+        subscriber.until(&json!({"type": "status", "state": "connecting"}));
+        // What the manager does not listen at the daemon makes itself.
+        assert!(bench.path("control.sock").exists());
+        daemon.signal(Signal::TERM);
+        assert_eq!(daemon.exit_code(), Some(0));
+        assert!(path.exists(), "the manager's socket is not ours to remove");
+        assert!(!bench.path("control.sock").exists());
+    }
+}
+
+#[test]
+fn a_socket_that_the_configuration_does_not_name_is_refused() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let socket = UnixListener::bind(bench.path("other.sock")).unwrap();
+    let Output { status, stderr, .. } = activated(&config, &socket).output().unwrap();
+    let stderr = String::from_utf8(stderr).unwrap();
+    assert_eq!(status.code(), Some(78), "{stderr}");
+    for part in ["other.sock", "publish.unix.path"] {
+        assert!(stderr.contains(part), "{part} not in {stderr}");
+    }
+    assert!(!bench.path("events.sock").exists());
+}
+
+#[test]
+fn what_is_no_unix_socket_is_refused() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let tcp = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let socket = UnixListener::from(OwnedFd::from(tcp));
+    let Output { status, stderr, .. } = activated(&config, &socket).output().unwrap();
+    let stderr = String::from_utf8(stderr).unwrap();
+    assert_eq!(status.code(), Some(78), "{stderr}");
+    assert!(stderr.contains("socket activation"), "{stderr}");
+}
