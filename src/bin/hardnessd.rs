@@ -6,19 +6,19 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Context;
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 use hardnessd::daemon::config::{Error as ConfigError, Setup};
 use hardnessd::daemon::log::{Log, Settings as LogSettings};
 use hardnessd::daemon::publish::Error as PublishError;
 use hardnessd::daemon::socket::Error as SocketError;
 use hardnessd::daemon::{Daemon, Error as DaemonError, Reload};
-use hardnessd::tools::{check, demo, doctor, replay, simulate, sniff, tail, watch};
+use hardnessd::tools::{check, demo, doctor, generate, replay, simulate, sniff, tail, watch};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
 /// Hardness events from a tactile array on a serial port
 #[derive(Debug, Parser)]
-#[command(version, about, max_term_width = 100)]
+#[command(version, about, max_term_width = 100, after_long_help = EXIT_CODES)]
 struct Args {
     #[command(subcommand)]
     command: Command,
@@ -48,9 +48,16 @@ enum Command {
     Doctor(doctor::Args),
     /// Look at raw bytes and propose a [sensor.frame]: TOML on stdout
     Sniff(sniff::Args),
+    /// Write man pages and completions, for a package
+    #[command(hide = true)]
+    Generate(generate::Args),
 }
 
-/// What an operator's script may rely on (docs: exit codes).
+const EXIT_CODES: &str = "Exit codes: 0 done, also after SIGINT and SIGTERM; 1 failed or bad data; \
+    2 wrong usage; 66 a file named here is missing or unreadable; 69 device or daemon unavailable; \
+    74 I/O error; 78 bad configuration or model, or a file that the configuration names.";
+
+/// What an operator's script may rely on.
 mod exit {
     pub(super) const FAILED: u8 = 1;
     pub(super) const USAGE: u8 = 2;
@@ -99,6 +106,7 @@ async fn dispatch(command: Command) -> anyhow::Result<()> {
         Command::Check(args) => Ok(check::run(&args)?),
         Command::Doctor(args) => Ok(doctor::run(&args)?),
         Command::Sniff(args) => Ok(sniff::run(args, shutdown()?).await?),
+        Command::Generate(args) => Ok(generate::run(args, Args::command())?),
     }
 }
 
@@ -222,6 +230,9 @@ fn exit_code(error: &anyhow::Error) -> u8 {
             sniff::Error::Unexplained { .. } => exit::FAILED,
             sniff::Error::Print(_) => exit::IO,
         };
+    }
+    if error.is::<generate::Error>() {
+        return exit::IO;
     }
     if error.is::<hardnessd::daemon::log::Error>() {
         return exit::CONFIG;

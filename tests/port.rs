@@ -1,0 +1,195 @@
+//! `sniff` and `doctor` as they are used: the real binary, recordings and ptys of the simulator.
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy knows no helper of a test as a test"
+)]
+
+mod bench;
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::process::Command;
+
+use bench::{BINARY, Bench, Daemon, hardnessd, wait_for};
+use serde_json::json;
+
+/// Exit code, stdout, stderr.
+fn run(arguments: &[&str]) -> (i32, String, String) {
+    let output = hardnessd(arguments);
+    (
+        output.status.code().unwrap(),
+        String::from_utf8(output.stdout).unwrap(),
+        String::from_utf8(output.stderr).unwrap(),
+    )
+}
+
+fn recorded(bench: &Bench, preset: &str) -> String {
+    let path = bench.path("sensor.bin").to_str().unwrap().to_owned();
+    let played = ["--presses", "4", "--fps", "20", "--seed", "5"];
+    let arguments = [
+        &["simulate", "--to", &path, "--preset", preset],
+        &played[..],
+    ];
+    let (code, _, stderr) = run(&arguments.concat());
+    assert_eq!(code, 0, "{stderr}");
+    path
+}
+
+/// The proposal in a configuration, as `check` takes it.
+fn checked(bench: &Bench, proposal: &str) -> String {
+    let text = format!("[[sensor]]\nname = \"forearm\"\nport = \"/dev/ttyACM0\"\n{proposal}");
+    let path = bench.path("proposed.toml");
+    fs::write(&path, text).unwrap();
+    let (code, stdout, stderr) = run(&["check", "--config", path.to_str().unwrap()]);
+    assert_eq!(code, 0, "{stderr}\n{proposal}");
+    stdout
+}
+
+#[test]
+fn a_recording_of_an_unknown_layout_is_named_and_the_proposal_runs() {
+    let bench = Bench::new();
+    for preset in [
+        "jx255n",
+        "jx255n-u16",
+        "jq",
+        "jq-tail",
+        "jq-u16",
+        "ff-tail",
+        "zero-run",
+    ] {
+        let (code, toml, stderr) = run(&["sniff", &recorded(&bench, preset)]);
+        assert_eq!(code, 0, "{preset}: {stderr}");
+        assert!(toml.contains("[sensor.frame]"), "{toml}");
+        // Without a checksum, a header and a tail look alike in the middle of a stream.
+        let named = format!("preset = \"{preset}\"");
+        let is_named = toml.contains(&named) || preset.starts_with("jq");
+        assert!(is_named, "{preset} is not named in\n{toml}");
+        // A capture decodes with what was proposed.
+        let config = bench.path("proposed.toml");
+        checked(&bench, &toml);
+        let (code, events, stderr) = run(&[
+            "replay",
+            bench.path("sensor.bin").to_str().unwrap(),
+            "--config",
+            config.to_str().unwrap(),
+        ]);
+        assert_eq!(code, 0, "{stderr}");
+        let presses = events.matches("\"state\":\"begin\"").count();
+        assert_eq!(presses, 4, "{preset}: {toml}");
+    }
+}
+
+#[test]
+fn a_sensor_at_a_port_is_sniffed_while_it_plays() {
+    let bench = Bench::new();
+    let _sensor = bench.sensor(&["--speed", "4"]);
+    let port = bench.path("port").to_str().unwrap().to_owned();
+    let (code, toml, stderr) = run(&["sniff", "--port", &port, "--seconds", "2"]);
+    assert_eq!(code, 0, "{stderr}");
+    assert!(stderr.contains("press the sensor"), "{stderr}");
+    assert!(toml.contains("preset = \"jx255n\""), "{toml}");
+    checked(&bench, &toml);
+}
+
+#[test]
+fn sniff_says_why_it_has_no_proposal() {
+    let bench = Bench::new();
+    let check = |arguments: &[&str], code: i32, part: &str| {
+        let (found, stdout, stderr) = run(&[&["sniff"], arguments].concat());
+        assert_eq!(found, code, "{arguments:?}: {stderr}");
+        assert!(stderr.contains(part) && stdout.is_empty(), "{stderr}");
+    };
+    let noise = bench.path("noise.bin");
+    let mut state = 1_u32;
+    let mut random = || {
+        state ^= state << 13;
+        state ^= state >> 17;
+        state ^= state << 5;
+        state as u8
+    };
+    fs::write(&noise, (0..40_000).map(|_| random()).collect::<Vec<u8>>()).unwrap();
+    check(&[noise.to_str().unwrap()], 1, "no layout");
+    check(&["/no/such.bin"], 66, "/no/such.bin");
+    check(
+        &["--port", "/dev/no-such"],
+        69,
+        "hardnessd doctor --port /dev/no-such",
+    );
+    check(&[], 2, "required");
+}
+
+#[test]
+fn doctor_names_what_is_missing_and_who_holds_a_port() {
+    let bench = Bench::new();
+    let (code, stdout, _) = run(&["doctor", "--port", "/dev/no-such"]);
+    assert_eq!(code, 1);
+    assert!(
+        stdout.starts_with("/dev/no-such: no such device"),
+        "{stdout}"
+    );
+
+    let _sensor = bench.sensor(&[]);
+    let daemon = Daemon::start(&bench.configure("hardnessd.toml", "events.sock", ""));
+    bench.subscriber().until(&json!({"state": "live"}));
+    let port = bench.path("port").to_str().unwrap().to_owned();
+    let (code, stdout, stderr) = run(&["doctor", "--port", &port]);
+    assert_eq!(code, 1);
+    let holder = format!(
+        "held by process {} (hardnessd): kill",
+        daemon.process.0.id()
+    );
+    assert!(stdout.contains(&holder), "{holder:?} not in {stdout}");
+    assert!(stderr.contains("expected none"), "{stderr}");
+}
+
+#[test]
+fn doctor_names_the_group_that_may_use_a_port() {
+    let bench = Bench::new();
+    let _sensor = bench.sensor(&[]);
+    let port = bench.path("port");
+    let device = fs::canonicalize(&port).unwrap();
+    let is_root = rustix::process::geteuid().is_root();
+    // Root may do everything: it asks as somebody else, from where that one may go.
+    let mut command = if is_root {
+        let copy = bench.path("hardnessd");
+        fs::copy(BINARY, &copy).unwrap();
+        let everyone = fs::Permissions::from_mode(0o755);
+        fs::set_permissions(copy.parent().unwrap(), everyone).unwrap();
+        let mut command = Command::new("setpriv");
+        command
+            .args(["--reuid", "65534", "--regid", "65534", "--clear-groups"])
+            .arg(copy);
+        command
+    } else {
+        fs::set_permissions(&device, fs::Permissions::from_mode(0o000)).unwrap();
+        Command::new(BINARY)
+    };
+    let output = command
+        .args(["doctor", "--port"])
+        .arg(&device)
+        .output()
+        .unwrap();
+    let stdout = String::from_utf8(output.stdout).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{stdout}");
+    assert!(stdout.contains("permission denied to "), "{stdout}");
+    assert!(stdout.contains("sudo "), "no cure in {stdout}");
+}
+
+/// It takes half a second; ten on a busy machine are no reason to wait longer.
+#[test]
+fn ten_megabytes_are_sniffed_in_time() {
+    let bench = Bench::new();
+    let path = bench.path("long.bin").to_str().unwrap().to_owned();
+    let (code, _, stderr) = run(&["simulate", "--to", &path, "--fps", "100", "--presses", "32"]);
+    assert_eq!(code, 0, "{stderr}");
+    let bytes = fs::read(&path).unwrap();
+    wait_for("enough bytes", || bytes.len() > 10_000_000);
+    fs::write(Path::new(&path), &bytes[..10_000_000]).unwrap();
+    let start = std::time::Instant::now();
+    let (code, toml, stderr) = run(&["sniff", &path]);
+    let elapsed = start.elapsed();
+    assert_eq!(code, 0, "{stderr}");
+    assert!(toml.contains("preset = \"jx255n\""), "{toml}");
+    assert!(elapsed.as_secs() < 10, "{elapsed:?}");
+}
