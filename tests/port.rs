@@ -111,6 +111,9 @@ fn sniff_says_why_it_has_no_proposal() {
     fs::write(&noise, (0..40_000).map(|_| random()).collect::<Vec<u8>>()).unwrap();
     check(&[noise.to_str().unwrap()], 1, "no layout");
     check(&["/no/such.bin"], 66, "/no/such.bin");
+    // A cause is told once.
+    let (_, _, stderr) = run(&["sniff", "/no/such.bin"]);
+    assert_eq!(stderr.matches("os error 2").count(), 1, "{stderr}");
     check(
         &["--port", "/dev/no-such"],
         69,

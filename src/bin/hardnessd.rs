@@ -85,10 +85,22 @@ fn main() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("hardnessd: {error:#}");
+            eprintln!("hardnessd: {}", told(&error));
             ExitCode::from(exit_code(&error))
         }
     }
+}
+
+/// An error and its causes in one line, each of them once: many name their cause themselves.
+fn told(error: &anyhow::Error) -> String {
+    let mut line = String::new();
+    for cause in error.chain().map(ToString::to_string) {
+        if !line.contains(&cause) {
+            line += if line.is_empty() { "" } else { ": " };
+            line += &cause;
+        }
+    }
+    line
 }
 
 async fn dispatch(command: Command) -> anyhow::Result<()> {
