@@ -13,7 +13,22 @@ pub mod sniff;
 pub mod tail;
 pub mod watch;
 
+use std::error::Error;
 use std::io::{ErrorKind, Write};
+
+/// What is printed of an error: one line, with the causes that it does not tell itself.
+pub fn line(error: &(dyn Error + 'static)) -> String {
+    let mut line = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        let text = error.to_string();
+        if !line.ends_with(&text) {
+            line = format!("{line}: {text}");
+        }
+        cause = error.source();
+    }
+    line
+}
 
 /// Writes lines to stdout at once. `Ok(false)`: nobody reads any more, which ends a tool quietly.
 fn print(lines: &[u8]) -> std::io::Result<bool> {
@@ -21,5 +36,26 @@ fn print(lines: &[u8]) -> std::io::Result<bool> {
     match out.write_all(lines).and_then(|()| out.flush()) {
         Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(false),
         written => written.map(|()| true),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Debug, thiserror::Error)]
+    enum Told {
+        #[error("x: cannot read: {0}")]
+        Whole(#[source] std::io::Error),
+        #[error("x: cannot read")]
+        Bare(#[source] std::io::Error),
+    }
+
+    #[test]
+    fn a_cause_is_told_once() {
+        let cause = || std::io::Error::other("no such file");
+        for told in [Told::Whole(cause()), Told::Bare(cause())] {
+            assert_eq!(line(&told), "x: cannot read: no such file");
+        }
     }
 }

@@ -12,7 +12,7 @@ use hardnessd::daemon::log::{Log, Settings as LogSettings};
 use hardnessd::daemon::publish::Error as PublishError;
 use hardnessd::daemon::socket::Error as SocketError;
 use hardnessd::daemon::{Daemon, Error as DaemonError, Reload};
-use hardnessd::tools::{check, demo, doctor, generate, replay, simulate, sniff, tail, watch};
+use hardnessd::tools::{self, check, demo, doctor, generate, replay, simulate, sniff, tail, watch};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
@@ -85,22 +85,10 @@ fn main() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("hardnessd: {}", told(&error));
+            eprintln!("hardnessd: {}", tools::line(error.as_ref()));
             ExitCode::from(exit_code(&error))
         }
     }
-}
-
-/// An error and its causes in one line, each of them once: many name their cause themselves.
-fn told(error: &anyhow::Error) -> String {
-    let mut line = String::new();
-    for cause in error.chain().map(ToString::to_string) {
-        if !line.contains(&cause) {
-            line += if line.is_empty() { "" } else { ": " };
-            line += &cause;
-        }
-    }
-    line
 }
 
 async fn dispatch(command: Command) -> anyhow::Result<()> {

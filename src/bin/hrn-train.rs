@@ -11,6 +11,7 @@ use hardnessd::frame::RawFrame;
 use hardnessd::simulator::{
     DatasetSettings, Material, SensorProfile, Sequence, SequenceSettings, Shapes, Split,
 };
+use hardnessd::tools;
 use hardnessd::train::compare::{self, Plan};
 use hardnessd::train::dataset::{Dataset, DatasetError, LabelChoice};
 use hardnessd::train::export;
@@ -210,7 +211,7 @@ fn main() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("hrn-train: {error:#}");
+            eprintln!("hrn-train: {}", tools::line(error.as_ref()));
             ExitCode::from(exit_code(&error))
         }
     }
