@@ -1,0 +1,140 @@
+//! What early verdicts are worth, measured on simulated presses: how often one comes, how often it
+//! is the final one, and how much sooner.
+//!
+//!     cargo run --release --example early_verdicts -- [PRESSES]
+//!
+//! PRESSES (default 200, some minutes) of each material at 5, 20 and 100 frames/s, with the settings and the model
+//! that are built in. Prints the table of `docs/daemon.md`, and how many early verdicts came before the
+//! press had reached 95 % of its greatest force: none should.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use hardnessd::event::{Event, Hardness, Phase, PressState};
+use hardnessd::frame::Stamp;
+use hardnessd::pipeline::{Clock, Judgement, Pipeline, Settings};
+use hardnessd::simulator::{Material, Sequence, SequenceSettings};
+use hardnessd::verdict::{BUILT_IN, Hrn};
+use hardnessd::wire::{self, Layout};
+use hardnessd::{press, tare};
+
+const SEED: u64 = 1;
+/// Of a press's greatest force: from here on it no longer rises.
+const RISEN: f32 = 0.95;
+
+fn main() {
+    let presses = std::env::args().nth(1);
+    let presses = presses.map_or(200, |text| text.parse().expect("a number of presses"));
+    let hrn = Arc::new(Hrn::load(BUILT_IN).expect("the model in the binary is one"));
+    println!("| material | 5 frames/s | 20 frames/s | 100 frames/s |");
+    println!("|---|---|---|---|");
+    let mut rising = 0;
+    for material in Material::ALL {
+        print!("| {material} |");
+        for frame_rate_hz in [5.0, 20.0, 100.0] {
+            let sequence = Sequence::new(SequenceSettings {
+                seed: SEED,
+                frame_rate_hz,
+                materials: vec![material],
+                presses: Some(presses),
+                ..SequenceSettings::default()
+            });
+            let presses = measure(sequence, frame_rate_hz, &hrn);
+            print!(" {} |", cell(&presses));
+            rising += presses
+                .iter()
+                .filter(|press| press.is_judged_rising())
+                .count();
+        }
+        println!();
+    }
+    println!("\nwhile the load was rising: {rising}");
+}
+
+/// A press with what came of it.
+#[derive(Default)]
+struct Press {
+    /// Total force of each of its frames, newtons.
+    forces_n: Vec<f32>,
+    /// Its early verdict, when that came, and after how many of the frames.
+    early: Option<(Hardness, Duration, usize)>,
+    /// Its final verdict, and when that came.
+    last: Option<(Hardness, Duration)>,
+}
+
+impl Press {
+    /// Whether its early verdict came before the load had risen.
+    fn is_judged_rising(&self) -> bool {
+        let greatest_n = |forces_n: &[f32]| forces_n.iter().copied().fold(0.0, f32::max);
+        self.early.as_ref().is_some_and(|(_, _, frames)| {
+            greatest_n(&self.forces_n[..*frames]) < RISEN * greatest_n(&self.forces_n)
+        })
+    }
+}
+
+fn measure(sequence: Sequence, frame_rate_hz: f64, hrn: &Arc<Hrn>) -> Vec<Press> {
+    let layout = Layout::new(&wire::Settings::default()).expect("the default is a layout");
+    let judgement = Judgement {
+        calibration: tare::Settings::default(),
+        press: press::Settings::default(),
+        min_confidence: 0.0,
+        min_force_n: 0.0,
+        hrn: Arc::clone(hrn),
+    };
+    let settings = Settings {
+        sensor: "sensor".to_owned(),
+        frame_rate_hz,
+        layout: layout.clone(),
+        judgement,
+    };
+    let mut pipeline = Pipeline::new(settings, Clock::FrameRate);
+    let mut presses: Vec<Press> = Vec::new();
+    let mut bytes = Vec::new();
+    for (index, frame) in sequence.enumerate() {
+        bytes.clear();
+        layout.encode(&frame.raw, &mut bytes);
+        let mono = Duration::from_secs_f64(index as f64 / frame_rate_hz);
+        let at = Stamp {
+            mono,
+            wall: jiff::Timestamp::UNIX_EPOCH,
+        };
+        for event in pipeline.push(&bytes, at) {
+            match (event, presses.last_mut()) {
+                (Event::Press(press), _) if press.state == PressState::Begin => {
+                    presses.push(Press::default());
+                }
+                (Event::Frame(frame), Some(press)) if press.last.is_none() => {
+                    press.forces_n.push(frame.newtons.iter().sum());
+                }
+                (Event::Hardness(verdict), Some(press)) => match verdict.phase {
+                    Phase::Early => press.early = Some((verdict, mono, press.forces_n.len())),
+                    Phase::Final => press.last = Some((verdict, mono)),
+                },
+                _ => {}
+            }
+        }
+    }
+    presses
+}
+
+/// Share of presses with an early verdict, share of these with the level of the final one, and by
+/// how much they came sooner (median).
+fn cell(presses: &[Press]) -> String {
+    let mut sooner_s = Vec::new();
+    let mut same = 0;
+    for press in presses {
+        if let (Some((early, at, _)), Some((last, end))) = (&press.early, &press.last) {
+            same += usize::from(early.level == last.level);
+            sooner_s.push((*end - *at).as_secs_f64());
+        }
+    }
+    sooner_s.sort_by(f64::total_cmp);
+    let percent = |part: usize, whole: usize| 100.0 * part as f64 / whole as f64;
+    let came = percent(sooner_s.len(), presses.len());
+    sooner_s
+        .get(sooner_s.len() / 2)
+        .map_or("none".to_owned(), |median_s| {
+            let same = percent(same, sooner_s.len());
+            format!("{came:.1} %, {same:.1} %, {median_s:.2} s")
+        })
+}
