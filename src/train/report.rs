@@ -142,7 +142,8 @@ pub fn run(details: &Details) -> anyhow::Result<String> {
     page.table(&tables::stages(&details.history));
     page.note(
         "Blue: loss and accuracy on what is learnt from (of a GAN, the discriminator's loss). \
-         Orange: on held-out objects, or the generator's loss. Dashed: real frames.",
+         Orange: on held-out objects, the generator's loss, or within a component. Dashed: real \
+         frames.",
     );
     page.panels(figures::stages(&details.history));
     if !details.worth.sets.is_empty() {

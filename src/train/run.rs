@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use super::checkpoint::Checkpoint;
 use super::dataset::{LabelChoice, Source};
-use super::likeness::Likeness;
+use super::history::{self, Metrics};
 use super::settings::{Profile, Settings};
 
 /// Checkpoints kept of a stage: the newest, and one before it.
@@ -183,9 +183,10 @@ impl Run {
     fn take_metrics(&self, stage: &str, other: &Path) -> anyhow::Result<()> {
         let path = other.join("metrics.csv");
         let text = fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+        history::check_columns(&text, &path)?;
         let mut own = fs::read_to_string(self.path("metrics.csv")).unwrap_or_default();
         if own.is_empty() {
-            own = format!("{METRICS_COLUMNS}\n");
+            own = history::columns() + "\n";
         }
         let of_stage = |row: &&str| row.split(',').next() == Some(stage);
         own = own
@@ -204,11 +205,14 @@ impl Run {
     ///
     /// # Errors
     ///
-    /// Those of reading and writing.
+    /// Those of reading and writing, or if another version began the file with other columns.
     pub fn metrics(&self, stage: &'static str, step: u64) -> anyhow::Result<Metrics> {
         let path = self.path("metrics.csv");
         let before = fs::read_to_string(&path).unwrap_or_default();
-        let mut text = format!("{METRICS_COLUMNS}\n");
+        if !before.is_empty() {
+            history::check_columns(&before, &path)?;
+        }
+        let mut text = history::columns() + "\n";
         let mut seconds_before = 0.0;
         for row in before.lines().skip(1) {
             let mut cells = row.split(',');
@@ -225,11 +229,7 @@ impl Run {
         }
         self.write("metrics.csv", text.as_bytes())?;
         let file = File::options().append(true).open(&path)?;
-        Ok(Metrics {
-            file,
-            stage,
-            seconds_before,
-        })
+        Ok(Metrics::new(file, stage, seconds_before))
     }
 }
 
@@ -251,107 +251,6 @@ fn checkpoints(run: &Path, stage: &str) -> anyhow::Result<Vec<PathBuf>> {
     }
     paths.sort();
     Ok(paths)
-}
-
-/// Of a GAN's stage, `loss` is the discriminator's; what a stage does not have stays empty.
-const METRICS_COLUMNS: &str = "stage,step,epoch,loss,learning_rate,accuracy,\
-    validation_loss,validation_accuracy,generator_loss,sigma_min,sigma_mean,sigma_max,pixel_std,\
-    pixel_std_real,feature_distance,seconds";
-
-/// `metrics.csv`, open for one stage.
-#[derive(Debug)]
-pub struct Metrics {
-    file: File,
-    stage: &'static str,
-    /// What the stage had taken at the checkpoint it goes on from.
-    seconds_before: f64,
-}
-
-/// One row of `metrics.csv`.
-#[derive(Debug, Clone, Copy)]
-pub struct Row {
-    /// Steps done.
-    pub step: u64,
-    /// Epochs done.
-    pub epoch: u32,
-    /// Mean training loss of the epoch.
-    pub loss: f64,
-    /// Of the epoch's last step.
-    pub learning_rate: f64,
-    /// Share of the epoch's samples judged rightly, each before the step that learnt from it; of a
-    /// recogniser's stage.
-    pub accuracy: Option<f64>,
-    /// Loss and accuracy on the validation objects, where they were judged.
-    pub validation: Option<(f64, f64)>,
-    /// Since this process took the stage up. The file has the sum over processes; what was done
-    /// after the last checkpoint of a killed one is not in it, and is done again.
-    pub seconds: f64,
-    /// Of a GAN's stage.
-    pub adversarial: Option<Adversarial>,
-}
-
-/// What a GAN's row has beside.
-#[derive(Debug, Clone, Copy)]
-pub struct Adversarial {
-    /// Mean of the epoch.
-    pub generator_loss: f64,
-    /// Least, mean and greatest deviation of the mixture.
-    pub sigma: [f64; 3],
-    /// Generated frames beside real ones, where they were compared.
-    pub likeness: Option<Likeness>,
-}
-
-impl Metrics {
-    /// Adds a row.
-    ///
-    /// # Errors
-    ///
-    /// Those of writing.
-    pub fn add(&mut self, row: &Row) -> anyhow::Result<()> {
-        let Row {
-            step,
-            epoch,
-            loss,
-            learning_rate,
-            seconds,
-            ..
-        } = row;
-        let (stage, seconds) = (self.stage, self.seconds_before + seconds);
-        let validation = match row.validation {
-            Some((loss, accuracy)) => format!("{loss:.6},{accuracy:.4}"),
-            None => ",".to_owned(),
-        };
-        let accuracy = row
-            .accuracy
-            .map_or_else(String::new, |share| format!("{share:.4}"));
-        let mut line =
-            format!("{stage},{step},{epoch},{loss:.6},{learning_rate},{accuracy},{validation}");
-        match row.adversarial {
-            Some(Adversarial {
-                generator_loss,
-                sigma: [least, mean, greatest],
-                ..
-            }) => line += &format!(",{generator_loss:.6},{least:.5},{mean:.5},{greatest:.5}"),
-            None => line += ",,,,",
-        }
-        match row.adversarial.and_then(|adversarial| adversarial.likeness) {
-            Some(Likeness {
-                pixel_std,
-                pixel_std_real,
-                pixel_std_component,
-                feature_distance,
-            }) => {
-                line += &format!(
-                    ",{pixel_std:.5},{pixel_std_real:.5},{pixel_std_component:.5},\
-                     {feature_distance:.5}"
-                );
-            }
-            None => line += ",,,,",
-        }
-        line += &format!(",{seconds:.1}\n");
-        // One write a row: a full disk leaves whole rows.
-        self.file.write_all(line.as_bytes()).context("metrics.csv")
-    }
 }
 
 /// Writes a file beside its place, flushes it and renames it.
@@ -398,6 +297,7 @@ fn revision() -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::train::history::Row;
 
     #[test]
     fn seconds_go_on_from_the_row_of_the_checkpoint() {

@@ -183,7 +183,7 @@ const PICTURES: [(&str, &[(&str, &str)]); 5] = [
         &[("accuracy", "train"), ("validation_accuracy", "valid")],
     ),
     (
-        "sigma: least, mean, greatest",
+        "sigma",
         &[
             ("sigma_min", "train"),
             ("sigma_mean", "train"),
@@ -192,7 +192,11 @@ const PICTURES: [(&str, &[(&str, &str)]); 5] = [
     ),
     (
         "taxels' deviation",
-        &[("pixel_std", "train"), ("pixel_std_real", "diagonal")],
+        &[
+            ("pixel_std", "train"),
+            ("pixel_std_component", "valid"),
+            ("pixel_std_real", "diagonal"),
+        ],
     ),
     ("distance of features", &[("feature_distance", "train")]),
 ];
