@@ -1,7 +1,7 @@
 //! `hardnessd watch`: the sensors of a running daemon, on a terminal.
 //!
 //! A subscriber like any other, which asks for the totals once a second, and connects again when the
-//! daemon goes away. What is known is kept in [`view`], what it looks like in [`draw`]; here they
+//! daemon goes away. What is known is kept in `view`, what it looks like in `draw`; here they
 //! are brought together with the socket, the keys and the clock.
 
 mod ansi;
