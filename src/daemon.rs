@@ -12,6 +12,7 @@ mod http;
 mod hub;
 pub mod log;
 pub mod publish;
+pub mod record;
 mod request;
 mod sensor;
 pub(crate) mod serial;
@@ -34,11 +35,13 @@ use tracing::{error, info, warn};
 use self::config::Setup;
 use self::log::Log;
 use self::publish::Publishers;
+use self::record::{Recorder, Tap, Tape, Target};
 use self::sensor::{Command, Sensor, Sensors};
 use self::serial::Link;
 use crate::event::{Hello, ModelCard, PROTOCOL, SensorCard, Status};
 use crate::frame::Stamp;
 use crate::pipeline::{Clock, Pipeline};
+use crate::recording::{About, Labels};
 
 /// How long subscribers may take to fetch their last lines: the daemon must be gone within 1 s.
 const FAREWELL: Duration = Duration::from_millis(300);
@@ -55,6 +58,9 @@ pub enum Error {
     /// No random numbers, without which a run cannot be told from another.
     #[error("/dev/urandom: {0}")]
     Random(#[source] std::io::Error),
+    /// What was to be recorded is not there, or cannot be written.
+    #[error(transparent)]
+    Record(#[from] record::Error),
     /// A fault of this program.
     #[error("{0} stopped by itself")]
     Stopped(&'static str),
@@ -75,6 +81,8 @@ pub struct Daemon {
     setup: Setup,
     hello: Hello,
     publishers: Publishers,
+    /// Where a recording goes, if there is one.
+    target: Option<Target>,
 }
 
 /// The moment, on both clocks.
@@ -98,9 +106,32 @@ impl Daemon {
         let http = setup.config.http.as_ref().map(|http| http.listen);
         let publishers = Publishers::bind(&setup.config.publish, http)?;
         Ok(Self {
+            target: setup.config.record.clone().map(Target::Directory),
             setup,
             hello,
             publishers,
+        })
+    }
+
+    /// A daemon without sockets that records into `file`, which is at `path` and empty. It ends by
+    /// itself when a sensor is not there to begin with, or all are gone.
+    ///
+    /// # Errors
+    ///
+    /// If there are no random numbers.
+    pub fn recording(
+        mut setup: Setup,
+        path: PathBuf,
+        file: File,
+        labels: Labels,
+    ) -> Result<Self, Error> {
+        setup.config.http = None;
+        setup.config.publish.tcp = None;
+        setup.config.publish.unix.enabled = false;
+        setup.config.record = None;
+        Ok(Self {
+            target: Some(Target::File { path, file, labels }),
+            ..Self::bind(setup)?
         })
     }
 
@@ -124,17 +155,25 @@ impl Daemon {
             mut setup,
             hello,
             publishers,
+            target,
         } = self;
         let run = hello.run.clone();
-        let hub = hub::start(hello);
+        let mut recorder = target
+            .map(|target| Recorder::start(target, about(&setup, &hello)))
+            .transpose()?;
+        let tap = recorder.as_ref().map_or(Tap::default(), Recorder::tap);
+        let hub = hub::start(hello, tap);
 
         let mut tasks = JoinSet::new();
         let mut commands = Vec::new();
-        for (settings, sensor) in setup.pipelines().zip(&setup.config.sensors) {
+        for (index, sensor) in setup.config.sensors.iter().enumerate() {
             let (sender, inbox) = mpsc::channel(QUESTIONS);
-            let pipeline = Pipeline::new(settings, Clock::Arrival);
+            let pipeline = Pipeline::new(setup.pipeline(sensor), Clock::Arrival);
             let link = Link::new(&sensor.port, sensor.baud);
-            tasks.spawn(sensor::serve(pipeline, link, hub.clone(), inbox));
+            let tape = recorder.as_ref().map_or(Tape::default(), |recorder| {
+                recorder.tape(index, setup.recorded(sensor))
+            });
+            tasks.spawn(sensor::serve(pipeline, link, tape, hub.clone(), inbox));
             commands.push(Sensor {
                 name: sensor.name.clone(),
                 commands: sender,
@@ -157,6 +196,7 @@ impl Daemon {
                 () = &mut shutdown => break Ok(()),
                 Some(_) = tasks.join_next() => break Err(Error::Stopped("a sensor")),
                 Some(_) = publishers.join_next() => break Err(Error::Stopped("a listener")),
+                () = record_ended(&mut recorder) => break Ok(()),
                 _ = heartbeat.tick() => {
                     if let Some(statuses) = alive(&hub, &sensors).await {
                         systemd::alive(&statuses);
@@ -200,7 +240,26 @@ impl Daemon {
         if tokio::time::timeout(FAREWELL, farewell).await.is_err() {
             warn!("a subscriber did not fetch its last lines");
         }
-        outcome
+        let recorded = match recorder {
+            // A file that was asked for by itself is worth waiting for.
+            Some(recorder) if setup.config.record.is_none() => recorder.finish().await,
+            Some(recorder) => tokio::time::timeout(FAREWELL, recorder.finish())
+                .await
+                .unwrap_or_else(|_| {
+                    warn!("the disk did not take the end of the recording");
+                    Ok(())
+                }),
+            None => Ok(()),
+        };
+        outcome.and(recorded.map_err(Error::Record))
+    }
+}
+
+/// Waits until there is no more to record; for ever, if nothing is.
+async fn record_ended(recorder: &mut Option<Recorder>) {
+    match recorder {
+        Some(recorder) => recorder.stopped().await,
+        None => std::future::pending().await,
     }
 }
 
@@ -274,6 +333,18 @@ fn announce(setup: &Setup, run: &str) {
 /// The model as events name it.
 fn short(setup: &Setup) -> &str {
     &setup.hrn.sha256()[..12]
+}
+
+fn about(setup: &Setup, hello: &Hello) -> About {
+    let sensors = setup.config.sensors.iter();
+    About {
+        robot: hello.robot.clone(),
+        run: hello.run.clone(),
+        boot_id: hello.boot_id.clone(),
+        reason: None,
+        labels: Labels::new(),
+        sensors: sensors.map(|sensor| setup.recorded(sensor)).collect(),
+    }
 }
 
 fn hello(setup: &Setup, run: String) -> Hello {

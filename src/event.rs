@@ -104,7 +104,7 @@ impl Event {
 }
 
 /// State of a sensor's link.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LinkState {
     /// Never opened, or open without a frame for under 2.5 periods.
@@ -337,6 +337,9 @@ pub enum Reply {
         /// What a `tare` did.
         #[serde(skip_serializing_if = "Option::is_none")]
         tare: Option<Tared>,
+        /// Where a `blackbox` was written.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        blackbox: Option<String>,
     },
 }
 
@@ -413,6 +416,10 @@ fn line<T: Serialize>(value: &T) -> String {
 }
 
 /// RFC 3339 in UTC with microseconds, so that every time has one width.
+pub(crate) fn time_text(time: Timestamp) -> String {
+    format!("{time:.6}")
+}
+
 fn rfc3339<S: Serializer>(time: &Timestamp, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_str(&format_args!("{time:.6}"))
 }

@@ -4,6 +4,8 @@
 //! dead-taxel replacement. Only `tare` makes the second from the first, so raw counts cannot
 //! reach the press tracker.
 
+use serde::{Deserialize, Serialize};
+
 /// Rows of a frame, and of the network's input (paper, "Tactile sensor").
 pub const ROWS: usize = 28;
 /// Columns of a frame.
@@ -39,7 +41,8 @@ impl std::fmt::Debug for RawFrame {
 }
 
 /// A frame in newtons.
-#[derive(Clone, Copy, PartialEq)]
+#[derive(Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "Vec<f32>", into = "Vec<f32>")]
 pub struct Frame {
     /// `[ROWS, COLS]` flattened, row-major, in newtons a taxel; finite and not negative.
     pub newtons: [f32; TAXELS],
@@ -60,6 +63,47 @@ impl std::fmt::Debug for Frame {
             .field("force_n", &self.force_n())
             .field("peak_n", &peak)
             .finish()
+    }
+}
+
+impl From<Frame> for Vec<f32> {
+    fn from(frame: Frame) -> Self {
+        frame.newtons.to_vec()
+    }
+}
+
+impl TryFrom<Vec<f32>> for Frame {
+    type Error = String;
+
+    fn try_from(newtons: Vec<f32>) -> Result<Self, String> {
+        newtons
+            .try_into()
+            .map(|newtons| Self { newtons })
+            .map_err(|found: Vec<f32>| format!("found {} taxels, expected {TAXELS}", found.len()))
+    }
+}
+
+/// A value a taxel as a list, for `#[serde(with)]`: serde itself knows no arrays of this length.
+pub(crate) mod taxels {
+    use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error};
+
+    use super::TAXELS;
+
+    pub(crate) fn serialize<T: Serialize, S: Serializer>(
+        taxels: &[T; TAXELS],
+        serializer: S,
+    ) -> Result<S::Ok, S::Error> {
+        serializer.collect_seq(taxels)
+    }
+
+    pub(crate) fn deserialize<'de, T: Deserialize<'de>, D: Deserializer<'de>>(
+        deserializer: D,
+    ) -> Result<Box<[T; TAXELS]>, D::Error> {
+        let taxels = Vec::deserialize(deserializer)?;
+        let found = taxels.len();
+        taxels
+            .try_into()
+            .map_err(|_| D::Error::invalid_length(found, &"784 taxels"))
     }
 }
 
@@ -115,7 +159,7 @@ impl Array {
 
 /// When something came, on the two clocks that matter: one that never jumps, for durations, and
 /// the calendar, for people.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Stamp {
     /// CLOCK_MONOTONIC.
     pub mono: std::time::Duration,

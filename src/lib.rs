@@ -12,6 +12,7 @@ pub mod press;
 pub mod verdict;
 pub mod event;
 pub mod pipeline;
+pub mod recording;
 
 pub mod random;
 pub mod simulator;

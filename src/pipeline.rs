@@ -10,6 +10,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
 
 use crate::event::{
     Event, FrameEvent, Hardness, LinkState, Note, Phase, Press, PressState, Rejection, Status,
@@ -19,7 +20,7 @@ use crate::frame::{Frame, RawFrame, Stamp};
 use crate::press::{self, Abort, Change, End, Moment, Peak, PressTracker};
 use crate::tare::{self, Contact, Offsets, Progress, Tare};
 use crate::verdict::Hrn;
-use crate::wire::{Decoded, Decoder, Layout};
+use crate::wire::{self, Decoded, Decoder, Layout};
 
 /// What a pipeline is made for.
 #[derive(Debug, Clone)]
@@ -96,12 +97,18 @@ pub struct Pipeline {
     tare: Tare,
     tracker: PressTracker,
     judgement: Judgement,
+    seen: Seen,
+    /// What became of a tare that was asked for, until it is fetched.
+    retared: Option<Result<Tared, RetareError>>,
+}
+
+/// What the pipeline itself knows of the past.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Seen {
     link: Link,
     tare_met_contact: bool,
     /// The offsets before the tare that was asked for and is being taken.
     retaring: Option<Offsets>,
-    /// What became of it, until it is fetched.
-    retared: Option<Result<Tared, RetareError>>,
     context: Option<serde_json::Value>,
     frames: u64,
     frames_damaged: u64,
@@ -115,7 +122,17 @@ pub struct Pipeline {
     told: (LinkState, Option<String>),
 }
 
-#[derive(Debug)]
+/// All that a pipeline has seen, without its settings: one of the same settings that recalls it
+/// goes on as the first would, event for event. Recordings begin with it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Memory {
+    decoder: wire::Memory,
+    tare: tare::Memory,
+    tracker: press::Memory,
+    pipeline: Seen,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 enum Link {
     /// Never opened; why the last try failed.
     Closed { reason: Option<String> },
@@ -151,19 +168,45 @@ impl Pipeline {
             tracker: PressTracker::new(judgement.press.clone()),
             decoder: Decoder::new(layout),
             judgement,
-            link: Link::Closed { reason: None },
-            tare_met_contact: false,
-            retaring: None,
+            seen: Seen {
+                link: Link::Closed { reason: None },
+                tare_met_contact: false,
+                retaring: None,
+                context: None,
+                frames: 0,
+                frames_damaged: 0,
+                chunks: VecDeque::new(),
+                recent: VecDeque::with_capacity(RATE_FRAMES),
+                last_bytes: None,
+                last_frame: None,
+                told: (LinkState::Connecting, None),
+            },
             retared: None,
-            context: None,
-            frames: 0,
-            frames_damaged: 0,
-            chunks: VecDeque::new(),
-            recent: VecDeque::with_capacity(RATE_FRAMES),
-            last_bytes: None,
-            last_frame: None,
-            told: (LinkState::Connecting, None),
         }
+    }
+
+    /// All it has seen.
+    pub fn memory(&self) -> Memory {
+        Memory {
+            decoder: self.decoder.memory(),
+            tare: self.tare.memory(),
+            tracker: self.tracker.memory(),
+            pipeline: self.seen.clone(),
+        }
+    }
+
+    /// Goes on where the one of the same settings stood whose memory this is.
+    pub fn recall(&mut self, memory: Memory) {
+        self.decoder.recall(memory.decoder);
+        self.tare.recall(memory.tare);
+        self.tracker.recall(memory.tracker);
+        self.seen = memory.pipeline;
+        self.retared = None;
+    }
+
+    /// Whole frames and damaged ones since the start.
+    pub fn frame_counts(&self) -> (u64, u64) {
+        (self.seen.frames, self.seen.frames_damaged)
     }
 
     /// Takes over changed settings at once. The baseline and a press under way stay.
@@ -183,7 +226,7 @@ impl Pipeline {
         if self.tracker.is_pressed() {
             return Err(RetareError::Pressed);
         }
-        if !matches!(self.link, Link::Live { .. }) {
+        if !matches!(self.seen.link, Link::Live { .. }) {
             return Err(RetareError::NotLive);
         }
         if self.tare.is_taking() {
@@ -192,7 +235,7 @@ impl Pipeline {
         if !self.tare.retake() {
             return Err(RetareError::NoFrames);
         }
-        self.retaring = Some(self.tare.offsets());
+        self.seen.retaring = Some(self.tare.offsets());
         Ok(())
     }
 
@@ -203,7 +246,7 @@ impl Pipeline {
 
     /// What the controller says it is doing: echoed in presses and verdicts until it changes.
     pub fn set_context(&mut self, context: Option<serde_json::Value>) {
-        self.context = context;
+        self.seen.context = context;
     }
 
     /// Name of the sensor.
@@ -213,7 +256,7 @@ impl Pipeline {
 
     /// When the last whole frame came.
     pub fn last_frame(&self) -> Option<Stamp> {
-        self.last_frame
+        self.seen.last_frame
     }
 
     /// What may change while it runs, as it is now.
@@ -224,17 +267,17 @@ impl Pipeline {
     /// The port is open: what comes next does not continue what came before.
     pub fn opened(&mut self, at: Stamp) -> Vec<Event> {
         self.decoder.restart();
-        self.chunks.clear();
-        self.last_bytes = None;
-        if matches!(self.link, Link::Closed { .. }) {
-            self.link = Link::Opened { since: at.mono };
+        self.seen.chunks.clear();
+        self.seen.last_bytes = None;
+        if matches!(self.seen.link, Link::Closed { .. }) {
+            self.seen.link = Link::Opened { since: at.mono };
         }
         self.status_if_changed(at)
     }
 
     /// The port could not be opened. Once it has been open, the loss already says so.
     pub fn unavailable(&mut self, reason: String, at: Stamp) -> Vec<Event> {
-        if let Link::Closed { reason: known } = &mut self.link {
+        if let Link::Closed { reason: known } = &mut self.seen.link {
             *known = Some(reason);
         }
         self.status_if_changed(at)
@@ -244,9 +287,9 @@ impl Pipeline {
     pub fn push(&mut self, bytes: &[u8], at: Stamp) -> Vec<Event> {
         let mut events = self.tick(at);
         self.decoder.push(bytes);
-        self.last_bytes = Some(at.mono);
+        self.seen.last_bytes = Some(at.mono);
         if self.clock == Clock::Arrival {
-            self.chunks.push_back((self.decoder.received(), at));
+            self.seen.chunks.push_back((self.decoder.received(), at));
         }
         self.drain(&mut events);
         events
@@ -263,16 +306,16 @@ impl Pipeline {
             .is_some_and(|deadline| at.mono >= deadline)
         {
             self.decoder.settle();
-            self.last_bytes = None;
+            self.seen.last_bytes = None;
             self.drain(&mut events);
         }
         if let Some(deadline) = self.stale_deadline()
             && at.mono >= deadline
         {
-            self.link = Link::Stale;
+            self.seen.link = Link::Stale;
             self.abandon_retare(RetareError::NotLive);
             // From the last frame on, so that its time and this one are of one clock reading.
-            let since = self.last_frame.unwrap_or(at);
+            let since = self.seen.last_frame.unwrap_or(at);
             let wait = deadline.saturating_sub(since.mono);
             let wall = since.wall.checked_add(wait).unwrap_or(at.wall);
             events.extend(self.status_if_changed(Stamp {
@@ -297,9 +340,9 @@ impl Pipeline {
         self.decoder.settle();
         self.drain(&mut events);
         self.decoder.restart();
-        self.last_bytes = None;
-        self.recent.clear();
-        self.link = Link::Lost { reason };
+        self.seen.last_bytes = None;
+        self.seen.recent.clear();
+        self.seen.link = Link::Lost { reason };
         self.abandon_retare(RetareError::NotLive);
         events.extend(self.status_if_changed(at));
         self.abort(Abort::Lost, &mut events);
@@ -320,10 +363,10 @@ impl Pipeline {
         self.decoder.settle();
         self.drain(&mut events);
         self.abort(Abort::EndOfRecording, &mut events);
-        self.link = Link::Lost {
+        self.seen.link = Link::Lost {
             reason: Abort::EndOfRecording.reason().to_owned(),
         };
-        let at = at.or(self.last_frame).unwrap_or(EPOCH);
+        let at = at.or(self.seen.last_frame).unwrap_or(EPOCH);
         // What is left over never became a frame.
         self.decoder.restart();
         events.push(Event::Status(self.status(at)));
@@ -339,16 +382,20 @@ impl Pipeline {
             time: at.wall,
             state,
             reason,
-            frames: self.frames,
-            frames_damaged: self.frames_damaged,
+            frames: self.seen.frames,
+            frames_damaged: self.seen.frames_damaged,
             bytes_skipped: self.decoder.skipped(),
             frame_rate_hz: self.measured_rate_hz(),
         }
     }
 
     fn state(&self) -> (LinkState, Option<String>) {
-        let tare = || self.tare_met_contact.then(|| "tare: contact".to_owned());
-        match &self.link {
+        let tare = || {
+            self.seen
+                .tare_met_contact
+                .then(|| "tare: contact".to_owned())
+        };
+        match &self.seen.link {
             Link::Closed { reason } => (LinkState::Connecting, reason.clone()),
             Link::Opened { .. } => (LinkState::Connecting, None),
             Link::Live { .. } => (LinkState::Live, tare()),
@@ -362,33 +409,37 @@ impl Pipeline {
 
     fn status_if_changed(&mut self, at: Stamp) -> Vec<Event> {
         let state = self.state();
-        if self.told == state {
+        if self.seen.told == state {
             return Vec::new();
         }
-        self.told = state;
+        self.seen.told = state;
         vec![Event::Status(self.status(at))]
     }
 
     fn measured_rate_hz(&self) -> Option<f64> {
         let span = self
+            .seen
             .recent
             .back()?
-            .checked_sub(*self.recent.front()?)?
+            .checked_sub(*self.seen.recent.front()?)?
             .as_secs_f64();
         match self.clock {
-            _ if self.recent.len() < 2 => None,
+            _ if self.seen.recent.len() < 2 => None,
             Clock::FrameRate => Some(self.frame_rate_hz),
-            Clock::Arrival => (span > 0.0).then(|| (self.recent.len() - 1) as f64 / span),
+            Clock::Arrival => (span > 0.0).then(|| (self.seen.recent.len() - 1) as f64 / span),
         }
     }
 
     fn pause_deadline(&self) -> Option<Duration> {
-        let last_bytes = self.last_bytes.filter(|_| self.decoder.pending() > 0)?;
+        let last_bytes = self
+            .seen
+            .last_bytes
+            .filter(|_| self.decoder.pending() > 0)?;
         Some(last_bytes + self.period.mul_f64(PAUSE_PERIODS))
     }
 
     fn stale_deadline(&self) -> Option<Duration> {
-        match self.link {
+        match self.seen.link {
             Link::Opened { since } | Link::Live { since } if self.clock == Clock::Arrival => {
                 Some(since + self.period.mul_f64(STALE_PERIODS))
             }
@@ -403,12 +454,17 @@ impl Pipeline {
                     let stamp = self.stamp_of(end);
                     self.take(&frame, stamp, events);
                 }
-                Err(_damage) => self.frames_damaged += 1,
+                Err(_damage) => self.seen.frames_damaged += 1,
             }
         }
         let settled = self.decoder.received() - self.decoder.pending() as u64;
-        while self.chunks.front().is_some_and(|&(end, _)| end <= settled) {
-            self.chunks.pop_front();
+        while self
+            .seen
+            .chunks
+            .front()
+            .is_some_and(|&(end, _)| end <= settled)
+        {
+            self.seen.chunks.pop_front();
         }
     }
 
@@ -416,12 +472,13 @@ impl Pipeline {
     fn stamp_of(&self, end: u64) -> Stamp {
         match self.clock {
             Clock::Arrival => self
+                .seen
                 .chunks
                 .iter()
                 .find(|&&(chunk_end, _)| chunk_end >= end)
                 .map_or(EPOCH, |&(_, stamp)| stamp),
             Clock::FrameRate => {
-                let mono = Duration::from_secs_f64(self.frames as f64 / self.frame_rate_hz);
+                let mono = Duration::from_secs_f64(self.seen.frames as f64 / self.frame_rate_hz);
                 Stamp {
                     mono,
                     wall: EPOCH.wall.checked_add(mono).unwrap_or(Timestamp::MAX),
@@ -433,20 +490,20 @@ impl Pipeline {
     /// A whole frame.
     fn take(&mut self, raw: &RawFrame, stamp: Stamp, events: &mut Vec<Event>) {
         let at = Moment {
-            frame: self.frames,
+            frame: self.seen.frames,
             stamp,
         };
-        self.frames += 1;
-        self.last_frame = Some(stamp);
-        if self.recent.len() == RATE_FRAMES {
-            self.recent.pop_front();
+        self.seen.frames += 1;
+        self.seen.last_frame = Some(stamp);
+        if self.seen.recent.len() == RATE_FRAMES {
+            self.seen.recent.pop_front();
         }
-        self.recent.push_back(stamp.mono);
-        self.link = Link::Live { since: stamp.mono };
+        self.seen.recent.push_back(stamp.mono);
+        self.seen.link = Link::Live { since: stamp.mono };
 
         let frame = self.tare.apply(raw);
         // A baseline stands, be it that another is being taken.
-        let tared = !self.tare.is_taking() || self.retaring.is_some();
+        let tared = !self.tare.is_taking() || self.seen.retaring.is_some();
         let changes = if tared {
             self.tracker.push(&frame, at)
         } else {
@@ -474,13 +531,13 @@ impl Pipeline {
     fn observe(&mut self, raw: &RawFrame) {
         match self.tare.observe(raw) {
             Progress::Ready | Progress::Taking => {}
-            Progress::Contact if self.retaring.is_some() => {
+            Progress::Contact if self.seen.retaring.is_some() => {
                 self.abandon_retare(RetareError::Touched);
             }
-            Progress::Contact => self.tare_met_contact = true,
+            Progress::Contact => self.seen.tare_met_contact = true,
             Progress::Taken => {
-                self.tare_met_contact = false;
-                if let Some(old) = self.retaring.take() {
+                self.seen.tare_met_contact = false;
+                if let Some(old) = self.seen.retaring.take() {
                     self.retared = Some(Ok(Tared {
                         sensor: self.sensor.clone(),
                         old,
@@ -492,7 +549,7 @@ impl Pipeline {
     }
 
     fn abandon_retare(&mut self, reason: RetareError) {
-        if self.retaring.take().is_some() {
+        if self.seen.retaring.take().is_some() {
             self.tare.give_up();
             self.retared = Some(Err(reason));
         }
@@ -555,7 +612,7 @@ impl Pipeline {
             frame: at.frame,
             reason,
             frames,
-            context: self.context.clone(),
+            context: self.seen.context.clone(),
         })
     }
 
@@ -605,7 +662,7 @@ impl Pipeline {
             force_n: peak.force_n,
             model: hrn.sha256()[..12].to_owned(),
             state: self.state().0,
-            context: self.context.clone(),
+            context: self.seen.context.clone(),
             mono_ns: (self.clock == Clock::Arrival).then_some(stamp.mono.as_nanos() as u64),
             age_at_publish_ms: None,
             latency_us: None,

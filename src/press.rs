@@ -151,7 +151,7 @@ impl Settings {
 }
 
 /// A frame of a press: its number and when its last byte came.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Moment {
     /// Number of the frame, per sensor.
     pub frame: u64,
@@ -160,7 +160,7 @@ pub struct Moment {
 }
 
 /// The frame of maximal contact area so far; ties go to the greater force, then the earlier one.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Peak {
     /// Which frame.
     pub moment: Moment,
@@ -257,7 +257,14 @@ pub struct PressTracker {
     presses: u64,
 }
 
-#[derive(Debug)]
+/// What a [`PressTracker`] has seen, without its settings.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Memory {
+    state: State,
+    presses: u64,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 enum State {
     Idle,
     Pressed(Box<Pressed>),
@@ -267,7 +274,7 @@ enum State {
     },
 }
 
-#[derive(Debug)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Pressed {
     press: u64,
     began: Duration,
@@ -280,14 +287,14 @@ struct Pressed {
 }
 
 /// The latest frames that are all near the largest area and force so far.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 struct Settling {
     near: VecDeque<Load>,
     most_area: u32,
     most_force_n: f64,
 }
 
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 struct Load {
     at: Duration,
     contact_area_taxels: u32,
@@ -307,6 +314,22 @@ impl PressTracker {
     /// Takes over changed settings; a press under way goes on under them.
     pub fn reload(&mut self, settings: Settings) {
         self.settings = settings;
+    }
+
+    /// What it has seen.
+    pub fn memory(&self) -> Memory {
+        Memory {
+            state: self.state.clone(),
+            presses: self.presses,
+        }
+    }
+
+    /// Goes on where the one stood whose memory this is.
+    pub fn recall(&mut self, memory: Memory) {
+        Memory {
+            state: self.state,
+            presses: self.presses,
+        } = memory;
     }
 
     /// Whether a press is under way.

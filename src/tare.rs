@@ -6,7 +6,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::frame::{Array, COLS, Frame, ROWS, RawFrame, TAXELS};
+use crate::frame::{Array, COLS, Frame, ROWS, RawFrame, TAXELS, taxels};
 
 /// The `[sensor.calibration]` table.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -131,7 +131,7 @@ pub enum Progress {
 }
 
 /// A baseline, summed up over the array's live taxels.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Offsets {
     /// Mean over the taxels.
     pub mean_counts: f32,
@@ -157,13 +157,24 @@ pub struct Tare {
     dead: Vec<(usize, Vec<usize>)>,
 }
 
+/// What a [`Tare`] has seen, without its settings.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Memory {
+    #[serde(with = "taxels")]
+    baseline: Box<[f32; TAXELS]>,
+    taking: Option<Taking>,
+}
+
 /// Sums over the frames of a tare.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Taking {
     wanted: u32,
     seen: u32,
+    #[serde(with = "taxels")]
     sum: Box<[u32; TAXELS]>,
+    #[serde(with = "taxels")]
     least: Box<[u16; TAXELS]>,
+    #[serde(with = "taxels")]
     most: Box<[u16; TAXELS]>,
 }
 
@@ -212,6 +223,22 @@ impl Tare {
         self.max_n = settings.tare_max_n;
         self.contact = contact;
         self.dead = dead(settings, self.array);
+    }
+
+    /// What it has seen.
+    pub fn memory(&self) -> Memory {
+        Memory {
+            baseline: self.baseline.clone(),
+            taking: self.taking.clone(),
+        }
+    }
+
+    /// Goes on where the one stood whose memory this is.
+    pub fn recall(&mut self, memory: Memory) {
+        Memory {
+            baseline: self.baseline,
+            taking: self.taking,
+        } = memory;
     }
 
     /// Whether a tare is being taken.

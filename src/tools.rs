@@ -7,6 +7,8 @@ mod faults;
 pub mod generate;
 mod player;
 mod pty;
+pub mod record;
+pub mod recover;
 pub mod replay;
 pub mod simulate;
 pub mod sniff;

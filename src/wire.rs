@@ -17,7 +17,7 @@ mod zero_run;
 use serde::{Deserialize, Serialize};
 
 pub use self::checksum::Checksum;
-pub use self::decoder::{Damage, Decoded, Decoder};
+pub use self::decoder::{Damage, Decoded, Decoder, Memory};
 use crate::frame::{Array, RawFrame};
 
 /// Ready-made layouts.

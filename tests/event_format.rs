@@ -161,9 +161,19 @@ fn replies_are_frozen() {
         &Reply::Ok {
             id: Some(json!("a")),
             tare: None,
+            blackbox: None,
         }
         .to_line(),
         r#"{"type":"ok","id":"a"}"#,
+    );
+    check(
+        &Reply::Ok {
+            id: None,
+            tare: None,
+            blackbox: Some("/var/lib/hardnessd/blackbox.mcap".to_owned()),
+        }
+        .to_line(),
+        r#"{"type":"ok","blackbox":"/var/lib/hardnessd/blackbox.mcap"}"#,
     );
     let offsets = |mean_counts| Offsets {
         mean_counts,
@@ -178,6 +188,7 @@ fn replies_are_frozen() {
                 old: offsets(2.25),
                 new: offsets(2.5),
             }),
+            blackbox: None,
         }
         .to_line(),
         r#"{"type":"ok","tare":{"sensor":"forearm","old":{"mean_counts":2.25,"least_counts":1.5,"most_counts":9.0},"new":{"mean_counts":2.5,"least_counts":1.5,"most_counts":9.0}}}"#,

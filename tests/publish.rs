@@ -73,7 +73,7 @@ fn the_control_socket_tares_and_gives_presses_their_context() {
     assert_eq!(control.next().unwrap()["type"], "hello");
     refused(&control.ask(r#"{"tare":"forearm"}"#), "not live");
     refused(&control.ask(r#"{"tare":"wrist"}"#), "forearm");
-    refused(&control.ask(r#"{"blackbox":"forearm"}"#), "recorder");
+    refused(&control.ask(r#"{"blackbox":"forearm"}"#), "[record]");
 
     let context = json!({"sensor": "forearm", "tag": "pick-17", "speed_mm_s": 5.0});
     let command = json!({"context": context, "id": "c"}).to_string();

@@ -10,9 +10,12 @@ use clap::{CommandFactory, Parser, Subcommand};
 use hardnessd::daemon::config::{Error as ConfigError, Setup};
 use hardnessd::daemon::log::{Log, Settings as LogSettings};
 use hardnessd::daemon::publish::Error as PublishError;
+use hardnessd::daemon::record::Error as RecordError;
 use hardnessd::daemon::socket::Error as SocketError;
 use hardnessd::daemon::{Daemon, Error as DaemonError, Reload};
-use hardnessd::tools::{self, check, demo, doctor, generate, replay, simulate, sniff, tail, watch};
+use hardnessd::tools::{
+    self, check, demo, doctor, generate, record, recover, replay, simulate, sniff, tail, watch,
+};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
@@ -36,6 +39,10 @@ enum Command {
     Demo(demo::Args),
     /// Play a simulated sensor at a pty
     Simulate(simulate::Args),
+    /// Record sensors to a file, with what they were judged to be
+    Record(record::Args),
+    /// Save what is whole in a damaged recording
+    Recover(recover::Args),
     /// Play a recording through the same pipeline: events on stdout as JSON lines
     Replay(replay::Args),
     /// Print events of a running daemon
@@ -100,6 +107,13 @@ async fn dispatch(command: Command) -> anyhow::Result<()> {
             Ok(demo::run(args, shutdown()?).await?)
         }
         Command::Simulate(args) => Ok(simulate::run(args, shutdown()?).await?),
+        Command::Record(args) => {
+            let shutdown = shutdown()?;
+            let setup = Setup::load(&args.config)?;
+            let _log = Log::start(setup.config.log, "info")?;
+            Ok(record::run(args, setup, shutdown).await?)
+        }
+        Command::Recover(args) => Ok(recover::run(&args)?),
         Command::Replay(args) => Ok(replay::run(args, shutdown()?).await?),
         Command::Tail(args) => Ok(tail::run(args, shutdown()?).await?),
         Command::Watch(args) => Ok(watch::run(args, shutdown()?).await?),
@@ -163,6 +177,10 @@ fn exit_code(error: &anyhow::Error) -> u8 {
         }
         // In use or refused: another time it may work.
         DaemonError::Publish(_) | DaemonError::Random(_) => exit::IO,
+        DaemonError::Record(RecordError::Unavailable { .. } | RecordError::Lost { .. }) => {
+            exit::UNAVAILABLE
+        }
+        DaemonError::Record(_) => exit::IO,
         DaemonError::Stopped(_) => exit::FAILED,
     };
     if let Some(error) = error.downcast_ref::<ConfigError>() {
@@ -195,10 +213,24 @@ fn exit_code(error: &anyhow::Error) -> u8 {
             simulate::Error::Recording { .. } | simulate::Error::Pty { .. } => exit::IO,
         };
     }
+    if let Some(error) = error.downcast_ref::<record::Error>() {
+        return match error {
+            record::Error::Create { .. } => exit::IO,
+            record::Error::Daemon(error) => of_daemon(error),
+        };
+    }
+    if let Some(error) = error.downcast_ref::<recover::Error>() {
+        return match error {
+            recover::Error::Unreadable { .. } => exit::NO_INPUT,
+            recover::Error::Nothing { .. } => exit::FAILED,
+            recover::Error::Write { .. } => exit::IO,
+        };
+    }
     if let Some(error) = error.downcast_ref::<replay::Error>() {
         return match error {
             replay::Error::Config(error) => of_config(error),
-            replay::Error::Unreadable { .. } | replay::Error::Format { .. } => exit::NO_INPUT,
+            replay::Error::Unreadable { .. } => exit::NO_INPUT,
+            replay::Error::Recording { .. } | replay::Error::Sensor { .. } => exit::FAILED,
             replay::Error::Broken { .. } | replay::Error::Print(_) => exit::IO,
         };
     }
@@ -225,7 +257,8 @@ fn exit_code(error: &anyhow::Error) -> u8 {
     }
     if let Some(error) = error.downcast_ref::<sniff::Error>() {
         return match error {
-            sniff::Error::Unreadable { .. } | sniff::Error::Format { .. } => exit::NO_INPUT,
+            sniff::Error::Unreadable { .. } => exit::NO_INPUT,
+            sniff::Error::Recording { .. } => exit::FAILED,
             sniff::Error::Unavailable { .. } => exit::UNAVAILABLE,
             sniff::Error::Unexplained { .. } => exit::FAILED,
             sniff::Error::Print(_) => exit::IO,

@@ -145,6 +145,13 @@ struct Client<S: Stream> {
     service: Service,
 }
 
+/// What a command did that its answer tells.
+#[derive(Default)]
+struct Done {
+    tare: Option<Tared>,
+    blackbox: Option<String>,
+}
+
 /// What a subscriber did.
 enum Heard {
     Line(BytesMut),
@@ -241,27 +248,28 @@ impl<S: Stream> Client<S> {
         let answered = match line.request {
             Ok(Request::Subscribe(subscription)) => {
                 let subscribed = hub.subscribe(id, subscription).await?;
-                subscribed.map(|()| (Vec::new(), None))
+                subscribed.map(|()| (Vec::new(), Done::default()))
             }
-            Ok(Request::Status) => Ok((statuses(sensors).await, None)),
-            Ok(Request::Last) => Ok((hub.finals().await?, None)),
+            Ok(Request::Status) => Ok((statuses(sensors).await, Done::default())),
+            Ok(Request::Last) => Ok((hub.finals().await?, Done::default())),
             Ok(Request::Change(change)) => {
                 let changed = self.change(change).await;
-                changed.map(|tare| (Vec::new(), tare))
+                changed.map(|done| (Vec::new(), done))
             }
             Err(message) => Err(message),
         };
         Ok(match answered {
-            Ok((mut lines, tare)) => {
-                lines.push(Reply::Ok { id: line.id, tare }.into());
+            Ok((mut lines, Done { tare, blackbox })) => {
+                let id = line.id;
+                lines.push(Reply::Ok { id, tare, blackbox }.into());
                 lines
             }
             Err(message) => vec![error(message, line.id)],
         })
     }
 
-    /// Carries a command out; what a tare did is told in the answer.
-    async fn change(&self, change: Change) -> Result<Option<Tared>, String> {
+    /// Carries a command out.
+    async fn change(&self, change: Change) -> Result<Done, String> {
         if self.service.access == Access::ReadOnly {
             return Err(format!(
                 "{}: found a command that changes something, expected it on the control socket",
@@ -274,7 +282,10 @@ impl<S: Stream> Client<S> {
                 let (reply, outcome) = oneshot::channel();
                 tell(sensors, "tare", &sensor, Command::Tare(reply)).await?;
                 match outcome.await {
-                    Ok(Ok(tared)) => Ok(Some(tared)),
+                    Ok(Ok(tared)) => Ok(Done {
+                        tare: Some(tared),
+                        ..Done::default()
+                    }),
                     Ok(Err(refusal)) => Err(format!("tare: {refusal}")),
                     Err(_) => Err("tare: the daemon is stopping".to_owned()),
                 }
@@ -282,12 +293,20 @@ impl<S: Stream> Client<S> {
             Change::Context { sensor, context } => {
                 let command = Command::Context(context);
                 tell(sensors, "context.sensor", &sensor, command).await?;
-                Ok(None)
+                Ok(Done::default())
             }
-            // The recorder that keeps the last bytes comes with recording.
-            Change::Blackbox { sensor } => Err(format!(
-                "blackbox: found no recorder for {sensor:?}: not in this version"
-            )),
+            Change::Blackbox { sensor } => {
+                let (reply, written) = oneshot::channel();
+                tell(sensors, "blackbox", &sensor, Command::Blackbox(reply)).await?;
+                match written.await {
+                    Ok(Ok(path)) => Ok(Done {
+                        blackbox: Some(path.display().to_string()),
+                        ..Done::default()
+                    }),
+                    Ok(Err(reason)) => Err(format!("blackbox: {reason}")),
+                    Err(_) => Err("blackbox: the recorder has no time for it".to_owned()),
+                }
+            }
         }
     }
 

@@ -18,7 +18,7 @@ pub use self::parse::Error;
 use super::log;
 use crate::pipeline::{self, Judgement};
 use crate::verdict::Hrn;
-use crate::{press, tare, wire};
+use crate::{press, recording, tare, wire};
 
 /// The whole file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -42,9 +42,9 @@ pub struct Config {
     /// The live page and what stands beside it; off unless given.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub http: Option<Http>,
-    /// Not in this version.
-    #[serde(default, skip_serializing)]
-    record: Option<toml::Value>,
+    /// The daemon's own recording; off unless given.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub record: Option<Record>,
     /// How the log is written.
     #[serde(default)]
     pub log: log::Settings,
@@ -161,6 +161,51 @@ impl Default for Http {
     fn default() -> Self {
         Self {
             listen: SocketAddr::from(([127, 0, 0, 1], 8256)),
+        }
+    }
+}
+
+/// The `[record]` table.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Record {
+    /// Where to; by default as [`Record::dir`] says.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    dir: Option<PathBuf>,
+    /// Whether all is recorded, or only the last minute when a fault happens.
+    pub continuous: bool,
+    /// A file that has grown to so many million bytes is ended, and the next begun.
+    pub rotate_mb: u64,
+    /// Likewise after so long.
+    pub rotate_s: u64,
+    /// So many million bytes stay free on the disk: below it nothing is written.
+    pub keep_free_mb: u64,
+}
+
+impl Default for Record {
+    fn default() -> Self {
+        Self {
+            dir: None,
+            continuous: true,
+            rotate_mb: 256,
+            rotate_s: 3600,
+            keep_free_mb: 1024,
+        }
+    }
+}
+
+impl Record {
+    /// The directory: as configured, else the service's state directory, else
+    /// `/var/lib/hardnessd`.
+    pub fn dir(&self) -> PathBuf {
+        if let Some(dir) = &self.dir {
+            return dir.clone();
+        }
+        let directories = env::var("STATE_DIRECTORY").unwrap_or_default();
+        // systemd separates several by colons.
+        match directories.split(':').next() {
+            Some(first) if !first.is_empty() => PathBuf::from(first),
+            _ => PathBuf::from("/var/lib/hardnessd"),
         }
     }
 }
@@ -317,6 +362,7 @@ impl Config {
             ),
             ("publish.tcp.listen", ours.tcp != theirs.tcp),
             ("http.listen", self.http != other.http),
+            ("record", self.record != other.record),
         ];
         differs
             .iter()
@@ -357,13 +403,33 @@ impl Setup {
 
     /// Settings of every sensor's pipeline, in order.
     pub fn pipelines(&self) -> impl Iterator<Item = pipeline::Settings> {
-        self.config.sensors.iter().map(|sensor| pipeline::Settings {
+        let sensors = self.config.sensors.iter();
+        sensors.map(|sensor| self.pipeline(sensor))
+    }
+
+    /// Settings of one sensor's pipeline.
+    pub fn pipeline(&self, sensor: &Sensor) -> pipeline::Settings {
+        pipeline::Settings {
             sensor: sensor.name.clone(),
             frame_rate_hz: sensor.frame_rate_hz,
             layout: wire::Layout::new(&sensor.frame)
                 .expect("a layout was checked when its configuration was read"),
             judgement: self.judgement(sensor),
-        })
+        }
+    }
+
+    /// What a recording says of a sensor.
+    pub fn recorded(&self, sensor: &Sensor) -> recording::Sensor {
+        recording::Sensor {
+            name: sensor.name.clone(),
+            frame_rate_hz: sensor.frame_rate_hz,
+            frame: sensor.frame.clone(),
+            calibration: sensor.calibration.clone(),
+            press: self.config.press.clone(),
+            min_confidence: self.config.model.min_confidence,
+            min_force_n: self.config.model.min_force_n,
+            model: self.hrn.sha256().to_owned(),
+        }
     }
 
     /// What a reload may change of a sensor.

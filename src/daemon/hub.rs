@@ -17,6 +17,7 @@ use tokio::sync::{mpsc, oneshot};
 use self::subscriber::Subscriber;
 pub(crate) use self::tally::{Counts, Tally, Verdicts};
 use super::log;
+use super::record::Tap;
 use super::request::{Kinds, Subscription};
 use crate::event::{Event, Hello, Kind, Reply};
 
@@ -67,6 +68,7 @@ struct Hub {
     /// Last final verdict, by sensor.
     finals: BTreeMap<String, Line>,
     tally: Tally,
+    tap: Tap,
     subscribers: BTreeMap<u64, Subscriber>,
     joined: u64,
 }
@@ -79,6 +81,7 @@ impl Hub {
             forgotten: [0; Kinds::NUMBERED.len()],
             finals: BTreeMap::new(),
             tally: Tally::default(),
+            tap: Tap::default(),
             subscribers: BTreeMap::new(),
             joined: 0,
         }
@@ -88,13 +91,6 @@ impl Hub {
     /// byte came that made it possible, `now` when it is published; both CLOCK_MONOTONIC.
     fn publish(&mut self, mut event: Event, arrival: Duration, now: Duration) {
         let kind = event.kind();
-        let wanted = self
-            .subscribers
-            .values()
-            .any(|subscriber| subscriber.wants(kind));
-        if kind == Kind::Frame && !wanted {
-            return;
-        }
         if let Event::Hardness(verdict) = &mut event {
             // Rounded: more digits than the clock is good for would only be noise.
             verdict.age_at_publish_ms = verdict.mono_ns.map(|at| {
@@ -107,6 +103,11 @@ impl Hub {
         if kind != Kind::Frame {
             self.hello.seq += 1;
             event.number(self.hello.seq);
+        }
+        self.tap.event(&event);
+        let mut subscribers = self.subscribers.values();
+        if kind == Kind::Frame && !subscribers.any(|subscriber| subscriber.wants(kind)) {
+            return;
         }
         let line = Line::from(&event);
         if line.seq.is_some() {
@@ -354,10 +355,14 @@ impl Handle {
 /// Commands under way; the hub never waits, so the queue is short unless the machine is.
 const COMMANDS: usize = 256;
 
-/// Starts the hub. It ends when every handle is gone.
-pub(crate) fn start(hello: Hello) -> Handle {
+/// Starts the hub, which shows `tap` what it publishes. It ends when every handle is gone.
+pub(crate) fn start(hello: Hello, tap: Tap) -> Handle {
     let (commands, inbox) = mpsc::channel(COMMANDS);
-    tokio::spawn(serve(Hub::new(hello), inbox));
+    let hub = Hub {
+        tap,
+        ..Hub::new(hello)
+    };
+    tokio::spawn(serve(hub, inbox));
     Handle { commands }
 }
 
@@ -435,6 +440,7 @@ async fn serve(mut hub: Hub, mut inbox: mpsc::Receiver<Command>) {
             }
             Command::Close => {
                 closing = true;
+                hub.tap = Tap::default();
                 waiting.clear();
             }
         }

@@ -4,6 +4,7 @@
 //! pipeline and sends what came of it. It shares nothing, so a sensor that is lost disturbs no
 //! other.
 
+use std::path::PathBuf;
 use std::time::Duration;
 
 use serde_json::Value;
@@ -12,9 +13,11 @@ use tokio::time::Instant;
 
 use super::hub;
 use super::log;
+use super::record::Tape;
 use super::serial::{Link, Turn};
 use crate::event::{Event, Kind, Status, Tared};
 use crate::pipeline::{Judgement, Pipeline, RetareError};
+use crate::recording::Input;
 
 /// What a sensor can be asked.
 #[derive(Debug)]
@@ -25,6 +28,8 @@ pub(crate) enum Command {
     Tare(oneshot::Sender<Result<Tared, RetareError>>),
     /// What the controller says it is doing.
     Context(Option<Value>),
+    /// To have its last minute written; the answer is where.
+    Blackbox(oneshot::Sender<Result<PathBuf, String>>),
     /// To judge otherwise from now on.
     Reload(Box<Judgement>),
     /// To end: a press is aborted, then nothing comes any more.
@@ -77,6 +82,7 @@ impl Sensors {
 pub(crate) async fn serve(
     mut pipeline: Pipeline,
     mut link: Link,
+    mut tape: Tape,
     hub: hub::Handle,
     mut commands: mpsc::Receiver<Command>,
 ) {
@@ -94,6 +100,7 @@ pub(crate) async fn serve(
                     continue;
                 }
                 Some(Command::Tare(reply)) => {
+                    tape.note(&pipeline, &Input::Tare, super::now());
                     match pipeline.retare() {
                         Ok(()) => taring = Some(reply),
                         Err(refusal) => {
@@ -105,30 +112,37 @@ pub(crate) async fn serve(
                 }
                 Some(Command::Context(context)) => {
                     log::context(pipeline.sensor(), context.as_ref());
-                    pipeline.set_context(context);
+                    tape.feed(&mut pipeline, Input::Context(context), super::now());
+                    continue;
+                }
+                Some(Command::Blackbox(reply)) => {
+                    tape.blackbox(reply);
                     continue;
                 }
                 Some(Command::Reload(judgement)) => {
+                    tape.reload(&pipeline, &judgement, super::now());
                     pipeline.reload(*judgement);
                     continue;
                 }
                 Some(Command::Finish) | None => {
-                    return hub.publish(pipeline.shutdown(), super::now().mono).await;
+                    let at = super::now();
+                    let events = tape.feed(&mut pipeline, Input::Shutdown, at);
+                    return hub.publish(events, at.mono).await;
                 }
             },
             turn = link.turn() => {
                 let at = super::now();
-                let events = match turn {
-                    Turn::Bytes(bytes) => pipeline.push(bytes, at),
-                    Turn::Opened => pipeline.opened(at),
-                    Turn::Unavailable(reason) => pipeline.unavailable(reason, at),
-                    Turn::Lost(reason) => pipeline.lost(reason, at),
+                let input = match turn {
+                    Turn::Bytes(bytes) => Input::Bytes(bytes.into()),
+                    Turn::Opened => Input::Opened,
+                    Turn::Unavailable(reason) => Input::Unavailable(reason.into()),
+                    Turn::Lost(reason) => Input::Lost(reason.into()),
                 };
-                (events, at)
+                (tape.feed(&mut pipeline, input, at), at)
             }
             () = until(deadline) => {
                 let at = super::now();
-                (pipeline.tick(at), at)
+                (tape.feed(&mut pipeline, Input::Tick, at), at)
             }
         };
         if events

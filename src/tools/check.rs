@@ -83,6 +83,14 @@ pub fn run(args: &Args) -> Result<(), Error> {
     } else {
         "no socket\n".to_owned()
     };
+    if let Some(record) = &setup.config.record {
+        let what = if record.continuous {
+            "recordings and black boxes"
+        } else {
+            "black boxes"
+        };
+        lines += &format!("{what} in {}\n", record.dir().display());
+    }
     let tcp = setup.config.publish.tcp.as_ref().map(|tcp| tcp.listen);
     let http = setup.config.http.as_ref().map(|http| http.listen);
     for (key, way, listen) in [

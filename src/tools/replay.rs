@@ -5,7 +5,7 @@
 
 use std::fs::File;
 use std::future::Future;
-use std::io::{self, Read};
+use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -17,13 +17,15 @@ use crate::daemon::config::{self, Config, Sensor, Setup};
 use crate::daemon::now;
 use crate::event::{Event, Kind};
 use crate::pipeline::{Clock, Pipeline};
+use crate::recording::{self, Playback, Reader};
 
 /// Arguments of `replay`.
 #[derive(Debug, Clone, ClapArgs)]
 pub struct Args {
-    /// Recording: .bin, raw bytes back to back
+    /// Recording: .mcap, or .bin, raw bytes back to back
     file: PathBuf,
-    /// Configuration whose first sensor it was [default: a JX255N by default settings]
+    /// Configuration: its model judges; of a .bin, its first sensor is the one recorded [default:
+    /// the model built in, a JX255N by default settings]
     #[arg(long, value_name = "F")]
     config: Option<PathBuf>,
     /// Play so many times as fast as the sensor did [default: as fast as it goes]
@@ -45,11 +47,21 @@ pub enum Error {
         /// Why not.
         source: io::Error,
     },
-    /// A format of a later version.
-    #[error("{path}: found a recording that is not .bin, expected .bin: not in this version")]
-    Format {
+    /// It is damaged, or none of ours.
+    #[error("{path}: {source}")]
+    Recording {
         /// Of the recording.
         path: PathBuf,
+        /// What is wrong with it.
+        source: recording::Error,
+    },
+    /// It describes a sensor that cannot be.
+    #[error("{path}: {source}")]
+    Sensor {
+        /// Of the recording.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: recording::PlaybackError,
     },
     /// Reading broke off.
     #[error("{path}: {source}")]
@@ -82,34 +94,90 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
 }
 
 async fn play(args: Args) -> Result<(), Error> {
-    let Args {
-        file: path,
-        config,
-        speed,
-    } = args;
-    if path
-        .extension()
-        .is_some_and(|extension| extension == "mcap")
-    {
-        return Err(Error::Format { path });
-    }
-    let setup = match config {
-        Some(config) => Setup::load(&config)?,
+    let setup = match &args.config {
+        Some(config) => Setup::load(config)?,
         None => {
-            let config = Config::new(vec![Sensor::new(path.clone())]);
+            let config = Config::new(vec![Sensor::new(args.file.clone())]);
             Setup::of(config, Path::new("defaults"))?
         }
     };
+    let path = &args.file;
+    let recording = File::open(path).map_err(|source| Error::Unreadable {
+        path: path.clone(),
+        source,
+    })?;
+    let extension = path.extension().unwrap_or_default();
+    if extension == "mcap" {
+        play_recording(&args, BufReader::new(recording), setup).await
+    } else {
+        play_bytes(&args, recording, &setup).await
+    }
+}
+
+/// A recording of ours: what its sensors learnt, at the moments they learnt it.
+async fn play_recording(args: &Args, file: impl Read, setup: Setup) -> Result<(), Error> {
+    let path = &args.file;
+    let failed = |source| match source {
+        recording::Error::Io(source) => Error::Broken {
+            path: path.clone(),
+            source,
+        },
+        source => Error::Recording {
+            path: path.clone(),
+            source,
+        },
+    };
+    let mut playback = Playback::new(setup.hrn);
+    let mut seq = 0;
+    // The first moment played, and when that was.
+    let mut begun: Option<(Duration, Instant)> = None;
+    for found in Reader::new(file) {
+        let found = found.map_err(failed)?;
+        if let Some(speed) = args.speed {
+            let now = Instant::now();
+            let (first, start) = *begun.get_or_insert((found.at.mono, now));
+            let since = found.at.mono.saturating_sub(first).as_secs_f64() / speed;
+            // A moment beyond counting does not come.
+            let since = Duration::try_from_secs_f64(since).unwrap_or(Duration::MAX);
+            match start.checked_add(since) {
+                Some(due) => tokio::time::sleep_until(due).await,
+                None => std::future::pending().await,
+            }
+        }
+        let events = playback.feed(found).map_err(|source| Error::Sensor {
+            path: path.clone(),
+            source,
+        })?;
+        if !print(events, &mut seq)? {
+            return Ok(());
+        }
+    }
+    if playback.sensors() == 0 {
+        return Err(failed(recording::Error::Foreign {
+            found: "no state of a sensor".to_owned(),
+            expected: "a recording of hardnessd",
+        }));
+    }
+    if let Some(model) = playback.other_model() {
+        eprintln!(
+            "warning: {}: recorded with model {}, played with another",
+            path.display(),
+            model.get(..12).unwrap_or(model)
+        );
+    }
+    print(playback.end(), &mut seq)?;
+    Ok(())
+}
+
+/// Bytes back to back.
+async fn play_bytes(args: &Args, mut recording: File, setup: &Setup) -> Result<(), Error> {
+    let path = &args.file;
     let settings = setup
         .pipelines()
         .next()
         .expect("a configuration has at least one sensor");
-    let mut recording = File::open(&path).map_err(|source| Error::Unreadable {
-        path: path.clone(),
-        source,
-    })?;
     let frame_bytes = settings.layout.max_frame_bytes();
-    let pace = speed.map(|speed| {
+    let pace = args.speed.map(|speed| {
         Duration::from_secs_f64(1.0 / (settings.frame_rate_hz * speed * frame_bytes as f64))
     });
     let mut chunk = vec![
@@ -128,7 +196,10 @@ async fn play(args: Args) -> Result<(), Error> {
         let read = match recording.read(&mut chunk) {
             Ok(read) => read,
             Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
-            Err(source) => return Err(Error::Broken { path, source }),
+            Err(source) => {
+                let path = path.clone();
+                return Err(Error::Broken { path, source });
+            }
         };
         if read == 0 {
             print(pipeline.end_of_recording(None), &mut seq)?;

@@ -10,7 +10,7 @@ mod tests;
 use std::fmt::Write;
 use std::fs::File;
 use std::future::Future;
-use std::io::{self, Read};
+use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -19,12 +19,13 @@ use clap::Args as ClapArgs;
 use self::proposal::{Proposal, propose};
 use super::simulate::positive;
 use crate::daemon::serial::{Link, Turn};
+use crate::recording::{self, Entry, Input, Reader};
 use crate::wire::Settings;
 
 /// Arguments of `sniff`.
 #[derive(Debug, Clone, ClapArgs)]
 pub struct Args {
-    /// Recording: .bin, raw bytes back to back; best with presses in it
+    /// Recording: .mcap, or .bin, raw bytes back to back; best with presses in it
     #[arg(required_unless_present = "port", conflicts_with = "port")]
     file: Option<PathBuf>,
     /// Listen at this port instead; press the sensor meanwhile
@@ -51,11 +52,13 @@ pub enum Error {
         /// Why not.
         source: io::Error,
     },
-    /// A recording that holds no raw bytes.
-    #[error("{path}: found a recording that is not .bin, expected .bin")]
-    Format {
+    /// It is damaged, or none of ours.
+    #[error("{path}: {source}")]
+    Recording {
         /// Of the recording.
         path: PathBuf,
+        /// What is wrong with it.
+        source: recording::Error,
     },
     /// The port does not open, or was lost before a byte came.
     #[error("{path}: {reason}; `hardnessd doctor --port {path}` says more")]
@@ -121,20 +124,38 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, Error> {
+    let file = File::open(path).map_err(|source| Error::Unreadable {
+        path: path.to_owned(),
+        source,
+    })?;
+    let mut bytes = Vec::new();
     if path
         .extension()
         .is_some_and(|extension| extension == "mcap")
     {
-        let path = path.to_owned();
-        return Err(Error::Format { path });
+        // Of several sensors, the first one's.
+        let mut sensor = None;
+        for found in Reader::new(BufReader::new(file)) {
+            let found = found.map_err(|source| Error::Recording {
+                path: path.to_owned(),
+                source,
+            })?;
+            if let Entry::Input(Input::Bytes(more)) = found.entry
+                && *sensor.get_or_insert(found.sensor.clone()) == found.sensor
+            {
+                bytes.extend_from_slice(&more);
+            }
+            if bytes.len() >= MOST_BYTES {
+                break;
+            }
+        }
+        return Ok(bytes);
     }
-    let mut bytes = Vec::new();
-    File::open(path)
-        .and_then(|file| file.take(MOST_BYTES as u64).read_to_end(&mut bytes))
-        .map_err(|source| Error::Unreadable {
-            path: path.to_owned(),
-            source,
-        })?;
+    let read = file.take(MOST_BYTES as u64).read_to_end(&mut bytes);
+    read.map_err(|source| Error::Unreadable {
+        path: path.to_owned(),
+        source,
+    })?;
     Ok(bytes)
 }
 

@@ -1,5 +1,7 @@
 //! Bytes in, whole frames and damage out.
 
+use serde::{Deserialize, Serialize};
+
 use super::{Framing, Layout, text, zero_run};
 use crate::frame::RawFrame;
 
@@ -86,6 +88,17 @@ pub struct Decoder {
     anchor: u64,
 }
 
+/// What a [`Decoder`] has seen and still holds, without its layout.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Memory {
+    pending: Vec<u8>,
+    received: u64,
+    skipped: u64,
+    settled: bool,
+    locked: bool,
+    anchor: u64,
+}
+
 impl Decoder {
     /// A decoder at the start of a stream.
     pub fn new(layout: Layout) -> Self {
@@ -101,6 +114,31 @@ impl Decoder {
             locked,
             anchor: 0,
         }
+    }
+
+    /// What it has seen and still holds.
+    pub fn memory(&self) -> Memory {
+        Memory {
+            pending: self.buffer[self.start..].to_vec(),
+            received: self.received,
+            skipped: self.skipped,
+            settled: self.settled,
+            locked: self.locked,
+            anchor: self.anchor,
+        }
+    }
+
+    /// Goes on where the one stood whose memory this is.
+    pub fn recall(&mut self, memory: Memory) {
+        Memory {
+            pending: self.buffer,
+            received: self.received,
+            skipped: self.skipped,
+            settled: self.settled,
+            locked: self.locked,
+            anchor: self.anchor,
+        } = memory;
+        self.start = 0;
     }
 
     /// The layout it decodes.

@@ -147,7 +147,8 @@ pub(super) fn load(path: &Path) -> Result<Config, Error> {
         &mut unix.path,
         &mut unix.control_path,
     ];
-    for path in paths.into_iter().flatten() {
+    let record = config.record.as_mut().map(|record| &mut record.dir);
+    for path in paths.into_iter().chain(record).flatten() {
         *path = directory.join(&*path);
     }
     Ok(config)
@@ -183,7 +184,6 @@ fn check(config: &Config, path: &Path) -> Result<(), Error> {
     let absent = [
         ("publish.zenoh", config.publish.zenoh.is_some()),
         ("publish.ros2", config.publish.ros2.is_some()),
-        ("record", config.record.is_some()),
     ];
     if let Some((key, _)) = absent.iter().find(|(_, given)| *given) {
         return Err(Error::NotInThisVersion {
@@ -215,6 +215,18 @@ fn check(config: &Config, path: &Path) -> Result<(), Error> {
         let key = "publish.unix.max_clients".to_owned();
         return Err(value(key, "0".to_owned(), "1 or more"));
     }
+    if let Some(record) = &config.record {
+        for (key, found, least) in [
+            ("record.rotate_mb", record.rotate_mb, 1),
+            ("record.rotate_s", record.rotate_s, 1),
+            ("record.keep_free_mb", record.keep_free_mb, 0),
+        ] {
+            if !(least..=MOST).contains(&found) {
+                let expected = "1 to 1000000000 (keep_free_mb also 0)";
+                return Err(value(key.to_owned(), found.to_string(), expected));
+            }
+        }
+    }
     let unix = &config.publish.unix;
     if unix.enabled && unix.control_path() == unix.path() {
         let key = "publish.unix.control_path".to_owned();
@@ -223,6 +235,9 @@ fn check(config: &Config, path: &Path) -> Result<(), Error> {
     }
     Ok(())
 }
+
+/// More megabytes than any disk has, few enough to be counted in bytes; 31 years.
+const MOST: u64 = 1_000_000_000;
 
 fn check_sensor(sensor: &Sensor, twin: bool, path: &Path) -> Result<(), Error> {
     let name = &sensor.name;

@@ -101,8 +101,8 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
             &["publish.zenoh", "not in this version"],
         ),
         (
-            "[[sensor]]\nport = \"p\"\n[record]\ndir = \"/x\"",
-            &["record", "not in this version"],
+            "[[sensor]]\nport = \"p\"\n[record]\nrotate_mb = 0",
+            &["record.rotate_mb", "0"],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[log]\nformat = \"xml\"",

@@ -1,0 +1,300 @@
+//! Recording: a thread of its own that writes what the sensors' tasks and the hub tell it.
+//!
+//! In: what happens to the sensors, and events, over a bounded queue. Out: files. Nothing waits for
+//! it: what finds no room is dropped and counted, and the sensor's next entry is a state, from
+//! which a replay goes on. A disk that fails or is full stops the recording, not the daemon; it
+//! goes on when there is room again.
+
+mod clerk;
+
+use std::fs::File;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
+use std::time::Duration;
+
+use tokio::sync::oneshot;
+
+use self::clerk::Clerk;
+use super::config;
+use crate::event::{Event, Kind};
+use crate::frame::Stamp;
+use crate::pipeline::{Judgement, Pipeline};
+use crate::recording::{About, Entry, Input, Labels, Sensor, State};
+
+/// Entries and events that may wait: some 4 s of a sensor at 100 frames/s.
+const QUEUED: usize = 8192;
+/// How often a sensor's state is noted: what a file that begins between has to take from before
+/// it, and what a damaged chunk costs a replay at the most.
+const STATE_EVERY: Duration = Duration::from_secs(10);
+/// Over the time between two states, a fault if so many frames and this share were damaged.
+const DAMAGED_FRAMES: u64 = 5;
+const DAMAGED_SHARE: f64 = 0.1;
+
+/// Where a recording goes.
+#[derive(Debug)]
+pub(crate) enum Target {
+    /// Into this one file, made by whoever asks; it ends when it cannot be written or when there
+    /// is no sensor to record.
+    File {
+        path: PathBuf,
+        file: File,
+        labels: Labels,
+    },
+    /// Into files of a directory, as configured.
+    Directory(config::Record),
+}
+
+/// Why a recording into one file came to its end.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The file cannot be written.
+    #[error("{path}: {source}")]
+    Write {
+        /// Of the recording.
+        path: PathBuf,
+        /// Why not.
+        source: crate::recording::Error,
+    },
+    /// A sensor is not there.
+    #[error("sensor {sensor:?}: found {reason}, expected a device to record")]
+    Unavailable {
+        /// Its name.
+        sensor: String,
+        /// Why not.
+        reason: String,
+    },
+    /// All sensors are gone; what they sent is recorded.
+    #[error("sensor {sensor:?} lost: {reason}; the recording ends there")]
+    Lost {
+        /// The last one.
+        sensor: String,
+        /// Why.
+        reason: String,
+    },
+    /// There is no thread to be had.
+    #[error("no thread for the recording: {0}")]
+    Thread(#[source] std::io::Error),
+}
+
+/// What the thread is told.
+#[derive(Debug)]
+enum Job {
+    Entry {
+        sensor: usize,
+        at: Stamp,
+        entry: Entry,
+    },
+    Event(Box<Event>),
+    /// Much of what a sensor sent was damaged.
+    Damage {
+        sensor: usize,
+    },
+    /// To write the last minute of a sensor.
+    Blackbox {
+        sensor: usize,
+        reply: oneshot::Sender<Result<PathBuf, String>>,
+    },
+}
+
+/// The way to the thread.
+#[derive(Debug, Clone)]
+struct Jobs {
+    sender: SyncSender<Job>,
+    dropped: Arc<AtomicU64>,
+}
+
+impl Jobs {
+    /// Tells the thread, if there is room; `false`: there was none.
+    fn tell(&self, job: Job) -> bool {
+        match self.sender.try_send(job) {
+            Ok(()) => true,
+            // The thread has ended: so has the recording, and that is said elsewhere.
+            Err(TrySendError::Disconnected(_)) => true,
+            Err(TrySendError::Full(_)) => {
+                self.dropped.fetch_add(1, Ordering::Relaxed);
+                false
+            }
+        }
+    }
+}
+
+/// The thread, as the daemon holds it.
+#[derive(Debug)]
+pub(crate) struct Recorder {
+    jobs: Jobs,
+    labels: Labels,
+    frames: bool,
+    /// Comes when there is no more to record.
+    stop: oneshot::Receiver<()>,
+    ended: oneshot::Receiver<Result<(), Error>>,
+}
+
+impl Recorder {
+    /// Starts it.
+    pub(crate) fn start(target: Target, mut about: About) -> Result<Self, Error> {
+        let (labels, frames) = match &target {
+            Target::File { labels, .. } => (labels.clone(), true),
+            Target::Directory(settings) => (Labels::new(), settings.continuous),
+        };
+        about.labels = labels.clone();
+        let (sender, inbox) = sync_channel(QUEUED);
+        let dropped = Arc::new(AtomicU64::new(0));
+        let (stopping, stop) = oneshot::channel();
+        let clerk = Clerk::new(target, about, dropped.clone(), stopping);
+        let (end, ended) = oneshot::channel();
+        std::thread::Builder::new()
+            .name("recorder".to_owned())
+            .spawn(move || {
+                // The daemon may be gone already.
+                let _ = end.send(clerk.run(&inbox));
+            })
+            .map_err(Error::Thread)?;
+        Ok(Self {
+            jobs: Jobs { sender, dropped },
+            labels,
+            frames,
+            stop,
+            ended,
+        })
+    }
+
+    /// For the task of the `index`-th sensor.
+    pub(crate) fn tape(&self, index: usize, sensor: Sensor) -> Tape {
+        Tape(Some(Box::new(Reel {
+            jobs: self.jobs.clone(),
+            index,
+            sensor,
+            labels: self.labels.clone(),
+            noted: None,
+            counted: (0, 0),
+        })))
+    }
+
+    /// For the hub.
+    pub(crate) fn tap(&self) -> Tap {
+        Tap(Some((self.jobs.clone(), self.frames)))
+    }
+
+    /// Waits until there is no more to record, be it that the thread has ended.
+    pub(crate) async fn stopped(&mut self) {
+        // Gone without a word is ended, too.
+        let _ = (&mut self.stop).await;
+    }
+
+    /// Waits for the file to be whole. Tapes and tap have to be gone: the thread ends when nobody
+    /// is left to tell it anything.
+    pub(crate) async fn finish(self) -> Result<(), Error> {
+        drop(self.jobs);
+        // A thread that panicked has said so.
+        self.ended.await.unwrap_or(Ok(()))
+    }
+}
+
+/// Where one sensor's task notes what happens; nowhere, if there is no recorder.
+#[derive(Debug, Default)]
+pub(crate) struct Tape(Option<Box<Reel>>);
+
+#[derive(Debug)]
+struct Reel {
+    jobs: Jobs,
+    index: usize,
+    sensor: Sensor,
+    labels: Labels,
+    /// When a state was last noted; `None` if what followed it is not all there.
+    noted: Option<Duration>,
+    /// Whole and damaged frames by then.
+    counted: (u64, u64),
+}
+
+impl Tape {
+    /// Notes what is about to happen to `pipeline`, and lets it happen.
+    pub(crate) fn feed(
+        &mut self,
+        pipeline: &mut Pipeline,
+        input: Input<'_>,
+        at: Stamp,
+    ) -> Vec<Event> {
+        self.note(pipeline, &input, at);
+        input.feed(pipeline, at)
+    }
+
+    /// Notes what is about to happen to `pipeline`.
+    pub(crate) fn note(&mut self, pipeline: &Pipeline, input: &Input<'_>, at: Stamp) {
+        if let Some(reel) = &mut self.0 {
+            reel.begin(pipeline, at);
+            reel.tell(at, Entry::Input(input.to_owned()));
+        }
+    }
+
+    /// Notes that `pipeline` is judged otherwise from now on.
+    pub(crate) fn reload(&mut self, pipeline: &Pipeline, judgement: &Judgement, at: Stamp) {
+        if let Some(reel) = &mut self.0 {
+            reel.begin(pipeline, at);
+            reel.sensor.adopt(judgement);
+            reel.tell(at, Entry::Settings(Box::new(reel.sensor.clone())));
+        }
+    }
+
+    /// Has the last minute written; the answer comes when that is done.
+    pub(crate) fn blackbox(&self, reply: oneshot::Sender<Result<PathBuf, String>>) {
+        // Without an answer the asker learns that there was none.
+        match &self.0 {
+            Some(reel) => {
+                let sensor = reel.index;
+                reel.jobs.tell(Job::Blackbox { sensor, reply });
+            }
+            None => {
+                let reason = "found no [record] in the configuration, expected it: nothing is kept";
+                let _ = reply.send(Err(reason.to_owned()));
+            }
+        }
+    }
+}
+
+impl Reel {
+    fn begin(&mut self, pipeline: &Pipeline, at: Stamp) {
+        let due = |noted| at.mono.saturating_sub(noted) >= STATE_EVERY;
+        if !self.noted.is_none_or(due) {
+            return;
+        }
+        let counts = pipeline.frame_counts();
+        let (whole, damaged) = (counts.0 - self.counted.0, counts.1 - self.counted.1);
+        let share = damaged as f64 / (whole + damaged).max(1) as f64;
+        if self.noted.is_some() && damaged >= DAMAGED_FRAMES && share > DAMAGED_SHARE {
+            let sensor = self.index;
+            self.jobs.tell(Job::Damage { sensor });
+        }
+        self.counted = counts;
+        self.noted = Some(at.mono);
+        let state = State {
+            sensor: self.sensor.clone(),
+            memory: pipeline.memory(),
+            labels: self.labels.clone(),
+        };
+        self.tell(at, Entry::State(Box::new(state)));
+    }
+
+    fn tell(&mut self, at: Stamp, entry: Entry) {
+        let sensor = self.index;
+        if !self.jobs.tell(Job::Entry { sensor, at, entry }) {
+            self.noted = None;
+        }
+    }
+}
+
+/// Where the hub shows events; nowhere, if there is no recorder.
+#[derive(Debug, Default)]
+pub(crate) struct Tap(Option<(Jobs, bool)>);
+
+impl Tap {
+    /// Shows an event as it is published.
+    pub(crate) fn event(&self, event: &Event) {
+        if let Some((jobs, frames)) = &self.0
+            && (*frames || event.kind() != Kind::Frame)
+        {
+            jobs.tell(Job::Event(Box::new(event.clone())));
+        }
+    }
+}

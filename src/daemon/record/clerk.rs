@@ -1,0 +1,456 @@
+//! The recorder's thread: which file is open, when it ends, and what to do when the disk fails.
+
+use std::fs::{self, File};
+use std::io::{self, BufWriter, ErrorKind};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
+use std::time::{Duration, Instant};
+
+use tokio::sync::oneshot;
+use tracing::{info, warn};
+
+use super::{Error, Job, Target};
+use crate::daemon::config;
+use crate::event::{Event, LinkState, PressState};
+use crate::frame::Stamp;
+use crate::recording::{self, About, Entry, Input, Ring, Writer};
+
+/// How often what was written is handed to the system: kill -9 loses no more.
+const FLUSH_EVERY: Duration = Duration::from_millis(500);
+/// How long a disk that failed or is full is left alone.
+const RETRY_AFTER: Duration = Duration::from_secs(5);
+/// Faults of one sensor that come sooner after a black box write none.
+const FAULT_EVERY: Duration = Duration::from_secs(60);
+/// So much more than the floor has to be free before a recording goes on: a sixteenth.
+const ROOM_SHARE: u64 = 16;
+/// As disks are sold.
+const MB: u64 = 1_000_000;
+
+/// What the thread knows.
+pub(super) struct Clerk {
+    target: Target,
+    about: About,
+    dropped: Arc<AtomicU64>,
+    dropped_said: u64,
+    sensors: Vec<Watched>,
+    open: Option<Open>,
+    /// Where there is no file and there should be one: when to try again.
+    retry: Option<Instant>,
+    /// Whether the disk is why.
+    paused: bool,
+    /// Told when there is no more to record.
+    stop: Option<oneshot::Sender<()>>,
+    gone: Option<Error>,
+    frames: u64,
+    presses: u64,
+}
+
+/// A sensor, as the thread sees it.
+#[derive(Default)]
+struct Watched {
+    ring: Ring,
+    /// Whether its port is open, once that is known.
+    is_open: Option<bool>,
+    last_fault: Option<Instant>,
+}
+
+/// A file being written.
+struct Open {
+    path: PathBuf,
+    file: Arc<File>,
+    writer: Writer<BufWriter<Arc<File>>>,
+    since: Instant,
+}
+
+impl Open {
+    fn new(path: PathBuf, file: File, about: &About) -> Result<Self, recording::Error> {
+        let file = Arc::new(file);
+        let writer = Writer::new(BufWriter::new(file.clone()), about)?;
+        Ok(Self {
+            path,
+            file,
+            writer,
+            since: Instant::now(),
+        })
+    }
+
+    fn finish(self) -> Result<(), recording::Error> {
+        self.writer.finish()?;
+        Ok(())
+    }
+}
+
+/// What a job came to, if to no good.
+enum Failure {
+    Write(recording::Error),
+    /// No sensor is left.
+    Gone(Error),
+}
+
+impl From<recording::Error> for Failure {
+    fn from(error: recording::Error) -> Self {
+        Failure::Write(error)
+    }
+}
+
+impl Clerk {
+    pub(super) fn new(
+        target: Target,
+        about: About,
+        dropped: Arc<AtomicU64>,
+        stop: oneshot::Sender<()>,
+    ) -> Self {
+        Self {
+            sensors: about.sensors.iter().map(|_| Watched::default()).collect(),
+            target,
+            about,
+            dropped,
+            dropped_said: 0,
+            open: None,
+            retry: None,
+            paused: false,
+            stop: Some(stop),
+            gone: None,
+            frames: 0,
+            presses: 0,
+        }
+    }
+
+    /// Writes until nobody is left to tell it anything, or there is no more to record.
+    pub(super) fn run(mut self, jobs: &Receiver<Job>) -> Result<(), Error> {
+        self.begin()?;
+        let mut flush = Instant::now() + FLUSH_EVERY;
+        loop {
+            let left = flush.saturating_duration_since(Instant::now());
+            match jobs.recv_timeout(left) {
+                Ok(job) => {
+                    let done = self.take(job);
+                    self.settle(done)?;
+                }
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => return self.end(),
+            }
+            if Instant::now() >= flush {
+                let done = self.look_after();
+                self.settle(done)?;
+                flush = Instant::now() + FLUSH_EVERY;
+            }
+        }
+    }
+
+    fn begin(&mut self) -> Result<(), Error> {
+        match &self.target {
+            Target::File { path, file, .. } => {
+                let opened = file.try_clone().map_err(recording::Error::from);
+                let opened = opened.and_then(|file| Open::new(path.clone(), file, &self.about));
+                let path = path.clone();
+                self.open = Some(opened.map_err(|source| Error::Write { path, source })?);
+            }
+            Target::Directory(settings) if settings.continuous => {
+                self.retry = Some(Instant::now());
+                self.look_after_directory();
+            }
+            Target::Directory(_) => {}
+        }
+        Ok(())
+    }
+
+    /// One file that fails is the end of it; in a directory the next may do.
+    fn settle(&mut self, done: Result<(), Failure>) -> Result<(), Error> {
+        match (done, &self.target) {
+            (Ok(()), _) => {}
+            (Err(Failure::Gone(gone)), _) => {
+                self.gone = self.gone.take().or(Some(gone));
+                if let Some(stop) = self.stop.take() {
+                    // The daemon may be stopping already.
+                    let _ = stop.send(());
+                }
+            }
+            (Err(Failure::Write(source)), Target::File { path, .. }) => {
+                let path = path.clone();
+                return Err(Error::Write { path, source });
+            }
+            (Err(Failure::Write(error)), Target::Directory(_)) => {
+                self.open = None;
+                self.pause(&error);
+            }
+        }
+        Ok(())
+    }
+
+    /// Leaves the disk alone for a while, and says why once.
+    fn pause(&mut self, reason: &recording::Error) {
+        if !self.paused {
+            warn!(%reason, "recording stopped; it goes on when there is room");
+        }
+        self.paused = true;
+        self.retry = Some(Instant::now() + RETRY_AFTER);
+    }
+
+    fn end(mut self) -> Result<(), Error> {
+        let gone = self.gone.take().map_or(Ok(()), Err);
+        let Some(open) = self.open.take() else {
+            return gone;
+        };
+        let (path, file) = (open.path.clone(), open.file.clone());
+        let mut finished = open.finish();
+        if matches!(self.target, Target::File { .. }) {
+            finished = finished.and_then(|()| Ok(file.sync_all()?));
+            info!(
+                path = %path.display(),
+                frames = self.frames,
+                presses = self.presses,
+                "recorded"
+            );
+        }
+        finished.map_err(|source| Error::Write { path, source })?;
+        gone
+    }
+
+    fn take(&mut self, job: Job) -> Result<(), Failure> {
+        match job {
+            Job::Entry { sensor, at, entry } => self.entry(sensor, at, entry),
+            Job::Event(event) => self.event(&event),
+            Job::Damage { sensor } => {
+                self.fault(sensor, "damaged frames");
+                Ok(())
+            }
+            Job::Blackbox { sensor, reply } => {
+                let written = self.blackbox(sensor, "asked for");
+                if let Err(reason) = &written {
+                    self.say_no_blackbox(sensor, reason);
+                }
+                // The asker may have gone.
+                let _ = reply.send(written);
+                Ok(())
+            }
+        }
+    }
+
+    fn entry(&mut self, sensor: usize, at: Stamp, entry: Entry) -> Result<(), Failure> {
+        if let Entry::Settings(settings) = &entry {
+            self.about.sensors[sensor] = (**settings).clone();
+        }
+        let written = match &mut self.open {
+            Some(open) => open.writer.entry(sensor, at, &entry),
+            None => Ok(()),
+        };
+        let gone = match &entry {
+            Entry::Input(Input::Opened) => {
+                self.sensors[sensor].is_open = Some(true);
+                None
+            }
+            Entry::Input(Input::Lost(reason)) => {
+                self.sensors[sensor].is_open = Some(false);
+                let any = self.sensors.iter().any(|s| s.is_open != Some(false));
+                (!any).then(|| Error::Lost {
+                    sensor: self.about.sensors[sensor].name.clone(),
+                    reason: reason.clone().into_owned(),
+                })
+            }
+            Entry::Input(Input::Unavailable(reason)) if self.sensors[sensor].is_open.is_none() => {
+                Some(Error::Unavailable {
+                    sensor: self.about.sensors[sensor].name.clone(),
+                    reason: reason.clone().into_owned(),
+                })
+            }
+            _ => None,
+        };
+        if self.directory().is_some() {
+            self.sensors[sensor].ring.push(at, entry);
+        }
+        // Not before it is in the ring: the next file may do.
+        written?;
+        match gone {
+            Some(gone) if matches!(self.target, Target::File { .. }) => Err(Failure::Gone(gone)),
+            _ => Ok(()),
+        }
+    }
+
+    fn event(&mut self, event: &Event) -> Result<(), Failure> {
+        match event {
+            Event::Frame(_) => self.frames += 1,
+            Event::Press(press) if press.state == PressState::Begin => self.presses += 1,
+            _ => {}
+        }
+        if let Some(open) = &mut self.open {
+            open.writer.event(event)?;
+        }
+        let fault = match event {
+            Event::Status(status) if status.state == LinkState::Lost => "lost",
+            Event::Status(status) if status.state == LinkState::Stale => "stale",
+            _ => return Ok(()),
+        };
+        let mut sensors = self.about.sensors.iter();
+        if let Some(sensor) = sensors.position(|sensor| sensor.name == event.sensor()) {
+            self.fault(sensor, fault);
+        }
+        Ok(())
+    }
+
+    /// Writes what led to a fault, unless it was done a moment ago.
+    fn fault(&mut self, sensor: usize, fault: &str) {
+        let now = Instant::now();
+        let recent = |last: Instant| now.duration_since(last) < FAULT_EVERY;
+        if self.directory().is_none() || self.sensors[sensor].last_fault.is_some_and(recent) {
+            return;
+        }
+        self.sensors[sensor].last_fault = Some(now);
+        if let Err(reason) = self.blackbox(sensor, fault) {
+            self.say_no_blackbox(sensor, &reason);
+        }
+    }
+
+    fn say_no_blackbox(&self, sensor: usize, reason: &str) {
+        let sensor = self.about.sensors[sensor].name.as_str();
+        warn!(sensor, reason, "no black box");
+    }
+
+    fn directory(&self) -> Option<&config::Record> {
+        match &self.target {
+            Target::File { .. } => None,
+            Target::Directory(settings) => Some(settings),
+        }
+    }
+
+    /// Writes the last minute of a sensor to a file of its own.
+    fn blackbox(&self, sensor: usize, reason: &str) -> Result<PathBuf, String> {
+        let Some(settings) = self.directory() else {
+            return Err("found a recording into one file, expected the daemon".to_owned());
+        };
+        let name = &self.about.sensors[sensor].name;
+        let about = About {
+            reason: Some(reason.to_owned()),
+            sensors: vec![self.about.sensors[sensor].clone()],
+            ..self.about.clone()
+        };
+        let written = || -> Result<PathBuf, recording::Error> {
+            let directory = settings.dir();
+            has_room(&directory, settings.keep_free_mb * MB)?;
+            let (path, file) = create(&directory, &format!("blackbox-{name}"))?;
+            let fill = || {
+                let mut open = Open::new(path.clone(), file, &about)?;
+                for (at, entry) in self.sensors[sensor].ring.all() {
+                    open.writer.entry(0, *at, entry)?;
+                }
+                open.finish()
+            };
+            match fill() {
+                Ok(()) => Ok(path),
+                Err(error) => {
+                    // Half of it is of no use, and the disk may be full.
+                    let _ = fs::remove_file(&path);
+                    Err(error)
+                }
+            }
+        };
+        let path = written().map_err(|error| error.to_string())?;
+        info!(sensor = name.as_str(), reason, path = %path.display(), "black box");
+        Ok(path)
+    }
+
+    /// What is due every half second.
+    fn look_after(&mut self) -> Result<(), Failure> {
+        let dropped = self.dropped.load(Ordering::Relaxed);
+        if dropped > self.dropped_said {
+            let count = dropped - self.dropped_said;
+            warn!(count, "no room in the recorder's queue: entries dropped");
+            self.dropped_said = dropped;
+        }
+        if let Some(open) = &mut self.open {
+            open.writer.flush()?;
+        }
+        self.look_after_directory();
+        Ok(())
+    }
+
+    /// Ends a file that is full or old or leaves too little room, and begins the next.
+    fn look_after_directory(&mut self) {
+        let Target::Directory(settings) = &self.target else {
+            return;
+        };
+        let settings = settings.clone();
+        let directory = settings.dir();
+        let floor = settings.keep_free_mb * MB;
+        if let Some(open) = &self.open {
+            let full = open.file.metadata();
+            let full = full.is_ok_and(|file| file.len() >= settings.rotate_mb * MB);
+            let old = open.since.elapsed() >= Duration::from_secs(settings.rotate_s);
+            let room = has_room(&directory, floor);
+            if full || old || room.is_err() {
+                let ended = self.open.take().map_or(Ok(()), Open::finish);
+                match (ended, room) {
+                    (Err(error), _) => return self.pause(&error),
+                    (Ok(()), Err(error)) => return self.pause(&error.into()),
+                    (Ok(()), Ok(())) => self.retry = Some(Instant::now()),
+                }
+            }
+        }
+        if self.retry.is_none_or(|at| Instant::now() < at) {
+            return;
+        }
+        // After a pause a little more room is asked for, so that it does not begin and end over
+        // and over.
+        let floor = if self.paused {
+            floor + floor / ROOM_SHARE
+        } else {
+            floor
+        };
+        let begun = has_room(&directory, floor)
+            .map_err(recording::Error::from)
+            .and_then(|()| self.next_file(&directory));
+        match begun {
+            Ok(open) => {
+                info!(path = %open.path.display(), "recording");
+                self.open = Some(open);
+                self.retry = None;
+                self.paused = false;
+            }
+            Err(error) => self.pause(&error),
+        }
+    }
+
+    /// A file that begins with every sensor's last state and what came since.
+    fn next_file(&self, directory: &Path) -> Result<Open, recording::Error> {
+        let (path, file) = create(directory, "hardnessd")?;
+        let mut open = Open::new(path, file, &self.about)?;
+        for (index, sensor) in self.sensors.iter().enumerate() {
+            for (at, entry) in sensor.ring.latest() {
+                open.writer.entry(index, *at, entry)?;
+            }
+        }
+        open.writer.flush()?;
+        Ok(open)
+    }
+}
+
+/// Whether the disk has so many bytes free for us.
+fn has_room(directory: &Path, floor: u64) -> io::Result<()> {
+    fs::create_dir_all(directory).map_err(|error| named(directory, &error))?;
+    let disk = rustix::fs::statvfs(directory).map_err(|error| named(directory, &error.into()))?;
+    let free = disk.f_bavail.saturating_mul(disk.f_frsize);
+    if free < floor {
+        let message = format!(
+            "{}: found {} MB free, expected at least {} (record.keep_free_mb)",
+            directory.display(),
+            free / MB,
+            floor / MB
+        );
+        return Err(io::Error::new(ErrorKind::StorageFull, message));
+    }
+    Ok(())
+}
+
+/// A new file, named by what it is and by now.
+fn create(directory: &Path, what: &str) -> io::Result<(PathBuf, File)> {
+    let now = jiff::Timestamp::now().strftime("%Y%m%dT%H%M%S%.3fZ");
+    let path = directory.join(format!("{what}-{now}.mcap"));
+    let file = File::create_new(&path).map_err(|error| named(&path, &error))?;
+    Ok((path, file))
+}
+
+fn named(path: &Path, error: &io::Error) -> io::Error {
+    io::Error::new(error.kind(), format!("{}: {error}", path.display()))
+}

@@ -1,0 +1,233 @@
+//! Recordings: what sensors sent and when, as MCAP files that ROS tools open.
+//!
+//! In: what happens to a sensor's pipeline ([`Input`]) and the events that came of it. Out: bytes
+//! of a file, and back: the inputs, which a [`Playback`] turns into the very same events. A file
+//! can be played from its first [`State`] of a sensor on, and has one every few seconds, so that a
+//! damaged stretch costs no more than itself. Nothing here opens a file or asks the time; MCAP is
+//! named in no other module.
+
+mod message;
+mod playback;
+mod reader;
+mod recover;
+mod ring;
+mod writer;
+
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+pub use self::playback::{Playback, PlaybackError};
+pub use self::reader::{Found, Reader};
+pub use self::recover::{Recovered, recover};
+pub use self::ring::Ring;
+pub use self::writer::{About, Writer};
+use crate::event::Event;
+use crate::frame::Stamp;
+use crate::pipeline::{self, Judgement, Pipeline};
+use crate::verdict::Hrn;
+use crate::{press, tare, wire};
+
+/// One thing that happens to a pipeline. It learns of nothing else.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Input<'a> {
+    /// The port is open.
+    Opened,
+    /// The port could not be opened, and why.
+    Unavailable(Cow<'a, str>),
+    /// Bytes came.
+    Bytes(Cow<'a, [u8]>),
+    /// Time has passed.
+    Tick,
+    /// The device is gone, and why.
+    Lost(Cow<'a, str>),
+    /// A tare was asked for.
+    Tare,
+    /// What the controller says it is doing.
+    Context(Option<Value>),
+    /// The daemon stops.
+    Shutdown,
+}
+
+impl Input<'_> {
+    /// Passes it on to `pipeline`. Whether a tare could be taken only [`Pipeline::retare`] says.
+    pub fn feed(self, pipeline: &mut Pipeline, at: Stamp) -> Vec<Event> {
+        match self {
+            Input::Opened => pipeline.opened(at),
+            Input::Unavailable(reason) => pipeline.unavailable(reason.into_owned(), at),
+            Input::Bytes(bytes) => pipeline.push(&bytes, at),
+            Input::Tick => pipeline.tick(at),
+            Input::Lost(reason) => pipeline.lost(reason.into_owned(), at),
+            Input::Tare => {
+                // A refusal changes nothing and publishes nothing.
+                let _ = pipeline.retare();
+                Vec::new()
+            }
+            Input::Context(context) => {
+                pipeline.set_context(context);
+                Vec::new()
+            }
+            Input::Shutdown => pipeline.shutdown(),
+        }
+    }
+
+    /// The same, borrowing nothing.
+    pub fn to_owned(&self) -> Input<'static> {
+        let text = |text: &Cow<'_, str>| Cow::Owned(text.clone().into_owned());
+        match self {
+            Input::Opened => Input::Opened,
+            Input::Unavailable(reason) => Input::Unavailable(text(reason)),
+            Input::Bytes(bytes) => Input::Bytes(Cow::Owned(bytes.clone().into_owned())),
+            Input::Tick => Input::Tick,
+            Input::Lost(reason) => Input::Lost(text(reason)),
+            Input::Tare => Input::Tare,
+            Input::Context(context) => Input::Context(context.clone()),
+            Input::Shutdown => Input::Shutdown,
+        }
+    }
+}
+
+/// What a recording holds of one sensor, in order.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Entry {
+    /// Something happened to it.
+    Input(Input<'static>),
+    /// It was judged otherwise from then on: the configuration was read again.
+    Settings(Box<Sensor>),
+    /// How its pipeline stood then.
+    State(Box<State>),
+}
+
+/// A sensor, as far as a replay has to know it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Sensor {
+    /// Its name.
+    pub name: String,
+    /// Expected rate.
+    pub frame_rate_hz: f64,
+    /// How its frames are written.
+    pub frame: wire::Settings,
+    /// Counts to newtons.
+    pub calibration: tare::Settings,
+    /// What a press is.
+    pub press: press::Settings,
+    /// A verdict below this confidence is rejected.
+    pub min_confidence: f32,
+    /// A verdict on less force is rejected.
+    pub min_force_n: f64,
+    /// SHA-256 of the model that judged.
+    pub model: String,
+}
+
+/// Why a sensor's description in a recording cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum SensorError {
+    /// Its layout.
+    #[error("frame.{0}")]
+    Frame(#[from] wire::LayoutError),
+    /// Its calibration.
+    #[error("calibration.{0}")]
+    Calibration(#[from] tare::SettingsError),
+    /// Its presses.
+    #[error("press.{0}")]
+    Press(#[from] press::SettingsError),
+    /// A rate no sensor has.
+    #[error("frame_rate_hz: found {0}, expected frames a second above 0")]
+    FrameRate(f64),
+}
+
+impl Sensor {
+    /// The settings of its pipeline; `hrn` judges.
+    ///
+    /// # Errors
+    ///
+    /// If a value is out of its range.
+    pub fn settings(&self, hrn: &Arc<Hrn>) -> Result<pipeline::Settings, SensorError> {
+        let layout = wire::Layout::new(&self.frame)?;
+        self.calibration.check(layout.array())?;
+        self.press.check()?;
+        let hz = self.frame_rate_hz;
+        // The bounds of the configuration, with room.
+        if !(1e-3..=1e6).contains(&hz) {
+            return Err(SensorError::FrameRate(hz));
+        }
+        Ok(pipeline::Settings {
+            sensor: self.name.clone(),
+            frame_rate_hz: hz,
+            layout,
+            judgement: self.judgement(hrn),
+        })
+    }
+
+    /// The part of them that may change.
+    pub fn judgement(&self, hrn: &Arc<Hrn>) -> Judgement {
+        Judgement {
+            calibration: self.calibration.clone(),
+            press: self.press.clone(),
+            min_confidence: self.min_confidence,
+            min_force_n: self.min_force_n,
+            hrn: hrn.clone(),
+        }
+    }
+
+    /// Takes over what a reload has changed.
+    pub fn adopt(&mut self, judgement: &Judgement) {
+        self.calibration = judgement.calibration.clone();
+        self.press = judgement.press.clone();
+        self.min_confidence = judgement.min_confidence;
+        self.min_force_n = judgement.min_force_n;
+        self.model = judgement.hrn.sha256().to_owned();
+    }
+}
+
+/// How a sensor's pipeline stood: enough to go on from there.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct State {
+    /// The sensor.
+    pub sensor: Sensor,
+    /// What its pipeline had seen.
+    pub memory: pipeline::Memory,
+    /// The recording's labels, said again where a checksum guards them.
+    pub labels: Labels,
+}
+
+/// What was pressed and whatever else its user wrote down, by key.
+pub type Labels = BTreeMap<String, String>;
+
+/// Why a recording cannot be written or read.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// Reading or writing broke off.
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+    /// It is damaged or cut off.
+    #[error("{0}: `hardnessd recover` saves what is whole")]
+    Damaged(String),
+    /// MCAP, but none of ours, or of a later version.
+    #[error("found {found}, expected {expected}")]
+    Foreign {
+        /// What there is.
+        found: String,
+        /// What there should be.
+        expected: &'static str,
+    },
+}
+
+impl From<mcap::McapError> for Error {
+    fn from(error: mcap::McapError) -> Self {
+        match error {
+            mcap::McapError::Io(error) => Error::Io(error),
+            mcap::McapError::BadMagic => Error::Foreign {
+                found: "no MCAP file".to_owned(),
+                expected: "a recording",
+            },
+            other => Error::Damaged(format!("found a damaged recording ({other})")),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,122 @@
+//! Entries of a recording back into events.
+
+use std::sync::Arc;
+
+use super::{Entry, Found, Labels, SensorError};
+use crate::event::Event;
+use crate::frame::Stamp;
+use crate::pipeline::{Clock, Pipeline};
+use crate::verdict::Hrn;
+
+/// The pipelines of a recording's sensors, fed with what they were fed then.
+#[derive(Debug)]
+pub struct Playback {
+    hrn: Arc<Hrn>,
+    players: Vec<Player>,
+}
+
+#[derive(Debug)]
+struct Player {
+    pipeline: Pipeline,
+    last: Stamp,
+    labels: Labels,
+    /// Model that judged when it was recorded.
+    model: String,
+}
+
+/// An entry that cannot be played.
+#[derive(Debug, thiserror::Error)]
+#[error("sensor {sensor:?}: {problem}")]
+pub struct PlaybackError {
+    sensor: String,
+    problem: SensorError,
+}
+
+impl Playback {
+    /// Plays no sensor yet; `hrn` judges.
+    pub fn new(hrn: Arc<Hrn>) -> Self {
+        Self {
+            hrn,
+            players: Vec::new(),
+        }
+    }
+
+    /// The events of one entry. What comes before a sensor's first state cannot be played and
+    /// gives none. `mono_ns` is null: the moment was another boot's.
+    ///
+    /// # Errors
+    ///
+    /// If the recording describes a sensor that cannot be.
+    pub fn feed(&mut self, found: Found) -> Result<Vec<Event>, PlaybackError> {
+        let Found { sensor, at, entry } = found;
+        let mut players = self.players.iter_mut();
+        let known = players.find(|player| player.pipeline.sensor() == sensor);
+        let mut events = match (entry, known) {
+            (Entry::State(state), known) => {
+                let described = state.sensor.settings(&self.hrn);
+                let settings = described.map_err(|problem| PlaybackError { sensor, problem })?;
+                // Where nothing is missing the pipeline stands so already.
+                let mut pipeline = Pipeline::new(settings, Clock::Arrival);
+                pipeline.recall(state.memory);
+                let player = Player {
+                    pipeline,
+                    last: at,
+                    labels: state.labels,
+                    model: state.sensor.model,
+                };
+                match known {
+                    Some(known) => *known = player,
+                    None => self.players.push(player),
+                }
+                Vec::new()
+            }
+            (Entry::Settings(described), Some(known)) => {
+                known.pipeline.reload(described.judgement(&self.hrn));
+                known.model = described.model;
+                Vec::new()
+            }
+            (Entry::Input(input), Some(known)) => {
+                known.last = at;
+                input.feed(&mut known.pipeline, at)
+            }
+            (_, None) => Vec::new(),
+        };
+        forget_boot(&mut events);
+        Ok(events)
+    }
+
+    /// The recording has ended: the last events of every sensor.
+    pub fn end(&mut self) -> Vec<Event> {
+        let players = self.players.iter_mut();
+        let mut events: Vec<Event> = players
+            .flat_map(|player| player.pipeline.end_of_recording(Some(player.last)))
+            .collect();
+        forget_boot(&mut events);
+        events
+    }
+
+    /// How many sensors have been met so far.
+    pub fn sensors(&self) -> usize {
+        self.players.len()
+    }
+
+    /// The labels of the recording, as far as it has been played.
+    pub fn labels(&self) -> Labels {
+        let players = self.players.first();
+        players.map_or_else(Labels::new, |player| player.labels.clone())
+    }
+
+    /// A model that judged then and is not the one that judges now.
+    pub fn other_model(&self) -> Option<&str> {
+        let models = self.players.iter().map(|player| player.model.as_str());
+        models.into_iter().find(|model| *model != self.hrn.sha256())
+    }
+}
+
+fn forget_boot(events: &mut [Event]) {
+    for event in events {
+        if let Event::Hardness(verdict) = event {
+            verdict.mono_ns = None;
+        }
+    }
+}

@@ -1,0 +1,102 @@
+//! Bytes of an MCAP file back into entries.
+
+use std::collections::BTreeSet;
+use std::io::{ErrorKind, Read};
+
+use mcap::records::{Record, op};
+use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+
+use super::message::{self, INPUT};
+use super::{Entry, Error};
+use crate::frame::Stamp;
+
+/// What happened to a sensor, and when.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Found {
+    /// The sensor's name.
+    pub sensor: String,
+    /// When.
+    pub at: Stamp,
+    /// What.
+    pub entry: Entry,
+}
+
+/// Longest record that is read: far above a chunk of ours, far below what would fill memory.
+const LONGEST_RECORD_BYTES: usize = 64 << 20;
+
+/// Reads a recording from its beginning: what happened, in order. It ends after the first error.
+pub struct Reader<R> {
+    source: R,
+    linear: LinearReader,
+    schemas: BTreeSet<u16>,
+    channels: BTreeSet<u16>,
+    /// No more entries: the summary, an error or the end was reached.
+    done: bool,
+}
+
+impl<R: Read> Reader<R> {
+    /// Reads from `source`.
+    pub fn new(source: R) -> Self {
+        let options = LinearReaderOptions::default()
+            .with_prevalidate_chunk_crcs(true)
+            .with_record_length_limit(LONGEST_RECORD_BYTES);
+        Self {
+            source,
+            linear: LinearReader::new_with_options(options),
+            schemas: BTreeSet::new(),
+            channels: BTreeSet::new(),
+            done: false,
+        }
+    }
+
+    fn read(&mut self) -> Result<Option<Found>, Error> {
+        loop {
+            let Some(event) = self.linear.next_event() else {
+                return Ok(None);
+            };
+            let found = match event? {
+                LinearReadEvent::ReadRequest(wanted) => {
+                    let read = loop {
+                        match self.source.read(self.linear.insert(wanted)) {
+                            Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                            read => break read?,
+                        }
+                    };
+                    self.linear.notify_read(read);
+                    continue;
+                }
+                LinearReadEvent::Record { opcode, .. } if opcode == op::DATA_END => {
+                    // What follows repeats what was read.
+                    return Ok(None);
+                }
+                LinearReadEvent::Record { opcode, data } => mcap::parse_record(opcode, data)?,
+            };
+            match found {
+                Record::Schema { header, .. } if header.name == INPUT.schema => {
+                    self.schemas.insert(header.id);
+                }
+                Record::Channel(channel) if self.schemas.contains(&channel.schema_id) => {
+                    self.channels.insert(channel.id);
+                }
+                Record::Message { header, data } if self.channels.contains(&header.channel_id) => {
+                    let (sensor, at, entry) = message::decode_entry(&data)?;
+                    return Ok(Some(Found { sensor, at, entry }));
+                }
+                _ => {}
+            }
+        }
+    }
+}
+
+impl<R: Read> Iterator for Reader<R> {
+    type Item = Result<Found, Error>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.done {
+            return None;
+        }
+        let found = self.read().transpose();
+        self.done = !matches!(found, Some(Ok(_)));
+        found
+    }
+}

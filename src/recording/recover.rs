@@ -1,0 +1,345 @@
+//! What is whole in a damaged recording, into a new one.
+//!
+//! One scan from front to back that trusts no index: each chunk is taken if its checksum fits. Where
+//! a record does not fill its length, nobody knows where the next begins: it is looked for by what
+//! every compressed chunk has at the same place.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::{Read, Seek, SeekFrom, Write};
+
+use mcap::MAGIC;
+use mcap::records::{Channel, Record, op};
+use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use mcap::write::NoSeek;
+
+use super::message::{self, TOPICS};
+use super::{Error, writer};
+
+/// What became of a damaged recording.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Recovered {
+    /// Messages saved.
+    pub messages: u64,
+    /// Whole chunks.
+    pub chunks: u64,
+    /// First and last moment saved, in nanoseconds since 1970.
+    pub span_ns: Option<(u64, u64)>,
+    /// Where damaged stretches begin and how long they are, in bytes of the file.
+    pub lost: Vec<(u64, u64)>,
+    /// Whole chunks' messages of a channel that nothing tells of.
+    pub messages_unknown: u64,
+    /// Whether the file had its end.
+    pub complete: bool,
+}
+
+/// Opcode and length.
+const RECORD_HEAD_BYTES: u64 = 9;
+/// No record is longer: a chunk of ours holds half a second.
+const LONGEST_RECORD_BYTES: u64 = 256 << 20;
+/// Where a chunk names its compression, from the record's beginning on: after opcode, length, two
+/// times, the size and the checksum.
+const COMPRESSION_AT: u64 = RECORD_HEAD_BYTES + 28;
+/// The name, with its length.
+const COMPRESSION: [u8; 8] = *b"\x04\0\0\0zstd";
+/// Bytes searched at once.
+const BLOCK_BYTES: usize = 1 << 20;
+
+/// Copies what is whole in `broken` to `good`, and says what that was.
+///
+/// # Errors
+///
+/// If reading or writing fails; damage is none.
+pub fn recover<R: Read + Seek, W: Write>(broken: R, good: W) -> Result<(Recovered, W), Error> {
+    let mut scan = Scan::new(broken)?;
+    let mut copy = Copy::new(good)?;
+    scan.run(&mut copy)?;
+    copy.done.lost = scan.lost;
+    copy.done.complete = scan.complete;
+    copy.out.finish()?;
+    let mut good = copy.out.into_inner().into_inner();
+    good.flush()?;
+    Ok((copy.done, good))
+}
+
+/// The damaged file.
+struct Scan<R> {
+    file: R,
+    length: u64,
+    lost: Vec<(u64, u64)>,
+    complete: bool,
+}
+
+impl<R: Read + Seek> Scan<R> {
+    fn new(mut file: R) -> Result<Self, Error> {
+        let length = file.seek(SeekFrom::End(0))?;
+        Ok(Self {
+            file,
+            length,
+            lost: Vec::new(),
+            complete: false,
+        })
+    }
+
+    fn run<W: Write>(&mut self, copy: &mut Copy<W>) -> Result<(), Error> {
+        // A damaged magic costs nothing.
+        let mut place = MAGIC.len() as u64;
+        while place < self.length {
+            let Some((opcode, end)) = self.record_at(place)? else {
+                place = self.skip(place)?;
+                continue;
+            };
+            let body = self.bytes(place + RECORD_HEAD_BYTES, end)?;
+            match (opcode, body.len()) {
+                // What follows says nothing new. Their lengths are fixed: another one is another
+                // record, damaged in its first byte.
+                (op::DATA_END, 4) | (op::FOOTER, 20) => {
+                    self.complete = true;
+                    return Ok(());
+                }
+                _ => {}
+            }
+            let Some(record) = exact(opcode, &body) else {
+                place = self.skip(place)?;
+                continue;
+            };
+            match record {
+                Record::Chunk { .. } => match records(&body) {
+                    Some(records) => {
+                        copy.done.chunks += 1;
+                        copy.take(records)?;
+                    }
+                    None => self.lost.push((place, end - place)),
+                },
+                record => copy.take(vec![record.into_owned()])?,
+            }
+            place = end;
+        }
+        Ok(())
+    }
+
+    /// The record at `place`, if one can stand there: its opcode, and where it ends.
+    fn record_at(&mut self, place: u64) -> Result<Option<(u8, u64)>, Error> {
+        let head = self.bytes(place, place + RECORD_HEAD_BYTES)?;
+        let Ok(head) = <[u8; RECORD_HEAD_BYTES as usize]>::try_from(head) else {
+            return Ok(None);
+        };
+        let [opcode, length @ ..] = head;
+        let length = u64::from_le_bytes(length);
+        let end = place + RECORD_HEAD_BYTES + length.min(self.length);
+        let known = (op::HEADER..=op::DATA_END).contains(&opcode);
+        let fits = length <= LONGEST_RECORD_BYTES && end <= self.length;
+        Ok((known && fits).then_some((opcode, end)))
+    }
+
+    /// Gives up what stands at `place`; where the next chunk is, or the end.
+    fn skip(&mut self, place: u64) -> Result<u64, Error> {
+        let next = self.next_chunk(place + 1)?.unwrap_or(self.length);
+        self.lost.push((place, next - place));
+        Ok(next)
+    }
+
+    /// Where the next chunk begins, whole or not, from `place` on.
+    fn next_chunk(&mut self, place: u64) -> Result<Option<u64>, Error> {
+        let mut from = place + COMPRESSION_AT;
+        while from < self.length {
+            let block = self.bytes(from, from + BLOCK_BYTES as u64)?;
+            let windows = block.windows(COMPRESSION.len()).enumerate();
+            for (at, _) in windows.filter(|(_, window)| *window == COMPRESSION) {
+                let start = from + at as u64 - COMPRESSION_AT;
+                if let Some((op::CHUNK, end)) = self.record_at(start)?
+                    && exact(op::CHUNK, &self.bytes(start + RECORD_HEAD_BYTES, end)?).is_some()
+                {
+                    return Ok(Some(start));
+                }
+            }
+            // The pattern may stand across the border.
+            from += (BLOCK_BYTES - COMPRESSION.len() + 1) as u64;
+        }
+        Ok(None)
+    }
+
+    /// The bytes from `start` to `end`, fewer where the file ends before.
+    fn bytes(&mut self, start: u64, end: u64) -> Result<Vec<u8>, Error> {
+        self.file.seek(SeekFrom::Start(start))?;
+        let mut bytes = Vec::new();
+        self.file
+            .by_ref()
+            .take(end - start)
+            .read_to_end(&mut bytes)?;
+        Ok(bytes)
+    }
+}
+
+/// A record that fills its bytes to the last one: one whose length was damaged does not, and where
+/// it ends nobody knows then.
+fn exact(opcode: u8, body: &[u8]) -> Option<Record<'_>> {
+    let record = mcap::parse_record(opcode, body).ok()?;
+    let text = |text: &str| 4 + text.len();
+    let map = |map: &BTreeMap<String, String>| {
+        4 + map.iter().map(|(k, v)| text(k) + text(v)).sum::<usize>()
+    };
+    let bytes = match &record {
+        Record::Header(header) => text(&header.profile) + text(&header.library),
+        Record::Schema { header, data } => {
+            2 + text(&header.name) + text(&header.encoding) + 4 + data.len()
+        }
+        Record::Channel(channel) => {
+            4 + text(&channel.topic) + text(&channel.message_encoding) + map(&channel.metadata)
+        }
+        Record::Chunk { header, data } => 36 + text(&header.compression) + data.len(),
+        Record::MessageIndex(index) => 6 + 16 * index.records.len(),
+        Record::Metadata(metadata) => text(&metadata.name) + map(&metadata.metadata),
+        // It has a checksum.
+        Record::Attachment { .. } => body.len(),
+        // Messages stand in chunks, the others after the end of the data.
+        _ => return None,
+    };
+    (bytes == body.len()).then_some(record)
+}
+
+/// The records of a chunk, if it is whole. Its checksum is asked before anything in it is believed.
+fn records(body: &[u8]) -> Option<Vec<Record<'static>>> {
+    let options = LinearReaderOptions::default()
+        .with_skip_start_magic(true)
+        .with_skip_end_magic(true)
+        .with_prevalidate_chunk_crcs(true)
+        .with_record_length_limit(LONGEST_RECORD_BYTES as usize);
+    let mut reader = LinearReader::new_with_options(options);
+    let mut chunk = [&[op::CHUNK], &(body.len() as u64).to_le_bytes()[..], body].concat();
+    let mut records = Vec::new();
+    while let Some(event) = reader.next_event() {
+        match event.ok()? {
+            LinearReadEvent::ReadRequest(wanted) => {
+                let wanted = wanted.min(chunk.len());
+                let rest = chunk.split_off(wanted);
+                reader.insert(wanted).copy_from_slice(&chunk);
+                reader.notify_read(wanted);
+                chunk = rest;
+            }
+            LinearReadEvent::Record { opcode, data } => {
+                records.push(mcap::parse_record(opcode, data).ok()?.into_owned());
+            }
+        }
+    }
+    Some(records)
+}
+
+/// The new file.
+struct Copy<W: Write> {
+    out: mcap::Writer<NoSeek<W>>,
+    schemas: BTreeMap<u16, (String, String, Vec<u8>)>,
+    channels: BTreeMap<u16, Channel>,
+    /// Those that the new file has.
+    begun: BTreeSet<u16>,
+    done: Recovered,
+}
+
+impl<W: Write> Copy<W> {
+    fn new(good: W) -> Result<Self, Error> {
+        Ok(Self {
+            out: writer::options().create(NoSeek::new(good))?,
+            schemas: BTreeMap::new(),
+            channels: BTreeMap::new(),
+            begun: BTreeSet::new(),
+            done: Recovered::default(),
+        })
+    }
+
+    fn take(&mut self, records: Vec<Record<'static>>) -> Result<(), Error> {
+        for record in records {
+            match record {
+                Record::Metadata(metadata) => self.out.write_metadata(&metadata)?,
+                Record::Schema { header, data } => {
+                    let schema = (header.name, header.encoding, data.into_owned());
+                    self.schemas.insert(header.id, schema);
+                }
+                Record::Channel(channel) => {
+                    self.channels.insert(channel.id, channel);
+                }
+                Record::Message { header, data } => {
+                    if !self.begin(header.channel_id, &data)? {
+                        self.done.messages_unknown += 1;
+                        continue;
+                    }
+                    self.out.write_to_known_channel(&header, &data)?;
+                    self.done.messages += 1;
+                    let time = header.log_time;
+                    let (first, last) = self.done.span_ns.unwrap_or((time, time));
+                    self.done.span_ns = Some((first.min(time), last.max(time)));
+                }
+                // Indexes are made anew.
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// Sees to it that the new file has this channel; `false`: nothing tells which it is.
+    fn begin(&mut self, id: u16, message: &[u8]) -> Result<bool, Error> {
+        if self.begun.contains(&id) {
+            return Ok(true);
+        }
+        if !self.channels.contains_key(&id) && !self.restore(id, message) {
+            return Ok(false);
+        }
+        let channel = &self.channels[&id];
+        let schema_id = channel.schema_id;
+        if let Some((name, encoding, data)) = self.schemas.get(&schema_id) {
+            self.out
+                .add_schema_with_id(schema_id, name, encoding, data)?;
+        } else if schema_id != 0 {
+            return Ok(false);
+        }
+        let Channel {
+            topic,
+            message_encoding,
+            metadata,
+            ..
+        } = channel;
+        self.out
+            .add_channel_with_id(id, schema_id, topic, message_encoding, metadata)?;
+        self.begun.insert(id);
+        Ok(true)
+    }
+
+    /// Tells a channel of ours whose record is lost: its number says which of its sensor's it is,
+    /// and every message names the sensor.
+    fn restore(&mut self, id: u16, message: &[u8]) -> bool {
+        let place = usize::from(id.wrapping_sub(1)) % TOPICS.len();
+        let named = |name: &String| {
+            let ours = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
+            !name.is_empty() && name.chars().all(ours)
+        };
+        let Some(sensor) = message::sensor_of(message).filter(named) else {
+            return false;
+        };
+        let topic = TOPICS[place];
+        let schema_id = writer::schema_id(topic);
+        let text = topic.text().into_bytes();
+        let schema = (topic.schema.to_owned(), "ros2msg".to_owned(), text);
+        if *self.schemas.entry(schema_id).or_insert(schema.clone()) != schema {
+            return false;
+        }
+        let channel = Channel {
+            id,
+            schema_id,
+            topic: writer::topic_name(&sensor, topic),
+            message_encoding: "cdr".to_owned(),
+            metadata: BTreeMap::new(),
+        };
+        self.channels.insert(id, channel);
+        true
+    }
+}
+
+impl Recovered {
+    /// Bytes of damaged stretches.
+    pub fn lost_bytes(&self) -> u64 {
+        self.lost.iter().map(|(_, bytes)| bytes).sum()
+    }
+
+    /// Whether nothing was missing.
+    pub fn is_whole(&self) -> bool {
+        self.complete && self.lost.is_empty() && self.messages_unknown == 0
+    }
+}

@@ -1,0 +1,139 @@
+//! The last minute of one sensor, so that a fault can be looked at after it happened.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use super::{Entry, Input};
+use crate::frame::Stamp;
+
+/// What is kept.
+const KEPT: Duration = Duration::from_secs(60);
+/// More is not, however short a time that is: a device that floods its line must not fill the
+/// memory. The JX255N sends 5 MB a minute at 100 frames/s.
+const KEPT_BYTES: usize = 32 << 20;
+
+/// Entries of one sensor, in stretches that each begin with a state.
+#[derive(Debug, Default)]
+pub struct Ring {
+    stretches: VecDeque<Stretch>,
+}
+
+#[derive(Debug)]
+struct Stretch {
+    entries: Vec<(Stamp, Entry)>,
+    bytes: usize,
+}
+
+impl Ring {
+    /// Adds an entry, and lets go of stretches that are not needed to go back a minute. Nothing is
+    /// kept before the first state.
+    pub fn push(&mut self, at: Stamp, entry: Entry) {
+        if matches!(entry, Entry::State(_)) {
+            self.stretches.push_back(Stretch {
+                entries: Vec::new(),
+                bytes: 0,
+            });
+        }
+        let Some(stretch) = self.stretches.back_mut() else {
+            return;
+        };
+        stretch.bytes += match &entry {
+            Entry::Input(Input::Bytes(bytes)) => bytes.len(),
+            _ => 0,
+        };
+        // A minute of entries without bytes is small; what one takes by itself is not nothing.
+        stretch.bytes += size_of::<(Stamp, Entry)>();
+        stretch.entries.push((at, entry));
+        while self.is_longer_than_needed(at) {
+            self.stretches.pop_front();
+        }
+    }
+
+    fn is_longer_than_needed(&self, now: Stamp) -> bool {
+        let bytes: usize = self.stretches.iter().map(|stretch| stretch.bytes).sum();
+        let second = self.stretches.get(1);
+        second.is_some_and(|second| {
+            let (begin, _) = second.entries[0];
+            bytes > KEPT_BYTES || now.mono.saturating_sub(begin.mono) >= KEPT
+        })
+    }
+
+    /// All of it: a minute and up to a stretch more, beginning with a state.
+    pub fn all(&self) -> impl Iterator<Item = &(Stamp, Entry)> {
+        self.stretches.iter().flat_map(|stretch| &stretch.entries)
+    }
+
+    /// From the last state on.
+    pub fn latest(&self) -> impl Iterator<Item = &(Stamp, Entry)> {
+        self.stretches.back().into_iter().flat_map(|s| &s.entries)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::pipeline::{Clock, Pipeline};
+    use crate::recording::{Labels, Sensor, State};
+    use crate::verdict::{BUILT_IN, Hrn};
+    use crate::{press, tare, wire};
+
+    fn at(seconds: u64) -> Stamp {
+        Stamp {
+            mono: Duration::from_secs(seconds),
+            wall: jiff::Timestamp::UNIX_EPOCH,
+        }
+    }
+
+    fn state() -> Entry {
+        let hrn = Arc::new(Hrn::load(BUILT_IN).unwrap());
+        let sensor = Sensor {
+            name: "forearm".to_owned(),
+            frame_rate_hz: 5.0,
+            frame: wire::Settings::default(),
+            calibration: tare::Settings::default(),
+            press: press::Settings::default(),
+            min_confidence: 0.0,
+            min_force_n: 0.0,
+            model: hrn.sha256().to_owned(),
+        };
+        let pipeline = Pipeline::new(sensor.settings(&hrn).unwrap(), Clock::Arrival);
+        Entry::State(Box::new(State {
+            sensor,
+            memory: pipeline.memory(),
+            labels: Labels::new(),
+        }))
+    }
+
+    #[test]
+    fn a_minute_is_kept_and_begins_with_a_state() {
+        let mut ring = Ring::default();
+        let state = state();
+        ring.push(at(0), Entry::Input(Input::Tick));
+        assert_eq!(ring.all().count(), 0);
+        for second in 0..200 {
+            if second % 10 == 0 {
+                ring.push(at(second), state.clone());
+            }
+            ring.push(at(second), Entry::Input(Input::Tick));
+        }
+        let first = ring.all().next().unwrap();
+        assert!(matches!(first.1, Entry::State(_)));
+        assert_eq!(first.0, at(130));
+        assert_eq!(ring.latest().count(), 11);
+    }
+
+    #[test]
+    fn a_flood_is_kept_for_as_long_as_there_is_room() {
+        let mut ring = Ring::default();
+        let state = state();
+        let flood = Entry::Input(Input::Bytes(vec![0; 1 << 20].into()));
+        for second in 0..50 {
+            ring.push(at(second), state.clone());
+            ring.push(at(second), flood.clone());
+        }
+        let kept = ring.all().count() / 2;
+        assert!((30..=32).contains(&kept), "{kept}");
+    }
+}

@@ -1,0 +1,207 @@
+use std::io::Cursor;
+use std::time::Duration;
+
+use super::*;
+use crate::frame::RawFrame;
+use crate::pipeline::Clock;
+use crate::verdict::BUILT_IN;
+
+fn hrn() -> Arc<Hrn> {
+    Arc::new(Hrn::load(BUILT_IN).unwrap())
+}
+
+fn sensor(hrn: &Hrn) -> Sensor {
+    Sensor {
+        name: "forearm".to_owned(),
+        frame_rate_hz: 5.0,
+        frame: wire::Settings::default(),
+        calibration: tare::Settings::default(),
+        press: press::Settings::default(),
+        min_confidence: 0.0,
+        min_force_n: 0.0,
+        model: hrn.sha256().to_owned(),
+    }
+}
+
+fn at(ms: u64) -> Stamp {
+    let mono = Duration::from_millis(1_000_000 + ms) + Duration::from_nanos(7);
+    // The calendar is set back in the middle: nobody's durations may know.
+    let step_s = if ms > 8_000 { -3_600 } else { 0 };
+    let wall = jiff::Timestamp::new(1_790_000_000 + step_s, 123_456_789).unwrap();
+    Stamp {
+        mono,
+        wall: wall.checked_add(Duration::from_millis(ms)).unwrap(),
+    }
+}
+
+/// Two presses of a second and a half, a context, a stutter, a tare, a loss and a return: what
+/// happened, and when.
+fn story() -> Vec<(Stamp, Input<'static>)> {
+    let layout = wire::Layout::new(&wire::Settings::default()).unwrap();
+    let mut story = vec![(at(0), Input::Opened)];
+    for frame in 0..80_u64 {
+        let mut raw = RawFrame::default();
+        raw.counts.fill(3);
+        if [20..28, 50..58].iter().any(|press| press.contains(&frame)) {
+            for place in 300..300 + 4 * (frame % 10) as usize {
+                raw.counts[place] = 60 + frame as u16;
+            }
+        }
+        let mut bytes = Vec::new();
+        layout.encode(&raw, &mut bytes);
+        if frame == 33 {
+            bytes[100] ^= 1;
+        }
+        let ms = 200 * frame + 10;
+        match frame {
+            12 => story.push((
+                at(ms),
+                Input::Context(Some(serde_json::json!({"tag": "x"}))),
+            )),
+            35 => story.push((at(ms), Input::Tare)),
+            54 => {
+                story.push((at(ms), Input::Lost("end of file".into())));
+                story.push((at(ms + 1), Input::Unavailable("no such device".into())));
+                story.push((at(ms + 2), Input::Opened));
+            }
+            _ => {}
+        }
+        // In three pieces, as a line brings them.
+        for (piece, bytes) in bytes.chunks(300).enumerate() {
+            let came = at(ms + 20 * piece as u64 + 3);
+            story.push((came, Input::Bytes(bytes.to_vec().into())));
+        }
+    }
+    story.push((at(17_000), Input::Tick));
+    story.push((at(17_500), Input::Shutdown));
+    story
+}
+
+/// The file, and the events as they were when it was written. A state stands every `states`
+/// inputs, a chunk ends after every `chunk`.
+fn recorded(states: usize, chunk: usize) -> (Vec<u8>, Vec<Event>) {
+    let hrn = hrn();
+    let described = sensor(&hrn);
+    let about = About {
+        robot: "arm-7".to_owned(),
+        run: "r".to_owned(),
+        boot_id: "b".to_owned(),
+        reason: None,
+        labels: labels(),
+        sensors: vec![described.clone()],
+    };
+    let mut writer = Writer::new(Vec::new(), &about).unwrap();
+    let mut pipeline = Pipeline::new(described.settings(&hrn).unwrap(), Clock::Arrival);
+    let mut events = Vec::new();
+    for (index, (at, input)) in story().into_iter().enumerate() {
+        if index % states == 0 {
+            let state = State {
+                sensor: described.clone(),
+                memory: pipeline.memory(),
+                labels: labels(),
+            };
+            writer.entry(0, at, &Entry::State(Box::new(state))).unwrap();
+        }
+        writer.entry(0, at, &Entry::Input(input.clone())).unwrap();
+        let mut came = input.feed(&mut pipeline, at);
+        for event in &mut came {
+            writer.event(event).unwrap();
+            if let Event::Hardness(verdict) = event {
+                verdict.mono_ns = None;
+            }
+        }
+        events.append(&mut came);
+        if index % chunk == chunk - 1 {
+            writer.flush().unwrap();
+        }
+    }
+    (writer.finish().unwrap(), events)
+}
+
+fn labels() -> Labels {
+    Labels::from([("level".to_owned(), "2".to_owned())])
+}
+
+fn play(file: &[u8]) -> Vec<Event> {
+    let mut playback = Playback::new(hrn());
+    let mut events = Vec::new();
+    for found in Reader::new(file) {
+        events.extend(playback.feed(found.unwrap()).unwrap());
+    }
+    assert_eq!(playback.labels(), labels());
+    events
+}
+
+#[test]
+fn a_recording_gives_the_very_events_it_was_made_of() {
+    let (file, events) = recorded(1000, 7);
+    let verdicts = events.iter().filter(|e| matches!(e, Event::Hardness(_)));
+    assert!(verdicts.count() >= 2);
+    assert_eq!(play(&file), events);
+}
+
+#[test]
+fn a_pipeline_that_recalls_another_goes_on_as_that_one() {
+    // A state before each input: each time the pipeline is made anew from what was written.
+    let (file, events) = recorded(1, 7);
+    assert_eq!(play(&file), events);
+}
+
+#[test]
+fn a_file_cut_off_anywhere_is_saved_up_to_its_last_whole_chunk() {
+    let (file, _) = recorded(10, 7);
+    let inputs = |file: &[u8]| Reader::new(file).map(Result::unwrap).count();
+    let all = inputs(&file);
+    let mut saved_before = 0;
+    for cut in (0..file.len()).step_by(97) {
+        let (recovered, good) = recover(Cursor::new(&file[..cut]), Vec::new()).unwrap();
+        let saved = inputs(&good);
+        assert!(saved >= saved_before && saved <= all, "{saved} at {cut}");
+        assert!(!recovered.is_whole() || saved == all);
+        saved_before = saved;
+    }
+    assert_eq!(saved_before, all, "what is cut off last is the summary");
+    let (recovered, good) = recover(Cursor::new(&file), Vec::new()).unwrap();
+    assert!(recovered.is_whole(), "{recovered:?}");
+    assert_eq!(play(&good), play(&file));
+}
+
+#[test]
+fn one_flipped_bit_costs_its_chunk_and_no_more() {
+    let (file, _) = recorded(10, 7);
+    let messages = |file: &[u8]| recover(Cursor::new(file), Vec::new()).unwrap();
+    let (whole, _) = messages(&file);
+    // A chunk has seven inputs, what came of them, and perhaps a state.
+    let largest = 7 * 4 + 1;
+    // All of a chunk with what stands around it, and samples of the rest.
+    let middle = file.len() / 2..file.len() / 2 + 800;
+    for place in (0..file.len()).filter(|p| p % 31 == 0 || middle.contains(p)) {
+        let mut file = file.clone();
+        file[place] ^= 1 << (place % 8);
+        let (found, good) = messages(&file);
+        let lost = whole.messages - found.messages;
+        assert!(
+            lost <= largest,
+            "{lost} messages lost by byte {place}: {found:?}"
+        );
+        assert!(found.lost.len() <= 1, "{found:?} by byte {place}");
+        // What is saved can be read and played.
+        if place % 50 == 0 {
+            play(&good);
+        }
+    }
+}
+
+#[test]
+fn what_is_no_recording_is_refused_in_words() {
+    let error = |file: &[u8]| {
+        let mut errors = Reader::new(file).filter_map(Result::err);
+        errors.next().map(|error| error.to_string())
+    };
+    assert!(error(b"no recording at all").unwrap().contains("no MCAP"));
+    let (file, _) = recorded(10, 7);
+    assert_eq!(error(&file), None);
+    assert!(error(&file[..file.len() / 2]).unwrap().contains("recover"));
+    let (nothing, _) = recover(Cursor::new(b"no recording at all"), Vec::new()).unwrap();
+    assert_eq!(nothing.messages, 0);
+}

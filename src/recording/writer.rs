@@ -1,0 +1,177 @@
+//! Entries and events into bytes of an MCAP file.
+
+use std::collections::BTreeMap;
+use std::io::Write;
+
+use mcap::records::{MessageHeader, Metadata};
+use mcap::write::NoSeek;
+use mcap::{Compression, WriteOptions};
+
+use super::message::{self, TOPICS, Topic};
+use super::{Entry, Error, Labels, Sensor};
+use crate::event::Event;
+use crate::frame::Stamp;
+
+/// What a recording says of itself, for people: a replay reads the [`super::State`]s alone.
+#[derive(Debug, Clone, PartialEq)]
+pub struct About {
+    /// Name of the robot.
+    pub robot: String,
+    /// Of this start of the daemon, as in `hello`.
+    pub run: String,
+    /// The kernel's boot id: within one, moments of CLOCK_MONOTONIC can be compared.
+    pub boot_id: String,
+    /// Why it was written, if not to record.
+    pub reason: Option<String>,
+    /// What was pressed, and the like.
+    pub labels: Labels,
+    /// The sensors, in the order of their channels.
+    pub sensors: Vec<Sensor>,
+}
+
+/// Writes one recording.
+pub struct Writer<W: Write> {
+    out: mcap::Writer<NoSeek<W>>,
+    sensors: Vec<String>,
+    sequence: u32,
+}
+
+/// As every recording of ours is written: whole chunks, so that one that was cut off ends with
+/// a whole one.
+pub(super) fn options() -> WriteOptions {
+    WriteOptions::new()
+        .profile("ros2")
+        .library(concat!("hardnessd ", env!("CARGO_PKG_VERSION")))
+        .compression(Some(Compression::Zstd))
+        .compression_threads(0)
+        .disable_seeking(true)
+}
+
+/// Number of a channel: the same for the same place, so that it can be told without its record.
+pub(super) fn channel_id(sensor: usize, topic: Topic) -> u16 {
+    let place = TOPICS.iter().position(|known| *known == topic);
+    let place = place.expect("every topic stands in TOPICS");
+    u16::try_from(sensor * TOPICS.len() + place + 1).expect("a daemon has few sensors")
+}
+
+/// Number of a topic's schema.
+pub(super) fn schema_id(topic: Topic) -> u16 {
+    let place = TOPICS.iter().position(|known| *known == topic);
+    place.expect("every topic stands in TOPICS") as u16 + 1
+}
+
+/// A channel's name.
+pub(super) fn topic_name(sensor: &str, topic: Topic) -> String {
+    format!("/tactile/{sensor}/{}", topic.name)
+}
+
+impl<W: Write> Writer<W> {
+    /// Begins a recording.
+    ///
+    /// # Errors
+    ///
+    /// Those of writing to `out`.
+    pub fn new(out: W, about: &About) -> Result<Self, Error> {
+        let mut out = options().create(NoSeek::new(out))?;
+        let text = |key: &str, value: &str| (key.to_owned(), value.to_owned());
+        let mut recording = BTreeMap::from([
+            text("robot", &about.robot),
+            text("run", &about.run),
+            text("boot_id", &about.boot_id),
+            text("version", env!("CARGO_PKG_VERSION")),
+        ]);
+        recording.extend(about.reason.iter().map(|reason| text("reason", reason)));
+        let mut metadata = vec![("hardnessd.recording", recording)];
+        if !about.labels.is_empty() {
+            metadata.push(("hardnessd.labels", about.labels.clone()));
+        }
+        for sensor in &about.sensors {
+            let settings = serde_json::to_string(sensor)
+                .expect("plain structs of numbers and strings always serialise");
+            let sensor = BTreeMap::from([
+                text("name", &sensor.name),
+                text("model", &sensor.model),
+                text("settings", &settings),
+            ]);
+            metadata.push(("hardnessd.sensor", sensor));
+        }
+        for (name, metadata) in metadata {
+            let name = name.to_owned();
+            out.write_metadata(&Metadata { name, metadata })?;
+        }
+        for topic in TOPICS {
+            let text = topic.text();
+            out.add_schema_with_id(schema_id(topic), topic.schema, "ros2msg", text.as_bytes())?;
+        }
+        for (index, sensor) in about.sensors.iter().enumerate() {
+            for topic in TOPICS {
+                let name = topic_name(&sensor.name, topic);
+                let id = channel_id(index, topic);
+                out.add_channel_with_id(id, schema_id(topic), &name, "cdr", &BTreeMap::new())?;
+            }
+        }
+        out.flush()?;
+        Ok(Self {
+            out,
+            sensors: about.sensors.iter().map(|s| s.name.clone()).collect(),
+            sequence: 0,
+        })
+    }
+
+    /// Adds what happened to the `sensor`-th sensor.
+    ///
+    /// # Errors
+    ///
+    /// Those of writing; the writer is of no more use then.
+    pub fn entry(&mut self, sensor: usize, at: Stamp, entry: &Entry) -> Result<(), Error> {
+        let bytes = message::encode_entry(&self.sensors[sensor], at, entry);
+        self.write(channel_id(sensor, message::INPUT), at.wall, &bytes)
+    }
+
+    /// Adds an event; one of a sensor that the recording does not have is left out.
+    ///
+    /// # Errors
+    ///
+    /// Those of writing; the writer is of no more use then.
+    pub fn event(&mut self, event: &Event) -> Result<(), Error> {
+        let mut sensors = self.sensors.iter();
+        let Some(sensor) = sensors.position(|sensor| sensor == event.sensor()) else {
+            return Ok(());
+        };
+        let (topic, time, bytes) = message::encode_event(event);
+        self.write(channel_id(sensor, topic), time, &bytes)
+    }
+
+    fn write(&mut self, channel_id: u16, time: jiff::Timestamp, data: &[u8]) -> Result<(), Error> {
+        let log_time = u64::try_from(time.as_nanosecond()).unwrap_or(0);
+        let header = MessageHeader {
+            channel_id,
+            sequence: self.sequence,
+            log_time,
+            publish_time: log_time,
+        };
+        self.sequence = self.sequence.wrapping_add(1);
+        Ok(self.out.write_to_known_channel(&header, data)?)
+    }
+
+    /// Ends the chunk at hand and hands it on: what is lost with the process is what came since.
+    ///
+    /// # Errors
+    ///
+    /// Those of writing; the writer is of no more use then.
+    pub fn flush(&mut self) -> Result<(), Error> {
+        Ok(self.out.flush()?)
+    }
+
+    /// Ends the recording and hands back what it was written to.
+    ///
+    /// # Errors
+    ///
+    /// Those of writing.
+    pub fn finish(mut self) -> Result<W, Error> {
+        self.out.finish()?;
+        let mut inner = self.out.into_inner().into_inner();
+        inner.flush()?;
+        Ok(inner)
+    }
+}

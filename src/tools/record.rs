@@ -1,0 +1,97 @@
+//! `hardnessd record`: a daemon without sockets that writes what comes to a file.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::future::Future;
+use std::io;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::Args as ClapArgs;
+
+use super::simulate::positive;
+use crate::daemon::config::Setup;
+use crate::daemon::{self, Daemon, record};
+
+/// Arguments of `record`.
+#[derive(Debug, Clone, ClapArgs)]
+pub struct Args {
+    /// Configuration; its ways out are not opened
+    #[arg(long, value_name = "F")]
+    pub config: PathBuf,
+    /// Recording to write (.mcap); a file that exists is left alone
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// What to write down in it, such as level=2 or object=7; may be repeated
+    #[arg(long = "label", value_name = "KEY=VALUE", value_parser = label)]
+    labels: Vec<(String, String)>,
+    /// End after so long [default: at SIGINT or SIGTERM, or when no sensor is left]
+    #[arg(long, value_name = "S", value_parser = positive)]
+    seconds: Option<f64>,
+}
+
+/// Why there is no recording, or why it ended before its time.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The file cannot be made.
+    #[error("--out {path}: {source}, expected a new file")]
+    Create {
+        /// As given.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
+    /// Recording failed, or the sensors were not there.
+    #[error(transparent)]
+    Daemon(#[from] daemon::Error),
+}
+
+/// Records until `shutdown` comes, the time is over or no sensor is left.
+///
+/// # Errors
+///
+/// [`Error`], if the file cannot be made or written, a sensor is not there to begin with, or the
+/// last one is lost.
+pub async fn run(
+    args: Args,
+    setup: Setup,
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), Error> {
+    let path = args.out;
+    let file = File::create_new(&path).map_err(|source| Error::Create {
+        path: path.clone(),
+        source,
+    })?;
+    let labels: BTreeMap<String, String> = args.labels.into_iter().collect();
+    let daemon = Daemon::recording(setup, path.clone(), file, labels)?;
+    let over = async {
+        match args.seconds {
+            // A time beyond counting is none.
+            Some(seconds) => {
+                let time = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
+                tokio::time::sleep(time).await;
+            }
+            None => std::future::pending().await,
+        }
+    };
+    let end = async {
+        tokio::select! {
+            () = shutdown => {}
+            () = over => {}
+        }
+    };
+    let recorded = daemon.run(end, None).await;
+    if let Err(daemon::Error::Record(record::Error::Unavailable { .. })) = &recorded {
+        // It holds nothing, and the next try shall find its place free.
+        let _ = fs::remove_file(&path);
+    }
+    Ok(recorded?)
+}
+
+/// `KEY=VALUE`.
+fn label(text: &str) -> Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((key, value)) if !key.is_empty() => Ok((key.to_owned(), value.to_owned())),
+        _ => Err("expected KEY=VALUE".to_owned()),
+    }
+}

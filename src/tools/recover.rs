@@ -1,0 +1,144 @@
+//! `hardnessd recover`: what is whole in a damaged recording, into a new one.
+
+use std::fs::{self, File};
+use std::io::{self, BufReader, BufWriter, ErrorKind};
+use std::path::{Path, PathBuf};
+
+use clap::Args as ClapArgs;
+use jiff::Timestamp;
+
+use crate::recording::{self, Recovered};
+
+/// Arguments of `recover`.
+#[derive(Debug, Clone, ClapArgs)]
+pub struct Args {
+    /// Recording that is damaged or was cut off; it is not changed
+    broken: PathBuf,
+    /// Recording to write (.mcap); a file that exists is left alone
+    #[arg(long, value_name = "GOOD")]
+    out: PathBuf,
+}
+
+/// Why nothing was saved.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The damaged file cannot be read.
+    #[error("{path}: cannot read: {source}")]
+    Unreadable {
+        /// As given.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
+    /// There is nothing to be saved.
+    #[error("{path}: found no whole chunk of messages in {bytes} bytes, expected a recording")]
+    Nothing {
+        /// As given.
+        path: PathBuf,
+        /// All of it.
+        bytes: u64,
+    },
+    /// The new file cannot be written.
+    #[error("--out {path}: {source}")]
+    Write {
+        /// As given.
+        path: PathBuf,
+        /// Why not.
+        source: recording::Error,
+    },
+}
+
+/// Saves what is whole; says on stderr what that is, and what is lost.
+///
+/// # Errors
+///
+/// [`Error`], if there is nothing to be saved or a file cannot be read or written. The new file is
+/// then not there.
+pub fn run(args: &Args) -> Result<(), Error> {
+    let unreadable = |source| Error::Unreadable {
+        path: args.broken.clone(),
+        source,
+    };
+    let broken = File::open(&args.broken).map_err(unreadable)?;
+    let bytes = broken.metadata().map_err(unreadable)?.len();
+    let unwritten = |source: recording::Error| Error::Write {
+        path: args.out.clone(),
+        source,
+    };
+    if args.out.exists() {
+        let exists = io::Error::new(ErrorKind::AlreadyExists, "exists, expected a new file");
+        return Err(unwritten(exists.into()));
+    }
+    // Beside its place, so that a file of that name is always a whole one.
+    let mut name = args.out.file_name().unwrap_or_default().to_owned();
+    name.push(".part");
+    let part = args.out.with_file_name(name);
+    let saved = save(broken, &part).and_then(|recovered| {
+        if recovered.messages > 0 {
+            fs::rename(&part, &args.out)?;
+            sync_directory(&args.out)?;
+        }
+        Ok(recovered)
+    });
+    let recovered = match saved {
+        Ok(recovered) if recovered.messages > 0 => recovered,
+        other => {
+            // It may never have been there.
+            let _ = fs::remove_file(&part);
+            return Err(match other {
+                Ok(_) => Error::Nothing {
+                    path: args.broken.clone(),
+                    bytes,
+                },
+                Err(error) => unwritten(error),
+            });
+        }
+    };
+    eprintln!("{}", account(&recovered));
+    Ok(())
+}
+
+fn save(broken: File, part: &Path) -> Result<Recovered, recording::Error> {
+    let good = File::create(part)?;
+    let (recovered, good) = recording::recover(BufReader::new(broken), BufWriter::new(good))?;
+    let good = good.into_inner().map_err(io::IntoInnerError::into_error)?;
+    good.sync_all()?;
+    Ok(recovered)
+}
+
+/// A name is on the disk when its directory is.
+fn sync_directory(file: &Path) -> io::Result<()> {
+    let directory = file.parent().filter(|path| !path.as_os_str().is_empty());
+    File::open(directory.unwrap_or(Path::new(".")))?.sync_all()
+}
+
+/// What was saved and what was lost, in lines.
+fn account(recovered: &Recovered) -> String {
+    let Recovered {
+        messages,
+        chunks,
+        span_ns,
+        lost,
+        messages_unknown,
+        complete,
+    } = recovered;
+    let time = |ns: u64| {
+        let time = Timestamp::from_nanosecond(i128::from(ns));
+        time.map_or_else(|_| "?".to_owned(), |time| format!("{time:.3}"))
+    };
+    let (first, last) = span_ns.map_or_else(Default::default, |(a, b)| (time(a), time(b)));
+    let mut text = format!("saved {messages} messages in {chunks} chunks, {first} to {last}");
+    for (place, bytes) in lost {
+        text += &format!("\nlost {bytes} damaged bytes at byte {place}");
+    }
+    if *messages_unknown > 0 {
+        text += &format!("\nlost {messages_unknown} messages of channels that nothing describes");
+    }
+    if !complete {
+        text += "\nthe end was missing: the recording was cut off, or it is still being written";
+    }
+    if recovered.is_whole() {
+        text += "\nlost nothing";
+    }
+    text
+}

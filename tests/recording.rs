@@ -1,0 +1,456 @@
+//! Recordings of the real binary on a real pty: replayed, cut off, damaged, on a bad disk.
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy knows no helper of a test as a test"
+)]
+
+mod bench;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use bench::{BINARY, Bench, Daemon, PATIENCE, Process, Subscriber, hardnessd, wait_for};
+use hardnessd::random::Stream;
+use hardnessd::recording::{Entry, Found, Input, Reader};
+use rustix::process::Signal;
+use serde_json::{Value, json};
+
+/// A configuration without sockets' paths: for `record`.
+fn configure(bench: &Bench, fps: u32) -> PathBuf {
+    let path = bench.path("record.toml");
+    let text =
+        format!("[[sensor]]\nname = \"forearm\"\nport = \"port\"\nframe_rate_hz = {fps}.0\n");
+    fs::write(&path, text).unwrap();
+    path
+}
+
+/// A configuration whose sensor counts as stale only after 1.25 s: a busy machine is no fault.
+fn configure_patient(bench: &Bench, record: &str) -> PathBuf {
+    let config = bench.configure("hardnessd.toml", "events.sock", record);
+    let text = fs::read_to_string(&config).unwrap();
+    fs::write(
+        &config,
+        text.replace("frame_rate_hz = 20.0", "frame_rate_hz = 2.0"),
+    )
+    .unwrap();
+    config
+}
+
+fn record(config: &Path, out: &Path, more: &[&str]) -> Process {
+    let mut command = Command::new(BINARY);
+    command.args(["record", "--config"]).arg(config);
+    command.arg("--out").arg(out).args(more);
+    let child = command.stderr(Stdio::null()).stdout(Stdio::null()).spawn();
+    Process(child.unwrap())
+}
+
+fn replay(recording: &Path) -> Vec<Value> {
+    let output = hardnessd(&["replay", recording.to_str().unwrap()]);
+    assert!(output.status.success(), "{recording:?}: {output:?}");
+    assert_eq!(
+        output.stdout,
+        hardnessd(&["replay", recording.to_str().unwrap(), "--speed", "1000"]).stdout,
+        "twice the same, whatever the speed"
+    );
+    let text = String::from_utf8(output.stdout).unwrap();
+    text.lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect()
+}
+
+/// An event without what only a live one has.
+fn timeless(mut event: Value) -> Value {
+    for key in ["mono_ns", "age_at_publish_ms", "latency_us"] {
+        if let Some(value) = event.get_mut(key) {
+            *value = Value::Null;
+        }
+    }
+    event
+}
+
+fn entries(recording: &Path) -> Vec<Found> {
+    let file = fs::File::open(recording).unwrap();
+    Reader::new(std::io::BufReader::new(file))
+        .map(Result::unwrap)
+        .collect()
+}
+
+fn is_bytes(found: &Found) -> bool {
+    matches!(found.entry, Entry::Input(Input::Bytes(_)))
+}
+
+fn recordings_in(directory: &Path, what: &str) -> Vec<PathBuf> {
+    let Ok(found) = fs::read_dir(directory) else {
+        return Vec::new();
+    };
+    let mut found: Vec<PathBuf> = found.map(|entry| entry.unwrap().path()).collect();
+    found.retain(|path| {
+        path.file_name()
+            .unwrap()
+            .to_str()
+            .unwrap()
+            .starts_with(what)
+    });
+    found.sort();
+    found
+}
+
+fn mono() -> Duration {
+    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    Duration::try_from(now).unwrap()
+}
+
+#[test]
+fn a_replay_repeats_what_subscribers_read_live() {
+    let bench = Bench::new();
+    let script = bench.path("faults.toml");
+    fs::write(
+        &script,
+        "[[fault]]\nat_s = 2.0\nkind = \"flip\"\nframes = 3\n\
+         [[fault]]\nat_s = 4.0\nkind = \"drop-bytes\"\nbytes = 9\n\
+         [[fault]]\nat_s = 6.0\nkind = \"silence\"\nfor_s = 0.4\n\
+         [[fault]]\nat_s = 8.0\nkind = \"unplug\"\nfor_s = 0.3\n",
+    )
+    .unwrap();
+    let config = bench.configure(
+        "hardnessd.toml",
+        "events.sock",
+        "[record]\ndir = \"rec\"\nkeep_free_mb = 0\n",
+    );
+    let mut daemon = Daemon::start(&config);
+    let mut subscriber = bench.subscriber();
+    let mut sensor = bench.sensor(&["--presses", "3", "--faults", script.to_str().unwrap()]);
+    let mut control = Subscriber::connect(&bench.path("control.sock"));
+    let context = r#"{"context":{"sensor":"forearm","tag":"pick"}}"#;
+    assert_eq!(control.ask(context)["type"], "ok");
+    assert_eq!(sensor.exit_code(), Some(0));
+    daemon.process.signal(Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    let mut live: Vec<Value> = std::iter::from_fn(|| subscriber.next()).collect();
+    live.retain(|event| event["seq"].is_u64() && event["type"] != "hello");
+    let states: Vec<&Value> = live.iter().map(|event| &event["state"]).collect();
+    assert!(states.contains(&&json!("stale")) && states.contains(&&json!("lost")));
+    assert!(
+        live.iter()
+            .filter(|event| event["phase"] == "final")
+            .count()
+            >= 2
+    );
+
+    let recordings = recordings_in(&bench.path("rec"), "hardnessd-");
+    let [recording] = recordings.as_slice() else {
+        panic!("{recordings:?}");
+    };
+    let mut replayed = replay(recording);
+    let end = replayed.pop().unwrap();
+    assert_eq!(end["reason"], "end of recording");
+    // The subscriber came a moment after the start.
+    let first = live[0]["seq"].as_u64().unwrap();
+    replayed.retain(|event| event["seq"].as_u64().unwrap() >= first);
+    let live: Vec<Value> = live.into_iter().map(timeless).collect();
+    assert_eq!(replayed, live);
+}
+
+#[test]
+fn record_writes_a_new_file_for_as_long_as_there_is_a_sensor() {
+    let bench = Bench::new();
+    let config = configure(&bench, 20);
+    let out = bench.path("a.mcap");
+    let labels = ["--label", "level=2", "--label", "object=7"];
+    // Nothing to record: said, and no file left behind.
+    let mut none = record(&config, &out, &labels);
+    assert_eq!(none.exit_code(), Some(69));
+    assert!(!out.exists());
+
+    let _sensor = bench.sensor(&[]);
+    let seconds = [&labels[..], &["--seconds", "1.5"]].concat();
+    let mut recording = record(&config, &out, &seconds);
+    assert_eq!(recording.exit_code(), Some(0));
+    let found = entries(&out);
+    let Entry::State(state) = &found[0].entry else {
+        panic!("{:?}", found[0]);
+    };
+    assert_eq!(state.labels["object"], "7");
+    assert!(found.iter().filter(|found| is_bytes(found)).count() > 20);
+    let last = &found.last().unwrap().entry;
+    assert_eq!(*last, Entry::Input(Input::Shutdown));
+    let before = fs::read(&out).unwrap();
+    let mut again = record(&config, &out, &[]);
+    assert_eq!(again.exit_code(), Some(74));
+    assert_eq!(fs::read(&out).unwrap(), before);
+
+    // A signal ends it as well, and so does the loss of its sensor, with another code.
+    let second = bench.path("b.mcap");
+    let mut recording = record(&config, &second, &[]);
+    wait_for("a frame", || {
+        fs::metadata(&second).is_ok_and(|file| file.len() > 8_000)
+    });
+    recording.signal(Signal::INT);
+    assert_eq!(recording.exit_code(), Some(0));
+    replay(&second);
+    let third = bench.path("c.mcap");
+    let mut sensor = bench.sensor_at("port", 20, &["--presses", "1"]);
+    let mut recording = record(&config, &third, &[]);
+    assert_eq!(sensor.exit_code(), Some(0));
+    assert_eq!(recording.exit_code(), Some(69));
+    let events = replay(&third);
+    assert_eq!(
+        events
+            .iter()
+            .filter(|event| event["phase"] == "final")
+            .count(),
+        1
+    );
+    let lost = events
+        .iter()
+        .find(|event| event["state"] == "lost")
+        .unwrap();
+    assert!(lost["reason"].is_string(), "{lost}");
+}
+
+#[test]
+fn killed_at_any_moment_less_than_a_second_is_lost() {
+    let bench = Bench::new();
+    let config = configure(&bench, 100);
+    let _sensor = bench.sensor_at("port", 100, &[]);
+    let mut moments = Stream::new(1, "moments of death");
+    for round in 0..10 {
+        let out = bench.path(&format!("{round}.mcap"));
+        let good = bench.path(&format!("{round}.good.mcap"));
+        let mut recording = record(&config, &out, &[]);
+        wait_for("the file", || {
+            fs::metadata(&out).is_ok_and(|file| file.len() > 8_000)
+        });
+        std::thread::sleep(Duration::from_secs_f64(1.5 * moments.uniform()));
+        let before = mono();
+        recording.signal(Signal::KILL);
+        recording.exit_code();
+        let output = hardnessd(&[
+            "recover",
+            out.to_str().unwrap(),
+            "--out",
+            good.to_str().unwrap(),
+        ]);
+        assert!(output.status.success(), "{output:?}");
+        let found = entries(&good);
+        let last = found.iter().rfind(|found| is_bytes(found)).unwrap();
+        let lost = before.saturating_sub(last.at.mono);
+        assert!(
+            lost < Duration::from_secs(1),
+            "{lost:?} lost in round {round}"
+        );
+        // Nothing is missing between: bytes came every 4 ms or so.
+        let moments: Vec<Duration> = found.iter().map(|found| found.at.mono).collect();
+        let gap = moments.windows(2).map(|two| two[1] - two[0]).max().unwrap();
+        assert!(gap < Duration::from_millis(500), "{gap:?} in round {round}");
+        let events = replay(&good);
+        assert_eq!(events.last().unwrap()["reason"], "end of recording");
+    }
+}
+
+#[test]
+fn recover_says_what_it_saved_and_leaves_files_alone() {
+    let bench = Bench::new();
+    let path = |name: &str| bench.path(name).to_str().unwrap().to_owned();
+    let recover = |broken: &str, good: &str| {
+        let output = hardnessd(&["recover", &path(broken), "--out", &path(good)]);
+        let said = String::from_utf8(output.stderr).unwrap();
+        (output.status.code().unwrap(), said)
+    };
+    let (code, said) = recover("none.mcap", "good.mcap");
+    assert_eq!(code, 66, "{said}");
+    fs::write(path("noise.mcap"), vec![7; 100_000]).unwrap();
+    let (code, said) = recover("noise.mcap", "good.mcap");
+    assert_eq!(code, 1, "{said}");
+    assert!(!bench.path("good.mcap").exists());
+
+    let _sensor = bench.sensor(&[]);
+    let config = configure(&bench, 20);
+    let out = bench.path("a.mcap");
+    assert_eq!(
+        record(&config, &out, &["--seconds", "3"]).exit_code(),
+        Some(0)
+    );
+    let (code, said) = recover("a.mcap", "whole.mcap");
+    assert_eq!(code, 0, "{said}");
+    assert!(said.contains("lost nothing"), "{said}");
+    let (code, said) = recover("noise.mcap", "whole.mcap");
+    assert_eq!(code, 74, "{said}");
+    assert_eq!(replay(&bench.path("whole.mcap")), replay(&out));
+
+    let mut bytes = fs::read(&out).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 4;
+    fs::write(&out, bytes).unwrap();
+    let (code, said) = recover("a.mcap", "good.mcap");
+    assert_eq!(code, 0, "{said}");
+    let left = fs::read_dir(bench.path("")).unwrap();
+    let parts = left.filter(|entry| {
+        let name = entry.as_ref().unwrap().file_name();
+        name.to_str().unwrap().ends_with(".part")
+    });
+    assert_eq!(parts.count(), 0);
+    replay(&bench.path("good.mcap"));
+}
+
+#[test]
+fn the_last_minute_is_written_on_request_and_at_a_fault() {
+    let bench = Bench::new();
+    let record = "[record]\ndir = \"rec\"\ncontinuous = false\nkeep_free_mb = 0\n";
+    let config = configure_patient(&bench, record);
+    let mut daemon = Daemon::start(&config);
+    let mut sensor = bench.sensor(&["--presses", "2"]);
+    let mut subscriber = bench.subscriber();
+    let live = subscriber.until(&json!({"phase": "final"}));
+    let mut control = Subscriber::connect(&bench.path("control.sock"));
+    let answer = control.ask(r#"{"blackbox":"forearm","id":1}"#);
+    assert_eq!(answer["type"], "ok", "{answer}");
+    let written = PathBuf::from(answer["blackbox"].as_str().unwrap());
+    let events = replay(&written);
+    let verdict = events
+        .iter()
+        .find(|event| event["phase"] == "final")
+        .unwrap();
+    let mut live = timeless(live);
+    live["seq"] = verdict["seq"].clone();
+    assert_eq!(*verdict, live);
+    let unknown = control.ask(r#"{"blackbox":"wrist"}"#);
+    assert_eq!(unknown["type"], "error", "{unknown}");
+
+    assert_eq!(sensor.exit_code(), Some(0));
+    let line = daemon.logged("reason=\"lost\"");
+    assert!(line.contains("black box"), "{line}");
+    let boxes = recordings_in(&bench.path("rec"), "");
+    assert_eq!(boxes.len(), 2, "{boxes:?}");
+    let events = replay(boxes.iter().find(|path| **path != written).unwrap());
+    assert!(events.iter().any(|event| event["state"] == "lost"));
+    // A second fault within the minute writes nothing.
+    let _sensor = bench.sensor(&["--presses", "1"]);
+    subscriber.until(&json!({"state": "live"}));
+    subscriber.until(&json!({"state": "lost"}));
+    daemon.process.signal(Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    assert_eq!(recordings_in(&bench.path("rec"), "").len(), 2);
+}
+
+#[test]
+fn much_damage_is_a_fault() {
+    let bench = Bench::new();
+    let record = "[record]\ndir = \"rec\"\ncontinuous = false\nkeep_free_mb = 0\n";
+    let config = configure_patient(&bench, record);
+    let script = bench.path("faults.toml");
+    // Half of the frames, never so many in a row that the sensor is stale.
+    let faults: String = (1..9)
+        .map(|at_s| format!("[[fault]]\nat_s = {at_s}.0\nkind = \"flip\"\nframes = 10\n"))
+        .collect();
+    fs::write(&script, faults).unwrap();
+    let mut daemon = Daemon::start(&config);
+    let _sensor = bench.sensor(&["--faults", script.to_str().unwrap()]);
+    let line = daemon.logged("black box");
+    assert!(line.contains("damaged frames"), "{line}");
+    let boxes = recordings_in(&bench.path("rec"), "blackbox-forearm-");
+    let events = replay(&boxes[0]);
+    let end = events.last().unwrap();
+    assert!(end["frames_damaged"].as_u64().unwrap() >= 50, "{end}");
+}
+
+#[test]
+fn files_end_in_time_and_each_can_be_played_by_itself() {
+    let bench = Bench::new();
+    let record = "[record]\ndir = \"rec\"\nrotate_s = 2\nkeep_free_mb = 0\n";
+    let config = bench.configure("hardnessd.toml", "events.sock", record);
+    let mut daemon = Daemon::start(&config);
+    let _sensor = bench.sensor(&[]);
+    let mut subscriber = bench.subscriber();
+    let mut verdicts = Vec::new();
+    while recordings_in(&bench.path("rec"), "hardnessd-").len() < 4 {
+        verdicts.push(subscriber.until(&json!({"phase": "final"})));
+    }
+    daemon.process.signal(Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    let mut played: Vec<(u64, Value)> = Vec::new();
+    for recording in recordings_in(&bench.path("rec"), "hardnessd-") {
+        for mut event in replay(&recording) {
+            if event["phase"] == "final" {
+                event["seq"] = Value::Null;
+                played.push((event["press"].as_u64().unwrap(), event));
+            }
+        }
+    }
+    for live in verdicts {
+        let press = live["press"].as_u64().unwrap();
+        let mut live = timeless(live);
+        live["seq"] = Value::Null;
+        let same: Vec<_> = played
+            .iter()
+            .filter(|(number, _)| *number == press)
+            .collect();
+        assert!(!same.is_empty(), "press {press} is in no file");
+        assert!(same.iter().all(|(_, event)| *event == live));
+    }
+}
+
+#[test]
+fn a_disk_that_is_full_or_fails_does_not_stop_the_sensor() {
+    // Below the floor: said once, and nothing is written.
+    let bench = Bench::new();
+    let record = "[record]\ndir = \"rec\"\nkeep_free_mb = 1000000000\n";
+    let config = bench.configure("hardnessd.toml", "events.sock", record);
+    let mut daemon = Daemon::start(&config);
+    daemon.logged("recording stopped");
+    let mut sensor = bench.sensor(&["--presses", "1"]);
+    let mut subscriber = bench.subscriber();
+    subscriber.until(&json!({"phase": "final"}));
+    let mut control = Subscriber::connect(&bench.path("control.sock"));
+    let answer = control.ask(r#"{"blackbox":"forearm"}"#);
+    assert!(answer["message"].as_str().unwrap().contains("keep_free_mb"));
+    assert_eq!(sensor.exit_code(), Some(0));
+    daemon.process.signal(Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    let log = daemon.whole_log();
+    assert_eq!(log.matches("recording stopped").count(), 1, "{log}");
+    assert_eq!(recordings_in(&bench.path("rec"), ""), Vec::<PathBuf>::new());
+}
+
+#[test]
+fn recording_goes_on_when_writes_succeed_again() {
+    // No file may grow beyond 24 blocks of 1 KiB, which is what a full disk looks like from inside.
+    let bench = Bench::new();
+    let record = "[record]\ndir = \"rec\"\nkeep_free_mb = 0\n";
+    let config = bench.configure("hardnessd.toml", "events.sock", record);
+    let script = format!(
+        "trap '' XFSZ; ulimit -f 24; exec {BINARY} run --config {}",
+        config.display()
+    );
+    let child = Command::new("bash")
+        .args(["-c", &script])
+        .stderr(Stdio::null())
+        .spawn();
+    let mut daemon = Process(child.unwrap());
+    wait_for("the socket", || bench.path("events.sock").exists());
+    let _sensor = bench.sensor_at("port", 20, &[]);
+    let mut subscriber = bench.subscriber();
+    let start = std::time::Instant::now();
+    let mut verdicts = 0;
+    while recordings_in(&bench.path("rec"), "hardnessd-").len() < 2 {
+        subscriber.until(&json!({"phase": "final"}));
+        verdicts += 1;
+        assert!(start.elapsed() < PATIENCE, "no second file");
+    }
+    assert!(verdicts > 0);
+    daemon.signal(Signal::TERM);
+    assert_eq!(daemon.exit_code(), Some(0));
+    // The first one broke off; what it had is saved.
+    let broken = recordings_in(&bench.path("rec"), "hardnessd-")[0].clone();
+    let good = bench.path("good.mcap");
+    let output = hardnessd(&[
+        "recover",
+        broken.to_str().unwrap(),
+        "--out",
+        good.to_str().unwrap(),
+    ]);
+    assert!(output.status.success(), "{output:?}");
+    assert!(!entries(&good).is_empty());
+}
