@@ -5,7 +5,8 @@
 //! thread of a busy machine (2026-11-21; `models/README.md`).
 //!
 //! In: labelled and unlabelled frames. Out: a run's directory with the model that the daemon loads
-//! and what it is worth. In reading order: [`dataset`] and [`augment`] make batches, [`generator`]
+//! and what it is worth. In reading order: [`simulated`] and [`collect`] make
+//! data sets, [`dataset`] and [`augment`] batches, [`generator`]
 //! makes frames, [`network`] and [`hrn`] judge them, [`losses`] and [`gan`] set one against the
 //! other, [`optimiser`] and [`fit`] learn, [`features`] is the trivial baseline, [`methods`] are
 //! the table's rows over the parts of [`stages`], [`onnx`] and [`export`] write the file,
@@ -15,6 +16,7 @@
 pub mod settings;
 pub mod dataset;
 pub mod simulated;
+pub mod collect;
 pub mod augment;
 pub mod layers;
 pub mod network;

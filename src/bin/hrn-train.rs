@@ -7,11 +7,13 @@ use std::time::Instant;
 use anyhow::Context as _;
 use burn::tensor::Device;
 use clap::{Parser, Subcommand, ValueEnum};
+use hardnessd::daemon::config::{Config, Error as ConfigError, Sensor, Setup};
 use hardnessd::frame::RawFrame;
 use hardnessd::simulator::{
     DatasetSettings, Material, SensorProfile, Sequence, SequenceSettings, Shapes, Split,
 };
 use hardnessd::tools;
+use hardnessd::train::collect::{self, Capture, CollectError, Labelling};
 use hardnessd::train::compare::{self, Plan};
 use hardnessd::train::dataset::{Dataset, DatasetError, LabelChoice};
 use hardnessd::train::export;
@@ -41,6 +43,8 @@ struct Arguments {
 enum Command {
     /// Simulate a labelled data set (default: the paper's 10,000 + 1,000 samples)
     Simulate(Simulate),
+    /// Make a data set of recordings of known objects, through the daemon's own decoding
+    Collect(Collect),
     /// Train one method
     Train(Train),
     /// Train every method under several seeds and make the paper's tables; run again to go on
@@ -99,6 +103,31 @@ struct Simulate {
     /// Also draw samples of every material and a press of every level
     #[arg(long, value_name = "S.png")]
     sheet: Option<PathBuf>,
+}
+
+#[derive(Debug, clap::Args)]
+struct Collect {
+    /// The data set to write
+    #[arg(long, value_name = "D.npz")]
+    out: PathBuf,
+    /// Hardness level, 1 (hard) to 4, or 0: unlabelled [default: the recording's label "level"]
+    #[arg(long, value_name = "L", value_parser = clap::value_parser!(u8).range(0..=4))]
+    level: Option<u8>,
+    /// What was pressed [default: the recording's label "object", else a new one]
+    #[arg(long, value_name = "K")]
+    object: Option<u32>,
+    /// For training or for test
+    #[arg(long, default_value = "train")]
+    split: SplitName,
+    /// Add to the data set, if it is there
+    #[arg(long)]
+    append: bool,
+    /// Configuration whose first sensor a .bin is of [default: a JX255N by default settings]
+    #[arg(long, value_name = "F")]
+    config: Option<PathBuf>,
+    /// Recordings: .mcap, or .bin, raw bytes back to back
+    #[arg(value_name = "CAPTURE", required = true)]
+    captures: Vec<PathBuf>,
 }
 
 #[derive(Debug, clap::Args)]
@@ -193,6 +222,15 @@ enum SplitName {
     Test,
 }
 
+impl From<SplitName> for Split {
+    fn from(name: SplitName) -> Self {
+        match name {
+            SplitName::Train => Split::Train,
+            SplitName::Test => Split::Test,
+        }
+    }
+}
+
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
     if let Err(error) = end_at_signals() {
@@ -201,6 +239,7 @@ fn main() -> ExitCode {
     }
     let done = match arguments.command {
         Command::Simulate(arguments) => simulate(&arguments),
+        Command::Collect(arguments) => collect(&arguments),
         Command::Train(arguments) => train(&arguments),
         Command::Compare(arguments) => compare(arguments),
         Command::Evaluate(arguments) => evaluate(&arguments),
@@ -243,10 +282,13 @@ struct Unreadable {
 fn exit_code(error: &anyhow::Error) -> u8 {
     let has = |test: fn(&(dyn std::error::Error + 'static)) -> bool| error.chain().any(test);
     if has(|e| {
-        e.is::<Unreadable>() || matches!(e.downcast_ref(), Some(DatasetError::Unreadable { .. }))
+        e.is::<Unreadable>()
+            || matches!(e.downcast_ref(), Some(DatasetError::Unreadable { .. }))
+            || matches!(e.downcast_ref(), Some(CollectError::Unreadable { .. }))
+            || matches!(e.downcast_ref(), Some(ConfigError::Unreadable { .. }))
     }) {
         66
-    } else if has(|e| e.is::<ModelError>() || e.is::<SettingsError>()) {
+    } else if has(|e| e.is::<ModelError>() || e.is::<SettingsError>() || e.is::<ConfigError>()) {
         78
     } else if has(<dyn std::error::Error>::is::<std::io::Error>) {
         74
@@ -294,6 +336,47 @@ fn simulate(arguments: &Simulate) -> anyhow::Result<()> {
         arguments.out.display(),
         count as f64 / seconds
     );
+    Ok(())
+}
+
+fn collect(arguments: &Collect) -> anyhow::Result<()> {
+    let setup = match &arguments.config {
+        Some(config) => Setup::load(config)?,
+        None => {
+            let defaults = Config::new(vec![Sensor::new(PathBuf::new())]);
+            Setup::of(defaults, Path::new("defaults"))?
+        }
+    };
+    let of_bytes = setup
+        .pipelines()
+        .next()
+        .context("the configuration has no sensor")?;
+    let captures = arguments
+        .captures
+        .iter()
+        .map(|path| Capture::read(path, &of_bytes))
+        .collect::<Result<Vec<_>, _>>()?;
+    let before = if arguments.append {
+        collect::existing(&arguments.out)?
+    } else {
+        None
+    };
+    let presses: usize = captures.iter().map(Capture::presses).sum();
+    let all = before
+        .as_ref()
+        .map_or(0, |(dataset, _)| dataset.samples.len())
+        + presses;
+    let labelling = Labelling {
+        level: arguments.level,
+        object: arguments.object,
+        split: arguments.split.into(),
+    };
+    write_whole(
+        &arguments.out,
+        &collect::to_bytes(&captures, labelling, before)?,
+    )?;
+    let out = arguments.out.display();
+    println!("{out}: {presses} presses collected, {all} in all");
     Ok(())
 }
 
@@ -403,10 +486,7 @@ fn report_of(directory: &Path, out: &Path) -> anyhow::Result<()> {
 fn evaluate(arguments: &Evaluate) -> anyhow::Result<()> {
     let hrn = load(&arguments.model)?;
     let dataset = Dataset::read(&arguments.data)?;
-    let indices = dataset.labelled(match arguments.split {
-        SplitName::Train => Split::Train,
-        SplitName::Test => Split::Test,
-    })?;
+    let indices = dataset.labelled(arguments.split.into())?;
     let evaluation = export::evaluate(&hrn, &dataset, &indices)?;
     if arguments.json {
         println!("{}", serde_json::to_string(&evaluation)?);

@@ -1,0 +1,303 @@
+//! Recordings of known objects as samples of a data set.
+//!
+//! In: captures, `.mcap` or `.bin`. Out: the chosen frame of every press that was judged. The
+//! daemon's own pipeline decodes, tares and selects, so what is learnt from is what will be judged.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{BufReader, Cursor, Read};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use serde_json::{Value, json};
+
+use super::dataset::{self, Dataset, DatasetError, Sample};
+use crate::event::{Event, Phase, PressState};
+use crate::frame::{Frame, Stamp};
+use crate::pipeline::{self, Clock, Pipeline};
+use crate::recording::{self, Labels, Playback, PlaybackError, Reader};
+use crate::simulator::Split;
+use crate::verdict::{Hrn, sha256_hex};
+
+/// What a data set says of who made it.
+const COLLECTED: &str = concat!("hrn-train collect ", env!("CARGO_PKG_VERSION"));
+
+/// What the samples are said to be; what is `None` the capture's labels say.
+#[derive(Debug, Clone, Copy)]
+pub struct Labelling {
+    /// 1..=4, or 0: unlabelled.
+    pub level: Option<u8>,
+    /// What was pressed. Where neither says it, captures of one call are one object, a new one.
+    pub object: Option<u32>,
+    /// For training or for test.
+    pub split: Split,
+}
+
+/// Why a capture gives no samples.
+#[derive(Debug, thiserror::Error)]
+pub enum CollectError {
+    /// Missing or unreadable.
+    #[error("{path}: {source}")]
+    Unreadable {
+        /// The capture.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// Damaged, or none of ours.
+    #[error("{path}: {source}")]
+    Recording {
+        /// The capture.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: recording::Error,
+    },
+    /// It describes a sensor that cannot be.
+    #[error("{path}: {source}")]
+    Sensor {
+        /// The capture.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: PlaybackError,
+    },
+    /// A label that is missing or no number in its range.
+    #[error("{path}: label {key}: found {found}, expected {expected}: --{key} says it, too")]
+    Label {
+        /// The capture.
+        path: PathBuf,
+        /// Of the label.
+        key: &'static str,
+        /// As it is.
+        found: String,
+        /// As it should be.
+        expected: &'static str,
+    },
+    /// Nothing was pressed, or no press was judged.
+    #[error("{path}: found no press with a verdict, expected one or more")]
+    NoPress {
+        /// The capture.
+        path: PathBuf,
+    },
+}
+
+/// The samples of one capture.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Capture {
+    path: PathBuf,
+    sha256: String,
+    labels: Labels,
+    /// Chosen frame and force of each press.
+    presses: Vec<(Frame, f32)>,
+}
+
+impl Capture {
+    /// Reads a capture; `of_bytes` is the sensor of one that does not describe its own.
+    ///
+    /// # Errors
+    ///
+    /// If it cannot be read, is damaged, or no press in it was judged.
+    pub fn read(path: &Path, of_bytes: &pipeline::Settings) -> Result<Self, CollectError> {
+        let path = path.to_owned();
+        let mut bytes = Vec::new();
+        let read = File::open(&path).and_then(|file| BufReader::new(file).read_to_end(&mut bytes));
+        if let Err(source) = read {
+            return Err(CollectError::Unreadable { path, source });
+        }
+        let mut selection = Selection::default();
+        let labels = if path
+            .extension()
+            .is_some_and(|extension| extension == "mcap")
+        {
+            play(&bytes, &of_bytes.judgement.hrn, &path, &mut selection)?
+        } else {
+            let mut pipeline = Pipeline::new(of_bytes.clone(), Clock::FrameRate);
+            selection.take(pipeline.push(&bytes, NOT_LOOKED_AT));
+            selection.take(pipeline.end_of_recording(None));
+            Labels::new()
+        };
+        if selection.presses.is_empty() {
+            return Err(CollectError::NoPress { path });
+        }
+        Ok(Self {
+            sha256: sha256_hex(&bytes),
+            path,
+            labels,
+            presses: selection.presses,
+        })
+    }
+
+    /// How many presses it has.
+    pub fn presses(&self) -> usize {
+        self.presses.len()
+    }
+
+    fn number(&self, key: &'static str, expected: &'static str) -> Result<u32, CollectError> {
+        let label = self.labels.get(key);
+        let wrong = || CollectError::Label {
+            path: self.path.clone(),
+            key,
+            found: label.map_or("none".to_owned(), |label| format!("{label:?}")),
+            expected,
+        };
+        label.and_then(|l| l.parse().ok()).ok_or_else(wrong)
+    }
+
+    fn level(&self, given: Option<u8>) -> Result<u8, CollectError> {
+        const EXPECTED: &str = "a level from 0 (unlabelled) to 4";
+        let level = match given {
+            Some(level) => u32::from(level),
+            None => self.number("level", EXPECTED)?,
+        };
+        let known = u8::try_from(level).ok();
+        let known = known.filter(|level| usize::from(*level) <= dataset::levels().len());
+        known.ok_or_else(|| CollectError::Label {
+            path: self.path.clone(),
+            key: "level",
+            found: level.to_string(),
+            expected: EXPECTED,
+        })
+    }
+}
+
+/// A time for a pipeline whose clock is the frame rate.
+const NOT_LOOKED_AT: Stamp = Stamp {
+    mono: std::time::Duration::ZERO,
+    wall: jiff::Timestamp::UNIX_EPOCH,
+};
+
+fn play(
+    bytes: &[u8],
+    hrn: &Arc<Hrn>,
+    path: &Path,
+    selection: &mut Selection,
+) -> Result<Labels, CollectError> {
+    let mut playback = Playback::new(hrn.clone());
+    for found in Reader::new(bytes) {
+        let found = found.map_err(|source| CollectError::Recording {
+            path: path.to_owned(),
+            source,
+        })?;
+        let events = playback.feed(found);
+        selection.take(events.map_err(|source| CollectError::Sensor {
+            path: path.to_owned(),
+            source,
+        })?);
+    }
+    selection.take(playback.end());
+    Ok(playback.labels())
+}
+
+/// The frames of presses under way, by sensor, until one is chosen.
+#[derive(Debug, Default)]
+struct Selection {
+    held: BTreeMap<String, Held>,
+    presses: Vec<(Frame, f32)>,
+}
+
+#[derive(Debug, Default)]
+struct Held {
+    frames: BTreeMap<u64, Vec<f32>>,
+    is_pressed: bool,
+}
+
+impl Selection {
+    fn take(&mut self, events: Vec<Event>) {
+        for event in events {
+            let held = self.held.entry(event.sensor().to_owned()).or_default();
+            match event {
+                Event::Frame(frame) => {
+                    if !held.is_pressed {
+                        held.frames.clear();
+                    }
+                    held.frames.insert(frame.frame, frame.newtons);
+                }
+                // Its first frame came just before.
+                Event::Press(press) => held.is_pressed = press.state == PressState::Begin,
+                Event::Hardness(verdict) if verdict.phase == Phase::Final => {
+                    // One that began before the recording did may have its frame there.
+                    if let Some(newtons) = held.frames.remove(&verdict.frame)
+                        && let Ok(frame) = Frame::try_from(newtons)
+                    {
+                        self.presses.push((frame, verdict.force_n as f32));
+                    }
+                }
+                Event::Hardness(_) | Event::Status(_) => {}
+            }
+        }
+    }
+}
+
+/// The bytes of a data set of `captures`, after the samples of `before` if there are any.
+///
+/// # Errors
+///
+/// If a level or an object is neither given nor a label, or the archive cannot be built.
+pub fn to_bytes(
+    captures: &[Capture],
+    labelling: Labelling,
+    before: Option<(Dataset, Value)>,
+) -> anyhow::Result<Vec<u8>> {
+    let (mut samples, mut meta) = match before {
+        Some((dataset, meta)) => (dataset.samples, meta),
+        None => (
+            Vec::new(),
+            json!({"materials": [], "seed": null, "captures": []}),
+        ),
+    };
+    let last = samples.iter().filter_map(|sample| sample.object).max();
+    let new_object = last.map_or(0, |object| object + 1);
+    meta["levels"] = json!(dataset::levels());
+    // Were it still the simulator's name, models trained on this would be said to be of simulated
+    // data only.
+    meta["generator"] = json!(COLLECTED);
+    for capture in captures {
+        let level = capture.level(labelling.level)?;
+        let object = match labelling.object {
+            Some(object) => object,
+            None if capture.labels.contains_key("object") => {
+                capture.number("object", "a number")?
+            }
+            None => new_object,
+        };
+        samples.extend(capture.presses.iter().map(|(frame, force_n)| Sample {
+            frame: *frame,
+            level,
+            object: Some(object),
+            material: None,
+            force_n: Some(*force_n),
+            split: labelling.split,
+            shore: None,
+            source: 0,
+        }));
+        let said = json!({
+            "name": capture.path.file_name().unwrap_or_default().to_string_lossy(),
+            "sha256": capture.sha256,
+            "level": level,
+            "object": object,
+            "presses": capture.presses.len(),
+            "split": match labelling.split { Split::Train => "train", Split::Test => "test" },
+            "labels": capture.labels,
+        });
+        match meta["captures"].as_array_mut() {
+            Some(captures) => captures.push(said),
+            None => meta["captures"] = json!([said]),
+        }
+    }
+    Ok(dataset::write(Cursor::new(Vec::new()), &samples, &meta)?.into_inner())
+}
+
+/// What is in the file to be appended to; nothing, if it is not there yet.
+///
+/// # Errors
+///
+/// If it is there and no data set.
+pub fn existing(path: &Path) -> Result<Option<(Dataset, Value)>, DatasetError> {
+    if !path.exists() {
+        return Ok(None);
+    }
+    let meta = match dataset::meta(path)? {
+        meta @ Value::Object(_) => meta,
+        _ => json!({}),
+    };
+    Ok(Some((Dataset::read(path)?, meta)))
+}
