@@ -1,0 +1,199 @@
+#!/usr/bin/env python3
+"""Recordings in other people's readers: mcap, mcap-ros2-support and rosbags.
+
+    python -m venv venv && venv/bin/pip install mcap mcap-ros2-support rosbags
+    venv/bin/python tests/peers/recording.py target/debug/hardnessd
+
+Claims: a recording of the daemon, and what `recover` saves of one that was killed, open in all three;
+they count the same messages; and every field of the daemon's hardness events is in them, with its
+value.
+"""
+
+import json
+import math
+import os
+import pathlib
+import signal
+import struct
+import subprocess
+import sys
+import time
+
+from bench import Bench, wait_for
+from mcap.reader import make_reader
+from mcap_ros2.reader import read_ros2_messages
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+TOPICS = ["input", "frame", "hardness", "press", "status"]
+NULL = {"level": 0, "label": "", "rejected": "", "context": "", "mono_ns": 0, "reason": ""}
+
+
+def by_mcap(path):
+    """Messages a topic, and the metadata, by the plain reader with its index."""
+    with open(path, "rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        counts = dict.fromkeys(TOPICS, 0)
+        for schema, channel, message in reader.iter_messages():
+            assert channel.message_encoding == "cdr" and schema.encoding == "ros2msg"
+            counts[channel.topic.rsplit("/", 1)[1]] += 1
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+    return counts, metadata
+
+
+def by_mcap_ros2(path):
+    """All messages, decoded, a topic."""
+    messages = {topic: [] for topic in TOPICS}
+    for found in read_ros2_messages(path):
+        messages[found.channel.topic.rsplit("/", 1)[1]].append(found.ros_msg)
+    return messages
+
+
+def by_rosbags(path):
+    """The same, by a third reader."""
+    messages = {topic: [] for topic in TOPICS}
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with AnyReader([pathlib.Path(path)], default_typestore=store) as reader:
+        for connection, _, data in reader.messages():
+            message = reader.deserialize(data, connection.msgtype)
+            messages[connection.topic.rsplit("/", 1)[1]].append(message)
+    return messages
+
+
+def same(found, expected, key):
+    """A field of a message is that of the JSON event."""
+    if key == "age_at_publish_ms":
+        return math.isclose(found, expected)
+    if key == "context":
+        return (json.loads(found) if found else None) == expected
+    if expected is None:
+        return found == NULL[key] if key in NULL else math.isnan(found)
+    if key == "probabilities":
+        return all(math.isclose(a, b, rel_tol=1e-6) for a, b in zip(found, expected, strict=True))
+    if key == "notes":
+        return list(found) == expected
+    if isinstance(expected, float):
+        # JSON has forces and areas rounded to 0.001, confidence as f32.
+        return abs(found - expected) <= 0.0005 + 1e-6
+    return found == expected
+
+
+def check(path, live):
+    """All readers agree with each other and with what subscribers read."""
+    counts, metadata = by_mcap(path)
+    ros2, bags = by_mcap_ros2(path), by_rosbags(path)
+    for topic in TOPICS:
+        assert counts[topic] == len(ros2[topic]) == len(bags[topic]), (topic, counts)
+    for messages in (ros2, bags):
+        for kind in ("hardness", "press", "status"):
+            found = {message.seq: message for message in messages[kind]}
+            compared = 0
+            for event in live:
+                if event["type"] != kind or event.get("seq") not in found:
+                    continue
+                message = found[event["seq"]]
+                for key, value in event.items():
+                    if key != "type":
+                        got = getattr(message, key)
+                        assert same(got, value, key), (kind, key, got, value)
+                assert message.header.frame_id == event["sensor"]
+                compared += 1
+            assert compared or not live, f"no {kind} to compare"
+        image = messages["frame"][-1]
+        assert (image.height, image.width, image.encoding) == (28, 28, "32FC1")
+        newtons = struct.unpack("<784f", bytes(image.data))
+        assert min(newtons) >= 0 and max(newtons) < 100
+        raw = b"".join(bytes(message.data) for message in messages["input"] if message.kind == 0)
+        # All but the frames under way at both ends, if frames were not damaged.
+        assert 0 <= len(raw) - 790 * counts["frame"] < 2 * 790, (len(raw), counts)
+    return counts, metadata
+
+
+def daemon(binary):
+    """The daemon's own recording beside what a subscriber read."""
+    more = '[record]\ndir = "rec"\nkeep_free_mb = 0\n'
+    with Bench(binary, more=more) as bench:
+        running = bench.daemon()
+        tail = subprocess.Popen(
+            [binary, "tail", "--json", "--socket", bench.path("events.sock")],
+            stdout=subprocess.PIPE,
+        )
+        sensor = bench.sensor("forearm", "--presses", "3", "--force", "15", "--seed", "3")
+        sensor.wait(timeout=60)
+        running.send_signal(signal.SIGTERM)
+        running.wait(timeout=10)
+        live = [json.loads(line) for line in tail.communicate(timeout=10)[0].splitlines()]
+        (recording,) = pathlib.Path(bench.path("rec")).glob("hardnessd-*.mcap")
+        counts, metadata = check(recording, live)
+        assert metadata["hardnessd.recording"]["robot"] == "arm-7"
+        assert json.loads(metadata["hardnessd.sensor"]["settings"])["name"] == "forearm"
+        finals = [event for event in live if event.get("phase") == "final"]
+        assert counts["hardness"] >= len(finals) >= 2, counts
+        return counts
+
+
+def killed(binary):
+    """What is saved of a recording that was killed."""
+    with Bench(binary) as bench:
+        sensor = bench.sensor("forearm", "--force", "15")
+        out, good = bench.path("out.mcap"), bench.path("good.mcap")
+        config = bench.path("hardnessd.toml")
+        recorder = bench._start(
+            ["record", "--config", config, "--out", out, "--label", "level=2"], "recorder"
+        )
+        wait_for("the recording", lambda: os.path.exists(out) and os.path.getsize(out) > 20_000)
+        time.sleep(1.3)
+        recorder.kill()
+        recorder.wait()
+        sensor.kill()
+        saved = subprocess.run([binary, "recover", out, "--out", good], capture_output=True, text=True)
+        assert saved.returncode == 0, saved
+        assert "the end was missing" in saved.stderr, saved.stderr
+        counts, metadata = check(good, [])
+        assert metadata["hardnessd.labels"] == {"level": "2"}
+        return counts
+
+
+def full(binary):
+    """On a disk that fills up the recording stops, the sensor does not; with room it goes on."""
+    more = '[record]\ndir = "rec"\nkeep_free_mb = 8\n'
+    with Bench(binary, more=more) as bench:
+        bench.sensor("forearm", "--force", "15")
+        os.mkdir(bench.path("rec"))
+        config, log = bench.path("hardnessd.toml"), bench.path("log")
+        # A disk of its own, which only that process and its /proc see.
+        script = f"mount -t tmpfs -o size=16m none {bench.path('rec')} && exec {binary} run --config {config}"
+        with open(log, "wb") as output:
+            running = subprocess.Popen(
+                ["unshare", "--mount", "--map-root-user", "bash", "-c", script], stderr=output
+            )
+        bench.processes.append(running)
+        disk = pathlib.Path(f"/proc/{running.pid}/root{bench.path('rec')}")
+        wait_for("a recording", lambda: disk.exists() and list(disk.glob("*.mcap")))
+        (disk / "filler").write_bytes(bytes(10_000_000))
+        said = lambda: pathlib.Path(log).read_text()  # noqa: E731
+        wait_for("the stop", lambda: "recording stopped" in said())
+        first = list(disk.glob("hardnessd-*.mcap"))
+        size = first[0].stat().st_size
+        ask = ["tail", "--json", "--socket", bench.path("events.sock"), "--types", "press"]
+        subprocess.run([binary, *ask, "--count", "2", "--timeout", "30"], check=True, capture_output=True)
+        assert [first[0].stat().st_size, len(first)] == [size, 1]
+        (disk / "filler").unlink()
+        wait_for("a second recording", lambda: len(list(disk.glob("hardnessd-*.mcap"))) == 2)
+        assert said().count("recording stopped") == 1, said()
+        # The first was ended as it should be.
+        with open(first[0], "rb") as file:
+            assert make_reader(file).get_summary().statistics.message_count > 0
+
+
+if __name__ == "__main__":
+    binary = os.path.abspath(sys.argv[1])
+    print("recorded:", daemon(binary))
+    print("recovered:", killed(binary))
+    may = subprocess.run(["unshare", "--mount", "--map-root-user", "true"], capture_output=True)
+    if may.returncode == 0:
+        full(binary)
+        print("a full disk: the recording stops and goes on")
+    else:
+        print("a full disk: skipped, no mount namespaces here")
