@@ -6,6 +6,7 @@
 
 mod ansi;
 mod draw;
+mod look;
 mod screen;
 #[cfg(test)]
 mod tests;
@@ -22,7 +23,8 @@ use tokio::net::UnixStream;
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::time::{Instant, MissedTickBehavior};
 
-use self::draw::{Look, draw};
+use self::draw::draw;
+use self::look::Look;
 use self::screen::{Screen, keys};
 use self::view::{Key, Loss, QUESTION, View};
 use crate::daemon::config::Unix;

@@ -4,6 +4,8 @@
 //! live, the last frame is shown without its colours and under the word for what it is, the curves
 //! run out, and no number of it is called present.
 
+mod map;
+
 use std::time::Duration;
 
 use ratatui::Frame;
@@ -13,76 +15,8 @@ use ratatui::style::{Color, Modifier, Style};
 use ratatui::symbols::bar;
 use ratatui::widgets::{Sparkline, Widget};
 
+use super::look::Look;
 use super::view::{Link, Load, Sensor, Verdict, View, WINDOW, age};
-
-/// What the terminal can show.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Look {
-    /// 256 of them.
-    pub(super) colours: bool,
-    /// Bold and reversed.
-    pub(super) attributes: bool,
-    /// More than ASCII.
-    pub(super) unicode: bool,
-}
-
-impl Look {
-    /// By the variables `TERM`, `NO_COLOR` (<https://no-color.org>), and the first that is set of
-    /// `LC_ALL`, `LC_CTYPE` and `LANG`.
-    pub(super) fn new(term: &str, no_color: &str, locale: &str) -> Self {
-        let is_plain = ["", "dumb", "unknown"].contains(&term);
-        let is_old = term.starts_with("vt") || term.ends_with("-m") || term.ends_with("-mono");
-        let locale = locale.to_ascii_lowercase();
-        Self {
-            colours: !is_plain && !is_old && no_color.is_empty(),
-            attributes: !is_plain,
-            unicode: !is_plain && !is_old && (locale.contains("utf-8") || locale.contains("utf8")),
-        }
-    }
-
-    fn style(self, colour: Style, without: Modifier) -> Style {
-        match (self.colours, self.attributes) {
-            (true, _) => colour,
-            (false, true) => Style::new().add_modifier(without),
-            (false, false) => Style::new(),
-        }
-    }
-
-    fn heading(self) -> Style {
-        self.style(Style::new().fg(Color::Indexed(75)), Modifier::BOLD)
-    }
-
-    fn aside(self) -> Style {
-        self.style(Style::new().fg(Color::Indexed(245)), Modifier::empty())
-    }
-
-    fn strong(self) -> Style {
-        self.style(Style::new().add_modifier(Modifier::BOLD), Modifier::BOLD)
-    }
-
-    /// Of the word for a link: what is not live must not look like it.
-    fn link(self, link: Link) -> Style {
-        let (fg, bg) = match link {
-            Link::Live => (16, 40),
-            Link::Connecting => (16, 75),
-            Link::Stale | Link::Silent => (16, 214),
-            Link::Lost | Link::NoDaemon => (231, 160),
-        };
-        let without = match link {
-            Link::Live => Modifier::BOLD,
-            _ => Modifier::REVERSED.union(Modifier::BOLD),
-        };
-        let colour = Style::new()
-            .fg(Color::Indexed(fg))
-            .bg(Color::Indexed(bg))
-            .add_modifier(Modifier::BOLD);
-        self.style(colour, without)
-    }
-
-    fn separator(self) -> &'static str {
-        if self.unicode { " · " } else { " | " }
-    }
-}
 
 /// Widest picture that is one column.
 const NARROW: u16 = 64;
@@ -254,17 +188,6 @@ impl Page<'_> {
         self.band(row, &line, self.look.link(link));
     }
 
-    /// Columns and rows of the pressure map: the largest form that fits; `(0, 0)`: none does.
-    fn map_size(&self, sensor: &Sensor, width: u16, height: u16) -> (u16, u16) {
-        let cols = u16::try_from(sensor.cols).unwrap_or_default();
-        let rows = u16::try_from(sensor.rows).unwrap_or_default();
-        let forms = [(2 * cols, rows), (cols, rows.div_ceil(2))];
-        let fitting = forms
-            .into_iter()
-            .find(|form| form.0 <= width && form.1 <= height);
-        fitting.unwrap_or_default()
-    }
-
     /// One column: what matters most first, the rest as far as there is room.
     fn stack(&mut self, body: Rect, view: &View, sensor: &Sensor, link: Link) {
         let mut rows = Rows(body);
@@ -374,71 +297,6 @@ impl Page<'_> {
             _ => Style::new(),
         };
         self.text(rest, &line, style);
-    }
-
-    fn map(&mut self, area: Rect, (cols, rows): (u16, u16), sensor: &Sensor, link: Link) {
-        let top = sensor.highest_n().max(LEAST_SCALE_N);
-        let rest = self.text(area, "pressure ", self.look.heading());
-        self.text(rest, &format!("0 to {top:.2} N a taxel"), self.look.aside());
-        let area = Rect {
-            y: area.y + 1,
-            width: cols.min(area.width),
-            height: rows.min(area.height - 1),
-            ..area
-        };
-        // Two cells a taxel, or two taxels a cell: a cell is twice as high as it is wide.
-        let is_large = usize::from(cols) > sensor.cols;
-        let (taxel_cells, cell_taxels) = if is_large { (2, 1) } else { (1, 2) };
-        // By its root, or a soft touch would vanish beside a hard one.
-        let shade = |row, col| sensor.newtons(row, col).map(|n| (n / top).min(1.0).sqrt());
-        for y in 0..area.height {
-            for x in 0..area.width {
-                let col = usize::from(x) / taxel_cells;
-                let row = usize::from(y) * cell_taxels;
-                let upper = shade(row, col);
-                let lower = if is_large { upper } else { shade(row + 1, col) };
-                let cell = &mut self.buffer[(area.x + x, area.y + y)];
-                if self.look.colours {
-                    let ramp = if link == Link::Live { &HEAT } else { &GREY };
-                    let colour = |share: Option<f32>| match share {
-                        Some(share) => Color::Indexed(ramp[step(share, ramp.len())]),
-                        None => Color::Indexed(GREY[0]),
-                    };
-                    if self.look.unicode {
-                        cell.set_char('\u{2580}').set_fg(colour(upper));
-                        cell.set_bg(colour(lower));
-                    } else {
-                        // The greater of the two: a touch must not vanish.
-                        cell.set_char(' ').set_bg(colour(max(upper, lower)));
-                    }
-                } else {
-                    let share = max(upper, lower);
-                    let step = share.map_or(0, |share| step(share, CHARACTERS.len()));
-                    // Where nothing is pressed, the corners say how far the array goes.
-                    let is_corner =
-                        (x == 0 || x + 1 == area.width) && (y == 0 || y + 1 == area.height);
-                    let character = if step == 0 && is_corner {
-                        b'+'
-                    } else {
-                        CHARACTERS[step]
-                    };
-                    cell.set_char(char::from(character));
-                }
-            }
-        }
-        if link != Link::Live && area.height > 0 {
-            let word = format!(" {} ", link.name());
-            let width = u16::try_from(word.len())
-                .unwrap_or_default()
-                .min(area.width);
-            let place = Rect {
-                x: area.x + (area.width - width) / 2,
-                y: area.y,
-                width,
-                height: 1,
-            };
-            self.text(place, &word, self.look.link(link));
-        }
     }
 
     fn force(&mut self, area: Rect, sensor: &Sensor, link: Link) {
@@ -569,31 +427,8 @@ fn halves(area: Rect) -> (Rect, Rect) {
     (Rect { height, ..area }, lower)
 }
 
-fn max(one: Option<f32>, other: Option<f32>) -> Option<f32> {
-    one.into_iter().chain(other).reduce(f32::max)
-}
-
-/// Which of so many steps a share of 0 to 1 is.
-fn step(share: f32, steps: usize) -> usize {
-    ((share * steps as f32) as usize).min(steps - 1)
-}
-
-/// The map's scale reaches at least so far, in newtons a taxel: noise must not look like a touch.
-const LEAST_SCALE_N: f32 = 1.0;
-
 /// Steps of a newton or a taxel that a curve tells apart.
 const FINE: f32 = 1000.0;
-
-/// From nothing to the greatest pressure, of the 256 colours of xterm: dark, violet, red, yellow.
-const HEAT: [u8; 13] = [234, 53, 54, 90, 126, 161, 197, 203, 209, 215, 221, 227, 230];
-
-/// The same for what is no longer true.
-const GREY: [u8; 13] = [
-    234, 235, 236, 238, 240, 241, 243, 244, 246, 247, 249, 251, 253,
-];
-
-/// The same without colours.
-const CHARACTERS: &[u8; 10] = b" .:-=+*#%@";
 
 const ASCII_BARS: bar::Set<'static> = bar::Set {
     full: "#",

@@ -14,7 +14,8 @@ use rustix::termios::LocalModes;
 use serde_json::{Value, json};
 
 use super::ansi::Ansi;
-use super::draw::{Look, draw};
+use super::draw::draw;
+use super::look::Look;
 use super::screen::{Screen, pressed};
 use super::view::{Key, Link, Loss, View};
 use crate::frame::{COLS, Stamp, TAXELS};

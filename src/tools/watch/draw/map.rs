@@ -1,0 +1,114 @@
+//! The pressure map: in colours, in greys where it is no longer true, or in characters.
+
+use ratatui::layout::Rect;
+use ratatui::style::Color;
+
+use super::super::view::{Link, Sensor};
+use super::Page;
+
+impl Page<'_> {
+    /// Columns and rows of the pressure map: the largest form that fits; `(0, 0)`: none does.
+    pub(super) fn map_size(&self, sensor: &Sensor, width: u16, height: u16) -> (u16, u16) {
+        let cols = u16::try_from(sensor.cols).unwrap_or_default();
+        let rows = u16::try_from(sensor.rows).unwrap_or_default();
+        let forms = [(2 * cols, rows), (cols, rows.div_ceil(2))];
+        let fitting = forms
+            .into_iter()
+            .find(|form| form.0 <= width && form.1 <= height);
+        fitting.unwrap_or_default()
+    }
+
+    pub(super) fn map(
+        &mut self,
+        area: Rect,
+        (cols, rows): (u16, u16),
+        sensor: &Sensor,
+        link: Link,
+    ) {
+        let top = sensor.highest_n().max(LEAST_SCALE_N);
+        let rest = self.text(area, "pressure ", self.look.heading());
+        self.text(rest, &format!("0 to {top:.2} N a taxel"), self.look.aside());
+        let area = Rect {
+            y: area.y + 1,
+            width: cols.min(area.width),
+            height: rows.min(area.height - 1),
+            ..area
+        };
+        // Two cells a taxel, or two taxels a cell: a cell is twice as high as it is wide.
+        let is_large = usize::from(cols) > sensor.cols;
+        let (taxel_cells, cell_taxels) = if is_large { (2, 1) } else { (1, 2) };
+        // By its root, or a soft touch would vanish beside a hard one.
+        let shade = |row, col| sensor.newtons(row, col).map(|n| (n / top).min(1.0).sqrt());
+        for y in 0..area.height {
+            for x in 0..area.width {
+                let col = usize::from(x) / taxel_cells;
+                let row = usize::from(y) * cell_taxels;
+                let upper = shade(row, col);
+                let lower = if is_large { upper } else { shade(row + 1, col) };
+                let cell = &mut self.buffer[(area.x + x, area.y + y)];
+                if self.look.colours {
+                    let ramp = if link == Link::Live { &HEAT } else { &GREY };
+                    let colour = |share: Option<f32>| match share {
+                        Some(share) => Color::Indexed(ramp[step(share, ramp.len())]),
+                        None => Color::Indexed(GREY[0]),
+                    };
+                    if self.look.unicode {
+                        cell.set_char('\u{2580}').set_fg(colour(upper));
+                        cell.set_bg(colour(lower));
+                    } else {
+                        // The greater of the two: a touch must not vanish.
+                        cell.set_char(' ').set_bg(colour(max(upper, lower)));
+                    }
+                } else {
+                    let share = max(upper, lower);
+                    let step = share.map_or(0, |share| step(share, CHARACTERS.len()));
+                    // Where nothing is pressed, the corners say how far the array goes.
+                    let is_corner =
+                        (x == 0 || x + 1 == area.width) && (y == 0 || y + 1 == area.height);
+                    let character = if step == 0 && is_corner {
+                        b'+'
+                    } else {
+                        CHARACTERS[step]
+                    };
+                    cell.set_char(char::from(character));
+                }
+            }
+        }
+        if link != Link::Live && area.height > 0 {
+            let word = format!(" {} ", link.name());
+            let width = u16::try_from(word.len())
+                .unwrap_or_default()
+                .min(area.width);
+            let place = Rect {
+                x: area.x + (area.width - width) / 2,
+                y: area.y,
+                width,
+                height: 1,
+            };
+            self.text(place, &word, self.look.link(link));
+        }
+    }
+}
+
+fn max(one: Option<f32>, other: Option<f32>) -> Option<f32> {
+    one.into_iter().chain(other).reduce(f32::max)
+}
+
+/// Which of so many steps a share of 0 to 1 is.
+fn step(share: f32, steps: usize) -> usize {
+    ((share * steps as f32) as usize).min(steps - 1)
+}
+
+/// The map's scale reaches at least so far, in newtons a taxel: noise must not look like a touch.
+const LEAST_SCALE_N: f32 = 1.0;
+
+/// From nothing to the greatest pressure, of the 256 colours of xterm: dark, violet, red, yellow.
+const HEAT: [u8; 13] = [234, 53, 54, 90, 126, 161, 197, 203, 209, 215, 221, 227, 230];
+
+/// The same for what is no longer true.
+const GREY: [u8; 13] = [
+    234, 235, 236, 238, 240, 241, 243, 244, 246, 247, 249, 251, 253,
+];
+
+/// The same without colours.
+const CHARACTERS: &[u8; 10] = b" .:-=+*#%@";

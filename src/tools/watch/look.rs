@@ -1,0 +1,74 @@
+//! What a terminal can show, and what things look like on it.
+
+use ratatui::style::{Color, Modifier, Style};
+
+use super::view::Link;
+
+/// What the terminal can show.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Look {
+    /// 256 of them.
+    pub(super) colours: bool,
+    /// Bold and reversed.
+    pub(super) attributes: bool,
+    /// More than ASCII.
+    pub(super) unicode: bool,
+}
+
+impl Look {
+    /// By the variables `TERM`, `NO_COLOR` (<https://no-color.org>), and the first that is set of
+    /// `LC_ALL`, `LC_CTYPE` and `LANG`.
+    pub(super) fn new(term: &str, no_color: &str, locale: &str) -> Self {
+        let is_plain = ["", "dumb", "unknown"].contains(&term);
+        let is_old = term.starts_with("vt") || term.ends_with("-m") || term.ends_with("-mono");
+        let locale = locale.to_ascii_lowercase();
+        Self {
+            colours: !is_plain && !is_old && no_color.is_empty(),
+            attributes: !is_plain,
+            unicode: !is_plain && !is_old && (locale.contains("utf-8") || locale.contains("utf8")),
+        }
+    }
+
+    pub(super) fn style(self, colour: Style, without: Modifier) -> Style {
+        match (self.colours, self.attributes) {
+            (true, _) => colour,
+            (false, true) => Style::new().add_modifier(without),
+            (false, false) => Style::new(),
+        }
+    }
+
+    pub(super) fn heading(self) -> Style {
+        self.style(Style::new().fg(Color::Indexed(75)), Modifier::BOLD)
+    }
+
+    pub(super) fn aside(self) -> Style {
+        self.style(Style::new().fg(Color::Indexed(245)), Modifier::empty())
+    }
+
+    pub(super) fn strong(self) -> Style {
+        self.style(Style::new().add_modifier(Modifier::BOLD), Modifier::BOLD)
+    }
+
+    /// Of the word for a link: what is not live must not look like it.
+    pub(super) fn link(self, link: Link) -> Style {
+        let (fg, bg) = match link {
+            Link::Live => (16, 40),
+            Link::Connecting => (16, 75),
+            Link::Stale | Link::Silent => (16, 214),
+            Link::Lost | Link::NoDaemon => (231, 160),
+        };
+        let without = match link {
+            Link::Live => Modifier::BOLD,
+            _ => Modifier::REVERSED.union(Modifier::BOLD),
+        };
+        let colour = Style::new()
+            .fg(Color::Indexed(fg))
+            .bg(Color::Indexed(bg))
+            .add_modifier(Modifier::BOLD);
+        self.style(colour, without)
+    }
+
+    pub(super) fn separator(self) -> &'static str {
+        if self.unicode { " · " } else { " | " }
+    }
+}
