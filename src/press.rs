@@ -3,152 +3,15 @@
 //! In: tared [`Frame`]s with their number and the moment they came. Out: [`Change`]s, each
 //! complete in itself. The tracker asks no clock: a press lasts as long as its frames say.
 
+mod settings;
+
 use std::collections::VecDeque;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::frame::{Frame, Stamp, TAXELS};
-
-/// The `[press]` table.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Settings {
-    /// A taxel is in contact at or above this.
-    pub contact_threshold_n: f32,
-    /// A press begins with the first frame of at least this contact area.
-    pub begin_area_taxels: u32,
-    /// Frames below this contact area release the press.
-    pub end_area_taxels: u32,
-    /// So many of them in a row.
-    pub end_frames: u32,
-    /// A press of fewer frames in contact gets no verdict.
-    pub min_frames: u64,
-    /// A press is over after so long.
-    pub max_seconds: f64,
-    /// How long the contact must have settled for an early verdict.
-    pub early_settle_s: f64,
-    /// Least total force of an early verdict.
-    pub early_min_force_n: f64,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self {
-            contact_threshold_n: 0.07,
-            begin_area_taxels: 3,
-            end_area_taxels: 1,
-            end_frames: 2,
-            min_frames: 2,
-            max_seconds: 30.0,
-            early_settle_s: 0.3,
-            early_min_force_n: 1.0,
-        }
-    }
-}
-
-/// A value of [`Settings`] that cannot be used.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum SettingsError {
-    /// A quantity that must be positive and finite.
-    #[error("{key}: found {found}, expected a number above 0 and at most {max}")]
-    NotPositive {
-        /// Its key.
-        key: &'static str,
-        /// As given.
-        found: f64,
-        /// Largest allowed.
-        max: f64,
-    },
-    /// A quantity that must be finite and not negative.
-    #[error("{key}: found {found}, expected 0 or more and at most {max}")]
-    Negative {
-        /// Its key.
-        key: &'static str,
-        /// As given.
-        found: f64,
-        /// Largest allowed.
-        max: f64,
-    },
-    /// A count outside its range.
-    #[error("{key}: found {found}, expected {least} to {most}")]
-    Count {
-        /// Its key.
-        key: &'static str,
-        /// As given.
-        found: u64,
-        /// Smallest allowed.
-        least: u64,
-        /// Largest allowed.
-        most: u64,
-    },
-}
-
-/// Longest duration and largest force that settings may name.
-const LARGEST: f64 = 1e6;
-
-impl Settings {
-    /// Checks every value.
-    ///
-    /// # Errors
-    ///
-    /// If a force or duration is not finite or out of range, an area is 0 or above 784, the end
-    /// area is above the begin area, or a count of frames is 0.
-    pub fn check(&self) -> Result<(), SettingsError> {
-        for (key, found) in [
-            ("contact_threshold_n", f64::from(self.contact_threshold_n)),
-            ("max_seconds", self.max_seconds),
-        ] {
-            if !(found > 0.0 && found <= LARGEST) {
-                return Err(SettingsError::NotPositive {
-                    key,
-                    found,
-                    max: LARGEST,
-                });
-            }
-        }
-        for (key, found) in [
-            ("early_settle_s", self.early_settle_s),
-            ("early_min_force_n", self.early_min_force_n),
-        ] {
-            if !(0.0..=LARGEST).contains(&found) {
-                return Err(SettingsError::Negative {
-                    key,
-                    found,
-                    max: LARGEST,
-                });
-            }
-        }
-        for (key, found, most) in [
-            (
-                "begin_area_taxels",
-                u64::from(self.begin_area_taxels),
-                TAXELS as u64,
-            ),
-            (
-                "end_area_taxels",
-                u64::from(self.end_area_taxels),
-                self.begin_area_taxels.into(),
-            ),
-            (
-                "end_frames",
-                u64::from(self.end_frames),
-                u64::from(u32::MAX),
-            ),
-            ("min_frames", self.min_frames, u64::MAX),
-        ] {
-            if !(1..=most).contains(&found) {
-                return Err(SettingsError::Count {
-                    key,
-                    found,
-                    least: 1,
-                    most,
-                });
-            }
-        }
-        Ok(())
-    }
-}
+pub use self::settings::{Settings, SettingsError};
+use crate::frame::{Frame, Stamp};
 
 /// A frame of a press: its number and when its last byte came.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
