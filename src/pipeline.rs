@@ -5,6 +5,9 @@
 //! reconnects. It never waits, never logs and never asks the time: [`Pipeline::deadline`] says
 //! when it wants to be told that time has passed.
 
+mod events;
+mod link;
+
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,12 +15,10 @@ use std::time::Duration;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
-use crate::event::{
-    Event, FrameEvent, Hardness, LinkState, Note, Phase, Press, PressState, Rejection, Status,
-    Tared,
-};
-use crate::frame::{Frame, RawFrame, Stamp};
-use crate::press::{self, Abort, Change, End, Moment, Peak, PressTracker};
+use self::link::Link;
+use crate::event::{Event, FrameEvent, LinkState, Tared};
+use crate::frame::{RawFrame, Stamp};
+use crate::press::{self, Abort, Moment, PressTracker};
 use crate::tare::{self, Contact, Offsets, Progress, Tare};
 use crate::verdict::Hrn;
 use crate::wire::{self, Decoded, Decoder, Layout};
@@ -79,10 +80,6 @@ pub enum RetareError {
     NoFrames,
 }
 
-/// A frame is late after so many periods.
-const STALE_PERIODS: f64 = 2.5;
-/// A silence of so many periods ends what came before it.
-const PAUSE_PERIODS: f64 = 0.5;
 /// The measured rate is that over so many frames.
 const RATE_FRAMES: usize = 32;
 
@@ -130,20 +127,6 @@ pub struct Memory {
     tare: tare::Memory,
     tracker: press::Memory,
     pipeline: Seen,
-}
-
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-enum Link {
-    /// Never opened; why the last try failed.
-    Closed { reason: Option<String> },
-    /// Open since then, and no frame yet.
-    Opened { since: Duration },
-    /// The last frame came then.
-    Live { since: Duration },
-    /// Open and silent.
-    Stale,
-    /// Was open and is gone, or is open again without a frame.
-    Lost { reason: String },
 }
 
 impl Pipeline {
@@ -326,14 +309,6 @@ impl Pipeline {
         events
     }
 
-    /// When [`Self::tick`] is next due, on CLOCK_MONOTONIC.
-    pub fn deadline(&self) -> Option<Duration> {
-        match (self.pause_deadline(), self.stale_deadline()) {
-            (Some(pause), Some(stale)) => Some(pause.min(stale)),
-            (pause, stale) => pause.or(stale),
-        }
-    }
-
     /// The device is gone: a press under way is aborted.
     pub fn lost(&mut self, reason: String, at: Stamp) -> Vec<Event> {
         let mut events = Vec::new();
@@ -371,80 +346,6 @@ impl Pipeline {
         self.decoder.restart();
         events.push(Event::Status(self.status(at)));
         events
-    }
-
-    /// The link and its counters, now.
-    pub fn status(&self, at: Stamp) -> Status {
-        let (state, reason) = self.state();
-        Status {
-            seq: None,
-            sensor: self.sensor.clone(),
-            time: at.wall,
-            state,
-            reason,
-            frames: self.seen.frames,
-            frames_damaged: self.seen.frames_damaged,
-            bytes_skipped: self.decoder.skipped(),
-            frame_rate_hz: self.measured_rate_hz(),
-        }
-    }
-
-    fn state(&self) -> (LinkState, Option<String>) {
-        let tare = || {
-            self.seen
-                .tare_met_contact
-                .then(|| "tare: contact".to_owned())
-        };
-        match &self.seen.link {
-            Link::Closed { reason } => (LinkState::Connecting, reason.clone()),
-            Link::Opened { .. } => (LinkState::Connecting, None),
-            Link::Live { .. } => (LinkState::Live, tare()),
-            Link::Stale => (
-                LinkState::Stale,
-                Some("no frame for 2.5 periods".to_owned()),
-            ),
-            Link::Lost { reason } => (LinkState::Lost, Some(reason.clone())),
-        }
-    }
-
-    fn status_if_changed(&mut self, at: Stamp) -> Vec<Event> {
-        let state = self.state();
-        if self.seen.told == state {
-            return Vec::new();
-        }
-        self.seen.told = state;
-        vec![Event::Status(self.status(at))]
-    }
-
-    fn measured_rate_hz(&self) -> Option<f64> {
-        let span = self
-            .seen
-            .recent
-            .back()?
-            .checked_sub(*self.seen.recent.front()?)?
-            .as_secs_f64();
-        match self.clock {
-            _ if self.seen.recent.len() < 2 => None,
-            Clock::FrameRate => Some(self.frame_rate_hz),
-            Clock::Arrival => (span > 0.0).then(|| (self.seen.recent.len() - 1) as f64 / span),
-        }
-    }
-
-    fn pause_deadline(&self) -> Option<Duration> {
-        let last_bytes = self
-            .seen
-            .last_bytes
-            .filter(|_| self.decoder.pending() > 0)?;
-        Some(last_bytes + self.period.mul_f64(PAUSE_PERIODS))
-    }
-
-    fn stale_deadline(&self) -> Option<Duration> {
-        match self.seen.link {
-            Link::Opened { since } | Link::Live { since } if self.clock == Clock::Arrival => {
-                Some(since + self.period.mul_f64(STALE_PERIODS))
-            }
-            _ => None,
-        }
     }
 
     fn drain(&mut self, events: &mut Vec<Event>) {
@@ -559,146 +460,6 @@ impl Pipeline {
         if let Some(change) = self.tracker.abort(reason) {
             self.publish(change, events);
         }
-    }
-
-    fn publish(&self, change: Change, events: &mut Vec<Event>) {
-        match change {
-            Change::Begin { press, at } => {
-                events.push(self.press(press, PressState::Begin, at, 1, None));
-            }
-            Change::Settled { press, peak } => {
-                events.extend(self.judge(press, Phase::Early, &peak));
-            }
-            Change::End {
-                press,
-                last,
-                frames,
-                end,
-                peak,
-            } => {
-                let reason = match end {
-                    End::Release => None,
-                    End::Timeout => Some("timeout"),
-                };
-                events.push(self.press(press, PressState::End, last, frames, reason));
-                events.extend(self.judge(press, Phase::Final, &peak));
-            }
-            Change::Aborted {
-                press,
-                last,
-                frames,
-                reason,
-            } => {
-                let reason = Some(reason.reason());
-                events.push(self.press(press, PressState::Aborted, last, frames, reason));
-            }
-        }
-    }
-
-    fn press(
-        &self,
-        press: u64,
-        state: PressState,
-        at: Moment,
-        frames: u64,
-        reason: Option<&'static str>,
-    ) -> Event {
-        Event::Press(Press {
-            seq: None,
-            sensor: self.sensor.clone(),
-            time: at.stamp.wall,
-            press,
-            state,
-            frame: at.frame,
-            reason,
-            frames,
-            context: self.seen.context.clone(),
-        })
-    }
-
-    /// The verdict on a press. A model that cannot judge a finite frame was refused at its load;
-    /// should one fail all the same, the press has no verdict rather than a made-up one.
-    fn judge(&self, press: u64, phase: Phase, peak: &Peak) -> Option<Event> {
-        let Judgement {
-            min_confidence,
-            min_force_n,
-            hrn,
-            ..
-        } = &self.judgement;
-        let verdict = hrn.judge(&peak.frame).ok()?;
-        let rejected = if peak.force_n < *min_force_n {
-            Some(Rejection::LowForce)
-        } else if verdict.confidence < *min_confidence {
-            Some(Rejection::LowConfidence)
-        } else {
-            None
-        };
-        let level = rejected.is_none().then_some(verdict.level);
-        let label = level.and_then(|level| {
-            let known = hrn
-                .card()
-                .levels
-                .iter()
-                .find(|known| known.level == level)?;
-            Some(known.label.clone())
-        });
-        let pitch_mm = self.judgement.calibration.pitch_mm;
-        let Moment { frame, stamp } = peak.moment;
-        Some(Event::Hardness(Hardness {
-            seq: None,
-            sensor: self.sensor.clone(),
-            time: stamp.wall,
-            press,
-            phase,
-            level,
-            label,
-            rejected,
-            notes: self.notes(peak),
-            probabilities: verdict.probabilities,
-            confidence: verdict.confidence,
-            frame,
-            contact_area_taxels: peak.contact_area_taxels,
-            contact_area_mm2: f64::from(peak.contact_area_taxels) * pitch_mm * pitch_mm,
-            force_n: peak.force_n,
-            model: hrn.sha256()[..12].to_owned(),
-            state: self.state().0,
-            context: self.seen.context.clone(),
-            mono_ns: (self.clock == Clock::Arrival).then_some(stamp.mono.as_nanos() as u64),
-            age_at_publish_ms: None,
-            latency_us: None,
-        }))
-    }
-
-    fn notes(&self, peak: &Peak) -> Vec<Note> {
-        let layout = self.decoder.layout();
-        let full_scale = layout.full_scale();
-        let range = &self.judgement.hrn.card().range;
-        let [least_n, most_n] = range.force_n.map(f64::from);
-        let [least_taxels, most_taxels] = range.contact_area_taxels;
-        let trained = (least_n..=most_n).contains(&peak.force_n)
-            && (least_taxels..=most_taxels).contains(&peak.contact_area_taxels);
-        [
-            (Note::AtEdge, self.is_at_edge(&peak.frame)),
-            (
-                Note::Saturated,
-                full_scale.is_some_and(|f| self.tare.is_saturated(&peak.frame, f)),
-            ),
-            (Note::OutsideTraining, !trained),
-        ]
-        .into_iter()
-        .filter_map(|(note, applies)| applies.then_some(note))
-        .collect()
-    }
-
-    fn is_at_edge(&self, frame: &Frame) -> bool {
-        let array = self.decoder.layout().array();
-        let threshold_n = self.judgement.press.contact_threshold_n;
-        array.places().any(|place| {
-            frame.newtons[place] >= threshold_n
-                && array.position(place).is_some_and(|(row, col)| {
-                    row == 0 || col == 0 || row + 1 == array.rows || col + 1 == array.cols
-                })
-        })
     }
 }
 

@@ -1,4 +1,5 @@
 use super::*;
+use crate::event::{Note, Rejection};
 use crate::verdict::BUILT_IN;
 use crate::wire::{self, Preset};
 

@@ -1,0 +1,149 @@
+//! What a pipeline says of presses: press and hardness events.
+
+use super::{Clock, Judgement, Pipeline};
+use crate::event::{Event, Hardness, Note, Phase, Press, PressState, Rejection};
+use crate::frame::Frame;
+use crate::press::{Change, End, Moment, Peak};
+
+impl Pipeline {
+    /// What subscribers are told of a change.
+    pub(super) fn publish(&self, change: Change, events: &mut Vec<Event>) {
+        match change {
+            Change::Begin { press, at } => {
+                events.push(self.press(press, PressState::Begin, at, 1, None));
+            }
+            Change::Settled { press, peak } => {
+                events.extend(self.judge(press, Phase::Early, &peak));
+            }
+            Change::End {
+                press,
+                last,
+                frames,
+                end,
+                peak,
+            } => {
+                let reason = match end {
+                    End::Release => None,
+                    End::Timeout => Some("timeout"),
+                };
+                events.push(self.press(press, PressState::End, last, frames, reason));
+                events.extend(self.judge(press, Phase::Final, &peak));
+            }
+            Change::Aborted {
+                press,
+                last,
+                frames,
+                reason,
+            } => {
+                let reason = Some(reason.reason());
+                events.push(self.press(press, PressState::Aborted, last, frames, reason));
+            }
+        }
+    }
+
+    fn press(
+        &self,
+        press: u64,
+        state: PressState,
+        at: Moment,
+        frames: u64,
+        reason: Option<&'static str>,
+    ) -> Event {
+        Event::Press(Press {
+            seq: None,
+            sensor: self.sensor.clone(),
+            time: at.stamp.wall,
+            press,
+            state,
+            frame: at.frame,
+            reason,
+            frames,
+            context: self.seen.context.clone(),
+        })
+    }
+
+    /// The verdict on a press. A model that cannot judge a finite frame was refused at its load;
+    /// should one fail all the same, the press has no verdict rather than a made-up one.
+    fn judge(&self, press: u64, phase: Phase, peak: &Peak) -> Option<Event> {
+        let Judgement {
+            min_confidence,
+            min_force_n,
+            hrn,
+            ..
+        } = &self.judgement;
+        let verdict = hrn.judge(&peak.frame).ok()?;
+        let rejected = if peak.force_n < *min_force_n {
+            Some(Rejection::LowForce)
+        } else if verdict.confidence < *min_confidence {
+            Some(Rejection::LowConfidence)
+        } else {
+            None
+        };
+        let level = rejected.is_none().then_some(verdict.level);
+        let label = level.and_then(|level| {
+            let known = hrn
+                .card()
+                .levels
+                .iter()
+                .find(|known| known.level == level)?;
+            Some(known.label.clone())
+        });
+        let pitch_mm = self.judgement.calibration.pitch_mm;
+        let Moment { frame, stamp } = peak.moment;
+        Some(Event::Hardness(Hardness {
+            seq: None,
+            sensor: self.sensor.clone(),
+            time: stamp.wall,
+            press,
+            phase,
+            level,
+            label,
+            rejected,
+            notes: self.notes(peak),
+            probabilities: verdict.probabilities,
+            confidence: verdict.confidence,
+            frame,
+            contact_area_taxels: peak.contact_area_taxels,
+            contact_area_mm2: f64::from(peak.contact_area_taxels) * pitch_mm * pitch_mm,
+            force_n: peak.force_n,
+            model: hrn.sha256()[..12].to_owned(),
+            state: self.state().0,
+            context: self.seen.context.clone(),
+            mono_ns: (self.clock == Clock::Arrival).then_some(stamp.mono.as_nanos() as u64),
+            age_at_publish_ms: None,
+            latency_us: None,
+        }))
+    }
+
+    fn notes(&self, peak: &Peak) -> Vec<Note> {
+        let layout = self.decoder.layout();
+        let full_scale = layout.full_scale();
+        let range = &self.judgement.hrn.card().range;
+        let [least_n, most_n] = range.force_n.map(f64::from);
+        let [least_taxels, most_taxels] = range.contact_area_taxels;
+        let trained = (least_n..=most_n).contains(&peak.force_n)
+            && (least_taxels..=most_taxels).contains(&peak.contact_area_taxels);
+        [
+            (Note::AtEdge, self.is_at_edge(&peak.frame)),
+            (
+                Note::Saturated,
+                full_scale.is_some_and(|f| self.tare.is_saturated(&peak.frame, f)),
+            ),
+            (Note::OutsideTraining, !trained),
+        ]
+        .into_iter()
+        .filter_map(|(note, applies)| applies.then_some(note))
+        .collect()
+    }
+
+    fn is_at_edge(&self, frame: &Frame) -> bool {
+        let array = self.decoder.layout().array();
+        let threshold_n = self.judgement.press.contact_threshold_n;
+        array.places().any(|place| {
+            frame.newtons[place] >= threshold_n
+                && array.position(place).is_some_and(|(row, col)| {
+                    row == 0 || col == 0 || row + 1 == array.rows || col + 1 == array.cols
+                })
+        })
+    }
+}

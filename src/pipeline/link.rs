@@ -1,0 +1,117 @@
+//! The link of a sensor: its state, its measured rate, and when silence changes it.
+
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use super::{Clock, Pipeline};
+use crate::event::{Event, LinkState, Status};
+use crate::frame::Stamp;
+
+/// A frame is late after so many periods.
+const STALE_PERIODS: f64 = 2.5;
+/// A silence of so many periods ends what came before it.
+const PAUSE_PERIODS: f64 = 0.5;
+
+/// What is known of the port.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) enum Link {
+    /// Never opened; why the last try failed.
+    Closed { reason: Option<String> },
+    /// Open since then, and no frame yet.
+    Opened { since: Duration },
+    /// The last frame came then.
+    Live { since: Duration },
+    /// Open and silent.
+    Stale,
+    /// Was open and is gone, or is open again without a frame.
+    Lost { reason: String },
+}
+
+impl Pipeline {
+    /// When [`Self::tick`] is next due, on CLOCK_MONOTONIC.
+    pub fn deadline(&self) -> Option<Duration> {
+        match (self.pause_deadline(), self.stale_deadline()) {
+            (Some(pause), Some(stale)) => Some(pause.min(stale)),
+            (pause, stale) => pause.or(stale),
+        }
+    }
+
+    /// The link and its counters, now.
+    pub fn status(&self, at: Stamp) -> Status {
+        let (state, reason) = self.state();
+        Status {
+            seq: None,
+            sensor: self.sensor.clone(),
+            time: at.wall,
+            state,
+            reason,
+            frames: self.seen.frames,
+            frames_damaged: self.seen.frames_damaged,
+            bytes_skipped: self.decoder.skipped(),
+            frame_rate_hz: self.measured_rate_hz(),
+        }
+    }
+
+    /// State and reason.
+    pub(super) fn state(&self) -> (LinkState, Option<String>) {
+        let tare = || {
+            self.seen
+                .tare_met_contact
+                .then(|| "tare: contact".to_owned())
+        };
+        match &self.seen.link {
+            Link::Closed { reason } => (LinkState::Connecting, reason.clone()),
+            Link::Opened { .. } => (LinkState::Connecting, None),
+            Link::Live { .. } => (LinkState::Live, tare()),
+            Link::Stale => (
+                LinkState::Stale,
+                Some("no frame for 2.5 periods".to_owned()),
+            ),
+            Link::Lost { reason } => (LinkState::Lost, Some(reason.clone())),
+        }
+    }
+
+    /// A status, if state or reason are others than those last told.
+    pub(super) fn status_if_changed(&mut self, at: Stamp) -> Vec<Event> {
+        let state = self.state();
+        if self.seen.told == state {
+            return Vec::new();
+        }
+        self.seen.told = state;
+        vec![Event::Status(self.status(at))]
+    }
+
+    fn measured_rate_hz(&self) -> Option<f64> {
+        let span = self
+            .seen
+            .recent
+            .back()?
+            .checked_sub(*self.seen.recent.front()?)?
+            .as_secs_f64();
+        match self.clock {
+            _ if self.seen.recent.len() < 2 => None,
+            Clock::FrameRate => Some(self.frame_rate_hz),
+            Clock::Arrival => (span > 0.0).then(|| (self.seen.recent.len() - 1) as f64 / span),
+        }
+    }
+
+    /// When a silence settles what is pending.
+    pub(super) fn pause_deadline(&self) -> Option<Duration> {
+        let last_bytes = self
+            .seen
+            .last_bytes
+            .filter(|_| self.decoder.pending() > 0)?;
+        Some(last_bytes + self.period.mul_f64(PAUSE_PERIODS))
+    }
+
+    /// When a silence makes the link stale.
+    pub(super) fn stale_deadline(&self) -> Option<Duration> {
+        match self.seen.link {
+            Link::Opened { since } | Link::Live { since } if self.clock == Clock::Arrival => {
+                Some(since + self.period.mul_f64(STALE_PERIODS))
+            }
+            _ => None,
+        }
+    }
+}
