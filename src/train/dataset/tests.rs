@@ -1,0 +1,217 @@
+//! Files read back, and choices of samples.
+
+use std::io::Cursor;
+
+use ndarray::{Array1, Array3};
+use ndarray_npy::NpzWriter;
+
+use super::*;
+use crate::frame::{COLS, ROWS};
+use crate::verdict::sha256_hex;
+
+fn sample(level: u8, object: u32, split: Split) -> Sample {
+    let mut frame = Frame::default();
+    frame.newtons[usize::from(level)] = object as f32;
+    Sample {
+        frame,
+        level,
+        object: Some(object),
+        material: Some(level),
+        force_n: Some(2.5),
+        split,
+        shore: Some(70.0),
+        source: 0,
+    }
+}
+
+/// 4 levels x 10 objects x 5 presses.
+fn samples() -> Vec<Sample> {
+    (0..200_u32)
+        .map(|i| sample((i / 50) as u8 + 1, i / 5, Split::Train))
+        .collect()
+}
+
+fn bytes_of(samples: &[Sample]) -> Vec<u8> {
+    let meta = serde_json::json!({"seed": 7});
+    write(Cursor::new(Vec::new()), samples, &meta)
+        .unwrap()
+        .into_inner()
+}
+
+fn parse(bytes: &[u8]) -> Result<Dataset, DatasetError> {
+    file::parse(bytes, Path::new("D.npz"), "D.npz".to_owned())
+}
+
+#[test]
+fn a_file_reads_back_what_was_written() {
+    let samples = samples();
+    let bytes = bytes_of(&samples);
+    let read = parse(&bytes).unwrap();
+    assert_eq!(read.samples, samples);
+    assert_eq!(read.sources[0].seed, Some(7));
+    assert_eq!(read.sources[0].sha256, sha256_hex(&bytes));
+    // The file holds no date: the same samples give the same bytes.
+    assert_eq!(bytes, bytes_of(&samples));
+}
+
+#[test]
+fn optional_arrays_may_be_missing() {
+    let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
+    npz.add_array("frames", &Array3::<f32>::zeros((3, ROWS, COLS)))
+        .unwrap();
+    npz.add_array("level", &Array1::from(vec![0_u8, 1, 4]))
+        .unwrap();
+    let read = parse(npz.finish().unwrap().get_ref()).unwrap();
+    assert!(
+        read.samples
+            .iter()
+            .all(|s| s.split == Split::Train && s.object.is_none())
+    );
+    assert_eq!(read.labelled(Split::Train).unwrap(), [1, 2]);
+    let error = read.labelled(Split::Test).unwrap_err().to_string();
+    assert_eq!(error, "D.npz: the test split has no labelled samples");
+}
+
+#[test]
+fn what_is_not_as_agreed_is_named_with_what_was_found_and_expected() {
+    fn check(fill: impl FnOnce(&mut NpzWriter<Cursor<Vec<u8>>>), expected: &str) {
+        let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
+        fill(&mut npz);
+        let error = parse(npz.finish().unwrap().get_ref())
+            .unwrap_err()
+            .to_string();
+        assert!(error.starts_with("D.npz: "), "{error}");
+        assert!(
+            error.contains(expected),
+            "{error}\nshould contain\n{expected}"
+        );
+    }
+    let frames = |n: usize| Array3::<f32>::zeros((n, ROWS, COLS));
+    check(|_| {}, "array `frames`: found none, expected f32 [N,28,28]");
+    check(
+        |npz| {
+            npz.add_array("frames", &Array3::<f64>::zeros((2, ROWS, COLS)))
+                .unwrap();
+        },
+        "array `frames`: found dtype '<f8', expected f32 [N,28,28]",
+    );
+    check(
+        |npz| {
+            npz.add_array("frames", &Array3::<f32>::zeros((2, 27, COLS)))
+                .unwrap();
+        },
+        "array `frames`: found f32 [2, 27, 28], expected f32 [N,28,28]",
+    );
+    check(
+        |npz| npz.add_array("frames", &frames(0)).unwrap(),
+        "array `frames`: found no frame, expected at least one",
+    );
+    check(
+        |npz| {
+            npz.add_array("frames", &frames(2).mapv(|_| f32::NAN))
+                .unwrap();
+        },
+        "array `frames`: found NaN in frame 0, expected newtons",
+    );
+    check(
+        |npz| npz.add_array("frames", &frames(2)).unwrap(),
+        "array `level`: found none, expected u8 [2]",
+    );
+    check(
+        |npz| {
+            npz.add_array("frames", &frames(2)).unwrap();
+            npz.add_array("level", &Array1::from(vec![1_i64, 2]))
+                .unwrap();
+        },
+        "array `level`: found dtype '<i8', expected u8 [2]",
+    );
+    check(
+        |npz| {
+            npz.add_array("frames", &frames(2)).unwrap();
+            npz.add_array("level", &Array1::from(vec![1_u8, 5]))
+                .unwrap();
+        },
+        "array `level`: found 5 at 1, expected 0 (unlabelled) to 4",
+    );
+    check(
+        |npz| {
+            npz.add_array("frames", &frames(2)).unwrap();
+            npz.add_array("level", &Array1::from(vec![1_u8, 4]))
+                .unwrap();
+            npz.add_array("object", &Array1::from(vec![1_u32])).unwrap();
+        },
+        "array `object`: found u32 [1], expected u32 [2]",
+    );
+    check(
+        |npz| {
+            npz.add_array("frames", &frames(1)).unwrap();
+            npz.add_array("level", &Array1::from(vec![1_u8])).unwrap();
+            npz.add_array("meta", &Array1::from(b"{".to_vec())).unwrap();
+        },
+        "array `meta`: found EOF",
+    );
+    let error = parse(b"PK no zip").unwrap_err().to_string();
+    assert!(error.starts_with("D.npz: not an .npz file"), "{error}");
+}
+
+fn objects_of(dataset: &Dataset, indices: &[usize]) -> Vec<u32> {
+    let mut objects: Vec<u32> = indices
+        .iter()
+        .map(|&index| dataset.samples[index].object.unwrap())
+        .collect();
+    objects.dedup();
+    objects
+}
+
+#[test]
+fn held_out_objects_are_whole_and_of_every_level() {
+    let dataset = parse(&bytes_of(&samples())).unwrap();
+    let indices = dataset.labelled(Split::Train).unwrap();
+    let (kept, held) = dataset.hold_out(&indices, 0.2, 1);
+    assert_eq!((kept.len(), held.len()), (160, 40));
+    let (kept, held) = (objects_of(&dataset, &kept), objects_of(&dataset, &held));
+    assert_eq!((kept.len(), held.len()), (32, 8));
+    assert!(held.iter().all(|object| !kept.contains(object)));
+    let first_object: Vec<usize> = (0..5).collect();
+    assert_eq!(
+        dataset.hold_out(&first_object, 0.5, 1),
+        (first_object, vec![])
+    );
+    assert_ne!(
+        held,
+        objects_of(&dataset, &dataset.hold_out(&indices, 0.2, 2).1)
+    );
+}
+
+#[test]
+fn labels_are_chosen_by_object_and_equally_from_each_level() {
+    let dataset = parse(&bytes_of(&samples())).unwrap();
+    let indices = dataset.labelled(Split::Train).unwrap();
+    let chosen = dataset.choose_labelled(&indices, 48, LabelChoice::Object, 1);
+    for level in 1..=4 {
+        let of_level = chosen
+            .iter()
+            .filter(|&&i| dataset.samples[i].level == level)
+            .count();
+        assert_eq!(of_level, 12, "level {level}");
+    }
+    // Two whole objects and two presses of a third, of each level.
+    assert_eq!(objects_of(&dataset, &chosen).len(), 12);
+    // More labels are those and further ones: methods of one seed share what they can.
+    let more = dataset.choose_labelled(&indices, 100, LabelChoice::Object, 1);
+    assert!(chosen.iter().all(|index| more.contains(index)));
+
+    let random = dataset.choose_labelled(&indices, 48, LabelChoice::Random, 1);
+    assert_eq!(random.len(), 48);
+    let objects = objects_of(&dataset, &random).len();
+    assert!(objects > 24, "{objects} of 40 objects");
+}
+
+#[test]
+fn joined_files_keep_their_objects_apart() {
+    let part = parse(&bytes_of(&samples())).unwrap();
+    let all = Dataset::joined(vec![part.clone(), part]);
+    assert_eq!(all.sources.len(), 2);
+    let indices: Vec<usize> = (0..400).collect();
+    assert_eq!(objects_of(&all, &indices), (0..80).collect::<Vec<u32>>());
+}
