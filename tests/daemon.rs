@@ -444,6 +444,14 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         &["--baud", "158000"],
     );
     assert_eq!(hardnessd(&["run"]).status.code(), Some(2));
+    for beyond_any_sensor in [["--force", "1e30"], ["--fps", "1e9"], ["--fps", "nan"]] {
+        let arguments = [&["simulate"], &beyond_any_sensor[..]].concat();
+        assert_eq!(
+            hardnessd(&arguments).status.code(),
+            Some(2),
+            "{arguments:?}"
+        );
+    }
     assert_eq!(hardnessd(&["--version"]).status.code(), Some(0));
 }
 

@@ -29,13 +29,13 @@ pub struct Args {
     #[arg(long, value_name = "P", default_value = "jx255n", value_parser = preset)]
     preset: Preset,
     /// Frames a second
-    #[arg(long, value_name = "F", default_value_t = 5.0, value_parser = positive)]
+    #[arg(long, value_name = "F", default_value_t = 5.0, value_parser = frame_rate_hz)]
     fps: f64,
     /// Material pressed, in turn; several may be given [default: all eight]
     #[arg(long = "material", value_name = "M")]
     materials: Vec<Material>,
     /// Peak force of a press in newtons [default: drawn from 5 to 25]
-    #[arg(long, value_name = "N", value_parser = positive)]
+    #[arg(long, value_name = "N", value_parser = force_n)]
     force: Option<f64>,
     /// Seed of everything random
     #[arg(long, value_name = "S", default_value_t = 1)]
@@ -205,6 +205,24 @@ fn baud(args: &Args, bytes: usize) -> Result<u32, Error> {
 /// A preset by the name it has in the configuration.
 fn preset(name: &str) -> Result<Preset, NameError> {
     Preset::deserialize(name.into_deserializer())
+}
+
+/// A press is computed whole, and takes as long as it takes to reach its force: what no sensor
+/// does would fill the memory.
+fn frame_rate_hz(text: &str) -> Result<f64, String> {
+    within(text, 0.1, 1000.0)
+}
+
+/// As [`frame_rate_hz`]; 1,000 N is far beyond what such a film bears.
+fn force_n(text: &str) -> Result<f64, String> {
+    within(text, 0.01, 1000.0)
+}
+
+fn within(text: &str, least: f64, most: f64) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(number) if (least..=most).contains(&number) => Ok(number),
+        _ => Err(format!("expected a number from {least} to {most}")),
+    }
 }
 
 /// A number above 0.
