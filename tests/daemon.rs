@@ -444,7 +444,12 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         &["--baud", "158000"],
     );
     assert_eq!(hardnessd(&["run"]).status.code(), Some(2));
-    for beyond_any_sensor in [["--force", "1e30"], ["--fps", "1e9"], ["--fps", "nan"]] {
+    for beyond_any_sensor in [
+        ["--force", "1e30"],
+        ["--fps", "1e9"],
+        ["--fps", "nan"],
+        ["--speed", "1e-300"],
+    ] {
         let arguments = [&["simulate"], &beyond_any_sensor[..]].concat();
         assert_eq!(
             hardnessd(&arguments).status.code(),

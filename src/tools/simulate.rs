@@ -225,10 +225,7 @@ fn within(text: &str, least: f64, most: f64) -> Result<f64, String> {
     }
 }
 
-/// A number above 0.
+/// A number above 0, and not so far from 1 that seconds made of it fit no clock.
 pub(super) fn positive(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(number) if number.is_finite() && number > 0.0 => Ok(number),
-        _ => Err("expected a number above 0".to_owned()),
-    }
+    within(text, 1e-6, 1e9)
 }
