@@ -438,6 +438,7 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         &["frame_rate_hz", "14.58"],
     );
     fails(&["replay", "/no/such.bin"], 66, &["/no/such.bin"]);
+    fails(&["replay", "/"], 66, &["/: cannot read", "directory"]);
     fails(
         &["simulate", "--fps", "20", "--baud", "115200"],
         2,
