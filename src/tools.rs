@@ -16,7 +16,9 @@ pub mod tail;
 pub mod watch;
 
 use std::error::Error;
-use std::io::{ErrorKind, Write};
+use std::fs::File;
+use std::io::{self, ErrorKind, Write};
+use std::path::Path;
 
 /// What is printed of an error: one line, with the causes that it does not tell itself.
 pub fn line(error: &(dyn Error + 'static)) -> String {
@@ -24,7 +26,7 @@ pub fn line(error: &(dyn Error + 'static)) -> String {
     let mut cause = error.source();
     while let Some(error) = cause {
         let text = error.to_string();
-        if !line.ends_with(&text) {
+        if !line.contains(&text) {
             line = format!("{line}: {text}");
         }
         cause = error.source();
@@ -32,9 +34,19 @@ pub fn line(error: &(dyn Error + 'static)) -> String {
     line
 }
 
+/// Opens a file to read from. A directory is refused here: the system would do so at the first read
+/// only, when what was asked for has begun.
+fn open(path: &Path) -> io::Result<File> {
+    let file = File::open(path)?;
+    if file.metadata()?.is_dir() {
+        return Err(ErrorKind::IsADirectory.into());
+    }
+    Ok(file)
+}
+
 /// Writes lines to stdout at once. `Ok(false)`: nobody reads any more, which ends a tool quietly.
-fn print(lines: &[u8]) -> std::io::Result<bool> {
-    let mut out = std::io::stdout().lock();
+fn print(lines: &[u8]) -> io::Result<bool> {
+    let mut out = io::stdout().lock();
     match out.write_all(lines).and_then(|()| out.flush()) {
         Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(false),
         written => written.map(|()| true),
@@ -48,16 +60,20 @@ mod tests {
     #[derive(Debug, thiserror::Error)]
     enum Told {
         #[error("x: cannot read: {0}")]
-        Whole(#[source] std::io::Error),
+        Whole(#[source] io::Error),
         #[error("x: cannot read")]
-        Bare(#[source] std::io::Error),
+        Bare(#[source] io::Error),
+        #[error("x: {0}, expected a new file")]
+        Within(#[source] io::Error),
     }
 
     #[test]
     fn a_cause_is_told_once() {
-        let cause = || std::io::Error::other("no such file");
+        let cause = || io::Error::other("no such file");
         for told in [Told::Whole(cause()), Told::Bare(cause())] {
             assert_eq!(line(&told), "x: cannot read: no such file");
         }
+        let told = Told::Within(cause());
+        assert_eq!(line(&told), "x: no such file, expected a new file");
     }
 }

@@ -438,7 +438,13 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         &["frame_rate_hz", "14.58"],
     );
     fails(&["replay", "/no/such.bin"], 66, &["/no/such.bin"]);
-    fails(&["replay", "/"], 66, &["/: cannot read", "directory"]);
+    for tool in [
+        &["replay", "/"][..],
+        &["sniff", "/"],
+        &["recover", "/", "--out", "x.mcap"],
+    ] {
+        fails(tool, 66, &["/: cannot read", "directory"]);
+    }
     fails(
         &["simulate", "--fps", "20", "--baud", "115200"],
         2,

@@ -59,7 +59,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
         path: args.broken.clone(),
         source,
     };
-    let broken = File::open(&args.broken).map_err(unreadable)?;
+    let broken = super::open(&args.broken).map_err(unreadable)?;
     let bytes = broken.metadata().map_err(unreadable)?.len();
     let unwritten = |source: recording::Error| Error::Write {
         path: args.out.clone(),

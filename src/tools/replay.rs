@@ -102,14 +102,10 @@ async fn play(args: Args) -> Result<(), Error> {
         }
     };
     let path = &args.file;
-    let unreadable = |source| Error::Unreadable {
+    let recording = super::open(path).map_err(|source| Error::Unreadable {
         path: path.clone(),
         source,
-    };
-    let recording = File::open(path).map_err(unreadable)?;
-    if recording.metadata().map_err(unreadable)?.is_dir() {
-        return Err(unreadable(io::ErrorKind::IsADirectory.into()));
-    }
+    })?;
     let extension = path.extension().unwrap_or_default();
     if extension == "mcap" {
         play_recording(&args, BufReader::new(recording), setup).await

@@ -8,7 +8,6 @@ mod proposal;
 mod tests;
 
 use std::fmt::Write;
-use std::fs::File;
 use std::future::Future;
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
@@ -124,7 +123,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, Error> {
-    let file = File::open(path).map_err(|source| Error::Unreadable {
+    let file = super::open(path).map_err(|source| Error::Unreadable {
         path: path.to_owned(),
         source,
     })?;
