@@ -35,7 +35,7 @@ use tracing::{error, info, warn};
 use self::config::Setup;
 use self::log::Log;
 use self::publish::Publishers;
-use self::record::{Recorder, Tap, Tape, Target};
+use self::record::{EventRecorder, Recorder, SensorRecorder, Target};
 use self::sensor::{Command, Sensor, Sensors};
 use self::serial::Link;
 use crate::event::{Hello, ModelCard, PROTOCOL, SensorCard, Status};
@@ -161,8 +161,10 @@ impl Daemon {
         let mut recorder = target
             .map(|target| Recorder::start(target, about(&setup, &hello)))
             .transpose()?;
-        let tap = recorder.as_ref().map_or(Tap::default(), Recorder::tap);
-        let hub = hub::start(hello, tap);
+        let events = recorder
+            .as_ref()
+            .map_or(EventRecorder::default(), Recorder::of_hub);
+        let hub = hub::start(hello, events);
 
         let mut tasks = JoinSet::new();
         let mut commands = Vec::new();
@@ -170,10 +172,12 @@ impl Daemon {
             let (sender, inbox) = mpsc::channel(QUESTIONS);
             let pipeline = Pipeline::new(setup.pipeline(sensor), Clock::Arrival);
             let link = Link::new(&sensor.port, sensor.baud);
-            let tape = recorder.as_ref().map_or(Tape::default(), |recorder| {
-                recorder.tape(index, setup.recorded(sensor))
-            });
-            tasks.spawn(sensor::serve(pipeline, link, tape, hub.clone(), inbox));
+            let recorder = recorder
+                .as_ref()
+                .map_or(SensorRecorder::default(), |recorder| {
+                    recorder.of_sensor(index, setup.recorded(sensor))
+                });
+            tasks.spawn(sensor::serve(pipeline, link, recorder, hub.clone(), inbox));
             commands.push(Sensor {
                 name: sensor.name.clone(),
                 commands: sender,

@@ -17,7 +17,7 @@ use tokio::sync::{mpsc, oneshot};
 use self::subscriber::Subscriber;
 pub(crate) use self::tally::{Counts, Tally, Verdicts};
 use super::log;
-use super::record::Tap;
+use super::record::EventRecorder;
 use super::request::{Kinds, Subscription};
 use crate::event::{Event, Hello, Kind, Reply};
 
@@ -68,7 +68,7 @@ struct Hub {
     /// Last final verdict, by sensor.
     finals: BTreeMap<String, Line>,
     tally: Tally,
-    tap: Tap,
+    recorder: EventRecorder,
     subscribers: BTreeMap<u64, Subscriber>,
     joined: u64,
 }
@@ -81,7 +81,7 @@ impl Hub {
             forgotten: [0; Kinds::NUMBERED.len()],
             finals: BTreeMap::new(),
             tally: Tally::default(),
-            tap: Tap::default(),
+            recorder: EventRecorder::default(),
             subscribers: BTreeMap::new(),
             joined: 0,
         }
@@ -104,7 +104,7 @@ impl Hub {
             self.hello.seq += 1;
             event.number(self.hello.seq);
         }
-        self.tap.event(&event);
+        self.recorder.event(&event);
         let mut subscribers = self.subscribers.values();
         if kind == Kind::Frame && !subscribers.any(|subscriber| subscriber.wants(kind)) {
             return;
@@ -355,11 +355,11 @@ impl Handle {
 /// Commands under way; the hub never waits, so the queue is short unless the machine is.
 const COMMANDS: usize = 256;
 
-/// Starts the hub, which shows `tap` what it publishes. It ends when every handle is gone.
-pub(crate) fn start(hello: Hello, tap: Tap) -> Handle {
+/// Starts the hub, which shows `recorder` what it publishes. It ends when every handle is gone.
+pub(crate) fn start(hello: Hello, recorder: EventRecorder) -> Handle {
     let (commands, inbox) = mpsc::channel(COMMANDS);
     let hub = Hub {
-        tap,
+        recorder,
         ..Hub::new(hello)
     };
     tokio::spawn(serve(hub, inbox));
@@ -440,7 +440,7 @@ async fn serve(mut hub: Hub, mut inbox: mpsc::Receiver<Command>) {
             }
             Command::Close => {
                 closing = true;
-                hub.tap = Tap::default();
+                hub.recorder = EventRecorder::default();
                 waiting.clear();
             }
         }

@@ -5,7 +5,8 @@
 //! which a replay goes on. A disk that fails or is full stops the recording, not the daemon; it
 //! goes on when there is room again.
 
-mod clerk;
+mod file;
+mod worker;
 
 use std::fs::File;
 use std::path::PathBuf;
@@ -16,7 +17,7 @@ use std::time::Duration;
 
 use tokio::sync::oneshot;
 
-use self::clerk::Clerk;
+use self::worker::Worker;
 use super::config;
 use crate::event::{Event, Kind};
 use crate::frame::Stamp;
@@ -142,13 +143,13 @@ impl Recorder {
         let (sender, inbox) = sync_channel(QUEUED);
         let dropped = Arc::new(AtomicU64::new(0));
         let (stopping, stop) = oneshot::channel();
-        let clerk = Clerk::new(target, about, dropped.clone(), stopping);
+        let worker = Worker::new(target, about, dropped.clone(), stopping);
         let (end, ended) = oneshot::channel();
         std::thread::Builder::new()
             .name("recorder".to_owned())
             .spawn(move || {
                 // The daemon may be gone already.
-                let _ = end.send(clerk.run(&inbox));
+                let _ = end.send(worker.run(&inbox));
             })
             .map_err(Error::Thread)?;
         Ok(Self {
@@ -161,8 +162,8 @@ impl Recorder {
     }
 
     /// For the task of the `index`-th sensor.
-    pub(crate) fn tape(&self, index: usize, sensor: Sensor) -> Tape {
-        Tape(Some(Box::new(Reel {
+    pub(crate) fn of_sensor(&self, index: usize, sensor: Sensor) -> SensorRecorder {
+        SensorRecorder(Some(Box::new(Active {
             jobs: self.jobs.clone(),
             index,
             sensor,
@@ -173,8 +174,8 @@ impl Recorder {
     }
 
     /// For the hub.
-    pub(crate) fn tap(&self) -> Tap {
-        Tap(Some((self.jobs.clone(), self.frames)))
+    pub(crate) fn of_hub(&self) -> EventRecorder {
+        EventRecorder(Some((self.jobs.clone(), self.frames)))
     }
 
     /// Waits until there is no more to record, be it that the thread has ended.
@@ -183,7 +184,7 @@ impl Recorder {
         let _ = (&mut self.stop).await;
     }
 
-    /// Waits for the file to be whole. Tapes and tap have to be gone: the thread ends when nobody
+    /// Waits for the file to be whole. All these have to be gone: the thread ends when nobody
     /// is left to tell it anything.
     pub(crate) async fn finish(self) -> Result<(), Error> {
         drop(self.jobs);
@@ -194,10 +195,10 @@ impl Recorder {
 
 /// Where one sensor's task notes what happens; nowhere, if there is no recorder.
 #[derive(Debug, Default)]
-pub(crate) struct Tape(Option<Box<Reel>>);
+pub(crate) struct SensorRecorder(Option<Box<Active>>);
 
 #[derive(Debug)]
-struct Reel {
+struct Active {
     jobs: Jobs,
     index: usize,
     sensor: Sensor,
@@ -208,7 +209,7 @@ struct Reel {
     counted: (u64, u64),
 }
 
-impl Tape {
+impl SensorRecorder {
     /// Notes what is about to happen to `pipeline`, and lets it happen.
     pub(crate) fn feed(
         &mut self,
@@ -222,18 +223,18 @@ impl Tape {
 
     /// Notes what is about to happen to `pipeline`.
     pub(crate) fn note(&mut self, pipeline: &Pipeline, input: &Input<'_>, at: Stamp) {
-        if let Some(reel) = &mut self.0 {
-            reel.begin(pipeline, at);
-            reel.tell(at, Entry::Input(input.to_owned()));
+        if let Some(active) = &mut self.0 {
+            active.begin(pipeline, at);
+            active.tell(at, Entry::Input(input.to_owned()));
         }
     }
 
     /// Notes that `pipeline` is judged otherwise from now on.
     pub(crate) fn reload(&mut self, pipeline: &Pipeline, judgement: &Judgement, at: Stamp) {
-        if let Some(reel) = &mut self.0 {
-            reel.begin(pipeline, at);
-            reel.sensor.adopt(judgement);
-            reel.tell(at, Entry::Settings(Box::new(reel.sensor.clone())));
+        if let Some(active) = &mut self.0 {
+            active.begin(pipeline, at);
+            active.sensor.adopt(judgement);
+            active.tell(at, Entry::Settings(Box::new(active.sensor.clone())));
         }
     }
 
@@ -241,9 +242,9 @@ impl Tape {
     pub(crate) fn blackbox(&self, reply: oneshot::Sender<Result<PathBuf, String>>) {
         // Without an answer the asker learns that there was none.
         match &self.0 {
-            Some(reel) => {
-                let sensor = reel.index;
-                reel.jobs.tell(Job::Blackbox { sensor, reply });
+            Some(active) => {
+                let sensor = active.index;
+                active.jobs.tell(Job::Blackbox { sensor, reply });
             }
             None => {
                 let reason = "found no [record] in the configuration, expected it: nothing is kept";
@@ -253,7 +254,7 @@ impl Tape {
     }
 }
 
-impl Reel {
+impl Active {
     fn begin(&mut self, pipeline: &Pipeline, at: Stamp) {
         let due = |noted| at.mono.saturating_sub(noted) >= STATE_EVERY;
         if !self.noted.is_none_or(due) {
@@ -286,9 +287,9 @@ impl Reel {
 
 /// Where the hub shows events; nowhere, if there is no recorder.
 #[derive(Debug, Default)]
-pub(crate) struct Tap(Option<(Jobs, bool)>);
+pub(crate) struct EventRecorder(Option<(Jobs, bool)>);
 
-impl Tap {
+impl EventRecorder {
     /// Shows an event as it is published.
     pub(crate) fn event(&self, event: &Event) {
         if let Some((jobs, frames)) = &self.0

@@ -13,7 +13,7 @@ use tokio::time::Instant;
 
 use super::hub;
 use super::log;
-use super::record::Tape;
+use super::record::SensorRecorder;
 use super::serial::{Link, Turn};
 use crate::event::{Event, Kind, Status, Tared};
 use crate::pipeline::{Judgement, Pipeline, RetareError};
@@ -82,7 +82,7 @@ impl Sensors {
 pub(crate) async fn serve(
     mut pipeline: Pipeline,
     mut link: Link,
-    mut tape: Tape,
+    mut recorder: SensorRecorder,
     hub: hub::Handle,
     mut commands: mpsc::Receiver<Command>,
 ) {
@@ -100,7 +100,7 @@ pub(crate) async fn serve(
                     continue;
                 }
                 Some(Command::Tare(reply)) => {
-                    tape.note(&pipeline, &Input::Tare, super::now());
+                    recorder.note(&pipeline, &Input::Tare, super::now());
                     match pipeline.retare() {
                         Ok(()) => taring = Some(reply),
                         Err(refusal) => {
@@ -112,21 +112,21 @@ pub(crate) async fn serve(
                 }
                 Some(Command::Context(context)) => {
                     log::context(pipeline.sensor(), context.as_ref());
-                    tape.feed(&mut pipeline, Input::Context(context), super::now());
+                    recorder.feed(&mut pipeline, Input::Context(context), super::now());
                     continue;
                 }
                 Some(Command::Blackbox(reply)) => {
-                    tape.blackbox(reply);
+                    recorder.blackbox(reply);
                     continue;
                 }
                 Some(Command::Reload(judgement)) => {
-                    tape.reload(&pipeline, &judgement, super::now());
+                    recorder.reload(&pipeline, &judgement, super::now());
                     pipeline.reload(*judgement);
                     continue;
                 }
                 Some(Command::Finish) | None => {
                     let at = super::now();
-                    let events = tape.feed(&mut pipeline, Input::Shutdown, at);
+                    let events = recorder.feed(&mut pipeline, Input::Shutdown, at);
                     return hub.publish(events, at.mono).await;
                 }
             },
@@ -138,11 +138,11 @@ pub(crate) async fn serve(
                     Turn::Unavailable(reason) => Input::Unavailable(reason.into()),
                     Turn::Lost(reason) => Input::Lost(reason.into()),
                 };
-                (tape.feed(&mut pipeline, input, at), at)
+                (recorder.feed(&mut pipeline, input, at), at)
             }
             () = until(deadline) => {
                 let at = super::now();
-                (tape.feed(&mut pipeline, Input::Tick, at), at)
+                (recorder.feed(&mut pipeline, Input::Tick, at), at)
             }
         };
         if events

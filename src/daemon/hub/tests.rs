@@ -281,7 +281,7 @@ fn what_is_forgotten_during_a_slow_replay_is_counted() {
 
 #[tokio::test]
 async fn a_subscriber_that_waits_gets_a_line_without_asking_again() {
-    let hub = start(hub().hello, Tap::default());
+    let hub = start(hub().hello, EventRecorder::default());
     let (id, hello) = hub.join().await.unwrap();
     assert!(hello.json.starts_with(r#"{"type":"hello""#));
     let lines = hub.take(id).await.unwrap();

@@ -1,7 +1,6 @@
 //! The recorder's thread: which file is open, when it ends, and what to do when the disk fails.
 
-use std::fs::{self, File};
-use std::io::{self, BufWriter, ErrorKind};
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -11,11 +10,12 @@ use std::time::{Duration, Instant};
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
+use super::file::{MB, Open, create, has_room};
 use super::{Error, Job, Target};
 use crate::daemon::config;
 use crate::event::{Event, LinkState, PressState};
 use crate::frame::Stamp;
-use crate::recording::{self, About, Entry, Input, Ring, Writer};
+use crate::recording::{self, About, Entry, Input, Ring};
 
 /// How often what was written is handed to the system: kill -9 loses no more.
 const FLUSH_EVERY: Duration = Duration::from_millis(500);
@@ -25,11 +25,9 @@ const RETRY_AFTER: Duration = Duration::from_secs(5);
 const FAULT_EVERY: Duration = Duration::from_secs(60);
 /// So much more than the floor has to be free before a recording goes on: a sixteenth.
 const ROOM_SHARE: u64 = 16;
-/// As disks are sold.
-const MB: u64 = 1_000_000;
 
 /// What the thread knows.
-pub(super) struct Clerk {
+pub(super) struct Worker {
     target: Target,
     about: About,
     dropped: Arc<AtomicU64>,
@@ -56,32 +54,6 @@ struct Watched {
     last_fault: Option<Instant>,
 }
 
-/// A file being written.
-struct Open {
-    path: PathBuf,
-    file: Arc<File>,
-    writer: Writer<BufWriter<Arc<File>>>,
-    since: Instant,
-}
-
-impl Open {
-    fn new(path: PathBuf, file: File, about: &About) -> Result<Self, recording::Error> {
-        let file = Arc::new(file);
-        let writer = Writer::new(BufWriter::new(file.clone()), about)?;
-        Ok(Self {
-            path,
-            file,
-            writer,
-            since: Instant::now(),
-        })
-    }
-
-    fn finish(self) -> Result<(), recording::Error> {
-        self.writer.finish()?;
-        Ok(())
-    }
-}
-
 /// What a job came to, if to no good.
 enum Failure {
     Write(recording::Error),
@@ -95,7 +67,7 @@ impl From<recording::Error> for Failure {
     }
 }
 
-impl Clerk {
+impl Worker {
     pub(super) fn new(
         target: Target,
         about: About,
@@ -424,33 +396,4 @@ impl Clerk {
         open.writer.flush()?;
         Ok(open)
     }
-}
-
-/// Whether the disk has so many bytes free for us.
-fn has_room(directory: &Path, floor: u64) -> io::Result<()> {
-    fs::create_dir_all(directory).map_err(|error| named(directory, &error))?;
-    let disk = rustix::fs::statvfs(directory).map_err(|error| named(directory, &error.into()))?;
-    let free = disk.f_bavail.saturating_mul(disk.f_frsize);
-    if free < floor {
-        let message = format!(
-            "{}: found {} MB free, expected at least {} (record.keep_free_mb)",
-            directory.display(),
-            free / MB,
-            floor / MB
-        );
-        return Err(io::Error::new(ErrorKind::StorageFull, message));
-    }
-    Ok(())
-}
-
-/// A new file, named by what it is and by now.
-fn create(directory: &Path, what: &str) -> io::Result<(PathBuf, File)> {
-    let now = jiff::Timestamp::now().strftime("%Y%m%dT%H%M%S%.3fZ");
-    let path = directory.join(format!("{what}-{now}.mcap"));
-    let file = File::create_new(&path).map_err(|error| named(&path, &error))?;
-    Ok((path, file))
-}
-
-fn named(path: &Path, error: &io::Error) -> io::Error {
-    io::Error::new(error.kind(), format!("{}: {error}", path.display()))
 }

@@ -1,0 +1,67 @@
+//! The file being written, and the disk it lies on.
+
+use std::fs::{self, File};
+use std::io::{self, BufWriter, ErrorKind};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+
+use crate::recording::{self, About, Writer};
+
+/// As disks are sold.
+pub(super) const MB: u64 = 1_000_000;
+
+/// A file being written.
+pub(super) struct Open {
+    pub(super) path: PathBuf,
+    pub(super) file: Arc<File>,
+    pub(super) writer: Writer<BufWriter<Arc<File>>>,
+    pub(super) since: Instant,
+}
+
+impl Open {
+    pub(super) fn new(path: PathBuf, file: File, about: &About) -> Result<Self, recording::Error> {
+        let file = Arc::new(file);
+        let writer = Writer::new(BufWriter::new(file.clone()), about)?;
+        Ok(Self {
+            path,
+            file,
+            writer,
+            since: Instant::now(),
+        })
+    }
+
+    pub(super) fn finish(self) -> Result<(), recording::Error> {
+        self.writer.finish()?;
+        Ok(())
+    }
+}
+
+/// Whether the disk has so many bytes free for us.
+pub(super) fn has_room(directory: &Path, floor: u64) -> io::Result<()> {
+    fs::create_dir_all(directory).map_err(|error| named(directory, &error))?;
+    let disk = rustix::fs::statvfs(directory).map_err(|error| named(directory, &error.into()))?;
+    let free = disk.f_bavail.saturating_mul(disk.f_frsize);
+    if free < floor {
+        let message = format!(
+            "{}: found {} MB free, expected at least {} (record.keep_free_mb)",
+            directory.display(),
+            free / MB,
+            floor / MB
+        );
+        return Err(io::Error::new(ErrorKind::StorageFull, message));
+    }
+    Ok(())
+}
+
+/// A new file, named by what it is and by now.
+pub(super) fn create(directory: &Path, what: &str) -> io::Result<(PathBuf, File)> {
+    let now = jiff::Timestamp::now().strftime("%Y%m%dT%H%M%S%.3fZ");
+    let path = directory.join(format!("{what}-{now}.mcap"));
+    let file = File::create_new(&path).map_err(|error| named(&path, &error))?;
+    Ok((path, file))
+}
+
+fn named(path: &Path, error: &io::Error) -> io::Error {
+    io::Error::new(error.kind(), format!("{}: {error}", path.display()))
+}
