@@ -12,7 +12,7 @@ use std::fs;
 use std::io::{BufRead, Read, Write};
 use std::net::TcpStream;
 use std::os::unix::fs::PermissionsExt;
-use std::os::unix::net::UnixStream;
+use std::os::unix::net::{UnixListener, UnixStream};
 use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -178,6 +178,76 @@ fn tail_gives_a_script_the_events_it_counts_or_an_exit_code() {
         .unwrap();
     daemon.process.signal(Signal::TERM);
     assert_eq!(left.exit_code(), Some(69), "the daemon has ended");
+}
+
+#[test]
+fn tail_does_not_wait_for_a_hello_that_does_not_come_nor_take_another_protocol() {
+    let bench = Bench::new();
+    let says_first = |line: &'static str| {
+        let path = bench.path("events.sock");
+        let _ = fs::remove_file(&path);
+        let listener = UnixListener::bind(&path).unwrap();
+        let listening = std::thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
+            stream.write_all(line.as_bytes()).unwrap();
+            // Until it goes.
+            let _ = stream.read_to_end(&mut Vec::new());
+        });
+        let output = tail(&bench, &[]).output().unwrap();
+        listening.join().unwrap();
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(69), "{stderr}");
+        assert_eq!(stderr.lines().count(), 1, "{stderr}");
+        stderr
+    };
+    for (line, parts) in [
+        ("", ["no hello within 5 s", "expected"]),
+        (
+            "{\"type\":\"hello\",\"protocol\":2}\n",
+            ["protocol 2", "protocol 1"],
+        ),
+        ("{\"type\":\"ok\"}\n", ["\"ok\"", "expected a hello"]),
+        ("SSH-2.0\n", ["no JSON", "events.sock"]),
+    ] {
+        let stderr = says_first(line);
+        for part in parts {
+            assert!(stderr.contains(part), "{part:?} not in {stderr}");
+        }
+    }
+}
+
+#[test]
+fn ok_comes_before_all_that_since_asks_for() {
+    let bench = Bench::new();
+    let _daemon = bench.daemon();
+    let mut first = bench.subscriber();
+    let run = first.next().unwrap()["run"].as_str().unwrap().to_owned();
+    let mut sensor = bench.sensor(&["--presses", "1"]);
+    assert_eq!(sensor.exit_code(), Some(0));
+    // From then on nothing happens.
+    let last = first.until(&json!({"state": "lost", "type": "status"}))["seq"].clone();
+    for subscription in [
+        json!({"subscribe": ["hardness", "press", "status"], "since": format!("{run}:0")}),
+        json!({"subscribe": ["press"], "since": "another:7"}),
+    ] {
+        let mut subscriber = bench.subscriber();
+        assert_eq!(subscriber.next().unwrap()["type"], "hello");
+        assert_eq!(subscriber.next().unwrap()["state"], "lost");
+        subscriber.say(&subscription.to_string());
+        assert_eq!(subscriber.next().unwrap(), json!({"type": "ok"}));
+        let held = subscriber.next().unwrap();
+        let expected = if held["type"] == "gap" { "lost" } else { "seq" };
+        assert!(held.get(expected).is_some(), "{held}");
+        subscriber.until(&json!({"type": "press", "state": "end"}));
+        // Those that come later come too.
+        assert_eq!(subscriber.ask(r#"{"get":"status"}"#)["type"], "ok");
+    }
+    let mut again = bench.subscriber();
+    again.say(&json!({"subscribe": ["status"], "since": format!("{run}:1")}).to_string());
+    again.until(&json!({"type": "ok"}));
+    assert_eq!(again.until(&json!({"seq": last}))["state"], "lost");
+    let _sensor = bench.sensor(&["--presses", "1"]);
+    again.until(&json!({"state": "live"}));
 }
 
 /// Reads everything on a thread of its own until told to stop, and claims that nothing was missed.

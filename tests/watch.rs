@@ -11,6 +11,7 @@ use std::fs::File;
 use std::io::Read;
 use std::num::NonZero;
 use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixListener;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::mpsc::{self, Receiver};
@@ -175,6 +176,24 @@ fn it_shows_presses_loss_and_a_daemon_that_goes_and_comes_back() {
     terminal.shows("DAEMON SILENT");
     _daemon.process.signal(Signal::CONT);
     terminal.shows("LIVE");
+    terminal.press(b"q");
+    terminal.ends();
+}
+
+#[test]
+fn what_takes_the_connection_and_says_nothing_is_silent() {
+    let bench = Bench::new();
+    let path = bench.path("events.sock");
+    // The system takes connections for whoever listens.
+    let listener = UnixListener::bind(&path).unwrap();
+    let mut terminal = Terminal::new(&path, (80, 24), &[]);
+    terminal.shows("NO DAEMON");
+    terminal.shows("DAEMON SILENT  no answer for");
+    std::fs::remove_file(&path).unwrap();
+    drop(listener);
+    terminal.shows("NO DAEMON");
+    let _daemon = bench.daemon();
+    terminal.shows("CONNECTING");
     terminal.press(b"q");
     terminal.ends();
 }

@@ -238,6 +238,8 @@ fn exit_code(error: &anyhow::Error) -> u8 {
         return match error {
             tail::Error::Timeout { .. } => exit::FAILED,
             tail::Error::NoDaemon { .. }
+            | tail::Error::Mute { .. }
+            | tail::Error::Foreign { .. }
             | tail::Error::Refused { .. }
             | tail::Error::Closed { .. } => exit::UNAVAILABLE,
             tail::Error::Print(_) => exit::IO,

@@ -18,7 +18,7 @@ use tokio::net::UnixStream;
 
 use super::simulate::positive;
 use crate::daemon::config::Unix;
-use crate::event::Kind;
+use crate::event::{Kind, PROTOCOL};
 
 /// Arguments of `tail`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -67,6 +67,20 @@ pub enum Error {
         /// Why not.
         source: io::Error,
     },
+    /// Somebody listens, and is no daemon.
+    #[error("{path}: found no hello within {} s, expected a daemon's", HELLO.as_secs())]
+    Mute {
+        /// Of the socket.
+        path: PathBuf,
+    },
+    /// Somebody speaks, and is no daemon of this protocol.
+    #[error("{path}: found {found}, expected a hello of protocol {PROTOCOL}")]
+    Foreign {
+        /// Of the socket.
+        path: PathBuf,
+        /// What it says first.
+        found: String,
+    },
     /// The daemon has no room.
     #[error("{path}: the daemon says: {message}")]
     Refused {
@@ -85,6 +99,10 @@ pub enum Error {
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
 }
+
+/// How long a daemon may take to say hello: a hundred times as long as one takes (contract, section
+/// 5), for one that a service manager has to start first.
+const HELLO: Duration = Duration::from_secs(5);
 
 fn expected(count: Option<u64>) -> String {
     count.map_or("to go on".to_owned(), |count| count.to_string())
@@ -136,38 +154,75 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
         .write_all(request.as_bytes())
         .await
         .map_err(no_daemon)?;
-    let mut lines = BufReader::new(daemon);
-    let mut line = String::new();
-    let mut met = false;
+    let mut lines = Lines {
+        path: path.clone(),
+        input: BufReader::new(daemon),
+        line: String::new(),
+    };
+    match tokio::time::timeout(HELLO, lines.next()).await {
+        Ok(hello) => meet(&hello?, path)?,
+        Err(_) => return Err(Error::Mute { path }),
+    }
     loop {
-        line.clear();
-        match lines.read_line(&mut line).await {
-            Ok(0) => return Err(Error::Closed { path }),
-            Ok(_) => {}
-            Err(source) => return Err(no_daemon(source)),
-        }
-        let Ok(event) = serde_json::from_str::<Value>(&line) else {
-            let source = io::Error::new(io::ErrorKind::InvalidData, "found no JSON");
-            return Err(no_daemon(source));
-        };
+        let event = lines.next().await?;
         let kind = event["type"].as_str().unwrap_or_default();
-        met |= kind == "hello";
-        if !met && kind == "error" {
-            let message = event["message"].as_str().unwrap_or_default().to_owned();
-            return Err(Error::Refused { path, message });
-        }
         // What was queued before the subscription took effect is not meant.
         let counts = Kind::named(kind).is_some_and(|kind| args.types.contains(&kind));
         if !counts && kind != "gap" {
             continue;
         }
-        if !show(args, &event, &line)? {
+        if !show(args, &event, &lines.line)? {
             return Ok(());
         }
         *found += u64::from(counts);
         if args.count == Some(*found) {
             return Ok(());
         }
+    }
+}
+
+/// Goes on only if this is what a daemon says first.
+fn meet(hello: &Value, path: PathBuf) -> Result<(), Error> {
+    let kind = hello["type"].as_str().unwrap_or_default();
+    let found = match (kind, &hello["protocol"]) {
+        ("hello", protocol) if *protocol == PROTOCOL => return Ok(()),
+        ("hello", protocol) => format!("protocol {protocol}"),
+        ("error", _) => {
+            let message = hello["message"].as_str().unwrap_or_default().to_owned();
+            return Err(Error::Refused { path, message });
+        }
+        (kind, _) => format!("{kind:?}"),
+    };
+    Err(Error::Foreign { path, found })
+}
+
+/// What the daemon says.
+struct Lines {
+    path: PathBuf,
+    input: BufReader<UnixStream>,
+    /// The last one, as it came.
+    line: String,
+}
+
+impl Lines {
+    async fn next(&mut self) -> Result<Value, Error> {
+        let broken = |path: &PathBuf, source| Error::NoDaemon {
+            path: path.clone(),
+            source,
+        };
+        self.line.clear();
+        match self.input.read_line(&mut self.line).await {
+            Ok(0) => {
+                let path = self.path.clone();
+                return Err(Error::Closed { path });
+            }
+            Ok(_) => {}
+            Err(source) => return Err(broken(&self.path, source)),
+        }
+        serde_json::from_str(&self.line).map_err(|_| {
+            let source = io::Error::new(io::ErrorKind::InvalidData, "found no JSON");
+            broken(&self.path, source)
+        })
     }
 }
 

@@ -93,7 +93,8 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
             }
             _ = questions.tick() => daemon.ask(),
             heard = daemon.next() => match heard {
-                Ok(line) => view.hear(&line, now()),
+                Ok(Heard::Connection) => view.wait(now().mono),
+                Ok(Heard::Line(line)) => view.hear(&line, now()),
                 Err(loss) => view.lose(loss),
             },
         }
@@ -119,6 +120,13 @@ struct Daemon {
     pause: Instant,
 }
 
+/// What comes of a daemon that is there.
+enum Heard {
+    /// It has taken the connection.
+    Connection,
+    Line(String),
+}
+
 impl Daemon {
     fn new(path: PathBuf) -> Self {
         Self {
@@ -129,20 +137,16 @@ impl Daemon {
     }
 
     /// The next line, or why there is no daemon. Nothing is lost if the wait is given up.
-    async fn next(&mut self) -> Result<String, Loss> {
-        if self.connection.is_none() {
+    async fn next(&mut self) -> Result<Heard, Loss> {
+        let Some((lines, _)) = &mut self.connection else {
             tokio::time::sleep_until(self.pause).await;
             self.pause = Instant::now() + PAUSE;
-        }
-        let lines = match &mut self.connection {
-            Some((lines, _)) => lines,
-            none => {
-                let connected = connect(&self.path).await.map_err(Loss::Unreachable)?;
-                &mut none.insert(connected).0
-            }
+            let connected = connect(&self.path).await.map_err(Loss::Unreachable)?;
+            self.connection = Some(connected);
+            return Ok(Heard::Connection);
         };
         if let Ok(Some(line)) = lines.next_line().await {
-            return Ok(line);
+            return Ok(Heard::Line(line));
         }
         self.connection = None;
         self.pause = Instant::now() + PAUSE;

@@ -38,9 +38,8 @@ pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
         page.title(row, view);
     }
     let Some(sensor) = view.sensor() else {
-        if let Some(row) = rows.take(1) {
-            let line = format!(" NO DAEMON  {}", view.absence());
-            page.band(row, &line, look.link(Link::NoDaemon));
+        if let (Some(row), Some((link, reason))) = (rows.take(1), view.trouble(now)) {
+            page.band(row, &format!(" {}  {reason}", link.name()), look.link(link));
         }
         page.keys(foot, view);
         return;

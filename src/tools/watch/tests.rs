@@ -136,6 +136,27 @@ fn a_value_is_as_old_as_its_event_however_late_it_is_read() {
 }
 
 #[test]
+fn what_does_not_say_hello_is_silent_and_another_protocol_is_none() {
+    let mut met = pressed_sensor();
+    met.lose(Loss::Closed);
+    for mut view in [View::new(), met] {
+        view.wait(at(0).mono);
+        let text = |view: &View, ms| shown(view, ms, (80, 24), PLAIN);
+        assert!(text(&view, 2_900).contains("NO DAEMON"));
+        let silent = text(&view, 3_100);
+        assert!(silent.contains("DAEMON SILENT"), "{silent}");
+        assert!(silent.contains("no answer for 3.1 s"), "{silent}");
+        let mut other = hello("b", &["forearm"]);
+        other["protocol"] = json!(2);
+        hear(&mut view, 4_000, other);
+        let refused = text(&view, 4_100);
+        for part in ["NO DAEMON", "found protocol 2, expected 1"] {
+            assert!(refused.contains(part), "{refused}");
+        }
+    }
+}
+
+#[test]
 fn what_is_not_live_is_not_shown_as_present() {
     let live = shown(&pressed_sensor(), 300, (80, 24), PLAIN);
     for part in [

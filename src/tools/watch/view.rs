@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use serde_json::Value;
 
+use crate::event::PROTOCOL;
 use crate::frame::{COLS, ROWS, Stamp, TAXELS};
 
 /// How far back the curves go.
@@ -33,12 +34,21 @@ pub(super) struct View {
     pub(super) sensors: Vec<Sensor>,
     /// Index of the sensor that is looked at.
     pub(super) chosen: usize,
-    /// Why there is no daemon, if there is none.
-    absent: Option<String>,
+    daemon: Daemon,
     /// When the daemon last said anything.
     heard: Duration,
     /// Events that it had no room for; `None`: their number is unknown.
     pub(super) missed: Option<u64>,
+}
+
+/// Whether there is a daemon.
+#[derive(Debug, PartialEq, Eq)]
+enum Daemon {
+    /// There is none, and why.
+    Absent(String),
+    /// Something has taken the connection and not said what it is; why there was none before.
+    Unknown(String),
+    Met,
 }
 
 /// Who speaks.
@@ -172,7 +182,7 @@ impl View {
             hello: None,
             sensors: Vec::new(),
             chosen: 0,
-            absent: Some("connecting".to_owned()),
+            daemon: Daemon::Absent("connecting".to_owned()),
             heard: Duration::ZERO,
             missed: Some(0),
         }
@@ -191,7 +201,9 @@ impl View {
                 self.missed = self.missed.zip(lost).map(|(sum, lost)| sum + lost);
             }
             // Before a hello: there is no room.
-            "error" if self.absent.is_some() => self.absent = Some(text(&event, "message")),
+            "error" if self.daemon != Daemon::Met => {
+                self.daemon = Daemon::Absent(text(&event, "message"));
+            }
             kind => {
                 let name = text(&event, "sensor");
                 let at = moment(&event, now);
@@ -202,7 +214,20 @@ impl View {
         }
     }
 
+    /// Something has taken the connection at `now`: it is given as long to say what it is as a
+    /// daemon to answer.
+    pub(super) fn wait(&mut self, now: Duration) {
+        self.heard = now;
+        self.daemon = Daemon::Unknown(self.absence().to_owned());
+    }
+
     fn meet(&mut self, event: &Value) {
+        let protocol = &event["protocol"];
+        if *protocol != PROTOCOL {
+            let reason = format!("found protocol {protocol}, expected {PROTOCOL}");
+            self.daemon = Daemon::Absent(reason);
+            return;
+        }
         let hello = hello(event);
         // In another run numbers begin again, and nothing of the old one is known any more.
         if self
@@ -220,16 +245,16 @@ impl View {
             self.missed = Some(0);
         }
         self.hello = Some(hello);
-        self.absent = None;
+        self.daemon = Daemon::Met;
     }
 
     /// The daemon went away, or does not answer.
     pub(super) fn lose(&mut self, loss: Loss) {
         match loss {
-            Loss::Unreachable(reason) => self.absent = Some(reason),
+            Loss::Unreachable(reason) => self.daemon = Daemon::Absent(reason),
             // Where it never said hello, why it did not is known already.
-            Loss::Closed if self.absent.is_some() => {}
-            Loss::Closed => self.absent = Some("it closed the connection".to_owned()),
+            Loss::Closed if matches!(self.daemon, Daemon::Absent(_)) => {}
+            Loss::Closed => self.daemon = Daemon::Absent("it closed the connection".to_owned()),
         }
     }
 
@@ -251,13 +276,8 @@ impl View {
 
     /// What holds for a sensor, and why.
     pub(super) fn link(&self, sensor: &Sensor, now: Duration) -> (Link, Option<String>) {
-        if let Some(reason) = &self.absent {
-            return (Link::NoDaemon, Some(reason.clone()));
-        }
-        let silence = now.saturating_sub(self.heard);
-        if silence > SILENCE {
-            let reason = format!("no answer for {}", age(silence));
-            return (Link::Silent, Some(reason));
+        if let Some((link, reason)) = self.trouble(now) {
+            return (link, Some(reason));
         }
         let Some(status) = &sensor.status else {
             return (Link::Connecting, None);
@@ -271,9 +291,25 @@ impl View {
         (link, status.reason.clone())
     }
 
-    /// Why no daemon is there, where none has ever been met.
-    pub(super) fn absence(&self) -> &str {
-        self.absent.as_deref().unwrap_or_default()
+    /// What keeps the daemon from telling of any sensor, and why.
+    pub(super) fn trouble(&self, now: Duration) -> Option<(Link, String)> {
+        let silence = now.saturating_sub(self.heard);
+        match &self.daemon {
+            Daemon::Absent(reason) => Some((Link::NoDaemon, reason.clone())),
+            Daemon::Unknown(_) | Daemon::Met if silence > SILENCE => {
+                Some((Link::Silent, format!("no answer for {}", age(silence))))
+            }
+            Daemon::Unknown(reason) => Some((Link::NoDaemon, reason.clone())),
+            Daemon::Met => None,
+        }
+    }
+
+    /// Why there is no daemon.
+    fn absence(&self) -> &str {
+        match &self.daemon {
+            Daemon::Absent(reason) | Daemon::Unknown(reason) => reason,
+            Daemon::Met => "",
+        }
     }
 }
 
