@@ -200,17 +200,14 @@ impl<S: Stream> Client<S> {
                     Heard::Line(line) => {
                         let answer = self.answer(id, &line).await?;
                         // What the hub gave before it answered belongs before the answer.
-                        let ended = match next.try_recv() {
-                            Ok(lines) => {
-                                self.send(&lines).await?;
-                                next = hub.take(id).await?;
-                                false
-                            }
-                            Err(waiting) => waiting == TryRecvError::Closed,
-                        };
+                        let given = next.try_recv();
+                        if let Ok(lines) = &given {
+                            self.send(lines).await?;
+                        }
                         self.send(&answer).await?;
-                        if ended {
-                            return Ok(());
+                        // Another subscription ends the wait under the old one.
+                        if given != Err(TryRecvError::Empty) {
+                            next = hub.take(id).await?;
                         }
                     }
                     Heard::TooLong => {

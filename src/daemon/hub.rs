@@ -22,7 +22,7 @@ use super::request::{Kinds, Subscription};
 use crate::event::{Event, Hello, Kind, Reply};
 
 /// A line to be sent.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Line {
     /// Number of the event, if it has one; of a `hello`, the latest number given.
     pub(crate) seq: Option<u64>,
@@ -305,7 +305,8 @@ impl Handle {
         Ok(lines)
     }
 
-    /// Changes a subscription; the error is for the subscriber.
+    /// Changes a subscription; the error is for the subscriber. A call of [`Handle::take`] that is
+    /// under way ends: with lines under the old subscription, or with none.
     pub(crate) async fn subscribe(
         &self,
         id: u64,
@@ -412,16 +413,9 @@ async fn serve(mut hub: Hub, mut inbox: mpsc::Receiver<Command>) {
                 subscription,
                 reply,
             } => {
+                // What is held may be due at once: the subscriber asks again once it has answered.
+                waiting.remove(&id);
                 let _ = reply.send(hub.subscribe(id, &subscription));
-                // What was held may be due at once.
-                if waiting.contains_key(&id) {
-                    let lines = hub.take(id);
-                    if !lines.is_empty()
-                        && let Some(reply) = waiting.remove(&id)
-                    {
-                        let _ = reply.send(lines);
-                    }
-                }
             }
             Command::Finals { reply } => {
                 let _ = reply.send(hub.finals.values().cloned().collect());
