@@ -17,6 +17,8 @@ pub mod recording;
 pub mod random;
 pub mod simulator;
 
+pub mod wording;
+
 pub mod daemon;
 pub mod tools;
 #[cfg(feature = "train")]

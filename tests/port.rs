@@ -11,7 +11,8 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::Command;
 
-use bench::{BINARY, Bench, Daemon, hardnessd, wait_for};
+use bench::{BINARY, Bench, Daemon, Process, hardnessd, wait_for};
+use rustix::process::Signal;
 use serde_json::json;
 
 /// Exit code, stdout, stderr.
@@ -132,6 +133,14 @@ fn doctor_names_what_is_missing_and_who_holds_a_port() {
         "{stdout}"
     );
 
+    // One line says that it is none, whatever else may be said of it.
+    for port in ["/dev/null", "/tmp", "Cargo.toml"] {
+        let (code, stdout, _) = run(&["doctor", "--port", port]);
+        assert_eq!(code, 1, "{stdout}");
+        assert_eq!(stdout.lines().count(), 1, "{stdout}");
+        assert!(stdout.contains("expected a serial port"), "{stdout}");
+    }
+
     let _sensor = bench.sensor(&[]);
     let daemon = Daemon::start(&bench.configure("hardnessd.toml", "events.sock", ""));
     bench.subscriber().until(&json!({"state": "live"}));
@@ -139,7 +148,7 @@ fn doctor_names_what_is_missing_and_who_holds_a_port() {
     let (code, stdout, stderr) = run(&["doctor", "--port", &port]);
     assert_eq!(code, 1);
     let holder = format!(
-        "held by process {} (hardnessd): kill",
+        "held by process {}, the daemon (hardnessd run): sudo systemctl stop hardnessd",
         daemon.process.0.id()
     );
     assert!(stdout.contains(&holder), "{holder:?} not in {stdout}");
@@ -177,6 +186,54 @@ fn doctor_names_the_group_that_may_use_a_port() {
     assert_eq!(output.status.code(), Some(1), "{stdout}");
     assert!(stdout.contains("permission denied to "), "{stdout}");
     assert!(stdout.contains("sudo "), "no cure in {stdout}");
+}
+
+#[test]
+fn a_simulated_sensor_ends_at_a_signal_and_takes_its_link_along() {
+    let bench = Bench::new();
+    let long = bench.path("long.bin");
+    for signal in [Signal::INT, Signal::TERM, Signal::HUP] {
+        let mut at_pty = bench.sensor(&[]);
+        let mut to_file = Command::new(BINARY);
+        to_file.args([
+            "simulate",
+            "--fps",
+            "1000",
+            "--presses",
+            "4000000000",
+            "--to",
+        ]);
+        let mut to_file = Process(to_file.arg(&long).spawn().unwrap());
+        wait_for("a frame", || {
+            fs::metadata(&long).is_ok_and(|file| file.len() > 0)
+        });
+        for process in [&mut at_pty, &mut to_file] {
+            let start = std::time::Instant::now();
+            process.signal(signal);
+            assert_eq!(process.exit_code(), Some(0), "{signal:?}");
+            let elapsed = start.elapsed();
+            assert!(elapsed.as_secs() < 1, "{signal:?}: {elapsed:?}");
+        }
+        assert!(
+            fs::symlink_metadata(bench.path("port")).is_err(),
+            "{signal:?}"
+        );
+        // Whole frames, as many as there was time for.
+        assert_eq!(fs::metadata(&long).unwrap().len() % 790, 0);
+        fs::remove_file(&long).unwrap();
+    }
+}
+
+#[test]
+fn a_link_that_became_anothers_is_left() {
+    let bench = Bench::new();
+    let mut sensor = bench.sensor(&[]);
+    let link = bench.path("port");
+    fs::remove_file(&link).unwrap();
+    std::os::unix::fs::symlink("/dev/null", &link).unwrap();
+    sensor.signal(Signal::HUP);
+    assert_eq!(sensor.exit_code(), Some(0));
+    assert_eq!(fs::read_link(&link).unwrap(), Path::new("/dev/null"));
 }
 
 /// It takes half a second; ten on a busy machine are no reason to wait longer.

@@ -159,6 +159,18 @@ fn record_writes_a_new_file_for_as_long_as_there_is_a_sensor() {
     let config = configure(&bench, 20);
     let out = bench.path("a.mcap");
     let labels = ["--label", "level=2", "--label", "object=7"];
+    // A level that no model has is no label of one.
+    for level in ["level=9", "level=hard", "level=-1"] {
+        let config = config.to_str().unwrap();
+        let out = out.to_str().unwrap();
+        let output = hardnessd(&["record", "--config", config, "--out", out, "--label", level]);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(
+            said.contains("1 (hard), 2 (firm)") && said.lines().count() == 1,
+            "{said}"
+        );
+    }
     // Nothing to record: said, and no file left behind.
     let mut none = record(&config, &out, &labels);
     assert_eq!(none.exit_code(), Some(69));
@@ -280,6 +292,36 @@ fn recover_says_what_it_saved_and_leaves_files_alone() {
     assert_eq!(code, 74, "{said}");
     assert_eq!(replay(&bench.path("whole.mcap")), replay(&out));
 
+    // Cut off anywhere it is played to its end, with the last words that bytes would have.
+    let whole = fs::read(&out).unwrap();
+    let mut aborted = 0;
+    for cut in [
+        0,
+        1,
+        8,
+        100,
+        whole.len() / 4,
+        whole.len() / 2,
+        whole.len() * 3 / 4,
+    ] {
+        fs::write(path("cut.mcap"), &whole[..cut]).unwrap();
+        let output = hardnessd(&["replay", &path("cut.mcap")]);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert_eq!(said.lines().count(), 1, "{said}");
+        let events = String::from_utf8(output.stdout).unwrap();
+        let events: Vec<&str> = events.lines().collect();
+        assert_eq!(events.is_empty(), cut <= 100, "{events:?}");
+        if let [.., before, last] = events.as_slice() {
+            assert!(last.contains(r#""reason":"end of recording""#), "{last}");
+            aborted += usize::from(before.contains("aborted"));
+        }
+        let presses = |state: &str| events.iter().filter(|event| event.contains(state)).count();
+        let (begun, ended) = (presses(r#""begin""#), presses(r#""end""#));
+        assert_eq!(begun, ended + presses(r#""aborted""#), "{events:?}");
+    }
+    assert!(aborted > 0, "no cut lies within a press");
+
     let mut bytes = fs::read(&out).unwrap();
     let middle = bytes.len() / 2;
     bytes[middle] ^= 4;
@@ -293,6 +335,50 @@ fn recover_says_what_it_saved_and_leaves_files_alone() {
     });
     assert_eq!(parts.count(), 0);
     replay(&bench.path("good.mcap"));
+}
+
+#[test]
+fn what_other_programs_recorded_is_no_recording_of_ours() {
+    let bench = Bench::new();
+    let path = |name: &str| bench.path(name).to_str().unwrap().to_owned();
+    let mut foreign = mcap::Writer::new(fs::File::create(path("foreign.mcap")).unwrap()).unwrap();
+    let channel = foreign.add_channel(
+        0,
+        "/camera/image",
+        "json",
+        &std::collections::BTreeMap::new(),
+    );
+    let header = mcap::records::MessageHeader {
+        channel_id: channel.unwrap(),
+        sequence: 1,
+        log_time: 1,
+        publish_time: 1,
+    };
+    foreign.write_to_known_channel(&header, b"{}").unwrap();
+    foreign.finish().unwrap();
+    for (arguments, found) in [
+        (
+            vec!["replay".to_owned(), path("foreign.mcap")],
+            "no state of a sensor",
+        ),
+        (
+            vec![
+                "recover".to_owned(),
+                path("foreign.mcap"),
+                "--out".to_owned(),
+                path("good.mcap"),
+            ],
+            "found 1 messages of other programs",
+        ),
+    ] {
+        let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+        let output = hardnessd(&arguments);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert!(said.contains(found) && said.lines().count() == 1, "{said}");
+        assert!(said.contains("expected a recording of hardnessd"), "{said}");
+        assert!(!bench.path("good.mcap").exists());
+    }
 }
 
 #[test]

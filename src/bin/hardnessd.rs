@@ -104,11 +104,11 @@ async fn dispatch(command: Command) -> anyhow::Result<()> {
         Command::Demo(args) => {
             // The events are what is shown: the log would say each again.
             let _log = Log::start(LogSettings::default(), "warn")?;
-            Ok(demo::run(args, shutdown()?).await?)
+            Ok(demo::run(args, shutdown_or_hangup()?).await?)
         }
-        Command::Simulate(args) => Ok(simulate::run(args, shutdown()?).await?),
+        Command::Simulate(args) => Ok(simulate::run(args, shutdown_or_hangup()?).await?),
         Command::Record(args) => {
-            let shutdown = shutdown()?;
+            let shutdown = shutdown_or_hangup()?;
             let setup = Setup::load(&args.config)?;
             let _log = Log::start(setup.config.log, "info")?;
             Ok(record::run(args, setup, shutdown).await?)
@@ -160,6 +160,33 @@ fn shutdown() -> io::Result<impl Future<Output = ()>> {
             _ = terminate.recv() => {}
         }
     })
+}
+
+/// As [`shutdown`], or the terminal is gone: for tools that would leave something behind.
+fn shutdown_or_hangup() -> io::Result<impl Future<Output = ()>> {
+    let shutdown = shutdown()?;
+    let mut hangup = match hangup_is_ignored() {
+        true => None,
+        false => Some(signal(SignalKind::hangup())?),
+    };
+    Ok(async move {
+        match &mut hangup {
+            Some(hangup) => tokio::select! {
+                () = shutdown => {}
+                _ = hangup.recv() => {}
+            },
+            None => shutdown.await,
+        }
+    })
+}
+
+/// Whoever started this (`nohup`) wants it to outlive the terminal: a handler would undo that.
+fn hangup_is_ignored() -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    let mask = ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
+    // Bit 0 is signal 1, SIGHUP.
+    mask.is_some_and(|mask| mask & 1 == 1)
 }
 
 fn exit_code(error: &anyhow::Error) -> u8 {
@@ -215,6 +242,7 @@ fn exit_code(error: &anyhow::Error) -> u8 {
     }
     if let Some(error) = error.downcast_ref::<record::Error>() {
         return match error {
+            record::Error::Level { .. } => exit::USAGE,
             record::Error::Create { .. } => exit::IO,
             record::Error::Daemon(error) => of_daemon(error),
         };
@@ -222,7 +250,7 @@ fn exit_code(error: &anyhow::Error) -> u8 {
     if let Some(error) = error.downcast_ref::<recover::Error>() {
         return match error {
             recover::Error::Unreadable { .. } => exit::NO_INPUT,
-            recover::Error::Nothing { .. } => exit::FAILED,
+            recover::Error::Nothing { .. } | recover::Error::Foreign { .. } => exit::FAILED,
             recover::Error::Write { .. } => exit::IO,
         };
     }

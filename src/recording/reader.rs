@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::io::{ErrorKind, Read};
 
+use mcap::MAGIC;
 use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
@@ -30,6 +31,7 @@ pub struct Reader<R> {
     linear: LinearReader,
     schemas: BTreeSet<u16>,
     channels: BTreeSet<u16>,
+    bytes: u64,
     /// No more entries: the summary, an error or the end was reached.
     done: bool,
 }
@@ -45,6 +47,7 @@ impl<R: Read> Reader<R> {
             linear: LinearReader::new_with_options(options),
             schemas: BTreeSet::new(),
             channels: BTreeSet::new(),
+            bytes: 0,
             done: false,
         }
     }
@@ -62,6 +65,14 @@ impl<R: Read> Reader<R> {
                             read => break read?,
                         }
                     };
+                    self.bytes += read as u64;
+                    if read == 0 && self.bytes < MAGIC.len() as u64 {
+                        // Nothing of it could be saved.
+                        return Err(Error::Foreign {
+                            found: format!("{} bytes", self.bytes),
+                            expected: "a recording",
+                        });
+                    }
                     self.linear.notify_read(read);
                     continue;
                 }

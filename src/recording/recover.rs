@@ -20,6 +20,8 @@ use super::{Error, writer};
 pub struct Recovered {
     /// Messages saved.
     pub messages: u64,
+    /// Those among them that other programs wrote.
+    pub messages_foreign: u64,
     /// Whole chunks.
     pub chunks: u64,
     /// First and last moment saved, in nanoseconds since 1970.
@@ -263,6 +265,8 @@ impl<W: Write> Copy<W> {
                     }
                     self.out.write_to_known_channel(&header, &data)?;
                     self.done.messages += 1;
+                    let topic = &self.channels[&header.channel_id].topic;
+                    self.done.messages_foreign += u64::from(!writer::is_topic_of_ours(topic));
                     let time = header.log_time;
                     let (first, last) = self.done.span_ns.unwrap_or((time, time));
                     self.done.span_ns = Some((first.min(time), last.max(time)));

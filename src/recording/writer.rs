@@ -65,6 +65,14 @@ pub(super) fn topic_name(sensor: &str, topic: Topic) -> String {
     format!("/tactile/{sensor}/{}", topic.name)
 }
 
+/// Whether a channel of this name may be one of ours.
+pub(super) fn is_topic_of_ours(name: &str) -> bool {
+    let parts = name
+        .strip_prefix("/tactile/")
+        .and_then(|rest| rest.split_once('/'));
+    parts.is_some_and(|(_, name)| TOPICS.iter().any(|topic| topic.name == name))
+}
+
 impl<W: Write> Writer<W> {
     /// Begins a recording.
     ///

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
 
-use self::checks::{User, examine, ports};
+use self::checks::{User, examine, ports, refused};
 
 /// Arguments of `doctor`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -55,7 +55,10 @@ pub fn run(args: &Args) -> Result<(), Error> {
     }
     for port in ports {
         let port = std::path::absolute(&port).unwrap_or(port);
-        let faults = examine(root, &port, &user);
+        let faults = match refused(root, &port) {
+            Some(fault) => vec![fault],
+            None => examine(root, &port, &user),
+        };
         found += faults.len();
         if faults.is_empty() {
             lines += &format!("{}: no fault found\n", port.display());

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use crate::random::Stream;
+use crate::wording;
 
 /// The file format, for `--help`.
 pub(crate) const FORMAT: &str = r#"The faults of --faults FILE, a TOML file; times in the sensor's seconds from the start:
@@ -22,7 +23,12 @@ pub(crate) const FORMAT: &str = r#"The faults of --faults FILE, a TOML file; tim
   kind = "drop-bytes"    # `bytes` of each of `frames` frames are not sent
   kind = "flip"          # `bits` of each of `frames` frames are inverted
 
-`for_s` is needed where it applies; `bytes`, `bits` and `frames` are 1 unless given."#;
+`for_s` is needed where it applies; `bytes`, `bits` and `frames` are 1 unless given, and `bytes`
+and `bits` at most 1000000."#;
+
+/// Bytes or bits struck at a frame: a minute and a half of a line at 115,200 baud, far beyond what
+/// a frame has.
+const MOST_STRUCK: usize = 1_000_000;
 
 /// Why a script cannot be played.
 #[derive(Debug, thiserror::Error)]
@@ -152,11 +158,8 @@ impl Faults {
     }
 
     fn parse(text: &str, seed: u64) -> Result<Self, String> {
-        let script: Script = toml::from_str(text).map_err(|error| {
-            let before = &text[..error.span().map_or(0, |span| span.start).min(text.len())];
-            let line = before.matches('\n').count() + 1;
-            format!("line {line}: {}", error.message().replace('\n', ": "))
-        })?;
+        let script: Script =
+            toml::from_str(text).map_err(|error| wording::of_toml(text, &error))?;
         let faults = script
             .faults
             .iter()
@@ -246,6 +249,13 @@ impl Table {
         ];
         if let Some((key, _)) = misplaced.iter().find(|(_, misplaced)| *misplaced) {
             return Err(format!("{key}: found a value, expected none for this kind"));
+        }
+        for (key, number) in [("bytes", self.bytes), ("bits", self.bits)] {
+            if let Some(number) = number.filter(|&number| number > MOST_STRUCK) {
+                return Err(format!(
+                    "{key}: found {number}, expected at most {MOST_STRUCK}"
+                ));
+            }
         }
         let from_s = self.at_s;
         let (bytes, bits) = (self.bytes.unwrap_or(1), self.bits.unwrap_or(1));
@@ -344,6 +354,22 @@ mod tests {
             ),
             ("[[fault]]\nat_s = -1.0\nkind = \"flip\"", "at_s"),
             ("[[fault]]\nkind = \"flip\"", "at_s"),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"noise\"\nbytes = 99999999999",
+                "bytes: found 99999999999, expected at most 1000000",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"flip\"\nbits = 1000001",
+                "bits: found 1000001",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"flip\"\nbits = -1",
+                "expected a whole number from 0",
+            ),
+            (
+                "[[fault]]\nat_s = \"soon\"\nkind = \"flip\"",
+                "expected a number",
+            ),
         ] {
             let problem = Faults::parse(script, 1).unwrap_err();
             assert!(problem.contains(expected), "{problem}");

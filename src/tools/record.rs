@@ -12,6 +12,7 @@ use clap::Args as ClapArgs;
 use super::simulate::positive;
 use crate::daemon::config::Setup;
 use crate::daemon::{self, Daemon, record};
+use crate::verdict::Level;
 
 /// Arguments of `record`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -33,6 +34,16 @@ pub struct Args {
 /// Why there is no recording, or why it ended before its time.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
+    /// A label that says what was pressed, by a level that there is not.
+    #[error(
+        "--label level: found {found:?}, expected 0 (unlabelled) or one of the model's: {levels}"
+    )]
+    Level {
+        /// As given.
+        found: String,
+        /// Those of the model.
+        levels: String,
+    },
     /// The file cannot be made.
     #[error("--out {path}: {source}, expected a new file")]
     Create {
@@ -50,13 +61,14 @@ pub enum Error {
 ///
 /// # Errors
 ///
-/// [`Error`], if the file cannot be made or written, a sensor is not there to begin with, or the
-/// last one is lost.
+/// [`Error`], if a label says a level that the model has not, the file cannot be made or written, a
+/// sensor is not there to begin with, or the last one is lost.
 pub async fn run(
     args: Args,
     setup: Setup,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
+    check_level(&args.labels, &setup.hrn.card().levels)?;
     let path = args.out;
     let file = File::create_new(&path).map_err(|source| Error::Create {
         path: path.clone(),
@@ -86,6 +98,28 @@ pub async fn run(
         let _ = fs::remove_file(&path);
     }
     Ok(recorded?)
+}
+
+/// What is labelled `level` becomes a data set: a level that is none is found out before anything
+/// is pressed.
+fn check_level(labels: &[(String, String)], levels: &[Level]) -> Result<(), Error> {
+    let is_level = |found: &str| {
+        found
+            .parse()
+            .is_ok_and(|found: u8| found == 0 || levels.iter().any(|level| level.level == found))
+    };
+    let mut said = labels.iter().filter(|(key, _)| key == "level");
+    match said.find(|(_, found)| !is_level(found)) {
+        None => Ok(()),
+        Some((_, found)) => {
+            let one = |level: &Level| format!("{} ({})", level.level, level.label);
+            let levels: Vec<String> = levels.iter().map(one).collect();
+            Err(Error::Level {
+                found: found.clone(),
+                levels: levels.join(", "),
+            })
+        }
+    }
 }
 
 /// `KEY=VALUE`.

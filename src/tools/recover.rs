@@ -38,6 +38,17 @@ pub enum Error {
         /// All of it.
         bytes: u64,
     },
+    /// MCAP, but no recording of ours.
+    #[error(
+        "{path}: found {messages} messages of other programs and no other, expected a recording of \
+         hardnessd"
+    )]
+    Foreign {
+        /// As given.
+        path: PathBuf,
+        /// Whole ones.
+        messages: u64,
+    },
     /// The new file cannot be written.
     #[error("--out {path}: {source}")]
     Write {
@@ -74,18 +85,22 @@ pub fn run(args: &Args) -> Result<(), Error> {
     name.push(".part");
     let part = args.out.with_file_name(name);
     let saved = save(broken, &part).and_then(|recovered| {
-        if recovered.messages > 0 {
+        if has_ours(&recovered) {
             fs::rename(&part, &args.out)?;
             sync_directory(&args.out)?;
         }
         Ok(recovered)
     });
     let recovered = match saved {
-        Ok(recovered) if recovered.messages > 0 => recovered,
+        Ok(recovered) if has_ours(&recovered) => recovered,
         other => {
             // It may never have been there.
             let _ = fs::remove_file(&part);
             return Err(match other {
+                Ok(Recovered { messages, .. }) if messages > 0 => Error::Foreign {
+                    path: args.broken.clone(),
+                    messages,
+                },
                 Ok(_) => Error::Nothing {
                     path: args.broken.clone(),
                     bytes,
@@ -112,6 +127,11 @@ fn sync_directory(file: &Path) -> io::Result<()> {
     File::open(directory.unwrap_or(Path::new(".")))?.sync_all()
 }
 
+/// Whether anything of ours was saved.
+fn has_ours(recovered: &Recovered) -> bool {
+    recovered.messages > recovered.messages_foreign
+}
+
 /// What was saved and what was lost, in lines.
 fn account(recovered: &Recovered) -> String {
     let Recovered {
@@ -121,6 +141,7 @@ fn account(recovered: &Recovered) -> String {
         lost,
         messages_unknown,
         complete,
+        messages_foreign: _,
     } = recovered;
     let time = |ns: u64| {
         let time = Timestamp::from_nanosecond(i128::from(ns));

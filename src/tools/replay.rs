@@ -114,8 +114,33 @@ async fn play(args: Args) -> Result<(), Error> {
     }
 }
 
-/// A recording of ours: what its sensors learnt, at the moments they learnt it.
+/// A recording of ours. One that is cut off or damaged ends as bytes do that end there, and says
+/// afterwards what is wrong with it.
 async fn play_recording(args: &Args, file: impl Read, setup: Setup) -> Result<(), Error> {
+    let mut playback = Playback::new(setup.hrn);
+    let mut seq = 0;
+    let played = play_entries(args, file, &mut playback, &mut seq).await;
+    if let Ok(false) = played {
+        return Ok(());
+    }
+    if let Some(model) = playback.other_model() {
+        eprintln!(
+            "warning: {}: recorded with model {}, played with another",
+            args.file.display(),
+            model.get(..12).unwrap_or(model)
+        );
+    }
+    print(playback.end(), &mut seq)?;
+    played.map(drop)
+}
+
+/// What its sensors learnt, at the moments they learnt it. `false`: nobody reads.
+async fn play_entries(
+    args: &Args,
+    file: impl Read,
+    playback: &mut Playback,
+    seq: &mut u64,
+) -> Result<bool, Error> {
     let path = &args.file;
     let failed = |source| match source {
         recording::Error::Io(source) => Error::Broken {
@@ -127,8 +152,6 @@ async fn play_recording(args: &Args, file: impl Read, setup: Setup) -> Result<()
             source,
         },
     };
-    let mut playback = Playback::new(setup.hrn);
-    let mut seq = 0;
     // The first moment played, and when that was.
     let mut begun: Option<(Duration, Instant)> = None;
     for found in Reader::new(file) {
@@ -148,8 +171,8 @@ async fn play_recording(args: &Args, file: impl Read, setup: Setup) -> Result<()
             path: path.clone(),
             source,
         })?;
-        if !print(events, &mut seq)? {
-            return Ok(());
+        if !print(events, seq)? {
+            return Ok(false);
         }
     }
     if playback.sensors() == 0 {
@@ -158,15 +181,7 @@ async fn play_recording(args: &Args, file: impl Read, setup: Setup) -> Result<()
             expected: "a recording of hardnessd",
         }));
     }
-    if let Some(model) = playback.other_model() {
-        eprintln!(
-            "warning: {}: recorded with model {}, played with another",
-            path.display(),
-            model.get(..12).unwrap_or(model)
-        );
-    }
-    print(playback.end(), &mut seq)?;
-    Ok(())
+    Ok(true)
 }
 
 /// Bytes back to back.

@@ -2,7 +2,7 @@
 
 use std::fs::File;
 use std::future::Future;
-use std::io::{BufWriter, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
@@ -109,11 +109,16 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         Some(path) => Faults::load(path, args.seed)?,
         None => Faults::none(),
     };
-    if let Some(path) = &args.to {
-        return record(path, &layout, sequence(&args), faults).map_err(|source| Error::Recording {
-            path: path.clone(),
-            source,
-        });
+    if let Some(path) = args.to.clone() {
+        let settings = sequence(&args);
+        // On a thread of its own: neither the physics nor a slow disk is to be waited for at a signal.
+        let to = path.clone();
+        let recorded = tokio::task::spawn_blocking(move || record(&to, &layout, settings, faults));
+        let written = tokio::select! {
+            recorded = recorded => recorded.expect("the simulation does not panic"),
+            () = shutdown => Ok(()),
+        };
+        return written.map_err(|source| Error::Recording { path, source });
     }
     let baud = baud(&args, layout.max_frame_bytes())?;
     let what = args
@@ -158,7 +163,8 @@ fn record(
     settings: SequenceSettings,
     mut faults: Faults,
 ) -> std::io::Result<()> {
-    let mut recording = BufWriter::new(File::create(path)?);
+    // Frame by frame: stopped at any moment, it holds what was played until then.
+    let mut recording = File::create(path)?;
     let frame_rate_hz = settings.frame_rate_hz;
     let mut bytes = Vec::with_capacity(layout.max_frame_bytes());
     for (index, frame) in (0_u32..).zip(Sequence::new(settings)) {
@@ -168,7 +174,7 @@ fn record(
             recording.write_all(&bytes)?;
         }
     }
-    recording.into_inner()?.sync_all()
+    recording.sync_all()
 }
 
 /// The rate of the line: as given, if it carries the frames; else the first usual one that does,

@@ -6,6 +6,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{augment, gan, optimiser};
+use crate::wording;
 
 /// How long a run may take.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -145,8 +146,8 @@ impl Default for Settings {
 #[derive(Debug, thiserror::Error)]
 pub enum SettingsError {
     /// Not TOML, an unknown key, or a value of another type.
-    #[error(transparent)]
-    Toml(#[from] toml::de::Error),
+    #[error("{0}")]
+    Syntax(String),
     /// A value outside its range.
     #[error("`{key}`: found {found}, expected {expected}")]
     Range {
@@ -203,9 +204,11 @@ impl Settings {
     /// If `text` is no TOML of our keys, or a value lies outside its range.
     pub fn overridden(&self, text: &str) -> Result<Self, SettingsError> {
         // Once as a whole, for errors that show the line; once over these settings.
-        let _: Self = toml::from_str(text)?;
+        let syntax = |error| SettingsError::Syntax(wording::of_toml(text, &error));
+        let _: Self = toml::from_str(text).map_err(syntax)?;
         let own = toml::Table::try_from(self).expect("settings are plain tables of numbers");
-        let merged: Self = merged(own, toml::from_str(text)?).try_into()?;
+        let given = toml::from_str(text).map_err(syntax)?;
+        let merged: Self = merged(own, given).try_into().map_err(syntax)?;
         merged.checked()
     }
 
@@ -349,7 +352,10 @@ mod tests {
     fn unusable_settings_are_refused_by_name() {
         for (text, expected) in [
             ("epoch = 3", "unknown field `epoch`"),
-            ("[training]\nepochs = \"3\"", "expected u32"),
+            (
+                "[training]\nepochs = \"3\"",
+                "line 2: invalid type: string \"3\", expected a whole number from 0",
+            ),
             (
                 "[training]\nepochs = 0",
                 "`training.epochs`: found 0, expected 1 or more",
@@ -376,6 +382,7 @@ mod tests {
                 .unwrap_err()
                 .to_string();
             assert!(error.contains(expected), "{text}: {error}");
+            assert!(!error.contains('\n'), "{text}: {error}");
         }
     }
 }

@@ -1,8 +1,10 @@
 //! The checks: what the trees under a root (`/`, but for tests) say of a port.
 
+use std::ffi::OsStr;
 use std::fmt;
 use std::fs;
-use std::os::unix::fs::MetadataExt;
+use std::os::unix::ffi::OsStrExt;
+use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
 /// Something wrong, and what mends it.
@@ -55,6 +57,33 @@ pub(super) fn ports(root: &Path) -> Vec<PathBuf> {
     ports
 }
 
+/// That `port` is there and can be no serial port at all: nothing else is to be said of it.
+pub(super) fn refused(root: &Path, port: &Path) -> Option<Fault> {
+    let file = fs::metadata(port).ok()?;
+    let found = match file.file_type() {
+        kind if kind.is_char_device() => device_of_another_kind(root, file.rdev())?,
+        kind if kind.is_dir() => "a directory".to_owned(),
+        kind if kind.is_file() => "a regular file".to_owned(),
+        kind if kind.is_block_device() => "a disk".to_owned(),
+        kind if kind.is_fifo() => "a pipe".to_owned(),
+        _ => "a socket".to_owned(),
+    };
+    Some(Fault {
+        what: format!("found {found}, expected a serial port"),
+        cure: others(&ports(root)),
+    })
+}
+
+/// The kernel's name of what the character device `number` is, if that is no tty. Ptys have no
+/// entry there, and where there is no sysfs nothing is known.
+fn device_of_another_kind(root: &Path, number: u64) -> Option<String> {
+    let (major, minor) = (rustix::fs::major(number), rustix::fs::minor(number));
+    let entry = format!("sys/dev/char/{major}:{minor}/subsystem");
+    let subsystem = fs::read_link(root.join(entry)).ok()?;
+    let name = subsystem.file_name()?.to_string_lossy();
+    (name != "tty").then(|| format!("a device of the kind {name}"))
+}
+
 /// All that is wrong with `port`, an absolute path under `root`.
 pub(super) fn examine(root: &Path, port: &Path, user: &User) -> Vec<Fault> {
     let Some(device) = device(root, port) else {
@@ -75,17 +104,21 @@ fn device(root: &Path, port: &Path) -> Option<PathBuf> {
     Some(Path::new("/").join(device))
 }
 
-fn missing(others: &[PathBuf]) -> Fault {
-    let cure = if others.is_empty() {
-        "no other is there either: plug the sensor in, then see `sudo dmesg | grep tty`".to_owned()
-    } else {
-        let keys = others.iter().map(|port| format!("port = {port:?}"));
-        format!("these are there: {}", keys.collect::<Vec<_>>().join(", "))
-    };
+fn missing(ports: &[PathBuf]) -> Fault {
     Fault {
         what: "no such device".to_owned(),
-        cure,
+        cure: others(ports),
     }
+}
+
+/// What could be meant instead.
+fn others(ports: &[PathBuf]) -> String {
+    if ports.is_empty() {
+        return "no other is there either: plug the sensor in, then see `sudo dmesg | grep tty`"
+            .to_owned();
+    }
+    let keys = ports.iter().map(|port| format!("port = {port:?}"));
+    format!("these are there: {}", keys.collect::<Vec<_>>().join(", "))
 }
 
 fn denied(root: &Path, device: &Path, user: &User) -> Option<Fault> {
@@ -137,13 +170,34 @@ fn held(root: &Path, device: &Path, own: u32) -> Vec<Fault> {
         let is_device =
             |file: fs::DirEntry| fs::read_link(file.path()).is_ok_and(|target| target == device);
         if files.flatten().any(is_device) {
-            faults.push(Fault {
-                what: format!("held by process {pid} ({})", command(root, pid)),
-                cure: format!("kill {pid}"),
+            faults.push(if is_daemon(root, pid) {
+                Fault {
+                    what: format!("held by process {pid}, the daemon (hardnessd run)"),
+                    cure: format!(
+                        "sudo systemctl stop hardnessd; where it is no service, kill {pid}"
+                    ),
+                }
+            } else {
+                Fault {
+                    what: format!("held by process {pid} ({})", command(root, pid)),
+                    cure: format!("kill {pid}"),
+                }
             });
         }
     }
     faults
+}
+
+/// `hardnessd run`, and none of its tools, which have the same name.
+fn is_daemon(root: &Path, pid: u32) -> bool {
+    let line = fs::read(root.join("proc").join(pid.to_string()).join("cmdline"));
+    let line = line.unwrap_or_default();
+    let mut words = line.split(|&byte| byte == 0);
+    let is_ours = words.next().is_some_and(|program| {
+        let program = Path::new(OsStr::from_bytes(program));
+        program.file_name() == Some(OsStr::new("hardnessd"))
+    });
+    is_ours && words.next() == Some(b"run")
 }
 
 /// ModemManager writes to every new USB serial port, unless a udev rule tells it not to.

@@ -7,7 +7,7 @@ use std::process::{Child, Command};
 
 use tempfile::TempDir;
 
-use super::checks::{User, examine, ports};
+use super::checks::{User, examine, ports, refused};
 use crate::tools::pty::Pty;
 
 const PORT: &str = "/dev/serial/by-id/usb-film-if00";
@@ -151,6 +151,41 @@ fn whoever_holds_the_port_is_named() {
         &machine.faults(PORT),
         &["held by process 88 (minicom)", "kill 88"],
     );
+}
+
+#[test]
+fn the_daemon_that_holds_the_port_is_stopped_as_a_service() {
+    let machine = Machine::new();
+    machine.put("proc/88/comm", "hardnessd\n");
+    machine.put("proc/88/cmdline", "/usr/bin/hardnessd\0run\0--config\0x\0");
+    fs::create_dir_all(machine.path("proc/88/fd")).unwrap();
+    symlink("/dev/ttyUSB0", machine.path("proc/88/fd/3")).unwrap();
+    one(
+        &machine.faults(PORT),
+        &["process 88, the daemon", "systemctl stop hardnessd"],
+    );
+    // A tool of the same name is no service.
+    machine.put("proc/88/cmdline", "hardnessd\0record\0--config\0x\0");
+    one(&machine.faults(PORT), &["(hardnessd): kill 88"]);
+}
+
+#[test]
+fn what_is_no_serial_port_is_said_to_be_none() {
+    let machine = Machine::new();
+    let root = Path::new("/");
+    let refusal = |port: &Path| refused(root, port).map(|fault| fault.to_string());
+    for (port, found) in [
+        (Path::new("/dev/null"), "found a device of the kind mem"),
+        (machine.0.path(), "found a directory"),
+        (&machine.path("etc/group"), "found a regular file"),
+    ] {
+        let said = refusal(port).unwrap();
+        assert!(said.starts_with(found), "{said}");
+        assert!(said.contains("expected a serial port"), "{said}");
+    }
+    let pty = Pty::open(None).unwrap();
+    assert_eq!(refusal(pty.path()), None);
+    assert_eq!(refusal(Path::new("/dev/no-such")), None);
 }
 
 /// Ends with the test.
