@@ -11,8 +11,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use bench::{BINARY, Bench, hardnessd};
-use hardnessd::simulator::Split;
+use hardnessd::simulator::{self, DatasetSettings, Split};
 use hardnessd::train::dataset::{Dataset, Sample, meta};
+use hardnessd::train::simulated;
 use serde_json::Value;
 
 fn collect(out: &Path, arguments: &[&str]) -> Output {
@@ -83,6 +84,8 @@ fn samples_are_the_frames_that_the_daemon_judges() {
             "level=1",
             "--label",
             "object=7",
+            "--label",
+            "material=oak",
             "--seconds",
             "12",
         ])
@@ -94,6 +97,9 @@ fn samples_are_the_frames_that_the_daemon_judges() {
     assert!(samples.iter().all(|s| s.level == 1 && s.object == Some(7)));
     assert!(samples.iter().all(|s| s.split == Split::Train));
     assert_are_those(&samples, &judged(&capture));
+    // What it is made of stands beside it, by its place among the names.
+    assert!(samples.iter().all(|s| s.material == Some(0)));
+    assert_eq!(meta(&out).unwrap()["materials"], serde_json::json!(["oak"]));
     assert!(
         meta(&out).unwrap()["generator"]
             .as_str()
@@ -123,6 +129,23 @@ fn samples_are_the_frames_that_the_daemon_judges() {
     // Without a number an object is a new one.
     let new = collected(&out, &["--append", "--level", "4", text(&fixture)]);
     assert_eq!(new.last().unwrap().object, Some(8));
+    // That one is of no known material, and the array is for all or for none.
+    assert!(new.iter().all(|sample| sample.material.is_none()));
+
+    // After simulated samples a material keeps its place, and a new one is put behind.
+    let settings = DatasetSettings {
+        objects: 1,
+        test_objects: 1,
+        presses: 1,
+        ..DatasetSettings::default()
+    };
+    let simulated = simulator::dataset(&settings, 1, |_| {});
+    let simulated = simulated::to_bytes(&settings, simulated).unwrap();
+    std::fs::write(&out, simulated).unwrap();
+    let both = collected(&out, &["--append", text(&capture)]);
+    assert_eq!(both[0].material, Some(0));
+    assert_eq!(both.last().unwrap().material, Some(8));
+    assert_eq!(meta(&out).unwrap()["materials"][8], "oak");
 }
 
 #[test]

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
+use hardnessd::train::dataset::{self, Dataset};
 use hardnessd::verdict::Hrn;
 use rustix::process::{Pid, Signal};
 use serde_json::Value;
@@ -206,7 +207,14 @@ fn a_run_learns_and_leaves_what_it_promises() {
     // What `evaluate` measures on an exported copy is what the run wrote down.
     let (copy, data) = (trial.out.join("copy.onnx"), data().1.to_str().unwrap());
     let copy = copy.to_str().unwrap();
-    succeed(&["export", trial.out.to_str().unwrap(), "--out", copy]);
+    // Like every file that the trainer writes, it takes the place of what stood there, and says so.
+    for said in ["", "replaced"] {
+        let output = hrn_train(&["export", trial.out.to_str().unwrap(), "--out", copy]);
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.success(), "{stderr}");
+        assert_eq!(stderr.is_empty(), said.is_empty(), "{stderr}");
+        assert!(stderr.contains(said), "{stderr}");
+    }
     assert_eq!(std::fs::read(copy).unwrap(), trial.read("hrn.onnx"));
     let printed = succeed(&["evaluate", "--model", copy, "--data", data, "--json"]);
     let printed: Value = serde_json::from_str(&printed).unwrap();
@@ -446,6 +454,16 @@ fn bad_input_has_its_exit_code_and_one_line() {
     };
     let train = |more: &[&str]| method("hrn100", &[&["--out", &out], more].concat());
     let no_gan = path("no gan");
+    let lowest = |force: &str| {
+        let force = format!("--lowest-force={force}");
+        hrn_train(&["simulate", &force, "--out", &out])
+    };
+    let (model, heavy) = (path("model.onnx"), path("heavy.npz"));
+    std::fs::write(&model, hardnessd::verdict::BUILT_IN).unwrap();
+    let mut samples = Dataset::read(Path::new(&data)).unwrap().samples;
+    samples[0].frame.newtons[0] = 1e38;
+    let file = std::fs::File::create(&heavy).unwrap();
+    dataset::write(file, &samples, &serde_json::json!({})).unwrap();
     let cases = [
         (train(&["--data", &missing]), 66, "missing"),
         (train(&["--data", &text]), 1, "not an .npz file"),
@@ -457,7 +475,27 @@ fn bad_input_has_its_exit_code_and_one_line() {
         (
             train(&["--data", &data, "--config", &text]),
             78,
-            "unknown field `epoch`",
+            "line 1: unknown field `epoch`",
+        ),
+        (
+            train(&["--data", &data, "--labels", "3"]),
+            2,
+            "--labels: found 3, expected at least 4",
+        ),
+        (
+            train(&["--data", &data, "--labels", "161"]),
+            2,
+            "at most the data's 160",
+        ),
+        (train(&["--data", &data, "--labels=-1"]), 2, "--labels"),
+        (lowest("nan"), 2, "expected newtons from 0.01 to 25"),
+        (lowest("inf"), 2, "expected newtons from 0.01 to 25"),
+        (lowest("-5"), 2, "expected newtons from 0.01 to 25"),
+        (lowest("1e9"), 2, "expected newtons from 0.01 to 25"),
+        (
+            hrn_train(&["evaluate", "--model", &model, "--data", &heavy]),
+            1,
+            "heavy.npz: array `frames`: found 1e38 at [0,0,0]",
         ),
         (hrn_train(&["inspect", &text]), 78, "not an ONNX model"),
         (hrn_train(&["inspect", &missing]), 66, "missing"),

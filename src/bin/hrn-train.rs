@@ -17,7 +17,7 @@ use hardnessd::train::collect::{self, Capture, CollectError, Labelling};
 use hardnessd::train::compare::{self, Plan};
 use hardnessd::train::dataset::{Dataset, DatasetError, LabelChoice};
 use hardnessd::train::export;
-use hardnessd::train::methods::{self, Method};
+use hardnessd::train::methods::{self, LabelsError, Method};
 use hardnessd::train::metrics::Evaluation;
 use hardnessd::train::run::{Description, Run, write_whole};
 use hardnessd::train::settings::{Profile, SettingsError};
@@ -55,7 +55,7 @@ enum Command {
     Report {
         /// Directory of the run or the comparison
         directory: PathBuf,
-        /// The page to write
+        /// The page to write; one that is there is replaced
         #[arg(long, value_name = "R.html")]
         out: PathBuf,
     },
@@ -63,7 +63,7 @@ enum Command {
     Export {
         /// Directory of the run
         run: PathBuf,
-        /// The model file to write
+        /// The model file to write; one that is there is replaced
         #[arg(long, value_name = "M.onnx")]
         out: PathBuf,
     },
@@ -76,7 +76,7 @@ enum Command {
 
 #[derive(Debug, clap::Args)]
 struct Simulate {
-    /// The data set to write
+    /// The data set to write; one that is there is replaced
     #[arg(long, value_name = "D.npz")]
     out: PathBuf,
     /// Everything random follows from it
@@ -91,8 +91,9 @@ struct Simulate {
     /// Presses of each object
     #[arg(long, default_value_t = DatasetSettings::default().presses)]
     presses: u32,
-    /// The least nominal force, in newtons
-    #[arg(long, value_name = "N", default_value_t = DatasetSettings::default().lowest_force_n)]
+    /// The least nominal force, in newtons; the greatest is 25
+    #[arg(long, value_name = "N", default_value_t = DatasetSettings::default().lowest_force_n,
+          value_parser = lowest_force_n)]
     lowest_force: f32,
     /// Distribution of shapes: matched (the same for all materials) or paper
     #[arg(long, default_value = "matched")]
@@ -107,7 +108,7 @@ struct Simulate {
 
 #[derive(Debug, clap::Args)]
 struct Collect {
-    /// The data set to write
+    /// The data set to write; one that is there is replaced
     #[arg(long, value_name = "D.npz")]
     out: PathBuf,
     /// Hardness level, 1 (hard) to 4, or 0: unlabelled [default: the recording's label "level"]
@@ -125,7 +126,8 @@ struct Collect {
     /// Configuration whose first sensor a .bin is of [default: a JX255N by default settings]
     #[arg(long, value_name = "F")]
     config: Option<PathBuf>,
-    /// Recordings: .mcap, or .bin, raw bytes back to back
+    /// Recordings: .mcap, or .bin, raw bytes back to back. If all have a label "material", the data
+    /// set has that array
     #[arg(value_name = "CAPTURE", required = true)]
     captures: Vec<PathBuf>,
 }
@@ -193,6 +195,14 @@ struct Compare {
     /// Also swap the two materials of each level: 16 times features and hrn15-tuned, 4 times ours
     #[arg(long)]
     swaps: bool,
+}
+
+/// From the least of `hardnessd simulate --force` to the greatest nominal force.
+fn lowest_force_n(text: &str) -> Result<f32, String> {
+    match text.parse() {
+        Ok(force_n) if (0.01..=25.0).contains(&force_n) => Ok(force_n),
+        _ => Err("expected newtons from 0.01 to 25".to_owned()),
+    }
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -278,10 +288,12 @@ struct Unreadable {
     source: std::io::Error,
 }
 
-/// 66 unreadable input, 78 bad configuration or model, 74 other I/O, else 1.
+/// 2 wrong usage, 66 unreadable input, 78 bad configuration or model, 74 other I/O, else 1.
 fn exit_code(error: &anyhow::Error) -> u8 {
     let has = |test: fn(&(dyn std::error::Error + 'static)) -> bool| error.chain().any(test);
-    if has(|e| {
+    if has(|e| matches!(e.downcast_ref(), Some(LabelsError::Range { .. }))) {
+        2
+    } else if has(|e| {
         e.is::<Unreadable>()
             || matches!(e.downcast_ref(), Some(DatasetError::Unreadable { .. }))
             || matches!(e.downcast_ref(), Some(CollectError::Unreadable { .. }))
@@ -304,6 +316,16 @@ fn read(path: &Path) -> Result<Vec<u8>, Unreadable> {
     })
 }
 
+/// Writes what was asked for. What stood there is replaced, at one stroke, and that is said.
+fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let is_new = !path.exists();
+    write_whole(path, bytes)?;
+    if !is_new {
+        eprintln!("{}: replaced what stood there", path.display());
+    }
+    Ok(())
+}
+
 fn load(path: &Path) -> anyhow::Result<Hrn> {
     Hrn::load(&read(path)?).with_context(|| path.display().to_string())
 }
@@ -324,13 +346,13 @@ fn simulate(arguments: &Simulate) -> anyhow::Result<()> {
     let seconds = begun.elapsed().as_secs_f64();
 
     if let Some(path) = &arguments.sheet {
-        write_whole(
+        write(
             path,
             &sheet::sheet(&samples, &one_press_a_level(&settings))?,
         )?;
     }
     let count = samples.len();
-    write_whole(&arguments.out, &simulated::to_bytes(&settings, samples)?)?;
+    write(&arguments.out, &simulated::to_bytes(&settings, samples)?)?;
     println!(
         "{}: {count} samples in {seconds:.1} s, {:.0} a second",
         arguments.out.display(),
@@ -371,10 +393,13 @@ fn collect(arguments: &Collect) -> anyhow::Result<()> {
         object: arguments.object,
         split: arguments.split.into(),
     };
-    write_whole(
-        &arguments.out,
-        &collect::to_bytes(&captures, labelling, before)?,
-    )?;
+    let is_added_to = before.is_some();
+    let bytes = collect::to_bytes(&captures, labelling, before)?;
+    if is_added_to {
+        write_whole(&arguments.out, &bytes)?;
+    } else {
+        write(&arguments.out, &bytes)?;
+    }
     let out = arguments.out.display();
     println!("{out}: {presses} presses collected, {all} in all");
     Ok(())
@@ -478,7 +503,7 @@ fn report_of(directory: &Path, out: &Path) -> anyhow::Result<()> {
         path: directory.to_owned(),
         source,
     })?;
-    write_whole(out, report::of(directory)?.as_bytes())?;
+    write(out, report::of(directory)?.as_bytes())?;
     println!("{}", out.display());
     Ok(())
 }
@@ -499,7 +524,7 @@ fn evaluate(arguments: &Evaluate) -> anyhow::Result<()> {
 fn export_run(run: &Path, out: &Path) -> anyhow::Result<()> {
     let model = run.join("hrn.onnx");
     let hrn = load(&model).context("the run has no model yet; train --resume finishes it")?;
-    write_whole(out, &read(&model)?)?;
+    write(out, &read(&model)?)?;
     println!("{}: sha256 {}", out.display(), hrn.sha256());
     Ok(())
 }
@@ -531,7 +556,7 @@ fn inspect(path: &Path) -> anyhow::Result<()> {
 
 fn print_evaluation(evaluation: &Evaluation) {
     let interval = evaluation.accuracy_interval_by_object.map_or_else(
-        || "no objects given, so no interval".to_owned(),
+        || "no interval without two objects of a level".to_owned(),
         |[low, high]| {
             format!(
                 "95 % by object: {:.1} to {:.1} %",

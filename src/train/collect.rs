@@ -9,6 +9,7 @@ use std::io::{BufReader, Cursor, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use anyhow::Context as _;
 use serde_json::{Value, json};
 
 use super::dataset::{self, Dataset, DatasetError, Sample};
@@ -227,11 +228,13 @@ impl Selection {
     }
 }
 
-/// The bytes of a data set of `captures`, after the samples of `before` if there are any.
+/// The bytes of a data set of `captures`, after the samples of `before` if there are any. It has
+/// the array `material` if every capture is labelled with one.
 ///
 /// # Errors
 ///
-/// If a level or an object is neither given nor a label, or the archive cannot be built.
+/// If a level or an object is neither given nor a label, there are more materials than an array of
+/// u8 can tell apart, or the archive cannot be built.
 pub fn to_bytes(
     captures: &[Capture],
     labelling: Labelling,
@@ -246,6 +249,8 @@ pub fn to_bytes(
     };
     let last = samples.iter().filter_map(|sample| sample.object).max();
     let new_object = last.map_or(0, |object| object + 1);
+    let mut materials: Vec<String> =
+        serde_json::from_value(meta["materials"].take()).unwrap_or_default();
     meta["levels"] = json!(dataset::levels());
     // Were it still the simulator's name, models trained on this would be said to be of simulated
     // data only.
@@ -259,11 +264,15 @@ pub fn to_bytes(
             }
             None => new_object,
         };
+        let material = capture.labels.get("material");
+        let material = material
+            .map(|name| index_of(name, &mut materials))
+            .transpose()?;
         samples.extend(capture.presses.iter().map(|(frame, force_n)| Sample {
             frame: *frame,
             level,
             object: Some(object),
-            material: None,
+            material,
             force_n: Some(*force_n),
             split: labelling.split,
             shore: None,
@@ -283,7 +292,20 @@ pub fn to_bytes(
             None => meta["captures"] = json!([said]),
         }
     }
+    meta["materials"] = json!(materials);
     Ok(dataset::write(Cursor::new(Vec::new()), &samples, &meta)?.into_inner())
+}
+
+/// The place of a name in `meta.materials`; a new one is added.
+fn index_of(name: &str, materials: &mut Vec<String>) -> anyhow::Result<u8> {
+    let known = materials.iter().position(|material| material == name);
+    let index = known.unwrap_or(materials.len());
+    if known.is_none() {
+        materials.push(name.to_owned());
+    }
+    u8::try_from(index).with_context(|| {
+        format!("label material: found {name:?} beside 256 others, expected no more than those")
+    })
 }
 
 /// What is in the file to be appended to; nothing, if it is not there yet.

@@ -3,10 +3,10 @@
 use std::collections::BTreeSet;
 use std::time::Instant;
 
-use anyhow::{Context as _, ensure};
+use anyhow::Context as _;
 use burn::tensor::Device;
 
-use super::dataset::Dataset;
+use super::dataset::{Dataset, DatasetError};
 use super::export::{self, Recogniser};
 use super::features::{self, Baseline};
 use super::generator::COMPONENTS;
@@ -121,22 +121,49 @@ impl Method {
     }
 }
 
+/// Why so many labels cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum LabelsError {
+    /// The data has no labelled training samples.
+    #[error(transparent)]
+    None(#[from] DatasetError),
+    /// More were asked for than there are, or too few for one of each level.
+    #[error(
+        "--labels: found {asked}, expected at least {least} (one of each level and file) and at \
+         most the data's {labelled}"
+    )]
+    Range {
+        /// As given.
+        asked: usize,
+        /// Levels times files.
+        least: usize,
+        /// Labelled training samples.
+        labelled: usize,
+    },
+}
+
 /// How many labels `method` uses of `dataset`, if it may use `asked` or its own share.
 ///
 /// # Errors
 ///
 /// If the data has no labelled training samples, fewer than asked for, or too few of them for one
 /// of each level.
-pub fn labels(method: Method, dataset: &Dataset, asked: Option<usize>) -> anyhow::Result<usize> {
+pub fn labels(
+    method: Method,
+    dataset: &Dataset,
+    asked: Option<usize>,
+) -> Result<usize, LabelsError> {
     let labelled = dataset.labelled(Split::Train)?.len();
     let least = super::dataset::levels().len() * dataset.sources.len();
-    let labels = asked.unwrap_or_else(|| method.labels(labelled).max(least).min(labelled));
-    ensure!(
-        asked.is_none() || (least..=labelled).contains(&labels),
-        "{labels} labels asked for: the data has {labelled}, and one of each level and file is \
-         needed"
-    );
-    Ok(labels)
+    match asked {
+        Some(asked) if !(least..=labelled).contains(&asked) => Err(LabelsError::Range {
+            asked,
+            least,
+            labelled,
+        }),
+        Some(asked) => Ok(asked),
+        None => Ok(method.labels(labelled).max(least).min(labelled)),
+    }
 }
 
 /// Runs a method to its model and evaluation in the run's directory; takes up whatever is there.

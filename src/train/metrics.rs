@@ -82,7 +82,7 @@ pub struct Evaluation {
     /// Mean negative log-likelihood, nats.
     pub nll: f64,
     /// 95 % interval of the accuracy by a bootstrap over objects within each level; null
-    /// without objects.
+    /// without objects, and where no level has two of them.
     pub accuracy_interval_by_object: Option<[f64; 2]>,
 }
 
@@ -109,7 +109,7 @@ impl Evaluation {
             nll: negative_log_likelihood(judged),
             accuracy_interval_by_object: by_object(judged)
                 .and_then(|objects| accuracy_by_object(&[&objects]))
-                .map(|estimate| estimate.interval),
+                .and_then(|estimate| estimate.interval),
         }
     }
 }
@@ -250,8 +250,9 @@ pub fn by_object(judged: &[Judged]) -> Option<Vec<ObjectCount>> {
 pub struct Estimate {
     /// Over all samples, and over the seeds if there are several.
     pub mean: f64,
-    /// Low and high end.
-    pub interval: [f64; 2],
+    /// Low and high end; `None` where no level has two objects: every draw is then the same, which
+    /// says nothing of other objects.
+    pub interval: Option<[f64; 2]>,
 }
 
 /// A method's accuracy over its seeds' judgements of the same samples; `None` if there are none.
@@ -290,8 +291,16 @@ fn bootstrap<'a>(counts: impl Iterator<Item = (&'a ObjectCount, i64)>) -> Option
         .into_values()
         .map(|objects| objects.into_values().collect())
         .collect();
-    let ratio = |(sum, samples): (i64, u64)| sum as f64 / samples as f64;
     let add = |(sum, samples), &(value, more): &(i64, u64)| (sum + value, samples + more);
+    if levels.is_empty() {
+        return None;
+    }
+    let ratio = |(sum, samples): (i64, u64)| sum as f64 / samples as f64;
+    let mean = ratio(levels.iter().flatten().fold((0, 0), add));
+    if levels.iter().all(|objects| objects.len() < 2) {
+        let interval = None;
+        return Some(Estimate { mean, interval });
+    }
     let mut stream = Stream::new(0, "bootstrap by object");
     let mut draws: Vec<f64> = (0..BOOTSTRAP_DRAWS)
         .map(|_| {
@@ -305,9 +314,9 @@ fn bootstrap<'a>(counts: impl Iterator<Item = (&'a ObjectCount, i64)>) -> Option
         })
         .collect();
     draws.sort_by(f64::total_cmp);
-    (!levels.is_empty()).then(|| Estimate {
-        mean: ratio(levels.iter().flatten().fold((0, 0), add)),
-        interval: [quantile(&draws, 0.025), quantile(&draws, 0.975)],
+    Some(Estimate {
+        mean,
+        interval: Some([quantile(&draws, 0.025), quantile(&draws, 0.975)]),
     })
 }
 
@@ -458,9 +467,24 @@ mod tests {
         let (first, second) = (counts(&[0, 10, 48, 30]), counts(&[2, 12, 50, 32]));
         let difference = difference_by_object(&[(&first, &second)]).unwrap();
         assert_eq!(difference.mean, -0.04);
-        assert_eq!(difference.interval, [-0.04, -0.04]);
+        assert_eq!(difference.interval, Some([-0.04, -0.04]));
         assert_eq!(difference_by_object(&[(&first, &second[..3])]), None);
         assert_eq!(difference_by_object(&[]), None);
+    }
+
+    #[test]
+    fn one_object_a_level_has_no_interval() {
+        let (first, second) = (counts(&[40]), counts(&[45]));
+        let accuracy = accuracy_by_object(&[&first]).unwrap();
+        assert_eq!((accuracy.mean, accuracy.interval), (0.8, None));
+        let difference = difference_by_object(&[(&first, &second)]).unwrap();
+        assert_eq!((difference.mean, difference.interval), (-0.1, None));
+        let samples = [1, 2].map(|level| judged(level, [0.7, 0.1, 0.1, 0.1], u32::from(level)));
+        let evaluation = Evaluation::of(&samples, 4);
+        assert_eq!(evaluation.accuracy_interval_by_object, None);
+        let two = [3, 4].map(|object| judged(1, [0.7, 0.1, 0.1, 0.1], object));
+        let evaluation = Evaluation::of(&[&samples[..], &two].concat(), 4);
+        assert!(evaluation.accuracy_interval_by_object.is_some());
     }
 
     #[test]
@@ -473,7 +497,7 @@ mod tests {
         for pairs in [&[pair][..], &[pair, pair]] {
             let Estimate { mean, interval } = difference_by_object(pairs).unwrap();
             assert_eq!(mean, 0.0);
-            for (end, expected) in interval.into_iter().zip([-0.0196, 0.0196]) {
+            for (end, expected) in interval.unwrap().into_iter().zip([-0.0196, 0.0196]) {
                 assert!((end - expected).abs() < 0.0012, "{interval:?}");
             }
         }

@@ -7,7 +7,7 @@ use std::fs::{self, File};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, bail, ensure};
+use anyhow::{Context as _, anyhow, bail, ensure};
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 
@@ -15,6 +15,7 @@ use super::checkpoint::Checkpoint;
 use super::dataset::{LabelChoice, Source};
 use super::history::{self, Metrics};
 use super::settings::{Profile, Settings};
+use crate::wording;
 
 /// Checkpoints kept of a stage: the newest, and one before it.
 const CHECKPOINTS_KEPT: usize = 2;
@@ -58,6 +59,7 @@ impl Run {
         match fs::read_to_string(&path) {
             Ok(text) => {
                 let told = toml::from_str(&text);
+                let told = told.map_err(|error| anyhow!(wording::of_toml(&text, &error)));
                 Ok(Some(told.with_context(|| path.display().to_string())?))
             }
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),

@@ -384,7 +384,7 @@ pub fn evaluation(evaluation: &Evaluation) -> Table {
         (
             "accuracy, %",
             format!("{:.1}", 100.0 * evaluation.accuracy),
-            interval.map_or(String::new(), interval_text),
+            interval_text(interval),
         ),
         ("kappa", optional(evaluation.kappa), String::new()),
         (

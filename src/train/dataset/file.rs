@@ -14,6 +14,9 @@ use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::simulator::Split;
 use crate::verdict::sha256_hex;
 
+/// More on a taxel than any sensor shows, and little enough that sums of squares stay finite.
+const MOST_NEWTONS: f32 = 1e6;
+
 /// The samples in `bytes`, which are those of the file `path`.
 pub(super) fn parse(bytes: &[u8], path: &Path, name: String) -> Result<Dataset, DatasetError> {
     let mut file = File::open(bytes, path)?;
@@ -28,13 +31,15 @@ pub(super) fn parse(bytes: &[u8], path: &Path, name: String) -> Result<Dataset, 
     if n == 0 {
         return Err(file.error("frames", "no frame".to_owned(), "at least one".to_owned()));
     }
-    if let Some(place) = frames.iter().position(|n| !n.is_finite() || *n < 0.0) {
-        let found = format!("{} in frame {}", frames[place], place / TAXELS);
-        return Err(file.error(
-            "frames",
-            found,
-            "newtons, finite and not below 0".to_owned(),
-        ));
+    if let Some(place) = frames
+        .iter()
+        .position(|n| !(0.0..=MOST_NEWTONS).contains(n))
+    {
+        let (frame, taxel) = (place / TAXELS, place % TAXELS);
+        let (row, col) = (taxel / COLS, taxel % COLS);
+        let found = format!("{:?} at [{frame},{row},{col}]", frames[place]);
+        let expected = format!("newtons from 0 to {MOST_NEWTONS:e}");
+        return Err(file.error("frames", found, expected));
     }
     let level: Vec<u8> = file
         .read("level", &[], Some(n))?
@@ -44,6 +49,9 @@ pub(super) fn parse(bytes: &[u8], path: &Path, name: String) -> Result<Dataset, 
     let force: Option<Vec<f32>> = file.read("force", &[], Some(n))?;
     let split: Option<Vec<u8>> = file.read("split", &[], Some(n))?;
     let shore: Option<Vec<f32>> = file.read("shore", &[], Some(n))?;
+    for (array, values) in [("force", &force), ("shore", &shore)] {
+        file.finite(array, values.as_deref().unwrap_or_default())?;
+    }
     let levels = levels().len();
     file.within("level", &level, levels as u8, "0 (unlabelled) to 4")?;
     file.within(
@@ -225,6 +233,16 @@ impl<'a> File<'a> {
         };
         serde_json::from_slice(&text)
             .map_err(|error| self.error("meta", error.to_string(), "JSON in UTF-8".to_owned()))
+    }
+
+    fn finite(&self, array: &'static str, values: &[f32]) -> Result<(), DatasetError> {
+        match values.iter().position(|value| !value.is_finite()) {
+            None => Ok(()),
+            Some(place) => {
+                let found = format!("{} at {place}", values[place]);
+                Err(self.error(array, found, "finite numbers".to_owned()))
+            }
+        }
     }
 
     fn within(

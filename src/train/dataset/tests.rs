@@ -111,8 +111,28 @@ fn what_is_not_as_agreed_is_named_with_what_was_found_and_expected() {
             npz.add_array("frames", &frames(2).mapv(|_| f32::NAN))
                 .unwrap();
         },
-        "array `frames`: found NaN in frame 0, expected newtons",
+        "array `frames`: found NaN at [0,0,0], expected newtons from 0 to 1e6",
     );
+    check(
+        |npz| {
+            let mut frames = frames(2);
+            frames[[1, 3, 4]] = 1e38;
+            npz.add_array("frames", &frames).unwrap();
+        },
+        "array `frames`: found 1e38 at [1,3,4], expected newtons from 0 to 1e6",
+    );
+    for array in ["force", "shore"] {
+        check(
+            |npz| {
+                npz.add_array("frames", &frames(2)).unwrap();
+                npz.add_array("level", &Array1::from(vec![1_u8, 2]))
+                    .unwrap();
+                npz.add_array(array, &Array1::from(vec![1.0, f32::INFINITY]))
+                    .unwrap();
+            },
+            &format!("array `{array}`: found inf at 1, expected finite numbers"),
+        );
+    }
     check(
         |npz| npz.add_array("frames", &frames(2)).unwrap(),
         "array `level`: found none, expected u8 [2]",

@@ -23,8 +23,8 @@ pub(super) fn accuracies(rows: &[Row], set: &str, title: &str) -> String {
         paper.map(|paper| paper.accuracy_percent)
     };
     let interval_of = |row: &Row| {
-        let estimate = tables::accuracy(row, set);
-        estimate.map(|estimate| estimate.interval.map(|end| 100.0 * end))
+        let interval = tables::accuracy(row, set)?.interval?;
+        Some(interval.map(|end| 100.0 * end))
     };
     let least = shown
         .iter()

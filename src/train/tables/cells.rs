@@ -68,11 +68,14 @@ pub fn accuracy(row: &Row, set: &str) -> Option<Estimate> {
 }
 
 pub(super) fn interval(row: &Row, set: &str) -> String {
-    accuracy(row, set).map_or("-".to_owned(), |estimate| interval_text(estimate.interval))
+    interval_text(accuracy(row, set).and_then(|estimate| estimate.interval))
 }
 
-pub(super) fn interval_text([low, high]: [f64; 2]) -> String {
-    format!("{:.1} to {:.1}", 100.0 * low, 100.0 * high)
+/// In per cent; a dash where there is none.
+pub(super) fn interval_text(interval: Option<[f64; 2]>) -> String {
+    interval.map_or("-".to_owned(), |[low, high]| {
+        format!("{:.1} to {:.1}", 100.0 * low, 100.0 * high)
+    })
 }
 
 /// Paired with the reference's runs of the same seeds.
@@ -89,10 +92,18 @@ pub(super) fn less_reference(row: &Row, rows: &[Row], set: &str) -> String {
         Some((own, other.1))
     };
     let pairs: Vec<(&[ObjectCount], &[ObjectCount])> = own.iter().filter_map(pair).collect();
-    metrics::difference_by_object(&pairs).map_or("-".to_owned(), |estimate| {
-        let [low, high] = estimate.interval.map(|end| 100.0 * end);
-        format!("{:+.1} ({low:+.1} to {high:+.1})", 100.0 * estimate.mean)
-    })
+    metrics::difference_by_object(&pairs).map_or("-".to_owned(), difference_text)
+}
+
+/// In points.
+fn difference_text(difference: Estimate) -> String {
+    let mean = 100.0 * difference.mean;
+    match difference.interval {
+        Some([low, high]) => {
+            format!("{mean:+.1} ({:+.1} to {:+.1})", 100.0 * low, 100.0 * high)
+        }
+        None => format!("{mean:+.1} (-)"),
+    }
 }
 
 pub(super) fn percent_of(evaluation: &Evaluation, level: usize) -> Option<f64> {
@@ -192,6 +203,20 @@ pub fn thousands(value: u64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_interval_that_is_none_is_a_dash() {
+        assert_eq!(interval_text(Some([0.5, 0.625])), "50.0 to 62.5");
+        assert_eq!(interval_text(None), "-");
+        let text = |interval| {
+            difference_text(Estimate {
+                mean: 0.02,
+                interval,
+            })
+        };
+        assert_eq!(text(Some([-0.01, 0.05])), "+2.0 (-1.0 to +5.0)");
+        assert_eq!(text(None), "+2.0 (-)");
+    }
 
     #[test]
     fn numbers_are_readable() {
