@@ -12,8 +12,7 @@ use hardnessd::event::{Event, Phase};
 use hardnessd::frame::{Frame, Stamp};
 use hardnessd::pipeline::{Clock, Judgement, Pipeline, Settings};
 use hardnessd::verdict::{BUILT_IN, Hrn};
-use hardnessd::wire::{Decoder, Layout};
-use hardnessd::{press, tare, wire};
+use hardnessd::wire::{self, Decoder, Layout};
 
 /// What a read of a serial port at 115,200 baud gives at a time, about.
 const CHUNK_BYTES: usize = 64;
@@ -36,18 +35,11 @@ fn hrn() -> Arc<Hrn> {
 }
 
 fn pipeline(hrn: &Arc<Hrn>) -> Pipeline {
-    let judgement = Judgement {
-        calibration: tare::Settings::default(),
-        press: press::Settings::default(),
-        min_confidence: 0.0,
-        min_force_n: 0.0,
-        hrn: Arc::clone(hrn),
-    };
     let settings = Settings {
         sensor: "sensor".to_owned(),
         frame_rate_hz: 5.0,
         layout: layout(),
-        judgement,
+        judgement: Judgement::new(Arc::clone(hrn)),
     };
     Pipeline::new(settings, Clock::FrameRate)
 }

@@ -16,7 +16,6 @@ use hardnessd::pipeline::{Clock, Judgement, Pipeline, Settings};
 use hardnessd::simulator::{Material, Sequence, SequenceSettings};
 use hardnessd::verdict::{BUILT_IN, Hrn};
 use hardnessd::wire::{self, Layout};
-use hardnessd::{press, tare};
 
 const SEED: u64 = 1;
 /// Of a press's greatest force: from here on it no longer rises.
@@ -74,18 +73,11 @@ impl Press {
 
 fn measure(sequence: Sequence, frame_rate_hz: f64, hrn: &Arc<Hrn>) -> Vec<Press> {
     let layout = Layout::new(&wire::Settings::default()).expect("the default is a layout");
-    let judgement = Judgement {
-        calibration: tare::Settings::default(),
-        press: press::Settings::default(),
-        min_confidence: 0.0,
-        min_force_n: 0.0,
-        hrn: Arc::clone(hrn),
-    };
     let settings = Settings {
         sensor: "sensor".to_owned(),
         frame_rate_hz,
         layout: layout.clone(),
-        judgement,
+        judgement: Judgement::new(Arc::clone(hrn)),
     };
     let mut pipeline = Pipeline::new(settings, Clock::FrameRate);
     let mut presses: Vec<Press> = Vec::new();

@@ -51,6 +51,19 @@ pub struct Judgement {
     pub hrn: Arc<Hrn>,
 }
 
+impl Judgement {
+    /// `hrn` judges, with default settings, and rejects nothing.
+    pub fn new(hrn: Arc<Hrn>) -> Self {
+        Self {
+            calibration: tare::Settings::default(),
+            press: press::Settings::default(),
+            min_confidence: 0.0,
+            min_force_n: 0.0,
+            hrn,
+        }
+    }
+}
+
 /// Where the times of frames come from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Clock {

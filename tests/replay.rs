@@ -12,7 +12,7 @@ use hardnessd::event::Event;
 use hardnessd::frame::Stamp;
 use hardnessd::pipeline::{Clock, Judgement, Pipeline, Settings};
 use hardnessd::verdict::{BUILT_IN, Hrn};
-use hardnessd::{press, tare, wire};
+use hardnessd::wire;
 use serde_json::Value;
 
 fn fixtures() -> PathBuf {
@@ -120,13 +120,7 @@ fn pipeline() -> Pipeline {
             sensor: "sensor".to_owned(),
             frame_rate_hz: 5.0,
             layout: wire::Layout::new(&wire::Settings::default()).unwrap(),
-            judgement: Judgement {
-                calibration: tare::Settings::default(),
-                press: press::Settings::default(),
-                min_confidence: 0.0,
-                min_force_n: 0.0,
-                hrn: Arc::new(Hrn::load(BUILT_IN).unwrap()),
-            },
+            judgement: Judgement::new(Arc::new(Hrn::load(BUILT_IN).unwrap())),
         },
         Clock::FrameRate,
     )

@@ -6,6 +6,9 @@
 )]
 
 mod bench;
+#[path = "../src/tools/pty/pair.rs"]
+#[allow(dead_code, reason = "nobody here asks where the device is")]
+mod pair;
 
 use std::fs::File;
 use std::io::Read;
@@ -18,8 +21,8 @@ use std::sync::mpsc::{self, Receiver};
 use std::time::{Duration, Instant};
 
 use bench::{BINARY, Bench, PATIENCE, Process, hardnessd};
+use pair::Pair;
 use rustix::process::Signal;
-use rustix::pty::OpenptFlags;
 use rustix::termios::{LocalModes, Winsize};
 
 /// A terminal, and a `watch` on it.
@@ -34,16 +37,7 @@ struct Terminal {
 
 impl Terminal {
     fn new(socket: &Path, size: (u16, u16), variables: &[(&str, &str)]) -> Self {
-        let master = rustix::pty::openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
-        rustix::pty::grantpt(&master).unwrap();
-        rustix::pty::unlockpt(&master).unwrap();
-        let name = rustix::pty::ptsname(&master, Vec::new()).unwrap();
-        let device = File::options()
-            .read(true)
-            .write(true)
-            .open(name.to_str().unwrap())
-            .unwrap();
-        let device = OwnedFd::from(device);
+        let Pair { master, device, .. } = Pair::open().unwrap();
         let end = || Stdio::from(device.try_clone().unwrap());
         resize(&master, size);
         let watch = Command::new(BINARY)

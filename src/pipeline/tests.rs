@@ -14,13 +14,7 @@ fn pipeline(preset: Preset) -> Pipeline {
             ..wire::Settings::default()
         })
         .unwrap(),
-        judgement: Judgement {
-            calibration: tare::Settings::default(),
-            press: press::Settings::default(),
-            min_confidence: 0.0,
-            min_force_n: 0.0,
-            hrn: Arc::new(Hrn::load(BUILT_IN).unwrap()),
-        },
+        judgement: Judgement::new(Arc::new(Hrn::load(BUILT_IN).unwrap())),
     };
     Pipeline::new(settings, Clock::Arrival)
 }

@@ -71,13 +71,9 @@ impl Ring {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
-
     use super::*;
     use crate::pipeline::{Clock, Pipeline};
-    use crate::recording::{Labels, Sensor, State};
-    use crate::verdict::{BUILT_IN, Hrn};
-    use crate::{press, tare, wire};
+    use crate::recording::{Labels, State, tests};
 
     fn at(seconds: u64) -> Stamp {
         Stamp {
@@ -87,17 +83,8 @@ mod tests {
     }
 
     fn state() -> Entry {
-        let hrn = Arc::new(Hrn::load(BUILT_IN).unwrap());
-        let sensor = Sensor {
-            name: "forearm".to_owned(),
-            frame_rate_hz: 5.0,
-            frame: wire::Settings::default(),
-            calibration: tare::Settings::default(),
-            press: press::Settings::default(),
-            min_confidence: 0.0,
-            min_force_n: 0.0,
-            model: hrn.sha256().to_owned(),
-        };
+        let hrn = tests::hrn();
+        let sensor = tests::sensor(&hrn);
         let pipeline = Pipeline::new(sensor.settings(&hrn).unwrap(), Clock::Arrival);
         Entry::State(Box::new(State {
             sensor,

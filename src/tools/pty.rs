@@ -4,19 +4,19 @@
 //! It keeps its own descriptor of the device side, so that the pair lives while readers come and
 //! go. Dropped, it plays an unplug: both sides are closed and the link is removed.
 
-use std::ffi::OsStr;
+pub(crate) mod pair;
+
 use std::fs;
 use std::io::{self, ErrorKind};
 use std::os::fd::OwnedFd;
-use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use rustix::fs::{Mode, OFlags};
 use rustix::io::Errno;
-use rustix::pty::OpenptFlags;
 use rustix::termios::{OptionalActions, QueueSelector};
 use tokio::time::Instant;
+
+use self::pair::Pair;
 
 /// Bytes unread for so long have no reader: what waits is thrown away, and a lock that a killed
 /// reader left (TIOCEXCL outlives it here) is opened.
@@ -45,15 +45,12 @@ impl Pty {
     ///
     /// If the system has no pair to give, or something that is no link stands at `link`.
     pub(crate) fn open(link: Option<&Path>) -> io::Result<Self> {
-        let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
-        let master = rustix::pty::openpt(flags)?;
-        rustix::pty::grantpt(&master)?;
-        rustix::pty::unlockpt(&master)?;
+        let Pair {
+            master,
+            device,
+            path,
+        } = Pair::open()?;
         rustix::io::ioctl_fionbio(&master, true)?;
-        let name = rustix::pty::ptsname(&master, Vec::new())?;
-        let path = PathBuf::from(OsStr::from_bytes(name.as_bytes()));
-        let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC;
-        let device = rustix::fs::open(&path, flags, Mode::empty())?;
         // A fresh tty echoes and edits lines: not what a sensor does.
         let mut settings = rustix::termios::tcgetattr(&device)?;
         settings.make_raw();

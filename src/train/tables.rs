@@ -136,21 +136,22 @@ pub fn headline(rows: &[Row]) -> Table {
     table
 }
 
+/// What tables of accuracies show of a method.
+const ACCURACIES: [&str; 7] = [
+    "level 1",
+    "level 2",
+    "level 3",
+    "level 4",
+    "overall",
+    "95 %",
+    "less ours",
+];
+
 /// Table 2, the paper's figures in brackets.
 pub fn table_2(rows: &[Row]) -> Table {
     let note = "Category accuracies and overall accuracy in per cent on the data set's own test \
                 split, of the paper's size; in brackets the paper's.";
-    let head = [
-        "method",
-        "labels",
-        "level 1",
-        "level 2",
-        "level 3",
-        "level 4",
-        "overall",
-        "95 %",
-        "less ours",
-    ];
+    let head = [&["method", "labels"], &ACCURACIES[..]].concat();
     let mut table = Table::new("Table 2: accuracy", note, &head);
     for row in rows {
         let paper = paper_row(row);
@@ -180,16 +181,7 @@ pub fn fresh(rows: &[Row]) -> [Table; 2] {
 
 fn accuracies(rows: &[Row], set: &str, title: &str) -> Table {
     let note = "Accuracy in per cent on 20 objects of each test material; \"less ours\" in points.";
-    let head = [
-        "method",
-        "level 1",
-        "level 2",
-        "level 3",
-        "level 4",
-        "overall",
-        "95 %",
-        "less ours",
-    ];
+    let head = [&["method"], &ACCURACIES[..]].concat();
     let mut table = Table::new(title, note, &head);
     for row in rows {
         let mut cells = vec![row.title.clone()];

@@ -1,6 +1,5 @@
 //! What is known, how old it is called, and what of it is drawn in which room.
 
-use std::fs::File;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
@@ -9,7 +8,6 @@ use ratatui::backend::{Backend, TestBackend};
 use ratatui::buffer::Buffer;
 use ratatui::layout::Size;
 use ratatui::style::Color;
-use rustix::pty::OpenptFlags;
 use rustix::termios::LocalModes;
 use serde_json::{Value, json};
 
@@ -19,6 +17,7 @@ use super::look::Look;
 use super::screen::{Screen, pressed};
 use super::view::{Key, Link, Loss, View};
 use crate::frame::{COLS, Stamp, TAXELS};
+use crate::tools::pty::pair::Pair;
 
 const COLOURS: Look = Look {
     colours: true,
@@ -453,15 +452,7 @@ fn a_panic_with_the_screen_open() {
 
 #[test]
 fn a_panic_gives_the_terminal_back() {
-    let master = rustix::pty::openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
-    rustix::pty::grantpt(&master).unwrap();
-    rustix::pty::unlockpt(&master).unwrap();
-    let name = rustix::pty::ptsname(&master, Vec::new()).unwrap();
-    let device = File::options()
-        .read(true)
-        .write(true)
-        .open(name.to_str().unwrap())
-        .unwrap();
+    let Pair { master, device, .. } = Pair::open().unwrap();
     let end = || Stdio::from(device.try_clone().unwrap());
     let ended = Command::new(std::env::current_exe().unwrap())
         .args([

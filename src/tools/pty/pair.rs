@@ -1,0 +1,42 @@
+//! A pseudo-terminal as the system gives it: the simulator's port, and the terminals of tests, which
+//! take this file as it is.
+
+use std::ffi::OsStr;
+use std::io;
+use std::os::fd::OwnedFd;
+use std::os::unix::ffi::OsStrExt;
+use std::path::PathBuf;
+
+use rustix::fs::{Mode, OFlags};
+use rustix::pty::OpenptFlags;
+
+/// Both sides, and where the device is.
+#[derive(Debug)]
+pub(crate) struct Pair {
+    pub(crate) master: OwnedFd,
+    pub(crate) device: OwnedFd,
+    pub(crate) path: PathBuf,
+}
+
+impl Pair {
+    /// A new one, with the settings of a fresh terminal. No child inherits it.
+    ///
+    /// # Errors
+    ///
+    /// If the system has none to give.
+    pub(crate) fn open() -> io::Result<Self> {
+        let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
+        let master = rustix::pty::openpt(flags)?;
+        rustix::pty::grantpt(&master)?;
+        rustix::pty::unlockpt(&master)?;
+        let name = rustix::pty::ptsname(&master, Vec::new())?;
+        let path = PathBuf::from(OsStr::from_bytes(name.as_bytes()));
+        let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC;
+        let device = rustix::fs::open(&path, flags, Mode::empty())?;
+        Ok(Self {
+            master,
+            device,
+            path,
+        })
+    }
+}
