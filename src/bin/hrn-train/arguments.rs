@@ -1,0 +1,219 @@
+//! What the trainer can be asked for.
+
+use std::path::PathBuf;
+
+use clap::{Parser, Subcommand, ValueEnum};
+use hardnessd::simulator::{DatasetSettings, SensorProfile, Shapes, Split};
+use hardnessd::train::dataset::LabelChoice;
+use hardnessd::train::methods::Method;
+use hardnessd::train::settings::Profile;
+
+/// Trains and evaluates the hardness recognition network.
+#[derive(Debug, Parser)]
+#[command(name = "hrn-train", version)]
+pub(super) struct Arguments {
+    #[command(subcommand)]
+    pub(super) command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub(super) enum Command {
+    /// Simulate a labelled data set (default: the paper's 10,000 + 1,000 samples)
+    Simulate(Simulate),
+    /// Make a data set of recordings of known objects, through the daemon's own decoding
+    Collect(Collect),
+    /// Train one method
+    Train(Train),
+    /// Train every method under several seeds and make the paper's tables; run again to go on
+    Compare(Compare),
+    /// Run an exported model on a data set
+    Evaluate(Evaluate),
+    /// Write one page that shows a run or a comparison
+    Report {
+        /// Directory of the run or the comparison
+        directory: PathBuf,
+        /// The page to write; one that is there is replaced
+        #[arg(long, value_name = "R.html")]
+        out: PathBuf,
+    },
+    /// Write the model of a finished run to a file of its own
+    Export {
+        /// Directory of the run
+        run: PathBuf,
+        /// The model file to write; one that is there is replaced
+        #[arg(long, value_name = "M.onnx")]
+        out: PathBuf,
+    },
+    /// Check a model file as the daemon does and print its card
+    Inspect {
+        /// The model file
+        model: PathBuf,
+    },
+}
+
+#[derive(Debug, clap::Args)]
+pub(super) struct Simulate {
+    /// The data set to write; one that is there is replaced
+    #[arg(long, value_name = "D.npz")]
+    pub(super) out: PathBuf,
+    /// Everything random follows from it
+    #[arg(long, default_value_t = DatasetSettings::default().seed)]
+    pub(super) seed: u64,
+    /// Objects of each training material
+    #[arg(long, default_value_t = DatasetSettings::default().objects)]
+    pub(super) objects: u32,
+    /// Objects of each test material
+    #[arg(long, default_value_t = DatasetSettings::default().test_objects)]
+    pub(super) test_objects: u32,
+    /// Presses of each object
+    #[arg(long, default_value_t = DatasetSettings::default().presses)]
+    pub(super) presses: u32,
+    /// The least nominal force, in newtons; the greatest is 25
+    #[arg(long, value_name = "N", default_value_t = DatasetSettings::default().lowest_force_n,
+          value_parser = lowest_force_n)]
+    pub(super) lowest_force: f32,
+    /// Distribution of shapes: matched (the same for all materials) or paper
+    #[arg(long, default_value = "matched")]
+    pub(super) shapes: Shapes,
+    /// Spread of the sensor's taxels: clean or raw
+    #[arg(long, default_value = "clean")]
+    pub(super) sensor_profile: SensorProfile,
+    /// Also draw samples of every material and a press of every level
+    #[arg(long, value_name = "S.png")]
+    pub(super) sheet: Option<PathBuf>,
+}
+
+#[derive(Debug, clap::Args)]
+pub(super) struct Collect {
+    /// The data set to write; one that is there is replaced
+    #[arg(long, value_name = "D.npz")]
+    pub(super) out: PathBuf,
+    /// Hardness level, 1 (hard) to 4, or 0: unlabelled [default: the recording's label "level"]
+    #[arg(long, value_name = "L", value_parser = clap::value_parser!(u8).range(0..=4))]
+    pub(super) level: Option<u8>,
+    /// What was pressed [default: the recording's label "object", else a new one]
+    #[arg(long, value_name = "K")]
+    pub(super) object: Option<u32>,
+    /// For training or for test
+    #[arg(long, default_value = "train")]
+    pub(super) split: SplitName,
+    /// Add to the data set, if it is there
+    #[arg(long)]
+    pub(super) append: bool,
+    /// Configuration whose first sensor a .bin is of [default: a JX255N by default settings]
+    #[arg(long, value_name = "F")]
+    pub(super) config: Option<PathBuf>,
+    /// Recordings: .mcap, or .bin, raw bytes back to back. If all have a label "material", the data
+    /// set has that array
+    #[arg(value_name = "CAPTURE", required = true)]
+    pub(super) captures: Vec<PathBuf>,
+}
+
+#[derive(Debug, clap::Args)]
+pub(super) struct Train {
+    /// What to train
+    #[arg(long)]
+    pub(super) method: Method,
+    /// Data to learn from; several files are joined
+    #[arg(long, value_name = "D.npz", required = true)]
+    pub(super) data: Vec<PathBuf>,
+    /// Directory of the run
+    #[arg(long, value_name = "RUN")]
+    pub(super) out: PathBuf,
+    /// Everything random follows from it
+    #[arg(long, default_value_t = 1)]
+    pub(super) seed: u64,
+    /// How long it may take
+    #[arg(long, default_value = "paper")]
+    pub(super) profile: Profile,
+    /// Settings that override the profile's (see config/hrn-train.toml)
+    #[arg(long, value_name = "F.toml")]
+    pub(super) config: Option<PathBuf>,
+    /// Go on with a run that was stopped
+    #[arg(long)]
+    pub(super) resume: bool,
+    /// Take stages that another run finished, where they are the very same; may be repeated
+    #[arg(long, value_name = "RUN")]
+    pub(super) from: Vec<PathBuf>,
+    /// Use so many labels instead of the method's share
+    #[arg(long, value_name = "N")]
+    pub(super) labels: Option<usize>,
+    /// Whether they are those of whole objects
+    #[arg(long, default_value = "object")]
+    pub(super) label_choice: LabelChoice,
+    /// Where to compute
+    #[arg(long, default_value = "cpu")]
+    pub(super) device: DeviceName,
+    /// End when this process ends, the one that started this one
+    #[arg(long, hide = true, value_name = "PID")]
+    pub(super) parent: Option<i32>,
+}
+
+#[derive(Debug, clap::Args)]
+pub(super) struct Compare {
+    /// The data set to learn from
+    #[arg(long, value_name = "D.npz")]
+    pub(super) data: PathBuf,
+    /// Directory of the comparison
+    #[arg(long, value_name = "DIR")]
+    pub(super) out: PathBuf,
+    /// Which methods; all by default
+    #[arg(long, value_name = "M", value_delimiter = ',', num_args = 1..)]
+    pub(super) methods: Vec<Method>,
+    /// Seeds 1 to N
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
+    pub(super) seeds: u64,
+    /// How long each run may take
+    #[arg(long, default_value = "paper")]
+    pub(super) profile: Profile,
+    /// Runs at a time, each on one thread; as many as there are cores by default
+    #[arg(long, value_name = "J")]
+    pub(super) jobs: Option<std::num::NonZeroUsize>,
+    /// Also swap the two materials of each level: 16 times features and hrn15-tuned, 4 times ours
+    #[arg(long)]
+    pub(super) swaps: bool,
+}
+
+/// From the least of `hardnessd simulate --force` to the greatest nominal force.
+fn lowest_force_n(text: &str) -> Result<f32, String> {
+    match text.parse() {
+        Ok(force_n) if (0.01..=25.0).contains(&force_n) => Ok(force_n),
+        _ => Err("expected newtons from 0.01 to 25".to_owned()),
+    }
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub(super) enum DeviceName {
+    Cpu,
+}
+
+#[derive(Debug, clap::Args)]
+pub(super) struct Evaluate {
+    /// The model file
+    #[arg(long, value_name = "M.onnx")]
+    pub(super) model: PathBuf,
+    /// The data set
+    #[arg(long, value_name = "D.npz")]
+    pub(super) data: PathBuf,
+    /// Which of its samples
+    #[arg(long, default_value = "test")]
+    pub(super) split: SplitName,
+    /// Print JSON
+    #[arg(long)]
+    pub(super) json: bool,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub(super) enum SplitName {
+    Train,
+    Test,
+}
+
+impl From<SplitName> for Split {
+    fn from(name: SplitName) -> Self {
+        match name {
+            SplitName::Train => Split::Train,
+            SplitName::Test => Split::Test,
+        }
+    }
+}
