@@ -27,6 +27,7 @@ pub mod optimiser;
 pub mod learner;
 pub mod checkpoint;
 pub mod features;
+pub mod baseline;
 pub mod likeness;
 pub mod history;
 pub mod run;

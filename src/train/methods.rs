@@ -6,9 +6,10 @@ use std::time::Instant;
 use anyhow::Context as _;
 use burn::tensor::Device;
 
+use super::baseline::Baseline;
 use super::dataset::{Dataset, DatasetError};
 use super::export::{self, Recogniser};
-use super::features::{self, Baseline};
+use super::features;
 use super::generator::COMPONENTS;
 use super::history::Row;
 use super::losses::Game;
