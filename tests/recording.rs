@@ -153,6 +153,99 @@ fn a_replay_repeats_what_subscribers_read_live() {
     assert_eq!(replayed, live);
 }
 
+/// What two sensors were judged to be, each by itself: numbers run over both.
+fn verdicts_of(events: &[Value], sensor: &str) -> Vec<Value> {
+    let verdicts = events
+        .iter()
+        .filter(|event| event["type"] == "hardness" && event["sensor"] == sensor);
+    verdicts
+        .map(|event| {
+            let mut event = timeless(event.clone());
+            event["seq"].take();
+            event
+        })
+        .collect()
+}
+
+#[test]
+fn two_sensors_in_one_recording_are_judged_as_they_were_live() {
+    let bench = Bench::new();
+    let more = "[[sensor]]\nname = \"wrist\"\nport = \"port-2\"\nframe_rate_hz = 20.0\n\
+                [record]\ndir = \"rec\"\nkeep_free_mb = 0\n";
+    let config = bench.configure("hardnessd.toml", "events.sock", more);
+    let mut daemon = Daemon::start(&config);
+    let mut subscriber = bench.subscriber();
+    let mut forearm = bench.sensor(&["--presses", "2"]);
+    let mut wrist = bench.sensor_at("port-2", 20, &["--presses", "3", "--seed", "2"]);
+    assert_eq!((forearm.exit_code(), wrist.exit_code()), (Some(0), Some(0)));
+    daemon.process.signal(Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    let live: Vec<Value> = std::iter::from_fn(|| subscriber.next()).collect();
+    let recordings = recordings_in(&bench.path("rec"), "hardnessd-");
+    let [recording] = recordings.as_slice() else {
+        panic!("{recordings:?}");
+    };
+    let replayed = replay(recording);
+    for (sensor, presses) in [("forearm", 2), ("wrist", 3)] {
+        let verdicts = verdicts_of(&live, sensor);
+        let finals = verdicts.iter().filter(|event| event["phase"] == "final");
+        assert_eq!(finals.count(), presses, "{sensor}");
+        assert_eq!(verdicts_of(&replayed, sensor), verdicts);
+    }
+
+    // `record` takes both into one file, too.
+    let out = bench.path("both.mcap");
+    let mut recording = record(&config, &out, &[]);
+    // Without a sensor at a port there would be nothing to record.
+    assert_eq!(recording.exit_code(), Some(69));
+    let mut forearm = bench.sensor(&["--presses", "1"]);
+    let mut wrist = bench.sensor_at("port-2", 20, &["--presses", "1", "--seed", "2"]);
+    let mut recording = record(&config, &out, &[]);
+    forearm.exit_code();
+    wrist.exit_code();
+    assert_eq!(recording.exit_code(), Some(69), "the last one is lost");
+    let replayed = replay(&out);
+    for sensor in ["forearm", "wrist"] {
+        assert!(!verdicts_of(&replayed, sensor).is_empty(), "{sensor}");
+    }
+}
+
+#[test]
+fn a_terminal_that_goes_ends_a_recording_whole_unless_it_shall_outlive_it() {
+    let bench = Bench::new();
+    let _sensor = bench.sensor(&[]);
+    let config = configure(&bench, 20);
+    let recorded = |out: &Path| {
+        wait_for("the file", || {
+            fs::metadata(out).is_ok_and(|file| file.len() > 8_000)
+        });
+    };
+    let out = bench.path("a.mcap");
+    let mut recording = record(&config, &out, &[]);
+    recorded(&out);
+    recording.signal(Signal::HUP);
+    assert_eq!(recording.exit_code(), Some(0));
+    assert_eq!(replay(&out).last().unwrap()["reason"], "end of recording");
+
+    let out = bench.path("b.mcap");
+    let mut command = Command::new("nohup");
+    command
+        .arg(BINARY)
+        .args(["record", "--config"])
+        .arg(&config);
+    command.arg("--out").arg(&out).stdout(Stdio::null());
+    let mut recording = Process(command.stderr(Stdio::null()).spawn().unwrap());
+    recorded(&out);
+    recording.signal(Signal::HUP);
+    let before = fs::metadata(&out).unwrap().len();
+    wait_for("more", || {
+        fs::metadata(&out).unwrap().len() > before + 8_000
+    });
+    recording.signal(Signal::TERM);
+    assert_eq!(recording.exit_code(), Some(0));
+    replay(&out);
+}
+
 #[test]
 fn record_writes_a_new_file_for_as_long_as_there_is_a_sensor() {
     let bench = Bench::new();

@@ -5,7 +5,6 @@ use std::io;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::Context;
 use clap::{CommandFactory, Parser, Subcommand};
 use hardnessd::daemon::config::{Error as ConfigError, Setup};
 use hardnessd::daemon::log::{Log, Settings as LogSettings};
@@ -16,7 +15,7 @@ use hardnessd::daemon::{Daemon, Error as DaemonError, Reload};
 use hardnessd::tools::{
     self, check, demo, doctor, generate, record, recover, replay, simulate, sniff, tail, watch,
 };
-use tokio::signal::unix::{SignalKind, signal};
+use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::mpsc;
 
 /// Hardness events from a tactile array on a serial port
@@ -75,7 +74,6 @@ mod exit {
 }
 
 fn main() -> ExitCode {
-    let args = Args::parse();
     let runtime = match tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
@@ -86,7 +84,20 @@ fn main() -> ExitCode {
             return ExitCode::from(exit::IO);
         }
     };
-    let done = runtime.block_on(dispatch(args.command));
+    // Before all else, be it the arguments: a signal that comes early must not kill.
+    let signals = {
+        let _inside = runtime.enter();
+        Signals::catch()
+    };
+    let signals = match signals {
+        Ok(signals) => signals,
+        Err(error) => {
+            eprintln!("hardnessd: no signals: {error}");
+            return ExitCode::from(exit::IO);
+        }
+    };
+    let args = Args::parse();
+    let done = runtime.block_on(dispatch(args.command, signals));
     // A port may be stuck in its driver on a thread of its own: not worth waiting for.
     runtime.shutdown_background();
     match done {
@@ -98,36 +109,44 @@ fn main() -> ExitCode {
     }
 }
 
-async fn dispatch(command: Command) -> anyhow::Result<()> {
+async fn dispatch(command: Command, signals: Signals) -> anyhow::Result<()> {
     match command {
-        Command::Run { config } => run(config).await,
+        Command::Run { config } => run(config, signals).await,
         Command::Demo(args) => {
             // The events are what is shown: the log would say each again.
             let _log = Log::start(LogSettings::default(), "warn")?;
-            Ok(demo::run(args, shutdown_or_hangup()?).await?)
+            Ok(demo::run(args, signals.end()).await?)
         }
-        Command::Simulate(args) => Ok(simulate::run(args, shutdown_or_hangup()?).await?),
+        Command::Simulate(args) => Ok(simulate::run(args, signals.end()).await?),
         Command::Record(args) => {
-            let shutdown = shutdown_or_hangup()?;
             let setup = Setup::load(&args.config)?;
             let _log = Log::start(setup.config.log, "info")?;
-            Ok(record::run(args, setup, shutdown).await?)
+            Ok(record::run(args, setup, signals.end()).await?)
         }
-        Command::Recover(args) => Ok(recover::run(&args)?),
-        Command::Replay(args) => Ok(replay::run(args, shutdown()?).await?),
-        Command::Tail(args) => Ok(tail::run(args, shutdown()?).await?),
-        Command::Watch(args) => Ok(watch::run(args, shutdown()?).await?),
-        Command::Check(args) => Ok(check::run(&args)?),
-        Command::Doctor(args) => Ok(doctor::run(&args)?),
-        Command::Sniff(args) => Ok(sniff::run(args, shutdown()?).await?),
+        Command::Recover(args) => interruptible(signals, move || recover::run(&args)).await,
+        Command::Replay(args) => Ok(replay::run(args, signals.end()).await?),
+        Command::Tail(args) => Ok(tail::run(args, signals.end()).await?),
+        Command::Watch(args) => Ok(watch::run(args, signals.end()).await?),
+        Command::Check(args) => interruptible(signals, move || check::run(&args)).await,
+        Command::Doctor(args) => interruptible(signals, move || doctor::run(&args)).await,
+        Command::Sniff(args) => Ok(sniff::run(args, signals.end()).await?),
         Command::Generate(args) => Ok(generate::run(args, Args::command())?),
     }
 }
 
-async fn run(path: PathBuf) -> anyhow::Result<()> {
-    // Before all else: a signal that comes early must not kill.
-    let shutdown = shutdown()?;
-    let mut hangup = signal(SignalKind::hangup()).context("SIGHUP")?;
+/// Work that looks for no signal; one ends it, which is a failure.
+async fn interruptible<E: std::error::Error + Send + Sync + 'static>(
+    signals: Signals,
+    work: impl FnOnce() -> Result<(), E> + Send + 'static,
+) -> anyhow::Result<()> {
+    tokio::select! {
+        done = tokio::task::spawn_blocking(work) => Ok(done??),
+        () = signals.end() => anyhow::bail!("interrupted"),
+    }
+}
+
+async fn run(path: PathBuf, signals: Signals) -> anyhow::Result<()> {
+    let (shutdown, mut hangup) = signals.apart();
     let setup = Setup::load(&path)?;
     let log = Log::start(setup.config.log, "info")?;
     let daemon = Daemon::bind(setup)?;
@@ -150,43 +169,63 @@ async fn run(path: PathBuf) -> anyhow::Result<()> {
         .await?)
 }
 
-/// SIGINT or SIGTERM.
-fn shutdown() -> io::Result<impl Future<Output = ()>> {
-    let mut interrupt = signal(SignalKind::interrupt())?;
-    let mut terminate = signal(SignalKind::terminate())?;
-    Ok(async move {
+/// The signals that this process takes.
+struct Signals {
+    interrupt: Signal,
+    terminate: Signal,
+    hangup: Signal,
+    /// Whether whoever started it wants it to outlive the terminal, as nohup(1) does.
+    outlives_terminal: bool,
+}
+
+impl Signals {
+    /// From now on none of them kills.
+    fn catch() -> io::Result<Self> {
+        // Which it was is known only before one is caught.
+        let outlives_terminal = ignores_hangup();
+        Ok(Self {
+            interrupt: signal(SignalKind::interrupt())?,
+            terminate: signal(SignalKind::terminate())?,
+            hangup: signal(SignalKind::hangup())?,
+            outlives_terminal,
+        })
+    }
+
+    /// SIGINT, SIGTERM, or SIGHUP of a terminal that has gone.
+    async fn end(self) {
+        let outlives_terminal = self.outlives_terminal;
+        let (shutdown, mut hangup) = self.apart();
         tokio::select! {
-            _ = interrupt.recv() => {}
-            _ = terminate.recv() => {}
+            () = shutdown => {}
+            _ = hangup.recv(), if !outlives_terminal => {}
         }
-    })
+    }
+
+    /// SIGINT or SIGTERM, and SIGHUP for another use.
+    fn apart(self) -> (impl Future<Output = ()>, Signal) {
+        let Self {
+            mut interrupt,
+            mut terminate,
+            hangup,
+            ..
+        } = self;
+        let shutdown = async move {
+            tokio::select! {
+                _ = interrupt.recv() => {}
+                _ = terminate.recv() => {}
+            }
+        };
+        (shutdown, hangup)
+    }
 }
 
-/// As [`shutdown`], or the terminal is gone: for tools that would leave something behind.
-fn shutdown_or_hangup() -> io::Result<impl Future<Output = ()>> {
-    let shutdown = shutdown()?;
-    let mut hangup = match hangup_is_ignored() {
-        true => None,
-        false => Some(signal(SignalKind::hangup())?),
-    };
-    Ok(async move {
-        match &mut hangup {
-            Some(hangup) => tokio::select! {
-                () = shutdown => {}
-                _ = hangup.recv() => {}
-            },
-            None => shutdown.await,
-        }
-    })
-}
-
-/// Whoever started this (`nohup`) wants it to outlive the terminal: a handler would undo that.
-fn hangup_is_ignored() -> bool {
+/// Whether SIGHUP is ignored, by proc_pid_status(5): `SigIgn` is a mask in hex, signal 1 its lowest
+/// bit. Where /proc is hidden it is taken not to be.
+fn ignores_hangup() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
-    let mask = ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
-    // Bit 0 is signal 1, SIGHUP.
-    mask.is_some_and(|mask| mask & 1 == 1)
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok())
+        .is_some_and(|mask| mask & 1 == 1)
 }
 
 fn exit_code(error: &anyhow::Error) -> u8 {
