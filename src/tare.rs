@@ -39,13 +39,15 @@ impl Default for Settings {
 /// A value of [`Settings`] that cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SettingsError {
-    /// A quantity that must be positive and finite.
-    #[error("{key}: found {found}, expected a number above 0")]
+    /// A quantity that must be positive, and not so large that no film has it.
+    #[error("{key}: found {found:?}, expected a number above 0 and at most {max}")]
     NotPositive {
         /// Its key.
         key: &'static str,
         /// As given.
         found: f64,
+        /// Largest allowed.
+        max: f64,
     },
     /// More frames than a sum of counts can hold.
     #[error("tare_frames: found {found}, expected 0 to {max}")]
@@ -71,6 +73,19 @@ pub enum SettingsError {
     },
 }
 
+/// What every sum and product of a frame stays finite with, and far beyond any film: a count of the
+/// JX255N is 0.04 N, its taxels are 3.5 mm apart, and 1 MN rests on no taxel.
+const MOST_NEWTONS_PER_COUNT: f64 = 1e3;
+const MOST_PITCH_MM: f64 = 1e3;
+const MOST_TARE_N: f64 = 1e6;
+
+/// The number that was written, not the one nearest to it among the shorter ones.
+fn as_written(value: f32) -> f64 {
+    let text = format!("{value:?}");
+    text.parse()
+        .expect("a number's own text is a number's text")
+}
+
 /// 65535 counts x 65536 frames stay below 2^32.
 const MOST_TARE_FRAMES: u32 = 65_536;
 
@@ -79,16 +94,20 @@ impl Settings {
     ///
     /// # Errors
     ///
-    /// If `newtons_per_count`, `pitch_mm` or `tare_max_n` is not above 0 and finite, `tare_frames`
-    /// is above 65,536, or a dead taxel lies outside `array`.
+    /// If `newtons_per_count`, `pitch_mm` or `tare_max_n` is not above 0 or is beyond any film,
+    /// `tare_frames` is above 65,536, or a dead taxel lies outside `array`.
     pub fn check(&self, array: Array) -> Result<(), SettingsError> {
-        for (key, found) in [
-            ("newtons_per_count", f64::from(self.newtons_per_count)),
-            ("pitch_mm", self.pitch_mm),
-            ("tare_max_n", f64::from(self.tare_max_n)),
+        for (key, found, max) in [
+            (
+                "newtons_per_count",
+                as_written(self.newtons_per_count),
+                MOST_NEWTONS_PER_COUNT,
+            ),
+            ("pitch_mm", self.pitch_mm, MOST_PITCH_MM),
+            ("tare_max_n", as_written(self.tare_max_n), MOST_TARE_N),
         ] {
-            if !(found.is_finite() && found > 0.0) {
-                return Err(SettingsError::NotPositive { key, found });
+            if !(found > 0.0 && found <= max) {
+                return Err(SettingsError::NotPositive { key, found, max });
             }
         }
         if self.tare_frames > MOST_TARE_FRAMES {

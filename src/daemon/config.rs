@@ -5,6 +5,7 @@
 //! error that names file and key, what was found and what was expected. Paths in the file are
 //! relative to its directory.
 
+mod check;
 mod parse;
 
 use std::env;

@@ -45,7 +45,7 @@ impl Default for Settings {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SettingsError {
     /// A quantity that must be positive and finite.
-    #[error("{key}: found {found}, expected a number above 0 and at most {max}")]
+    #[error("{key}: found {found:?}, expected a number above 0 and at most {max}")]
     NotPositive {
         /// Its key.
         key: &'static str,
@@ -55,7 +55,7 @@ pub enum SettingsError {
         max: f64,
     },
     /// A quantity that must be finite and not negative.
-    #[error("{key}: found {found}, expected 0 or more and at most {max}")]
+    #[error("{key}: found {found:?}, expected 0 or more and at most {max}")]
     Negative {
         /// Its key.
         key: &'static str,

@@ -5,7 +5,10 @@ use std::fs;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use super::{Config, Model, Sensor};
+use toml::de::DeTable;
+
+use super::check::check;
+use super::{Config, Model};
 use crate::verdict::{self, Hrn, ModelError};
 use crate::{press, tare, wire};
 
@@ -131,15 +134,18 @@ impl Place {
 }
 
 pub(super) fn load(path: &Path) -> Result<Config, Error> {
-    let text = fs::read_to_string(path).map_err(|source| Error::Unreadable {
+    let bytes = fs::read(path).map_err(|source| Error::Unreadable {
         path: path.to_owned(),
         source,
     })?;
-    let mut config: Config = toml::from_str(&text).map_err(|error| syntax(path, &text, &error))?;
-    check(&config, path)?;
+    let text = text(&bytes, path)?;
+    let mut config: Config = toml::from_str(text).map_err(|error| syntax(path, text, &error))?;
     let directory = path.parent().unwrap_or(Path::new(""));
     for sensor in &mut config.sensors {
-        sensor.port = directory.join(&sensor.port);
+        // None stays none.
+        if !sensor.port.as_os_str().is_empty() {
+            sensor.port = directory.join(&sensor.port);
+        }
     }
     let unix = &mut config.publish.unix;
     let paths = [
@@ -151,10 +157,35 @@ pub(super) fn load(path: &Path) -> Result<Config, Error> {
     for path in paths.into_iter().chain(record).flatten() {
         *path = directory.join(&*path);
     }
+    check(&config, path)?;
     Ok(config)
 }
 
+fn text<'a>(bytes: &'a [u8], path: &Path) -> Result<&'a str, Error> {
+    std::str::from_utf8(bytes).map_err(|error| {
+        let (before, after) = bytes.split_at(error.valid_up_to());
+        let before = String::from_utf8_lossy(before);
+        Error::Syntax {
+            path: path.to_owned(),
+            place: Place::of(&before, before.len()),
+            problem: format!("found byte {:#04x}, expected UTF-8", after[0]),
+        }
+    })
+}
+
 fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Error {
+    if let Some(start) = error
+        .message()
+        .starts_with("missing field")
+        .then(|| sensor_without_port(text))
+        .flatten()
+    {
+        return Error::Syntax {
+            path: path.to_owned(),
+            place: Place::of(text, start),
+            problem: "sensor.port: found none, expected the path of a device".to_owned(),
+        };
+    }
     let start = error.span().map_or(0, |span| span.start);
     // The parser says what was found and expected; the key stands before it on its line.
     let line_start = text[..start].rfind('\n').map_or(0, |newline| newline + 1);
@@ -163,7 +194,7 @@ fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Error {
         .split_once('=')
         .map(|(key, _)| key.trim())
         .filter(|key| !key.is_empty());
-    let message = error.message().replace('\n', ": ");
+    let message = plain(&error.message().replace('\n', ": "));
     Error::Syntax {
         path: path.to_owned(),
         place: Place::of(text, start),
@@ -174,152 +205,43 @@ fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Error {
     }
 }
 
-fn check(config: &Config, path: &Path) -> Result<(), Error> {
-    let value = |key: String, found: String, expected| Error::Value {
-        path: path.to_owned(),
-        key,
-        found,
-        expected,
-    };
-    let absent = [
-        ("publish.zenoh", config.publish.zenoh.is_some()),
-        ("publish.ros2", config.publish.ros2.is_some()),
-    ];
-    if let Some((key, _)) = absent.iter().find(|(_, given)| *given) {
-        return Err(Error::NotInThisVersion {
-            path: path.to_owned(),
-            key,
-        });
-    }
-    if config.robot.is_empty() || config.robot.chars().any(char::is_control) {
-        let found = format!("{:?}", config.robot);
-        return Err(value("robot".to_owned(), found, "a name"));
-    }
-    if config.sensors.is_empty() {
-        let expected = "at least one [[sensor]] with a port";
-        return Err(value("sensor".to_owned(), "none".to_owned(), expected));
-    }
-    for (index, sensor) in config.sensors.iter().enumerate() {
-        let twin = config.sensors[..index]
-            .iter()
-            .any(|earlier| earlier.name == sensor.name);
-        check_sensor(sensor, twin, path)?;
-    }
-    config.press.check().map_err(|problem| Error::Table {
-        path: path.to_owned(),
-        table: "press".to_owned(),
-        problem: Unusable::Press(problem),
+/// Where the first `[[sensor]]` without a port begins: what is missing has no place of its own, and
+/// nothing but a port can be missing.
+fn sensor_without_port(text: &str) -> Option<usize> {
+    let file = DeTable::parse(text).ok()?;
+    let mut sensors = file.get_ref().get("sensor")?.get_ref().as_array()?.iter();
+    let found = sensors.find(|sensor| {
+        let sensor = sensor.get_ref().as_table();
+        sensor.is_some_and(|keys| keys.get("port").is_none())
     })?;
-    check_model(&config.model, &value)?;
-    if config.publish.unix.max_clients == 0 {
-        let key = "publish.unix.max_clients".to_owned();
-        return Err(value(key, "0".to_owned(), "1 or more"));
-    }
-    if let Some(record) = &config.record {
-        for (key, found, least) in [
-            ("record.rotate_mb", record.rotate_mb, 1),
-            ("record.rotate_s", record.rotate_s, 1),
-            ("record.keep_free_mb", record.keep_free_mb, 0),
-        ] {
-            if !(least..=MOST).contains(&found) {
-                let expected = "1 to 1000000000 (keep_free_mb also 0)";
-                return Err(value(key.to_owned(), found.to_string(), expected));
-            }
-        }
-    }
-    let unix = &config.publish.unix;
-    if unix.enabled && unix.control_path() == unix.path() {
-        let key = "publish.unix.control_path".to_owned();
-        let found = unix.control_path().display().to_string();
-        return Err(value(key, found, "another path than that of events"));
-    }
-    Ok(())
+    Some(found.span().start)
 }
 
-/// More megabytes than any disk has, few enough to be counted in bytes; 31 years.
-const MOST: u64 = 1_000_000_000;
-
-fn check_sensor(sensor: &Sensor, twin: bool, path: &Path) -> Result<(), Error> {
-    let name = &sensor.name;
-    let value = |key: &str, found: String, expected| {
-        let key = format!("sensor.{key} of {name:?}");
-        Err(Error::Value {
-            path: path.to_owned(),
-            key,
-            found,
-            expected,
-        })
+/// A message of the parser in the words of a configuration, not of a program.
+fn plain(message: &str) -> String {
+    let Some((found, expected)) = message.rsplit_once(", expected ") else {
+        return message.to_owned();
     };
-    let table = |table: &str, problem| Error::Table {
-        path: path.to_owned(),
-        table: format!("sensor[{name:?}].{table}"),
-        problem,
+    let expected = match expected {
+        "u8" => "a whole number from 0 to 255",
+        "u16" => "a whole number from 0 to 65535",
+        "u32" => "a whole number from 0 to 4294967295",
+        "u64" | "usize" => "a whole number, 0 or more",
+        "f32" | "f64" => "a number",
+        "a boolean" => "true or false",
+        "a sequence" => "a list",
+        "an array of length 2" | "a tuple of size 2" => "a list of two",
+        "path string" => "a path",
+        table if table.starts_with("struct ") => "a table",
+        other => other,
     };
-    let named = name.starts_with(|first: char| first.is_ascii_lowercase())
-        && name
-            .chars()
-            .all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_');
-    if !named {
-        return value("name", format!("{name:?}"), "[a-z][a-z0-9_]*");
-    }
-    if twin {
-        return value(
-            "name",
-            format!("{name:?} twice"),
-            "a name of its own for each sensor",
-        );
-    }
-    if sensor.port.as_os_str().is_empty() {
-        return value("port", "an empty path".to_owned(), "the path of a device");
-    }
-    if sensor.baud == 0 {
-        return value("baud", "0".to_owned(), "bits a second, 1 or more");
-    }
-    let hz = sensor.frame_rate_hz;
-    if !(FRAME_RATES_HZ.0..=FRAME_RATES_HZ.1).contains(&hz) {
-        return value(
-            "frame_rate_hz",
-            hz.to_string(),
-            "frames a second, 0.01 to 10000",
-        );
-    }
-    let layout = wire::Layout::new(&sensor.frame)
-        .map_err(|problem| table("frame", Unusable::Frame(problem)))?;
-    sensor
-        .calibration
-        .check(layout.array())
-        .map_err(|problem| table("calibration", Unusable::Calibration(problem)))
-}
-
-/// Wider than any sensor, narrow enough that a period is a sane time to wait.
-const FRAME_RATES_HZ: (f64, f64) = (0.01, 10_000.0);
-
-fn check_model(
-    model: &Model,
-    value: &impl Fn(String, String, &'static str) -> Error,
-) -> Result<(), Error> {
-    if !(0.0..=1.0).contains(&model.min_confidence) {
-        let found = model.min_confidence.to_string();
-        return Err(value("model.min_confidence".to_owned(), found, "0 to 1"));
-    }
-    if !(model.min_force_n.is_finite() && model.min_force_n >= 0.0) {
-        let found = model.min_force_n.to_string();
-        return Err(value(
-            "model.min_force_n".to_owned(),
-            found,
-            "newtons, 0 or more",
-        ));
-    }
-    match &model.sha256 {
-        Some(hash) if hash.len() != 64 || !hash.chars().all(|c| c.is_ascii_hexdigit()) => {
-            Err(value(
-                "model.sha256".to_owned(),
-                format!("{hash:?}"),
-                "64 hex digits",
-            ))
-        }
-        _ => Ok(()),
-    }
+    let found = match found.split_once(": ") {
+        Some(("invalid type" | "invalid value", "sequence")) => "found a list".to_owned(),
+        Some(("invalid type" | "invalid value", "map")) => "found a table".to_owned(),
+        Some(("invalid type" | "invalid value", value)) => format!("found {value}"),
+        _ => found.replace("invalid length ", "found a list of "),
+    };
+    format!("{found}, expected {expected}")
 }
 
 pub(super) fn model(model: &Model, path: &Path) -> Result<Hrn, Error> {

@@ -30,8 +30,42 @@ fn every_key_but_port_has_a_default() {
 
 #[test]
 fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
-    let cases: [(&str, &[&str]); 23] = [
-        ("[[sensor]]\nname = \"a\"", &["1:1", "missing field `port`"]),
+    let cases: [(&str, &[&str]); 32] = [
+        ("[[sensor]]\nname = \"a\"", &["1:1", "sensor.port", "none"]),
+        (
+            "# Two.\n[[sensor]]\nport = \"p\"\n\n[[sensor]]\nname = \"b\"",
+            &["5:1", "sensor.port: found none, expected the path"],
+        ),
+        (
+            "[[sensor]]\nport = \"p\"\n[[sensor]]\nname = \"b\"\nport = \"./p\"",
+            &["sensor.port of \"b\"", "as for \"sensor\"", "of its own"],
+        ),
+        ("[[sensor]]\nport = \"\"", &["sensor.port", "empty"]),
+        (
+            "[[sensor]]\nport = \"p\"\n[sensor.frame]\nmask = 65536",
+            &["4:8", "mask: found integer `65536`", "from 0 to 65535"],
+        ),
+        (
+            "[[sensor]]\nport = \"p\"\n[sensor.frame]\nrows = -1",
+            &["4:8", "rows: found", "-1", "a whole number, 0 or more"],
+        ),
+        (
+            "[[sensor]]\nport = \"p\"\n[sensor.calibration]\npitch_mm = \"3\"",
+            &["4:12", "pitch_mm: found string \"3\", expected a number"],
+        ),
+        (
+            "[[sensor]]\nport = \"p\"\n[sensor.calibration]\npitch_mm = 1e200",
+            &["calibration.pitch_mm: found 1e200,", "at most 1000"],
+        ),
+        (
+            "[[sensor]]\nport = \"p\"\n[sensor.calibration]\nnewtons_per_count = 1e38",
+            &["newtons_per_count: found 1e38,", "at most 1000"],
+        ),
+        (
+            "[[sensor]]\nport = \"p\"\n[http]\nlisten = \"127.0.0.1:99\"\n\
+             [publish.tcp]\nlisten = \"0.0.0.0:99\"",
+            &["http.listen: found 127.0.0.1:99", "0.0.0.0:99", "another"],
+        ),
         ("bad", &["1:"]),
         ("[log]", &["sensor", "found none"]),
         (
@@ -40,7 +74,7 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
         ),
         (
             "[[sensor]]\nport = \"p\"\nbaud = \"9\"",
-            &["3:8", "baud", "\"9\"", "u32"],
+            &["3:8", "baud: found string \"9\"", "0 to 4294967295"],
         ),
         ("[[sensor]]\nport = \"p\"\nbaud = 0", &["sensor.baud", "0"]),
         ("[[sensor]]\nport = \"p\"\nname = \"Arm\"", &["name", "Arm"]),
@@ -118,6 +152,100 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
         for part in expected {
             assert!(error.contains(part), "{text:?}: {part:?} not in {error:?}");
         }
+    }
+}
+
+#[test]
+fn no_message_speaks_of_types_of_a_program() {
+    for (table, key, value) in [
+        ("", "baud", "-1"),
+        ("", "baud", "1.5"),
+        ("", "name", "7"),
+        ("", "port", "7"),
+        ("", "frame_rate_hz", "true"),
+        ("[sensor.frame]", "cols", "[]"),
+        ("[sensor.frame]", "mask", "99999999999"),
+        ("[sensor.frame]", "invert", "1"),
+        ("[sensor.calibration]", "tare_frames", "-5"),
+        ("[sensor.calibration]", "dead_taxels", "3"),
+        ("[sensor.calibration]", "dead_taxels", "[3]"),
+        ("[sensor.calibration]", "dead_taxels", "[[1]]"),
+        ("[sensor.calibration]", "dead_taxels", "[[1, -2]]"),
+        ("[press]", "min_frames", "-1"),
+        ("[press]", "contact_threshold_n", "\"a\""),
+        ("[publish.unix]", "max_clients", "-1"),
+        ("[publish.unix]", "enabled", "\"yes\""),
+        ("[record]", "rotate_s", "-1"),
+        ("[model]", "path", "4"),
+    ] {
+        // Where the table is the sensor's own, a port would stand there twice.
+        let port = if key == "port" { "" } else { "port = \"p\"\n" };
+        let error = load(&format!("[[sensor]]\n{port}{table}\n{key} = {value}")).unwrap_err();
+        assert!(error.contains("expected "), "{error}");
+        assert!(error.contains(&format!("{key}: ")), "{error}");
+        for word in [
+            "u8",
+            "u16",
+            "u32",
+            "u64",
+            "usize",
+            "f32",
+            "f64",
+            "struct",
+            "sequence",
+            "invalid",
+            "boolean,",
+            "tuple",
+            "path string",
+        ] {
+            let message = error.split_once(": ").unwrap().1;
+            assert!(!message.contains(word), "{word:?} in {message:?}");
+        }
+    }
+}
+
+#[test]
+fn a_file_that_is_no_utf_8_is_a_bad_one_and_its_place_is_named() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("hardnessd.toml");
+    std::fs::write(&path, b"# a\nrobot = \"\xff\"\n").unwrap();
+    let error = Config::load(&path).unwrap_err();
+    let text = error.to_string();
+    assert!(
+        text.contains("toml:2:10: found byte 0xff, expected UTF-8"),
+        "{text}"
+    );
+    assert!(matches!(error, Error::Syntax { .. }));
+}
+
+#[test]
+fn two_names_of_one_device_are_one_port() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("hardnessd.toml");
+    std::fs::write(directory.path().join("tty"), "").unwrap();
+    std::os::unix::fs::symlink("tty", directory.path().join("by-id")).unwrap();
+    let text = "[[sensor]]\nport = \"tty\"\n[[sensor]]\nname = \"b\"\nport = \"by-id\"";
+    std::fs::write(&path, text).unwrap();
+    let error = Config::load(&path).unwrap_err().to_string();
+    assert!(error.contains("sensor.port of \"b\""), "{error}");
+}
+
+#[test]
+fn listeners_may_share_an_address_or_a_port_but_not_both() {
+    for (tcp, http, allowed) in [
+        ("127.0.0.1:99", "127.0.0.1:99", false),
+        ("0.0.0.0:99", "127.0.0.1:99", false),
+        ("127.0.0.1:99", "[::]:99", false),
+        ("[::1]:99", "[::]:99", false),
+        ("127.0.0.1:99", "127.0.0.1:98", true),
+        ("127.0.0.1:99", "127.0.0.2:99", true),
+        ("0.0.0.0:99", "[::1]:99", true),
+        ("127.0.0.1:0", "127.0.0.1:0", true),
+    ] {
+        let loaded = load(&format!(
+            "{LEAST}[publish.tcp]\nlisten = \"{tcp}\"\n[http]\nlisten = \"{http}\""
+        ));
+        assert_eq!(loaded.is_ok(), allowed, "{tcp}, {http}: {loaded:?}");
     }
 }
 

@@ -1,0 +1,184 @@
+//! Whether every value can be used, and all of them together.
+
+use std::net::{IpAddr, SocketAddr};
+use std::path::Path;
+
+use super::parse::{Error, Unusable};
+use super::{Config, Model, Sensor};
+use crate::wire;
+
+/// Checks a configuration whose paths are not relative to its file any more; `path` is for messages.
+pub(super) fn check(config: &Config, path: &Path) -> Result<(), Error> {
+    let value = |key: String, found: String, expected| Error::Value {
+        path: path.to_owned(),
+        key,
+        found,
+        expected,
+    };
+    let absent = [
+        ("publish.zenoh", config.publish.zenoh.is_some()),
+        ("publish.ros2", config.publish.ros2.is_some()),
+    ];
+    if let Some((key, _)) = absent.iter().find(|(_, given)| *given) {
+        return Err(Error::NotInThisVersion {
+            path: path.to_owned(),
+            key,
+        });
+    }
+    if config.robot.is_empty() || config.robot.chars().any(char::is_control) {
+        let found = format!("{:?}", config.robot);
+        return Err(value("robot".to_owned(), found, "a name"));
+    }
+    if config.sensors.is_empty() {
+        let expected = "at least one [[sensor]] with a port";
+        return Err(value("sensor".to_owned(), "none".to_owned(), expected));
+    }
+    for (index, sensor) in config.sensors.iter().enumerate() {
+        check_sensor(sensor, &config.sensors[..index], path)?;
+    }
+    config.press.check().map_err(|problem| Error::Table {
+        path: path.to_owned(),
+        table: "press".to_owned(),
+        problem: Unusable::Press(problem),
+    })?;
+    check_model(&config.model, &value)?;
+    if config.publish.unix.max_clients == 0 {
+        let key = "publish.unix.max_clients".to_owned();
+        return Err(value(key, "0".to_owned(), "1 or more"));
+    }
+    if let Some(record) = &config.record {
+        for (key, found, least) in [
+            ("record.rotate_mb", record.rotate_mb, 1),
+            ("record.rotate_s", record.rotate_s, 1),
+            ("record.keep_free_mb", record.keep_free_mb, 0),
+        ] {
+            if !(least..=MOST).contains(&found) {
+                let expected = "1 to 1000000000 (keep_free_mb also 0)";
+                return Err(value(key.to_owned(), found.to_string(), expected));
+            }
+        }
+    }
+    let unix = &config.publish.unix;
+    if unix.enabled && unix.control_path() == unix.path() {
+        let key = "publish.unix.control_path".to_owned();
+        let found = unix.control_path().display().to_string();
+        return Err(value(key, found, "another path than that of events"));
+    }
+    let tcp = config.publish.tcp.as_ref().map(|tcp| tcp.listen);
+    let http = config.http.as_ref().map(|http| http.listen);
+    if let (Some(tcp), Some(http)) = (tcp, http)
+        && meet(tcp, http)
+    {
+        let found = format!("{http} beside publish.tcp.listen = {tcp}");
+        return Err(value(
+            "http.listen".to_owned(),
+            found,
+            "another address or port",
+        ));
+    }
+    Ok(())
+}
+
+/// Whether the system lets no two listen at these. With port 0 it chooses one that is free.
+fn meet(one: SocketAddr, other: SocketAddr) -> bool {
+    // All addresses are also those of the older version, by the kernel's default (bindv6only of
+    // ipv6(7)).
+    let covers = |all: IpAddr, ip: IpAddr| all.is_unspecified() && (all.is_ipv6() || ip.is_ipv4());
+    let (a, b) = (one.ip(), other.ip());
+    one.port() == other.port() && one.port() != 0 && (a == b || covers(a, b) || covers(b, a))
+}
+
+/// More megabytes than any disk has, few enough to be counted in bytes; 31 years.
+const MOST: u64 = 1_000_000_000;
+
+fn check_sensor(sensor: &Sensor, earlier: &[Sensor], path: &Path) -> Result<(), Error> {
+    let name = &sensor.name;
+    let value = |key: &str, found: String, expected| {
+        let key = format!("sensor.{key} of {name:?}");
+        Err(Error::Value {
+            path: path.to_owned(),
+            key,
+            found,
+            expected,
+        })
+    };
+    let table = |table: &str, problem| Error::Table {
+        path: path.to_owned(),
+        table: format!("sensor[{name:?}].{table}"),
+        problem,
+    };
+    let named = name.starts_with(|first: char| first.is_ascii_lowercase())
+        && name
+            .chars()
+            .all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_');
+    if !named {
+        return value("name", format!("{name:?}"), "[a-z][a-z0-9_]*");
+    }
+    if earlier.iter().any(|other| other.name == *name) {
+        return value(
+            "name",
+            format!("{name:?} twice"),
+            "a name of its own for each sensor",
+        );
+    }
+    if sensor.port.as_os_str().is_empty() {
+        return value("port", "an empty path".to_owned(), "the path of a device");
+    }
+    // Several names may lead to one device, if it is there.
+    let device = |sensor: &Sensor| {
+        let port = &sensor.port;
+        port.canonicalize().unwrap_or_else(|_| port.clone())
+    };
+    if let Some(other) = earlier.iter().find(|other| device(other) == device(sensor)) {
+        let found = format!("{}, as for {:?}", sensor.port.display(), other.name);
+        return value("port", found, "a port of its own for each sensor");
+    }
+    if sensor.baud == 0 {
+        return value("baud", "0".to_owned(), "bits a second, 1 or more");
+    }
+    let hz = sensor.frame_rate_hz;
+    if !(FRAME_RATES_HZ.0..=FRAME_RATES_HZ.1).contains(&hz) {
+        return value(
+            "frame_rate_hz",
+            format!("{hz:?}"),
+            "frames a second, 0.01 to 10000",
+        );
+    }
+    let layout = wire::Layout::new(&sensor.frame)
+        .map_err(|problem| table("frame", Unusable::Frame(problem)))?;
+    sensor
+        .calibration
+        .check(layout.array())
+        .map_err(|problem| table("calibration", Unusable::Calibration(problem)))
+}
+
+/// Wider than any sensor, narrow enough that a period is a sane time to wait.
+const FRAME_RATES_HZ: (f64, f64) = (0.01, 10_000.0);
+
+fn check_model(
+    model: &Model,
+    value: &impl Fn(String, String, &'static str) -> Error,
+) -> Result<(), Error> {
+    if !(0.0..=1.0).contains(&model.min_confidence) {
+        let found = format!("{:?}", model.min_confidence);
+        return Err(value("model.min_confidence".to_owned(), found, "0 to 1"));
+    }
+    if !(model.min_force_n.is_finite() && model.min_force_n >= 0.0) {
+        let found = format!("{:?}", model.min_force_n);
+        return Err(value(
+            "model.min_force_n".to_owned(),
+            found,
+            "newtons, 0 or more",
+        ));
+    }
+    match &model.sha256 {
+        Some(hash) if hash.len() != 64 || !hash.chars().all(|c| c.is_ascii_hexdigit()) => {
+            Err(value(
+                "model.sha256".to_owned(),
+                format!("{hash:?}"),
+                "64 hex digits",
+            ))
+        }
+        _ => Ok(()),
+    }
+}
