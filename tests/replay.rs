@@ -106,6 +106,41 @@ fn recordings_give_their_golden_events_twice_the_same() {
 }
 
 #[test]
+fn bytes_without_a_whole_frame_are_said_to_have_none() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("other.bin");
+    let mut frame = std::fs::read(fixtures().join("foam.5hz.bin")).unwrap();
+    // One frame of which a byte is damaged.
+    frame.truncate(790);
+    frame[400] ^= 1;
+    let text = "no frame ".repeat(100).into_bytes();
+    for (bytes, found) in [
+        (Vec::new(), "no whole frame in 0 bytes (0 damaged)"),
+        (text, "no whole frame in 900 bytes (0 damaged)"),
+        (frame, "no whole frame in 790 bytes (1 damaged)"),
+    ] {
+        std::fs::write(&path, bytes).unwrap();
+        let output = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
+            .arg("replay")
+            .arg(&path)
+            .output()
+            .unwrap();
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{stderr}");
+        assert_eq!(stderr.lines().count(), 1, "{stderr}");
+        for part in ["other.bin", found, "expected", "hardnessd sniff"] {
+            assert!(stderr.contains(part), "{part:?} not in {stderr}");
+        }
+        // The totals come all the same.
+        let events = String::from_utf8(output.stdout).unwrap();
+        assert!(
+            events.contains("\"reason\":\"end of recording\""),
+            "{events}"
+        );
+    }
+}
+
+#[test]
 fn the_pace_of_a_replay_does_not_show() {
     let recording = fixtures().join("flip.5hz.bin");
     assert_eq!(

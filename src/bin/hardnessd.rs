@@ -297,7 +297,9 @@ fn exit_code(error: &anyhow::Error) -> u8 {
         return match error {
             replay::Error::Config(error) => of_config(error),
             replay::Error::Unreadable { .. } => exit::NO_INPUT,
-            replay::Error::Recording { .. } | replay::Error::Sensor { .. } => exit::FAILED,
+            replay::Error::Recording { .. }
+            | replay::Error::Sensor { .. }
+            | replay::Error::NoFrame { .. } => exit::FAILED,
             replay::Error::Broken { .. } | replay::Error::Print(_) => exit::IO,
         };
     }

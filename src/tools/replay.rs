@@ -63,6 +63,19 @@ pub enum Error {
         /// What is wrong with it.
         source: recording::PlaybackError,
     },
+    /// Bytes of another layout, or none.
+    #[error(
+        "{path}: found no whole frame in {bytes_skipped} bytes ({frames_damaged} damaged), expected \
+         those of [sensor.frame]: hardnessd sniff {path} looks for another layout"
+    )]
+    NoFrame {
+        /// Of the recording.
+        path: PathBuf,
+        /// All there are.
+        bytes_skipped: u64,
+        /// Candidates.
+        frames_damaged: u64,
+    },
     /// Reading broke off.
     #[error("{path}: {source}")]
     Broken {
@@ -217,8 +230,17 @@ async fn play_bytes(args: &Args, mut recording: File, setup: &Setup) -> Result<(
             }
         };
         if read == 0 {
-            print(pipeline.end_of_recording(None), &mut seq)?;
-            return Ok(());
+            let end = pipeline.end_of_recording(None);
+            let none = end.iter().find_map(|event| match event {
+                Event::Status(status) if status.frames == 0 => Some(Error::NoFrame {
+                    path: path.clone(),
+                    bytes_skipped: status.bytes_skipped,
+                    frames_damaged: status.frames_damaged,
+                }),
+                _ => None,
+            });
+            print(end, &mut seq)?;
+            return none.map_or(Ok(()), Err);
         }
         if let Some(a_byte) = pace {
             bytes = bytes.saturating_add(u32::try_from(read).unwrap_or(u32::MAX));
