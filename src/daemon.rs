@@ -32,7 +32,7 @@ use tokio::task::{JoinHandle, JoinSet};
 use tokio::time::MissedTickBehavior;
 use tracing::{error, info, warn};
 
-use self::config::Setup;
+use self::config::{Config, Setup};
 use self::log::Log;
 use self::publish::Publishers;
 use self::record::{EventRecorder, Recorder, SensorRecorder, Target};
@@ -61,6 +61,9 @@ pub enum Error {
     /// What was to be recorded is not there, or cannot be written.
     #[error(transparent)]
     Record(#[from] record::Error),
+    /// Nobody to write the log to.
+    #[error(transparent)]
+    Log(#[from] log::Error),
     /// A fault of this program.
     #[error("{0} stopped by itself")]
     Stopped(&'static str),
@@ -92,6 +95,21 @@ pub(crate) fn now() -> Stamp {
         mono: Duration::try_from(mono).expect("CLOCK_MONOTONIC counts from 0 at boot"),
         wall: jiff::Timestamp::now(),
     }
+}
+
+/// Whether a daemon can write where `config` says, as far as looking tells: what another process
+/// holds, or a network refuses, only a try finds out.
+///
+/// # Errors
+///
+/// If a socket, the log or a recording cannot be where it shall.
+pub fn check(config: &Config) -> Result<(), Error> {
+    log::check(config.log)?;
+    publish::check(&config.publish.unix)?;
+    if let Some(settings) = &config.record {
+        record::check(settings)?;
+    }
+    Ok(())
 }
 
 impl Daemon {

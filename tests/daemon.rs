@@ -11,10 +11,11 @@
 mod bench;
 
 use std::fs;
-use std::io::{BufRead, Write};
+use std::io::{BufRead, Read, Write};
 use std::net::TcpListener;
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::{UnixDatagram, UnixListener};
+use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant, SystemTime};
 
@@ -407,6 +408,16 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         78,
         &["bad.toml", "end_framse", "end_frames"],
     );
+    fs::write(bench.path("latin.toml"), b"robot = \"\xe9\"").unwrap();
+    fails(
+        &[
+            "check",
+            "--config",
+            bench.path("latin.toml").to_str().unwrap(),
+        ],
+        78,
+        &["latin.toml:1:10", "UTF-8"],
+    );
     let config = written("[model]\npath = \"none.onnx\"\n");
     fails(
         &["run", "--config", &config],
@@ -465,6 +476,92 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         );
     }
     assert_eq!(hardnessd(&["--version"]).status.code(), Some(0));
+}
+
+#[test]
+fn check_refuses_what_run_would_refuse() {
+    let bench = Bench::new();
+    fs::write(bench.path("file"), "").unwrap();
+    fs::create_dir(bench.path("directory")).unwrap();
+    let long = format!("{}.sock", "x".repeat(110));
+    for (socket, more, key, found) in [
+        (long.as_str(), "", "path", "expected a path of at most 107"),
+        ("directory", "", "path", "no socket"),
+        ("file", "", "path", "no socket"),
+        ("none/none/events.sock", "", "path", "in no directory"),
+        ("file/events.sock", "", "path", "in no directory"),
+        (
+            "events.sock",
+            "control_path = \"directory\"\n",
+            "control_path",
+            "no socket",
+        ),
+    ] {
+        let config = bench.configure("bad.toml", socket, more);
+        let key = format!("publish.unix.{key}: found ");
+        for command in ["check", "run"] {
+            let arguments = [command, "--config", config.to_str().unwrap()];
+            fails(&arguments, 78, &[&key, found, "expected"]);
+        }
+    }
+    let journal = "[log]\nformat = \"journald\"\n";
+    let config = bench.configure("bad.toml", "events.sock", journal);
+    if !Path::new("/run/systemd/journal/socket").exists() {
+        for command in ["check", "run"] {
+            let arguments = [command, "--config", config.to_str().unwrap()];
+            fails(&arguments, 78, &["log.format", "journald", "expected"]);
+        }
+    }
+    // The daemon runs without its disk, and says so; whoever checks wants to know before.
+    for dir in ["file", "file/rec"] {
+        let record = format!("[record]\ndir = \"{dir}\"\n");
+        let config = bench.configure("bad.toml", "events.sock", &record);
+        let arguments = ["check", "--config", config.to_str().unwrap()];
+        fails(
+            &arguments,
+            78,
+            &["bad.toml", "record.dir: found ", "expected"],
+        );
+    }
+    assert!(!bench.path("events.sock").exists());
+    assert!(!bench.path("none").exists());
+}
+
+#[test]
+fn check_looks_and_changes_nothing() {
+    let bench = Bench::new();
+    let more = "[record]\ndir = \"a/b\"\n";
+    let config = bench.configure("hardnessd.toml", "new/events.sock", more);
+    let text = fs::read_to_string(&config).unwrap();
+    fs::write(&config, text.replace("20.0", "5.0")).unwrap();
+    let output = hardnessd(&["check", "--config", config.to_str().unwrap()]);
+    assert!(output.status.success(), "{output:?}");
+    let left = fs::read_dir(bench.path("")).unwrap().count();
+    assert_eq!(left, 1, "nothing but the configuration");
+    // Beside a running daemon, too.
+    let _daemon = Daemon::start(&config);
+    let output = hardnessd(&["check", "--config", config.to_str().unwrap()]);
+    assert!(output.status.success(), "{output:?}");
+}
+
+#[test]
+fn a_signal_ends_a_command_that_looks_for_none_as_a_failure() {
+    let bench = Bench::new();
+    let fifo = bench.path("fifo.toml");
+    let made = Command::new("mkfifo").arg(&fifo).status().unwrap();
+    assert!(made.success());
+    let mut command = Command::new(BINARY);
+    command.args(["check", "--config"]).arg(&fifo);
+    let child = command.stderr(Stdio::piped()).spawn().unwrap();
+    let mut check = Process(child);
+    // A writer gets through once somebody reads.
+    let _writer = fs::File::options().write(true).open(&fifo).unwrap();
+    check.signal(Signal::TERM);
+    assert_eq!(check.exit_code(), Some(1));
+    let mut said = String::new();
+    let mut stderr = check.0.stderr.take().unwrap();
+    stderr.read_to_string(&mut said).unwrap();
+    assert_eq!(said, "hardnessd: interrupted\n");
 }
 
 #[test]

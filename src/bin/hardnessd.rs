@@ -236,8 +236,11 @@ fn exit_code(error: &anyhow::Error) -> u8 {
     let of_daemon = |error: &DaemonError| match error {
         // The configuration names a file that it must not.
         DaemonError::Publish(PublishError::Socket(
-            SocketError::NoSocket { .. } | SocketError::TooLong { .. },
+            SocketError::NoSocket { .. }
+            | SocketError::NoDirectory { .. }
+            | SocketError::TooLong { .. },
         )) => exit::CONFIG,
+        DaemonError::Record(RecordError::Directory { .. }) | DaemonError::Log(_) => exit::CONFIG,
         DaemonError::Publish(PublishError::Unasked { .. } | PublishError::Passed(_)) => {
             exit::CONFIG
         }
@@ -258,6 +261,7 @@ fn exit_code(error: &anyhow::Error) -> u8 {
     if let Some(error) = error.downcast_ref::<check::Error>() {
         return match error {
             check::Error::Config(error) => of_config(error),
+            check::Error::Daemon { source, .. } => of_daemon(source),
             check::Error::FrameRate { .. } => exit::CONFIG,
             check::Error::Print(_) => exit::IO,
         };

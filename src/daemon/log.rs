@@ -15,8 +15,8 @@ use tracing_subscriber::layer::{Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Registry, reload};
 
-use journal::Journal;
-use lines::Lines;
+use self::journal::Journal;
+use self::lines::Lines;
 
 use crate::event::{Event, LinkState, PressState, Tared};
 use crate::pipeline::RetareError;
@@ -118,6 +118,14 @@ impl Log {
     }
 }
 
+/// Whether there is something to write to.
+pub(crate) fn check(settings: Settings) -> Result<(), Error> {
+    match settings.format {
+        Format::Text | Format::Json => Ok(()),
+        Format::Journald => journal::find().map_err(Error::Journal),
+    }
+}
+
 fn output(settings: Settings, lines: &Lines) -> Result<Output, Error> {
     let text = tracing_subscriber::fmt::layer()
         .with_writer(lines.clone())
@@ -125,7 +133,7 @@ fn output(settings: Settings, lines: &Lines) -> Result<Output, Error> {
     Ok(match settings.format {
         Format::Text => text.with_ansi(std::io::stderr().is_terminal()).boxed(),
         Format::Json => text.json().flatten_event(true).boxed(),
-        Format::Journald => Journal::find(lines).map_err(Error::Journal)?.boxed(),
+        Format::Journald => Journal::new(lines).map_err(Error::Journal)?.boxed(),
     })
 }
 

@@ -9,7 +9,7 @@ use tracing::info;
 
 use super::accept::{Stop, accept};
 use super::client::{Access, Service};
-use super::config::Publish;
+use super::config::{Publish, Unix};
 use super::http::Http;
 use super::hub;
 use super::sensor::Sensors;
@@ -19,6 +19,19 @@ use super::tcp::{self, Tcp};
 
 /// Permissions of the control socket: for the daemon's own user (contract, section 3).
 const CONTROL_MODE: u32 = 0o600;
+
+/// Keys of the sockets' paths.
+const EVENTS_KEY: &str = "publish.unix.path";
+const CONTROL_KEY: &str = "publish.unix.control_path";
+
+/// Whether the sockets can stand where they shall, as far as looking tells.
+pub(crate) fn check(unix: &Unix) -> Result<(), Error> {
+    if unix.enabled {
+        socket::check(EVENTS_KEY, &unix.path())?;
+        socket::check(CONTROL_KEY, &unix.control_path())?;
+    }
+    Ok(())
+}
 
 /// Why a way out cannot be had.
 #[derive(Debug, thiserror::Error)]
@@ -57,15 +70,15 @@ impl Publishers {
     pub(crate) fn bind(publish: &Publish, http: Option<SocketAddr>) -> Result<Self, Error> {
         let unix = &publish.unix;
         let mut passed = systemd::sockets().map_err(Error::Passed)?;
-        let mut socket = |path: &Path, mode| {
+        let mut socket = |key, path: &Path, mode| {
             let made = unix.enabled.then(|| {
-                let adopted = Socket::adopt(path, &mut passed);
-                adopted.unwrap_or_else(|| Socket::bind(path, mode))
+                let adopted = Socket::adopt(key, path, &mut passed);
+                adopted.unwrap_or_else(|| Socket::bind(key, path, mode))
             });
             made.transpose()
         };
-        let events = socket(&unix.path(), unix.mode.0)?;
-        let control = socket(&unix.control_path(), CONTROL_MODE)?;
+        let events = socket(EVENTS_KEY, &unix.path(), unix.mode.0)?;
+        let control = socket(CONTROL_KEY, &unix.control_path(), CONTROL_MODE)?;
         if let Some(left) = passed.first() {
             let address = left.local_addr().map_err(Error::Passed)?;
             let found = address.as_pathname().unwrap_or(Path::new("(no path)"));

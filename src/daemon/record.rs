@@ -9,12 +9,14 @@ mod file;
 mod worker;
 
 use std::fs::File;
-use std::path::PathBuf;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
 use std::time::Duration;
 
+use rustix::fs::{Access, AtFlags, CWD};
 use tokio::sync::oneshot;
 
 use self::worker::Worker;
@@ -74,9 +76,35 @@ pub enum Error {
         /// Why.
         reason: String,
     },
+    /// The directory of the configuration cannot be written to.
+    #[error("record.dir: found {path}: {source}, expected a directory that can be written to")]
+    Directory {
+        /// What there is of it.
+        path: PathBuf,
+        /// Why not.
+        source: std::io::Error,
+    },
     /// There is no thread to be had.
     #[error("no thread for the recording: {0}")]
     Thread(#[source] std::io::Error),
+}
+
+/// Whether this process may write to the directory, or make it.
+pub(crate) fn check(settings: &config::Record) -> Result<(), Error> {
+    let directory = settings.dir();
+    // What is missing of it is made.
+    let there = directory.ancestors().find(|place| place.exists());
+    let there = there.unwrap_or(Path::new("."));
+    let found = if there.is_dir() {
+        let may = Access::WRITE_OK | Access::EXEC_OK;
+        rustix::fs::accessat(CWD, there, may, AtFlags::EACCESS).map_err(std::io::Error::from)
+    } else {
+        Err(ErrorKind::NotADirectory.into())
+    };
+    found.map_err(|source| Error::Directory {
+        path: there.to_owned(),
+        source,
+    })
 }
 
 /// What the thread is told.

@@ -4,7 +4,7 @@
 //! one that answers is not.
 
 use std::fs::{self, DirBuilder, File, Permissions};
-use std::io::ErrorKind;
+use std::io::{self, ErrorKind};
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::{DirBuilderExt, FileTypeExt, MetadataExt, PermissionsExt};
 use std::os::unix::net::UnixListener as StdListener;
@@ -28,20 +28,34 @@ const BIND_PATIENCE: Duration = Duration::from_secs(1);
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// Somebody answers there.
-    #[error("{path}: found a socket in use by another process, expected a free path")]
+    #[error("{key}: found {path}, in use by another process, expected a free path")]
     InUse {
+        /// In the configuration.
+        key: &'static str,
         /// Of the socket.
         path: PathBuf,
     },
     /// Something else stands there.
-    #[error("{path}: found a file that is no socket, expected a socket or nothing")]
+    #[error("{key}: found {path}, which is no socket, expected a socket or nothing there")]
     NoSocket {
+        /// In the configuration.
+        key: &'static str,
         /// Of the file.
         path: PathBuf,
     },
+    /// No directory to put it in, and none to make that in.
+    #[error("{key}: found {path} in no directory, expected one, or one to make it in")]
+    NoDirectory {
+        /// In the configuration.
+        key: &'static str,
+        /// Of the socket.
+        path: PathBuf,
+    },
     /// The system's limit.
-    #[error("{path}: found {found} bytes, expected a socket path of at most {max}")]
+    #[error("{key}: found {path}, {found} bytes, expected a path of at most {max}")]
     TooLong {
+        /// In the configuration.
+        key: &'static str,
         /// As given.
         path: PathBuf,
         /// Its length.
@@ -50,14 +64,16 @@ pub enum Error {
         max: usize,
     },
     /// The system refused.
-    #[error("{path}: cannot {what}: {source}")]
+    #[error("{key}: {path}: cannot {what}: {source}")]
     Io {
+        /// In the configuration.
+        key: &'static str,
         /// Concerned.
         path: PathBuf,
         /// What was tried.
         what: &'static str,
         /// Why not.
-        source: std::io::Error,
+        source: io::Error,
     },
 }
 
@@ -72,28 +88,12 @@ pub(crate) struct Socket {
 }
 
 impl Socket {
-    /// Listens at `path`, whose file has `mode` from its first moment. The directory is made if it
-    /// alone is missing.
-    pub(crate) fn bind(path: &Path, mode: u32) -> Result<Self, Error> {
-        let failed = |what| {
-            move |source| Error::Io {
-                path: path.to_owned(),
-                what,
-                source,
-            }
-        };
-        let found = path.as_os_str().len();
-        if found > LONGEST_PATH_BYTES {
-            return Err(Error::TooLong {
-                path: path.to_owned(),
-                found,
-                max: LONGEST_PATH_BYTES,
-            });
-        }
-        let parent = match path.parent() {
-            Some(parent) if parent != Path::new("") => parent,
-            _ => Path::new("."),
-        };
+    /// Listens at `path`, whose file has `mode` from its first moment; `key` is the one that names it
+    /// in the configuration. The directory is made if it alone is missing.
+    pub(crate) fn bind(key: &'static str, path: &Path, mode: u32) -> Result<Self, Error> {
+        check(key, path)?;
+        let failed = |what| move |source| failed(key, path, what, source);
+        let parent = directory(path);
         match DirBuilder::new().mode(0o755).create(parent) {
             Err(error) if error.kind() != ErrorKind::AlreadyExists => {
                 return Err(failed("make its directory")(error));
@@ -101,9 +101,9 @@ impl Socket {
             _ => {}
         }
         // Two daemons that start at once must not both find the path free.
-        let directory = File::open(parent).map_err(failed("open its directory"))?;
-        lock(&directory).map_err(failed("lock its directory"))?;
-        vacant(path)?;
+        let held = File::open(parent).map_err(failed("open its directory"))?;
+        lock(&held).map_err(failed("lock its directory"))?;
+        vacant(key, path)?;
 
         // Bound in a directory of our own, given its mode, then moved into place: there is no
         // moment with another mode, nor one without a listener. The way through the descriptor
@@ -127,7 +127,11 @@ impl Socket {
 
     /// That of `passed` which listens at `path`, if one does. Its file, and
     /// the mode of that, stay the service manager's.
-    pub(crate) fn adopt(path: &Path, passed: &mut Vec<StdListener>) -> Option<Result<Self, Error>> {
+    pub(crate) fn adopt(
+        key: &'static str,
+        path: &Path,
+        passed: &mut Vec<StdListener>,
+    ) -> Option<Result<Self, Error>> {
         // The same file may have several names: /run and /var/run.
         let place = path.canonicalize().ok()?;
         let is_there = |socket: &StdListener| {
@@ -145,11 +149,7 @@ impl Socket {
                 path: path.to_owned(),
                 identity: None,
             }),
-            Err(source) => Err(Error::Io {
-                path: path.to_owned(),
-                what: "listen",
-                source,
-            }),
+            Err(source) => Err(failed(key, path, "listen", source)),
         })
     }
 }
@@ -191,24 +191,65 @@ fn lock(directory: &File) -> std::io::Result<()> {
     }
 }
 
-/// Makes sure that nothing alive stands at `path`.
-fn vacant(path: &Path) -> Result<(), Error> {
-    let failed = |what, source| {
-        Err(Error::Io {
+fn failed(key: &'static str, path: &Path, what: &'static str, source: io::Error) -> Error {
+    Error::Io {
+        key,
+        path: path.to_owned(),
+        what,
+        source,
+    }
+}
+
+/// Whether a socket can stand at `path`, as far as looking tells.
+pub(crate) fn check(key: &'static str, path: &Path) -> Result<(), Error> {
+    let found = path.as_os_str().len();
+    if found > LONGEST_PATH_BYTES {
+        return Err(Error::TooLong {
+            key,
             path: path.to_owned(),
-            what,
-            source,
-        })
+            found,
+            max: LONGEST_PATH_BYTES,
+        });
+    }
+    let parent = directory(path);
+    let has_directory = match fs::metadata(parent) {
+        Err(error) if error.kind() == ErrorKind::NotFound => directory(parent).is_dir(),
+        Err(error) if error.kind() == ErrorKind::NotADirectory => false,
+        Err(error) => return Err(failed(key, path, "find its directory", error)),
+        Ok(parent) => parent.is_dir(),
     };
+    if !has_directory {
+        let path = path.to_owned();
+        return Err(Error::NoDirectory { key, path });
+    }
+    is_there(key, path).map(drop)
+}
+
+/// The directory of a file.
+fn directory(path: &Path) -> &Path {
+    match path.parent() {
+        Some(parent) if parent != Path::new("") => parent,
+        _ => Path::new("."),
+    }
+}
+
+/// Whether a socket stands at `path`, be it dead; anything else there is an error.
+fn is_there(key: &'static str, path: &Path) -> Result<bool, Error> {
     match fs::symlink_metadata(path) {
-        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
-        Err(error) => return failed("look at", error),
-        Ok(file) if !file.file_type().is_socket() => {
-            return Err(Error::NoSocket {
-                path: path.to_owned(),
-            });
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(false),
+        Err(error) => Err(failed(key, path, "look at it", error)),
+        Ok(file) if file.file_type().is_socket() => Ok(true),
+        Ok(_) => {
+            let path = path.to_owned();
+            Err(Error::NoSocket { key, path })
         }
-        Ok(_) => {}
+    }
+}
+
+/// Makes sure that nothing alive stands at `path`.
+fn vacant(key: &'static str, path: &Path) -> Result<(), Error> {
+    if !is_there(key, path)? {
+        return Ok(());
     }
     // On a socket that nobody listens to, connect is refused; on any other outcome somebody may
     // (a full backlog, for one, would keep a blocking connect waiting).
@@ -223,10 +264,13 @@ fn vacant(path: &Path) -> Result<(), Error> {
     };
     match probe() {
         Err(Errno::CONNREFUSED | Errno::NOENT) => Ok(()),
-        Err(error @ (Errno::ACCESS | Errno::PERM)) => failed("try", error.into()),
-        _ => Err(Error::InUse {
-            path: path.to_owned(),
-        }),
+        Err(error @ (Errno::ACCESS | Errno::PERM)) => {
+            Err(failed(key, path, "try it", error.into()))
+        }
+        _ => {
+            let path = path.to_owned();
+            Err(Error::InUse { key, path })
+        }
     }
 }
 

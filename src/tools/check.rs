@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::Args as ClapArgs;
 
 use super::player::BITS_A_BYTE;
+use crate::daemon;
 use crate::daemon::config::{self, Sensor, Setup};
 use crate::wire::Layout;
 
@@ -23,6 +24,14 @@ pub enum Error {
     /// It cannot be used.
     #[error(transparent)]
     Config(#[from] config::Error),
+    /// What it names cannot be written to.
+    #[error("{path}: {source}")]
+    Daemon {
+        /// Of the configuration.
+        path: PathBuf,
+        /// What and why.
+        source: daemon::Error,
+    },
     /// More frames than the line carries.
     #[error(
         "{path}: sensor.frame_rate_hz of {sensor:?}: found {frame_rate_hz} frames/s of \
@@ -52,9 +61,14 @@ pub enum Error {
 ///
 /// # Errors
 ///
-/// [`Error`], if the configuration or its model cannot be used, or a line cannot carry its frames.
+/// [`Error`], if the configuration or its model cannot be used, a line cannot carry its frames, or
+/// what is named for sockets, log or recordings cannot be written to.
 pub fn run(args: &Args) -> Result<(), Error> {
     let setup = Setup::load(&args.config)?;
+    daemon::check(&setup.config).map_err(|source| Error::Daemon {
+        path: args.config.clone(),
+        source,
+    })?;
     let mut lines = format!("robot {}\n", setup.config.robot);
     for sensor in &setup.config.sensors {
         let layout = Layout::new(&sensor.frame)
@@ -63,8 +77,8 @@ pub fn run(args: &Args) -> Result<(), Error> {
         let (ours, models) = (sensor.calibration.pitch_mm, setup.hrn.card().pitch_mm);
         if (ours - f64::from(models)).abs() > PITCH_TOLERANCE_MM {
             eprintln!(
-                "warning: {}: sensor.calibration.pitch_mm of {:?}: found {ours}, \
-                 expected the model's {models}",
+                "warning: {}: sensor.calibration.pitch_mm of {:?}: found {ours:?}, \
+                 expected the model's {models:?}",
                 args.config.display(),
                 sensor.name
             );

@@ -29,17 +29,27 @@ pub(super) struct Journal {
 impl Journal {
     /// # Errors
     ///
-    /// If nobody listens there.
-    pub(super) fn find(lines: &Lines) -> io::Result<Self> {
-        let socket = UnixDatagram::unbound()?;
-        socket.set_nonblocking(true)?;
-        // The journal passes over an entry without fields. One that is full is there.
-        match socket.send_to(&[], SOCKET) {
-            Err(error) if error.kind() != ErrorKind::WouldBlock => Err(error),
-            _ => Ok(Self {
-                lines: lines.clone(),
-            }),
-        }
+    /// As [`find`].
+    pub(super) fn new(lines: &Lines) -> io::Result<Self> {
+        find()?;
+        Ok(Self {
+            lines: lines.clone(),
+        })
+    }
+}
+
+/// Looks for the journal.
+///
+/// # Errors
+///
+/// If nobody listens there.
+pub(super) fn find() -> io::Result<()> {
+    let socket = UnixDatagram::unbound()?;
+    socket.set_nonblocking(true)?;
+    // The journal passes over an entry without fields. One that is full is there.
+    match socket.send_to(&[], SOCKET) {
+        Err(error) if error.kind() != ErrorKind::WouldBlock => Err(error),
+        _ => Ok(()),
     }
 }
 
