@@ -10,27 +10,30 @@ pub fn of_toml(text: &str, error: &toml::de::Error) -> String {
 /// `message` on one line, and without the names that Rust has for types.
 pub fn plain(message: &str) -> String {
     let message = message.trim().replace('\n', ": ");
-    let mut parts = message.split(EXPECTED);
-    let first = parts.next().unwrap_or_default().to_owned();
-    parts.fold(first, |text, part| {
-        let (word, rest) = word_of(part);
-        let (words, rest) = match word {
-            "u8" | "u16" | "u32" | "u64" | "usize" => ("a whole number from 0", rest),
-            "i8" | "i16" | "i32" | "i64" | "isize" => ("a whole number", rest),
-            "f32" | "f64" => ("a number", rest),
-            "struct" => ("a table", word_of(rest.trim_start()).1),
-            word => (word, rest),
-        };
-        text + EXPECTED + words + rest
-    })
-}
-
-/// What stands before a type.
-const EXPECTED: &str = "expected ";
-
-fn word_of(text: &str) -> (&str, &str) {
-    let end = text.find(|c: char| !c.is_ascii_alphanumeric() && c != '_');
-    text.split_at(end.unwrap_or(text.len()))
+    let Some((found, expected)) = message.rsplit_once(", expected ") else {
+        return message;
+    };
+    let expected = match expected {
+        "u8" => "a whole number from 0 to 255",
+        "u16" => "a whole number from 0 to 65535",
+        "u32" => "a whole number from 0 to 4294967295",
+        "u64" | "usize" => "a whole number from 0",
+        "i8" | "i16" | "i32" | "i64" | "isize" => "a whole number",
+        "f32" | "f64" => "a number",
+        "a boolean" => "true or false",
+        "a sequence" => "a list",
+        "an array of length 2" => "a list of two",
+        "path string" => "a path",
+        table if table.starts_with("struct ") => "a table",
+        other => other,
+    };
+    let found = match found.split_once(": ") {
+        Some(("invalid type" | "invalid value", "sequence")) => "found a list".to_owned(),
+        Some(("invalid type" | "invalid value", "map")) => "found a table".to_owned(),
+        Some(("invalid type" | "invalid value", value)) => format!("found {value}"),
+        _ => found.replace("invalid length ", "found a list of "),
+    };
+    format!("{found}, expected {expected}")
 }
 
 #[cfg(test)]
@@ -42,15 +45,27 @@ mod tests {
         for (message, expected) in [
             (
                 "invalid value: integer `-1`, expected usize",
-                "invalid value: integer `-1`, expected a whole number from 0",
+                "found integer `-1`, expected a whole number from 0",
             ),
             (
                 "invalid type: string \"3\", expected f32\n",
-                "invalid type: string \"3\", expected a number",
+                "found string \"3\", expected a number",
             ),
             (
                 "invalid type: integer `3`, expected struct Table",
-                "invalid type: integer `3`, expected a table",
+                "found integer `3`, expected a table",
+            ),
+            (
+                "invalid value: integer `65536`, expected u16",
+                "found integer `65536`, expected a whole number from 0 to 65535",
+            ),
+            (
+                "invalid type: map, expected a sequence",
+                "found a table, expected a list",
+            ),
+            (
+                "invalid length 1, expected an array of length 2",
+                "found a list of 1, expected a list of two",
             ),
             (
                 "unknown field `bit`, expected one of `at_s`, `kind`",

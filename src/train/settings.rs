@@ -354,7 +354,7 @@ mod tests {
             ("epoch = 3", "unknown field `epoch`"),
             (
                 "[training]\nepochs = \"3\"",
-                "line 2: invalid type: string \"3\", expected a whole number from 0",
+                "line 2: found string \"3\", expected a whole number from 0 to 4294967295",
             ),
             (
                 "[training]\nepochs = 0",

@@ -10,7 +10,7 @@ use toml::de::DeTable;
 use super::check::check;
 use super::{Config, Model};
 use crate::verdict::{self, Hrn, ModelError};
-use crate::{press, tare, wire};
+use crate::{press, tare, wire, wording};
 
 /// Why there is no configuration. Each says file, key, what was found and what was expected.
 #[derive(Debug, thiserror::Error)]
@@ -194,7 +194,7 @@ fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Error {
         .split_once('=')
         .map(|(key, _)| key.trim())
         .filter(|key| !key.is_empty());
-    let message = plain(&error.message().replace('\n', ": "));
+    let message = wording::plain(error.message());
     Error::Syntax {
         path: path.to_owned(),
         place: Place::of(text, start),
@@ -215,33 +215,6 @@ fn sensor_without_port(text: &str) -> Option<usize> {
         sensor.is_some_and(|keys| keys.get("port").is_none())
     })?;
     Some(found.span().start)
-}
-
-/// A message of the parser in the words of a configuration, not of a program.
-fn plain(message: &str) -> String {
-    let Some((found, expected)) = message.rsplit_once(", expected ") else {
-        return message.to_owned();
-    };
-    let expected = match expected {
-        "u8" => "a whole number from 0 to 255",
-        "u16" => "a whole number from 0 to 65535",
-        "u32" => "a whole number from 0 to 4294967295",
-        "u64" | "usize" => "a whole number, 0 or more",
-        "f32" | "f64" => "a number",
-        "a boolean" => "true or false",
-        "a sequence" => "a list",
-        "an array of length 2" | "a tuple of size 2" => "a list of two",
-        "path string" => "a path",
-        table if table.starts_with("struct ") => "a table",
-        other => other,
-    };
-    let found = match found.split_once(": ") {
-        Some(("invalid type" | "invalid value", "sequence")) => "found a list".to_owned(),
-        Some(("invalid type" | "invalid value", "map")) => "found a table".to_owned(),
-        Some(("invalid type" | "invalid value", value)) => format!("found {value}"),
-        _ => found.replace("invalid length ", "found a list of "),
-    };
-    format!("{found}, expected {expected}")
 }
 
 pub(super) fn model(model: &Model, path: &Path) -> Result<Hrn, Error> {

@@ -47,7 +47,7 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
         ),
         (
             "[[sensor]]\nport = \"p\"\n[sensor.frame]\nrows = -1",
-            &["4:8", "rows: found", "-1", "a whole number, 0 or more"],
+            &["4:8", "rows: found", "-1", "a whole number from 0"],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[sensor.calibration]\npitch_mm = \"3\"",
