@@ -45,7 +45,11 @@ fn open(path: &Path) -> io::Result<File> {
 }
 
 /// Writes lines to stdout at once. `Ok(false)`: nobody reads any more, which ends a tool quietly.
-fn print(lines: &[u8]) -> io::Result<bool> {
+///
+/// # Errors
+///
+/// If stdout cannot be written to for another reason.
+pub fn print(lines: &[u8]) -> io::Result<bool> {
     let mut out = io::stdout().lock();
     match out.write_all(lines).and_then(|()| out.flush()) {
         Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(false),

@@ -362,6 +362,20 @@ fn every_method_leaves_a_model() {
 }
 
 #[test]
+fn a_reader_that_goes_ends_it_quietly() {
+    let model = concat!(env!("CARGO_MANIFEST_DIR"), "/models/hrn.onnx");
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    let output = Command::new(env!("CARGO_BIN_EXE_hrn-train"))
+        .args(["inspect", model])
+        .stdout(writer)
+        .output()
+        .unwrap();
+    let error = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && error.is_empty(), "{error}");
+}
+
+#[test]
 fn a_full_disk_is_an_error_and_leaves_the_last_checkpoint_intact() {
     let whole = Trial::new("ample disk");
     whole.train("8", &[]);

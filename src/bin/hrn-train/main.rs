@@ -1,5 +1,6 @@
 //! The trainer: one subcommand a stage, from simulated presses to the file the daemon loads.
 
+mod account;
 mod arguments;
 
 use std::path::{Path, PathBuf};
@@ -18,7 +19,6 @@ use hardnessd::train::compare::{self, Plan};
 use hardnessd::train::dataset::{Dataset, DatasetError};
 use hardnessd::train::export;
 use hardnessd::train::methods::{self, LabelsError, Method};
-use hardnessd::train::metrics::Evaluation;
 use hardnessd::train::run::{Description, Run, write_whole};
 use hardnessd::train::settings::SettingsError;
 use hardnessd::train::{report, sheet, simulated};
@@ -51,8 +51,8 @@ fn main() -> ExitCode {
         Command::Export { run, out } => export_run(&run, &out),
         Command::Inspect { model } => inspect(&model),
     };
-    match done {
-        Ok(()) => ExitCode::SUCCESS,
+    match done.and_then(|account| Ok(tools::print(account.as_bytes())?)) {
+        Ok(_) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("hrn-train: {}", tools::line(error.as_ref()));
             ExitCode::from(exit_code(&error))
@@ -124,7 +124,7 @@ fn load(path: &Path) -> anyhow::Result<Hrn> {
     Hrn::load(&read(path)?).with_context(|| path.display().to_string())
 }
 
-fn simulate(arguments: &Simulate) -> anyhow::Result<()> {
+fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
     let settings = DatasetSettings {
         seed: arguments.seed,
         objects: arguments.objects,
@@ -147,15 +147,14 @@ fn simulate(arguments: &Simulate) -> anyhow::Result<()> {
     }
     let count = samples.len();
     write(&arguments.out, &simulated::to_bytes(&settings, samples)?)?;
-    println!(
-        "{}: {count} samples in {seconds:.1} s, {:.0} a second",
+    Ok(format!(
+        "{}: {count} samples in {seconds:.1} s, {:.0} a second\n",
         arguments.out.display(),
         count as f64 / seconds
-    );
-    Ok(())
+    ))
 }
 
-fn collect(arguments: &Collect) -> anyhow::Result<()> {
+fn collect(arguments: &Collect) -> anyhow::Result<String> {
     let setup = match &arguments.config {
         Some(config) => Setup::load(config)?,
         None => {
@@ -195,8 +194,9 @@ fn collect(arguments: &Collect) -> anyhow::Result<()> {
         write(&arguments.out, &bytes)?;
     }
     let out = arguments.out.display();
-    println!("{out}: {presses} presses collected, {all} in all");
-    Ok(())
+    Ok(format!(
+        "{out}: {presses} presses collected, {all} in all\n"
+    ))
 }
 
 /// The training materials' presses as the sensor sees them over time.
@@ -215,7 +215,7 @@ fn one_press_a_level(settings: &DatasetSettings) -> Vec<(Material, Vec<RawFrame>
     Material::ALL[..4].iter().copied().map(press_of).collect()
 }
 
-fn train(arguments: &Train) -> anyhow::Result<()> {
+fn train(arguments: &Train) -> anyhow::Result<String> {
     if let Some(parent) = arguments.parent {
         end_with(parent)?;
     }
@@ -247,16 +247,15 @@ fn train(arguments: &Train) -> anyhow::Result<()> {
         .taking_from(arguments.from.clone());
     let begun = Instant::now();
     let evaluation = methods::train(arguments.method, &dataset, &description, &run, &device)?;
-    println!(
-        "trained in {:.1} s: {}",
+    let figures = evaluation.map_or_else(
+        || "not evaluated: the data has no labelled test samples\n".to_owned(),
+        |evaluation| account::of_evaluation(&evaluation),
+    );
+    Ok(format!(
+        "trained in {:.1} s: {}\n{figures}",
         begun.elapsed().as_secs_f64(),
         run.path("hrn.onnx").display()
-    );
-    match evaluation {
-        Some(evaluation) => print_evaluation(&evaluation),
-        None => println!("not evaluated: the data has no labelled test samples"),
-    }
-    Ok(())
+    ))
 }
 
 /// Has the system end this process when its parent does, whatever ends that.
@@ -272,7 +271,7 @@ fn end_with(parent: i32) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn compare(arguments: Compare) -> anyhow::Result<()> {
+fn compare(arguments: Compare) -> anyhow::Result<String> {
     let methods = if arguments.methods.is_empty() {
         Method::value_variants().to_vec()
     } else {
@@ -288,100 +287,37 @@ fn compare(arguments: Compare) -> anyhow::Result<()> {
         jobs: jobs.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from)),
         swaps: arguments.swaps,
     })?;
-    println!("{}", arguments.out.join("report.html").display());
-    Ok(())
+    Ok(format!("{}\n", arguments.out.join("report.html").display()))
 }
 
-fn report_of(directory: &Path, out: &Path) -> anyhow::Result<()> {
+fn report_of(directory: &Path, out: &Path) -> anyhow::Result<String> {
     std::fs::read_dir(directory).map_err(|source| Unreadable {
         path: directory.to_owned(),
         source,
     })?;
     write(out, report::of(directory)?.as_bytes())?;
-    println!("{}", out.display());
-    Ok(())
+    Ok(format!("{}\n", out.display()))
 }
 
-fn evaluate(arguments: &Evaluate) -> anyhow::Result<()> {
+fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     let hrn = load(&arguments.model)?;
     let dataset = Dataset::read(&arguments.data)?;
     let indices = dataset.labelled(arguments.split.into())?;
     let evaluation = export::evaluate(&hrn, &dataset, &indices)?;
-    if arguments.json {
-        println!("{}", serde_json::to_string(&evaluation)?);
+    Ok(if arguments.json {
+        serde_json::to_string(&evaluation)? + "\n"
     } else {
-        print_evaluation(&evaluation);
-    }
-    Ok(())
+        account::of_evaluation(&evaluation)
+    })
 }
 
-fn export_run(run: &Path, out: &Path) -> anyhow::Result<()> {
+fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {
     let model = run.join("hrn.onnx");
     let hrn = load(&model).context("the run has no model yet; train --resume finishes it")?;
     write(out, &read(&model)?)?;
-    println!("{}: sha256 {}", out.display(), hrn.sha256());
-    Ok(())
+    Ok(format!("{}: sha256 {}\n", out.display(), hrn.sha256()))
 }
 
-fn inspect(path: &Path) -> anyhow::Result<()> {
-    let hrn = load(path)?;
-    let card = hrn.card();
-    println!("{}", path.display());
-    println!("sha256        {}", hrn.sha256());
-    println!("format        {}", card.format);
-    println!("method        {}", card.method);
-    println!("validation    {}", card.validation);
-    for level in &card.levels {
-        println!(
-            "level {}       {}, Shore {}",
-            level.level, level.label, level.shore
-        );
-    }
-    println!("pitch         {} mm", card.pitch_mm);
-    let [least, most] = card.range.force_n;
-    println!("force         {least:.2} to {most:.2} N in training");
-    let [least, most] = card.range.contact_area_taxels;
-    println!("contact area  {least} to {most} taxels in training");
-    println!("data          {}", card.data);
-    println!("metrics       {}", card.metrics);
-    println!("check frames  {}, all reproduced", hrn.check().frames.len());
-    Ok(())
-}
-
-fn print_evaluation(evaluation: &Evaluation) {
-    let interval = evaluation.accuracy_interval_by_object.map_or_else(
-        || "no interval without two objects of a level".to_owned(),
-        |[low, high]| {
-            format!(
-                "95 % by object: {:.1} to {:.1} %",
-                low * 100.0,
-                high * 100.0
-            )
-        },
-    );
-    println!("samples            {}", evaluation.n);
-    println!(
-        "accuracy           {:.1} % ({interval})",
-        evaluation.accuracy * 100.0
-    );
-    let number = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.4}"));
-    println!("kappa              {}", number(evaluation.kappa));
-    println!("kappa, quadratic   {}", number(evaluation.kappa_quadratic));
-    println!("calibration error  {:.4}", evaluation.ece);
-    println!(
-        "log-likelihood     {:.4} nats lost a sample",
-        evaluation.nll
-    );
-    println!(
-        "truth \\ said  {}",
-        (1..=evaluation.confusion.len())
-            .map(|w| format!("{w:>7}"))
-            .collect::<String>()
-    );
-    for (level, row) in evaluation.confusion.iter().enumerate() {
-        let counts: String = row.iter().map(|count| format!("{count:>7}")).collect();
-        let right = evaluation.category_accuracy[level];
-        let right = right.map_or("-".to_owned(), |right| format!("{:.1} %", right * 100.0));
-        println!("level {}       {counts}   {right}", level + 1);
-    }
+fn inspect(path: &Path) -> anyhow::Result<String> {
+    Ok(account::of_model(path, &load(path)?))
 }

@@ -1,0 +1,89 @@
+//! What is said of a model and of how well it judges, as lines of text.
+
+use std::path::Path;
+
+use hardnessd::train::metrics::Evaluation;
+use hardnessd::verdict::Hrn;
+
+/// The card of the model read from `path`.
+pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
+    let card = hrn.card();
+    let levels: String = card
+        .levels
+        .iter()
+        .map(|level| {
+            format!(
+                "level {}       {}, Shore {}\n",
+                level.level, level.label, level.shore
+            )
+        })
+        .collect();
+    let [least_n, most_n] = card.range.force_n;
+    let [least_taxels, most_taxels] = card.range.contact_area_taxels;
+    format!(
+        "{}\n\
+         sha256        {}\n\
+         format        {}\n\
+         method        {}\n\
+         validation    {}\n\
+         {levels}\
+         pitch         {} mm\n\
+         force         {least_n:.2} to {most_n:.2} N in training\n\
+         contact area  {least_taxels} to {most_taxels} taxels in training\n\
+         data          {}\n\
+         metrics       {}\n\
+         check frames  {}, all reproduced\n",
+        path.display(),
+        hrn.sha256(),
+        card.format,
+        card.method,
+        card.validation,
+        card.pitch_mm,
+        card.data,
+        card.metrics,
+        hrn.check().frames.len()
+    )
+}
+
+/// The figures of an evaluation; last its confusion matrix, a row a true level.
+pub(super) fn of_evaluation(evaluation: &Evaluation) -> String {
+    let percent = |share: f64| share * 100.0;
+    let interval = evaluation.accuracy_interval_by_object.map_or_else(
+        || "no interval without two objects of a level".to_owned(),
+        |[low, high]| {
+            let (low, high) = (percent(low), percent(high));
+            format!("95 % by object: {low:.1} to {high:.1} %")
+        },
+    );
+    let number = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.4}"));
+    let levels: String = (1..=evaluation.confusion.len())
+        .map(|level| format!("{level:>7}"))
+        .collect();
+    let rows: String = evaluation
+        .confusion
+        .iter()
+        .zip(&evaluation.category_accuracy)
+        .enumerate()
+        .map(|(level, (row, right))| {
+            let counts: String = row.iter().map(|count| format!("{count:>7}")).collect();
+            let right = right.map_or("-".to_owned(), |right| format!("{:.1} %", percent(right)));
+            format!("level {}       {counts}   {right}\n", level + 1)
+        })
+        .collect();
+    format!(
+        "samples            {}\n\
+         accuracy           {:.1} % ({interval})\n\
+         kappa              {}\n\
+         kappa, quadratic   {}\n\
+         calibration error  {:.4}\n\
+         log-likelihood     {:.4} nats lost a sample\n\
+         truth \\ said  {levels}\n\
+         {rows}",
+        evaluation.n,
+        percent(evaluation.accuracy),
+        number(evaluation.kappa),
+        number(evaluation.kappa_quadratic),
+        evaluation.ece,
+        evaluation.nll
+    )
+}
