@@ -16,7 +16,7 @@ use ratatui::symbols::bar;
 use ratatui::widgets::{Sparkline, Widget};
 
 use super::look::Look;
-use super::view::{Link, Load, Sensor, Verdict, View, WINDOW, age};
+use super::view::{self, Link, Load, Sensor, Verdict, View, WINDOW, age};
 
 /// Widest picture that is one column.
 const NARROW: u16 = 64;
@@ -299,12 +299,12 @@ impl Page<'_> {
     }
 
     fn force(&mut self, area: Rect, sensor: &Sensor, link: Link) {
-        let present = |load: &super::view::Frame| format!("{:.2} N", load.force_n);
+        let present = |load: &view::Frame| format!("{:.2} N", load.force_n);
         self.curve(area, "force", sensor, link, present, |load| load.force_n);
     }
 
     fn contact(&mut self, area: Rect, sensor: &Sensor, link: Link) {
-        let present = |load: &super::view::Frame| format!("{} taxels", load.contact_area_taxels);
+        let present = |load: &view::Frame| format!("{} taxels", load.contact_area_taxels);
         let area_taxels = |load: &Load| load.contact_area_taxels as f32;
         self.curve(area, "contact area", sensor, link, present, area_taxels);
     }
@@ -316,7 +316,7 @@ impl Page<'_> {
         name: &str,
         sensor: &Sensor,
         link: Link,
-        present: impl Fn(&super::view::Frame) -> String,
+        present: impl Fn(&view::Frame) -> String,
         value: impl Fn(&Load) -> f32,
     ) {
         let mut rows = Rows(area);

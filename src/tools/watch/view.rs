@@ -3,28 +3,21 @@
 //! A moment is a [`Duration`] on CLOCK_MONOTONIC; that of an event is when it happened, not when it
 //! was read, so what lay in a queue is as old as it is. Nothing here has a clock or does I/O.
 
-use std::collections::VecDeque;
+mod sensor;
+
 use std::time::Duration;
 
 use serde_json::Value;
 
+pub(super) use self::sensor::{Frame, Load, Sensor, Verdict, WINDOW};
 use crate::event::PROTOCOL;
-use crate::frame::{COLS, ROWS, Stamp, TAXELS};
-
-/// How far back the curves go.
-pub(super) const WINDOW: Duration = Duration::from_secs(30);
+use crate::frame::Stamp;
 
 /// How often the daemon is asked for the totals, which it tells by itself only with a change.
 pub(super) const QUESTION: Duration = Duration::from_secs(1);
 
 /// A daemon that has answered nothing for three questions is taken for dead.
 const SILENCE: Duration = Duration::from_secs(3);
-
-/// Verdicts kept of a sensor: more than a tall terminal shows.
-const VERDICTS: usize = 100;
-
-/// A value is current for so many periods after its frame (contract, section 5).
-const PERIODS: f64 = 2.5;
 
 /// All that is shown.
 #[derive(Debug)]
@@ -62,72 +55,6 @@ pub(super) struct Hello {
     pub(super) validation: String,
     /// Of the levels, in order.
     pub(super) labels: Vec<String>,
-}
-
-/// One sensor.
-#[derive(Debug, Default)]
-pub(super) struct Sensor {
-    pub(super) name: String,
-    pub(super) rows: usize,
-    pub(super) cols: usize,
-    pub(super) status: Option<Status>,
-    /// Its last frame.
-    pub(super) frame: Option<Frame>,
-    trace: VecDeque<Load>,
-    pub(super) press: Option<Press>,
-    /// The newest first.
-    pub(super) verdicts: VecDeque<Verdict>,
-}
-
-/// What the daemon says of a link.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Status {
-    state: String,
-    reason: Option<String>,
-    pub(super) frames: u64,
-    pub(super) frames_damaged: u64,
-    pub(super) bytes_skipped: u64,
-    pub(super) frame_rate_hz: Option<f64>,
-}
-
-/// The last frame.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Frame {
-    pub(super) at: Duration,
-    /// `[28, 28]`, newtons a taxel.
-    newtons: Vec<f32>,
-    pub(super) force_n: f32,
-    pub(super) contact_area_taxels: u32,
-}
-
-/// A point of the curves.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Load {
-    at: Duration,
-    pub(super) force_n: f32,
-    pub(super) contact_area_taxels: u32,
-}
-
-/// The last press.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Press {
-    pub(super) at: Duration,
-    pub(super) number: u64,
-    pub(super) state: String,
-    pub(super) reason: Option<String>,
-}
-
-/// A verdict.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Verdict {
-    pub(super) at: Duration,
-    pub(super) press: u64,
-    pub(super) phase: String,
-    /// Level and label; or why there are none.
-    pub(super) level: Result<(u64, String), String>,
-    pub(super) probabilities: Vec<f64>,
-    pub(super) force_n: f64,
-    pub(super) notes: Vec<String>,
 }
 
 /// Whether what is shown of a sensor is true now.
@@ -310,152 +237,6 @@ impl View {
             Daemon::Absent(reason) | Daemon::Unknown(reason) => reason,
             Daemon::Met => "",
         }
-    }
-}
-
-impl Sensor {
-    fn new(card: &Value) -> Self {
-        let size = |key, most: usize| {
-            let size = card[key]
-                .as_u64()
-                .and_then(|size| usize::try_from(size).ok());
-            size.unwrap_or(most).clamp(1, most)
-        };
-        Self {
-            name: text(card, "name"),
-            rows: size("rows", ROWS),
-            cols: size("cols", COLS),
-            ..Self::default()
-        }
-    }
-
-    fn hear(&mut self, kind: &str, event: &Value, at: Duration) {
-        match kind {
-            "status" => {
-                self.status = Some(Status {
-                    state: text(event, "state"),
-                    reason: event["reason"].as_str().map(plain),
-                    frames: number(event, "frames"),
-                    frames_damaged: number(event, "frames_damaged"),
-                    bytes_skipped: number(event, "bytes_skipped"),
-                    frame_rate_hz: event["frame_rate_hz"].as_f64(),
-                });
-            }
-            "press" => {
-                self.press = Some(Press {
-                    at,
-                    number: number(event, "press"),
-                    state: text(event, "state"),
-                    reason: event["reason"].as_str().map(plain),
-                });
-            }
-            "hardness" => self.judge(event, at),
-            "frame" => self.show(event, at),
-            _ => {}
-        }
-    }
-
-    fn judge(&mut self, event: &Value, at: Duration) {
-        let level = match event["level"].as_u64() {
-            Some(level) => Ok((level, text(event, "label"))),
-            None => Err(text(event, "rejected").replace('_', " ")),
-        };
-        let verdict = Verdict {
-            at,
-            press: number(event, "press"),
-            phase: text(event, "phase"),
-            level,
-            probabilities: items(event, "probabilities")
-                .filter_map(Value::as_f64)
-                .collect(),
-            force_n: event["force_n"].as_f64().unwrap_or_default(),
-            notes: items(event, "notes")
-                .filter_map(Value::as_str)
-                .map(|note| plain(note).replace('_', " "))
-                .collect(),
-        };
-        // Asked for after a break of the connection, the last one may be known.
-        let is_same =
-            |known: &Verdict| (known.press, &known.phase) == (verdict.press, &verdict.phase);
-        if !self.verdicts.iter().any(is_same) {
-            self.verdicts.push_front(verdict);
-            self.verdicts.truncate(VERDICTS);
-        }
-    }
-
-    fn show(&mut self, event: &Value, at: Duration) {
-        let newtons: Vec<f32> = items(event, "newtons")
-            .filter_map(Value::as_f64)
-            .map(|newtons| newtons as f32)
-            .collect();
-        if newtons.len() != TAXELS {
-            return;
-        }
-        let load = Load {
-            at,
-            force_n: newtons.iter().sum(),
-            contact_area_taxels: u32::try_from(number(event, "contact_area_taxels"))
-                .unwrap_or_default(),
-        };
-        while self
-            .trace
-            .front()
-            .is_some_and(|first| first.at + WINDOW < at)
-        {
-            self.trace.pop_front();
-        }
-        self.trace.push_back(load);
-        self.frame = Some(Frame {
-            at,
-            newtons,
-            force_n: load.force_n,
-            contact_area_taxels: load.contact_area_taxels,
-        });
-    }
-
-    /// Newtons of the taxel at a row and column of the sensor's own array in the last frame: smaller
-    /// arrays sit in the middle of the 28x28 (contract, section 3).
-    pub(super) fn newtons(&self, row: usize, col: usize) -> Option<f32> {
-        let (top, left) = ((ROWS - self.rows) / 2, (COLS - self.cols) / 2);
-        let frame = self.frame.as_ref()?;
-        (row < self.rows && col < self.cols).then(|| frame.newtons[(top + row) * COLS + left + col])
-    }
-
-    /// The course of `value` up to `now` in so many equal spans, the greatest of each; `None` where
-    /// no frame was current.
-    pub(super) fn curve(
-        &self,
-        now: Duration,
-        spans: usize,
-        value: impl Fn(&Load) -> f32,
-    ) -> Vec<Option<f32>> {
-        let span = WINDOW.as_secs_f64() / spans.max(1) as f64;
-        let begin = now.as_secs_f64() - WINDOW.as_secs_f64();
-        let rate_hz = self.status.as_ref().and_then(|status| status.frame_rate_hz);
-        let mut curve = vec![None; spans];
-        let mut held: Vec<Option<f32>> = vec![None; spans];
-        for load in &self.trace {
-            let place = (load.at.as_secs_f64() - begin) / span;
-            if place >= 0.0 && (place as usize) < spans {
-                let cell: &mut Option<f32> = &mut curve[place as usize];
-                *cell = Some(cell.map_or(value(load), |most| most.max(value(load))));
-            }
-            // It stands for the spans after it, for as long as it is current.
-            let current = rate_hz.map_or(0.0, |hz| PERIODS / hz / span);
-            let first = place.max(0.0) as usize;
-            let last = (place + current).max(0.0) as usize;
-            for cell in held.iter_mut().take(last).skip(first) {
-                *cell = Some(value(load));
-            }
-        }
-        let filled = curve.into_iter().zip(held);
-        filled.map(|(own, held)| own.or(held)).collect()
-    }
-
-    /// The greatest taxel of the last frame.
-    pub(super) fn highest_n(&self) -> f32 {
-        let newtons = self.frame.iter().flat_map(|frame| &frame.newtons);
-        newtons.copied().fold(0.0, f32::max)
     }
 }
 
