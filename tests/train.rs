@@ -502,6 +502,12 @@ fn bad_input_has_its_exit_code_and_one_line() {
             "at most the data's 160",
         ),
         (train(&["--data", &data, "--labels=-1"]), 2, "--labels"),
+        #[cfg(not(feature = "cuda"))]
+        (
+            train(&["--data", &data, "--device", "cuda"]),
+            69,
+            "no CUDA device found, expected a build with --features cuda",
+        ),
         (lowest("nan"), 2, "expected newtons from 0.01 to 25"),
         (lowest("inf"), 2, "expected newtons from 0.01 to 25"),
         (lowest("-5"), 2, "expected newtons from 0.01 to 25"),

@@ -185,6 +185,8 @@ fn lowest_force_n(text: &str) -> Result<f32, String> {
 #[derive(Debug, Clone, Copy, ValueEnum)]
 pub(super) enum DeviceName {
     Cpu,
+    /// The first CUDA device; needs a build with `--features cuda`
+    Cuda,
 }
 
 #[derive(Debug, clap::Args)]

@@ -82,7 +82,7 @@ struct Unreadable {
     source: std::io::Error,
 }
 
-/// 2 wrong usage, 66 unreadable input, 78 bad configuration or model, 74 other I/O, else 1.
+/// 2 wrong usage, 66 unreadable input, 69 no such device, 78 bad configuration or model, 74 other I/O, else 1.
 fn exit_code(error: &anyhow::Error) -> u8 {
     let has = |test: fn(&(dyn std::error::Error + 'static)) -> bool| error.chain().any(test);
     if has(|e| matches!(e.downcast_ref(), Some(LabelsError::Range { .. }))) {
@@ -94,6 +94,8 @@ fn exit_code(error: &anyhow::Error) -> u8 {
             || matches!(e.downcast_ref(), Some(ConfigError::Unreadable { .. }))
     }) {
         66
+    } else if has(<dyn std::error::Error>::is::<NoCuda>) {
+        69
     } else if has(|e| e.is::<ModelError>() || e.is::<SettingsError>() || e.is::<ConfigError>()) {
         78
     } else if has(<dyn std::error::Error>::is::<std::io::Error>) {
@@ -241,8 +243,7 @@ fn train(arguments: &Train) -> anyhow::Result<String> {
         settings,
         data: dataset.sources.clone(),
     };
-    let DeviceName::Cpu = arguments.device;
-    let device = Device::flex();
+    let device = device(arguments.device)?;
     let run = Run::open(&arguments.out, &description, arguments.resume)?
         .taking_from(arguments.from.clone());
     let begun = Instant::now();
@@ -256,6 +257,27 @@ fn train(arguments: &Train) -> anyhow::Result<String> {
         begun.elapsed().as_secs_f64(),
         run.path("hrn.onnx").display()
     ))
+}
+
+/// A CUDA device was asked for.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "--device cuda: no CUDA device found, expected a build with --features cuda, a device and its \
+     driver"
+)]
+struct NoCuda;
+
+fn device(name: DeviceName) -> Result<Device, NoCuda> {
+    match name {
+        DeviceName::Cpu => Ok(Device::flex()),
+        #[cfg(feature = "cuda")]
+        DeviceName::Cuda => Device::enumerate(burn::tensor::DeviceType::Cuda)
+            .into_iter()
+            .next()
+            .ok_or(NoCuda),
+        #[cfg(not(feature = "cuda"))]
+        DeviceName::Cuda => Err(NoCuda),
+    }
 }
 
 /// Has the system end this process when its parent does, whatever ends that.
