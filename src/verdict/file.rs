@@ -148,12 +148,16 @@ fn describe_value(value: &pb::ValueInfoProto) -> String {
 /// Reads and checks all `hrn.*` keys.
 pub(super) fn read_metadata(proto: &pb::ModelProto) -> Result<(Card, Check), ModelError> {
     let text = |key: &'static str| {
-        proto
-            .metadata_props
-            .iter()
-            .find(|entry| entry.key == key)
-            .map(|entry| entry.value.as_str())
-            .ok_or(ModelError::KeyMissing { key })
+        let mut entries = proto.metadata_props.iter().filter(|entry| entry.key == key);
+        let first = entries.next().ok_or(ModelError::KeyMissing { key })?;
+        match entries.count() {
+            0 => Ok(first.value.as_str()),
+            more => Err(ModelError::KeyInvalid {
+                key,
+                found: format!("it {} times", 1 + more),
+                expected: "it once".to_owned(),
+            }),
+        }
     };
     let line = |key: &'static str| {
         let value = text(key)?;
@@ -268,9 +272,8 @@ fn check_check(check: &Check, levels: usize) -> Result<(), ModelError> {
     let usable = |newtons: &Vec<f32>| {
         newtons.len() == TAXELS && newtons.iter().all(|n| n.is_finite() && *n >= 0.0)
     };
-    // Two frames a level; a model of more than four levels may keep to eight.
-    let least = 8.min(2 * levels);
-    if check.frames.len() >= least
+    // Eight, two a level; a model of other than four levels cannot have both.
+    if [8, 2 * levels].contains(&check.frames.len())
         && check.frames.len() == check.probabilities.len()
         && check.frames.iter().all(usable)
         && check.probabilities.iter().all(|row| row.len() == levels)
@@ -289,7 +292,8 @@ fn check_check(check: &Check, levels: usize) -> Result<(), ModelError> {
         check.probabilities.len(),
         lengths(&check.probabilities)
     );
-    let expected = format!("at least {least} frames of {TAXELS} newtons, as many rows of {levels}");
+    let expected =
+        format!("8 frames of {TAXELS} newtons, or two a level, as many rows of {levels}");
     Err(ModelError::KeyInvalid {
         key: "hrn.check",
         found,

@@ -179,6 +179,25 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
     check("`hrn.check`: found 1 frames of lengths [2]", |p| {
         *value(p, "hrn.check") = r#"{"frames":[[1,2]],"probabilities":[[1,0,0,0]]}"#.into();
     });
+    for (count, found) in [(7, "found 7 frames"), (9, "found 9 frames")] {
+        check(found, |p| {
+            let Check {
+                frames,
+                probabilities,
+            } = serde_json::from_str(value(p, "hrn.check")).unwrap();
+            let changed = Check {
+                frames: frames.into_iter().cycle().take(count).collect(),
+                probabilities: probabilities.into_iter().cycle().take(count).collect(),
+            };
+            *value(p, "hrn.check") = serde_json::to_string(&changed).unwrap();
+        });
+    }
+    check("`hrn.format`: found it 2 times, expected it once", |p| {
+        let entries = &mut p.metadata_props;
+        let format = entries.iter().find(|entry| entry.key == "hrn.format");
+        let again = format.unwrap().clone();
+        entries.push(again);
+    });
     check(
         "check frame 3: probabilities differ from the trainer's by up to 0.01",
         |p| {
