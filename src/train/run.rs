@@ -7,14 +7,14 @@ use std::fs::{self, File};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, anyhow, bail, ensure};
+use anyhow::{Context as _, bail, ensure};
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 
 use super::checkpoint::Checkpoint;
 use super::dataset::{LabelChoice, Source};
 use super::history::{self, Metrics};
-use super::settings::{Profile, Settings};
+use super::settings::{Profile, Settings, SettingsError};
 use crate::wording;
 
 /// Checkpoints kept of a stage: the newest, and one before it.
@@ -56,10 +56,12 @@ impl Run {
     /// If `settings.toml` is there and cannot be read.
     pub fn told(directory: &Path) -> anyhow::Result<Option<Description>> {
         let path = directory.join("settings.toml");
-        match fs::read_to_string(&path) {
-            Ok(text) => {
+        match fs::read(&path) {
+            Ok(bytes) => {
+                let text = String::from_utf8_lossy(&bytes);
                 let told = toml::from_str(&text);
-                let told = told.map_err(|error| anyhow!(wording::of_toml(&text, &error)));
+                let told =
+                    told.map_err(|error| SettingsError::Syntax(wording::of_toml(&text, &error)));
                 Ok(Some(told.with_context(|| path.display().to_string())?))
             }
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
@@ -255,12 +257,28 @@ fn checkpoints(run: &Path, stage: &str) -> anyhow::Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-/// Writes a file beside its place, flushes it and renames it.
+/// Writes a file beside its place, flushes it and renames it; a link stays, and its target is
+/// written. What is no file, such as a pipe or a device, is written to as it stands.
 ///
 /// # Errors
 ///
-/// Those of writing; what stood there before then still stands.
+/// Those of writing; a file that stood there before then still stands.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let attempt = || -> std::io::Result<()> {
+        if path.is_symlink() && !path.exists() {
+            // A link to what is not there yet: so that there is a path to follow it to.
+            File::create(path)?;
+        }
+        match fs::metadata(path) {
+            Ok(found) if found.is_file() => replace(&fs::canonicalize(path)?, bytes),
+            Ok(_) => File::options().write(true).open(path)?.write_all(bytes),
+            Err(_) => replace(path, bytes),
+        }
+    };
+    attempt().with_context(|| path.display().to_string())
+}
+
+fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     let mut name = path.file_name().unwrap_or_default().to_owned();
     name.push(".part");
     let part = path.with_file_name(name);
@@ -275,10 +293,9 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
             .filter(|parent| !parent.as_os_str().is_empty());
         File::open(directory.unwrap_or(Path::new(".")))?.sync_all()
     };
-    attempt().map_err(|error| {
+    attempt().inspect_err(|_| {
         // A part left behind would fill the disk further; its removal may fail like the rest.
         let _ = fs::remove_file(&part);
-        anyhow::Error::new(error).context(path.display().to_string())
     })
 }
 
@@ -335,5 +352,33 @@ mod tests {
             .collect();
         assert_eq!(seconds, ["2.0", "4.0", "7.5"], "{text}");
         assert!(text.contains("second,5,"), "{text}");
+    }
+
+    #[test]
+    fn links_stay_and_what_is_no_file_is_written_to_as_it_stands() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().join(name);
+        fs::create_dir(path("elsewhere")).unwrap();
+        fs::write(path("elsewhere/file"), "before").unwrap();
+        for target in ["elsewhere/file", "elsewhere/new"] {
+            let link = path("link");
+            std::os::unix::fs::symlink(target, &link).unwrap();
+            write_whole(&link, b"after").unwrap();
+            assert!(link.is_symlink(), "{target}");
+            assert_eq!(fs::read(path(target)).unwrap(), b"after");
+            fs::remove_file(&link).unwrap();
+        }
+
+        let pipe = path("pipe");
+        let made = std::process::Command::new("mkfifo").arg(&pipe).status();
+        assert!(made.unwrap().success());
+        let reader = {
+            let pipe = pipe.clone();
+            std::thread::spawn(move || fs::read(pipe))
+        };
+        write_whole(&pipe, b"through").unwrap();
+        // Were it a file by now, the reader would still wait.
+        assert!(!pipe.is_file());
+        assert_eq!(reader.join().unwrap().unwrap(), b"through");
     }
 }
