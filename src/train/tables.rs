@@ -7,9 +7,9 @@ mod cells;
 
 use std::fmt::Write as _;
 
-use super::compare::results::{Comparison, Row, SwapEntry};
+use super::compare::results::{Comparison, Details, Row, SwapEntry};
 use super::compare::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS};
-use super::history::History;
+use super::history::{History, Stage};
 use super::metrics::{self, Evaluation};
 use cells::{
     before_temperature, beside, deviation, interval, interval_text, less_reference,
@@ -67,11 +67,17 @@ pub fn provenance(comparison: &Comparison) -> String {
     let mut lines = Vec::new();
     if let (Some(entry), Some(details)) = (comparison.entries.first(), comparison.details.first()) {
         let seeds = comparison.entries.iter().map(|entry| entry.seed).max();
+        let mut revisions: Vec<&str> = Vec::new();
+        for Details { revision, .. } in &comparison.details {
+            if !revisions.contains(&revision.as_str()) {
+                revisions.push(revision);
+            }
+        }
         lines.push(format!(
             "Made by hrn-train compare --profile {} --seeds {}, {}.",
             format!("{:?}", entry.profile).to_lowercase(),
             seeds.unwrap_or_default(),
-            details.revision
+            revisions.join(", ")
         ));
         for source in details.told.iter().flat_map(|told| &told.data) {
             let seed = source
@@ -129,7 +135,7 @@ pub fn headline(rows: &[Row]) -> Table {
             interval(row, MATCHED),
             less_reference(row, rows, MATCHED),
             with_spread(row, MATCHED, |e| e.kappa_quadratic, 3),
-            thousands(mean(&of_entries(row, |entry| entry.steps as f64)) as u64),
+            thousands(mean(&of_entries(row, |entry| entry.steps as f64)).round() as u64),
             thousands(mean(&of_entries(row, |entry| entry.seconds)).round() as u64),
         ]);
     }
@@ -335,17 +341,26 @@ pub fn price(rows: &[Row]) -> Table {
     ];
     let mut table = Table::new("Price", note, &head);
     for row in rows {
-        let stages: Vec<String> = row.runs[0]
-            .1
-            .history
-            .stages
-            .iter()
-            .map(|stage| format!("{} {}", stage.name, thousands(stage.steps())))
+        let histories = row.runs.iter().map(|(_, details)| &details.history);
+        let all: Vec<&Stage> = histories.flat_map(|history| &history.stages).collect();
+        let mut names: Vec<&str> = Vec::new();
+        for stage in &all {
+            if !names.contains(&stage.name.as_str()) {
+                names.push(&stage.name);
+            }
+        }
+        let mean_of = |name: &str| {
+            let own = all.iter().filter(|stage| stage.name == name);
+            mean(&own.map(|stage| stage.steps() as f64).collect::<Vec<_>>())
+        };
+        let stages: Vec<String> = names
+            .into_iter()
+            .map(|name| format!("{name} {}", thousands(mean_of(name).round() as u64)))
             .collect();
         table.rows.push(vec![
             row.title.clone(),
             thousands(row.runs[0].0.labels as u64),
-            thousands(mean(&of_entries(row, |entry| entry.steps as f64)) as u64),
+            thousands(mean(&of_entries(row, |entry| entry.steps as f64)).round() as u64),
             thousands(mean(&of_entries(row, |entry| entry.seconds)).round() as u64),
             stages.join(", "),
         ]);
@@ -436,3 +451,6 @@ pub fn swaps(swaps: &[SwapEntry]) -> Table {
     }
     table
 }
+
+#[cfg(test)]
+mod tests;
