@@ -12,8 +12,9 @@ use std::process::{Command, Output};
 
 use bench::{BINARY, Bench, hardnessd};
 use hardnessd::simulator::{self, DatasetSettings, Split};
-use hardnessd::train::dataset::{Dataset, Sample, meta};
+use hardnessd::train::dataset::{self, Dataset, Sample, meta};
 use hardnessd::train::simulated;
+use hardnessd::verdict::{Card, Hrn};
 use serde_json::Value;
 
 fn collect(out: &Path, arguments: &[&str]) -> Output {
@@ -77,21 +78,8 @@ fn samples_are_the_frames_that_the_daemon_judges() {
     let config = bench.configure("record.toml", "events.sock", "");
     let capture = bench.path("a.mcap");
     let _sensor = bench.sensor(&[]);
-    let recorded = Command::new(BINARY)
-        .args(["record", "--config", text(&config), "--out", text(&capture)])
-        .args([
-            "--label",
-            "level=1",
-            "--label",
-            "object=7",
-            "--label",
-            "material=oak",
-            "--seconds",
-            "12",
-        ])
-        .output()
-        .unwrap();
-    assert!(recorded.status.success(), "{recorded:?}");
+    let labels = ["level=1", "object=7", "material=oak", "shore=95"];
+    record(&config, &capture, &labels);
     let out = bench.path("own.npz");
     let samples = collected(&out, &[text(&capture)]);
     assert!(samples.iter().all(|s| s.level == 1 && s.object == Some(7)));
@@ -100,12 +88,9 @@ fn samples_are_the_frames_that_the_daemon_judges() {
     // What it is made of stands beside it, by its place among the names.
     assert!(samples.iter().all(|s| s.material == Some(0)));
     assert_eq!(meta(&out).unwrap()["materials"], serde_json::json!(["oak"]));
-    assert!(
-        meta(&out).unwrap()["generator"]
-            .as_str()
-            .unwrap()
-            .starts_with("hrn-train collect")
-    );
+    assert!(samples.iter().all(|s| s.shore == Some(95.0)));
+    let collector = concat!("hrn-train collect ", env!("CARGO_PKG_VERSION"));
+    assert_eq!(meta(&out).unwrap()["generator"], collector);
 
     // What is added says the same of what was there; what is given goes before labels.
     let more = [
@@ -126,11 +111,25 @@ fn samples_are_the_frames_that_the_daemon_judges() {
             .all(|s| (s.level, s.object) == (3, Some(7)) && s.split == Split::Test)
     );
     assert_eq!(meta(&out).unwrap()["captures"].as_array().unwrap().len(), 2);
+    assert_eq!(meta(&out).unwrap()["generator"], collector);
     // Without a number an object is a new one.
-    let new = collected(&out, &["--append", "--level", "4", text(&fixture)]);
-    assert_eq!(new.last().unwrap().object, Some(8));
-    // That one is of no known material, and the array is for all or for none.
-    assert!(new.iter().all(|sample| sample.material.is_none()));
+    let bytes = bench.path("bytes.npz");
+    let new = collected(&bytes, &["--append", "--level", "4", text(&fixture)]);
+    assert_eq!(new.last().unwrap().object, Some(10));
+    // That capture is of no known material, and the array is for all or for none.
+    let lost = ["--append", "--level", "4", text(&fixture)];
+    let expected = format!(
+        "{}: material: found none, expected one, as in {}: --label material=... when recording",
+        fixture.display(),
+        out.display()
+    );
+    assert_refused(&out, &lost, &expected);
+    let both_ways = ["--level", "4", text(&fixture), text(&capture)];
+    assert_refused(
+        &bench.path("new.npz"),
+        &both_ways,
+        "foam.5hz.bin: material: found none",
+    );
 
     // After simulated samples a material keeps its place, and a new one is put behind.
     let settings = DatasetSettings {
@@ -146,6 +145,145 @@ fn samples_are_the_frames_that_the_daemon_judges() {
     assert_eq!(both[0].material, Some(0));
     assert_eq!(both.last().unwrap().material, Some(8));
     assert_eq!(meta(&out).unwrap()["materials"][8], "oak");
+    assert_eq!(both.last().unwrap().shore, Some(95.0));
+    assert!(both[0].shore.is_some_and(|shore| shore != 95.0));
+    // Both had a part in it, and a model of it says so.
+    let both = Dataset::read(&out).unwrap();
+    assert_eq!(both.sources[0].is_simulated(), [true, false]);
+    let card = trained(&bench, &[&out]);
+    assert_eq!(card.validation, "simulated and recorded data");
+    assert_eq!(card.pitch_mm, 3.5);
+}
+
+/// Records the sensor of `config` for 12 s.
+fn record(config: &Path, out: &Path, labels: &[&str]) {
+    let recorded = Command::new(BINARY)
+        .args(["record", "--config", text(config), "--out", text(out)])
+        .args(["--seconds", "12"])
+        .args(labels.iter().flat_map(|label| ["--label", label]))
+        .output()
+        .unwrap();
+    assert!(recorded.status.success(), "{recorded:?}");
+}
+
+/// Refused with 1 and one line that has this in it, and nothing is written.
+#[track_caller]
+fn assert_refused(out: &Path, arguments: &[&str], part: &str) {
+    let before = std::fs::read(out).ok();
+    let output = collect(out, arguments);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains(part), "{said}\nshould contain\n{part}");
+    assert_eq!(said.lines().count(), 1, "{said}");
+    assert!(std::fs::read(out).ok() == before);
+}
+
+fn train(bench: &Bench, data: &[&Path]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_hrn-train"))
+        .args(["train", "--method", "features", "--out"])
+        .arg(bench.path("run"))
+        .args(data.iter().flat_map(|data| ["--data", text(data)]))
+        .output()
+        .unwrap()
+}
+
+/// The card of a model of the data.
+fn trained(bench: &Bench, data: &[&Path]) -> Card {
+    let output = train(bench, data);
+    assert!(output.status.success(), "{output:?}");
+    let model = std::fs::read(bench.path("run/hrn.onnx")).unwrap();
+    Hrn::load(&model).unwrap().card().clone()
+}
+
+#[test]
+fn a_model_is_of_the_pitch_of_its_recordings_and_pitches_do_not_mix() {
+    const NARROW: &str = "[sensor.calibration]\npitch_mm = 2.0\n";
+    let bench = Bench::new();
+    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/foam.5hz.bin");
+    let fixture = text(&fixture);
+    let config = bench.configure("narrow.toml", "events.sock", NARROW);
+    let capture = bench.path("narrow.mcap");
+    let sensor = bench.sensor(&[]);
+    record(&config, &capture, &[]);
+    drop(sensor);
+
+    let out = bench.path("narrow.npz");
+    collected(&out, &["--level", "1", text(&capture)]);
+    assert_eq!(meta(&out).unwrap()["pitch_mm"], 2.0);
+    // A .bin is of the configuration's sensor.
+    for level in ["1", "2", "3", "4"] {
+        let arguments = [
+            "--append",
+            "--level",
+            level,
+            "--config",
+            text(&config),
+            fixture,
+        ];
+        collected(&out, &arguments);
+    }
+    assert_eq!(trained(&bench, &[&out]).pitch_mm, 2.0);
+
+    let wide = bench.path("wide.npz");
+    collected(&wide, &["--level", "1", fixture]);
+    assert_eq!(meta(&wide).unwrap()["pitch_mm"], 3.5);
+    assert_refused(
+        &wide,
+        &["--append", "--level", "1", text(&capture)],
+        &format!(
+            "narrow.mcap: taxel pitch: found 2 mm, expected 3.5 mm, that of {}",
+            wide.display()
+        ),
+    );
+    assert_refused(
+        &bench.path("mixed.npz"),
+        &["--level", "1", text(&capture), fixture],
+        "foam.5hz.bin: taxel pitch: found 3.5 mm, expected 2 mm, that of",
+    );
+    let output = train(&bench, &[&out, &wide]);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(
+        said.contains("wide.npz: taxel pitch: found 3.5 mm"),
+        "{said}"
+    );
+}
+
+#[test]
+fn nothing_of_a_data_set_is_lost_when_it_is_added_to() {
+    let bench = Bench::new();
+    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/foam.5hz.bin");
+    let fixture = text(&fixture);
+    let out = bench.path("own.npz");
+    let append = ["--append", "--level", "1", fixture];
+
+    let most = ["--object", "4294967295", "--level", "1", fixture];
+    let samples = collected(&out, &most);
+    assert_refused(
+        &out,
+        &append,
+        "own.npz: array `object`: found 4294967295, expected a lower",
+    );
+    let both = collected(&out, &[&append[..], &["--object", "3"]].concat());
+    assert_eq!(both.last().unwrap().object, Some(3));
+
+    let write = |change: fn(&mut Sample)| {
+        let mut samples = samples.clone();
+        samples.iter_mut().for_each(change);
+        let file = std::fs::File::create(&out).unwrap();
+        dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+    };
+    write(|sample| sample.object = None);
+    let object = [&append[..], &["--object", "3"]].concat();
+    assert_refused(
+        &out,
+        &object,
+        "own.npz: object: found none, expected one, as in",
+    );
+    write(|sample| sample.force_n = None);
+    assert_refused(&out, &object, "own.npz: force: found none");
+    write(|sample| sample.shore = Some(70.0));
+    assert_refused(&out, &object, "foam.5hz.bin: shore: found none");
 }
 
 #[test]

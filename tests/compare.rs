@@ -186,7 +186,7 @@ fn tables_stand_beside_the_papers() {
 
 #[test]
 fn a_finished_comparison_does_nothing_again() {
-    let comparison = Comparison::new("twice", "features", &["--swaps"]);
+    let comparison = Comparison::new("twice", "features,features", &["--swaps"]);
     let first = comparison.run();
     assert!(first.contains("features-1: done"), "{first}");
     assert!(first.contains("features-24-swapped-13: done"), "{first}");
@@ -194,6 +194,8 @@ fn a_finished_comparison_does_nothing_again() {
     // Two seeds and, in this profile, 4 assignments of the materials' roles, with many labels and
     // with few.
     assert_eq!(models.len(), 2 * (2 + 4));
+    // A method that is named twice counts once.
+    assert_eq!(comparison.json("results.json").len(), 2 * 2);
     let swaps = comparison.json("swaps.json");
     assert_eq!(swaps.len(), 2 * 4);
     assert!(swaps.iter().all(|swap| swap["test"]["n"] == 4 * 20 * 10));

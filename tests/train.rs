@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
+use hardnessd::simulator::Split;
 use hardnessd::train::dataset::{self, Dataset};
 use hardnessd::verdict::Hrn;
 use rustix::process::{Pid, Signal};
@@ -354,6 +355,12 @@ fn every_method_leaves_a_model() {
         let settings = String::from_utf8(trial.read("settings.toml")).unwrap();
         // 15 or 50 % of 160.
         let labels = if method == "hrn50" { 80 } else { 24 };
+        if method == "hrn15-long" {
+            // Ours: 400 generated samples twice, in 4 steps each; 24 labelled ones twice, in one.
+            let metrics = String::from_utf8(trial.read("metrics.csv")).unwrap();
+            let last = metrics.lines().last().unwrap();
+            assert!(last.starts_with("hrn,10,10,"), "{last}");
+        }
         assert!(
             settings.contains(&format!("labels = {labels}\n")),
             "{settings}"
@@ -442,6 +449,8 @@ fn the_baseline_is_a_model_like_any_other() {
             .method,
         "features"
     );
+    let mistakes = std::fs::read(Path::new(out).join("samples/mistakes.png")).unwrap();
+    assert!(mistakes.starts_with(b"\x89PNG"));
     let model = model.to_str().unwrap();
     let train = [
         "evaluate", "--model", model, "--data", data, "--split", "train", "--json",
@@ -478,6 +487,21 @@ fn bad_input_has_its_exit_code_and_one_line() {
     samples[0].frame.newtons[0] = 1e38;
     let file = std::fs::File::create(&heavy).unwrap();
     dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+    samples.retain(|sample| sample.split == Split::Train);
+    samples[0].frame.newtons[0] = 0.0;
+    let untested = path("untested.npz");
+    let file = std::fs::File::create(&untested).unwrap();
+    dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+    let empty_split =
+        format!("{untested}: test split: found no labelled sample, expected one or more");
+    let corrupt = path("corrupt");
+    std::fs::create_dir(&corrupt).unwrap();
+    std::fs::write(
+        path("corrupt/settings.toml"),
+        b"method = \"hrn100\"\nprof\xff",
+    )
+    .unwrap();
+    let simulate = |more: &[&str]| hrn_train(&[&["simulate", "--out", &out], more].concat());
     let cases = [
         (train(&["--data", &missing]), 66, "missing"),
         (train(&["--data", &text]), 1, "not an .npz file"),
@@ -490,6 +514,24 @@ fn bad_input_has_its_exit_code_and_one_line() {
             train(&["--data", &data, "--config", &text]),
             78,
             "line 1: unknown field `epoch`",
+        ),
+        (train(&["--data", &data, "--from", &missing]), 66, "missing"),
+        (
+            method("hrn100", &["--data", &data, "--out", &corrupt, "--resume"]),
+            78,
+            "corrupt/settings.toml: line 2",
+        ),
+        (
+            hrn_train(&["evaluate", "--model", &model, "--data", &untested]),
+            1,
+            &empty_split,
+        ),
+        (simulate(&["--objects", "4294967295"]), 2, "0..=10000"),
+        (simulate(&["--presses", "0"]), 2, "1..=10000"),
+        (
+            simulate(&["--objects", "0", "--test-objects", "0"]),
+            2,
+            "found 0 and 0, expected one or more",
         ),
         (
             train(&["--data", &data, "--labels", "3"]),

@@ -16,7 +16,7 @@ use super::dataset::{self, Dataset, DatasetError, Sample};
 use crate::event::{Event, Phase, PressState};
 use crate::frame::{Frame, Stamp};
 use crate::pipeline::{self, Clock, Pipeline};
-use crate::recording::{self, Labels, Playback, PlaybackError, Reader};
+use crate::recording::{self, Entry, Found, Labels, Playback, PlaybackError, Reader};
 use crate::simulator::Split;
 use crate::verdict::{Hrn, sha256_hex};
 
@@ -62,7 +62,10 @@ pub enum CollectError {
         source: PlaybackError,
     },
     /// A label that is missing or no number in its range.
-    #[error("{path}: label {key}: found {found}, expected {expected}: --{key} says it, too")]
+    #[error(
+        "{path}: label {key}: found {found}, expected {expected}{}",
+        said_too(key)
+    )]
     Label {
         /// The capture.
         path: PathBuf,
@@ -73,6 +76,32 @@ pub enum CollectError {
         /// As it should be.
         expected: &'static str,
     },
+    /// Of another sensor than the others.
+    #[error("{path}: taxel pitch: found {found} mm, expected {expected} mm, that of {first}")]
+    Pitch {
+        /// The capture.
+        path: PathBuf,
+        /// Its pitch.
+        found: f64,
+        /// That of the others.
+        expected: f64,
+        /// One of them, or the data set that they are added to.
+        first: PathBuf,
+    },
+    /// An array that the data set would lose: it has a value for every sample, or is not there.
+    #[error(
+        "{path}: {array}: found none, expected one, as in {first}: {}it can be a data set of its \
+         own, and train takes several --data",
+        remedy(array)
+    )]
+    Lost {
+        /// Where there are no values.
+        path: PathBuf,
+        /// Its name.
+        array: &'static str,
+        /// Where there are.
+        first: PathBuf,
+    },
     /// Nothing was pressed, or no press was judged.
     #[error("{path}: found no press with a verdict, expected one or more")]
     NoPress {
@@ -81,12 +110,28 @@ pub enum CollectError {
     },
 }
 
+fn said_too(key: &str) -> String {
+    match key {
+        "level" | "object" => format!(": --{key} says it, too"),
+        _ => String::new(),
+    }
+}
+
+fn remedy(array: &str) -> String {
+    match array {
+        "material" | "shore" => format!("--label {array}=... when recording says it, or "),
+        _ => String::new(),
+    }
+}
+
 /// The samples of one capture.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Capture {
     path: PathBuf,
     sha256: String,
     labels: Labels,
+    /// Of the sensor's taxels.
+    pitch_mm: f64,
     /// Chosen frame and force of each press.
     presses: Vec<(Frame, f32)>,
 }
@@ -105,7 +150,7 @@ impl Capture {
             return Err(CollectError::Unreadable { path, source });
         }
         let mut selection = Selection::default();
-        let labels = if path
+        let (labels, pitch_mm) = if path
             .extension()
             .is_some_and(|extension| extension == "mcap")
         {
@@ -114,7 +159,7 @@ impl Capture {
             let mut pipeline = Pipeline::new(of_bytes.clone(), Clock::FrameRate);
             selection.take(pipeline.push(&bytes, NOT_LOOKED_AT));
             selection.take(pipeline.end_of_recording(None));
-            Labels::new()
+            (Labels::new(), of_bytes.judgement.calibration.pitch_mm)
         };
         if selection.presses.is_empty() {
             return Err(CollectError::NoPress { path });
@@ -123,6 +168,7 @@ impl Capture {
             sha256: sha256_hex(&bytes),
             path,
             labels,
+            pitch_mm,
             presses: selection.presses,
         })
     }
@@ -141,6 +187,20 @@ impl Capture {
             expected,
         };
         label.and_then(|l| l.parse().ok()).ok_or_else(wrong)
+    }
+
+    fn shore(&self) -> Result<Option<f32>, CollectError> {
+        let Some(label) = self.labels.get("shore") else {
+            return Ok(None);
+        };
+        let shore = label.parse().ok().filter(|shore: &f32| shore.is_finite());
+        let wrong = || CollectError::Label {
+            path: self.path.clone(),
+            key: "shore",
+            found: format!("{label:?}"),
+            expected: "a number",
+        };
+        shore.ok_or_else(wrong).map(Some)
     }
 
     fn level(&self, given: Option<u8>) -> Result<u8, CollectError> {
@@ -171,13 +231,18 @@ fn play(
     hrn: &Arc<Hrn>,
     path: &Path,
     selection: &mut Selection,
-) -> Result<Labels, CollectError> {
+) -> Result<(Labels, f64), CollectError> {
     let mut playback = Playback::new(hrn.clone());
+    let mut pitch_mm = None;
     for found in Reader::new(bytes) {
         let found = found.map_err(|source| CollectError::Recording {
             path: path.to_owned(),
             source,
         })?;
+        if let Some(found) = pitch_of(&found) {
+            let expected = *pitch_mm.get_or_insert(found);
+            check_pitch(path, found, expected, path)?;
+        }
         let events = playback.feed(found);
         selection.take(events.map_err(|source| CollectError::Sensor {
             path: path.to_owned(),
@@ -185,7 +250,29 @@ fn play(
         })?);
     }
     selection.take(playback.end());
-    Ok(playback.labels())
+    // Without a sensor there is no press either.
+    Ok((playback.labels(), pitch_mm.unwrap_or(dataset::PITCH_MM)))
+}
+
+/// What an entry says of its sensor's taxels.
+fn pitch_of(found: &Found) -> Option<f64> {
+    match &found.entry {
+        Entry::State(state) => Some(state.sensor.calibration.pitch_mm),
+        Entry::Settings(sensor) => Some(sensor.calibration.pitch_mm),
+        Entry::Input(_) => None,
+    }
+}
+
+fn check_pitch(path: &Path, found: f64, expected: f64, first: &Path) -> Result<(), CollectError> {
+    if found == expected {
+        return Ok(());
+    }
+    Err(CollectError::Pitch {
+        path: path.to_owned(),
+        found,
+        expected,
+        first: first.to_owned(),
+    })
 }
 
 /// The frames of presses under way, by sensor, until one is chosen.
@@ -229,55 +316,87 @@ impl Selection {
 }
 
 /// The bytes of a data set of `captures`, after the samples of `before` if there are any. It has
-/// the array `material` if every capture is labelled with one.
+/// the arrays `material` and `shore` if every capture is labelled with one.
 ///
 /// # Errors
 ///
-/// If a level or an object is neither given nor a label, there are more materials than an array of
-/// u8 can tell apart, or the archive cannot be built.
+/// If a level is neither given nor a label, captures and what was before are of different pitches
+/// or have different arrays, there are more objects or materials than arrays of u32 and u8 can tell
+/// apart, or the archive cannot be built.
 pub fn to_bytes(
     captures: &[Capture],
     labelling: Labelling,
     before: Option<(Dataset, Value)>,
 ) -> anyhow::Result<Vec<u8>> {
+    let mut pitch_mm = captures.first().map(|capture| capture.pitch_mm);
+    // Where the arrays of the first samples come from.
+    let mut first = captures.first().map(|capture| capture.path.clone());
     let (mut samples, mut meta) = match before {
-        Some((dataset, meta)) => (dataset.samples, meta),
+        Some((dataset, meta)) => {
+            (pitch_mm, first) = (Some(dataset.pitch_mm()), Some(dataset.path()));
+            (dataset.samples, meta)
+        }
         None => (
             Vec::new(),
             json!({"materials": [], "seed": null, "captures": []}),
         ),
     };
+    let (pitch_mm, first) = (
+        pitch_mm.unwrap_or(dataset::PITCH_MM),
+        first.unwrap_or_default(),
+    );
     let last = samples.iter().filter_map(|sample| sample.object).max();
-    let new_object = last.map_or(0, |object| object + 1);
+    let new_object = last.map_or(Some(0), |object| object.checked_add(1));
+    let no_new_object = || DatasetError::Array {
+        path: first.clone(),
+        array: "object",
+        found: u32::MAX.to_string(),
+        expected: "a lower number, for the next to be a new object's: --object says one".to_owned(),
+    };
     let mut materials: Vec<String> =
         serde_json::from_value(meta["materials"].take()).unwrap_or_default();
     meta["levels"] = json!(dataset::levels());
-    // Were it still the simulator's name, models trained on this would be said to be of simulated
-    // data only.
-    meta["generator"] = json!(COLLECTED);
+    // Models are said to be of simulated data, recorded or both by all who had a part in it.
+    let others = meta["generator"].as_str().unwrap_or_default();
+    let others = others
+        .split(", ")
+        .filter(|one| !["", COLLECTED].contains(one));
+    let generators: Vec<&str> = others.chain([COLLECTED]).collect();
+    meta["generator"] = json!(generators.join(", "));
+    meta["pitch_mm"] = json!(pitch_mm);
     for capture in captures {
+        check_pitch(&capture.path, capture.pitch_mm, pitch_mm, &first)?;
         let level = capture.level(labelling.level)?;
         let object = match labelling.object {
             Some(object) => object,
             None if capture.labels.contains_key("object") => {
                 capture.number("object", "a number")?
             }
-            None => new_object,
+            None => new_object.ok_or_else(no_new_object)?,
         };
         let material = capture.labels.get("material");
         let material = material
             .map(|name| index_of(name, &mut materials))
             .transpose()?;
-        samples.extend(capture.presses.iter().map(|(frame, force_n)| Sample {
-            frame: *frame,
-            level,
-            object: Some(object),
-            material,
-            force_n: Some(*force_n),
-            split: labelling.split,
-            shore: None,
-            source: 0,
-        }));
+        let shore = capture.shore()?;
+        let own: Vec<Sample> = capture
+            .presses
+            .iter()
+            .map(|(frame, force_n)| Sample {
+                frame: *frame,
+                level,
+                object: Some(object),
+                material,
+                force_n: Some(*force_n),
+                split: labelling.split,
+                shore,
+                source: 0,
+            })
+            .collect();
+        if let (Some(of_first), Some(of_this)) = (samples.first(), own.first()) {
+            check_arrays((of_first, &first), (of_this, &capture.path))?;
+        }
+        samples.extend(own);
         let said = json!({
             "name": capture.path.file_name().unwrap_or_default().to_string_lossy(),
             "sha256": capture.sha256,
@@ -294,6 +413,35 @@ pub fn to_bytes(
     }
     meta["materials"] = json!(materials);
     Ok(dataset::write(Cursor::new(Vec::new()), &samples, &meta)?.into_inner())
+}
+
+/// Refuses samples of which some have a value for an array, and some have none.
+fn check_arrays(
+    (before, first): (&Sample, &Path),
+    (added, path): (&Sample, &Path),
+) -> Result<(), CollectError> {
+    for (array, there, here) in [
+        ("object", before.object.is_some(), added.object.is_some()),
+        (
+            "material",
+            before.material.is_some(),
+            added.material.is_some(),
+        ),
+        ("force", before.force_n.is_some(), added.force_n.is_some()),
+        ("shore", before.shore.is_some(), added.shore.is_some()),
+    ] {
+        let (path, first) = match (there, here) {
+            (true, false) => (path, first),
+            (false, true) => (first, path),
+            _ => continue,
+        };
+        return Err(CollectError::Lost {
+            path: path.to_owned(),
+            array,
+            first: first.to_owned(),
+        });
+    }
+    Ok(())
 }
 
 /// The place of a name in `meta.materials`; a new one is added.

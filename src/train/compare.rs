@@ -140,7 +140,10 @@ struct Recipe {
 fn recipes(methods: &[Method], dataset: &Dataset) -> anyhow::Result<Vec<Recipe>> {
     let few = methods::labels(Method::Hrn15, dataset, None)?;
     let mut recipes = Vec::new();
-    for &method in methods {
+    for (number, &method) in methods.iter().enumerate() {
+        if methods[..number].contains(&method) {
+            continue;
+        }
         let own = Recipe {
             method,
             labels: None,
@@ -265,11 +268,8 @@ impl Round {
         if self.recipe.choice == LabelChoice::Random {
             arguments.extend(["--label-choice", "random"].map(str::to_owned));
         }
-        if let Some(other) = &self.shares_with {
-            let other = self.directory.with_file_name(other);
-            arguments.extend(["--from".to_owned(), path(&other)]);
-        }
         Job {
+            from: (self.shares_with.as_ref()).map(|other| self.directory.with_file_name(other)),
             after: self.shares_with.clone(),
             log: out.join("logs").join(format!("{name}.log")),
             product: self.directory.join("hrn.onnx"),

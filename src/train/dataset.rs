@@ -15,8 +15,8 @@ use crate::random::Stream;
 use crate::simulator::{LabelledSample, Split};
 use crate::verdict::Level;
 
-/// Distance between the sensor's taxels (paper, "Tactile sensor").
-pub const PITCH_MM: f32 = 3.5;
+/// Distance between the sensor's taxels where a file tells none (paper, "Tactile sensor").
+pub const PITCH_MM: f64 = 3.5;
 
 /// The four hardness levels of the paper's Table 1.
 pub fn levels() -> Vec<Level> {
@@ -107,19 +107,22 @@ pub struct Source {
     pub seed: Option<u64>,
     /// SHA-256 of the file.
     pub sha256: String,
-    /// What made it, where the file tells.
+    /// What made it, where the file tells; several are parted by commas.
     pub generator: Option<String>,
+    /// Distance between the sensor's taxels, where the file tells one.
+    pub pitch_mm: Option<f64>,
 }
 
 /// What our simulator calls itself in `meta.generator`.
 pub const SIMULATOR: &str = "hardnessd simulator";
 
 impl Source {
-    /// Whether our simulator made it.
-    pub fn is_simulated(&self) -> bool {
-        self.generator
-            .as_deref()
-            .is_some_and(|generator| generator.starts_with(SIMULATOR))
+    /// Whether our simulator is what made it, for each that did.
+    pub fn is_simulated(&self) -> Vec<bool> {
+        let generators = self.generator.as_deref().unwrap_or_default().split(", ");
+        generators
+            .map(|generator| generator.starts_with(SIMULATOR))
+            .collect()
     }
 }
 
@@ -130,6 +133,8 @@ pub struct Dataset {
     pub samples: Vec<Sample>,
     /// The files.
     pub sources: Vec<Source>,
+    /// Where they were read.
+    pub paths: Vec<PathBuf>,
 }
 
 /// Why a file is no data set.
@@ -164,14 +169,24 @@ pub enum DatasetError {
         expected: String,
     },
     /// Nothing to work on.
-    #[error("{}: the {split} split has no {kind} samples", path.display())]
+    #[error("{paths}: {split} split: found no labelled sample, expected one or more")]
     EmptySplit {
         /// The file, or files.
-        path: PathBuf,
+        paths: String,
         /// `train` or `test`.
         split: &'static str,
-        /// `labelled`, or empty for any.
-        kind: &'static str,
+    },
+    /// Of another sensor than the files before it.
+    #[error("{}: taxel pitch: found {found} mm, expected {expected} mm, that of {}", path.display(), first.display())]
+    Pitch {
+        /// The file.
+        path: PathBuf,
+        /// Its pitch.
+        found: f64,
+        /// That of the others.
+        expected: f64,
+        /// One of them.
+        first: PathBuf,
     },
 }
 
@@ -194,26 +209,68 @@ impl Dataset {
     }
 
     /// Several files as one data set; their objects stay apart.
-    #[must_use]
-    pub fn joined(parts: Vec<Self>) -> Self {
+    ///
+    /// # Errors
+    ///
+    /// If they are of sensors of different pitches, or their objects are more than a u32 counts.
+    pub fn joined(parts: Vec<Self>) -> Result<Self, DatasetError> {
         let mut all = Self {
             samples: Vec::new(),
             sources: Vec::new(),
+            paths: Vec::new(),
         };
-        let mut first_object = 0;
+        let mut first_object = 0_u64;
         for part in parts {
-            let source = all.sources.len();
+            let (source, path) = (all.sources.len(), part.path());
+            let (found, expected) = (part.pitch_mm(), all.pitch_mm());
+            if source > 0 && found != expected {
+                let first = all.path();
+                return Err(DatasetError::Pitch {
+                    path,
+                    found,
+                    expected,
+                    first,
+                });
+            }
             let last = part.samples.iter().filter_map(|sample| sample.object).max();
+            let next = last.map_or(first_object, |last| first_object + u64::from(last) + 1);
+            let too_many = DatasetError::Array {
+                path,
+                array: "object",
+                found: last.unwrap_or_default().to_string(),
+                expected: format!(
+                    "no number that, after {first_object} of other files, is beyond {}",
+                    u32::MAX
+                ),
+            };
+            let Ok(before) = u32::try_from(first_object) else {
+                return Err(too_many);
+            };
+            if next > u64::from(u32::MAX) + 1 {
+                return Err(too_many);
+            }
             all.samples
                 .extend(part.samples.into_iter().map(|sample| Sample {
-                    object: sample.object.map(|object| object + first_object),
+                    object: sample.object.map(|object| object + before),
                     source,
                     ..sample
                 }));
             all.sources.extend(part.sources);
-            first_object += last.map_or(0, |object| object + 1);
+            all.paths.extend(part.paths);
+            first_object = next;
         }
-        all
+        Ok(all)
+    }
+
+    /// Distance between taxels of the sensor that was pressed.
+    pub fn pitch_mm(&self) -> f64 {
+        let told = self.sources.first().and_then(|source| source.pitch_mm);
+        told.unwrap_or(PITCH_MM)
+    }
+
+    /// Where the first file was read.
+    pub fn path(&self) -> PathBuf {
+        self.paths.first().cloned().unwrap_or_default()
     }
 
     /// Indices of a split's labelled samples.
@@ -227,19 +284,14 @@ impl Dataset {
             .filter(|&index| wanted(&self.samples[index]))
             .collect();
         if indices.is_empty() {
-            let names: Vec<&str> = self
-                .sources
-                .iter()
-                .map(|source| source.name.as_str())
-                .collect();
+            let paths = self.paths.iter().map(|path| path.display().to_string());
             return Err(DatasetError::EmptySplit {
-                path: names.join(", ").into(),
+                paths: paths.collect::<Vec<_>>().join(", "),
                 split: if split == Split::Train {
                     "train"
                 } else {
                     "test"
                 },
-                kind: "labelled",
             });
         }
         Ok(indices)

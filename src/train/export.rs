@@ -52,7 +52,7 @@ pub fn finish(
     let mut card = Card {
         format: "1".to_owned(),
         levels: dataset::levels(),
-        pitch_mm: dataset::PITCH_MM,
+        pitch_mm: dataset.pitch_mm() as f32,
         method: description.method.clone(),
         data: data(&description.data)?,
         metrics: json!({ "temperature": recogniser.temperature }),
@@ -165,16 +165,11 @@ fn data(sources: &[Source]) -> serde_json::Result<String> {
 
 /// `hrn.validation`.
 fn validation(sources: &[Source]) -> &'static str {
-    let simulated = sources
-        .iter()
-        .filter(|source| source.is_simulated())
-        .count();
-    if simulated == sources.len() {
-        "simulated data only"
-    } else if simulated == 0 {
-        "recorded data"
-    } else {
-        "simulated and recorded data"
+    let simulated: Vec<bool> = sources.iter().flat_map(Source::is_simulated).collect();
+    match (simulated.contains(&true), simulated.contains(&false)) {
+        (true, true) => "simulated and recorded data",
+        (true, false) => "simulated data only",
+        (false, _) => "recorded data",
     }
 }
 

@@ -17,7 +17,7 @@ use super::metrics::Evaluation;
 use super::optimiser::{self, Rule};
 use super::run::{Description, Run};
 use super::settings::{Keep, Profile, Settings, Training, Validation};
-use super::stages::Stages;
+use super::stages::{self, Stages};
 use crate::frame::Frame;
 use crate::simulator::Split;
 
@@ -47,9 +47,6 @@ pub enum Method {
     /// Logistic regression on hand-made features of a frame.
     Features,
 }
-
-/// The paper's labels: what the shares below are of 10,000.
-const PAPER_LABELS: u32 = 1_500;
 
 impl Method {
     /// Its name in commands, files and tables.
@@ -81,14 +78,6 @@ impl Method {
                     Profile::Quick => 0.999,
                     Profile::Smoke => 0.9,
                 };
-            }
-            // Ours takes `pretraining.epochs` passes over the generated samples first.
-            Self::Hrn15Long => {
-                let levels = super::dataset::levels().len() as u32;
-                let generated =
-                    settings.generation.samples_a_component * COMPONENTS as u32 * levels;
-                let passes = generated.div_ceil(PAPER_LABELS);
-                settings.training.epochs += settings.pretraining.epochs * passes;
             }
             Self::Hrn15Tuned => {
                 settings.training = Training {
@@ -167,6 +156,56 @@ pub fn labels(
     }
 }
 
+/// The labelled samples that a run learns from and validates on.
+fn chosen(dataset: &Dataset, description: &Description) -> Result<Vec<usize>, DatasetError> {
+    let all = dataset.labelled(Split::Train)?;
+    let Description {
+        labels,
+        label_choice,
+        seed,
+        ..
+    } = *description;
+    Ok(if labels == all.len() {
+        all
+    } else {
+        dataset.choose_labelled(&all, labels, label_choice, seed)
+    })
+}
+
+/// Gives `hrn15-long` as many epochs as make the steps that ours would take on the same labels
+/// under the same settings; other methods keep theirs.
+///
+/// # Errors
+///
+/// If the data has no labelled training samples.
+pub fn lengthen(
+    method: Method,
+    dataset: &Dataset,
+    description: &mut Description,
+) -> Result<(), DatasetError> {
+    if method == Method::Hrn15Long {
+        let labelled = chosen(dataset, description)?;
+        let Description { settings, seed, .. } = description;
+        let (train, _) = dataset.hold_out(&labelled, settings.validation.share, *seed);
+        settings.training.epochs = epochs_as_long_as_ours(settings, train.len());
+    }
+    Ok(())
+}
+
+/// Epochs over `samples` whose steps are, to the nearest epoch, those of ours in pretraining and
+/// fine-tuning.
+fn epochs_as_long_as_ours(settings: &Settings, samples: usize) -> u32 {
+    let steps = |samples: u64, training: &Training| samples.div_ceil(training.batch as u64).max(1);
+    let levels = super::dataset::levels().len() as u64;
+    let generated = u64::from(settings.generation.samples_a_component) * COMPONENTS as u64 * levels;
+    let pretraining =
+        steps(generated, &settings.pretraining).saturating_mul(settings.pretraining.epochs.into());
+    let an_epoch = steps(samples as u64, &settings.training);
+    let more = pretraining.saturating_add(an_epoch / 2) / an_epoch;
+    let epochs = u64::from(settings.training.epochs).saturating_add(more);
+    u32::try_from(epochs).unwrap_or(u32::MAX)
+}
+
 /// Runs a method to its model and evaluation in the run's directory; takes up whatever is there.
 /// Gives the evaluation on the test split, if the data has one.
 ///
@@ -181,18 +220,7 @@ pub fn train(
     run: &Run,
     device: &Device,
 ) -> anyhow::Result<Option<Evaluation>> {
-    let all = dataset.labelled(Split::Train)?;
-    let labelled = if description.labels == all.len() {
-        all
-    } else {
-        let Description {
-            labels,
-            label_choice,
-            seed,
-            ..
-        } = *description;
-        dataset.choose_labelled(&all, labels, label_choice, seed)
-    };
+    let labelled = chosen(dataset, description)?;
     if method == Method::Features {
         return baseline(dataset, &labelled, description, run);
     }
@@ -263,6 +291,8 @@ fn baseline(
         seconds: begun.elapsed().as_secs_f64(),
         adversarial: None,
     })?;
+    let said: Vec<Vec<f32>> = rows.iter().map(|row| baseline.probabilities(row)).collect();
+    stages::draw_mistakes(run, dataset, ("training", labelled), &said)?;
     let (graph, raw_logits) = baseline.graph();
     let recogniser = Recogniser {
         graph,
@@ -307,13 +337,22 @@ mod tests {
         for (method, labels) in budget {
             assert_eq!(method.labels(10_000), labels, "{}", method.name());
         }
-        // Ours: 45,000 generated samples 200 times, then 1,500 labelled ones 200 times.
-        let long = Method::Hrn15Long.settings(Profile::Paper).training;
-        let ours = Method::Ours.settings(Profile::Paper);
-        let steps = u64::from(long.epochs) * 15;
-        let expected =
-            u64::from(ours.pretraining.epochs) * 450 + u64::from(ours.training.epochs) * 15;
-        assert_eq!((steps, expected), (93_000, 93_000));
+    }
+
+    #[test]
+    fn hrn15_long_takes_the_steps_of_ours() {
+        // Ours: 45,000 generated samples 200 times, 90,000 steps; then the labelled ones 200 times.
+        for (profile, samples, epochs) in [
+            (Profile::Paper, 1_500, 6_200),
+            (Profile::Quick, 1_500, 620),
+            (Profile::Paper, 600, 15_200),
+            (Profile::Paper, 660, 13_057),
+            (Profile::Smoke, 24, 10),
+        ] {
+            let settings = Method::Hrn15Long.settings(profile);
+            let found = epochs_as_long_as_ours(&settings, samples);
+            assert_eq!(found, epochs, "{profile:?}, {samples} labels");
+        }
     }
 
     #[test]

@@ -16,10 +16,11 @@ use crate::simulator::{self, DatasetSettings, LabelledSample, Material};
 /// Simulates on all cores, with a bar on a terminal.
 pub fn simulate(settings: &DatasetSettings) -> Vec<LabelledSample> {
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
-    let total = 4 * (settings.objects + settings.test_objects) * settings.presses;
+    let objects = u64::from(settings.objects) + u64::from(settings.test_objects);
+    let total = (4 * objects).saturating_mul(settings.presses.into());
     let style = ProgressStyle::with_template("{bar:30} {pos}/{len} samples, {per_sec}, {eta} left")
         .expect("the template is right");
-    let bar = ProgressBar::new(total.into()).with_style(style);
+    let bar = ProgressBar::new(total).with_style(style);
     let samples = simulator::dataset(settings, threads, |done| bar.set_position(done as u64));
     bar.finish_and_clear();
     samples

@@ -136,6 +136,7 @@ impl Stages<'_> {
         Ok(Dataset {
             samples,
             sources: Vec::new(),
+            paths: Vec::new(),
         })
     }
 
@@ -288,8 +289,7 @@ impl Stages<'_> {
         )
     }
 
-    /// Draws labelled samples that are judged wrongly: of held-out objects where there are some,
-    /// else of those learnt from.
+    /// Draws mistakes on held-out objects where there are some, else on those learnt from.
     fn draw_mistakes(&self, trained: &Trained) -> anyhow::Result<()> {
         let (kind, indices) = if self.validation.is_empty() {
             ("training", self.train)
@@ -301,26 +301,40 @@ impl Stages<'_> {
             .map(|&index| &self.dataset.samples[index].frame);
         let logits = trained.logits(frames, self.settings().full_scale_n, self.device);
         let probabilities = fit::probabilities(&logits, trained.temperature, self.device);
-        let mut rows: Vec<Strip> = (1..=levels())
-            .map(|level| Strip {
-                name: format!("level {level}"),
-                tiles: Vec::new(),
-            })
-            .collect();
-        let mut wrong = 0;
-        for (&index, row) in indices.iter().zip(&probabilities) {
-            let sample = &self.dataset.samples[index];
-            let said = fit::largest(row);
-            if said + 1 != usize::from(sample.level) {
-                wrong += 1;
-                let caption = format!("as {}, {:.0} %", said + 1, row[said] * 100.0);
-                rows[usize::from(sample.level) - 1]
-                    .tiles
-                    .push((&sample.frame, caption));
-            }
-        }
-        let title = format!("{wrong} of {} {kind} samples judged wrongly", indices.len());
-        self.run
-            .write("samples/mistakes.png", &sheet::strips(&title, &rows)?)
+        draw_mistakes(self.run, self.dataset, (kind, indices), &probabilities)
     }
+}
+
+/// Draws those of labelled samples of a kind that are judged wrongly, from each one's
+/// probabilities.
+///
+/// # Errors
+///
+/// If the run's directory cannot be written.
+pub(super) fn draw_mistakes(
+    run: &Run,
+    dataset: &Dataset,
+    (kind, indices): (&str, &[usize]),
+    probabilities: &[Vec<f32>],
+) -> anyhow::Result<()> {
+    let mut rows: Vec<Strip> = (1..=levels())
+        .map(|level| Strip {
+            name: format!("level {level}"),
+            tiles: Vec::new(),
+        })
+        .collect();
+    let mut wrong = 0;
+    for (&index, row) in indices.iter().zip(probabilities) {
+        let sample = &dataset.samples[index];
+        let said = fit::largest(row);
+        if said + 1 != usize::from(sample.level) {
+            wrong += 1;
+            let caption = format!("as {}, {:.0} %", said + 1, row[said] * 100.0);
+            rows[usize::from(sample.level) - 1]
+                .tiles
+                .push((&sample.frame, caption));
+        }
+    }
+    let title = format!("{wrong} of {} {kind} samples judged wrongly", indices.len());
+    run.write("samples/mistakes.png", &sheet::strips(&title, &rows)?)
 }

@@ -51,6 +51,10 @@ pub(super) enum Command {
     },
 }
 
+/// Objects of a material and presses of an object: more than fit in any memory, and few enough to
+/// be counted.
+const MOST: i64 = 10_000;
+
 #[derive(Debug, clap::Args)]
 pub(super) struct Simulate {
     /// The data set to write; one that is there is replaced
@@ -60,13 +64,16 @@ pub(super) struct Simulate {
     #[arg(long, default_value_t = DatasetSettings::default().seed)]
     pub(super) seed: u64,
     /// Objects of each training material
-    #[arg(long, default_value_t = DatasetSettings::default().objects)]
+    #[arg(long, default_value_t = DatasetSettings::default().objects,
+          value_parser = clap::value_parser!(u32).range(0..=MOST))]
     pub(super) objects: u32,
     /// Objects of each test material
-    #[arg(long, default_value_t = DatasetSettings::default().test_objects)]
+    #[arg(long, default_value_t = DatasetSettings::default().test_objects,
+          value_parser = clap::value_parser!(u32).range(0..=MOST))]
     pub(super) test_objects: u32,
     /// Presses of each object
-    #[arg(long, default_value_t = DatasetSettings::default().presses)]
+    #[arg(long, default_value_t = DatasetSettings::default().presses,
+          value_parser = clap::value_parser!(u32).range(1..=MOST))]
     pub(super) presses: u32,
     /// The least nominal force, in newtons; the greatest is 25
     #[arg(long, value_name = "N", default_value_t = DatasetSettings::default().lowest_force_n,
@@ -103,8 +110,8 @@ pub(super) struct Collect {
     /// Configuration whose first sensor a .bin is of [default: a JX255N by default settings]
     #[arg(long, value_name = "F")]
     pub(super) config: Option<PathBuf>,
-    /// Recordings: .mcap, or .bin, raw bytes back to back. If all have a label "material", the data
-    /// set has that array
+    /// Recordings: .mcap, or .bin, raw bytes back to back. If all have a label "material" or "shore",
+    /// the data set has that array; all or none must have it
     #[arg(value_name = "CAPTURE", required = true)]
     pub(super) captures: Vec<PathBuf>,
 }

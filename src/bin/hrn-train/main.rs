@@ -85,7 +85,7 @@ struct Unreadable {
 /// 2 wrong usage, 66 unreadable input, 69 no such device, 78 bad configuration or model, 74 other I/O, else 1.
 fn exit_code(error: &anyhow::Error) -> u8 {
     let has = |test: fn(&(dyn std::error::Error + 'static)) -> bool| error.chain().any(test);
-    if has(|e| matches!(e.downcast_ref(), Some(LabelsError::Range { .. }))) {
+    if has(|e| e.is::<NoObjects>() || matches!(e.downcast_ref(), Some(LabelsError::Range { .. }))) {
         2
     } else if has(|e| {
         e.is::<Unreadable>()
@@ -114,9 +114,9 @@ fn read(path: &Path) -> Result<Vec<u8>, Unreadable> {
 
 /// Writes what was asked for. What stood there is replaced, at one stroke, and that is said.
 fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
-    let is_new = !path.exists();
+    let is_replaced = path.is_file();
     write_whole(path, bytes)?;
-    if !is_new {
+    if is_replaced {
         eprintln!("{}: replaced what stood there", path.display());
     }
     Ok(())
@@ -125,6 +125,11 @@ fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
 fn load(path: &Path) -> anyhow::Result<Hrn> {
     Hrn::load(&read(path)?).with_context(|| path.display().to_string())
 }
+
+/// Nothing was asked for.
+#[derive(Debug, thiserror::Error)]
+#[error("--objects and --test-objects: found 0 and 0, expected one or more of either")]
+struct NoObjects;
 
 fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
     let settings = DatasetSettings {
@@ -137,6 +142,9 @@ fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
         profile: arguments.sensor_profile,
         ..DatasetSettings::default()
     };
+    if settings.objects == 0 && settings.test_objects == 0 {
+        return Err(NoObjects.into());
+    }
     let begun = Instant::now();
     let samples = simulated::simulate(&settings);
     let seconds = begun.elapsed().as_secs_f64();
@@ -233,8 +241,15 @@ fn train(arguments: &Train) -> anyhow::Result<String> {
         .iter()
         .map(|path| Dataset::read(path))
         .collect();
-    let dataset = Dataset::joined(parts?);
-    let description = Description {
+    let dataset = Dataset::joined(parts?)?;
+    for other in &arguments.from {
+        let unreadable = |source| Unreadable {
+            path: other.clone(),
+            source,
+        };
+        std::fs::read_dir(other).map_err(unreadable)?;
+    }
+    let mut description = Description {
         method: arguments.method.name().to_owned(),
         profile: arguments.profile,
         seed: arguments.seed,
@@ -243,6 +258,7 @@ fn train(arguments: &Train) -> anyhow::Result<String> {
         settings,
         data: dataset.sources.clone(),
     };
+    methods::lengthen(arguments.method, &dataset, &mut description)?;
     let device = device(arguments.device)?;
     let run = Run::open(&arguments.out, &description, arguments.resume)?
         .taking_from(arguments.from.clone());

@@ -5,6 +5,7 @@
 //! whatever reason, the system ends the others; what they have not finished goes on from its last
 //! checkpoint when it is run again.
 
+use std::ffi::OsStr;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus};
@@ -23,6 +24,8 @@ pub(super) struct Job {
     pub(super) name: String,
     /// The subcommand and its arguments.
     pub(super) arguments: Vec<String>,
+    /// The directory of a run that it takes finished stages from, if that is there by then.
+    pub(super) from: Option<PathBuf>,
     /// Where standard output and standard error go.
     pub(super) log: PathBuf,
     /// The file that stands when it is done.
@@ -31,6 +34,17 @@ pub(super) struct Job {
     pub(super) after: Option<String>,
     /// What it costs beside others, in any unit.
     pub(super) effort: f64,
+}
+
+impl Job {
+    /// The arguments that name the other run, once that has a directory: its method may not be
+    /// among those compared.
+    fn taking(&self) -> Vec<&OsStr> {
+        match &self.from {
+            Some(run) if run.is_dir() => vec![OsStr::new("--from"), run.as_os_str()],
+            _ => Vec::new(),
+        }
+    }
 }
 
 /// A run that ended without its product.
@@ -123,6 +137,7 @@ fn start(job: Job, board: &Board) -> anyhow::Result<Running> {
     let program = std::env::current_exe().context("this program's own path")?;
     let process = Command::new(program)
         .args(&job.arguments)
+        .args(job.taking())
         .args(["--parent", &std::process::id().to_string()])
         .env("RAYON_NUM_THREADS", "1")
         .stdin(std::process::Stdio::null())
@@ -240,5 +255,29 @@ impl Board {
             eprintln!("{done} of {} runs{left}", all.unwrap_or_default());
         }
         self.total.set_message(left);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stages_are_taken_only_from_a_run_that_is_there() {
+        let directory = tempfile::tempdir().unwrap();
+        let job = |from: &str| Job {
+            name: String::new(),
+            arguments: Vec::new(),
+            from: Some(directory.path().join(from)),
+            log: PathBuf::new(),
+            product: PathBuf::new(),
+            after: None,
+            effort: 1.0,
+        };
+        assert_eq!(job("missing").taking(), Vec::<&OsStr>::new());
+        assert_eq!(
+            job("").taking(),
+            [OsStr::new("--from"), directory.path().join("").as_os_str()]
+        );
     }
 }

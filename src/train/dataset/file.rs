@@ -80,15 +80,26 @@ pub(super) fn parse(bytes: &[u8], path: &Path, name: String) -> Result<Dataset, 
             source: 0,
         }
     };
+    let pitch = &meta["pitch_mm"];
+    let pitch_mm = pitch.as_f64().filter(|&mm| mm > 0.0);
+    if !pitch.is_null() && pitch_mm.is_none() {
+        let (found, expected) = (
+            format!("pitch_mm {pitch}"),
+            "millimetres above 0".to_owned(),
+        );
+        return Err(file.error("meta", found, expected));
+    }
     let source = Source {
         name,
         seed: meta["seed"].as_u64(),
         sha256: sha256_hex(bytes),
         generator: meta["generator"].as_str().map(str::to_owned),
+        pitch_mm,
     };
     Ok(Dataset {
         samples: (0..n).map(sample).collect(),
         sources: vec![source],
+        paths: vec![path.to_owned()],
     })
 }
 

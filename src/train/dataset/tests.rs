@@ -69,7 +69,10 @@ fn optional_arrays_may_be_missing() {
     );
     assert_eq!(read.labelled(Split::Train).unwrap(), [1, 2]);
     let error = read.labelled(Split::Test).unwrap_err().to_string();
-    assert_eq!(error, "D.npz: the test split has no labelled samples");
+    assert_eq!(
+        error,
+        "D.npz: test split: found no labelled sample, expected one or more"
+    );
 }
 
 #[test]
@@ -170,6 +173,15 @@ fn what_is_not_as_agreed_is_named_with_what_was_found_and_expected() {
         },
         "array `meta`: found EOF",
     );
+    check(
+        |npz| {
+            npz.add_array("frames", &frames(1)).unwrap();
+            npz.add_array("level", &Array1::from(vec![1_u8])).unwrap();
+            let meta = br#"{"pitch_mm":-1}"#.to_vec();
+            npz.add_array("meta", &Array1::from(meta)).unwrap();
+        },
+        "array `meta`: found pitch_mm -1, expected millimetres above 0",
+    );
     let error = parse(b"PK no zip").unwrap_err().to_string();
     assert!(error.starts_with("D.npz: not an .npz file"), "{error}");
 }
@@ -230,8 +242,47 @@ fn labels_are_chosen_by_object_and_equally_from_each_level() {
 #[test]
 fn joined_files_keep_their_objects_apart() {
     let part = parse(&bytes_of(&samples())).unwrap();
-    let all = Dataset::joined(vec![part.clone(), part]);
+    let all = Dataset::joined(vec![part.clone(), part]).unwrap();
     assert_eq!(all.sources.len(), 2);
     let indices: Vec<usize> = (0..400).collect();
     assert_eq!(objects_of(&all, &indices), (0..80).collect::<Vec<u32>>());
+}
+
+#[test]
+fn files_are_joined_while_their_objects_can_be_counted_and_their_pitch_is_one() {
+    let part = |last: u32, pitch_mm: Option<f64>, path: &str| {
+        let samples = [0, last].map(|object| Sample {
+            object: Some(object),
+            ..sample(1, 0, Split::Train)
+        });
+        let mut meta = serde_json::json!({});
+        if let Some(pitch_mm) = pitch_mm {
+            meta["pitch_mm"] = pitch_mm.into();
+        }
+        let bytes = write(Cursor::new(Vec::new()), &samples, &meta).unwrap();
+        file::parse(bytes.get_ref(), Path::new(path), path.to_owned()).unwrap()
+    };
+    let joined = |parts: [Dataset; 2]| Dataset::joined(parts.to_vec());
+    let most = joined([part(2, None, "a"), part(u32::MAX - 3, None, "b")]).unwrap();
+    assert_eq!(most.samples[3].object, Some(u32::MAX));
+    assert_eq!(most.pitch_mm(), 3.5);
+    for (parts, expected) in [
+        (
+            [part(2, None, "a"), part(u32::MAX - 2, None, "d/b")],
+            "d/b: array `object`: found 4294967293, expected no number that, after 3",
+        ),
+        (
+            [part(u32::MAX, None, "a"), part(0, None, "d/b")],
+            "d/b: array `object`: found 0, expected no number that, after 4294967296",
+        ),
+        (
+            [part(1, None, "a"), part(1, Some(2.0), "d/b")],
+            "d/b: taxel pitch: found 2 mm, expected 3.5 mm, that of a",
+        ),
+    ] {
+        let error = joined(parts).unwrap_err().to_string();
+        assert!(error.contains(expected), "{error}");
+    }
+    let narrow = [part(1, Some(2.0), "a"), part(1, Some(2.0), "b")];
+    assert_eq!(joined(narrow).unwrap().pitch_mm(), 2.0);
 }
