@@ -56,7 +56,7 @@ pub enum LayoutError {
         max: u16,
     },
     /// A key that this preset fixes.
-    #[error("{key}: found a value, expected none: preset {preset:?} fixes it")]
+    #[error("{key}: found a value, expected none: preset {preset} fixes it")]
     Fixed {
         /// The key.
         key: &'static str,

@@ -265,6 +265,55 @@ fn a_pause_makes_the_last_jq_frame_whole() {
 }
 
 #[test]
+fn long_noise_counts_alike_in_any_chunks() {
+    let digits = [b"7 ".repeat(9000), b"\n\n".to_vec()].concat();
+    let pairs = [[0x00, 0xFE].repeat(2500), vec![0xFF]].concat();
+    for (preset, noise) in [(Preset::Ascii, digits), (Preset::ZeroRun, pairs)] {
+        let layout = layout(preset);
+        let sent = frames(10, 3);
+        // Before any frame nothing tells noise from a frame whose beginning was missed; after one it
+        // is damage.
+        let first = encode(&layout, &sent[..1]);
+        let others = encode(&layout, &sent[1..]);
+        let bytes = [&noise, first.as_slice(), &noise, &others].concat();
+        let expected = decode(&layout, [bytes.as_slice()]);
+        assert_eq!(expected, (sent, 1), "{preset:?}");
+        for size in [1, 100, 3000, 10_000] {
+            let found = decode(&layout, bytes.chunks(size));
+            assert_eq!(found, expected, "{preset:?} by {size}");
+        }
+        let mut decoder = Decoder::new(layout.clone());
+        decoder.push(&noise[..noise.len() - 2]);
+        assert_eq!(decoder.next_frame(), None);
+        assert_eq!(decoder.pending(), layout.max_frame_bytes(), "{preset:?}");
+    }
+}
+
+#[test]
+fn what_stands_right_before_an_ascii_frame_costs_it_nothing() {
+    let layout = layout(Preset::Ascii);
+    let sent = frames(11, 2);
+    let [first, second] = [0, 1].map(|index| encode(&layout, &sent[index..=index]));
+    let after_space = |at: usize| at + first[at..].iter().position(|&b| b == b' ').unwrap() + 1;
+    for noise in [
+        b"abc".as_slice(),
+        b"\xFE\xFD",
+        b"noise, 3 x",
+        &first[..after_space(300)],
+        &first[..after_space(1500)],
+    ] {
+        for before in [&[][..], &first] {
+            let bytes = [before, noise, &second].concat();
+            for size in [1, 7, bytes.len()] {
+                let (found, _) = decode(&layout, bytes.chunks(size));
+                assert_eq!(found.last(), Some(&sent[1]), "{noise:?} by {size}");
+                assert_eq!(found.len(), 1 + before.len().min(1), "{noise:?} by {size}");
+            }
+        }
+    }
+}
+
+#[test]
 fn ascii_reads_any_separator_and_line_end() {
     let layout = Layout::new(&Settings {
         preset: Preset::Ascii,

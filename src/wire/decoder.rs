@@ -59,6 +59,8 @@ pub(super) enum Scan {
     Damaged(usize, Damage),
     /// The first so many bytes are a frame.
     Frame(usize, RawFrame),
+    /// The first so many bytes are more than a pending frame has; where one ends is not known yet.
+    Excess(usize),
 }
 
 /// What a scan may know beside the bytes.
@@ -75,7 +77,8 @@ pub(super) struct Context {
 }
 
 /// Finds frames in a stream of bytes. It holds on to at most the bytes of one pending frame
-/// (two where a layout without checksum, length or tail is not yet sure of its phase).
+/// (two where a layout that begins with a sync, without checksum or length, is not yet sure of its
+/// phase).
 #[derive(Debug)]
 pub struct Decoder {
     layout: Layout,
@@ -197,6 +200,10 @@ impl Decoder {
             match scan {
                 Scan::Wait => return None,
                 Scan::Skip(count) => self.pass_over(count),
+                Scan::Excess(count) => {
+                    self.start += count;
+                    self.skipped += count as u64;
+                }
                 Scan::Damaged(count, damage) => {
                     self.pass_over(count);
                     return Some(Err(damage));

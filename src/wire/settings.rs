@@ -1,5 +1,7 @@
 //! What a `[sensor.frame]` table may say.
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 
 use super::Checksum;
@@ -25,6 +27,13 @@ pub enum Preset {
     Ascii,
     /// 1..254 a value, `00 n` a run of zeros, `FF` ends.
     ZeroRun,
+}
+
+impl fmt::Display for Preset {
+    /// Its name in a configuration.
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        self.serialize(f)
+    }
 }
 
 /// The `[sensor.frame]` table: a preset, and what overrides it.

@@ -41,22 +41,52 @@ pub(super) fn scan(layout: &Layout, bytes: &[u8], context: Context) -> Scan {
         if count == 0 {
             return Scan::Skip(lines.at);
         }
-        let first = if count >= rows {
+        let row = if count >= rows {
             starts[count % rows]
         } else {
             0
         };
-        return match parse(layout, &bytes[first..start], rows, cols) {
+        let first = row + row_start(&bytes[row..start], cols);
+        // What is longer would be found or not, by how much of it came at once.
+        let is_short = lines.at - first <= layout.max_frame_bytes();
+        let frame = parse(layout, &bytes[first..start], rows, cols);
+        return match frame.filter(|_| is_short) {
             Some(_) if first > 0 => Scan::Skip(first),
             Some(frame) => Scan::Frame(lines.at, frame),
             None if context.locked => Scan::Damaged(lines.at, Damage::Cells),
             None => Scan::Skip(lines.at),
         };
     }
-    match bytes.len().checked_sub(2 * layout.max_frame_bytes()) {
-        Some(excess) if excess > 0 => Scan::Skip(excess),
+    match bytes.len().checked_sub(layout.max_frame_bytes()) {
+        Some(excess) if excess > 0 => Scan::Excess(excess),
         _ => Scan::Wait,
     }
+}
+
+fn is_separator(byte: u8) -> bool {
+    matches!(byte, b' ' | b'\t' | b',' | b'\r')
+}
+
+/// Where the row begins that ends the first line of `text`: what is left of a damaged frame, or
+/// noise, may stand right before it.
+fn row_start(text: &[u8], cols: usize) -> usize {
+    let end = text.iter().position(|&byte| byte == b'\n');
+    let line = &text[..end.unwrap_or(text.len())];
+    let mut start = line.len();
+    for _ in 0..cols {
+        let Some(last) = line[..start].iter().rposition(|&byte| !is_separator(byte)) else {
+            return 0;
+        };
+        let before = line[..last].iter().rposition(|&byte| is_separator(byte));
+        start = before.map_or(0, |before| before + 1);
+    }
+    if line[..start].iter().all(|&byte| is_separator(byte)) && line[start].is_ascii_digit() {
+        return 0;
+    }
+    let token = line[start..].iter().position(|&byte| is_separator(byte));
+    let token = &line[start..token.map_or(line.len(), |length| start + length)];
+    let strange = token.iter().rposition(|byte| !byte.is_ascii_digit());
+    start + strange.map_or(0, |strange| strange + 1)
 }
 
 fn parse(layout: &Layout, text: &[u8], rows: usize, cols: usize) -> Option<RawFrame> {
@@ -64,7 +94,7 @@ fn parse(layout: &Layout, text: &[u8], rows: usize, cols: usize) -> Option<RawFr
     let mut index = 0;
     for line in (Lines { bytes: text, at: 0 }) {
         let row_end = index + cols;
-        for token in line.split(|byte| matches!(byte, b' ' | b'\t' | b',' | b'\r')) {
+        for token in line.split(|&byte| is_separator(byte)) {
             if token.is_empty() {
                 continue;
             }

@@ -39,7 +39,7 @@ pub(super) fn scan(layout: &Layout, bytes: &[u8], context: Context) -> Scan {
     let longest = layout.max_frame_bytes();
     let Some(end) = bytes.iter().position(|&byte| byte == END) else {
         return match bytes.len().checked_sub(longest) {
-            Some(excess) if excess > 0 => Scan::Skip(excess),
+            Some(excess) if excess > 0 => Scan::Excess(excess),
             _ => Scan::Wait,
         };
     };
