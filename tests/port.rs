@@ -7,6 +7,7 @@
 mod bench;
 
 use std::fs;
+use std::io::Read as _;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::Command;
@@ -222,6 +223,22 @@ fn a_simulated_sensor_ends_at_a_signal_and_takes_its_link_along() {
         assert_eq!(fs::metadata(&long).unwrap().len() % 790, 0);
         fs::remove_file(&long).unwrap();
     }
+}
+
+#[test]
+fn a_reader_gets_the_last_frame_of_a_simulated_sensor_whole() {
+    let bench = Bench::new();
+    let mut sensor = bench.sensor(&["--presses", "1"]);
+    let mut port = fs::File::open(bench.path("port")).unwrap();
+    let mut bytes = Vec::new();
+    let mut chunk = [0; 4096];
+    // The end of a pty is an error.
+    while let Ok(read) = port.read(&mut chunk) {
+        bytes.extend_from_slice(&chunk[..read]);
+    }
+    assert_eq!(sensor.exit_code(), Some(0));
+    let last = bytes.len().checked_sub(790).expect("many frames");
+    assert_eq!(bytes[last..last + 4], [0xBB, 0xAA, 0x10, 0x03]);
 }
 
 #[test]

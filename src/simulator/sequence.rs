@@ -68,8 +68,8 @@ pub struct SequenceFrame {
 
 /// An iterator over the frames of a sequence; see [`SequenceSettings`].
 ///
-/// It begins with at least 2 s without load, so that tare has its frames at any rate, and rests
-/// 1 s after each press. A press too light to begin one (contract: 3 taxels) is made anew with
+/// It begins with at least 2 s and ten frames without load, so that tare has its frames at any rate,
+/// and rests at least 1 s and five frames after each press, which is held for at least three. A press too light to begin one (contract: 3 taxels) is made anew with
 /// more force, so that `presses` is the number that a press tracker sees.
 pub struct Sequence {
     settings: SequenceSettings,
@@ -86,10 +86,12 @@ pub struct Sequence {
     free_s: f64,
 }
 
-/// Rest before the first press, s.
-const FIRST_REST_S: f64 = 2.0;
-/// Rest after a press, s.
-const REST_S: f64 = 1.0;
+/// Rest before the first press, s and frames.
+const FIRST_REST: (f64, f64) = (2.0, 10.0);
+/// Rest after a press, s and frames.
+const REST: (f64, f64) = (1.0, 5.0);
+/// A press is held for so many frames at least.
+const HOLD_FRAMES: f64 = 3.0;
 /// Presses do not keep step with the frames: each is up to this much late, s.
 const DELAY_S: f64 = 0.25;
 
@@ -121,7 +123,7 @@ impl Sequence {
             ready: VecDeque::new(),
             made: 0,
             frames: 0,
-            free_s: FIRST_REST_S,
+            free_s: FIRST_REST.0.max(FIRST_REST.1 / rate),
         };
         sequence.rest(None);
         sequence
@@ -156,7 +158,8 @@ impl Sequence {
         let face = object.face(draws.below(POSTURES));
         let patch = draw_patch(material, face.roughness, &mut draws.child(1));
         let pose = Pose::draw(&face, &mut draws.child(2));
-        let hold_s = draws.range(0.8, 1.5);
+        let rate = self.settings.frame_rate_hz;
+        let hold_s = draws.range(0.8, 1.5).max(HOLD_FRAMES / rate);
         let properties = material.properties();
         let young_mpa = properties.young_mpa(draw_shore(material, &mut draws.child(3)));
         let specimen = Specimen::new(properties, young_mpa, &face, &pose, &patch);
@@ -176,7 +179,7 @@ impl Sequence {
                     }));
                 self.film = film;
                 self.frames = next;
-                self.free_s = touch_s + course.duration_s() + REST_S;
+                self.free_s = touch_s + course.duration_s() + REST.0.max(REST.1 / rate);
                 return self.rest(Some(material));
             }
             force_n *= HARDER;
@@ -280,7 +283,7 @@ mod tests {
         );
         let first = frames.iter().position(|frame| frame.loaded).unwrap();
         assert!(
-            first as f64 >= 2.0 * rate,
+            first as f64 >= 10.0_f64.max(2.0 * rate),
             "{first} frames of rest at {rate} Hz"
         );
         for frame in &frames {
@@ -300,7 +303,7 @@ mod tests {
                 .filter(|frame| frame.press == press && !frame.loaded)
                 .count();
             assert!(
-                rest as f64 > 0.9 * rate,
+                rest as f64 >= 5.0_f64.max(0.9 * rate),
                 "press {press} rests {rest} frames"
             );
         }
@@ -312,6 +315,8 @@ mod tests {
             (1, 5.0, SensorProfile::Clean),
             (2, 20.0, SensorProfile::Raw),
             (3, 100.0, SensorProfile::Clean),
+            (4, 0.5, SensorProfile::Clean),
+            (5, 1.5, SensorProfile::Raw),
         ] {
             check(&SequenceSettings {
                 seed,

@@ -105,8 +105,12 @@ impl Pty {
     /// Waits until the last bytes are read, but not for ever.
     pub(crate) async fn linger(&self) -> io::Result<()> {
         let end = Instant::now() + LINGER;
-        while rustix::io::ioctl_fionread(&self.device)? > 0 && Instant::now() < end {
+        // What was written is not at the device at once: nothing there once says little.
+        let mut empty = 0;
+        while empty < 3 && Instant::now() < end {
             tokio::time::sleep(Duration::from_millis(5)).await;
+            let is_empty = rustix::io::ioctl_fionread(&self.device)? == 0;
+            empty = if is_empty { empty + 1 } else { 0 };
         }
         Ok(())
     }
