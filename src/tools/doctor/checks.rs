@@ -170,7 +170,12 @@ fn held(root: &Path, device: &Path, own: u32) -> Vec<Fault> {
         let is_device =
             |file: fs::DirEntry| fs::read_link(file.path()).is_ok_and(|target| target == device);
         if files.flatten().any(is_device) {
-            faults.push(if is_daemon(root, pid) {
+            let tool = subcommand(root, pid);
+            // It made the port, and whoever wants it may open it.
+            if matches!(tool.as_deref(), Some(b"simulate" | b"demo")) {
+                continue;
+            }
+            faults.push(if tool.as_deref() == Some(b"run") {
                 Fault {
                     what: format!("held by process {pid}, the daemon (hardnessd run)"),
                     cure: format!(
@@ -188,16 +193,13 @@ fn held(root: &Path, device: &Path, own: u32) -> Vec<Fault> {
     faults
 }
 
-/// `hardnessd run`, and none of its tools, which have the same name.
-fn is_daemon(root: &Path, pid: u32) -> bool {
-    let line = fs::read(root.join("proc").join(pid.to_string()).join("cmdline"));
-    let line = line.unwrap_or_default();
+/// Which of `hardnessd`'s subcommands a process is.
+fn subcommand(root: &Path, pid: u32) -> Option<Vec<u8>> {
+    let line = fs::read(root.join("proc").join(pid.to_string()).join("cmdline")).ok()?;
     let mut words = line.split(|&byte| byte == 0);
-    let is_ours = words.next().is_some_and(|program| {
-        let program = Path::new(OsStr::from_bytes(program));
-        program.file_name() == Some(OsStr::new("hardnessd"))
-    });
-    is_ours && words.next() == Some(b"run")
+    let program = Path::new(OsStr::from_bytes(words.next()?));
+    let is_ours = program.file_name() == Some(OsStr::new("hardnessd"));
+    is_ours.then(|| words.next().unwrap_or_default().to_vec())
 }
 
 /// ModemManager writes to every new USB serial port, unless a udev rule tells it not to.

@@ -167,6 +167,9 @@ fn the_daemon_that_holds_the_port_is_stopped_as_a_service() {
     // A tool of the same name is no service.
     machine.put("proc/88/cmdline", "hardnessd\0record\0--config\0x\0");
     one(&machine.faults(PORT), &["(hardnessd): kill 88"]);
+    // One that made the port is in nobody's way.
+    machine.put("proc/88/cmdline", "hardnessd\0simulate\0--link\0port\0");
+    assert_eq!(machine.faults(PORT), Vec::<String>::new());
 }
 
 #[test]
