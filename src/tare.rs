@@ -4,7 +4,8 @@
 //! of the tare. A tare under load would zero a press away, so one is refused while the sensor is
 //! touched and tried again.
 
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::frame::{Array, COLS, Frame, ROWS, RawFrame, TAXELS, taxels};
 
@@ -21,7 +22,19 @@ pub struct Settings {
     /// How far above the array's median a taxel may rest.
     pub tare_max_n: f32,
     /// `[[row, col], ...]` in the sensor's own rows and columns.
+    #[serde(deserialize_with = "pairs")]
     pub dead_taxels: Vec<[usize; 2]>,
+}
+
+/// Lists of exactly two: of a longer one the TOML parser would drop the rest.
+fn pairs<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<[usize; 2]>, D::Error> {
+    let pair = |list: Vec<usize>| {
+        let length = list.len();
+        <[usize; 2]>::try_from(list)
+            .map_err(|_| D::Error::invalid_length(length, &"an array of length 2"))
+    };
+    let lists = Vec::<Vec<usize>>::deserialize(deserializer)?;
+    lists.into_iter().map(pair).collect()
 }
 
 impl Default for Settings {

@@ -17,8 +17,11 @@ pub mod watch;
 
 use std::error::Error;
 use std::fs::File;
-use std::io::{self, ErrorKind, Write};
+use std::io::{self, Write};
 use std::path::Path;
+use std::process::ExitCode;
+
+use clap::error::ErrorKind;
 
 /// What is printed of an error: one line, with the causes that it does not tell itself.
 pub fn line(error: &(dyn Error + 'static)) -> String {
@@ -34,12 +37,33 @@ pub fn line(error: &(dyn Error + 'static)) -> String {
     line
 }
 
+/// What clap says of arguments that it refuses, on one line, with exit code 2; or the help or version
+/// that was asked for.
+pub fn usage(program: &str, error: &clap::Error) -> ExitCode {
+    if matches!(
+        error.kind(),
+        ErrorKind::DisplayHelp
+            | ErrorKind::DisplayVersion
+            | ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand
+    ) {
+        let _ = error.print();
+        return ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(2));
+    }
+    let text = error.to_string();
+    let told = text.split("\n\nUsage:").next().unwrap_or_default();
+    let told = told.split("\n\nFor more").next().unwrap_or_default();
+    let told: Vec<&str> = told.split_whitespace().collect();
+    let told = told.join(" ");
+    eprintln!("{program}: {}", told.trim_start_matches("error: "));
+    ExitCode::from(2)
+}
+
 /// Opens a file to read from. A directory is refused here: the system would do so at the first read
 /// only, when what was asked for has begun.
 fn open(path: &Path) -> io::Result<File> {
     let file = File::open(path)?;
     if file.metadata()?.is_dir() {
-        return Err(ErrorKind::IsADirectory.into());
+        return Err(io::ErrorKind::IsADirectory.into());
     }
     Ok(file)
 }
@@ -52,7 +76,7 @@ fn open(path: &Path) -> io::Result<File> {
 pub fn print(lines: &[u8]) -> io::Result<bool> {
     let mut out = io::stdout().lock();
     match out.write_all(lines).and_then(|()| out.flush()) {
-        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(false),
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
         written => written.map(|()| true),
     }
 }

@@ -10,6 +10,13 @@ pub fn of_toml(text: &str, error: &toml::de::Error) -> String {
 /// `message` on one line, and without the names that Rust has for types.
 pub fn plain(message: &str) -> String {
     let message = message.trim().replace('\n', ": ");
+    match message.as_str() {
+        "duplicate key" => return "found it twice, expected it once".to_owned(),
+        "invalid socket address syntax" => {
+            return "found no address and port, expected such as 127.0.0.1:8255".to_owned();
+        }
+        _ => {}
+    }
     let Some((found, expected)) = message.rsplit_once(", expected ") else {
         return message;
     };

@@ -449,6 +449,12 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         &["frame_rate_hz", "14.58"],
     );
     fails(&["replay", "/no/such.bin"], 66, &["/no/such.bin"]);
+    fails(&["replay"], 2, &["not provided", "<FILE>"]);
+    fails(
+        &["simulate", "--material", "steel"],
+        2,
+        &["steel", "--material", "wood"],
+    );
     for tool in [
         &["replay", "/"][..],
         &["sniff", "/"],
@@ -562,6 +568,19 @@ fn a_signal_ends_a_command_that_looks_for_none_as_a_failure() {
     let mut stderr = check.0.stderr.take().unwrap();
     stderr.read_to_string(&mut said).unwrap();
     assert_eq!(said, "hardnessd: interrupted\n");
+}
+
+#[test]
+fn a_replay_of_any_length_ends_at_a_signal() {
+    for signal in [Signal::INT, Signal::TERM] {
+        let mut command = Command::new(BINARY);
+        // There is no end to it.
+        command.args(["replay", "/dev/zero"]).stdout(Stdio::null());
+        let mut replay = Process(command.spawn().unwrap());
+        std::thread::sleep(Duration::from_millis(300));
+        replay.signal(signal);
+        assert_eq!(replay.exit_code(), Some(0), "{signal:?}");
+    }
 }
 
 #[test]

@@ -96,7 +96,10 @@ fn main() -> ExitCode {
             return ExitCode::from(exit::IO);
         }
     };
-    let args = Args::parse();
+    let args = match Args::try_parse() {
+        Ok(args) => args,
+        Err(error) => return tools::usage("hardnessd", &error),
+    };
     let done = runtime.block_on(dispatch(args.command, signals));
     // A port may be stuck in its driver on a thread of its own: not worth waiting for.
     runtime.shutdown_background();

@@ -99,7 +99,6 @@ const CHUNK_BYTES: usize = 64 * 1024;
 /// [`Error`], if the recording or the configuration cannot be used.
 pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
     tokio::select! {
-        // The recording first: one that needs no pacing is over before a signal is looked for.
         biased;
         played = play(args) => played,
         () = shutdown => Ok(()),
@@ -179,6 +178,9 @@ async fn play_entries(
                 Some(due) => tokio::time::sleep_until(due).await,
                 None => std::future::pending().await,
             }
+        } else {
+            // A signal is looked for.
+            tokio::task::yield_now().await;
         }
         let events = playback.feed(found).map_err(|source| Error::Sensor {
             path: path.clone(),
@@ -245,6 +247,8 @@ async fn play_bytes(args: &Args, mut recording: File, setup: &Setup) -> Result<(
         if let Some(a_byte) = pace {
             bytes = bytes.saturating_add(u32::try_from(read).unwrap_or(u32::MAX));
             tokio::time::sleep_until(start + a_byte * bytes).await;
+        } else {
+            tokio::task::yield_now().await;
         }
         // The clock is the recording's: the moment given here is not looked at.
         if !print(pipeline.push(&chunk[..read], now()), &mut seq)? {

@@ -30,7 +30,7 @@ fn every_key_but_port_has_a_default() {
 
 #[test]
 fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
-    let cases: [(&str, &[&str]); 32] = [
+    let cases: [(&str, &[&str]); 33] = [
         ("[[sensor]]\nname = \"a\"", &["1:1", "sensor.port", "none"]),
         (
             "# Two.\n[[sensor]]\nport = \"p\"\n\n[[sensor]]\nname = \"b\"",
@@ -95,6 +95,10 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
             &["4:", "sync", "xyz", "hex"],
         ),
         (
+            "[[sensor]]\nport = \"p\"\n[sensor.frame]\npreset = \"ff-tail\"\nsync = \"AA\"",
+            &["frame.sync", "preset ff-tail fixes it"],
+        ),
+        (
             "[[sensor]]\nport = \"p\"\n[sensor.calibration]\ndead_taxels = [[28, 0]]",
             &["dead_taxels", "28"],
         ),
@@ -120,7 +124,7 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
         ),
         (
             "[[sensor]]\nport = \"p\"\n[publish.tcp]\nlisten = \"here:8255\"",
-            &["4:10", "listen", "socket address"],
+            &["4:10", "listen", "no address and port"],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[http]\nlisten = 8256",
@@ -171,6 +175,9 @@ fn no_message_speaks_of_types_of_a_program() {
         ("[sensor.calibration]", "dead_taxels", "[3]"),
         ("[sensor.calibration]", "dead_taxels", "[[1]]"),
         ("[sensor.calibration]", "dead_taxels", "[[1, -2]]"),
+        ("[sensor.calibration]", "dead_taxels", "[[1, 2, 3]]"),
+        ("[http]", "listen", "\"localhost:1\""),
+        ("[press]", "min_frames", "2\nmin_frames = 2"),
         ("[press]", "min_frames", "-1"),
         ("[press]", "contact_threshold_n", "\"a\""),
         ("[publish.unix]", "max_clients", "-1"),
