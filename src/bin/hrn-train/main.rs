@@ -36,7 +36,10 @@ use self::arguments::{
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() -> ExitCode {
-    let arguments = Arguments::parse();
+    let arguments = match Arguments::try_parse() {
+        Ok(arguments) => arguments,
+        Err(error) => return tools::usage("hrn-train", &error),
+    };
     if let Err(error) = end_at_signals() {
         eprintln!("hrn-train: signals: {error}");
         return ExitCode::from(74);
