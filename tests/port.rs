@@ -12,7 +12,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::Command;
 
-use bench::{BINARY, Bench, Daemon, Process, hardnessd, wait_for};
+use bench::{BINARY, Bench, Daemon, Process, by_terminal, hardnessd, wait_for};
 use rustix::process::Signal;
 use serde_json::json;
 
@@ -195,7 +195,7 @@ fn a_simulated_sensor_ends_at_a_signal_and_takes_its_link_along() {
     let long = bench.path("long.bin");
     for signal in [Signal::INT, Signal::TERM, Signal::HUP] {
         let mut at_pty = bench.sensor(&[]);
-        let mut to_file = Command::new(BINARY);
+        let mut to_file = by_terminal();
         to_file.args([
             "simulate",
             "--fps",

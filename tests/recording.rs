@@ -11,7 +11,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use bench::{BINARY, Bench, Daemon, PATIENCE, Process, Subscriber, hardnessd, wait_for};
+use bench::{
+    BINARY, Bench, Daemon, PATIENCE, Process, Subscriber, by_terminal, hardnessd, wait_for,
+};
 use hardnessd::random::Stream;
 use hardnessd::recording::{Entry, Found, Input, Reader};
 use rustix::process::Signal;
@@ -39,7 +41,7 @@ fn configure_patient(bench: &Bench, record: &str) -> PathBuf {
 }
 
 fn record(config: &Path, out: &Path, more: &[&str]) -> Process {
-    let mut command = Command::new(BINARY);
+    let mut command = by_terminal();
     command.args(["record", "--config"]).arg(config);
     command.arg("--out").arg(out).args(more);
     let child = command.stderr(Stdio::null()).stdout(Stdio::null()).spawn();

@@ -68,7 +68,7 @@ impl Bench {
         let link = self.path(port);
         // One that was killed has left its link, which tells nothing of the new one.
         let _ = fs::remove_file(&link);
-        let mut command = Command::new(BINARY);
+        let mut command = by_terminal();
         command.args(["simulate", "--force", "15", "--material", "hard-plastic"]);
         command
             .args(["--fps", &fps.to_string()])
@@ -83,6 +83,13 @@ impl Bench {
         });
         sensor
     }
+}
+
+/// The program with SIGHUP as a terminal starts it: tests may run under `nohup`, which is inherited.
+pub fn by_terminal() -> Command {
+    let mut command = Command::new("env");
+    command.args(["--default-signal=HUP", BINARY]);
+    command
 }
 
 /// A process that does not outlive its test.
