@@ -99,7 +99,6 @@ const CHUNK_BYTES: usize = 64 * 1024;
 /// [`Error`], if the recording or the configuration cannot be used.
 pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
     tokio::select! {
-        biased;
         played = play(args) => played,
         () = shutdown => Ok(()),
     }
