@@ -83,7 +83,7 @@ impl Networks {
         let images = Tensor::from_data(TensorData::new(images, [BATCH, 1, 28, 28]), &device);
         let levels_of = (0..BATCH).map(|n| (n % LEVELS) as u8 + 1);
         let adversaries = gan::Settings::default();
-        let gan = gan::initial(GAME, LEVELS, 1, &device);
+        let gan = gan::initial(GAME, LEVELS, false, 1, &device);
         let sgd = optimiser::Settings::default();
         let sides = |settings| {
             let sides = [gan.generator.clone(), gan.discriminator.clone()];
@@ -159,7 +159,12 @@ fn gan_step(gan: &mut [Learner; 2], images: &Tensor<4>, eta: &Tensor<2>) -> f64 
         real: images.clone(),
         labelled: None,
     };
-    let rules = (GAME, gan::Settings::default().sigma_penalty, RATE);
+    let rules = gan::Rules {
+        game: GAME,
+        sigma_penalty: gan::Settings::default().sigma_penalty,
+        sigma_cap: 0.0,
+        rate: RATE,
+    };
     let [generator, discriminator] = gan;
     let losses = gan::step(generator, discriminator, &batch, eta.clone(), rules);
     losses.0 + losses.1

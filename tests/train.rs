@@ -338,6 +338,29 @@ fn the_whole_method_killed_in_any_stage_resumes_bit_for_bit_and_shares_its_stage
 }
 
 #[test]
+fn deligans_options_resume_bit_for_bit_too() {
+    let settings = GAN_SETTINGS.replacen(
+        "[ustgan]",
+        "minibatch_discrimination = true\n[ustgan]\nturns = \"threshold\"\nsigma_cap = 0.15",
+        1,
+    );
+    let whole = Trial::of("nahrn", "whole options", &settings);
+    whole.train("6", &[]);
+    let killed = Trial::of("nahrn", "killed options", &settings);
+    interrupted(&killed, "6", ("ustgan", 1), Signal::KILL);
+    killed.train("6", &["--resume"]);
+    killed.assert_same(&whole);
+
+    let metrics = String::from_utf8(whole.read("metrics.csv")).unwrap();
+    let columns: Vec<&str> = metrics.lines().next().unwrap().split(',').collect();
+    let place = columns.iter().position(|column| *column == "sigma_max");
+    for row in metrics.lines().filter(|row| row.starts_with("ustgan")) {
+        let largest: f64 = row.split(',').nth(place.unwrap()).unwrap().parse().unwrap();
+        assert!(largest <= 0.150_001, "{row}");
+    }
+}
+
+#[test]
 fn every_method_leaves_a_model() {
     for method in [
         "nihrn",

@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
 use super::dataset::Dataset;
+use super::gan::balance::Balance;
 use super::network::{Weight, Weights, numbers};
 
 /// What a stage needs to go on, beside its settings and data.
@@ -38,6 +39,8 @@ pub struct Progress {
     pub step: u64,
     /// Least validation loss so far.
     pub best_loss: Option<f64>,
+    /// Of a GAN that takes turns by a threshold.
+    pub balance: Option<Balance>,
 }
 
 /// All that a stage's result follows from, as one hash: its settings, seed, frames in their order

@@ -178,7 +178,13 @@ impl State {
         } = *settings;
         Ok(Self {
             progress: checkpoint.progress,
-            learner: Learner::resumed(checkpoint, "", optimiser, averaging)?,
+            learner: Learner::resumed(
+                checkpoint,
+                "",
+                checkpoint.progress.step,
+                optimiser,
+                averaging,
+            )?,
             best: checkpoint.list("best").ok().cloned(),
         })
     }

@@ -1,15 +1,14 @@
 //! Generator and discriminator against each other: one loop for USTGAN, the STGANs, SGAN and
 //! IGAN.
 //!
-//! In: real frames, the game that is played (see [`losses`]) and the weights both start from.
+//! In: real frames, the game that is played (see [`super::losses`]) and the weights both start from.
 //! Out: both sides' weights. USTGAN and an STGAN differ in their frames and starting weights
 //! alone; SGAN and IGAN also see labelled frames. Written to the run's directory on the way:
 //! metrics, checkpoints and pictures of what fixed noise becomes.
 
 use std::time::Instant;
 
-use burn::tensor::{Device, Tensor};
-use serde::{Deserialize, Serialize};
+use burn::tensor::Device;
 
 use super::checkpoint::{Checkpoint, Origin, Progress};
 use super::dataset::Dataset;
@@ -18,83 +17,24 @@ use super::generator;
 use super::history::{Adversarial, Row};
 use super::hrn;
 use super::learner::Learner;
-use super::losses::{self, Game, Judged};
-use super::network::{self, Normalisation, Weights, numbers};
-use super::optimiser;
+use super::losses::Game;
+use super::network::{self, FEATURES, Weights};
 use super::run::Run;
-use super::settings::{SettingsError, check, check_loop};
 use crate::frame::Frame;
 use crate::random::Stream;
 
+pub(super) mod balance;
+pub(super) mod minibatch;
 mod samples;
+mod settings;
+mod step;
 #[cfg(test)]
 mod tests;
 
-/// How both sides learn; the defaults are the paper's ("Training of STGAN and USTGAN").
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Settings {
-    /// Real samples a step. The last batch of an epoch may be smaller.
-    pub batch: usize,
-    /// Generated samples of each component a step.
-    pub samples_a_component: usize,
-    /// Passes over the real samples: what the paper calls iterations. Counted in steps, its 500
-    /// would be six passes over the unlabelled samples; DeLiGAN's code calls an epoch so.
-    pub epochs: u32,
-    /// Lambda of Eq. (7), on a mean.
-    pub sigma_penalty: f64,
-    /// Decay a step of the running average of the discriminator's weights that is kept at the
-    /// end; 0: the weights themselves.
-    pub averaging: f64,
-    /// A checkpoint is written after every so many epochs, and after the last.
-    pub checkpoint_every_epochs: u32,
-    /// A picture is drawn, and generated samples are measured, after every so many epochs and
-    /// after the last.
-    pub picture_every_epochs: u32,
-    /// Of both sides.
-    pub optimiser: optimiser::Settings,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self {
-            batch: 100,
-            samples_a_component: 2,
-            epochs: 500,
-            sigma_penalty: 0.1,
-            averaging: 0.0,
-            checkpoint_every_epochs: 5,
-            picture_every_epochs: 25,
-            optimiser: optimiser::Settings {
-                rule: optimiser::Rule::Adam,
-                // The paper gives no betas; DeLiGAN's code has 0.5.
-                beta1: 0.5,
-                ..optimiser::Settings::default()
-            },
-        }
-    }
-}
-
-impl Settings {
-    /// Refuses what lies outside its range; `table` is where these settings stand.
-    pub(super) fn check(&self, table: &str) -> Result<(), SettingsError> {
-        check_loop(
-            table,
-            self.batch,
-            self.epochs,
-            self.averaging,
-            self.checkpoint_every_epochs,
-        )?;
-        let samples = self.samples_a_component;
-        let key = "samples_a_component";
-        check(table, key, samples as f64, samples > 0, "1 or more")?;
-        let (key, penalty) = ("sigma_penalty", self.sigma_penalty);
-        check(table, key, penalty, penalty >= 0.0, "0 or more")?;
-        let (key, every) = ("picture_every_epochs", self.picture_every_epochs);
-        check(table, key, every, every > 0, "1 or more")?;
-        self.optimiser.check(table)
-    }
-}
+use balance::{Balance, TURNS_A_BATCH};
+pub use settings::{Settings, Turns};
+use step::turn;
+pub use step::{Batch, Rules, step};
 
 /// Both sides.
 #[derive(Debug, Clone)]
@@ -106,11 +46,23 @@ pub struct Gan {
 }
 
 /// Both sides before training; the head is that of the game.
-pub fn initial(game: Game, levels: usize, seed: u64, device: &Device) -> Gan {
+pub fn initial(
+    game: Game,
+    levels: usize,
+    minibatch_discrimination: bool,
+    seed: u64,
+    device: &Device,
+) -> Gan {
     let stream = Stream::new(seed, "discriminator weights");
     let mut discriminator = Weights::default();
     network::add_trunk(&mut discriminator, &stream, device);
-    network::add_head(&mut discriminator, game.outputs(levels), &stream, device);
+    let features = if minibatch_discrimination {
+        minibatch::add(&mut discriminator, &stream, device)
+    } else {
+        FEATURES
+    };
+    let dims = [features, game.outputs(levels)];
+    network::add_head(&mut discriminator, dims, &stream, device);
     Gan {
         generator: generator::initial(seed, device),
         discriminator,
@@ -236,20 +188,31 @@ impl State {
             averaging,
             ..
         } = *settings;
+        let balance = (settings.turns == Turns::Threshold).then(Balance::new);
         Self {
-            progress: Progress::default(),
+            progress: Progress {
+                balance,
+                ..Progress::default()
+            },
             generator: Learner::fresh(initial.generator, optimiser, 0.0),
             discriminator: Learner::fresh(initial.discriminator, optimiser, averaging),
         }
     }
 
     fn resumed(checkpoint: &Checkpoint, settings: &Settings) -> anyhow::Result<Self> {
-        let resumed =
-            |side, averaging| Learner::resumed(checkpoint, side, settings.optimiser, averaging);
+        let Progress { step, balance, .. } = checkpoint.progress;
+        let steps = match balance {
+            None => [step; 2],
+            Some(balance) => [balance.generator_turns, balance.discriminator_turns],
+        };
+        let resumed = |side: usize, averaging| {
+            let (prefix, steps) = (SIDES[side], steps[side]);
+            Learner::resumed(checkpoint, prefix, steps, settings.optimiser, averaging)
+        };
         Ok(Self {
             progress: checkpoint.progress,
-            generator: resumed(SIDES[0], 0.0)?,
-            discriminator: resumed(SIDES[1], settings.averaging)?,
+            generator: resumed(0, 0.0)?,
+            discriminator: resumed(1, settings.averaging)?,
         })
     }
 
@@ -263,99 +226,36 @@ impl State {
         }
     }
 
-    /// [`step`] on the real samples `indices`; gives the losses of discriminator and generator.
+    /// A step, or its turns, on the real samples `indices`; gives the losses of discriminator and
+    /// generator.
     fn step(&mut self, task: &Task, indices: &[usize], rate: f64) -> (f64, f64) {
         let number = self.progress.step;
-        let batch = task.batch(indices, number);
-        let mut stream = task.stream("noise").child(number);
-        let samples = task.settings.samples_a_component;
-        let eta = generator::noise(samples, &mut stream, task.device);
         self.progress.step += 1;
-        let rules = (task.game, task.settings.sigma_penalty, rate);
-        step(
-            &mut self.generator,
-            &mut self.discriminator,
-            &batch,
-            eta,
-            rules,
-        )
+        let batch = task.batch(indices, number);
+        let settings = task.settings;
+        let rules = Rules {
+            game: task.game,
+            sigma_penalty: settings.sigma_penalty,
+            sigma_cap: settings.sigma_cap,
+            rate,
+        };
+        let stream = task.stream("noise").child(number);
+        let eta = |mut stream: Stream| {
+            generator::noise(settings.samples_a_component, &mut stream, task.device)
+        };
+        let (generator, discriminator) = (&mut self.generator, &mut self.discriminator);
+        let Some(balance) = &mut self.progress.balance else {
+            return step(generator, discriminator, &batch, eta(stream), rules);
+        };
+        balance.follow();
+        let mut sums = (0.0, 0.0);
+        for number in 0..TURNS_A_BATCH {
+            let eta = eta(stream.child(number));
+            let losses = turn(generator, discriminator, &batch, eta, (rules, balance));
+            sums = (sums.0 + losses.0, sums.1 + losses.1);
+        }
+        (sums.0 / TURNS_A_BATCH as f64, sums.1 / TURNS_A_BATCH as f64)
     }
-}
-
-/// A step of the discriminator, then one of the generator, by the rules of a game, with a penalty
-/// on sigma and a learning rate; gives the losses of both.
-pub fn step(
-    generator: &mut Learner,
-    discriminator: &mut Learner,
-    batch: &Batch,
-    eta: Tensor<2>,
-    (game, sigma_penalty, rate): (Game, f64, f64),
-) -> (f64, f64) {
-    // The generator does not change while the discriminator takes its step, so both use the
-    // same images, which the first takes as constants.
-    let tracked_generator = generator.weights.tracked();
-    let images = generator::images(&tracked_generator, eta, &mut Normalisation::Batch);
-
-    let tracked = discriminator.weights.tracked();
-    let loss = discriminator_loss(game, &tracked, batch, images.clone().inner());
-    let mut gradients = loss.backward();
-    discriminator.step(&tracked, &mut gradients, rate);
-
-    let sigma = tracked_generator.tensor::<2>("mixture.sigma");
-    let judge = &discriminator.weights;
-    let of_generator = generator_loss(game, judge, batch, images, sigma, sigma_penalty);
-    let mut gradients = of_generator.backward();
-    generator.step(&tracked_generator, &mut gradients, rate);
-    let number = |loss: &Tensor<1>| f64::from(numbers(loss)[0]);
-    (number(&loss), number(&of_generator))
-}
-
-/// What the discriminator is shown in a step beside generated images.
-#[derive(Debug)]
-pub struct Batch {
-    /// `[batch, 1, 28, 28]`.
-    pub real: Tensor<4>,
-    /// Images and targets `[batch, L]`.
-    pub labelled: Option<(Tensor<4>, Tensor<2>)>,
-}
-
-/// Every batch goes through the discriminator by itself and is normalised by its own statistics:
-/// mixed, a batch of real and generated frames would tell the layers what it is made of.
-fn judge(discriminator: &Weights, images: Tensor<4>) -> Judged {
-    let features = network::trunk(discriminator, images, &mut Normalisation::Batch);
-    Judged {
-        logits: network::head(discriminator, features.clone()),
-        features,
-    }
-}
-
-fn discriminator_loss(
-    game: Game,
-    discriminator: &Weights,
-    batch: &Batch,
-    generated: Tensor<4>,
-) -> Tensor<1> {
-    let labelled = batch.labelled.as_ref().map(|(images, targets)| {
-        let judged = judge(discriminator, images.clone());
-        (judged.logits, targets.clone())
-    });
-    let real = judge(discriminator, batch.real.clone());
-    let generated = judge(discriminator, generated);
-    losses::discriminator(game, real, generated, labelled)
-}
-
-fn generator_loss(
-    game: Game,
-    discriminator: &Weights,
-    batch: &Batch,
-    generated: Tensor<4>,
-    sigma: Tensor<2>,
-    sigma_penalty: f64,
-) -> Tensor<1> {
-    let generated = judge(discriminator, generated);
-    let real = || judge(discriminator, batch.real.clone());
-    losses::generator(game, real, generated)
-        .add(losses::sigma_penalty(sigma).mul_scalar(sigma_penalty))
 }
 
 /// Least, mean and greatest size of the mixture's deviations; their sign means nothing.

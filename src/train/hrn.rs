@@ -5,6 +5,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
+use super::gan::minibatch;
 use super::layers::STRIDE;
 use super::network::{self, FEATURES, LEAKY_SLOPE, Normalisation, Statistics, TRUNK, Weights};
 use super::onnx::{self, Graph};
@@ -16,19 +17,18 @@ pub fn initial(levels: usize, seed: u64, device: &Device) -> Weights {
     let stream = Stream::new(seed, "hrn weights");
     let mut weights = Weights::default();
     network::add_trunk(&mut weights, &stream, device);
-    network::add_head(&mut weights, levels, &stream, device);
+    network::add_head(&mut weights, [FEATURES, levels], &stream, device);
     weights
 }
 
 /// HRN before pretraining or fine-tuning: a USTGAN's discriminator with a head for `levels` levels
-/// in place of its own, which told real from generated.
+/// in place of its own, which told real from generated; what it knew of whole batches stays behind.
 pub fn inherited(discriminator: &Weights, levels: usize, seed: u64, device: &Device) -> Weights {
     let mut weights = discriminator.clone();
-    weights
-        .entries
-        .retain(|weight| !weight.name.starts_with("head."));
+    let of_trunk = |name: &str| !name.starts_with("head.") && !name.starts_with(minibatch::PREFIX);
+    weights.entries.retain(|weight| of_trunk(&weight.name));
     let stream = Stream::new(seed, "hrn weights");
-    network::add_head(&mut weights, levels, &stream, device);
+    network::add_head(&mut weights, [FEATURES, levels], &stream, device);
     weights
 }
 

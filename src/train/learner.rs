@@ -38,7 +38,8 @@ impl Learner {
         }
     }
 
-    /// One as [`Learner::lists`] put it under `prefix` into a checkpoint.
+    /// One as [`Learner::lists`] put it under `prefix` into a checkpoint, after so many steps of its
+    /// own.
     ///
     /// # Errors
     ///
@@ -46,6 +47,7 @@ impl Learner {
     pub fn resumed(
         checkpoint: &Checkpoint,
         prefix: &str,
+        steps: u64,
         settings: optimiser::Settings,
         averaging: f64,
     ) -> anyhow::Result<Self> {
@@ -72,7 +74,7 @@ impl Learner {
         };
         Ok(Self {
             weights: list("weights")?.clone(),
-            optimiser: Optimiser::resumed(settings, checkpoint.progress.step, moments),
+            optimiser: Optimiser::resumed(settings, steps, moments),
             averaging,
             average,
         })

@@ -131,6 +131,20 @@ impl Weights {
         numbers(&self.entry(name).values)
     }
 
+    /// The numbers of the weight called `name`, to be changed.
+    pub(super) fn values_mut(&mut self, name: &str) -> &mut Tensor<1> {
+        let mut entries = self.entries.iter_mut();
+        let found = entries.find(|weight| weight.name == name);
+        &mut found
+            .expect("a network asks for weights that it made")
+            .values
+    }
+
+    /// Whether there is one called `name`.
+    pub(super) fn has(&self, name: &str) -> bool {
+        self.entries.iter().any(|weight| weight.name == name)
+    }
+
     fn entry(&self, name: &str) -> &Weight {
         self.entries
             .iter()
@@ -214,10 +228,12 @@ pub fn add_trunk(weights: &mut Weights, stream: &Stream, device: &Device) {
     }
 }
 
-/// Adds the linear layer after the trunk: 1 output for a discriminator, L for a recogniser.
-pub fn add_head(weights: &mut Weights, outputs: usize, stream: &Stream, device: &Device) {
-    let values = truncated_normal(FEATURES * outputs, &mut stream.child(TRUNK.len() as u64));
-    weights.add("head.matrix", &[FEATURES, outputs], values, device);
+/// Adds the linear layer after the trunk, of `[features, outputs]`: 1 output for a discriminator,
+/// L for a recogniser.
+pub fn add_head(weights: &mut Weights, dims: [usize; 2], stream: &Stream, device: &Device) {
+    let [features, outputs] = dims;
+    let values = truncated_normal(features * outputs, &mut stream.child(TRUNK.len() as u64));
+    weights.add("head.matrix", &dims, values, device);
     weights.add("head.bias", &[outputs], vec![0.0; outputs], device);
 }
 
@@ -363,7 +379,7 @@ pub(super) fn batch_norm(
     }
 }
 
-/// The linear layer after the trunk: features `[batch, 64]` to `[batch, outputs]`.
+/// The linear layer after the trunk: features `[batch, features]` to `[batch, outputs]`.
 pub fn head(weights: &Weights, features: Tensor<2>) -> Tensor<2> {
     let matrix = weights.tensor::<2>("head.matrix");
     let bias = weights.tensor::<1>("head.bias");

@@ -109,6 +109,9 @@ pub struct Settings {
     /// Newtons a taxel that become 1 in the network's image; 0 N becomes -1. 10.2 N is what
     /// 8 bits of 0.04 N hold.
     pub full_scale_n: f64,
+    /// Whether the discriminators of USTGAN and STGANs also look at how alike the samples of a
+    /// batch are. Those of SGAN and IGAN do not: they become the recogniser.
+    pub minibatch_discrimination: bool,
     /// The GAN over unlabelled samples: USTGAN, or that of SGAN and IGAN.
     pub ustgan: gan::Settings,
     /// Each of the STGANs.
@@ -127,6 +130,7 @@ impl Default for Settings {
     fn default() -> Self {
         Self {
             full_scale_n: 10.2,
+            minibatch_discrimination: false,
             ustgan: gan::Settings::default(),
             stgan: gan::Settings {
                 // An epoch has 4 steps there and 85 here.

@@ -104,7 +104,14 @@ impl Stages<'_> {
         self.ensure_unlabelled()?;
         let game = Game::RealOrFake;
         let task = self.gan_task("ustgan", game, &self.settings().ustgan);
-        let initial = gan::initial(game, levels(), self.description.seed, self.device);
+        let minibatch_discrimination = self.settings().minibatch_discrimination;
+        let initial = gan::initial(
+            game,
+            levels(),
+            minibatch_discrimination,
+            self.description.seed,
+            self.device,
+        );
         gan::fit(&task, initial, self.run)
     }
 
@@ -244,7 +251,8 @@ impl Stages<'_> {
             labelled: self.train,
             ..self.gan_task(stage, game, &self.settings().ustgan)
         };
-        let initial = gan::initial(game, levels(), self.description.seed, self.device);
+        // Without minibatch discrimination: the discriminator becomes the recogniser.
+        let initial = gan::initial(game, levels(), false, self.description.seed, self.device);
         let gan = gan::fit(&task, initial, self.run)?;
         let weights = hrn::of_levels(&gan.discriminator, levels(), self.device);
         // The layers' statistics over all real frames that the discriminator has seen.

@@ -1,10 +1,18 @@
 //! Gradients of a whole step against differences, and how a stage starts.
 
+use super::step::{discriminator_loss, generator_loss, penalty};
 use super::*;
 use crate::frame::{COLS, ROWS};
-use burn::tensor::{DType, FloatDType, TensorData};
+use crate::train::network::{Normalisation, numbers};
+use burn::tensor::{DType, FloatDType, Tensor, TensorData};
 
-const GAMES: [Game; 3] = [Game::RealOrFake, Game::FakeLevel, Game::FeatureMatching];
+/// Each game, and whether with minibatch discrimination.
+const GAMES: [(Game, bool); 4] = [
+    (Game::RealOrFake, false),
+    (Game::RealOrFake, true),
+    (Game::FakeLevel, false),
+    (Game::FeatureMatching, false),
+];
 const LEVELS: usize = 4;
 
 fn device() -> Device {
@@ -37,7 +45,7 @@ struct Case {
     eta: Tensor<2>,
 }
 
-fn case(game: Game) -> Case {
+fn case(game: Game, minibatch_discrimination: bool) -> Case {
     let mut stream = Stream::new(8, "images");
     let mut random = |dims: [usize; 4]| -> Tensor<4> {
         let values: Vec<f32> = (0..dims.iter().product())
@@ -48,7 +56,7 @@ fn case(game: Game) -> Case {
     let real = random([7, 1, ROWS, COLS]);
     let images = random([5, 1, ROWS, COLS]);
     let targets = hrn::targets([1, 2, 3, 4, 2].into_iter(), LEVELS, &device());
-    let mut gan = initial(game, LEVELS, 3, &device());
+    let mut gan = initial(game, LEVELS, minibatch_discrimination, 3, &device());
     for weights in [&mut gan.generator, &mut gan.discriminator] {
         for (weight, number) in weights.entries.iter_mut().zip(0..) {
             let mut stream = Stream::new(9, &weight.name).child(number);
@@ -100,15 +108,8 @@ impl Case {
 
     fn generator_loss(&self, game: Game, generator: &Weights) -> Tensor<1> {
         let images = generator::images(generator, self.eta.clone(), &mut Normalisation::Batch);
-        let sigma = generator.tensor::<2>("mixture.sigma");
-        generator_loss(
-            game,
-            &self.gan.discriminator,
-            &self.batch,
-            images,
-            sigma,
-            0.1,
-        )
+        generator_loss(game, &self.gan.discriminator, &self.batch, images)
+            .add(penalty(generator, 0.1))
     }
 }
 
@@ -167,8 +168,8 @@ fn check(
 
 #[test]
 fn gradients_of_a_whole_step_agree_with_finite_differences() {
-    for game in GAMES {
-        let case = case(game);
+    for (game, minibatch_discrimination) in GAMES {
+        let case = case(game, minibatch_discrimination);
         let exact = case.in_double();
         check(
             &case.gan.discriminator,
@@ -185,7 +186,7 @@ fn gradients_of_a_whole_step_agree_with_finite_differences() {
 
 #[test]
 fn a_new_stage_starts_from_the_given_weights_with_fresh_moments() {
-    let gan = initial(Game::RealOrFake, LEVELS, 5, &device());
+    let gan = initial(Game::RealOrFake, LEVELS, false, 5, &device());
     let state = State::fresh(gan.clone(), &Settings::default());
     let checkpoint = state.checkpoint("");
     assert_eq!(checkpoint.progress, Progress::default());
