@@ -6,8 +6,7 @@
 
 Claims: all is root's, with the modes that lintian asks for; the configuration is a conffile and
 passes `check`; the installed binary shows a press; man pages and completions render and name every
-command; the units name what is installed; no script stumbles. Installing it needs root and a booted
-systemd: that is not tried.
+command; the units name what is installed; no script stumbles. machine.py installs it.
 """
 
 import argparse

@@ -1,0 +1,366 @@
+#!/usr/bin/env python3
+"""The Debian package on a booted machine: systemd, udev and a kernel's serial drivers.
+
+    apt-get install qemu-system-x86 qemu-utils mmdebstrap e2fsprogs
+    python3 tests/peers/machine.py target/debian/hardnessd_*.deb
+
+Boots the host's release of Debian in qemu (by KVM where it boots, else emulated: then the times say
+little) with an FTDI adapter and a PCI port, at which `hardnessd simulate` of the same package plays.
+Claims: apt installs the package, which starts nothing and whose rules act on the adapter that is
+plugged in; the daemon lives in its sandbox, reads both drivers and answers systemd in all that the
+unit promises; who may read and who may open is as documented; a cable that is pulled is `lost` and
+goes on when it is back; it starts at boot without its sensor; what is removed is gone.
+"""
+
+import argparse
+import json
+import os
+import re
+import tempfile
+import threading
+import time
+
+import guest
+from guest import Machine, wait_for
+
+PORT = "/dev/serial/by-id/usb-QEMU_QEMU_USB_SERIAL_film7-if00-port0"
+CONFIG = f"""robot = "arm-7"
+[[sensor]]
+name = "forearm"
+port = "{PORT}"
+frame_rate_hz = 10.0
+[[sensor]]
+name = "palm"
+port = "/dev/ttyS1"
+frame_rate_hz = 5.0
+[log]
+format = "journald"
+"""
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("package")
+    package = os.path.abspath(parser.parse_args().package)
+    start = time.monotonic()
+    with tempfile.TemporaryDirectory() as place:
+        guest.run("dpkg-deb", "-x", package, place)
+        with Machine(package, f"{place}/usr/bin/hardnessd") as machine:
+            say("booted", f"{machine.accelerator}, {machine.boot_s:.0f} s")
+            machine.film("forearm", "--fps", "10", "--force", "15", "--material", "hard-plastic")
+            machine.film("palm", "--fps", "5", "--force", "15", "--material", "wood")
+            for claim in [
+                installs, starts, reaches_subscribers, is_sandboxed, logs, holds_its_port, reloads,
+                is_watched, cable_is_pulled, reinstalls, stops, is_activated, boots, is_removed,
+            ]:
+                claim(machine)
+    say("done", f"{time.monotonic() - start:.0f} s")
+
+
+def say(what, figures):
+    print(f"{what}: {figures}", flush=True)
+
+
+def within(machine, seconds):
+    """A limit; an emulated machine on a busy host is granted ten times as much."""
+    return seconds if machine.accelerator == "kvm" else 10 * seconds
+
+
+def timed(machine, command):
+    start = time.monotonic()
+    return machine.run(command), time.monotonic() - start
+
+
+def show(machine, *names, unit="hardnessd.service"):
+    """Properties of the unit."""
+    shown = machine.run(f"systemctl show {unit} -p {','.join(names)}")
+    properties = dict(line.split("=", 1) for line in shown.splitlines())
+    return [properties[name] for name in names]
+
+
+def adapter(machine):
+    """What the rules have to do with: latency timer (ms), ModemManager's mark, HUPCL."""
+    return machine.run(f"""
+        cat /sys/bus/usb-serial/devices/ttyUSB0/latency_timer
+        udevadm info /dev/ttyUSB0 | grep -c ID_MM_DEVICE_IGNORE=1
+        stty -F {PORT} -a | grep -o .hupcl
+        true
+    """).split()
+
+
+def installs(machine):
+    assert adapter(machine) == ["0", "0", "hupcl"], "as the kernel and qemu leave it"
+    machine.run("tar -xf /dev/vdb -C /srv")
+    output, seconds = timed(machine, "apt-get install -y -o Dpkg::Use-Pty=0 /srv/hardnessd_*.deb 2>&1")
+    assert "warning" not in output.lower() and "error" not in output.lower(), output
+    assert machine.run("getent passwd hardnessd").endswith(":/usr/sbin/nologin")
+    assert "dialout" in machine.run("id -nG hardnessd")
+    assert machine.run("stat -c '%U %G %a' /run/hardnessd") == "hardnessd hardnessd 755"
+    for unit in ["hardnessd.service", "hardnessd.socket"]:
+        assert show(machine, "ActiveState", "UnitFileState", unit=unit) == ["inactive", "disabled"]
+    conffiles = machine.run("dpkg-query -W -f '${Conffiles}' hardnessd").split()
+    assert conffiles[::2] == ["/etc/hardnessd.toml"], conffiles
+    assert machine.run("dpkg --verify hardnessd") == ""
+    assert adapter(machine) == ["1", "1", "-hupcl"], adapter(machine)
+    say("installed", f"{seconds:.1f} s; nothing started; the rules act on the adapter that is there")
+
+
+def configure(machine, text):
+    machine.run(f"cat >/etc/hardnessd.toml <<'END'\n{text}END")
+
+
+def statuses(machine):
+    """The state of each sensor, as a new subscriber hears it."""
+    lines = machine.run("hardnessd tail --json --types status --count 2 --timeout 60").splitlines()
+    return {event["sensor"]: event for event in map(json.loads, lines)}
+
+
+def is_live(machine):
+    found = statuses(machine)
+    return all(event["state"] == "live" and not event["reason"] for event in found.values()) and found
+
+
+def starts(machine):
+    configure(machine, CONFIG)
+    _, seconds = timed(machine, "systemctl start hardnessd")
+    start = time.monotonic()
+    found = wait_for("live sensors", lambda: is_live(machine))
+    live_s = time.monotonic() - start
+    wait_for("notify text", lambda: show(machine, "StatusText") == ["2 of 2 sensors live"])
+    assert 'Status: "2 of 2 sensors live"' in machine.run("systemctl status hardnessd")
+    damaged = {name: event["frames_damaged"] for name, event in found.items()}
+    say("started", f"{seconds:.1f} s, both live after {live_s:.1f} s more, damaged frames {damaged}")
+
+
+def reaches_subscribers(machine):
+    machine.run("useradd reader -G hardnessd,dialout && useradd stranger")
+    sockets = machine.run("cd /run/hardnessd && stat -c '%n %U %G %a' *").splitlines()
+    assert sockets == [
+        "control.sock hardnessd hardnessd 600", "events.sock hardnessd hardnessd 660"
+    ], sockets
+    heard = machine.cables["forearm"].heard
+    tail = "hardnessd tail --json --types hardness --timeout 100 --count 8"
+    lines, seconds = timed(machine, f"runuser -u reader -- {tail}")
+    verdicts = [json.loads(line) for line in lines.splitlines()]
+    finals = [event for event in verdicts if event["phase"] == "final"]
+    found = {(event["sensor"], event["label"]) for event in finals}
+    assert len(finals) >= 2 and {sensor for sensor, _ in found} == {"forearm", "palm"}, verdicts
+    assert all(event["level"] == 1 for event in finals if event["sensor"] == "forearm"), finals
+    ages = sorted(event["latency_us"] / 1000 for event in finals)
+    assert machine.cables["forearm"].heard == heard, "neither the daemon nor ModemManager writes"
+    code, output = machine.ask(f"runuser -u stranger -- {tail}")
+    assert code == 69 and "ermission denied" in output, (code, output)
+    control = "hardnessd tail --socket /run/hardnessd/control.sock --count 1 --timeout 5"
+    code, output = machine.ask(f"runuser -u reader -- {control}")
+    assert code == 69 and "ermission denied" in output, (code, output)
+    say("subscribed", f"{len(finals)} final verdicts in {seconds:.1f} s, latency {ages[0]:.1f} to "
+        f"{ages[-1]:.1f} ms; strangers are refused")
+
+
+def is_sandboxed(machine):
+    (pid,) = show(machine, "MainPID")
+    lines = machine.run(f"cat /proc/{pid}/status").splitlines()
+    status = dict(line.split(":\t", 1) for line in lines if ":\t" in line)
+    uid = machine.run("id -u hardnessd")
+    assert status["Uid"].split() == [uid] * 4 and uid != "0", status["Uid"]
+    assert int(status["CapEff"], 16) == int(status["CapBnd"], 16) == 0
+    assert status["NoNewPrivs"] == "1" and status["Seccomp"] == "2"
+    exposure = machine.run("systemd-analyze security hardnessd --no-pager").splitlines()[-1]
+    assert float(re.search(r"\d+\.\d+", exposure)[0]) <= 2.0, exposure
+    say("sandboxed", f"user {uid}, no capabilities, {exposure.split(': ', 1)[1]}")
+
+
+def logs(machine):
+    line = machine.run("journalctl -u hardnessd -o json -n 1 HARDNESSD_PHASE=final")
+    entry = json.loads(line)
+    for name in "SENSOR PRESS LEVEL LABEL CONFIDENCE FORCE_N MODEL SEQ".split():
+        assert f"HARDNESSD_{name}" in entry, (name, entry)
+    assert entry["_SYSTEMD_UNIT"] == "hardnessd.service" and entry["_TRANSPORT"] == "journal", entry
+    fields = [name for name in entry if name.startswith("HARDNESSD_")]
+    assert machine.run("journalctl -u hardnessd -p err -q") == ""
+    say("journal", f"{len(fields)} fields of a verdict, no error")
+
+
+def holds_its_port(machine):
+    (pid,) = show(machine, "MainPID")
+    code, output = machine.ask(f"runuser -u reader -- head -c 1 {PORT}")
+    assert code == 1 and "Device or resource busy" in output, (code, output)
+    code, output = machine.ask("hardnessd record --config /etc/hardnessd.toml --out /srv/second.mcap")
+    assert code == 69 and "held by another process" in output, (code, output)
+    code, output = machine.ask(f"hardnessd doctor --port {PORT}")
+    assert code == 1 and f"held by process {pid}, the daemon" in output, (code, output)
+    say("exclusive", f"EBUSY for users, 69 for a second reader, doctor: {output.splitlines()[0]}")
+
+
+def reloads(machine):
+    (before,) = show(machine, "MainPID")
+    configure(machine, CONFIG + "[press]\nend_frames = 3\n")
+    machine.run("systemctl reload hardnessd")
+    wait_for("reload", lambda: "reloaded" in machine.run("journalctl -u hardnessd -n 40 -o cat"))
+    configure(machine, CONFIG.replace("/dev/ttyS1", "/dev/ttyS2"))
+    machine.run("systemctl reload hardnessd")
+    lines = "journalctl -u hardnessd -o json -n 40 --output-fields=MESSAGE,HARDNESSD_REASON"
+    refused = wait_for(
+        "refusal", lambda: [one for one in machine.run(lines).splitlines() if "reload refused" in one]
+    )
+    reason = json.loads(refused[0])["HARDNESSD_REASON"]
+    assert "port" in reason, reason
+    configure(machine, CONFIG)
+    machine.run("systemctl reload hardnessd")
+    assert show(machine, "MainPID", "NRestarts") == [before, "0"]
+    assert is_live(machine)
+    say("reloaded", f"without a restart; another port is refused: {reason}")
+
+
+def is_watched(machine):
+    pid, restarts = show(machine, "MainPID", "NRestarts")
+    started = int(show(machine, "ExecMainStartTimestampMonotonic")[0])
+    up_s = float(machine.run("cut -d' ' -f1 /proc/uptime")) - started / 1e6
+    assert restarts == "0" and up_s > 12, "fed for longer than WatchdogSec"
+    start = time.monotonic()
+    machine.run(f"kill -STOP {pid}")
+    wait_for("restart", lambda: show(machine, "NRestarts", "ActiveState") == ["1", "active"])
+    seconds = time.monotonic() - start
+    assert "Watchdog timeout" in machine.run("journalctl -u hardnessd -o cat -n 200")
+    wait_for("live sensors", lambda: is_live(machine))
+    say("watched", f"fed for {up_s:.0f} s; stopped by SIGSTOP it was new after {seconds:.1f} s")
+
+
+class Listener(threading.Thread):
+    """All events of a daemon from now on, each with when it came here."""
+
+    def __init__(self, machine):
+        super().__init__(daemon=True)
+        self.lines = machine.events.makefile()
+        self.events = []
+        machine.events.settimeout(None)
+        command = "exec hardnessd tail --json >/dev/virtio-ports/events"
+        machine.run(f"systemd-run --quiet --unit=listener sh -c '{command}'")
+        self.start()
+
+    def run(self):
+        for line in self.lines:
+            self.events.append((time.monotonic(), json.loads(line)))
+
+    def first(self, since, **fields):
+        """The first one with these fields from that time on."""
+        def there():
+            for at, event in list(self.events):
+                if at >= since and all(event.get(name) == value for name, value in fields.items()):
+                    return at, event
+        return wait_for(str(fields), there)
+
+
+def cable_is_pulled(machine, times=3):
+    before = show(machine, "MainPID", "NRestarts")
+    listener = Listener(machine)
+    figures = []
+    for _ in range(times):
+        _, press = listener.first(time.monotonic(), type="press", sensor="forearm", state="begin")
+        pulled = time.monotonic()
+        machine.pull()
+        at, lost = listener.first(pulled, type="status", sensor="forearm", state="lost")
+        lost_s = at - pulled
+        assert lost_s < within(machine, 0.1), lost_s
+        _, aborted = listener.first(pulled, type="press", sensor="forearm", press=press["press"])
+        assert aborted["state"] in ("aborted", "end"), aborted
+        plugged = time.monotonic()
+        machine.plug()
+        at, live = listener.first(plugged, type="status", sensor="forearm", state="live")
+        live_s = at - plugged
+        # 2 s between tries, the kernel's own time and a frame.
+        assert live_s < within(machine, 4), live_s
+        assert live["frames"] > lost["frames"], (lost, live)
+        _, begin = listener.first(plugged, type="press", sensor="forearm", state="begin")
+        assert begin["press"] == press["press"] + 1, (press, begin)
+        assert begin["frame"] > press["frame"], (press, begin)
+        assert adapter(machine) == ["1", "1", "-hupcl"], adapter(machine)
+        figures.append(f"lost after {lost_s * 1000:.0f} ms, live {live_s:.1f} s after it is back")
+    numbers = [event["seq"] for _, event in listener.events if "seq" in event]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), numbers
+    assert show(machine, "MainPID", "NRestarts") == before
+    machine.run("systemctl stop listener")
+    for one in figures:
+        say("cable", one)
+
+
+def reinstalls(machine):
+    (before,) = show(machine, "MainPID")
+    _, seconds = timed(machine, "dpkg -i /srv/hardnessd_*.deb 2>&1")
+    assert machine.run("cat /etc/hardnessd.toml") == CONFIG.strip()
+    after, state = show(machine, "MainPID", "ActiveState")
+    assert state == "active" and after != before, "the new binary runs"
+    wait_for("live sensors", lambda: is_live(machine))
+    say("reinstalled", f"{seconds:.1f} s; the configuration stays, a running daemon is restarted")
+
+
+def stops(machine):
+    timing = """
+        start=$(date +%s%N); systemctl stop hardnessd; end=$(date +%s%N)
+        echo $(((end - start) / 1000000))
+    """
+    stop_ms = int(machine.run(timing))
+    assert stop_ms < within(machine, 2000), stop_ms
+    found = show(machine, "ActiveState", "Result", "ExecMainStatus")
+    assert found == ["inactive", "success", "0"], found
+    assert machine.run("ls /run/hardnessd") == ""
+    for user in ["root", "hardnessd"]:
+        output = machine.run(f"runuser -u {user} -- hardnessd doctor --port {PORT}")
+        assert output.endswith("no fault found"), output
+    assert adapter(machine)[2] == "-hupcl"
+    say("stopped", f"{stop_ms} ms, with 0; doctor finds no fault, the daemon's user may open the port")
+
+
+def is_activated(machine):
+    machine.run("systemctl start hardnessd.socket")
+    found = machine.run("stat -c '%U %G %a' /run/hardnessd/events.sock")
+    assert found == "hardnessd hardnessd 660", found
+    assert show(machine, "ActiveState") == ["inactive"]
+    _, seconds = timed(machine, "runuser -u reader -- hardnessd tail --count 2 --timeout 100")
+    assert show(machine, "ActiveState") == ["active"]
+    wait_for("live sensors", lambda: is_live(machine))
+    machine.run("systemctl stop hardnessd")
+    assert show(machine, "ActiveState", unit="hardnessd.socket") == ["active"]
+    machine.run("systemctl stop hardnessd.socket hardnessd")
+    say("activated", f"the first subscriber has its statuses after {seconds:.1f} s")
+
+
+def boots(machine):
+    machine.run("systemctl enable hardnessd hardnessd.socket 2>&1")
+    machine.pull()
+    machine.reboot()
+    wait_for("the daemon", lambda: show(machine, "ActiveState") == ["active"])
+    found = wait_for("palm", lambda: (s := statuses(machine))["palm"]["state"] == "live" and s)
+    assert found["forearm"]["state"] == "connecting", found
+    assert machine.run("systemctl --failed --no-legend") == ""
+    plugged = time.monotonic()
+    machine.plug()
+    wait_for("live sensors", lambda: is_live(machine))
+    live_s = time.monotonic() - plugged
+    assert adapter(machine) == ["1", "1", "-hupcl"], adapter(machine)
+    say("booted again", f"{machine.boot_s:.0f} s, without its sensor; live {live_s:.1f} s after it is "
+        "plugged in for the first time")
+
+
+def left(machine):
+    """What stands anywhere under the package's name."""
+    return machine.run("""
+        find / -xdev -name '*hardnessd*' -not -path '/srv/*' -not -path '/proc/*' -not -path '/sys/*'
+        find /run -xdev -name '*hardnessd*'
+    """).splitlines()
+
+
+def is_removed(machine):
+    machine.run("apt-get remove -y -o Dpkg::Use-Pty=0 hardnessd 2>&1")
+    assert machine.ask("pgrep -x hardnessd")[0] == machine.ask("command -v hardnessd")[0] == 1
+    assert machine.run("cat /etc/hardnessd.toml") == CONFIG.strip()
+    machine.run("apt-get purge -y -o Dpkg::Use-Pty=0 hardnessd 2>&1")
+    # Where recordings lie, and a directory that goes with the next boot; and the user, as is usual.
+    assert sorted(left(machine)) == ["/run/hardnessd", "/var/lib/hardnessd"], left(machine)
+    assert machine.run("getent passwd hardnessd")
+    assert machine.run("systemctl --failed --no-legend; systemctl list-unit-files -q 'hardness*'; true") == ""
+    say("removed", "stopped and removed, the configuration by purge; user and recordings stay")
+
+
+if __name__ == "__main__":
+    main()
