@@ -11,7 +11,7 @@ use crate::train::settings::{SettingsError, check, check_loop};
 pub enum Turns {
     /// First the discriminator, then the generator, as the paper.
     Alternate,
-    /// Whoever is behind: see [`Balance`](super::balance::Balance).
+    /// Whoever is behind by the generator's loss, as in DeLiGAN's code.
     Threshold,
 }
 
