@@ -43,16 +43,10 @@ pub fn step(
     rules: Rules,
 ) -> (f64, f64) {
     // The generator does not change while the discriminator takes its step, so both use the
-    // same images, which the first takes as constants.
+    // same images.
     let generated = Generated::of(generator, eta);
 
-    let tracked = discriminator.weights.tracked();
-    let loss = discriminator_loss(
-        rules.game,
-        &tracked,
-        batch,
-        generated.images.clone().inner(),
-    );
+    let (tracked, loss) = told_apart(discriminator, batch, &generated, rules.game);
     let mut gradients = loss.backward();
     discriminator.step(&tracked, &mut gradients, rules.rate);
 
@@ -70,13 +64,7 @@ pub(super) fn turn(
     (rules, balance): (Rules, &mut Balance),
 ) -> (f64, f64) {
     let generated = Generated::of(generator, eta);
-    let tracked = discriminator.weights.tracked();
-    let loss = discriminator_loss(
-        rules.game,
-        &tracked,
-        batch,
-        generated.images.clone().inner(),
-    );
+    let (tracked, loss) = told_apart(discriminator, batch, &generated, rules.game);
     let fooled = generator_loss(rules.game, &discriminator.weights, batch, generated.images);
     let of_generator = match balance.turn(number(&fooled)) {
         Side::Generator => learn(generator, &generated.tracked, fooled, rules),
@@ -101,6 +89,20 @@ impl Generated {
         let images = generator::images(&tracked, eta, &mut Normalisation::Batch);
         Self { tracked, images }
     }
+}
+
+/// The discriminator's loss, to which generated images are constants, and the weights that its
+/// gradients lead to.
+fn told_apart(
+    discriminator: &Learner,
+    batch: &Batch,
+    generated: &Generated,
+    game: Game,
+) -> (Weights, Tensor<1>) {
+    let tracked = discriminator.weights.tracked();
+    let images = generated.images.clone().inner();
+    let loss = discriminator_loss(game, &tracked, batch, images);
+    (tracked, loss)
 }
 
 /// The generator's step on its loss and the penalty on sigma; gives their sum.
