@@ -44,15 +44,22 @@ pub enum Kind {
 }
 
 impl Kind {
+    /// All there are.
+    pub const ALL: [Kind; 4] = [Kind::Status, Kind::Press, Kind::Hardness, Kind::Frame];
+
+    /// The `type` of its events.
+    pub fn name(self) -> &'static str {
+        match self {
+            Kind::Status => "status",
+            Kind::Press => "press",
+            Kind::Hardness => "hardness",
+            Kind::Frame => "frame",
+        }
+    }
+
     /// The kind whose events have this `type`.
     pub fn named(name: &str) -> Option<Self> {
-        match name {
-            "status" => Some(Kind::Status),
-            "press" => Some(Kind::Press),
-            "hardness" => Some(Kind::Hardness),
-            "frame" => Some(Kind::Frame),
-            _ => None,
-        }
+        Self::ALL.into_iter().find(|kind| kind.name() == name)
     }
 }
 

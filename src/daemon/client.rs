@@ -4,6 +4,7 @@
 //! them, and reads requests between. Only a connection with [`Access::Control`] changes anything.
 
 use std::io;
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::{Buf, BytesMut};
@@ -333,7 +334,7 @@ async fn statuses(sensors: &Sensors) -> Vec<Line> {
     let statuses = sensors.statuses().await;
     statuses
         .into_iter()
-        .map(|status| Line::from(&Event::Status(status)))
+        .map(|status| Line::from(Arc::new(Event::Status(status))))
         .collect()
 }
 

@@ -28,6 +28,8 @@ pub(crate) struct Line {
     pub(crate) seq: Option<u64>,
     /// Its JSON, newline included.
     pub(crate) json: Arc<str>,
+    /// The event it tells of; none of a reply, and of a line that is held none any more.
+    pub(crate) event: Option<Arc<Event>>,
 }
 
 impl From<Reply> for Line {
@@ -35,15 +37,33 @@ impl From<Reply> for Line {
         Self {
             seq: None,
             json: reply.to_line().into(),
+            event: None,
         }
     }
 }
 
-impl From<&Event> for Line {
-    fn from(event: &Event) -> Self {
+impl From<Arc<Event>> for Line {
+    fn from(event: Arc<Event>) -> Self {
         Self {
             seq: event.seq(),
             json: event.to_line().into(),
+            event: Some(event),
+        }
+    }
+}
+
+impl Line {
+    /// Kind and sensor of its event.
+    fn about(&self) -> Option<(Kind, &str)> {
+        let event = self.event.as_deref()?;
+        Some((event.kind(), event.sensor()))
+    }
+
+    /// The same for a long time: what was sent is kept, what it was made from is not.
+    fn to_hold(&self) -> Self {
+        Self {
+            event: None,
+            ..self.clone()
         }
     }
 }
@@ -109,22 +129,23 @@ impl Hub {
         if kind == Kind::Frame && !subscribers.any(|subscriber| subscriber.wants(kind)) {
             return;
         }
-        let line = Line::from(&event);
+        let event = Arc::new(event);
+        let line = Line::from(event.clone());
         if line.seq.is_some() {
             log::event(&event);
             self.tally.count(&event);
             self.keep(Held {
                 kind,
-                line: line.clone(),
+                line: line.to_hold(),
             });
         }
-        if let Event::Hardness(verdict) = &event
+        if let Event::Hardness(verdict) = &*event
             && verdict.phase == crate::event::Phase::Final
         {
-            self.finals.insert(verdict.sensor.clone(), line.clone());
+            self.finals.insert(verdict.sensor.clone(), line.to_hold());
         }
         for subscriber in self.subscribers.values_mut() {
-            self.tally.dropped += subscriber.offer(kind, event.sensor(), &line);
+            self.tally.dropped += subscriber.offer(&line);
         }
     }
 

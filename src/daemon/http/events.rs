@@ -4,6 +4,7 @@
 //! stopped, which is the hub's `since`. Frames come only when asked for, and only the newest: who
 //! looks on wants the present.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use hyper::Request;
@@ -104,7 +105,11 @@ pub(super) async fn open(
     let mut first = format!("retry: {}\n", RETRY.as_millis()).into_bytes();
     write(&mut first, &run, &Line { seq: from, ..hello });
     for status in sensors.statuses().await {
-        write(&mut first, &run, &Line::from(&Event::Status(status)));
+        write(
+            &mut first,
+            &run,
+            &Line::from(Arc::new(Event::Status(status))),
+        );
     }
     // What the connection does not take stays in the hub, whose queue is bounded.
     let (sender, events) = mpsc::channel(1);

@@ -13,13 +13,6 @@ const QUEUE: usize = 1024;
 /// enough that a stalled subscriber holds little beyond its queue.
 const BATCH_BYTES: usize = 32 * 1024;
 
-/// An event waiting.
-struct Waiting {
-    kind: Kind,
-    sensor: String,
-    line: Line,
-}
-
 /// A subscriber's state.
 pub(super) struct Subscriber {
     kinds: Kinds,
@@ -28,7 +21,8 @@ pub(super) struct Subscriber {
     missing: Option<Reply>,
     /// Numbers of held events that `since` asked for, oldest first.
     replay: VecDeque<u64>,
-    queue: VecDeque<Waiting>,
+    /// Events waiting.
+    queue: VecDeque<Line>,
     /// Events of its kinds dropped since the last line it got.
     lost: u64,
     /// `gap` lines told since the hub last counted them.
@@ -60,10 +54,11 @@ impl Subscriber {
     /// Another subscription: what waits and is no longer wanted goes without a `gap`.
     pub(super) fn change(&mut self, kinds: Kinds, policy: Policy) {
         (self.kinds, self.policy) = (kinds, policy);
-        self.queue.retain(|event| kinds.contains(event.kind));
+        self.queue
+            .retain(|line| line.about().is_some_and(|(kind, _)| kinds.contains(kind)));
         if policy != Policy::Queue {
-            for event in std::mem::take(&mut self.queue) {
-                self.enqueue(event);
+            for line in std::mem::take(&mut self.queue) {
+                self.enqueue(line);
             }
         }
     }
@@ -73,7 +68,7 @@ impl Subscriber {
     pub(super) fn replay(&mut self, held: impl Iterator<Item = (u64, Kind)>, missing: Option<u64>) {
         self.missing = (missing != Some(0)).then_some(Reply::Gap { lost: missing });
         // What waits is held too, and comes with the rest.
-        self.queue.retain(|event| event.line.seq.is_none());
+        self.queue.retain(|line| line.seq.is_none());
         self.lost = 0;
         self.replay = held
             .filter(|&(seq, kind)| self.kinds.contains(kind) && !self.handed.contains(seq))
@@ -82,31 +77,24 @@ impl Subscriber {
     }
 
     /// A new event, wanted or not. Says how many it displaced that a `gap` will tell of.
-    pub(super) fn offer(&mut self, kind: Kind, sensor: &str, line: &Line) -> u64 {
+    pub(super) fn offer(&mut self, line: &Line) -> u64 {
         if let Some(seq) = line.seq {
             self.handed.remove(seq);
         }
-        if !self.wants(kind) {
-            return 0;
+        match line.about() {
+            Some((kind, _)) if self.wants(kind) => self.enqueue(line.clone()),
+            _ => 0,
         }
-        self.enqueue(Waiting {
-            kind,
-            sensor: sensor.to_owned(),
-            line: line.clone(),
-        })
     }
 
-    fn enqueue(&mut self, event: Waiting) -> u64 {
+    fn enqueue(&mut self, line: Line) -> u64 {
+        let frame = |line: &Line| matches!(line.about(), Some((Kind::Frame, _)));
         let newest_counts = match self.policy {
             Policy::Queue => false,
             Policy::Latest => true,
-            Policy::LatestFrames => event.kind == Kind::Frame,
+            Policy::LatestFrames => frame(&line),
         };
-        let older = || {
-            self.queue
-                .iter()
-                .position(|e| e.kind == event.kind && e.sensor == event.sensor)
-        };
+        let older = || self.queue.iter().position(|e| e.about() == line.about());
         let superseded = if newest_counts { older() } else { None };
         let superseded = superseded.or_else(|| (self.queue.len() == QUEUE).then_some(0));
         let mut lost = 0;
@@ -114,11 +102,11 @@ impl Subscriber {
             && let Some(dropped) = self.queue.remove(place)
         {
             // A newer frame stands for the older ones: that is what `latest` is for.
-            let silent = self.policy != Policy::Queue && dropped.kind == Kind::Frame;
+            let silent = self.policy != Policy::Queue && frame(&dropped);
             lost = u64::from(!silent);
         }
         self.lost += lost;
-        self.queue.push_back(event);
+        self.queue.push_back(line);
         lost
     }
 
@@ -145,16 +133,16 @@ impl Subscriber {
             }
         }
         while bytes < BATCH_BYTES
-            && let Some(event) = self.queue.pop_front()
+            && let Some(line) = self.queue.pop_front()
         {
             lines.extend(self.gap());
-            if let Some(seq) = event.line.seq
+            if let Some(seq) = line.seq
                 && held(seq).is_some()
             {
                 self.handed.insert(seq);
             }
-            bytes += event.line.json.len();
-            lines.push(event.line);
+            bytes += line.json.len();
+            lines.push(line);
         }
         lines
     }
