@@ -11,6 +11,7 @@ pub mod tare;
 pub mod press;
 pub mod verdict;
 pub mod event;
+mod ros;
 pub mod pipeline;
 pub mod recording;
 

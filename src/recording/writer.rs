@@ -7,10 +7,11 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::write::NoSeek;
 use mcap::{Compression, WriteOptions};
 
-use super::message::{self, TOPICS, Topic};
+use super::message::{self, TOPICS};
 use super::{Entry, Error, Labels, Sensor};
 use crate::event::Event;
 use crate::frame::Stamp;
+use crate::ros::{self, Topic};
 
 /// What a recording says of itself, for people: a replay reads the [`super::State`]s alone.
 #[derive(Debug, Clone, PartialEq)]
@@ -146,7 +147,7 @@ impl<W: Write> Writer<W> {
         let Some(sensor) = sensors.position(|sensor| sensor == event.sensor()) else {
             return Ok(());
         };
-        let (topic, time, bytes) = message::encode_event(event);
+        let (topic, time, bytes) = ros::encode(event);
         self.write(channel_id(sensor, topic), time, &bytes)
     }
 

@@ -1,5 +1,7 @@
 """A daemon, its simulated sensors and its sockets in a directory of their own."""
 
+import json
+import math
 import os
 import signal
 import subprocess
@@ -18,6 +20,28 @@ def wait_for(what, there):
             return found
         time.sleep(0.01)
     raise AssertionError(f"{what} does not come")
+
+
+# What stands in a ROS message where an event has null, if it is not NaN.
+NULL = {"level": 0, "label": "", "rejected": "", "context": "", "mono_ns": 0, "reason": ""}
+
+
+def same(found, expected, key):
+    """A field of a ROS message is that of the JSON event."""
+    if key == "age_at_publish_ms":
+        return math.isclose(found, expected)
+    if key == "context":
+        return (json.loads(found) if found else None) == expected
+    if expected is None:
+        return found == NULL[key] if key in NULL else math.isnan(found)
+    if key == "probabilities":
+        return all(math.isclose(a, b, rel_tol=1e-6) for a, b in zip(found, expected, strict=True))
+    if key == "notes":
+        return list(found) == expected
+    if isinstance(expected, float):
+        # JSON has forces and areas rounded to 0.001, confidence as f32.
+        return abs(found - expected) <= 0.0005 + 1e-6
+    return found == expected
 
 
 class Bench:

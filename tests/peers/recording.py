@@ -10,7 +10,6 @@ value.
 """
 
 import json
-import math
 import os
 import pathlib
 import signal
@@ -19,14 +18,13 @@ import subprocess
 import sys
 import time
 
-from bench import Bench, wait_for
+from bench import Bench, same, wait_for
 from mcap.reader import make_reader
 from mcap_ros2.reader import read_ros2_messages
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 TOPICS = ["input", "frame", "hardness", "press", "status"]
-NULL = {"level": 0, "label": "", "rejected": "", "context": "", "mono_ns": 0, "reason": ""}
 
 
 def by_mcap(path):
@@ -59,24 +57,6 @@ def by_rosbags(path):
             message = reader.deserialize(data, connection.msgtype)
             messages[connection.topic.rsplit("/", 1)[1]].append(message)
     return messages
-
-
-def same(found, expected, key):
-    """A field of a message is that of the JSON event."""
-    if key == "age_at_publish_ms":
-        return math.isclose(found, expected)
-    if key == "context":
-        return (json.loads(found) if found else None) == expected
-    if expected is None:
-        return found == NULL[key] if key in NULL else math.isnan(found)
-    if key == "probabilities":
-        return all(math.isclose(a, b, rel_tol=1e-6) for a, b in zip(found, expected, strict=True))
-    if key == "notes":
-        return list(found) == expected
-    if isinstance(expected, float):
-        # JSON has forces and areas rounded to 0.001, confidence as f32.
-        return abs(found - expected) <= 0.0005 + 1e-6
-    return found == expected
 
 
 def check(path, live):

@@ -1,0 +1,288 @@
+//! Events as ROS 2 messages: definitions, and bytes by them (CDR, little-endian).
+//!
+//! In: events. Out: the messages that recordings hold and ROS 2 subscribers get. Every message
+//! begins with a `std_msgs/Header`: the moment in UTC and the sensor's name. What is null in an
+//! event is 0, NaN or an empty string here, for a ROS message knows no null.
+
+use byteorder::LittleEndian;
+use jiff::Timestamp;
+use serde::de::Visitor;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde_json::Value;
+
+use crate::event::{self, Event};
+use crate::frame::{COLS, ROWS};
+
+/// What every message stands after: CDR, little-endian, no options (DDS-XTYPES 1.3, 7.6.3.1.2).
+pub(crate) const ENCAPSULATION: [u8; 4] = [0, 1, 0, 0];
+
+/// A channel of a sensor: `/tactile/SENSOR/NAME`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Topic {
+    pub(crate) name: &'static str,
+    pub(crate) schema: &'static str,
+    pub(crate) definition: &'static str,
+}
+
+pub(crate) const FRAME: Topic = Topic {
+    name: "frame",
+    schema: "sensor_msgs/msg/Image",
+    definition: "\
+std_msgs/Header header
+uint32 height
+uint32 width
+string encoding
+uint8 is_bigendian
+uint32 step
+uint8[] data
+",
+};
+
+pub(crate) const HARDNESS: Topic = Topic {
+    name: "hardness",
+    schema: "tactile_interfaces/msg/Hardness",
+    definition: include_str!("../clients/ros2/tactile_interfaces/msg/Hardness.msg"),
+};
+
+pub(crate) const PRESS: Topic = Topic {
+    name: "press",
+    schema: "tactile_interfaces/msg/Press",
+    definition: include_str!("../clients/ros2/tactile_interfaces/msg/Press.msg"),
+};
+
+pub(crate) const STATUS: Topic = Topic {
+    name: "status",
+    schema: "tactile_interfaces/msg/Status",
+    definition: include_str!("../clients/ros2/tactile_interfaces/msg/Status.msg"),
+};
+
+impl Topic {
+    /// The definition with those it refers to, as `ros2msg` has it.
+    pub(crate) fn text(&self) -> String {
+        let rule = "=".repeat(80);
+        format!(
+            "{}{rule}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
+             {rule}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n",
+            self.definition
+        )
+    }
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+pub(crate) struct Header {
+    stamp: Time,
+    pub(crate) frame_id: String,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+struct Time {
+    sec: i32,
+    nanosec: u32,
+}
+
+impl Header {
+    pub(crate) fn new(time: Timestamp, sensor: &str) -> Self {
+        // Seconds and nanoseconds of ROS count from the same second on; before 1970 ours do not.
+        let ns = time.as_nanosecond();
+        Self {
+            stamp: Time {
+                sec: ns.div_euclid(1_000_000_000) as i32,
+                nanosec: ns.rem_euclid(1_000_000_000) as u32,
+            },
+            frame_id: sensor.to_owned(),
+        }
+    }
+
+    pub(crate) fn time(&self) -> Option<Timestamp> {
+        let nanosec = i32::try_from(self.stamp.nanosec).ok()?;
+        Timestamp::new(i64::from(self.stamp.sec), nanosec).ok()
+    }
+}
+
+/// Bytes as one run: an element at a time is slow.
+#[derive(Debug)]
+pub(crate) struct Blob(pub(crate) Vec<u8>);
+
+impl Serialize for Blob {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_bytes(&self.0)
+    }
+}
+
+impl<'de> Deserialize<'de> for Blob {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct Bytes;
+        impl Visitor<'_> for Bytes {
+            type Value = Blob;
+
+            fn expecting(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                out.write_str("bytes")
+            }
+
+            fn visit_byte_buf<E>(self, bytes: Vec<u8>) -> Result<Blob, E> {
+                Ok(Blob(bytes))
+            }
+        }
+        deserializer.deserialize_byte_buf(Bytes)
+    }
+}
+
+#[derive(Debug, Serialize)]
+struct ImageMessage {
+    header: Header,
+    height: u32,
+    width: u32,
+    encoding: &'static str,
+    is_bigendian: u8,
+    step: u32,
+    data: Blob,
+}
+
+#[derive(Debug, Serialize)]
+struct HardnessMessage<'a> {
+    header: Header,
+    seq: u64,
+    sensor: &'a str,
+    time: String,
+    press: u64,
+    phase: String,
+    level: u8,
+    label: &'a str,
+    rejected: String,
+    notes: Vec<String>,
+    probabilities: &'a [f32],
+    confidence: f32,
+    frame: u64,
+    contact_area_taxels: u32,
+    contact_area_mm2: f64,
+    force_n: f64,
+    model: &'a str,
+    state: String,
+    context: String,
+    mono_ns: u64,
+    age_at_publish_ms: f64,
+    latency_us: u64,
+}
+
+#[derive(Debug, Serialize)]
+struct PressMessage<'a> {
+    header: Header,
+    seq: u64,
+    sensor: &'a str,
+    time: String,
+    press: u64,
+    state: String,
+    frame: u64,
+    reason: &'a str,
+    frames: u64,
+    context: String,
+}
+
+#[derive(Debug, Serialize)]
+struct StatusMessage<'a> {
+    header: Header,
+    seq: u64,
+    sensor: &'a str,
+    time: String,
+    state: String,
+    reason: &'a str,
+    frames: u64,
+    frames_damaged: u64,
+    bytes_skipped: u64,
+    frame_rate_hz: f64,
+}
+
+pub(crate) fn to_cdr(message: &impl Serialize) -> Vec<u8> {
+    let mut bytes = ENCAPSULATION.to_vec();
+    cdr_encoding::to_writer::<_, LittleEndian, _>(&mut bytes, message)
+        .expect("a message has only what CDR knows, and memory takes it");
+    bytes
+}
+
+/// A state without data, by the name it is published under.
+fn name(state: &impl Serialize) -> String {
+    match serde_json::to_value(state) {
+        Ok(Value::String(name)) => name,
+        other => unreachable!("a state without data is published as its name, not {other:?}"),
+    }
+}
+
+fn context(context: Option<&Value>) -> String {
+    context.map_or_else(String::new, Value::to_string)
+}
+
+/// An event, with its channel and its time.
+pub(crate) fn encode(event: &Event) -> (Topic, Timestamp, Vec<u8>) {
+    match event {
+        Event::Frame(frame) => {
+            let bytes = frame.newtons.iter().flat_map(|n| n.to_le_bytes()).collect();
+            let message = ImageMessage {
+                header: Header::new(frame.time, &frame.sensor),
+                height: ROWS as u32,
+                width: COLS as u32,
+                encoding: "32FC1",
+                is_bigendian: 0,
+                step: (COLS * size_of::<f32>()) as u32,
+                data: Blob(bytes),
+            };
+            (FRAME, frame.time, to_cdr(&message))
+        }
+        Event::Hardness(verdict) => {
+            let message = HardnessMessage {
+                header: Header::new(verdict.time, &verdict.sensor),
+                seq: verdict.seq.unwrap_or(0),
+                sensor: &verdict.sensor,
+                time: event::time_text(verdict.time),
+                press: verdict.press,
+                phase: name(&verdict.phase),
+                level: verdict.level.unwrap_or(0),
+                label: verdict.label.as_deref().unwrap_or_default(),
+                rejected: verdict.rejected.as_ref().map_or_else(String::new, name),
+                notes: verdict.notes.iter().map(name).collect(),
+                probabilities: &verdict.probabilities,
+                confidence: verdict.confidence,
+                frame: verdict.frame,
+                contact_area_taxels: verdict.contact_area_taxels,
+                contact_area_mm2: verdict.contact_area_mm2,
+                force_n: verdict.force_n,
+                model: &verdict.model,
+                state: name(&verdict.state),
+                context: context(verdict.context.as_ref()),
+                mono_ns: verdict.mono_ns.unwrap_or(0),
+                age_at_publish_ms: verdict.age_at_publish_ms.unwrap_or(f64::NAN),
+                latency_us: verdict.latency_us.unwrap_or(0),
+            };
+            (HARDNESS, verdict.time, to_cdr(&message))
+        }
+        Event::Press(press) => {
+            let message = PressMessage {
+                header: Header::new(press.time, &press.sensor),
+                seq: press.seq.unwrap_or(0),
+                sensor: &press.sensor,
+                time: event::time_text(press.time),
+                press: press.press,
+                state: name(&press.state),
+                frame: press.frame,
+                reason: press.reason.unwrap_or_default(),
+                frames: press.frames,
+                context: context(press.context.as_ref()),
+            };
+            (PRESS, press.time, to_cdr(&message))
+        }
+        Event::Status(status) => {
+            let message = StatusMessage {
+                header: Header::new(status.time, &status.sensor),
+                seq: status.seq.unwrap_or(0),
+                sensor: &status.sensor,
+                time: event::time_text(status.time),
+                state: name(&status.state),
+                reason: status.reason.as_deref().unwrap_or_default(),
+                frames: status.frames,
+                frames_damaged: status.frames_damaged,
+                bytes_skipped: status.bytes_skipped,
+                frame_rate_hz: status.frame_rate_hz.unwrap_or(f64::NAN),
+            };
+            (STATUS, status.time, to_cdr(&message))
+        }
+    }
+}
