@@ -13,12 +13,18 @@ mod hub;
 pub mod log;
 pub mod publish;
 pub mod record;
+#[cfg(any(feature = "ros2", feature = "zenoh"))]
+mod relay;
 mod request;
+#[cfg(feature = "ros2")]
+pub mod ros2;
 mod sensor;
 pub(crate) mod serial;
 pub mod socket;
 mod systemd;
 pub mod tcp;
+#[cfg(feature = "zenoh")]
+pub mod zenoh;
 
 use std::fs::File;
 use std::future::Future;
@@ -32,7 +38,7 @@ use tokio::task::{JoinHandle, JoinSet};
 use tokio::time::MissedTickBehavior;
 use tracing::{error, info, warn};
 
-use self::config::{Config, Setup};
+use self::config::{Config, Publish, Setup};
 use self::log::Log;
 use self::publish::Publishers;
 use self::record::{EventRecorder, Recorder, SensorRecorder, Target};
@@ -121,8 +127,7 @@ impl Daemon {
     /// refuses.
     pub fn bind(setup: Setup) -> Result<Self, Error> {
         let hello = hello(&setup, run_token().map_err(Error::Random)?);
-        let http = setup.config.http.as_ref().map(|http| http.listen);
-        let publishers = Publishers::bind(&setup.config.publish, http)?;
+        let publishers = Publishers::bind(&setup.config)?;
         Ok(Self {
             target: setup.config.record.clone().map(Target::Directory),
             setup,
@@ -144,8 +149,7 @@ impl Daemon {
         labels: Labels,
     ) -> Result<Self, Error> {
         setup.config.http = None;
-        setup.config.publish.tcp = None;
-        setup.config.publish.unix.enabled = false;
+        setup.config.publish = Publish::none();
         setup.config.record = None;
         Ok(Self {
             target: Some(Target::File { path, file, labels }),

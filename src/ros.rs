@@ -57,6 +57,13 @@ pub(crate) const STATUS: Topic = Topic {
 };
 
 impl Topic {
+    /// Of its schema, as a middleware has it.
+    #[cfg(feature = "ros2")]
+    pub(crate) fn package_and_name(&self) -> (&'static str, &'static str) {
+        let named = self.schema.split_once("/msg/");
+        named.expect("a schema is PACKAGE/msg/NAME")
+    }
+
     /// The definition with those it refers to, as `ros2msg` has it.
     pub(crate) fn text(&self) -> String {
         let rule = "=".repeat(80);

@@ -15,6 +15,9 @@ pub fn plain(message: &str) -> String {
         "invalid socket address syntax" => {
             return "found no address and port, expected such as 127.0.0.1:8255".to_owned();
         }
+        "invalid IP address syntax" => {
+            return "found no address, expected such as 192.0.2.7".to_owned();
+        }
         _ => {}
     }
     let Some((found, expected)) = message.rsplit_once(", expected ") else {

@@ -9,7 +9,7 @@ mod check;
 mod parse;
 
 use std::env;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -126,12 +126,26 @@ pub struct Publish {
     /// The same protocol over TCP; off unless given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tcp: Option<Tcp>,
-    /// Not in this version.
-    #[serde(skip_serializing)]
-    zenoh: Option<toml::Value>,
-    /// Not in this version.
-    #[serde(skip_serializing)]
-    ros2: Option<toml::Value>,
+    /// Keys of a zenoh session; off unless given, and only in a build that has it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub zenoh: Option<Zenoh>,
+    /// Topics of a ROS 2 node; off unless given, and only in a build that has it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ros2: Option<Ros2>,
+}
+
+impl Publish {
+    /// No way out at all.
+    pub fn none() -> Self {
+        let unix = Unix {
+            enabled: false,
+            ..Unix::default()
+        };
+        Self {
+            unix,
+            ..Self::default()
+        }
+    }
 }
 
 /// The `[publish.tcp]` table.
@@ -146,6 +160,82 @@ impl Default for Tcp {
     fn default() -> Self {
         Self {
             listen: SocketAddr::from(([127, 0, 0, 1], 8255)),
+        }
+    }
+}
+
+/// The `[publish.zenoh]` table. A session listens and connects as it says and looks for nobody.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Zenoh {
+    /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`.
+    pub listen: Vec<String>,
+    /// Endpoints of routers or peers to connect to, again and again until they are there.
+    pub connect: Vec<String>,
+    /// What stands after `tactile/` in every key; by default the robot's name.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    site: Option<String>,
+}
+
+impl Default for Zenoh {
+    fn default() -> Self {
+        Self {
+            listen: vec!["tcp/127.0.0.1:7447".to_owned()],
+            connect: Vec::new(),
+            site: None,
+        }
+    }
+}
+
+impl Zenoh {
+    /// What stands after `tactile/` in every key.
+    pub fn site<'a>(&'a self, robot: &'a str) -> &'a str {
+        self.site.as_deref().unwrap_or(robot)
+    }
+}
+
+/// The `[publish.ros2]` table.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Ros2 {
+    /// Domain; by default `$ROS_DOMAIN_ID`, else 0.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    domain_id: Option<u16>,
+    /// Namespace of the node and its topics.
+    pub namespace: String,
+    /// Addresses of the interfaces to use; none: every one, as ROS 2 does.
+    pub networks: Vec<IpAddr>,
+}
+
+impl Default for Ros2 {
+    fn default() -> Self {
+        Self {
+            domain_id: None,
+            namespace: "/".to_owned(),
+            networks: Vec::new(),
+        }
+    }
+}
+
+impl Ros2 {
+    /// The domain: as configured, else that of the environment, else 0.
+    ///
+    /// # Panics
+    ///
+    /// If it was not checked as every configuration that is read is.
+    pub fn domain_id(&self) -> u16 {
+        let chosen = self.chosen_domain_id();
+        chosen.expect("the domain was checked when the configuration was read")
+    }
+
+    /// The same before it is checked, or what stands in its place.
+    fn chosen_domain_id(&self) -> Result<u16, String> {
+        match (self.domain_id, env::var("ROS_DOMAIN_ID")) {
+            (Some(id), _) => Ok(id),
+            (None, Ok(text)) if !text.is_empty() => {
+                text.parse().map_err(|_| format!("$ROS_DOMAIN_ID {text:?}"))
+            }
+            (None, _) => Ok(0),
         }
     }
 }
@@ -362,6 +452,8 @@ impl Config {
                 unix.max_clients != their_unix.max_clients,
             ),
             ("publish.tcp.listen", ours.tcp != theirs.tcp),
+            ("publish.zenoh", ours.zenoh != theirs.zenoh),
+            ("publish.ros2", ours.ros2 != theirs.ros2),
             ("http.listen", self.http != other.http),
             ("record", self.record != other.record),
         ];

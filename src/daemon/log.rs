@@ -92,7 +92,11 @@ impl Log {
             Ok(directives) if !directives.is_empty() => {
                 EnvFilter::try_new(directives).map_err(Error::Filter)?
             }
-            _ => EnvFilter::new(level),
+            // Of libraries, what a person should know; those of DDS warn several times a second of
+            // what is none of anybody's business, and fail with a value where it matters.
+            _ => EnvFilter::new(format!(
+                "warn,rustdds=off,ros2_client=off,hardnessd={level}"
+            )),
         };
         // The filter stands beside the output, not in it: a filter of a layer's own does not
         // survive the layer's exchange.

@@ -9,13 +9,21 @@ use tracing::info;
 
 use super::accept::{Stop, accept};
 use super::client::{Access, Service};
-use super::config::{Publish, Unix};
+use super::config::{Config, Unix};
 use super::http::Http;
 use super::hub;
+#[cfg(feature = "ros2")]
+use super::hub::Line;
+#[cfg(any(feature = "ros2", feature = "zenoh"))]
+use super::relay::Worker;
+#[cfg(feature = "ros2")]
+use super::ros2;
 use super::sensor::Sensors;
 use super::socket::{self, Socket};
 use super::systemd;
 use super::tcp::{self, Tcp};
+#[cfg(feature = "zenoh")]
+use super::zenoh;
 
 /// Permissions of the control socket: for the daemon's own user (contract, section 3).
 const CONTROL_MODE: u32 = 0o600;
@@ -42,6 +50,14 @@ pub enum Error {
     /// A TCP listener.
     #[error(transparent)]
     Tcp(#[from] tcp::Error),
+    /// A ROS 2 node.
+    #[cfg(feature = "ros2")]
+    #[error(transparent)]
+    Ros2(#[from] ros2::Error),
+    /// A zenoh session.
+    #[cfg(feature = "zenoh")]
+    #[error(transparent)]
+    Zenoh(#[from] zenoh::Error),
     /// The service manager listens where the configuration does not.
     #[error(
         "socket activation: found a socket at {found}, expected publish.unix.path or control_path"
@@ -56,18 +72,22 @@ pub enum Error {
 }
 
 /// Listeners: whoever connects is served once [`Publishers::serve`] runs.
-#[derive(Debug)]
 pub(crate) struct Publishers {
     max_clients: usize,
     socket: Option<Socket>,
     control: Option<Socket>,
     tcp: Option<Tcp>,
     http: Option<Tcp>,
+    #[cfg(feature = "ros2")]
+    ros2: Option<Worker<Vec<Line>>>,
+    #[cfg(feature = "zenoh")]
+    zenoh: Option<Worker<zenoh::Job>>,
 }
 
 impl Publishers {
     /// Binds all that are asked for, or none.
-    pub(crate) fn bind(publish: &Publish, http: Option<SocketAddr>) -> Result<Self, Error> {
+    pub(crate) fn bind(config: &Config) -> Result<Self, Error> {
+        let publish = &config.publish;
         let unix = &publish.unix;
         let mut passed = systemd::sockets().map_err(Error::Passed)?;
         let mut socket = |key, path: &Path, mode| {
@@ -95,8 +115,22 @@ impl Publishers {
                 .as_ref()
                 .map(|tcp| Tcp::bind("publish.tcp.listen", tcp.listen))
                 .transpose()?,
-            http: http
-                .map(|listen| Tcp::bind("http.listen", listen))
+            http: config
+                .http
+                .as_ref()
+                .map(|http| Tcp::bind("http.listen", http.listen))
+                .transpose()?,
+            #[cfg(feature = "ros2")]
+            ros2: publish
+                .ros2
+                .as_ref()
+                .map(|settings| ros2::open(settings, sensors(config)))
+                .transpose()?,
+            #[cfg(feature = "zenoh")]
+            zenoh: publish
+                .zenoh
+                .as_ref()
+                .map(|settings| zenoh::open(settings, &config.robot, sensors(config)))
                 .transpose()?,
         })
     }
@@ -128,6 +162,10 @@ impl Publishers {
             control,
             tcp,
             http,
+            #[cfg(feature = "ros2")]
+            ros2,
+            #[cfg(feature = "zenoh")]
+            zenoh,
         } = self;
         let service = |access| Service {
             access,
@@ -157,6 +195,20 @@ impl Publishers {
             );
             tasks.spawn(accept(listener, Http::MOST_CONNECTIONS, http, stop.clone()));
         }
+        #[cfg(feature = "ros2")]
+        if let Some(ros2) = ros2 {
+            tasks.spawn(ros2.serve(hub.clone(), sensors.clone()));
+        }
+        #[cfg(feature = "zenoh")]
+        if let Some(zenoh) = zenoh {
+            tasks.spawn(zenoh.serve(hub.clone(), sensors.clone()));
+        }
         tasks
     }
+}
+
+#[cfg(any(feature = "ros2", feature = "zenoh"))]
+fn sensors(config: &Config) -> Vec<String> {
+    let sensors = config.sensors.iter();
+    sensors.map(|sensor| sensor.name.clone()).collect()
 }

@@ -1,6 +1,7 @@
 //! `hardnessd check`: what would run, without opening a device.
 
 use std::io;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
@@ -122,9 +123,45 @@ pub fn run(args: &Args) -> Result<(), Error> {
             }
         }
     }
+    lines += &networks(&setup, &args.config);
     super::print(lines.as_bytes())
         .map(drop)
         .map_err(Error::Print)
+}
+
+/// The ways out that have their peers find each other.
+fn networks(setup: &Setup, path: &Path) -> String {
+    let publish = &setup.config.publish;
+    let mut lines = String::new();
+    if let Some(zenoh) = &publish.zenoh {
+        lines += &format!(
+            "zenoh tactile/{}/, listening on {:?}, connecting to {:?}\n",
+            zenoh.site(&setup.config.robot),
+            zenoh.listen,
+            zenoh.connect
+        );
+        let open = |endpoint: &&String| {
+            let address = endpoint.trim_start_matches("tcp/");
+            let parsed = address.parse::<SocketAddr>();
+            parsed.map_or(true, |address| !address.ip().is_loopback())
+        };
+        for endpoint in zenoh.listen.iter().filter(open) {
+            eprintln!(
+                "warning: {}: publish.zenoh.listen: found {endpoint:?}, open to whoever reaches \
+                 it, expected a loopback address unless that is meant",
+                path.display()
+            );
+        }
+    }
+    if let Some(ros2) = &publish.ros2 {
+        let namespace = ros2.namespace.trim_end_matches('/');
+        lines += &format!(
+            "ros2 {namespace}/tactile/, domain {}, networks {:?}\n",
+            ros2.domain_id(),
+            ros2.networks
+        );
+    }
+    lines
 }
 
 /// Pitches closer than this are the same: datasheets give two digits.

@@ -109,3 +109,26 @@ class Bench:
         process = self._start(["simulate", "--link", link, "--fps", rate, *more], "sensors")
         wait_for("the port", lambda: os.path.exists(link))
         return process
+
+    def tail(self, *more):
+        """Reads the Unix socket, JSON a line, on stdout."""
+        arguments = [self.binary, "tail", "--json", "--socket", self.path("events.sock")]
+        return subprocess.Popen([*arguments, *more], stdout=subprocess.PIPE, text=True)
+
+    def freeze(self, peer, daemon):
+        """Stops a peer that reads another way, for 1,500 events of a sensor at 100 frames/s: a
+        subscriber of the socket misses none of them and waits for none, nor does the daemon's stop.
+        Says how many frames there were, the latest verdict in us and how long the stop took in s."""
+        peer.send_signal(signal.SIGSTOP)
+        lines = self.tail("--types", "frame,hardness,press,status", "--count", "1500", "--timeout", "60")
+        read = [json.loads(line) for line in lines.communicate()[0].splitlines()]
+        numbers = [event["frame"] for event in read if event["type"] == "frame"]
+        assert len(numbers) > 1400 and numbers == list(range(numbers[0], numbers[-1] + 1)), numbers
+        late = [event["latency_us"] for event in read if event["type"] == "hardness"]
+        assert late and max(late) < 50_000, late
+        start = time.monotonic()
+        daemon.send_signal(signal.SIGTERM)
+        assert daemon.wait(timeout=10) == 0
+        stopped_s = time.monotonic() - start
+        assert stopped_s < 1, stopped_s
+        return len(numbers), max(late), stopped_s

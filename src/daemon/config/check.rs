@@ -4,7 +4,7 @@ use std::net::{IpAddr, SocketAddr};
 use std::path::Path;
 
 use super::parse::{Error, Unusable};
-use super::{Config, Model, Sensor};
+use super::{Config, Model, Ros2, Sensor, Zenoh};
 use crate::wire;
 
 /// Checks a configuration whose paths are not relative to its file any more; `path` is for messages.
@@ -15,15 +15,17 @@ pub(super) fn check(config: &Config, path: &Path) -> Result<(), Error> {
         found,
         expected,
     };
-    let absent = [
-        ("publish.zenoh", config.publish.zenoh.is_some()),
-        ("publish.ros2", config.publish.ros2.is_some()),
-    ];
-    if let Some((key, _)) = absent.iter().find(|(_, given)| *given) {
-        return Err(Error::NotInThisVersion {
-            path: path.to_owned(),
-            key,
-        });
+    let publish = &config.publish;
+    for (feature, built, given) in [
+        ("zenoh", cfg!(feature = "zenoh"), publish.zenoh.is_some()),
+        ("ros2", cfg!(feature = "ros2"), publish.ros2.is_some()),
+    ] {
+        if given && !built {
+            return Err(Error::NotBuilt {
+                path: path.to_owned(),
+                feature,
+            });
+        }
     }
     if config.robot.is_empty() || config.robot.chars().any(char::is_control) {
         let found = format!("{:?}", config.robot);
@@ -64,6 +66,12 @@ pub(super) fn check(config: &Config, path: &Path) -> Result<(), Error> {
         let found = unix.control_path().display().to_string();
         return Err(value(key, found, "another path than that of events"));
     }
+    if let Some(zenoh) = &publish.zenoh {
+        check_zenoh(zenoh, &config.robot, &value)?;
+    }
+    if let Some(ros2) = &publish.ros2 {
+        check_ros2(ros2, &config.sensors, &value)?;
+    }
     let tcp = config.publish.tcp.as_ref().map(|tcp| tcp.listen);
     let http = config.http.as_ref().map(|http| http.listen);
     if let (Some(tcp), Some(http)) = (tcp, http)
@@ -78,6 +86,86 @@ pub(super) fn check(config: &Config, path: &Path) -> Result<(), Error> {
     }
     Ok(())
 }
+
+fn check_zenoh(
+    zenoh: &Zenoh,
+    robot: &str,
+    value: &impl Fn(String, String, &'static str) -> Error,
+) -> Result<(), Error> {
+    for (key, endpoints) in [("listen", &zenoh.listen), ("connect", &zenoh.connect)] {
+        let port = |address: &str| {
+            address
+                .rsplit_once(':')
+                .map(|(_, port)| port.parse::<u16>())
+        };
+        let good = |endpoint: &&String| {
+            let address = endpoint.strip_prefix("tcp/");
+            matches!(address.and_then(port), Some(Ok(_)))
+        };
+        if let Some(bad) = endpoints.iter().find(|endpoint| !good(endpoint)) {
+            let expected = "endpoints such as \"tcp/127.0.0.1:7447\"";
+            return Err(value(
+                format!("publish.zenoh.{key}"),
+                format!("{bad:?}"),
+                expected,
+            ));
+        }
+    }
+    // What the key expressions of zenoh keep for themselves.
+    let site = zenoh.site(robot);
+    if site.split('/').any(str::is_empty) || site.contains(['*', '$', '?', '#']) {
+        return Err(value(
+            "publish.zenoh.site".to_owned(),
+            format!("{site:?} (by default the robot's name)"),
+            "parts of a key, without * $ ? #",
+        ));
+    }
+    Ok(())
+}
+
+fn check_ros2(
+    ros2: &Ros2,
+    sensors: &[Sensor],
+    value: &impl Fn(String, String, &'static str) -> Error,
+) -> Result<(), Error> {
+    let found = match ros2.chosen_domain_id() {
+        Ok(id) if id > LAST_DOMAIN_ID => Some(format!("{id} (by default $ROS_DOMAIN_ID)")),
+        Ok(_) => None,
+        Err(found) => Some(found),
+    };
+    if let Some(found) = found {
+        return Err(value(
+            "publish.ros2.domain_id".to_owned(),
+            found,
+            "0 to 232",
+        ));
+    }
+    let token = |token: &str| {
+        token.starts_with(|first: char| first.is_ascii_alphabetic())
+            && token.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
+            && !token.contains("__")
+    };
+    let namespace = &ros2.namespace;
+    let tokens = namespace.strip_prefix('/');
+    if !tokens.is_some_and(|tokens| tokens.is_empty() || tokens.split('/').all(token)) {
+        return Err(value(
+            "publish.ros2.namespace".to_owned(),
+            format!("{namespace:?}"),
+            "a namespace of ROS such as \"/arm_7\"",
+        ));
+    }
+    match sensors.iter().find(|sensor| !token(&sensor.name)) {
+        Some(sensor) => Err(value(
+            format!("sensor.name of {:?}", sensor.name),
+            "two _ in a row".to_owned(),
+            "a name that ROS takes, beside publish.ros2",
+        )),
+        None => Ok(()),
+    }
+}
+
+/// Beyond it a domain's ports are no port numbers (DDSI-RTPS 2.5, 9.6.2.3).
+const LAST_DOMAIN_ID: u16 = 232;
 
 /// Whether the system lets no two listen at these. With port 0 it chooses one that is free.
 fn meet(one: SocketAddr, other: SocketAddr) -> bool {

@@ -55,13 +55,16 @@ pub enum Error {
         /// What the part says.
         problem: Unusable,
     },
-    /// A key of a part that is not built yet: never ignored in silence.
-    #[error("{path}: {key}: found a value, expected none: not in this version")]
-    NotInThisVersion {
+    /// A table of a part that this program was built without: never ignored in silence.
+    #[error(
+        "{path}: publish.{feature}: found a table, expected none: built without the feature \
+         {feature:?}"
+    )]
+    NotBuilt {
         /// Of the configuration.
         path: PathBuf,
-        /// As in the file.
-        key: &'static str,
+        /// Of the package, and the table's name.
+        feature: &'static str,
     },
     /// The model file cannot be read.
     #[error("{path}: model.path: cannot read {model}: {source}")]

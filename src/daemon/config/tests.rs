@@ -135,8 +135,9 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
             &["publish.unix.control_path", "/control.sock"],
         ),
         (
-            "[[sensor]]\nport = \"p\"\n[publish.zenoh]",
-            &["publish.zenoh", "not in this version"],
+            "[[sensor]]\nport = \"p\"\n[publish.zenoh]\nlisten = [\"udp/here\"]",
+            // Refused by a build without it, and for its value by one with it.
+            &["publish.zenoh"],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[record]\nrotate_mb = 0",
@@ -325,4 +326,49 @@ fn only_what_a_sensor_can_change_while_it_runs_may_differ_in_a_reload() {
             None => assert_eq!(difference, None),
         }
     }
+}
+
+#[cfg(all(feature = "ros2", feature = "zenoh"))]
+#[test]
+fn zenoh_and_ros2_take_what_their_networks_do() {
+    let bad: [(&str, &[&str]); 7] = [
+        (
+            "zenoh]\nlisten = [\"udp/127.0.0.1:7447\"]",
+            &["zenoh.listen", "udp/"],
+        ),
+        (
+            "zenoh]\nconnect = [\"tcp/router\"]",
+            &["zenoh.connect", "tcp/router"],
+        ),
+        ("zenoh]\nsite = \"hall//3\"", &["zenoh.site", "hall//3"]),
+        ("zenoh]\nsite = \"**\"", &["zenoh.site", "**"]),
+        (
+            "ros2]\ndomain_id = 233",
+            &["ros2.domain_id", "233", "0 to 232"],
+        ),
+        ("ros2]\nnamespace = \"arm_7\"", &["ros2.namespace", "arm_7"]),
+        (
+            "ros2]\nnetworks = [\"eth0\"]",
+            &["4:13", "networks", "no address"],
+        ),
+    ];
+    for (table, expected) in bad {
+        let error = load(&format!("{LEAST}[publish.{table}\n")).unwrap_err();
+        for part in expected {
+            assert!(error.contains(part), "{table:?}: {part:?} not in {error:?}");
+        }
+    }
+    let robot = "robot = \"arm #7\"\n";
+    let error = load(&format!("{robot}{LEAST}[publish.zenoh]\n")).unwrap_err();
+    assert!(
+        error.contains("zenoh.site") && error.contains("arm #7"),
+        "{error}"
+    );
+    let named = LEAST.replace("port", "name = \"a__b\"\nport");
+    let error = load(&format!("{named}[publish.ros2]\n")).unwrap_err();
+    assert!(error.contains("a__b"), "{error}");
+    let good = format!("{robot}{LEAST}[publish.zenoh]\nsite = \"hall/3\"\n[publish.ros2]\n");
+    let publish = load(&good).unwrap().publish;
+    assert_eq!(publish.zenoh.unwrap().site("arm #7"), "hall/3");
+    assert_eq!(publish.ros2, Some(Ros2::default()));
 }

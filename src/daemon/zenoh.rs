@@ -1,0 +1,224 @@
+//! Zenoh: every event under a key of its own, `tactile/SITE/SENSOR/KIND`, as the JSON of a socket.
+//!
+//! In: lines of the hub. Out: puts on a session that talks to nobody the configuration does not
+//! name; the last final verdict and status of each sensor to whoever asks for their key; and a
+//! liveliness token `tactile/SITE`, by which a daemon that has ended is told from one that is
+//! silent. Nothing is taken in that changes anything.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::net::TcpListener;
+
+use tokio::sync::mpsc::{self, WeakSender};
+use tracing::{info, warn};
+use zenoh::bytes::Encoding;
+use zenoh::liveliness::LivelinessToken;
+use zenoh::pubsub::Publisher;
+use zenoh::qos::CongestionControl;
+use zenoh::query::{Query, Queryable};
+use zenoh::{Session, Wait};
+
+use super::config;
+use super::hub::Line;
+use super::relay::Worker;
+use crate::event::{Event, Kind, Phase};
+
+/// Why there is no session.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// An address cannot be listened on.
+    #[error("publish.zenoh.listen: cannot listen on {endpoint}: {source}")]
+    Listen {
+        /// As configured.
+        endpoint: String,
+        /// Why not.
+        source: io::Error,
+    },
+    /// The library's own words.
+    #[error("publish.zenoh: {0}")]
+    Session(#[from] zenoh::Error),
+    /// There is no thread to be had.
+    #[error("no thread for publish.zenoh: {0}")]
+    Thread(#[from] io::Error),
+}
+
+/// What the thread is given.
+pub(super) enum Job {
+    Lines(Vec<Line>),
+    Query(Query),
+}
+
+impl From<Vec<Line>> for Job {
+    fn from(lines: Vec<Line>) -> Self {
+        Self::Lines(lines)
+    }
+}
+
+/// Opens a session as `settings` say, with keys below `tactile/SITE`.
+///
+/// # Errors
+///
+/// If an address to listen on cannot be had, or the session not be opened for another reason. A
+/// peer that cannot be reached is no error: it is tried again.
+pub(super) fn open(
+    settings: &config::Zenoh,
+    robot: &str,
+    sensors: Vec<String>,
+) -> Result<Worker<Job>, Error> {
+    // Asked here first: the library's words for it are a page, with the paths of its sources.
+    for endpoint in &settings.listen {
+        let address = endpoint.trim_start_matches("tcp/");
+        TcpListener::bind(address).map_err(|source| Error::Listen {
+            endpoint: endpoint.clone(),
+            source,
+        })?;
+    }
+    let site = settings.site(robot).to_owned();
+    let (listen, connect) = (&settings.listen, &settings.connect);
+    info!(way = "zenoh", site, ?listen, ?connect, "publishing");
+    let settings = settings.clone();
+    Worker::start(
+        "zenoh",
+        move |jobs| Zenoh::open(&settings, site, &sensors, jobs.downgrade()),
+        Zenoh::work,
+    )
+}
+
+/// An open session.
+struct Zenoh {
+    publishers: BTreeMap<String, Publisher<'static>>,
+    site: String,
+    /// By key, what is answered to a query.
+    last: BTreeMap<String, Line>,
+    // Undeclared when dropped, and the session closed last.
+    _queries: Queryable<()>,
+    _alive: LivelinessToken,
+    _session: Session,
+}
+
+impl Zenoh {
+    fn open(
+        settings: &config::Zenoh,
+        site: String,
+        sensors: &[String],
+        jobs: WeakSender<Job>,
+    ) -> Result<Self, Error> {
+        let session = zenoh::open(configuration(settings)?).wait()?;
+        let mut publishers = BTreeMap::new();
+        for sensor in sensors {
+            for kind in Kind::ALL {
+                let key = key(&site, sensor, kind);
+                // A frame is soon out of date; anything else is worth waiting for a while, on a
+                // thread where nobody else waits.
+                let publisher = session
+                    .declare_publisher(key.clone())
+                    .encoding(Encoding::APPLICATION_JSON)
+                    .congestion_control(match kind {
+                        Kind::Frame => CongestionControl::Drop,
+                        _ => CongestionControl::Block,
+                    })
+                    .express(kind == Kind::Hardness)
+                    .wait()?;
+                publishers.insert(key, publisher);
+            }
+        }
+        let queries = session
+            .declare_queryable(format!("tactile/{site}/**"))
+            // One that finds the thread busy is answered with nothing, and may ask again.
+            .callback(move |query| {
+                if let Some(jobs) = jobs.upgrade() {
+                    drop(jobs.try_send(Job::Query(query)));
+                }
+            })
+            .wait()?;
+        let alive = session
+            .liveliness()
+            .declare_token(format!("tactile/{site}"))
+            .wait()?;
+        Ok(Self {
+            publishers,
+            site,
+            last: BTreeMap::new(),
+            _queries: queries,
+            _alive: alive,
+            _session: session,
+        })
+    }
+
+    fn work(mut self, mut jobs: mpsc::Receiver<Job>) {
+        while let Some(job) = jobs.blocking_recv() {
+            match job {
+                Job::Lines(lines) => lines.into_iter().for_each(|line| self.publish(line)),
+                Job::Query(query) => self.answer(&query),
+            }
+        }
+    }
+
+    fn publish(&mut self, line: Line) {
+        let Some(event) = &line.event else {
+            warn!(gap = line.json.trim_end(), "zenoh is too slow");
+            return;
+        };
+        let key = key(&self.site, event.sensor(), event.kind());
+        let Some(publisher) = self.publishers.get(&key) else {
+            return;
+        };
+        if let Err(error) = publisher.put(text(&line)).wait() {
+            warn!(key, %error, "not published on zenoh");
+        }
+        let answers = match &**event {
+            Event::Hardness(verdict) => verdict.phase == Phase::Final,
+            Event::Status(_) => true,
+            Event::Press(_) | Event::Frame(_) => false,
+        };
+        if answers {
+            self.last.insert(key, line);
+        }
+    }
+
+    fn answer(&self, query: &Query) {
+        for (key, line) in &self.last {
+            let asked = zenoh::key_expr::keyexpr::new(key)
+                .is_ok_and(|key| query.key_expr().intersects(key));
+            if asked {
+                let reply = query
+                    .reply(key, text(line))
+                    .encoding(Encoding::APPLICATION_JSON);
+                if let Err(error) = reply.wait() {
+                    warn!(key, %error, "not answered on zenoh");
+                }
+            }
+        }
+    }
+}
+
+fn key(site: &str, sensor: &str, kind: Kind) -> String {
+    format!("tactile/{site}/{sensor}/{}", kind.name())
+}
+
+/// A message is no line of many.
+fn text(line: &Line) -> &str {
+    line.json.trim_end()
+}
+
+/// By default zenoh listens on every interface and looks for peers by multicast; this one does
+/// only what it is told.
+fn configuration(settings: &config::Zenoh) -> Result<zenoh::Config, Error> {
+    let json =
+        |endpoints: &[String]| serde_json::to_string(endpoints).expect("a list of strings is JSON");
+    let mut config = zenoh::Config::default();
+    for (key, value) in [
+        ("mode", "\"peer\"".to_owned()),
+        ("listen/endpoints", json(&settings.listen)),
+        ("connect/endpoints", json(&settings.connect)),
+        // An address that is in use is an error, a router that is not there yet is not.
+        ("listen/exit_on_failure", "true".to_owned()),
+        ("connect/exit_on_failure", "false".to_owned()),
+        ("scouting/multicast/enabled", "false".to_owned()),
+        // Without gossip a peer behind a router gets things twice; with it, none is connected to.
+        ("scouting/gossip/autoconnect", "[]".to_owned()),
+    ] {
+        config.insert_json5(key, &value)?;
+    }
+    Ok(config)
+}
