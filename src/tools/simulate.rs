@@ -4,6 +4,8 @@ use std::fs::File;
 use std::future::Future;
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::sync::mpsc::{self, TryRecvError};
+use std::time::Duration;
 
 use clap::Args as ClapArgs;
 use serde::Deserialize;
@@ -113,12 +115,20 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         let settings = sequence(&args);
         // On a thread of its own: neither the physics nor a slow disk is to be waited for at a signal.
         let to = path.clone();
-        let recorded = tokio::task::spawn_blocking(move || record(&to, &layout, settings, faults));
-        let written = tokio::select! {
-            recorded = recorded => recorded.expect("the simulation does not panic"),
-            () = shutdown => Ok(()),
+        let (stop, stopped) = mpsc::channel();
+        let mut recorded =
+            tokio::task::spawn_blocking(move || record(&to, &layout, settings, faults, &stopped));
+        let finished = tokio::select! {
+            finished = &mut recorded => Some(finished),
+            () = shutdown => {
+                drop(stop);
+                tokio::time::timeout(LAST_FRAME, recorded).await.ok()
+            }
         };
-        return written.map_err(|source| Error::Recording { path, source });
+        let written = finished.map(|finished| finished.expect("the simulation does not panic"));
+        return written
+            .unwrap_or(Ok(()))
+            .map_err(|source| Error::Recording { path, source });
     }
     let baud = baud(&args, layout.max_frame_bytes())?;
     let what = args
@@ -156,12 +166,17 @@ fn sequence(args: &Args) -> SequenceSettings {
     }
 }
 
-/// The bytes a sensor sends, back to back. While it is silent or unplugged it sends none.
+/// How long a signal waits for the frame that is being written.
+const LAST_FRAME: Duration = Duration::from_millis(500);
+
+/// The bytes a sensor sends, back to back, until the presses are over or the other end of `stopped`
+/// is dropped. While it is silent or unplugged it sends none.
 fn record(
     path: &Path,
     layout: &Layout,
     settings: SequenceSettings,
     mut faults: Faults,
+    stopped: &mpsc::Receiver<()>,
 ) -> std::io::Result<()> {
     // Frame by frame: stopped at any moment, it holds what was played until then.
     let mut recording = File::create(path)?;
@@ -172,6 +187,10 @@ fn record(
         layout.encode(&frame.raw, &mut bytes);
         if faults.strike(f64::from(index) / frame_rate_hz, &mut bytes) == Line::Up {
             recording.write_all(&bytes)?;
+        }
+        // A process that ends in the middle of a write may leave a part of it.
+        if stopped.try_recv() == Err(TryRecvError::Disconnected) {
+            return Ok(());
         }
     }
     recording.sync_all()
