@@ -2,7 +2,7 @@
 """The Debian package on a booted machine: systemd, udev and a kernel's serial drivers.
 
     apt-get install qemu-system-x86 qemu-utils mmdebstrap e2fsprogs
-    python3 tests/peers/machine.py target/debian/hardnessd_*.deb
+    python3 tests/peers/machine.py target/package-dist/debian/hardnessd_*.deb
 
 Boots the host's release of Debian in qemu (by KVM where it boots, else emulated: then the times say
 little) with an FTDI adapter and a PCI port, at which `hardnessd simulate` of the same package plays.

@@ -2,7 +2,7 @@
 """The Debian package, unpacked and used from where it was unpacked.
 
     .ci/deb trial
-    python3 tests/peers/package.py target/trial/debian/hardnessd_*.deb
+    python3 tests/peers/package.py target/package-debug/debian/hardnessd_*.deb
 
 Claims: all is root's, with the modes that lintian asks for; the configuration is a conffile and
 passes `check`; the installed binary shows a press; man pages and completions render and name every
