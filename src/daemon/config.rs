@@ -7,15 +7,17 @@
 
 mod check;
 mod parse;
+mod publish;
 
 use std::env;
-use std::net::{IpAddr, SocketAddr};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
 pub use self::parse::Error;
+pub use self::publish::{Mode, Publish, Ros2, Tcp, Unix, Zenoh};
 use super::log;
 use crate::pipeline::{self, Judgement};
 use crate::verdict::Hrn;
@@ -117,129 +119,6 @@ pub struct Model {
     pub min_force_n: f64,
 }
 
-/// The `[publish]` tables.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Publish {
-    /// The Unix socket.
-    pub unix: Unix,
-    /// The same protocol over TCP; off unless given.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub tcp: Option<Tcp>,
-    /// Keys of a zenoh session; off unless given, and only in a build that has it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub zenoh: Option<Zenoh>,
-    /// Topics of a ROS 2 node; off unless given, and only in a build that has it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub ros2: Option<Ros2>,
-}
-
-impl Publish {
-    /// No way out at all.
-    pub fn none() -> Self {
-        let unix = Unix {
-            enabled: false,
-            ..Unix::default()
-        };
-        Self {
-            unix,
-            ..Self::default()
-        }
-    }
-}
-
-/// The `[publish.tcp]` table.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Tcp {
-    /// Address and port.
-    pub listen: SocketAddr,
-}
-
-impl Default for Tcp {
-    fn default() -> Self {
-        Self {
-            listen: SocketAddr::from(([127, 0, 0, 1], 8255)),
-        }
-    }
-}
-
-/// The `[publish.zenoh]` table. A session listens and connects as it says and looks for nobody.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Zenoh {
-    /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`.
-    pub listen: Vec<String>,
-    /// Endpoints of routers or peers to connect to, again and again until they are there.
-    pub connect: Vec<String>,
-    /// What stands after `tactile/` in every key; by default the robot's name.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    site: Option<String>,
-}
-
-impl Default for Zenoh {
-    fn default() -> Self {
-        Self {
-            listen: vec!["tcp/127.0.0.1:7447".to_owned()],
-            connect: Vec::new(),
-            site: None,
-        }
-    }
-}
-
-impl Zenoh {
-    /// What stands after `tactile/` in every key.
-    pub fn site<'a>(&'a self, robot: &'a str) -> &'a str {
-        self.site.as_deref().unwrap_or(robot)
-    }
-}
-
-/// The `[publish.ros2]` table.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Ros2 {
-    /// Domain; by default `$ROS_DOMAIN_ID`, else 0.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    domain_id: Option<u16>,
-    /// Namespace of the node and its topics.
-    pub namespace: String,
-    /// Addresses of the interfaces to use; none: every one, as ROS 2 does.
-    pub networks: Vec<IpAddr>,
-}
-
-impl Default for Ros2 {
-    fn default() -> Self {
-        Self {
-            domain_id: None,
-            namespace: "/".to_owned(),
-            networks: Vec::new(),
-        }
-    }
-}
-
-impl Ros2 {
-    /// The domain: as configured, else that of the environment, else 0.
-    ///
-    /// # Panics
-    ///
-    /// If it was not checked as every configuration that is read is.
-    pub fn domain_id(&self) -> u16 {
-        let chosen = self.chosen_domain_id();
-        chosen.expect("the domain was checked when the configuration was read")
-    }
-
-    /// The same before it is checked, or what stands in its place.
-    fn chosen_domain_id(&self) -> Result<u16, String> {
-        match (self.domain_id, env::var("ROS_DOMAIN_ID")) {
-            (Some(id), _) => Ok(id),
-            (None, Ok(text)) if !text.is_empty() => {
-                text.parse().map_err(|_| format!("$ROS_DOMAIN_ID {text:?}"))
-            }
-            (None, _) => Ok(0),
-        }
-    }
-}
-
 /// The `[http]` table.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -298,92 +177,6 @@ impl Record {
             Some(first) if !first.is_empty() => PathBuf::from(first),
             _ => PathBuf::from("/var/lib/hardnessd"),
         }
-    }
-}
-
-/// The `[publish.unix]` table.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Unix {
-    /// Whether there is one.
-    pub enabled: bool,
-    /// Where; by default as [`Unix::path`] says.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    path: Option<PathBuf>,
-    /// Permissions of its file.
-    pub mode: Mode,
-    /// Where the control socket is; by default `control.sock` beside the other.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    control_path: Option<PathBuf>,
-    /// Subscribers at a time, on each socket and on TCP.
-    pub max_clients: usize,
-}
-
-impl Default for Unix {
-    fn default() -> Self {
-        Self {
-            enabled: true,
-            path: None,
-            mode: Mode(0o660),
-            control_path: None,
-            max_clients: 256,
-        }
-    }
-}
-
-impl Unix {
-    /// Where the socket is: as configured, else in the service's runtime directory, else in the
-    /// user's, else in `/run/hardnessd`.
-    pub fn path(&self) -> PathBuf {
-        if let Some(path) = &self.path {
-            return path.clone();
-        }
-        let named = |variable| env::var(variable).ok().filter(|value| !value.is_empty());
-        if let Some(directories) = named("RUNTIME_DIRECTORY") {
-            // systemd separates several by colons.
-            let first = directories.split(':').next().unwrap_or_default();
-            return Path::new(first).join("events.sock");
-        }
-        let directory = named("XDG_RUNTIME_DIR").unwrap_or_else(|| "/run".to_owned());
-        Path::new(&directory).join("hardnessd/events.sock")
-    }
-
-    /// Where the control socket is.
-    pub fn control_path(&self) -> PathBuf {
-        let beside = || self.path().with_file_name("control.sock");
-        self.control_path.clone().unwrap_or_else(beside)
-    }
-
-    /// The same, at `path`.
-    #[must_use]
-    pub fn at(self, path: PathBuf) -> Self {
-        Self {
-            path: Some(path),
-            ..self
-        }
-    }
-}
-
-/// Permissions of a file, written in octal.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
-pub struct Mode(pub u32);
-
-impl TryFrom<String> for Mode {
-    type Error = String;
-
-    fn try_from(text: String) -> Result<Self, String> {
-        u32::from_str_radix(&text, 8)
-            .ok()
-            .filter(|mode| *mode <= 0o777)
-            .map(Self)
-            .ok_or_else(|| format!("found {text:?}, expected octal permissions such as \"0660\""))
-    }
-}
-
-impl From<Mode> for String {
-    fn from(mode: Mode) -> Self {
-        format!("{:04o}", mode.0)
     }
 }
 
