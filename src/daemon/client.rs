@@ -4,7 +4,6 @@
 //! them, and reads requests between. Only a connection with [`Access::Control`] changes anything.
 
 use std::io;
-use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::{Buf, BytesMut};
@@ -18,7 +17,7 @@ use super::accept::Serve;
 use super::hub::{self, Closed, Line};
 use super::request::{self, Change, Request};
 use super::sensor::{Command, Sensors};
-use crate::event::{Event, Reply, Tared};
+use crate::event::{Reply, Tared};
 
 /// Longest line a subscriber may send (contract, section 5).
 const LONGEST_LINE_BYTES: usize = 64 * 1024;
@@ -330,12 +329,10 @@ async fn tell(sensors: &Sensors, key: &str, name: &str, command: Command) -> Res
     sensor.commands.send(command).await.map_err(stopping)
 }
 
-async fn statuses(sensors: &Sensors) -> Vec<Line> {
+/// Every sensor's current status.
+pub(super) async fn statuses(sensors: &Sensors) -> Vec<Line> {
     let statuses = sensors.statuses().await;
-    statuses
-        .into_iter()
-        .map(|status| Line::from(Arc::new(Event::Status(status))))
-        .collect()
+    statuses.into_iter().map(Line::from).collect()
 }
 
 fn error(message: String, id: Option<serde_json::Value>) -> Line {

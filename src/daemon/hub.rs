@@ -19,7 +19,7 @@ pub(crate) use self::tally::{Counts, Tally, Verdicts};
 use super::log;
 use super::record::EventRecorder;
 use super::request::{Kinds, Subscription};
-use crate::event::{Event, Hello, Kind, Reply};
+use crate::event::{Event, Hello, Kind, Reply, Status};
 
 /// A line to be sent.
 #[derive(Debug, Clone, PartialEq)]
@@ -49,6 +49,12 @@ impl From<Arc<Event>> for Line {
             json: event.to_line().into(),
             event: Some(event),
         }
+    }
+}
+
+impl From<Status> for Line {
+    fn from(status: Status) -> Self {
+        Arc::new(Event::Status(status)).into()
     }
 }
 

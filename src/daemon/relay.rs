@@ -4,15 +4,15 @@
 //! has the other end of a short channel. While that one is busy lines wait in the hub, as for any
 //! subscriber; what finds no room there is a `gap`.
 
-use std::sync::Arc;
 use std::thread;
 
 use tokio::sync::{mpsc, oneshot};
 
+use super::client;
 use super::hub::{self, Line};
 use super::request::{Policy, Subscription};
 use super::sensor::Sensors;
-use crate::event::{Event, Kind};
+use crate::event::Kind;
 
 /// Jobs under way to the thread: batches of lines, and questions that come between them.
 const JOBS: usize = 8;
@@ -86,10 +86,7 @@ async fn relay<J: From<Vec<Line>>>(
     };
     // Only a `since` can be refused.
     let _ = hub.subscribe(id, wanted).await?;
-    let statuses = sensors.statuses().await.into_iter();
-    let mut lines = statuses
-        .map(|status| Line::from(Arc::new(Event::Status(status))))
-        .collect();
+    let mut lines = client::statuses(sensors).await;
     while jobs.send(J::from(lines)).await.is_ok() {
         let Ok(next) = hub.take(id).await?.await else {
             break;

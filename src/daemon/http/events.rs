@@ -4,7 +4,6 @@
 //! stopped, which is the hub's `since`. Frames come only when asked for, and only the newest: who
 //! looks on wants the present.
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use hyper::Request;
@@ -14,7 +13,7 @@ use tokio::sync::mpsc;
 use crate::daemon::hub::{self, Closed, Line};
 use crate::daemon::request::{Kinds, Policy, Since, Subscription};
 use crate::daemon::sensor::Sensors;
-use crate::event::{Event, Kind};
+use crate::event::Kind;
 
 pub(super) const CONTENT_TYPE: &str = "text/event-stream";
 
@@ -105,11 +104,7 @@ pub(super) async fn open(
     let mut first = format!("retry: {}\n", RETRY.as_millis()).into_bytes();
     write(&mut first, &run, &Line { seq: from, ..hello });
     for status in sensors.statuses().await {
-        write(
-            &mut first,
-            &run,
-            &Line::from(Arc::new(Event::Status(status))),
-        );
+        write(&mut first, &run, &Line::from(status));
     }
     // What the connection does not take stays in the hub, whose queue is bounded.
     let (sender, events) = mpsc::channel(1);
