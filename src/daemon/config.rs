@@ -17,7 +17,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 pub use self::parse::Error;
-pub use self::publish::{Mode, Publish, Ros2, Tcp, Unix, Zenoh};
+pub use self::publish::{Endpoint, Mode, Publish, Ros2, Tcp, Unix, Zenoh};
 use super::log;
 use crate::pipeline::{self, Judgement};
 use crate::verdict::Hrn;

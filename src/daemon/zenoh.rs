@@ -27,10 +27,10 @@ use crate::event::{Event, Kind, Phase};
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// An address cannot be listened on.
-    #[error("publish.zenoh.listen: cannot listen on {endpoint}: {source}")]
+    #[error("publish.zenoh.listen: cannot listen on {endpoint:?}: {source}")]
     Listen {
         /// As configured.
-        endpoint: String,
+        endpoint: config::Endpoint,
         /// Why not.
         source: io::Error,
     },
@@ -67,8 +67,7 @@ pub(super) fn open(
 ) -> Result<Worker<Job>, Error> {
     // Asked here first: the library's words for it are a page, with the paths of its sources.
     for endpoint in &settings.listen {
-        let address = endpoint.trim_start_matches("tcp/");
-        TcpListener::bind(address).map_err(|source| Error::Listen {
+        TcpListener::bind(endpoint.address()).map_err(|source| Error::Listen {
             endpoint: endpoint.clone(),
             source,
         })?;
@@ -204,8 +203,9 @@ fn text(line: &Line) -> &str {
 /// By default zenoh listens on every interface and looks for peers by multicast; this one does
 /// only what it is told.
 fn configuration(settings: &config::Zenoh) -> Result<zenoh::Config, Error> {
-    let json =
-        |endpoints: &[String]| serde_json::to_string(endpoints).expect("a list of strings is JSON");
+    let json = |endpoints: &[config::Endpoint]| {
+        serde_json::to_string(endpoints).expect("a list of strings is JSON")
+    };
     let mut config = zenoh::Config::default();
     for (key, value) in [
         ("mode", "\"peer\"".to_owned()),

@@ -8,7 +8,7 @@ use clap::Args as ClapArgs;
 
 use super::player::BITS_A_BYTE;
 use crate::daemon;
-use crate::daemon::config::{self, Sensor, Setup};
+use crate::daemon::config::{self, Endpoint, Sensor, Setup};
 use crate::wire::Layout;
 
 /// Arguments of `check`.
@@ -140,9 +140,8 @@ fn networks(setup: &Setup, path: &Path) -> String {
             zenoh.listen,
             zenoh.connect
         );
-        let open = |endpoint: &&String| {
-            let address = endpoint.trim_start_matches("tcp/");
-            let parsed = address.parse::<SocketAddr>();
+        let open = |endpoint: &&Endpoint| {
+            let parsed = endpoint.address().parse::<SocketAddr>();
             parsed.map_or(true, |address| !address.ip().is_loopback())
         };
         for endpoint in zenoh.listen.iter().filter(open) {

@@ -92,25 +92,6 @@ fn check_zenoh(
     robot: &str,
     value: &impl Fn(String, String, &'static str) -> Error,
 ) -> Result<(), Error> {
-    for (key, endpoints) in [("listen", &zenoh.listen), ("connect", &zenoh.connect)] {
-        let port = |address: &str| {
-            address
-                .rsplit_once(':')
-                .map(|(_, port)| port.parse::<u16>())
-        };
-        let good = |endpoint: &&String| {
-            let address = endpoint.strip_prefix("tcp/");
-            matches!(address.and_then(port), Some(Ok(_)))
-        };
-        if let Some(bad) = endpoints.iter().find(|endpoint| !good(endpoint)) {
-            let expected = "endpoints such as \"tcp/127.0.0.1:7447\"";
-            return Err(value(
-                format!("publish.zenoh.{key}"),
-                format!("{bad:?}"),
-                expected,
-            ));
-        }
-    }
     // What the key expressions of zenoh keep for themselves.
     let site = zenoh.site(robot);
     if site.split('/').any(str::is_empty) || site.contains(['*', '$', '?', '#']) {

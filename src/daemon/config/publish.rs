@@ -1,6 +1,7 @@
 //! The `[publish]` tables: the ways out of the daemon but HTTP.
 
 use std::env;
+use std::fmt;
 use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 
@@ -58,9 +59,9 @@ impl Default for Tcp {
 #[serde(deny_unknown_fields, default)]
 pub struct Zenoh {
     /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`.
-    pub listen: Vec<String>,
+    pub listen: Vec<Endpoint>,
     /// Endpoints of routers or peers to connect to, again and again until they are there.
-    pub connect: Vec<String>,
+    pub connect: Vec<Endpoint>,
     /// What stands after `tactile/` in every key; by default the robot's name.
     #[serde(skip_serializing_if = "Option::is_none")]
     site: Option<String>,
@@ -69,7 +70,7 @@ pub struct Zenoh {
 impl Default for Zenoh {
     fn default() -> Self {
         Self {
-            listen: vec!["tcp/127.0.0.1:7447".to_owned()],
+            listen: vec![Endpoint("tcp/127.0.0.1:7447".to_owned())],
             connect: Vec::new(),
             site: None,
         }
@@ -80,6 +81,51 @@ impl Zenoh {
     /// What stands after `tactile/` in every key.
     pub fn site<'a>(&'a self, robot: &'a str) -> &'a str {
         self.site.as_deref().unwrap_or(robot)
+    }
+}
+
+/// Where a zenoh session listens or connects: `tcp/HOST:PORT`.
+#[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct Endpoint(String);
+
+impl Endpoint {
+    /// `HOST:PORT`.
+    pub fn address(&self) -> &str {
+        let address = Self::parse(&self.0);
+        address.expect("an endpoint is read from a text that is one")
+    }
+
+    fn parse(text: &str) -> Option<&str> {
+        let address = text.strip_prefix("tcp/")?;
+        let (_host, port) = address.rsplit_once(':')?;
+        port.parse::<u16>().ok().map(|_| address)
+    }
+}
+
+/// As it is written in the configuration.
+impl fmt::Debug for Endpoint {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(out)
+    }
+}
+
+impl TryFrom<String> for Endpoint {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        match Self::parse(&text) {
+            Some(_) => Ok(Self(text)),
+            None => Err(format!(
+                "found {text:?}, expected an endpoint such as \"tcp/127.0.0.1:7447\""
+            )),
+        }
+    }
+}
+
+impl From<Endpoint> for String {
+    fn from(endpoint: Endpoint) -> Self {
+        endpoint.0
     }
 }
 

@@ -135,9 +135,8 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
             &["publish.unix.control_path", "/control.sock"],
         ),
         (
-            "[[sensor]]\nport = \"p\"\n[publish.zenoh]\nlisten = [\"udp/here\"]",
-            // Refused by a build without it, and for its value by one with it.
-            &["publish.zenoh"],
+            "[[sensor]]\nport = \"p\"\n[publish.zenoh]\nlisten = [\"udp/here:1\"]",
+            &["4:10", "listen", "udp/here:1", "tcp/127.0.0.1:7447"],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[record]\nrotate_mb = 0",
@@ -334,11 +333,11 @@ fn zenoh_and_ros2_take_what_their_networks_do() {
     let bad: [(&str, &[&str]); 7] = [
         (
             "zenoh]\nlisten = [\"udp/127.0.0.1:7447\"]",
-            &["zenoh.listen", "udp/"],
+            &["4:10", "listen", "udp/"],
         ),
         (
             "zenoh]\nconnect = [\"tcp/router\"]",
-            &["zenoh.connect", "tcp/router"],
+            &["4:11", "connect", "tcp/router"],
         ),
         ("zenoh]\nsite = \"hall//3\"", &["zenoh.site", "hall//3"]),
         ("zenoh]\nsite = \"**\"", &["zenoh.site", "**"]),
@@ -371,4 +370,22 @@ fn zenoh_and_ros2_take_what_their_networks_do() {
     let publish = load(&good).unwrap().publish;
     assert_eq!(publish.zenoh.unwrap().site("arm #7"), "hall/3");
     assert_eq!(publish.ros2, Some(Ros2::default()));
+}
+
+#[test]
+fn a_table_of_a_part_that_was_not_built_in_is_refused_by_name() {
+    for (feature, built) in [
+        ("zenoh", cfg!(feature = "zenoh")),
+        ("ros2", cfg!(feature = "ros2")),
+    ] {
+        let loaded = load(&format!("{LEAST}[publish.{feature}]\n"));
+        if built {
+            assert!(loaded.is_ok(), "{loaded:?}");
+        } else {
+            let error = loaded.unwrap_err();
+            let expected =
+                format!("publish.{feature}: found a table, expected none: built without");
+            assert!(error.contains(&expected), "{error}");
+        }
+    }
 }
