@@ -6,6 +6,7 @@
 
 mod bench;
 
+use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 
@@ -318,6 +319,21 @@ fn metrics_say_what_was_published() {
     let build = get(address, "/metrics").body;
     let model = last["model"].as_str().unwrap();
     assert!(build.contains(&format!("model=\"{model}")), "{build}");
+}
+
+#[test]
+fn a_robot_of_any_name_leaves_the_metrics_readable() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "events.sock", HTTP);
+    let text = fs::read_to_string(&config).unwrap();
+    fs::write(&config, text.replace("\"arm-7\"", r#"'arm "7" \ left'"#)).unwrap();
+    let mut daemon = Daemon::start(&config);
+    let address = daemon.address("http");
+    let all = series(&get(address, "/metrics").body);
+    assert!(!all.is_empty());
+    for (name, _) in all {
+        assert!(name.contains(r#"{robot="arm \"7\" \\ left""#), "{name}");
+    }
 }
 
 #[test]

@@ -25,7 +25,7 @@ type Gauges = Family<Labels, Gauge<f64, std::sync::atomic::AtomicU64>>;
 /// The hub and the sensors in the text format. The label `robot` is on every series.
 pub(super) fn encode(survey: &Survey, vitals: &[Vitals]) -> String {
     let hello = &survey.hello;
-    let robot = ("robot".into(), hello.robot.clone().into());
+    let robot = ("robot".into(), escaped(&hello.robot).into());
     let mut registry = Registry::with_prefix_and_labels("hardnessd", [robot].into_iter());
     registry.register(
         "build",
@@ -62,6 +62,12 @@ pub(super) fn encode(survey: &Survey, vitals: &[Vitals]) -> String {
     let mut text = String::new();
     text::encode(&mut text, &registry).expect("writing to a string cannot fail");
     text
+}
+
+/// A label's value as the format wants it, which the library leaves to its callers. Of all values
+/// only the robot's name may hold such characters; it has no line feed.
+fn escaped(value: &str) -> String {
+    value.replace('\\', r"\\").replace('"', r#"\""#)
 }
 
 /// What the sensors say of themselves.
