@@ -144,6 +144,16 @@ impl Layout {
         }
     }
 
+    /// Bytes of a frame; of the shortest one where frames vary.
+    pub fn min_frame_bytes(&self) -> usize {
+        let cells = self.places.len();
+        match &self.framing {
+            Framing::Fixed(fixed) => fixed.frame_bytes(cells),
+            Framing::Text => text::min_frame_bytes(self.array),
+            Framing::ZeroRun => zero_run::min_frame_bytes(cells),
+        }
+    }
+
     /// Appends `frame` as the sensor would send it. Counts beyond what a cell can hold are
     /// clipped to its largest value; taxels outside the array are left out.
     pub fn encode(&self, frame: &RawFrame, out: &mut Vec<u8>) {

@@ -167,21 +167,31 @@ fn networks(setup: &Setup, path: &Path) -> String {
 const PITCH_TOLERANCE_MM: f64 = 0.005;
 
 fn line_of(sensor: &Sensor, layout: &Layout, path: &Path) -> Result<String, Error> {
-    let frame_bytes = layout.max_frame_bytes();
-    let bytes_per_s = sensor.frame_rate_hz * frame_bytes as f64;
+    let (shortest, longest) = (layout.min_frame_bytes(), layout.max_frame_bytes());
+    let bytes_per_s = sensor.frame_rate_hz * longest as f64;
     let capacity = f64::from(sensor.baud) / BITS_A_BYTE;
     let paced = is_paced(&sensor.port);
+    let error = |frame_bytes: usize| Error::FrameRate {
+        path: path.to_owned(),
+        sensor: sensor.name.clone(),
+        frame_rate_hz: sensor.frame_rate_hz,
+        frame_bytes,
+        most: capacity / frame_bytes as f64,
+        baud: sensor.baud,
+    };
+    if paced && sensor.frame_rate_hz * shortest as f64 > capacity {
+        return Err(error(shortest));
+    }
+    // How long frames are that vary, only the sensor knows.
     if paced && bytes_per_s > capacity {
-        return Err(Error::FrameRate {
-            path: path.to_owned(),
-            sensor: sensor.name.clone(),
-            frame_rate_hz: sensor.frame_rate_hz,
-            frame_bytes,
-            most: capacity / frame_bytes as f64,
-            baud: sensor.baud,
-        });
+        eprintln!("warning: {}", error(longest));
     }
     let array = layout.array();
+    let frame_bytes = if shortest == longest {
+        format!("{longest}")
+    } else {
+        format!("{shortest} to {longest}")
+    };
     let load = if paced {
         format!(
             "{bytes_per_s:.0} of {capacity:.0} bytes/s at {} baud",

@@ -12,6 +12,11 @@ pub(super) fn max_frame_bytes(array: Array, mask: u16) -> usize {
     array.rows * (array.cols * (digits + 2) + 2) + 2
 }
 
+/// Bytes of the shortest frame: one digit a value, one separator or LF after it and the blank line.
+pub(super) fn min_frame_bytes(array: Array) -> usize {
+    array.rows * array.cols * 2 + 1
+}
+
 pub(super) fn encode(cells: impl Iterator<Item = u16>, cols: usize, out: &mut Vec<u8>) {
     for (index, cell) in cells.enumerate() {
         out.extend_from_slice(cell.to_string().as_bytes());

@@ -7,15 +7,26 @@ use crate::frame::RawFrame;
 
 const END: u8 = 0xFF;
 
+/// Zeros of the longest run.
+const MAX_RUN: u8 = 254;
+
 /// Bytes of the longest frame: single zeros, two bytes each, and the end.
 pub(super) fn max_frame_bytes(cells: usize) -> usize {
     2 * cells + 1
 }
 
+/// Bytes of the shortest frame: runs of zeros as long as may be, and the end. What is left for the
+/// last run may be one value.
+pub(super) fn min_frame_bytes(cells: usize) -> usize {
+    let full_runs = cells / usize::from(MAX_RUN);
+    let rest = (cells % usize::from(MAX_RUN)).min(2);
+    2 * full_runs + rest + 1
+}
+
 pub(super) fn encode(cells: impl Iterator<Item = u16>, out: &mut Vec<u8>) {
     let mut zeros = 0_u8;
     for cell in cells {
-        if cell == 0 && zeros < 254 {
+        if cell == 0 && zeros < MAX_RUN {
             zeros += 1;
             continue;
         }
