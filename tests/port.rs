@@ -101,6 +101,7 @@ fn sniff_says_why_it_has_no_proposal() {
         let (found, stdout, stderr) = run(&[&["sniff"], arguments].concat());
         assert_eq!(found, code, "{arguments:?}: {stderr}");
         assert!(stderr.contains(part) && stdout.is_empty(), "{stderr}");
+        assert_eq!(stderr.lines().count(), 1, "{stderr}");
     };
     let noise = bench.path("noise.bin");
     let mut state = 1_u32;

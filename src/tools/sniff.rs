@@ -99,11 +99,6 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         }
         (None, port) => {
             let port = port.expect("clap asks for a port where there is no file");
-            eprintln!(
-                "listening at {} for {} s: press the sensor",
-                port.display(),
-                args.seconds
-            );
             let bytes = tokio::select! {
                 bytes = listen(&port, args.baud, args.seconds) => bytes?,
                 () = shutdown => return Ok(()),
@@ -168,7 +163,10 @@ async fn listen(path: &Path, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> 
     let _ = tokio::time::timeout(listened, async {
         while bytes.len() < MOST_BYTES {
             match link.turn().await {
-                Turn::Opened => {}
+                Turn::Opened => {
+                    let path = path.display();
+                    eprintln!("listening at {path} for {seconds} s: press the sensor");
+                }
                 Turn::Bytes(read) => bytes.extend_from_slice(read),
                 Turn::Unavailable(reason) | Turn::Lost(reason) => {
                     lost = Some(reason);

@@ -5,7 +5,9 @@
 //! checksum is the same in every frame. So: which distances do pairs of bytes recur at; which
 //! square array fits such a distance; which bytes are constant there. Nothing is decoded here.
 
-use crate::frame::ROWS;
+use std::collections::BTreeMap;
+
+use crate::frame::{Array, COLS, ROWS};
 use crate::wire::{Cell, Checksum, HexBytes, LengthField, Preset, Settings};
 
 /// Smallest side of an array looked for: below it, any short repetition would be one.
@@ -197,4 +199,53 @@ fn free(block: &[u8], tail: usize, side: usize, cell: Cell, checksum: Checksum) 
         cols: Some(side),
         order: None,
     }
+}
+
+/// The array that most blocks of lines have, if these are rows of a text.
+pub(super) fn text_array(bytes: &[u8]) -> Option<Array> {
+    let words = |line: &[u8]| {
+        line.split(|byte| matches!(byte, b' ' | b'\t' | b'\r' | b','))
+            .filter(|word| !word.is_empty())
+            .count()
+    };
+    let lines: Vec<usize> = bytes.split(|&byte| byte == b'\n').map(words).collect();
+    let blocks = lines.split(|&words| words == 0);
+    most_frequent(blocks.filter_map(|block| Some((block.len(), *block.last()?))))
+}
+
+/// The square array that most stretches between two FF unpack to, of those with zeros: without any
+/// they are those of `ff-tail`, too.
+pub(super) fn packed_array(bytes: &[u8]) -> Option<Array> {
+    let cells = |packed: &[u8]| {
+        let mut bytes = packed.iter();
+        let mut cells = 0;
+        while let Some(&byte) = bytes.next() {
+            cells += if byte == 0 {
+                usize::from(*bytes.next()?)
+            } else {
+                1
+            };
+        }
+        Some(cells)
+    };
+    let stretches = bytes.split(|&byte| byte == 0xFF);
+    let packed = stretches.filter(|stretch| stretch.contains(&0));
+    let squares = packed
+        .filter_map(cells)
+        .filter(|cells| cells.isqrt().pow(2) == *cells);
+    most_frequent(squares.map(|cells| (cells.isqrt(), cells.isqrt())))
+}
+
+/// The most frequent array, the largest of several; of those too small or too large, none.
+fn most_frequent(arrays: impl Iterator<Item = (usize, usize)>) -> Option<Array> {
+    let mut counts: BTreeMap<(usize, usize), usize> = BTreeMap::new();
+    for (rows, cols) in arrays {
+        if (SMALLEST_SIDE..=ROWS).contains(&rows) && (SMALLEST_SIDE..=COLS).contains(&cols) {
+            *counts.entry((rows, cols)).or_default() += 1;
+        }
+    }
+    let ((rows, cols), _) = counts
+        .into_iter()
+        .max_by_key(|&(array, count)| (count, array))?;
+    Some(Array { rows, cols })
 }

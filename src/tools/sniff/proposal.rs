@@ -5,7 +5,8 @@
 
 use std::cmp::Reverse;
 
-use super::candidates::candidates;
+use super::candidates::{candidates, packed_array, text_array};
+use crate::frame::{Array, COLS, ROWS};
 use crate::wire::{Cell, Checksum, Decoder, Layout, LengthField, Preset, Settings};
 
 /// What candidates are first tried on: so many pieces from all over the bytes, so that neither
@@ -54,17 +55,22 @@ pub(super) struct Proposal {
 pub(super) fn propose(bytes: &[u8]) -> Vec<Proposal> {
     let sample = sample(bytes);
     let presets = [
-        (Preset::FfTail, FF_TAIL_BITS),
-        (Preset::Ascii, ALL_IN_ORDER),
-        (Preset::ZeroRun, ALL_IN_ORDER),
+        (Preset::FfTail, FF_TAIL_BITS, Some(Array::FULL)),
+        (Preset::Ascii, ALL_IN_ORDER, text_array(&sample)),
+        (Preset::ZeroRun, ALL_IN_ORDER, packed_array(&sample)),
     ]
-    .map(|(preset, bits)| {
+    .into_iter()
+    .filter_map(|(preset, bits, array)| {
+        let Array { rows, cols } = array?;
         let settings = Settings {
             preset,
+            rows: (rows != ROWS).then_some(rows),
+            cols: (cols != COLS).then_some(cols),
             ..Settings::default()
         };
-        (settings, bits)
-    });
+        Some((settings, bits))
+    })
+    .collect::<Vec<_>>();
     let mut proposals: Vec<Proposal> = candidates(&sample)
         .iter()
         .chain(&presets)

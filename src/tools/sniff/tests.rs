@@ -129,6 +129,39 @@ fn presets_are_found() {
 }
 
 #[test]
+fn texts_and_packed_frames_of_any_array_are_found() {
+    let texts = [(16, 16), (8, 8), (10, 24)].map(|array| (Preset::Ascii, array));
+    let packed = [(16, 16), (20, 20)].map(|array| (Preset::ZeroRun, array));
+    let cases: Vec<_> = texts.into_iter().chain(packed).collect();
+    check_all(cases.iter().map(|&(preset, (rows, cols))| {
+        let settings = Settings {
+            preset,
+            rows: Some(rows),
+            cols: Some(cols),
+            ..Settings::default()
+        };
+        (settings, 1)
+    }));
+}
+
+#[test]
+fn frames_without_a_zero_are_not_taken_for_packed_ones() {
+    let layout = Layout::new(&Settings {
+        preset: Preset::FfTail,
+        ..Settings::default()
+    })
+    .unwrap();
+    let mut frames = frames(1);
+    for frame in &mut frames {
+        for count in &mut frame.counts {
+            *count += 1;
+        }
+    }
+    let proposals = propose(&line(&layout, &frames, &mut Stream::new(1, "line")));
+    assert_eq!(proposals[0].settings.preset, Preset::FfTail);
+}
+
+#[test]
 fn free_layouts_are_found() {
     check_all((0..20).map(|seed| {
         let mut stream = Stream::new(seed, "layouts");
