@@ -18,6 +18,10 @@ pub fn plain(message: &str) -> String {
         "invalid IP address syntax" => {
             return "found no address, expected such as 192.0.2.7".to_owned();
         }
+        // A name that is one of several.
+        "wanted string or table" => {
+            return "found a value that is no text, expected a name in quotes".to_owned();
+        }
         _ => {}
     }
     let Some((found, expected)) = message.rsplit_once(", expected ") else {

@@ -454,6 +454,12 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         78,
         &["frame_rate_hz", "14.58"],
     );
+    let config = written("[log]\nformat = 5\n");
+    fails(
+        &["check", "--config", &config],
+        78,
+        &["bad.toml:9:10", "format: found ", "expected a name"],
+    );
     fails(&["replay", "/no/such.bin"], 66, &["/no/such.bin"]);
     fails(&["replay"], 2, &["not provided", "<FILE>"]);
     fails(
@@ -488,6 +494,51 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         );
     }
     assert_eq!(hardnessd(&["--version"]).status.code(), Some(0));
+}
+
+#[test]
+fn check_refuses_a_rate_that_no_frame_would_allow_and_warns_of_one_that_some_do_not() {
+    let bench = Bench::new();
+    let config = bench.path("varying.toml");
+    let check = |rate: &str, preset: &str| {
+        let text = format!(
+            "[[sensor]]\nport = \"/dev/ttyUSB99\"\nframe_rate_hz = {rate}\n\
+             [sensor.frame]\npreset = \"{preset}\"\n"
+        );
+        fs::write(&config, text).unwrap();
+        let output = hardnessd(&["check", "--config", config.to_str().unwrap()]);
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        (output.status.code(), stderr)
+    };
+    // 115,200 baud; texts of 784 values are 1,569 to 5,546 bytes, packed zeros 9 to 1,569.
+    for (rate, preset, code, warning) in [
+        ("2.0", "ascii", 0, ""),
+        ("5.0", "ascii", 0, "5 frames/s of 5546 bytes"),
+        ("7.4", "ascii", 78, "7.4 frames/s of 1569 bytes"),
+        ("7.3", "zero-run", 0, ""),
+        ("100.0", "zero-run", 0, "100 frames/s of 1569 bytes"),
+        ("1300.0", "zero-run", 78, "1300 frames/s of 9 bytes"),
+    ] {
+        let (found, stderr) = check(rate, preset);
+        assert_eq!(found, Some(code), "{rate} {preset}: {stderr}");
+        let lines = usize::from(!warning.is_empty());
+        assert_eq!(stderr.lines().count(), lines, "{stderr}");
+        assert!(stderr.contains(warning), "{stderr}");
+    }
+}
+
+#[test]
+fn help_that_cannot_be_written_is_an_io_error() {
+    for asked in ["--help", "--version"] {
+        let output = Command::new(BINARY)
+            .arg(asked)
+            .stdout(fs::File::create("/dev/full").unwrap())
+            .output()
+            .unwrap();
+        assert_eq!(output.status.code(), Some(74), "{asked}");
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        assert!(stderr.contains("stdout: No space left"), "{stderr}");
+    }
 }
 
 #[test]
