@@ -18,9 +18,14 @@ import tty
 CACHE = os.path.join(
     os.environ.get("XDG_CACHE_HOME", os.path.expanduser("~/.cache")), "hardnessd", "machine"
 )
-# The kernel of linux-image-amd64 has ftdi_sio; ModemManager is there to be kept away.
-PACKAGES = """systemd systemd-sysv udev dbus kmod procps initramfs-tools linux-image-amd64 python3
-    modemmanager""".split()
+# The kernel of linux-image-* has ftdi_sio; ModemManager is there to be kept away.
+PACKAGES = "systemd systemd-sysv udev dbus kmod procps initramfs-tools python3 modemmanager".split()
+# By Debian's name of an architecture: qemu's, its machine and processor (for Arm a Raspberry Pi 4's), and
+# what Linux calls the port that has the console and the first one at the PCI bus.
+ARCHITECTURES = {
+    "amd64": ("x86_64", "pc", "max", "ttyS0", "ttyS1"),
+    "arm64": ("aarch64", "virt", "cortex-a72", "ttyAMA0", "ttyS0"),
+}
 # Runs what comes, one command a line, and answers with its exit code and output, in base64; 124: it
 # hung.
 AGENT = """#!/bin/bash
@@ -40,6 +45,12 @@ Environment=HOME=/root LC_ALL=C.UTF-8 DEBIAN_FRONTEND=noninteractive
 [Install]
 WantedBy=multi-user.target
 """
+# What it takes to mount the disk: a search for all that might takes half an hour on an emulated
+# processor.
+INITRAMFS = {
+    "etc/initramfs-tools/conf.d/machine": "MODULES=list",
+    "usr/share/initramfs-tools/modules.d/machine": "virtio_pci\nvirtio_blk\next4",
+}
 # For an emulated processor on a busy machine.
 PATIENCE_S = 300
 # KVM is there or it is not: where it boots, it does so in seconds.
@@ -52,10 +63,11 @@ def run(*command, **more):
     return done.stdout
 
 
-def image():
+def image(architecture):
     """The directory with `disk`, `vmlinuz` and `initrd.img`; made once (minutes), then kept."""
     release = run("sh", "-c", '. /etc/os-release; echo "$VERSION_CODENAME"').strip()
-    recipe = "\n".join([release, *PACKAGES, AGENT, SERVICE])
+    packages = [*PACKAGES, f"linux-image-{architecture}"]
+    recipe = "\n".join([release, *packages, AGENT, SERVICE, *INITRAMFS.values()])
     place = os.path.join(CACHE, hashlib.sha256(recipe.encode()).hexdigest()[:12])
     if os.path.isdir(place):
         return place
@@ -76,9 +88,15 @@ def image():
             # Made at the first boot.
             ': >"$1/etc/machine-id"',
         ]
+        modules = [
+            f'mkdir -p "$1/{os.path.dirname(path)}" && echo "{text}" >"$1/{path}"'
+            for path, text in INITRAMFS.items()
+        ]
         run(
-            "mmdebstrap", "--variant=minbase", "--include=" + ",".join(PACKAGES),
+            "mmdebstrap", "--variant=minbase", f"--architectures={architecture}",
+            "--include=" + ",".join(packages),
             "--aptopt=APT::Install-Recommends false",
+            *(f"--essential-hook={hook}" for hook in modules),
             *(f"--customize-hook={hook}" for hook in hooks), release, "root.tar", "-",
             input=sources, cwd=work,
         )
@@ -153,16 +171,18 @@ class Machine:
         self.program = program
         self.processes = []
         self.cables = {}
-        place = image()
+        self.architecture = run("dpkg-deb", "-f", package, "Architecture").strip()
+        name, board, processor, console, self.pci_port = ARCHITECTURES[self.architecture]
+        place = image(self.architecture)
         disk, load = self.path("disk"), self.path("load.tar")
         backing = ["-F", "raw", "-b", f"{place}/disk"]
         run("qemu-img", "create", "-q", "-f", "qcow2", *backing, disk)
         run("tar", "-cf", load, "-C", os.path.dirname(package), os.path.basename(package))
         self.command = [
-            "qemu-system-x86_64", "-machine", "pc", "-cpu", "max", "-smp", "2", "-m", "1024",
+            f"qemu-system-{name}", "-machine", board, "-cpu", processor, "-smp", "2", "-m", "1024",
             "-nodefaults", "-display", "none", "-nic", "none",
             "-kernel", f"{place}/vmlinuz", "-initrd", f"{place}/initrd.img",
-            "-append", "root=/dev/vda rw console=ttyS0 quiet",
+            "-append", f"root=/dev/vda rw console={console} quiet",
             "-drive", f"file={disk},format=qcow2,if=virtio,cache=unsafe",
             "-drive", f"file={load},format=raw,if=virtio,readonly=on",
             # A reboot is a new qemu: `reboot`.
@@ -196,7 +216,9 @@ class Machine:
     def _boot(self):
         start = time.monotonic()
         # A KVM that can be opened does not boot every kernel.
-        tries = {"kvm": KVM_PATIENCE_S} if os.access("/dev/kvm", os.R_OK | os.W_OK) else {}
+        own = self.architecture == run("dpkg", "--print-architecture").strip()
+        has_kvm = own and os.access("/dev/kvm", os.R_OK | os.W_OK)
+        tries = {"kvm": KVM_PATIENCE_S} if has_kvm else {}
         for self.accelerator, patience_s in [*tries.items(), ("tcg", PATIENCE_S)]:
             if self._started(patience_s, "-device", self.usb_serial()):
                 break

@@ -4,8 +4,9 @@
     apt-get install qemu-system-x86 qemu-utils mmdebstrap e2fsprogs
     python3 tests/peers/machine.py target/package-dist/debian/hardnessd_*.deb
 
-Boots the host's release of Debian in qemu (by KVM where it boots, else emulated: then the times say
-little) with an FTDI adapter and a PCI port, at which `hardnessd simulate` of the same package plays.
+Boots the host's release of Debian, for the package's processor, in qemu (by KVM where it boots, else
+emulated: then the times say little) with an FTDI adapter and a PCI port, at which `hardnessd simulate`
+of the same package plays, or that of another one where this machine is of another processor.
 Claims: apt installs the package, which starts nothing and whose rules act on the adapter that is
 plugged in; the daemon lives in its sandbox, reads both drivers and answers systemd in all that the
 unit promises; who may read and who may open is as documented; a cable that is pulled is `lost` and
@@ -24,34 +25,24 @@ import guest
 from guest import Machine, wait_for
 
 PORT = "/dev/serial/by-id/usb-QEMU_QEMU_USB_SERIAL_film7-if00-port0"
-CONFIG = f"""robot = "arm-7"
-[[sensor]]
-name = "forearm"
-port = "{PORT}"
-frame_rate_hz = 10.0
-[[sensor]]
-name = "palm"
-port = "/dev/ttyS1"
-frame_rate_hz = 5.0
-[log]
-format = "journald"
-"""
 
 
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("package")
-    package = os.path.abspath(parser.parse_args().package)
+    parser.add_argument("simulator", nargs="?", help="a hardnessd for this machine; default: the package's")
+    args = parser.parse_args()
+    package = os.path.abspath(args.package)
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as place:
         guest.run("dpkg-deb", "-x", package, place)
-        with Machine(package, f"{place}/usr/bin/hardnessd") as machine:
-            say("booted", f"{machine.accelerator}, {machine.boot_s:.0f} s")
+        with Machine(package, args.simulator or f"{place}/usr/bin/hardnessd") as machine:
+            say("booted", f"{machine.architecture}, {machine.accelerator}, {machine.boot_s:.0f} s")
             machine.film("forearm", "--fps", "10", "--force", "15", "--material", "hard-plastic")
             machine.film("palm", "--fps", "5", "--force", "15", "--material", "wood")
             for claim in [
                 installs, starts, reaches_subscribers, is_sandboxed, logs, holds_its_port, reloads,
-                is_watched, cable_is_pulled, reinstalls, stops, is_activated, boots, is_removed,
+                is_watched, cable_is_pulled, upgrades, stops, is_activated, boots, is_removed,
             ]:
                 claim(machine)
     say("done", f"{time.monotonic() - start:.0f} s")
@@ -89,7 +80,8 @@ def adapter(machine):
 
 
 def installs(machine):
-    assert adapter(machine) == ["0", "0", "hupcl"], "as the kernel and qemu leave it"
+    # As the kernel and qemu leave it.
+    wait_for("the adapter", lambda: adapter(machine) == ["0", "0", "hupcl"])
     machine.run("tar -xf /dev/vdb -C /srv")
     output, seconds = timed(machine, "apt-get install -y -o Dpkg::Use-Pty=0 /srv/hardnessd_*.deb 2>&1")
     assert "warning" not in output.lower() and "error" not in output.lower(), output
@@ -103,6 +95,22 @@ def installs(machine):
     assert machine.run("dpkg --verify hardnessd") == ""
     assert adapter(machine) == ["1", "1", "-hupcl"], adapter(machine)
     say("installed", f"{seconds:.1f} s; nothing started; the rules act on the adapter that is there")
+
+
+def config(palm):
+    """The adapter, and a port at the PCI bus."""
+    return f"""robot = "arm-7"
+[[sensor]]
+name = "forearm"
+port = "{PORT}"
+frame_rate_hz = 10.0
+[[sensor]]
+name = "palm"
+port = "/dev/{palm}"
+frame_rate_hz = 5.0
+[log]
+format = "journald"
+"""
 
 
 def configure(machine, text):
@@ -121,7 +129,7 @@ def is_live(machine):
 
 
 def starts(machine):
-    configure(machine, CONFIG)
+    configure(machine, config(machine.pci_port))
     _, seconds = timed(machine, "systemctl start hardnessd")
     start = time.monotonic()
     found = wait_for("live sensors", lambda: is_live(machine))
@@ -167,7 +175,9 @@ def is_sandboxed(machine):
     assert status["NoNewPrivs"] == "1" and status["Seccomp"] == "2"
     exposure = machine.run("systemd-analyze security hardnessd --no-pager").splitlines()[-1]
     assert float(re.search(r"\d+\.\d+", exposure)[0]) <= 2.0, exposure
-    say("sandboxed", f"user {uid}, no capabilities, {exposure.split(': ', 1)[1]}")
+    memory_mib = int(status["VmRSS"].split()[0]) / 1024
+    say("sandboxed", f"user {uid}, no capabilities, {exposure.split(': ', 1)[1]}; "
+        f"{memory_mib:.1f} MiB resident, with two sensors")
 
 
 def logs(machine):
@@ -194,10 +204,10 @@ def holds_its_port(machine):
 
 def reloads(machine):
     (before,) = show(machine, "MainPID")
-    configure(machine, CONFIG + "[press]\nend_frames = 3\n")
+    configure(machine, config(machine.pci_port) + "[press]\nend_frames = 3\n")
     machine.run("systemctl reload hardnessd")
     wait_for("reload", lambda: "reloaded" in machine.run("journalctl -u hardnessd -n 40 -o cat"))
-    configure(machine, CONFIG.replace("/dev/ttyS1", "/dev/ttyS2"))
+    configure(machine, config("ttyS2"))
     machine.run("systemctl reload hardnessd")
     lines = "journalctl -u hardnessd -o json -n 40 --output-fields=MESSAGE,HARDNESSD_REASON"
     refused = wait_for(
@@ -205,7 +215,7 @@ def reloads(machine):
     )
     reason = json.loads(refused[0])["HARDNESSD_REASON"]
     assert "port" in reason, reason
-    configure(machine, CONFIG)
+    configure(machine, config(machine.pci_port))
     machine.run("systemctl reload hardnessd")
     assert show(machine, "MainPID", "NRestarts") == [before, "0"]
     assert is_live(machine)
@@ -284,14 +294,26 @@ def cable_is_pulled(machine, times=3):
         say("cable", one)
 
 
-def reinstalls(machine):
+def upgrades(machine):
+    """To a next version, with one more line in the configuration that it brings."""
     (before,) = show(machine, "MainPID")
-    _, seconds = timed(machine, "dpkg -i /srv/hardnessd_*.deb 2>&1")
-    assert machine.run("cat /etc/hardnessd.toml") == CONFIG.strip()
+    machine.run("""
+        dpkg-deb -R /srv/hardnessd_*.deb /srv/next
+        sed -i 's/^Version: .*/&+next/' /srv/next/DEBIAN/control
+        echo '# next' >>/srv/next/etc/hardnessd.toml
+        dpkg-deb -b /srv/next /srv/next.deb
+    """)
+    # Asks nobody, as unattended-upgrades does.
+    install = "apt-get install -y -o Dpkg::Use-Pty=0 -o Dpkg::Options::=--force-confold /srv/next.deb 2>&1"
+    _, seconds = timed(machine, install)
+    assert machine.run("dpkg-query -W -f '${Version}' hardnessd").endswith("+next")
+    assert machine.run("cat /etc/hardnessd.toml") == config(machine.pci_port).strip()
+    assert machine.run("tail -n 1 /etc/hardnessd.toml.dpkg-dist") == "# next"
     after, state = show(machine, "MainPID", "ActiveState")
     assert state == "active" and after != before, "the new binary runs"
     wait_for("live sensors", lambda: is_live(machine))
-    say("reinstalled", f"{seconds:.1f} s; the configuration stays, a running daemon is restarted")
+    say("upgraded", f"{seconds:.1f} s; the configuration stays, the new one lies beside it, a running "
+        "daemon is restarted")
 
 
 def stops(machine):
@@ -335,11 +357,14 @@ def boots(machine):
     assert machine.run("systemctl --failed --no-legend") == ""
     plugged = time.monotonic()
     machine.plug()
-    wait_for("live sensors", lambda: is_live(machine))
+    wait_for("the forearm", lambda: statuses(machine)["forearm"]["state"] == "live")
     live_s = time.monotonic() - plugged
+    # Who is pressed while the tare is taken takes it again.
+    wait_for("live sensors", lambda: is_live(machine))
+    tared_s = time.monotonic() - plugged
     assert adapter(machine) == ["1", "1", "-hupcl"], adapter(machine)
     say("booted again", f"{machine.boot_s:.0f} s, without its sensor; live {live_s:.1f} s after it is "
-        "plugged in for the first time")
+        f"plugged in for the first time, tared after {tared_s:.1f} s")
 
 
 def left(machine):
@@ -353,7 +378,7 @@ def left(machine):
 def is_removed(machine):
     machine.run("apt-get remove -y -o Dpkg::Use-Pty=0 hardnessd 2>&1")
     assert machine.ask("pgrep -x hardnessd")[0] == machine.ask("command -v hardnessd")[0] == 1
-    assert machine.run("cat /etc/hardnessd.toml") == CONFIG.strip()
+    assert machine.run("cat /etc/hardnessd.toml") == config(machine.pci_port).strip()
     machine.run("apt-get purge -y -o Dpkg::Use-Pty=0 hardnessd 2>&1")
     # Where recordings lie, and a directory that goes with the next boot; and the user, as is usual.
     assert sorted(left(machine)) == ["/run/hardnessd", "/var/lib/hardnessd"], left(machine)
