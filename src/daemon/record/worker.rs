@@ -170,12 +170,15 @@ impl Worker {
         let mut finished = open.finish();
         if matches!(self.target, Target::File { .. }) {
             finished = finished.and_then(|()| Ok(file.sync_all()?));
-            info!(
-                path = %path.display(),
-                frames = self.frames,
-                presses = self.presses,
-                "recorded"
-            );
+            // Of a sensor that was never there nothing is kept.
+            if !matches!(gone, Err(Error::Unavailable { .. })) {
+                info!(
+                    path = %path.display(),
+                    frames = self.frames,
+                    presses = self.presses,
+                    "recorded"
+                );
+            }
         }
         finished.map_err(|source| Error::Write { path, source })?;
         gone
