@@ -173,13 +173,15 @@ class Machine:
         self.cables = {}
         self.architecture = run("dpkg-deb", "-f", package, "Architecture").strip()
         name, board, processor, console, self.pci_port = ARCHITECTURES[self.architecture]
+        qemu = f"qemu-system-{name}"
+        assert shutil.which(qemu), f"found no {qemu}, expected what .ci/machine names"
         place = image(self.architecture)
         disk, load = self.path("disk"), self.path("load.tar")
         backing = ["-F", "raw", "-b", f"{place}/disk"]
         run("qemu-img", "create", "-q", "-f", "qcow2", *backing, disk)
         run("tar", "-cf", load, "-C", os.path.dirname(package), os.path.basename(package))
         self.command = [
-            f"qemu-system-{name}", "-machine", board, "-cpu", processor, "-smp", "2", "-m", "1024",
+            qemu, "-machine", board, "-cpu", processor, "-smp", "2", "-m", "1024",
             "-nodefaults", "-display", "none", "-nic", "none",
             "-kernel", f"{place}/vmlinuz", "-initrd", f"{place}/initrd.img",
             "-append", f"root=/dev/vda rw console={console} quiet",
