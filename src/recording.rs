@@ -230,4 +230,4 @@ impl From<mcap::McapError> for Error {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

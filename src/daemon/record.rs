@@ -31,6 +31,8 @@ const QUEUED: usize = 8192;
 /// How often a sensor's state is noted: what a file that begins between has to take from before
 /// it, and what a damaged chunk costs a replay at the most.
 const STATE_EVERY: Duration = Duration::from_secs(10);
+/// And after so many bytes: what a flood makes the black box hold beyond its bound.
+const STATE_EVERY_BYTES: usize = 4 << 20;
 /// Over the time between two states, a fault if so many frames and this share were damaged.
 const DAMAGED_FRAMES: u64 = 5;
 const DAMAGED_SHARE: f64 = 0.1;
@@ -197,6 +199,7 @@ impl Recorder {
             sensor,
             labels: self.labels.clone(),
             noted: None,
+            bytes: 0,
             counted: (0, 0),
         })))
     }
@@ -233,6 +236,8 @@ struct Active {
     labels: Labels,
     /// When a state was last noted; `None` if what followed it is not all there.
     noted: Option<Duration>,
+    /// Told since then.
+    bytes: usize,
     /// Whole and damaged frames by then.
     counted: (u64, u64),
 }
@@ -252,17 +257,17 @@ impl SensorRecorder {
     /// Notes what is about to happen to `pipeline`.
     pub(crate) fn note(&mut self, pipeline: &Pipeline, input: &Input<'_>, at: Stamp) {
         if let Some(active) = &mut self.0 {
-            active.begin(pipeline, at);
-            active.tell(at, Entry::Input(input.to_owned()));
+            active.follow(pipeline, at, Entry::Input(input.to_owned()));
         }
     }
 
     /// Notes that `pipeline` is judged otherwise from now on.
     pub(crate) fn reload(&mut self, pipeline: &Pipeline, judgement: &Judgement, at: Stamp) {
         if let Some(active) = &mut self.0 {
-            active.begin(pipeline, at);
-            active.sensor.adopt(judgement);
-            active.tell(at, Entry::Settings(Box::new(active.sensor.clone())));
+            let mut sensor = active.sensor.clone();
+            sensor.adopt(judgement);
+            active.follow(pipeline, at, Entry::Settings(Box::new(sensor.clone())));
+            active.sensor = sensor;
         }
     }
 
@@ -283,8 +288,23 @@ impl SensorRecorder {
 }
 
 impl Active {
+    /// Tells `entry`, after a state if one is due. Where the state finds no room the entry goes
+    /// with it, be there room again: it would stand behind a gap.
+    fn follow(&mut self, pipeline: &Pipeline, at: Stamp, entry: Entry) {
+        self.begin(pipeline, at);
+        if self.noted.is_none() {
+            self.jobs.dropped.fetch_add(1, Ordering::Relaxed);
+            return;
+        }
+        if let Entry::Input(Input::Bytes(bytes)) = &entry {
+            self.bytes += bytes.len();
+        }
+        self.tell(at, entry);
+    }
+
     fn begin(&mut self, pipeline: &Pipeline, at: Stamp) {
-        let due = |noted| at.mono.saturating_sub(noted) >= STATE_EVERY;
+        let due =
+            |noted| at.mono.saturating_sub(noted) >= STATE_EVERY || self.bytes >= STATE_EVERY_BYTES;
         if !self.noted.is_none_or(due) {
             return;
         }
@@ -296,7 +316,7 @@ impl Active {
             self.jobs.tell(Job::Damage { sensor });
         }
         self.counted = counts;
-        self.noted = Some(at.mono);
+        (self.noted, self.bytes) = (Some(at.mono), 0);
         let state = State {
             sensor: self.sensor.clone(),
             memory: pipeline.memory(),
@@ -327,3 +347,6 @@ impl EventRecorder {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -6,11 +6,11 @@ use crate::frame::RawFrame;
 use crate::pipeline::Clock;
 use crate::verdict::BUILT_IN;
 
-pub(super) fn hrn() -> Arc<Hrn> {
+pub(crate) fn hrn() -> Arc<Hrn> {
     Arc::new(Hrn::load(BUILT_IN).unwrap())
 }
 
-pub(super) fn sensor(hrn: &Hrn) -> Sensor {
+pub(crate) fn sensor(hrn: &Hrn) -> Sensor {
     Sensor {
         name: "forearm".to_owned(),
         frame_rate_hz: 5.0,

@@ -305,21 +305,14 @@ impl Worker {
             let directory = settings.dir();
             has_room(&directory, settings.keep_free_mb * MB)?;
             let (path, file) = create(&directory, &format!("blackbox-{name}"))?;
-            let fill = || {
+            or_removed(&path, || {
                 let mut open = Open::new(path.clone(), file, &about)?;
                 for (at, entry) in self.sensors[sensor].ring.all() {
                     open.writer.entry(0, *at, entry)?;
                 }
                 open.finish()
-            };
-            match fill() {
-                Ok(()) => Ok(path),
-                Err(error) => {
-                    // Half of it is of no use, and the disk may be full.
-                    let _ = fs::remove_file(&path);
-                    Err(error)
-                }
-            }
+            })?;
+            Ok(path)
         };
         let path = written().map_err(|error| error.to_string())?;
         info!(sensor = name.as_str(), reason, path = %path.display(), "black box");
@@ -390,13 +383,26 @@ impl Worker {
     /// A file that begins with every sensor's last state and what came since.
     fn next_file(&self, directory: &Path) -> Result<Open, recording::Error> {
         let (path, file) = create(directory, "hardnessd")?;
-        let mut open = Open::new(path, file, &self.about)?;
-        for (index, sensor) in self.sensors.iter().enumerate() {
-            for (at, entry) in sensor.ring.latest() {
-                open.writer.entry(index, *at, entry)?;
+        or_removed(&path, || {
+            let mut open = Open::new(path.clone(), file, &self.about)?;
+            for (index, sensor) in self.sensors.iter().enumerate() {
+                for (at, entry) in sensor.ring.latest() {
+                    open.writer.entry(index, *at, entry)?;
+                }
             }
-        }
-        open.writer.flush()?;
-        Ok(open)
+            open.writer.flush()?;
+            Ok(open)
+        })
     }
+}
+
+/// Fills the new file at `path`. One that cannot be filled is of no use, and the disk may be full.
+fn or_removed<T>(
+    path: &Path,
+    fill: impl FnOnce() -> Result<T, recording::Error>,
+) -> Result<T, recording::Error> {
+    fill().inspect_err(|_| {
+        // What cannot be removed stays.
+        let _ = fs::remove_file(path);
+    })
 }

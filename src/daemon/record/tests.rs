@@ -1,0 +1,97 @@
+use std::sync::mpsc::Receiver;
+
+use super::*;
+use crate::pipeline::Clock;
+use crate::recording::{Ring, tests};
+
+fn recorder(sender: SyncSender<Job>) -> (SensorRecorder, Pipeline) {
+    let hrn = tests::hrn();
+    let sensor = tests::sensor(&hrn);
+    let pipeline = Pipeline::new(sensor.settings(&hrn).unwrap(), Clock::Arrival);
+    let active = Active {
+        jobs: Jobs {
+            sender,
+            dropped: Arc::default(),
+        },
+        index: 0,
+        sensor,
+        labels: Labels::new(),
+        noted: None,
+        bytes: 0,
+        counted: (0, 0),
+    };
+    (SensorRecorder(Some(Box::new(active))), pipeline)
+}
+
+fn at(ms: u64) -> Stamp {
+    Stamp {
+        mono: Duration::from_millis(ms),
+        wall: jiff::Timestamp::UNIX_EPOCH,
+    }
+}
+
+/// Numbers of the inputs that were told; those that follow a gap without a state between.
+fn told(inbox: &Receiver<Job>) -> (usize, Vec<u64>) {
+    let (mut count, mut bad) = (0, Vec::new());
+    let mut next = None;
+    for job in inbox {
+        match job {
+            Job::Entry {
+                entry: Entry::State(_),
+                ..
+            } => next = None,
+            Job::Entry {
+                entry: Entry::Input(Input::Bytes(bytes)),
+                ..
+            } => {
+                let number = u64::from_le_bytes(bytes[..].try_into().unwrap());
+                if next.is_some_and(|next| next != number) {
+                    bad.push(number);
+                }
+                next = Some(number + 1);
+                count += 1;
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+    (count, bad)
+}
+
+#[test]
+fn after_a_gap_comes_a_state() {
+    let (sender, inbox) = sync_channel(1);
+    let (mut recorder, pipeline) = recorder(sender);
+    // Takes what is told as fast as it comes: room appears at any moment.
+    let reader = std::thread::spawn(move || told(&inbox));
+    for number in 0..20_000_u64 {
+        let bytes = number.to_le_bytes().to_vec();
+        recorder.note(&pipeline, &Input::Bytes(bytes.into()), at(number));
+    }
+    drop(recorder);
+    let (count, bad) = reader.join().unwrap();
+    assert!(count > 0);
+    assert_eq!(bad, [0; 0], "of {count} told");
+}
+
+#[test]
+fn a_flood_is_bounded_in_the_black_box() {
+    let (sender, inbox) = sync_channel(4096);
+    let (mut recorder, pipeline) = recorder(sender);
+    let flood = Input::Bytes(vec![0; 1 << 16].into());
+    for _ in 0..1000 {
+        recorder.note(&pipeline, &flood, at(0));
+    }
+    drop(recorder);
+    let mut ring = Ring::default();
+    for job in inbox {
+        let Job::Entry { at, entry, .. } = job else {
+            panic!("{job:?}");
+        };
+        ring.push(at, entry);
+    }
+    let kept = ring
+        .all()
+        .filter(|(_, entry)| matches!(entry, Entry::Input(_)));
+    let kept = kept.count() << 16;
+    assert!((28 << 20..=36 << 20).contains(&kept), "{kept} bytes");
+}
