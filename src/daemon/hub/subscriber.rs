@@ -19,8 +19,8 @@ pub(super) struct Subscriber {
     policy: Policy,
     /// A `gap` that is due before all else: `since` reached back too far.
     missing: Option<Reply>,
-    /// Numbers of held events that `since` asked for, oldest first.
-    replay: VecDeque<u64>,
+    /// Held events that `since` asked for, oldest first: their numbers and kinds.
+    replay: VecDeque<(u64, Kind)>,
     /// Events waiting.
     queue: VecDeque<Line>,
     /// Events of its kinds dropped since the last line it got.
@@ -54,6 +54,7 @@ impl Subscriber {
     /// Another subscription: what waits and is no longer wanted goes without a `gap`.
     pub(super) fn change(&mut self, kinds: Kinds, policy: Policy) {
         (self.kinds, self.policy) = (kinds, policy);
+        self.replay.retain(|&(_, kind)| kinds.contains(kind));
         self.queue
             .retain(|line| line.about().is_some_and(|(kind, _)| kinds.contains(kind)));
         if policy != Policy::Queue {
@@ -72,7 +73,6 @@ impl Subscriber {
         self.lost = 0;
         self.replay = held
             .filter(|&(seq, kind)| self.kinds.contains(kind) && !self.handed.contains(seq))
-            .map(|(seq, _)| seq)
             .collect();
     }
 
@@ -119,7 +119,7 @@ impl Subscriber {
             lines.push(gap.into());
         }
         while bytes < BATCH_BYTES
-            && let Some(seq) = self.replay.pop_front()
+            && let Some((seq, _)) = self.replay.pop_front()
         {
             match held(seq) {
                 Some(line) => {

@@ -212,6 +212,21 @@ fn since_gives_what_is_held_then_what_comes_and_nothing_twice() {
 }
 
 #[test]
+fn another_subscription_reaches_what_since_asked_for() {
+    let mut hub = hub();
+    for _ in 0..5 {
+        hub.tell(press("a"));
+        hub.tell(status("a"));
+    }
+    let (id, _) = hub.join();
+    hub.subscribe(id, &wanting(&Kinds::NUMBERED, Policy::Queue, Some(0)))
+        .unwrap();
+    hub.subscribe(id, &wanting(&[Kind::Status], Policy::Queue, None))
+        .unwrap();
+    assert_eq!(hub.drain(id), numbers("status", (2..=10).step_by(2)));
+}
+
+#[test]
 fn since_older_than_what_is_held_says_how_much_is_gone() {
     let mut hub = hub();
     for _ in 0..HELD + 100 {
