@@ -288,9 +288,13 @@ impl<S: Stream> Client<S> {
                 }
             }
             Change::Context { sensor, context } => {
-                let command = Command::Context(context);
+                let (reply, held) = oneshot::channel();
+                let command = Command::Context(context, reply);
                 tell(sensors, "context.sensor", &sensor, command).await?;
-                Ok(Done::default())
+                match held.await {
+                    Ok(()) => Ok(Done::default()),
+                    Err(_) => Err("context: the daemon is stopping".to_owned()),
+                }
             }
             Change::Blackbox { sensor } => {
                 let (reply, written) = oneshot::channel();

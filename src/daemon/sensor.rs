@@ -26,8 +26,8 @@ pub(crate) enum Command {
     Status(oneshot::Sender<Vitals>),
     /// To take another tare; the answer comes once it is taken or given up.
     Tare(oneshot::Sender<Result<Tared, RetareError>>),
-    /// What the controller says it is doing.
-    Context(Option<Value>),
+    /// What the controller says it is doing; the answer comes once it holds.
+    Context(Option<Value>, oneshot::Sender<()>),
     /// To have its last minute written; the answer is where.
     Blackbox(oneshot::Sender<Result<PathBuf, String>>),
     /// To judge otherwise from now on.
@@ -110,9 +110,10 @@ pub(crate) async fn serve(
                     }
                     continue;
                 }
-                Some(Command::Context(context)) => {
+                Some(Command::Context(context, reply)) => {
                     log::context(pipeline.sensor(), context.as_ref());
                     recorder.feed(&mut pipeline, Input::Context(context), super::now());
+                    let _ = reply.send(());
                     continue;
                 }
                 Some(Command::Blackbox(reply)) => {
