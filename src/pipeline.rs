@@ -207,13 +207,18 @@ impl Pipeline {
 
     /// Takes over changed settings at once. The baseline and a press under way stay.
     pub fn reload(&mut self, judgement: Judgement) {
+        if judgement.calibration.tare_frames == 0 {
+            self.abandon_retare(RetareError::NoFrames);
+            self.seen.tare_met_contact = false;
+        }
         self.tare
             .reload(&judgement.calibration, contact(&judgement.press));
         self.tracker.reload(judgement.press.clone());
         self.judgement = judgement;
     }
 
-    /// Takes another tare from the next frames on; [`Self::retared`] tells what became of it.
+    /// Takes another tare from the next frames on; [`Self::retared`] tells what became of it. A
+    /// press that timed out is over: a drift that looks like one is mended so.
     ///
     /// # Errors
     ///

@@ -526,4 +526,17 @@ mod tests {
         ));
         assert!(!tracker.is_pressed());
     }
+
+    #[test]
+    fn what_is_out_of_range_is_told_as_it_was_written() {
+        let settings = Settings {
+            contact_threshold_n: -0.07,
+            ..Settings::default()
+        };
+        let told = settings.check().unwrap_err().to_string();
+        assert!(
+            told.starts_with("contact_threshold_n: found -0.07, expected"),
+            "{told}"
+        );
+    }
 }

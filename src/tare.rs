@@ -8,6 +8,7 @@ use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::frame::{Array, COLS, Frame, ROWS, RawFrame, TAXELS, taxels};
+use crate::wording::as_written;
 
 /// The `[sensor.calibration]` table.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -91,13 +92,6 @@ pub enum SettingsError {
 const MOST_NEWTONS_PER_COUNT: f64 = 1e3;
 const MOST_PITCH_MM: f64 = 1e3;
 const MOST_TARE_N: f64 = 1e6;
-
-/// The number that was written, not the one nearest to it among the shorter ones.
-fn as_written(value: f32) -> f64 {
-    let text = format!("{value:?}");
-    text.parse()
-        .expect("a number's own text is a number's text")
-}
 
 /// 65535 counts x 65536 frames stay below 2^32.
 const MOST_TARE_FRAMES: u32 = 65_536;
@@ -248,8 +242,12 @@ impl Tare {
         }
     }
 
-    /// Takes over changed settings; the baseline in force stays.
+    /// Takes over changed settings; the baseline in force stays. A tare under way begins anew if
+    /// it takes another number of frames now, or ends if it takes none.
     pub fn reload(&mut self, settings: &Settings, contact: Contact) {
+        if self.taking.is_some() && self.frames != settings.tare_frames {
+            self.taking = (settings.tare_frames > 0).then(|| Taking::new(settings.tare_frames));
+        }
         self.newtons_per_count = settings.newtons_per_count;
         self.frames = settings.tare_frames;
         self.max_n = settings.tare_max_n;

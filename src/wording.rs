@@ -7,6 +7,13 @@ pub fn of_toml(text: &str, error: &toml::de::Error) -> String {
     format!("line {line}: {}", plain(error.message()))
 }
 
+/// The number that was written, not the one nearest to it among the shorter ones.
+pub(crate) fn as_written(value: f32) -> f64 {
+    let text = format!("{value:?}");
+    text.parse()
+        .expect("a number's own text is a number's text")
+}
+
 /// `message` on one line, and without the names that Rust has for types.
 pub fn plain(message: &str) -> String {
     let message = message.trim().replace('\n', ": ");

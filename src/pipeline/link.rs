@@ -102,14 +102,14 @@ impl Pipeline {
             .seen
             .last_bytes
             .filter(|_| self.decoder.pending() > 0)?;
-        Some(last_bytes + self.period.mul_f64(PAUSE_PERIODS))
+        Some(last_bytes.saturating_add(self.period.mul_f64(PAUSE_PERIODS)))
     }
 
     /// When a silence makes the link stale.
     pub(super) fn stale_deadline(&self) -> Option<Duration> {
         match self.seen.link {
             Link::Opened { since } | Link::Live { since } if self.clock == Clock::Arrival => {
-                Some(since + self.period.mul_f64(STALE_PERIODS))
+                Some(since.saturating_add(self.period.mul_f64(STALE_PERIODS)))
             }
             _ => None,
         }

@@ -93,6 +93,59 @@ fn a_load_during_tare_is_said_and_tracked_as_no_press() {
 }
 
 #[test]
+fn a_reload_changes_the_tare_under_way() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    play(&mut pipeline, 0, &[raw(9, 50); 5]);
+    let with = |pipeline: &Pipeline, tare_frames| {
+        let mut judgement = pipeline.judgement().clone();
+        judgement.calibration.tare_frames = tare_frames;
+        judgement
+    };
+    pipeline.reload(with(&pipeline, 2));
+    assert_eq!(play(&mut pipeline, 5, &[raw(0, 0); 2]), ["Live"]);
+    assert_eq!(pipeline.retare(), Ok(()));
+    pipeline.reload(with(&pipeline, 0));
+    assert_eq!(pipeline.retared(), Some(Err(RetareError::NoFrames)));
+
+    let mut pipeline = self::pipeline(Preset::Jx255n);
+    play(&mut pipeline, 0, &[raw(9, 50); 5]);
+    pipeline.reload(with(&pipeline, 0));
+    assert_eq!(
+        play(&mut pipeline, 5, &[raw(9, 50)]),
+        ["Live", "Begin 1"],
+        "no tare is awaited"
+    );
+}
+
+#[test]
+fn a_press_that_timed_out_is_no_reason_against_a_tare() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    play(&mut pipeline, 0, &[raw(0, 0); 5]);
+    let drift = raw(784 - 400, 3);
+    let told = play(&mut pipeline, 5, &[drift; 160]);
+    assert!(told.contains(&"End 1 (timeout)".to_owned()), "{told:?}");
+    assert_eq!(pipeline.retare(), Ok(()));
+    play(&mut pipeline, 165, &[drift; 5]);
+    assert!(matches!(pipeline.retared(), Some(Ok(_))));
+    let mut pressed = drift;
+    pressed.counts[400..409].fill(53);
+    let told = play(&mut pipeline, 170, &[drift, drift, pressed]);
+    assert_eq!(told, ["Begin 2"], "the baseline is the drift's");
+}
+
+#[test]
+fn moments_beyond_all_time_are_no_panic() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    play(&mut pipeline, 0, &[raw(0, 0)]);
+    pipeline.decoder.push(&[0xBB, 0xAA]);
+    pipeline.seen.last_bytes = Some(Duration::MAX);
+    pipeline.seen.link = Link::Live {
+        since: Duration::MAX,
+    };
+    assert_eq!(pipeline.deadline(), Some(Duration::MAX));
+}
+
+#[test]
 fn a_tare_on_request_zeroes_drift_and_is_refused_or_given_up_under_load() {
     let mut pipeline = pipeline(Preset::Jx255n);
     assert_eq!(pipeline.retare(), Err(RetareError::NotLive));

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::frame::TAXELS;
+use crate::wording::as_written;
 
 /// The `[press]` table.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -90,7 +91,7 @@ impl Settings {
     /// area is above the begin area, or a count of frames is 0.
     pub fn check(&self) -> Result<(), SettingsError> {
         for (key, found) in [
-            ("contact_threshold_n", f64::from(self.contact_threshold_n)),
+            ("contact_threshold_n", as_written(self.contact_threshold_n)),
             ("max_seconds", self.max_seconds),
         ] {
             if !(found > 0.0 && found <= LARGEST) {
