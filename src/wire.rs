@@ -80,6 +80,8 @@ pub struct Layout {
     array: Array,
     mask: u16,
     invert: bool,
+    /// What a cell can hold.
+    largest_cell: u16,
     full_scale: Option<u16>,
     /// Wire position of a taxel -> its place in the frame.
     places: Vec<u16>,
@@ -105,7 +107,7 @@ impl Layout {
             }
         }
         let array = Array { rows, cols };
-        let (framing, all_ones, full_scale) = framing(settings, rows * cols)?;
+        let (framing, all_ones, largest) = framing(settings, rows * cols)?;
         let mask = settings.mask.unwrap_or(all_ones);
         if mask == 0 || mask > all_ones {
             return Err(LayoutError::Mask {
@@ -114,12 +116,16 @@ impl Layout {
             });
         }
         let order = settings.order.unwrap_or(Order::RowMajor);
+        let invert = settings.invert.unwrap_or(false);
+        let largest_cell = largest.unwrap_or(all_ones).min(mask);
+        let is_known = largest.is_some() || settings.mask.is_some();
         Ok(Self {
             framing,
             array,
             mask,
-            invert: settings.invert.unwrap_or(false),
-            full_scale: settings.mask.or(full_scale),
+            invert,
+            largest_cell,
+            full_scale: is_known.then_some(if invert { mask } else { largest_cell }),
             places: places(array, order),
         })
     }
@@ -157,16 +163,14 @@ impl Layout {
     /// Appends `frame` as the sensor would send it. Counts beyond what a cell can hold are
     /// clipped to its largest value; taxels outside the array are left out.
     pub fn encode(&self, frame: &RawFrame, out: &mut Vec<u8>) {
-        let top = self
-            .full_scale
-            .map_or(self.mask, |full| full.min(self.mask));
         let cells = self.places.iter().map(|&place| {
-            let count = frame.counts[usize::from(place)].min(top);
-            if self.invert {
+            let count = frame.counts[usize::from(place)].min(self.mask);
+            let cell = if self.invert {
                 self.mask - count
             } else {
                 count
-            }
+            };
+            cell.min(self.largest_cell)
         });
         match &self.framing {
             Framing::Fixed(fixed) => fixed.encode(cells, self.places.len(), out),

@@ -6,7 +6,7 @@
 
 use hardnessd::frame::{RawFrame, TAXELS};
 use hardnessd::random::Stream;
-use hardnessd::wire::{Decoder, Layout, Preset, Settings};
+use hardnessd::wire::{Decoded, Decoder, Layout, Preset, Settings};
 use proptest::prelude::*;
 
 const PRESETS: [Preset; 8] = [
@@ -389,6 +389,41 @@ fn cells_masks_orders_and_small_arrays_land_in_place() {
     layout.encode(&found[0], &mut again);
     // The mask hides the top bits of the first cell, so only that byte differs.
     assert_eq!(again[3..14], body[3..14]);
+}
+
+#[test]
+fn a_cell_that_cannot_be_sent_is_neither_sent_nor_full_scale() {
+    // 255 is the mark of both: cells go up to 254, be it that the mask is written out.
+    for preset in ["ff-tail", "zero-run"] {
+        for (rest, full_scale, sent, read) in [
+            ("", 254, 255, 254),
+            ("mask = 255", 254, 255, 254),
+            ("mask = 0x7F", 127, 255, 127),
+            // A cell counts down from 255 here, and 0 has to be 1.
+            ("invert = true", 255, 0, 1),
+            ("invert = true", 255, 255, 255),
+        ] {
+            let text = format!("preset = '{preset}'\n{rest}");
+            let layout = Layout::new(&toml::from_str(&text).unwrap()).unwrap();
+            assert_eq!(layout.full_scale(), Some(full_scale), "{text}");
+            let frame = RawFrame {
+                counts: [sent; TAXELS],
+            };
+            let mut bytes = Vec::new();
+            for _ in 0..2 {
+                layout.encode(&frame, &mut bytes);
+            }
+            let mut decoder = Decoder::new(layout);
+            decoder.push(&bytes);
+            decoder.settle();
+            let mut whole = 0;
+            while let Some(Ok(Decoded { frame, .. })) = decoder.next_frame() {
+                assert_eq!(frame.counts, [read; TAXELS], "{text}");
+                whole += 1;
+            }
+            assert_eq!(whole, 2, "{text}");
+        }
+    }
 }
 
 #[test]

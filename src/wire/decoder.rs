@@ -9,13 +9,8 @@ use crate::frame::RawFrame;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum Damage {
     /// The length field is not that of the layout.
-    #[error("length field is {found}, expected {expected}")]
-    Length {
-        /// As received.
-        found: usize,
-        /// Of the layout.
-        expected: usize,
-    },
+    #[error("the length field is not the layout's")]
+    Length,
     /// The checksum does not fit.
     #[error("checksum is {found:04x}, expected {expected:04x}")]
     Checksum {
@@ -77,7 +72,7 @@ pub(super) struct Context {
 }
 
 /// Finds frames in a stream of bytes. It holds on to at most the bytes of one pending frame
-/// (two where a layout that begins with a sync, without checksum or length, is not yet sure of its
+/// (two where a layout that begins with a sync, without checksum or tail, is not yet sure of its
 /// phase).
 #[derive(Debug)]
 pub struct Decoder {

@@ -122,7 +122,7 @@ impl Fixed {
             return Scan::Wait;
         }
         if bytes[..self.header.len()] != self.header {
-            return Scan::Damaged(1, self.wrong_length(bytes));
+            return Scan::Damaged(1, Damage::Length);
         }
         if bytes.len() < self.total() {
             return Scan::Wait;
@@ -133,18 +133,6 @@ impl Fixed {
         match self.check_end(bytes) {
             Ok(()) => self.whole(layout, bytes),
             Err(damage) => Scan::Damaged(1, damage),
-        }
-    }
-
-    fn wrong_length(&self, bytes: &[u8]) -> Damage {
-        let field = |header: &[u8]| match header[self.sync.len()..] {
-            [value] => usize::from(value),
-            [first, second] => usize::from(u16::from_le_bytes([first, second])),
-            _ => 0,
-        };
-        Damage::Length {
-            found: field(&bytes[..self.header.len()]),
-            expected: field(&self.header),
         }
     }
 
