@@ -422,6 +422,14 @@ fn line<T: Serialize>(value: &T) -> String {
     text
 }
 
+/// The name that a state, phase or note is published under, for whatever shall agree with it.
+pub(crate) fn name(state: &impl Serialize) -> String {
+    match serde_json::to_value(state) {
+        Ok(serde_json::Value::String(name)) => name,
+        other => unreachable!("a state without data is published as its name, not {other:?}"),
+    }
+}
+
 /// RFC 3339 in UTC with microseconds, so that every time has one width.
 pub(crate) fn time_text(time: Timestamp) -> String {
     format!("{time:.6}")

@@ -10,7 +10,7 @@ use serde::de::Visitor;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::Value;
 
-use crate::event::{self, Event};
+use crate::event::{self, Event, name};
 use crate::frame::{COLS, ROWS};
 
 /// What every message stands after: CDR, little-endian, no options (DDS-XTYPES 1.3, 7.6.3.1.2).
@@ -204,14 +204,6 @@ pub(crate) fn to_cdr(message: &impl Serialize) -> Vec<u8> {
     cdr_encoding::to_writer::<_, LittleEndian, _>(&mut bytes, message)
         .expect("a message has only what CDR knows, and memory takes it");
     bytes
-}
-
-/// A state without data, by the name it is published under.
-fn name(state: &impl Serialize) -> String {
-    match serde_json::to_value(state) {
-        Ok(Value::String(name)) => name,
-        other => unreachable!("a state without data is published as its name, not {other:?}"),
-    }
 }
 
 fn context(context: Option<&Value>) -> String {

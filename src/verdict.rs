@@ -1,7 +1,7 @@
 //! A frame becomes a verdict: loads an HRN from ONNX bytes and judges frames with it.
 //!
-//! In: the bytes of a model file (contract: `docs` of the model file in the README), then frames
-//! in newtons. Out: [`Verdict`]s. A file is refused unless all of it is as agreed and it
+//! In: the bytes of a model file as `hrn-train export` writes them, then frames in newtons. Out:
+//! [`Verdict`]s. A file is refused unless all of it is as agreed and it
 //! reproduces the probabilities that its trainer wrote into it, so a loaded [`Hrn`] is known to
 //! compute what was evaluated. Never reads a file itself, never prints, never trains.
 

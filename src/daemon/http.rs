@@ -199,7 +199,7 @@ impl Http {
         let mut ready = statuses.len() == self.sensors.0.len();
         for status in &statuses {
             ready &= status.state == LinkState::Live;
-            let state = super::log::name(&status.state);
+            let state = crate::event::name(&status.state);
             lines += &format!("{} {state}\n", status.sensor);
         }
         let code = if ready {

@@ -18,7 +18,7 @@ use tracing_subscriber::{EnvFilter, Registry, reload};
 use self::journal::Journal;
 use self::lines::Lines;
 
-use crate::event::{Event, LinkState, PressState, Tared};
+use crate::event::{Event, LinkState, PressState, Tared, name};
 use crate::pipeline::RetareError;
 
 /// The `[log]` table.
@@ -234,12 +234,4 @@ pub(crate) fn context(sensor: &str, context: Option<&serde_json::Value>) {
         context = context.map(tracing::field::display),
         "context"
     );
-}
-
-/// The name under which a state is published, so that log and event agree.
-pub(crate) fn name(state: &impl Serialize) -> String {
-    match serde_json::to_value(state) {
-        Ok(serde_json::Value::String(name)) => name,
-        other => unreachable!("a state without data is published as its name, not {other:?}"),
-    }
 }

@@ -12,9 +12,8 @@ use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
 
 use crate::daemon::hub::{Counts, Survey, Verdicts};
-use crate::daemon::log;
 use crate::daemon::sensor::Vitals;
-use crate::event::LinkState;
+use crate::event::{self, LinkState};
 
 pub(super) const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
@@ -92,7 +91,7 @@ fn links(registry: &mut Registry, vitals: &[Vitals]) {
         }
         for known in LinkState::ALL {
             let mut labels = labels.clone();
-            labels.push(("state", log::name(&known)));
+            labels.push(("state", event::name(&known)));
             let holds = f64::from(u8::from(status.state == known));
             state.get_or_create(&labels).set(holds);
         }
