@@ -90,7 +90,9 @@ impl Worker {
         }
     }
 
-    /// Writes until nobody is left to tell it anything, or there is no more to record.
+    /// Writes until nobody is left to tell it anything, or there is no more to record. Only one
+    /// file that fails is an error: of a directory, which the daemon has beside its work, it is a
+    /// line in the log.
     pub(super) fn run(mut self, jobs: &Receiver<Job>) -> Result<(), Error> {
         self.begin()?;
         let mut flush = Instant::now() + FLUSH_EVERY;
@@ -180,7 +182,11 @@ impl Worker {
                 );
             }
         }
-        finished.map_err(|source| Error::Write { path, source })?;
+        match (finished, &self.target) {
+            (Ok(()), _) => {}
+            (Err(source), Target::File { .. }) => return Err(Error::Write { path, source }),
+            (Err(reason), Target::Directory(_)) => self.pause(&reason),
+        }
         gone
     }
 
