@@ -343,8 +343,9 @@ impl Dataset {
         (kept, held)
     }
 
-    /// Chooses `labels` of `indices`, equally many a level (and source). By object, whole ones
-    /// are taken, and of the last of each level only as many presses as are still wanted.
+    /// Chooses `labels` of `indices`, equally many a level (and source); of one with fewer all, and
+    /// the more of the others. By object, whole ones are taken, and of the last of each level only
+    /// as many presses as are still wanted.
     pub fn choose_labelled(
         &self,
         indices: &[usize],
@@ -357,16 +358,30 @@ impl Dataset {
             LabelChoice::Object => self.objects(indices, &stream),
             LabelChoice::Random => self.groups(indices, &stream, |_| None),
         };
-        let group_count = groups.len();
+        let size_of = |objects: &Vec<Vec<usize>>| objects.iter().map(Vec::len).sum();
+        let sizes: Vec<usize> = groups.values().map(size_of).collect();
         let mut chosen = Vec::with_capacity(labels);
-        for (number, objects) in groups.into_values().enumerate() {
-            // The first groups take one more where the number does not divide.
-            let wanted = labels / group_count + usize::from(number < labels % group_count);
+        for (objects, wanted) in groups.into_values().zip(shares(&sizes, labels)) {
             chosen.extend(objects.into_iter().flatten().take(wanted));
         }
         chosen.sort_unstable();
         chosen
     }
+}
+
+/// How many of `labels` each of some groups gives: all alike, but none more than its size. The
+/// first that have more give one more where the number does not divide.
+fn shares(sizes: &[usize], labels: usize) -> Vec<usize> {
+    let given = |each: usize| -> usize { sizes.iter().map(|size| each.min(*size)).sum() };
+    let each = (0..=labels).take_while(|&each| given(each) <= labels);
+    let each = each.last().unwrap_or_default();
+    let mut left = labels - given(each);
+    let share = |&size: &usize| {
+        let one_more = size > each && left > 0;
+        left -= usize::from(one_more);
+        each.min(size) + usize::from(one_more)
+    };
+    sizes.iter().map(share).collect()
 }
 
 #[cfg(test)]

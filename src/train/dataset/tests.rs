@@ -233,6 +233,21 @@ fn labels_are_chosen_by_object_and_equally_from_each_level() {
     let more = dataset.choose_labelled(&indices, 100, LabelChoice::Object, 1);
     assert!(chosen.iter().all(|index| more.contains(index)));
 
+    // A level that has fewer gives all, and the others the more: never fewer than are told of.
+    let few: Vec<usize> = (0..10).chain(50..200).collect();
+    for choice in [LabelChoice::Object, LabelChoice::Random] {
+        let chosen = dataset.choose_labelled(&few, 101, choice, 1);
+        let of_level = [1, 2, 3, 4].map(|level| {
+            let levels = chosen.iter().map(|&i| dataset.samples[i].level);
+            levels.filter(|&found| found == level).count()
+        });
+        assert_eq!(of_level, [10, 31, 30, 30], "{choice:?}");
+    }
+    assert_eq!(
+        dataset.choose_labelled(&few, 160, LabelChoice::Object, 1),
+        few
+    );
+
     let random = dataset.choose_labelled(&indices, 48, LabelChoice::Random, 1);
     assert_eq!(random.len(), 48);
     let objects = objects_of(&dataset, &random).len();
