@@ -12,7 +12,7 @@ use std::process::{Command, Output};
 
 use bench::{BINARY, Bench, hardnessd};
 use hardnessd::simulator::{self, DatasetSettings, Split};
-use hardnessd::train::dataset::{self, Dataset, Sample, meta};
+use hardnessd::train::dataset::{self, Dataset, Kind, Sample, meta};
 use hardnessd::train::simulated;
 use hardnessd::verdict::{Card, Hrn};
 use serde_json::Value;
@@ -149,7 +149,7 @@ fn samples_are_the_frames_that_the_daemon_judges() {
     assert!(both[0].shore.is_some_and(|shore| shore != 95.0));
     // Both had a part in it, and a model of it says so.
     let both = Dataset::read(&out).unwrap();
-    assert_eq!(both.sources[0].is_simulated(), [true, false]);
+    assert_eq!(both.sources[0].kinds(), [Kind::Simulated, Kind::Recorded]);
     let card = trained(&bench, &[&out]);
     assert_eq!(card.validation, "simulated and recorded data");
     assert_eq!(card.pitch_mm, 3.5);
@@ -284,6 +284,11 @@ fn nothing_of_a_data_set_is_lost_when_it_is_added_to() {
     assert_refused(&out, &object, "own.npz: force: found none");
     write(|sample| sample.shore = Some(70.0));
     assert_refused(&out, &object, "foam.5hz.bin: shore: found none");
+    // Nothing told who made it, and that is not forgotten either.
+    write(|_| ());
+    collected(&out, &object);
+    let kinds = Dataset::read(&out).unwrap().sources[0].kinds();
+    assert_eq!(kinds, [Kind::Unknown, Kind::Recorded]);
 }
 
 #[test]

@@ -22,6 +22,8 @@ use crate::verdict::{Hrn, sha256_hex};
 
 /// What a data set says of who made it.
 const COLLECTED: &str = concat!("hrn-train collect ", env!("CARGO_PKG_VERSION"));
+/// And of who made it where it says nothing.
+const UNKNOWN: &str = "unknown";
 
 /// What the samples are said to be; what is `None` the capture's labels say.
 #[derive(Debug, Clone, Copy)]
@@ -331,9 +333,11 @@ pub fn to_bytes(
     let mut pitch_mm = captures.first().map(|capture| capture.pitch_mm);
     // Where the arrays of the first samples come from.
     let mut first = captures.first().map(|capture| capture.path.clone());
+    let mut others = String::new();
     let (mut samples, mut meta) = match before {
         Some((dataset, meta)) => {
             (pitch_mm, first) = (Some(dataset.pitch_mm()), Some(dataset.path()));
+            others = meta["generator"].as_str().unwrap_or(UNKNOWN).to_owned();
             (dataset.samples, meta)
         }
         None => (
@@ -357,7 +361,6 @@ pub fn to_bytes(
         serde_json::from_value(meta["materials"].take()).unwrap_or_default();
     meta["levels"] = json!(dataset::levels());
     // Models are said to be of simulated data, recorded or both by all who had a part in it.
-    let others = meta["generator"].as_str().unwrap_or_default();
     let others = others
         .split(", ")
         .filter(|one| !["", COLLECTED].contains(one));

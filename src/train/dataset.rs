@@ -115,14 +115,30 @@ pub struct Source {
 
 /// What our simulator calls itself in `meta.generator`.
 pub const SIMULATOR: &str = "hardnessd simulator";
+/// What `hrn-train collect` calls itself there.
+pub const COLLECTOR: &str = "hrn-train collect";
+
+/// What kind of samples a file has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// Our simulator's.
+    Simulated,
+    /// `hrn-train collect`'s.
+    Recorded,
+    /// Something else made them, or it is not told what.
+    Unknown,
+}
 
 impl Source {
-    /// Whether our simulator is what made it, for each that did.
-    pub fn is_simulated(&self) -> Vec<bool> {
+    /// Of what kinds its samples are, in the order of those who had a part in it.
+    pub fn kinds(&self) -> Vec<Kind> {
+        let kind = |generator: &str| match generator {
+            _ if generator.starts_with(SIMULATOR) => Kind::Simulated,
+            _ if generator.starts_with(COLLECTOR) => Kind::Recorded,
+            _ => Kind::Unknown,
+        };
         let generators = self.generator.as_deref().unwrap_or_default().split(", ");
-        generators
-            .map(|generator| generator.starts_with(SIMULATOR))
-            .collect()
+        generators.map(kind).collect()
     }
 }
 

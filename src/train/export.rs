@@ -7,7 +7,7 @@
 use anyhow::ensure;
 use serde_json::json;
 
-use super::dataset::{self, Dataset, Source};
+use super::dataset::{self, Dataset, Kind, Source};
 use super::metrics::{Evaluation, Judged};
 use super::onnx::{self, Graph};
 use super::run::{Description, Run};
@@ -165,11 +165,15 @@ fn data(sources: &[Source]) -> serde_json::Result<String> {
 
 /// `hrn.validation`.
 fn validation(sources: &[Source]) -> &'static str {
-    let simulated: Vec<bool> = sources.iter().flat_map(Source::is_simulated).collect();
-    match (simulated.contains(&true), simulated.contains(&false)) {
-        (true, true) => "simulated and recorded data",
-        (true, false) => "simulated data only",
-        (false, _) => "recorded data",
+    let kinds: Vec<Kind> = sources.iter().flat_map(Source::kinds).collect();
+    let [simulated, recorded, unknown] =
+        [Kind::Simulated, Kind::Recorded, Kind::Unknown].map(|kind| kinds.contains(&kind));
+    match (simulated, recorded, unknown) {
+        (true, false, false) => "simulated data only",
+        (true, true, false) => "simulated and recorded data",
+        (false, true, false) => "recorded data",
+        (false, false, _) => "data of unknown origin",
+        (_, _, true) => "data partly of unknown origin",
     }
 }
 
@@ -191,4 +195,51 @@ fn range(dataset: &Dataset, train: &[usize]) -> Range {
         range.contact_area_taxels = [least.min(area), most.max(area)];
     }
     range
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_model_is_said_to_be_of_what_is_told_of_its_data() {
+        for (generators, expected) in [
+            (
+                &[Some("hardnessd simulator 0.1.0")][..],
+                "simulated data only",
+            ),
+            (&[Some("hrn-train collect 0.1.0")], "recorded data"),
+            (
+                &[Some("hardnessd simulator 0.1.0, hrn-train collect 0.2.0")],
+                "simulated and recorded data",
+            ),
+            (
+                &[
+                    Some("hardnessd simulator 0.1.0"),
+                    Some("hrn-train collect 0.1.0"),
+                ],
+                "simulated and recorded data",
+            ),
+            (&[None], "data of unknown origin"),
+            (&[Some("finite elements")], "data of unknown origin"),
+            (
+                &[Some("hrn-train collect 0.1.0"), None],
+                "data partly of unknown origin",
+            ),
+            (
+                &[Some("unknown, hrn-train collect 0.1.0")],
+                "data partly of unknown origin",
+            ),
+        ] {
+            let source = |generator: &Option<&str>| Source {
+                name: String::new(),
+                seed: None,
+                sha256: String::new(),
+                generator: generator.map(str::to_owned),
+                pitch_mm: None,
+            };
+            let sources: Vec<Source> = generators.iter().map(source).collect();
+            assert_eq!(validation(&sources), expected, "{generators:?}");
+        }
+    }
 }
