@@ -30,7 +30,8 @@ const UNKNOWN: &str = "unknown";
 pub struct Labelling {
     /// 1..=4, or 0: unlabelled.
     pub level: Option<u8>,
-    /// What was pressed. Where neither says it, captures of one call are one object, a new one.
+    /// What was pressed; in another data set the same number is another object. Where neither
+    /// says it, captures of one call are one object, a new one.
     pub object: Option<u32>,
     /// For training or for test.
     pub split: Split,

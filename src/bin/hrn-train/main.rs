@@ -208,7 +208,8 @@ fn collect(arguments: &Collect) -> anyhow::Result<String> {
     }
     let out = arguments.out.display();
     Ok(format!(
-        "{out}: {presses} presses collected, {all} in all\n"
+        "{out}: {presses} presses collected, {all} in all; an object's further presses belong into \
+         this file, not another\n"
     ))
 }
 
