@@ -24,3 +24,8 @@ pub use material::{Material, Split, UnknownMaterial};
 pub use object::{Shapes, UnknownShapes};
 pub use sensor::{NEWTONS_PER_COUNT, SensorProfile, Threshold, UnknownProfile};
 pub use sequence::{Sequence, SequenceFrame, SequenceSettings};
+
+/// Of what [`dataset`] makes of the same settings and seed: to be raised with every change of its
+/// samples. A comparison names the files that it keeps by it, so that none of an older simulator is
+/// taken for one of this.
+pub const VERSION: u32 = 1;

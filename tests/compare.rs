@@ -10,6 +10,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant, SystemTime};
 
+use hardnessd::train::dataset::{self, Dataset};
 use hardnessd::train::paper;
 use serde_json::Value;
 
@@ -203,6 +204,56 @@ fn a_finished_comparison_does_nothing_again() {
     assert!(!again.contains("done"), "{again}");
     assert!(comparison.models() == models, "a run was done again");
     assert_eq!(comparison.text("results.json"), results);
+
+    // What was told otherwise is none of its runs.
+    let told = comparison.text("runs/features-1/settings.toml");
+    for (from, to, expected) in [
+        ("seed = 1\n", "seed = 2\n", "`seed`: found 2, expected 1"),
+        ("features", "hrn100", "`method`: found \"hrn100\", expected"),
+        (
+            "labels = 160",
+            "labels = 24",
+            "`labels`: found 24, expected 160",
+        ),
+        (
+            "\"object\"",
+            "\"random\"",
+            "`label_choice`: found \"random\"",
+        ),
+        (
+            "full_scale_n = 10.2",
+            "full_scale_n = 9.0",
+            "`settings.full_scale_n`: found 9.0, expected 10.2",
+        ),
+    ] {
+        let path = comparison.out.join("runs/features-1/settings.toml");
+        std::fs::write(path, told.replacen(from, to, 1)).unwrap();
+        let output = comparison.command().output().unwrap();
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{error}");
+        assert!(error.contains(expected), "{error}");
+        assert_eq!(error.lines().count(), 1, "{error}");
+    }
+}
+
+#[test]
+fn data_that_cannot_be_swapped_is_refused_before_anything_is_run() {
+    let comparison = Comparison::new("unswappable", "features", &["--swaps"]);
+    let data = data().0.path().join("unsaid.npz");
+    let samples = Dataset::read(&self::data().1).unwrap().samples;
+    let file = std::fs::File::create(&data).unwrap();
+    dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+    let mut command = hrn_train(&["compare", "--profile", "smoke", "--swaps"]);
+    command.args(["--methods", "features", "--data"]).arg(&data);
+    let output = command.arg("--out").arg(&comparison.out).output().unwrap();
+    let error = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{error}");
+    let expected = "unsaid.npz: `meta.settings`: found null, expected the simulator's";
+    assert!(
+        error.contains("--swaps") && error.contains(expected),
+        "{error}"
+    );
+    assert!(comparison.models().is_empty(), "{error}");
 }
 
 #[test]
@@ -264,8 +315,12 @@ fn at_work_in(directory: &Path) -> bool {
 
 #[test]
 fn a_failing_run_is_named_and_the_others_go_on() {
-    let comparison = Comparison::new("failing", "hrn100,features", &["--jobs", "1"]);
-    // A file where a run wants a directory.
+    let more = ["--jobs", "1", "--swaps"].as_slice();
+    let comparison = Comparison::new("failing", "hrn100,features", more);
+    // What ends the swaps before they begin; then a file where a run wants a directory.
+    let swapped = comparison.out.join("runs/features-swapped-none");
+    std::fs::create_dir_all(&swapped).unwrap();
+    std::fs::write(swapped.join("settings.toml"), "neither").unwrap();
     std::fs::create_dir_all(comparison.out.join("runs/hrn100-1")).unwrap();
     std::fs::write(comparison.out.join("runs/hrn100-1/checkpoints"), "").unwrap();
     let output = comparison.command().output().unwrap();
@@ -274,6 +329,10 @@ fn a_failing_run_is_named_and_the_others_go_on() {
     let last = errors.lines().last().unwrap();
     assert!(
         last.contains("1 run failed") && last.contains("hrn100-1"),
+        "{last}"
+    );
+    assert!(
+        last.contains("features-swapped-none/settings.toml"),
         "{last}"
     );
     assert_eq!(comparison.json("results.json").len(), 5);

@@ -357,6 +357,24 @@ mod tests {
     }
 
     #[test]
+    fn other_samples_are_another_version() {
+        // Newtons of all frames of each material. Where they are others on purpose, raise VERSION
+        // with them; a count here and there may be a machine's own.
+        let samples = dataset(&small(Shapes::Matched), 2, |_| ());
+        let newtons = Material::ALL.map(|material| {
+            let own = samples.iter().filter(|s| s.material == material.index());
+            own.map(|sample| sample.frame.force_n()).sum::<f64>()
+        });
+        let expected = [24.28, 20.92, 20.76, 19.80, 45.32, 41.64, 41.16, 39.00];
+        let alike = |(found, expected): (&f64, &f64)| (found / expected - 1.0).abs() < 5e-3;
+        assert!(
+            newtons.iter().zip(&expected).all(alike),
+            "{newtons:.2?} of version {}",
+            super::super::VERSION
+        );
+    }
+
+    #[test]
     fn samples_are_labelled_as_their_material() {
         let samples = dataset(&small(Shapes::Matched), 2, |_| ());
         assert_eq!(samples.len(), (4 + 4 * 2) * 9);

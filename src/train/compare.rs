@@ -21,10 +21,11 @@ pub use sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS};
 use self::children::{Failure, Job};
 use self::results::{Comparison, Entry};
 use self::sets::TestSet;
+use self::swaps::Swaps;
 use super::dataset::{Dataset, LabelChoice, Source};
-use super::methods::{self, Method};
+use super::methods::{self, LabelsError, Method, Request};
 use super::report;
-use super::run::{Run, write_whole};
+use super::run::{Description, Run, write_whole};
 use super::settings::Profile;
 use super::tables;
 
@@ -61,6 +62,7 @@ pub fn compare(plan: &Plan) -> anyhow::Result<()> {
     let _lock = lock(&plan.out)?;
     let dataset = Dataset::read(&plan.data)?;
     let recipes = recipes(&plan.methods, &dataset)?;
+    let swaps = Swaps::of(plan, &recipes)?;
     let mut rounds = Vec::new();
     for recipe in &recipes {
         for seed in 1..=plan.seeds {
@@ -70,10 +72,8 @@ pub fn compare(plan: &Plan) -> anyhow::Result<()> {
                 .join(format!("{}-{seed}", recipe.name()));
             rounds.push(Round {
                 recipe: *recipe,
-                seed,
-                profile: plan.profile,
+                told: recipe.told(seed, plan.profile, &dataset)?,
                 data: plan.data.clone(),
-                sources: dataset.sources.clone(),
                 directory,
                 // USTGAN is the same, and what the STGANs generate.
                 shares_with: matches!(recipe.method, Method::Nahrn | Method::Nihrn)
@@ -86,17 +86,22 @@ pub fn compare(plan: &Plan) -> anyhow::Result<()> {
     write_results(plan, &rounds, &sets)?;
     // The longest first, but every method once before any method twice.
     open.sort_by(|(a, first), (b, second)| {
-        a.seed
-            .cmp(&b.seed)
+        (a.told.seed)
+            .cmp(&b.told.seed)
             .then(second.effort.total_cmp(&first.effort))
     });
     let jobs = open.into_iter().map(|(_, job)| job).collect();
     let mut failures = children::run(jobs, plan.jobs, |_| write_results(plan, &rounds, &sets))?;
-    if plan.swaps {
-        failures.extend(swaps::run(plan, &recipes)?);
-        write_tables(&plan.out)?;
+    let swapped = swaps.map_or(Ok(()), |swaps| {
+        failures.extend(swaps.run(plan)?);
+        write_tables(&plan.out)
+    });
+    let failed = report_failures(&failures, &plan.out);
+    match (failed, swapped) {
+        // Both in one line: the runs that failed before are not forgotten.
+        (Err(failed), Err(error)) => bail!("{failed}; then {error:#}"),
+        (failed, swapped) => failed.and(swapped),
     }
-    report_failures(&failures, &plan.out)
 }
 
 /// Nobody else may work in the directory while the file is open.
@@ -180,6 +185,24 @@ impl Recipe {
         name
     }
 
+    /// What its run of a seed is told.
+    fn told(
+        &self,
+        seed: u64,
+        profile: Profile,
+        dataset: &Dataset,
+    ) -> Result<Description, LabelsError> {
+        let request = Request {
+            method: self.method,
+            profile,
+            seed,
+            labels: self.labels,
+            label_choice: self.choice,
+            settings: self.method.settings(profile),
+        };
+        request.description(dataset)
+    }
+
     /// What a run costs, in TFLOP of the `paper` profile: 2.5 GFLOP a step of a GAN, 0.6 a step of
     /// HRN, without the stages that it takes from ours. Other profiles keep the proportions.
     fn effort(&self) -> f64 {
@@ -200,10 +223,8 @@ impl Recipe {
 #[derive(Debug)]
 struct Round {
     recipe: Recipe,
-    seed: u64,
-    profile: Profile,
+    told: Description,
     data: PathBuf,
-    sources: Vec<Source>,
     directory: PathBuf,
     /// Name of a run that has stages in common with it.
     shares_with: Option<String>,
@@ -223,16 +244,25 @@ impl Round {
         let hashes = |sources: &[Source]| -> Vec<String> {
             sources.iter().map(|source| source.sha256.clone()).collect()
         };
-        ensure!(
-            told.profile == self.profile && hashes(&told.data) == hashes(&self.sources),
-            "{}: a run of other data or of another profile; found {:?} of {}, expected {:?} of {}",
-            self.directory.display(),
-            told.profile,
-            hashes(&told.data).join(", "),
-            self.profile,
-            hashes(&self.sources).join(", ")
-        );
-        Ok(())
+        let (found, expected) = (hashes(&told.data), hashes(&self.told.data));
+        let difference = if found == expected {
+            // The file's name may be another by now.
+            let data = self.told.data.clone();
+            Description { data, ..told }.difference(&self.told)?
+        } else {
+            let (found, expected) = (found.join(", "), expected.join(", "));
+            Some(format!(
+                "sha256 of the data: found {found}, expected {expected}"
+            ))
+        };
+        match difference {
+            None => Ok(()),
+            Some(difference) => bail!(
+                "{}: holds a run that was told otherwise; {difference}; compare into another \
+                 directory, or remove this one to have it run again",
+                self.directory.display()
+            ),
+        }
     }
 
     fn job(&self, out: &Path) -> Job {
@@ -243,7 +273,7 @@ impl Round {
             .unwrap_or_default()
             .to_string_lossy()
             .into_owned();
-        let profile = clap::ValueEnum::to_possible_value(&self.profile);
+        let profile = clap::ValueEnum::to_possible_value(&self.told.profile);
         let mut arguments: Vec<String> = [
             "train",
             "--resume",
@@ -254,7 +284,7 @@ impl Round {
             "--out",
             &path(&self.directory),
             "--seed",
-            &self.seed.to_string(),
+            &self.told.seed.to_string(),
             "--profile",
             profile
                 .as_ref()

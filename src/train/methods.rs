@@ -7,7 +7,7 @@ use anyhow::Context as _;
 use burn::tensor::Device;
 
 use super::baseline::Baseline;
-use super::dataset::{Dataset, DatasetError};
+use super::dataset::{Dataset, DatasetError, LabelChoice};
 use super::export::{self, Recogniser};
 use super::features;
 use super::generator::COMPONENTS;
@@ -16,7 +16,7 @@ use super::losses::Game;
 use super::metrics::Evaluation;
 use super::optimiser::{self, Rule};
 use super::run::{Description, Run};
-use super::settings::{Keep, Profile, Settings, Training, Validation};
+use super::settings::{Keep, Profile, Settings, SettingsError, Training, Validation};
 use super::stages::{self, Stages};
 use crate::frame::Frame;
 use crate::simulator::Split;
@@ -172,22 +172,86 @@ fn chosen(dataset: &Dataset, description: &Description) -> Result<Vec<usize>, Da
     })
 }
 
-/// Gives `hrn15-long` as many epochs as make the steps that ours would take on the same labels
-/// under the same settings; other methods keep theirs.
+/// What is asked of a run, before its data says what that comes to.
+#[derive(Debug, Clone, Copy)]
+pub struct Request {
+    /// What to train.
+    pub method: Method,
+    /// How long it may take.
+    pub profile: Profile,
+    /// Everything random follows from it.
+    pub seed: u64,
+    /// Labels to use instead of the method's share.
+    pub labels: Option<usize>,
+    /// How they are chosen.
+    pub label_choice: LabelChoice,
+    /// Of the method, with what overrides them.
+    pub settings: Settings,
+}
+
+impl Request {
+    /// What the run is told of `dataset`: `hrn15-long` gets as many epochs as make the steps that
+    /// ours would take on the same labels under the same settings.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`labels`].
+    pub fn description(&self, dataset: &Dataset) -> Result<Description, LabelsError> {
+        let mut description = Description {
+            method: self.method.name().to_owned(),
+            profile: self.profile,
+            seed: self.seed,
+            labels: labels(self.method, dataset, self.labels)?,
+            label_choice: self.label_choice,
+            settings: self.settings,
+            data: dataset.sources.clone(),
+        };
+        if self.method == Method::Hrn15Long {
+            let labelled = chosen(dataset, &description)?;
+            let share = self.settings.validation.share;
+            let (train, _) = dataset.hold_out(&labelled, share, self.seed);
+            description.settings.training.epochs =
+                epochs_as_long_as_ours(&self.settings, train.len());
+        }
+        Ok(description)
+    }
+}
+
+/// Makes sure that objects held out are used, and says so where a share is none of them.
 ///
 /// # Errors
 ///
-/// If the data has no labelled training samples.
-pub fn lengthen(
+/// If the method has no use for them, the best weights are to be kept by none of them, or the data
+/// has no labelled training samples.
+pub fn check_validation(
     method: Method,
     dataset: &Dataset,
-    description: &mut Description,
-) -> Result<(), DatasetError> {
-    if method == Method::Hrn15Long {
-        let labelled = chosen(dataset, description)?;
-        let Description { settings, seed, .. } = description;
-        let (train, _) = dataset.hold_out(&labelled, settings.validation.share, *seed);
-        settings.training.epochs = epochs_as_long_as_ours(settings, train.len());
+    description: &Description,
+) -> anyhow::Result<()> {
+    let Validation { share, keep, .. } = description.settings.validation;
+    if share == 0.0 || method == Method::Features {
+        return Ok(());
+    }
+    let refused = |expected| SettingsError::Range {
+        key: "validation.share".to_owned(),
+        found: share,
+        expected,
+    };
+    if matches!(method, Method::Sgan | Method::Igan) {
+        return Err(refused("0: sgan and igan have no use for held-out objects").into());
+    }
+    let labelled = chosen(dataset, description)?;
+    let (_, held_out) = dataset.hold_out(&labelled, share, description.seed);
+    if held_out.is_empty() && keep == Keep::Best {
+        let expected = "one that, with `validation.keep` best, rounds to an object or more of a \
+                        level's labelled ones";
+        return Err(refused(expected).into());
+    }
+    if held_out.is_empty() {
+        eprintln!(
+            "`validation.share`: {share} of the labelled objects of each level rounds to none: \
+             nothing is held out, and no temperature is fitted"
+        );
     }
     Ok(())
 }

@@ -40,6 +40,33 @@ pub struct Description {
     pub data: Vec<Source>,
 }
 
+impl Description {
+    /// The first key that is not as `expected`, with what both have there; `None` if they are the
+    /// same.
+    ///
+    /// # Errors
+    ///
+    /// If there is a number that TOML does not have.
+    pub fn difference(&self, expected: &Self) -> anyhow::Result<Option<String>> {
+        let (found, expected) = (
+            toml::Table::try_from(self)?,
+            toml::Table::try_from(expected)?,
+        );
+        Ok(difference("", &found, &expected))
+    }
+}
+
+fn difference(table: &str, found: &toml::Table, expected: &toml::Table) -> Option<String> {
+    let mut keys = found.iter();
+    keys.find_map(|(key, found)| match (found, &expected[key]) {
+        (toml::Value::Table(found), toml::Value::Table(expected)) => {
+            difference(&format!("{table}{key}."), found, expected)
+        }
+        (found, expected) => (found != expected)
+            .then(|| format!("`{table}{key}`: found {found}, expected {expected}")),
+    })
+}
+
 /// A run's directory.
 #[derive(Debug)]
 pub struct Run {
@@ -82,13 +109,12 @@ impl Run {
         };
         match Self::told(directory)? {
             Some(before) if resume => {
-                ensure!(
-                    before == *description,
-                    "{}: this run was started with other settings or data; found {}, expected {}",
-                    run.path("settings.toml").display(),
-                    toml::to_string(description)?.replace('\n', "; "),
-                    toml::to_string(&before)?.replace('\n', "; ")
-                );
+                if let Some(difference) = description.difference(&before)? {
+                    bail!(
+                        "{}: this run was started with other settings or data; {difference}",
+                        run.path("settings.toml").display()
+                    );
+                }
                 return Ok(run);
             }
             Some(_) => bail!(

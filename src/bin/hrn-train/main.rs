@@ -18,8 +18,8 @@ use hardnessd::train::collect::{self, Capture, CollectError, Labelling};
 use hardnessd::train::compare::{self, Plan};
 use hardnessd::train::dataset::{Dataset, DatasetError};
 use hardnessd::train::export;
-use hardnessd::train::methods::{self, LabelsError, Method};
-use hardnessd::train::run::{Description, Run, write_whole};
+use hardnessd::train::methods::{self, LabelsError, Method, Request};
+use hardnessd::train::run::{Run, write_whole};
 use hardnessd::train::settings::SettingsError;
 use hardnessd::train::{report, sheet, simulated};
 use hardnessd::verdict::{Hrn, ModelError};
@@ -253,8 +253,8 @@ fn train(arguments: &Train) -> anyhow::Result<String> {
         };
         std::fs::read_dir(other).map_err(unreadable)?;
     }
-    let mut description = Description {
-        method: arguments.method.name().to_owned(),
+    let request = Request {
+        method: arguments.method,
         profile: arguments.profile,
         seed: arguments.seed,
         labels: methods::labels(arguments.method, &dataset, arguments.labels)?,
@@ -262,7 +262,8 @@ fn train(arguments: &Train) -> anyhow::Result<String> {
         settings,
         data: dataset.sources.clone(),
     };
-    methods::lengthen(arguments.method, &dataset, &mut description)?;
+    let description = request.description(&dataset)?;
+    methods::check_validation(arguments.method, &dataset, &description)?;
     let device = device(arguments.device)?;
     let run = Run::open(&arguments.out, &description, arguments.resume)?
         .taking_from(arguments.from.clone());

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, ensure};
 
-use crate::simulator::{DatasetSettings, SensorProfile, Shapes, Split};
+use crate::simulator::{self, DatasetSettings, SensorProfile, Shapes, Split};
 use crate::train::dataset::Dataset;
 use crate::train::run::write_whole;
 use crate::train::settings::Profile;
@@ -148,12 +148,13 @@ fn simulated(directory: &Path, name: &str, settings: &DatasetSettings) -> anyhow
 }
 
 /// Where the samples of `settings` are kept: another simulator or other settings, another file.
+/// Whoever changes what the simulator makes raises [`simulator::VERSION`].
 pub(super) fn file_of(
     directory: &Path,
     name: &str,
     settings: &DatasetSettings,
 ) -> anyhow::Result<PathBuf> {
     let told = serde_json::to_string(settings).context("the simulator's settings")?;
-    let hash = sha256_hex(format!("{} {told}", env!("CARGO_PKG_VERSION")).as_bytes());
+    let hash = sha256_hex(format!("{} {told}", simulator::VERSION).as_bytes());
     Ok(directory.join(format!("{name}-{}.npz", &hash[..8])))
 }

@@ -7,6 +7,8 @@
 
 use std::path::PathBuf;
 
+use anyhow::Context as _;
+
 use super::children::{self, Failure};
 use super::results::{SwapEntry, read_json};
 use super::{Plan, Recipe, Round, sets, unfinished};
@@ -14,7 +16,7 @@ use crate::simulator::{DatasetSettings, LabelledSample, Material};
 use crate::train::dataset::{Dataset, LabelChoice};
 use crate::train::methods::Method;
 use crate::train::metrics::Evaluation;
-use crate::train::run::{Run, write_whole};
+use crate::train::run::write_whole;
 use crate::train::settings::Profile;
 use crate::train::simulated;
 
@@ -54,61 +56,81 @@ pub(super) fn name(swapped_levels: [bool; 4]) -> String {
     }
 }
 
-/// Runs what is not finished and writes `swaps.json`.
-pub(super) fn run(plan: &Plan, recipes: &[Recipe]) -> anyhow::Result<Vec<Failure>> {
-    let wanted: Vec<(Recipe, [bool; 4])> = recipes
-        .iter()
-        .flat_map(|recipe| {
-            assignments(recipe, plan.profile)
-                .into_iter()
-                .map(|swapped| (*recipe, swapped))
-        })
-        .collect();
-    if wanted.is_empty() {
-        return Ok(Vec::new());
+/// What is to be run with materials swapped.
+#[derive(Debug)]
+pub(super) struct Swaps {
+    wanted: Vec<(Recipe, [bool; 4])>,
+    /// What the data sets are simulated with, but for the roles.
+    settings: DatasetSettings,
+}
+
+impl Swaps {
+    /// Those that the plan asks for, if there are any.
+    ///
+    /// # Errors
+    ///
+    /// If the data does not say what it was simulated with.
+    pub(super) fn of(plan: &Plan, recipes: &[Recipe]) -> anyhow::Result<Option<Self>> {
+        let wanted: Vec<(Recipe, [bool; 4])> = recipes
+            .iter()
+            .flat_map(|recipe| {
+                assignments(recipe, plan.profile)
+                    .into_iter()
+                    .map(|swapped| (*recipe, swapped))
+            })
+            .collect();
+        if !plan.swaps || wanted.is_empty() {
+            return Ok(None);
+        }
+        let settings = DatasetSettings {
+            test_objects: sets::FRESH_OBJECTS,
+            ..simulated::settings_of(&plan.data).context("--swaps")?
+        };
+        Ok(Some(Self { wanted, settings }))
     }
-    let settings = DatasetSettings {
-        test_objects: sets::FRESH_OBJECTS,
-        ..simulated::settings_of(&plan.data)?
-    };
-    let mut parts = None;
-    let mut rounds = Vec::with_capacity(wanted.len());
-    for (recipe, swapped) in &wanted {
-        let file = file(plan, settings, *swapped, &mut parts)?;
-        let run = format!("{}-swapped-{}", recipe.name(), name(*swapped));
-        rounds.push(Round {
-            recipe: *recipe,
-            seed: SEED,
-            profile: plan.profile,
-            sources: Dataset::read(&file)?.sources,
-            data: file,
-            directory: plan.out.join("runs").join(run),
-            // With nobody swapped it is the comparison's own run, judged on more objects.
-            shares_with: (*swapped == [false; 4]).then(|| format!("{}-{SEED}", recipe.name())),
-        });
-    }
-    let open = unfinished(&rounds, &plan.out)?;
-    let jobs = open.into_iter().map(|(_, job)| job).collect();
-    let failures = children::run(jobs, plan.jobs, |_| Ok(()))?;
-    let mut entries = Vec::new();
-    for (round, (_, swapped_levels)) in rounds.iter().zip(&wanted) {
-        let told = Run::told(&round.directory)?;
-        let test: Option<Evaluation> = read_json(&round.directory.join("evaluation.json"))?;
-        if let (true, Some(told), Some(test)) = (round.is_finished(), told, test) {
-            entries.push(SwapEntry {
-                method: told.method,
-                seed: told.seed,
-                labels: told.labels,
-                swapped_levels: *swapped_levels,
-                test,
+
+    /// Runs what is not finished and writes `swaps.json`.
+    ///
+    /// # Errors
+    ///
+    /// If a file cannot be read or written, or a directory holds a run that was told otherwise.
+    pub(super) fn run(&self, plan: &Plan) -> anyhow::Result<Vec<Failure>> {
+        let mut parts = None;
+        let mut rounds = Vec::with_capacity(self.wanted.len());
+        for (recipe, swapped) in &self.wanted {
+            let file = file(plan, self.settings, *swapped, &mut parts)?;
+            let run = format!("{}-swapped-{}", recipe.name(), name(*swapped));
+            rounds.push(Round {
+                recipe: *recipe,
+                told: recipe.told(SEED, plan.profile, &Dataset::read(&file)?)?,
+                data: file,
+                directory: plan.out.join("runs").join(run),
+                // With nobody swapped it is the comparison's own run, judged on more objects.
+                shares_with: (*swapped == [false; 4]).then(|| format!("{}-{SEED}", recipe.name())),
             });
         }
+        let open = unfinished(&rounds, &plan.out)?;
+        let jobs = open.into_iter().map(|(_, job)| job).collect();
+        let failures = children::run(jobs, plan.jobs, |_| Ok(()))?;
+        let mut entries = Vec::new();
+        for (round, (_, swapped_levels)) in rounds.iter().zip(&self.wanted) {
+            let test: Option<Evaluation> = read_json(&round.directory.join("evaluation.json"))?;
+            if let (true, Some(test)) = (round.is_finished(), test) {
+                entries.push(SwapEntry {
+                    method: round.told.method.clone(),
+                    seed: round.told.seed,
+                    labels: round.told.labels,
+                    swapped_levels: *swapped_levels,
+                    test,
+                });
+            }
+        }
+        write_whole(
+            &plan.out.join("swaps.json"),
+            &serde_json::to_vec_pretty(&entries)?,
+        )?;
+        Ok(failures)
     }
-    write_whole(
-        &plan.out.join("swaps.json"),
-        &serde_json::to_vec_pretty(&entries)?,
-    )?;
-    Ok(failures)
 }
 
 /// Samples without any swap, and with all.
