@@ -92,7 +92,14 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
     let steps = u64::from(epochs) * steps_an_epoch;
     let origin = task.origin(&initial);
     let mut state = match run.latest(task.stage, &origin, epochs, task.device)? {
-        Some(checkpoint) => State::resumed(&checkpoint, task.settings)?,
+        Some(checkpoint) => {
+            // Frames generated on another device, or on more threads, may differ in their last
+            // bits; the run goes on from its weights all the same.
+            if !task.dataset.sources.is_empty() {
+                run.check_origin(task.stage, &checkpoint, &origin)?;
+            }
+            State::resumed(&checkpoint, task.settings)?
+        }
         None => State::fresh(initial, task.settings),
     };
     let mut metrics = run.metrics(task.stage, state.progress.step)?;

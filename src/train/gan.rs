@@ -102,7 +102,10 @@ pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
     let steps = u64::from(epochs) * task.real.len().div_ceil(batch) as u64;
     let origin = task.origin(&initial);
     let mut state = match run.latest(task.stage, &origin, epochs, task.device)? {
-        Some(checkpoint) => State::resumed(&checkpoint, task.settings)?,
+        Some(checkpoint) => {
+            run.check_origin(task.stage, &checkpoint, &origin)?;
+            State::resumed(&checkpoint, task.settings)?
+        }
         None => State::fresh(initial, task.settings),
     };
     let mut metrics = run.metrics(task.stage, state.progress.step)?;

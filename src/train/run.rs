@@ -199,8 +199,11 @@ impl Run {
             let Ok(checkpoint) = Checkpoint::read(&path, device) else {
                 continue;
             };
+            let Ok(metrics) = metrics_of(other) else {
+                continue;
+            };
             if checkpoint.origin == origin && checkpoint.progress.epoch == epochs {
-                self.take_metrics(stage, other)?;
+                self.take_metrics(stage, &metrics)?;
                 self.save(stage, &checkpoint)?;
                 return Ok(Some(checkpoint));
             }
@@ -208,12 +211,31 @@ impl Run {
         Ok(None)
     }
 
-    /// Adds another run's rows of `stage` to `metrics.csv`: they are part of what this run's
-    /// model cost.
-    fn take_metrics(&self, stage: &str, other: &Path) -> anyhow::Result<()> {
-        let path = other.join("metrics.csv");
-        let text = fs::read_to_string(&path).with_context(|| path.display().to_string())?;
-        history::check_columns(&text, &path)?;
+    /// Makes sure that a stage's checkpoint follows from what the stage has now.
+    ///
+    /// # Errors
+    ///
+    /// If its origin is another.
+    pub fn check_origin(
+        &self,
+        stage: &str,
+        checkpoint: &Checkpoint,
+        origin: &str,
+    ) -> anyhow::Result<()> {
+        ensure!(
+            checkpoint.origin == origin,
+            "{}: {stage}: the checkpoint is of other frames, settings or starting weights, or of \
+             another version of the program; found origin {:.12}, expected {origin:.12}; train \
+             into another directory",
+            self.path("checkpoints").display(),
+            checkpoint.origin
+        );
+        Ok(())
+    }
+
+    /// Adds the rows of `stage` of another run's metrics to `metrics.csv`: they are part of what
+    /// this run's model cost.
+    fn take_metrics(&self, stage: &str, text: &str) -> anyhow::Result<()> {
         let mut own = fs::read_to_string(self.path("metrics.csv")).unwrap_or_default();
         if own.is_empty() {
             own = history::columns() + "\n";
@@ -261,6 +283,14 @@ impl Run {
         let file = File::options().append(true).open(&path)?;
         Ok(Metrics::new(file, stage, seconds_before))
     }
+}
+
+/// The text of a run's `metrics.csv`, if its columns are those of this version.
+fn metrics_of(run: &Path) -> anyhow::Result<String> {
+    let path = run.join("metrics.csv");
+    let text = fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+    history::check_columns(&text, &path)?;
+    Ok(text)
 }
 
 /// Paths of a stage's checkpoints in a run's directory, oldest first.
