@@ -7,6 +7,7 @@
 
 use std::time::Instant;
 
+use anyhow::ensure;
 use burn::tensor::{Device, Tensor, activation};
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -121,6 +122,7 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
         let due = |every: u32| last || epoch.is_multiple_of(every);
 
         let loss = loss_sum / task.train.len() as f64;
+        ensure_finite(task.stage, epoch, loss)?;
         let mut validation = None;
         if !validation_samples.is_empty() && due(validation_settings.every_epochs) {
             validation = Some(state.validate(task));
@@ -381,6 +383,20 @@ pub fn probabilities(logits: &[Vec<f32>], temperature: f32, device: &Device) -> 
         numbers(&activation::softmax(scaled, 0))
     };
     logits.iter().map(one).collect()
+}
+
+/// Ends a stage whose loss is no number any more: no further step would make it one.
+///
+/// # Errors
+///
+/// If the mean loss of an epoch is not finite.
+pub(super) fn ensure_finite(stage: &str, epoch: u32, loss: f64) -> anyhow::Result<()> {
+    ensure!(
+        loss.is_finite(),
+        "{stage}: epoch {epoch}: loss: found {loss}, expected a finite number: the training has \
+         diverged"
+    );
+    Ok(())
 }
 
 /// A bar over a stage's steps.
