@@ -134,14 +134,17 @@ impl Trial {
         arguments
     }
 
-    fn train(&self, seed: &'static str, more: &[&str]) -> String {
+    fn output(&self, seed: &'static str, more: &[&str]) -> Output {
         let arguments = self.arguments(seed);
-        let all: Vec<&str> = arguments
-            .iter()
-            .map(String::as_str)
-            .chain(more.iter().copied())
-            .collect();
-        succeed(&all)
+        let own = arguments.iter().map(String::as_str);
+        hrn_train(&own.chain(more.iter().copied()).collect::<Vec<_>>())
+    }
+
+    #[track_caller]
+    fn train(&self, seed: &'static str, more: &[&str]) {
+        let output = self.output(seed, more);
+        let errors = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{:?}: {errors}", self.out);
     }
 
     fn read(&self, name: &str) -> Vec<u8> {
@@ -335,6 +338,95 @@ fn the_whole_method_killed_in_any_stage_resumes_bit_for_bit_and_shares_its_stage
     let other = Trial::of("nahrn", "other seed", GAN_SETTINGS);
     other.train("7", &["--from", whole.out.to_str().unwrap()]);
     assert!(other.out.join("samples/ustgan-000004.png").exists());
+    // One whose metrics are another version's is no failure: the stage is trained here.
+    std::fs::write(whole.out.join("metrics.csv"), "stage,other\n").unwrap();
+    let foreign = Trial::of("nahrn", "foreign metrics", GAN_SETTINGS);
+    foreign.train("6", &["--from", whole.out.to_str().unwrap()]);
+    foreign.assert_same(&alone);
+}
+
+#[test]
+fn a_discriminators_statistics_are_over_what_it_learnt_from() {
+    let [plain, augmented] = [("plain", ""), ("augmented", AUGMENTED)].map(|(name, more)| {
+        let trial = Trial::of("sgan", name, &format!("{GAN_SETTINGS}{more}"));
+        trial.train("1", &[]);
+        trial
+    });
+    // What only recognisers are told changes nothing of it.
+    plain.assert_same(&augmented);
+}
+
+/// Settings that SGAN and IGAN have no stage for.
+const AUGMENTED: &str = "
+    [training]
+    batch = 16
+    augmentation.symmetries = true
+    augmentation.shift_taxels = 2
+";
+
+#[test]
+fn held_out_objects_are_used_or_it_is_said() {
+    for (method, settings, code, expected) in [
+        (
+            "sgan",
+            "share = 0.25",
+            78,
+            "`validation.share`: found 0.25, expected 0: sgan and igan",
+        ),
+        (
+            "igan",
+            "share = 0.25\nkeep = \"best\"",
+            78,
+            "`validation.share`: found 0.25, expected 0: sgan and igan",
+        ),
+        // Four objects a level.
+        (
+            "hrn100",
+            "share = 0.1\nkeep = \"best\"",
+            78,
+            "`validation.share`: found 0.1, expected one that, with `validation.keep` best, rounds",
+        ),
+        (
+            "hrn100",
+            "share = 0.1",
+            0,
+            "`validation.share`: 0.1 of the labelled objects of each level rounds to none",
+        ),
+    ] {
+        let name = format!("held out {method} {code}");
+        let trial = Trial::of(method, &name, &format!("[validation]\n{settings}\n"));
+        let output = trial.output("1", &[]);
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(code), "{error}");
+        assert_eq!(error.matches(expected).count(), 1, "{error}");
+        assert_eq!(trial.out.exists(), code == 0, "{name}");
+        let _ = std::fs::remove_dir_all(trial.out);
+    }
+}
+
+#[test]
+fn a_training_that_diverges_ends_where_it_does() {
+    for (method, settings, expected) in [
+        (
+            "hrn100",
+            "[training.optimiser]",
+            "hrn: epoch 1: loss: found NaN",
+        ),
+        (
+            "sgan",
+            "[ustgan.optimiser]",
+            "sgan: epoch 1: loss: found NaN",
+        ),
+    ] {
+        let settings = format!("{settings}\nlearning_rate = 1e30\n");
+        let trial = Trial::of(method, &format!("diverging {method}"), &settings);
+        let output = trial.output("1", &[]);
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{error}");
+        let last = error.lines().last().unwrap();
+        assert!(last.contains(expected), "{error}");
+        assert!(trial.checkpoints().is_empty(), "{method}");
+    }
 }
 
 #[test]
@@ -438,23 +530,20 @@ fn another_seed_gives_other_weights_and_a_run_is_not_overwritten() {
     other.train("4", &[]);
     assert!(first.read("hrn.onnx") != other.read("hrn.onnx"));
 
-    let again = hrn_train(
-        &first
-            .arguments("3")
-            .iter()
-            .map(String::as_str)
-            .collect::<Vec<_>>(),
-    );
-    assert_eq!(again.status.code(), Some(1));
-    assert!(String::from_utf8_lossy(&again.stderr).contains("--resume goes on with it"));
-    let mut otherwise = first.arguments("5");
-    otherwise.push("--resume".to_owned());
-    let otherwise = hrn_train(&otherwise.iter().map(String::as_str).collect::<Vec<_>>());
-    assert_eq!(
-        otherwise.status.code(),
-        Some(1),
-        "resumed with another seed"
-    );
+    let refused = |seed, more: &[&str], expected: &str| {
+        let output = first.output(seed, more);
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{error}");
+        assert!(error.contains(expected), "{error}");
+    };
+    refused("3", &[], "--resume goes on with it");
+    refused("5", &["--resume"], "`seed`: found 5, expected 3");
+    // Nor does it go on from a checkpoint of another run.
+    for name in first.checkpoints() {
+        let place = |trial: &Trial| trial.out.join("checkpoints").join(&name);
+        std::fs::copy(place(&other), place(&first)).unwrap();
+    }
+    refused("3", &["--resume"], "hrn: the checkpoint is of other frames");
 }
 
 #[test]
@@ -525,7 +614,15 @@ fn bad_input_has_its_exit_code_and_one_line() {
     )
     .unwrap();
     let simulate = |more: &[&str]| hrn_train(&[&["simulate", "--out", &out], more].concat());
+    let no_run = format!("hrn-train: {missing}/hrn.onnx: ");
+    let beside = path("beside.npz");
+    let sheet = ["--sheet", "/dev/null/no", "--out", &beside];
     let cases = [
+        (
+            hrn_train(&[&["simulate", "--presses", "1"], &sheet[..]].concat()),
+            74,
+            "/dev/null/no",
+        ),
         (train(&["--data", &missing]), 66, "missing"),
         (train(&["--data", &text]), 1, "not an .npz file"),
         (
@@ -584,6 +681,12 @@ fn bad_input_has_its_exit_code_and_one_line() {
         ),
         (hrn_train(&["inspect", &text]), 78, "not an ONNX model"),
         (hrn_train(&["inspect", &missing]), 66, "missing"),
+        (hrn_train(&["export", &missing, "--out", &out]), 66, &no_run),
+        (
+            hrn_train(&["export", &corrupt, "--out", &out]),
+            66,
+            "the run has no model yet",
+        ),
         (
             hrn_train(&["evaluate", "--model", &text, "--data", &data]),
             78,
@@ -615,4 +718,6 @@ fn bad_input_has_its_exit_code_and_one_line() {
         assert!(error.contains(expected), "{error}");
         assert!(code != 2 || error.lines().count() == 1, "{error}");
     }
+    // A picture that cannot be written does not cost the data set.
+    assert!(Dataset::read(Path::new(&beside)).is_ok());
 }

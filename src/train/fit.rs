@@ -151,7 +151,7 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
     bar.finish_and_clear();
 
     let weights = match validation_settings.keep {
-        Keep::Best => state.best.unwrap_or(state.learner.weights),
+        Keep::Best => state.best.unwrap_or_else(|| state.learner.evaluated()),
         Keep::Last => state.learner.evaluated(),
     };
     let mut trained = task.with_statistics(weights);
@@ -303,8 +303,8 @@ impl Task<'_> {
         }
     }
 
-    /// Statistics of the normalised layers over all training samples, augmented as in training,
-    /// in batches of the same size.
+    /// Statistics of the normalised layers over the training samples, augmented as the settings
+    /// say, in whole batches of their size: what is left over for a smaller one is not counted.
     fn statistics(&self, weights: &Weights) -> Statistics {
         let mut statistics = Statistics::default();
         let mut order = self.train.to_vec();

@@ -8,6 +8,7 @@
 use anyhow::ensure;
 use burn::tensor::Device;
 
+use super::augment;
 use super::dataset::{Dataset, Sample};
 use super::export::{self, Recogniser};
 use super::fit::{self, Trained};
@@ -18,7 +19,7 @@ use super::losses::Game;
 use super::metrics::Evaluation;
 use super::network::Weights;
 use super::run::{Description, Run};
-use super::settings::{Settings, Validation};
+use super::settings::{Settings, Training, Validation};
 use super::sheet::{self, Strip};
 use crate::frame::Frame;
 use crate::random::Stream;
@@ -258,6 +259,11 @@ impl Stages<'_> {
         // The layers' statistics over all real frames that the discriminator has seen.
         let mut real = self.unlabelled.to_vec();
         real.extend(self.train);
+        let settings = Training {
+            batch: self.settings().ustgan.batch,
+            augmentation: augment::Settings::default(),
+            ..self.settings().training
+        };
         let task = fit::Task {
             train: &real,
             ..self.fit_task(stage)
