@@ -152,14 +152,16 @@ fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
     let samples = simulated::simulate(&settings);
     let seconds = begun.elapsed().as_secs_f64();
 
-    if let Some(path) = &arguments.sheet {
-        write(
-            path,
-            &sheet::sheet(&samples, &one_press_a_level(&settings))?,
-        )?;
-    }
     let count = samples.len();
+    let sheet = match &arguments.sheet {
+        Some(path) => Some((path, sheet::sheet(&samples, &one_press_a_level(&settings))?)),
+        None => None,
+    };
+    // The data set first: a picture that cannot be written does not cost it.
     write(&arguments.out, &simulated::to_bytes(&settings, samples)?)?;
+    if let Some((path, picture)) = sheet {
+        write(path, &picture)?;
+    }
     Ok(format!(
         "{}: {count} samples in {seconds:.1} s, {:.0} a second\n",
         arguments.out.display(),
@@ -257,10 +259,9 @@ fn train(arguments: &Train) -> anyhow::Result<String> {
         method: arguments.method,
         profile: arguments.profile,
         seed: arguments.seed,
-        labels: methods::labels(arguments.method, &dataset, arguments.labels)?,
+        labels: arguments.labels,
         label_choice: arguments.label_choice,
         settings,
-        data: dataset.sources.clone(),
     };
     let description = request.description(&dataset)?;
     methods::check_validation(arguments.method, &dataset, &description)?;
@@ -356,7 +357,11 @@ fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
 
 fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {
     let model = run.join("hrn.onnx");
-    let hrn = load(&model).context("the run has no model yet; train --resume finishes it")?;
+    let mut loaded = load(&model);
+    if run.join("settings.toml").exists() && !model.exists() {
+        loaded = loaded.context("the run has no model yet; train --resume finishes it");
+    }
+    let hrn = loaded?;
     write(out, &read(&model)?)?;
     Ok(format!("{}: sha256 {}\n", out.display(), hrn.sha256()))
 }
