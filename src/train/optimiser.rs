@@ -46,7 +46,8 @@ pub struct Settings {
     pub beta1: f64,
     /// Adam's decay of the gradient's square. (Below Eq. 8 the paper has the two swapped.)
     pub beta2: f64,
-    /// Share of a kernel taken away a step, times the learning rate; not of biases.
+    /// Share of a kernel taken away a step, times the learning rate; not of biases, nor
+    /// of the mixture's mu and sigma.
     pub weight_decay: f64,
 }
 
@@ -158,7 +159,8 @@ impl Optimiser {
                 }
             };
             let mut values = weight.values.clone();
-            if weight_decay > 0.0 && weight.dims.len() > 1 {
+            let is_kernel = weight.dims.len() > 1 && !weight.name.starts_with("mixture.");
+            if weight_decay > 0.0 && is_kernel {
                 values = values.mul_scalar(1.0 - rate * weight_decay);
             }
             weight.values = values.sub(step.mul_scalar(rate));
@@ -182,6 +184,45 @@ impl Optimiser {
             settings,
             step,
             moments,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::tensor::Device;
+
+    #[test]
+    fn weight_decay_takes_from_kernels_alone() {
+        let mut weights = Weights::default();
+        for (name, dims) in [
+            ("conv1.kernel", &[1, 1, 1, 1][..]),
+            ("head.matrix", &[1, 1]),
+            ("head.bias", &[1]),
+            ("mixture.mu", &[1, 1]),
+            ("mixture.sigma", &[1, 1]),
+        ] {
+            weights.add(name, dims, vec![2.0], &Device::flex());
+        }
+        let tracked = weights.tracked();
+        // Every weight has a gradient, of 0.
+        let values = tracked.entries.iter().map(|weight| weight.values.clone());
+        let loss = Tensor::cat(values.collect(), 0).mul_scalar(0.0).sum();
+        let settings = Settings {
+            weight_decay: 0.5,
+            ..Settings::default()
+        };
+        let mut gradients = loss.backward();
+        Optimiser::new(settings, &weights).step(&mut weights, &tracked, &mut gradients, 0.5);
+        for (name, expected) in [
+            ("conv1.kernel", 1.5),
+            ("head.matrix", 1.5),
+            ("head.bias", 2.0),
+            ("mixture.mu", 2.0),
+            ("mixture.sigma", 2.0),
+        ] {
+            assert_eq!(weights.numbers(name), [expected], "{name}");
         }
     }
 }
