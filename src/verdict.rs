@@ -322,7 +322,7 @@ impl Hrn {
 }
 
 /// Index and value of the largest; the first of equal ones.
-fn argmax(values: &[f32]) -> (usize, f32) {
+pub(crate) fn argmax(values: &[f32]) -> (usize, f32) {
     let mut best = (0, f32::NEG_INFINITY);
     for (index, &value) in values.iter().enumerate() {
         if value > best.1 {

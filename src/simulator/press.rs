@@ -110,10 +110,7 @@ impl Specimen {
     /// Flow over a step of `time_s`, for a plastic specimen; else nothing.
     pub(super) fn flow(&self, time_s: f64) -> Local<'static> {
         match self.properties.law {
-            Law::Plastic { hardness } => Local::Flow {
-                hardness_mpa: hardness * self.young_mpa,
-                time_s,
-            },
+            Law::Plastic { .. } => self.local(1.0, &[], time_s),
             Law::Solid | Law::Foam { .. } => Local::None,
         }
     }

@@ -22,6 +22,7 @@ use super::run::Run;
 use super::settings::{Keep, Training, Validation};
 use crate::frame::Frame;
 use crate::random::Stream;
+use crate::verdict::argmax;
 
 /// Samples a pass without gradients.
 const JUDGED_AT_ONCE: usize = 250;
@@ -85,7 +86,8 @@ impl Trained {
 ///
 /// # Errors
 ///
-/// If the run's directory cannot be read or written.
+/// If the run's directory cannot be read or written, its checkpoint is of another stage than this,
+/// or the loss is no number any more.
 pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> {
     let Training { batch, epochs, .. } = *task.settings;
     let (validation_samples, validation_settings) = task.validation;
@@ -229,7 +231,7 @@ impl State {
         let right = indices
             .iter()
             .zip(judged.chunks(task.levels))
-            .filter(|(index, logits)| largest(logits) == task.level(**index))
+            .filter(|(index, logits)| argmax(logits).0 == task.level(**index))
             .count();
         (f64::from(numbers(&loss)[0]), right)
     }
@@ -242,7 +244,7 @@ impl State {
         let loss = mean_loss(&judged, 1.0);
         let right = judged
             .iter()
-            .filter(|(level, logits)| largest(logits) == *level)
+            .filter(|(level, logits)| argmax(logits).0 == *level)
             .count();
         let better = self.progress.best_loss.is_none_or(|best| loss < best);
         if settings.keep == Keep::Best && better {
@@ -338,17 +340,6 @@ impl Task<'_> {
     fn level(&self, index: usize) -> usize {
         usize::from(self.dataset.samples[index].level) - 1
     }
-}
-
-/// The place of the largest number, the first of equal ones.
-pub(super) fn largest(logits: &[f32]) -> usize {
-    (1..logits.len()).fold(0, |best, index| {
-        if logits[index] > logits[best] {
-            index
-        } else {
-            best
-        }
-    })
 }
 
 /// Mean cross-entropy of logits over `temperature`.

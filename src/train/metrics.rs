@@ -11,6 +11,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::random::Stream;
+use crate::verdict::argmax;
 
 /// Equal-width bins of the largest probability in the expected calibration error.
 const CALIBRATION_BINS: usize = 15;
@@ -33,13 +34,7 @@ pub struct Judged {
 impl Judged {
     /// The predicted level, from 0; equal probabilities go to the lower level (Eq. 10).
     fn prediction(&self) -> usize {
-        (1..self.probabilities.len()).fold(0, |best, index| {
-            if self.probabilities[index] > self.probabilities[best] {
-                index
-            } else {
-                best
-            }
-        })
+        argmax(&self.probabilities).0
     }
 
     fn truth(&self) -> usize {

@@ -7,6 +7,7 @@ use anyhow::Context as _;
 use font8x8::legacy::BASIC_LEGACY;
 
 use crate::frame::{COLS, Frame, ROWS, RawFrame};
+use crate::press;
 use crate::simulator::{LabelledSample, Material, NEWTONS_PER_COUNT};
 
 /// Frames in a row of the sheet.
@@ -41,11 +42,10 @@ pub fn sheet(
     let width = MARGIN + TILES * (TILE + GAP);
     let height = HEAD + 8 * ROW + HEAD + sequences.len() * ROW + FOOT;
     let mut canvas = Canvas::new(width, height);
-    canvas.text(
-        GAP,
-        GAP,
-        "samples: force pressed with, contact area at 0.07 N, greatest taxel",
-    );
+    let threshold_n = contact_threshold_n();
+    let title =
+        format!("samples: force pressed with, contact area at {threshold_n} N, greatest taxel");
+    canvas.text(GAP, GAP, &title);
     let mut top = HEAD;
     for material in Material::ALL {
         let mut of_material: Vec<&LabelledSample> = samples
@@ -56,7 +56,7 @@ pub fn sheet(
         of_material.sort_by(|a, b| a.force_n.total_cmp(&b.force_n));
         for (tile, sample) in spread(&of_material).enumerate() {
             let peak = sample.frame.newtons.iter().copied().fold(0.0, f32::max);
-            let area = sample.frame.contact_area_taxels(0.07);
+            let area = sample.frame.contact_area_taxels(threshold_n);
             let caption = format!("{:.0}N {area} {peak:.1}N", sample.force_n);
             canvas.tile(tile, top, &sample.frame, &caption);
         }
@@ -103,7 +103,7 @@ impl<'a> Strip<'a> {
     pub fn of(name: &str, frames: impl Iterator<Item = &'a Frame>) -> Self {
         let tile = |frame: &'a Frame| {
             let peak = frame.newtons.iter().copied().fold(0.0, f32::max);
-            let area = frame.contact_area_taxels(0.07);
+            let area = frame.contact_area_taxels(contact_threshold_n());
             let force = frame.force_n();
             (frame, format!("{area} {force:.0}N {peak:.1}N"))
         };
@@ -112,6 +112,15 @@ impl<'a> Strip<'a> {
             tiles: frames.map(tile).collect(),
         }
     }
+}
+
+fn contact_threshold_n() -> f32 {
+    press::Settings::default().contact_threshold_n
+}
+
+/// What the captions of [`Strip::of`] say, for titles.
+pub fn captions() -> String {
+    format!("contact area at {} N, force, peak", contact_threshold_n())
 }
 
 /// Draws rows of frames under a title.

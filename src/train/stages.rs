@@ -24,6 +24,7 @@ use super::sheet::{self, Strip};
 use crate::frame::Frame;
 use crate::random::Stream;
 use crate::simulator::Split;
+use crate::verdict::argmax;
 
 /// Stages of the four STGANs.
 const STGANS: [&str; 4] = ["stgan1", "stgan2", "stgan3", "stgan4"];
@@ -170,8 +171,8 @@ impl Stages<'_> {
                 rows.push(Strip::of(&name, part.iter().copied()));
             }
         }
-        let title = "levels, real and generated: contact area at 0.07 N, force, peak";
-        let picture = sheet::strips(title, &rows)?;
+        let title = format!("levels, real and generated: {}", sheet::captions());
+        let picture = sheet::strips(&title, &rows)?;
         self.run.write("samples/generated.png", &picture)
     }
 
@@ -256,7 +257,8 @@ impl Stages<'_> {
         let initial = gan::initial(game, levels(), false, self.description.seed, self.device);
         let gan = gan::fit(&task, initial, self.run)?;
         let weights = hrn::of_levels(&gan.discriminator, levels(), self.device);
-        // The layers' statistics over all real frames that the discriminator has seen.
+        // The layers' statistics over all real frames that the discriminator has seen, as it has
+        // seen them.
         let mut real = self.unlabelled.to_vec();
         real.extend(self.train);
         let settings = Training {
@@ -266,6 +268,7 @@ impl Stages<'_> {
         };
         let task = fit::Task {
             train: &real,
+            settings: &settings,
             ..self.fit_task(stage)
         };
         Ok(task.with_statistics(weights))
@@ -340,10 +343,10 @@ pub(super) fn draw_mistakes(
     let mut wrong = 0;
     for (&index, row) in indices.iter().zip(probabilities) {
         let sample = &dataset.samples[index];
-        let said = fit::largest(row);
+        let (said, confidence) = argmax(row);
         if said + 1 != usize::from(sample.level) {
             wrong += 1;
-            let caption = format!("as {}, {:.0} %", said + 1, row[said] * 100.0);
+            let caption = format!("as {}, {:.0} %", said + 1, confidence * 100.0);
             rows[usize::from(sample.level) - 1]
                 .tiles
                 .push((&sample.frame, caption));

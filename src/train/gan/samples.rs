@@ -60,7 +60,7 @@ impl Task<'_> {
             rows.push(Strip::of("  again", second.iter()));
         }
         let stage = self.stage;
-        let title = format!("{stage} after {epoch} epochs: contact area at 0.07 N, force, peak");
+        let title = format!("{stage} after {epoch} epochs: {}", sheet::captions());
         let name = format!("samples/{stage}-{epoch:06}.png");
         run.write(&name, &sheet::strips(&title, &rows)?)
     }
