@@ -152,7 +152,7 @@ impl Weights {
             .expect("a network asks for weights that it made")
     }
 
-    /// The same weights as leaves of an autodiff graph on `device`.
+    /// The same weights as leaves of an autodiff graph.
     #[must_use]
     pub fn tracked(&self) -> Self {
         let track = |weight: &Weight| Weight {
