@@ -217,7 +217,9 @@ impl Faults {
                     frames,
                 } if time_s >= *from_s && *frames > 0 => {
                     *frames -= 1;
-                    for _ in 0..*bits {
+                    // Where all bytes were dropped there is none to invert.
+                    let bits = if frame.is_empty() { 0 } else { *bits };
+                    for _ in 0..bits {
                         let bit = stream.below(frame.len() * 8);
                         frame[bit / 8] ^= 1 << (bit % 8);
                     }
@@ -340,6 +342,24 @@ mod tests {
         assert_eq!(struck(4.4), (Line::Up, 100, 0));
         assert_eq!(struck(5.0), (Line::Up, 100, 1));
         assert_eq!(struck(5.2), (Line::Up, 100, 0));
+    }
+
+    #[test]
+    fn a_frame_of_which_nothing_is_left_has_no_bits_to_flip() {
+        let script = r#"
+            [[fault]]
+            at_s = 1.0
+            kind = "drop-bytes"
+            bytes = 1000
+            [[fault]]
+            at_s = 1.0
+            kind = "flip"
+            bits = 3
+        "#;
+        let mut faults = Faults::parse(script, 1).unwrap();
+        let mut frame = vec![0_u8; 100];
+        assert_eq!(faults.strike(1.0, &mut frame), Line::Up);
+        assert!(frame.is_empty());
     }
 
     #[test]
