@@ -73,7 +73,8 @@ fn open(path: &Path) -> io::Result<File> {
     Ok(file)
 }
 
-/// Writes lines to stdout at once. `Ok(false)`: nobody reads any more, which ends a tool quietly.
+/// Writes lines to stdout at once, and waits until there is room for them: not for a thread that has
+/// anything else to do. `Ok(false)`: nobody reads any more, which ends a tool quietly.
 ///
 /// # Errors
 ///
@@ -84,6 +85,11 @@ pub fn print(lines: &[u8]) -> io::Result<bool> {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
         written => written.map(|()| true),
     }
+}
+
+/// As [`print`], from a thread of its own: whoever reads may take as long as they like.
+async fn print_apart(lines: Vec<u8>) -> io::Result<bool> {
+    tokio::task::spawn_blocking(move || print(&lines)).await?
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@ use std::future::Future;
 use std::io;
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::time::Duration;
 
 use clap::{CommandFactory, Parser, Subcommand};
 use hardnessd::daemon::config::{Error as ConfigError, Setup};
@@ -73,6 +74,9 @@ mod exit {
     pub(super) const CONFIG: u8 = 78;
 }
 
+/// How long what is being written may take to be whole.
+const LAST_LINES: Duration = Duration::from_millis(200);
+
 fn main() -> ExitCode {
     let runtime = match tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -101,8 +105,8 @@ fn main() -> ExitCode {
         Err(error) => return tools::usage("hardnessd", &error),
     };
     let done = runtime.block_on(dispatch(args.command, signals));
-    // A port may be stuck in its driver on a thread of its own: not worth waiting for.
-    runtime.shutdown_background();
+    // A port may be stuck in its driver on a thread of its own, or nobody read stdout.
+    runtime.shutdown_timeout(LAST_LINES);
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

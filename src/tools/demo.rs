@@ -155,31 +155,44 @@ async fn print(
     let mut played = std::pin::pin!(player.play(sequence));
     let mut shutdown = std::pin::pin!(shutdown);
     let mut last_byte: Option<Instant> = None;
+    // The line on its way to stdout: the sensor and the daemon wait for no reader.
+    let mut printing = std::pin::pin!(None);
     loop {
         let patience = last_byte.map(|at| at + PATIENCE);
         tokio::select! {
+            // What there is to read counts before the patience with it.
+            biased;
             () = &mut shutdown => return Ok(()),
-            read = lines.read_until(b'\n', &mut line) => {
+            printed = wait(printing.as_mut().as_pin_mut()) => {
+                printing.set(None);
+                let printed: io::Result<bool> = printed;
+                if !printed.map_err(io("stdout"))? || Some(finals) == presses {
+                    return Ok(());
+                }
+            }
+            read = lines.read_until(b'\n', &mut line), if printing.is_none() => {
                 if read.map_err(io("socket"))? == 0 {
                     return Err(Error::Closed);
                 }
-                if !super::print(&line).map_err(io("stdout"))? {
-                    return Ok(());
-                }
                 finals += u32::from(is_final(&line));
-                if Some(finals) == presses {
-                    return Ok(());
-                }
-                line.clear();
+                printing.set(Some(super::print_apart(std::mem::take(&mut line))));
             }
             ended = &mut played, if last_byte.is_none() => {
                 ended.map_err(io("pty"))?;
                 last_byte = Some(Instant::now());
             }
-            () = until(patience) => {
+            () = until(patience), if printing.is_none() => {
                 return Err(Error::Missed { found: finals, presses: presses.unwrap_or(0) });
             }
         }
+    }
+}
+
+/// The output of what there is to wait for.
+async fn wait<T: Future>(one: Option<T>) -> T::Output {
+    match one {
+        Some(one) => one.await,
+        None => std::future::pending().await,
     }
 }
 

@@ -7,10 +7,10 @@ use std::fs::File;
 use std::future::Future;
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::sync::mpsc::{self, Receiver, RecvTimeoutError};
+use std::time::{Duration, Instant};
 
 use clap::Args as ClapArgs;
-use tokio::time::Instant;
 
 use super::simulate::positive;
 use crate::daemon::config::{self, Config, Sensor, Setup};
@@ -98,13 +98,20 @@ const CHUNK_BYTES: usize = 64 * 1024;
 ///
 /// [`Error`], if the recording or the configuration cannot be used.
 pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
-    tokio::select! {
-        played = play(args) => played,
+    // On a thread of its own: neither a recording that is a pipe nor whoever reads stdout is to be
+    // waited for at a signal.
+    let (stop, stopped) = mpsc::channel();
+    let played = tokio::task::spawn_blocking(move || play(&args, &stopped));
+    let ended = tokio::select! {
+        played = played => played.expect("a replay does not panic"),
         () = shutdown => Ok(()),
-    }
+    };
+    drop(stop);
+    ended
 }
 
-async fn play(args: Args) -> Result<(), Error> {
+/// Plays to the end, or until the other end of `stopped` is dropped.
+fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Error> {
     let setup = match &args.config {
         Some(config) => Setup::load(config)?,
         None => {
@@ -117,27 +124,54 @@ async fn play(args: Args) -> Result<(), Error> {
         path: path.clone(),
         source,
     })?;
+    let pace = Pace {
+        speed: args.speed,
+        start: None,
+        stopped,
+    };
     let extension = path.extension().unwrap_or_default();
     if extension == "mcap" {
-        play_recording(&args, BufReader::new(recording), setup).await
+        play_recording(path, BufReader::new(recording), setup, pace)
     } else {
-        play_bytes(&args, recording, &setup).await
+        play_bytes(path, recording, &setup, pace)
+    }
+}
+
+/// When what is played comes.
+struct Pace<'a> {
+    speed: Option<f64>,
+    /// When the first was played.
+    start: Option<Instant>,
+    stopped: &'a Receiver<()>,
+}
+
+impl Pace<'_> {
+    /// Waits for what came so long after the first; `false`: nothing more is to be played.
+    fn wait(&mut self, since: Duration) -> bool {
+        let start = *self.start.get_or_insert_with(Instant::now);
+        let left = self.speed.map_or(Duration::ZERO, |speed| {
+            let due = Duration::try_from_secs_f64(since.as_secs_f64() / speed);
+            // A moment beyond counting does not come.
+            let due = due.unwrap_or(Duration::MAX);
+            due.saturating_sub(start.elapsed())
+        });
+        self.stopped.recv_timeout(left) != Err(RecvTimeoutError::Disconnected)
     }
 }
 
 /// A recording of ours. One that is cut off or damaged ends as bytes do that end there, and says
 /// afterwards what is wrong with it.
-async fn play_recording(args: &Args, file: impl Read, setup: Setup) -> Result<(), Error> {
+fn play_recording(path: &Path, file: impl Read, setup: Setup, pace: Pace) -> Result<(), Error> {
     let mut playback = Playback::new(setup.hrn);
     let mut seq = 0;
-    let played = play_entries(args, file, &mut playback, &mut seq).await;
+    let played = play_entries(path, file, pace, &mut playback, &mut seq);
     if let Ok(false) = played {
         return Ok(());
     }
     if let Some(model) = playback.other_model() {
         eprintln!(
             "warning: {}: recorded with model {}, played with another",
-            args.file.display(),
+            path.display(),
             model.get(..12).unwrap_or(model)
         );
     }
@@ -145,44 +179,34 @@ async fn play_recording(args: &Args, file: impl Read, setup: Setup) -> Result<()
     played.map(drop)
 }
 
-/// What its sensors learnt, at the moments they learnt it. `false`: nobody reads.
-async fn play_entries(
-    args: &Args,
+/// What its sensors learnt, at the moments they learnt it. `false`: nobody reads, or it was stopped.
+fn play_entries(
+    path: &Path,
     file: impl Read,
+    mut pace: Pace,
     playback: &mut Playback,
     seq: &mut u64,
 ) -> Result<bool, Error> {
-    let path = &args.file;
     let failed = |source| match source {
         recording::Error::Io(source) => Error::Broken {
-            path: path.clone(),
+            path: path.to_owned(),
             source,
         },
         source => Error::Recording {
-            path: path.clone(),
+            path: path.to_owned(),
             source,
         },
     };
-    // The first moment played, and when that was.
-    let mut begun: Option<(Duration, Instant)> = None;
+    // The first moment played.
+    let mut first: Option<Duration> = None;
     for found in Reader::new(file) {
         let found = found.map_err(failed)?;
-        if let Some(speed) = args.speed {
-            let now = Instant::now();
-            let (first, start) = *begun.get_or_insert((found.at.mono, now));
-            let since = found.at.mono.saturating_sub(first).as_secs_f64() / speed;
-            // A moment beyond counting does not come.
-            let since = Duration::try_from_secs_f64(since).unwrap_or(Duration::MAX);
-            match start.checked_add(since) {
-                Some(due) => tokio::time::sleep_until(due).await,
-                None => std::future::pending().await,
-            }
-        } else {
-            // A signal is looked for.
-            tokio::task::yield_now().await;
+        let first = *first.get_or_insert(found.at.mono);
+        if !pace.wait(found.at.mono.saturating_sub(first)) {
+            return Ok(false);
         }
         let events = playback.feed(found).map_err(|source| Error::Sensor {
-            path: path.clone(),
+            path: path.to_owned(),
             source,
         })?;
         if !print(events, seq)? {
@@ -199,34 +223,27 @@ async fn play_entries(
 }
 
 /// Bytes back to back.
-async fn play_bytes(args: &Args, mut recording: File, setup: &Setup) -> Result<(), Error> {
-    let path = &args.file;
+fn play_bytes(path: &Path, mut file: File, setup: &Setup, mut pace: Pace) -> Result<(), Error> {
     let settings = setup
         .pipelines()
         .next()
         .expect("a configuration has at least one sensor");
     let frame_bytes = settings.layout.max_frame_bytes();
-    let pace = args.speed.map(|speed| {
-        Duration::from_secs_f64(1.0 / (settings.frame_rate_hz * speed * frame_bytes as f64))
-    });
-    let mut chunk = vec![
-        0;
-        if pace.is_some() {
-            frame_bytes
-        } else {
-            CHUNK_BYTES
-        }
-    ];
+    let frame_rate_hz = settings.frame_rate_hz;
+    let chunk_bytes = match pace.speed {
+        Some(_) => frame_bytes,
+        None => CHUNK_BYTES,
+    };
+    let mut chunk = vec![0; chunk_bytes];
     let mut pipeline = Pipeline::new(settings, Clock::FrameRate);
     let mut seq = 0;
-    let start = Instant::now();
-    let mut bytes: u32 = 0;
+    let mut bytes = 0_u64;
     loop {
-        let read = match recording.read(&mut chunk) {
+        let read = match file.read(&mut chunk) {
             Ok(read) => read,
             Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
             Err(source) => {
-                let path = path.clone();
+                let path = path.to_owned();
                 return Err(Error::Broken { path, source });
             }
         };
@@ -234,7 +251,7 @@ async fn play_bytes(args: &Args, mut recording: File, setup: &Setup) -> Result<(
             let end = pipeline.end_of_recording(None);
             let none = end.iter().find_map(|event| match event {
                 Event::Status(status) if status.frames == 0 => Some(Error::NoFrame {
-                    path: path.clone(),
+                    path: path.to_owned(),
                     bytes_skipped: status.bytes_skipped,
                     frames_damaged: status.frames_damaged,
                 }),
@@ -243,14 +260,12 @@ async fn play_bytes(args: &Args, mut recording: File, setup: &Setup) -> Result<(
             print(end, &mut seq)?;
             return none.map_or(Ok(()), Err);
         }
-        if let Some(a_byte) = pace {
-            bytes = bytes.saturating_add(u32::try_from(read).unwrap_or(u32::MAX));
-            tokio::time::sleep_until(start + a_byte * bytes).await;
-        } else {
-            tokio::task::yield_now().await;
-        }
+        bytes += read as u64;
+        let since = bytes as f64 / frame_bytes as f64 / frame_rate_hz;
         // The clock is the recording's: the moment given here is not looked at.
-        if !print(pipeline.push(&chunk[..read], now()), &mut seq)? {
+        if !pace.wait(Duration::from_secs_f64(since))
+            || !print(pipeline.push(&chunk[..read], now()), &mut seq)?
+        {
             return Ok(());
         }
     }

@@ -142,11 +142,14 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let pace = Pace::new(args.fps, baud, args.speed);
     let player = Player::new(args.link.as_deref(), layout, pace, faults).map_err(failed)?;
     let line = format!("{}\n", player.path().display());
-    // Nobody may want to know the path: the link says it too.
-    super::print(line.as_bytes()).map_err(failed)?;
     let settings = sequence(&args);
+    let play = async {
+        // Nobody may want to know the path: the link says it too.
+        super::print_apart(line.into_bytes()).await?;
+        player.play(settings).await
+    };
     tokio::select! {
-        played = player.play(settings) => played.map_err(failed),
+        played = play => played.map_err(failed),
         () = shutdown => Ok(()),
     }
 }

@@ -92,21 +92,30 @@ const MOST_BYTES: usize = 16 << 20;
 ///
 /// [`Error`], if there are no bytes, or nothing explains them.
 pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
-    let (path, bytes) = match (args.file, args.port) {
-        (Some(file), _) => {
-            let bytes = read(&file)?;
-            (file, bytes)
-        }
-        (None, port) => {
-            let port = port.expect("clap asks for a port where there is no file");
-            let bytes = tokio::select! {
-                bytes = listen(&port, args.baud, args.seconds) => bytes?,
-                () = shutdown => return Ok(()),
-            };
-            (port, bytes)
-        }
+    tokio::select! {
+        done = sniff(args) => done,
+        () = shutdown => Ok(()),
+    }
+}
+
+async fn sniff(args: Args) -> Result<(), Error> {
+    let listened = match &args.port {
+        Some(port) => Some(listen(port, args.baud, args.seconds).await?),
+        None => None,
     };
-    let proposals = propose(&bytes);
+    let path = args.file.or(args.port);
+    let path = path.expect("clap asks for a port where there is no file");
+    // A file may be a pipe, and many bytes take their time: a signal is looked for here.
+    let told = tokio::task::spawn_blocking(move || match listened {
+        Some(bytes) => tell(path, &bytes),
+        None => read(&path).and_then(|bytes| tell(path, &bytes)),
+    });
+    told.await.expect("a proposal is made without a panic")
+}
+
+/// Prints what explains `bytes`.
+fn tell(path: PathBuf, bytes: &[u8]) -> Result<(), Error> {
+    let proposals = propose(bytes);
     let Some((best, others)) = proposals.split_first() else {
         let bytes = bytes.len();
         return Err(Error::Unexplained { path, bytes });

@@ -171,7 +171,13 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
         if !counts && kind != "gap" {
             continue;
         }
-        if !show(args, &event, &lines.line)? {
+        let text = if args.json {
+            lines.line.clone()
+        } else {
+            readable::line(&event) + "\n"
+        };
+        let printed = super::print_apart(text.into_bytes()).await;
+        if !printed.map_err(Error::Print)? {
             return Ok(());
         }
         *found += u64::from(counts);
@@ -224,14 +230,4 @@ impl Lines {
             broken(&self.path, source)
         })
     }
-}
-
-/// Prints an event at once; `false`: nobody reads.
-fn show(args: &Args, event: &Value, line: &str) -> Result<bool, Error> {
-    let printed = if args.json {
-        super::print(line.as_bytes())
-    } else {
-        super::print((readable::line(event) + "\n").as_bytes())
-    };
-    printed.map_err(Error::Print)
 }
