@@ -6,17 +6,22 @@
     venv/bin/python tests/peers/page.py target/debug/hardnessd [--pictures DIRECTORY]
 
 Claims: events arrive and are drawn; a silent and a lost sensor show within 1 s, and no old value
-stands as a current one; sensors can be chosen; nothing is wider than a phone of 360 px; no console
+stands as a current one; what comes late, after a connection broke, is shown as old as it is, whatever
+the browser's clock says; sensors can be chosen; nothing is wider than a phone of 360 px; no console
 error and no breach of the page's policy; a daemon that goes is said, and the page finds it again by
 itself. With --pictures it leaves one of each state, light, dark and narrow.
 """
 
 import argparse
+import datetime
+import json
 import os
+import re
 import shutil
 import signal
 import socket
 import time
+import urllib.request
 
 from bench import Bench, wait_for
 from selenium import webdriver
@@ -164,6 +169,39 @@ def loss_shows_at_once(page, bench, sensors):
     return {state: round(delay, 3) for state, delay in delays.items()}
 
 
+def what_comes_late_is_as_old_as_it_is(page, bench, sensors):
+    """The connection breaks, a verdict is missed, its sensor falls silent, the page connects again."""
+    forearm = sensors["forearm"]
+
+    def last():
+        with urllib.request.urlopen(f"http://{bench.address('http')}/api/status") as answer:
+            return json.load(answer)["sensors"][0]["last"]
+
+    shown = wait_for("a verdict", lambda: re.match(r"press (\d+),", page.text("when")))
+    page.run("source.close()")
+    wait_for("a verdict that is missed", lambda: last()["press"] > int(shown[1]) + 1)
+    forearm.send_signal(signal.SIGSTOP)
+    missed = last()
+    time.sleep(4)
+    # The browser's clock is put forward an hour, and the page hears of the daemon's once more.
+    page.run("const real = Date.now; Date.now = () => real() + 3600e3; window.real = real;")
+    before = page.run("return heard")
+    wait_for("a status", lambda: page.run("return heard") > before)
+    page.run("listen()")
+    said = wait_for("what was missed", lambda: re.match(rf"press {missed['press']}, (\S+)\ss ago", page.text("when")))
+    age = time.time() - datetime.datetime.fromisoformat(missed["time"]).timestamp() - missed["age_at_publish_ms"] / 1000
+    assert abs(float(said[1]) - age) < 2, f"{said[0]}, expected {age:.1f} s"
+    numbers = [row.text.split()[1] for row in page.driver.find_elements(By.CSS_SELECTOR, "#rows tr")]
+    assert numbers[0].startswith(f"#{missed['press']}"), numbers
+    veil = page.text("veil-text")
+    silent = re.match(r"stale · last frame (\d+)", veil)
+    assert silent and int(silent[1]) >= 4, veil
+    page.picture("late-dark")
+    page.run("Date.now = window.real")
+    forearm.send_signal(signal.SIGCONT)
+    wait_for("live again", lambda: page.text("state") == "live" and not page.shown("veil"))
+
+
 def sensors_can_be_chosen(page):
     wrist = page.driver.find_element(By.XPATH, "//nav/button[text()='wrist']")
     wrist.click()
@@ -210,6 +248,7 @@ def main(binary, pictures):
             page.driver.get(f"http://{bench.address('http')}/")
             events_arrive(page, bench, sensors)
             fits_a_phone(page)
+            what_comes_late_is_as_old_as_it_is(page, bench, sensors)
             delays = loss_shows_at_once(page, bench, sensors)
             sensors_can_be_chosen(page)
             complaints = page.complaints()
