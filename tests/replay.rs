@@ -7,6 +7,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use hardnessd::event::Event;
 use hardnessd::frame::Stamp;
@@ -149,6 +150,35 @@ fn the_pace_of_a_replay_does_not_show() {
     );
 }
 
+#[test]
+fn a_frame_comes_no_earlier_than_its_time_however_long_frames_are() {
+    let directory = tempfile::tempdir().unwrap();
+    for preset in ["ascii", "zero-run", "jx255n"] {
+        let path = |extension| directory.path().join(preset).with_extension(extension);
+        let simulated = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
+            .args(["simulate", "--presses", "1", "--preset", preset, "--to"])
+            .arg(path("bin"))
+            .status()
+            .unwrap();
+        assert!(simulated.success());
+        let config =
+            format!("[[sensor]]\nport = \"none\"\n[sensor.frame]\npreset = \"{preset}\"\n");
+        std::fs::write(path("toml"), config).unwrap();
+        let config = path("toml");
+        let start = Instant::now();
+        let more = ["--config", config.to_str().unwrap(), "--speed", "10"];
+        let events = replay(&path("bin"), &more);
+        let took = start.elapsed();
+        let last = events.lines().last().unwrap();
+        let frames = serde_json::from_str::<Value>(last).unwrap()["frames"].clone();
+        let frames = frames.as_f64().unwrap();
+        assert!(frames > 10.0, "{events}");
+        // At 5 frames/s, ten times as fast.
+        let least = Duration::from_secs_f64((frames - 1.0) / 50.0);
+        assert!(took >= least, "{preset}: {took:?} for {frames} frames");
+    }
+}
+
 fn pipeline() -> Pipeline {
     Pipeline::new(
         Settings {
@@ -163,7 +193,7 @@ fn pipeline() -> Pipeline {
 
 fn events<'a>(chunks: impl Iterator<Item = &'a [u8]>) -> Vec<Event> {
     let at = Stamp {
-        mono: std::time::Duration::ZERO,
+        mono: Duration::ZERO,
         wall: jiff::Timestamp::UNIX_EPOCH,
     };
     let mut pipeline = pipeline();

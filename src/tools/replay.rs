@@ -228,16 +228,15 @@ fn play_bytes(path: &Path, mut file: File, setup: &Setup, mut pace: Pace) -> Res
         .pipelines()
         .next()
         .expect("a configuration has at least one sensor");
-    let frame_bytes = settings.layout.max_frame_bytes();
     let frame_rate_hz = settings.frame_rate_hz;
     let chunk_bytes = match pace.speed {
-        Some(_) => frame_bytes,
+        // No two frames end in so many: each comes at its own moment.
+        Some(_) => settings.layout.min_frame_bytes(),
         None => CHUNK_BYTES,
     };
     let mut chunk = vec![0; chunk_bytes];
     let mut pipeline = Pipeline::new(settings, Clock::FrameRate);
     let mut seq = 0;
-    let mut bytes = 0_u64;
     loop {
         let read = match file.read(&mut chunk) {
             Ok(read) => read,
@@ -260,15 +259,19 @@ fn play_bytes(path: &Path, mut file: File, setup: &Setup, mut pace: Pace) -> Res
             print(end, &mut seq)?;
             return none.map_or(Ok(()), Err);
         }
-        bytes += read as u64;
-        let since = bytes as f64 / frame_bytes as f64 / frame_rate_hz;
         // The clock is the recording's: the moment given here is not looked at.
-        if !pace.wait(Duration::from_secs_f64(since))
-            || !print(pipeline.push(&chunk[..read], now()), &mut seq)?
-        {
+        let events = pipeline.push(&chunk[..read], now());
+        let (frames, _) = pipeline.frame_counts();
+        let since = time_of(frames.saturating_sub(1), frame_rate_hz);
+        if !pace.wait(since) || !print(events, &mut seq)? {
             return Ok(());
         }
     }
+}
+
+/// When whole frame `number` of bytes without times came, after the first.
+fn time_of(number: u64, frame_rate_hz: f64) -> Duration {
+    Duration::try_from_secs_f64(number as f64 / frame_rate_hz).unwrap_or(Duration::MAX)
 }
 
 /// Prints what a subscriber would get; `false`: nobody reads.
