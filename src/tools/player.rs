@@ -96,6 +96,8 @@ impl Player {
         let start = Instant::now();
         let mut bytes = Vec::with_capacity(self.layout.max_frame_bytes());
         let mut index = 0_u32;
+        // When the line has room again: a long frame delays the next.
+        let mut free = start;
         while let Some(frame) = frames.recv().await {
             let due = start + self.pace.period * index;
             tokio::time::sleep_until(due).await;
@@ -107,7 +109,7 @@ impl Player {
                     if self.pty.is_none() {
                         self.pty = Some(Pty::open(self.link.as_deref())?);
                     }
-                    self.send(&bytes, due).await?;
+                    free = self.send(&bytes, due.max(free)).await?;
                 }
                 Line::Silent => {}
                 Line::Unplugged => self.pty = None,
@@ -120,9 +122,11 @@ impl Player {
         }
     }
 
-    async fn send(&mut self, bytes: &[u8], from: Instant) -> io::Result<()> {
+    /// Sends from this moment on; when the last byte is there.
+    async fn send(&mut self, bytes: &[u8], from: Instant) -> io::Result<Instant> {
+        let mut at = from;
         let Some(pty) = &mut self.pty else {
-            return Ok(());
+            return Ok(at);
         };
         let slice = (self.pace.bytes_per_s * SLICE.as_secs_f64())
             .ceil()
@@ -131,11 +135,11 @@ impl Player {
         for slice in bytes.chunks(slice as usize) {
             sent += slice.len() as f64;
             // A byte is there when its last bit is.
-            let at = from + Duration::from_secs_f64(sent / self.pace.bytes_per_s);
+            at = from + Duration::from_secs_f64(sent / self.pace.bytes_per_s);
             tokio::time::sleep_until(at).await;
             pty.write(slice)?;
         }
-        Ok(())
+        Ok(at)
     }
 }
 

@@ -130,7 +130,10 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
             .unwrap_or(Ok(()))
             .map_err(|source| Error::Recording { path, source });
     }
-    let baud = baud(&args, layout.max_frame_bytes())?;
+    let (baud, warning) = baud(&args, &layout)?;
+    if let Some(warning) = warning {
+        eprintln!("{warning}");
+    }
     let what = args
         .link
         .as_ref()
@@ -199,35 +202,41 @@ fn record(
     recording.sync_all()
 }
 
-/// The rate of the line: as given, if it carries the frames; else the first usual one that does,
-/// from 115,200 on.
-fn baud(args: &Args, bytes: usize) -> Result<u32, Error> {
+/// The rate of the line: as given, if it carries the shortest frames; else the first usual one that
+/// does, from 115,200 on. With it what there is to be said: another rate than that, or longer frames
+/// that may come late.
+fn baud(args: &Args, layout: &Layout) -> Result<(u32, Option<String>), Error> {
     const USUAL: [u32; 7] = [
         115_200, 230_400, 460_800, 921_600, 1_000_000, 2_000_000, 4_000_000,
     ];
-    let needed = (args.fps * bytes as f64 * BITS_A_BYTE).ceil() as u32;
-    match args.baud {
-        Some(baud) if baud < needed => Err(Error::Baud {
-            baud,
-            needed,
-            fps: args.fps,
-            bytes,
-        }),
-        Some(baud) => Ok(baud),
+    let needed = |bytes: usize| (args.fps * bytes as f64 * BITS_A_BYTE).ceil() as u32;
+    let short = |baud, bytes| Error::Baud {
+        baud,
+        needed: needed(bytes),
+        fps: args.fps,
+        bytes,
+    };
+    let (shortest, longest) = (layout.min_frame_bytes(), layout.max_frame_bytes());
+    let least = needed(shortest);
+    let baud = match args.baud {
+        Some(baud) if baud < least => return Err(short(baud, shortest)),
+        Some(baud) => baud,
         None => {
-            let baud = USUAL
-                .into_iter()
-                .find(|&usual| usual >= needed)
-                .unwrap_or(needed);
-            if baud != USUAL[0] {
-                eprintln!(
-                    "{} baud cannot carry {} frames/s of {bytes} bytes: played at {baud}",
-                    USUAL[0], args.fps
-                );
-            }
-            Ok(baud)
+            let usual = USUAL.into_iter().find(|&usual| usual >= least);
+            usual.unwrap_or(least)
         }
-    }
+    };
+    let warning = if baud < needed(longest) {
+        Some(format!("warning: {}", short(baud, longest)))
+    } else if args.baud.is_none() && baud != USUAL[0] {
+        let (usual, fps) = (USUAL[0], args.fps);
+        Some(format!(
+            "{usual} baud cannot carry {fps} frames/s of {shortest} bytes: played at {baud}"
+        ))
+    } else {
+        None
+    };
+    Ok((baud, warning))
 }
 
 /// A preset by the name it has in the configuration.
@@ -256,4 +265,48 @@ fn within(text: &str, least: f64, most: f64) -> Result<f64, String> {
 /// A number above 0, and not so far from 1 that seconds made of it fit no clock.
 pub(super) fn positive(text: &str) -> Result<f64, String> {
     within(text, 1e-6, 1e9)
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Debug, Parser)]
+    struct Line {
+        #[command(flatten)]
+        args: Args,
+    }
+
+    #[test]
+    fn the_shortest_frame_chooses_the_rate_and_the_longest_one_warns() {
+        // Texts of 784 values are 1,569 to 5,546 bytes, packed zeros 9 to 1,569.
+        for (arguments, expected, said) in [
+            ("", Some(115_200), ""),
+            ("--fps 20", Some(230_400), "played at 230400"),
+            ("--preset ascii", Some(115_200), "warning"),
+            ("--preset ascii --fps 2", Some(115_200), ""),
+            ("--preset ascii --baud 115200", Some(115_200), "of 5546"),
+            ("--preset ascii --baud 78450", Some(78_450), "warning"),
+            ("--preset ascii --baud 78449", None, "of 1569"),
+            ("--preset ascii --fps 10", Some(230_400), "warning"),
+            ("--preset zero-run --baud 9600", Some(9_600), "of 1569"),
+            ("--baud 39499", None, "at least 39500"),
+        ] {
+            let words = ["simulate"].into_iter().chain(arguments.split_whitespace());
+            let args = Line::try_parse_from(words).unwrap().args;
+            let layout = Layout::new(&Frame {
+                preset: args.preset,
+                ..Frame::default()
+            });
+            let (found, warning) = match baud(&args, &layout.unwrap()) {
+                Ok((found, warning)) => (Some(found), warning.unwrap_or_default()),
+                Err(error) => (None, error.to_string()),
+            };
+            assert_eq!(found, expected, "{arguments}");
+            assert_eq!(warning.is_empty(), said.is_empty(), "{warning}");
+            assert!(warning.contains(said), "{said:?} not in {warning:?}");
+        }
+    }
 }
