@@ -22,7 +22,7 @@ use serde_json::Value;
 
 pub use self::playback::{Playback, PlaybackError};
 pub use self::reader::{Found, Reader};
-pub use self::recover::{Recovered, recover};
+pub use self::recover::{RecoverError, Recovered, recover};
 pub use self::ring::Ring;
 pub use self::writer::{About, Writer};
 use crate::event::Event;

@@ -371,10 +371,20 @@ fn recover_says_what_it_saved_and_leaves_files_alone() {
     };
     let (code, said) = recover("none.mcap", "good.mcap");
     assert_eq!(code, 66, "{said}");
+    // What is no recording yet, of somebody who gives files such names too.
+    fs::write(path("good.mcap.part"), "theirs").unwrap();
     fs::write(path("noise.mcap"), vec![7; 100_000]).unwrap();
     let (code, said) = recover("noise.mcap", "good.mcap");
     assert_eq!(code, 1, "{said}");
     assert!(!bench.path("good.mcap").exists());
+    let output = Command::new(BINARY)
+        .args(["recover", "/dev/stdin", "--out", &path("good.mcap")])
+        .stdin(Stdio::piped())
+        .output()
+        .unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(66), "{said}");
+    assert!(said.contains("/dev/stdin: cannot read: "), "{said}");
 
     let _sensor = bench.sensor(&[]);
     let config = configure(&bench, 20);
@@ -431,7 +441,9 @@ fn recover_says_what_it_saved_and_leaves_files_alone() {
         let name = entry.as_ref().unwrap().file_name();
         name.to_str().unwrap().ends_with(".part")
     });
-    assert_eq!(parts.count(), 0);
+    assert_eq!(parts.count(), 1);
+    let theirs = fs::read_to_string(path("good.mcap.part")).unwrap();
+    assert_eq!(theirs, "theirs");
     replay(&bench.path("good.mcap"));
 }
 

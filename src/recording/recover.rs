@@ -5,7 +5,7 @@
 //! every compressed chunk has at the same place.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::{Read, Seek, SeekFrom, Write};
+use std::io::{self, Read, Seek, SeekFrom, Write};
 
 use mcap::MAGIC;
 use mcap::records::{Channel, Record, op};
@@ -34,6 +34,17 @@ pub struct Recovered {
     pub complete: bool,
 }
 
+/// Which of the two files failed.
+#[derive(Debug, thiserror::Error)]
+pub enum RecoverError {
+    /// The damaged one.
+    #[error(transparent)]
+    Read(io::Error),
+    /// The new one.
+    #[error(transparent)]
+    Write(#[from] Error),
+}
+
 /// Opcode and length.
 const RECORD_HEAD_BYTES: u64 = 9;
 /// No record is longer: a chunk of ours holds half a second.
@@ -51,43 +62,52 @@ const BLOCK_BYTES: usize = 1 << 20;
 /// # Errors
 ///
 /// If reading or writing fails; damage is none.
-pub fn recover<R: Read + Seek, W: Write>(broken: R, good: W) -> Result<(Recovered, W), Error> {
-    let mut scan = Scan::new(broken)?;
+pub fn recover<R: Read + Seek, W: Write>(
+    broken: R,
+    good: W,
+) -> Result<(Recovered, W), RecoverError> {
+    let mut scan = Scan::new(broken).map_err(RecoverError::Read)?;
     let mut copy = Copy::new(good)?;
-    scan.run(&mut copy)?;
+    while let Some(records) = scan.next().map_err(RecoverError::Read)? {
+        copy.take(records)?;
+    }
     copy.done.lost = scan.lost;
+    copy.done.chunks = scan.chunks;
     copy.done.complete = scan.complete;
-    copy.out.finish()?;
-    let mut good = copy.out.into_inner().into_inner();
-    good.flush()?;
-    Ok((copy.done, good))
+    Ok(copy.finish()?)
 }
 
 /// The damaged file.
 struct Scan<R> {
     file: R,
     length: u64,
+    /// Where it goes on.
+    place: u64,
+    chunks: u64,
     lost: Vec<(u64, u64)>,
     complete: bool,
 }
 
 impl<R: Read + Seek> Scan<R> {
-    fn new(mut file: R) -> Result<Self, Error> {
+    fn new(mut file: R) -> io::Result<Self> {
         let length = file.seek(SeekFrom::End(0))?;
         Ok(Self {
             file,
             length,
+            // A damaged magic costs nothing.
+            place: MAGIC.len() as u64,
+            chunks: 0,
             lost: Vec::new(),
             complete: false,
         })
     }
 
-    fn run<W: Write>(&mut self, copy: &mut Copy<W>) -> Result<(), Error> {
-        // A damaged magic costs nothing.
-        let mut place = MAGIC.len() as u64;
-        while place < self.length {
+    /// The next records that are whole; `None`: there are no more.
+    fn next(&mut self) -> io::Result<Option<Vec<Record<'static>>>> {
+        while self.place < self.length {
+            let place = self.place;
             let Some((opcode, end)) = self.record_at(place)? else {
-                place = self.skip(place)?;
+                self.place = self.skip(place)?;
                 continue;
             };
             let body = self.bytes(place + RECORD_HEAD_BYTES, end)?;
@@ -96,31 +116,31 @@ impl<R: Read + Seek> Scan<R> {
                 // record, damaged in its first byte.
                 (op::DATA_END, 4) | (op::FOOTER, 20) => {
                     self.complete = true;
-                    return Ok(());
+                    return Ok(None);
                 }
                 _ => {}
             }
             let Some(record) = exact(opcode, &body) else {
-                place = self.skip(place)?;
+                self.place = self.skip(place)?;
                 continue;
             };
+            self.place = end;
             match record {
                 Record::Chunk { .. } => match records(&body) {
                     Some(records) => {
-                        copy.done.chunks += 1;
-                        copy.take(records)?;
+                        self.chunks += 1;
+                        return Ok(Some(records));
                     }
                     None => self.lost.push((place, end - place)),
                 },
-                record => copy.take(vec![record.into_owned()])?,
+                record => return Ok(Some(vec![record.into_owned()])),
             }
-            place = end;
         }
-        Ok(())
+        Ok(None)
     }
 
     /// The record at `place`, if one can stand there: its opcode, and where it ends.
-    fn record_at(&mut self, place: u64) -> Result<Option<(u8, u64)>, Error> {
+    fn record_at(&mut self, place: u64) -> io::Result<Option<(u8, u64)>> {
         let head = self.bytes(place, place + RECORD_HEAD_BYTES)?;
         let Ok(head) = <[u8; RECORD_HEAD_BYTES as usize]>::try_from(head) else {
             return Ok(None);
@@ -134,14 +154,14 @@ impl<R: Read + Seek> Scan<R> {
     }
 
     /// Gives up what stands at `place`; where the next chunk is, or the end.
-    fn skip(&mut self, place: u64) -> Result<u64, Error> {
+    fn skip(&mut self, place: u64) -> io::Result<u64> {
         let next = self.next_chunk(place + 1)?.unwrap_or(self.length);
         self.lost.push((place, next - place));
         Ok(next)
     }
 
     /// Where the next chunk begins, whole or not, from `place` on.
-    fn next_chunk(&mut self, place: u64) -> Result<Option<u64>, Error> {
+    fn next_chunk(&mut self, place: u64) -> io::Result<Option<u64>> {
         let mut from = place + COMPRESSION_AT;
         while from < self.length {
             let block = self.bytes(from, from + BLOCK_BYTES as u64)?;
@@ -161,7 +181,7 @@ impl<R: Read + Seek> Scan<R> {
     }
 
     /// The bytes from `start` to `end`, fewer where the file ends before.
-    fn bytes(&mut self, start: u64, end: u64) -> Result<Vec<u8>, Error> {
+    fn bytes(&mut self, start: u64, end: u64) -> io::Result<Vec<u8>> {
         self.file.seek(SeekFrom::Start(start))?;
         let mut bytes = Vec::new();
         self.file
@@ -245,6 +265,14 @@ impl<W: Write> Copy<W> {
             begun: BTreeSet::new(),
             done: Recovered::default(),
         })
+    }
+
+    /// Ends the new file.
+    fn finish(mut self) -> Result<(Recovered, W), Error> {
+        self.out.finish()?;
+        let mut good = self.out.into_inner().into_inner();
+        good.flush()?;
+        Ok((self.done, good))
     }
 
     fn take(&mut self, records: Vec<Record<'static>>) -> Result<(), Error> {

@@ -1,5 +1,6 @@
 //! `hardnessd recover`: what is whole in a damaged recording, into a new one.
 
+use std::ffi::OsString;
 use std::fs::{self, File};
 use std::io::{self, BufReader, BufWriter, ErrorKind};
 use std::path::{Path, PathBuf};
@@ -7,7 +8,7 @@ use std::path::{Path, PathBuf};
 use clap::Args as ClapArgs;
 use jiff::Timestamp;
 
-use crate::recording::{self, Recovered};
+use crate::recording::{self, RecoverError, Recovered};
 
 /// Arguments of `recover`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -80,21 +81,18 @@ pub fn run(args: &Args) -> Result<(), Error> {
         let exists = io::Error::new(ErrorKind::AlreadyExists, "exists, expected a new file");
         return Err(unwritten(exists.into()));
     }
-    // Beside its place, so that a file of that name is always a whole one.
-    let mut name = args.out.file_name().unwrap_or_default().to_owned();
-    name.push(".part");
-    let part = args.out.with_file_name(name);
-    let saved = save(broken, &part).and_then(|recovered| {
+    let (part, file) = part(&args.out).map_err(|error| unwritten(error.into()))?;
+    let saved = save(broken, file).and_then(|recovered| {
         if has_ours(&recovered) {
-            fs::rename(&part, &args.out)?;
-            sync_directory(&args.out)?;
+            let put = fs::rename(&part, &args.out).and_then(|()| sync_directory(&args.out));
+            put.map_err(recording::Error::from)?;
         }
         Ok(recovered)
     });
     let recovered = match saved {
         Ok(recovered) if has_ours(&recovered) => recovered,
         other => {
-            // It may never have been there.
+            // It may be in its place already.
             let _ = fs::remove_file(&part);
             return Err(match other {
                 Ok(Recovered { messages, .. }) if messages > 0 => Error::Foreign {
@@ -105,7 +103,8 @@ pub fn run(args: &Args) -> Result<(), Error> {
                     path: args.broken.clone(),
                     bytes,
                 },
-                Err(error) => unwritten(error),
+                Err(RecoverError::Read(error)) => unreadable(error),
+                Err(RecoverError::Write(error)) => unwritten(error),
             });
         }
     };
@@ -113,11 +112,26 @@ pub fn run(args: &Args) -> Result<(), Error> {
     Ok(())
 }
 
-fn save(broken: File, part: &Path) -> Result<Recovered, recording::Error> {
-    let good = File::create(part)?;
-    let (recovered, good) = recording::recover(BufReader::new(broken), BufWriter::new(good))?;
-    let good = good.into_inner().map_err(io::IntoInnerError::into_error)?;
-    good.sync_all()?;
+/// A new file beside the place of `out`, so that one of that name is always a whole one. What stands
+/// there already is somebody's.
+fn part(out: &Path) -> io::Result<(PathBuf, File)> {
+    let mut end = OsString::from(".part");
+    loop {
+        let mut name = out.file_name().unwrap_or_default().to_owned();
+        name.push(&end);
+        let part = out.with_file_name(name);
+        match File::create_new(&part) {
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => end.push(".part"),
+            made => return made.map(|file| (part, file)),
+        }
+    }
+}
+
+fn save(broken: File, part: File) -> Result<Recovered, RecoverError> {
+    let (recovered, part) = recording::recover(BufReader::new(broken), BufWriter::new(part))?;
+    let part = part.into_inner().map_err(io::IntoInnerError::into_error);
+    let synced = part.and_then(|part| part.sync_all());
+    synced.map_err(recording::Error::from)?;
     Ok(recovered)
 }
 
