@@ -7,9 +7,9 @@
 //! (method notes, pitfall 1), so [`Normalisation`] says where the statistics come from, and they
 //! are taken anew before every evaluation and export.
 
-use burn::tensor::{Device, Tensor, TensorData, activation};
+use burn::tensor::{Device, Tensor, TensorData};
 
-use super::layers::{Geometry, convolution, normalised};
+use super::layers::{Geometry, convolution, leaky_relu, normalised};
 use crate::frame::{COLS, ROWS};
 use crate::random::Stream;
 
@@ -277,23 +277,6 @@ pub enum Normalisation<'a> {
     Collect(&'a mut Statistics),
     /// From those collected: evaluation.
     Fixed(&'a Statistics),
-}
-
-/// LeakyReLU as a product with a factor that autodiff holds constant. burn's own goes through
-/// `mask_where`, which took 17 % of a step.
-pub fn leaky_relu<const D: usize>(x: Tensor<D>, slope: f32) -> Tensor<D> {
-    if !x.is_autodiff() {
-        return activation::leaky_relu(x, f64::from(slope));
-    }
-    // sign is -1, 0, 1, so the factor is the slope, the middle, or 1.
-    let half = (1.0 - slope) / 2.0;
-    let factor = x
-        .clone()
-        .inner()
-        .sign()
-        .mul_scalar(half)
-        .add_scalar(1.0 - half);
-    x.mul(factor.autodiff())
 }
 
 /// The trunk: images `[batch, 1, 28, 28]` in [-1, 1], background -1, to features `[batch, 64]`.

@@ -2,7 +2,9 @@
 
 use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
+use burn::backend::ops::FloatTensorOps;
 use burn::tensor::TensorData;
+use rayon::prelude::*;
 
 use super::{Geometry, Layers};
 
@@ -30,33 +32,47 @@ fn tensor<const D: usize>(values: Vec<f32>, shape: [usize; D]) -> FlexTensor {
 }
 
 impl Layers for Flex {
+    fn product(kernels: FlexTensor, patches: FlexTensor) -> FlexTensor {
+        Flex::float_matmul(kernels, patches)
+    }
+
     fn patches(x: FlexTensor, geometry: Geometry) -> FlexTensor {
         let x = Contiguous::of(x);
-        let x = x.numbers();
-        let batch = x.len() / (geometry.channels * geometry.size * geometry.size);
-        let places = geometry.small() * geometry.small();
-        let mut values = Vec::with_capacity(geometry.taps() * places * batch);
-        for run in geometry.runs(batch) {
-            match run {
-                Some(image) => values.extend_from_slice(&x[image..image + batch]),
-                None => values.resize(values.len() + batch, 0.0),
+        let image = x.numbers().len() / geometry.channels;
+        let batch = image / (geometry.size * geometry.size);
+        let row = geometry.small() * geometry.small() * batch;
+        let taps = geometry.kernel * geometry.kernel;
+        let mut values = vec![0.0; geometry.taps() * row];
+        let rows = values.par_chunks_exact_mut(row).enumerate();
+        rows.for_each(|(index, patches)| {
+            let image = &x.numbers()[index / taps * image..][..image];
+            let runs = geometry.runs(index % taps, batch);
+            for (run, patch) in runs.zip(patches.chunks_exact_mut(batch)) {
+                let Some(run) = run else { continue };
+                patch.copy_from_slice(&image[run..run + batch]);
             }
-        }
-        tensor(values, [geometry.taps(), places * batch])
+        });
+        tensor(values, [geometry.taps(), row])
     }
 
     fn from_patches(patches: FlexTensor, geometry: Geometry, batch: usize) -> FlexTensor {
         let patches = Contiguous::of(patches);
-        let patches = patches.numbers();
         let Geometry { channels, size, .. } = geometry;
+        let of_channel = patches.numbers().len() / channels;
+        let taps = geometry.kernel * geometry.kernel;
         let mut values = vec![0.0; channels * size * size * batch];
-        for (run, patch) in geometry.runs(batch).zip(patches.chunks_exact(batch)) {
-            let Some(image) = run else { continue };
-            let sums = &mut values[image..image + batch];
-            for (sum, value) in sums.iter_mut().zip(patch) {
-                *sum += value;
-            }
-        }
+        let images = values.par_chunks_exact_mut(size * size * batch);
+        images
+            .zip(patches.numbers().par_chunks_exact(of_channel))
+            .for_each(|(image, patches)| {
+                let runs = (0..taps).flat_map(|tap| geometry.runs(tap, batch));
+                for (run, patch) in runs.zip(patches.chunks_exact(batch)) {
+                    let Some(run) = run else { continue };
+                    for (sum, value) in image[run..run + batch].iter_mut().zip(patch) {
+                        *sum += value;
+                    }
+                }
+            });
         tensor(values, [channels, size, size, batch])
     }
 
@@ -69,7 +85,28 @@ impl Layers for Flex {
     ) -> FlexTensor {
         Rows::new(x, gamma, beta, epsilon, slope).forward()
     }
+
+    fn leaky_relu(x: FlexTensor, slope: f32) -> FlexTensor {
+        leaky(x.clone(), x, slope)
+    }
 }
+
+/// `values`, those where `x` is below 0 times `slope`; where it is 0, times the middle.
+pub(super) fn leaky(values: FlexTensor, x: FlexTensor, slope: f32) -> FlexTensor {
+    let shape = values.layout().shape().clone();
+    let (values, x) = (Contiguous::of(values), Contiguous::of(x));
+    let half = (1.0 - slope) / 2.0;
+    let factor = |x: f32| {
+        let sign = f32::from(x > 0.0) - f32::from(x < 0.0);
+        sign * half + (1.0 - half)
+    };
+    let numbers = values.numbers().par_iter().zip(x.numbers());
+    let scaled = numbers.with_min_len(NUMBERS).map(|(y, &x)| y * factor(x));
+    FlexTensor::from_data(TensorData::new(scaled.collect::<Vec<f32>>(), shape))
+}
+
+/// Fewer numbers are not worth another thread.
+const NUMBERS: usize = 1 << 14;
 
 /// What batch normalisation works on: a row a channel.
 pub(super) struct Rows {
@@ -114,9 +151,9 @@ impl Rows {
     }
 
     /// Every row of `x` with its constants.
-    fn rows(&self) -> impl Iterator<Item = (&[f32], Row)> {
-        let parameters = self.gamma.numbers().iter().zip(self.beta.numbers());
-        let rows = self.x.numbers().chunks_exact(self.shape()[1]);
+    fn rows(&self) -> impl IndexedParallelIterator<Item = (&[f32], Row)> {
+        let parameters = (self.gamma.numbers().par_iter()).zip(self.beta.numbers());
+        let rows = self.x.numbers().par_chunks_exact(self.shape()[1]);
         rows.zip(parameters).map(|(x, (&gamma, &beta))| {
             let count = x.len() as f32;
             let mean = sum(x, |x| x) / count;
@@ -133,15 +170,19 @@ impl Rows {
     }
 
     fn forward(&self) -> FlexTensor {
-        let mut values = Vec::with_capacity(self.x.numbers().len());
-        for (x, row) in self.rows() {
-            let (scale, slope) = (row.gamma * row.rate, self.slope);
-            values.extend(x.iter().map(|x| {
-                let z = scale * (x - row.mean) + row.beta;
-                z.max(slope * z)
-            }));
-        }
-        tensor(values, self.shape())
+        let [channels, count] = self.shape();
+        let mut values = vec![0.0; channels * count];
+        values
+            .par_chunks_exact_mut(count)
+            .zip(self.rows())
+            .for_each(|(values, (x, row))| {
+                let (scale, slope) = (row.gamma * row.rate, self.slope);
+                for (y, x) in values.iter_mut().zip(x) {
+                    let z = scale * (x - row.mean) + row.beta;
+                    *y = z.max(slope * z);
+                }
+            });
+        tensor(values, [channels, count])
     }
 
     /// Gradients of x, gamma and beta from that of y. With `u = (x - mean) rate` and `g` the
@@ -149,27 +190,27 @@ impl Rows {
     pub(super) fn backward(&self, gradient: FlexTensor) -> [FlexTensor; 3] {
         let gradient = Contiguous::of(gradient);
         let [channels, count] = self.shape();
-        let mut of_x = Vec::with_capacity(channels * count);
-        let (mut of_gamma, mut of_beta) = (Vec::new(), Vec::new());
-        let mut before = vec![0.0; count];
-        for ((x, row), gradient) in self.rows().zip(gradient.numbers().chunks_exact(count)) {
-            let (scale, slope) = (row.gamma * row.rate, self.slope);
-            for ((before, x), gradient) in before.iter_mut().zip(x).zip(gradient) {
-                let z = scale * (x - row.mean) + row.beta;
-                *before = gradient * if z > 0.0 { 1.0 } else { slope };
-            }
-            let total = sum(&before, |g| g);
-            let product = row.rate * sum_of_products(&before, x, row.mean);
-            let (mean, share) = (total / count as f32, product / count as f32);
-            of_x.extend(
-                before
-                    .iter()
-                    .zip(x)
-                    .map(|(g, x)| scale * (g - mean - (x - row.mean) * row.rate * share)),
-            );
-            of_gamma.push(product);
-            of_beta.push(total);
-        }
+        let mut of_x = vec![0.0; channels * count];
+        let (of_gamma, of_beta) = of_x
+            .par_chunks_exact_mut(count)
+            .zip(gradient.numbers().par_chunks_exact(count))
+            .zip(self.rows())
+            .map(|((of_x, gradient), (x, row))| {
+                let (scale, slope) = (row.gamma * row.rate, self.slope);
+                // The gradient before the LeakyReLU, until it is that of x.
+                for ((before, x), gradient) in of_x.iter_mut().zip(x).zip(gradient) {
+                    let z = scale * (x - row.mean) + row.beta;
+                    *before = gradient * if z > 0.0 { 1.0 } else { slope };
+                }
+                let total = sum(of_x, |g| g);
+                let product = row.rate * sum_of_products(of_x, x, row.mean);
+                let (mean, share) = (total / count as f32, product / count as f32);
+                for (g, x) in of_x.iter_mut().zip(x) {
+                    *g = scale * (*g - mean - (x - row.mean) * row.rate * share);
+                }
+                (product, total)
+            })
+            .unzip();
         [
             tensor(of_x, [channels, count]),
             tensor(of_gamma, [channels]),
