@@ -30,6 +30,11 @@ const RATE: f64 = 1e-3;
 const GAME: Game = Game::RealOrFake;
 
 fn main() {
+    // As hrn-train does: steps are taken on a thread of the pool.
+    rayon::scope(|_| run());
+}
+
+fn run() {
     let arguments: Vec<String> = std::env::args().collect();
     if let Some(place) = arguments.iter().position(|argument| argument == "--serve") {
         serve(Path::new(&arguments[place + 1]));

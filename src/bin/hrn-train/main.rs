@@ -47,7 +47,9 @@ fn main() -> ExitCode {
     let done = match arguments.command {
         Command::Simulate(arguments) => simulate(&arguments),
         Command::Collect(arguments) => collect(&arguments),
-        Command::Train(arguments) => train(&arguments),
+        // On a thread of the pool: from outside, every operation on several threads would first
+        // wake one of them.
+        Command::Train(arguments) => rayon::scope(|_| train(&arguments)),
         Command::Compare(arguments) => compare(arguments),
         Command::Evaluate(arguments) => evaluate(&arguments),
         Command::Report { directory, out } => report_of(&directory, &out),
