@@ -248,7 +248,7 @@ impl Round {
         let difference = if found == expected {
             // The file's name may be another by now.
             let data = self.told.data.clone();
-            Description { data, ..told }.difference(&self.told)?
+            Description { data, ..told }.difference(&self.told)
         } else {
             let (found, expected) = (found.join(", "), expected.join(", "));
             Some(format!(
