@@ -170,7 +170,7 @@ pub fn normalised(
 /// LeakyReLU, whose slope at 0 lies in the middle. burn's own goes through `mask_where`, which took
 /// 17 % of a step.
 pub fn leaky_relu<const D: usize>(x: Tensor<D>, slope: f32) -> Tensor<D> {
-    if !is_ours(&x) {
+    if !is_ours(&x) || !x.is_autodiff() {
         return activation::leaky_relu(x, f64::from(slope));
     }
     Tensor::from_dispatch(<Dispatch as Layers>::leaky_relu(x.into_dispatch(), slope))
