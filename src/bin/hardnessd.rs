@@ -104,9 +104,10 @@ fn main() -> ExitCode {
         Ok(args) => args,
         Err(error) => return tools::usage("hardnessd", &error),
     };
+    let prints = !matches!(args.command, Command::Run { .. });
     let done = runtime.block_on(dispatch(args.command, signals));
     // A port may be stuck in its driver on a thread of its own, or nobody read stdout.
-    runtime.shutdown_timeout(LAST_LINES);
+    runtime.shutdown_timeout(if prints { LAST_LINES } else { Duration::ZERO });
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
@@ -301,7 +302,7 @@ fn exit_code(error: &anyhow::Error) -> u8 {
         return match error {
             recover::Error::Unreadable { .. } => exit::NO_INPUT,
             recover::Error::Nothing { .. } | recover::Error::Foreign { .. } => exit::FAILED,
-            recover::Error::Write { .. } => exit::IO,
+            recover::Error::Broken { .. } | recover::Error::Write { .. } => exit::IO,
         };
     }
     if let Some(error) = error.downcast_ref::<replay::Error>() {

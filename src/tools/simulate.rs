@@ -148,8 +148,8 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let settings = sequence(&args);
     let play = async {
         // Nobody may want to know the path: the link says it too.
-        super::print_apart(line.into_bytes()).await?;
-        player.play(settings).await
+        let told = super::print_apart(line.into_bytes());
+        tokio::try_join!(told, player.play(settings)).map(|_| ())
     };
     tokio::select! {
         played = play => played.map_err(failed),
