@@ -2,7 +2,7 @@
 
 use std::ffi::OsString;
 use std::fs::{self, File};
-use std::io::{self, BufReader, BufWriter, ErrorKind};
+use std::io::{self, BufReader, BufWriter, ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
@@ -29,6 +29,14 @@ pub enum Error {
         /// As given.
         path: PathBuf,
         /// Why not.
+        source: io::Error,
+    },
+    /// Its disk failed while it was read.
+    #[error("{path}: {source}")]
+    Broken {
+        /// As given.
+        path: PathBuf,
+        /// Why.
         source: io::Error,
     },
     /// There is nothing to be saved.
@@ -103,7 +111,13 @@ pub fn run(args: &Args) -> Result<(), Error> {
                     path: args.broken.clone(),
                     bytes,
                 },
-                Err(RecoverError::Read(error)) => unreadable(error),
+                Err(RecoverError::Read(error)) if error.kind() == ErrorKind::NotSeekable => {
+                    unreadable(error)
+                }
+                Err(RecoverError::Read(source)) => Error::Broken {
+                    path: args.broken.clone(),
+                    source,
+                },
                 Err(RecoverError::Write(error)) => unwritten(error),
             });
         }
@@ -113,7 +127,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
 }
 
 /// A new file beside the place of `out`, so that one of that name is always a whole one. What stands
-/// there already is somebody's.
+/// there already is somebody's, unless it is what an earlier try that was ended has left.
 fn part(out: &Path) -> io::Result<(PathBuf, File)> {
     let mut end = OsString::from(".part");
     loop {
@@ -121,10 +135,24 @@ fn part(out: &Path) -> io::Result<(PathBuf, File)> {
         name.push(&end);
         let part = out.with_file_name(name);
         match File::create_new(&part) {
+            Err(error) if error.kind() == ErrorKind::AlreadyExists && is_left_over(&part) => {
+                return File::create(&part).map(|file| (part, file));
+            }
             Err(error) if error.kind() == ErrorKind::AlreadyExists => end.push(".part"),
             made => return made.map(|file| (part, file)),
         }
     }
+}
+
+/// Whether a file is the beginning of a recording, or nothing yet.
+fn is_left_over(part: &Path) -> bool {
+    let begins = |file: File| -> io::Result<bool> {
+        let mut start = Vec::new();
+        file.take(mcap::MAGIC.len() as u64)
+            .read_to_end(&mut start)?;
+        Ok(mcap::MAGIC.starts_with(&start))
+    };
+    super::open(part).and_then(begins).unwrap_or(false)
 }
 
 fn save(broken: File, part: File) -> Result<Recovered, RecoverError> {
