@@ -87,7 +87,7 @@ pub(crate) async fn serve(
     mut commands: mpsc::Receiver<Command>,
 ) {
     // Who waits for a tare.
-    let mut taring: Option<oneshot::Sender<Result<Tared, RetareError>>> = None;
+    let mut taring = None;
     loop {
         let deadline = pipeline.deadline();
         let (events, at) = tokio::select! {
@@ -123,6 +123,7 @@ pub(crate) async fn serve(
                 Some(Command::Reload(judgement)) => {
                     recorder.reload(&pipeline, &judgement, super::now());
                     pipeline.reload(*judgement);
+                    answer(&mut pipeline, &mut taring);
                     continue;
                 }
                 Some(Command::Finish) | None => {
@@ -153,13 +154,22 @@ pub(crate) async fn serve(
         {
             link.proven();
         }
-        if let Some(outcome) = pipeline.retared() {
-            log::tare(pipeline.sensor(), &outcome);
-            if let Some(reply) = taring.take() {
-                let _ = reply.send(outcome);
-            }
-        }
+        answer(&mut pipeline, &mut taring);
         hub.publish(events, at.mono).await;
+    }
+}
+
+/// Says what became of a tare that was asked for, once that is known.
+fn answer(
+    pipeline: &mut Pipeline,
+    taring: &mut Option<oneshot::Sender<Result<Tared, RetareError>>>,
+) {
+    if let Some(outcome) = pipeline.retared() {
+        log::tare(pipeline.sensor(), &outcome);
+        if let Some(reply) = taring.take() {
+            // The asker may have gone.
+            let _ = reply.send(outcome);
+        }
     }
 }
 
