@@ -59,7 +59,8 @@ fn told(inbox: &Receiver<Job>) -> (usize, Vec<u64>) {
 
 #[test]
 fn after_a_gap_comes_a_state() {
-    let (sender, inbox) = sync_channel(1);
+    // Room for a state and inputs: the first are told whoever runs when.
+    let (sender, inbox) = sync_channel(4);
     let (mut recorder, pipeline) = recorder(sender);
     // Takes what is told as fast as it comes: room appears at any moment.
     let reader = std::thread::spawn(move || told(&inbox));
