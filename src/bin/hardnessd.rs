@@ -142,14 +142,17 @@ async fn dispatch(command: Command, signals: Signals) -> anyhow::Result<()> {
     }
 }
 
-/// Work that looks for no signal; one ends it, which is a failure.
+/// Work that looks for no signal; one ends it, and that it is not done is said.
 async fn interruptible<E: std::error::Error + Send + Sync + 'static>(
     signals: Signals,
     work: impl FnOnce() -> Result<(), E> + Send + 'static,
 ) -> anyhow::Result<()> {
     tokio::select! {
         done = tokio::task::spawn_blocking(work) => Ok(done??),
-        () = signals.end() => anyhow::bail!("interrupted"),
+        () = signals.end() => {
+            eprintln!("hardnessd: interrupted");
+            Ok(())
+        }
     }
 }
 
