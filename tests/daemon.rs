@@ -608,23 +608,55 @@ fn check_looks_and_changes_nothing() {
 }
 
 #[test]
-fn a_signal_ends_a_command_that_looks_for_none_too() {
+fn a_signal_ends_every_command_that_waits_for_a_file() {
     let bench = Bench::new();
-    let fifo = bench.path("fifo.toml");
+    let fifo = bench.path("fifo");
     let made = Command::new("mkfifo").arg(&fifo).status().unwrap();
     assert!(made.success());
+    let fifo = fifo.to_str().unwrap();
+    let new = bench.path("new.mcap");
+    let new = new.to_str().unwrap();
+    let model = bench.configure("model.toml", "x.sock", "[model]\npath = \"fifo\"\n");
+    for (arguments, said) in [
+        (&["run", "--config", fifo][..], ""),
+        (&["run", "--config", model.to_str().unwrap()], ""),
+        (&["record", "--config", fifo, "--out", new], ""),
+        (&["simulate", "--faults", fifo], ""),
+        (&["check", "--config", fifo], "hardnessd: interrupted\n"),
+    ] {
+        let mut command = Command::new(BINARY);
+        command.args(arguments).stderr(Stdio::piped());
+        let mut process = Process(command.spawn().unwrap());
+        // A writer gets through once somebody reads.
+        let _writer = fs::File::options().write(true).open(fifo).unwrap();
+        process.signal(Signal::TERM);
+        assert_eq!(process.exit_code(), Some(0), "{arguments:?}");
+        let mut heard = String::new();
+        let mut stderr = process.0.stderr.take().unwrap();
+        stderr.read_to_string(&mut heard).unwrap();
+        assert_eq!(heard, said, "{arguments:?}");
+    }
+}
+
+#[test]
+fn a_configuration_may_be_a_pipe_but_has_an_end() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let text = fs::read_to_string(&config).unwrap();
     let mut command = Command::new(BINARY);
-    command.args(["check", "--config"]).arg(&fifo);
-    let child = command.stderr(Stdio::piped()).spawn().unwrap();
-    let mut check = Process(child);
-    // A writer gets through once somebody reads.
-    let _writer = fs::File::options().write(true).open(&fifo).unwrap();
-    check.signal(Signal::TERM);
+    command.args(["check", "--config", "/dev/stdin"]);
+    let piped = command.stdin(Stdio::piped()).stdout(Stdio::piped());
+    let mut check = Process(piped.spawn().unwrap());
+    let mut stdin = check.0.stdin.take().unwrap();
+    let text = text.replace("20.0", "5.0");
+    stdin.write_all(text.as_bytes()).unwrap();
+    drop(stdin);
     assert_eq!(check.exit_code(), Some(0));
-    let mut said = String::new();
-    let mut stderr = check.0.stderr.take().unwrap();
-    stderr.read_to_string(&mut said).unwrap();
-    assert_eq!(said, "hardnessd: interrupted\n");
+    fails(
+        &["check", "--config", "/dev/zero"],
+        78,
+        &["/dev/zero", "more than 1048576 bytes"],
+    );
 }
 
 #[test]

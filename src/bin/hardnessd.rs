@@ -2,7 +2,8 @@
 
 use std::future::Future;
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::pin::pin;
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -127,9 +128,12 @@ async fn dispatch(command: Command, signals: Signals) -> anyhow::Result<()> {
         }
         Command::Simulate(args) => Ok(simulate::run(args, signals.end()).await?),
         Command::Record(args) => {
-            let setup = Setup::load(&args.config)?;
+            let mut end = pin!(signals.end());
+            let Some(setup) = load(&args.config, end.as_mut()).await? else {
+                return Ok(());
+            };
             let _log = Log::start(setup.config.log, "info")?;
-            Ok(record::run(args, setup, signals.end()).await?)
+            Ok(record::run(args, setup, end).await?)
         }
         Command::Recover(args) => interruptible(signals, move || recover::run(&args)).await,
         Command::Replay(args) => Ok(replay::run(args, signals.end()).await?),
@@ -147,18 +151,37 @@ async fn interruptible<E: std::error::Error + Send + Sync + 'static>(
     signals: Signals,
     work: impl FnOnce() -> Result<(), E> + Send + 'static,
 ) -> anyhow::Result<()> {
+    let done = until(signals.end(), work).await?;
+    if done.is_none() {
+        eprintln!("hardnessd: interrupted");
+    }
+    Ok(())
+}
+
+/// The configuration and its model; `None`: `end` came first.
+async fn load(path: &Path, end: impl Future<Output = ()>) -> anyhow::Result<Option<Setup>> {
+    let path = path.to_owned();
+    until(end, move || Setup::load(&path)).await
+}
+
+/// What `work` gives, on a thread of its own: a file may be a pipe that says nothing. `None`: `end`
+/// came first, and nobody waits for the thread.
+async fn until<T: Send + 'static, E: std::error::Error + Send + Sync + 'static>(
+    end: impl Future<Output = ()>,
+    work: impl FnOnce() -> Result<T, E> + Send + 'static,
+) -> anyhow::Result<Option<T>> {
     tokio::select! {
-        done = tokio::task::spawn_blocking(work) => Ok(done??),
-        () = signals.end() => {
-            eprintln!("hardnessd: interrupted");
-            Ok(())
-        }
+        done = tokio::task::spawn_blocking(work) => Ok(Some(done??)),
+        () = end => Ok(None),
     }
 }
 
 async fn run(path: PathBuf, signals: Signals) -> anyhow::Result<()> {
     let (shutdown, mut hangup) = signals.apart();
-    let setup = Setup::load(&path)?;
+    let mut shutdown = pin!(shutdown);
+    let Some(setup) = load(&path, shutdown.as_mut()).await? else {
+        return Ok(());
+    };
     let log = Log::start(setup.config.log, "info")?;
     let daemon = Daemon::bind(setup)?;
     let (request, requests) = mpsc::channel(1);

@@ -4,6 +4,7 @@ use std::fs::File;
 use std::future::Future;
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::pin::pin;
 use std::sync::mpsc::{self, TryRecvError};
 use std::time::Duration;
 
@@ -107,8 +108,17 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         preset: args.preset,
         ..Frame::default()
     })?;
-    let faults = match &args.faults {
-        Some(path) => Faults::load(path, args.seed)?,
+    let mut shutdown = pin!(shutdown);
+    let faults = match args.faults.clone() {
+        Some(path) => {
+            // The script may be a pipe that says nothing.
+            let seed = args.seed;
+            let loaded = tokio::task::spawn_blocking(move || Faults::load(&path, seed));
+            tokio::select! {
+                loaded = loaded => loaded.expect("a script is read without a panic")?,
+                () = &mut shutdown => return Ok(()),
+            }
+        }
         None => Faults::none(),
     };
     if let Some(path) = args.to.clone() {

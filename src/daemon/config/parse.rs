@@ -1,8 +1,8 @@
 //! Reading the file: text to [`Config`], and every way in which that can fail.
 
 use std::fmt;
-use std::fs;
-use std::io::Read;
+use std::fs::File;
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use toml::de::DeTable;
@@ -22,6 +22,12 @@ pub enum Error {
         path: PathBuf,
         /// Why not.
         source: std::io::Error,
+    },
+    /// More than any configuration has: another file, or a device without an end.
+    #[error("{path}: found more than {MAX_BYTES} bytes, expected a configuration")]
+    TooLong {
+        /// Of the configuration.
+        path: PathBuf,
     },
     /// No TOML, an unknown key, or a value of the wrong type.
     #[error("{path}:{place}: {problem}")]
@@ -136,11 +142,19 @@ impl Place {
     }
 }
 
+/// Room for a hundred sensors with every taxel dead.
+const MAX_BYTES: usize = 1 << 20;
+
 pub(super) fn load(path: &Path) -> Result<Config, Error> {
-    let bytes = fs::read(path).map_err(|source| Error::Unreadable {
+    let bytes = read(path, MAX_BYTES).map_err(|source| Error::Unreadable {
         path: path.to_owned(),
         source,
     })?;
+    if bytes.len() > MAX_BYTES {
+        return Err(Error::TooLong {
+            path: path.to_owned(),
+        });
+    }
     let text = text(&bytes, path)?;
     let mut config: Config = toml::from_str(text).map_err(|error| syntax(path, text, &error))?;
     let directory = path.parent().unwrap_or(Path::new(""));
@@ -162,6 +176,15 @@ pub(super) fn load(path: &Path) -> Result<Config, Error> {
     }
     check(&config, path)?;
     Ok(config)
+}
+
+/// A file, or as much of it as is enough to be refused: a byte more than `most`. It may be a pipe,
+/// such as `<(...)` of a shell, and whoever writes to it is waited for.
+fn read(path: &Path, most: usize) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    let file = File::open(path)?;
+    file.take(most as u64 + 1).read_to_end(&mut bytes)?;
+    Ok(bytes)
 }
 
 fn text<'a>(bytes: &'a [u8], path: &Path) -> Result<&'a str, Error> {
@@ -224,14 +247,8 @@ pub(super) fn model(model: &Model, path: &Path) -> Result<Hrn, Error> {
     let hrn = match &model.path {
         None => Hrn::load(verdict::BUILT_IN),
         Some(file) => {
-            // A byte more than is accepted is enough to be refused.
-            let mut bytes = Vec::new();
-            fs::File::open(file)
-                .and_then(|open| {
-                    open.take(verdict::MAX_FILE_BYTES as u64 + 1)
-                        .read_to_end(&mut bytes)
-                })
-                .map_err(|source| Error::ModelUnreadable {
+            let bytes =
+                read(file, verdict::MAX_FILE_BYTES).map_err(|source| Error::ModelUnreadable {
                     path: path.to_owned(),
                     model: file.clone(),
                     source,
