@@ -1,7 +1,8 @@
 //! What the operator reads: one line an event, on stderr or in the journal.
 //!
 //! Field names are stable: they are those of the published events. The level comes from
-//! `RUST_LOG`, else it is `info` for the daemon. Nothing here goes to stdout, which belongs to events.
+//! `RUST_LOG`, levels and `TARGET=LEVEL` separated by commas, else it is `info` for the daemon. Nothing
+//! here goes to stdout, which belongs to events.
 
 mod journal;
 mod lines;
@@ -11,9 +12,10 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use tracing::{info, warn};
+use tracing_subscriber::filter::Targets;
 use tracing_subscriber::layer::{Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
-use tracing_subscriber::{EnvFilter, Registry, reload};
+use tracing_subscriber::{Registry, reload};
 
 use self::journal::Journal;
 use self::lines::Lines;
@@ -69,9 +71,15 @@ pub enum Error {
         journal::SOCKET
     )]
     Journal(#[source] std::io::Error),
-    /// `RUST_LOG` cannot be read.
-    #[error("RUST_LOG: {0}")]
-    Filter(#[source] tracing_subscriber::filter::ParseError),
+    /// `RUST_LOG` is not what it should be.
+    #[error(
+        "RUST_LOG: found {found:?}, expected off, error, warn, info, debug or trace, or TARGET=LEVEL, \
+         as in \"warn,hardnessd=debug\""
+    )]
+    Filter {
+        /// The part of it that is wrong.
+        found: String,
+    },
     /// No thread for its lines.
     #[error("log: cannot start a thread: {0}")]
     Thread(#[source] std::io::Error),
@@ -88,16 +96,7 @@ impl Log {
     /// If `RUST_LOG` is malformed, the journal is asked for and cannot be reached, or a log has
     /// been started before.
     pub fn start(settings: Settings, level: &str) -> Result<Self, Error> {
-        let filter = match std::env::var(EnvFilter::DEFAULT_ENV) {
-            Ok(directives) if !directives.is_empty() => {
-                EnvFilter::try_new(directives).map_err(Error::Filter)?
-            }
-            // Of libraries, what a person should know; those of DDS warn several times a second of
-            // what is none of anybody's business, and fail with a value where it matters.
-            _ => EnvFilter::new(format!(
-                "warn,rustdds=off,ros2_client=off,hardnessd={level}"
-            )),
-        };
+        let filter = filter(&std::env::var("RUST_LOG").unwrap_or_default(), level)?;
         // The filter stands beside the output, not in it: a filter of a layer's own does not
         // survive the layer's exchange.
         let lines = Lines::start().map_err(Error::Thread)?;
@@ -120,6 +119,31 @@ impl Log {
             .reload(output(settings, &self.lines)?)
             .map_err(|_| Error::Twice)
     }
+}
+
+/// What `directives` let through; where there are none, the daemon's own from `level` on.
+fn filter(directives: &str, level: &str) -> Result<Targets, Error> {
+    // Of libraries, what a person should know; those of DDS warn several times a second of what is
+    // none of anybody's business, and fail with a value where it matters.
+    let unasked = format!("warn,rustdds=off,ros2_client=off,hardnessd={level}");
+    let parts = |directives: &str| -> Vec<String> {
+        let parts = directives.split(',').map(str::trim);
+        parts
+            .filter(|part| !part.is_empty())
+            .map(str::to_owned)
+            .collect()
+    };
+    let mut asked = parts(directives);
+    if asked.is_empty() {
+        asked = parts(&unasked);
+    }
+    // A bracket begins the name of a span, which nothing here has: it would be taken for a target's.
+    let is_sound = |part: &String| !part.contains('[') && part.parse::<Targets>().is_ok();
+    if let Some(found) = asked.iter().find(|part| !is_sound(part)).cloned() {
+        return Err(Error::Filter { found });
+    }
+    let parsed = asked.join(",").parse();
+    Ok(parsed.expect("a list of sound parts is sound"))
 }
 
 /// Whether there is something to write to.
@@ -234,4 +258,56 @@ pub(crate) fn context(sensor: &str, context: Option<&serde_json::Value>) {
         context = context.map(tracing::field::display),
         "context"
     );
+}
+
+#[cfg(test)]
+mod tests {
+    use tracing::Level;
+
+    use super::*;
+
+    #[test]
+    fn rust_log_chooses_by_target_and_says_what_it_does_not_understand() {
+        for (asked, ours, theirs) in [
+            ("", Some(Level::INFO), Some(Level::WARN)),
+            (" , ", Some(Level::INFO), Some(Level::WARN)),
+            ("debug", Some(Level::DEBUG), Some(Level::DEBUG)),
+            (
+                "hardnessd=debug,info",
+                Some(Level::DEBUG),
+                Some(Level::INFO),
+            ),
+            (" WARN, hardnessd=3,", Some(Level::INFO), Some(Level::WARN)),
+            ("hardnessd::daemon::log=trace", Some(Level::TRACE), None),
+            ("hardnessd", Some(Level::TRACE), None),
+            ("off", None, None),
+        ] {
+            let filter = filter(asked, "info").unwrap();
+            let most = |target| {
+                let levels = [
+                    Level::TRACE,
+                    Level::DEBUG,
+                    Level::INFO,
+                    Level::WARN,
+                    Level::ERROR,
+                ];
+                levels
+                    .into_iter()
+                    .find(|level| filter.would_enable(target, level))
+            };
+            assert_eq!(most(module_path!()), ours, "{asked:?}");
+            assert_eq!(most("zenoh::net"), theirs, "{asked:?}");
+        }
+        for (asked, found) in [
+            ("info,hardnessd=loud", "hardnessd=loud"),
+            ("hardnessd=debug=info", "hardnessd=debug=info"),
+            ("info,hardnessd[press]=debug", "hardnessd[press]=debug"),
+        ] {
+            let said = filter(asked, "info").unwrap_err().to_string();
+            assert!(
+                said.starts_with(&format!("RUST_LOG: found {found:?}, ")),
+                "{said}"
+            );
+        }
+    }
 }
