@@ -1,8 +1,9 @@
 //! `hardnessd recover`: what is whole in a damaged recording, into a new one.
 
 use std::ffi::OsString;
-use std::fs::{self, File};
-use std::io::{self, BufReader, BufWriter, ErrorKind, Read};
+use std::fs::{self, File, Metadata, TryLockError};
+use std::io::{self, BufReader, BufWriter, ErrorKind};
+use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
@@ -85,14 +86,15 @@ pub fn run(args: &Args) -> Result<(), Error> {
         path: args.out.clone(),
         source,
     };
-    if args.out.exists() {
-        let exists = io::Error::new(ErrorKind::AlreadyExists, "exists, expected a new file");
-        return Err(unwritten(exists.into()));
-    }
-    let (part, file) = part(&args.out).map_err(|error| unwritten(error.into()))?;
-    let saved = save(broken, file).and_then(|recovered| {
+    // `file` is held, and its lock with it, until all is done.
+    let (part, file) = is_new(&args.out)
+        .and_then(|()| part(&args.out))
+        .map_err(|error| unwritten(error.into()))?;
+    let saved = save(broken, &file).and_then(|recovered| {
         if has_ours(&recovered) {
-            let put = fs::rename(&part, &args.out).and_then(|()| sync_directory(&args.out));
+            let put = is_new(&args.out)
+                .and_then(|()| fs::rename(&part, &args.out))
+                .and_then(|()| sync_directory(&args.out));
             put.map_err(recording::Error::from)?;
         }
         Ok(recovered)
@@ -126,39 +128,61 @@ pub fn run(args: &Args) -> Result<(), Error> {
     Ok(())
 }
 
+/// Whether nothing stands at `out`.
+fn is_new(out: &Path) -> io::Result<()> {
+    if out.exists() {
+        let exists = "exists, expected a new file";
+        return Err(io::Error::new(ErrorKind::AlreadyExists, exists));
+    }
+    Ok(())
+}
+
 /// A new file beside the place of `out`, so that one of that name is always a whole one. What stands
-/// there already is somebody's, unless it is what an earlier try that was ended has left.
+/// there already is somebody's, unless it is what an earlier try that was ended has left. It is
+/// locked: what two wrote there at once would be whole for neither.
 fn part(out: &Path) -> io::Result<(PathBuf, File)> {
     let mut end = OsString::from(".part");
     loop {
         let mut name = out.file_name().unwrap_or_default().to_owned();
         name.push(&end);
         let part = out.with_file_name(name);
-        match File::create_new(&part) {
-            Err(error) if error.kind() == ErrorKind::AlreadyExists && is_left_over(&part) => {
-                return File::create(&part).map(|file| (part, file));
-            }
-            Err(error) if error.kind() == ErrorKind::AlreadyExists => end.push(".part"),
-            made => return made.map(|file| (part, file)),
+        let file = match File::create_new(&part) {
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => match left_over(&part) {
+                Some(file) => file,
+                None => {
+                    end.push(".part");
+                    continue;
+                }
+            },
+            made => made?,
+        };
+        // Where the file system has no locks nobody holds one.
+        if let Err(TryLockError::WouldBlock) = file.try_lock() {
+            let held = "another hardnessd recover is writing it";
+            return Err(io::Error::new(ErrorKind::ResourceBusy, held));
+        }
+        // Whoever held it may have put it in its place meanwhile.
+        let ours = file.metadata()?;
+        let is_ours = |there: Metadata| (there.dev(), there.ino()) == (ours.dev(), ours.ino());
+        if fs::metadata(&part).is_ok_and(is_ours) {
+            file.set_len(0)?;
+            return Ok((part, file));
         }
     }
 }
 
-/// Whether a file is the beginning of a recording, or nothing yet.
-fn is_left_over(part: &Path) -> bool {
-    let begins = |file: File| -> io::Result<bool> {
-        let mut start = Vec::new();
-        file.take(mcap::MAGIC.len() as u64)
-            .read_to_end(&mut start)?;
-        Ok(mcap::MAGIC.starts_with(&start))
-    };
-    super::open(part).and_then(begins).unwrap_or(false)
+/// What stands at `part`, if that is the beginning of a recording or nothing yet.
+fn left_over(part: &Path) -> Option<File> {
+    let file = File::options().read(true).write(true).open(part).ok()?;
+    let mut start = [0; mcap::MAGIC.len()];
+    let read = file.read_at(&mut start, 0).ok()?;
+    mcap::MAGIC.starts_with(&start[..read]).then_some(file)
 }
 
-fn save(broken: File, part: File) -> Result<Recovered, RecoverError> {
-    let (recovered, part) = recording::recover(BufReader::new(broken), BufWriter::new(part))?;
-    let part = part.into_inner().map_err(io::IntoInnerError::into_error);
-    let synced = part.and_then(|part| part.sync_all());
+fn save(broken: File, part: &File) -> Result<Recovered, RecoverError> {
+    let (recovered, written) = recording::recover(BufReader::new(broken), BufWriter::new(part))?;
+    let written = written.into_inner().map_err(io::IntoInnerError::into_error);
+    let synced = written.and_then(File::sync_all);
     synced.map_err(recording::Error::from)?;
     Ok(recovered)
 }
@@ -204,4 +228,25 @@ fn account(recovered: &Recovered) -> String {
         text += "\nlost nothing";
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn two_do_not_write_one_file() {
+        let directory = tempfile::tempdir().unwrap();
+        let out = directory.path().join("good.mcap");
+        let (first, held) = part(&out).unwrap();
+        fs::write(&first, mcap::MAGIC).unwrap();
+        let refused = part(&out).unwrap_err();
+        assert_eq!(refused.kind(), ErrorKind::ResourceBusy);
+        assert_eq!(fs::read(&first).unwrap(), mcap::MAGIC);
+        // Ended before its time.
+        drop(held);
+        let (second, file) = part(&out).unwrap();
+        assert_eq!(second, first);
+        assert_eq!(file.metadata().unwrap().len(), 0);
+    }
 }
