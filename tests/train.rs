@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use hardnessd::simulator::Split;
+use hardnessd::simulator::{Material, Split};
 use hardnessd::train::dataset::{self, Dataset};
 use hardnessd::verdict::Hrn;
 use rustix::process::{Pid, Signal};
@@ -573,6 +573,28 @@ fn the_baseline_is_a_model_like_any_other() {
 }
 
 #[test]
+fn swapped_levels_train_on_the_other_material() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("swapped.npz");
+    let out = path.to_str().unwrap();
+    let few = ["--objects", "1", "--test-objects", "1", "--presses", "1"];
+    succeed(
+        &[
+            &["simulate", "--out", out, "--swapped-levels", "42"],
+            &few[..],
+        ]
+        .concat(),
+    );
+    let samples = Dataset::read(&path).unwrap().samples;
+    assert_eq!(samples.len(), 8);
+    for sample in samples {
+        let material = Material::ALL[usize::from(sample.material.unwrap())];
+        let swapped = [2, 4].contains(&sample.level);
+        assert_eq!(sample.split != material.split(), swapped, "{material:?}");
+    }
+}
+
+#[test]
 fn bad_input_has_its_exit_code_and_one_line() {
     let path = |name: &str| data().0.path().join(name).to_str().unwrap().to_owned();
     let (data, missing, text, out) = (
@@ -648,6 +670,11 @@ fn bad_input_has_its_exit_code_and_one_line() {
         ),
         (simulate(&["--objects", "4294967295"]), 2, "0..=10000"),
         (simulate(&["--presses", "0"]), 2, "1..=10000"),
+        (
+            simulate(&["--swapped-levels", "25"]),
+            2,
+            "expected levels from 1 to 4, such as 24",
+        ),
         (
             simulate(&["--objects", "0", "--test-objects", "0"]),
             2,

@@ -85,6 +85,9 @@ pub(super) struct Simulate {
     /// Spread of the sensor's taxels: clean or raw
     #[arg(long, default_value = "clean")]
     pub(super) sensor_profile: SensorProfile,
+    /// Levels whose two materials change roles, such as 24: the paper's test material trains
+    #[arg(long, value_name = "LEVELS", value_parser = swapped_levels)]
+    pub(super) swapped_levels: Option<[bool; 4]>,
     /// Also draw samples of every material and a press of every level
     #[arg(long, value_name = "S.png")]
     pub(super) sheet: Option<PathBuf>,
@@ -189,6 +192,19 @@ fn lowest_force_n(text: &str) -> Result<f32, String> {
         Ok(force_n) if (0.01..=25.0).contains(&force_n) => Ok(force_n),
         _ => Err("expected newtons from 0.01 to 25".to_owned()),
     }
+}
+
+/// The digits of the levels, in any order.
+fn swapped_levels(text: &str) -> Result<[bool; 4], String> {
+    let mut swapped = [false; 4];
+    for digit in text.chars() {
+        let place = digit.to_digit(10).and_then(|level| level.checked_sub(1));
+        match place.and_then(|place| swapped.get_mut(place as usize)) {
+            Some(level) => *level = true,
+            None => return Err("expected levels from 1 to 4, such as 24".to_owned()),
+        }
+    }
+    Ok(swapped)
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]

@@ -145,6 +145,7 @@ fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
         lowest_force_n: arguments.lowest_force,
         shapes: arguments.shapes,
         profile: arguments.sensor_profile,
+        swapped_levels: arguments.swapped_levels.unwrap_or_default(),
         ..DatasetSettings::default()
     };
     if settings.objects == 0 && settings.test_objects == 0 {
