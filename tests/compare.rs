@@ -237,23 +237,39 @@ fn a_finished_comparison_does_nothing_again() {
 }
 
 #[test]
-fn data_that_cannot_be_swapped_is_refused_before_anything_is_run() {
-    let comparison = Comparison::new("unswappable", "features", &["--swaps"]);
-    let data = data().0.path().join("unsaid.npz");
-    let samples = Dataset::read(&self::data().1).unwrap().samples;
-    let file = std::fs::File::create(&data).unwrap();
-    dataset::write(file, &samples, &serde_json::json!({})).unwrap();
-    let mut command = hrn_train(&["compare", "--profile", "smoke", "--swaps"]);
-    command.args(["--methods", "features", "--data"]).arg(&data);
-    let output = command.arg("--out").arg(&comparison.out).output().unwrap();
-    let error = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(1), "{error}");
-    let expected = "unsaid.npz: `meta.settings`: found null, expected the simulator's";
-    assert!(
-        error.contains("--swaps") && error.contains(expected),
-        "{error}"
-    );
-    assert!(comparison.models().is_empty(), "{error}");
+fn data_that_will_not_do_is_refused_before_anything_is_made() {
+    let path = |name: &str| data().0.path().join(name);
+    let samples = Dataset::read(&data().1).unwrap().samples;
+    let write = |name: &str, meta: Value| {
+        let file = std::fs::File::create(path(name)).unwrap();
+        dataset::write(file, &samples, &meta).unwrap();
+    };
+    write("unsaid.npz", serde_json::json!({}));
+    // A seed that the fresh test objects have.
+    write("fresh.npz", serde_json::json!({"seed": 2_019_002}));
+    std::fs::write(path("text.npz"), "neither").unwrap();
+    for (name, more, code, expected) in [
+        (
+            "unsaid.npz",
+            &["--swaps"][..],
+            1,
+            "--swaps: DIR/unsaid.npz: `meta.settings`: found null, expected the simulator's",
+        ),
+        ("fresh.npz", &[], 1, "DIR/fresh.npz: found seed 2019002"),
+        ("text.npz", &[], 1, "DIR/text.npz: not an .npz file"),
+        ("missing.npz", &[], 66, "DIR/missing.npz: No such file"),
+    ] {
+        let out = path("will not do");
+        let mut command = hrn_train(&["compare", "--profile", "smoke", "--methods", "features"]);
+        command.args(more).arg("--data").arg(path(name));
+        let output = command.arg("--out").arg(&out).output().unwrap();
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(code), "{error}");
+        let expected = expected.replace("DIR", data().0.path().to_str().unwrap());
+        assert!(error.contains(&expected), "{error}");
+        assert_eq!(error.lines().count(), 1, "{error}");
+        assert!(!out.exists(), "{name}");
+    }
 }
 
 #[test]

@@ -55,14 +55,16 @@ pub struct Plan {
 /// If the data cannot be read, the directory cannot be written, holds runs that were told otherwise
 /// or is being worked on by another process, or at the end if a run failed.
 pub fn compare(plan: &Plan) -> anyhow::Result<()> {
+    // Nothing is made before it is known that the data will do.
+    let dataset = Dataset::read(&plan.data)?;
+    sets::check_seed(&dataset)?;
+    let recipes = recipes(&plan.methods, &dataset)?;
+    let swaps = Swaps::of(plan, &recipes)?;
     for part in ["data", "runs", "logs"] {
         let part = plan.out.join(part);
         std::fs::create_dir_all(&part).with_context(|| part.display().to_string())?;
     }
     let _lock = lock(&plan.out)?;
-    let dataset = Dataset::read(&plan.data)?;
-    let recipes = recipes(&plan.methods, &dataset)?;
-    let swaps = Swaps::of(plan, &recipes)?;
     let mut rounds = Vec::new();
     for recipe in &recipes {
         for seed in 1..=plan.seeds {

@@ -55,24 +55,33 @@ pub const SHIFTS: [(&str, &str); 3] = [
     ("raw", "taxels as uneven as on a raw film array"),
 ];
 
+/// Makes sure that no model learns from the fresh objects.
+///
+/// # Errors
+///
+/// If the data has a seed of theirs.
+pub(super) fn check_seed(dataset: &Dataset) -> anyhow::Result<()> {
+    let seed = dataset.sources[0].seed;
+    ensure!(
+        !FRESH_SEEDS.iter().any(|&fresh| seed == Some(fresh)),
+        "{}: found seed {}, expected another than the fresh test objects'",
+        dataset.path().display(),
+        seed.unwrap_or_default()
+    );
+    Ok(())
+}
+
 /// All sets in order; those that are simulated lie in `directory`. The first is left out where
 /// `dataset` has no labelled test samples.
 ///
 /// # Errors
 ///
-/// If a file cannot be read or written, or the data has a seed of the fresh objects.
+/// If a file cannot be read or written.
 pub(super) fn all(
     dataset: Dataset,
     profile: Profile,
     directory: &Path,
 ) -> anyhow::Result<Vec<TestSet>> {
-    let seed = dataset.sources[0].seed;
-    ensure!(
-        !FRESH_SEEDS.iter().any(|&fresh| seed == Some(fresh)),
-        "{}: found seed {}, expected another than the fresh test objects'",
-        dataset.sources[0].name,
-        seed.unwrap_or_default()
-    );
     let mut sets = Vec::new();
     if let Ok(indices) = dataset.labelled(Split::Test) {
         sets.push(TestSet {
