@@ -55,7 +55,11 @@ impl Comparison {
     }
 
     fn command(&self) -> Command {
-        let mut command = hrn_train(&["compare", "--profile", "smoke", "--seeds", "2"]);
+        self.command_of("2")
+    }
+
+    fn command_of(&self, seeds: &str) -> Command {
+        let mut command = hrn_train(&["compare", "--profile", "smoke", "--seeds", seeds]);
         command.args(["--methods", self.methods]).args(self.more);
         command
             .arg("--data")
@@ -205,6 +209,30 @@ fn a_finished_comparison_does_nothing_again() {
     assert!(comparison.models() == models, "a run was done again");
     assert_eq!(comparison.text("results.json"), results);
 
+    // Another method's runs, as good as finished.
+    for run in ["1", "swapped-13"] {
+        let from = comparison.out.join(format!("runs/features-24-{run}"));
+        let to = comparison.out.join(format!("runs/ours-{run}"));
+        std::fs::create_dir(&to).unwrap();
+        for name in ["hrn.onnx", "evaluation.json", "metrics.csv"] {
+            std::fs::copy(from.join(name), to.join(name)).unwrap();
+        }
+        let told = std::fs::read_to_string(from.join("settings.toml")).unwrap();
+        let told = told.replacen("features", "ours", 1);
+        std::fs::write(to.join("settings.toml"), told).unwrap();
+    }
+    // Asked for less, a comparison forgets nothing of what stands there.
+    let less = comparison.command_of("1").output().unwrap();
+    assert!(less.status.success(), "{less:?}");
+    let all = comparison.json("results.json");
+    assert_eq!(
+        all[..4],
+        serde_json::from_str::<Vec<Value>>(&results).unwrap()
+    );
+    assert_eq!((all.len(), &all[4]["run"]), (5, &Value::from("ours-1")));
+    let all = comparison.json("swaps.json");
+    assert_eq!((all.len(), &all[8]["method"]), (9, &Value::from("ours")));
+
     // What was told otherwise is none of its runs.
     let told = comparison.text("runs/features-1/settings.toml");
     for (from, to, expected) in [
@@ -234,6 +262,19 @@ fn a_finished_comparison_does_nothing_again() {
         assert!(error.contains(expected), "{error}");
         assert_eq!(error.lines().count(), 1, "{error}");
     }
+    std::fs::write(comparison.out.join("runs/features-1/settings.toml"), told).unwrap();
+
+    // Nor does it stand beside them where it is not asked for.
+    let settings = comparison.out.join("runs/features-2/settings.toml");
+    let told = comparison.text("runs/features-2/settings.toml");
+    std::fs::write(&settings, told.replacen("10.2", "9.0", 1)).unwrap();
+    let output = comparison.command_of("1").output().unwrap();
+    let error = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{error}");
+    let said = "runs/features-2: not asked for, and left out of the tables; \
+                `settings.full_scale_n`: found 9.0, expected 10.2";
+    assert!(error.contains(said), "{error}");
+    assert_eq!(comparison.json("results.json").len(), 4);
 }
 
 #[test]

@@ -2,18 +2,21 @@
 //!
 //! In: a data set. Out, in a directory: `data/`, what every model is judged on; `runs/`, a run's
 //! directory a method and seed; `logs/`; and `results.json`, `tables.md` and `report.html`, written
-//! anew whenever a run ends. Nothing is trained in this process: each run is one of its own, so
-//! that it can be stopped, resumed and spread as it likes, and what is finished is not done again.
+//! anew whenever a run ends, of all finished runs that stand there, asked for this time or before.
+//! Nothing is trained in this process: each run is one of its own, so that it can be stopped,
+//! resumed and spread as it likes, and what is finished is not done again.
 
 mod children;
 pub mod results;
 mod sets;
 mod swaps;
 
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail, ensure};
+use clap::ValueEnum as _;
 use rustix::fs::FlockOperation;
 
 pub use sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS};
@@ -36,9 +39,9 @@ pub struct Plan {
     pub data: PathBuf,
     /// Directory of the comparison.
     pub out: PathBuf,
-    /// Which methods.
+    /// Which methods to run.
     pub methods: Vec<Method>,
-    /// Seeds 1 to this one.
+    /// To run under seeds 1 to this one.
     pub seeds: u64,
     /// How long each run may take.
     pub profile: Profile,
@@ -46,6 +49,13 @@ pub struct Plan {
     pub jobs: usize,
     /// Whether to swap the materials' roles as well.
     pub swaps: bool,
+}
+
+impl Plan {
+    /// Whether it has a recipe's runs done.
+    fn asks(&self, recipe: &Recipe) -> bool {
+        self.methods.contains(&recipe.method)
+    }
 }
 
 /// Runs what is not finished, and writes results and tables of all that is.
@@ -58,31 +68,14 @@ pub fn compare(plan: &Plan) -> anyhow::Result<()> {
     // Nothing is made before it is known that the data will do.
     let dataset = Dataset::read(&plan.data)?;
     sets::check_seed(&dataset)?;
-    let recipes = recipes(&plan.methods, &dataset)?;
+    let recipes = recipes(plan, &dataset)?;
     let swaps = Swaps::of(plan, &recipes)?;
     for part in ["data", "runs", "logs"] {
         let part = plan.out.join(part);
         std::fs::create_dir_all(&part).with_context(|| part.display().to_string())?;
     }
     let _lock = lock(&plan.out)?;
-    let mut rounds = Vec::new();
-    for recipe in &recipes {
-        for seed in 1..=plan.seeds {
-            let directory = plan
-                .out
-                .join("runs")
-                .join(format!("{}-{seed}", recipe.name()));
-            rounds.push(Round {
-                recipe: *recipe,
-                told: recipe.told(seed, plan.profile, &dataset)?,
-                data: plan.data.clone(),
-                directory,
-                // USTGAN is the same, and what the STGANs generate.
-                shares_with: matches!(recipe.method, Method::Nahrn | Method::Nihrn)
-                    .then(|| format!("{}-{seed}", Method::Ours.name())),
-            });
-        }
-    }
+    let rounds = rounds(plan, &recipes, &dataset)?;
     let mut open = unfinished(&rounds, &plan.out)?;
     let sets = sets::all(dataset, plan.profile, &plan.out.join("data"))?;
     write_results(plan, &rounds, &sets)?;
@@ -143,9 +136,10 @@ struct Recipe {
     choice: LabelChoice,
 }
 
-/// The rows that `methods` have.
-fn recipes(methods: &[Method], dataset: &Dataset) -> anyhow::Result<Vec<Recipe>> {
+/// The rows that there can be, those of the plan's methods first.
+fn recipes(plan: &Plan, dataset: &Dataset) -> anyhow::Result<Vec<Recipe>> {
     let few = methods::labels(Method::Hrn15, dataset, None)?;
+    let methods = [&plan.methods, Method::value_variants()].concat();
     let mut recipes = Vec::new();
     for (number, &method) in methods.iter().enumerate() {
         if methods[..number].contains(&method) {
@@ -174,6 +168,32 @@ fn recipes(methods: &[Method], dataset: &Dataset) -> anyhow::Result<Vec<Recipe>>
     Ok(recipes)
 }
 
+/// Every run that the plan asks for, and those that another finished before.
+fn rounds(plan: &Plan, recipes: &[Recipe], dataset: &Dataset) -> anyhow::Result<Vec<Round>> {
+    let runs = plan.out.join("runs");
+    let mut rounds = Vec::new();
+    for recipe in recipes {
+        let asked = if plan.asks(recipe) { plan.seeds } else { 0 };
+        let mut seeds = recipe.seeds_in(&runs)?;
+        seeds.extend(1..=asked);
+        for seed in seeds {
+            let round = Round {
+                recipe: *recipe,
+                told: recipe.told(seed, plan.profile, dataset)?,
+                data: plan.data.clone(),
+                directory: runs.join(format!("{}-{seed}", recipe.name())),
+                // USTGAN is the same, and what the STGANs generate.
+                shares_with: matches!(recipe.method, Method::Nahrn | Method::Nihrn)
+                    .then(|| format!("{}-{seed}", Method::Ours.name())),
+            };
+            if (1..=asked).contains(&seed) || round.counts() {
+                rounds.push(round);
+            }
+        }
+    }
+    Ok(rounds)
+}
+
 impl Recipe {
     /// Of its runs' directories.
     fn name(&self) -> String {
@@ -185,6 +205,18 @@ impl Recipe {
             name += "-random";
         }
         name
+    }
+
+    /// Seeds of its runs that stand in a directory.
+    fn seeds_in(&self, runs: &Path) -> anyhow::Result<BTreeSet<u64>> {
+        let prefix = self.name() + "-";
+        let mut seeds = BTreeSet::new();
+        for entry in std::fs::read_dir(runs).with_context(|| runs.display().to_string())? {
+            let name = entry?.file_name();
+            let name = name.to_str().and_then(|name| name.strip_prefix(&prefix));
+            seeds.extend(name.and_then(|seed| seed.parse::<u64>().ok()));
+        }
+        Ok(seeds)
     }
 
     /// What its run of a seed is told.
@@ -238,16 +270,44 @@ impl Round {
         self.directory.join("hrn.onnx").exists()
     }
 
+    /// Whether a run that is not asked for belongs in the tables: it is finished, and was told what
+    /// it would be told now. That it was told otherwise is said.
+    fn counts(&self) -> bool {
+        if !self.is_finished() {
+            return false;
+        }
+        let difference = self
+            .difference()
+            .unwrap_or_else(|error| Some(format!("{error:#}")));
+        if let Some(difference) = &difference {
+            let run = self.directory.display();
+            eprintln!("{run}: not asked for, and left out of the tables; {difference}");
+        }
+        difference.is_none()
+    }
+
     /// Makes sure that what stands in the directory was told what this round is.
     fn check(&self) -> anyhow::Result<()> {
+        match self.difference()? {
+            None => Ok(()),
+            Some(difference) => bail!(
+                "{}: holds a run that was told otherwise; {difference}; compare into another \
+                 directory, or remove this one to have it run again",
+                self.directory.display()
+            ),
+        }
+    }
+
+    /// What the run in the directory was told otherwise; `None` if nothing, or if there is no run.
+    fn difference(&self) -> anyhow::Result<Option<String>> {
         let Some(told) = Run::told(&self.directory)? else {
-            return Ok(());
+            return Ok(None);
         };
         let hashes = |sources: &[Source]| -> Vec<String> {
             sources.iter().map(|source| source.sha256.clone()).collect()
         };
         let (found, expected) = (hashes(&told.data), hashes(&self.told.data));
-        let difference = if found == expected {
+        Ok(if found == expected {
             // The file's name may be another by now.
             let data = self.told.data.clone();
             Description { data, ..told }.difference(&self.told)
@@ -256,15 +316,7 @@ impl Round {
             Some(format!(
                 "sha256 of the data: found {found}, expected {expected}"
             ))
-        };
-        match difference {
-            None => Ok(()),
-            Some(difference) => bail!(
-                "{}: holds a run that was told otherwise; {difference}; compare into another \
-                 directory, or remove this one to have it run again",
-                self.directory.display()
-            ),
-        }
+        })
     }
 
     fn job(&self, out: &Path) -> Job {
@@ -313,7 +365,10 @@ impl Round {
 }
 
 /// The rounds that are still to be run.
-fn unfinished<'a>(rounds: &'a [Round], out: &Path) -> anyhow::Result<Vec<(&'a Round, Job)>> {
+fn unfinished<'a>(
+    rounds: impl IntoIterator<Item = &'a Round>,
+    out: &Path,
+) -> anyhow::Result<Vec<(&'a Round, Job)>> {
     let mut open = Vec::new();
     for round in rounds {
         round.check()?;

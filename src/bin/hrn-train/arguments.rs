@@ -169,10 +169,10 @@ pub(super) struct Compare {
     /// Directory of the comparison
     #[arg(long, value_name = "DIR")]
     pub(super) out: PathBuf,
-    /// Which methods; all by default
+    /// Which methods to run; all by default. Tables also have what was finished in DIR before
     #[arg(long, value_name = "M", value_delimiter = ',', num_args = 1..)]
     pub(super) methods: Vec<Method>,
-    /// Seeds 1 to N
+    /// Under seeds 1 to N
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     pub(super) seeds: u64,
     /// How long each run may take

@@ -56,22 +56,22 @@ pub(super) fn name(swapped_levels: [bool; 4]) -> String {
     }
 }
 
-/// What is to be run with materials swapped.
+/// What is run with materials swapped, and what can have been before.
 #[derive(Debug)]
 pub(super) struct Swaps {
-    wanted: Vec<(Recipe, [bool; 4])>,
+    every: Vec<(Recipe, [bool; 4])>,
     /// What the data sets are simulated with, but for the roles.
     settings: DatasetSettings,
 }
 
 impl Swaps {
-    /// Those that the plan asks for, if there are any.
+    /// Those of all `recipes`, if the plan asks for any of them.
     ///
     /// # Errors
     ///
     /// If the data does not say what it was simulated with.
     pub(super) fn of(plan: &Plan, recipes: &[Recipe]) -> anyhow::Result<Option<Self>> {
-        let wanted: Vec<(Recipe, [bool; 4])> = recipes
+        let every: Vec<(Recipe, [bool; 4])> = recipes
             .iter()
             .flat_map(|recipe| {
                 assignments(recipe, plan.profile)
@@ -79,14 +79,14 @@ impl Swaps {
                     .map(|swapped| (*recipe, swapped))
             })
             .collect();
-        if !plan.swaps || wanted.is_empty() {
+        if !plan.swaps || !every.iter().any(|(recipe, _)| plan.asks(recipe)) {
             return Ok(None);
         }
         let settings = DatasetSettings {
             test_objects: sets::FRESH_OBJECTS,
             ..simulated::settings_of(&plan.data).context("--swaps")?
         };
-        Ok(Some(Self { wanted, settings }))
+        Ok(Some(Self { every, settings }))
     }
 
     /// Runs what is not finished and writes `swaps.json`.
@@ -96,24 +96,31 @@ impl Swaps {
     /// If a file cannot be read or written, or a directory holds a run that was told otherwise.
     pub(super) fn run(&self, plan: &Plan) -> anyhow::Result<Vec<Failure>> {
         let mut parts = None;
-        let mut rounds = Vec::with_capacity(self.wanted.len());
-        for (recipe, swapped) in &self.wanted {
-            let file = file(plan, self.settings, *swapped, &mut parts)?;
+        let mut rounds = Vec::with_capacity(self.every.len());
+        for (recipe, swapped) in &self.every {
             let run = format!("{}-swapped-{}", recipe.name(), name(*swapped));
-            rounds.push(Round {
+            let directory = plan.out.join("runs").join(run);
+            if !plan.asks(recipe) && !directory.is_dir() {
+                continue;
+            }
+            let file = file(plan, self.settings, *swapped, &mut parts)?;
+            let round = Round {
                 recipe: *recipe,
                 told: recipe.told(SEED, plan.profile, &Dataset::read(&file)?)?,
                 data: file,
-                directory: plan.out.join("runs").join(run),
+                directory,
                 // With nobody swapped it is the comparison's own run, judged on more objects.
                 shares_with: (*swapped == [false; 4]).then(|| format!("{}-{SEED}", recipe.name())),
-            });
+            };
+            if plan.asks(recipe) || round.counts() {
+                rounds.push((round, *swapped));
+            }
         }
-        let open = unfinished(&rounds, &plan.out)?;
+        let open = unfinished(rounds.iter().map(|(round, _)| round), &plan.out)?;
         let jobs = open.into_iter().map(|(_, job)| job).collect();
         let failures = children::run(jobs, plan.jobs, |_| Ok(()))?;
         let mut entries = Vec::new();
-        for (round, (_, swapped_levels)) in rounds.iter().zip(&self.wanted) {
+        for (round, swapped_levels) in &rounds {
             let test: Option<Evaluation> = read_json(&round.directory.join("evaluation.json"))?;
             if let (true, Some(test)) = (round.is_finished(), test) {
                 entries.push(SwapEntry {
