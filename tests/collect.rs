@@ -303,7 +303,7 @@ fn what_cannot_be_collected_is_said_and_nothing_is_written() {
     let noise: PathBuf = bench.path("noise.mcap");
     std::fs::write(&noise, [7; 1000]).unwrap();
     for (arguments, code, part) in [
-        (&[fixture][..], 1, "level: found none"),
+        (&[fixture][..], 2, "level: found none, expected --level"),
         (&["--level", "5", fixture], 2, "5"),
         (&["--level", "1", text(&none)], 66, "none.mcap"),
         (&["--level", "1", text(&empty)], 1, "no press"),

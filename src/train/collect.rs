@@ -64,7 +64,13 @@ pub enum CollectError {
         /// What is wrong with it.
         source: PlaybackError,
     },
-    /// A label that is missing or no number in its range.
+    /// Neither given nor a label.
+    #[error("{path}: level: found none, expected --level, or a recording with the label level")]
+    NoLevel {
+        /// The capture.
+        path: PathBuf,
+    },
+    /// A label that is no number in its range.
     #[error(
         "{path}: label {key}: found {found}, expected {expected}{}",
         said_too(key)
@@ -181,15 +187,22 @@ impl Capture {
         self.presses.len()
     }
 
-    fn number(&self, key: &'static str, expected: &'static str) -> Result<u32, CollectError> {
-        let label = self.labels.get(key);
-        let wrong = || CollectError::Label {
+    /// The label `key`, if there is one.
+    fn number(
+        &self,
+        key: &'static str,
+        expected: &'static str,
+    ) -> Result<Option<u32>, CollectError> {
+        let Some(label) = self.labels.get(key) else {
+            return Ok(None);
+        };
+        let wrong = |_| CollectError::Label {
             path: self.path.clone(),
             key,
-            found: label.map_or("none".to_owned(), |label| format!("{label:?}")),
+            found: format!("{label:?}"),
             expected,
         };
-        label.and_then(|l| l.parse().ok()).ok_or_else(wrong)
+        label.parse().map(Some).map_err(wrong)
     }
 
     fn shore(&self) -> Result<Option<f32>, CollectError> {
@@ -210,7 +223,11 @@ impl Capture {
         const EXPECTED: &str = "a level from 0 (unlabelled) to 4";
         let level = match given {
             Some(level) => u32::from(level),
-            None => self.number("level", EXPECTED)?,
+            None => self
+                .number("level", EXPECTED)?
+                .ok_or_else(|| CollectError::NoLevel {
+                    path: self.path.clone(),
+                })?,
         };
         let known = u8::try_from(level).ok();
         let known = known.filter(|level| usize::from(*level) <= dataset::levels().len());
@@ -373,10 +390,10 @@ pub fn to_bytes(
         let level = capture.level(labelling.level)?;
         let object = match labelling.object {
             Some(object) => object,
-            None if capture.labels.contains_key("object") => {
-                capture.number("object", "a number")?
-            }
-            None => new_object.ok_or_else(no_new_object)?,
+            None => match capture.number("object", "a number")? {
+                Some(object) => object,
+                None => new_object.ok_or_else(no_new_object)?,
+            },
         };
         let material = capture.labels.get("material");
         let material = material

@@ -90,7 +90,11 @@ struct Unreadable {
 /// 2 wrong usage, 66 unreadable input, 69 no such device, 78 bad configuration or model, 74 other I/O, else 1.
 fn exit_code(error: &anyhow::Error) -> u8 {
     let has = |test: fn(&(dyn std::error::Error + 'static)) -> bool| error.chain().any(test);
-    if has(|e| e.is::<NoObjects>() || matches!(e.downcast_ref(), Some(LabelsError::Range { .. }))) {
+    if has(|e| {
+        e.is::<NoObjects>()
+            || matches!(e.downcast_ref(), Some(LabelsError::Range { .. }))
+            || matches!(e.downcast_ref(), Some(CollectError::NoLevel { .. }))
+    }) {
         2
     } else if has(|e| {
         e.is::<Unreadable>()
