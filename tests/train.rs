@@ -406,26 +406,56 @@ fn held_out_objects_are_used_or_it_is_said() {
 
 #[test]
 fn a_training_that_diverges_ends_where_it_does() {
-    for (method, settings, expected) in [
+    let one_step = "epochs = 1\nbatch = 1000\n";
+    for (name, method, settings, rate, expected) in [
         (
+            "loss",
             "hrn100",
-            "[training.optimiser]",
+            "[training]\n",
+            1e30,
             "hrn: epoch 1: loss: found NaN",
         ),
         (
+            "GAN's loss",
             "sgan",
-            "[ustgan.optimiser]",
+            "[ustgan]\n",
+            1e30,
             "sgan: epoch 1: loss: found NaN",
         ),
+        // By the very last step.
+        (
+            "weight",
+            "hrn100",
+            &format!("[training]\n{one_step}"),
+            1e300,
+            "hrn: epoch 1: conv1.kernel: found ",
+        ),
+        (
+            "GAN's weight",
+            "nahrn",
+            &format!("[ustgan]\n{one_step}"),
+            1e300,
+            "ustgan: epoch 1: ",
+        ),
+        (
+            "logit",
+            "hrn100",
+            &format!("[training]\n{one_step}"),
+            1e30,
+            "hrn: epoch 1: logit: found NaN",
+        ),
     ] {
-        let settings = format!("{settings}\nlearning_rate = 1e30\n");
-        let trial = Trial::of(method, &format!("diverging {method}"), &settings);
+        let settings = format!("{settings}optimiser.learning_rate = {rate:e}\n");
+        let trial = Trial::of(method, &format!("diverging {name}"), &settings);
         let output = trial.output("1", &[]);
         let error = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(1), "{error}");
+        assert_eq!(output.status.code(), Some(1), "{name}: {error}");
         let last = error.lines().last().unwrap();
-        assert!(last.contains(expected), "{error}");
-        assert!(trial.checkpoints().is_empty(), "{method}");
+        assert!(
+            last.contains(expected) && last.ends_with(": the training has diverged"),
+            "{name}: {error}"
+        );
+        assert_eq!(trial.checkpoints().is_empty(), name != "logit", "{name}");
     }
 }
 

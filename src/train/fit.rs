@@ -87,7 +87,7 @@ impl Trained {
 /// # Errors
 ///
 /// If the run's directory cannot be read or written, its checkpoint is of another stage than this,
-/// or the loss is no number any more.
+/// or the loss, a weight or what they compute at the end is no number any more.
 pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> {
     let Training { batch, epochs, .. } = *task.settings;
     let (validation_samples, validation_settings) = task.validation;
@@ -124,7 +124,8 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
         let due = |every: u32| last || epoch.is_multiple_of(every);
 
         let loss = loss_sum / task.train.len() as f64;
-        ensure_finite(task.stage, epoch, loss)?;
+        ensure_finite(task.stage, epoch, "loss", loss)?;
+        ensure_finite_weights(task.stage, epoch, &state.learner.weights)?;
         let mut validation = None;
         if !validation_samples.is_empty() && due(validation_settings.every_epochs) {
             validation = Some(state.validate(task));
@@ -156,7 +157,7 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
         Keep::Best => state.best.unwrap_or_else(|| state.learner.evaluated()),
         Keep::Last => state.learner.evaluated(),
     };
-    let mut trained = task.with_statistics(weights);
+    let mut trained = task.finished(weights, epochs)?;
     if !validation_samples.is_empty() {
         trained.temperature = temperature(&task.judge(&trained, validation_samples));
     }
@@ -297,12 +298,27 @@ impl Task<'_> {
     }
 
     /// A recogniser of `weights` with statistics over the training samples and no temperature.
-    pub fn with_statistics(&self, weights: Weights) -> Trained {
+    fn with_statistics(&self, weights: Weights) -> Trained {
         Trained {
             statistics: self.statistics(&weights),
             weights,
             temperature: 1.0,
         }
+    }
+
+    /// The same at a stage's end, after so many epochs.
+    ///
+    /// # Errors
+    ///
+    /// If it computes what is no number, as weights can that are numbers themselves.
+    pub fn finished(&self, weights: Weights, epochs: u32) -> anyhow::Result<Trained> {
+        let trained = self.with_statistics(weights);
+        for (_, logits) in self.judge(&trained, &self.train[..1]) {
+            for logit in logits {
+                ensure_finite(self.stage, epochs, "logit", logit.into())?;
+            }
+        }
+        Ok(trained)
     }
 
     /// Statistics of the normalised layers over the training samples, augmented as the settings
@@ -376,17 +392,36 @@ pub fn probabilities(logits: &[Vec<f32>], temperature: f32, device: &Device) -> 
     logits.iter().map(one).collect()
 }
 
-/// Ends a stage whose loss is no number any more: no further step would make it one.
+/// Ends a stage of which something is no number any more: no further step would make it one.
 ///
 /// # Errors
 ///
-/// If the mean loss of an epoch is not finite.
-pub(super) fn ensure_finite(stage: &str, epoch: u32, loss: f64) -> anyhow::Result<()> {
+/// If `found`, which is `what` of it, is not finite.
+pub(super) fn ensure_finite(stage: &str, epoch: u32, what: &str, found: f64) -> anyhow::Result<()> {
     ensure!(
-        loss.is_finite(),
-        "{stage}: epoch {epoch}: loss: found {loss}, expected a finite number: the training has \
+        found.is_finite(),
+        "{stage}: epoch {epoch}: {what}: found {found}, expected a finite number: the training has \
          diverged"
     );
+    Ok(())
+}
+
+/// Ends a stage whose weights are no numbers any more; a step's loss is that of the weights before
+/// it.
+///
+/// # Errors
+///
+/// If one of `weights` is not finite.
+pub(super) fn ensure_finite_weights(
+    stage: &str,
+    epoch: u32,
+    weights: &Weights,
+) -> anyhow::Result<()> {
+    for weight in &weights.entries {
+        for value in numbers(&weight.values) {
+            ensure_finite(stage, epoch, &weight.name, value.into())?;
+        }
+    }
     Ok(())
 }
 

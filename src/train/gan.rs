@@ -12,7 +12,7 @@ use burn::tensor::Device;
 
 use super::checkpoint::{Checkpoint, Origin, Progress};
 use super::dataset::Dataset;
-use super::fit::{ensure_finite, progress_bar, report};
+use super::fit::{ensure_finite, ensure_finite_weights, progress_bar, report};
 use super::generator;
 use super::history::{Adversarial, Row};
 use super::hrn;
@@ -97,7 +97,7 @@ pub struct Task<'a> {
 /// # Errors
 ///
 /// If the run's directory cannot be read or written, its checkpoint is of another stage than this,
-/// or a loss is no number any more.
+/// or a loss or a weight is no number any more.
 pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
     let Settings { batch, epochs, .. } = *task.settings;
     let steps = u64::from(epochs) * task.real.len().div_ceil(batch) as u64;
@@ -131,7 +131,10 @@ pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
         let n = task.real.len() as f64;
         let (loss, generator_loss) = (discriminator_sum / n, generator_sum / n);
         for loss in [loss, generator_loss] {
-            ensure_finite(task.stage, epoch, loss)?;
+            ensure_finite(task.stage, epoch, "loss", loss)?;
+        }
+        for side in [&state.generator, &state.discriminator] {
+            ensure_finite_weights(task.stage, epoch, &side.weights)?;
         }
         let sigma = sigma_range(&state.generator.weights);
         let mut likeness = None;

@@ -246,7 +246,8 @@ impl Stages<'_> {
     ///
     /// # Errors
     ///
-    /// If there are no unlabelled samples, or the run's directory cannot be read or written.
+    /// If there are no unlabelled samples, the run's directory cannot be read or written, or the
+    /// training diverges.
     pub fn semi_supervised(&self, stage: &'static str, game: Game) -> anyhow::Result<Trained> {
         self.ensure_unlabelled()?;
         let task = gan::Task {
@@ -271,7 +272,7 @@ impl Stages<'_> {
             settings: &settings,
             ..self.fit_task(stage)
         };
-        Ok(task.with_statistics(weights))
+        task.finished(weights, self.settings().ustgan.epochs)
     }
 
     /// Writes the model, what it is worth and what it still gets wrong.
