@@ -568,6 +568,16 @@ fn another_seed_gives_other_weights_and_a_run_is_not_overwritten() {
     };
     refused("3", &[], "--resume goes on with it");
     refused("5", &["--resume"], "`seed`: found 5, expected 3");
+    // Nor is it gone on with by two at once.
+    let other_process = std::fs::File::open(&first.out).unwrap();
+    let lock = rustix::fs::FlockOperation::LockExclusive;
+    rustix::fs::flock(&other_process, lock).unwrap();
+    refused(
+        "3",
+        &["--resume"],
+        "seed 3: another process is at work here",
+    );
+    drop(other_process);
     // Nor does it go on from a checkpoint of another run.
     for name in first.checkpoints() {
         let place = |trial: &Trial| trial.out.join("checkpoints").join(&name);

@@ -12,12 +12,10 @@ mod sets;
 mod swaps;
 
 use std::collections::BTreeSet;
-use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail, ensure};
 use clap::ValueEnum as _;
-use rustix::fs::FlockOperation;
 
 pub use sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS};
 
@@ -28,7 +26,7 @@ use self::swaps::Swaps;
 use super::dataset::{Dataset, LabelChoice, Source};
 use super::methods::{self, LabelsError, Method, Request};
 use super::report;
-use super::run::{Description, Run, write_whole};
+use super::run::{Description, Run, lock, write_whole};
 use super::settings::Profile;
 use super::tables;
 
@@ -96,18 +94,6 @@ pub fn compare(plan: &Plan) -> anyhow::Result<()> {
         // Both in one line: the runs that failed before are not forgotten.
         (Err(failed), Err(error)) => bail!("{failed}; then {error:#}"),
         (failed, swapped) => failed.and(swapped),
-    }
-}
-
-/// Nobody else may work in the directory while the file is open.
-fn lock(out: &Path) -> anyhow::Result<File> {
-    let directory = File::open(out).with_context(|| out.display().to_string())?;
-    match rustix::fs::flock(&directory, FlockOperation::NonBlockingLockExclusive) {
-        Ok(()) => Ok(directory),
-        Err(rustix::io::Errno::WOULDBLOCK) => {
-            bail!("{}: another process is comparing here", out.display())
-        }
-        Err(error) => Err(std::io::Error::from(error)).with_context(|| out.display().to_string()),
     }
 }
 

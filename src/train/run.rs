@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail, ensure};
 use burn::tensor::Device;
+use rustix::fs::FlockOperation;
 use serde::{Deserialize, Serialize};
 
 use super::checkpoint::Checkpoint;
@@ -68,10 +69,11 @@ fn difference(table: &str, found: &toml::Table, expected: &toml::Table) -> Optio
     })
 }
 
-/// A run's directory.
+/// A run's directory, in which no other process runs while it is open.
 #[derive(Debug)]
 pub struct Run {
     directory: PathBuf,
+    _lock: File,
     /// Directories of other runs, whose finished stages may be taken.
     others: Vec<PathBuf>,
 }
@@ -101,11 +103,13 @@ impl Run {
     ///
     /// # Errors
     ///
-    /// If a run stands there and `resume` is not asked for, if it was told otherwise, or if the
-    /// directory cannot be written.
+    /// If a run stands there and `resume` is not asked for, if it was told otherwise or another
+    /// process is at it, or if the directory cannot be written.
     pub fn open(directory: &Path, description: &Description, resume: bool) -> anyhow::Result<Self> {
+        fs::create_dir_all(directory).with_context(|| directory.display().to_string())?;
         let run = Self {
             directory: directory.to_owned(),
+            _lock: lock(directory)?,
             others: Vec::new(),
         };
         match Self::told(directory)? {
@@ -356,6 +360,23 @@ fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     })
 }
 
+/// Nobody else may work in a directory while the file is open.
+///
+/// # Errors
+///
+/// If somebody does, or the directory cannot be opened.
+pub(super) fn lock(directory: &Path) -> anyhow::Result<File> {
+    let context = || directory.display().to_string();
+    let file = File::open(directory).with_context(context)?;
+    match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => Ok(file),
+        Err(rustix::io::Errno::WOULDBLOCK) => {
+            bail!("{}: another process is at work here", context())
+        }
+        Err(error) => Err(std::io::Error::from(error)).with_context(context),
+    }
+}
+
 /// This package's version, and the commit of the checkout that it was built in, if that is still
 /// there.
 fn revision() -> String {
@@ -380,6 +401,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let run = Run {
             directory: directory.path().to_owned(),
+            _lock: lock(directory.path()).unwrap(),
             others: Vec::new(),
         };
         let row = |step, seconds| Row {
@@ -409,6 +431,19 @@ mod tests {
             .collect();
         assert_eq!(seconds, ["2.0", "4.0", "7.5"], "{text}");
         assert!(text.contains("second,5,"), "{text}");
+    }
+
+    #[test]
+    fn only_one_at_a_time_works_in_a_directory() {
+        let directory = tempfile::tempdir().unwrap();
+        let held = lock(directory.path()).unwrap();
+        let error = lock(directory.path()).unwrap_err().to_string();
+        assert!(
+            error.ends_with(": another process is at work here"),
+            "{error}"
+        );
+        drop(held);
+        lock(directory.path()).unwrap();
     }
 
     #[test]
