@@ -325,26 +325,26 @@ fn checkpoints(run: &Path, stage: &str) -> anyhow::Result<Vec<PathBuf>> {
 ///
 /// Those of writing; a file that stood there before then still stands.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
-    let attempt = || -> std::io::Result<()> {
+    let attempt = || -> anyhow::Result<()> {
         if path.is_symlink() && !path.exists() {
             // A link to what is not there yet: so that there is a path to follow it to.
             File::create(path)?;
         }
         match fs::metadata(path) {
             Ok(found) if found.is_file() => replace(&fs::canonicalize(path)?, bytes),
-            Ok(_) => File::options().write(true).open(path)?.write_all(bytes),
+            Ok(_) => Ok(File::options().write(true).open(path)?.write_all(bytes)?),
             Err(_) => replace(path, bytes),
         }
     };
     attempt().with_context(|| path.display().to_string())
 }
 
-fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+fn replace(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let mut name = path.file_name().unwrap_or_default().to_owned();
     name.push(".part");
     let part = path.with_file_name(name);
-    let attempt = || -> std::io::Result<()> {
-        let mut file = File::create(&part)?;
+    let mut file = create_anew(&part).with_context(|| part.display().to_string())?;
+    let mut attempt = || -> std::io::Result<()> {
         file.write_all(bytes)?;
         file.sync_all()?;
         fs::rename(&part, path)?;
@@ -357,7 +357,17 @@ fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     attempt().inspect_err(|_| {
         // A part left behind would fill the disk further; its removal may fail like the rest.
         let _ = fs::remove_file(&part);
-    })
+    })?;
+    Ok(())
+}
+
+/// A new file in the place of what a killed process left, which may not be writable; of a link,
+/// not of what it points to.
+fn create_anew(path: &Path) -> std::io::Result<File> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(error),
+        _ => File::create_new(path),
+    }
 }
 
 /// Nobody else may work in a directory while the file is open.
@@ -444,6 +454,31 @@ mod tests {
         );
         drop(held);
         lock(directory.path()).unwrap();
+    }
+
+    #[test]
+    fn whatever_has_the_name_of_the_part_loses_nothing_but_a_part() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().join(name);
+        // As a killed process leaves it, here even for reading only.
+        fs::write(path("file.part"), "longer than what is written now").unwrap();
+        let only_reading = std::os::unix::fs::PermissionsExt::from_mode(0o400);
+        fs::set_permissions(path("file.part"), only_reading).unwrap();
+        write_whole(&path("file"), b"whole").unwrap();
+        assert_eq!(fs::read(path("file")).unwrap(), b"whole");
+        assert!(!path("file.part").exists());
+
+        fs::write(path("target"), "somebody's").unwrap();
+        std::os::unix::fs::symlink("target", path("file.part")).unwrap();
+        write_whole(&path("file"), b"again").unwrap();
+        assert_eq!(fs::read(path("target")).unwrap(), b"somebody's");
+        assert!(!path("file").is_symlink());
+
+        fs::create_dir(path("file.part")).unwrap();
+        let error = write_whole(&path("file"), b"never").unwrap_err();
+        let error = format!("{error:#}");
+        assert!(error.contains("file.part: Is a directory"), "{error}");
+        assert_eq!(fs::read(path("file")).unwrap(), b"again");
     }
 
     #[test]
