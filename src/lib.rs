@@ -6,6 +6,7 @@
 //! moment they came. `daemon`, `tools` and `train` are the ends.
 
 pub mod frame;
+pub mod wording;
 pub mod wire;
 pub mod tare;
 pub mod press;
@@ -17,8 +18,6 @@ pub mod recording;
 
 pub mod random;
 pub mod simulator;
-
-pub mod wording;
 
 pub mod daemon;
 pub mod tools;

@@ -365,11 +365,6 @@ impl<W: Write> Copy<W> {
 }
 
 impl Recovered {
-    /// Bytes of damaged stretches.
-    pub fn lost_bytes(&self) -> u64 {
-        self.lost.iter().map(|(_, bytes)| bytes).sum()
-    }
-
     /// Whether nothing was missing.
     pub fn is_whole(&self) -> bool {
         self.complete && self.lost.is_empty() && self.messages_unknown == 0

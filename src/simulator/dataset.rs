@@ -96,7 +96,7 @@ pub struct LabelledSample {
 }
 
 /// A taxel with this many counts is in contact (contract: 0.07 N at 0.04 N a count).
-pub(super) const CONTACT_COUNTS: u16 = 2;
+const CONTACT_COUNTS: u16 = 2;
 /// Taxels in contact that begin a press (contract).
 pub(super) const BEGIN_AREA_TAXELS: usize = 3;
 
@@ -160,9 +160,9 @@ pub fn dataset(
 }
 
 /// The streams of one object: its geometry, poses and forces, and what its material adds.
-pub(super) struct Draws {
-    pub(super) geometry: Stream,
-    pub(super) body: Stream,
+struct Draws {
+    geometry: Stream,
+    body: Stream,
 }
 
 impl Draws {

@@ -91,7 +91,7 @@ const STEP: f64 = 0.01;
 
 /// S(x) of the bonded layer, x = q h, k = 3 - 4 nu:
 /// `S = [k sinh 2x - 2x] / [k cosh 2x + (k^2 + 1) / 2 + 2 x^2]`.
-pub(super) fn layer_ratio(x: f64, nu: f64) -> f64 {
+fn layer_ratio(x: f64, nu: f64) -> f64 {
     let k = 3.0 - 4.0 * nu;
     (k * (2.0 * x).sinh() - 2.0 * x) / (k * (2.0 * x).cosh() + 0.5 * (k * k + 1.0) + 2.0 * x * x)
 }

@@ -14,7 +14,7 @@ use crate::random::Stream;
 /// Newtons a count stands for (contract, `newtons_per_count`): 8 bits are 10.2 N.
 pub const NEWTONS_PER_COUNT: f32 = 0.04;
 /// Cells along a taxel.
-pub(super) const CELLS_PER_TAXEL: usize = 4;
+const CELLS_PER_TAXEL: usize = 4;
 /// Width of a cell, mm.
 pub(super) const CELL_MM: f64 = PITCH_MM / CELLS_PER_TAXEL as f64;
 /// Width of the sensor in cells.
