@@ -7,6 +7,7 @@
 
 mod events;
 mod link;
+mod retare;
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -16,10 +17,11 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
 use self::link::Link;
+pub use self::retare::RetareError;
 use crate::event::{Event, FrameEvent, LinkState, Tared};
 use crate::frame::{RawFrame, Stamp};
 use crate::press::{self, Abort, Moment, PressTracker};
-use crate::tare::{self, Contact, Offsets, Progress, Tare};
+use crate::tare::{self, Contact, Offsets, Tare};
 use crate::verdict::Hrn;
 use crate::wire::{self, Decoded, Decoder, Layout};
 
@@ -71,26 +73,6 @@ pub enum Clock {
     Arrival,
     /// Frame n comes n periods after 1970-01-01T00:00:00Z: bytes without times.
     FrameRate,
-}
-
-/// Why a tare was not taken on request; the offsets stay as they were.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum RetareError {
-    /// What is pressed now would be zeroed away.
-    #[error("found a press, expected none")]
-    Pressed,
-    /// What rests on the sensor would be.
-    #[error("found the sensor touched, expected it free")]
-    Touched,
-    /// No frames to average.
-    #[error("found a sensor that is not live, expected frames")]
-    NotLive,
-    /// Its outcome has to come first.
-    #[error("found a tare under way, expected none")]
-    UnderWay,
-    /// `tare_frames` is 0.
-    #[error("found calibration.tare_frames = 0, expected 1 or more")]
-    NoFrames,
 }
 
 /// The measured rate is that over so many frames.
@@ -215,34 +197,6 @@ impl Pipeline {
             .reload(&judgement.calibration, contact(&judgement.press));
         self.tracker.reload(judgement.press.clone());
         self.judgement = judgement;
-    }
-
-    /// Takes another tare from the next frames on; [`Self::retared`] tells what became of it. A
-    /// press that timed out is over: a drift that looks like one is mended so.
-    ///
-    /// # Errors
-    ///
-    /// If one cannot be taken now: see [`RetareError`]. Nothing has changed then.
-    pub fn retare(&mut self) -> Result<(), RetareError> {
-        if self.tracker.is_pressed() {
-            return Err(RetareError::Pressed);
-        }
-        if !matches!(self.seen.link, Link::Live { .. }) {
-            return Err(RetareError::NotLive);
-        }
-        if self.tare.is_taking() {
-            return Err(RetareError::UnderWay);
-        }
-        if !self.tare.retake() {
-            return Err(RetareError::NoFrames);
-        }
-        self.seen.retaring = Some(self.tare.offsets());
-        Ok(())
-    }
-
-    /// What became of a tare that was asked for, once.
-    pub fn retared(&mut self) -> Option<Result<Tared, RetareError>> {
-        self.retared.take()
     }
 
     /// What the controller says it is doing: echoed in presses and verdicts until it changes.
@@ -442,35 +396,6 @@ impl Pipeline {
         )));
         for change in changes {
             self.publish(change, events);
-        }
-    }
-
-    /// Shows the tare a frame. A first tare is tried until it is taken; one that was asked for is
-    /// given up when the sensor is touched, for a baseline stands.
-    fn observe(&mut self, raw: &RawFrame) {
-        match self.tare.observe(raw) {
-            Progress::Ready | Progress::Taking => {}
-            Progress::Contact if self.seen.retaring.is_some() => {
-                self.abandon_retare(RetareError::Touched);
-            }
-            Progress::Contact => self.seen.tare_met_contact = true,
-            Progress::Taken => {
-                self.seen.tare_met_contact = false;
-                if let Some(old) = self.seen.retaring.take() {
-                    self.retared = Some(Ok(Tared {
-                        sensor: self.sensor.clone(),
-                        old,
-                        new: self.tare.offsets(),
-                    }));
-                }
-            }
-        }
-    }
-
-    fn abandon_retare(&mut self, reason: RetareError) {
-        if self.seen.retaring.take().is_some() {
-            self.tare.give_up();
-            self.retared = Some(Err(reason));
         }
     }
 

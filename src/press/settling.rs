@@ -1,0 +1,57 @@
+//! Whether a contact has settled, so that an early verdict may come.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use super::Settings;
+
+/// The latest frames that are all near the largest area and force so far.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct Settling {
+    near: VecDeque<Load>,
+    most_area: u32,
+    most_force_n: f64,
+}
+
+/// What a frame bears.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub(super) struct Load {
+    pub(super) at: Duration,
+    pub(super) contact_area_taxels: u32,
+    pub(super) force_n: f64,
+}
+
+impl Settling {
+    /// Adds a frame; whether over at least `early_settle_s` and [`SETTLED_FRAMES`] frames area
+    /// and force stayed near their largest so far, with enough force.
+    pub(super) fn push(&mut self, load: Load, settings: &Settings) -> bool {
+        self.most_area = self.most_area.max(load.contact_area_taxels);
+        self.most_force_n = self.most_force_n.max(load.force_n);
+        self.near.push_back(load);
+        let (most_area, most_force_n) = (self.most_area, self.most_force_n);
+        let is_near = |load: &Load| {
+            let area_gap = f64::from(most_area - load.contact_area_taxels);
+            area_gap <= (SETTLED_SHARE * f64::from(most_area)).max(1.0)
+                && most_force_n - load.force_n <= SETTLED_SHARE * most_force_n
+        };
+        // The largest values only grow: a frame once too far below them stays so.
+        if let Some(last_far) = self.near.iter().rposition(|load| !is_near(load)) {
+            self.near.drain(..=last_far);
+        }
+        let settle = Duration::from_secs_f64(settings.early_settle_s);
+        let covers = |first: &Load| load.at.saturating_sub(first.at) >= settle;
+        while self.near.len() > SETTLED_FRAMES && self.near.get(1).is_some_and(covers) {
+            self.near.pop_front();
+        }
+        load.force_n >= settings.early_min_force_n
+            && self.near.len() >= SETTLED_FRAMES
+            && self.near.front().is_some_and(covers)
+    }
+}
+
+/// Contract, section 4: an early verdict needs three settled frames ...
+const SETTLED_FRAMES: usize = 3;
+/// ... whose area and force are within 5 % of their largest so far.
+const SETTLED_SHARE: f64 = 0.05;

@@ -1,0 +1,131 @@
+//! What turns counts into newtons, as the configuration says it.
+
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize};
+
+use crate::frame::Array;
+use crate::wording::as_written;
+
+/// The `[sensor.calibration]` table.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Settings {
+    /// Force of one count.
+    pub newtons_per_count: f32,
+    /// Distance of taxel centres.
+    pub pitch_mm: f64,
+    /// Frames averaged at start; 0: no tare.
+    pub tare_frames: u32,
+    /// How far above the array's median a taxel may rest.
+    pub tare_max_n: f32,
+    /// `[[row, col], ...]` in the sensor's own rows and columns.
+    #[serde(deserialize_with = "pairs")]
+    pub dead_taxels: Vec<[usize; 2]>,
+}
+
+/// Lists of exactly two: of a longer one the TOML parser would drop the rest.
+fn pairs<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<[usize; 2]>, D::Error> {
+    let pair = |list: Vec<usize>| {
+        let length = list.len();
+        <[usize; 2]>::try_from(list)
+            .map_err(|_| D::Error::invalid_length(length, &"an array of length 2"))
+    };
+    let lists = Vec::<Vec<usize>>::deserialize(deserializer)?;
+    lists.into_iter().map(pair).collect()
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            newtons_per_count: 0.04,
+            pitch_mm: 3.5,
+            tare_frames: 5,
+            tare_max_n: 0.5,
+            dead_taxels: Vec::new(),
+        }
+    }
+}
+
+/// A value of [`Settings`] that cannot be used.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum SettingsError {
+    /// A quantity that must be positive, and not so large that no film has it.
+    #[error("{key}: found {found:?}, expected a number above 0 and at most {max}")]
+    NotPositive {
+        /// Its key.
+        key: &'static str,
+        /// As given.
+        found: f64,
+        /// Largest allowed.
+        max: f64,
+    },
+    /// More frames than a sum of counts can hold.
+    #[error("tare_frames: found {found}, expected 0 to {max}")]
+    TareFrames {
+        /// As given.
+        found: u32,
+        /// Largest.
+        max: u32,
+    },
+    /// A dead taxel outside the array.
+    #[error(
+        "dead_taxels: found [{row}, {col}], expected a row below {} and a column below {}",
+        array.rows,
+        array.cols
+    )]
+    DeadTaxel {
+        /// As given.
+        row: usize,
+        /// As given.
+        col: usize,
+        /// The array.
+        array: Array,
+    },
+}
+
+/// What every sum and product of a frame stays finite with, and far beyond any film: a count of the
+/// JX255N is 0.04 N, its taxels are 3.5 mm apart, and 1 MN rests on no taxel.
+const MOST_NEWTONS_PER_COUNT: f64 = 1e3;
+const MOST_PITCH_MM: f64 = 1e3;
+const MOST_TARE_N: f64 = 1e6;
+
+/// 65535 counts x 65536 frames stay below 2^32.
+const MOST_TARE_FRAMES: u32 = 65_536;
+
+impl Settings {
+    /// Checks the values against the sensor's array.
+    ///
+    /// # Errors
+    ///
+    /// If `newtons_per_count`, `pitch_mm` or `tare_max_n` is not above 0 or is beyond any film,
+    /// `tare_frames` is above 65,536, or a dead taxel lies outside `array`.
+    pub fn check(&self, array: Array) -> Result<(), SettingsError> {
+        for (key, found, max) in [
+            (
+                "newtons_per_count",
+                as_written(self.newtons_per_count),
+                MOST_NEWTONS_PER_COUNT,
+            ),
+            ("pitch_mm", self.pitch_mm, MOST_PITCH_MM),
+            ("tare_max_n", as_written(self.tare_max_n), MOST_TARE_N),
+        ] {
+            if !(found > 0.0 && found <= max) {
+                return Err(SettingsError::NotPositive { key, found, max });
+            }
+        }
+        if self.tare_frames > MOST_TARE_FRAMES {
+            return Err(SettingsError::TareFrames {
+                found: self.tare_frames,
+                max: MOST_TARE_FRAMES,
+            });
+        }
+        match self
+            .dead_taxels
+            .iter()
+            .find(|[row, col]| *row >= array.rows || *col >= array.cols)
+        {
+            Some(&[row, col]) => Err(SettingsError::DeadTaxel { row, col, array }),
+            None => Ok(()),
+        }
+    }
+}
