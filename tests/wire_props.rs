@@ -290,6 +290,19 @@ fn long_noise_counts_alike_in_any_chunks() {
 }
 
 #[test]
+fn lines_of_noise_before_the_first_ascii_frame_are_no_damage_in_any_chunks() {
+    let text = "preset = 'ascii'\nrows = 2\ncols = 1";
+    let layout = Layout::new(&toml::from_str(text).unwrap()).unwrap();
+    // Longer than a frame, so that its first lines are let go of somewhere in their middle.
+    let bytes = [b"x 1\n".repeat(9), b"\n7\n8\n\n".to_vec()].concat();
+    let expected = decode(&layout, [bytes.as_slice()]);
+    assert_eq!((expected.0.len(), expected.1), (1, 0));
+    for size in 1..bytes.len() {
+        assert_eq!(decode(&layout, bytes.chunks(size)), expected, "by {size}");
+    }
+}
+
+#[test]
 fn what_stands_right_before_an_ascii_frame_costs_it_nothing() {
     let layout = layout(Preset::Ascii);
     let sent = frames(11, 2);
@@ -389,6 +402,38 @@ fn cells_masks_orders_and_small_arrays_land_in_place() {
     layout.encode(&found[0], &mut again);
     // The mask hides the top bits of the first cell, so only that byte differs.
     assert_eq!(again[3..14], body[3..14]);
+}
+
+#[test]
+fn every_length_cell_checksum_and_order_stands_where_it_should() {
+    // Two rows of three cells; the sensor's first row is 1 2 3, its second 4 5 6.
+    let mut frame = RawFrame::default();
+    for (index, count) in (1..=6).enumerate() {
+        frame.counts[(13 + index / 3) * 28 + 12 + index % 3] = count;
+    }
+    for (text, expected) in [
+        ("", &[1, 2, 3, 4, 5, 6][..]),
+        ("order = 'serpentine'", &[1, 2, 3, 6, 5, 4]),
+        ("order = 'column-major'", &[1, 4, 2, 5, 3, 6]),
+        ("length = 'u8'", &[6, 1, 2, 3, 4, 5, 6]),
+        ("length = 'u16le'", &[6, 0, 1, 2, 3, 4, 5, 6]),
+        ("length = 'u16be'", &[0, 6, 1, 2, 3, 4, 5, 6]),
+        ("cell = 'u16le'", &[1, 0, 2, 0, 3, 0, 4, 0, 5, 0, 6, 0]),
+        ("cell = 'u16be'", &[0, 1, 0, 2, 0, 3, 0, 4, 0, 5, 0, 6]),
+        // Over the sync too: A5 + 21, and A5 ^ 7.
+        ("checksum = 'sum8'", &[1, 2, 3, 4, 5, 6, 0xBA]),
+        ("checksum = 'xor8'", &[1, 2, 3, 4, 5, 6, 0xA2]),
+    ] {
+        let text = format!("preset = 'jq'\nsync = 'A5'\nrows = 2\ncols = 3\n{text}");
+        let layout = Layout::new(&toml::from_str(&text).unwrap()).unwrap();
+        let bytes = encode(&layout, &[frame]);
+        assert_eq!(bytes, [&[0xA5], expected].concat(), "{text}");
+        assert_eq!(
+            decode(&layout, [bytes.as_slice()]),
+            (vec![frame], 0),
+            "{text}"
+        );
+    }
 }
 
 #[test]

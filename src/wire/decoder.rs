@@ -54,7 +54,7 @@ pub(super) enum Scan {
     Damaged(usize, Damage),
     /// The first so many bytes are a frame.
     Frame(usize, RawFrame),
-    /// The first so many bytes are more than a pending frame has; where one ends is not known yet.
+    /// So many bytes belong to no frame, and whether one ended with them is not known.
     Excess(usize),
 }
 

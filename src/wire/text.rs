@@ -44,7 +44,8 @@ pub(super) fn scan(layout: &Layout, bytes: &[u8], context: Context) -> Scan {
             continue;
         }
         if count == 0 {
-            return Scan::Skip(lines.at);
+            // It may be the rest of a line whose beginning was too much to keep: no frame's end.
+            return Scan::Excess(lines.at);
         }
         let row = if count >= rows {
             starts[count % rows]
