@@ -339,6 +339,67 @@ mod tests {
     }
 
     #[test]
+    fn what_a_tare_compares_is_the_array_and_its_live_taxels() {
+        let check = |settings: &Settings, array: Array, contact, frames: [RawFrame; 2]| {
+            let mut tare = Tare::new(settings, array, contact);
+            frames.map(|raw| tare.observe(&raw))[1]
+        };
+        let settings = |dead: &[[usize; 2]]| Settings {
+            tare_frames: 2,
+            ..settings(dead)
+        };
+        let flicker = [[(0, 2), (1, 2), (2, 2)], [(0, 9), (1, 9), (2, 9)]].map(|c| raw(&c));
+        let row = [[0, 0], [0, 1], [0, 2]];
+        for (dead, expected) in [
+            (&row[..], Progress::Taken),
+            (&row[..2], Progress::Taken),
+            (&[], Progress::Contact),
+        ] {
+            let found = check(&settings(dead), Array::FULL, CONTACT, flicker);
+            assert_eq!(found, expected, "{dead:?}");
+        }
+        // What lies high is what lies above the most: some taxels may rest low, and what is outside
+        // a small array reads 0.
+        let low = raw(&[(0, 0), (1, 0), (2, 0), (3, 0)]);
+        let high = RawFrame {
+            counts: low.counts.map(|count| 15 * count),
+        };
+        assert_eq!(
+            check(&settings(&[]), Array::FULL, CONTACT, [high; 2]),
+            Progress::Taken
+        );
+        let array = Array { rows: 5, cols: 4 };
+        let mut small = RawFrame::default();
+        array.places().for_each(|place| small.counts[place] = 30);
+        assert_eq!(
+            check(&settings(&[]), array, CONTACT, [small; 2]),
+            Progress::Taken
+        );
+        // At the threshold a taxel varies: two counts are 0.08 N.
+        let two = [[(0, 2), (1, 2), (2, 2)], [(0, 4), (1, 4), (2, 4)]].map(|c| raw(&c));
+        for (threshold_n, expected) in [(0.08, Progress::Contact), (0.081, Progress::Taken)] {
+            let contact = Contact {
+                threshold_n,
+                ..CONTACT
+            };
+            let found = check(&settings(&[]), Array::FULL, contact, two);
+            assert_eq!(found, expected, "{threshold_n} N");
+        }
+    }
+
+    #[test]
+    fn full_scale_is_reached_above_any_baseline_by_live_taxels_alone() {
+        let mut tare = Tare::new(&settings(&[[0, 0]]), Array::FULL, CONTACT);
+        for _ in 0..5 {
+            tare.observe(&raw(&[(0, 200), (1, 7)]));
+        }
+        let is_saturated = |at, count| tare.is_saturated(&tare.apply(&raw(&[(at, count)])), 255);
+        assert!(is_saturated(1, 255) && is_saturated(2, 255));
+        assert!(!is_saturated(1, 254) && !is_saturated(2, 254));
+        assert!(!is_saturated(0, 255), "a dead one says nothing");
+    }
+
+    #[test]
     fn another_tare_leaves_the_baseline_until_it_is_taken_or_given_up() {
         let mut settings = settings(&[[0, 1]]);
         settings.tare_frames = 2;

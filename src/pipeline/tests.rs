@@ -1,3 +1,6 @@
+use prost::Message as _;
+use tract_onnx::pb;
+
 use super::*;
 use crate::event::{Note, Rejection};
 use crate::verdict::BUILT_IN;
@@ -214,10 +217,12 @@ fn silence_is_stale_after_two_and_a_half_periods_and_ends_no_press() {
     let deadline = pipeline.deadline().unwrap();
     assert_eq!(deadline, at(1000).mono + PERIOD.mul_f64(2.5));
     assert!(pipeline.tick(at(1499)).is_empty());
-    assert_eq!(
-        words(&pipeline.tick(at(1500))),
-        ["Stale (no frame for 2.5 periods)"]
-    );
+    let told = pipeline.tick(at(1507));
+    assert_eq!(words(&told), ["Stale (no frame for 2.5 periods)"]);
+    let Event::Status(status) = &told[0] else {
+        panic!("{told:?}")
+    };
+    assert_eq!(status.time, at(1500).wall, "when it became so");
     assert_eq!(pipeline.deadline(), None);
     let back = [raw(5, 50), raw(0, 0), raw(0, 0)];
     assert_eq!(
@@ -344,18 +349,101 @@ fn verdicts_below_the_thresholds_are_rejected() {
 }
 
 #[test]
-fn notes_name_the_edge_and_saturation() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    play(&mut pipeline, 0, &[raw(0, 0); 5]);
-    let mut held = raw(9, 255);
-    held.counts[0] = 10;
-    let mut events = Vec::new();
-    for (number, raw) in (5..).zip([held, held, raw(0, 0), raw(0, 0)]) {
-        let bytes = bytes(&pipeline, &raw);
-        events.extend(pipeline.push(&bytes, at(number * 200)));
+fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
+    let full = Layout::new(&wire::Settings::default()).unwrap().array();
+    let small = "preset = 'jx255n'\nrows = 10\ncols = 12";
+    let small = Layout::new(&toml::from_str(small).unwrap()).unwrap();
+    let check =
+        |layout: Option<&Layout>, range: [f32; 2], place: usize, count, expected: &[Note]| {
+            let mut pipeline = pipeline(Preset::Jx255n);
+            if let Some(layout) = layout {
+                pipeline.decoder = Decoder::new(layout.clone());
+            }
+            let mut file = pb::ModelProto::decode(BUILT_IN).unwrap();
+            for entry in &mut file.metadata_props {
+                if entry.key == "hrn.range" {
+                    entry.value = serde_json::json!({
+                        "force_n": range,
+                        "contact_area_taxels": [9, 10],
+                    })
+                    .to_string();
+                }
+            }
+            pipeline.judgement.hrn = Arc::new(Hrn::load(&file.encode_to_vec()).unwrap());
+            play(&mut pipeline, 0, &[raw(0, 0); 5]);
+            let mut held = RawFrame::default();
+            // Three by three in the middle.
+            for taxel in [348, 376, 404].into_iter().flat_map(|row| row..row + 3) {
+                held.counts[taxel] = 50;
+            }
+            held.counts[place] = count;
+            let mut events = Vec::new();
+            for (number, raw) in (5..).zip([held, held, raw(0, 0), raw(0, 0)]) {
+                let bytes = bytes(&pipeline, &raw);
+                events.extend(pipeline.push(&bytes, at(number * 200)));
+            }
+            let Some(Event::Hardness(verdict)) = events.last() else {
+                panic!("{events:?}")
+            };
+            assert_eq!(verdict.notes, expected, "{count} at {place}, {range:?}");
+        };
+    let wide = [0.0, 100.0];
+    check(None, wide, 348, 50, &[]);
+    for (row, col) in [(0, 9), (27, 9), (9, 0), (9, 27)] {
+        check(None, wide, full.place(row, col), 10, &[Note::AtEdge]);
+        // Below the contact threshold.
+        check(None, wide, full.place(row, col), 1, &[]);
     }
-    let Some(Event::Hardness(verdict)) = events.last() else {
-        panic!("{events:?}")
+    for (row, col) in [(0, 5), (9, 5), (5, 0), (5, 11)] {
+        let place = small.array().place(row, col);
+        check(Some(&small), wide, place, 10, &[Note::AtEdge]);
+        check(None, wide, place, 10, &[]);
+    }
+    check(None, wide, 348, 255, &[Note::Saturated]);
+    check(None, wide, 348, 254, &[]);
+    // 9 x 50 x 0.04 N.
+    check(None, [0.0, 17.9], 348, 50, &[Note::OutsideTraining]);
+    check(None, [18.1, 100.0], 348, 50, &[Note::OutsideTraining]);
+    check(None, wide, 348, 1, &[Note::OutsideTraining]);
+}
+
+#[test]
+fn the_end_of_the_input_makes_a_jq_frame_whole() {
+    let frames = |events: &[Event]| {
+        let frames = events.iter().filter(|e| matches!(e, Event::Frame(_)));
+        frames.count()
     };
-    assert!(verdict.notes.contains(&Note::AtEdge) && verdict.notes.contains(&Note::Saturated));
+    let mut pipeline = self::pipeline(Preset::Jq);
+    let bytes = bytes(&pipeline, &raw(0, 0));
+    assert_eq!(frames(&pipeline.push(&bytes, at(0))), 0);
+    assert_eq!(frames(&pipeline.lost("end of file".to_owned(), at(10))), 1);
+    pipeline.opened(at(20));
+    // Half a frame, a loss: what comes then is not its other half.
+    pipeline.push(&bytes[..400], at(30));
+    pipeline.lost("end of file".to_owned(), at(40));
+    pipeline.opened(at(50));
+    assert_eq!(frames(&pipeline.push(&bytes[400..], at(60))), 0);
+    assert_eq!(frames(&pipeline.push(&bytes, at(80))), 0);
+    assert_eq!(frames(&pipeline.end_of_recording(Some(at(90)))), 1);
+    let status = pipeline.status(at(90));
+    assert_eq!((status.frames, status.bytes_skipped), (2, 788));
+}
+
+#[test]
+fn the_rate_is_measured_over_the_last_frames() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    let mut rates = vec![pipeline.status(at(0)).frame_rate_hz];
+    for number in 0..2 {
+        play(&mut pipeline, number, &[raw(0, 0)]);
+        rates.push(pipeline.status(at(0)).frame_rate_hz);
+    }
+    assert_eq!(rates, [None, None, Some(5.0)]);
+    // From one rate to twice that: after 32 frames nothing of the first is left.
+    let bytes = bytes(&pipeline, &raw(0, 0));
+    for number in 0..RATE_FRAMES as u64 {
+        pipeline.push(&bytes, at(300 + 100 * number));
+    }
+    assert_eq!(pipeline.status(at(0)).frame_rate_hz, Some(10.0));
+    pipeline.lost("end of file".to_owned(), at(9000));
+    assert_eq!(pipeline.status(at(9000)).frame_rate_hz, None);
 }

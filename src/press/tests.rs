@@ -114,6 +114,96 @@ fn a_held_press_times_out_once_and_waits_for_release() {
 }
 
 #[test]
+fn a_press_held_at_its_limit_counts_the_release_it_has_begun() {
+    let settings = Settings {
+        max_seconds: 1.0,
+        early_settle_s: 9.0,
+        ..Settings::default()
+    };
+    let mut loads = vec![(5, 2.0); 5];
+    loads.extend([(0, 0.0), (0, 0.0), (5, 2.0)]);
+    assert_eq!(track(&settings, &loads, 5), "b1@0 t@5:last4 n5 peak0 b2@7");
+}
+
+#[test]
+fn a_press_too_short_for_a_verdict_at_its_limit_is_aborted() {
+    let settings = Settings {
+        max_seconds: 0.4,
+        min_frames: 9,
+        ..Settings::default()
+    };
+    assert_eq!(
+        track(&settings, &[(5, 2.0); 4], 5),
+        "b1@0 s@2:0 x@2:last2 n3 short"
+    );
+}
+
+#[test]
+fn frames_below_the_end_area_release_though_something_is_touched() {
+    let settings = Settings {
+        begin_area_taxels: 5,
+        end_area_taxels: 3,
+        early_settle_s: 9.0,
+        ..Settings::default()
+    };
+    let loads = [
+        (4, 9.),
+        (5, 2.),
+        (3, 2.),
+        (2, 2.),
+        (2, 2.),
+        (4, 9.),
+        (5, 2.),
+    ];
+    assert_eq!(track(&settings, &loads, 5), "b1@1 e@4:last2 n2 peak1 b2@6");
+    // So it is after a timeout.
+    let settings = Settings {
+        max_seconds: 0.2,
+        ..settings
+    };
+    let loads = [(5, 2.), (5, 2.), (2, 2.), (2, 2.), (5, 2.)];
+    assert_eq!(track(&settings, &loads, 5), "b1@0 t@1:last1 n2 peak0 b2@4");
+}
+
+#[test]
+fn what_was_reloaded_holds_for_the_press_under_way() {
+    let mut tracker = PressTracker::new(Settings::default());
+    for number in 0..3 {
+        let _ = tracker.push(&frame(5, 2.0), moment(number, 5));
+    }
+    tracker.reload(Settings {
+        end_frames: 1,
+        ..Settings::default()
+    });
+    assert!(matches!(
+        tracker.push(&frame(0, 0.0), moment(3, 5))[..],
+        [Change::End { frames: 3, .. }]
+    ));
+}
+
+#[test]
+fn a_contact_settles_within_a_taxel_or_5_percent_of_its_largest_area_and_force() {
+    let settles = |loads: &[(usize, f32)]| track(&Settings::default(), loads, 5).contains(" s@");
+    for (loads, expected) in [
+        (&[(100, 8.), (95, 8.), (95, 8.)][..], true),
+        (&[(100, 8.), (94, 8.), (94, 8.)], false),
+        (&[(5, 8.), (4, 8.), (4, 8.)], true),
+        (&[(5, 8.), (3, 8.), (3, 8.)], false),
+        (&[(100, 8.), (100, 7.625), (100, 7.625)], true),
+        (&[(100, 8.), (100, 7.5), (100, 7.5)], false),
+        // One far frame among them is enough.
+        (&[(100, 8.), (94, 8.), (100, 8.)], false),
+        // So are several, once a greater one comes.
+        (&[(100, 0.5), (100, 0.5), (100, 0.5), (100, 8.)], false),
+        // The least force, and a little less.
+        (&[(4, 1.), (4, 1.), (4, 1.)], true),
+        (&[(4, 0.9375), (4, 0.9375), (4, 0.9375)], false),
+    ] {
+        assert_eq!(settles(loads), expected, "{loads:?}");
+    }
+}
+
+#[test]
 fn settled_contact_is_reported_once_and_never_while_the_load_rises() {
     // At 5 frames/s three frames within 5 % span 0.4 s.
     check(
@@ -149,6 +239,19 @@ fn an_aborted_press_leaves_the_tracker_idle() {
         })
     ));
     assert!(!tracker.is_pressed());
+}
+
+#[test]
+fn a_loss_does_not_release_what_timed_out() {
+    let mut tracker = PressTracker::new(Settings {
+        max_seconds: 0.2,
+        ..Settings::default()
+    });
+    for number in 0..2 {
+        let _ = tracker.push(&frame(5, 2.0), moment(number, 5));
+    }
+    assert_eq!(tracker.abort(Abort::Lost), None);
+    assert_eq!(tracker.push(&frame(5, 2.0), moment(2, 5)), []);
 }
 
 #[test]
