@@ -222,11 +222,23 @@ impl Hrn {
         let inference = onnx.model_for_proto_model(&proto).map_err(graph_error)?;
         // From here on only the plan is kept: the protobuf is as large again as the weights.
         drop(proto);
-        let plan = inference
+        let optimized = inference
             .with_input_fact(0, f32::fact([1, 1, ROWS, COLS]).into())
             .and_then(InferenceModelExt::into_optimized)
-            .and_then(TypedModel::into_runnable)
             .map_err(graph_error)?;
+        // The inference library does not hold a graph to the shapes it declares.
+        let agreed = f32::fact([1, card.levels.len()]);
+        for output in [logits_output, probabilities_output] {
+            let computed = optimized.output_fact(output).map_err(graph_error)?;
+            if computed.without_value() != agreed {
+                return Err(ModelError::Signature {
+                    what: "outputs",
+                    found: format!("computed as {computed:?}"),
+                    expected: format!("{agreed:?}"),
+                });
+            }
+        }
+        let plan = optimized.into_runnable().map_err(graph_error)?;
 
         let hrn = Self {
             plan,

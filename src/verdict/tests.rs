@@ -260,6 +260,40 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
 }
 
 #[test]
+fn outputs_of_another_length_than_declared_are_refused() {
+    for name in ["logits", "probabilities"] {
+        let mut changed = proto();
+        let graph = graph(&mut changed);
+        let node = graph.node.iter_mut().find(|node| node.output[0] == name);
+        node.unwrap().output[0] = "four".into();
+        for node in &mut graph.node {
+            for input in node.input.iter_mut().filter(|input| *input == name) {
+                *input = "four".into();
+            }
+        }
+        let axis = pb::AttributeProto {
+            name: "axis".into(),
+            r#type: pb::attribute_proto::AttributeType::Int as i32,
+            i: 1,
+            ..Default::default()
+        };
+        graph.node.push(pb::NodeProto {
+            name: "eight".into(),
+            op_type: "Concat".into(),
+            input: vec!["four".into(), "four".into()],
+            output: vec![name.into()],
+            attribute: vec![axis],
+            ..Default::default()
+        });
+        let error = Hrn::load(&changed.encode_to_vec()).unwrap_err().to_string();
+        assert_eq!(
+            error, "model outputs computed as 1,8,F32: expected 1,4,F32",
+            "{name}"
+        );
+    }
+}
+
+#[test]
 fn an_oversized_or_foreign_file_is_refused() {
     let error = Hrn::load(&vec![0; MAX_FILE_BYTES + 1])
         .unwrap_err()
