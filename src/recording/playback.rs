@@ -71,7 +71,9 @@ impl Playback {
                 Vec::new()
             }
             (Entry::Settings(described), Some(known)) => {
-                known.pipeline.reload(described.judgement(&self.hrn));
+                let settings = described.settings(&self.hrn);
+                let settings = settings.map_err(|problem| PlaybackError { sensor, problem })?;
+                known.pipeline.reload(settings.judgement);
                 known.model = described.model;
                 Vec::new()
             }

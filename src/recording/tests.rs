@@ -2,6 +2,7 @@ use std::io::Cursor;
 use std::time::Duration;
 
 use super::*;
+use crate::event::Rejection;
 use crate::frame::RawFrame;
 use crate::pipeline::Clock;
 use crate::verdict::BUILT_IN;
@@ -78,10 +79,10 @@ fn story() -> Vec<(Stamp, Input<'static>)> {
 }
 
 /// The file, and the events as they were when it was written. A state stands every `states`
-/// inputs, a chunk ends after every `chunk`.
+/// inputs, a chunk ends after every `chunk`; between the presses the configuration is read again.
 fn recorded(states: usize, chunk: usize) -> (Vec<u8>, Vec<Event>) {
     let hrn = hrn();
-    let described = sensor(&hrn);
+    let mut described = sensor(&hrn);
     let about = About {
         robot: "arm-7".to_owned(),
         run: "r".to_owned(),
@@ -101,6 +102,13 @@ fn recorded(states: usize, chunk: usize) -> (Vec<u8>, Vec<Event>) {
                 labels: labels(),
             };
             writer.entry(0, at, &Entry::State(Box::new(state))).unwrap();
+        }
+        if index == 120 {
+            described.min_force_n = 1e3;
+            described.press.end_frames = 1;
+            let settings = Entry::Settings(Box::new(described.clone()));
+            writer.entry(0, at, &settings).unwrap();
+            pipeline.reload(described.judgement(&hrn));
         }
         writer.entry(0, at, &Entry::Input(input.clone())).unwrap();
         let mut came = input.feed(&mut pipeline, at);
@@ -135,8 +143,13 @@ fn play(file: &[u8]) -> Vec<Event> {
 #[test]
 fn a_recording_gives_the_very_events_it_was_made_of() {
     let (file, events) = recorded(1000, 7);
-    let verdicts = events.iter().filter(|e| matches!(e, Event::Hardness(_)));
-    assert!(verdicts.count() >= 2);
+    let verdicts = events.iter().filter_map(|event| match event {
+        Event::Hardness(verdict) => Some(verdict.rejected),
+        _ => None,
+    });
+    let rejected: Vec<_> = verdicts.collect();
+    assert_eq!(rejected.first(), Some(&None));
+    assert_eq!(rejected.last(), Some(&Some(Rejection::LowForce)));
     assert_eq!(play(&file), events);
 }
 
@@ -145,6 +158,36 @@ fn a_pipeline_that_recalls_another_goes_on_as_that_one() {
     // A state before each input: each time the pipeline is made anew from what was written.
     let (file, events) = recorded(1, 7);
     assert_eq!(play(&file), events);
+}
+
+#[test]
+fn a_sensor_that_cannot_be_is_refused_wherever_it_is_described() {
+    let hrn = hrn();
+    let good = sensor(&hrn);
+    let pipeline = Pipeline::new(good.settings(&hrn).unwrap(), Clock::Arrival);
+    let state = |sensor: Sensor| {
+        Entry::State(Box::new(State {
+            sensor,
+            memory: pipeline.memory(),
+            labels: labels(),
+        }))
+    };
+    let mut bad = good.clone();
+    bad.press.early_settle_s = -1.0;
+    for last in [state(bad.clone()), Entry::Settings(Box::new(bad))] {
+        let mut playback = Playback::new(hrn.clone());
+        let mut feed = |entry| {
+            playback.feed(Found {
+                sensor: "forearm".to_owned(),
+                at: at(0),
+                entry,
+            })
+        };
+        feed(state(good.clone())).unwrap();
+        let error = feed(last).unwrap_err().to_string();
+        let told = "sensor \"forearm\": press.early_settle_s: found -1.0";
+        assert!(error.starts_with(told), "{error}");
+    }
 }
 
 #[test]
@@ -171,8 +214,8 @@ fn one_flipped_bit_costs_its_chunk_and_no_more() {
     let (file, _) = recorded(10, 7);
     let messages = |file: &[u8]| recover(Cursor::new(file), Vec::new()).unwrap();
     let (whole, _) = messages(&file);
-    // A chunk has seven inputs, what came of them, and perhaps a state.
-    let largest = 7 * 4 + 1;
+    // A chunk has seven inputs, what came of them, perhaps a state and other settings.
+    let largest = 7 * 4 + 2;
     // All of a chunk with what stands around it, and samples of the rest.
     let middle = file.len() / 2..file.len() / 2 + 800;
     for place in (0..file.len()).filter(|p| p % 31 == 0 || middle.contains(p)) {
