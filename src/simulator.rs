@@ -32,4 +32,4 @@ pub use sequence::{Sequence, SequenceFrame, SequenceSettings};
 /// Of what [`dataset`] makes of the same settings and seed: to be raised with every change of its
 /// samples. A comparison names the files that it keeps by it, so that none of an older simulator is
 /// taken for one of this.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;

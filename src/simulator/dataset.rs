@@ -26,7 +26,8 @@ pub struct DatasetSettings {
     pub objects: u32,
     /// Objects of each test material.
     pub test_objects: u32,
-    /// Presses of each object.
+    /// Presses of each object. Of all postures each under all nominal forces are 48; fewer are some
+    /// of those, of different postures and forces.
     pub presses: u32,
     /// The least of the eight nominal forces; the greatest is 25 N (paper).
     pub lowest_force_n: f32,
@@ -102,6 +103,8 @@ pub(super) const BEGIN_AREA_TAXELS: usize = 3;
 
 pub(super) const HIGHEST_FORCE_N: f64 = 25.0;
 const FORCES: usize = 8;
+/// Presses of an object in each posture under each nominal force.
+const ROUND: usize = POSTURES * FORCES;
 const FORCE_JITTER: f64 = 0.08;
 /// Sensors that each split's objects are shared over.
 const SENSORS: u32 = 8;
@@ -248,11 +251,13 @@ impl Subject {
     ) {
         let properties = self.material.properties();
         let young_mpa = properties.young_mpa(self.shore);
+        let presses = press_numbers(settings.presses as usize);
         for posture in 0..POSTURES {
             let face = self.object.face(posture);
             let mut roughness = self.draws.body.child(1).child(posture as u64);
             let patch = draw_patch(self.material, face.roughness, &mut roughness);
-            for press in (posture..settings.presses as usize).step_by(POSTURES) {
+            let of_posture = |press: &usize| press % POSTURES == posture;
+            for press in presses.iter().copied().filter(of_posture) {
                 let mut paired = self.draws.geometry.child(1).child(press as u64);
                 let pose = Pose::draw(&face, &mut paired);
                 let nominal = nominal_force_n(settings.lowest_force_n, press / POSTURES % FORCES);
@@ -298,6 +303,23 @@ impl Subject {
             force_n *= HARDER;
         }
     }
+}
+
+/// The numbers of an object's presses: press n is of posture n mod 6, under force n / 6 mod 8. Fewer
+/// than all postures under all forces are some of those 48, no posture or force of them more than
+/// once oftener than another.
+fn press_numbers(count: usize) -> Vec<usize> {
+    if count >= ROUND {
+        return (0..count).collect();
+    }
+    // In steps of five eight forces come once each, and neighbours are far apart. After half a round
+    // they go on by one: each posture has met four by then, and would meet the same ones again. The
+    // first is in the middle.
+    let force = |place: usize| (FORCES / 2 + 5 * place + place / (ROUND / 2)) % FORCES;
+    let number = |place: usize| place % POSTURES + POSTURES * force(place);
+    let mut numbers: Vec<usize> = (0..count).map(number).collect();
+    numbers.sort_unstable();
+    numbers
 }
 
 /// Stiffness of the arm, N/mm (assumed), and its speed (paper).
@@ -357,6 +379,54 @@ mod tests {
     }
 
     #[test]
+    fn few_presses_are_of_all_postures_and_forces() {
+        // Of a whole round or more, all in order.
+        for count in [48, 49, 50, 100] {
+            assert!(press_numbers(count).into_iter().eq(0..count), "{count}");
+        }
+        for count in 1..ROUND {
+            let numbers = press_numbers(count);
+            let times = |kinds: usize, of: fn(usize) -> usize| -> Vec<usize> {
+                let count = |kind| numbers.iter().filter(|&&n| of(n) == kind).count();
+                (0..kinds).map(count).collect()
+            };
+            let (postures, forces) = (
+                times(POSTURES, |n| n % POSTURES),
+                times(FORCES, |n| n / POSTURES),
+            );
+            for (times, name) in [(postures, "postures"), (forces, "forces")] {
+                assert_eq!(times.iter().sum::<usize>(), count);
+                let (least, most) = (times.iter().min(), times.iter().max());
+                assert!(
+                    most.unwrap() - least.unwrap() <= 1,
+                    "{count}: {name} {times:?}"
+                );
+            }
+            assert!(numbers.is_sorted_by(|a, b| a < b), "{numbers:?}");
+        }
+    }
+
+    #[test]
+    fn few_presses_are_some_of_the_many() {
+        let of = |presses| {
+            let settings = DatasetSettings {
+                presses,
+                test_objects: 0,
+                ..small(Shapes::Matched)
+            };
+            dataset(&settings, 2, |_| ())
+        };
+        let (five, fifty) = (of(5), of(50));
+        assert_eq!(five.len(), 4 * 5);
+        assert!(five.iter().all(|sample| fifty.contains(sample)));
+        let mean_n = |samples: &[LabelledSample]| {
+            samples.iter().map(|s| s.force_n).sum::<f32>() / samples.len() as f32
+        };
+        // Nominal forces are 13 N in the mean.
+        assert!((10.0..14.0).contains(&mean_n(&five)), "{}", mean_n(&five));
+    }
+
+    #[test]
     fn other_samples_are_another_version() {
         // Newtons of all frames of each material. Where they are others on purpose, raise VERSION
         // with them; a count here and there may be a machine's own.
@@ -365,7 +435,9 @@ mod tests {
             let own = samples.iter().filter(|s| s.material == material.index());
             own.map(|sample| sample.frame.force_n()).sum::<f64>()
         });
-        let expected = [24.28, 20.92, 20.76, 19.80, 45.32, 41.64, 41.16, 39.00];
+        let expected = [
+            139.48, 130.56, 126.36, 135.24, 259.08, 260.00, 259.52, 259.32,
+        ];
         let alike = |(found, expected): (&f64, &f64)| (found / expected - 1.0).abs() < 5e-3;
         assert!(
             newtons.iter().zip(&expected).all(alike),

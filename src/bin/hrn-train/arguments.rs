@@ -71,7 +71,7 @@ pub(super) struct Simulate {
     #[arg(long, default_value_t = DatasetSettings::default().test_objects,
           value_parser = clap::value_parser!(u32).range(0..=MOST))]
     pub(super) test_objects: u32,
-    /// Presses of each object
+    /// Presses of each object; fewer than 48 are some of its six postures under eight forces each
     #[arg(long, default_value_t = DatasetSettings::default().presses,
           value_parser = clap::value_parser!(u32).range(1..=MOST))]
     pub(super) presses: u32,
