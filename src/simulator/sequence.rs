@@ -69,8 +69,9 @@ pub struct SequenceFrame {
 /// An iterator over the frames of a sequence; see [`SequenceSettings`].
 ///
 /// It begins with at least 2 s and ten frames without load, so that tare has its frames at any rate,
-/// and rests at least 1 s and five frames after each press, which is held for at least three. A press too light to begin one (contract: 3 taxels) is made anew with
-/// more force, so that `presses` is the number that a press tracker sees.
+/// and rests at least 1 s and five frames after each press, which is held for at least three. A press
+/// too light to begin one (contract: 3 taxels) is made anew with more force, so that `presses` is the
+/// number that a press tracker sees.
 pub struct Sequence {
     settings: SequenceSettings,
     root: Stream,
@@ -244,26 +245,47 @@ fn is_one_press(frames: &[(RawFrame, bool)]) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use std::time::Duration;
 
-    /// Presses that a tracker with the contract's settings sees.
-    fn tracked(frames: &[SequenceFrame]) -> Vec<(u32, usize)> {
+    use super::*;
+    use crate::frame::{Array, Stamp};
+    use crate::press::{self, Change, End, Moment, PressTracker};
+    use crate::tare::{self, Tare};
+
+    /// Presses that the daemon sees by its default settings, with their frames in contact.
+    fn tracked(frames: &[SequenceFrame], rate_hz: f64) -> Vec<(u32, u64)> {
+        let calibration = tare::Settings {
+            tare_frames: 0,
+            ..tare::Settings::default()
+        };
+        let settings = press::Settings::default();
+        let contact = tare::Contact {
+            threshold_n: settings.contact_threshold_n,
+            area_taxels: settings.begin_area_taxels,
+        };
+        let tare = Tare::new(&calibration, Array::FULL, contact);
+        let mut tracker = PressTracker::new(settings);
         let mut seen = Vec::new();
-        let mut held: Option<(u32, usize, u32)> = None;
-        for frame in frames {
-            let area = contact_taxels(&frame.raw);
-            held = match held {
-                None if area >= BEGIN_AREA_TAXELS => Some((frame.press, 1, 0)),
-                Some((press, length, 1)) if area == 0 => {
-                    seen.push((press, length));
-                    None
-                }
-                Some((press, length, empty)) if area == 0 => Some((press, length, empty + 1)),
-                Some((press, length, _)) => Some((press, length + 1, 0)),
-                None => None,
+        for (number, frame) in (0_u32..).zip(frames) {
+            let mono = Duration::from_secs_f64(f64::from(number) / rate_hz);
+            let wall = jiff::Timestamp::UNIX_EPOCH;
+            let at = Moment {
+                frame: number.into(),
+                stamp: Stamp { mono, wall },
             };
+            for change in tracker.push(&tare.apply(&frame.raw), at) {
+                match change {
+                    Change::End {
+                        end: End::Release,
+                        frames,
+                        ..
+                    } => seen.push((frame.press, frames)),
+                    Change::Begin { .. } | Change::Settled { .. } => {}
+                    other => panic!("{other:?}"),
+                }
+            }
         }
-        assert!(held.is_none(), "the last press never ends");
+        assert!(!tracker.is_pressed(), "the last press never ends");
         seen
     }
 
@@ -273,14 +295,11 @@ mod tests {
         let materials = settings.materials.clone();
         let frames: Vec<SequenceFrame> = Sequence::new(settings.clone()).collect();
         let expected: Vec<u32> = (1..=presses).collect();
-        let seen = tracked(&frames);
+        let seen = tracked(&frames, rate);
         let numbers: Vec<u32> = seen.iter().map(|&(press, _)| press).collect();
         assert_eq!(numbers, expected, "{settings:?}");
-        // The daemon gives a press up after 30 s and wants 2 frames.
-        assert!(
-            seen.iter()
-                .all(|&(_, length)| length >= 2 && (length as f64) < 15.0 * rate)
-        );
+        // Far from the 30 s after which the daemon gives a press up.
+        assert!(seen.iter().all(|&(_, held)| (held as f64) < 15.0 * rate));
         let first = frames.iter().position(|frame| frame.loaded).unwrap();
         assert!(
             first as f64 >= 10.0_f64.max(2.0 * rate),
