@@ -421,6 +421,11 @@ mod tests {
         let new = tare.offsets();
         assert_eq!((new.least_counts, new.most_counts), (2.0, 9.0));
         assert!((new.mean_counts - (2.0 * 782.0 + 9.0) / 783.0).abs() < 1e-4);
+        // A reload that leaves their number leaves those taken.
+        assert!(tare.retake());
+        assert_eq!(tare.observe(&raw(&[])), Progress::Taking);
+        tare.reload(&settings, CONTACT);
+        assert_eq!(tare.observe(&raw(&[])), Progress::Taken);
         settings.tare_frames = 0;
         tare.reload(&settings, CONTACT);
         assert!(!tare.retake());
