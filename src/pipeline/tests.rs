@@ -284,6 +284,16 @@ fn half_a_period_of_silence_makes_a_jq_frame_whole_at_its_own_time() {
         panic!("{events:?}")
     };
     assert_eq!(status.time, at(0).wall, "the frame's last byte came then");
+    // Live, it would be stale later than that.
+    pipeline.push(&bytes, at(200));
+    assert_eq!(pipeline.deadline(), Some(at(300).mono));
+    assert_eq!(words(&pipeline.tick(at(300))), [""; 0]);
+    assert_eq!(pipeline.deadline(), Some(at(700).mono));
+    // What is pending after a pause is not waited for again and again.
+    pipeline.push(&bytes[..400], at(350));
+    assert_eq!(pipeline.deadline(), Some(at(450).mono));
+    assert_eq!(words(&pipeline.tick(at(450))), [""; 0]);
+    assert_eq!(pipeline.deadline(), Some(at(700).mono));
 }
 
 #[test]
@@ -335,15 +345,19 @@ fn verdicts_below_the_thresholds_are_rejected() {
             let bytes = bytes(&pipeline, &raw);
             events.extend(pipeline.push(&bytes, at(number * 200)));
         }
-        let Some(Event::Hardness(verdict)) = events.last() else {
+        let Some(Event::Hardness(verdict)) = events.pop() else {
             panic!("{events:?}")
         };
         assert_eq!(verdict.rejected, expected);
         assert_eq!(verdict.level.is_some(), expected.is_none());
         assert_eq!(verdict.label.is_some(), expected.is_none());
         assert!((verdict.probabilities.iter().sum::<f32>() - 1.0).abs() < 1e-5);
+        let came = at(verdict.frame * 200).mono.as_nanos() as u64;
+        assert_eq!(verdict.mono_ns, Some(came));
+        verdict
     };
-    check(0.0, 0.0, None);
+    let verdict = check(0.0, 0.0, None);
+    check(verdict.force_n, verdict.confidence, None);
     check(100.0, 0.0, Some(Rejection::LowForce));
     check(0.0, 1.1, Some(Rejection::LowConfidence));
 }
