@@ -249,6 +249,42 @@ fn jq_is_not_misled_by_its_header_in_the_data() {
 }
 
 #[test]
+fn after_a_restart_nothing_is_made_of_the_bytes_before() {
+    for preset in PRESETS {
+        let layout = layout(preset);
+        // A header of jq in the data: which one is a frame's, the place in the stream decides.
+        let mut held = frames(12, 1)[0];
+        for (place, byte) in (300..).zip([0xAA, 0x55, 0x03, 0x99]) {
+            held.counts[place] = byte;
+        }
+        let whole = encode(&layout, &[held; 5]);
+        let mut bytes = whole.clone();
+        bytes.remove(100);
+        let found = |decoder: &mut Decoder| {
+            decoder.push(&bytes);
+            decoder.settle();
+            let items = std::iter::from_fn(|| decoder.next_frame());
+            items
+                .map(|item| item.map(|decoded| decoded.frame))
+                .collect::<Vec<_>>()
+        };
+        let expected = found(&mut Decoder::new(layout.clone()));
+        for before in [450, 800, 1600] {
+            let mut decoder = Decoder::new(layout.clone());
+            decoder.push(&whole[..before]);
+            while decoder.next_frame().is_some() {}
+            decoder.restart();
+            assert_eq!(decoder.pending(), 0);
+            assert_eq!(
+                found(&mut decoder),
+                expected,
+                "{preset:?}, {before} bytes before"
+            );
+        }
+    }
+}
+
+#[test]
 fn a_pause_makes_the_last_jq_frame_whole() {
     let layout = layout(Preset::Jq);
     let bytes = encode(&layout, &frames(9, 1));
@@ -299,6 +335,11 @@ fn lines_of_noise_before_the_first_ascii_frame_are_no_damage_in_any_chunks() {
     assert_eq!((expected.0.len(), expected.1), (1, 0));
     for size in 1..bytes.len() {
         assert_eq!(decode(&layout, bytes.chunks(size)), expected, "by {size}");
+    }
+    // Nor is what is left of a number a number.
+    let bytes = [b"7".as_slice(), &[b'0'; 30], b"1\n8\n\n"].concat();
+    for size in 1..=bytes.len() {
+        assert_eq!(decode(&layout, bytes.chunks(size)).0, [], "by {size}");
     }
 }
 
