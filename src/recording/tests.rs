@@ -154,6 +154,22 @@ fn a_recording_gives_the_very_events_it_was_made_of() {
 }
 
 #[test]
+fn a_recording_ends_when_the_last_thing_in_it_happened() {
+    let (file, _) = recorded(1000, 7);
+    let mut playback = Playback::new(hrn());
+    for found in Reader::new(file.as_slice()) {
+        playback.feed(found.unwrap()).unwrap();
+    }
+    let events = playback.end();
+    let [Event::Status(status)] = &events[..] else {
+        panic!("{events:?}")
+    };
+    assert_eq!(status.time, at(17_500).wall);
+    assert_eq!(status.reason.as_deref(), Some("end of recording"));
+    assert_eq!((status.frames, status.frames_damaged), (79, 1));
+}
+
+#[test]
 fn a_pipeline_that_recalls_another_goes_on_as_that_one() {
     // A state before each input: each time the pipeline is made anew from what was written.
     let (file, events) = recorded(1, 7);
