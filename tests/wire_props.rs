@@ -412,6 +412,16 @@ fn zero_run_packs_runs_across_254_zeros() {
 }
 
 #[test]
+fn an_empty_zero_run_is_noise_and_an_end_alone_no_damage() {
+    let text = "preset = 'zero-run'\nrows = 1\ncols = 2";
+    let mut decoder = Decoder::new(Layout::new(&toml::from_str(text).unwrap()).unwrap());
+    decoder.push(&[5, 6, 0xFF, 0xFF, 0, 0, 5, 6, 0xFF]);
+    let found: Vec<_> = std::iter::from_fn(|| decoder.next_frame()).collect();
+    assert!(matches!(found[..], [Ok(_), Ok(_)]), "{found:?}");
+    assert_eq!(decoder.skipped(), 3);
+}
+
+#[test]
 fn cells_masks_orders_and_small_arrays_land_in_place() {
     let text = r#"
         preset = "jx255n"
@@ -525,6 +535,7 @@ fn a_layout_that_cannot_work_is_refused_with_its_key() {
             "length: found 784 payload bytes, expected at most 255",
         ),
         ("mask = 0x1FF", "mask: found 511, expected 1 to 255"),
+        ("mask = 0", "mask: found 0, expected 1 to 255"),
         (
             "preset = 'zero-run'\ntail = 'FF'",
             "tail: found a value, expected none",
