@@ -126,6 +126,14 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
             .unwrap();
         tensor.data_location = Some(pb::tensor_proto::DataLocation::External as i32);
     });
+    check("tensor `scale` lies in an external file", |p| {
+        let tensors = &mut graph(p).initializer;
+        let scale = tensors.iter_mut().find(|t| t.name == "scale").unwrap();
+        scale.external_data.push(pb::StringStringEntryProto {
+            key: "location".into(),
+            value: "weights.bin".into(),
+        });
+    });
     check("model graph cannot be run", |p| {
         graph(p).node[0].op_type = "Divination".into();
     });
@@ -175,6 +183,12 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
         "`hrn.range`: found",
         set("hrn.range", "{\"force_n\":[1,2]}"),
     );
+    for range in [
+        r#"{"force_n":[2,1],"contact_area_taxels":[1,2]}"#,
+        r#"{"force_n":[1,2],"contact_area_taxels":[2,1]}"#,
+    ] {
+        check("expected [least, greatest]", set("hrn.range", range));
+    }
     check("`hrn.metrics`: found", set("hrn.metrics", "{"));
     check("`hrn.check`: found 1 frames of lengths [2]", |p| {
         *value(p, "hrn.check") = r#"{"frames":[[1,2]],"probabilities":[[1,0,0,0]]}"#.into();
