@@ -285,6 +285,35 @@ fn after_a_restart_nothing_is_made_of_the_bytes_before() {
 }
 
 #[test]
+fn jq_waits_for_no_header_that_is_farther_from_its_phase() {
+    let layout = layout(Preset::Jq);
+    let mut held = frames(8, 1)[0];
+    for (place, byte) in (300..).zip([0xAA, 0x55, 0x03, 0x99]) {
+        held.counts[place] = byte;
+    }
+    let mut bytes = encode(&layout, &vec![held; 4]);
+    // Behind the header in the second frame's data: that one is followed by nothing.
+    bytes.remove(788 + 600);
+    let mut decoder = Decoder::new(layout);
+    let mut whole = Vec::new();
+    for (at, byte) in bytes.iter().enumerate() {
+        decoder.push(&[*byte]);
+        while let Some(item) = decoder.next_frame() {
+            if item.is_ok() {
+                whole.push(at + 1);
+            }
+        }
+        assert!(
+            decoder.pending() < 788 + 4,
+            "{} bytes held",
+            decoder.pending()
+        );
+    }
+    // The first and the third, as soon as the header after them is there.
+    assert_eq!(whole, [788 + 4, 3 * 788 - 1 + 4]);
+}
+
+#[test]
 fn a_pause_makes_the_last_jq_frame_whole() {
     let layout = layout(Preset::Jq);
     let bytes = encode(&layout, &frames(9, 1));

@@ -71,9 +71,9 @@ pub(super) struct Context {
     pub anchor: u64,
 }
 
-/// Finds frames in a stream of bytes. It holds on to at most the bytes of one pending frame
-/// (two where a layout that begins with a sync, without checksum or tail, is not yet sure of its
-/// phase).
+/// Finds frames in a stream of bytes. It holds on to at most the bytes of one pending frame and the
+/// header that must follow it. Only a layout that begins with a sync, without checksum or tail, may
+/// come to hold two: after damage, where headers in the data leave it unsure of its phase.
 #[derive(Debug)]
 pub struct Decoder {
     layout: Layout,

@@ -209,6 +209,13 @@ impl Fixed {
     /// press held still, where a header in the data repeats in every frame. Damage mostly loses
     /// or adds few bytes, so the one nearest to the phase before it is taken: its place in
     /// `bytes`. `None`: more bytes are needed.
+    ///
+    /// A followed candidate is held, up to two frames of bytes, while a header within it that is
+    /// nearer has yet to be followed. Less is not enough. Let `HuHv` be as long as a frame, `H` its
+    /// header. Two streams begin with `HuHvHu`: `Hu HvHu HvHu`, what is left of a damaged frame and
+    /// two whole ones with a header in their data, and `HuHv Huvw`, two whole ones of which the first
+    /// has it. They differ first where the frame at the second `H` would end. Decided before, the one
+    /// would give a frame that was never sent, or the other lose one that is whole.
     fn nearest_in_phase(&self, bytes: &[u8], context: Context) -> Option<usize> {
         let period = self.total() as u64;
         let distance = |at: usize| {
@@ -222,7 +229,7 @@ impl Fixed {
             if at >= self.total() || at + self.header.len() > bytes.len() {
                 break;
             }
-            if self.is_followed(&bytes[at..], context.settled)? && distance(at) < distance(best) {
+            if distance(at) < distance(best) && self.is_followed(&bytes[at..], context.settled)? {
                 best = at;
             }
             at += 1;
