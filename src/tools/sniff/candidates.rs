@@ -4,6 +4,10 @@
 //! stands between the cells of two frames is `checksum, tail, sync, length`, of which all but the
 //! checksum is the same in every frame. So: which distances do pairs of bytes recur at; which
 //! square array fits such a distance; which bytes are constant there. Nothing is decoded here.
+//!
+//! What bytes cannot tell: whether a mark stands before its cells or after them, where no checksum
+//! says it (the frames are the same); whether a zero beside a mark belongs to it or is a taxel that
+//! is never pressed; an array that is not square, but for `ascii`, or smaller than 4x4.
 
 use std::collections::BTreeMap;
 
@@ -31,9 +35,11 @@ const CHECKSUMS: [Checksum; 5] = [
     Checksum::Crc16Ccitt,
 ];
 
-/// What its constant bytes must tell, in bits: as much as one byte of noise. Zeros that stand where
-/// nothing ever presses tell next to nothing.
-const LEAST_BITS: f64 = 8.0;
+/// What the constant bytes of a frame of `period` bytes must tell, in bits: as much as one byte that
+/// stands once a frame and hardly anywhere else, but no more than one byte of noise.
+fn least_bits(period: usize) -> f64 {
+    f64::min(8.0, 0.85 * (period as f64).log2())
+}
 
 /// Layouts worth trying, each with the bits that its constant bytes tell. Cells of two bytes are
 /// taken as low byte first: which it is shows only in the frames.
@@ -47,8 +53,9 @@ pub(super) fn candidates(bytes: &[u8]) -> Vec<(Settings, u32)> {
                 let constant = overhead.saturating_sub(checksum.bytes());
                 for (bits, block) in constant_blocks(&columns, constant, &rarity) {
                     // A header of zeros would be found in every frame at rest, again and again.
-                    let is_header =
-                        |header: &[u8]| header.is_empty() || told(header, &rarity) >= LEAST_BITS;
+                    let is_header = |header: &[u8]| {
+                        header.is_empty() || told(header, &rarity) >= least_bits(period)
+                    };
                     found.extend(
                         (0..=constant)
                             .filter(|&tail| is_header(&block[tail..]))
@@ -143,7 +150,7 @@ fn constant_blocks(
         .take(columns.len())
         .filter_map(|block| block.iter().copied().collect::<Option<Vec<u8>>>())
         .map(|block| (told(&block, rarity), block))
-        .filter(|&(bits, _)| bits >= LEAST_BITS)
+        .filter(|&(bits, _)| bits >= least_bits(columns.len()))
         .collect();
     blocks.sort_by(|a, b| b.0.total_cmp(&a.0).then_with(|| a.1.cmp(&b.1)));
     blocks.dedup();
@@ -156,14 +163,18 @@ fn told(block: &[u8], rarity: &[f64; 256]) -> f64 {
     block.iter().map(|&byte| rarity[usize::from(byte)]).sum()
 }
 
-/// How much each byte tells, in bits: the rarer, the more.
+/// How much each byte tells, in bits: the rarer, the more. What a quarter of all are is a taxel at rest
+/// and tells nothing: some of them beside a mark would make it a better one.
 fn rarity(bytes: &[u8]) -> [f64; 256] {
     let mut counts = [1_u32; 256];
     for &byte in bytes {
         counts[usize::from(byte)] += 1;
     }
     let total = (bytes.len() + 256) as f64;
-    counts.map(|count| (total / f64::from(count)).log2())
+    counts.map(|count| match (total / f64::from(count)).log2() {
+        bits if bits > 2.0 => bits,
+        _ => 0.0,
+    })
 }
 
 /// The layout whose constant bytes are `block`: first `tail` bytes of tail, then sync and, if the
@@ -213,6 +224,12 @@ pub(super) fn text_array(bytes: &[u8]) -> Option<Array> {
     most_frequent(blocks.filter_map(|block| Some((block.len(), *block.last()?))))
 }
 
+/// The square array that most stretches between two FF have cells for.
+pub(super) fn marked_array(bytes: &[u8]) -> Option<Array> {
+    let stretches = bytes.split(|&byte| byte == 0xFF);
+    most_frequent(stretches.filter_map(|stretch| square(stretch.len())))
+}
+
 /// The square array that most stretches between two FF unpack to, of those with zeros: without any
 /// they are those of `ff-tail`, too.
 pub(super) fn packed_array(bytes: &[u8]) -> Option<Array> {
@@ -230,10 +247,13 @@ pub(super) fn packed_array(bytes: &[u8]) -> Option<Array> {
     };
     let stretches = bytes.split(|&byte| byte == 0xFF);
     let packed = stretches.filter(|stretch| stretch.contains(&0));
-    let squares = packed
-        .filter_map(cells)
-        .filter(|cells| cells.isqrt().pow(2) == *cells);
-    most_frequent(squares.map(|cells| (cells.isqrt(), cells.isqrt())))
+    most_frequent(packed.filter_map(cells).filter_map(square))
+}
+
+/// Rows and columns of the square array of so many cells.
+fn square(cells: usize) -> Option<(usize, usize)> {
+    let side = cells.isqrt();
+    (side * side == cells).then_some((side, side))
 }
 
 /// The most frequent array, the largest of several; of those too small or too large, none.

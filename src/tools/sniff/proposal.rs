@@ -5,7 +5,7 @@
 
 use std::cmp::Reverse;
 
-use super::candidates::{candidates, packed_array, text_array};
+use super::candidates::{candidates, marked_array, packed_array, text_array};
 use crate::frame::{Array, COLS, ROWS};
 use crate::wire::{Cell, Checksum, Decoder, Layout, LengthField, Preset, Settings};
 
@@ -47,7 +47,9 @@ pub(super) struct Proposal {
     /// Told by the constant bytes.
     bits: u32,
     is_checked: bool,
-    has_length: bool,
+    length_bytes: usize,
+    is_preset: bool,
+    overhead_bytes: usize,
     keys: usize,
 }
 
@@ -55,7 +57,7 @@ pub(super) struct Proposal {
 pub(super) fn propose(bytes: &[u8]) -> Vec<Proposal> {
     let sample = sample(bytes);
     let presets = [
-        (Preset::FfTail, FF_TAIL_BITS, Some(Array::FULL)),
+        (Preset::FfTail, FF_TAIL_BITS, marked_array(&sample)),
         (Preset::Ascii, ALL_IN_ORDER, text_array(&sample)),
         (Preset::ZeroRun, ALL_IN_ORDER, packed_array(&sample)),
     ]
@@ -111,9 +113,9 @@ impl Proposal {
                 || is_other(&settings, decoder.layout(), |settings| {
                     settings.checksum = Some(Checksum::None);
                 }),
-            has_length: is_other(&settings, decoder.layout(), |settings| {
-                settings.length = Some(LengthField::None);
-            }),
+            length_bytes: length_bytes(&settings, decoder.layout()),
+            is_preset: is_preset(&settings),
+            overhead_bytes: overhead_bytes(&settings, decoder.layout()),
             settings,
             frames: tally.frames,
             frames_changed: tally.changed,
@@ -162,7 +164,8 @@ impl Tally {
 /// Best first. A checksum that fits frames which change is no accident, whatever more another
 /// layout makes of damaged ones. Else shares within two frames or a fiftieth of the best are equal
 /// (damage in a mark costs the longer mark more), and among equals the more telling marks go first,
-/// then a length field before a longer sync, then few keys, a preset most of all, before many.
+/// then a length field before a longer sync, a preset as it is, few bytes beside the cells (the rest are
+/// taxels at rest), and few keys before many.
 fn rank(proposals: &mut [Proposal]) {
     let most = |of: fn(&Proposal) -> u64| proposals.iter().map(of).max().unwrap_or_default();
     let changed = most(Proposal::bytes_changed);
@@ -175,7 +178,9 @@ fn rank(proposals: &mut [Proposal]) {
             Reverse(p.bits == ALL_IN_ORDER || p.is_checked && 4 * p.bytes_changed() >= 3 * changed),
             Reverse(p.bytes_explained.min(enough)),
             Reverse(p.bits),
-            Reverse(p.has_length),
+            Reverse(p.length_bytes),
+            Reverse(p.is_preset),
+            p.overhead_bytes,
             p.keys,
             Reverse(p.bytes_explained),
         )
@@ -248,6 +253,47 @@ fn is_other(settings: &Settings, layout: &Layout, change: impl Fn(&mut Settings)
     let mut changed = settings.clone();
     change(&mut changed);
     Layout::new(&changed).is_ok_and(|other| other != *layout)
+}
+
+/// Whether the layout is the same after `change`.
+fn is_same(settings: &Settings, layout: &Layout, change: impl Fn(&mut Settings)) -> bool {
+    let mut changed = settings.clone();
+    change(&mut changed);
+    Layout::new(&changed).as_ref() == Ok(layout)
+}
+
+/// Bytes of the length field.
+fn length_bytes(settings: &Settings, layout: &Layout) -> usize {
+    let has = |length| is_same(settings, layout, |settings| settings.length = Some(length));
+    if has(LengthField::U8) {
+        1
+    } else if has(LengthField::U16le) || has(LengthField::U16be) {
+        2
+    } else {
+        0
+    }
+}
+
+/// Bytes of a frame beside its cells.
+fn overhead_bytes(settings: &Settings, layout: &Layout) -> usize {
+    let has = |cell| is_same(settings, layout, |settings| settings.cell = Some(cell));
+    let is_wide = has(Cell::U16le) || has(Cell::U16be);
+    let Array { rows, cols } = layout.array();
+    layout.max_frame_bytes() - rows * cols * if is_wide { 2 } else { 1 }
+}
+
+/// Whether nothing but the size of the array differs from the preset.
+fn is_preset(settings: &Settings) -> bool {
+    let Settings {
+        preset, rows, cols, ..
+    } = *settings;
+    let sized = Settings {
+        preset,
+        rows,
+        cols,
+        ..Settings::default()
+    };
+    *settings == sized
 }
 
 /// Keys beside the preset.

@@ -50,19 +50,23 @@ fn decoded(layout: Layout, bytes: &[u8]) -> Vec<RawFrame> {
         .collect()
 }
 
-/// Frames in `of` that `among` has not, at the same place in order.
+/// Frames in `of` that `among` has not, in the same order: those outside the longest sequence that
+/// both have.
 fn missing(of: &[RawFrame], among: &[RawFrame]) -> usize {
-    let mut rest = among.iter();
-    let mut missing = 0;
+    let mut common = vec![0; among.len() + 1];
     for frame in of {
-        let mut ahead = rest.clone();
-        if ahead.any(|other| other == frame) {
-            rest = ahead;
-        } else {
-            missing += 1;
+        let mut before = 0;
+        for (index, other) in among.iter().enumerate() {
+            let longest = common[index + 1];
+            common[index + 1] = if frame == other {
+                before + 1
+            } else {
+                longest.max(common[index])
+            };
+            before = longest;
         }
     }
-    missing
+    of.len() - common[among.len()]
 }
 
 /// What is proposed must be the layout; without a checksum another may do that finds the same
@@ -193,6 +197,59 @@ fn free_layouts_are_found() {
         };
         (settings, seed)
     }));
+}
+
+#[test]
+fn marks_of_one_byte_are_found_around_small_arrays() {
+    let shapes = [(1, 0), (0, 1), (1, 1), (2, 0), (1, 2)];
+    let cells = [Cell::U8, Cell::U16le];
+    let checksums = [Checksum::None, Checksum::Sum8, Checksum::Crc16Modbus];
+    let sides = [5, 6, 8, 10, 12, 16, 20];
+    check_all((0..70).map(|seed| {
+        let mut stream = Stream::new(seed, "small");
+        let (sync, tail) = shapes[seed as usize % shapes.len()];
+        let mut mark =
+            |length| HexBytes((0..length).map(|_| 1 + stream.below(255) as u8).collect());
+        let (sync, tail) = (mark(sync), mark(tail));
+        let side = sides[seed as usize % sides.len()];
+        let settings = Settings {
+            sync: Some(sync),
+            tail: Some(tail),
+            length: Some(LengthField::None),
+            cell: Some(cells[stream.below(2)]),
+            checksum: Some(checksums[stream.below(3)]),
+            rows: Some(side),
+            cols: Some(side),
+            ..Settings::default()
+        };
+        (settings, seed)
+    }));
+}
+
+#[test]
+fn presets_of_small_arrays_are_found() {
+    let presets = [
+        Preset::Jx255n,
+        Preset::Jx255nU16,
+        Preset::Jq,
+        Preset::JqU16,
+        Preset::FfTail,
+    ];
+    let cases = presets
+        .into_iter()
+        .flat_map(|preset| [5, 8, 12, 16].map(|side| (preset, side)));
+    for (preset, side) in cases {
+        let settings = Settings {
+            preset,
+            rows: Some(side),
+            cols: Some(side),
+            ..Settings::default()
+        };
+        let layout = Layout::new(&settings).unwrap();
+        let bytes = line(&layout, &frames(1), &mut Stream::new(1, "line"));
+        let proposals = propose(&bytes);
+        assert_eq!(proposals[0].settings, settings, "{preset:?} {side}");
+    }
 }
 
 #[test]
