@@ -23,7 +23,8 @@ use std::process::ExitCode;
 
 use clap::error::ErrorKind;
 
-/// What is printed of an error: one line, with the causes that it does not tell itself.
+/// What is printed of an error: one line, with the causes that it does not tell itself. Whatever a file
+/// is called, it cannot break the line or speak to the terminal.
 pub fn line(error: &(dyn Error + 'static)) -> String {
     let mut line = error.to_string();
     let mut cause = error.source();
@@ -34,7 +35,12 @@ pub fn line(error: &(dyn Error + 'static)) -> String {
         }
         cause = error.source();
     }
-    line
+    let shown = |c: char| {
+        let escaped = c.is_control().then(|| c.escape_default());
+        let plain = escaped.is_none().then_some(c);
+        escaped.into_iter().flatten().chain(plain)
+    };
+    line.chars().flat_map(shown).collect()
 }
 
 /// What clap says of arguments that it refuses, on one line, with exit code 2; or the help or version
@@ -114,5 +120,11 @@ mod tests {
         }
         let told = Told::Within(cause());
         assert_eq!(line(&told), "x: no such file, expected a new file");
+    }
+
+    #[test]
+    fn an_error_is_one_line_whatever_a_file_is_called() {
+        let told = io::Error::other("a\nb\u{1b}[2J\t\u{e9}: cannot read");
+        assert_eq!(line(&told), "a\\nb\\u{1b}[2J\\t\u{e9}: cannot read");
     }
 }
