@@ -190,9 +190,6 @@ fn check_sensor(sensor: &Sensor, earlier: &[Sensor], path: &Path) -> Result<(), 
             "a name of its own for each sensor",
         );
     }
-    if sensor.port.as_os_str().is_empty() {
-        return value("port", "an empty path".to_owned(), "the path of a device");
-    }
     // Several names may lead to one device, if it is there.
     let device = |sensor: &Sensor| {
         let port = &sensor.port;

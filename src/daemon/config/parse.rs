@@ -159,23 +159,54 @@ pub(super) fn load(path: &Path) -> Result<Config, Error> {
     let mut config: Config = toml::from_str(text).map_err(|error| syntax(path, text, &error))?;
     let directory = path.parent().unwrap_or(Path::new(""));
     for sensor in &mut config.sensors {
-        // None stays none.
-        if !sensor.port.as_os_str().is_empty() {
-            sensor.port = directory.join(&sensor.port);
-        }
+        let key = format!("sensor.port of {:?}", sensor.name);
+        resolve(
+            &mut sensor.port,
+            directory,
+            key,
+            "the path of a device",
+            path,
+        )?;
     }
     let unix = &mut config.publish.unix;
     let paths = [
-        &mut config.model.path,
-        &mut unix.path,
-        &mut unix.control_path,
+        ("model.path", Some(&mut config.model.path)),
+        ("publish.unix.path", Some(&mut unix.path)),
+        ("publish.unix.control_path", Some(&mut unix.control_path)),
+        (
+            "record.dir",
+            config.record.as_mut().map(|record| &mut record.dir),
+        ),
     ];
-    let record = config.record.as_mut().map(|record| &mut record.dir);
-    for path in paths.into_iter().chain(record).flatten() {
-        *path = directory.join(&*path);
+    for (key, given) in paths {
+        if let Some(Some(given)) = given {
+            resolve(given, directory, key.to_owned(), "a path", path)?;
+        }
     }
     check(&config, path)?;
     Ok(config)
+}
+
+/// Takes a path of the file as relative to its directory. An empty one would be the directory itself,
+/// one with a control character cannot be opened or breaks a line of the log in two.
+fn resolve(
+    given: &mut PathBuf,
+    directory: &Path,
+    key: String,
+    expected: &'static str,
+    path: &Path,
+) -> Result<(), Error> {
+    let text = given.to_string_lossy();
+    if text.is_empty() || text.chars().any(char::is_control) {
+        return Err(Error::Value {
+            path: path.to_owned(),
+            key,
+            found: format!("{text:?}"),
+            expected,
+        });
+    }
+    *given = directory.join(&*given);
+    Ok(())
 }
 
 /// A file, or as much of it as is enough to be refused: a byte more than `most`. It may be a pipe,

@@ -30,7 +30,7 @@ fn every_key_but_port_has_a_default() {
 
 #[test]
 fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
-    let cases: [(&str, &[&str]); 33] = [
+    let cases: [(&str, &[&str]); 38] = [
         ("[[sensor]]\nname = \"a\"", &["1:1", "sensor.port", "none"]),
         (
             "# Two.\n[[sensor]]\nport = \"p\"\n\n[[sensor]]\nname = \"b\"",
@@ -40,7 +40,10 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
             "[[sensor]]\nport = \"p\"\n[[sensor]]\nname = \"b\"\nport = \"./p\"",
             &["sensor.port of \"b\"", "as for \"sensor\"", "of its own"],
         ),
-        ("[[sensor]]\nport = \"\"", &["sensor.port", "empty"]),
+        (
+            "[[sensor]]\nport = \"\"",
+            &["sensor.port of \"sensor\"", "found \"\""],
+        ),
         (
             "[[sensor]]\nport = \"p\"\n[sensor.frame]\nmask = 65536",
             &["4:8", "mask: found integer `65536`", "from 0 to 65535"],
@@ -133,6 +136,26 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
         (
             "[[sensor]]\nport = \"p\"\n[publish.unix]\npath = \"/control.sock\"",
             &["publish.unix.control_path", "/control.sock"],
+        ),
+        (
+            "[[sensor]]\nport = \"p\"\n[publish.unix]\npath = \"\"",
+            &["publish.unix.path", "found \"\"", "a path"],
+        ),
+        (
+            "[[sensor]]\nport = \"p\"\n[publish.unix]\ncontrol_path = \"a\\nb\"",
+            &["publish.unix.control_path", r#""a\nb""#],
+        ),
+        (
+            "[[sensor]]\nport = \"a\\u0000b\"",
+            &["sensor.port", r#""a\0b""#, "the path of a device"],
+        ),
+        (
+            "[[sensor]]\nport = \"p\"\n[model]\npath = \"\"",
+            &["model.path", "found \"\""],
+        ),
+        (
+            "[[sensor]]\nport = \"p\"\n[record]\ndir = \"\"",
+            &["record.dir", "found \"\""],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[publish.zenoh]\nlisten = [\"udp/here:1\"]",
