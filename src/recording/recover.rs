@@ -13,7 +13,7 @@ use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::write::NoSeek;
 
 use super::message::{self, TOPICS};
-use super::{Error, writer};
+use super::{Entry, Error, writer};
 
 /// What became of a damaged recording.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -22,6 +22,8 @@ pub struct Recovered {
     pub messages: u64,
     /// Those among them that other programs wrote.
     pub messages_foreign: u64,
+    /// Those that are states of a sensor: a recording can be played from the first of them on.
+    pub states: u64,
     /// Whole chunks.
     pub chunks: u64,
     /// First and last moment saved, in nanoseconds since 1970.
@@ -295,6 +297,11 @@ impl<W: Write> Copy<W> {
                     self.done.messages += 1;
                     let topic = &self.channels[&header.channel_id].topic;
                     self.done.messages_foreign += u64::from(!writer::is_topic_of_ours(topic));
+                    if writer::is_input(topic) {
+                        let entry = message::decode_entry(&data);
+                        let is_state = matches!(entry, Ok((_, _, Entry::State(_))));
+                        self.done.states += u64::from(is_state);
+                    }
                     let time = header.log_time;
                     let (first, last) = self.done.span_ns.unwrap_or((time, time));
                     self.done.span_ns = Some((first.min(time), last.max(time)));

@@ -252,6 +252,24 @@ fn one_flipped_bit_costs_its_chunk_and_no_more() {
 }
 
 #[test]
+fn what_is_saved_without_a_state_is_told() {
+    let (file, _) = recorded(1000, 7);
+    let mut unplayable = 0;
+    for place in (0..file.len()).step_by(97) {
+        let mut file = file.clone();
+        file[place] ^= 1;
+        let (found, good) = recover(Cursor::new(&file), Vec::new()).unwrap();
+        let mut playback = Playback::new(hrn());
+        for found in Reader::new(&good[..]) {
+            playback.feed(found.unwrap()).unwrap();
+        }
+        assert_eq!(found.states, playback.sensors() as u64, "byte {place}");
+        unplayable += usize::from(found.messages > 0 && found.states == 0);
+    }
+    assert!(unplayable > 0, "no byte lies within the first chunk");
+}
+
+#[test]
 fn what_is_no_recording_is_refused_in_words() {
     let error = |file: &[u8]| {
         let mut errors = Reader::new(file).filter_map(Result::err);

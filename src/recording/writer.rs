@@ -7,7 +7,7 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::write::NoSeek;
 use mcap::{Compression, WriteOptions};
 
-use super::message::{self, TOPICS};
+use super::message::{self, INPUT, TOPICS};
 use super::{Entry, Error, Labels, Sensor};
 use crate::event::Event;
 use crate::frame::Stamp;
@@ -72,6 +72,11 @@ pub(super) fn is_topic_of_ours(name: &str) -> bool {
         .strip_prefix("/tactile/")
         .and_then(|rest| rest.split_once('/'));
     parts.is_some_and(|(_, name)| TOPICS.iter().any(|topic| topic.name == name))
+}
+
+/// Whether it is the topic of what happened to a sensor.
+pub(super) fn is_input(name: &str) -> bool {
+    is_topic_of_ours(name) && name.rsplit('/').next() == Some(INPUT.name)
 }
 
 impl<W: Write> Writer<W> {

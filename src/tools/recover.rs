@@ -208,6 +208,7 @@ fn account(recovered: &Recovered) -> String {
         messages_unknown,
         complete,
         messages_foreign: _,
+        states,
     } = recovered;
     let time = |ns: u64| {
         let time = Timestamp::from_nanosecond(i128::from(ns));
@@ -223,6 +224,10 @@ fn account(recovered: &Recovered) -> String {
     }
     if !complete {
         text += "\nthe end was missing: the recording was cut off, or it is still being written";
+    }
+    if *states == 0 {
+        text += "\nno state of a sensor is left: `hardnessd replay` has nothing to begin with, \
+                 `hardnessd sniff` reads the bytes";
     }
     if recovered.is_whole() {
         text += "\nlost nothing";
