@@ -6,6 +6,7 @@
 
 mod map;
 
+use std::borrow::Cow;
 use std::time::Duration;
 
 use ratatui::Frame;
@@ -111,6 +112,12 @@ impl Rows {
 impl Page<'_> {
     fn text(&mut self, area: Rect, text: &str, style: Style) -> Rect {
         let width = usize::from(area.width);
+        let shown = |c: char| if c.is_ascii() { c } else { '?' };
+        // Names are whatever they are configured as.
+        let text = match self.look.unicode {
+            true => Cow::Borrowed(text),
+            false => text.chars().map(shown).collect(),
+        };
         let (end, _) = self.buffer.set_stringn(area.x, area.y, text, width, style);
         Rect {
             x: end,

@@ -345,6 +345,11 @@ fn without_colours_pressure_is_told_by_characters_and_nothing_but_ascii_is_writt
     let text = rows(&buffer).join("\n");
     assert!(text.is_ascii(), "{text}");
     assert!(text.contains("@@@@@@@@"), "{text}");
+    let mut named = hello("a", &["forearm"]);
+    named["robot"] = json!("b\u{e4}r-7");
+    let named = told(&[(0, named)]);
+    assert!(shown(&named, 0, (80, 24), PLAIN).starts_with("b?r-7 "));
+    assert!(shown(&named, 0, (80, 24), COLOURS).starts_with("b\u{e4}r-7 "));
 }
 
 #[test]
