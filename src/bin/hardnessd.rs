@@ -217,6 +217,10 @@ impl Signals {
     fn catch() -> io::Result<Self> {
         // Which it was is known only before one is caught.
         let outlives_terminal = ignores_hangup();
+        // A file that must not grow is no reason to die of: the write fails, as on a full disk.
+        drop(signal(SignalKind::from_raw(
+            rustix::process::Signal::XFSZ.as_raw(),
+        ))?);
         Ok(Self {
             interrupt: signal(SignalKind::interrupt())?,
             terminate: signal(SignalKind::terminate())?,

@@ -5,6 +5,7 @@ mod arguments;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::Context as _;
@@ -23,7 +24,7 @@ use hardnessd::train::run::{Run, write_whole};
 use hardnessd::train::settings::SettingsError;
 use hardnessd::train::{report, sheet, simulated};
 use hardnessd::verdict::{Hrn, ModelError};
-use signal_hook::consts::{SIGINT, SIGTERM};
+use signal_hook::consts::{SIGINT, SIGTERM, SIGXFSZ};
 use signal_hook::iterator::Signals;
 
 use self::arguments::{
@@ -69,6 +70,8 @@ fn main() -> ExitCode {
 /// the disk is whole at any moment, and a run goes on from its last checkpoint, so there is
 /// nothing to wait for.
 fn end_at_signals() -> std::io::Result<()> {
+    // A file that must not grow is no reason to die of: the write fails, as on a full disk.
+    signal_hook::flag::register(SIGXFSZ, Arc::default())?;
     let mut signals = Signals::new([SIGINT, SIGTERM])?;
     std::thread::spawn(move || {
         if signals.forever().next().is_some() {
