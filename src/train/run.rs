@@ -241,7 +241,7 @@ impl Run {
     /// Adds the rows of `stage` of another run's metrics to `metrics.csv`: they are part of what
     /// this run's model cost.
     fn take_metrics(&self, stage: &str, text: &str) -> anyhow::Result<()> {
-        let mut own = fs::read_to_string(self.path("metrics.csv")).unwrap_or_default();
+        let mut own = self.metrics_before()?;
         if own.is_empty() {
             own = history::columns() + "\n";
         }
@@ -264,29 +264,41 @@ impl Run {
     ///
     /// Those of reading and writing, or if another version began the file with other columns.
     pub fn metrics(&self, stage: &'static str, step: u64) -> anyhow::Result<Metrics> {
-        let path = self.path("metrics.csv");
-        let before = fs::read_to_string(&path).unwrap_or_default();
-        if !before.is_empty() {
-            history::check_columns(&before, &path)?;
-        }
-        let mut text = history::columns() + "\n";
+        let before = self.metrics_before()?;
+        let columns = history::columns();
         let mut seconds_before = 0.0;
+        let mut text = columns.clone() + "\n";
         for row in before.lines().skip(1) {
-            let mut cells = row.split(',');
-            let of_stage = cells.next() == Some(stage);
-            let row_step = cells.next().and_then(|cell| cell.parse::<u64>().ok());
-            if !of_stage || row_step.is_some_and(|row_step| row_step <= step) {
-                text.push_str(row);
-                text.push('\n');
-                let seconds = row.rsplit(',').next().and_then(|cell| cell.parse().ok());
-                if let (true, Some(seconds)) = (of_stage, seconds) {
-                    seconds_before = seconds;
-                }
+            let cells: Vec<&str> = row.split(',').collect();
+            let row_step = cells.get(1).and_then(|cell| cell.parse::<u64>().ok());
+            let is_done = cells[0] != stage || row_step.is_some_and(|row_step| row_step <= step);
+            // A full disk may have broken one off.
+            if !is_done || cells.len() != columns.split(',').count() {
+                continue;
+            }
+            text.push_str(row);
+            text.push('\n');
+            let seconds = cells.last().and_then(|cell| cell.parse().ok());
+            if let (true, Some(seconds)) = (cells[0] == stage, seconds) {
+                seconds_before = seconds;
             }
         }
         self.write("metrics.csv", text.as_bytes())?;
-        let file = File::options().append(true).open(&path)?;
+        let path = self.path("metrics.csv");
+        let file = File::options().append(true).open(&path);
+        let file = file.with_context(|| path.display().to_string())?;
         Ok(Metrics::new(file, stage, seconds_before))
+    }
+
+    /// What `metrics.csv` has so far; nothing, if it is not there yet.
+    fn metrics_before(&self) -> anyhow::Result<String> {
+        let path = self.path("metrics.csv");
+        match fs::read_to_string(&path) {
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(String::new()),
+            Err(error) => Err(error).with_context(|| path.display().to_string()),
+            Ok(text) if text.is_empty() => Ok(text),
+            Ok(text) => history::check_columns(&text, &path).map(|()| text),
+        }
     }
 }
 
@@ -441,6 +453,15 @@ mod tests {
             .collect();
         assert_eq!(seconds, ["2.0", "4.0", "7.5"], "{text}");
         assert!(text.contains("second,5,"), "{text}");
+
+        // A row that a full disk broke off goes; a file that is something else stays as it is.
+        fs::write(run.path("metrics.csv"), text.clone() + "sec").unwrap();
+        run.metrics("first", 30).unwrap();
+        assert_eq!(fs::read_to_string(run.path("metrics.csv")).unwrap(), text);
+        fs::write(run.path("metrics.csv"), b"\xff").unwrap();
+        let error = format!("{:#}", run.metrics("first", 30).unwrap_err());
+        assert!(error.contains("metrics.csv"), "{error}");
+        assert_eq!(fs::read(run.path("metrics.csv")).unwrap(), b"\xff");
     }
 
     #[test]
