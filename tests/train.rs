@@ -666,6 +666,12 @@ fn bad_input_has_its_exit_code_and_one_line() {
     let untested = path("untested.npz");
     let file = std::fs::File::create(&untested).unwrap();
     dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+    for sample in &mut samples {
+        sample.level *= u8::from(sample.level != 3);
+    }
+    let without_level_3 = path("without level 3.npz");
+    let file = std::fs::File::create(&without_level_3).unwrap();
+    dataset::write(file, &samples, &serde_json::json!({})).unwrap();
     let empty_split =
         format!("{untested}: test split: found no labelled sample, expected one or more");
     let corrupt = path("corrupt");
@@ -774,6 +780,11 @@ fn bad_input_has_its_exit_code_and_one_line() {
             "no unlabelled training samples are left",
         ),
         (
+            method("ours", &["--data", &without_level_3, "--out", &no_gan]),
+            1,
+            "no labelled training samples of level 3 for its STGAN",
+        ),
+        (
             hrn_train(&["simulate", "--presses", "1", "--out", "/dev/null/no"]),
             74,
             "/dev/null/no",
@@ -785,6 +796,8 @@ fn bad_input_has_its_exit_code_and_one_line() {
         assert!(error.contains(expected), "{error}");
         assert!(code != 2 || error.lines().count() == 1, "{error}");
     }
+    // Nothing is trained, nor a run begun, of which a stage could not be done.
+    assert!(!Path::new(&no_gan).exists());
     // A picture that cannot be written does not cost the data set.
     assert!(Dataset::read(Path::new(&beside)).is_ok());
 }

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::time::Instant;
 
-use anyhow::Context as _;
+use anyhow::{Context as _, ensure};
 use burn::tensor::Device;
 
 use super::baseline::Baseline;
@@ -217,16 +217,42 @@ impl Request {
     }
 }
 
-/// Makes sure that objects held out are used, and says so where a share is none of them.
+/// Makes sure, before anything is made, that the data has what all stages of a method need.
 ///
 /// # Errors
 ///
-/// If the method has no use for them, the best weights are to be kept by none of them, or the data
-/// has no labelled training samples.
-pub fn check_validation(
+/// If it has no labelled training samples, a GAN is left without unlabelled ones, an STGAN without
+/// any of its level, or objects are to be held out in vain.
+pub fn check(method: Method, dataset: &Dataset, description: &Description) -> anyhow::Result<()> {
+    let labelled = chosen(dataset, description)?;
+    let has_gan = matches!(
+        method,
+        Method::Ours | Method::Nahrn | Method::Nihrn | Method::Sgan | Method::Igan
+    );
+    ensure!(
+        !has_gan || !unlabelled(dataset, &labelled).is_empty(),
+        "no unlabelled training samples are left for the GAN: {} labels are used, found 0, expected \
+         1 or more",
+        description.labels
+    );
+    let has_stgans = matches!(method, Method::Ours | Method::Nihrn);
+    for level in super::dataset::levels() {
+        let of_level = |&index: &usize| dataset.samples[index].level == level.level;
+        ensure!(
+            !has_stgans || labelled.iter().any(of_level),
+            "no labelled training samples of level {} for its STGAN: found 0, expected 1 or more",
+            level.level
+        );
+    }
+    check_validation(method, dataset, description, &labelled)
+}
+
+/// Makes sure that objects held out are used, and says so where a share is none of them.
+fn check_validation(
     method: Method,
     dataset: &Dataset,
     description: &Description,
+    labelled: &[usize],
 ) -> anyhow::Result<()> {
     let Validation { share, keep, .. } = description.settings.validation;
     if share == 0.0 || method == Method::Features {
@@ -240,8 +266,7 @@ pub fn check_validation(
     if matches!(method, Method::Sgan | Method::Igan) {
         return Err(refused("0: sgan and igan have no use for held-out objects").into());
     }
-    let labelled = chosen(dataset, description)?;
-    let (_, held_out) = dataset.hold_out(&labelled, share, description.seed);
+    let (_, held_out) = dataset.hold_out(labelled, share, description.seed);
     if held_out.is_empty() && keep == Keep::Best {
         let expected = "one that, with `validation.keep` best, rounds to an object or more of a \
                         level's labelled ones";
@@ -270,13 +295,13 @@ fn epochs_as_long_as_ours(settings: &Settings, samples: usize) -> u32 {
     u32::try_from(epochs).unwrap_or(u32::MAX)
 }
 
-/// Runs a method to its model and evaluation in the run's directory; takes up whatever is there.
-/// Gives the evaluation on the test split, if the data has one.
+/// Runs a method to its model and evaluation in the run's directory, on data that passed [`check`];
+/// takes up whatever is there. Gives the evaluation on the test split, if the data has one.
 ///
 /// # Errors
 ///
-/// If the data has no labelled training samples, a GAN is left without unlabelled ones, or the
-/// directory cannot be read or written.
+/// If the data has no labelled training samples, the training diverges, or the directory cannot be
+/// read or written.
 pub fn train(
     method: Method,
     dataset: &Dataset,

@@ -5,7 +5,6 @@
 //! each part's checkpoints, metrics and pictures. What a stage has done is taken up, never done
 //! again.
 
-use anyhow::ensure;
 use burn::tensor::Device;
 
 use super::augment;
@@ -38,11 +37,11 @@ fn levels() -> usize {
 pub struct Stages<'a> {
     /// Where the samples are.
     pub dataset: &'a Dataset,
-    /// Labelled samples to learn from.
+    /// Labelled samples to learn from; for STGANs, of every level.
     pub train: &'a [usize],
     /// Labelled samples of held-out objects; may be empty.
     pub validation: &'a [usize],
-    /// Training samples whose levels are not used.
+    /// Training samples whose levels are not used; for a GAN, one or more.
     pub unlabelled: &'a [usize],
     /// Settings and seed.
     pub description: &'a Description,
@@ -76,16 +75,6 @@ impl Stages<'_> {
         }
     }
 
-    fn ensure_unlabelled(&self) -> anyhow::Result<()> {
-        ensure!(
-            !self.unlabelled.is_empty(),
-            "no unlabelled training samples are left for the GAN: {} labels are used, found 0, \
-             expected 1 or more",
-            self.description.labels
-        );
-        Ok(())
-    }
-
     /// HRN's random start.
     pub fn random(&self) -> Weights {
         hrn::initial(levels(), self.description.seed, self.device)
@@ -101,9 +90,8 @@ impl Stages<'_> {
     ///
     /// # Errors
     ///
-    /// If there are no unlabelled samples, or the run's directory cannot be read or written.
+    /// If the run's directory cannot be read or written, or the training diverges.
     pub fn ustgan(&self) -> anyhow::Result<Gan> {
-        self.ensure_unlabelled()?;
         let game = Game::RealOrFake;
         let task = self.gan_task("ustgan", game, &self.settings().ustgan);
         let minibatch_discrimination = self.settings().minibatch_discrimination;
@@ -123,12 +111,11 @@ impl Stages<'_> {
     ///
     /// # Errors
     ///
-    /// If a level has no labelled samples, or the run's directory cannot be read or written.
+    /// If the run's directory cannot be read or written, or a training diverges.
     pub fn generated(&self, ustgan: &Gan) -> anyhow::Result<Dataset> {
         let mut samples = Vec::new();
         for (stage, level) in STGANS.into_iter().zip(1..) {
             let real = self.of_level(level);
-            ensure!(!real.is_empty(), "{stage}: no labelled sample of its level");
             let frames = self.generated_of(stage, &real, ustgan)?;
             samples.extend(frames.into_iter().map(|frame| Sample {
                 frame,
@@ -206,7 +193,7 @@ impl Stages<'_> {
     ///
     /// # Errors
     ///
-    /// If the run's directory cannot be read or written.
+    /// If the run's directory cannot be read or written, or the training diverges.
     pub fn pretrained(&self, generated: &Dataset, initial: Weights) -> anyhow::Result<Weights> {
         let train: Vec<usize> = (0..generated.samples.len()).collect();
         let task = fit::Task {
@@ -237,7 +224,7 @@ impl Stages<'_> {
     ///
     /// # Errors
     ///
-    /// If the run's directory cannot be read or written.
+    /// If the run's directory cannot be read or written, or the training diverges.
     pub fn trained(&self, stage: &'static str, initial: Weights) -> anyhow::Result<Trained> {
         fit::fit(&self.fit_task(stage), initial, self.run)
     }
@@ -246,10 +233,8 @@ impl Stages<'_> {
     ///
     /// # Errors
     ///
-    /// If there are no unlabelled samples, the run's directory cannot be read or written, or the
-    /// training diverges.
+    /// If the run's directory cannot be read or written, or the training diverges.
     pub fn semi_supervised(&self, stage: &'static str, game: Game) -> anyhow::Result<Trained> {
-        self.ensure_unlabelled()?;
         let task = gan::Task {
             labelled: self.train,
             ..self.gan_task(stage, game, &self.settings().ustgan)

@@ -274,7 +274,7 @@ fn train(arguments: &Train) -> anyhow::Result<String> {
         settings,
     };
     let description = request.description(&dataset)?;
-    methods::check_validation(arguments.method, &dataset, &description)?;
+    methods::check(arguments.method, &dataset, &description)?;
     let device = device(arguments.device)?;
     let run = Run::open(&arguments.out, &description, arguments.resume)?
         .taking_from(arguments.from.clone());
