@@ -128,7 +128,9 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
         ensure_finite_weights(task.stage, epoch, &state.learner.weights)?;
         let mut validation = None;
         if !validation_samples.is_empty() && due(validation_settings.every_epochs) {
-            validation = Some(state.validate(task));
+            let judged = state.validate(task);
+            ensure_finite(task.stage, epoch, "validation loss", judged.0)?;
+            validation = Some(judged);
         }
         let seconds = begun.elapsed().as_secs_f64();
         metrics.add(&Row {
