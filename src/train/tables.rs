@@ -67,18 +67,20 @@ pub fn provenance(comparison: &Comparison) -> String {
     let mut lines = Vec::new();
     if let (Some(entry), Some(details)) = (comparison.entries.first(), comparison.details.first()) {
         let seeds = comparison.entries.iter().map(|entry| entry.seed).max();
-        let mut revisions: Vec<&str> = Vec::new();
-        for Details { revision, .. } in &comparison.details {
-            if !revisions.contains(&revision.as_str()) {
-                revisions.push(revision);
-            }
-        }
-        lines.push(format!(
-            "Made by hrn-train compare --profile {} --seeds {}, {}.",
+        let mut made_by = format!(
+            "Made by hrn-train compare --profile {} --seeds {}",
             format!("{:?}", entry.profile).to_lowercase(),
             seeds.unwrap_or_default(),
-            revisions.join(", ")
-        ));
+        );
+        let mut revisions: Vec<&str> = Vec::new();
+        for Details { revision, .. } in &comparison.details {
+            // Results can stand without their runs.
+            if !revision.is_empty() && !revisions.contains(&revision.as_str()) {
+                revisions.push(revision);
+                made_by += &format!(", {revision}");
+            }
+        }
+        lines.push(made_by + ".");
         for source in details.told.iter().flat_map(|told| &told.data) {
             let seed = source
                 .seed

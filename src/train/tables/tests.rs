@@ -66,4 +66,9 @@ fn every_revision_that_made_a_run_is_named_once() {
     ]));
     let line = told.lines().next().unwrap();
     assert!(line.ends_with("--seeds 3, 0.1 (aa), 0.1 (bb)."), "{line}");
+    let told = provenance(&comparison(&[(1, "")]));
+    assert!(
+        told.starts_with("Made by hrn-train compare --profile smoke --seeds 1.\n"),
+        "{told}"
+    );
 }
