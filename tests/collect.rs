@@ -240,6 +240,27 @@ fn a_model_is_of_the_pitch_of_its_recordings_and_pitches_do_not_mix() {
         &["--level", "1", text(&capture), fixture],
         "foam.5hz.bin: taxel pitch: found 3.5 mm, expected 2 mm, that of",
     );
+    // A model is evaluated on data of another pitch, but not without a word.
+    let model = bench.path("run/hrn.onnx");
+    for (data, said) in [
+        (&out, ""),
+        (
+            &wide,
+            "wide.npz: taxel pitch: found 3.5 mm, expected 2 mm, that of the model\n",
+        ),
+    ] {
+        let output = Command::new(env!("CARGO_BIN_EXE_hrn-train"))
+            .args(["evaluate", "--split", "train", "--model", text(&model)])
+            .args(["--data", text(data)])
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{output:?}");
+        let errors = String::from_utf8(output.stderr).unwrap();
+        assert!(
+            errors.ends_with(said) && errors.starts_with("warning: ") != said.is_empty(),
+            "{errors}"
+        );
+    }
     let output = train(&bench, &[&out, &wide]);
     let said = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(1), "{said}");

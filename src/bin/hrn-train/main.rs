@@ -356,6 +356,13 @@ fn report_of(directory: &Path, out: &Path) -> anyhow::Result<String> {
 fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     let hrn = load(&arguments.model)?;
     let dataset = Dataset::read(&arguments.data)?;
+    let (of_model, of_data) = (hrn.card().pitch_mm, dataset.pitch_mm() as f32);
+    if of_model != of_data {
+        eprintln!(
+            "warning: {}: taxel pitch: found {of_data} mm, expected {of_model} mm, that of the model",
+            arguments.data.display()
+        );
+    }
     let indices = dataset.labelled(arguments.split.into())?;
     let evaluation = export::evaluate(&hrn, &dataset, &indices)?;
     Ok(if arguments.json {
