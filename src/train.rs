@@ -30,6 +30,7 @@ pub mod features;
 pub mod baseline;
 pub mod likeness;
 pub mod history;
+pub mod disk;
 pub mod run;
 pub mod fit;
 pub mod gan;

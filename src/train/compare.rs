@@ -24,9 +24,10 @@ use self::results::{Comparison, Entry};
 use self::sets::TestSet;
 use self::swaps::Swaps;
 use super::dataset::{Dataset, LabelChoice, Source};
+use super::disk::{lock, write_whole};
 use super::methods::{self, LabelsError, Method, Request};
 use super::report;
-use super::run::{Description, Run, lock, write_whole};
+use super::run::{Description, Run};
 use super::settings::Profile;
 use super::tables;
 

@@ -10,10 +10,11 @@ use serde::{Deserialize, Serialize};
 
 use super::sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS, TestSet};
 use crate::train::dataset::LabelChoice;
+use crate::train::disk::write_whole;
 use crate::train::export;
 use crate::train::history::History;
 use crate::train::metrics::{self, Bin, Evaluation, Judged, ObjectCount};
-use crate::train::run::{Description, Run, write_whole};
+use crate::train::run::{Description, Run};
 use crate::train::settings::Profile;
 use crate::train::tables::thousands;
 use crate::verdict::{Hrn, sha256_hex};

@@ -10,7 +10,7 @@ use anyhow::{Context as _, ensure};
 
 use crate::simulator::{self, DatasetSettings, SensorProfile, Shapes, Split};
 use crate::train::dataset::Dataset;
-use crate::train::run::write_whole;
+use crate::train::disk::write_whole;
 use crate::train::settings::Profile;
 use crate::train::simulated;
 use crate::verdict::sha256_hex;

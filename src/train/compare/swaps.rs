@@ -14,9 +14,9 @@ use super::results::{SwapEntry, read_json};
 use super::{Plan, Recipe, Round, sets, unfinished};
 use crate::simulator::{DatasetSettings, LabelledSample, Material};
 use crate::train::dataset::{Dataset, LabelChoice};
+use crate::train::disk::write_whole;
 use crate::train::methods::Method;
 use crate::train::metrics::Evaluation;
-use crate::train::run::write_whole;
 use crate::train::settings::Profile;
 use crate::train::simulated;
 
