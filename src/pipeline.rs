@@ -368,6 +368,10 @@ impl Pipeline {
         };
         self.seen.frames += 1;
         self.seen.last_frame = Some(stamp);
+        // A rate is not one over a silence.
+        if self.seen.link == Link::Stale {
+            self.seen.recent.clear();
+        }
         if self.seen.recent.len() == RATE_FRAMES {
             self.seen.recent.pop_front();
         }

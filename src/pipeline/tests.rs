@@ -458,6 +458,12 @@ fn the_rate_is_measured_over_the_last_frames() {
         pipeline.push(&bytes, at(300 + 100 * number));
     }
     assert_eq!(pipeline.status(at(0)).frame_rate_hz, Some(10.0));
+    // A silence that was stale is not in the rate of what comes after it.
+    pipeline.tick(at(8000));
+    for (moment, rate) in [(8000, None), (8200, Some(5.0))] {
+        pipeline.push(&bytes, at(moment));
+        assert_eq!(pipeline.status(at(moment)).frame_rate_hz, rate);
+    }
     pipeline.lost("end of file".to_owned(), at(9000));
     assert_eq!(pipeline.status(at(9000)).frame_rate_hz, None);
 }
