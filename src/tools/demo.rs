@@ -6,7 +6,7 @@
 
 use std::fs::{self, DirBuilder};
 use std::future::Future;
-use std::io;
+use std::io::{self, ErrorKind};
 use std::net::SocketAddr;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
@@ -222,15 +222,35 @@ fn is_final(line: &[u8]) -> bool {
 struct Place(PathBuf);
 
 impl Place {
+    /// A new one: where a container is started again one that was killed there had the same number.
     fn new() -> io::Result<Self> {
-        let path = std::env::temp_dir().join(format!("hardnessd-demo-{}", std::process::id()));
-        DirBuilder::new().mode(0o700).create(&path)?;
-        Ok(Self(path))
+        let mut path = std::env::temp_dir().join(format!("hardnessd-demo-{}", std::process::id()));
+        loop {
+            match DirBuilder::new().mode(0o700).create(&path) {
+                Err(error) if error.kind() == ErrorKind::AlreadyExists => {
+                    path.as_mut_os_string().push("-");
+                }
+                made => return made.map(|()| Self(path)),
+            }
+        }
     }
 }
 
 impl Drop for Place {
     fn drop(&mut self) {
         let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_killed_demonstration_has_left_is_not_in_the_way() {
+        let left = Place::new().unwrap();
+        let place = Place::new().unwrap();
+        assert_ne!(left.0, place.0);
+        assert!(left.0.is_dir() && place.0.is_dir());
     }
 }
