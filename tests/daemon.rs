@@ -225,7 +225,9 @@ fn sighup_changes_all_or_nothing() {
     assert_eq!(rejected(&mut subscriber), Value::Null);
     let line = daemon.logged("\"phase\":\"final\"");
     let line: Value = serde_json::from_str(&line).unwrap();
-    assert_eq!(line["sensor"], "forearm");
+    assert_eq!(line["level"], "INFO");
+    assert_eq!(line["fields"]["sensor"], "forearm");
+    assert!(line["fields"]["level"].is_u64(), "{line}");
 }
 
 #[test]

@@ -160,7 +160,8 @@ fn output(settings: Settings, lines: &Lines) -> Result<Output, Error> {
         .with_target(false);
     Ok(match settings.format {
         Format::Text => text.with_ansi(std::io::stderr().is_terminal()).boxed(),
-        Format::Json => text.json().flatten_event(true).boxed(),
+        // The fields in an object of their own: a verdict has a `level`, as the line has.
+        Format::Json => text.json().boxed(),
         Format::Journald => Journal::new(lines).map_err(Error::Journal)?.boxed(),
     })
 }
