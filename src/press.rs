@@ -6,6 +6,7 @@
 mod settings;
 mod settling;
 
+use std::cmp::Ordering;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
@@ -284,13 +285,22 @@ impl PressTracker {
     }
 }
 
+/// By how much of itself a force differs from an equal one at most: each taxel is an f32, rounded once
+/// less its baseline and once in newtons.
+const ROUNDING: f64 = 2.0 * f32::EPSILON as f64;
+
 impl Pressed {
     fn touch(&mut self, frame: &Frame, at: Moment, area: u32) {
         self.last = at;
         self.frames += 1;
         self.released_frames = 0;
         let force_n = frame.force_n();
-        if (area, force_n) > (self.peak.contact_area_taxels, self.peak.force_n) {
+        let is_greater = match area.cmp(&self.peak.contact_area_taxels) {
+            Ordering::Less => false,
+            Ordering::Equal => force_n > self.peak.force_n * (1.0 + ROUNDING),
+            Ordering::Greater => true,
+        };
+        if is_greater {
             self.peak = Peak {
                 moment: at,
                 frame: *frame,

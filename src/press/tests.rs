@@ -102,6 +102,26 @@ fn ties_of_area_go_to_force_then_to_the_earlier_frame() {
 }
 
 #[test]
+fn equal_counts_are_a_tie_however_their_newtons_are_rounded() {
+    let mut tracker = PressTracker::new(Settings::default());
+    let mut changes = Vec::new();
+    // In f32 the second is greater by 7e-9 N.
+    let counts = [[2_u8, 5, 6], [3, 4, 6], [0; 3], [0; 3]];
+    for (number, counts) in (0..).zip(counts) {
+        let mut frame = Frame::default();
+        for (newtons, count) in frame.newtons.iter_mut().zip(counts) {
+            *newtons = 0.04 * f32::from(count);
+        }
+        changes.extend(tracker.push(&frame, moment(number, 5)));
+    }
+    let peak = changes.into_iter().find_map(|change| match change {
+        Change::End { peak, .. } => Some(peak),
+        _ => None,
+    });
+    assert_eq!(peak.unwrap().moment.frame, 0);
+}
+
+#[test]
 fn a_held_press_times_out_once_and_waits_for_release() {
     let settings = Settings {
         max_seconds: 1.0,
