@@ -328,17 +328,9 @@ fn checkpoints(run: &Path, stage: &str) -> anyhow::Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-/// This package's version, and the commit of the checkout that it was built in, if that is still
-/// there.
+/// This package's version, and the commit it was built from.
 fn revision() -> String {
-    let described = std::process::Command::new("git")
-        .args(["-C", env!("CARGO_MANIFEST_DIR")])
-        .args(["describe", "--always", "--dirty", "--abbrev=12"])
-        .output()
-        .ok()
-        .filter(|output| output.status.success())
-        .and_then(|output| String::from_utf8(output.stdout).ok());
-    let commit = described.as_deref().map_or("no checkout", str::trim);
+    let commit = env!("HARDNESSD_REVISION");
     format!("hardnessd {} ({commit})", env!("CARGO_PKG_VERSION"))
 }
 
