@@ -1,13 +1,14 @@
 //! Data sets as `.npz` files: arrays with the names, types and shapes of contract, section 7.
 
-use std::io::{Cursor, Seek, Write};
+use std::io::{self, Cursor, Read, Seek, Write};
 use std::path::Path;
 
 use ndarray::{ArrayD, ArrayView, ArrayView1, ArrayView3, Dimension};
 use ndarray_npy::{
-    NpzReader, NpzWriter, ReadNpyError, ReadNpzError, ReadableElement, WritableElement,
-    WriteNpzError,
+    NpzReader, NpzWriter, ReadDataError, ReadNpyError, ReadNpzError, ReadableElement,
+    WritableElement, WriteNpzError,
 };
+use py_literal::Value;
 
 use super::{Dataset, DatasetError, Sample, Source, levels};
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
@@ -177,6 +178,34 @@ impl Element for u8 {
     const NAME: &'static str = "u8";
 }
 
+/// An element that is read before room is made for it: a header may say that there are more than fit
+/// in any memory.
+#[derive(Clone)]
+struct Met<T>(T);
+
+impl<T: ReadableElement> ReadableElement for Met<T> {
+    fn read_to_end_exact_vec<R: Read>(
+        reader: R,
+        type_desc: &Value,
+        len: usize,
+    ) -> Result<Vec<Self>, ReadDataError> {
+        // A wrong type is said before a wrong length.
+        T::read_to_end_exact_vec(io::empty(), type_desc, 0)?;
+        let expected = len.saturating_mul(size_of::<T>());
+        let mut bytes = Vec::new();
+        let one_more = (expected as u64).saturating_add(1);
+        reader
+            .take(one_more)
+            .read_to_end(&mut bytes)
+            .map_err(ReadDataError::Io)?;
+        if bytes.len() < expected {
+            return Err(ReadDataError::MissingData);
+        }
+        let values = T::read_to_end_exact_vec(bytes.as_slice(), type_desc, len)?;
+        Ok(values.into_iter().map(Self).collect())
+    }
+}
+
 /// An `.npz` file being read.
 struct File<'a> {
     npz: NpzReader<Cursor<&'a [u8]>>,
@@ -218,7 +247,7 @@ impl<'a> File<'a> {
         let lengths: String = inner.iter().map(|length| format!(",{length}")).collect();
         let count = n.map_or_else(|| "N".to_owned(), |n| n.to_string());
         let expected = format!("{} [{count}{lengths}]", T::NAME);
-        let values: ArrayD<T> = self.npz.by_name(array).map_err(|error| {
+        let values: ArrayD<Met<T>> = self.npz.by_name(array).map_err(|error| {
             let found = match error {
                 ReadNpzError::Npy(ReadNpyError::WrongDescriptor(found)) => format!("dtype {found}"),
                 other => other.to_string(),
@@ -234,7 +263,9 @@ impl<'a> File<'a> {
             return Err(self.error(array, format!("{} {shape:?}", T::NAME), expected));
         }
         // Row-major whatever the file's order.
-        Ok(Some(values.iter().cloned().collect()))
+        Ok(Some(
+            values.iter().map(|Met(value)| value.clone()).collect(),
+        ))
     }
 
     /// The array `meta`; null if it is not there.

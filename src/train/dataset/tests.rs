@@ -76,6 +76,23 @@ fn optional_arrays_may_be_missing() {
 }
 
 #[test]
+fn more_frames_than_fit_in_memory_are_an_error() {
+    let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
+    npz.add_array("frames", &Array3::<f32>::zeros((2, ROWS, COLS)))
+        .unwrap();
+    let mut bytes = npz.finish().unwrap().into_inner();
+    // The header is padded with spaces, so there is room for a longer number.
+    let shape = b"(2, 28, 28)";
+    let place = bytes.windows(shape.len()).position(|part| part == shape);
+    let line = bytes[place.unwrap()..].split_mut(|&byte| byte == b'\n');
+    let line = line.into_iter().next().unwrap();
+    line.copy_within(..line.len() - 12, 12);
+    line[..12 + shape.len()].copy_from_slice(b"(9999999999999, 28, 28)");
+    let error = parse(&bytes).unwrap_err().to_string();
+    assert!(error.contains("array `frames`: found"), "{error}");
+}
+
+#[test]
 fn what_is_not_as_agreed_is_named_with_what_was_found_and_expected() {
     fn check(fill: impl FnOnce(&mut NpzWriter<Cursor<Vec<u8>>>), expected: &str) {
         let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
