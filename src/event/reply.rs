@@ -59,7 +59,7 @@ impl Reply {
 /// Who is speaking, and of what.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Hello {
-    /// [`PROTOCOL`].
+    /// [`PROTOCOL`](super::PROTOCOL).
     pub protocol: u32,
     /// `hardnessd`.
     pub server: &'static str,
