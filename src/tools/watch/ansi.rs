@@ -6,10 +6,10 @@
 use std::convert::Infallible;
 use std::fmt::Write;
 
-use ratatui::backend::{Backend, ClearType, WindowSize};
-use ratatui::buffer::Cell;
-use ratatui::layout::{Position, Size};
-use ratatui::style::{Color, Modifier};
+use ratatui_core::backend::{Backend, ClearType, WindowSize};
+use ratatui_core::buffer::Cell;
+use ratatui_core::layout::{Position, Size};
+use ratatui_core::style::{Color, Modifier};
 
 /// Takes over the terminal: alternate screen, no cursor. A terminal that knows neither passes over
 /// both.

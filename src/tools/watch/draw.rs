@@ -4,20 +4,19 @@
 //! live, the last frame is shown without its colours and under the word for what it is, the curves
 //! run out, and no number of it is called present.
 
+mod curve;
 mod map;
 
 use std::borrow::Cow;
 use std::time::Duration;
 
-use ratatui::Frame;
-use ratatui::buffer::Buffer;
-use ratatui::layout::Rect;
-use ratatui::style::{Color, Modifier, Style};
-use ratatui::symbols::bar;
-use ratatui::widgets::{Sparkline, Widget};
+use ratatui_core::buffer::Buffer;
+use ratatui_core::layout::Rect;
+use ratatui_core::style::{Color, Modifier, Style};
+use ratatui_core::terminal::Frame;
 
 use super::look::Look;
-use super::view::{self, Link, Load, Sensor, Verdict, View, WINDOW, age};
+use super::view::{Link, Sensor, Verdict, View, age};
 
 /// Widest picture that is one column.
 const NARROW: u16 = 64;
@@ -305,62 +304,6 @@ impl Page<'_> {
         self.text(rest, &line, style);
     }
 
-    fn force(&mut self, area: Rect, sensor: &Sensor, link: Link) {
-        let present = |load: &view::Frame| format!("{:.2} N", load.force_n);
-        self.curve(area, "force", sensor, link, present, |load| load.force_n);
-    }
-
-    fn contact(&mut self, area: Rect, sensor: &Sensor, link: Link) {
-        let present = |load: &view::Frame| format!("{} taxels", load.contact_area_taxels);
-        let area_taxels = |load: &Load| load.contact_area_taxels as f32;
-        self.curve(area, "contact area", sensor, link, present, area_taxels);
-    }
-
-    /// A heading with the present value, if there is one, and the last 30 s.
-    fn curve(
-        &mut self,
-        area: Rect,
-        name: &str,
-        sensor: &Sensor,
-        link: Link,
-        present: impl Fn(&view::Frame) -> String,
-        value: impl Fn(&Load) -> f32,
-    ) {
-        let mut rows = Rows(area);
-        let Some(row) = rows.take(1) else { return };
-        let curve = sensor.curve(self.now, usize::from(area.width), value);
-        let most = curve.iter().flatten().copied().fold(0.0, f32::max);
-        let rest = self.text(row, &format!("{name} "), self.look.heading());
-        let rest = match (&sensor.frame, link) {
-            (Some(frame), Link::Live) => self.text(rest, &present(frame), self.look.strong()),
-            _ => self.text(rest, "not known", self.look.aside()),
-        };
-        let seconds = WINDOW.as_secs();
-        let scale = format!("  {seconds} s, to {most:.0}");
-        self.text(rest, &scale, self.look.aside());
-        let bars: Vec<Option<u64>> = curve
-            .iter()
-            .map(|value| value.map(|value| (value * FINE).round() as u64))
-            .collect();
-        let set = if self.look.unicode {
-            bar::NINE_LEVELS
-        } else {
-            ASCII_BARS
-        };
-        let absent = if self.look.unicode { "\u{b7}" } else { " " };
-        Sparkline::default()
-            .data(bars)
-            .max(((most * FINE).round() as u64).max(1))
-            .bar_set(set)
-            .absent_value_symbol(absent)
-            .absent_value_style(self.look.aside())
-            .style(
-                self.look
-                    .style(Style::new().fg(Color::Indexed(75)), Modifier::empty()),
-            )
-            .render(rows.0, self.buffer);
-    }
-
     fn verdicts(&mut self, area: Rect, view: &View, sensor: &Sensor, link: Link) {
         let mut rows = Rows(area);
         let Some(row) = rows.take(1) else { return };
@@ -432,18 +375,3 @@ fn halves(area: Rect) -> (Rect, Rect) {
     };
     (Rect { height, ..area }, lower)
 }
-
-/// Steps of a newton or a taxel that a curve tells apart.
-const FINE: f32 = 1000.0;
-
-const ASCII_BARS: bar::Set<'static> = bar::Set {
-    full: "#",
-    seven_eighths: "#",
-    three_quarters: "+",
-    five_eighths: "+",
-    half: "=",
-    three_eighths: "-",
-    one_quarter: "-",
-    one_eighth: ".",
-    empty: " ",
-};

@@ -1,6 +1,6 @@
 //! What a terminal can show, and what things look like on it.
 
-use ratatui::style::{Color, Modifier, Style};
+use ratatui_core::style::{Color, Modifier, Style};
 
 use super::view::Link;
 

@@ -9,8 +9,8 @@ use std::panic;
 use std::sync::{OnceLock, mpsc as std_mpsc};
 use std::time::Duration;
 
-use ratatui::layout::Size;
-use ratatui::{Frame, Terminal};
+use ratatui_core::layout::Size;
+use ratatui_core::terminal::{Frame, Terminal};
 use rustix::termios::{OptionalActions, Termios};
 use tokio::sync::mpsc;
 

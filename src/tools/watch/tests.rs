@@ -3,11 +3,11 @@
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use ratatui::Terminal;
-use ratatui::backend::{Backend, TestBackend};
-use ratatui::buffer::Buffer;
-use ratatui::layout::Size;
-use ratatui::style::Color;
+use ratatui_core::backend::{Backend, TestBackend};
+use ratatui_core::buffer::Buffer;
+use ratatui_core::layout::Size;
+use ratatui_core::style::Color;
+use ratatui_core::terminal::Terminal;
 use rustix::termios::LocalModes;
 use serde_json::{Value, json};
 
@@ -111,7 +111,7 @@ fn rows(buffer: &Buffer) -> Vec<String> {
     let width = usize::from(buffer.area.width);
     let cells = buffer.content.chunks(width);
     cells
-        .map(|row| row.iter().map(ratatui::buffer::Cell::symbol).collect())
+        .map(|row| row.iter().map(ratatui_core::buffer::Cell::symbol).collect())
         .collect()
 }
 
@@ -232,6 +232,50 @@ fn a_curve_has_holes_where_there_was_no_frame() {
     // Twenty seconds later the first is past.
     let curve = sensor.curve(at(36_000).mono, 30, |load| load.force_n);
     assert_eq!(curve.iter().flatten().count(), 1);
+}
+
+#[test]
+fn a_bar_is_as_high_as_its_share_of_the_highest() {
+    let mut view = told(&[
+        (0, hello("a", &["forearm"])),
+        (0, status("forearm", "live")),
+    ]);
+    for (ms, newtons) in [(10_000, 2.0), (20_000, 1.25), (29_950, 0.5)] {
+        hear(&mut view, ms, frame("forearm", newtons, 1));
+    }
+    // Bars of the force from left to right: what stands in each of the rows, lower first.
+    let bars = |look| {
+        let rows = rows(&picture(&view, 30_000, (150, 40), look));
+        let heading = rows.iter().position(|row| row.contains("force ")).unwrap();
+        let end = rows
+            .iter()
+            .position(|row| row.contains("contact area"))
+            .unwrap();
+        let start = rows[heading]
+            .split("force ")
+            .next()
+            .unwrap()
+            .chars()
+            .count();
+        let column = |x| -> String {
+            let cells = rows[heading + 1..end].iter().rev();
+            cells.map(|row| row.chars().nth(x).unwrap()).collect()
+        };
+        let mut bars: Vec<String> = (start..150).map(column).collect();
+        bars.dedup();
+        bars.retain(|bar| !bar.trim().is_empty() && !bar.starts_with('\u{b7}'));
+        bars
+    };
+    // Seven rows of eight eighths.
+    assert_eq!(
+        bars(COLOURS),
+        [
+            "\u{2588}".repeat(7).as_str(),
+            "\u{2588}\u{2588}\u{2588}\u{2588}\u{2583}  ",
+            "\u{2588}\u{2586}     "
+        ]
+    );
+    assert_eq!(bars(PLAIN), ["#######", "####-  ", "#+     "]);
 }
 
 #[test]

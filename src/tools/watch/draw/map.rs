@@ -1,7 +1,7 @@
 //! The pressure map: in colours, in greys where it is no longer true, or in characters.
 
-use ratatui::layout::Rect;
-use ratatui::style::Color;
+use ratatui_core::layout::Rect;
+use ratatui_core::style::Color;
 
 use super::super::view::{Link, Sensor};
 use super::Page;
