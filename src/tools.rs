@@ -1,10 +1,10 @@
 //! What stands around the daemon: a sensor to try it on, recordings played again, eyes on a terminal.
 
+pub mod args;
 pub mod check;
 pub mod demo;
 pub mod doctor;
 mod faults;
-pub mod generate;
 mod player;
 mod pty;
 pub mod record;

@@ -7,63 +7,19 @@ use std::pin::pin;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use clap::{CommandFactory, Parser, Subcommand};
+use clap::Parser;
 use hardnessd::daemon::config::{Error as ConfigError, Setup};
 use hardnessd::daemon::log::{Log, Settings as LogSettings};
 use hardnessd::daemon::publish::Error as PublishError;
 use hardnessd::daemon::record::Error as RecordError;
 use hardnessd::daemon::socket::Error as SocketError;
 use hardnessd::daemon::{Daemon, Error as DaemonError, Reload};
+use hardnessd::tools::args::{Args, Command};
 use hardnessd::tools::{
-    self, check, demo, doctor, generate, record, recover, replay, simulate, sniff, tail, watch,
+    self, check, demo, doctor, record, recover, replay, simulate, sniff, tail, watch,
 };
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::mpsc;
-
-/// Hardness events from a tactile array on a serial port
-#[derive(Debug, Parser)]
-#[command(version, about, max_term_width = 100, after_long_help = EXIT_CODES)]
-struct Args {
-    #[command(subcommand)]
-    command: Command,
-}
-
-#[derive(Debug, Subcommand)]
-enum Command {
-    /// Serve: sensors in, events out, until SIGTERM; SIGHUP reads the configuration again
-    Run {
-        /// Configuration
-        #[arg(long, value_name = "F")]
-        config: PathBuf,
-    },
-    /// Show it all on a simulated sensor: events on stdout as JSON lines
-    Demo(demo::Args),
-    /// Play a simulated sensor at a pty
-    Simulate(simulate::Args),
-    /// Record sensors to a file, with what they were judged to be
-    Record(record::Args),
-    /// Save what is whole in a damaged recording
-    Recover(recover::Args),
-    /// Play a recording through the same pipeline: events on stdout as JSON lines
-    Replay(replay::Args),
-    /// Print events of a running daemon
-    Tail(tail::Args),
-    /// Show the sensors of a running daemon on the terminal
-    Watch(watch::Args),
-    /// Check a configuration and say what would run
-    Check(check::Args),
-    /// Say why a port will not work, and what mends it
-    Doctor(doctor::Args),
-    /// Look at raw bytes and propose a [sensor.frame]: TOML on stdout
-    Sniff(sniff::Args),
-    /// Write man pages and completions, for a package
-    #[command(hide = true)]
-    Generate(generate::Args),
-}
-
-const EXIT_CODES: &str = "Exit codes: 0 done, also after SIGINT and SIGTERM; 1 failed or bad data; \
-    2 wrong usage; 66 a file named here is missing or unreadable; 69 device or daemon unavailable; \
-    74 I/O error; 78 bad configuration or model, or a file that the configuration names.";
 
 /// What an operator's script may rely on.
 mod exit {
@@ -142,7 +98,6 @@ async fn dispatch(command: Command, signals: Signals) -> anyhow::Result<()> {
         Command::Check(args) => interruptible(signals, move || check::run(&args)).await,
         Command::Doctor(args) => interruptible(signals, move || doctor::run(&args)).await,
         Command::Sniff(args) => Ok(sniff::run(args, signals.end()).await?),
-        Command::Generate(args) => Ok(generate::run(args, Args::command())?),
     }
 }
 
@@ -376,9 +331,6 @@ fn exit_code(error: &anyhow::Error) -> u8 {
             sniff::Error::Unexplained { .. } => exit::FAILED,
             sniff::Error::Print(_) => exit::IO,
         };
-    }
-    if error.is::<generate::Error>() {
-        return exit::IO;
     }
     if error.is::<hardnessd::daemon::log::Error>() {
         return exit::CONFIG;
