@@ -6,17 +6,16 @@
 //! Presses of one object are near-copies, so an interval over frames is too narrow: ours draws
 //! whole objects.
 
-use std::collections::BTreeMap;
+mod by_object;
 
 use serde::{Deserialize, Serialize};
 
-use crate::random::Stream;
 use crate::verdict::argmax;
+
+pub use by_object::{Estimate, ObjectCount, accuracy_by_object, by_object, difference_by_object};
 
 /// Equal-width bins of the largest probability in the expected calibration error.
 const CALIBRATION_BINS: usize = 15;
-/// Draws of the bootstrap.
-const BOOTSTRAP_DRAWS: usize = 2_000;
 /// A probability of 0 for what happened would make the NLL infinite.
 const SMALLEST_PROBABILITY: f64 = 1e-12;
 
@@ -209,120 +208,6 @@ fn negative_log_likelihood(judged: &[Judged]) -> f64 {
     judged.iter().map(of_one).sum::<f64>() / judged.len() as f64
 }
 
-/// How an object was judged.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct ObjectCount {
-    /// Its true level, 1..=L.
-    pub level: u8,
-    /// Its number.
-    pub object: u32,
-    /// Samples judged rightly.
-    pub right: u64,
-    /// Samples of it.
-    pub samples: u64,
-}
-
-/// The objects of `judged` in the order of level and number; `None` if a sample has no object.
-pub fn by_object(judged: &[Judged]) -> Option<Vec<ObjectCount>> {
-    let mut objects: BTreeMap<(u8, u32), (u64, u64)> = BTreeMap::new();
-    for one in judged {
-        let (right, samples) = objects.entry((one.level, one.object?)).or_default();
-        *right += u64::from(one.prediction() == one.truth());
-        *samples += 1;
-    }
-    let count = |((level, object), (right, samples))| ObjectCount {
-        level,
-        object,
-        right,
-        samples,
-    };
-    Some(objects.into_iter().map(count).collect())
-}
-
-/// A share of samples, or a difference of two, with its 95 % interval by a bootstrap over objects
-/// within each level.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Estimate {
-    /// Over all samples, and over the seeds if there are several.
-    pub mean: f64,
-    /// Low and high end; `None` where no level has two objects: every draw is then the same, which
-    /// says nothing of other objects.
-    pub interval: Option<[f64; 2]>,
-}
-
-/// A method's accuracy over its seeds' judgements of the same samples; `None` if there are none.
-pub fn accuracy_by_object(seeds: &[&[ObjectCount]]) -> Option<Estimate> {
-    let counts = seeds.iter().copied().flatten();
-    bootstrap(counts.map(|count| (count, count.right as i64)))
-}
-
-/// A method's accuracy less another's, over `seeds`: both methods' judgements of the same samples
-/// under one seed, a pair each. An object is drawn with both, so that what makes it hard for both
-/// cancels out. `None` without pairs, or if two do not count the same samples.
-pub fn difference_by_object(seeds: &[(&[ObjectCount], &[ObjectCount])]) -> Option<Estimate> {
-    let samples = |count: &ObjectCount| (count.level, count.object, count.samples);
-    let mut differences = Vec::new();
-    for (method, other) in seeds {
-        if !method.iter().map(samples).eq(other.iter().map(samples)) {
-            return None;
-        }
-        let pairs = method.iter().zip(*other);
-        differences.extend(pairs.map(|(a, b)| (a, a.right as i64 - b.right as i64)));
-    }
-    bootstrap(differences.into_iter())
-}
-
-/// Estimates a sum over objects by their samples; an object that comes several times is added up.
-/// Draws whole objects, with replacement, as many as each level has; seed 0.
-fn bootstrap<'a>(counts: impl Iterator<Item = (&'a ObjectCount, i64)>) -> Option<Estimate> {
-    let mut levels: BTreeMap<u8, BTreeMap<u32, (i64, u64)>> = BTreeMap::new();
-    for (count, value) in counts {
-        let objects = levels.entry(count.level).or_default();
-        let (sum, samples) = objects.entry(count.object).or_default();
-        *sum += value;
-        *samples += count.samples;
-    }
-    let levels: Vec<Vec<(i64, u64)>> = levels
-        .into_values()
-        .map(|objects| objects.into_values().collect())
-        .collect();
-    let add = |(sum, samples), &(value, more): &(i64, u64)| (sum + value, samples + more);
-    if levels.is_empty() {
-        return None;
-    }
-    let ratio = |(sum, samples): (i64, u64)| sum as f64 / samples as f64;
-    let mean = ratio(levels.iter().flatten().fold((0, 0), add));
-    if levels.iter().all(|objects| objects.len() < 2) {
-        let interval = None;
-        return Some(Estimate { mean, interval });
-    }
-    let mut stream = Stream::new(0, "bootstrap by object");
-    let mut draws: Vec<f64> = (0..BOOTSTRAP_DRAWS)
-        .map(|_| {
-            let mut total = (0, 0);
-            for level in &levels {
-                for _ in level {
-                    total = add(total, &level[stream.below(level.len())]);
-                }
-            }
-            ratio(total)
-        })
-        .collect();
-    draws.sort_by(f64::total_cmp);
-    Some(Estimate {
-        mean,
-        interval: Some([quantile(&draws, 0.025), quantile(&draws, 0.975)]),
-    })
-}
-
-/// Linear between the two nearest, as numpy's default.
-fn quantile(sorted: &[f64], q: f64) -> f64 {
-    let place = q * (sorted.len() - 1) as f64;
-    let below = place.floor() as usize;
-    let above = (below + 1).min(sorted.len() - 1);
-    sorted[below] + (place - below as f64) * (sorted[above] - sorted[below])
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -355,7 +240,7 @@ mod tests {
         }
     }
 
-    fn judged(level: u8, probabilities: [f32; 4], object: u32) -> Judged {
+    pub(super) fn judged(level: u8, probabilities: [f32; 4], object: u32) -> Judged {
         Judged {
             level,
             probabilities: probabilities.to_vec(),
@@ -441,60 +326,5 @@ mod tests {
         let evaluation = Evaluation::of(&[sample], 4);
         assert_eq!(evaluation.accuracy_interval_by_object, None);
         assert_eq!(evaluation.kappa, None);
-    }
-
-    /// Objects of 50 samples of one level: how many each method judged rightly.
-    fn counts(right: &[u64]) -> Vec<ObjectCount> {
-        (0..)
-            .zip(right)
-            .map(|(object, &right)| ObjectCount {
-                level: 1,
-                object,
-                right,
-                samples: 50,
-            })
-            .collect()
-    }
-
-    #[test]
-    fn a_difference_that_is_the_same_on_every_object_is_certain() {
-        // The objects differ widely, but the second method is two samples better on each.
-        let (first, second) = (counts(&[0, 10, 48, 30]), counts(&[2, 12, 50, 32]));
-        let difference = difference_by_object(&[(&first, &second)]).unwrap();
-        assert_eq!(difference.mean, -0.04);
-        assert_eq!(difference.interval, Some([-0.04, -0.04]));
-        assert_eq!(difference_by_object(&[(&first, &second[..3])]), None);
-        assert_eq!(difference_by_object(&[]), None);
-    }
-
-    #[test]
-    fn one_object_a_level_has_no_interval() {
-        let (first, second) = (counts(&[40]), counts(&[45]));
-        let accuracy = accuracy_by_object(&[&first]).unwrap();
-        assert_eq!((accuracy.mean, accuracy.interval), (0.8, None));
-        let difference = difference_by_object(&[(&first, &second)]).unwrap();
-        assert_eq!((difference.mean, difference.interval), (-0.1, None));
-        let samples = [1, 2].map(|level| judged(level, [0.7, 0.1, 0.1, 0.1], u32::from(level)));
-        let evaluation = Evaluation::of(&samples, 4);
-        assert_eq!(evaluation.accuracy_interval_by_object, None);
-        let two = [3, 4].map(|object| judged(1, [0.7, 0.1, 0.1, 0.1], object));
-        let evaluation = Evaluation::of(&[&samples[..], &two].concat(), 4);
-        assert!(evaluation.accuracy_interval_by_object.is_some());
-    }
-
-    #[test]
-    fn the_interval_of_a_difference_is_the_normal_one_for_many_objects() {
-        // Half of 400 objects 10 samples better, half 10 worse, each seed the same way: the mean's
-        // standard deviation is 0.2 / sqrt(400) = 0.01, whatever the number of seeds.
-        let first = counts(&[30; 400]);
-        let second = counts(&[[20; 200], [40; 200]].concat());
-        let pair = (&first[..], &second[..]);
-        for pairs in [&[pair][..], &[pair, pair]] {
-            let Estimate { mean, interval } = difference_by_object(pairs).unwrap();
-            assert_eq!(mean, 0.0);
-            for (end, expected) in interval.unwrap().into_iter().zip([-0.0196, 0.0196]) {
-                assert!((end - expected).abs() < 0.0012, "{interval:?}");
-            }
-        }
     }
 }

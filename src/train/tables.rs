@@ -12,8 +12,8 @@ use super::compare::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS};
 use super::history::{History, Stage};
 use super::metrics::{self, Evaluation};
 use cells::{
-    before_temperature, beside, deviation, interval, interval_text, less_reference,
-    mean_over_seeds, number, of_entries, percent_of, with_spread,
+    before_temperature, beside, deviation, interval, interval_text, least, less_features,
+    less_reference, mean_over_seeds, most, number, of_entries, percent_of, with_spread,
 };
 
 pub use cells::{
@@ -93,7 +93,8 @@ pub fn provenance(comparison: &Comparison) -> String {
     }
     lines.push(
         "Simulated data, unless you gave your own. Intervals are 95 %, by a bootstrap over objects \
-         within each level; ± is the standard deviation over seeds."
+         within each level and, where there are several, over seeds: those of one seed do not hold \
+         what another seed, or another rounding, gives. ± is the standard deviation over seeds."
             .to_owned(),
     );
     lines.join("\n")
@@ -421,8 +422,9 @@ pub fn evaluation(evaluation: &Evaluation) -> Table {
 /// The roles of materials swapped.
 pub fn swaps(swaps: &[SwapEntry]) -> Table {
     let note = "The two materials of some levels in each other's roles, each time learnt anew and \
-                judged on 20 objects a material: accuracy in per cent over the assignments. Its \
-                spread is what the choice of materials alone does.";
+                judged on 20 objects a material of the paper's shapes: accuracy in per cent over the \
+                assignments. Its spread is what the choice of materials alone does. \"Less \
+                features\": over the same assignments and labels, in points, least to most.";
     let head = [
         "method",
         "labels",
@@ -432,6 +434,7 @@ pub fn swaps(swaps: &[SwapEntry]) -> Table {
         "deviation",
         "least",
         "most",
+        "less features",
     ];
     let mut table = Table::new("Materials swapped", note, &head);
     for group in swap_groups(swaps) {
@@ -447,8 +450,9 @@ pub fn swaps(swaps: &[SwapEntry]) -> Table {
             unswapped.map_or("-".to_owned(), |swap| number(100.0 * swap.test.accuracy, 1)),
             number(mean(&percents), 1),
             deviation(&percents).map_or("-".to_owned(), |sd| number(sd, 1)),
-            number(percents.iter().copied().fold(f64::INFINITY, f64::min), 1),
-            number(percents.iter().copied().fold(0.0, f64::max), 1),
+            number(least(&percents), 1),
+            number(most(&percents), 1),
+            less_features(&group, swaps),
         ]);
     }
     table

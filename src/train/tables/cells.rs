@@ -8,6 +8,9 @@ use crate::train::paper;
 /// The method that the others are compared with.
 pub const REFERENCE: &str = "ours";
 
+/// What every network must be better than.
+const FEATURES: &str = "features";
+
 /// Mean counts of some evaluations.
 pub fn mean_confusion(evaluations: &[&Evaluation]) -> Vec<Vec<f64>> {
     let levels = evaluations.first().map_or(0, |first| first.confusion.len());
@@ -95,6 +98,25 @@ pub(super) fn less_reference(row: &Row, rows: &[Row], set: &str) -> String {
     metrics::difference_by_object(&pairs).map_or("-".to_owned(), difference_text)
 }
 
+/// Assignments of a method less those of `features` with the same labels, where both have one.
+pub(super) fn less_features(group: &[&SwapEntry], swaps: &[SwapEntry]) -> String {
+    if group[0].method == FEATURES {
+        return String::new();
+    }
+    let key = |swap: &SwapEntry| (swap.seed, swap.labels, swap.swapped_levels);
+    let of_features = |own: &&SwapEntry| {
+        let mut others = swaps.iter().filter(|swap| swap.method == FEATURES);
+        let other = others.find(|swap| key(swap) == key(own))?;
+        Some(100.0 * (own.test.accuracy - other.test.accuracy))
+    };
+    let points: Vec<f64> = group.iter().filter_map(of_features).collect();
+    if points.is_empty() {
+        return "-".to_owned();
+    }
+    let (low, high) = (least(&points), most(&points));
+    format!("{:+.1} ({low:+.1} to {high:+.1})", mean(&points))
+}
+
 /// In points.
 fn difference_text(difference: Estimate) -> String {
     let mean = 100.0 * difference.mean;
@@ -169,6 +191,16 @@ pub(super) fn beside(here: String, there: Option<f64>, decimals: usize) -> Strin
 /// Mean; 0 of nothing.
 pub fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len().max(1) as f64
+}
+
+/// The least; infinite of nothing.
+pub(super) fn least(values: &[f64]) -> f64 {
+    values.iter().copied().fold(f64::INFINITY, f64::min)
+}
+
+/// The most; minus infinity of nothing.
+pub(super) fn most(values: &[f64]) -> f64 {
+    values.iter().copied().fold(f64::NEG_INFINITY, f64::max)
 }
 
 /// Standard deviation of a sample; `None` of fewer than two.
