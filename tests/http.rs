@@ -9,6 +9,7 @@ mod bench;
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
+use std::time::Duration;
 
 use bench::{Bench, Daemon, PATIENCE, wait_for};
 use serde_json::{Value, json};
@@ -145,6 +146,24 @@ fn events_broken_off_and_resumed_come_once_each() {
     assert_eq!(other.next()["seq"], Value::Null, "the status as it is");
     assert_eq!(other.next(), json!({"type": "gap", "lost": null}));
     assert_eq!(other.next()["type"], "press");
+}
+
+#[test]
+fn requests_given_up_at_once_leave_no_subscriber() {
+    let bench = Bench::new();
+    let (_daemon, address) = serving(&bench);
+    for _ in 0..6 {
+        for wait_us in 0..50 {
+            let stream = open(address, "GET /events", &[]);
+            // Wherever the daemon is with it by then.
+            std::thread::sleep(Duration::from_micros(2 * wait_us));
+            drop(stream);
+        }
+        wait_for("the end of all subscribers", || {
+            let none = "hardnessd_subscribers{robot=\"arm-7\"} 0\n";
+            get(address, "/metrics").body.contains(none)
+        });
+    }
 }
 
 #[test]

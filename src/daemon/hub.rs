@@ -316,7 +316,8 @@ impl Handle {
             .await;
     }
 
-    /// A new subscriber: its number, and the `hello` for it.
+    /// A new subscriber: its number, and the `hello` for it. Whoever asks has to come to
+    /// [`Handle::leave`], so it may not be dropped between: it is a task, or a part of one.
     pub(crate) async fn join(&self) -> Result<(u64, Line), Closed> {
         self.ask(|reply| Command::Join { reply }).await
     }

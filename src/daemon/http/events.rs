@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use hyper::Request;
 use hyper::body::Bytes;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 
 use crate::daemon::hub::{self, Closed, Line};
 use crate::daemon::request::{Kinds, Policy, Since, Subscription};
@@ -84,22 +84,44 @@ fn decoded(text: &str) -> Option<String> {
 }
 
 /// Subscribes; the inner error is for the asker.
+///
+/// All of it is a task of its own: a request whose browser goes away is dropped wherever it waits,
+/// and a subscriber that has joined the hub must leave it.
 pub(super) async fn open(
     hub: &hub::Handle,
     sensors: &Sensors,
     wanted: Subscription,
 ) -> Result<Result<mpsc::Receiver<Bytes>, String>, Closed> {
-    let run = hub.survey().await?.hello.run;
-    let (id, hello) = hub.join().await?;
+    let (reply, opened) = oneshot::channel();
+    let (hub, sensors) = (hub.clone(), sensors.clone());
+    tokio::spawn(async move {
+        if let Ok((id, hello)) = hub.join().await {
+            // Any end of it is a reason to stop: the asker's, the hub's, or the connection's.
+            let _ = serve(&hub, &sensors, id, hello, wanted, reply).await;
+            hub.leave(id).await;
+        }
+    });
+    opened.await.map_err(|_| Closed)
+}
+
+/// Serves one that has joined, from the answer to its request on.
+async fn serve(
+    hub: &hub::Handle,
+    sensors: &Sensors,
+    id: u64,
+    hello: Line,
+    wanted: Subscription,
+    opened: oneshot::Sender<Result<mpsc::Receiver<Bytes>, String>>,
+) -> Option<()> {
+    let run = hub.survey().await.ok()?.hello.run;
     // Where a connection that breaks before its first event is to go on.
     let from = match &wanted.since {
         None => hello.seq,
         Some(since) if since.run == run => None,
         Some(_) => Some(0),
     };
-    if let Err(message) = hub.subscribe(id, wanted).await? {
-        hub.leave(id).await;
-        return Ok(Err(message));
+    if let Err(message) = hub.subscribe(id, wanted).await.ok()? {
+        return opened.send(Err(message)).ok();
     }
     let mut first = format!("retry: {}\n", RETRY.as_millis()).into_bytes();
     write(&mut first, &run, &Line { seq: from, ..hello });
@@ -108,13 +130,8 @@ pub(super) async fn open(
     }
     // What the connection does not take stays in the hub, whose queue is bounded.
     let (sender, events) = mpsc::channel(1);
-    let hub = hub.clone();
-    tokio::spawn(async move {
-        // Either end of it is a reason to stop: the hub's, or the connection's.
-        let _ = pass_on(&hub, id, &run, first, &sender).await;
-        hub.leave(id).await;
-    });
-    Ok(Ok(events))
+    opened.send(Ok(events)).ok()?;
+    pass_on(hub, id, &run, first, &sender).await
 }
 
 /// Hands events to the connection until it is gone or the hub has ended.
