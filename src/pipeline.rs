@@ -382,7 +382,8 @@ impl Pipeline {
         // A baseline stands, be it that another is being taken.
         let tared = !self.tare.is_taking() || self.seen.retaring.is_some();
         let changes = if tared {
-            self.tracker.push(&frame, at)
+            let marks = self.marks(raw, &frame);
+            self.tracker.push(&frame, marks, at)
         } else {
             Vec::new()
         };

@@ -24,6 +24,16 @@ pub struct Moment {
     pub stamp: Stamp,
 }
 
+/// What else is known of a frame, by the settings that it came under: others may hold when its press
+/// is judged.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Marks {
+    /// The contact touches the border of the array.
+    pub at_edge: bool,
+    /// A live taxel reads full scale.
+    pub saturated: bool,
+}
+
 /// The frame of maximal contact area so far; ties go to the greater force, then the earlier one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Peak {
@@ -31,6 +41,9 @@ pub struct Peak {
     pub moment: Moment,
     /// Its taxels.
     pub frame: Frame,
+    /// What else is known of it.
+    #[serde(default)]
+    pub marks: Marks,
     /// Its contact area.
     pub contact_area_taxels: u32,
     /// Its total force.
@@ -188,7 +201,7 @@ impl PressTracker {
     }
 
     /// Takes the next frame in, and tells what it changed, in order.
-    pub fn push(&mut self, frame: &Frame, at: Moment) -> Vec<Change> {
+    pub fn push(&mut self, frame: &Frame, marks: Marks, at: Moment) -> Vec<Change> {
         let area = frame.contact_area_taxels(self.settings.contact_threshold_n);
         let touched = area >= self.settings.end_area_taxels;
         let mut changes = Vec::new();
@@ -199,6 +212,7 @@ impl PressTracker {
                 let peak = Peak {
                     moment: at,
                     frame: *frame,
+                    marks,
                     contact_area_taxels: area,
                     force_n: frame.force_n(),
                 };
@@ -216,7 +230,7 @@ impl PressTracker {
                     peak,
                 }));
             }
-            State::Pressed(pressed) if touched => pressed.touch(frame, at, area),
+            State::Pressed(pressed) if touched => pressed.touch(frame, marks, at, area),
             State::Pressed(pressed) => pressed.released_frames += 1,
             State::AwaitingRelease { released_frames } => {
                 *released_frames = if touched { 0 } else { *released_frames + 1 };
@@ -290,7 +304,7 @@ impl PressTracker {
 const ROUNDING: f64 = 2.0 * f32::EPSILON as f64;
 
 impl Pressed {
-    fn touch(&mut self, frame: &Frame, at: Moment, area: u32) {
+    fn touch(&mut self, frame: &Frame, marks: Marks, at: Moment, area: u32) {
         self.last = at;
         self.frames += 1;
         self.released_frames = 0;
@@ -304,6 +318,7 @@ impl Pressed {
             self.peak = Peak {
                 moment: at,
                 frame: *frame,
+                marks,
                 contact_area_taxels: area,
                 force_n,
             };

@@ -2,8 +2,8 @@
 
 use super::{Clock, Judgement, Pipeline};
 use crate::event::{Event, Hardness, Note, Phase, Press, PressState, Rejection};
-use crate::frame::Frame;
-use crate::press::{Change, End, Moment, Peak};
+use crate::frame::{Frame, RawFrame};
+use crate::press::{Change, End, Marks, Moment, Peak};
 
 impl Pipeline {
     /// What subscribers are told of a change.
@@ -116,24 +116,28 @@ impl Pipeline {
     }
 
     fn notes(&self, peak: &Peak) -> Vec<Note> {
-        let layout = self.decoder.layout();
-        let full_scale = layout.full_scale();
         let range = &self.judgement.hrn.card().range;
         let [least_n, most_n] = range.force_n.map(f64::from);
         let [least_taxels, most_taxels] = range.contact_area_taxels;
         let trained = (least_n..=most_n).contains(&peak.force_n)
             && (least_taxels..=most_taxels).contains(&peak.contact_area_taxels);
         [
-            (Note::AtEdge, self.is_at_edge(&peak.frame)),
-            (
-                Note::Saturated,
-                full_scale.is_some_and(|f| self.tare.is_saturated(&peak.frame, f)),
-            ),
+            (Note::AtEdge, peak.marks.at_edge),
+            (Note::Saturated, peak.marks.saturated),
             (Note::OutsideTraining, !trained),
         ]
         .into_iter()
         .filter_map(|(note, applies)| applies.then_some(note))
         .collect()
+    }
+
+    /// What is known of a frame by the settings of now.
+    pub(super) fn marks(&self, raw: &RawFrame, frame: &Frame) -> Marks {
+        let full_scale = self.decoder.layout().full_scale();
+        Marks {
+            at_edge: self.is_at_edge(frame),
+            saturated: full_scale.is_some_and(|f| self.tare.is_saturated(raw, f)),
+        }
     }
 
     fn is_at_edge(&self, frame: &Frame) -> bool {

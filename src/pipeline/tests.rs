@@ -422,6 +422,33 @@ fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
 }
 
 #[test]
+fn the_notes_are_of_the_settings_that_the_chosen_frame_came_under() {
+    let check = |counts, newtons_per_count, threshold_n, expected: &[Note]| {
+        let mut pipeline = pipeline(Preset::Jx255n);
+        play(&mut pipeline, 0, &[raw(0, 0); 5]);
+        let mut held = raw(9, counts);
+        held.counts[0] = 5;
+        play(&mut pipeline, 5, &[held, raw(3, 100)]);
+        let mut judgement = pipeline.judgement().clone();
+        judgement.calibration.newtons_per_count = newtons_per_count;
+        judgement.press.contact_threshold_n = threshold_n;
+        pipeline.reload(judgement);
+        play(&mut pipeline, 7, &[raw(0, 0)]);
+        let bytes = bytes(&pipeline, &raw(0, 0));
+        let events = pipeline.push(&bytes, at(1600));
+        let Some(Event::Hardness(verdict)) = events.last() else {
+            panic!("{events:?}")
+        };
+        let notes = verdict.notes.iter().copied();
+        let notes: Vec<Note> = notes.filter(|&n| n != Note::OutsideTraining).collect();
+        assert_eq!(notes, expected, "{counts} counts, then {newtons_per_count}");
+    };
+    check(254, 0.01, 0.07, &[Note::AtEdge]);
+    check(255, 0.08, 0.07, &[Note::AtEdge, Note::Saturated]);
+    check(254, 0.04, 2.0, &[Note::AtEdge]);
+}
+
+#[test]
 fn the_end_of_the_input_makes_a_jq_frame_whole() {
     let frames = |events: &[Event]| {
         let frames = events.iter().filter(|e| matches!(e, Event::Frame(_)));

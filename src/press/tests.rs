@@ -23,7 +23,11 @@ fn track(settings: &Settings, loads: &[(usize, f32)], rate_hz: u64) -> String {
     let mut tracker = PressTracker::new(settings.clone());
     let mut text = Vec::new();
     for (number, &(area, force_n)) in (0..).zip(loads) {
-        for change in tracker.push(&frame(area, force_n), moment(number, rate_hz)) {
+        for change in tracker.push(
+            &frame(area, force_n),
+            Marks::default(),
+            moment(number, rate_hz),
+        ) {
             text.push(match change {
                 Change::Begin { press, at } => format!("b{press}@{}", at.frame),
                 Change::Settled { peak, .. } => format!("s@{number}:{}", peak.moment.frame),
@@ -112,7 +116,7 @@ fn equal_counts_are_a_tie_however_their_newtons_are_rounded() {
         for (newtons, count) in frame.newtons.iter_mut().zip(counts) {
             *newtons = 0.04 * f32::from(count);
         }
-        changes.extend(tracker.push(&frame, moment(number, 5)));
+        changes.extend(tracker.push(&frame, Marks::default(), moment(number, 5)));
     }
     let peak = changes.into_iter().find_map(|change| match change {
         Change::End { peak, .. } => Some(peak),
@@ -189,14 +193,14 @@ fn frames_below_the_end_area_release_though_something_is_touched() {
 fn what_was_reloaded_holds_for_the_press_under_way() {
     let mut tracker = PressTracker::new(Settings::default());
     for number in 0..3 {
-        let _ = tracker.push(&frame(5, 2.0), moment(number, 5));
+        let _ = tracker.push(&frame(5, 2.0), Marks::default(), moment(number, 5));
     }
     tracker.reload(Settings {
         end_frames: 1,
         ..Settings::default()
     });
     assert!(matches!(
-        tracker.push(&frame(0, 0.0), moment(3, 5))[..],
+        tracker.push(&frame(0, 0.0), Marks::default(), moment(3, 5))[..],
         [Change::End { frames: 3, .. }]
     ));
 }
@@ -248,7 +252,7 @@ fn settling_needs_its_time_at_high_rates() {
 fn an_aborted_press_leaves_the_tracker_idle() {
     let mut tracker = PressTracker::new(Settings::default());
     assert_eq!(tracker.abort(Abort::Lost), None);
-    let _ = tracker.push(&frame(5, 2.0), moment(0, 5));
+    let _ = tracker.push(&frame(5, 2.0), Marks::default(), moment(0, 5));
     assert!(matches!(
         tracker.abort(Abort::Lost),
         Some(Change::Aborted {
@@ -268,10 +272,13 @@ fn a_loss_does_not_release_what_timed_out() {
         ..Settings::default()
     });
     for number in 0..2 {
-        let _ = tracker.push(&frame(5, 2.0), moment(number, 5));
+        let _ = tracker.push(&frame(5, 2.0), Marks::default(), moment(number, 5));
     }
     assert_eq!(tracker.abort(Abort::Lost), None);
-    assert_eq!(tracker.push(&frame(5, 2.0), moment(2, 5)), []);
+    assert_eq!(
+        tracker.push(&frame(5, 2.0), Marks::default(), moment(2, 5)),
+        []
+    );
 }
 
 #[test]

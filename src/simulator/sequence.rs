@@ -249,7 +249,7 @@ mod tests {
 
     use super::*;
     use crate::frame::{Array, Stamp};
-    use crate::press::{self, Change, End, Moment, PressTracker};
+    use crate::press::{self, Change, End, Marks, Moment, PressTracker};
     use crate::tare::{self, Tare};
 
     /// Presses that the daemon sees by its default settings, with their frames in contact.
@@ -273,7 +273,7 @@ mod tests {
                 frame: number.into(),
                 stamp: Stamp { mono, wall },
             };
-            for change in tracker.push(&tare.apply(&frame.raw), at) {
+            for change in tracker.push(&tare.apply(&frame.raw), Marks::default(), at) {
                 match change {
                     Change::End {
                         end: End::Release,
