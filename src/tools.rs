@@ -23,8 +23,7 @@ use std::process::ExitCode;
 
 use clap::error::ErrorKind;
 
-/// What is printed of an error: one line, with the causes that it does not tell itself. Whatever a file
-/// is called, it cannot break the line or speak to the terminal.
+/// What is printed of an error: one line, with the causes that it does not tell itself.
 pub fn line(error: &(dyn Error + 'static)) -> String {
     let mut line = error.to_string();
     let mut cause = error.source();
@@ -35,12 +34,18 @@ pub fn line(error: &(dyn Error + 'static)) -> String {
         }
         cause = error.source();
     }
+    shown(&line)
+}
+
+/// One line of text. Whatever a file or a process in it is called, it cannot break the line or speak to
+/// the terminal.
+fn shown(text: &str) -> String {
     let shown = |c: char| {
         let escaped = c.is_control().then(|| c.escape_default());
         let plain = escaped.is_none().then_some(c);
         escaped.into_iter().flatten().chain(plain)
     };
-    line.chars().flat_map(shown).collect()
+    text.chars().flat_map(shown).collect()
 }
 
 /// What clap says of arguments that it refuses, on one line, with exit code 2; or the help or version
@@ -65,7 +70,7 @@ pub fn usage(program: &str, error: &clap::Error) -> ExitCode {
     let told = told.split("\n\nFor more").next().unwrap_or_default();
     let told: Vec<&str> = told.split_whitespace().collect();
     let told = told.join(" ");
-    eprintln!("{program}: {}", told.trim_start_matches("error: "));
+    eprintln!("{program}: {}", shown(told.trim_start_matches("error: ")));
     ExitCode::from(2)
 }
 

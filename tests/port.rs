@@ -135,6 +135,11 @@ fn doctor_names_what_is_missing_and_who_holds_a_port() {
         "{stdout}"
     );
 
+    // Its name cannot make two of the line, nor speak to the terminal.
+    let (_, stdout, _) = run(&["doctor", "--port", "/dev/no\nsuch\u{1b}[2J"]);
+    assert!(stdout.starts_with("/dev/no\\nsuch\\u{1b}[2J: "), "{stdout}");
+    assert_eq!(stdout.lines().count(), 1, "{stdout}");
+
     // One line says that it is none, whatever else may be said of it.
     for port in ["/dev/null", "/tmp", "Cargo.toml"] {
         let (code, stdout, _) = run(&["doctor", "--port", port]);

@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 use clap::Args as ClapArgs;
 
 use self::checks::{User, examine, ports, refused};
+use super::shown;
 
 /// Arguments of `doctor`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -47,11 +48,12 @@ pub fn run(args: &Args) -> Result<(), Error> {
         .port
         .as_ref()
         .map_or_else(|| ports(root), |port| vec![port.clone()]);
-    let mut lines = String::new();
+    let mut lines = Vec::new();
     let mut found = 0;
     if ports.is_empty() {
         found += 1;
-        lines += "no USB serial port: plug the sensor in, then see `sudo dmesg | grep tty`\n";
+        let line = "no USB serial port: plug the sensor in, then see `sudo dmesg | grep tty`";
+        lines.push(line.to_owned());
     }
     for port in ports {
         let port = std::path::absolute(&port).unwrap_or(port);
@@ -61,13 +63,14 @@ pub fn run(args: &Args) -> Result<(), Error> {
         };
         found += faults.len();
         if faults.is_empty() {
-            lines += &format!("{}: no fault found\n", port.display());
+            lines.push(format!("{}: no fault found", port.display()));
         }
         for fault in faults {
-            lines += &format!("{}: {fault}\n", port.display());
+            lines.push(format!("{}: {fault}", port.display()));
         }
     }
-    super::print(lines.as_bytes()).map_err(Error::Print)?;
+    let told: String = lines.iter().map(|line| shown(line) + "\n").collect();
+    super::print(told.as_bytes()).map_err(Error::Print)?;
     match found {
         0 => Ok(()),
         found => Err(Error::Faults { found }),

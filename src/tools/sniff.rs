@@ -16,6 +16,7 @@ use std::time::Duration;
 use clap::Args as ClapArgs;
 
 use self::proposal::{Proposal, propose};
+use super::shown;
 use super::simulate::positive;
 use crate::daemon::serial::{Link, Turn};
 use crate::recording::{self, Entry, Input, Reader};
@@ -173,7 +174,7 @@ async fn listen(path: &Path, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> 
         while bytes.len() < MOST_BYTES {
             match link.turn().await {
                 Turn::Opened => {
-                    let path = path.display();
+                    let path = shown(&path.display().to_string());
                     eprintln!("listening at {path} for {seconds} s: press the sensor");
                 }
                 Turn::Bytes(read) => bytes.extend_from_slice(read),
@@ -196,7 +197,8 @@ async fn listen(path: &Path, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> 
 
 fn toml(path: &Path, bytes: usize, best: &Proposal, next: Option<&Proposal>) -> String {
     let mut toml = String::new();
-    let mut remark = |words: String| writeln!(toml, "# {words}").expect("a string takes it all");
+    let mut remark =
+        |words: String| writeln!(toml, "# {}", shown(&words)).expect("a string takes it all");
     remark(format!("{}: {bytes} bytes", path.display()));
     remark(format!("explained: {}", said(best)));
     match next {

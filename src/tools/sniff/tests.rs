@@ -263,11 +263,12 @@ fn the_simplest_settings_are_proposed() {
     let proposals = propose(&bytes);
     assert_eq!(proposals[0].settings, settings);
     let words = toml(
-        std::path::Path::new("x.bin"),
+        std::path::Path::new("x\n[y].bin"),
         bytes.len(),
         &proposals[0],
         None,
     );
+    assert!(words.starts_with("# x\\n[y].bin: "), "{words}");
     let end = "[sensor.frame]\npreset = \"jx255n\"\nsync = \"A5 5A\"\n";
     assert!(words.ends_with(end), "{words}");
 }
