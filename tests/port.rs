@@ -122,7 +122,8 @@ fn sniff_says_why_it_has_no_proposal() {
         69,
         "hardnessd doctor --port /dev/no-such",
     );
-    check(&[], 2, "required");
+    check(&[], 2, "not provided: <FILE|--port <P>>");
+    check(&["x.bin", "--port", "y"], 2, "cannot be used with");
 }
 
 #[test]

@@ -13,7 +13,7 @@ use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use clap::Args as ClapArgs;
+use clap::{ArgGroup, Args as ClapArgs};
 
 use self::proposal::{Proposal, propose};
 use super::shown;
@@ -24,9 +24,9 @@ use crate::wire::Settings;
 
 /// Arguments of `sniff`.
 #[derive(Debug, Clone, ClapArgs)]
+#[command(group(ArgGroup::new("source").args(["file", "port"]).required(true)))]
 pub struct Args {
     /// Recording: .mcap, or .bin, raw bytes back to back; best with presses in it
-    #[arg(required_unless_present = "port", conflicts_with = "port")]
     file: Option<PathBuf>,
     /// Listen at this port instead; press the sensor meanwhile
     #[arg(long, value_name = "P")]
