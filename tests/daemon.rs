@@ -487,6 +487,7 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         ["--fps", "1e9"],
         ["--fps", "nan"],
         ["--speed", "1e-300"],
+        ["--presses", "0"],
     ] {
         let arguments = [&["simulate"], &beyond_any_sensor[..]].concat();
         assert_eq!(

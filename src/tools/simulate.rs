@@ -44,7 +44,7 @@ pub struct Args {
     #[arg(long, value_name = "S", default_value_t = 1)]
     seed: u64,
     /// End after so many presses [default: never]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     presses: Option<u32>,
     /// Play so many times as fast
     #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = positive)]
