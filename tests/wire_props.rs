@@ -314,6 +314,21 @@ fn jq_waits_for_no_header_that_is_farther_from_its_phase() {
 }
 
 #[test]
+fn of_two_headers_as_near_to_its_phase_jq_takes_the_earlier() {
+    let layout = layout(Preset::Jq);
+    let mut held = frames(8, 1)[0];
+    for (place, byte) in (300..).zip([0xAA, 0x55, 0x03, 0x99]) {
+        held.counts[place] = byte;
+    }
+    let sent = vec![held; 5];
+    let mut bytes = encode(&layout, &sent);
+    // Half as many as stand before the header in the data: without them the next frame begins as far
+    // before the phase as the header in its data stands behind it, and either is followed.
+    bytes.drain(788 + 400..788 + 400 + (4 + 300) / 2);
+    assert_eq!(decode(&layout, [bytes.as_slice()]).0, sent[1..]);
+}
+
+#[test]
 fn a_pause_makes_the_last_jq_frame_whole() {
     let layout = layout(Preset::Jq);
     let bytes = encode(&layout, &frames(9, 1));

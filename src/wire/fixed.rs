@@ -208,7 +208,7 @@ impl Fixed {
     /// After damage, several candidates may be followed by what looks like a header, as in a
     /// press held still, where a header in the data repeats in every frame. Damage mostly loses
     /// or adds few bytes, so the one nearest to the phase before it is taken: its place in
-    /// `bytes`. `None`: more bytes are needed.
+    /// `bytes`, the earlier of two as near. `None`: more bytes are needed.
     ///
     /// A followed candidate is held, up to two frames of bytes, while a header within it that is
     /// nearer has yet to be followed. Less is not enough. Let `HuHv` be as long as a frame, `H` its
