@@ -5,30 +5,10 @@ use serde::{Deserialize, Serialize};
 use super::{Framing, Layout, text, zero_run};
 use crate::frame::RawFrame;
 
-/// Why a candidate frame was dropped.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum Damage {
-    /// The length field is not that of the layout.
-    #[error("the length field is not the layout's")]
-    Length,
-    /// The checksum does not fit.
-    #[error("checksum is {found:04x}, expected {expected:04x}")]
-    Checksum {
-        /// As received.
-        found: u16,
-        /// Over the bytes received.
-        expected: u16,
-    },
-    /// The tail does not stand at its place.
-    #[error("the tail does not stand at its place")]
-    Tail,
-    /// No header follows, and nothing else vouches for the frame.
-    #[error("no header follows the frame")]
-    NotFollowed,
-    /// What stands between two frame ends is not a frame.
-    #[error("what stands before the frame's end is not a frame")]
-    Cells,
-}
+/// A candidate frame was dropped: it had a valid sync and failed length, tail, checksum or what must
+/// follow.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Damage;
 
 /// A whole frame and where in the stream it ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -51,7 +31,7 @@ pub(super) enum Scan {
     Skip(usize),
     /// A candidate is damaged; so many bytes of it are passed over, and the search goes on
     /// inside the rest.
-    Damaged(usize, Damage),
+    Damaged(usize),
     /// The first so many bytes are a frame.
     Frame(usize, RawFrame),
     /// So many bytes belong to no frame, and whether one ended with them is not known.
@@ -199,9 +179,9 @@ impl Decoder {
                     self.start += count;
                     self.skipped += count as u64;
                 }
-                Scan::Damaged(count, damage) => {
+                Scan::Damaged(count) => {
                     self.pass_over(count);
-                    return Some(Err(damage));
+                    return Some(Err(Damage));
                 }
                 Scan::Frame(count, frame) => {
                     self.start += count;

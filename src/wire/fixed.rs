@@ -6,7 +6,7 @@
 //! follows, because the header can stand in the data. A layout with a tail alone is whole when
 //! the tail stands at its place.
 
-use super::decoder::{Context, Damage, Scan};
+use super::decoder::{Context, Scan};
 use super::{Cell, Checksum, Layout, LayoutError, LengthField};
 use crate::frame::RawFrame;
 
@@ -122,7 +122,7 @@ impl Fixed {
             return Scan::Wait;
         }
         if bytes[..self.header.len()] != self.header {
-            return Scan::Damaged(1, Damage::Length);
+            return Scan::Damaged(1);
         }
         if bytes.len() < self.total() {
             return Scan::Wait;
@@ -130,28 +130,19 @@ impl Fixed {
         if self.checksum == Checksum::None && self.tail.is_empty() {
             return self.scan_for_follower(layout, bytes, context);
         }
-        match self.check_end(bytes) {
-            Ok(()) => self.whole(layout, bytes),
-            Err(damage) => Scan::Damaged(1, damage),
+        if self.ends_well(bytes) {
+            self.whole(layout, bytes)
+        } else {
+            Scan::Damaged(1)
         }
     }
 
-    /// Checksum and tail of a candidate of full length.
-    fn check_end(&self, bytes: &[u8]) -> Result<(), Damage> {
+    /// Whether checksum and tail of a candidate of full length are right.
+    fn ends_well(&self, bytes: &[u8]) -> bool {
         let at = self.header.len() + self.payload_bytes;
-        let expected = self.checksum.of(&bytes[..at]);
-        let found = match bytes[at..at + self.checksum.bytes()] {
-            [low, high] => u16::from_le_bytes([low, high]),
-            [value] => u16::from(value),
-            _ => expected,
-        };
-        if bytes[at + self.checksum.bytes()..self.total()] != self.tail {
-            return Err(Damage::Tail);
-        }
-        if found != expected {
-            return Err(Damage::Checksum { found, expected });
-        }
-        Ok(())
+        let expected = self.checksum.of(&bytes[..at]).to_le_bytes();
+        let (found, tail) = bytes[at..self.total()].split_at(self.checksum.bytes());
+        tail == self.tail && expected.starts_with(found)
     }
 
     fn whole(&self, layout: &Layout, bytes: &[u8]) -> Scan {
@@ -182,7 +173,7 @@ impl Fixed {
     fn scan_for_follower(&self, layout: &Layout, bytes: &[u8], context: Context) -> Scan {
         match self.is_followed(bytes, context.settled) {
             None => Scan::Wait,
-            Some(false) => Scan::Damaged(1, Damage::NotFollowed),
+            Some(false) => Scan::Damaged(1),
             Some(true) if context.locked => self.whole(layout, bytes),
             Some(true) => match self.nearest_in_phase(bytes, context) {
                 None => Scan::Wait,
@@ -252,7 +243,7 @@ impl Fixed {
         if bytes.len() < total {
             return Scan::Wait;
         }
-        if self.check_end(bytes).is_ok() {
+        if self.ends_well(bytes) {
             return self.whole(layout, bytes);
         }
         // The next place whose tail may stand right.
@@ -263,7 +254,7 @@ impl Fixed {
 /// Only the first candidate after a whole frame counts as damaged; the rest is a search.
 fn lost(skip: usize, context: Context) -> Scan {
     if context.locked {
-        Scan::Damaged(skip, Damage::Tail)
+        Scan::Damaged(skip)
     } else {
         Scan::Skip(skip)
     }

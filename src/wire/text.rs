@@ -2,7 +2,7 @@
 //! blank line ends the frame.
 
 use super::Layout;
-use super::decoder::{Context, Damage, Scan};
+use super::decoder::{Context, Scan};
 use crate::frame::{Array, RawFrame};
 
 /// Bytes of the longest frame looked for: every value at its widest with two separators, CRLF
@@ -59,7 +59,7 @@ pub(super) fn scan(layout: &Layout, bytes: &[u8], context: Context) -> Scan {
         return match frame.filter(|_| is_short) {
             Some(_) if first > 0 => Scan::Skip(first),
             Some(frame) => Scan::Frame(lines.at, frame),
-            None if context.locked => Scan::Damaged(lines.at, Damage::Cells),
+            None if context.locked => Scan::Damaged(lines.at),
             None => Scan::Skip(lines.at),
         };
     }

@@ -2,7 +2,7 @@
 //! ends the frame.
 
 use super::Layout;
-use super::decoder::{Context, Damage, Scan};
+use super::decoder::{Context, Scan};
 use crate::frame::RawFrame;
 
 const END: u8 = 0xFF;
@@ -67,7 +67,7 @@ pub(super) fn scan(layout: &Layout, bytes: &[u8], context: Context) -> Scan {
         }
     }
     if context.locked && end > 0 {
-        Scan::Damaged(end + 1, Damage::Cells)
+        Scan::Damaged(end + 1)
     } else {
         Scan::Skip(end + 1)
     }
