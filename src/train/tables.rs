@@ -17,7 +17,8 @@ use cells::{
 };
 
 pub use cells::{
-    REFERENCE, accuracy, evaluations, mean, mean_confusion, paper_row, swap_groups, thousands,
+    REFERENCE, accuracy, evaluations, mean, mean_confusion, paper_row, rounded, swap_groups,
+    thousands,
 };
 
 /// A table.

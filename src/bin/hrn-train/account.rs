@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use hardnessd::train::metrics::Evaluation;
+use hardnessd::train::tables::rounded;
 use hardnessd::verdict::Hrn;
 
 /// The card of the model read from `path`.
@@ -55,7 +56,7 @@ pub(super) fn of_evaluation(evaluation: &Evaluation) -> String {
             format!("95 % by object: {low:.1} to {high:.1} %")
         },
     );
-    let number = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.4}"));
+    let number = |value: Option<f64>| value.map_or("-".to_owned(), |value| rounded(value, 4));
     let levels: String = (1..=evaluation.confusion.len())
         .map(|level| format!("{level:>7}"))
         .collect();
@@ -76,7 +77,7 @@ pub(super) fn of_evaluation(evaluation: &Evaluation) -> String {
          kappa              {}\n\
          kappa, quadratic   {}\n\
          calibration error  {:.4}\n\
-         log-likelihood     {:.4} nats lost a sample\n\
+         log-likelihood     {} nats lost a sample\n\
          truth \\ said  {levels}\n\
          {rows}",
         evaluation.n,
@@ -84,6 +85,6 @@ pub(super) fn of_evaluation(evaluation: &Evaluation) -> String {
         number(evaluation.kappa),
         number(evaluation.kappa_quadratic),
         evaluation.ece,
-        evaluation.nll
+        rounded(evaluation.nll, 4)
     )
 }

@@ -119,12 +119,14 @@ pub(super) fn less_features(group: &[&SwapEntry], swaps: &[SwapEntry]) -> String
 
 /// In points.
 fn difference_text(difference: Estimate) -> String {
-    let mean = 100.0 * difference.mean;
+    let points = |share: f64| match rounded(100.0 * share, 1) {
+        text if text == "0.0" || text.starts_with('-') => text,
+        more => format!("+{more}"),
+    };
+    let mean = points(difference.mean);
     match difference.interval {
-        Some([low, high]) => {
-            format!("{mean:+.1} ({:+.1} to {:+.1})", 100.0 * low, 100.0 * high)
-        }
-        None => format!("{mean:+.1} (-)"),
+        Some([low, high]) => format!("{mean} ({} to {})", points(low), points(high)),
+        None => format!("{mean} (-)"),
     }
 }
 
@@ -167,7 +169,7 @@ pub(super) fn mean_over_seeds(
     if values.is_empty() {
         return "-".to_owned();
     }
-    format!("{:.decimals$}", mean(&values))
+    rounded(mean(&values), decimals)
 }
 
 /// The calibration error before the temperature, where one was fitted.
@@ -212,10 +214,15 @@ pub(super) fn deviation(values: &[f64]) -> Option<f64> {
 
 /// A number without decimals that are all 0.
 pub(super) fn number(value: f64, decimals: usize) -> String {
-    if value.fract() == 0.0 {
-        format!("{value:.0}")
-    } else {
-        format!("{value:.decimals$}")
+    rounded(value, if value.fract() == 0.0 { 0 } else { decimals })
+}
+
+/// To so many decimals. What rounds to zero has no sign.
+pub fn rounded(value: f64, decimals: usize) -> String {
+    let text = format!("{value:.decimals$}");
+    match text.strip_prefix('-') {
+        Some(zero) if zero.bytes().all(|byte| matches!(byte, b'0' | b'.')) => zero.to_owned(),
+        _ => text,
     }
 }
 
@@ -248,6 +255,7 @@ mod tests {
         };
         assert_eq!(text(Some([-0.01, 0.05])), "+2.0 (-1.0 to +5.0)");
         assert_eq!(text(None), "+2.0 (-)");
+        assert_eq!(text(Some([-4e-4, 4e-4])), "+2.0 (0.0 to 0.0)");
     }
 
     #[test]
@@ -260,5 +268,9 @@ mod tests {
             (number(12.0, 1), number(12.25, 1)),
             ("12".to_owned(), "12.2".to_owned())
         );
+        for (value, expected) in [(-4e-5, "0.0000"), (-6e-5, "-0.0001"), (4e-5, "0.0000")] {
+            assert_eq!(rounded(value, 4), expected);
+        }
+        assert_eq!(number(-0.0, 1), "0");
     }
 }
