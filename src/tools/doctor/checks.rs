@@ -3,9 +3,12 @@
 use std::ffi::OsStr;
 use std::fmt;
 use std::fs;
+use std::io;
 use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
+
+use rustix::fs::{Access, AtFlags, CWD, accessat};
 
 /// Something wrong, and what mends it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -27,6 +30,8 @@ pub(super) struct User {
     pub(super) uid: u32,
     /// That the process has, not those of the files.
     pub(super) gids: Vec<u32>,
+    /// What the kernel says to reading and writing: it knows access lists and containers, too.
+    pub(super) access: fn(&Path) -> io::Result<()>,
 }
 
 impl User {
@@ -36,8 +41,18 @@ impl User {
         let mut gids: Vec<u32> = groups.into_iter().map(rustix::fs::Gid::as_raw).collect();
         gids.push(rustix::process::getegid().as_raw());
         let name = entry(root, "etc/passwd", uid).map_or(uid.to_string(), |line| field(&line, 0));
-        Self { name, uid, gids }
+        Self {
+            name,
+            uid,
+            gids,
+            access,
+        }
     }
+}
+
+fn access(path: &Path) -> io::Result<()> {
+    let wanted = Access::READ_OK | Access::WRITE_OK;
+    Ok(accessat(CWD, path, wanted, AtFlags::EACCESS)?)
 }
 
 /// Every USB serial port: by its lasting name where it has one.
@@ -123,10 +138,12 @@ fn others(ports: &[PathBuf]) -> String {
 
 fn denied(root: &Path, device: &Path, user: &User) -> Option<Fault> {
     const READ_WRITE: u32 = 0o6;
-    let file = fs::metadata(under(root, device)).ok()?;
+    let path = under(root, device);
+    let refusal = (user.access)(&path).err()?;
+    let file = fs::metadata(path).ok()?;
     let (mode, gid) = (file.mode(), file.gid());
     let allows = |shift: u32| (mode >> shift) & READ_WRITE == READ_WRITE;
-    let granted = if user.uid == 0 {
+    let by_mode = if user.uid == 0 {
         true
     } else if user.uid == file.uid() {
         allows(6)
@@ -135,10 +152,15 @@ fn denied(root: &Path, device: &Path, user: &User) -> Option<Fault> {
     } else {
         allows(0)
     };
-    if granted {
-        return None;
-    }
     let (line, name, shown) = (entry(root, "etc/group", gid), &user.name, device.display());
+    if by_mode {
+        return Some(Fault {
+            what: format!("refused to {name}, whom its mode would let in ({refusal})"),
+            cure: format!(
+                "see `getfacl {shown}`; a container or service must be given the device itself"
+            ),
+        });
+    }
     let group = line.as_ref().map_or(gid.to_string(), |line| field(line, 0));
     let is_listed = line.is_some_and(|line| field(&line, 3).split(',').any(|one| one == name));
     let cure = if gid == 0 || !allows(3) {

@@ -1,6 +1,7 @@
 //! Each fault is found in a tree that has it, and in no other.
 
 use std::fs::{self, File};
+use std::io;
 use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command};
@@ -11,6 +12,11 @@ use super::checks::{User, examine, ports, refused};
 use crate::tools::pty::Pty;
 
 const PORT: &str = "/dev/serial/by-id/usb-film-if00";
+
+/// What it says to opening a port.
+type Kernel = fn(&Path) -> io::Result<()>;
+const GRANTED: Kernel = |_| Ok(());
+const REFUSED: Kernel = |_| Err(io::ErrorKind::PermissionDenied.into());
 
 /// A machine without fault: an FTDI adapter that its user may use.
 struct Machine(TempDir);
@@ -49,10 +55,22 @@ impl Machine {
     }
 
     fn faults_of(&self, port: &str, gids: Vec<u32>) -> Vec<String> {
+        // A kernel that goes by group and mode alone.
+        let gid = fs::metadata(self.path("dev/ttyUSB0")).unwrap().gid();
+        let access = if gids.contains(&gid) {
+            GRANTED
+        } else {
+            REFUSED
+        };
+        self.faults_under(port, gids, access)
+    }
+
+    fn faults_under(&self, port: &str, gids: Vec<u32>, access: Kernel) -> Vec<String> {
         let user = User {
             name: "ada".to_owned(),
             uid: 12_345,
             gids,
+            access,
         };
         let faults = examine(self.0.path(), Path::new(port), &user);
         faults.iter().map(ToString::to_string).collect()
@@ -118,6 +136,21 @@ fn the_group_of_the_device_is_the_one_to_join() {
         &["log in again, or `newgrp dialout`"],
     );
     assert_eq!(machine.faults_of(PORT, vec![20]), Vec::<String>::new());
+}
+
+#[test]
+fn what_the_kernel_says_goes_before_mode_and_group() {
+    let machine = Machine::new();
+    let gid = fs::metadata(machine.path("dev/ttyUSB0")).unwrap().gid();
+    // An access list, as of systemd's uaccess, lets in who is in no group of the port ...
+    let stranger = vec![gid + 1];
+    let faults = machine.faults_under(PORT, stranger, GRANTED);
+    assert_eq!(faults, Vec::<String>::new());
+    // ... and another, or a container, keeps out who is.
+    one(
+        &machine.faults_under(PORT, vec![gid], REFUSED),
+        &["refused to ada, whom its mode would let in", "getfacl"],
+    );
 }
 
 #[test]
