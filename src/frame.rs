@@ -76,6 +76,9 @@ impl TryFrom<Vec<f32>> for Frame {
     type Error = String;
 
     fn try_from(newtons: Vec<f32>) -> Result<Self, String> {
+        if let Some(found) = newtons.iter().find(|&&n| !n.is_finite() || n < 0.0) {
+            return Err(format!("found {found} N at a taxel, expected 0 or more"));
+        }
         newtons
             .try_into()
             .map(|newtons| Self { newtons })

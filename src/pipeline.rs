@@ -124,6 +124,23 @@ pub struct Memory {
     pipeline: Seen,
 }
 
+impl Memory {
+    /// Whether a pipeline can have come to this: a recording may say anything.
+    pub(crate) fn is_possible(&self) -> bool {
+        let Seen {
+            frames,
+            frames_damaged,
+            recent,
+            ..
+        } = &self.pipeline;
+        self.decoder
+            .is_possible(frames.saturating_add(*frames_damaged))
+            && self.tare.is_possible()
+            && self.tracker.is_possible(*frames)
+            && recent.len() <= RATE_FRAMES
+    }
+}
+
 impl Pipeline {
     /// A pipeline whose port has not been opened.
     pub fn new(settings: Settings, clock: Clock) -> Self {

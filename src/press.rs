@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 pub use self::settings::{Settings, SettingsError};
 use self::settling::{Load, Settling};
-use crate::frame::{Frame, Stamp};
+use crate::frame::{Frame, Stamp, TAXELS};
 
 /// A frame of a press: its number and when its last byte came.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -140,6 +140,26 @@ pub struct PressTracker {
 pub struct Memory {
     state: State,
     presses: u64,
+}
+
+impl Memory {
+    /// Whether a tracker can have come to this in so many frames.
+    pub(crate) fn is_possible(&self, frames: u64) -> bool {
+        let is_press = |pressed: &Pressed| {
+            let peak = &pressed.peak;
+            pressed.press == self.presses
+                && pressed.frames <= frames
+                && peak.moment.frame < frames
+                && peak.contact_area_taxels as usize <= TAXELS
+                && peak.force_n == peak.frame.force_n()
+                && pressed.settling.as_ref().is_none_or(Settling::is_possible)
+        };
+        self.presses <= frames
+            && match &self.state {
+                State::Pressed(pressed) => is_press(pressed),
+                State::Idle | State::AwaitingRelease { .. } => true,
+            }
+    }
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -137,6 +137,9 @@ pub enum SensorError {
     /// A rate no sensor has.
     #[error("frame_rate_hz: found {0}, expected frames a second above 0")]
     FrameRate(f64),
+    /// What its pipeline is said to have seen.
+    #[error("memory: found what no pipeline can have come to, expected the memory of one")]
+    Memory,
 }
 
 impl Sensor {

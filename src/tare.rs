@@ -8,6 +8,7 @@ mod settings;
 
 use serde::{Deserialize, Serialize};
 
+use self::settings::MOST_TARE_FRAMES;
 pub use self::settings::{Settings, SettingsError};
 use crate::frame::{Array, COLS, Frame, ROWS, RawFrame, TAXELS, taxels};
 
@@ -66,6 +67,21 @@ pub struct Memory {
     #[serde(with = "taxels")]
     baseline: Box<[f32; TAXELS]>,
     taking: Option<Taking>,
+}
+
+impl Memory {
+    /// Whether a tare can have come to this.
+    pub(crate) fn is_possible(&self) -> bool {
+        // A mean of counts, with room for its rounding.
+        let is_count = |mean: &f32| (0.0..=65_536.0).contains(mean);
+        let are_sums = |taking: &Taking| {
+            let most = u64::from(taking.seen) * u64::from(u16::MAX);
+            taking.seen < taking.wanted
+                && taking.wanted <= MOST_TARE_FRAMES
+                && taking.sum.iter().all(|&sum| u64::from(sum) <= most)
+        };
+        self.baseline.iter().all(is_count) && self.taking.as_ref().is_none_or(are_sums)
+    }
 }
 
 /// Sums over the frames of a tare.

@@ -24,6 +24,12 @@ pub(super) struct Load {
 }
 
 impl Settling {
+    /// Whether frames can have come to this.
+    pub(super) fn is_possible(&self) -> bool {
+        let is_less = |load: &Load| load.contact_area_taxels <= self.most_area;
+        self.near.iter().all(is_less)
+    }
+
     /// Adds a frame; whether over at least `early_settle_s` and [`SETTLED_FRAMES`] frames area
     /// and force stayed near their largest so far, with enough force.
     pub(super) fn push(&mut self, load: Load, settings: &Settings) -> bool {

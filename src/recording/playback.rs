@@ -53,7 +53,11 @@ impl Playback {
         let known = players.find(|player| player.pipeline.sensor() == sensor);
         let mut events = match (entry, known) {
             (Entry::State(state), known) => {
-                let described = state.sensor.settings(&self.hrn);
+                let described = if state.memory.is_possible() {
+                    state.sensor.settings(&self.hrn)
+                } else {
+                    Err(SensorError::Memory)
+                };
                 let settings = described.map_err(|problem| PlaybackError { sensor, problem })?;
                 // Where nothing is missing the pipeline stands so already.
                 let mut pipeline = Pipeline::new(settings, Clock::Arrival);

@@ -1,6 +1,8 @@
 use std::io::Cursor;
 use std::time::Duration;
 
+use serde_json::json;
+
 use super::*;
 use crate::event::Rejection;
 use crate::frame::RawFrame;
@@ -55,10 +57,7 @@ fn story() -> Vec<(Stamp, Input<'static>)> {
         }
         let ms = 200 * frame + 10;
         match frame {
-            12 => story.push((
-                at(ms),
-                Input::Context(Some(serde_json::json!({"tag": "x"}))),
-            )),
+            12 => story.push((at(ms), Input::Context(Some(json!({"tag": "x"}))))),
             35 => story.push((at(ms), Input::Tare)),
             54 => {
                 story.push((at(ms), Input::Lost("end of file".into())));
@@ -203,6 +202,79 @@ fn a_sensor_that_cannot_be_is_refused_wherever_it_is_described() {
         let error = feed(last).unwrap_err().to_string();
         let told = "sensor \"forearm\": press.early_settle_s: found -1.0";
         assert!(error.starts_with(told), "{error}");
+    }
+}
+
+#[test]
+fn a_memory_that_no_pipeline_came_to_is_refused() {
+    let hrn = hrn();
+    let sensor = sensor(&hrn);
+    let mut pipeline = Pipeline::new(sensor.settings(&hrn).unwrap(), Clock::Arrival);
+    // Some are in the first tare, some in a press.
+    let (mut taring, mut pressed) = (None, None);
+    for (moment, input) in story() {
+        input.feed(&mut pipeline, moment);
+        let state = State {
+            sensor: sensor.clone(),
+            memory: pipeline.memory(),
+            labels: labels(),
+        };
+        let kept = match pipeline.frame_counts().0 {
+            3 => &mut taring,
+            22 => &mut pressed,
+            _ => continue,
+        };
+        *kept = Some(serde_json::to_value(state).unwrap());
+    }
+    let fed = |state: &Option<Value>, change: Option<(&str, Value)>| {
+        let mut state = state.clone().unwrap();
+        if let Some((place, value)) = change {
+            *state.pointer_mut(place).unwrap() = value;
+        }
+        let state = serde_json::from_value(state).map_err(|error| error.to_string())?;
+        let found = Found {
+            sensor: "forearm".to_owned(),
+            at: at(0),
+            entry: Entry::State(Box::new(state)),
+        };
+        let played = Playback::new(hrn.clone()).feed(found);
+        played.map(drop).map_err(|error| error.to_string())
+    };
+    assert_eq!(fed(&taring, None), Ok(()));
+    assert_eq!(fed(&pressed, None), Ok(()));
+    let peak = "/memory/tracker/state/Pressed/peak";
+    let near = "/memory/tracker/state/Pressed/settling/near/0";
+    for (state, place, value) in [
+        (&taring, "/memory/decoder/received", json!(5)),
+        (&taring, "/memory/decoder/received", json!(u64::MAX)),
+        (&taring, "/memory/decoder/skipped", json!(1_000_000)),
+        (&taring, "/memory/decoder/anchor", json!(1_u64 << 40)),
+        (&taring, "/memory/tare/baseline/7", json!(-1.0)),
+        (&taring, "/memory/tare/baseline/7", json!(1e39)),
+        (&taring, "/memory/tare/taking/seen", json!(5)),
+        (&taring, "/memory/tare/taking/wanted", json!(u32::MAX)),
+        (&taring, "/memory/tare/taking/sum/7", json!(u32::MAX)),
+        (&taring, "/memory/pipeline/frames", json!(u64::MAX)),
+        (
+            &taring,
+            "/memory/pipeline/frames_damaged",
+            json!(1_u64 << 40),
+        ),
+        (&taring, "/memory/tracker/presses", json!(4)),
+        (&pressed, "/memory/tracker/presses", json!(2)),
+        (&pressed, &format!("{peak}/contact_area_taxels"), json!(785)),
+        (&pressed, &format!("{peak}/force_n"), json!(1e9)),
+        (&pressed, &format!("{near}/contact_area_taxels"), json!(9)),
+        (&pressed, &format!("{peak}/moment/frame"), json!(22)),
+    ] {
+        let told = fed(state, Some((place, value.clone()))).unwrap_err();
+        let expected = "sensor \"forearm\": memory: found what no pipeline can have come to";
+        assert!(told.starts_with(expected), "{place} = {value}: {told}");
+    }
+    let newtons = format!("{peak}/frame/300");
+    for wrong in [-1.0, 1e39] {
+        let told = fed(&pressed, Some((&newtons, json!(wrong)))).unwrap_err();
+        assert!(told.contains("N at a taxel, expected 0 or more"), "{told}");
     }
 }
 

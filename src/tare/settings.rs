@@ -90,7 +90,7 @@ const MOST_PITCH_MM: f64 = 1e3;
 const MOST_TARE_N: f64 = 1e6;
 
 /// 65535 counts x 65536 frames stay below 2^32.
-const MOST_TARE_FRAMES: u32 = 65_536;
+pub(super) const MOST_TARE_FRAMES: u32 = 65_536;
 
 impl Settings {
     /// Checks the values against the sensor's array.

@@ -77,6 +77,20 @@ pub struct Memory {
     anchor: u64,
 }
 
+impl Memory {
+    /// Whether a decoder can have come to this that gave so many frames, whole and damaged ones.
+    pub(crate) fn is_possible(&self, frames: u64) -> bool {
+        let passed = self.received.checked_sub(self.pending.len() as u64);
+        self.received < MOST_BYTES
+            && passed.is_some_and(|passed| {
+                self.skipped <= passed && self.anchor <= passed && frames <= passed
+            })
+    }
+}
+
+/// More than any line brings.
+const MOST_BYTES: u64 = 1 << 62;
+
 impl Decoder {
     /// A decoder at the start of a stream.
     pub fn new(layout: Layout) -> Self {
