@@ -4,6 +4,7 @@ pub mod args;
 pub mod check;
 pub mod demo;
 pub mod doctor;
+pub mod exit;
 mod faults;
 mod player;
 mod pty;
@@ -60,9 +61,9 @@ pub fn usage(program: &str, error: &clap::Error) -> ExitCode {
         return match error.print() {
             Err(failure) if !error.use_stderr() && failure.kind() != io::ErrorKind::BrokenPipe => {
                 eprintln!("{program}: stdout: {failure}");
-                ExitCode::from(74)
+                ExitCode::from(exit::IO)
             }
-            _ => ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(2)),
+            _ => ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(exit::USAGE)),
         };
     }
     let text = error.to_string();
@@ -71,7 +72,7 @@ pub fn usage(program: &str, error: &clap::Error) -> ExitCode {
     let told: Vec<&str> = told.split_whitespace().collect();
     let told = told.join(" ");
     eprintln!("{program}: {}", shown(told.trim_start_matches("error: ")));
-    ExitCode::from(2)
+    ExitCode::from(exit::USAGE)
 }
 
 /// Opens a file to read from. A directory is refused here: the system would do so at the first read

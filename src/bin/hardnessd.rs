@@ -10,26 +10,14 @@ use std::time::Duration;
 use clap::Parser;
 use hardnessd::daemon::config::{Error as ConfigError, Setup};
 use hardnessd::daemon::log::{Log, Settings as LogSettings};
-use hardnessd::daemon::publish::Error as PublishError;
-use hardnessd::daemon::record::Error as RecordError;
-use hardnessd::daemon::socket::Error as SocketError;
-use hardnessd::daemon::{Daemon, Error as DaemonError, Reload};
+use hardnessd::daemon::{Daemon, Reload};
 use hardnessd::tools::args::{Args, Command};
+use hardnessd::tools::exit::{self, Failure};
 use hardnessd::tools::{
     self, check, demo, doctor, record, recover, replay, simulate, sniff, tail, watch,
 };
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::mpsc;
-
-/// What an operator's script may rely on.
-mod exit {
-    pub(super) const FAILED: u8 = 1;
-    pub(super) const USAGE: u8 = 2;
-    pub(super) const NO_INPUT: u8 = 66;
-    pub(super) const UNAVAILABLE: u8 = 69;
-    pub(super) const IO: u8 = 74;
-    pub(super) const CONFIG: u8 = 78;
-}
 
 /// How long what is being written may take to be whole.
 const LAST_LINES: Duration = Duration::from_millis(200);
@@ -68,13 +56,13 @@ fn main() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("hardnessd: {}", tools::line(error.as_ref()));
-            ExitCode::from(exit_code(&error))
+            eprintln!("hardnessd: {}", tools::line(&error));
+            ExitCode::from(error.code())
         }
     }
 }
 
-async fn dispatch(command: Command, signals: Signals) -> anyhow::Result<()> {
+async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
     match command {
         Command::Run { config } => run(config, signals).await,
         Command::Demo(args) => {
@@ -102,11 +90,11 @@ async fn dispatch(command: Command, signals: Signals) -> anyhow::Result<()> {
 }
 
 /// Work that looks for no signal; one ends it, and that it is not done is said.
-async fn interruptible<E: std::error::Error + Send + Sync + 'static>(
+async fn interruptible<E: Into<Failure> + Send + 'static>(
     signals: Signals,
     work: impl FnOnce() -> Result<(), E> + Send + 'static,
-) -> anyhow::Result<()> {
-    let done = until(signals.end(), work).await?;
+) -> Result<(), Failure> {
+    let done = until(signals.end(), work).await.map_err(Into::into)?;
     if done.is_none() {
         eprintln!("hardnessd: interrupted");
     }
@@ -114,24 +102,26 @@ async fn interruptible<E: std::error::Error + Send + Sync + 'static>(
 }
 
 /// The configuration and its model; `None`: `end` came first.
-async fn load(path: &Path, end: impl Future<Output = ()>) -> anyhow::Result<Option<Setup>> {
+async fn load(path: &Path, end: impl Future<Output = ()>) -> Result<Option<Setup>, ConfigError> {
     let path = path.to_owned();
     until(end, move || Setup::load(&path)).await
 }
 
 /// What `work` gives, on a thread of its own: a file may be a pipe that says nothing. `None`: `end`
 /// came first, and nobody waits for the thread.
-async fn until<T: Send + 'static, E: std::error::Error + Send + Sync + 'static>(
+async fn until<T: Send + 'static, E: Send + 'static>(
     end: impl Future<Output = ()>,
     work: impl FnOnce() -> Result<T, E> + Send + 'static,
-) -> anyhow::Result<Option<T>> {
+) -> Result<Option<T>, E> {
     tokio::select! {
-        done = tokio::task::spawn_blocking(work) => Ok(Some(done??)),
+        done = tokio::task::spawn_blocking(work) => {
+            done.expect("the work does not panic").map(Some)
+        }
         () = end => Ok(None),
     }
 }
 
-async fn run(path: PathBuf, signals: Signals) -> anyhow::Result<()> {
+async fn run(path: PathBuf, signals: Signals) -> Result<(), Failure> {
     let (shutdown, mut hangup) = signals.apart();
     let mut shutdown = pin!(shutdown);
     let Some(setup) = load(&path, shutdown.as_mut()).await? else {
@@ -219,124 +209,4 @@ fn ignores_hangup() -> bool {
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
     mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok())
         .is_some_and(|mask| mask & 1 == 1)
-}
-
-fn exit_code(error: &anyhow::Error) -> u8 {
-    let of_config = |error: &ConfigError| match error {
-        ConfigError::Unreadable { .. } => exit::NO_INPUT,
-        _ => exit::CONFIG,
-    };
-    let of_daemon = |error: &DaemonError| match error {
-        // The configuration names a file that it must not.
-        DaemonError::Publish(PublishError::Socket(
-            SocketError::NoSocket { .. }
-            | SocketError::NoDirectory { .. }
-            | SocketError::TooLong { .. },
-        )) => exit::CONFIG,
-        DaemonError::Record(RecordError::Directory { .. }) | DaemonError::Log(_) => exit::CONFIG,
-        DaemonError::Publish(PublishError::Unasked { .. } | PublishError::Passed(_)) => {
-            exit::CONFIG
-        }
-        // In use or refused: another time it may work.
-        DaemonError::Publish(_) | DaemonError::Random(_) => exit::IO,
-        DaemonError::Record(RecordError::Unavailable { .. } | RecordError::Lost { .. }) => {
-            exit::UNAVAILABLE
-        }
-        DaemonError::Record(_) => exit::IO,
-        DaemonError::Stopped(_) => exit::FAILED,
-    };
-    if let Some(error) = error.downcast_ref::<ConfigError>() {
-        return of_config(error);
-    }
-    if let Some(error) = error.downcast_ref::<DaemonError>() {
-        return of_daemon(error);
-    }
-    if let Some(error) = error.downcast_ref::<check::Error>() {
-        return match error {
-            check::Error::Config(error) => of_config(error),
-            check::Error::Daemon { source, .. } => of_daemon(source),
-            check::Error::FrameRate { .. } => exit::CONFIG,
-            check::Error::Print(_) => exit::IO,
-        };
-    }
-    if let Some(error) = error.downcast_ref::<demo::Error>() {
-        return match error {
-            demo::Error::Config(error) => of_config(error),
-            demo::Error::Daemon(error) => of_daemon(error),
-            demo::Error::Layout(_) => exit::CONFIG,
-            demo::Error::Io { .. } => exit::IO,
-            demo::Error::Missed { .. } | demo::Error::Closed => exit::FAILED,
-        };
-    }
-    if let Some(error) = error.downcast_ref::<simulate::Error>() {
-        return match error {
-            simulate::Error::Faults(error) if error.is_unreadable() => exit::NO_INPUT,
-            simulate::Error::Faults(_) => exit::FAILED,
-            simulate::Error::Layout(_) | simulate::Error::Baud { .. } => exit::USAGE,
-            simulate::Error::Recording { .. } | simulate::Error::Pty { .. } => exit::IO,
-        };
-    }
-    if let Some(error) = error.downcast_ref::<record::Error>() {
-        return match error {
-            record::Error::Level { .. } => exit::USAGE,
-            record::Error::Create { .. } => exit::IO,
-            record::Error::Daemon(error) => of_daemon(error),
-        };
-    }
-    if let Some(error) = error.downcast_ref::<recover::Error>() {
-        return match error {
-            recover::Error::Unreadable { .. } => exit::NO_INPUT,
-            recover::Error::Nothing { .. } | recover::Error::Foreign { .. } => exit::FAILED,
-            recover::Error::Broken { .. } | recover::Error::Write { .. } => exit::IO,
-        };
-    }
-    if let Some(error) = error.downcast_ref::<replay::Error>() {
-        return match error {
-            replay::Error::Config(error) => of_config(error),
-            replay::Error::Unreadable { .. } => exit::NO_INPUT,
-            replay::Error::Recording { .. }
-            | replay::Error::Sensor { .. }
-            | replay::Error::NoFrame { .. } => exit::FAILED,
-            replay::Error::Broken { .. } | replay::Error::Print(_) => exit::IO,
-        };
-    }
-    if let Some(error) = error.downcast_ref::<tail::Error>() {
-        return match error {
-            tail::Error::Timeout { .. } => exit::FAILED,
-            tail::Error::NoDaemon { .. }
-            | tail::Error::Mute { .. }
-            | tail::Error::Foreign { .. }
-            | tail::Error::Refused { .. }
-            | tail::Error::Closed { .. } => exit::UNAVAILABLE,
-            tail::Error::Print(_) => exit::IO,
-        };
-    }
-    if let Some(error) = error.downcast_ref::<watch::Error>() {
-        return match error {
-            watch::Error::NoTerminal => exit::USAGE,
-            watch::Error::Terminal(_) => exit::IO,
-        };
-    }
-    if let Some(error) = error.downcast_ref::<doctor::Error>() {
-        return match error {
-            doctor::Error::Faults { .. } => exit::FAILED,
-            doctor::Error::Print(_) => exit::IO,
-        };
-    }
-    if let Some(error) = error.downcast_ref::<sniff::Error>() {
-        return match error {
-            sniff::Error::Unreadable { .. } => exit::NO_INPUT,
-            sniff::Error::Recording { .. } => exit::FAILED,
-            sniff::Error::Unavailable { .. } => exit::UNAVAILABLE,
-            sniff::Error::Unexplained { .. } => exit::FAILED,
-            sniff::Error::Print(_) => exit::IO,
-        };
-    }
-    if error.is::<hardnessd::daemon::log::Error>() {
-        return exit::CONFIG;
-    }
-    if error.is::<io::Error>() {
-        return exit::IO;
-    }
-    exit::FAILED
 }

@@ -1,0 +1,135 @@
+//! How a command fails, and the exit code that an operator's script may rely on for it.
+
+use super::{check, demo, doctor, record, recover, replay, simulate, sniff, tail, watch};
+use crate::daemon;
+use crate::daemon::config::Error as ConfigError;
+use crate::daemon::publish::Error as PublishError;
+use crate::daemon::record::Error as RecordError;
+use crate::daemon::socket::Error as SocketError;
+
+/// Failed, or bad data.
+pub const FAILED: u8 = 1;
+/// Wrong usage.
+pub const USAGE: u8 = 2;
+/// A file named on the command line is missing or unreadable.
+pub const NO_INPUT: u8 = 66;
+/// A device or the daemon is not there.
+pub const UNAVAILABLE: u8 = 69;
+/// I/O error.
+pub const IO: u8 = 74;
+/// Bad configuration or model, or a file that the configuration names.
+pub const CONFIG: u8 = 78;
+
+/// How a command of `hardnessd` failed.
+#[derive(Debug, thiserror::Error)]
+#[error(transparent)]
+#[expect(
+    missing_docs,
+    reason = "each is the command's own, and says what it is"
+)]
+pub enum Failure {
+    Config(#[from] ConfigError),
+    Log(#[from] daemon::log::Error),
+    Daemon(#[from] daemon::Error),
+    Demo(#[from] demo::Error),
+    Simulate(#[from] simulate::Error),
+    Record(#[from] record::Error),
+    Recover(#[from] recover::Error),
+    Replay(#[from] replay::Error),
+    Tail(#[from] tail::Error),
+    Watch(#[from] watch::Error),
+    Check(#[from] check::Error),
+    Doctor(#[from] doctor::Error),
+    Sniff(#[from] sniff::Error),
+}
+
+impl Failure {
+    /// The exit code.
+    pub fn code(&self) -> u8 {
+        match self {
+            Self::Config(error)
+            | Self::Demo(demo::Error::Config(error))
+            | Self::Replay(replay::Error::Config(error))
+            | Self::Check(check::Error::Config(error)) => of_config(error),
+
+            Self::Daemon(error)
+            | Self::Demo(demo::Error::Daemon(error))
+            | Self::Record(record::Error::Daemon(error))
+            | Self::Check(check::Error::Daemon { source: error, .. }) => of_daemon(error),
+
+            Self::Demo(demo::Error::Missed { .. } | demo::Error::Closed)
+            | Self::Recover(recover::Error::Nothing { .. } | recover::Error::Foreign { .. })
+            | Self::Replay(
+                replay::Error::Recording { .. }
+                | replay::Error::Sensor { .. }
+                | replay::Error::NoFrame { .. },
+            )
+            | Self::Tail(tail::Error::Timeout { .. })
+            | Self::Doctor(doctor::Error::Faults { .. })
+            | Self::Sniff(sniff::Error::Recording { .. } | sniff::Error::Unexplained { .. }) => {
+                FAILED
+            }
+
+            Self::Simulate(simulate::Error::Layout(_) | simulate::Error::Baud { .. })
+            | Self::Record(record::Error::Level { .. })
+            | Self::Watch(watch::Error::NoTerminal) => USAGE,
+
+            Self::Simulate(simulate::Error::Faults(error)) if error.is_unreadable() => NO_INPUT,
+            Self::Simulate(simulate::Error::Faults(_)) => FAILED,
+            Self::Recover(recover::Error::Unreadable { .. })
+            | Self::Replay(replay::Error::Unreadable { .. })
+            | Self::Sniff(sniff::Error::Unreadable { .. }) => NO_INPUT,
+
+            Self::Tail(
+                tail::Error::NoDaemon { .. }
+                | tail::Error::Mute { .. }
+                | tail::Error::Foreign { .. }
+                | tail::Error::Refused { .. }
+                | tail::Error::Closed { .. },
+            )
+            | Self::Sniff(sniff::Error::Unavailable { .. }) => UNAVAILABLE,
+
+            Self::Demo(demo::Error::Io { .. })
+            | Self::Simulate(simulate::Error::Recording { .. } | simulate::Error::Pty { .. })
+            | Self::Record(record::Error::Create { .. })
+            | Self::Recover(recover::Error::Broken { .. } | recover::Error::Write { .. })
+            | Self::Replay(replay::Error::Broken { .. } | replay::Error::Print(_))
+            | Self::Tail(tail::Error::Print(_))
+            | Self::Watch(watch::Error::Terminal(_))
+            | Self::Check(check::Error::Print(_))
+            | Self::Doctor(doctor::Error::Print(_))
+            | Self::Sniff(sniff::Error::Print(_)) => IO,
+
+            Self::Log(_)
+            | Self::Demo(demo::Error::Layout(_))
+            | Self::Check(check::Error::FrameRate { .. }) => CONFIG,
+        }
+    }
+}
+
+fn of_config(error: &ConfigError) -> u8 {
+    match error {
+        ConfigError::Unreadable { .. } => NO_INPUT,
+        _ => CONFIG,
+    }
+}
+
+fn of_daemon(error: &daemon::Error) -> u8 {
+    match error {
+        // The configuration names a file that it must not.
+        daemon::Error::Publish(PublishError::Socket(
+            SocketError::NoSocket { .. }
+            | SocketError::NoDirectory { .. }
+            | SocketError::TooLong { .. },
+        )) => CONFIG,
+        daemon::Error::Record(RecordError::Directory { .. }) | daemon::Error::Log(_) => CONFIG,
+        daemon::Error::Publish(PublishError::Unasked { .. } | PublishError::Passed(_)) => CONFIG,
+        // In use or refused: another time it may work.
+        daemon::Error::Publish(_) | daemon::Error::Random(_) => IO,
+        daemon::Error::Record(RecordError::Unavailable { .. } | RecordError::Lost { .. }) => {
+            UNAVAILABLE
+        }
+        daemon::Error::Record(_) => IO,
+        daemon::Error::Stopped(_) => FAILED,
+    }
+}
