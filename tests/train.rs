@@ -91,6 +91,7 @@ const GAN_SETTINGS: &str = "
 
 struct Trial {
     method: &'static str,
+    data: PathBuf,
     out: PathBuf,
     config: PathBuf,
 }
@@ -107,6 +108,7 @@ impl Trial {
         std::fs::write(&config, settings).unwrap();
         Self {
             method,
+            data: data().1.clone(),
             out: directory.join(name),
             config,
         }
@@ -125,7 +127,7 @@ impl Trial {
         .map(str::to_owned)
         .to_vec();
         for (flag, path) in [
-            ("--data", &data().1),
+            ("--data", &self.data),
             ("--out", &self.out),
             ("--config", &self.config),
         ] {
@@ -510,6 +512,26 @@ fn every_method_leaves_a_model() {
             settings.contains(&format!("labels = {labels}\n")),
             "{settings}"
         );
+    }
+}
+
+#[test]
+fn a_discriminator_learns_from_unlabelled_samples_too() {
+    let mut samples = Dataset::read(&data().1).unwrap().samples;
+    // Of each object two presses; the first samples of all are then unlabelled.
+    for (number, sample) in samples.iter_mut().enumerate() {
+        sample.level *= u8::from(number % 10 > 1);
+    }
+    let path = data().0.path().join("unlabelled.npz");
+    let file = std::fs::File::create(&path).unwrap();
+    dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+    for method in ["sgan", "igan"] {
+        let trial = Trial {
+            data: path.clone(),
+            ..Trial::of(method, &format!("unlabelled {method}"), GAN_SETTINGS)
+        };
+        trial.train("1", &[]);
+        assert!(Hrn::load(&trial.read("hrn.onnx")).is_ok(), "{method}");
     }
 }
 

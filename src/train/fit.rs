@@ -315,10 +315,9 @@ impl Task<'_> {
     /// If it computes what is no number, as weights can that are numbers themselves.
     pub fn finished(&self, weights: Weights, epochs: u32) -> anyhow::Result<Trained> {
         let trained = self.with_statistics(weights);
-        for (_, logits) in self.judge(&trained, &self.train[..1]) {
-            for logit in logits {
-                ensure_finite(self.stage, epochs, "logit", logit.into())?;
-            }
+        // Of one frame, which need not be a labelled one.
+        for logit in self.logits(&trained, &self.train[..1]).concat() {
+            ensure_finite(self.stage, epochs, "logit", logit.into())?;
         }
         Ok(trained)
     }
@@ -346,12 +345,15 @@ impl Task<'_> {
 
     /// Level, from 0, and logits of each of `indices`.
     fn judge(&self, trained: &Trained, indices: &[usize]) -> Vec<(usize, Vec<f32>)> {
+        let levels = indices.iter().map(|&index| self.level(index));
+        levels.zip(self.logits(trained, indices)).collect()
+    }
+
+    fn logits(&self, trained: &Trained, indices: &[usize]) -> Vec<Vec<f32>> {
         let frames = indices
             .iter()
             .map(|&index| &self.dataset.samples[index].frame);
-        let rows = trained.logits(frames, self.full_scale_n, self.device);
-        let levels = indices.iter().map(|&index| self.level(index));
-        levels.zip(rows).collect()
+        trained.logits(frames, self.full_scale_n, self.device)
     }
 
     /// Of a labelled sample, from 0.
