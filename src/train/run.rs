@@ -41,8 +41,23 @@ pub struct Description {
 
 impl Description {
     /// The first key that is not as `expected`, with what both have there; `None` if they are the
-    /// same.
+    /// same. Data are the same if their bytes are: a file may have been renamed.
     pub fn difference(&self, expected: &Self) -> Option<String> {
+        let hashes = |sources: &[Source]| -> Vec<String> {
+            sources.iter().map(|source| source.sha256.clone()).collect()
+        };
+        let (found, wanted) = (hashes(&self.data), hashes(&expected.data));
+        if found != wanted {
+            let (found, wanted) = (found.join(", "), wanted.join(", "));
+            return Some(format!(
+                "sha256 of the data: found {found}, expected {wanted}"
+            ));
+        }
+        let data = self.data.clone();
+        let expected = &Self {
+            data,
+            ..expected.clone()
+        };
         if self == expected {
             return None;
         }
@@ -338,6 +353,35 @@ fn revision() -> String {
 mod tests {
     use super::*;
     use crate::train::history::Row;
+
+    fn description(name: &str, sha256: &str) -> Description {
+        Description {
+            method: "nahrn".to_owned(),
+            profile: Profile::Smoke,
+            seed: 1,
+            labels: 4,
+            label_choice: LabelChoice::Object,
+            settings: Settings::of(Profile::Smoke),
+            data: vec![Source {
+                name: name.to_owned(),
+                seed: None,
+                sha256: sha256.to_owned(),
+                generator: None,
+                pitch_mm: None,
+            }],
+        }
+    }
+
+    #[test]
+    fn a_run_goes_on_with_its_data_under_another_name_and_with_no_other() {
+        let directory = tempfile::tempdir().unwrap();
+        let open = |name, sha256| Run::open(directory.path(), &description(name, sha256), true);
+        drop(open("a.npz", "12").unwrap());
+        drop(open("b.npz", "12").unwrap());
+        let error = open("a.npz", "34").unwrap_err().to_string();
+        let expected = "other settings or data; sha256 of the data: found 34, expected 12";
+        assert!(error.ends_with(expected), "{error}");
+    }
 
     #[test]
     fn seconds_go_on_from_the_row_of_the_checkpoint() {
