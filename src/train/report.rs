@@ -169,7 +169,7 @@ pub fn run(details: &Details) -> anyhow::Result<String> {
     let provenance = format!(
         "{} labels. {}.",
         tables::thousands(told.labels as u64),
-        details.revision
+        details.revisions.replace('\n', ", ")
     );
     Ok(page.finish(&title, &provenance))
 }

@@ -133,6 +133,7 @@ impl Run {
                         run.path("settings.toml").display()
                     );
                 }
+                run.add_revisions(&revision())?;
                 return Ok(run);
             }
             Some(_) => bail!(
@@ -220,7 +221,11 @@ impl Run {
             let Ok(metrics) = metrics_of(other) else {
                 continue;
             };
+            let Ok(revisions) = fs::read_to_string(other.join("revision")) else {
+                continue;
+            };
             if checkpoint.origin == origin && checkpoint.progress.epoch == epochs {
+                self.add_revisions(&revisions)?;
                 self.take_metrics(stage, &metrics)?;
                 self.save(stage, &checkpoint)?;
                 return Ok(Some(checkpoint));
@@ -249,6 +254,26 @@ impl Run {
             checkpoint.origin
         );
         Ok(())
+    }
+
+    /// Adds those lines of `revisions` to the run's that are not among them: other programs had a
+    /// part in it.
+    fn add_revisions(&self, revisions: &str) -> anyhow::Result<()> {
+        let path = self.path("revision");
+        let before = match fs::read_to_string(&path) {
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => String::new(),
+            read => read.with_context(|| path.display().to_string())?,
+        };
+        let mut all = before.clone();
+        for revision in revisions.lines() {
+            if !all.lines().any(|known| known == revision) {
+                all += &format!("{revision}\n");
+            }
+        }
+        if all == before {
+            return Ok(());
+        }
+        self.write("revision", all.as_bytes())
     }
 
     /// Adds the rows of `stage` of another run's metrics to `metrics.csv`: they are part of what
@@ -351,8 +376,12 @@ fn revision() -> String {
 
 #[cfg(test)]
 mod tests {
+    use burn::tensor::Tensor;
+
     use super::*;
+    use crate::train::checkpoint::Progress;
     use crate::train::history::Row;
+    use crate::train::network::{Weight, Weights};
 
     fn description(name: &str, sha256: &str) -> Description {
         Description {
@@ -381,6 +410,56 @@ mod tests {
         let error = open("a.npz", "34").unwrap_err().to_string();
         let expected = "other settings or data; sha256 of the data: found 34, expected 12";
         assert!(error.ends_with(expected), "{error}");
+    }
+
+    #[test]
+    fn every_program_that_had_a_part_in_a_run_is_named() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().join(name);
+        let open = |name: &str, resume| {
+            Run::open(&path(name), &description("a.npz", "12"), resume).unwrap()
+        };
+        let made_by = |revisions: &str, name: &str| {
+            fs::write(path(name).join("revision"), revisions).unwrap();
+        };
+        let revisions = |name: &str| fs::read_to_string(path(name).join("revision")).unwrap();
+        let own = revision();
+
+        // Begun by others, gone on with by this one, twice.
+        drop(open("other", false));
+        made_by("0.1 (aa)\n0.1 (bb)\n", "other");
+        for _ in 0..2 {
+            drop(open("other", true));
+            assert_eq!(revisions("other"), format!("0.1 (aa)\n0.1 (bb)\n{own}\n"));
+        }
+
+        // A stage that is taken from there was made by all of them.
+        let device = Device::flex();
+        let weight = Weight {
+            name: "bias".to_owned(),
+            dims: vec![1],
+            values: Tensor::zeros([1], &device),
+        };
+        let weights = Weights {
+            entries: vec![weight],
+        };
+        let checkpoint = Checkpoint {
+            origin: "same".to_owned(),
+            progress: Progress {
+                epoch: 3,
+                ..Progress::default()
+            },
+            lists: vec![("weights".to_owned(), weights)],
+        };
+        let other = open("other", true);
+        other.save("ustgan", &checkpoint).unwrap();
+        other.metrics("ustgan", 0).unwrap();
+        let run = open("run", false).taking_from(vec![path("other")]);
+        let taken = |origin| run.latest("ustgan", origin, 3, &device).unwrap();
+        assert!(taken("another").is_none());
+        assert_eq!(revisions("run"), format!("{own}\n"));
+        assert!(taken("same").is_some());
+        assert_eq!(revisions("run"), format!("{own}\n0.1 (aa)\n0.1 (bb)\n"));
     }
 
     #[test]

@@ -7,7 +7,7 @@ mod cells;
 
 use std::fmt::Write as _;
 
-use super::compare::results::{Comparison, Details, Row, SwapEntry};
+use super::compare::results::{Comparison, Row, SwapEntry};
 use super::compare::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS};
 use super::history::{History, Stage};
 use super::metrics::{self, Evaluation};
@@ -74,9 +74,10 @@ pub fn provenance(comparison: &Comparison) -> String {
             seeds.unwrap_or_default(),
         );
         let mut revisions: Vec<&str> = Vec::new();
-        for Details { revision, .. } in &comparison.details {
-            // Results can stand without their runs.
-            if !revision.is_empty() && !revisions.contains(&revision.as_str()) {
+        // Results can stand without their runs.
+        let all = comparison.details.iter();
+        for revision in all.flat_map(|details| details.revisions.lines()) {
+            if !revisions.contains(&revision) {
                 revisions.push(revision);
                 made_by += &format!(", {revision}");
             }

@@ -186,8 +186,8 @@ pub struct Details {
     pub directory: PathBuf,
     /// What it was told.
     pub told: Option<Description>,
-    /// What made it.
-    pub revision: String,
+    /// What made it, a line each.
+    pub revisions: String,
     /// On each test set.
     pub worth: Worth,
     /// How it trained.
@@ -201,11 +201,11 @@ impl Details {
     ///
     /// If a file is there and is not as it should be.
     pub fn read(directory: &Path) -> anyhow::Result<Self> {
-        let revision = std::fs::read_to_string(directory.join("revision")).unwrap_or_default();
+        let revisions = std::fs::read_to_string(directory.join("revision")).unwrap_or_default();
         Ok(Self {
             directory: directory.to_owned(),
             told: Run::told(directory)?,
-            revision: revision.trim().to_owned(),
+            revisions: revisions.trim().to_owned(),
             worth: Worth::read(directory),
             history: History::read(directory)?,
         })

@@ -31,7 +31,7 @@ fn comparison(runs: &[(u64, &str)]) -> Comparison {
         run: format!("hrn15-{seed}"),
     };
     let details = |&(steps, revision): &(u64, &str)| Details {
-        revision: revision.to_owned(),
+        revisions: revision.to_owned(),
         history: History {
             stages: vec![Stage {
                 name: "hrn".to_owned(),
@@ -61,11 +61,12 @@ fn steps_are_means_over_seeds_to_the_nearest_step() {
 fn every_revision_that_made_a_run_is_named_once() {
     let told = provenance(&comparison(&[
         (1, "0.1 (aa)"),
-        (1, "0.1 (bb)"),
+        (1, "0.1 (bb)\n0.1 (cc)"),
         (1, "0.1 (aa)"),
     ]));
     let line = told.lines().next().unwrap();
-    assert!(line.ends_with("--seeds 3, 0.1 (aa), 0.1 (bb)."), "{line}");
+    let named = "--seeds 3, 0.1 (aa), 0.1 (bb), 0.1 (cc).";
+    assert!(line.ends_with(named), "{line}");
     let told = provenance(&comparison(&[(1, "")]));
     assert!(
         told.starts_with("Made by hrn-train compare --profile smoke --seeds 1.\n"),
