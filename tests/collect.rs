@@ -305,6 +305,14 @@ fn nothing_of_a_data_set_is_lost_when_it_is_added_to() {
     assert_refused(&out, &object, "own.npz: force: found none");
     write(|sample| sample.shore = Some(70.0));
     assert_refused(&out, &object, "foam.5hz.bin: shore: found none");
+    // Nor does a test object become one to learn from, or the other way round.
+    write(|sample| sample.split = Split::Test);
+    let expected = format!(
+        "{fixture}: object 4294967295: found it for train, expected it for test, as in {}",
+        out.display()
+    );
+    assert_refused(&out, &[&append[..], &most[..2]].concat(), &expected);
+    collected(&out, &object);
     // Nothing told who made it, and that is not forgotten either.
     write(|_| ());
     collected(&out, &object);

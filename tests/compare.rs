@@ -314,6 +314,36 @@ fn data_that_will_not_do_is_refused_before_anything_is_made() {
 }
 
 #[test]
+fn data_that_a_comparison_is_no_measure_of_is_warned_of() {
+    let path = data().0.path().join("odd.npz");
+    let mut samples = Dataset::read(&data().1).unwrap().samples;
+    let (object, material) = (samples[0].object, samples[0].material);
+    let of_level = samples.iter_mut().filter(|sample| sample.level == 1);
+    for sample in of_level {
+        (sample.object, sample.material) = (object, material);
+    }
+    let file = std::fs::File::create(&path).unwrap();
+    dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+    // Told before anything is made, which fails here.
+    let mut command = hrn_train(&["compare", "--profile", "smoke", "--out", "/dev/null/no"]);
+    let output = command.arg("--data").arg(&path).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(74), "{said}");
+    let expected = format!(
+        "warning: {}: object 0: found it in both splits, expected it in one",
+        path.display()
+    );
+    assert_eq!(said.matches(&expected).count(), 1, "{said}");
+    assert_eq!(said.lines().count(), 2, "{said}");
+    // As is one that is evaluated.
+    let model = concat!(env!("CARGO_MANIFEST_DIR"), "/models/hrn.onnx");
+    let data = path.to_str().unwrap();
+    let output = succeed(&["evaluate", "--model", model, "--data", data]);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains("object 0: found it in both splits"), "{said}");
+}
+
+#[test]
 fn a_stopped_or_killed_comparison_takes_its_runs_with_it_and_goes_on() {
     let comparison = Comparison::new("killed", "hrn100,features", &["--jobs", "1"]);
     let mut finished = Vec::new();

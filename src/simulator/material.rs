@@ -36,6 +36,16 @@ pub enum Split {
     Test = 1,
 }
 
+impl Split {
+    /// `train` or `test`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Train => "train",
+            Self::Test => "test",
+        }
+    }
+}
+
 /// A name that is no material's.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(

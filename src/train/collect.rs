@@ -111,6 +111,23 @@ pub enum CollectError {
         /// Where there are.
         first: PathBuf,
     },
+    /// The same object for training and for test.
+    #[error(
+        "{path}: object {object}: found it for {found}, expected it for {expected}, as in {first}: \
+         presses of one object are near-copies"
+    )]
+    Splits {
+        /// The capture.
+        path: PathBuf,
+        /// The object's number.
+        object: u32,
+        /// What its presses here are for.
+        found: &'static str,
+        /// What those before are for.
+        expected: &'static str,
+        /// The data set that they are added to.
+        first: PathBuf,
+    },
     /// Nothing was pressed, or no press was judged.
     #[error("{path}: found no press with a verdict, expected one or more")]
     NoPress {
@@ -340,8 +357,8 @@ impl Selection {
 ///
 /// # Errors
 ///
-/// If a level is neither given nor a label, captures and what was before are of different pitches
-/// or have different arrays, there are more objects or materials than arrays of u32 and u8 can tell
+/// If a level is neither given nor a label, captures and what was before are of different pitches,
+/// have different arrays or the same object in different splits, there are more objects or materials than arrays of u32 and u8 can tell
 /// apart, or the archive cannot be built.
 pub fn to_bytes(
     captures: &[Capture],
@@ -416,6 +433,7 @@ pub fn to_bytes(
             .collect();
         if let (Some(of_first), Some(of_this)) = (samples.first(), own.first()) {
             check_arrays((of_first, &first), (of_this, &capture.path))?;
+            check_splits((&samples, &first), (of_this, &capture.path))?;
         }
         samples.extend(own);
         let said = json!({
@@ -424,7 +442,7 @@ pub fn to_bytes(
             "level": level,
             "object": object,
             "presses": capture.presses.len(),
-            "split": match labelling.split { Split::Train => "train", Split::Test => "test" },
+            "split": labelling.split.name(),
             "labels": capture.labels,
         });
         match meta["captures"].as_array_mut() {
@@ -463,6 +481,23 @@ fn check_arrays(
         });
     }
     Ok(())
+}
+
+/// Refuses a sample of an object that has others in the other split.
+fn check_splits(
+    (before, first): (&[Sample], &Path),
+    (added, path): (&Sample, &Path),
+) -> Result<(), CollectError> {
+    let others = |sample: &&Sample| sample.split != added.split && sample.shares_object_with(added);
+    before.iter().find(others).map_or(Ok(()), |other| {
+        Err(CollectError::Splits {
+            path: path.to_owned(),
+            object: added.object.unwrap_or_default(),
+            found: added.split.name(),
+            expected: other.split.name(),
+            first: first.to_owned(),
+        })
+    })
 }
 
 /// The place of a name in `meta.materials`; a new one is added.

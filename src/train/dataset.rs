@@ -95,6 +95,15 @@ impl From<LabelledSample> for Sample {
     }
 }
 
+impl Sample {
+    /// Whether both are of one object: of the same number, and not of another material or level.
+    pub fn shares_object_with(&self, other: &Self) -> bool {
+        let same_level = self.level == other.level || self.level == 0 || other.level == 0;
+        let same_number = self.object.is_some() && self.object == other.object;
+        same_number && self.material == other.material && same_level
+    }
+}
+
 /// By source and level: a list of objects, each a list of samples.
 type Groups = BTreeMap<(usize, u8), Vec<Vec<usize>>>;
 
@@ -284,6 +293,33 @@ impl Dataset {
         told.unwrap_or(PITCH_MM)
     }
 
+    /// An object that has samples in both splits, if there is one.
+    pub fn object_in_both_splits(&self) -> Option<u32> {
+        let mut tests: BTreeMap<Option<u32>, Vec<&Sample>> = BTreeMap::new();
+        for sample in &self.samples {
+            if sample.split == Split::Test {
+                tests.entry(sample.object).or_default().push(sample);
+            }
+        }
+        let is_tested = |sample: &&Sample| {
+            let mut tests = tests.get(&sample.object).into_iter().flatten();
+            sample.split == Split::Train && tests.any(|test| test.shares_object_with(sample))
+        };
+        self.samples.iter().find(is_tested)?.object
+    }
+
+    /// Says so if an object has samples in both splits.
+    pub fn warn_of_object_in_both_splits(&self) {
+        if let Some(object) = self.object_in_both_splits() {
+            eprintln!(
+                "warning: {}: object {object}: found it in both splits, expected it in one: its \
+                 presses are near-copies, and a test on them says too much of a model that learnt \
+                 from others",
+                self.path().display()
+            );
+        }
+    }
+
     /// Where the first file was read.
     pub fn path(&self) -> PathBuf {
         self.paths.first().cloned().unwrap_or_default()
@@ -303,11 +339,7 @@ impl Dataset {
             let paths = self.paths.iter().map(|path| path.display().to_string());
             return Err(DatasetError::EmptySplit {
                 paths: paths.collect::<Vec<_>>().join(", "),
-                split: if split == Split::Train {
-                    "train"
-                } else {
-                    "test"
-                },
+                split: split.name(),
             });
         }
         Ok(indices)

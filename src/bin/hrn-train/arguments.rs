@@ -101,8 +101,8 @@ pub(super) struct Collect {
     /// Hardness level, 1 (hard) to 4, or 0: unlabelled [default: the recording's label "level"]
     #[arg(long, value_name = "L", value_parser = clap::value_parser!(u8).range(0..=4))]
     pub(super) level: Option<u8>,
-    /// What was pressed; all its presses belong into one data set [default: the recording's label
-    /// "object", else a new one]
+    /// What was pressed; all its presses belong into one split of one data set [default: the
+    /// recording's label "object", else a new one]
     #[arg(long, value_name = "K")]
     pub(super) object: Option<u32>,
     /// For training or for test

@@ -258,7 +258,11 @@ fn train(arguments: &Train) -> anyhow::Result<String> {
         .iter()
         .map(|path| Dataset::read(path))
         .collect();
-    let dataset = Dataset::joined(parts?)?;
+    let parts = parts?;
+    for part in &parts {
+        part.warn_of_object_in_both_splits();
+    }
+    let dataset = Dataset::joined(parts)?;
     for other in &arguments.from {
         let unreadable = |source| Unreadable {
             path: other.clone(),
@@ -364,6 +368,7 @@ fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
             arguments.data.display()
         );
     }
+    dataset.warn_of_object_in_both_splits();
     let indices = dataset.labelled(arguments.split.into())?;
     let evaluation = export::evaluate(&hrn, &dataset, &indices)?;
     Ok(if arguments.json {

@@ -213,6 +213,37 @@ fn objects_of(dataset: &Dataset, indices: &[usize]) -> Vec<u32> {
 }
 
 #[test]
+fn an_object_in_both_splits_is_found() {
+    let (train, test, three) = (Split::Train, Split::Test, Some(3));
+    for (pair, expected) in [
+        ([(train, three, None, 1), (test, three, None, 1)], three),
+        ([(test, three, None, 0), (train, three, None, 1)], three),
+        ([(train, three, None, 0), (test, three, None, 1)], three),
+        ([(test, three, None, 1), (test, three, None, 1)], None),
+        ([(train, three, None, 1), (test, Some(4), None, 1)], None),
+        ([(train, None, None, 1), (test, None, None, 1)], None),
+        // Numbered by level, or by material.
+        ([(train, three, None, 1), (test, three, None, 2)], None),
+        (
+            [(train, three, Some(5), 1), (test, three, Some(6), 1)],
+            None,
+        ),
+    ] {
+        let of = |(split, object, material, level)| Sample {
+            object,
+            material,
+            ..sample(level, 0, split)
+        };
+        let dataset = Dataset {
+            samples: pair.map(of).to_vec(),
+            sources: Vec::new(),
+            paths: Vec::new(),
+        };
+        assert_eq!(dataset.object_in_both_splits(), expected, "{pair:?}");
+    }
+}
+
+#[test]
 fn held_out_objects_are_whole_and_of_every_level() {
     let dataset = parse(&bytes_of(&samples())).unwrap();
     let indices = dataset.labelled(Split::Train).unwrap();
