@@ -323,18 +323,20 @@ fn data_that_a_comparison_is_no_measure_of_is_warned_of() {
         (sample.object, sample.material) = (object, material);
     }
     let file = std::fs::File::create(&path).unwrap();
-    dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+    dataset::write(file, &samples, &serde_json::json!({"pitch_mm": 2.0})).unwrap();
     // Told before anything is made, which fails here.
     let mut command = hrn_train(&["compare", "--profile", "smoke", "--out", "/dev/null/no"]);
     let output = command.arg("--data").arg(&path).output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(74), "{said}");
-    let expected = format!(
-        "warning: {}: object 0: found it in both splits, expected it in one",
-        path.display()
-    );
-    assert_eq!(said.matches(&expected).count(), 1, "{said}");
-    assert_eq!(said.lines().count(), 2, "{said}");
+    for expected in [
+        "object 0: found it in both splits, expected it in one",
+        "taxel pitch: found 2 mm, expected 3.5 mm, that of the simulated test objects",
+    ] {
+        let expected = format!("warning: {}: {expected}", path.display());
+        assert_eq!(said.matches(&expected).count(), 1, "{said}");
+    }
+    assert_eq!(said.lines().count(), 3, "{said}");
     // As is one that is evaluated.
     let model = concat!(env!("CARGO_MANIFEST_DIR"), "/models/hrn.onnx");
     let data = path.to_str().unwrap();

@@ -67,6 +67,7 @@ pub fn compare(plan: &Plan) -> anyhow::Result<()> {
     // Nothing is made before it is known that the data will do.
     let dataset = Dataset::read(&plan.data)?;
     sets::check_seed(&dataset)?;
+    sets::warn_of_pitch(&dataset);
     dataset.warn_of_object_in_both_splits();
     let recipes = recipes(plan, &dataset)?;
     let swaps = Swaps::of(plan, &recipes)?;

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, ensure};
 
 use crate::simulator::{self, DatasetSettings, SensorProfile, Shapes, Split};
-use crate::train::dataset::Dataset;
+use crate::train::dataset::{Dataset, PITCH_MM};
 use crate::train::disk::write_whole;
 use crate::train::settings::Profile;
 use crate::train::simulated;
@@ -69,6 +69,19 @@ pub(super) fn check_seed(dataset: &Dataset) -> anyhow::Result<()> {
         seed.unwrap_or_default()
     );
     Ok(())
+}
+
+/// Says so if the data are of another sensor than what is simulated, whose pitch is fixed: figures on
+/// fresh objects then say little.
+pub(super) fn warn_of_pitch(dataset: &Dataset) {
+    let pitch_mm = dataset.pitch_mm();
+    if pitch_mm != PITCH_MM {
+        eprintln!(
+            "warning: {}: taxel pitch: found {pitch_mm} mm, expected {PITCH_MM} mm, that of the \
+             simulated test objects",
+            dataset.path().display()
+        );
+    }
 }
 
 /// All sets in order; those that are simulated lie in `directory`. The first is left out where
