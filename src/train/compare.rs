@@ -226,17 +226,18 @@ impl Recipe {
         request.description(dataset)
     }
 
-    /// What a run costs, in TFLOP of the `paper` profile: 2.5 GFLOP a step of a GAN, 0.6 a step of
-    /// HRN, without the stages that it takes from ours. Other profiles keep the proportions.
+    /// What a run costs, in thousands of HRN's steps in the `paper` profile, a step of a GAN as six
+    /// (by the seconds in `results/quick`), without the stages that it takes from ours. Other
+    /// profiles keep the proportions.
     fn effort(&self) -> f64 {
         match self.method {
-            Method::Ours => 181.0,
-            Method::Sgan | Method::Igan => 107.0,
-            Method::Hrn15Long | Method::Nihrn => 56.0,
-            Method::Hrn100 => 12.0,
-            Method::Hrn15Tuned => 9.0,
-            Method::Hrn50 => 6.0,
-            Method::Hrn15 | Method::Nahrn => 2.0,
+            Method::Ours => 396.0,
+            Method::Sgan | Method::Igan => 255.0,
+            Method::Hrn15Long | Method::Nihrn => 93.0,
+            Method::Hrn100 => 20.0,
+            Method::Hrn15Tuned => 15.0,
+            Method::Hrn50 => 10.0,
+            Method::Hrn15 | Method::Nahrn => 3.0,
             Method::Features => 0.5,
         }
     }

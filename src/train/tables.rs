@@ -336,7 +336,7 @@ pub fn shifts(rows: &[Row]) -> Table {
 /// Labels, steps and seconds of each method, stage by stage.
 pub fn price(rows: &[Row]) -> Table {
     let note = "Mean over seeds. A step is a batch of 100 of either network; one of a GAN costs \
-                about four of HRN.";
+                about six of HRN in seconds.";
     let head = [
         "method",
         "labels",
