@@ -5,8 +5,8 @@
 //! patches under a kernel copies whole runs of `batch` numbers; the product of the kernels
 //! `[outputs, inputs k k]` with these patches `[inputs k k, rows' columns' batch]` is the next
 //! layer's image as it stands, and a channel's statistics are those of a row. An HRN step of 100
-//! takes 15 ms of a core; with burn's own convolution and the system's allocator it took 33
-//! (`benches/train_step.rs`, 2026-11-21).
+//! takes 9.5 ms of a core (`results/quick`); with burn's own convolution and the system's allocator it
+//! took more than twice as long as with these (`benches/train_step.rs`, 2026-11-21).
 //!
 //! [`patches`] and [`from_patches`] are each other's adjoint, so the transposed convolution is the
 //! same two steps in the other order, and so are all gradients.

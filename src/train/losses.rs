@@ -73,7 +73,8 @@ pub fn discriminator(
     let (real, generated) = (real.logits, generated.logits);
     let loss = match game {
         // Eqs. (3), (5): L_D = -E log D(x) - E log(1 - D(G(z))). The paper prints +log D(G(z))
-        // for the second term, which has no lower bound.
+        // for the second term, which has no lower bound. Eq. (8) is this loss again, of features;
+        // below it the paper calls beta^G the discriminator's parameters and beta^D the generator's.
         Game::RealOrFake => softplus(real.neg()).mean().add(softplus(generated).mean()),
         // Real: not generated. Generated: the last level.
         Game::FakeLevel => {

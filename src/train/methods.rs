@@ -42,7 +42,8 @@ pub enum Method {
     Nihrn,
     /// Control: HRN15 with as many steps as ours.
     Hrn15Long,
-    /// Control: HRN15 with Adam, stopped early on objects held out of its own labels.
+    /// Control: HRN15 with Adam, the best of every epoch's weights on objects held out of its own
+    /// labels.
     Hrn15Tuned,
     /// Logistic regression on hand-made features of a frame.
     Features,

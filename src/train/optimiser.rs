@@ -44,7 +44,7 @@ pub struct Settings {
     pub schedule: Schedule,
     /// Adam's decay of the gradient's mean.
     pub beta1: f64,
-    /// Adam's decay of the gradient's square. (Below Eq. 8 the paper has the two swapped.)
+    /// Adam's decay of the gradient's square.
     pub beta2: f64,
     /// Share of a kernel taken away a step, times the learning rate; not of biases, nor
     /// of the mixture's mu and sigma.

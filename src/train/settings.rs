@@ -170,7 +170,8 @@ impl Settings {
         let paper = Self::default();
         match profile {
             Profile::Paper => paper,
-            // A tenth of the paper's steps everywhere: all methods take about an hour of one core.
+            // A tenth of the paper's steps everywhere: all methods take 34 minutes of one core a
+            // seed (`results/quick`).
             Profile::Quick => paper.with_epochs(50, 20),
             Profile::Smoke => Self {
                 generation: Generation {
