@@ -12,8 +12,8 @@ use burn::tensor::{Device, Tensor, TensorData};
 use hardnessd::random::Stream;
 use hardnessd::train::learner::Learner;
 use hardnessd::train::losses::Game;
-use hardnessd::train::network::{Normalisation, numbers};
-use hardnessd::train::{gan, generator, hrn, optimiser};
+use hardnessd::train::network::numbers;
+use hardnessd::train::{fit, gan, generator, hrn, optimiser};
 use ndarray::{ArrayD, IxDyn};
 use ndarray_npy::NpzWriter;
 use rustix::time::{ClockId, clock_gettime};
@@ -108,22 +108,16 @@ impl Networks {
     fn run(&mut self, name: &str, steps: usize) -> (f64, Vec<f64>) {
         let begun = processor_seconds();
         let step = |_| match name {
-            "hrn" => self.hrn_step(),
+            "hrn" => {
+                let (images, targets) = (self.images.clone(), self.targets.clone());
+                fit::step(&mut self.hrn, images, targets, RATE).0
+            }
             "gan" => gan_step(&mut self.gan, &self.images, &self.eta),
             "gan-sgd" => gan_step(&mut self.gan_sgd, &self.images, &self.eta),
             _ => panic!("{name}: expected hrn, gan or gan-sgd"),
         };
         let losses = (0..steps).map(step).collect();
         (processor_seconds() - begun, losses)
-    }
-
-    fn hrn_step(&mut self) -> f64 {
-        let tracked = self.hrn.weights.tracked();
-        let logits = hrn::logits(&tracked, self.images.clone(), &mut Normalisation::Batch);
-        let loss = hrn::cross_entropy(logits, self.targets.clone());
-        let mut gradients = loss.backward();
-        self.hrn.step(&tracked, &mut gradients, RATE);
-        f64::from(numbers(&loss)[0])
     }
 
     fn write(&self, path: &Path) {

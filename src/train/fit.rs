@@ -166,6 +166,23 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
     Ok(trained)
 }
 
+/// A step of HRN on images `[batch, 1, 28, 28]` and targets `[batch, L]`; gives the mean loss and
+/// the logits that it had before it, row by row.
+pub fn step(
+    hrn: &mut Learner,
+    images: Tensor<4>,
+    targets: Tensor<2>,
+    rate: f64,
+) -> (f64, Vec<f32>) {
+    let tracked = hrn.weights.tracked();
+    let logits = hrn::logits(&tracked, images, &mut Normalisation::Batch);
+    let judged = numbers(&logits);
+    let loss = hrn::cross_entropy(logits, targets);
+    let mut gradients = loss.backward();
+    hrn.step(&tracked, &mut gradients, rate);
+    (f64::from(numbers(&loss)[0]), judged)
+}
+
 /// All that changes from step to step.
 #[derive(Debug)]
 struct State {
@@ -224,19 +241,14 @@ impl State {
             task.images(indices, self.progress.step),
             task.targets(indices),
         );
-        let tracked = self.learner.weights.tracked();
-        let logits = hrn::logits(&tracked, images, &mut Normalisation::Batch);
-        let judged = numbers(&logits);
-        let loss = hrn::cross_entropy(logits, targets);
-        let mut gradients = loss.backward();
-        self.learner.step(&tracked, &mut gradients, rate);
+        let (loss, judged) = step(&mut self.learner, images, targets, rate);
         self.progress.step += 1;
         let right = indices
             .iter()
             .zip(judged.chunks(task.levels))
             .filter(|(index, logits)| argmax(logits).0 == task.level(**index))
             .count();
-        (f64::from(numbers(&loss)[0]), right)
+        (loss, right)
     }
 
     /// Loss and accuracy on the validation samples; keeps the weights if they are the best.
