@@ -1,8 +1,8 @@
 //! Counter-based random streams: a value depends only on seed, stream name and position.
 //!
-//! Nothing here holds hidden global state, so a stream can be saved as one number and resumed,
-//! and a new stream never shifts an old one. The mixing function is SplitMix64's finaliser
-//! (Steele, Lea, Flood 2014), which is enough for simulation and initial weights, not for secrets.
+//! Nothing here holds hidden global state, and a new stream never shifts an old one. The mixing
+//! function is SplitMix64's finaliser (Steele, Lea, Flood 2014), which is enough for simulation and
+//! initial weights, not for secrets.
 
 /// A stream of random numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,17 +37,6 @@ impl Stream {
             key: mix(self.key ^ mix(index.wrapping_add(GOLDEN_GAMMA))),
             position: 0,
         }
-    }
-
-    /// How many words have been drawn; with the name and the seed, the whole state.
-    pub fn position(&self) -> u64 {
-        self.position
-    }
-
-    /// The same stream as if `position` words had been drawn.
-    #[must_use]
-    pub fn at(self, position: u64) -> Self {
-        Self { position, ..self }
     }
 
     /// 64 random bits.
@@ -96,14 +85,6 @@ impl Stream {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_stream_resumes_from_its_position() {
-        let mut stream = Stream::new(7, "noise");
-        let _ = stream.normal();
-        let mut resumed = Stream::new(7, "noise").at(stream.position());
-        assert_eq!(stream.next_u64(), resumed.next_u64());
-    }
 
     #[test]
     fn streams_differ_by_seed_name_and_child() {

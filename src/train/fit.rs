@@ -13,7 +13,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::augment;
 use super::checkpoint::{Checkpoint, Origin, Progress};
-use super::dataset::Dataset;
+use super::dataset::{self, Dataset};
 use super::history::Row;
 use super::hrn;
 use super::learner::Learner;
@@ -38,8 +38,6 @@ pub struct Task<'a> {
     pub train: &'a [usize],
     /// Samples of held-out training objects, and how they are used; may be empty.
     pub validation: (&'a [usize], Validation),
-    /// Levels there are.
-    pub levels: usize,
     /// Newtons a taxel that become 1 in the image.
     pub full_scale_n: f64,
     /// How.
@@ -183,6 +181,10 @@ pub fn step(
     (f64::from(numbers(&loss)[0]), judged)
 }
 
+fn levels() -> usize {
+    dataset::levels().len()
+}
+
 /// All that changes from step to step.
 #[derive(Debug)]
 struct State {
@@ -245,7 +247,7 @@ impl State {
         self.progress.step += 1;
         let right = indices
             .iter()
-            .zip(judged.chunks(task.levels))
+            .zip(judged.chunks(levels()))
             .filter(|(index, logits)| argmax(logits).0 == task.level(**index))
             .count();
         (loss, right)
@@ -308,7 +310,7 @@ impl Task<'_> {
         let levels_of = indices
             .iter()
             .map(|&index| self.dataset.samples[index].level);
-        hrn::targets(levels_of, self.levels, self.device)
+        hrn::targets(levels_of, levels(), self.device)
     }
 
     /// A recogniser of `weights` with statistics over the training samples and no temperature.

@@ -165,7 +165,8 @@ impl Weights {
     }
 
     /// How many numbers there are.
-    pub fn count(&self) -> usize {
+    #[cfg(test)]
+    pub(super) fn count(&self) -> usize {
         self.entries
             .iter()
             .map(|weight| weight.dims.iter().product::<usize>())

@@ -212,7 +212,6 @@ impl Stages<'_> {
             dataset: self.dataset,
             train: self.train,
             validation: (self.validation, self.settings().validation),
-            levels: levels(),
             full_scale_n: self.settings().full_scale_n,
             settings: &self.settings().training,
             seed: self.description.seed,
