@@ -76,10 +76,10 @@ pub fn compare(plan: &Plan) -> anyhow::Result<()> {
         std::fs::create_dir_all(&part).with_context(|| part.display().to_string())?;
     }
     let _lock = lock(&plan.out)?;
-    let rounds = rounds(plan, &recipes, &dataset)?;
-    let mut open = unfinished(&rounds, &plan.out)?;
+    let runs = planned(plan, &recipes, &dataset)?;
+    let mut open = unfinished(&runs, &plan.out)?;
     let sets = sets::all(dataset, plan.profile, &plan.out.join("data"))?;
-    write_results(plan, &rounds, &sets)?;
+    write_results(plan, &runs, &sets)?;
     // The longest first, but every method once before any method twice.
     open.sort_by(|(a, first), (b, second)| {
         (a.told.seed)
@@ -87,7 +87,7 @@ pub fn compare(plan: &Plan) -> anyhow::Result<()> {
             .then(second.effort.total_cmp(&first.effort))
     });
     let jobs = open.into_iter().map(|(_, job)| job).collect();
-    let mut failures = children::run(jobs, plan.jobs, |_| write_results(plan, &rounds, &sets))?;
+    let mut failures = children::run(jobs, plan.jobs, |_| write_results(plan, &runs, &sets))?;
     let swapped = swaps.map_or(Ok(()), |swaps| {
         failures.extend(swaps.run(plan)?);
         write_tables(&plan.out)
@@ -158,29 +158,29 @@ fn recipes(plan: &Plan, dataset: &Dataset) -> anyhow::Result<Vec<Recipe>> {
 }
 
 /// Every run that the plan asks for, and those that another finished before.
-fn rounds(plan: &Plan, recipes: &[Recipe], dataset: &Dataset) -> anyhow::Result<Vec<Round>> {
-    let runs = plan.out.join("runs");
-    let mut rounds = Vec::new();
+fn planned(plan: &Plan, recipes: &[Recipe], dataset: &Dataset) -> anyhow::Result<Vec<PlannedRun>> {
+    let directory = plan.out.join("runs");
+    let mut runs = Vec::new();
     for recipe in recipes {
         let asked = if plan.asks(recipe) { plan.seeds } else { 0 };
-        let mut seeds = recipe.seeds_in(&runs)?;
+        let mut seeds = recipe.seeds_in(&directory)?;
         seeds.extend(1..=asked);
         for seed in seeds {
-            let round = Round {
+            let run = PlannedRun {
                 recipe: *recipe,
                 told: recipe.told(seed, plan.profile, dataset)?,
                 data: plan.data.clone(),
-                directory: runs.join(format!("{}-{seed}", recipe.name())),
+                directory: directory.join(format!("{}-{seed}", recipe.name())),
                 // USTGAN is the same, and what the STGANs generate.
                 shares_with: matches!(recipe.method, Method::Nahrn | Method::Nihrn)
                     .then(|| format!("{}-{seed}", Method::Ours.name())),
             };
-            if (1..=asked).contains(&seed) || round.counts() {
-                rounds.push(round);
+            if (1..=asked).contains(&seed) || run.counts() {
+                runs.push(run);
             }
         }
     }
-    Ok(rounds)
+    Ok(runs)
 }
 
 impl Recipe {
@@ -243,9 +243,9 @@ impl Recipe {
     }
 }
 
-/// One training run.
+/// A training run of the plan, finished or not.
 #[derive(Debug)]
-struct Round {
+struct PlannedRun {
     recipe: Recipe,
     told: Description,
     data: PathBuf,
@@ -254,7 +254,7 @@ struct Round {
     shares_with: Option<String>,
 }
 
-impl Round {
+impl PlannedRun {
     /// Whether its model stands.
     fn is_finished(&self) -> bool {
         self.directory.join("hrn.onnx").exists()
@@ -276,7 +276,7 @@ impl Round {
         difference.is_none()
     }
 
-    /// Makes sure that what stands in the directory was told what this round is.
+    /// Makes sure that what stands in the directory was told what this run is to be.
     fn check(&self) -> anyhow::Result<()> {
         match self.difference()? {
             None => Ok(()),
@@ -339,27 +339,27 @@ impl Round {
     }
 }
 
-/// The rounds that are still to be run.
+/// What is still to be run.
 fn unfinished<'a>(
-    rounds: impl IntoIterator<Item = &'a Round>,
+    runs: impl IntoIterator<Item = &'a PlannedRun>,
     out: &Path,
-) -> anyhow::Result<Vec<(&'a Round, Job)>> {
+) -> anyhow::Result<Vec<(&'a PlannedRun, Job)>> {
     let mut open = Vec::new();
-    for round in rounds {
-        round.check()?;
-        if !round.is_finished() {
-            open.push((round, round.job(out)));
+    for run in runs {
+        run.check()?;
+        if !run.is_finished() {
+            open.push((run, run.job(out)));
         }
     }
     Ok(open)
 }
 
-/// Writes `results.json` of the finished rounds, and the tables.
-fn write_results(plan: &Plan, rounds: &[Round], sets: &[TestSet]) -> anyhow::Result<()> {
+/// Writes `results.json` of the finished runs, and the tables.
+fn write_results(plan: &Plan, runs: &[PlannedRun], sets: &[TestSet]) -> anyhow::Result<()> {
     let mut entries = Vec::new();
-    for round in rounds.iter().filter(|round| round.is_finished()) {
-        if let Some(told) = Run::told(&round.directory)? {
-            entries.push(Entry::of(&round.directory, &told, sets)?);
+    for run in runs.iter().filter(|run| run.is_finished()) {
+        if let Some(told) = Run::told(&run.directory)? {
+            entries.push(Entry::of(&run.directory, &told, sets)?);
         }
     }
     let json = serde_json::to_vec_pretty(&entries)?;

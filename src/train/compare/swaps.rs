@@ -11,7 +11,7 @@ use anyhow::Context as _;
 
 use super::children::{self, Failure};
 use super::results::{SwapEntry, read_json};
-use super::{Plan, Recipe, Round, sets, unfinished};
+use super::{Plan, PlannedRun, Recipe, sets, unfinished};
 use crate::simulator::{DatasetSettings, LabelledSample, Material};
 use crate::train::dataset::{Dataset, LabelChoice};
 use crate::train::disk::write_whole;
@@ -96,15 +96,15 @@ impl Swaps {
     /// If a file cannot be read or written, or a directory holds a run that was told otherwise.
     pub(super) fn run(&self, plan: &Plan) -> anyhow::Result<Vec<Failure>> {
         let mut parts = None;
-        let mut rounds = Vec::with_capacity(self.every.len());
+        let mut runs = Vec::with_capacity(self.every.len());
         for (recipe, swapped) in &self.every {
-            let run = format!("{}-swapped-{}", recipe.name(), name(*swapped));
-            let directory = plan.out.join("runs").join(run);
+            let name = format!("{}-swapped-{}", recipe.name(), name(*swapped));
+            let directory = plan.out.join("runs").join(name);
             if !plan.asks(recipe) && !directory.is_dir() {
                 continue;
             }
             let file = file(plan, self.settings, *swapped, &mut parts)?;
-            let round = Round {
+            let run = PlannedRun {
                 recipe: *recipe,
                 told: recipe.told(SEED, plan.profile, &Dataset::read(&file)?)?,
                 data: file,
@@ -112,21 +112,21 @@ impl Swaps {
                 // With nobody swapped it is the comparison's own run, judged on more objects.
                 shares_with: (*swapped == [false; 4]).then(|| format!("{}-{SEED}", recipe.name())),
             };
-            if plan.asks(recipe) || round.counts() {
-                rounds.push((round, *swapped));
+            if plan.asks(recipe) || run.counts() {
+                runs.push((run, *swapped));
             }
         }
-        let open = unfinished(rounds.iter().map(|(round, _)| round), &plan.out)?;
+        let open = unfinished(runs.iter().map(|(run, _)| run), &plan.out)?;
         let jobs = open.into_iter().map(|(_, job)| job).collect();
         let failures = children::run(jobs, plan.jobs, |_| Ok(()))?;
         let mut entries = Vec::new();
-        for (round, swapped_levels) in &rounds {
-            let test: Option<Evaluation> = read_json(&round.directory.join("evaluation.json"))?;
-            if let (true, Some(test)) = (round.is_finished(), test) {
+        for (run, swapped_levels) in &runs {
+            let test: Option<Evaluation> = read_json(&run.directory.join("evaluation.json"))?;
+            if let (true, Some(test)) = (run.is_finished(), test) {
                 entries.push(SwapEntry {
-                    method: round.told.method.clone(),
-                    seed: round.told.seed,
-                    labels: round.told.labels,
+                    method: run.told.method.clone(),
+                    seed: run.told.seed,
+                    labels: run.told.labels,
                     swapped_levels: *swapped_levels,
                     test,
                 });
