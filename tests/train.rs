@@ -227,7 +227,11 @@ fn a_run_learns_and_leaves_what_it_promises() {
     let written: Value = serde_json::from_slice(&trial.read("evaluation.json")).unwrap();
     assert_eq!(printed, written);
     assert_eq!(printed["n"], 40);
-    assert!(succeed(&["inspect", copy]).contains("simulated data only"));
+    let inspected = succeed(&["inspect", copy]);
+    assert!(inspected.contains("simulated data only"), "{inspected}");
+    let temperature = hrn.card().metrics["temperature"].as_f64().unwrap();
+    let line = format!("\ntemperature   {temperature:.3}\n");
+    assert!(inspected.contains(&line), "{inspected}");
 }
 
 /// Starts or resumes a run and sends `signal` as soon as `count` checkpoints of `stage` stand,

@@ -19,6 +19,11 @@ pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
             )
         })
         .collect();
+    let temperature = card.metrics["temperature"]
+        .as_f64()
+        .map_or_else(String::new, |temperature| {
+            format!("temperature   {temperature:.3}\n")
+        });
     let [least_n, most_n] = card.range.force_n;
     let [least_taxels, most_taxels] = card.range.contact_area_taxels;
     format!(
@@ -31,6 +36,7 @@ pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
          pitch         {} mm\n\
          force         {least_n:.2} to {most_n:.2} N in training\n\
          contact area  {least_taxels} to {most_taxels} taxels in training\n\
+         {temperature}\
          data          {}\n\
          metrics       {}\n\
          check frames  {}, all reproduced\n",

@@ -114,6 +114,7 @@ impl Worth {
             return Ok(worth);
         }
         let hrn = Hrn::load(&bytes).with_context(|| model.display().to_string())?;
+        // Every model of ours says its own; of another's that does not, 1 gives no figure before it.
         let temperature = hrn.card().metrics["temperature"].as_f64().unwrap_or(1.0);
         for set in sets {
             let judged = export::judge(&hrn, &set.dataset, &set.indices)?;
