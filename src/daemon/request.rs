@@ -186,7 +186,10 @@ fn request(mut fields: Map<String, Value>) -> Result<Request, String> {
         Request::Change(Change::Blackbox { sensor })
     } else {
         let found = fields.keys().next().map_or("no key".to_owned(), short);
-        return Err(format!("found {found}, expected \"subscribe\" or \"get\""));
+        return Err(format!(
+            "found {found}, expected \"subscribe\" or \"get\", or on the control socket \"tare\", \
+             \"context\" or \"blackbox\""
+        ));
     };
     match fields.keys().next() {
         Some(key) => Err(format!(
@@ -343,6 +346,10 @@ mod tests {
             (br#"{"context":"pick","id":"a"}"#, "\"pick\""),
             (br#"{"context":{"tag":"x"},"id":"a"}"#, "context.sensor"),
             (br#"{"id":"a"}"#, "no key"),
+            (
+                br#"{"retare":"a","id":"a"}"#,
+                "\"tare\", \"context\" or \"blackbox\"",
+            ),
         ] {
             let read = parse(line);
             let message = read.request.unwrap_err();
