@@ -139,6 +139,11 @@ impl Memory {
             && self.tracker.is_possible(*frames)
             && recent.len() <= RATE_FRAMES
     }
+
+    /// What the controller had said it was doing.
+    pub(crate) fn context(&self) -> Option<&serde_json::Value> {
+        self.pipeline.context.as_ref()
+    }
 }
 
 impl Pipeline {

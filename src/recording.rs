@@ -101,6 +101,45 @@ pub enum Entry {
     State(Box<State>),
 }
 
+impl Entry {
+    /// About how much memory it takes with its moment, in bytes.
+    pub(crate) fn weight(&self) -> usize {
+        let beside = match self {
+            Entry::Input(Input::Bytes(bytes)) => bytes.len(),
+            Entry::Input(Input::Unavailable(reason) | Input::Lost(reason)) => reason.len(),
+            Entry::Input(Input::Context(context)) => context.as_ref().map_or(0, heap_bytes),
+            Entry::Input(_) => 0,
+            Entry::Settings(sensor) => text_bytes(sensor),
+            Entry::State(state) => text_bytes(state) + state.memory.context().map_or(0, heap_bytes),
+        };
+        size_of::<(Stamp, Self)>() + beside
+    }
+}
+
+/// As JSON: of numbers in lists, which is most of a state, about what they take in memory.
+fn text_bytes(value: &impl Serialize) -> usize {
+    serde_json::to_vec(value).map_or(0, |text| text.len())
+}
+
+/// What a value takes beside itself: small objects take many times their text.
+fn heap_bytes(value: &Value) -> usize {
+    match value {
+        Value::Null | Value::Bool(_) | Value::Number(_) => 0,
+        Value::String(text) => text.len(),
+        Value::Array(items) => {
+            size_of_val(items.as_slice()) + items.iter().map(heap_bytes).sum::<usize>()
+        }
+        Value::Object(fields) => {
+            // A B-tree's nodes have 11 places, of which 5 may be taken.
+            let places = 11 * fields.len().div_ceil(5);
+            let held = fields
+                .iter()
+                .map(|(key, value)| key.len() + heap_bytes(value));
+            places * size_of::<(String, Value)>() + held.sum::<usize>()
+        }
+    }
+}
+
 /// A sensor, as far as a replay has to know it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Sensor {

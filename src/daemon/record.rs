@@ -31,7 +31,7 @@ const QUEUED: usize = 8192;
 /// How often a sensor's state is noted: what a file that begins between has to take from before
 /// it, and what a damaged chunk costs a replay at the most.
 const STATE_EVERY: Duration = Duration::from_secs(10);
-/// And after so many bytes: what a flood makes the black box hold beyond its bound.
+/// And after so many bytes of entries: what a flood makes the black box hold beyond its bound.
 const STATE_EVERY_BYTES: usize = 4 << 20;
 /// Over the time between two states, a fault if so many frames and this share were damaged.
 const DAMAGED_FRAMES: u64 = 5;
@@ -236,7 +236,7 @@ struct Active {
     labels: Labels,
     /// When a state was last noted; `None` if what followed it is not all there.
     noted: Option<Duration>,
-    /// Told since then.
+    /// What was told since then takes so much memory.
     bytes: usize,
     /// Whole and damaged frames by then.
     counted: (u64, u64),
@@ -296,9 +296,7 @@ impl Active {
             self.jobs.dropped.fetch_add(1, Ordering::Relaxed);
             return;
         }
-        if let Entry::Input(Input::Bytes(bytes)) = &entry {
-            self.bytes += bytes.len();
-        }
+        self.bytes += entry.weight();
         self.tell(at, entry);
     }
 

@@ -3,13 +3,13 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use super::{Entry, Input};
+use super::Entry;
 use crate::frame::Stamp;
 
 /// What is kept.
 const KEPT: Duration = Duration::from_secs(60);
-/// More is not, however short a time that is: a device that floods its line must not fill the
-/// memory. The JX255N sends 5 MB a minute at 100 frames/s.
+/// More is not, however short a time that is: neither a device that floods its line nor a controller
+/// that floods the control socket may fill the memory. The JX255N sends 5 MB a minute at 100 frames/s.
 const KEPT_BYTES: usize = 32 << 20;
 
 /// Entries of one sensor, in stretches that each begin with a state.
@@ -37,12 +37,7 @@ impl Ring {
         let Some(stretch) = self.stretches.back_mut() else {
             return;
         };
-        stretch.bytes += match &entry {
-            Entry::Input(Input::Bytes(bytes)) => bytes.len(),
-            _ => 0,
-        };
-        // A minute of entries without bytes is small; what one takes by itself is not nothing.
-        stretch.bytes += size_of::<(Stamp, Entry)>();
+        stretch.bytes += entry.weight();
         stretch.entries.push((at, entry));
         while self.is_longer_than_needed(at) {
             self.stretches.pop_front();
@@ -73,7 +68,7 @@ impl Ring {
 mod tests {
     use super::*;
     use crate::pipeline::{Clock, Pipeline};
-    use crate::recording::{Labels, State, tests};
+    use crate::recording::{Input, Labels, State, tests};
 
     fn at(seconds: u64) -> Stamp {
         Stamp {

@@ -76,23 +76,28 @@ fn after_a_gap_comes_a_state() {
 
 #[test]
 fn a_flood_is_bounded_in_the_black_box() {
-    let (sender, inbox) = sync_channel(4096);
-    let (mut recorder, pipeline) = recorder(sender);
-    let flood = Input::Bytes(vec![0; 1 << 16].into());
-    for _ in 0..1000 {
-        recorder.note(&pipeline, &flood, at(0));
+    // Less than 1 KiB as text, and in memory 100 objects.
+    let context = serde_json::json!({ "tags": vec![serde_json::json!({ "": 0 }); 100] });
+    assert!(context.to_string().len() < 1024);
+    for flood in [
+        Input::Bytes(vec![0; 1 << 16].into()),
+        Input::Context(Some(context)),
+    ] {
+        assert!(Entry::Input(flood.to_owned()).weight() > 60_000);
+        let (sender, inbox) = sync_channel(4096);
+        let (mut recorder, pipeline) = recorder(sender);
+        for _ in 0..1000 {
+            recorder.note(&pipeline, &flood, at(0));
+        }
+        drop(recorder);
+        let mut ring = Ring::default();
+        for job in inbox {
+            let Job::Entry { at, entry, .. } = job else {
+                panic!("{job:?}");
+            };
+            ring.push(at, entry);
+        }
+        let kept: usize = ring.all().map(|(_, entry)| entry.weight()).sum();
+        assert!((28 << 20..=36 << 20).contains(&kept), "{kept} bytes");
     }
-    drop(recorder);
-    let mut ring = Ring::default();
-    for job in inbox {
-        let Job::Entry { at, entry, .. } = job else {
-            panic!("{job:?}");
-        };
-        ring.push(at, entry);
-    }
-    let kept = ring
-        .all()
-        .filter(|(_, entry)| matches!(entry, Entry::Input(_)));
-    let kept = kept.count() << 16;
-    assert!((28 << 20..=36 << 20).contains(&kept), "{kept} bytes");
 }
