@@ -6,6 +6,8 @@
 
 mod reply;
 
+use std::time::Duration;
+
 use jiff::Timestamp;
 use serde::{Serialize, Serializer};
 
@@ -275,6 +277,9 @@ pub struct Hardness {
     pub age_at_publish_ms: Option<f64>,
     /// From the arrival of the byte that made the decision possible; null in a replay.
     pub latency_us: Option<u64>,
+    /// When that byte came, on CLOCK_MONOTONIC; not published.
+    #[serde(skip)]
+    pub arrival: Duration,
 }
 
 /// One tared frame.

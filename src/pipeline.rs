@@ -90,6 +90,8 @@ pub struct Pipeline {
     tracker: PressTracker,
     judgement: Judgement,
     seen: Seen,
+    /// When the last of the bytes came that are being decoded.
+    arrival: Duration,
     /// What became of a tare that was asked for, until it is fetched.
     retared: Option<Result<Tared, RetareError>>,
 }
@@ -181,6 +183,7 @@ impl Pipeline {
                 last_frame: None,
                 told: (LinkState::Connecting, None),
             },
+            arrival: Duration::ZERO,
             retared: None,
         }
     }
@@ -268,7 +271,7 @@ impl Pipeline {
         if self.clock == Clock::Arrival {
             self.seen.chunks.push_back((self.decoder.received(), at));
         }
-        self.drain(&mut events);
+        self.drain(at.mono, &mut events);
         events
     }
 
@@ -282,9 +285,7 @@ impl Pipeline {
             .pause_deadline()
             .is_some_and(|deadline| at.mono >= deadline)
         {
-            self.decoder.settle();
-            self.seen.last_bytes = None;
-            self.drain(&mut events);
+            self.settle(at, &mut events);
         }
         if let Some(deadline) = self.stale_deadline()
             && at.mono >= deadline
@@ -306,10 +307,8 @@ impl Pipeline {
     /// The device is gone: a press under way is aborted.
     pub fn lost(&mut self, reason: String, at: Stamp) -> Vec<Event> {
         let mut events = Vec::new();
-        self.decoder.settle();
-        self.drain(&mut events);
+        self.settle(at, &mut events);
         self.decoder.restart();
-        self.seen.last_bytes = None;
         self.seen.recent.clear();
         self.seen.link = Link::Lost { reason };
         self.abandon_retare(RetareError::NotLive);
@@ -329,8 +328,7 @@ impl Pipeline {
     /// `at` is the recording's own last moment; without one, that of the last frame.
     pub fn end_of_recording(&mut self, at: Option<Stamp>) -> Vec<Event> {
         let mut events = Vec::new();
-        self.decoder.settle();
-        self.drain(&mut events);
+        self.settle(at.unwrap_or(EPOCH), &mut events);
         self.abort(Abort::EndOfRecording, &mut events);
         self.seen.link = Link::Lost {
             reason: Abort::EndOfRecording.reason().to_owned(),
@@ -342,7 +340,16 @@ impl Pipeline {
         events
     }
 
-    fn drain(&mut self, events: &mut Vec<Event>) {
+    /// No byte follows for now. What is whole then was so with the last byte that came.
+    fn settle(&mut self, at: Stamp, events: &mut Vec<Event>) {
+        self.decoder.settle();
+        let arrival = self.seen.last_bytes.take().unwrap_or(at.mono);
+        self.drain(arrival, events);
+    }
+
+    /// Takes what is whole now that bytes have come, the last at `arrival`.
+    fn drain(&mut self, arrival: Duration, events: &mut Vec<Event>) {
+        self.arrival = arrival;
         while let Some(found) = self.decoder.next_frame() {
             match found {
                 Ok(Decoded { frame, end }) => {

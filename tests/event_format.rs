@@ -6,6 +6,8 @@
     reason = "clippy knows no helper of a test as a test"
 )]
 
+use std::time::Duration;
+
 use hardnessd::event::*;
 use hardnessd::tare::Offsets;
 use hardnessd::verdict::Level;
@@ -53,6 +55,7 @@ fn hardness() -> Hardness {
         mono_ns: Some(5_000_000_000),
         age_at_publish_ms: Some(0.25),
         latency_us: Some(150),
+        arrival: Duration::ZERO,
     }
 }
 

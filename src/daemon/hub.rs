@@ -113,9 +113,9 @@ impl Hub {
         }
     }
 
-    /// Numbers `event` and offers it to every subscriber that wants it. `arrival` is when the
-    /// byte came that made it possible, `now` when it is published; both CLOCK_MONOTONIC.
-    fn publish(&mut self, mut event: Event, arrival: Duration, now: Duration) {
+    /// Numbers `event` and offers it to every subscriber that wants it, at `now` of
+    /// CLOCK_MONOTONIC.
+    fn publish(&mut self, mut event: Event, now: Duration) {
         let kind = event.kind();
         if let Event::Hardness(verdict) = &mut event {
             // Rounded: more digits than the clock is good for would only be noise.
@@ -123,8 +123,8 @@ impl Hub {
                 let age = now.saturating_sub(Duration::from_nanos(at));
                 (age.as_secs_f64() * 1e6).round() / 1e3
             });
-            verdict.latency_us =
-                Some(u64::try_from(now.saturating_sub(arrival).as_micros()).unwrap_or(u64::MAX));
+            let latency = now.saturating_sub(verdict.arrival).as_micros();
+            verdict.latency_us = Some(u64::try_from(latency).unwrap_or(u64::MAX));
         }
         if kind != Kind::Frame {
             self.hello.seq += 1;
@@ -244,7 +244,6 @@ impl Hub {
 enum Command {
     Publish {
         events: Vec<Event>,
-        arrival: Duration,
     },
     Describe {
         hello: Box<Hello>,
@@ -296,13 +295,10 @@ pub(crate) struct Handle {
 pub(crate) struct Closed;
 
 impl Handle {
-    /// Publishes events of one sensor, which became possible at `arrival`.
-    pub(crate) async fn publish(&self, events: Vec<Event>, arrival: Duration) {
+    /// Publishes events of one sensor.
+    pub(crate) async fn publish(&self, events: Vec<Event>) {
         if !events.is_empty() {
-            let _ = self
-                .commands
-                .send(Command::Publish { events, arrival })
-                .await;
+            let _ = self.commands.send(Command::Publish { events }).await;
         }
     }
 
@@ -402,9 +398,9 @@ async fn serve(mut hub: Hub, mut inbox: mpsc::Receiver<Command>) {
     while let Some(command) = inbox.recv().await {
         // An answer nobody waits for is a subscriber that has just gone.
         match command {
-            Command::Publish { events, arrival } => {
+            Command::Publish { events } => {
                 for event in events {
-                    hub.publish(event, arrival, super::now().mono);
+                    hub.publish(event, super::now().mono);
                 }
                 for id in waiting.keys().copied().collect::<Vec<_>>() {
                     let lines = hub.take(id);

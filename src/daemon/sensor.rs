@@ -90,7 +90,7 @@ pub(crate) async fn serve(
     let mut taring = None;
     loop {
         let deadline = pipeline.deadline();
-        let (events, at) = tokio::select! {
+        let events = tokio::select! {
             // In no order: a sensor that never pauses must still stop when told, and questions
             // that never pause must not keep it from its port.
             command = commands.recv() => match command {
@@ -127,9 +127,8 @@ pub(crate) async fn serve(
                     continue;
                 }
                 Some(Command::Finish) | None => {
-                    let at = super::now();
-                    let events = recorder.feed(&mut pipeline, Input::Shutdown, at);
-                    return hub.publish(events, at.mono).await;
+                    let events = recorder.feed(&mut pipeline, Input::Shutdown, super::now());
+                    return hub.publish(events).await;
                 }
             },
             turn = link.turn() => {
@@ -140,12 +139,9 @@ pub(crate) async fn serve(
                     Turn::Unavailable(reason) => Input::Unavailable(reason.into()),
                     Turn::Lost(reason) => Input::Lost(reason.into()),
                 };
-                (recorder.feed(&mut pipeline, input, at), at)
+                recorder.feed(&mut pipeline, input, at)
             }
-            () = until(deadline) => {
-                let at = super::now();
-                (recorder.feed(&mut pipeline, Input::Tick, at), at)
-            }
+            () = until(deadline) => recorder.feed(&mut pipeline, Input::Tick, super::now()),
         };
         if events
             .iter()
@@ -155,7 +151,7 @@ pub(crate) async fn serve(
             link.proven();
         }
         answer(&mut pipeline, &mut taring);
-        hub.publish(events, at.mono).await;
+        hub.publish(events).await;
     }
 }
 

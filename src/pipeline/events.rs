@@ -112,6 +112,7 @@ impl Pipeline {
             mono_ns: (self.clock == Clock::Arrival).then_some(stamp.mono.as_nanos() as u64),
             age_at_publish_ms: None,
             latency_us: None,
+            arrival: self.arrival,
         }))
     }
 

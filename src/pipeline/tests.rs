@@ -471,6 +471,30 @@ fn the_end_of_the_input_makes_a_jq_frame_whole() {
 }
 
 #[test]
+fn a_verdict_became_possible_with_the_last_byte_it_rests_on() {
+    // The last frame of the press is the ninth. A header ends it, a pause does, its last byte does.
+    for (preset, every_ms, came) in [
+        (Preset::Jq, 90, 9 * 90),
+        (Preset::Jq, 200, 8 * 200),
+        (Preset::Jx255n, 200, 8 * 200),
+    ] {
+        let mut pipeline = pipeline(preset);
+        let mut events = Vec::new();
+        let (free, held) = ([raw(0, 0); 5], [raw(9, 50); 2]);
+        let frames = [&free[..], &held[..], &free[..3]].concat();
+        for (number, raw) in (0..).zip(frames) {
+            let bytes = bytes(&pipeline, &raw);
+            events.extend(pipeline.push(&bytes, at(number * every_ms)));
+        }
+        let verdicts = events.iter().filter_map(|event| match event {
+            Event::Hardness(verdict) => Some(verdict.arrival),
+            _ => None,
+        });
+        assert_eq!(verdicts.collect::<Vec<_>>(), [at(came).mono], "{preset:?}");
+    }
+}
+
+#[test]
 fn the_rate_is_measured_over_the_last_frames() {
     let mut pipeline = pipeline(Preset::Jx255n);
     let mut rates = vec![pipeline.status(at(0)).frame_rate_hz];

@@ -67,7 +67,7 @@ fn frame(sensor: &str, number: u64) -> Event {
 
 impl Hub {
     fn tell(&mut self, event: Event) {
-        self.publish(event, Duration::ZERO, Duration::ZERO);
+        self.publish(event, Duration::ZERO);
     }
 
     /// All a subscriber gets now, each line as `TYPE:SEQ`, `gap:LOST` or `frame:NUMBER`.
@@ -300,8 +300,7 @@ async fn a_subscriber_that_waits_gets_a_line_without_asking_again() {
     let (id, hello) = hub.join().await.unwrap();
     assert!(hello.json.starts_with(r#"{"type":"hello""#));
     let lines = hub.take(id).await.unwrap();
-    hub.publish(vec![status("a"), press("a")], Duration::ZERO)
-        .await;
+    hub.publish(vec![status("a"), press("a")]).await;
     assert_eq!(lines.await.unwrap().len(), 2);
     let last = hub.take(id).await.unwrap();
     hub.close().await;
