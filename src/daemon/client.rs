@@ -2,8 +2,10 @@
 //!
 //! The protocol of lines, whatever they travel over: a task fetches lines from the hub and writes
 //! them, and reads requests between. Only a connection with [`Access::Control`] changes anything.
+//! While one of its commands is carried out, events go on and the next request waits.
 
 use std::io;
+use std::pin::Pin;
 use std::time::Duration;
 
 use bytes::{Buf, BytesMut};
@@ -103,6 +105,54 @@ pub(crate) struct Service {
     pub(crate) sensors: Sensors,
 }
 
+impl Service {
+    /// Carries a command out.
+    async fn change(&self, change: Change) -> Result<Done, String> {
+        if self.access == Access::ReadOnly {
+            return Err(format!(
+                "{}: found a command that changes something, expected it on the control socket",
+                change.key()
+            ));
+        }
+        let sensors = &self.sensors;
+        match change {
+            Change::Tare { sensor } => {
+                let (reply, outcome) = oneshot::channel();
+                tell(sensors, "tare", &sensor, Command::Tare(reply)).await?;
+                match outcome.await {
+                    Ok(Ok(tared)) => Ok(Done {
+                        tare: Some(tared),
+                        ..Done::default()
+                    }),
+                    Ok(Err(refusal)) => Err(format!("tare: {refusal}")),
+                    Err(_) => Err("tare: the daemon is stopping".to_owned()),
+                }
+            }
+            Change::Context { sensor, context } => {
+                let (reply, held) = oneshot::channel();
+                let command = Command::Context(context, reply);
+                tell(sensors, "context.sensor", &sensor, command).await?;
+                match held.await {
+                    Ok(()) => Ok(Done::default()),
+                    Err(_) => Err("context: the daemon is stopping".to_owned()),
+                }
+            }
+            Change::Blackbox { sensor } => {
+                let (reply, written) = oneshot::channel();
+                tell(sensors, "blackbox", &sensor, Command::Blackbox(reply)).await?;
+                match written.await {
+                    Ok(Ok(path)) => Ok(Done {
+                        blackbox: Some(path.display().to_string()),
+                        ..Done::default()
+                    }),
+                    Ok(Err(reason)) => Err(format!("blackbox: {reason}")),
+                    Err(_) => Err("blackbox: the recorder has no time for it".to_owned()),
+                }
+            }
+        }
+    }
+}
+
 impl<S: Stream> Serve<S> for Service {
     fn serve(&self, stream: S) -> impl Future<Output = ()> + Send + 'static {
         let client = Client::new(stream, self.clone());
@@ -152,6 +202,9 @@ struct Done {
     blackbox: Option<String>,
 }
 
+/// A command that is being carried out; it ends with the answer.
+type Doing = Pin<Box<dyn Future<Output = Line> + Send>>;
+
 /// What a subscriber did.
 enum Heard {
     Line(BytesMut),
@@ -186,30 +239,29 @@ impl<S: Stream> Client<S> {
         self.send(&lines).await?;
         let mut next = hub.take(id).await?;
         let mut hearing = true;
+        let mut doing: Option<Doing> = None;
         let mut pause = HALF_CLOSED_CHECKS.0;
         loop {
             tokio::select! {
                 biased;
                 lines = &mut next => {
-                    // Closed: all has been sent.
-                    let Ok(lines) = lines else { return Ok(()) };
+                    let Ok(lines) = lines else {
+                        // Closed: all has been sent but the answer to a command.
+                        if let Some(doing) = doing {
+                            self.send(&[doing.await]).await?;
+                        }
+                        return Ok(());
+                    };
                     self.send(&lines).await?;
                     next = hub.take(id).await?;
                 }
-                heard = hear(&mut self.input, &mut self.unread), if hearing => match heard? {
-                    Heard::Line(line) => {
-                        let answer = self.answer(id, &line).await?;
-                        // What the hub gave before it answered belongs before the answer.
-                        let given = next.try_recv();
-                        if let Ok(lines) = &given {
-                            self.send(lines).await?;
-                        }
-                        self.send(&answer).await?;
-                        // Another subscription ends the wait under the old one.
-                        if given != Err(TryRecvError::Empty) {
-                            next = hub.take(id).await?;
-                        }
-                    }
+                answer = done(&mut doing) => {
+                    doing = None;
+                    self.send(&[answer]).await?;
+                }
+                heard = hear(&mut self.input, &mut self.unread),
+                if hearing && doing.is_none() => match heard? {
+                    Heard::Line(line) => doing = self.heed(id, &line, &mut next).await?,
                     Heard::TooLong => {
                         let message = format!(
                             "found a line over {LONGEST_LINE_BYTES} bytes, expected a shorter one"
@@ -239,76 +291,47 @@ impl<S: Stream> Client<S> {
         }
     }
 
-    async fn answer(&self, id: u64, line: &[u8]) -> Result<Vec<Line>, End> {
-        let Service { hub, sensors, .. } = &self.service;
+    /// Answers a request, or begins what a command asks for. `next` is the take under way.
+    async fn heed(
+        &mut self,
+        id: u64,
+        line: &[u8],
+        next: &mut oneshot::Receiver<Vec<Line>>,
+    ) -> Result<Option<Doing>, End> {
+        let Service { hub, sensors, .. } = self.service.clone();
         let line = request::parse(line);
         let answered = match line.request {
             Ok(Request::Subscribe(subscription)) => {
                 let subscribed = hub.subscribe(id, subscription).await?;
-                subscribed.map(|()| (Vec::new(), Done::default()))
+                subscribed.map(|()| Vec::new())
             }
-            Ok(Request::Status) => Ok((statuses(sensors).await, Done::default())),
-            Ok(Request::Last) => Ok((hub.finals().await?, Done::default())),
+            Ok(Request::Status) => Ok(statuses(&sensors).await),
+            Ok(Request::Last) => Ok(hub.finals().await?),
             Ok(Request::Change(change)) => {
-                let changed = self.change(change).await;
-                changed.map(|done| (Vec::new(), done))
+                // May take long: frames to average, a file to be written.
+                let service = self.service.clone();
+                return Ok(Some(Box::pin(async move {
+                    answer(service.change(change).await, line.id)
+                })));
             }
             Err(message) => Err(message),
         };
-        Ok(match answered {
-            Ok((mut lines, Done { tare, blackbox })) => {
-                let id = line.id;
-                lines.push(Reply::Ok { id, tare, blackbox }.into());
-                lines
-            }
-            Err(message) => vec![error(message, line.id)],
-        })
-    }
-
-    /// Carries a command out.
-    async fn change(&self, change: Change) -> Result<Done, String> {
-        if self.service.access == Access::ReadOnly {
-            return Err(format!(
-                "{}: found a command that changes something, expected it on the control socket",
-                change.key()
-            ));
+        // What the hub gave before it answered belongs before the answer.
+        let given = next.try_recv();
+        if let Ok(lines) = &given {
+            self.send(lines).await?;
         }
-        let sensors = &self.service.sensors;
-        match change {
-            Change::Tare { sensor } => {
-                let (reply, outcome) = oneshot::channel();
-                tell(sensors, "tare", &sensor, Command::Tare(reply)).await?;
-                match outcome.await {
-                    Ok(Ok(tared)) => Ok(Done {
-                        tare: Some(tared),
-                        ..Done::default()
-                    }),
-                    Ok(Err(refusal)) => Err(format!("tare: {refusal}")),
-                    Err(_) => Err("tare: the daemon is stopping".to_owned()),
-                }
-            }
-            Change::Context { sensor, context } => {
-                let (reply, held) = oneshot::channel();
-                let command = Command::Context(context, reply);
-                tell(sensors, "context.sensor", &sensor, command).await?;
-                match held.await {
-                    Ok(()) => Ok(Done::default()),
-                    Err(_) => Err("context: the daemon is stopping".to_owned()),
-                }
-            }
-            Change::Blackbox { sensor } => {
-                let (reply, written) = oneshot::channel();
-                tell(sensors, "blackbox", &sensor, Command::Blackbox(reply)).await?;
-                match written.await {
-                    Ok(Ok(path)) => Ok(Done {
-                        blackbox: Some(path.display().to_string()),
-                        ..Done::default()
-                    }),
-                    Ok(Err(reason)) => Err(format!("blackbox: {reason}")),
-                    Err(_) => Err("blackbox: the recorder has no time for it".to_owned()),
-                }
-            }
+        let (mut lines, answered) = match answered {
+            Ok(lines) => (lines, Ok(Done::default())),
+            Err(message) => (Vec::new(), Err(message)),
+        };
+        lines.push(answer(answered, line.id));
+        self.send(&lines).await?;
+        // Another subscription ends the wait under the old one.
+        if given != Err(TryRecvError::Empty) {
+            *next = hub.take(id).await?;
         }
+        Ok(None)
     }
 
     async fn send(&mut self, lines: &[Line]) -> Result<(), End> {
@@ -339,6 +362,21 @@ pub(super) async fn statuses(sensors: &Sensors) -> Vec<Line> {
     statuses.into_iter().map(Line::from).collect()
 }
 
+/// Waits for the answer to a command; for ever, if none is being carried out.
+async fn done(doing: &mut Option<Doing>) -> Line {
+    match doing {
+        Some(doing) => doing.await,
+        None => std::future::pending().await,
+    }
+}
+
+fn answer(answered: Result<Done, String>, id: Option<serde_json::Value>) -> Line {
+    match answered {
+        Ok(Done { tare, blackbox }) => Reply::Ok { id, tare, blackbox }.into(),
+        Err(message) => error(message, id),
+    }
+}
+
 fn error(message: String, id: Option<serde_json::Value>) -> Line {
     Reply::Error { message, id }.into()
 }
@@ -365,3 +403,6 @@ async fn hear(input: &mut (impl AsyncRead + Unpin), unread: &mut BytesMut) -> io
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

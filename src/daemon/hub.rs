@@ -466,4 +466,4 @@ async fn serve(mut hub: Hub, mut inbox: mpsc::Receiver<Command>) {
 }
 
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;

@@ -8,8 +8,8 @@ use crate::event::{FrameEvent, LinkState, ModelCard, PressState, Status};
 
 const RUN: &str = "5eed";
 
-fn hub() -> Hub {
-    Hub::new(Hello {
+pub(in crate::daemon) fn hello() -> Hello {
+    Hello {
         protocol: crate::event::PROTOCOL,
         server: "hardnessd",
         version: "0",
@@ -23,7 +23,11 @@ fn hub() -> Hub {
             validation: String::new(),
             levels: Vec::new(),
         },
-    })
+    }
+}
+
+fn hub() -> Hub {
+    Hub::new(hello())
 }
 
 fn status(sensor: &str) -> Event {
@@ -40,7 +44,7 @@ fn status(sensor: &str) -> Event {
     })
 }
 
-fn press(sensor: &str) -> Event {
+pub(in crate::daemon) fn press(sensor: &str) -> Event {
     Event::Press(crate::event::Press {
         seq: None,
         sensor: sensor.to_owned(),
@@ -296,7 +300,7 @@ fn what_is_forgotten_during_a_slow_replay_is_counted() {
 
 #[tokio::test]
 async fn a_subscriber_that_waits_gets_a_line_without_asking_again() {
-    let hub = start(hub().hello, EventRecorder::default());
+    let hub = start(hello(), EventRecorder::default());
     let (id, hello) = hub.join().await.unwrap();
     assert!(hello.json.starts_with(r#"{"type":"hello""#));
     let lines = hub.take(id).await.unwrap();

@@ -1,0 +1,51 @@
+use serde_json::Value;
+use tokio::io::{AsyncBufReadExt, BufReader};
+use tokio::sync::mpsc;
+
+use super::*;
+use crate::daemon::hub::tests::{hello, press};
+use crate::daemon::record::EventRecorder;
+use crate::daemon::sensor::Sensor;
+use crate::pipeline::RetareError;
+
+/// Far longer than anything here takes.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+#[tokio::test]
+async fn events_go_on_and_requests_wait_while_a_command_is_carried_out() {
+    let hub = hub::start(hello(), EventRecorder::default());
+    let (commands, mut inbox) = mpsc::channel(1);
+    let name = "a".to_owned();
+    let service = Service {
+        access: Access::Control,
+        max_clients: 1,
+        hub: hub.clone(),
+        sensors: Sensors(vec![Sensor { name, commands }]),
+    };
+    let (ours, theirs) = UnixStream::pair().unwrap();
+    tokio::spawn(service.serve(theirs));
+    let (input, mut output) = ours.into_split();
+    let mut lines = BufReader::new(input).lines();
+    let mut next = async || -> Value {
+        let line = tokio::time::timeout(PATIENCE, lines.next_line()).await;
+        serde_json::from_str(&line.unwrap().unwrap().unwrap()).unwrap()
+    };
+
+    // The status for its beginning, which this sensor does not tell.
+    let Some(Command::Status(_)) = inbox.recv().await else {
+        panic!("another command");
+    };
+    assert_eq!(next().await["type"], "hello");
+    let asked = b"{\"tare\":\"a\",\"id\":1}\n{\"get\":\"last\",\"id\":2}\n";
+    output.write_all(asked).await.unwrap();
+    let Some(Command::Tare(tare)) = inbox.recv().await else {
+        panic!("another command");
+    };
+    hub.publish(vec![press("a")]).await;
+    assert_eq!(next().await["type"], "press");
+    tare.send(Err(RetareError::NotLive)).unwrap();
+    for (kind, id) in [("error", 1), ("ok", 2)] {
+        let answer = next().await;
+        assert_eq!((&answer["type"], &answer["id"]), (&kind.into(), &id.into()));
+    }
+}
