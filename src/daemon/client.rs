@@ -21,7 +21,7 @@ use super::request::{self, Change, Request};
 use super::sensor::{Command, Sensors};
 use crate::event::{Reply, Tared};
 
-/// Longest line a subscriber may send (contract, section 5).
+/// Longest line a subscriber may send (`docs/controller.md`).
 const LONGEST_LINE_BYTES: usize = 64 * 1024;
 
 /// When a connection whose other end has stopped sending is looked after, first and at the least.

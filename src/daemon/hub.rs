@@ -74,7 +74,7 @@ impl Line {
     }
 }
 
-/// Numbered events held for `since` (contract, section 5: at least 4,096).
+/// Numbered events held for `since` (`docs/controller.md`).
 const HELD: usize = 4096;
 
 /// A numbered event as it was sent.

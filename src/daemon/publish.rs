@@ -25,7 +25,7 @@ use super::tcp::{self, Tcp};
 #[cfg(feature = "zenoh")]
 use super::zenoh;
 
-/// Permissions of the control socket: for the daemon's own user (contract, section 3).
+/// Permissions of the control socket: for the daemon's own user.
 const CONTROL_MODE: u32 = 0o600;
 
 /// Keys of the sockets' paths.

@@ -22,7 +22,7 @@ pub(crate) enum Request {
     Change(Change),
 }
 
-/// A command of the control socket (contract, section 5).
+/// A command of the control socket.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Change {
     /// Take another tare.
@@ -200,7 +200,7 @@ fn request(mut fields: Map<String, Value>) -> Result<Request, String> {
     }
 }
 
-/// A context is shorter, written as JSON without spaces (contract, section 5).
+/// A context is shorter, written as JSON without spaces.
 const CONTEXT_BYTES: usize = 1024;
 
 fn name(key: &str, value: &Value) -> Result<String, String> {

@@ -96,9 +96,9 @@ pub struct LabelledSample {
     pub shore: f32,
 }
 
-/// A taxel with this many counts is in contact (contract: 0.07 N at 0.04 N a count).
+/// A taxel with this many counts is in contact (`contact_threshold_n`: 0.07 N at 0.04 N a count).
 const CONTACT_COUNTS: u16 = 2;
-/// Taxels in contact that begin a press (contract).
+/// Taxels in contact that begin a press, as the press tracker has it.
 pub(super) const BEGIN_AREA_TAXELS: usize = 3;
 
 pub(super) const HIGHEST_FORCE_N: f64 = 25.0;

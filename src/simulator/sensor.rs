@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::frame::{COLS, ROWS, RawFrame, TAXELS};
 use crate::random::Stream;
 
-/// Newtons a count stands for (contract, `newtons_per_count`): 8 bits are 10.2 N.
+/// Newtons a count stands for, as `newtons_per_count` unless configured: 8 bits are 10.2 N.
 pub const NEWTONS_PER_COUNT: f32 = 0.04;
 /// Cells along a taxel.
 const CELLS_PER_TAXEL: usize = 4;

@@ -70,7 +70,7 @@ pub struct SequenceFrame {
 ///
 /// It begins with at least 2 s and ten frames without load, so that tare has its frames at any rate,
 /// and rests at least 1 s and five frames after each press, which is held for at least three. A press
-/// too light to begin one (contract: 3 taxels) is made anew with more force, so that `presses` is the
+/// too light to begin one (3 taxels) is made anew with more force, so that `presses` is the
 /// number that a press tracker sees.
 pub struct Sequence {
     settings: SequenceSettings,
@@ -227,8 +227,8 @@ impl Iterator for Sequence {
     }
 }
 
-/// Whether a press tracker sees exactly one press in these frames (contract, section 4): it
-/// begins at 3 taxels, lasts 2 frames and is not interrupted by 2 frames without contact.
+/// Whether a press tracker sees exactly one press in these frames, as it is set without a configuration:
+/// a press begins at 3 taxels, lasts 2 frames and is not interrupted by 2 frames without contact.
 fn is_one_press(frames: &[(RawFrame, bool)]) -> bool {
     let areas: Vec<usize> = frames.iter().map(|(raw, _)| contact_taxels(raw)).collect();
     let Some(begin) = areas.iter().position(|&area| area >= BEGIN_AREA_TAXELS) else {

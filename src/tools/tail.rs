@@ -100,8 +100,8 @@ pub enum Error {
     Print(#[source] io::Error),
 }
 
-/// How long a daemon may take to say hello: a hundred times as long as one takes (contract, section
-/// 5), for one that a service manager has to start first.
+/// How long a daemon may take to say hello: a hundred times the 50 ms that one takes at most,
+/// for one that a service manager has to start first.
 const HELLO: Duration = Duration::from_secs(5);
 
 fn expected(count: Option<u64>) -> String {

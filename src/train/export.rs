@@ -16,7 +16,7 @@ use crate::press;
 use crate::simulator::Split;
 use crate::verdict::{Card, Check, Hrn, Range};
 
-/// Check frames a level (contract).
+/// Check frames a level (`docs/formats.md`).
 const CHECK_FRAMES_A_LEVEL: usize = 2;
 
 /// A recogniser as a graph.

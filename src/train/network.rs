@@ -4,7 +4,7 @@
 //! them: an optimiser, a checkpoint and the inheritance USTGAN -> STGAN -> HRN then need to know
 //! nothing about layers. Batch normalisation keeps no running statistics: with decay 0.9 they
 //! scored .475 where statistics taken over the training set scored .843 with the same weights
-//! (method notes, pitfall 1), so [`Normalisation`] says where the statistics come from, and they
+//! (`docs/method.md`), so [`Normalisation`] says where the statistics come from, and they
 //! are taken anew before every evaluation and export.
 
 use burn::tensor::{Device, Tensor, TensorData};

@@ -1,4 +1,4 @@
-//! What a model file must be before its graph is built (contract, section 6).
+//! What a model file must be before its graph is built (`docs/formats.md`).
 //!
 //! In: the file as ONNX's own messages. Out: what it says of itself, or what in it is not as
 //! agreed. Nothing here runs the model.

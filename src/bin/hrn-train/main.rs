@@ -67,8 +67,8 @@ fn main() -> ExitCode {
     }
 }
 
-/// SIGINT and SIGTERM end the process at once, with 0 (contract, section 1). Whatever stands on
-/// the disk is whole at any moment, and a run goes on from its last checkpoint, so there is
+/// SIGINT and SIGTERM end the process at once, with 0. Whatever stands on the
+/// disk is whole at any moment, and a run goes on from its last checkpoint, so there is
 /// nothing to wait for.
 fn end_at_signals() -> std::io::Result<()> {
     // A file that must not grow is no reason to die of: the write fails, as on a full disk.

@@ -6,7 +6,7 @@ use super::{HELD, Line};
 use crate::daemon::request::{Kinds, Policy, Subscription};
 use crate::event::{Kind, Reply};
 
-/// Events waiting for a subscriber (contract, section 5).
+/// Events waiting for a subscriber (`docs/controller.md`).
 const QUEUE: usize = 1024;
 
 /// Bytes handed out at a time, and a line more: enough that a write carries many events, few

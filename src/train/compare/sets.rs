@@ -19,7 +19,7 @@ use crate::verdict::sha256_hex;
 const FRESH_SEEDS: [u64; 2] = [2_019_001, 2_019_002];
 /// Seed of the other gain map.
 const OTHER_SENSORS_SEED: u64 = 2_019_003;
-/// Fresh objects of each test material (contract).
+/// Fresh objects of each test material.
 pub(super) const FRESH_OBJECTS: u32 = 20;
 /// A softer cover has this part of the usual one's modulus.
 const SOFTER: f64 = 0.5;

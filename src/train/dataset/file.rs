@@ -1,4 +1,4 @@
-//! Data sets as `.npz` files: arrays with the names, types and shapes of contract, section 7.
+//! Data sets as `.npz` files: arrays with the names, types and shapes of `docs/formats.md`.
 
 use std::io::{self, Cursor, Read, Seek, Write};
 use std::path::Path;
