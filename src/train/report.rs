@@ -50,8 +50,8 @@ pub fn comparison(comparison: &Comparison) -> anyhow::Result<String> {
             MATCHED,
             "accuracy on fresh objects of matched shapes",
         ),
-        "Fresh objects, shapes alike for all materials: mean over seeds, its 95 % interval by \
-         object, and a tick for each seed.",
+        "Fresh objects, shapes alike for all materials: mean over seeds, its 95 % interval, \
+         and a tick for each seed.",
     );
 
     page.section("table-2", "Table 2");
