@@ -18,11 +18,11 @@ use serde::{Deserialize, Serialize};
 
 use self::link::Link;
 pub use self::retare::RetareError;
-use crate::event::{Event, FrameEvent, LinkState, Tared};
+use crate::event::{Event, FrameEvent, LinkState, Phase, Tared};
 use crate::frame::{RawFrame, Stamp};
 use crate::press::{self, Abort, Moment, PressTracker};
 use crate::tare::{self, Contact, Offsets, Tare};
-use crate::verdict::Hrn;
+use crate::verdict::{Hrn, ModelError};
 use crate::wire::{self, Decoded, Decoder, Layout};
 
 /// What a pipeline is made for.
@@ -75,6 +75,19 @@ pub enum Clock {
     FrameRate,
 }
 
+/// A verdict that was due and did not come: the model failed.
+#[derive(Debug)]
+pub struct Unjudged {
+    /// Name of the sensor.
+    pub sensor: String,
+    /// Number of the press.
+    pub press: u64,
+    /// When in the press it was to be judged.
+    pub phase: Phase,
+    /// How the model failed.
+    pub error: ModelError,
+}
+
 /// The measured rate is that over so many frames.
 const RATE_FRAMES: usize = 32;
 
@@ -94,6 +107,8 @@ pub struct Pipeline {
     arrival: Duration,
     /// What became of a tare that was asked for, until it is fetched.
     retared: Option<Result<Tared, RetareError>>,
+    /// Verdicts that did not come, until they are fetched.
+    unjudged: Vec<Unjudged>,
 }
 
 /// What the pipeline itself knows of the past.
@@ -185,6 +200,7 @@ impl Pipeline {
             },
             arrival: Duration::ZERO,
             retared: None,
+            unjudged: Vec::new(),
         }
     }
 
@@ -227,6 +243,11 @@ impl Pipeline {
     /// What the controller says it is doing: echoed in presses and verdicts until it changes.
     pub fn set_context(&mut self, context: Option<serde_json::Value>) {
         self.seen.context = context;
+    }
+
+    /// Verdicts that did not come, each told once.
+    pub fn unjudged(&mut self) -> Vec<Unjudged> {
+        std::mem::take(&mut self.unjudged)
     }
 
     /// Name of the sensor.

@@ -11,7 +11,7 @@ use std::io::IsTerminal;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use tracing::{info, warn};
+use tracing::{error, info, warn};
 use tracing_subscriber::filter::Targets;
 use tracing_subscriber::layer::{Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
@@ -21,7 +21,7 @@ use self::journal::Journal;
 use self::lines::Lines;
 
 use crate::event::{Event, LinkState, PressState, Tared, name};
-use crate::pipeline::RetareError;
+use crate::pipeline::{RetareError, Unjudged};
 
 /// The `[log]` table.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -250,6 +250,17 @@ pub(crate) fn tare(sensor: &str, outcome: &Result<Tared, RetareError>) {
         ),
         Err(refusal) => warn!(sensor, reason = %refusal, "tare refused"),
     }
+}
+
+/// A verdict that did not come.
+pub(crate) fn unjudged(unjudged: &Unjudged) {
+    error!(
+        sensor = unjudged.sensor.as_str(),
+        press = unjudged.press,
+        phase = name(&unjudged.phase),
+        reason = %unjudged.error,
+        "no verdict"
+    );
 }
 
 /// What a controller says it is doing.

@@ -43,6 +43,8 @@ pub(crate) struct Vitals {
     /// Age of its last whole frame.
     pub(crate) last_frame_age: Option<Duration>,
     pub(crate) contact_threshold_n: f32,
+    /// Verdicts that did not come since the start.
+    pub(crate) unjudged: u64,
 }
 
 /// A way to one sensor.
@@ -88,6 +90,7 @@ pub(crate) async fn serve(
 ) {
     // Who waits for a tare.
     let mut taring = None;
+    let mut unjudged = 0;
     loop {
         let deadline = pipeline.deadline();
         let events = tokio::select! {
@@ -96,7 +99,7 @@ pub(crate) async fn serve(
             command = commands.recv() => match command {
                 Some(Command::Status(reply)) => {
                     // The asker may have gone.
-                    let _ = reply.send(vitals(&pipeline));
+                    let _ = reply.send(vitals(&pipeline, unjudged));
                     continue;
                 }
                 Some(Command::Tare(reply)) => {
@@ -151,6 +154,10 @@ pub(crate) async fn serve(
             link.proven();
         }
         answer(&mut pipeline, &mut taring);
+        for failed in pipeline.unjudged() {
+            log::unjudged(&failed);
+            unjudged += 1;
+        }
         hub.publish(events).await;
     }
 }
@@ -169,7 +176,7 @@ fn answer(
     }
 }
 
-fn vitals(pipeline: &Pipeline) -> Vitals {
+fn vitals(pipeline: &Pipeline, unjudged: u64) -> Vitals {
     let now = super::now();
     Vitals {
         status: pipeline.status(now),
@@ -177,6 +184,7 @@ fn vitals(pipeline: &Pipeline) -> Vitals {
             .last_frame()
             .map(|frame| now.mono.saturating_sub(frame.mono)),
         contact_threshold_n: pipeline.judgement().press.contact_threshold_n,
+        unjudged,
     }
 }
 

@@ -1,13 +1,13 @@
 //! What a pipeline says of presses: press and hardness events.
 
-use super::{Clock, Judgement, Pipeline};
+use super::{Clock, Judgement, Pipeline, Unjudged};
 use crate::event::{Event, Hardness, Note, Phase, Press, PressState, Rejection};
 use crate::frame::{Frame, RawFrame};
 use crate::press::{Change, End, Marks, Moment, Peak};
 
 impl Pipeline {
     /// What subscribers are told of a change.
-    pub(super) fn publish(&self, change: Change, events: &mut Vec<Event>) {
+    pub(super) fn publish(&mut self, change: Change, events: &mut Vec<Event>) {
         match change {
             Change::Begin { press, at } => {
                 events.push(self.press(press, PressState::Begin, at, 1, None));
@@ -62,16 +62,28 @@ impl Pipeline {
         })
     }
 
-    /// The verdict on a press. A model that cannot judge a finite frame was refused at its load;
-    /// should one fail all the same, the press has no verdict rather than a made-up one.
-    fn judge(&self, press: u64, phase: Phase, peak: &Peak) -> Option<Event> {
+    /// The verdict on a press. A model that fails on its own check frames was refused at its load;
+    /// should one fail on another, the press has no verdict rather than a made-up one, and
+    /// [`Self::unjudged`] tells of it.
+    fn judge(&mut self, press: u64, phase: Phase, peak: &Peak) -> Option<Event> {
         let Judgement {
             min_confidence,
             min_force_n,
             hrn,
             ..
         } = &self.judgement;
-        let verdict = hrn.judge(&peak.frame).ok()?;
+        let verdict = match hrn.judge(&peak.frame) {
+            Ok(verdict) => verdict,
+            Err(error) => {
+                self.unjudged.push(Unjudged {
+                    sensor: self.sensor.clone(),
+                    press,
+                    phase,
+                    error,
+                });
+                return None;
+            }
+        };
         let rejected = if peak.force_n < *min_force_n {
             Some(Rejection::LowForce)
         } else if verdict.confidence < *min_confidence {

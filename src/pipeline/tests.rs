@@ -494,6 +494,63 @@ fn a_verdict_became_possible_with_the_last_byte_it_rests_on() {
     }
 }
 
+/// The built-in model, but its logits are NaN where a taxel bears more than 1,000 N: they are
+/// multiplied with the root of what is left to that, over itself.
+fn failing_model() -> Hrn {
+    let mut file = pb::ModelProto::decode(BUILT_IN).unwrap();
+    let graph = file.graph.as_mut().unwrap();
+    graph.initializer.push(pb::TensorProto {
+        name: "limit".to_owned(),
+        dims: vec![1],
+        data_type: pb::tensor_proto::DataType::Float as i32,
+        float_data: vec![1000.0],
+        ..Default::default()
+    });
+    let makes_logits = |node: &pb::NodeProto| node.output == ["logits"];
+    let place = graph.node.iter().position(makes_logits).unwrap();
+    graph.node[place].output = vec!["finite".to_owned()];
+    let nodes = [
+        ("GlobalMaxPool", &["frame"][..], "most"),
+        ("Flatten", &["most"], "flat"),
+        ("Sub", &["limit", "flat"], "left"),
+        ("Sqrt", &["left"], "root"),
+        ("Div", &["root", "root"], "one"),
+        ("Mul", &["finite", "one"], "logits"),
+    ];
+    let nodes = nodes.map(|(op, input, output)| pb::NodeProto {
+        op_type: op.to_owned(),
+        name: output.to_owned(),
+        input: input.iter().map(|&name| name.to_owned()).collect(),
+        output: vec![output.to_owned()],
+        ..Default::default()
+    });
+    graph.node.splice(place + 1..place + 1, nodes);
+    Hrn::load(&file.encode_to_vec()).unwrap()
+}
+
+#[test]
+fn a_press_that_the_model_fails_on_ends_without_a_verdict_and_that_is_told() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    play(&mut pipeline, 0, &[raw(0, 0); 5]);
+    let mut judgement = pipeline.judgement().clone();
+    judgement.hrn = Arc::new(failing_model());
+    judgement.calibration.newtons_per_count = 10.0;
+    pipeline.reload(judgement);
+    let press = |counts| [raw(9, counts), raw(9, counts), raw(0, 0), raw(0, 0)];
+    let told = play(&mut pipeline, 5, &press(99));
+    assert_eq!(told, ["Begin 1", "End 1", "Final of 5"]);
+    assert!(pipeline.unjudged().is_empty());
+    let told = play(&mut pipeline, 9, &press(101));
+    assert_eq!(told, ["Begin 2", "End 2"]);
+    let told = pipeline.unjudged();
+    let [failed] = &told[..] else {
+        panic!("{told:?}");
+    };
+    assert_eq!((failed.press, failed.phase), (2, Phase::Final));
+    assert!(matches!(failed.error, ModelError::NotFinite { .. }));
+    assert!(pipeline.unjudged().is_empty(), "told once");
+}
+
 #[test]
 fn the_rate_is_measured_over_the_last_frames() {
     let mut pipeline = pipeline(Preset::Jx255n);

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::{Entry, Found, Labels, SensorError};
 use crate::event::Event;
 use crate::frame::Stamp;
-use crate::pipeline::{Clock, Pipeline};
+use crate::pipeline::{Clock, Pipeline, Unjudged};
 use crate::verdict::Hrn;
 
 /// The pipelines of a recording's sensors, fed with what they were fed then.
@@ -99,6 +99,14 @@ impl Playback {
             .collect();
         forget_boot(&mut events);
         events
+    }
+
+    /// Verdicts that did not come, each told once.
+    pub fn unjudged(&mut self) -> Vec<Unjudged> {
+        let players = self.players.iter_mut();
+        players
+            .flat_map(|player| player.pipeline.unjudged())
+            .collect()
     }
 
     /// How many sensors have been met so far.

@@ -16,7 +16,7 @@ use super::simulate::positive;
 use crate::daemon::config::{self, Config, Sensor, Setup};
 use crate::daemon::now;
 use crate::event::{Event, Kind};
-use crate::pipeline::{Clock, Pipeline};
+use crate::pipeline::{Clock, Pipeline, Unjudged};
 use crate::recording::{self, Playback, Reader};
 
 /// Arguments of `replay`.
@@ -175,7 +175,9 @@ fn play_recording(path: &Path, file: impl Read, setup: Setup, pace: Pace) -> Res
             model.get(..12).unwrap_or(model)
         );
     }
-    print(playback.end(), &mut seq)?;
+    let end = playback.end();
+    warn(playback.unjudged());
+    print(end, &mut seq)?;
     played.map(drop)
 }
 
@@ -209,6 +211,7 @@ fn play_entries(
             path: path.to_owned(),
             source,
         })?;
+        warn(playback.unjudged());
         if !print(events, seq)? {
             return Ok(false);
         }
@@ -248,6 +251,7 @@ fn play_bytes(path: &Path, mut file: File, setup: &Setup, mut pace: Pace) -> Res
         };
         if read == 0 {
             let end = pipeline.end_of_recording(None);
+            warn(pipeline.unjudged());
             let none = end.iter().find_map(|event| match event {
                 Event::Status(status) if status.frames == 0 => Some(Error::NoFrame {
                     path: path.to_owned(),
@@ -261,6 +265,7 @@ fn play_bytes(path: &Path, mut file: File, setup: &Setup, mut pace: Pace) -> Res
         }
         // The clock is the recording's: the moment given here is not looked at.
         let events = pipeline.push(&chunk[..read], now());
+        warn(pipeline.unjudged());
         let (frames, _) = pipeline.frame_counts();
         let since = time_of(frames.saturating_sub(1), frame_rate_hz);
         if !pace.wait(since) || !print(events, &mut seq)? {
@@ -272,6 +277,20 @@ fn play_bytes(path: &Path, mut file: File, setup: &Setup, mut pace: Pace) -> Res
 /// When whole frame `number` of bytes without times came, after the first.
 fn time_of(number: u64, frame_rate_hz: f64) -> Duration {
     Duration::try_from_secs_f64(number as f64 / frame_rate_hz).unwrap_or(Duration::MAX)
+}
+
+/// Says which verdicts are missing.
+fn warn(unjudged: Vec<Unjudged>) {
+    for Unjudged {
+        sensor,
+        press,
+        phase,
+        error,
+    } in unjudged
+    {
+        let phase = crate::event::name(&phase);
+        eprintln!("warning: sensor {sensor:?}: no {phase} verdict on press {press}: {error}");
+    }
 }
 
 /// Prints what a subscriber would get; `false`: nobody reads.

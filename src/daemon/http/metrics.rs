@@ -71,11 +71,13 @@ fn escaped(value: &str) -> String {
 
 /// What the sensors say of themselves.
 fn links(registry: &mut Registry, vitals: &[Vitals]) {
-    let (frames, damaged, skipped) = <(Counters, Counters, Counters)>::default();
+    let (frames, damaged, skipped, unjudged) =
+        <(Counters, Counters, Counters, Counters)>::default();
     let (state, rate, age) = <(Gauges, Gauges, Gauges)>::default();
     for Vitals {
         status,
         last_frame_age,
+        unjudged: failed,
         ..
     } in vitals
     {
@@ -83,6 +85,7 @@ fn links(registry: &mut Registry, vitals: &[Vitals]) {
         frames.get_or_create(&labels).inc_by(status.frames);
         damaged.get_or_create(&labels).inc_by(status.frames_damaged);
         skipped.get_or_create(&labels).inc_by(status.bytes_skipped);
+        unjudged.get_or_create(&labels).inc_by(*failed);
         if let Some(hz) = status.frame_rate_hz {
             rate.get_or_create(&labels).set(hz);
         }
@@ -100,6 +103,8 @@ fn links(registry: &mut Registry, vitals: &[Vitals]) {
     registry.register("frames_damaged", "Damaged frames", damaged);
     let help = "Bytes that belonged to no whole frame";
     registry.register_with_unit("skipped", help, Unit::Bytes, skipped);
+    let help = "Verdicts that did not come: the model failed, the log says how";
+    registry.register("verdicts_failed", help, unjudged);
     let help = "State of the link: 1 for the one that holds";
     registry.register("link_state", help, state);
     let hertz = Unit::Other("hertz".to_owned());
