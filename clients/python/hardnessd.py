@@ -130,9 +130,12 @@ class Client:
             self.connection.close()
 
     def _connected(self):
-        """Events of one connection; it ends by an exception."""
+        """Events of one connection; it ends by an exception, or because the client is closed."""
         self.connection = Connection(self.address)
         try:
+            if self.closed:
+                # By another thread, which had no connection to close yet.
+                return
             self.hello = self.connection.receive()
             if self.hello.get("type") != "hello":
                 raise ConnectionError(self.hello.get("message", "no hardnessd answers there"))
@@ -148,7 +151,7 @@ class Client:
                 self.place = f"{run}:{self.hello['seq']}"
             self.connection.send(subscription)
             subscribed = False
-            while True:
+            while not self.closed:
                 event = self.connection.receive()
                 kind, seq = event.get("type"), event.get("seq")
                 if kind == "ok":

@@ -4,7 +4,8 @@
     python3 tests/peers/client.py target/debug/hardnessd
 
 Claims: over connections broken at random each numbered event is given once and in order; a daemon
-that ends and comes back is said, and its events follow; the control socket's answers arrive.
+that ends and comes back is said, and its events follow; a client closed at any moment ends; the control
+socket's answers arrive.
 """
 
 import pathlib
@@ -73,6 +74,25 @@ def resumes(bench, address):
     print(f"{address}: {len(numbers)} events over {breaks} breaks, each once")
 
 
+def ends_when_closed(bench):
+    client, events = hardnessd.Client(bench.path("events.sock")), Events()
+
+    def connect(address):
+        connection = connected(address)
+        # Another thread, at the worst of moments: it finds no connection to close.
+        client.close()
+        return connection
+
+    connected, hardnessd.Connection = hardnessd.Connection, connect
+    try:
+        thread = collect(client, events)
+        thread.join(PATIENCE_S)
+    finally:
+        hardnessd.Connection = connected
+    assert not thread.is_alive() and not events, events
+    print("a client closed while it connects is at its end")
+
+
 def notices_a_restart(bench, daemon):
     client, events = hardnessd.Client(bench.path("events.sock")), Events()
     thread = collect(client, events)
@@ -132,6 +152,7 @@ def main(binary):
         host, port = bench.address("tcp").rsplit(":", 1)
         resumes(bench, bench.path("events.sock"))
         resumes(bench, (host, int(port)))
+        ends_when_closed(bench)
         notices_a_restart(bench, daemon)
         commands(bench)
 
