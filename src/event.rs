@@ -331,7 +331,8 @@ fn line<T: Serialize>(value: &T) -> String {
     text
 }
 
-/// The name that a state, phase or note is published under, for whatever shall agree with it.
+/// The name under which a state, phase or note is published: the log, the metrics and recordings use it
+/// too.
 pub(crate) fn name(state: &impl Serialize) -> String {
     match serde_json::to_value(state) {
         Ok(serde_json::Value::String(name)) => name,

@@ -2,8 +2,9 @@
 //! subscribers, and only the two ends touch the world.
 //!
 //! The modules below stand in reading order. Each from [`frame`] to [`random`] uses only those
-//! above it and does no I/O, waits for nothing and asks no clock: it is given bytes and the
-//! moment they came. `daemon`, `tools` and `train` are the ends.
+//! above it and opens nothing, waits for nothing and asks no clock: it is given bytes and the
+//! moment they came; [`recording`] also what to read from and write to. `daemon`, `tools` and
+//! `train` are the ends.
 
 pub mod frame;
 pub mod wording;

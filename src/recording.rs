@@ -31,7 +31,8 @@ use crate::pipeline::{self, Judgement, Pipeline};
 use crate::verdict::Hrn;
 use crate::{press, tare, wire};
 
-/// One thing that happens to a pipeline. It learns of nothing else.
+/// One thing that happens to a pipeline. Beside these only its settings change
+/// ([`Entry::Settings`]).
 #[derive(Debug, Clone, PartialEq)]
 pub enum Input<'a> {
     /// The port is open.

@@ -193,7 +193,8 @@ impl Hrn {
     ///
     /// # Errors
     ///
-    /// Whatever in the file is not as agreed; each [`ModelError`] but the last two names it.
+    /// If anything in the file is not as agreed, which the [`ModelError`] names, or if one of its check
+    /// frames cannot be judged: as [`Hrn::judge`].
     pub fn load(bytes: &[u8]) -> Result<Self, ModelError> {
         if bytes.len() > MAX_FILE_BYTES {
             return Err(ModelError::TooLarge { found: bytes.len() });

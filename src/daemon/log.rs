@@ -123,8 +123,8 @@ impl Log {
 
 /// What `directives` let through; where there are none, the daemon's own from `level` on.
 fn filter(directives: &str, level: &str) -> Result<Targets, Error> {
-    // Of libraries, what a person should know; those of DDS warn several times a second of what is
-    // none of anybody's business, and fail with a value where it matters.
+    // Of libraries only warnings. Those of DDS warn several times a second of what nobody has to
+    // mend; what matters they return as an error.
     let unasked = format!("warn,rustdds=off,ros2_client=off,hardnessd={level}");
     let parts = |directives: &str| -> Vec<String> {
         let parts = directives.split(',').map(str::trim);

@@ -273,7 +273,7 @@ impl SensorRecorder {
 
     /// Has the last minute written; the answer comes when that is done.
     pub(crate) fn blackbox(&self, reply: oneshot::Sender<Result<PathBuf, String>>) {
-        // Without an answer the asker learns that there was none.
+        // Where there is no room for the job `reply` goes with it, and the asker sees that.
         match &self.0 {
             Some(active) => {
                 let sensor = active.index;

@@ -32,7 +32,7 @@ pub(crate) enum Change {
         sensor: String,
         context: Option<Value>,
     },
-    /// Keep the last bytes of this sensor.
+    /// Write the last minute of this sensor to a file.
     Blackbox { sensor: String },
 }
 

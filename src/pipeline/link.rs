@@ -10,7 +10,8 @@ use crate::frame::Stamp;
 
 /// A frame is late after so many periods.
 const STALE_PERIODS: f64 = 2.5;
-/// A silence of so many periods ends what came before it.
+/// After a silence of so many periods the bytes that are pending are settled: none that come later
+/// belong to them.
 const PAUSE_PERIODS: f64 = 0.5;
 
 /// What is known of the port.

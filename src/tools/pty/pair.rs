@@ -1,5 +1,5 @@
-//! A pseudo-terminal as the system gives it: the simulator's port, and the terminals of tests, which
-//! take this file as it is.
+//! A pseudo-terminal as the system gives it: the port of the simulator. The tests include this file for
+//! their terminals.
 
 use std::ffi::OsStr;
 use std::io;
