@@ -237,6 +237,9 @@ pub struct State {
     pub labels: Labels,
 }
 
+/// What every recording begins with.
+pub const MAGIC: &[u8] = mcap::MAGIC;
+
 /// What was pressed and whatever else its user wrote down, by key.
 pub type Labels = BTreeMap<String, String>;
 

@@ -174,9 +174,9 @@ fn part(out: &Path) -> io::Result<(PathBuf, File)> {
 /// What stands at `part`, if that is the beginning of a recording or nothing yet.
 fn left_over(part: &Path) -> Option<File> {
     let file = File::options().read(true).write(true).open(part).ok()?;
-    let mut start = [0; mcap::MAGIC.len()];
+    let mut start = [0; recording::MAGIC.len()];
     let read = file.read_at(&mut start, 0).ok()?;
-    mcap::MAGIC.starts_with(&start[..read]).then_some(file)
+    recording::MAGIC.starts_with(&start[..read]).then_some(file)
 }
 
 fn save(broken: File, part: &File) -> Result<Recovered, RecoverError> {
@@ -244,10 +244,10 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let out = directory.path().join("good.mcap");
         let (first, held) = part(&out).unwrap();
-        fs::write(&first, mcap::MAGIC).unwrap();
+        fs::write(&first, recording::MAGIC).unwrap();
         let refused = part(&out).unwrap_err();
         assert_eq!(refused.kind(), ErrorKind::ResourceBusy);
-        assert_eq!(fs::read(&first).unwrap(), mcap::MAGIC);
+        assert_eq!(fs::read(&first).unwrap(), recording::MAGIC);
         // Ended before its time.
         drop(held);
         let (second, file) = part(&out).unwrap();
