@@ -17,6 +17,7 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
 use self::link::Link;
+pub(crate) use self::link::STALE_PERIODS;
 pub use self::retare::RetareError;
 use crate::event::{Event, FrameEvent, LinkState, Phase, Tared};
 use crate::frame::{RawFrame, Stamp};

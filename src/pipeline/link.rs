@@ -9,7 +9,7 @@ use crate::event::{Event, LinkState, Status};
 use crate::frame::Stamp;
 
 /// A frame is late after so many periods.
-const STALE_PERIODS: f64 = 2.5;
+pub(crate) const STALE_PERIODS: f64 = 2.5;
 /// After a silence of so many periods the bytes that are pending are settled: none that come later
 /// belong to them.
 const PAUSE_PERIODS: f64 = 0.5;

@@ -6,16 +6,14 @@ use std::time::Duration;
 use serde_json::Value;
 
 use super::{items, number, plain, text};
-use crate::frame::{COLS, ROWS, TAXELS};
+use crate::frame::{Array, COLS, ROWS, TAXELS};
+use crate::pipeline::STALE_PERIODS;
 
 /// How far back the curves go.
 pub(in crate::tools::watch) const WINDOW: Duration = Duration::from_secs(30);
 
 /// Verdicts kept of a sensor: more than a tall terminal shows.
 const VERDICTS: usize = 100;
-
-/// A value is current for so many periods after its frame (contract, section 5).
-const PERIODS: f64 = 2.5;
 
 /// One sensor.
 #[derive(Debug, Default)]
@@ -186,9 +184,9 @@ impl Sensor {
     /// Newtons of the taxel at a row and column of the sensor's own array in the last frame: smaller
     /// arrays sit in the middle of the 28x28 (contract, section 3).
     pub(in crate::tools::watch) fn newtons(&self, row: usize, col: usize) -> Option<f32> {
-        let (top, left) = ((ROWS - self.rows) / 2, (COLS - self.cols) / 2);
+        let (rows, cols) = (self.rows, self.cols);
         let frame = self.frame.as_ref()?;
-        (row < self.rows && col < self.cols).then(|| frame.newtons[(top + row) * COLS + left + col])
+        (row < rows && col < cols).then(|| frame.newtons[Array { rows, cols }.place(row, col)])
     }
 
     /// The course of `value` up to `now` in so many equal spans, the greatest of each; `None` where
@@ -211,7 +209,7 @@ impl Sensor {
                 *cell = Some(cell.map_or(value(load), |most| most.max(value(load))));
             }
             // It stands for the spans after it, for as long as it is current.
-            let current = rate_hz.map_or(0.0, |hz| PERIODS / hz / span);
+            let current = rate_hz.map_or(0.0, |hz| STALE_PERIODS / hz / span);
             let first = place.max(0.0) as usize;
             let last = (place + current).max(0.0) as usize;
             for cell in held.iter_mut().take(last).skip(first) {
