@@ -295,13 +295,8 @@ impl Setup {
 
     /// Settings of one sensor's pipeline.
     pub fn pipeline(&self, sensor: &Sensor) -> pipeline::Settings {
-        pipeline::Settings {
-            sensor: sensor.name.clone(),
-            frame_rate_hz: sensor.frame_rate_hz,
-            layout: wire::Layout::new(&sensor.frame)
-                .expect("a layout was checked when its configuration was read"),
-            judgement: self.judgement(sensor),
-        }
+        let settings = self.recorded(sensor).settings(&self.hrn);
+        settings.expect("a sensor was checked when its configuration was read")
     }
 
     /// What a recording says of a sensor.
@@ -320,13 +315,7 @@ impl Setup {
 
     /// What a reload may change of a sensor.
     pub fn judgement(&self, sensor: &Sensor) -> Judgement {
-        Judgement {
-            calibration: sensor.calibration.clone(),
-            press: self.config.press.clone(),
-            min_confidence: self.config.model.min_confidence,
-            min_force_n: self.config.model.min_force_n,
-            hrn: self.hrn.clone(),
-        }
+        self.recorded(sensor).judgement(&self.hrn)
     }
 }
 
