@@ -10,7 +10,7 @@ use divan::Bencher;
 use divan::counter::{BytesCount, ItemsCount};
 use hardnessd::event::{Event, Phase};
 use hardnessd::frame::{Frame, Stamp};
-use hardnessd::pipeline::{Clock, Judgement, Pipeline, Settings};
+use hardnessd::pipeline::{Clock, Criteria, Pipeline, Settings};
 use hardnessd::verdict::{BUILT_IN, Hrn};
 use hardnessd::wire::{self, Decoder, Layout};
 
@@ -39,7 +39,7 @@ fn pipeline(hrn: &Arc<Hrn>) -> Pipeline {
         sensor: "sensor".to_owned(),
         frame_rate_hz: 5.0,
         layout: layout(),
-        judgement: Judgement::new(Arc::clone(hrn)),
+        criteria: Criteria::new(Arc::clone(hrn)),
     };
     Pipeline::new(settings, Clock::FrameRate)
 }

@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use hardnessd::event::{Event, Hardness, Phase, PressState};
 use hardnessd::frame::Stamp;
-use hardnessd::pipeline::{Clock, Judgement, Pipeline, Settings};
+use hardnessd::pipeline::{Clock, Criteria, Pipeline, Settings};
 use hardnessd::simulator::{Material, Sequence, SequenceSettings};
 use hardnessd::verdict::{BUILT_IN, Hrn};
 use hardnessd::wire::{self, Layout};
@@ -77,7 +77,7 @@ fn measure(sequence: Sequence, frame_rate_hz: f64, hrn: &Arc<Hrn>) -> Vec<Press>
         sensor: "sensor".to_owned(),
         frame_rate_hz,
         layout: layout.clone(),
-        judgement: Judgement::new(Arc::clone(hrn)),
+        criteria: Criteria::new(Arc::clone(hrn)),
     };
     let mut pipeline = Pipeline::new(settings, Clock::FrameRate);
     let mut presses: Vec<Press> = Vec::new();

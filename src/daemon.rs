@@ -240,9 +240,9 @@ impl Daemon {
                             setup = changed;
                             hub.describe(self::hello(&setup, run.clone())).await;
                             for (sensor, settings) in sensors.0.iter().zip(&setup.config.sensors) {
-                                let judgement = Box::new(setup.judgement(settings));
+                                let criteria = Box::new(setup.criteria(settings));
                                 // A sensor that has ended is noticed above.
-                                let _ = sensor.commands.send(Command::Reload(judgement)).await;
+                                let _ = sensor.commands.send(Command::Reload(criteria)).await;
                             }
                             info!(model = short(&setup), "reloaded");
                         }
@@ -390,7 +390,7 @@ fn hello(setup: &Setup, run: String) -> Hello {
             .map(|settings| SensorCard {
                 rows: settings.layout.array().rows,
                 cols: settings.layout.array().cols,
-                pitch_mm: settings.judgement.calibration.pitch_mm,
+                pitch_mm: settings.criteria.calibration.pitch_mm,
                 name: settings.sensor,
             })
             .collect(),

@@ -36,12 +36,12 @@ pub struct Settings {
     /// How its frames are written.
     pub layout: Layout,
     /// The parts that may change while it runs.
-    pub judgement: Judgement,
+    pub criteria: Criteria,
 }
 
 /// The part of the settings that a reload may change.
 #[derive(Debug, Clone)]
-pub struct Judgement {
+pub struct Criteria {
     /// Counts to newtons.
     pub calibration: tare::Settings,
     /// What a press is.
@@ -54,7 +54,7 @@ pub struct Judgement {
     pub hrn: Arc<Hrn>,
 }
 
-impl Judgement {
+impl Criteria {
     /// `hrn` judges, with default settings, and rejects nothing.
     pub fn new(hrn: Arc<Hrn>) -> Self {
         Self {
@@ -102,7 +102,7 @@ pub struct Pipeline {
     decoder: Decoder,
     tare: Tare,
     tracker: PressTracker,
-    judgement: Judgement,
+    criteria: Criteria,
     seen: Seen,
     /// When the last of the bytes came that are being decoded.
     arrival: Duration,
@@ -171,7 +171,7 @@ impl Pipeline {
             sensor,
             frame_rate_hz,
             layout,
-            judgement,
+            criteria,
         } = settings;
         Self {
             sensor,
@@ -179,13 +179,13 @@ impl Pipeline {
             frame_rate_hz,
             clock,
             tare: Tare::new(
-                &judgement.calibration,
+                &criteria.calibration,
                 layout.array(),
-                contact(&judgement.press),
+                contact(&criteria.press),
             ),
-            tracker: PressTracker::new(judgement.press.clone()),
+            tracker: PressTracker::new(criteria.press.clone()),
             decoder: Decoder::new(layout),
-            judgement,
+            criteria,
             seen: Seen {
                 link: Link::Closed { reason: None },
                 tare_met_contact: false,
@@ -230,15 +230,15 @@ impl Pipeline {
     }
 
     /// Takes over changed settings at once. The baseline and a press under way stay.
-    pub fn reload(&mut self, judgement: Judgement) {
-        if judgement.calibration.tare_frames == 0 {
+    pub fn reload(&mut self, criteria: Criteria) {
+        if criteria.calibration.tare_frames == 0 {
             self.abandon_retare(RetareError::NoFrames);
             self.seen.tare_met_contact = false;
         }
         self.tare
-            .reload(&judgement.calibration, contact(&judgement.press));
-        self.tracker.reload(judgement.press.clone());
-        self.judgement = judgement;
+            .reload(&criteria.calibration, contact(&criteria.press));
+        self.tracker.reload(criteria.press.clone());
+        self.criteria = criteria;
     }
 
     /// What the controller says it is doing: echoed in presses and verdicts until it changes.
@@ -262,8 +262,8 @@ impl Pipeline {
     }
 
     /// What may change while it runs, as it is now.
-    pub fn judgement(&self) -> &Judgement {
-        &self.judgement
+    pub fn criteria(&self) -> &Criteria {
+        &self.criteria
     }
 
     /// The port is open: what comes next does not continue what came before.
@@ -448,7 +448,7 @@ impl Pipeline {
             stamp.wall,
             at.frame,
             frame.newtons.to_vec(),
-            frame.contact_area_taxels(self.judgement.press.contact_threshold_n),
+            frame.contact_area_taxels(self.criteria.press.contact_threshold_n),
         )));
         for change in changes {
             self.publish(change, events);

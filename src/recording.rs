@@ -27,7 +27,7 @@ pub use self::ring::Ring;
 pub use self::writer::{About, Writer};
 use crate::event::Event;
 use crate::frame::Stamp;
-use crate::pipeline::{self, Judgement, Pipeline};
+use crate::pipeline::{self, Criteria, Pipeline};
 use crate::verdict::Hrn;
 use crate::{press, tare, wire};
 
@@ -201,13 +201,13 @@ impl Sensor {
             sensor: self.name.clone(),
             frame_rate_hz: hz,
             layout,
-            judgement: self.judgement(hrn),
+            criteria: self.criteria(hrn),
         })
     }
 
     /// The part of them that may change.
-    pub fn judgement(&self, hrn: &Arc<Hrn>) -> Judgement {
-        Judgement {
+    pub fn criteria(&self, hrn: &Arc<Hrn>) -> Criteria {
+        Criteria {
             calibration: self.calibration.clone(),
             press: self.press.clone(),
             min_confidence: self.min_confidence,
@@ -217,12 +217,12 @@ impl Sensor {
     }
 
     /// Takes over what a reload has changed.
-    pub fn adopt(&mut self, judgement: &Judgement) {
-        self.calibration = judgement.calibration.clone();
-        self.press = judgement.press.clone();
-        self.min_confidence = judgement.min_confidence;
-        self.min_force_n = judgement.min_force_n;
-        self.model = judgement.hrn.sha256().to_owned();
+    pub fn adopt(&mut self, criteria: &Criteria) {
+        self.calibration = criteria.calibration.clone();
+        self.press = criteria.press.clone();
+        self.min_confidence = criteria.min_confidence;
+        self.min_force_n = criteria.min_force_n;
+        self.model = criteria.hrn.sha256().to_owned();
     }
 }
 

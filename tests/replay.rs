@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use hardnessd::event::Event;
 use hardnessd::frame::Stamp;
-use hardnessd::pipeline::{Clock, Judgement, Pipeline, Settings};
+use hardnessd::pipeline::{Clock, Criteria, Pipeline, Settings};
 use hardnessd::verdict::{BUILT_IN, Hrn};
 use hardnessd::wire;
 use serde_json::Value;
@@ -185,7 +185,7 @@ fn pipeline() -> Pipeline {
             sensor: "sensor".to_owned(),
             frame_rate_hz: 5.0,
             layout: wire::Layout::new(&wire::Settings::default()).unwrap(),
-            judgement: Judgement::new(Arc::new(Hrn::load(BUILT_IN).unwrap())),
+            criteria: Criteria::new(Arc::new(Hrn::load(BUILT_IN).unwrap())),
         },
         Clock::FrameRate,
     )

@@ -19,7 +19,7 @@ use serde::{Deserialize, Serialize};
 pub use self::parse::Error;
 pub use self::publish::{Endpoint, Mode, Publish, Ros2, Tcp, Unix, Zenoh};
 use super::log;
-use crate::pipeline::{self, Judgement};
+use crate::pipeline::{self, Criteria};
 use crate::verdict::Hrn;
 use crate::{press, recording, tare, wire};
 
@@ -314,8 +314,8 @@ impl Setup {
     }
 
     /// What a reload may change of a sensor.
-    pub fn judgement(&self, sensor: &Sensor) -> Judgement {
-        self.recorded(sensor).judgement(&self.hrn)
+    pub fn criteria(&self, sensor: &Sensor) -> Criteria {
+        self.recorded(sensor).criteria(&self.hrn)
     }
 }
 

@@ -23,7 +23,7 @@ use self::worker::Worker;
 use super::config;
 use crate::event::{Event, Kind};
 use crate::frame::Stamp;
-use crate::pipeline::{Judgement, Pipeline};
+use crate::pipeline::{Criteria, Pipeline};
 use crate::recording::{About, Entry, Input, Labels, Sensor, State};
 
 /// Entries and events that may wait: some 4 s of a sensor at 100 frames/s.
@@ -262,10 +262,10 @@ impl SensorRecorder {
     }
 
     /// Notes that `pipeline` is judged otherwise from now on.
-    pub(crate) fn reload(&mut self, pipeline: &Pipeline, judgement: &Judgement, at: Stamp) {
+    pub(crate) fn reload(&mut self, pipeline: &Pipeline, criteria: &Criteria, at: Stamp) {
         if let Some(active) = &mut self.0 {
             let mut sensor = active.sensor.clone();
-            sensor.adopt(judgement);
+            sensor.adopt(criteria);
             active.follow(pipeline, at, Entry::Settings(Box::new(sensor.clone())));
             active.sensor = sensor;
         }

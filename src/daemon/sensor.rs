@@ -16,7 +16,7 @@ use super::log;
 use super::record::SensorRecorder;
 use super::serial::{Link, Turn};
 use crate::event::{Event, Kind, Status, Tared};
-use crate::pipeline::{Judgement, Pipeline, RetareError};
+use crate::pipeline::{Criteria, Pipeline, RetareError};
 use crate::recording::Input;
 
 /// What a sensor can be asked.
@@ -31,7 +31,7 @@ pub(crate) enum Command {
     /// To have its last minute written; the answer is where.
     Blackbox(oneshot::Sender<Result<PathBuf, String>>),
     /// To judge otherwise from now on.
-    Reload(Box<Judgement>),
+    Reload(Box<Criteria>),
     /// To end: a press is aborted, then nothing comes any more.
     Finish,
 }
@@ -123,9 +123,9 @@ pub(crate) async fn serve(
                     recorder.blackbox(reply);
                     continue;
                 }
-                Some(Command::Reload(judgement)) => {
-                    recorder.reload(&pipeline, &judgement, super::now());
-                    pipeline.reload(*judgement);
+                Some(Command::Reload(criteria)) => {
+                    recorder.reload(&pipeline, &criteria, super::now());
+                    pipeline.reload(*criteria);
                     answer(&mut pipeline, &mut taring);
                     continue;
                 }
@@ -183,7 +183,7 @@ fn vitals(pipeline: &Pipeline, unjudged: u64) -> Vitals {
         last_frame_age: pipeline
             .last_frame()
             .map(|frame| now.mono.saturating_sub(frame.mono)),
-        contact_threshold_n: pipeline.judgement().press.contact_threshold_n,
+        contact_threshold_n: pipeline.criteria().press.contact_threshold_n,
         unjudged,
     }
 }

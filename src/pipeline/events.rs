@@ -1,6 +1,6 @@
 //! What a pipeline says of presses: press and hardness events.
 
-use super::{Clock, Judgement, Pipeline, Unjudged};
+use super::{Clock, Criteria, Pipeline, Unjudged};
 use crate::event::{Event, Hardness, Note, Phase, Press, PressState, Rejection};
 use crate::frame::{Frame, RawFrame};
 use crate::press::{Change, End, Marks, Moment, Peak};
@@ -66,12 +66,12 @@ impl Pipeline {
     /// should one fail on another, the press has no verdict rather than a made-up one, and
     /// [`Self::unjudged`] tells of it.
     fn judge(&mut self, press: u64, phase: Phase, peak: &Peak) -> Option<Event> {
-        let Judgement {
+        let Criteria {
             min_confidence,
             min_force_n,
             hrn,
             ..
-        } = &self.judgement;
+        } = &self.criteria;
         let verdict = match hrn.judge(&peak.frame) {
             Ok(verdict) => verdict,
             Err(error) => {
@@ -100,7 +100,7 @@ impl Pipeline {
                 .find(|known| known.level == level)?;
             Some(known.label.clone())
         });
-        let pitch_mm = self.judgement.calibration.pitch_mm;
+        let pitch_mm = self.criteria.calibration.pitch_mm;
         let Moment { frame, stamp } = peak.moment;
         Some(Event::Hardness(Hardness {
             seq: None,
@@ -129,7 +129,7 @@ impl Pipeline {
     }
 
     fn notes(&self, peak: &Peak) -> Vec<Note> {
-        let range = &self.judgement.hrn.card().range;
+        let range = &self.criteria.hrn.card().range;
         let [least_n, most_n] = range.force_n.map(f64::from);
         let [least_taxels, most_taxels] = range.contact_area_taxels;
         let trained = (least_n..=most_n).contains(&peak.force_n)
@@ -155,7 +155,7 @@ impl Pipeline {
 
     fn is_at_edge(&self, frame: &Frame) -> bool {
         let array = self.decoder.layout().array();
-        let threshold_n = self.judgement.press.contact_threshold_n;
+        let threshold_n = self.criteria.press.contact_threshold_n;
         array.places().any(|place| {
             frame.newtons[place] >= threshold_n
                 && array.position(place).is_some_and(|(row, col)| {

@@ -17,7 +17,7 @@ fn pipeline(preset: Preset) -> Pipeline {
             ..wire::Settings::default()
         })
         .unwrap(),
-        judgement: Judgement::new(Arc::new(Hrn::load(BUILT_IN).unwrap())),
+        criteria: Criteria::new(Arc::new(Hrn::load(BUILT_IN).unwrap())),
     };
     Pipeline::new(settings, Clock::Arrival)
 }
@@ -100,9 +100,9 @@ fn a_reload_changes_the_tare_under_way() {
     let mut pipeline = pipeline(Preset::Jx255n);
     play(&mut pipeline, 0, &[raw(9, 50); 5]);
     let with = |pipeline: &Pipeline, tare_frames| {
-        let mut judgement = pipeline.judgement().clone();
-        judgement.calibration.tare_frames = tare_frames;
-        judgement
+        let mut criteria = pipeline.criteria().clone();
+        criteria.calibration.tare_frames = tare_frames;
+        criteria
     };
     pipeline.reload(with(&pipeline, 2));
     assert_eq!(play(&mut pipeline, 5, &[raw(0, 0); 2]), ["Live"]);
@@ -337,8 +337,8 @@ fn totals_balance_with_damage() {
 fn verdicts_below_the_thresholds_are_rejected() {
     let check = |min_force_n: f64, min_confidence: f32, expected: Option<Rejection>| {
         let mut pipeline = pipeline(Preset::Jx255n);
-        pipeline.judgement.min_force_n = min_force_n;
-        pipeline.judgement.min_confidence = min_confidence;
+        pipeline.criteria.min_force_n = min_force_n;
+        pipeline.criteria.min_confidence = min_confidence;
         play(&mut pipeline, 0, &[raw(0, 0); 5]);
         let mut events = Vec::new();
         for (number, raw) in (5..).zip([raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)]) {
@@ -383,7 +383,7 @@ fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
                     .to_string();
                 }
             }
-            pipeline.judgement.hrn = Arc::new(Hrn::load(&file.encode_to_vec()).unwrap());
+            pipeline.criteria.hrn = Arc::new(Hrn::load(&file.encode_to_vec()).unwrap());
             play(&mut pipeline, 0, &[raw(0, 0); 5]);
             let mut held = RawFrame::default();
             // Three by three in the middle.
@@ -429,10 +429,10 @@ fn the_notes_are_of_the_settings_that_the_chosen_frame_came_under() {
         let mut held = raw(9, counts);
         held.counts[0] = 5;
         play(&mut pipeline, 5, &[held, raw(3, 100)]);
-        let mut judgement = pipeline.judgement().clone();
-        judgement.calibration.newtons_per_count = newtons_per_count;
-        judgement.press.contact_threshold_n = threshold_n;
-        pipeline.reload(judgement);
+        let mut criteria = pipeline.criteria().clone();
+        criteria.calibration.newtons_per_count = newtons_per_count;
+        criteria.press.contact_threshold_n = threshold_n;
+        pipeline.reload(criteria);
         play(&mut pipeline, 7, &[raw(0, 0)]);
         let bytes = bytes(&pipeline, &raw(0, 0));
         let events = pipeline.push(&bytes, at(1600));
@@ -532,10 +532,10 @@ fn failing_model() -> Hrn {
 fn a_press_that_the_model_fails_on_ends_without_a_verdict_and_that_is_told() {
     let mut pipeline = pipeline(Preset::Jx255n);
     play(&mut pipeline, 0, &[raw(0, 0); 5]);
-    let mut judgement = pipeline.judgement().clone();
-    judgement.hrn = Arc::new(failing_model());
-    judgement.calibration.newtons_per_count = 10.0;
-    pipeline.reload(judgement);
+    let mut criteria = pipeline.criteria().clone();
+    criteria.hrn = Arc::new(failing_model());
+    criteria.calibration.newtons_per_count = 10.0;
+    pipeline.reload(criteria);
     let press = |counts| [raw(9, counts), raw(9, counts), raw(0, 0), raw(0, 0)];
     let told = play(&mut pipeline, 5, &press(99));
     assert_eq!(told, ["Begin 1", "End 1", "Final of 5"]);

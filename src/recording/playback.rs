@@ -77,7 +77,7 @@ impl Playback {
             (Entry::Settings(described), Some(known)) => {
                 let settings = described.settings(&self.hrn);
                 let settings = settings.map_err(|problem| PlaybackError { sensor, problem })?;
-                known.pipeline.reload(settings.judgement);
+                known.pipeline.reload(settings.criteria);
                 known.model = described.model;
                 Vec::new()
             }

@@ -107,7 +107,7 @@ fn recorded(states: usize, chunk: usize) -> (Vec<u8>, Vec<Event>) {
             described.press.end_frames = 1;
             let settings = Entry::Settings(Box::new(described.clone()));
             writer.entry(0, at, &settings).unwrap();
-            pipeline.reload(described.judgement(&hrn));
+            pipeline.reload(described.criteria(&hrn));
         }
         writer.entry(0, at, &Entry::Input(input.clone())).unwrap();
         let mut came = input.feed(&mut pipeline, at);

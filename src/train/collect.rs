@@ -180,12 +180,12 @@ impl Capture {
             .extension()
             .is_some_and(|extension| extension == "mcap")
         {
-            play(&bytes, &of_bytes.judgement.hrn, &path, &mut selection)?
+            play(&bytes, &of_bytes.criteria.hrn, &path, &mut selection)?
         } else {
             let mut pipeline = Pipeline::new(of_bytes.clone(), Clock::FrameRate);
             selection.take(pipeline.push(&bytes, NOT_LOOKED_AT));
             selection.take(pipeline.end_of_recording(None));
-            (Labels::new(), of_bytes.judgement.calibration.pitch_mm)
+            (Labels::new(), of_bytes.criteria.calibration.pitch_mm)
         };
         if selection.presses.is_empty() {
             return Err(CollectError::NoPress { path });
