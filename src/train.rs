@@ -32,6 +32,7 @@ pub mod likeness;
 pub mod history;
 pub mod disk;
 pub mod run;
+mod progress;
 pub mod fit;
 pub mod gan;
 pub mod stages;

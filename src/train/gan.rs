@@ -12,13 +12,13 @@ use burn::tensor::Device;
 
 use super::checkpoint::{Checkpoint, Origin, Progress};
 use super::dataset::Dataset;
-use super::fit::{ensure_finite, ensure_finite_weights, progress_bar, report};
 use super::generator;
 use super::history::{Adversarial, Row};
 use super::hrn;
 use super::learner::Learner;
 use super::losses::Game;
 use super::network::{self, FEATURES, Weights};
+use super::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
 use super::run::Run;
 use crate::frame::Frame;
 use crate::random::Stream;
