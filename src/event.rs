@@ -17,6 +17,15 @@ use crate::frame::{COLS, ROWS};
 /// Version of the format, announced in `hello`.
 pub const PROTOCOL: u32 = 1;
 
+/// A context is shorter, written as JSON without spaces.
+pub const CONTEXT_BYTES: usize = 1024;
+
+/// Whether a sensor may be called so: `[a-z][a-z0-9_]*`.
+pub fn is_sensor_name(name: &str) -> bool {
+    let part = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
+    name.starts_with(|first: char| first.is_ascii_lowercase()) && name.chars().all(part)
+}
+
 /// A numbered or live event of one sensor.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "type", rename_all = "lowercase")]

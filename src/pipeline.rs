@@ -19,7 +19,7 @@ use serde::{Deserialize, Serialize};
 use self::link::Link;
 pub(crate) use self::link::STALE_PERIODS;
 pub use self::retare::RetareError;
-use crate::event::{Event, FrameEvent, LinkState, Phase, Tared};
+use crate::event::{self, Event, FrameEvent, LinkState, Phase, Tared};
 use crate::frame::{RawFrame, Stamp};
 use crate::press::{self, Abort, Moment, PressTracker};
 use crate::tare::{self, Contact, Offsets, Tare};
@@ -149,13 +149,18 @@ impl Memory {
             frames,
             frames_damaged,
             recent,
+            context,
             ..
         } = &self.pipeline;
+        let is_context = |context: &serde_json::Value| {
+            context.is_object() && context.to_string().len() < event::CONTEXT_BYTES
+        };
         self.decoder
             .is_possible(frames.saturating_add(*frames_damaged))
             && self.tare.is_possible()
             && self.tracker.is_possible(*frames)
             && recent.len() <= RATE_FRAMES
+            && context.as_ref().is_none_or(is_context)
     }
 
     /// What the controller had said it was doing.

@@ -25,7 +25,7 @@ pub use self::reader::{Found, Reader};
 pub use self::recover::{RecoverError, Recovered, recover};
 pub use self::ring::Ring;
 pub use self::writer::{About, Writer};
-use crate::event::Event;
+use crate::event::{self, Event};
 use crate::frame::Stamp;
 use crate::pipeline::{self, Criteria, Pipeline};
 use crate::verdict::Hrn;
@@ -165,6 +165,9 @@ pub struct Sensor {
 /// Why a sensor's description in a recording cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum SensorError {
+    /// Its name.
+    #[error("name: found {0:?}, expected [a-z][a-z0-9_]*")]
+    Name(String),
     /// Its layout.
     #[error("frame.{0}")]
     Frame(#[from] wire::LayoutError),
@@ -189,6 +192,9 @@ impl Sensor {
     ///
     /// If a value is out of its range.
     pub fn settings(&self, hrn: &Arc<Hrn>) -> Result<pipeline::Settings, SensorError> {
+        if !event::is_sensor_name(&self.name) {
+            return Err(SensorError::Name(self.name.clone()));
+        }
         let layout = wire::Layout::new(&self.frame)?;
         self.calibration.check(layout.array())?;
         self.press.check()?;

@@ -483,19 +483,24 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
     );
     assert_eq!(hardnessd(&["run"]).status.code(), Some(2));
     for beyond_any_sensor in [
-        ["--force", "1e30"],
-        ["--fps", "1e9"],
-        ["--fps", "nan"],
-        ["--speed", "1e-300"],
-        ["--presses", "0"],
+        ["simulate", "--force", "1000"],
+        ["simulate", "--fps", "1e9"],
+        ["simulate", "--fps", "nan"],
+        ["simulate", "--speed", "1e-300"],
+        ["simulate", "--presses", "0"],
+        ["demo", "--speed", "0.0001"],
+        ["demo", "--speed", "300000"],
     ] {
-        let arguments = [&["simulate"], &beyond_any_sensor[..]].concat();
-        assert_eq!(
-            hardnessd(&arguments).status.code(),
-            Some(2),
-            "{arguments:?}"
-        );
+        fails(&beyond_any_sensor, 2, &[beyond_any_sensor[1]]);
     }
+    // What a recording is goes by its name.
+    let to = ["simulate", "--presses", "1", "--to", "x.mcap"];
+    fails(&to, 2, &["--to", ".mcap"]);
+    fails(
+        &["record", "--config", "x.toml", "--out", "x.bin"],
+        2,
+        &["--out", ".bin"],
+    );
     assert_eq!(hardnessd(&["--version"]).status.code(), Some(0));
 }
 

@@ -7,7 +7,7 @@
 use serde::Serialize;
 use serde_json::{Map, Value};
 
-use crate::event::Kind;
+use crate::event::{CONTEXT_BYTES, Kind};
 
 /// A usable line.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -199,9 +199,6 @@ fn request(mut fields: Map<String, Value>) -> Result<Request, String> {
         None => Ok(request),
     }
 }
-
-/// A context is shorter, written as JSON without spaces.
-const CONTEXT_BYTES: usize = 1024;
 
 fn name(key: &str, value: &Value) -> Result<String, String> {
     value

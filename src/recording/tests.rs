@@ -187,9 +187,16 @@ fn a_sensor_that_cannot_be_is_refused_wherever_it_is_described() {
             labels: labels(),
         }))
     };
-    let mut bad = good.clone();
+    let (mut bad, mut nameless) = (good.clone(), good.clone());
     bad.press.early_settle_s = -1.0;
-    for last in [state(bad.clone()), Entry::Settings(Box::new(bad))] {
+    nameless.name = "\u{1b}[2J\n".to_owned();
+    let of_name = "name: found \"\\u{1b}[2J\\n\", expected [a-z]";
+    let of_press = "press.early_settle_s: found -1.0";
+    for (last, told) in [
+        (state(bad.clone()), of_press),
+        (Entry::Settings(Box::new(bad)), of_press),
+        (state(nameless), of_name),
+    ] {
         let mut playback = Playback::new(hrn.clone());
         let mut feed = |entry| {
             playback.feed(Found {
@@ -200,8 +207,8 @@ fn a_sensor_that_cannot_be_is_refused_wherever_it_is_described() {
         };
         feed(state(good.clone())).unwrap();
         let error = feed(last).unwrap_err().to_string();
-        let told = "sensor \"forearm\": press.early_settle_s: found -1.0";
-        assert!(error.starts_with(told), "{error}");
+        let told = format!("sensor \"forearm\": {told}");
+        assert!(error.starts_with(&told), "{error}");
     }
 }
 
@@ -245,6 +252,12 @@ fn a_memory_that_no_pipeline_came_to_is_refused() {
     let peak = "/memory/tracker/state/Pressed/peak";
     let near = "/memory/tracker/state/Pressed/settling/near/0";
     for (state, place, value) in [
+        (&taring, "/memory/pipeline/context", json!("picking")),
+        (
+            &taring,
+            "/memory/pipeline/context",
+            json!({"tag": "x".repeat(1024)}),
+        ),
         (&taring, "/memory/decoder/received", json!(5)),
         (&taring, "/memory/decoder/received", json!(u64::MAX)),
         (&taring, "/memory/decoder/skipped", json!(1_000_000)),

@@ -20,7 +20,7 @@ use tokio::time::Instant;
 
 use super::faults::Faults;
 use super::player::{Pace, Player};
-use super::simulate::positive;
+use super::simulate::within;
 use crate::daemon::config::{Config, Http, Sensor, Setup};
 use crate::daemon::{self, Daemon};
 use crate::simulator::SequenceSettings;
@@ -38,8 +38,8 @@ pub struct Args {
     /// Address of the live page
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0")]
     http: SocketAddr,
-    /// Play so many times as fast
-    #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = positive)]
+    /// Play so many times as fast, 0.01 to 100
+    #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = speed)]
     speed: f64,
 }
 
@@ -125,6 +125,11 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     };
     let (served, printed) = tokio::join!(daemon, printing);
     printed.and(served.map_err(Error::Daemon))
+}
+
+/// Beyond 100 the 2 ms between frames are more than a busy machine's timers can keep.
+fn speed(text: &str) -> Result<f64, String> {
+    within(text, 0.01, 100.0)
 }
 
 /// The defaults, with every time of a press shortened as the sensor is hastened.

@@ -71,7 +71,7 @@ impl Failure {
             }
 
             Self::Simulate(simulate::Error::Layout(_) | simulate::Error::Baud { .. })
-            | Self::Record(record::Error::Level { .. })
+            | Self::Record(record::Error::Level { .. } | record::Error::Twice { .. })
             | Self::Watch(watch::Error::NoTerminal) => USAGE,
 
             Self::Simulate(simulate::Error::Faults(error)) if error.is_unreadable() => NO_INPUT,

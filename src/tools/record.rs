@@ -21,7 +21,7 @@ pub struct Args {
     #[arg(long, value_name = "F")]
     pub config: PathBuf,
     /// Recording to write (.mcap); a file that exists is left alone
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = recording)]
     out: PathBuf,
     /// What to write down in it, such as level=2 or object=7; may be repeated
     #[arg(long = "label", value_name = "KEY=VALUE", value_parser = label)]
@@ -44,6 +44,12 @@ pub enum Error {
         /// Those of the model.
         levels: String,
     },
+    /// Two labels of one key.
+    #[error("--label {key}: found it twice, expected it once")]
+    Twice {
+        /// The key.
+        key: String,
+    },
     /// The file cannot be made.
     #[error("--out {path}: {source}, expected a new file")]
     Create {
@@ -61,20 +67,25 @@ pub enum Error {
 ///
 /// # Errors
 ///
-/// [`Error`], if a label says a level that the model has not, the file cannot be made or written, a
-/// sensor is not there to begin with, or the last one is lost.
+/// [`Error`], if a label says a level that the model has not or one is given twice, the file cannot be
+/// made or written, a sensor is not there to begin with, or the last one is lost.
 pub async fn run(
     args: Args,
     setup: Setup,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
     check_level(&args.labels, &setup.hrn.card().levels)?;
+    let mut labels = BTreeMap::new();
+    for (key, value) in args.labels {
+        if labels.insert(key.clone(), value).is_some() {
+            return Err(Error::Twice { key });
+        }
+    }
     let path = args.out;
     let file = File::create_new(&path).map_err(|source| Error::Create {
         path: path.clone(),
         source,
     })?;
-    let labels: BTreeMap<String, String> = args.labels.into_iter().collect();
     let daemon = Daemon::recording(setup, path.clone(), file, labels)?;
     let over = async {
         match args.seconds {
@@ -119,6 +130,17 @@ fn check_level(labels: &[(String, String)], levels: &[Level]) -> Result<(), Erro
                 levels: levels.join(", "),
             })
         }
+    }
+}
+
+/// A file that `replay` does not take for raw bytes: it goes by the name.
+fn recording(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match path.extension() {
+        Some(extension) if extension == "bin" => {
+            Err("expected a name that ends in .mcap: .bin is for raw bytes".to_owned())
+        }
+        _ => Ok(path),
     }
 }
 

@@ -26,7 +26,7 @@ pub struct Args {
     #[arg(long, value_name = "PATH")]
     link: Option<PathBuf>,
     /// Write what the sensor sends to this .bin file instead, as fast as it goes
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["link", "speed", "baud"], requires = "presses")]
+    #[arg(long, value_name = "FILE", value_parser = raw_bytes, conflicts_with_all = ["link", "speed", "baud"], requires = "presses")]
     to: Option<PathBuf>,
     /// Layout of a frame
     #[arg(long, value_name = "P", default_value = "jx255n", value_parser = preset)]
@@ -254,18 +254,30 @@ fn preset(name: &str) -> Result<Preset, NameError> {
     Preset::deserialize(name.into_deserializer())
 }
 
+/// A file that `replay` takes for raw bytes: it goes by the name.
+fn raw_bytes(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match path.extension() {
+        Some(extension) if extension == "mcap" => {
+            Err("expected another name: .mcap is for recordings of that format".to_owned())
+        }
+        _ => Ok(path),
+    }
+}
+
 /// A press is computed whole, and takes as long as it takes to reach its force: what no sensor
 /// does would fill the memory.
 fn frame_rate_hz(text: &str) -> Result<f64, String> {
     within(text, 0.1, 1000.0)
 }
 
-/// As [`frame_rate_hz`]; 1,000 N is far beyond what such a film bears.
+/// As [`frame_rate_hz`]: the softest material takes minutes to bear 1,000 N, and the sensor shows no
+/// more than 10 N a taxel.
 fn force_n(text: &str) -> Result<f64, String> {
-    within(text, 0.01, 1000.0)
+    within(text, 0.01, 200.0)
 }
 
-fn within(text: &str, least: f64, most: f64) -> Result<f64, String> {
+pub(super) fn within(text: &str, least: f64, most: f64) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(number) if (least..=most).contains(&number) => Ok(number),
         _ => Err(format!("expected a number from {least} to {most}")),

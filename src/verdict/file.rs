@@ -242,7 +242,8 @@ fn check_levels(levels: &[Level]) -> Result<(), ModelError> {
     }
     for text in levels.iter().flat_map(|level| [&level.label, &level.shore]) {
         if text.is_empty() || text.chars().any(char::is_control) {
-            let expected = "labels without control characters".to_owned();
+            let expected =
+                "`label` and `shore`, neither empty nor with control characters".to_owned();
             return Err(ModelError::KeyInvalid {
                 key,
                 found: format!("{text:?}"),
@@ -285,6 +286,14 @@ fn check_check(check: &Check, levels: usize) -> Result<(), ModelError> {
         lengths.dedup();
         lengths
     };
+    let unusable = |n: &&f32| !(n.is_finite() && **n >= 0.0);
+    if let Some(newtons) = check.frames.iter().flatten().find(unusable) {
+        return Err(ModelError::KeyInvalid {
+            key: "hrn.check",
+            found: format!("{newtons} in a frame"),
+            expected: "newtons of 0 or more".to_owned(),
+        });
+    }
     let found = format!(
         "{} frames of lengths {:?}, {} rows of probabilities of lengths {:?}",
         check.frames.len(),

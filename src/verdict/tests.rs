@@ -174,7 +174,7 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
         },
     );
     check(
-        "`hrn.levels`: found \"ha\\u{1b}rd\", expected labels without",
+        "`hrn.levels`: found \"ha\\u{1b}rd\", expected `label` and `shore`, neither",
         |p| {
             *value(p, "hrn.levels") = value(p, "hrn.levels").replace("hard", "ha\\u001brd");
         },
@@ -190,6 +190,14 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
         check("expected [least, greatest]", set("hrn.range", range));
     }
     check("`hrn.metrics`: found", set("hrn.metrics", "{"));
+    check(
+        "`hrn.check`: found -1 in a frame, expected newtons of 0 or more",
+        |p| {
+            let mut check: Check = serde_json::from_str(value(p, "hrn.check")).unwrap();
+            check.frames[3][7] = -1.0;
+            *value(p, "hrn.check") = serde_json::to_string(&check).unwrap();
+        },
+    );
     check("`hrn.check`: found 1 frames of lengths [2]", |p| {
         *value(p, "hrn.check") = r#"{"frames":[[1,2]],"probabilities":[[1,0,0,0]]}"#.into();
     });

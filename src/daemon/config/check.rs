@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::parse::{Error, Unusable};
 use super::{Config, Model, Ros2, Sensor, Zenoh};
-use crate::wire;
+use crate::{event, wire};
 
 /// Checks a configuration whose paths are not relative to its file any more; `path` is for messages.
 pub(super) fn check(config: &Config, path: &Path) -> Result<(), Error> {
@@ -176,11 +176,7 @@ fn check_sensor(sensor: &Sensor, earlier: &[Sensor], path: &Path) -> Result<(), 
         table: format!("sensor[{name:?}].{table}"),
         problem,
     };
-    let named = name.starts_with(|first: char| first.is_ascii_lowercase())
-        && name
-            .chars()
-            .all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_');
-    if !named {
+    if !event::is_sensor_name(name) {
         return value("name", format!("{name:?}"), "[a-z][a-z0-9_]*");
     }
     if earlier.iter().any(|other| other.name == *name) {

@@ -311,6 +311,8 @@ impl Worker {
             let directory = settings.dir();
             has_room(&directory, settings.keep_free_mb * MB)?;
             let (path, file) = create(&directory, &format!("blackbox-{name}"))?;
+            // Whoever asked for it may be elsewhere.
+            let path = std::path::absolute(&path).unwrap_or(path);
             or_removed(&path, || {
                 let mut open = Open::new(path.clone(), file, &about)?;
                 for (at, entry) in self.sensors[sensor].ring.all() {
