@@ -19,7 +19,7 @@ pub mod watch;
 use std::error::Error;
 use std::fs::File;
 use std::io::{self, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::error::ErrorKind;
@@ -73,6 +73,18 @@ pub fn usage(program: &str, error: &clap::Error) -> ExitCode {
     let told = told.join(" ");
     eprintln!("{program}: {}", shown(told.trim_start_matches("error: ")));
     ExitCode::from(exit::USAGE)
+}
+
+/// A recording to write. Which kind it is goes by its name when it is read, so it may not be called as
+/// the other kind is.
+fn named_unlike(name: &str, other: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(name);
+    match path.extension() {
+        Some(extension) if extension == other => Err(format!(
+            "expected another name: .{other} is for the other kind of recording"
+        )),
+        _ => Ok(path),
+    }
 }
 
 /// Opens a file to read from. A directory is refused here: the system would do so at the first read

@@ -21,7 +21,7 @@ pub struct Args {
     #[arg(long, value_name = "F")]
     pub config: PathBuf,
     /// Recording to write (.mcap); a file that exists is left alone
-    #[arg(long, value_name = "FILE", value_parser = recording)]
+    #[arg(long, value_name = "FILE", value_parser = |name: &str| super::named_unlike(name, "bin"))]
     out: PathBuf,
     /// What to write down in it, such as level=2 or object=7; may be repeated
     #[arg(long = "label", value_name = "KEY=VALUE", value_parser = label)]
@@ -130,17 +130,6 @@ fn check_level(labels: &[(String, String)], levels: &[Level]) -> Result<(), Erro
                 levels: levels.join(", "),
             })
         }
-    }
-}
-
-/// A file that `replay` does not take for raw bytes: it goes by the name.
-fn recording(text: &str) -> Result<PathBuf, String> {
-    let path = PathBuf::from(text);
-    match path.extension() {
-        Some(extension) if extension == "bin" => {
-            Err("expected a name that ends in .mcap: .bin is for raw bytes".to_owned())
-        }
-        _ => Ok(path),
     }
 }
 

@@ -26,7 +26,7 @@ pub struct Args {
     #[arg(long, value_name = "PATH")]
     link: Option<PathBuf>,
     /// Write what the sensor sends to this .bin file instead, as fast as it goes
-    #[arg(long, value_name = "FILE", value_parser = raw_bytes, conflicts_with_all = ["link", "speed", "baud"], requires = "presses")]
+    #[arg(long, value_name = "FILE", value_parser = |name: &str| super::named_unlike(name, "mcap"), conflicts_with_all = ["link", "speed", "baud"], requires = "presses")]
     to: Option<PathBuf>,
     /// Layout of a frame
     #[arg(long, value_name = "P", default_value = "jx255n", value_parser = preset)]
@@ -252,17 +252,6 @@ fn baud(args: &Args, layout: &Layout) -> Result<(u32, Option<String>), Error> {
 /// A preset by the name it has in the configuration.
 fn preset(name: &str) -> Result<Preset, NameError> {
     Preset::deserialize(name.into_deserializer())
-}
-
-/// A file that `replay` takes for raw bytes: it goes by the name.
-fn raw_bytes(text: &str) -> Result<PathBuf, String> {
-    let path = PathBuf::from(text);
-    match path.extension() {
-        Some(extension) if extension == "mcap" => {
-            Err("expected another name: .mcap is for recordings of that format".to_owned())
-        }
-        _ => Ok(path),
-    }
 }
 
 /// A press is computed whole, and takes as long as it takes to reach its force: what no sensor
