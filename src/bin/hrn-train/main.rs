@@ -14,7 +14,7 @@ use clap::{Parser as _, ValueEnum as _};
 use hardnessd::daemon::config::{Config, Error as ConfigError, Sensor, Setup};
 use hardnessd::frame::RawFrame;
 use hardnessd::simulator::{DatasetSettings, Material, Sequence, SequenceSettings};
-use hardnessd::tools;
+use hardnessd::tools::{self, exit};
 use hardnessd::train::collect::{self, Capture, CollectError, Labelling};
 use hardnessd::train::compare::{self, Plan};
 use hardnessd::train::dataset::{Dataset, DatasetError};
@@ -44,7 +44,7 @@ fn main() -> ExitCode {
     };
     if let Err(error) = end_at_signals() {
         eprintln!("hrn-train: signals: {error}");
-        return ExitCode::from(74);
+        return ExitCode::from(exit::IO);
     }
     let done = match arguments.command {
         Command::Simulate(arguments) => simulate(&arguments),
@@ -99,22 +99,22 @@ fn exit_code(error: &anyhow::Error) -> u8 {
             || matches!(e.downcast_ref(), Some(LabelsError::Range { .. }))
             || matches!(e.downcast_ref(), Some(CollectError::NoLevel { .. }))
     }) {
-        2
+        exit::USAGE
     } else if has(|e| {
         e.is::<Unreadable>()
             || matches!(e.downcast_ref(), Some(DatasetError::Unreadable { .. }))
             || matches!(e.downcast_ref(), Some(CollectError::Unreadable { .. }))
             || matches!(e.downcast_ref(), Some(ConfigError::Unreadable { .. }))
     }) {
-        66
+        exit::NO_INPUT
     } else if has(<dyn std::error::Error>::is::<NoCuda>) {
-        69
+        exit::UNAVAILABLE
     } else if has(|e| e.is::<ModelError>() || e.is::<SettingsError>() || e.is::<ConfigError>()) {
-        78
+        exit::CONFIG
     } else if has(<dyn std::error::Error>::is::<std::io::Error>) {
-        74
+        exit::IO
     } else {
-        1
+        exit::FAILED
     }
 }
 
