@@ -22,11 +22,13 @@ mod press;
 mod sensor;
 mod sequence;
 mod texture;
+mod tracked;
 
+pub use crate::tare::NEWTONS_PER_COUNT;
 pub use dataset::{DatasetSettings, LabelledSample, dataset};
 pub use material::{Material, Split, UnknownMaterial};
 pub use object::{Shapes, UnknownShapes};
-pub use sensor::{NEWTONS_PER_COUNT, SensorProfile, Threshold, UnknownProfile};
+pub use sensor::{SensorProfile, UnknownProfile};
 pub use sequence::{Sequence, SequenceFrame, SequenceSettings};
 
 /// Of what [`dataset`] makes of the same settings and seed: to be raised with every change of its

@@ -9,7 +9,7 @@ mod settings;
 use serde::{Deserialize, Serialize};
 
 use self::settings::MOST_TARE_FRAMES;
-pub use self::settings::{Settings, SettingsError};
+pub use self::settings::{NEWTONS_PER_COUNT, PITCH_MM, Settings, SettingsError};
 use crate::frame::{Array, COLS, Frame, ROWS, RawFrame, TAXELS, taxels};
 
 /// When a frame counts as touched while a tare is taken.

@@ -103,20 +103,15 @@ impl Fields {
 
 /// Solves `problem` from the pressure given (a guess; any non-negative field) and leaves the
 /// solution there.
-#[expect(
-    clippy::needless_range_loop,
-    reason = "one cell of seven fields at a time"
-)]
 pub(super) fn solve(
     convolver: &mut Convolver,
     fields: &mut Fields,
     problem: &Problem,
     pressure_mpa: &mut [f32],
 ) -> Contact {
-    let cells = pressure_mpa.len();
     let area = problem.cell_mm * problem.cell_mm;
     let total = problem.force_n / area;
-    fields.resize(cells);
+    fields.resize(pressure_mpa.len());
     start(problem, total, pressure_mpa);
     // The kernel's value at a wavelength of 16 cells stands for it in the preconditioner.
     let elastic = {
@@ -125,7 +120,7 @@ pub(super) fn solve(
     };
     let mut radius_mm = contact_radius(pressure_mpa, area);
     let mut restart = true;
-    let mut fresh = false;
+    let mut is_displacement_known = false;
     let mut rz_before = 1.0;
     let mut contact = Contact {
         approach_mm: 0.0,
@@ -135,112 +130,44 @@ pub(super) fn solve(
     };
     while contact.iterations < MAX_ITERATIONS {
         contact.iterations += 1;
-        if !fresh {
+        if !is_displacement_known {
             convolver.convolve(problem.spectrum, pressure_mpa, &mut fields.displacement);
         }
         // Late in the solve single cells flicker at the rim; the radius must not follow them.
         if contact.iterations < 30 {
             radius_mm = contact_radius(pressure_mpa, area);
         }
-        // Gradient and preconditioner; the approach is the multiplier of the force constraint.
-        let (mut sum_inverse, mut sum_residual) = (0.0_f64, 0.0_f64);
-        for i in 0..cells {
-            let (w, slope) = problem.local.at(i, pressure_mpa[i], radius_mm);
-            let inverse = 1.0 / (elastic + slope);
-            let residual = fields.displacement[i] + problem.gap_mm[i] + w;
-            fields.slope[i] = slope;
-            fields.inverse[i] = inverse;
-            fields.residual[i] = residual;
-            if pressure_mpa[i] > 0.0 {
-                sum_inverse += f64::from(inverse);
-                sum_residual += f64::from(residual * inverse);
-            }
-        }
-        let approach = sum_residual / sum_inverse;
-        contact.approach_mm = approach;
-        let approach = approach as f32;
-        let (mut error, mut work, mut rz, mut cross) = (0.0_f64, 0.0_f64, 0.0_f64, 0.0_f64);
-        let mut penetration = 0.0_f32;
-        for i in 0..cells {
-            let r = fields.residual[i] - approach;
-            let p = pressure_mpa[i];
-            if p > 0.0 {
-                let z = r * fields.inverse[i];
-                error += f64::from(p * r.abs());
-                work += f64::from(p * (fields.residual[i] - problem.gap_mm[i]));
-                rz += f64::from(r * z);
-                cross += f64::from(fields.previous[i] * z);
-                fields.previous[i] = r;
-            } else {
-                penetration = penetration.max(-r);
-                fields.previous[i] = 0.0;
-            }
-            fields.residual[i] = r;
-        }
-        let compression = (work / total).max(1e-9);
+        let balance = fields.balance(problem, pressure_mpa, radius_mm, elastic);
+        contact.approach_mm = balance.approach_mm;
+        let misfit = fields.misfit(problem, pressure_mpa, balance.approach_mm as f32);
+        let compression = (misfit.work / total).max(1e-9);
         let slack = (problem.tolerance * compression) as f32;
-        if error <= problem.tolerance * work.max(1e-12) && penetration < 10.0 * slack {
+        if misfit.error <= problem.tolerance * misfit.work.max(1e-12)
+            && misfit.penetration < 10.0 * slack
+        {
             contact.converged = true;
             break;
         }
-        // Conjugate direction (Polak and Ribiere, never negative), kept free of net force.
+        // Polak and Ribiere, never negative.
         let beta = if restart {
             0.0
         } else {
-            ((rz - cross) / rz_before).max(0.0)
+            ((misfit.rz - misfit.cross) / rz_before).max(0.0)
         } as f32;
-        rz_before = rz.max(1e-30);
-        let mut sum_direction = 0.0_f64;
-        for i in 0..cells {
-            fields.direction[i] = if pressure_mpa[i] > 0.0 {
-                let t = fields.residual[i] * fields.inverse[i] + beta * fields.direction[i];
-                sum_direction += f64::from(t);
-                t
-            } else {
-                0.0
-            };
-        }
-        let shift = (sum_direction / sum_inverse) as f32;
-        for i in 0..cells {
-            if pressure_mpa[i] > 0.0 {
-                fields.direction[i] -= shift * fields.inverse[i];
-            }
-        }
+        rz_before = misfit.rz.max(1e-30);
+        fields.turn(pressure_mpa, beta, balance.sum_inverse);
         convolver.convolve(problem.spectrum, &fields.direction, &mut fields.response);
-        let (mut numerator, mut denominator) = (0.0_f64, 0.0_f64);
-        for i in 0..cells {
-            let t = fields.direction[i];
-            numerator += f64::from(fields.residual[i] * t);
-            denominator += f64::from(t * (fields.response[i] + fields.slope[i] * t));
-        }
-        let step = if denominator > 0.0 {
-            (numerator / denominator) as f32
-        } else {
-            1.0
-        };
-        // Step; clip tension away; load cells that would penetrate.
-        restart = false;
-        let mut clipped = false;
-        let mut sum = 0.0_f64;
-        for i in 0..cells {
-            let p = pressure_mpa[i];
-            if p > 0.0 {
-                let next = p - step * fields.direction[i];
-                clipped |= next < 0.0;
-                pressure_mpa[i] = next.max(0.0);
-            } else if fields.residual[i] < -slack {
-                pressure_mpa[i] = -step.max(0.0) * fields.residual[i] * fields.inverse[i];
-                restart |= pressure_mpa[i] > 0.0;
-            }
-            sum += f64::from(pressure_mpa[i]);
-        }
-        fresh = !(clipped || restart || contact.iterations.is_multiple_of(25));
-        if fresh {
+        let step = fields.step_length();
+        let change = fields.advance(pressure_mpa, step, slack);
+        restart = change.loaded;
+        is_displacement_known =
+            !(change.clipped || change.loaded || contact.iterations.is_multiple_of(25));
+        if is_displacement_known {
             for (u, &response) in fields.displacement.iter_mut().zip(&fields.response) {
                 *u -= step * response;
             }
-        } else if sum > 0.0 {
-            let scale = (total / sum) as f32;
+        } else if change.sum_mpa > 0.0 {
+            let scale = (total / change.sum_mpa) as f32;
             pressure_mpa.iter_mut().for_each(|p| *p *= scale);
         } else {
             pressure_mpa.fill(0.0);
@@ -249,6 +176,154 @@ pub(super) fn solve(
     }
     contact.radius_mm = radius_mm;
     contact
+}
+
+/// The approach at which the loaded cells balance, and the sum of their inverse slopes.
+struct Balance {
+    approach_mm: f64,
+    sum_inverse: f64,
+}
+
+/// How far a pressure is from the solution.
+struct Misfit {
+    /// Sum over the loaded cells of pressure times |gap|.
+    error: f64,
+    /// The same of pressure times compression.
+    work: f64,
+    /// Residual times preconditioned residual; `cross` with the residual of the step before.
+    rz: f64,
+    cross: f64,
+    /// Of the deepest unloaded cell, mm.
+    penetration: f32,
+}
+
+/// What a step did.
+struct Change {
+    /// A cell would have been in tension.
+    clipped: bool,
+    /// A cell without load would have penetrated.
+    loaded: bool,
+    sum_mpa: f64,
+}
+
+#[expect(
+    clippy::needless_range_loop,
+    reason = "one cell of several fields at a time"
+)]
+impl Fields {
+    /// Residual, slope and preconditioner of every cell. The approach is the multiplier of the
+    /// force constraint.
+    fn balance(
+        &mut self,
+        problem: &Problem,
+        pressure_mpa: &[f32],
+        radius_mm: f64,
+        elastic: f32,
+    ) -> Balance {
+        let (mut sum_inverse, mut sum_residual) = (0.0_f64, 0.0_f64);
+        for i in 0..pressure_mpa.len() {
+            let (w, slope) = problem.local.at(i, pressure_mpa[i], radius_mm);
+            let inverse = 1.0 / (elastic + slope);
+            let residual = self.displacement[i] + problem.gap_mm[i] + w;
+            self.slope[i] = slope;
+            self.inverse[i] = inverse;
+            self.residual[i] = residual;
+            if pressure_mpa[i] > 0.0 {
+                sum_inverse += f64::from(inverse);
+                sum_residual += f64::from(residual * inverse);
+            }
+        }
+        Balance {
+            approach_mm: sum_residual / sum_inverse,
+            sum_inverse,
+        }
+    }
+
+    /// Takes the approach off the residuals, and measures them.
+    fn misfit(&mut self, problem: &Problem, pressure_mpa: &[f32], approach_mm: f32) -> Misfit {
+        let (mut error, mut work, mut rz, mut cross) = (0.0_f64, 0.0_f64, 0.0_f64, 0.0_f64);
+        let mut penetration = 0.0_f32;
+        for i in 0..pressure_mpa.len() {
+            let r = self.residual[i] - approach_mm;
+            let p = pressure_mpa[i];
+            if p > 0.0 {
+                let z = r * self.inverse[i];
+                error += f64::from(p * r.abs());
+                work += f64::from(p * (self.residual[i] - problem.gap_mm[i]));
+                rz += f64::from(r * z);
+                cross += f64::from(self.previous[i] * z);
+                self.previous[i] = r;
+            } else {
+                penetration = penetration.max(-r);
+                self.previous[i] = 0.0;
+            }
+            self.residual[i] = r;
+        }
+        Misfit {
+            error,
+            work,
+            rz,
+            cross,
+            penetration,
+        }
+    }
+
+    /// The next conjugate direction, kept free of net force.
+    fn turn(&mut self, pressure_mpa: &[f32], beta: f32, sum_inverse: f64) {
+        let mut sum_direction = 0.0_f64;
+        for i in 0..pressure_mpa.len() {
+            self.direction[i] = if pressure_mpa[i] > 0.0 {
+                let t = self.residual[i] * self.inverse[i] + beta * self.direction[i];
+                sum_direction += f64::from(t);
+                t
+            } else {
+                0.0
+            };
+        }
+        let shift = (sum_direction / sum_inverse) as f32;
+        for i in 0..pressure_mpa.len() {
+            if pressure_mpa[i] > 0.0 {
+                self.direction[i] -= shift * self.inverse[i];
+            }
+        }
+    }
+
+    /// How far to go along the direction whose displacement is `response`.
+    fn step_length(&self) -> f32 {
+        let (mut numerator, mut denominator) = (0.0_f64, 0.0_f64);
+        for i in 0..self.direction.len() {
+            let t = self.direction[i];
+            numerator += f64::from(self.residual[i] * t);
+            denominator += f64::from(t * (self.response[i] + self.slope[i] * t));
+        }
+        if denominator > 0.0 {
+            (numerator / denominator) as f32
+        } else {
+            1.0
+        }
+    }
+
+    /// Steps; clips tension away; loads cells that would penetrate by more than `slack`.
+    fn advance(&self, pressure_mpa: &mut [f32], step: f32, slack: f32) -> Change {
+        let mut change = Change {
+            clipped: false,
+            loaded: false,
+            sum_mpa: 0.0,
+        };
+        for i in 0..pressure_mpa.len() {
+            let p = pressure_mpa[i];
+            if p > 0.0 {
+                let next = p - step * self.direction[i];
+                change.clipped |= next < 0.0;
+                pressure_mpa[i] = next.max(0.0);
+            } else if self.residual[i] < -slack {
+                pressure_mpa[i] = -step.max(0.0) * self.residual[i] * self.inverse[i];
+                change.loaded |= pressure_mpa[i] > 0.0;
+            }
+            change.sum_mpa += f64::from(pressure_mpa[i]);
+        }
+        change
+    }
 }
 
 /// Makes the guess carry the force; without one, loads the lowest cell.

@@ -5,11 +5,14 @@
 //! the state of each Kelvin element; pressure is taken as linear in time within a step, for which
 //! the element's update is exact.
 
-use super::dataset::{ARM_N_MM, SPEED_MM_S};
 use super::material::Law;
 use super::press::{Bench, Specimen, Step, Window, touches_border};
 use super::sensor::taxel_forces;
 use crate::frame::TAXELS;
+
+/// Stiffness of the arm, N/mm (assumed), and its speed (paper).
+pub(super) const ARM_N_MM: f64 = 10.0;
+pub(super) const SPEED_MM_S: f64 = 5.0;
 
 /// A press from touch to separation.
 pub(super) struct Course {

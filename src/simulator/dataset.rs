@@ -8,12 +8,14 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use serde::{Deserialize, Serialize};
 
+use super::course::{ARM_N_MM, SPEED_MM_S};
 use super::material::{Material, Split};
 use super::object::{Object, POSTURES, Pose, Shapes};
 use super::press::{Bench, COVER_YOUNG_MPA, Specimen};
-use super::sensor::{Film, NEWTONS_PER_COUNT, Sensor, SensorProfile, Threshold, taxel_forces};
+use super::sensor::{Film, Sensor, SensorProfile, taxel_forces};
 use super::texture::Patch;
-use crate::frame::{Frame, RawFrame};
+use super::tracked::{begins_press, ideal_tare};
+use crate::frame::Frame;
 use crate::random::Stream;
 
 /// What to simulate.
@@ -35,8 +37,6 @@ pub struct DatasetSettings {
     pub shapes: Shapes,
     /// Spread of the sensors.
     pub profile: SensorProfile,
-    /// Activation of their taxels.
-    pub threshold: Threshold,
     /// Of the sensors' gains, thresholds and dead taxels; `None`: `seed`.
     pub sensor_seed: Option<u64>,
     /// Young's modulus of the sensors' cover, MPa.
@@ -56,7 +56,6 @@ impl Default for DatasetSettings {
             lowest_force_n: 1.0,
             shapes: Shapes::Matched,
             profile: SensorProfile::Clean,
-            threshold: Threshold::Spread,
             sensor_seed: None,
             cover_young_mpa: COVER_YOUNG_MPA,
             swapped_levels: [false; 4],
@@ -95,11 +94,6 @@ pub struct LabelledSample {
     /// The object's Shore hardness.
     pub shore: f32,
 }
-
-/// A taxel with this many counts is in contact (`contact_threshold_n`: 0.07 N at 0.04 N a count).
-const CONTACT_COUNTS: u16 = 2;
-/// Taxels in contact that begin a press, as the press tracker has it.
-pub(super) const BEGIN_AREA_TAXELS: usize = 3;
 
 pub(super) const HIGHEST_FORCE_N: f64 = 25.0;
 const FORCES: usize = 8;
@@ -227,7 +221,6 @@ impl Subject {
         };
         let sensor = Sensor::new(
             settings.profile,
-            settings.threshold,
             &Stream::new(settings.sensor_seed.unwrap_or(settings.seed), sensors)
                 .child(u64::from(number % SENSORS)),
         );
@@ -265,9 +258,9 @@ impl Subject {
                 let hold_s = paired.range(0.8, 1.5);
                 let specimen = Specimen::new(properties, young_mpa, &face, &pose, &patch);
                 let mut noise = self.draws.body.child(2).child(press as u64);
-                let (force_n, raw) = self.press(bench, &specimen, force_n, hold_s, &mut noise);
+                let (force_n, frame) = self.press(bench, &specimen, force_n, hold_s, &mut noise);
                 take(LabelledSample {
-                    frame: ideal_tare(&raw),
+                    frame,
                     level: self.material.level(),
                     object: 0,
                     material: self.material.index(),
@@ -287,7 +280,7 @@ impl Subject {
         mut force_n: f64,
         hold_s: f64,
         noise: &mut Stream,
-    ) -> (f64, RawFrame) {
+    ) -> (f64, Frame) {
         let gain = self.sensor.press_gain(noise);
         let mut tries = 0;
         loop {
@@ -295,10 +288,10 @@ impl Subject {
             let (window, pressure, _) = bench.press(specimen, force_n, ramp_s, hold_s);
             let forces = taxel_forces(&pressure, window.width, window.corner);
             let crept = Film::new().advance(&forces, hold_s + 0.5 * ramp_s);
-            let raw = self.sensor.read(&crept, gain, noise);
+            let frame = ideal_tare(&self.sensor.read(&crept, gain, noise));
             tries += 1;
-            if contact_taxels(&raw) >= BEGIN_AREA_TAXELS || tries == TRIES {
-                return (force_n, raw);
+            if begins_press(&frame) || tries == TRIES {
+                return (force_n, frame);
             }
             force_n *= HARDER;
         }
@@ -322,9 +315,6 @@ fn press_numbers(count: usize) -> Vec<usize> {
     numbers
 }
 
-/// Stiffness of the arm, N/mm (assumed), and its speed (paper).
-pub(super) const ARM_N_MM: f64 = 10.0;
-pub(super) const SPEED_MM_S: f64 = 5.0;
 /// Indentation that a sample's ramp is reckoned with; sequences compute theirs.
 const TYPICAL_DEPTH_MM: f64 = 2.0;
 
@@ -332,23 +322,6 @@ const TYPICAL_DEPTH_MM: f64 = 2.0;
 fn nominal_force_n(lowest_n: f32, step: usize) -> f64 {
     let lowest = f64::from(lowest_n);
     lowest + (HIGHEST_FORCE_N - lowest) * step as f64 / (FORCES - 1) as f64
-}
-
-/// Taxels in contact under a zero baseline.
-pub(super) fn contact_taxels(raw: &RawFrame) -> usize {
-    raw.counts
-        .iter()
-        .filter(|&&counts| counts >= CONTACT_COUNTS)
-        .count()
-}
-
-/// What tare makes of counts whose baseline is 0.
-fn ideal_tare(raw: &RawFrame) -> Frame {
-    Frame {
-        newtons: raw
-            .counts
-            .map(|counts| f32::from(counts) * NEWTONS_PER_COUNT),
-    }
 }
 
 #[cfg(test)]
@@ -458,7 +431,7 @@ mod tests {
             );
             let shore = material.properties().shore;
             assert!((shore.low..=shore.high).contains(&f64::from(sample.shore)));
-            assert!(sample.frame.contact_area_taxels(0.07) as usize >= BEGIN_AREA_TAXELS);
+            assert!(begins_press(&sample.frame));
             // Gains, crosstalk and film creep add, thresholds take away.
             let ratio = sample.frame.force_n() / f64::from(sample.force_n);
             assert!(

@@ -10,9 +10,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::frame::{COLS, ROWS, RawFrame, TAXELS};
 use crate::random::Stream;
+use crate::tare::{NEWTONS_PER_COUNT, PITCH_MM};
 
-/// Newtons a count stands for, as `newtons_per_count` unless configured: 8 bits are 10.2 N.
-pub const NEWTONS_PER_COUNT: f32 = 0.04;
 /// Cells along a taxel.
 const CELLS_PER_TAXEL: usize = 4;
 /// Width of a cell, mm.
@@ -20,7 +19,6 @@ pub(super) const CELL_MM: f64 = PITCH_MM / CELLS_PER_TAXEL as f64;
 /// Width of the sensor in cells.
 pub(super) const CELLS: usize = ROWS * CELLS_PER_TAXEL;
 
-const PITCH_MM: f64 = 3.5;
 /// The part of the pitch that senses.
 const ACTIVE_MM: f64 = 3.0;
 /// Depth of the film under the cover's surface.
@@ -65,18 +63,6 @@ impl std::str::FromStr for SensorProfile {
 #[error("no sensor profile \"{0}\"; there are clean, raw")]
 pub struct UnknownProfile(pub String);
 
-/// What the paper's "minimum discrimination of 0.2 N" means for a taxel.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Threshold {
-    /// Thresholds scatter, and 0.2 N is what every taxel is sure to feel.
-    Spread,
-    /// Every taxel starts to feel at exactly 0.2 N.
-    Sharp,
-    /// Every taxel feels any load.
-    None,
-}
-
 /// Relative spreads of a profile: a taxel, a row, a column, a press.
 struct Spread {
     taxel: f64,
@@ -114,7 +100,7 @@ pub(super) struct Sensor {
 
 impl Sensor {
     /// Draws an instance.
-    pub(super) fn new(profile: SensorProfile, threshold: Threshold, stream: &Stream) -> Self {
+    pub(super) fn new(profile: SensorProfile, stream: &Stream) -> Self {
         let spread = profile.spread();
         let lines = |sd: f64, name: u64, count: usize| -> Vec<f64> {
             let mut stream = stream.child(name);
@@ -134,13 +120,9 @@ impl Sensor {
         let mut draws = stream.child(4);
         let sigma = (THRESHOLD_BOUND_N / THRESHOLD_MEDIAN_N).ln() / 3.0;
         let threshold_n = (0..TAXELS)
-            .map(|_| match threshold {
-                Threshold::Spread => {
-                    let drawn = THRESHOLD_MEDIAN_N * (sigma * draws.normal()).exp();
-                    drawn.min(THRESHOLD_BOUND_N) as f32
-                }
-                Threshold::Sharp => THRESHOLD_BOUND_N as f32,
-                Threshold::None => 0.0,
+            .map(|_| {
+                let drawn = THRESHOLD_MEDIAN_N * (sigma * draws.normal()).exp();
+                drawn.min(THRESHOLD_BOUND_N) as f32
             })
             .collect();
         Self {
@@ -337,6 +319,13 @@ mod tests {
         (pressure, force)
     }
 
+    /// A raw sensor whose taxels feel any load.
+    fn without_thresholds(seed: u64) -> Sensor {
+        let mut sensor = Sensor::new(SensorProfile::Raw, &Stream::new(seed, "sensor"));
+        sensor.threshold_n.fill(0.0);
+        sensor
+    }
+
     #[test]
     fn taxel_forces_add_up_to_the_force() {
         let (pressure, force) = smooth_load();
@@ -349,11 +338,7 @@ mod tests {
     fn readings_follow_the_force_within_the_sensors_spread() {
         let (pressure, force) = smooth_load();
         let taxels = taxel_forces(&pressure, 48, (30, 33)).map(|f| f * 0.1);
-        let sensor = Sensor::new(
-            SensorProfile::Clean,
-            Threshold::Spread,
-            &Stream::new(5, "sensor"),
-        );
+        let sensor = Sensor::new(SensorProfile::Clean, &Stream::new(5, "sensor"));
         let raw = sensor.read(&taxels, 1.0, &mut Stream::new(5, "noise"));
         let read: f64 = raw
             .counts
@@ -372,11 +357,7 @@ mod tests {
     fn a_point_load_draws_no_cross() {
         let mut forces = [0.0; TAXELS];
         forces[14 * COLS + 14] = 25.0;
-        let sensor = Sensor::new(
-            SensorProfile::Raw,
-            Threshold::None,
-            &Stream::new(6, "sensor"),
-        );
+        let sensor = without_thresholds(6);
         let raw = sensor.read(&forces, 1.0, &mut Stream::new(6, "noise"));
         assert_eq!(
             raw.counts.iter().filter(|&&counts| counts > 0).count(),
@@ -395,11 +376,7 @@ mod tests {
         let crept = film.advance(&forces, 0.1)[0] / 3.0;
         assert!((1.05..1.07).contains(&crept), "film creep {crept}");
         forces = [0.0; TAXELS];
-        let sensor = Sensor::new(
-            SensorProfile::Raw,
-            Threshold::None,
-            &Stream::new(1, "sensor"),
-        );
+        let sensor = without_thresholds(1);
         let raw = sensor.read(
             &film.advance(&forces, 0.01),
             1.0,
@@ -410,11 +387,7 @@ mod tests {
 
     #[test]
     fn every_taxel_feels_the_guaranteed_load_and_full_scale_is_8_bits() {
-        let sensor = Sensor::new(
-            SensorProfile::Clean,
-            Threshold::Spread,
-            &Stream::new(9, "sensor"),
-        );
+        let sensor = Sensor::new(SensorProfile::Clean, &Stream::new(9, "sensor"));
         let mut noise = Stream::new(9, "noise");
         let dead = sensor.gain.iter().filter(|&&gain| gain == 0.0).count();
         let felt = |raw: RawFrame| raw.counts.iter().filter(|&&c| c > 0).count();

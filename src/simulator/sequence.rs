@@ -6,13 +6,12 @@
 use std::collections::VecDeque;
 
 use super::course::Course;
-use super::dataset::{
-    BEGIN_AREA_TAXELS, HARDER, HIGHEST_FORCE_N, TRIES, contact_taxels, draw_patch, draw_shore,
-};
+use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES, draw_patch, draw_shore};
 use super::material::Material;
 use super::object::{Object, POSTURES, Pose, Shapes};
 use super::press::{Bench, Specimen};
-use super::sensor::{Film, Sensor, SensorProfile, Threshold};
+use super::sensor::{Film, Sensor, SensorProfile};
+use super::tracked::is_one_press;
 use crate::frame::{RawFrame, TAXELS};
 use crate::random::Stream;
 
@@ -33,8 +32,6 @@ pub struct SequenceSettings {
     pub shapes: Shapes,
     /// Spread of the sensor.
     pub profile: SensorProfile,
-    /// Activation of its taxels.
-    pub threshold: Threshold,
 }
 
 impl Default for SequenceSettings {
@@ -48,7 +45,6 @@ impl Default for SequenceSettings {
             presses: None,
             shapes: Shapes::Matched,
             profile: SensorProfile::Clean,
-            threshold: Threshold::Spread,
         }
     }
 }
@@ -114,7 +110,7 @@ impl Sequence {
         );
         // A name of its own: a sequence meets no object and no sensor of any data set.
         let root = Stream::new(settings.seed, "sequence");
-        let sensor = Sensor::new(settings.profile, settings.threshold, &root.child(0));
+        let sensor = Sensor::new(settings.profile, &root.child(0));
         let mut sequence = Self {
             settings,
             root,
@@ -170,7 +166,9 @@ impl Sequence {
             let mut noise = draws.child(4).child(attempt);
             let mut film = self.film.clone();
             let (frames, next) = self.play(&course, touch_s, &mut film, &mut noise);
-            if attempt as usize == TRIES || is_one_press(&frames) {
+            if attempt as usize == TRIES
+                || is_one_press(frames.iter().map(|(raw, _)| raw), 1.0 / rate)
+            {
                 self.ready
                     .extend(frames.into_iter().map(|(raw, loaded)| SequenceFrame {
                         raw,
@@ -225,22 +223,6 @@ impl Iterator for Sequence {
         }
         self.ready.pop_front()
     }
-}
-
-/// Whether a press tracker sees exactly one press in these frames, as it is set without a configuration:
-/// a press begins at 3 taxels, lasts 2 frames and is not interrupted by 2 frames without contact.
-fn is_one_press(frames: &[(RawFrame, bool)]) -> bool {
-    let areas: Vec<usize> = frames.iter().map(|(raw, _)| contact_taxels(raw)).collect();
-    let Some(begin) = areas.iter().position(|&area| area >= BEGIN_AREA_TAXELS) else {
-        return false;
-    };
-    let end = areas
-        .iter()
-        .rposition(|&area| area > 0)
-        .expect("the frame of `begin` has contact");
-    let held = &areas[begin..=end];
-    held.iter().filter(|&&area| area > 0).count() >= 2
-        && !held.windows(2).any(|pair| pair == [0, 0])
 }
 
 #[cfg(test)]

@@ -6,6 +6,11 @@ use serde::{Deserialize, Deserializer, Serialize};
 use crate::frame::Array;
 use crate::wording::as_written;
 
+/// Force of one count of the JX255N: 8 bits are 10.2 N.
+pub const NEWTONS_PER_COUNT: f32 = 0.04;
+/// Distance of its taxel centres (paper, "Tactile sensor").
+pub const PITCH_MM: f64 = 3.5;
+
 /// The `[sensor.calibration]` table.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -37,8 +42,8 @@ fn pairs<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<[usize; 2]>, 
 impl Default for Settings {
     fn default() -> Self {
         Self {
-            newtons_per_count: 0.04,
-            pitch_mm: 3.5,
+            newtons_per_count: NEWTONS_PER_COUNT,
+            pitch_mm: PITCH_MM,
             tare_frames: 5,
             tare_max_n: 0.5,
             dead_taxels: Vec::new(),

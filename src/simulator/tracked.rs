@@ -1,0 +1,60 @@
+//! Simulated frames as the daemon sees them: tared, and followed by its press tracker.
+//!
+//! In: raw frames at a steady rate, the sensor unloaded before the first. Out: their newtons, and
+//! the frames of the one press in them.
+
+use std::time::Duration;
+
+use crate::frame::{Frame, RawFrame, Stamp};
+use crate::press::{Change, End, Marks, Moment, PressTracker, Settings};
+use crate::tare::NEWTONS_PER_COUNT;
+
+/// What tare makes of counts whose baseline is 0.
+pub(super) fn ideal_tare(raw: &RawFrame) -> Frame {
+    Frame {
+        newtons: raw
+            .counts
+            .map(|counts| f32::from(counts) * NEWTONS_PER_COUNT),
+    }
+}
+
+/// Whether a press tracker without a configuration begins a press with this frame.
+pub(super) fn begins_press(frame: &Frame) -> bool {
+    let Settings {
+        contact_threshold_n,
+        begin_area_taxels,
+        ..
+    } = Settings::default();
+    frame.contact_area_taxels(contact_threshold_n) >= begin_area_taxels
+}
+
+/// Whether a press tracker without a configuration sees exactly one press in these frames, and its
+/// release, if two frames without load follow.
+pub(super) fn is_one_press<'a>(
+    frames: impl IntoIterator<Item = &'a RawFrame>,
+    period_s: f64,
+) -> bool {
+    let settings = Settings::default();
+    let rest = std::iter::repeat_n(RawFrame::default(), settings.end_frames as usize);
+    let mut tracker = PressTracker::new(settings);
+    let mut ends = 0;
+    for (number, raw) in (0_u32..).zip(frames.into_iter().copied().chain(rest)) {
+        let at = Moment {
+            frame: number.into(),
+            stamp: Stamp {
+                mono: Duration::from_secs_f64(period_s * f64::from(number)),
+                wall: jiff::Timestamp::UNIX_EPOCH,
+            },
+        };
+        for change in tracker.push(&ideal_tare(&raw), Marks::default(), at) {
+            match change {
+                Change::Begin { .. } | Change::Settled { .. } => {}
+                Change::End {
+                    end: End::Release, ..
+                } => ends += 1,
+                Change::End { .. } | Change::Aborted { .. } => return false,
+            }
+        }
+    }
+    ends == 1
+}
