@@ -10,10 +10,12 @@ use std::path::Path;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use hardnessd::random::Stream;
-use hardnessd::train::learner::Learner;
-use hardnessd::train::losses::Game;
-use hardnessd::train::network::numbers;
-use hardnessd::train::{fit, gan, generator, hrn, optimiser};
+use hardnessd::train::learn::learner::Learner;
+use hardnessd::train::learn::{fit, gan};
+use hardnessd::train::net::losses::Game;
+use hardnessd::train::net::network::numbers;
+use hardnessd::train::net::{generator, hrn};
+use hardnessd::train::settings::{GanSettings, OptimiserSettings};
 use ndarray::{ArrayD, IxDyn};
 use ndarray_npy::NpzWriter;
 use rustix::time::{ClockId, clock_gettime};
@@ -87,9 +89,9 @@ impl Networks {
         let images: Vec<f32> = (0..BATCH * 28 * 28).map(pixel).collect();
         let images = Tensor::from_data(TensorData::new(images, [BATCH, 1, 28, 28]), &device);
         let levels_of = (0..BATCH).map(|n| (n % LEVELS) as u8 + 1);
-        let adversaries = gan::Settings::default();
-        let gan = gan::initial(GAME, LEVELS, false, 1, &device);
-        let sgd = optimiser::Settings::default();
+        let adversaries = GanSettings::default();
+        let gan = gan::initial(GAME, LEVELS, 1, &device);
+        let sgd = OptimiserSettings::default();
         let sides = |settings| {
             let sides = [gan.generator.clone(), gan.discriminator.clone()];
             sides.map(|weights| Learner::fresh(weights, settings, 0.0))
@@ -160,8 +162,7 @@ fn gan_step(gan: &mut [Learner; 2], images: &Tensor<4>, eta: &Tensor<2>) -> f64 
     };
     let rules = gan::Rules {
         game: GAME,
-        sigma_penalty: gan::Settings::default().sigma_penalty,
-        sigma_cap: 0.0,
+        sigma_penalty: GanSettings::default().sigma_penalty,
         rate: RATE,
     };
     let [generator, discriminator] = gan;

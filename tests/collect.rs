@@ -12,8 +12,8 @@ use std::process::{Command, Output};
 
 use bench::{BINARY, Bench, hardnessd};
 use hardnessd::simulator::{self, DatasetSettings, Split};
-use hardnessd::train::dataset::{self, Dataset, Kind, Sample, meta};
-use hardnessd::train::simulated;
+use hardnessd::train::data::dataset::{self, Dataset, Kind, Sample, meta};
+use hardnessd::train::data::simulated;
 use hardnessd::verdict::{Card, Hrn};
 use serde_json::Value;
 

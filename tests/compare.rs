@@ -10,8 +10,8 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant, SystemTime};
 
-use hardnessd::train::dataset::{self, Dataset};
-use hardnessd::train::paper;
+use hardnessd::train::data::dataset::{self, Dataset};
+use hardnessd::train::judge::paper;
 use serde_json::Value;
 
 fn hrn_train(arguments: &[&str]) -> Command {

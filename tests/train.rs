@@ -10,7 +10,7 @@ use std::process::{Command, Output};
 use std::sync::OnceLock;
 
 use hardnessd::simulator::{Material, Split};
-use hardnessd::train::dataset::{self, Dataset};
+use hardnessd::train::data::dataset::{self, Dataset};
 use hardnessd::verdict::Hrn;
 use rustix::process::{Pid, Signal};
 use serde_json::Value;
@@ -462,29 +462,6 @@ fn a_training_that_diverges_ends_where_it_does() {
             "{name}: {error}"
         );
         assert_eq!(trial.checkpoints().is_empty(), name != "logit", "{name}");
-    }
-}
-
-#[test]
-fn deligans_options_resume_bit_for_bit_too() {
-    let settings = GAN_SETTINGS.replacen(
-        "[ustgan]",
-        "minibatch_discrimination = true\n[ustgan]\nturns = \"threshold\"\nsigma_cap = 0.15",
-        1,
-    );
-    let whole = Trial::of("nahrn", "whole options", &settings);
-    whole.train("6", &[]);
-    let killed = Trial::of("nahrn", "killed options", &settings);
-    interrupted(&killed, "6", ("ustgan", 1), Signal::KILL);
-    killed.train("6", &["--resume"]);
-    killed.assert_same(&whole);
-
-    let metrics = String::from_utf8(whole.read("metrics.csv")).unwrap();
-    let columns: Vec<&str> = metrics.lines().next().unwrap().split(',').collect();
-    let place = columns.iter().position(|column| *column == "sigma_max");
-    for row in metrics.lines().filter(|row| row.starts_with("ustgan")) {
-        let largest: f64 = row.split(',').nth(place.unwrap()).unwrap().parse().unwrap();
-        assert!(largest <= 0.150_001, "{row}");
     }
 }
 

@@ -6,20 +6,22 @@ use std::time::Instant;
 use anyhow::{Context as _, ensure};
 use burn::tensor::Device;
 
-use super::baseline::Baseline;
-use super::dataset::{Dataset, DatasetError, LabelChoice};
-use super::export::{self, Recogniser};
-use super::features;
-use super::generator::COMPONENTS;
-use super::history::Row;
-use super::losses::Game;
-use super::metrics::Evaluation;
-use super::optimiser::{self, Rule};
-use super::run::{Description, Run};
-use super::settings::{Keep, Profile, Settings, SettingsError, Training, Validation};
-use super::stages::{self, Stages};
 use crate::frame::Frame;
 use crate::simulator::Split;
+use crate::train::data::dataset::{Dataset, DatasetError, LabelChoice};
+use crate::train::judge::baseline::Baseline;
+use crate::train::judge::features;
+use crate::train::judge::metrics::Evaluation;
+use crate::train::model::export::{self, Recogniser};
+use crate::train::net::generator::COMPONENTS;
+use crate::train::net::losses::Game;
+use crate::train::run::history::Row;
+use crate::train::run::{Description, Run};
+use crate::train::settings::optimiser::Rule;
+use crate::train::settings::{
+    Keep, OptimiserSettings, Profile, Settings, SettingsError, Training, Validation,
+};
+use crate::train::stages::{self, Stages};
 
 /// A row of the table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -83,7 +85,7 @@ impl Method {
             Self::Hrn15Tuned => {
                 settings.training = Training {
                     epochs: 5 * settings.training.epochs,
-                    optimiser: optimiser::Settings {
+                    optimiser: OptimiserSettings {
                         rule: Rule::Adam,
                         ..settings.training.optimiser
                     },
@@ -145,7 +147,7 @@ pub fn labels(
     asked: Option<usize>,
 ) -> Result<usize, LabelsError> {
     let labelled = dataset.labelled(Split::Train)?.len();
-    let least = super::dataset::levels().len() * dataset.sources.len();
+    let least = crate::train::data::dataset::levels().len() * dataset.sources.len();
     match asked {
         Some(asked) if !(least..=labelled).contains(&asked) => Err(LabelsError::Range {
             asked,
@@ -237,7 +239,7 @@ pub fn check(method: Method, dataset: &Dataset, description: &Description) -> an
         description.labels
     );
     let has_stgans = matches!(method, Method::Ours | Method::Nihrn);
-    for level in super::dataset::levels() {
+    for level in crate::train::data::dataset::levels() {
         let of_level = |&index: &usize| dataset.samples[index].level == level.level;
         ensure!(
             !has_stgans || labelled.iter().any(of_level),
@@ -286,7 +288,7 @@ fn check_validation(
 /// fine-tuning.
 fn epochs_as_long_as_ours(settings: &Settings, samples: usize) -> u32 {
     let steps = |samples: u64, training: &Training| samples.div_ceil(training.batch as u64).max(1);
-    let levels = super::dataset::levels().len() as u64;
+    let levels = crate::train::data::dataset::levels().len() as u64;
     let generated = u64::from(settings.generation.samples_a_component) * COMPONENTS as u64 * levels;
     let pretraining =
         steps(generated, &settings.pretraining).saturating_mul(settings.pretraining.epochs.into());
@@ -370,7 +372,11 @@ fn baseline(
         .iter()
         .map(|&index| usize::from(dataset.samples[index].level) - 1)
         .collect();
-    let baseline = Baseline::fit(&rows, &level_of, super::dataset::levels().len());
+    let baseline = Baseline::fit(
+        &rows,
+        &level_of,
+        crate::train::data::dataset::levels().len(),
+    );
     run.metrics("features", 0)?.add(&Row {
         step: baseline.steps.into(),
         epoch: baseline.steps,

@@ -1,6 +1,11 @@
 //! A run's directory: settings, revision, metrics, checkpoints, the model and its evaluation.
 //!
-//! Every file is whole whenever it stands there ([`super::disk`]), also after SIGKILL or a full disk.
+//! Every file is whole whenever it stands there ([`disk`]), also after SIGKILL or a full disk.
+
+pub mod checkpoint;
+pub mod disk;
+pub mod history;
+pub mod progress;
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
@@ -9,12 +14,12 @@ use anyhow::{Context as _, bail, ensure};
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 
-use super::checkpoint::Checkpoint;
-use super::dataset::{LabelChoice, Source};
-use super::disk::{lock, write_whole};
-use super::history::{self, Metrics};
-use super::settings::{Profile, Settings, SettingsError};
+use crate::train::data::dataset::{LabelChoice, Source};
+use crate::train::settings::{Profile, Settings, SettingsError, retired};
 use crate::wording;
+use checkpoint::Checkpoint;
+use disk::{lock, write_whole};
+use history::Metrics;
 
 /// Checkpoints kept of a stage: the newest, and one before it.
 const CHECKPOINTS_KEPT: usize = 2;
@@ -40,6 +45,22 @@ pub struct Description {
 }
 
 impl Description {
+    /// Reads `settings.toml`, also one of an earlier version, as long as the run used none of the
+    /// options that are gone.
+    fn read(text: &str) -> Result<Self, SettingsError> {
+        let syntax = |error| SettingsError::Syntax(wording::of_toml(text, &error));
+        let mut table: toml::Table = toml::from_str(text).map_err(syntax)?;
+        let had_retired = match table.get_mut("settings") {
+            Some(toml::Value::Table(settings)) => retired::strip(settings)?,
+            _ => false,
+        };
+        if had_retired {
+            return table.try_into().map_err(syntax);
+        }
+        // From the text itself, so that an error can name the line.
+        toml::from_str(text).map_err(syntax)
+    }
+
     /// The first key that is not as `expected`, with what both have there; `None` if they are the
     /// same. Data are the same if their bytes are: a file may have been renamed.
     pub fn difference(&self, expected: &Self) -> Option<String> {
@@ -101,10 +122,7 @@ impl Run {
         let path = directory.join("settings.toml");
         match fs::read(&path) {
             Ok(bytes) => {
-                let text = String::from_utf8_lossy(&bytes);
-                let told = toml::from_str(&text);
-                let told =
-                    told.map_err(|error| SettingsError::Syntax(wording::of_toml(&text, &error)));
+                let told = Description::read(&String::from_utf8_lossy(&bytes));
                 Ok(Some(told.with_context(|| path.display().to_string())?))
             }
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),

@@ -5,8 +5,20 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{augment, gan, optimiser};
+pub mod augmentation;
+mod bounds;
+pub mod gan;
+pub mod optimiser;
+pub(in crate::train) mod retired;
+
 use crate::wording;
+
+pub use augmentation::AugmentationSettings;
+pub use bounds::SettingsError;
+pub use gan::GanSettings;
+pub use optimiser::OptimiserSettings;
+
+use bounds::{check, check_loop};
 
 /// How long a run may take.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -66,9 +78,9 @@ pub struct Training {
     /// A checkpoint is written after every so many epochs, and after the last.
     pub checkpoint_every_epochs: u32,
     /// The rule of the steps.
-    pub optimiser: optimiser::Settings,
+    pub optimiser: OptimiserSettings,
     /// What is done to a frame before each use.
-    pub augmentation: augment::Settings,
+    pub augmentation: AugmentationSettings,
 }
 
 impl Default for Training {
@@ -78,8 +90,8 @@ impl Default for Training {
             epochs: 200,
             averaging: 0.0,
             checkpoint_every_epochs: 5,
-            optimiser: optimiser::Settings::default(),
-            augmentation: augment::Settings::default(),
+            optimiser: OptimiserSettings::default(),
+            augmentation: AugmentationSettings::default(),
         }
     }
 }
@@ -109,13 +121,10 @@ pub struct Settings {
     /// Newtons a taxel that become 1 in the network's image; 0 N becomes -1. 10.2 N is what
     /// 8 bits of 0.04 N hold.
     pub full_scale_n: f64,
-    /// Whether the discriminators of USTGAN and STGANs also look at how alike the samples of a
-    /// batch are. Those of SGAN and IGAN do not: they become the recogniser.
-    pub minibatch_discrimination: bool,
     /// The GAN over unlabelled samples: USTGAN, or that of SGAN and IGAN.
-    pub ustgan: gan::Settings,
+    pub ustgan: GanSettings,
     /// Each of the STGANs.
-    pub stgan: gan::Settings,
+    pub stgan: GanSettings,
     /// What the STGANs' generators are asked for.
     pub generation: Generation,
     /// HRN on the generated samples.
@@ -130,13 +139,12 @@ impl Default for Settings {
     fn default() -> Self {
         Self {
             full_scale_n: 10.2,
-            minibatch_discrimination: false,
-            ustgan: gan::Settings::default(),
-            stgan: gan::Settings {
+            ustgan: GanSettings::default(),
+            stgan: GanSettings {
                 // An epoch has 4 steps there and 85 here.
                 checkpoint_every_epochs: 50,
                 picture_every_epochs: 100,
-                ..gan::Settings::default()
+                ..GanSettings::default()
             },
             generation: Generation::default(),
             pretraining: Training::default(),
@@ -146,26 +154,8 @@ impl Default for Settings {
     }
 }
 
-/// Why settings cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum SettingsError {
-    /// Not TOML, an unknown key, or a value of another type.
-    #[error("{0}")]
-    Syntax(String),
-    /// A value outside its range.
-    #[error("`{key}`: found {found}, expected {expected}")]
-    Range {
-        /// Path of the key.
-        key: String,
-        /// Its value.
-        found: f64,
-        /// What is accepted.
-        expected: &'static str,
-    },
-}
-
 impl Settings {
-    /// The defaults of a profile. A method may have others: [`super::methods::Method::settings`].
+    /// The defaults of a profile. A method may have others: [`crate::train::methods::Method::settings`].
     pub fn of(profile: Profile) -> Self {
         let paper = Self::default();
         match profile {
@@ -183,7 +173,7 @@ impl Settings {
     }
 
     fn with_epochs(self, gan_epochs: u32, training_epochs: u32) -> Self {
-        let gan = |settings: gan::Settings| gan::Settings {
+        let gan = |settings: GanSettings| GanSettings {
             epochs: gan_epochs,
             checkpoint_every_epochs: settings.checkpoint_every_epochs.min(gan_epochs / 2),
             picture_every_epochs: settings.picture_every_epochs.min(gan_epochs / 2),
@@ -265,42 +255,6 @@ impl Training {
         let key = "augmentation.shift_taxels";
         check(table, key, shift, shift <= 4, "0 to 4")
     }
-}
-
-/// Checks what every loop has.
-pub(super) fn check_loop(
-    table: &str,
-    batch: usize,
-    epochs: u32,
-    averaging: f64,
-    checkpoint_every_epochs: u32,
-) -> Result<(), SettingsError> {
-    // Batch normalisation needs two samples.
-    check(table, "batch", batch as f64, batch > 1, "2 or more")?;
-    check(table, "epochs", epochs, epochs > 0, "1 or more")?;
-    let fits = (0.0..1.0).contains(&averaging);
-    check(table, "averaging", averaging, fits, "0 to below 1")?;
-    let (key, every) = ("checkpoint_every_epochs", checkpoint_every_epochs);
-    check(table, key, every, every > 0, "1 or more")
-}
-
-/// Refuses a value of `table` and `key` unless it `fits`.
-pub(super) fn check(
-    table: &str,
-    key: &str,
-    found: impl Into<f64>,
-    fits: bool,
-    expected: &'static str,
-) -> Result<(), SettingsError> {
-    let found = found.into();
-    if fits && found.is_finite() {
-        return Ok(());
-    }
-    Err(SettingsError::Range {
-        key: format!("{table}{key}"),
-        found,
-        expected,
-    })
 }
 
 fn merged(mut under: toml::Table, over: toml::Table) -> toml::Table {

@@ -7,29 +7,28 @@
 
 use burn::tensor::Device;
 
-use super::augment;
-use super::dataset::{Dataset, Sample};
-use super::export::{self, Recogniser};
-use super::fit::{self, Trained};
-use super::gan::{self, Gan};
-use super::generator;
-use super::hrn;
-use super::losses::Game;
-use super::metrics::Evaluation;
-use super::network::Weights;
-use super::run::{Description, Run};
-use super::settings::{Settings, Training, Validation};
-use super::sheet::{self, Strip};
 use crate::frame::Frame;
 use crate::random::Stream;
 use crate::simulator::Split;
+use crate::train::data::dataset::{Dataset, Sample};
+use crate::train::judge::metrics::Evaluation;
+use crate::train::judge::sheet::{self, Strip};
+use crate::train::learn::fit::{self, Trained};
+use crate::train::learn::gan::{self, Gan};
+use crate::train::model::export::{self, Recogniser};
+use crate::train::net::generator;
+use crate::train::net::hrn;
+use crate::train::net::losses::Game;
+use crate::train::net::network::Weights;
+use crate::train::run::{Description, Run};
+use crate::train::settings::{AugmentationSettings, GanSettings, Settings, Training, Validation};
 use crate::verdict::argmax;
 
 /// Stages of the four STGANs.
 const STGANS: [&str; 4] = ["stgan1", "stgan2", "stgan3", "stgan4"];
 
 fn levels() -> usize {
-    super::dataset::levels().len()
+    crate::train::data::dataset::levels().len()
 }
 
 /// What all stages of a run share.
@@ -60,7 +59,7 @@ impl Stages<'_> {
         &'a self,
         stage: &'static str,
         game: Game,
-        settings: &'a gan::Settings,
+        settings: &'a GanSettings,
     ) -> gan::Task<'a> {
         gan::Task {
             stage,
@@ -94,14 +93,7 @@ impl Stages<'_> {
     pub fn ustgan(&self) -> anyhow::Result<Gan> {
         let game = Game::RealOrFake;
         let task = self.gan_task("ustgan", game, &self.settings().ustgan);
-        let minibatch_discrimination = self.settings().minibatch_discrimination;
-        let initial = gan::initial(
-            game,
-            levels(),
-            minibatch_discrimination,
-            self.description.seed,
-            self.device,
-        );
+        let initial = gan::initial(game, levels(), self.description.seed, self.device);
         gan::fit(&task, initial, self.run)
     }
 
@@ -238,8 +230,7 @@ impl Stages<'_> {
             labelled: self.train,
             ..self.gan_task(stage, game, &self.settings().ustgan)
         };
-        // Without minibatch discrimination: the discriminator becomes the recogniser.
-        let initial = gan::initial(game, levels(), false, self.description.seed, self.device);
+        let initial = gan::initial(game, levels(), self.description.seed, self.device);
         let gan = gan::fit(&task, initial, self.run)?;
         let weights = hrn::of_levels(&gan.discriminator, levels(), self.device);
         // The layers' statistics over all real frames that the discriminator has seen, as it has
@@ -248,7 +239,7 @@ impl Stages<'_> {
         real.extend(self.train);
         let settings = Training {
             batch: self.settings().ustgan.batch,
-            augmentation: augment::Settings::default(),
+            augmentation: AugmentationSettings::default(),
             ..self.settings().training
         };
         let task = fit::Task {

@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use hardnessd::train::metrics::Evaluation;
-use hardnessd::train::tables::rounded;
+use hardnessd::train::compare::digits::rounded;
+use hardnessd::train::judge::metrics::Evaluation;
 use hardnessd::verdict::Hrn;
 
 /// The card of the model read from `path`.

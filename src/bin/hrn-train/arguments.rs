@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Parser, Subcommand, ValueEnum};
 use hardnessd::simulator::{DatasetSettings, SensorProfile, Shapes, Split};
-use hardnessd::train::dataset::LabelChoice;
+use hardnessd::train::data::dataset::LabelChoice;
 use hardnessd::train::methods::Method;
 use hardnessd::train::settings::Profile;
 

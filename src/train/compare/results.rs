@@ -8,15 +8,15 @@ use anyhow::Context as _;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
+use super::digits::thousands;
 use super::sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS, TestSet};
-use crate::train::dataset::LabelChoice;
-use crate::train::disk::write_whole;
-use crate::train::export;
-use crate::train::history::History;
-use crate::train::metrics::{self, Bin, Evaluation, Judged, ObjectCount};
+use crate::train::data::dataset::LabelChoice;
+use crate::train::judge::metrics::{self, Bin, Evaluation, Judged, ObjectCount};
+use crate::train::model::export;
+use crate::train::run::disk::write_whole;
+use crate::train::run::history::History;
 use crate::train::run::{Description, Run};
 use crate::train::settings::Profile;
-use crate::train::tables::thousands;
 use crate::verdict::{Hrn, sha256_hex};
 
 /// A finished run and what its exported model is worth: an element of `results.json`.

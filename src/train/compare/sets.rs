@@ -9,10 +9,10 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, ensure};
 
 use crate::simulator::{self, DatasetSettings, SensorProfile, Shapes, Split};
-use crate::train::dataset::{Dataset, PITCH_MM};
-use crate::train::disk::write_whole;
+use crate::train::data::dataset::{Dataset, PITCH_MM};
+use crate::train::data::simulated;
+use crate::train::run::disk::write_whole;
 use crate::train::settings::Profile;
-use crate::train::simulated;
 use crate::verdict::sha256_hex;
 
 /// Seeds of the fresh objects, of `paper` and of `matched` shapes.
@@ -43,13 +43,13 @@ impl TestSet {
 }
 
 /// Key of the data set's own test split.
-pub const PAPER_SPLIT: &str = "paper_split";
+pub(super) const PAPER_SPLIT: &str = "paper_split";
 /// Key of the fresh objects of `paper` shapes.
-pub const FRESH: &str = "fresh";
+pub(super) const FRESH: &str = "fresh";
 /// Key of the fresh objects of `matched` shapes.
-pub const MATCHED: &str = "matched";
+pub(super) const MATCHED: &str = "matched";
 /// Keys of the fresh objects of `paper` shapes under another sensor, and what is other about it.
-pub const SHIFTS: [(&str, &str); 3] = [
+pub(super) const SHIFTS: [(&str, &str); 3] = [
     ("gain_map", "other gains, thresholds and dead taxels"),
     ("soft_cover", "a cover half as stiff"),
     ("raw", "taxels as uneven as on a raw film array"),

@@ -10,15 +10,16 @@ use std::path::PathBuf;
 use anyhow::Context as _;
 
 use super::children::{self, Failure};
+use super::plan::{Plan, PlannedRun, Recipe, unfinished};
 use super::results::{SwapEntry, read_json};
-use super::{Plan, PlannedRun, Recipe, sets, unfinished};
+use super::sets;
 use crate::simulator::{DatasetSettings, LabelledSample, Material};
-use crate::train::dataset::{Dataset, LabelChoice};
-use crate::train::disk::write_whole;
+use crate::train::data::dataset::{Dataset, LabelChoice};
+use crate::train::data::simulated;
+use crate::train::judge::metrics::Evaluation;
 use crate::train::methods::Method;
-use crate::train::metrics::Evaluation;
+use crate::train::run::disk::write_whole;
 use crate::train::settings::Profile;
-use crate::train::simulated;
 
 /// The seed of every run.
 const SEED: u64 = 1;

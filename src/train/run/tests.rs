@@ -3,9 +3,9 @@
 use burn::tensor::Tensor;
 
 use super::*;
-use crate::train::checkpoint::Progress;
-use crate::train::history::Row;
-use crate::train::network::{Weight, Weights};
+use crate::train::net::network::{Weight, Weights};
+use crate::train::run::checkpoint::Progress;
+use crate::train::run::history::Row;
 
 fn description(name: &str, sha256: &str) -> Description {
     Description {

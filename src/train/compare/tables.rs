@@ -1,0 +1,462 @@
+//! The paper's Tables 2 and 3 beside ours, and what they leave out.
+//!
+//! In: a comparison's results. Out: tables as rows of text, which `tables.md` and the report show
+//! alike.
+
+mod cells;
+
+use std::fmt::Write as _;
+
+use super::digits::{number, thousands};
+use crate::train::compare::results::{Comparison, Row, SwapEntry};
+use crate::train::compare::sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS};
+use crate::train::judge::metrics::{self, Evaluation};
+use crate::train::run::history::{History, Stage};
+use cells::{
+    before_temperature, beside, deviation, interval, interval_text, least, less_features,
+    less_reference, mean_over_seeds, most, of_entries, percent_of, with_spread,
+};
+
+pub use cells::{REFERENCE, accuracy, evaluations, mean, mean_confusion, paper_row, swap_groups};
+
+/// A table.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Table {
+    /// What it shows.
+    pub title: String,
+    /// How to read it.
+    pub note: String,
+    /// Names of the columns.
+    pub head: Vec<String>,
+    /// Its cells.
+    pub rows: Vec<Vec<String>>,
+}
+
+impl Table {
+    fn new(title: &str, note: &str, head: &[&str]) -> Self {
+        Self {
+            title: title.to_owned(),
+            note: note.to_owned(),
+            head: head.iter().map(|&name| name.to_owned()).collect(),
+            rows: Vec::new(),
+        }
+    }
+
+    fn markdown(&self) -> String {
+        let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
+        let rule: Vec<String> = (0..self.head.len())
+            .map(|column| if column == 0 { "---" } else { "---:" }.to_owned())
+            .collect();
+        let rows: String = self.rows.iter().map(|row| line(row)).collect();
+        format!("{}\n\n{}{}{rows}", self.note, line(&self.head), line(&rule))
+    }
+}
+
+/// `tables.md`.
+pub fn markdown(comparison: &Comparison) -> String {
+    let mut text = format!("# Comparison\n\n{}\n", provenance(comparison));
+    for table in all(comparison) {
+        let _ = write!(text, "\n## {}\n\n{}", table.title, table.markdown());
+    }
+    text
+}
+
+/// Where the figures come from, a line of text each.
+pub fn provenance(comparison: &Comparison) -> String {
+    let mut lines = Vec::new();
+    if let (Some(entry), Some(details)) = (comparison.entries.first(), comparison.details.first()) {
+        let seeds = comparison.entries.iter().map(|entry| entry.seed).max();
+        let mut made_by = format!(
+            "Made by hrn-train compare --profile {} --seeds {}",
+            format!("{:?}", entry.profile).to_lowercase(),
+            seeds.unwrap_or_default(),
+        );
+        let mut revisions: Vec<&str> = Vec::new();
+        // Results can stand without their runs.
+        let all = comparison.details.iter();
+        for revision in all.flat_map(|details| details.revisions.lines()) {
+            if !revisions.contains(&revision) {
+                revisions.push(revision);
+                made_by += &format!(", {revision}");
+            }
+        }
+        lines.push(made_by + ".");
+        for source in details.told.iter().flat_map(|told| &told.data) {
+            let seed = source
+                .seed
+                .map_or(String::new(), |seed| format!(" (seed {seed})"));
+            lines.push(format!(
+                "Learnt from {}{seed}, sha256 {}.",
+                source.name, source.sha256
+            ));
+        }
+    }
+    lines.push(
+        "Simulated data, unless you gave your own. Intervals are 95 %, by a bootstrap over objects \
+         within each level and, where there are several, over seeds: those of one seed do not hold \
+         what another seed, or another rounding, gives. ± is the standard deviation over seeds."
+            .to_owned(),
+    );
+    lines.join("\n")
+}
+
+/// Every table, in the order to read them.
+fn all(comparison: &Comparison) -> Vec<Table> {
+    let rows = comparison.rows();
+    let mut tables = vec![headline(&rows), table_2(&rows)];
+    tables.extend(fresh(&rows));
+    tables.extend([table_3(&rows), confusions(&rows)]);
+    tables.extend([calibration(&rows), shifts(&rows), price(&rows)]);
+    if !comparison.swaps.is_empty() {
+        tables.push(swaps(&comparison.swaps));
+    }
+    tables
+}
+
+/// The table to read first.
+pub fn headline(rows: &[Row]) -> Table {
+    let note = "20 fresh objects of each test material, shapes alike for all materials, so that \
+                shape says nothing of hardness. \"less ours\": difference of accuracies on the same \
+                frames under the same seeds, in points. Seconds are those of one thread; stages \
+                that a method shares with another are in the price of both.";
+    let head = [
+        "method",
+        "labels",
+        "accuracy, %",
+        "95 %",
+        "less ours",
+        "kappa, quadratic",
+        "steps",
+        "seconds",
+    ];
+    let mut table = Table::new("The whole of it", note, &head);
+    for row in rows {
+        table.rows.push(vec![
+            row.title.clone(),
+            thousands(row.runs[0].0.labels as u64),
+            with_spread(row, MATCHED, |e| Some(100.0 * e.accuracy), 1),
+            interval(row, MATCHED),
+            less_reference(row, rows, MATCHED),
+            with_spread(row, MATCHED, |e| e.kappa_quadratic, 3),
+            thousands(mean(&of_entries(row, |entry| entry.steps as f64)).round() as u64),
+            thousands(mean(&of_entries(row, |entry| entry.seconds)).round() as u64),
+        ]);
+    }
+    table
+}
+
+/// What tables of accuracies show of a method.
+const ACCURACIES: [&str; 7] = [
+    "level 1",
+    "level 2",
+    "level 3",
+    "level 4",
+    "overall",
+    "95 %",
+    "less ours",
+];
+
+/// Table 2, the paper's figures in brackets.
+pub fn table_2(rows: &[Row]) -> Table {
+    let note = "Category accuracies and overall accuracy in per cent on the data set's own test \
+                split, of the paper's size; in brackets the paper's.";
+    let head = [&["method", "labels"], &ACCURACIES[..]].concat();
+    let mut table = Table::new("Table 2: accuracy", note, &head);
+    for row in rows {
+        let paper = paper_row(row);
+        let mut cells = vec![row.title.clone(), thousands(row.runs[0].0.labels as u64)];
+        for level in 0..4 {
+            let here = mean_over_seeds(row, PAPER_SPLIT, |e| percent_of(e, level), 1);
+            let there = paper.map(|paper| paper.category_accuracy_percent[level]);
+            cells.push(beside(here, there, 1));
+        }
+        let here = with_spread(row, PAPER_SPLIT, |e| Some(100.0 * e.accuracy), 1);
+        cells.push(beside(here, paper.map(|paper| paper.accuracy_percent), 1));
+        cells.push(interval(row, PAPER_SPLIT));
+        cells.push(less_reference(row, rows, PAPER_SPLIT));
+        table.rows.push(cells);
+    }
+    table
+}
+
+/// Accuracies on the fresh objects of either shapes.
+pub fn fresh(rows: &[Row]) -> [Table; 2] {
+    [
+        (FRESH, "Fresh objects, shapes as the paper's pictures"),
+        (MATCHED, "Fresh objects, the same shapes for all materials"),
+    ]
+    .map(|(set, title)| accuracies(rows, set, title))
+}
+
+fn accuracies(rows: &[Row], set: &str, title: &str) -> Table {
+    let note = "Accuracy in per cent on 20 objects of each test material; \"less ours\" in points.";
+    let head = [&["method"], &ACCURACIES[..]].concat();
+    let mut table = Table::new(title, note, &head);
+    for row in rows {
+        let mut cells = vec![row.title.clone()];
+        cells.extend((0..4).map(|level| mean_over_seeds(row, set, |e| percent_of(e, level), 1)));
+        cells.push(with_spread(row, set, |e| Some(100.0 * e.accuracy), 1));
+        cells.push(interval(row, set));
+        cells.push(less_reference(row, rows, set));
+        table.rows.push(cells);
+    }
+    table
+}
+
+/// Table 3's kappas, the paper's in brackets.
+pub fn table_3(rows: &[Row]) -> Table {
+    let note = "Cohen's kappa on the counts, and the same with quadratic weights, because levels \
+                are ordinal; in brackets what the paper's counts give.";
+    let head = [
+        "method",
+        "test split: kappa",
+        "quadratic",
+        "fresh, paper's shapes: kappa",
+        "quadratic",
+        "fresh, matched shapes: kappa",
+        "quadratic",
+    ];
+    let mut table = Table::new("Table 3: kappa", note, &head);
+    for row in rows {
+        let paper = paper_row(row);
+        let quadratic = paper.and_then(|paper| metrics::kappa_quadratic(&paper.counts()));
+        let mut cells = vec![row.title.clone()];
+        for set in [PAPER_SPLIT, FRESH, MATCHED] {
+            let known = set == PAPER_SPLIT;
+            let there = |value: Option<f64>| value.filter(|_| known);
+            let kappa = with_spread(row, set, |e| e.kappa, 4);
+            cells.push(beside(kappa, there(paper.map(|paper| paper.kappa)), 4));
+            let kappa = with_spread(row, set, |e| e.kappa_quadratic, 4);
+            cells.push(beside(kappa, there(quadratic), 4));
+        }
+        table.rows.push(cells);
+    }
+    table
+}
+
+/// Table 3's confusion matrices as counts, the paper's to the right.
+fn confusions(rows: &[Row]) -> Table {
+    let note = "Samples of the test split, mean over seeds; the paper's are of 250 a level. Rows \
+                are the truth, columns what was said.";
+    let head = [
+        "method", "truth", "1", "2", "3", "4", "paper: 1", "2", "3", "4",
+    ];
+    let mut table = Table::new("Table 3: confusion", note, &head);
+    for row in rows {
+        let counts = mean_confusion(&evaluations(row, PAPER_SPLIT));
+        for (truth, counts) in counts.iter().enumerate() {
+            let title = if truth == 0 {
+                row.title.clone()
+            } else {
+                String::new()
+            };
+            let mut cells = vec![title, format!("level {}", truth + 1)];
+            cells.extend(counts.iter().map(|&count| number(count, 1)));
+            let paper = paper_row(row).map(|paper| paper.confusion[truth]);
+            cells.extend((0..4).map(|said| match paper {
+                Some(counts) => counts[said].to_string(),
+                None => "-".to_owned(),
+            }));
+            table.rows.push(cells);
+        }
+    }
+    table
+}
+
+/// How sure the models are, beside how sure they should be.
+pub fn calibration(rows: &[Row]) -> Table {
+    let note = "Expected calibration error (15 bins of the largest probability) and mean negative \
+                log-likelihood in nats, on materials that no model has seen. \"Raw\": before the \
+                temperature that methods with held-out objects fit on them.";
+    let head = [
+        "method",
+        "test split: ECE",
+        "NLL",
+        "fresh, paper's shapes: ECE",
+        "raw",
+        "NLL",
+        "fresh, matched shapes: ECE",
+        "raw",
+        "NLL",
+    ];
+    let mut table = Table::new("Calibration", note, &head);
+    for row in rows {
+        let mut cells = vec![row.title.clone()];
+        for set in [PAPER_SPLIT, FRESH, MATCHED] {
+            cells.push(with_spread(row, set, |e| Some(e.ece), 3));
+            if set != PAPER_SPLIT {
+                cells.push(before_temperature(row, set));
+            }
+            cells.push(with_spread(row, set, |e| Some(e.nll), 3));
+        }
+        table.rows.push(cells);
+    }
+    table
+}
+
+/// The same objects under other sensors.
+pub fn shifts(rows: &[Row]) -> Table {
+    let what: Vec<String> = SHIFTS
+        .iter()
+        .map(|(name, what)| format!("{}: {what}", name.replace('_', " ")))
+        .collect();
+    let note = format!(
+        "The fresh objects of the paper's shapes, pressed again on other sensors: accuracy in per \
+         cent and expected calibration error. {}.",
+        what.join("; ")
+    );
+    let mut head = vec![
+        "method".to_owned(),
+        "as before: accuracy".to_owned(),
+        "ECE".to_owned(),
+    ];
+    for (name, _) in SHIFTS {
+        head.extend([
+            format!("{}: accuracy", name.replace('_', " ")),
+            "ECE".to_owned(),
+        ]);
+    }
+    let mut table = Table {
+        head,
+        ..Table::new("Another sensor", &note, &[])
+    };
+    for row in rows {
+        let mut cells = vec![row.title.clone()];
+        for set in std::iter::once(FRESH).chain(SHIFTS.map(|(name, _)| name)) {
+            cells.push(with_spread(row, set, |e| Some(100.0 * e.accuracy), 1));
+            cells.push(with_spread(row, set, |e| Some(e.ece), 3));
+        }
+        table.rows.push(cells);
+    }
+    table
+}
+
+/// Labels, steps and seconds of each method, stage by stage.
+pub fn price(rows: &[Row]) -> Table {
+    let note = "Mean over seeds. A step is a batch of 100 of either network; one of a GAN costs \
+                about six of HRN in seconds.";
+    let head = [
+        "method",
+        "labels",
+        "steps",
+        "seconds",
+        "steps of each stage",
+    ];
+    let mut table = Table::new("Price", note, &head);
+    for row in rows {
+        let histories = row.runs.iter().map(|(_, details)| &details.history);
+        let all: Vec<&Stage> = histories.flat_map(|history| &history.stages).collect();
+        let mut names: Vec<&str> = Vec::new();
+        for stage in &all {
+            if !names.contains(&stage.name.as_str()) {
+                names.push(&stage.name);
+            }
+        }
+        let mean_of = |name: &str| {
+            let own = all.iter().filter(|stage| stage.name == name);
+            mean(&own.map(|stage| stage.steps() as f64).collect::<Vec<_>>())
+        };
+        let stages: Vec<String> = names
+            .into_iter()
+            .map(|name| format!("{name} {}", thousands(mean_of(name).round() as u64)))
+            .collect();
+        table.rows.push(vec![
+            row.title.clone(),
+            thousands(row.runs[0].0.labels as u64),
+            thousands(mean(&of_entries(row, |entry| entry.steps as f64)).round() as u64),
+            thousands(mean(&of_entries(row, |entry| entry.seconds)).round() as u64),
+            stages.join(", "),
+        ]);
+    }
+    table
+}
+
+/// The stages of one run.
+pub fn stages(history: &History) -> Table {
+    let mut table = Table::new("Stages", "", &["stage", "steps", "seconds"]);
+    for stage in &history.stages {
+        table.rows.push(vec![
+            stage.name.clone(),
+            thousands(stage.steps()),
+            number(stage.seconds(), 1),
+        ]);
+    }
+    table
+}
+
+/// One evaluation.
+pub fn evaluation(evaluation: &Evaluation) -> Table {
+    let mut table = Table::new("Evaluation", "", &["", "", ""]);
+    let interval = evaluation.accuracy_interval_by_object;
+    let optional = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.4}"));
+    let rows = [
+        ("samples", thousands(evaluation.n as u64), String::new()),
+        (
+            "accuracy, %",
+            format!("{:.1}", 100.0 * evaluation.accuracy),
+            interval_text(interval),
+        ),
+        ("kappa", optional(evaluation.kappa), String::new()),
+        (
+            "kappa, quadratic",
+            optional(evaluation.kappa_quadratic),
+            String::new(),
+        ),
+        (
+            "calibration error",
+            format!("{:.4}", evaluation.ece),
+            String::new(),
+        ),
+        (
+            "negative log-likelihood",
+            format!("{:.4}", evaluation.nll),
+            String::new(),
+        ),
+    ];
+    table.rows = rows
+        .map(|(name, value, more)| vec![name.to_owned(), value, more])
+        .to_vec();
+    table
+}
+
+/// The roles of materials swapped.
+pub fn swaps(swaps: &[SwapEntry]) -> Table {
+    let note = "The two materials of some levels in each other's roles, each time learnt anew and \
+                judged on 20 objects a material of the paper's shapes: accuracy in per cent over the \
+                assignments. Its spread is what the choice of materials alone does. \"Less \
+                features\": over the same assignments and labels, in points, least to most.";
+    let head = [
+        "method",
+        "labels",
+        "assignments",
+        "as in the paper",
+        "mean",
+        "deviation",
+        "least",
+        "most",
+        "less features",
+    ];
+    let mut table = Table::new("Materials swapped", note, &head);
+    for group in swap_groups(swaps) {
+        let percents: Vec<f64> = group
+            .iter()
+            .map(|swap| 100.0 * swap.test.accuracy)
+            .collect();
+        let unswapped = group.iter().find(|swap| swap.swapped_levels == [false; 4]);
+        table.rows.push(vec![
+            group[0].method.clone(),
+            thousands(group[0].labels as u64),
+            group.len().to_string(),
+            unswapped.map_or("-".to_owned(), |swap| number(100.0 * swap.test.accuracy, 1)),
+            number(mean(&percents), 1),
+            deviation(&percents).map_or("-".to_owned(), |sd| number(sd, 1)),
+            number(least(&percents), 1),
+            number(most(&percents), 1),
+            less_features(&group, swaps),
+        ]);
+    }
+    table
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,323 @@
+//! Recordings of known objects as samples of a data set.
+//!
+//! In: captures, `.mcap` or `.bin`. Out: the chosen frame of every press that was judged. The
+//! daemon's own pipeline decodes, tares and selects, so what is learnt from is what will be judged.
+
+mod capture;
+
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use serde_json::{Value, json};
+
+pub use self::capture::Capture;
+use crate::recording::{self, PlaybackError};
+use crate::simulator::Split;
+use crate::train::data::dataset::{self, Dataset, DatasetError, Sample};
+
+/// What a data set says of who made it.
+const COLLECTED: &str = concat!("hrn-train collect ", env!("CARGO_PKG_VERSION"));
+/// And of who made it where it says nothing.
+const UNKNOWN: &str = "unknown";
+
+/// What the samples are said to be; what is `None` the capture's labels say.
+#[derive(Debug, Clone, Copy)]
+pub struct Labelling {
+    /// 1..=4, or 0: unlabelled.
+    pub level: Option<u8>,
+    /// What was pressed; in another data set the same number is another object. Where neither
+    /// says it, captures of one call are one object, a new one.
+    pub object: Option<u32>,
+    /// For training or for test.
+    pub split: Split,
+}
+
+/// Why a capture gives no samples.
+#[derive(Debug, thiserror::Error)]
+pub enum CollectError {
+    /// Missing or unreadable.
+    #[error("{path}: {source}")]
+    Unreadable {
+        /// The capture.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// Damaged, or none of ours.
+    #[error("{path}: {source}")]
+    Recording {
+        /// The capture.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: recording::Error,
+    },
+    /// It describes a sensor that cannot be.
+    #[error("{path}: {source}")]
+    Sensor {
+        /// The capture.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: PlaybackError,
+    },
+    /// Neither given nor a label.
+    #[error("{path}: level: found none, expected --level, or a recording with the label level")]
+    NoLevel {
+        /// The capture.
+        path: PathBuf,
+    },
+    /// A label that is no number in its range.
+    #[error(
+        "{path}: label {key}: found {found}, expected {expected}{}",
+        said_too(key)
+    )]
+    Label {
+        /// The capture.
+        path: PathBuf,
+        /// Of the label.
+        key: &'static str,
+        /// As it is.
+        found: String,
+        /// As it should be.
+        expected: &'static str,
+    },
+    /// Of another sensor than the others.
+    #[error("{path}: taxel pitch: found {found} mm, expected {expected} mm, that of {first}")]
+    Pitch {
+        /// The capture.
+        path: PathBuf,
+        /// Its pitch.
+        found: f64,
+        /// That of the others.
+        expected: f64,
+        /// One of them, or the data set that they are added to.
+        first: PathBuf,
+    },
+    /// An array that the data set would lose: it has a value for every sample, or is not there.
+    #[error(
+        "{path}: {array}: found none, expected one, as in {first}: {}it can be a data set of its \
+         own, and train takes several --data",
+        remedy(array)
+    )]
+    Lost {
+        /// Where there are no values.
+        path: PathBuf,
+        /// Its name.
+        array: &'static str,
+        /// Where there are.
+        first: PathBuf,
+    },
+    /// The same object for training and for test.
+    #[error(
+        "{path}: object {object}: found it for {found}, expected it for {expected}, as in {first}: \
+         presses of one object are near-copies"
+    )]
+    Splits {
+        /// The capture.
+        path: PathBuf,
+        /// The object's number.
+        object: u32,
+        /// What its presses here are for.
+        found: &'static str,
+        /// What those before are for.
+        expected: &'static str,
+        /// The data set that they are added to.
+        first: PathBuf,
+    },
+    /// Nothing was pressed, or no press was judged.
+    #[error("{path}: found no press with a verdict, expected one or more")]
+    NoPress {
+        /// The capture.
+        path: PathBuf,
+    },
+}
+
+fn said_too(key: &str) -> String {
+    match key {
+        "level" | "object" => format!(": --{key} says it, too"),
+        _ => String::new(),
+    }
+}
+
+fn remedy(array: &str) -> String {
+    match array {
+        "material" | "shore" => format!("--label {array}=... when recording says it, or "),
+        _ => String::new(),
+    }
+}
+
+/// The bytes of a data set of `captures`, after the samples of `before` if there are any. It has
+/// the arrays `material` and `shore` if every capture is labelled with one.
+///
+/// # Errors
+///
+/// If a level is neither given nor a label, captures and what was before are of different pitches,
+/// have different arrays or the same object in different splits, there are more objects or materials
+/// than arrays of u32 and u8 can tell apart, or the archive cannot be built.
+pub fn to_bytes(
+    captures: &[Capture],
+    labelling: Labelling,
+    before: Option<(Dataset, Value)>,
+) -> anyhow::Result<Vec<u8>> {
+    let mut pitch_mm = captures.first().map(|capture| capture.pitch_mm);
+    // Where the arrays of the first samples come from.
+    let mut first = captures.first().map(|capture| capture.path.clone());
+    let mut others = String::new();
+    let (mut samples, mut meta) = match before {
+        Some((dataset, meta)) => {
+            (pitch_mm, first) = (Some(dataset.pitch_mm()), Some(dataset.path()));
+            others = meta["generator"].as_str().unwrap_or(UNKNOWN).to_owned();
+            (dataset.samples, meta)
+        }
+        None => (
+            Vec::new(),
+            json!({"materials": [], "seed": null, "captures": []}),
+        ),
+    };
+    let (pitch_mm, first) = (
+        pitch_mm.unwrap_or(dataset::PITCH_MM),
+        first.unwrap_or_default(),
+    );
+    let last = samples.iter().filter_map(|sample| sample.object).max();
+    let new_object = last.map_or(Some(0), |object| object.checked_add(1));
+    let no_new_object = || DatasetError::Array {
+        path: first.clone(),
+        array: "object",
+        found: u32::MAX.to_string(),
+        expected: "a lower number, for the next to be a new object's: --object says one".to_owned(),
+    };
+    let mut materials: Vec<String> =
+        serde_json::from_value(meta["materials"].take()).unwrap_or_default();
+    meta["levels"] = json!(dataset::levels());
+    // Models are said to be of simulated data, recorded or both by all who had a part in it.
+    let others = others
+        .split(", ")
+        .filter(|one| !["", COLLECTED].contains(one));
+    let generators: Vec<&str> = others.chain([COLLECTED]).collect();
+    meta["generator"] = json!(generators.join(", "));
+    meta["pitch_mm"] = json!(pitch_mm);
+    for capture in captures {
+        capture::check_pitch(&capture.path, capture.pitch_mm, pitch_mm, &first)?;
+        let level = capture.level(labelling.level)?;
+        let object = match labelling.object {
+            Some(object) => object,
+            None => match capture.number("object", "a number")? {
+                Some(object) => object,
+                None => new_object.ok_or_else(no_new_object)?,
+            },
+        };
+        let material = capture.labels.get("material");
+        let material = material
+            .map(|name| index_of(name, &mut materials))
+            .transpose()?;
+        let shore = capture.shore()?;
+        let own: Vec<Sample> = capture
+            .presses
+            .iter()
+            .map(|(frame, force_n)| Sample {
+                frame: *frame,
+                level,
+                object: Some(object),
+                material,
+                force_n: Some(*force_n),
+                split: labelling.split,
+                shore,
+                source: 0,
+            })
+            .collect();
+        if let (Some(of_first), Some(of_this)) = (samples.first(), own.first()) {
+            check_arrays((of_first, &first), (of_this, &capture.path))?;
+            check_splits((&samples, &first), (of_this, &capture.path))?;
+        }
+        samples.extend(own);
+        let said = json!({
+            "name": capture.path.file_name().unwrap_or_default().to_string_lossy(),
+            "sha256": capture.sha256,
+            "level": level,
+            "object": object,
+            "presses": capture.presses.len(),
+            "split": labelling.split.name(),
+            "labels": capture.labels,
+        });
+        match meta["captures"].as_array_mut() {
+            Some(captures) => captures.push(said),
+            None => meta["captures"] = json!([said]),
+        }
+    }
+    meta["materials"] = json!(materials);
+    Ok(dataset::write(Cursor::new(Vec::new()), &samples, &meta)?.into_inner())
+}
+
+/// Refuses samples of which some have a value for an array, and some have none.
+fn check_arrays(
+    (before, first): (&Sample, &Path),
+    (added, path): (&Sample, &Path),
+) -> Result<(), CollectError> {
+    for (array, there, here) in [
+        ("object", before.object.is_some(), added.object.is_some()),
+        (
+            "material",
+            before.material.is_some(),
+            added.material.is_some(),
+        ),
+        ("force", before.force_n.is_some(), added.force_n.is_some()),
+        ("shore", before.shore.is_some(), added.shore.is_some()),
+    ] {
+        let (path, first) = match (there, here) {
+            (true, false) => (path, first),
+            (false, true) => (first, path),
+            _ => continue,
+        };
+        return Err(CollectError::Lost {
+            path: path.to_owned(),
+            array,
+            first: first.to_owned(),
+        });
+    }
+    Ok(())
+}
+
+/// Refuses a sample of an object that has others in the other split.
+fn check_splits(
+    (before, first): (&[Sample], &Path),
+    (added, path): (&Sample, &Path),
+) -> Result<(), CollectError> {
+    let others = |sample: &&Sample| sample.split != added.split && sample.shares_object_with(added);
+    before.iter().find(others).map_or(Ok(()), |other| {
+        Err(CollectError::Splits {
+            path: path.to_owned(),
+            object: added.object.unwrap_or_default(),
+            found: added.split.name(),
+            expected: other.split.name(),
+            first: first.to_owned(),
+        })
+    })
+}
+
+/// The place of a name in `meta.materials`; a new one is added.
+fn index_of(name: &str, materials: &mut Vec<String>) -> anyhow::Result<u8> {
+    let known = materials.iter().position(|material| material == name);
+    let index = known.unwrap_or(materials.len());
+    if known.is_none() {
+        materials.push(name.to_owned());
+    }
+    u8::try_from(index).with_context(|| {
+        format!("label material: found {name:?} beside 256 others, expected no more than those")
+    })
+}
+
+/// What is in the file to be appended to; nothing, if it is not there yet.
+///
+/// # Errors
+///
+/// If it is there and no data set.
+pub fn existing(path: &Path) -> Result<Option<(Dataset, Value)>, DatasetError> {
+    if !path.exists() {
+        return Ok(None);
+    }
+    let meta = match dataset::meta(path)? {
+        meta @ Value::Object(_) => meta,
+        _ => json!({}),
+    };
+    Ok(Some((Dataset::read(path)?, meta)))
+}

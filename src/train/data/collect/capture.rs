@@ -1,0 +1,222 @@
+//! One recording of a known object, and the presses in it.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use super::CollectError;
+use crate::event::{Event, Phase, PressState};
+use crate::frame::{Frame, Stamp};
+use crate::pipeline::{self, Clock, Pipeline};
+use crate::recording::{Entry, Found, Labels, Playback, Reader};
+use crate::train::data::dataset;
+use crate::verdict::{Hrn, sha256_hex};
+
+/// The samples of one capture.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Capture {
+    pub(super) path: PathBuf,
+    pub(super) sha256: String,
+    pub(super) labels: Labels,
+    /// Of the sensor's taxels.
+    pub(super) pitch_mm: f64,
+    /// Chosen frame and force of each press.
+    pub(super) presses: Vec<(Frame, f32)>,
+}
+
+impl Capture {
+    /// Reads a capture; `of_bytes` is the sensor of one that does not describe its own.
+    ///
+    /// # Errors
+    ///
+    /// If it cannot be read, is damaged, or no press in it was judged.
+    pub fn read(path: &Path, of_bytes: &pipeline::Settings) -> Result<Self, CollectError> {
+        let path = path.to_owned();
+        let mut bytes = Vec::new();
+        let read = File::open(&path).and_then(|file| BufReader::new(file).read_to_end(&mut bytes));
+        if let Err(source) = read {
+            return Err(CollectError::Unreadable { path, source });
+        }
+        let mut selection = Selection::default();
+        let (labels, pitch_mm) = if path
+            .extension()
+            .is_some_and(|extension| extension == "mcap")
+        {
+            play(&bytes, &of_bytes.criteria.hrn, &path, &mut selection)?
+        } else {
+            let mut pipeline = Pipeline::new(of_bytes.clone(), Clock::FrameRate);
+            selection.take(pipeline.push(&bytes, NOT_LOOKED_AT));
+            selection.take(pipeline.end_of_recording(None));
+            (Labels::new(), of_bytes.criteria.calibration.pitch_mm)
+        };
+        if selection.presses.is_empty() {
+            return Err(CollectError::NoPress { path });
+        }
+        Ok(Self {
+            sha256: sha256_hex(&bytes),
+            path,
+            labels,
+            pitch_mm,
+            presses: selection.presses,
+        })
+    }
+
+    /// How many presses it has.
+    pub fn presses(&self) -> usize {
+        self.presses.len()
+    }
+
+    /// The label `key`, if there is one.
+    pub(super) fn number(
+        &self,
+        key: &'static str,
+        expected: &'static str,
+    ) -> Result<Option<u32>, CollectError> {
+        let Some(label) = self.labels.get(key) else {
+            return Ok(None);
+        };
+        let wrong = |_| CollectError::Label {
+            path: self.path.clone(),
+            key,
+            found: format!("{label:?}"),
+            expected,
+        };
+        label.parse().map(Some).map_err(wrong)
+    }
+
+    pub(super) fn shore(&self) -> Result<Option<f32>, CollectError> {
+        let Some(label) = self.labels.get("shore") else {
+            return Ok(None);
+        };
+        let shore = label.parse().ok().filter(|shore: &f32| shore.is_finite());
+        let wrong = || CollectError::Label {
+            path: self.path.clone(),
+            key: "shore",
+            found: format!("{label:?}"),
+            expected: "a number",
+        };
+        shore.ok_or_else(wrong).map(Some)
+    }
+
+    pub(super) fn level(&self, given: Option<u8>) -> Result<u8, CollectError> {
+        const EXPECTED: &str = "a level from 0 (unlabelled) to 4";
+        let level = match given {
+            Some(level) => u32::from(level),
+            None => self
+                .number("level", EXPECTED)?
+                .ok_or_else(|| CollectError::NoLevel {
+                    path: self.path.clone(),
+                })?,
+        };
+        let known = u8::try_from(level).ok();
+        let known = known.filter(|level| usize::from(*level) <= dataset::levels().len());
+        known.ok_or_else(|| CollectError::Label {
+            path: self.path.clone(),
+            key: "level",
+            found: level.to_string(),
+            expected: EXPECTED,
+        })
+    }
+}
+
+/// A time for a pipeline whose clock is the frame rate.
+const NOT_LOOKED_AT: Stamp = Stamp {
+    mono: std::time::Duration::ZERO,
+    wall: jiff::Timestamp::UNIX_EPOCH,
+};
+
+fn play(
+    bytes: &[u8],
+    hrn: &Arc<Hrn>,
+    path: &Path,
+    selection: &mut Selection,
+) -> Result<(Labels, f64), CollectError> {
+    let mut playback = Playback::new(hrn.clone());
+    let mut pitch_mm = None;
+    for found in Reader::new(bytes) {
+        let found = found.map_err(|source| CollectError::Recording {
+            path: path.to_owned(),
+            source,
+        })?;
+        if let Some(found) = pitch_of(&found) {
+            let expected = *pitch_mm.get_or_insert(found);
+            check_pitch(path, found, expected, path)?;
+        }
+        let events = playback.feed(found);
+        selection.take(events.map_err(|source| CollectError::Sensor {
+            path: path.to_owned(),
+            source,
+        })?);
+    }
+    selection.take(playback.end());
+    // Without a sensor there is no press either.
+    Ok((playback.labels(), pitch_mm.unwrap_or(dataset::PITCH_MM)))
+}
+
+/// What an entry says of its sensor's taxels.
+fn pitch_of(found: &Found) -> Option<f64> {
+    match &found.entry {
+        Entry::State(state) => Some(state.sensor.calibration.pitch_mm),
+        Entry::Settings(sensor) => Some(sensor.calibration.pitch_mm),
+        Entry::Input(_) => None,
+    }
+}
+
+pub(super) fn check_pitch(
+    path: &Path,
+    found: f64,
+    expected: f64,
+    first: &Path,
+) -> Result<(), CollectError> {
+    if found == expected {
+        return Ok(());
+    }
+    Err(CollectError::Pitch {
+        path: path.to_owned(),
+        found,
+        expected,
+        first: first.to_owned(),
+    })
+}
+
+/// The frames of presses under way, by sensor, until one is chosen.
+#[derive(Debug, Default)]
+struct Selection {
+    held: BTreeMap<String, Held>,
+    presses: Vec<(Frame, f32)>,
+}
+
+#[derive(Debug, Default)]
+struct Held {
+    frames: BTreeMap<u64, Vec<f32>>,
+    is_pressed: bool,
+}
+
+impl Selection {
+    fn take(&mut self, events: Vec<Event>) {
+        for event in events {
+            let held = self.held.entry(event.sensor().to_owned()).or_default();
+            match event {
+                Event::Frame(frame) => {
+                    if !held.is_pressed {
+                        held.frames.clear();
+                    }
+                    held.frames.insert(frame.frame, frame.newtons);
+                }
+                // Its first frame came just before.
+                Event::Press(press) => held.is_pressed = press.state == PressState::Begin,
+                Event::Hardness(verdict) if verdict.phase == Phase::Final => {
+                    // One that began before the recording did may have its frame there.
+                    if let Some(newtons) = held.frames.remove(&verdict.frame)
+                        && let Ok(frame) = Frame::try_from(newtons)
+                    {
+                        self.presses.push((frame, verdict.force_n as f32));
+                    }
+                }
+                Event::Hardness(_) | Event::Status(_) => {}
+            }
+        }
+    }
+}

@@ -1,0 +1,8 @@
+//! How good a recogniser or a generated frame is, beside what trivial methods reach; and pictures.
+
+pub mod features;
+pub mod baseline;
+pub mod likeness;
+pub mod paper;
+pub mod metrics;
+pub mod sheet;

@@ -1,0 +1,6 @@
+//! Steps down a gradient: the optimiser, and the loops of recognisers and GANs.
+
+pub mod optimiser;
+pub mod learner;
+pub mod fit;
+pub mod gan;

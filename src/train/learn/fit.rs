@@ -1,0 +1,430 @@
+//! The supervised training loop: Eq. (9) minimised over labelled frames.
+//!
+//! In: a data set, which of its samples to learn from and which to validate on, and initial
+//! weights. Out: weights, the statistics of their batch normalisation, and a temperature. Written
+//! to the run's directory on the way: metrics and checkpoints, from which a killed run goes on bit
+//! for bit. The test split never enters here.
+
+use std::time::Instant;
+
+use burn::tensor::{Device, Tensor, activation};
+
+use crate::frame::Frame;
+use crate::random::Stream;
+use crate::train::data::augment;
+use crate::train::data::dataset::{self, Dataset};
+use crate::train::learn::learner::Learner;
+use crate::train::net::hrn;
+use crate::train::net::network::{Normalisation, Statistics, Weights, numbers};
+use crate::train::run::Run;
+use crate::train::run::checkpoint::{Checkpoint, Origin, Progress};
+use crate::train::run::history::Row;
+use crate::train::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
+use crate::train::settings::{Keep, Training, Validation};
+use crate::verdict::argmax;
+
+/// Samples a pass without gradients.
+const JUDGED_AT_ONCE: usize = 250;
+
+/// What is to be learnt, and from what.
+#[derive(Debug)]
+pub struct Task<'a> {
+    /// Name of the stage: of its checkpoints and of its rows in `metrics.csv`.
+    pub stage: &'static str,
+    /// Where the samples are.
+    pub dataset: &'a Dataset,
+    /// Labelled samples to learn from.
+    pub train: &'a [usize],
+    /// Samples of held-out training objects, and how they are used; may be empty.
+    pub validation: (&'a [usize], Validation),
+    /// Newtons a taxel that become 1 in the image.
+    pub full_scale_n: f64,
+    /// How.
+    pub settings: &'a Training,
+    /// Of the order of the samples and their augmentation.
+    pub seed: u64,
+    /// Where.
+    pub device: &'a Device,
+}
+
+/// A trained recogniser.
+#[derive(Debug)]
+pub struct Trained {
+    /// Of trunk and head.
+    pub weights: Weights,
+    /// Mean and variance of each normalised layer over the training samples.
+    pub statistics: Statistics,
+    /// What the logits are divided by; 1 without validation objects.
+    pub temperature: f32,
+}
+
+impl Trained {
+    /// Logits of `frames`, a row each, before temperature.
+    pub fn logits<'a>(
+        &self,
+        frames: impl Iterator<Item = &'a Frame>,
+        full_scale_n: f64,
+        device: &Device,
+    ) -> Vec<Vec<f32>> {
+        let frames: Vec<&Frame> = frames.collect();
+        let mut rows = Vec::with_capacity(frames.len());
+        for part in frames.chunks(JUDGED_AT_ONCE) {
+            let images = hrn::images(part.iter().copied(), full_scale_n, device);
+            let mut normalisation = Normalisation::Fixed(&self.statistics);
+            let logits = hrn::logits(&self.weights, images, &mut normalisation);
+            let levels = logits.dims()[1];
+            rows.extend(numbers(&logits).chunks(levels).map(<[f32]>::to_vec));
+        }
+        rows
+    }
+}
+
+/// Trains from `initial`, or from the stage's last checkpoint in `run`.
+///
+/// # Errors
+///
+/// If the run's directory cannot be read or written, its checkpoint is of another stage than this,
+/// or the loss, a weight or what they compute at the end is no number any more.
+pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> {
+    let Training { batch, epochs, .. } = *task.settings;
+    let (validation_samples, validation_settings) = task.validation;
+    let steps_an_epoch = task.train.len().div_ceil(batch) as u64;
+    let steps = u64::from(epochs) * steps_an_epoch;
+    let origin = task.origin(&initial);
+    let mut state = match run.latest(task.stage, &origin, epochs, task.device)? {
+        Some(checkpoint) => {
+            // Frames generated on another device, or on more threads, may differ in their last
+            // bits; the run goes on from its weights all the same.
+            if !task.dataset.sources.is_empty() {
+                run.check_origin(task.stage, &checkpoint, &origin)?;
+            }
+            State::resumed(&checkpoint, task.settings)?
+        }
+        None => State::fresh(initial, task.settings),
+    };
+    let mut metrics = run.metrics(task.stage, state.progress.step)?;
+    let bar = progress_bar(task.stage, steps, state.progress.step);
+    let begun = Instant::now();
+
+    while state.progress.epoch < epochs {
+        let (mut loss_sum, mut right, mut rate) = (0.0, 0, 0.0);
+        for indices in task.epoch_order(state.progress.epoch).chunks(batch) {
+            rate = task.settings.optimiser.rate_at(state.progress.step, steps);
+            let learnt = state.step(task, indices, rate);
+            loss_sum += learnt.0 * indices.len() as f64;
+            right += learnt.1;
+            bar.inc(1);
+        }
+        state.progress.epoch += 1;
+        let Progress { epoch, step, .. } = state.progress;
+        let last = epoch == epochs;
+        let due = |every: u32| last || epoch.is_multiple_of(every);
+
+        let loss = loss_sum / task.train.len() as f64;
+        ensure_finite(task.stage, epoch, "loss", loss)?;
+        ensure_finite_weights(task.stage, epoch, &state.learner.weights)?;
+        let mut validation = None;
+        if !validation_samples.is_empty() && due(validation_settings.every_epochs) {
+            let judged = state.validate(task);
+            ensure_finite(task.stage, epoch, "validation loss", judged.0)?;
+            validation = Some(judged);
+        }
+        let seconds = begun.elapsed().as_secs_f64();
+        metrics.add(&Row {
+            step,
+            epoch,
+            loss,
+            learning_rate: rate,
+            accuracy: Some(right as f64 / task.train.len() as f64),
+            validation,
+            seconds,
+            adversarial: None,
+        })?;
+        let mut message = format!("loss {loss:.4}");
+        if let Some((loss, accuracy)) = validation {
+            let accuracy = accuracy * 100.0;
+            message += &format!(", validation loss {loss:.4}, accuracy {accuracy:.1} %");
+        }
+        report(&bar, task.stage, epoch, epochs, message);
+        if due(task.settings.checkpoint_every_epochs) {
+            run.save(task.stage, &state.checkpoint(&origin))?;
+        }
+    }
+    bar.finish_and_clear();
+
+    let weights = match validation_settings.keep {
+        Keep::Best => state.best.unwrap_or_else(|| state.learner.evaluated()),
+        Keep::Last => state.learner.evaluated(),
+    };
+    let mut trained = task.finished(weights, epochs)?;
+    if !validation_samples.is_empty() {
+        trained.temperature = temperature(&task.judge(&trained, validation_samples));
+    }
+    Ok(trained)
+}
+
+/// A step of HRN on images `[batch, 1, 28, 28]` and targets `[batch, L]`; gives the mean loss and
+/// the logits that it had before it, row by row.
+pub fn step(
+    hrn: &mut Learner,
+    images: Tensor<4>,
+    targets: Tensor<2>,
+    rate: f64,
+) -> (f64, Vec<f32>) {
+    let tracked = hrn.weights.tracked();
+    let logits = hrn::logits(&tracked, images, &mut Normalisation::Batch);
+    let judged = numbers(&logits);
+    let loss = hrn::cross_entropy(logits, targets);
+    let mut gradients = loss.backward();
+    hrn.step(&tracked, &mut gradients, rate);
+    (f64::from(numbers(&loss)[0]), judged)
+}
+
+fn levels() -> usize {
+    dataset::levels().len()
+}
+
+/// All that changes from step to step.
+#[derive(Debug)]
+struct State {
+    progress: Progress,
+    learner: Learner,
+    /// Of the least validation loss, if those are kept.
+    best: Option<Weights>,
+}
+
+impl State {
+    fn fresh(weights: Weights, settings: &Training) -> Self {
+        Self {
+            progress: Progress::default(),
+            learner: Learner::fresh(weights, settings.optimiser, settings.averaging),
+            best: None,
+        }
+    }
+
+    fn resumed(checkpoint: &Checkpoint, settings: &Training) -> anyhow::Result<Self> {
+        let Training {
+            optimiser,
+            averaging,
+            ..
+        } = *settings;
+        Ok(Self {
+            progress: checkpoint.progress,
+            learner: Learner::resumed(
+                checkpoint,
+                "",
+                checkpoint.progress.step,
+                optimiser,
+                averaging,
+            )?,
+            best: checkpoint.list("best").ok().cloned(),
+        })
+    }
+
+    fn checkpoint(&self, origin: &str) -> Checkpoint {
+        let mut lists = self.learner.lists("");
+        lists.extend(
+            self.best
+                .iter()
+                .map(|list| ("best".to_owned(), list.clone())),
+        );
+        Checkpoint {
+            origin: origin.to_owned(),
+            progress: self.progress,
+            lists,
+        }
+    }
+
+    /// One step on the samples `indices`; gives the batch's mean loss, and how many of them were
+    /// judged rightly before it.
+    fn step(&mut self, task: &Task, indices: &[usize], rate: f64) -> (f64, usize) {
+        let (images, targets) = (
+            task.images(indices, self.progress.step),
+            task.targets(indices),
+        );
+        let (loss, judged) = step(&mut self.learner, images, targets, rate);
+        self.progress.step += 1;
+        let right = indices
+            .iter()
+            .zip(judged.chunks(levels()))
+            .filter(|(index, logits)| argmax(logits).0 == task.level(**index))
+            .count();
+        (loss, right)
+    }
+
+    /// Loss and accuracy on the validation samples; keeps the weights if they are the best.
+    fn validate(&mut self, task: &Task) -> (f64, f64) {
+        let trained = task.with_statistics(self.learner.evaluated());
+        let (samples, settings) = task.validation;
+        let judged = task.judge(&trained, samples);
+        let loss = mean_loss(&judged, 1.0);
+        let right = judged
+            .iter()
+            .filter(|(level, logits)| argmax(logits).0 == *level)
+            .count();
+        let better = self.progress.best_loss.is_none_or(|best| loss < best);
+        if settings.keep == Keep::Best && better {
+            self.progress.best_loss = Some(loss);
+            self.best = Some(trained.weights);
+        }
+        (loss, right as f64 / judged.len() as f64)
+    }
+}
+
+impl Task<'_> {
+    fn origin(&self, initial: &Weights) -> String {
+        let settings = (self.settings, self.validation.1, self.full_scale_n);
+        Origin::new(self.stage, &settings, self.seed)
+            .samples(self.dataset, self.train)
+            .samples(self.dataset, self.validation.0)
+            .weights(initial)
+            .finish()
+    }
+
+    /// The training samples in the order of epoch `epoch`.
+    fn epoch_order(&self, epoch: u32) -> Vec<usize> {
+        let mut order = self.train.to_vec();
+        self.stream("order").child(epoch.into()).shuffle(&mut order);
+        order
+    }
+
+    fn stream(&self, name: &str) -> Stream {
+        Stream::new(self.seed, &format!("{} {name}", self.stage))
+    }
+
+    /// Images of one batch, augmented for step `step`.
+    fn images(&self, indices: &[usize], step: u64) -> Tensor<4> {
+        let mut stream = self.stream("augmentation").child(step);
+        let frames: Vec<Frame> = indices
+            .iter()
+            .map(|&index| {
+                let frame = &self.dataset.samples[index].frame;
+                augment::vary(frame, self.settings.augmentation, &mut stream)
+            })
+            .collect();
+        hrn::images(frames.iter(), self.full_scale_n, self.device)
+    }
+
+    fn targets(&self, indices: &[usize]) -> Tensor<2> {
+        let levels_of = indices
+            .iter()
+            .map(|&index| self.dataset.samples[index].level);
+        hrn::targets(levels_of, levels(), self.device)
+    }
+
+    /// A recogniser of `weights` with statistics over the training samples and no temperature.
+    fn with_statistics(&self, weights: Weights) -> Trained {
+        Trained {
+            statistics: self.statistics(&weights),
+            weights,
+            temperature: 1.0,
+        }
+    }
+
+    /// The same at a stage's end, after so many epochs.
+    ///
+    /// # Errors
+    ///
+    /// If it computes what is no number, as weights can that are numbers themselves.
+    pub fn finished(&self, weights: Weights, epochs: u32) -> anyhow::Result<Trained> {
+        let trained = self.with_statistics(weights);
+        // Of one frame, which need not be a labelled one.
+        for logit in self.logits(&trained, &self.train[..1]).concat() {
+            ensure_finite(self.stage, epochs, "logit", logit.into())?;
+        }
+        Ok(trained)
+    }
+
+    /// Statistics of the normalised layers over the training samples, augmented as the settings
+    /// say, in whole batches of their size: what is left over for a smaller one is not counted.
+    fn statistics(&self, weights: &Weights) -> Statistics {
+        let mut statistics = Statistics::default();
+        let mut order = self.train.to_vec();
+        self.stream("statistics").shuffle(&mut order);
+        for (indices, number) in order
+            .chunks_exact(self.settings.batch.min(order.len()))
+            .zip(0..)
+        {
+            // Steps count from 0, so no step shares a batch's sub-stream counted from the end.
+            let images = self.images(indices, u64::MAX - number);
+            hrn::logits(
+                weights,
+                images,
+                &mut Normalisation::Collect(&mut statistics),
+            );
+        }
+        statistics
+    }
+
+    /// Level, from 0, and logits of each of `indices`.
+    fn judge(&self, trained: &Trained, indices: &[usize]) -> Vec<(usize, Vec<f32>)> {
+        let levels = indices.iter().map(|&index| self.level(index));
+        levels.zip(self.logits(trained, indices)).collect()
+    }
+
+    fn logits(&self, trained: &Trained, indices: &[usize]) -> Vec<Vec<f32>> {
+        let frames = indices
+            .iter()
+            .map(|&index| &self.dataset.samples[index].frame);
+        trained.logits(frames, self.full_scale_n, self.device)
+    }
+
+    /// Of a labelled sample, from 0.
+    fn level(&self, index: usize) -> usize {
+        usize::from(self.dataset.samples[index].level) - 1
+    }
+}
+
+/// Mean cross-entropy of logits over `temperature`.
+fn mean_loss(judged: &[(usize, Vec<f32>)], temperature: f64) -> f64 {
+    let loss = |(level, logits): &(usize, Vec<f32>)| {
+        let scaled: Vec<f64> = logits.iter().map(|&l| f64::from(l) / temperature).collect();
+        let top = scaled.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        top + scaled.iter().map(|l| (l - top).exp()).sum::<f64>().ln() - scaled[*level]
+    };
+    judged.iter().map(loss).sum::<f64>() / judged.len() as f64
+}
+
+/// The temperature of least loss, between 1/8 and 8: the loss is convex in 1/T, so shrinking a
+/// bracket around the least finds it.
+fn temperature(judged: &[(usize, Vec<f32>)]) -> f32 {
+    let (mut low, mut high) = (0.125_f64, 8.0_f64);
+    for _ in 0..60 {
+        let (left, right) = (low + (high - low) / 3.0, high - (high - low) / 3.0);
+        if mean_loss(judged, 1.0 / left) < mean_loss(judged, 1.0 / right) {
+            high = right;
+        } else {
+            low = left;
+        }
+    }
+    (2.0 / (low + high)) as f32
+}
+
+/// Probabilities, a row each, of logits over `temperature`.
+pub fn probabilities(logits: &[Vec<f32>], temperature: f32, device: &Device) -> Vec<Vec<f32>> {
+    let one = |row: &Vec<f32>| {
+        let scaled = Tensor::<1>::from_floats(row.as_slice(), device).div_scalar(temperature);
+        numbers(&activation::softmax(scaled, 0))
+    };
+    logits.iter().map(one).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_temperature_undoes_overconfidence() {
+        // Logits of two levels that are right in 3 of 4 cases, stated four times too surely.
+        let honest = 3.0_f64.ln();
+        let judged: Vec<(usize, Vec<f32>)> = (0..8)
+            .map(|n| (usize::from(n % 4 == 0), vec![(4.0 * honest) as f32, 0.0]))
+            .collect();
+        assert!(
+            (temperature(&judged) - 4.0).abs() < 1e-3,
+            "{}",
+            temperature(&judged)
+        );
+        assert!(mean_loss(&judged, 4.0) < mean_loss(&judged, 1.0));
+    }
+}

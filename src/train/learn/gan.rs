@@ -1,0 +1,310 @@
+//! Generator and discriminator against each other: one loop for USTGAN, the STGANs, SGAN and
+//! IGAN.
+//!
+//! In: real frames, the game that is played (see [`crate::train::net::losses`]) and the weights both start from.
+//! Out: both sides' weights. USTGAN and an STGAN differ in their frames and starting weights
+//! alone; SGAN and IGAN also see labelled frames. Written to the run's directory on the way:
+//! metrics, checkpoints and pictures of what fixed noise becomes.
+
+use std::time::Instant;
+
+use burn::tensor::Device;
+
+use crate::frame::Frame;
+use crate::random::Stream;
+use crate::train::data::dataset::Dataset;
+use crate::train::learn::learner::Learner;
+use crate::train::net::generator;
+use crate::train::net::hrn;
+use crate::train::net::losses::Game;
+use crate::train::net::network::{self, FEATURES, Weights};
+use crate::train::run::Run;
+use crate::train::run::checkpoint::{Checkpoint, Origin, Progress};
+use crate::train::run::history::{Adversarial, Row};
+use crate::train::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
+use crate::train::settings::GanSettings;
+
+mod samples;
+mod step;
+#[cfg(test)]
+mod tests;
+
+pub use step::{Batch, Rules, step};
+
+/// Both sides.
+#[derive(Debug, Clone)]
+pub struct Gan {
+    /// Of the generator and its mixture.
+    pub generator: Weights,
+    /// Of trunk and head.
+    pub discriminator: Weights,
+}
+
+/// Both sides before training; the head is that of the game.
+pub fn initial(game: Game, levels: usize, seed: u64, device: &Device) -> Gan {
+    let stream = Stream::new(seed, "discriminator weights");
+    let mut discriminator = Weights::default();
+    network::add_trunk(&mut discriminator, &stream, device);
+    let dims = [FEATURES, game.outputs(levels)];
+    network::add_head(&mut discriminator, dims, &stream, device);
+    Gan {
+        generator: generator::initial(seed, device),
+        discriminator,
+    }
+}
+
+/// What is to be learnt, and from what.
+#[derive(Debug)]
+pub struct Task<'a> {
+    /// Name of the stage: of its checkpoints, pictures and rows in `metrics.csv`.
+    pub stage: &'static str,
+    /// What the discriminator tells apart.
+    pub game: Game,
+    /// Where the samples are.
+    pub dataset: &'a Dataset,
+    /// Samples taken as real, without their levels.
+    pub real: &'a [usize],
+    /// Samples whose levels the discriminator learns; empty where the game has no levels.
+    pub labelled: &'a [usize],
+    /// Newtons a taxel that become 1 in the image.
+    pub full_scale_n: f64,
+    /// How.
+    pub settings: &'a GanSettings,
+    /// Of noise and orders.
+    pub seed: u64,
+    /// Where.
+    pub device: &'a Device,
+}
+
+/// Trains from `initial` with fresh optimisers, or from the stage's last checkpoint in `run`.
+///
+/// # Errors
+///
+/// If the run's directory cannot be read or written, its checkpoint is of another stage than this,
+/// or a loss or a weight is no number any more.
+pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
+    let GanSettings { batch, epochs, .. } = *task.settings;
+    let steps = u64::from(epochs) * task.real.len().div_ceil(batch) as u64;
+    let origin = task.origin(&initial);
+    let mut state = match run.latest(task.stage, &origin, epochs, task.device)? {
+        Some(checkpoint) => {
+            run.check_origin(task.stage, &checkpoint, &origin)?;
+            State::resumed(&checkpoint, task.settings)?
+        }
+        None => State::fresh(initial, task.settings),
+    };
+    let mut metrics = run.metrics(task.stage, state.progress.step)?;
+    let mut reference = None;
+    let bar = progress_bar(task.stage, steps, state.progress.step);
+    let begun = Instant::now();
+
+    while state.progress.epoch < epochs {
+        let (mut discriminator_sum, mut generator_sum, mut rate) = (0.0, 0.0, 0.0);
+        let order = task.order("order", task.real, state.progress.epoch.into());
+        for indices in order.chunks(batch) {
+            rate = task.settings.optimiser.rate_at(state.progress.step, steps);
+            let losses = state.step(task, indices, rate);
+            discriminator_sum += losses.0 * indices.len() as f64;
+            generator_sum += losses.1 * indices.len() as f64;
+            bar.inc(1);
+        }
+        state.progress.epoch += 1;
+        let Progress { epoch, step, .. } = state.progress;
+        let due = |every: u32| epoch == epochs || epoch.is_multiple_of(every);
+
+        let n = task.real.len() as f64;
+        let (loss, generator_loss) = (discriminator_sum / n, generator_sum / n);
+        for loss in [loss, generator_loss] {
+            ensure_finite(task.stage, epoch, "loss", loss)?;
+        }
+        for side in [&state.generator, &state.discriminator] {
+            ensure_finite_weights(task.stage, epoch, &side.weights)?;
+        }
+        let sigma = sigma_range(&state.generator.weights);
+        let mut likeness = None;
+        if due(task.settings.picture_every_epochs) {
+            if reference.is_none() {
+                reference = Some(task.reference()?);
+            }
+            let real = reference.as_ref().expect("set just now");
+            likeness = Some(task.likeness(real, &state.generator.weights)?);
+            task.picture(&state.generator.weights, epoch, run)?;
+        }
+        metrics.add(&Row {
+            step,
+            epoch,
+            loss,
+            learning_rate: rate,
+            accuracy: None,
+            validation: None,
+            seconds: begun.elapsed().as_secs_f64(),
+            adversarial: Some(Adversarial {
+                generator_loss,
+                sigma,
+                likeness,
+            }),
+        })?;
+        let mut message = format!(
+            "losses {loss:.3} {generator_loss:.3}, sigma {:.3}",
+            sigma[1]
+        );
+        if let Some(likeness) = likeness {
+            let (distance, std) = (likeness.feature_distance, likeness.pixel_std);
+            message += &format!(", distance {distance:.3}, pixel std {std:.3}");
+        }
+        report(&bar, task.stage, epoch, epochs, message);
+        if due(task.settings.checkpoint_every_epochs) {
+            run.save(task.stage, &state.checkpoint(&origin))?;
+        }
+    }
+    bar.finish_and_clear();
+    Ok(Gan {
+        discriminator: state.discriminator.evaluated(),
+        generator: state.generator.weights,
+    })
+}
+
+/// All that changes from step to step.
+#[derive(Debug)]
+struct State {
+    progress: Progress,
+    generator: Learner,
+    discriminator: Learner,
+}
+
+/// Prefixes of the two sides' lists in a checkpoint.
+const SIDES: [&str; 2] = ["generator ", "discriminator "];
+
+impl State {
+    fn fresh(initial: Gan, settings: &GanSettings) -> Self {
+        let GanSettings {
+            optimiser,
+            averaging,
+            ..
+        } = *settings;
+        Self {
+            progress: Progress::default(),
+            generator: Learner::fresh(initial.generator, optimiser, 0.0),
+            discriminator: Learner::fresh(initial.discriminator, optimiser, averaging),
+        }
+    }
+
+    fn resumed(checkpoint: &Checkpoint, settings: &GanSettings) -> anyhow::Result<Self> {
+        let steps = checkpoint.progress.step;
+        let resumed = |prefix: &str, averaging| {
+            Learner::resumed(checkpoint, prefix, steps, settings.optimiser, averaging)
+        };
+        Ok(Self {
+            progress: checkpoint.progress,
+            generator: resumed(SIDES[0], 0.0)?,
+            discriminator: resumed(SIDES[1], settings.averaging)?,
+        })
+    }
+
+    fn checkpoint(&self, origin: &str) -> Checkpoint {
+        let mut lists = self.generator.lists(SIDES[0]);
+        lists.extend(self.discriminator.lists(SIDES[1]));
+        Checkpoint {
+            origin: origin.to_owned(),
+            progress: self.progress,
+            lists,
+        }
+    }
+
+    /// A step of both sides on the real samples `indices`; gives the losses of discriminator and
+    /// generator.
+    fn step(&mut self, task: &Task, indices: &[usize], rate: f64) -> (f64, f64) {
+        let number = self.progress.step;
+        self.progress.step += 1;
+        let batch = task.batch(indices, number);
+        let settings = task.settings;
+        let rules = Rules {
+            game: task.game,
+            sigma_penalty: settings.sigma_penalty,
+            rate,
+        };
+        let mut stream = task.stream("noise").child(number);
+        let eta = generator::noise(settings.samples_a_component, &mut stream, task.device);
+        step(
+            &mut self.generator,
+            &mut self.discriminator,
+            &batch,
+            eta,
+            rules,
+        )
+    }
+}
+
+/// Least, mean and greatest size of the mixture's deviations; their sign means nothing.
+fn sigma_range(generator: &Weights) -> [f64; 3] {
+    let sizes: Vec<f64> = generator
+        .numbers("mixture.sigma")
+        .iter()
+        .map(|sigma| f64::from(sigma.abs()))
+        .collect();
+    [
+        sizes.iter().copied().fold(f64::INFINITY, f64::min),
+        sizes.iter().sum::<f64>() / sizes.len() as f64,
+        sizes.iter().copied().fold(0.0, f64::max),
+    ]
+}
+
+impl Task<'_> {
+    fn origin(&self, initial: &Gan) -> String {
+        let settings = (self.settings, self.full_scale_n);
+        Origin::new(self.stage, &settings, self.seed)
+            .samples(self.dataset, self.real)
+            .samples(self.dataset, self.labelled)
+            .weights(&initial.generator)
+            .weights(&initial.discriminator)
+            .finish()
+    }
+
+    fn stream(&self, name: &str) -> Stream {
+        Stream::new(self.seed, &format!("{} {name}", self.stage))
+    }
+
+    /// `samples` in the order of pass `pass`.
+    fn order(&self, name: &str, samples: &[usize], pass: u64) -> Vec<usize> {
+        let mut order = samples.to_vec();
+        self.stream(name).child(pass).shuffle(&mut order);
+        order
+    }
+
+    fn frames(&self, indices: &[usize]) -> Vec<&Frame> {
+        let frame = |&index: &usize| &self.dataset.samples[index].frame;
+        indices.iter().map(frame).collect()
+    }
+
+    /// The images of step `step`. The labelled samples are fewer than the real ones and come
+    /// again and again.
+    fn batch(&self, real: &[usize], step: u64) -> Batch {
+        let images = |indices: &[usize]| {
+            hrn::images(
+                self.frames(indices).into_iter(),
+                self.full_scale_n,
+                self.device,
+            )
+        };
+        let batches = self.labelled.len().div_ceil(self.settings.batch) as u64;
+        let labelled = (batches > 0).then(|| {
+            let order = self.order("labelled order", self.labelled, step / batches);
+            let mut parts = order.chunks(self.settings.batch);
+            let indices = parts
+                .nth((step % batches) as usize)
+                .expect("so many there are");
+            let levels_of = indices
+                .iter()
+                .map(|&index| self.dataset.samples[index].level);
+            let levels = crate::train::data::dataset::levels().len();
+            (
+                images(indices),
+                hrn::targets(levels_of, levels, self.device),
+            )
+        });
+        Batch {
+            real: images(real),
+            labelled,
+        }
+    }
+}

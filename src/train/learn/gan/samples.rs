@@ -1,0 +1,67 @@
+//! What the generator makes of fixed noise as it trains: measured against real frames, and drawn
+//! beside them.
+
+use anyhow::Context as _;
+
+use super::Task;
+use crate::train::judge::likeness::{Likeness, Reference};
+use crate::train::judge::sheet::{self, Strip};
+use crate::train::net::generator;
+use crate::train::net::network::{Normalisation, Weights};
+use crate::train::run::Run;
+
+/// Real frames, at most, that generated ones are measured against; they are measured pair by pair.
+const COMPARED: usize = 500;
+/// Pairs of strips of generated frames in a picture.
+const STRIPS: usize = 3;
+
+impl Task<'_> {
+    /// Real samples to measure generated ones by.
+    pub(super) fn reference(&self) -> anyhow::Result<Reference> {
+        let order = self.order("compared", self.real, 0);
+        let frames = self.frames(&order[..order.len().min(COMPARED)]);
+        Reference::of(&frames, self.full_scale_n).context("real samples")
+    }
+
+    /// Compares what fixed noise becomes with them.
+    pub(super) fn likeness(
+        &self,
+        real: &Reference,
+        generator: &Weights,
+    ) -> anyhow::Result<Likeness> {
+        let samples = self.settings.samples_a_component;
+        let statistics = generator::statistics(generator, samples, self.seed, self.device);
+        let frames = generator::generate(
+            generator,
+            &statistics,
+            COMPARED / generator::COMPONENTS,
+            self.full_scale_n,
+            &mut self.stream("compared noise"),
+            self.device,
+        );
+        real.compare(&frames, generator::COMPONENTS)
+            .context("generated samples")
+    }
+
+    /// Draws what fixed noise becomes beside real frames: of each component one frame, and under
+    /// it another.
+    pub(super) fn picture(&self, generator: &Weights, epoch: u32, run: &Run) -> anyhow::Result<()> {
+        let samples = self.settings.samples_a_component.max(2);
+        let eta = generator::noise(samples, &mut self.stream("picture"), self.device);
+        let images = generator::images(generator, eta, &mut Normalisation::Batch);
+        let generated = generator::frames(&images, self.full_scale_n);
+        let order = self.order("compared", self.real, 0);
+        let real = self.frames(&order);
+        let mut rows = vec![Strip::of("real", real.into_iter().take(sheet::TILES))];
+        let (first, second) = generated.split_at(generator::COMPONENTS);
+        let parts = first.chunks(sheet::TILES).zip(second.chunks(sheet::TILES));
+        for (first, second) in parts.take(STRIPS) {
+            rows.push(Strip::of("generated", first.iter()));
+            rows.push(Strip::of("  again", second.iter()));
+        }
+        let stage = self.stage;
+        let title = format!("{stage} after {epoch} epochs: {}", sheet::captions());
+        let name = format!("samples/{stage}-{epoch:06}.png");
+        run.write(&name, &sheet::strips(&title, &rows)?)
+    }
+}

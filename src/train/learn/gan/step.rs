@@ -1,0 +1,134 @@
+//! One step of both sides against each other, the discriminator first.
+//!
+//! In: both sides as they learn, what is real, noise, the rules. Out: both losses; the sides have
+//! moved.
+
+use burn::tensor::Tensor;
+
+use crate::train::learn::learner::Learner;
+use crate::train::net::generator;
+use crate::train::net::losses::{self, Game, Judged};
+use crate::train::net::network::{self, Normalisation, Weights, numbers};
+
+/// What a step goes by.
+#[derive(Debug, Clone, Copy)]
+pub struct Rules {
+    /// What the discriminator tells apart.
+    pub game: Game,
+    /// Lambda of Eq. (7).
+    pub sigma_penalty: f64,
+    /// Learning rate.
+    pub rate: f64,
+}
+
+/// What the discriminator is shown in a step beside generated images.
+#[derive(Debug)]
+pub struct Batch {
+    /// `[batch, 1, 28, 28]`.
+    pub real: Tensor<4>,
+    /// Images and targets `[batch, L]`.
+    pub labelled: Option<(Tensor<4>, Tensor<2>)>,
+}
+
+/// A step of the discriminator, then one of the generator; gives the losses of both.
+pub fn step(
+    generator: &mut Learner,
+    discriminator: &mut Learner,
+    batch: &Batch,
+    eta: Tensor<2>,
+    rules: Rules,
+) -> (f64, f64) {
+    // The generator does not change while the discriminator takes its step, so both use the
+    // same images.
+    let generated = Generated::of(generator, eta);
+
+    let (tracked, loss) = told_apart(discriminator, batch, &generated, rules.game);
+    let mut gradients = loss.backward();
+    discriminator.step(&tracked, &mut gradients, rules.rate);
+
+    let fooled = generator_loss(rules.game, &discriminator.weights, batch, generated.images);
+    let of_generator = learn(generator, &generated.tracked, fooled, rules);
+    (number(&loss), of_generator)
+}
+
+/// Images, and the weights that their gradients lead to.
+struct Generated {
+    tracked: Weights,
+    images: Tensor<4>,
+}
+
+impl Generated {
+    fn of(generator: &Learner, eta: Tensor<2>) -> Self {
+        let tracked = generator.weights.tracked();
+        let images = generator::images(&tracked, eta, &mut Normalisation::Batch);
+        Self { tracked, images }
+    }
+}
+
+/// The discriminator's loss, to which generated images are constants, and the weights that its
+/// gradients lead to.
+fn told_apart(
+    discriminator: &Learner,
+    batch: &Batch,
+    generated: &Generated,
+    game: Game,
+) -> (Weights, Tensor<1>) {
+    let tracked = discriminator.weights.tracked();
+    let images = generated.images.clone().inner();
+    let loss = discriminator_loss(game, &tracked, batch, images);
+    (tracked, loss)
+}
+
+/// The generator's step on its loss and the penalty on sigma; gives their sum.
+fn learn(generator: &mut Learner, tracked: &Weights, fooled: Tensor<1>, rules: Rules) -> f64 {
+    let loss = fooled.add(penalty(tracked, rules.sigma_penalty));
+    let mut gradients = loss.backward();
+    generator.step(tracked, &mut gradients, rules.rate);
+    number(&loss)
+}
+
+fn number(loss: &Tensor<1>) -> f64 {
+    f64::from(numbers(loss)[0])
+}
+
+/// Every batch goes through the discriminator by itself and is normalised by its own statistics:
+/// mixed, a batch of real and generated frames would tell the layers what it is made of.
+fn judge(discriminator: &Weights, images: Tensor<4>) -> Judged {
+    let features = network::trunk(discriminator, images, &mut Normalisation::Batch);
+    Judged {
+        logits: network::head(discriminator, features.clone()),
+        features,
+    }
+}
+
+pub(super) fn discriminator_loss(
+    game: Game,
+    discriminator: &Weights,
+    batch: &Batch,
+    generated: Tensor<4>,
+) -> Tensor<1> {
+    let labelled = batch.labelled.as_ref().map(|(images, targets)| {
+        let judged = judge(discriminator, images.clone());
+        (judged.logits, targets.clone())
+    });
+    let real = judge(discriminator, batch.real.clone());
+    let generated = judge(discriminator, generated);
+    losses::discriminator(game, real, generated, labelled)
+}
+
+/// Without [`penalty`].
+pub(super) fn generator_loss(
+    game: Game,
+    discriminator: &Weights,
+    batch: &Batch,
+    generated: Tensor<4>,
+) -> Tensor<1> {
+    let generated = judge(discriminator, generated);
+    let real = || judge(discriminator, batch.real.clone());
+    losses::generator(game, real, generated)
+}
+
+/// Lambda times Eq. (7)'s penalty on the mixture's sigma.
+pub(super) fn penalty(generator: &Weights, lambda: f64) -> Tensor<1> {
+    losses::sigma_penalty(generator.tensor::<2>("mixture.sigma")).mul_scalar(lambda)
+}

@@ -1,0 +1,4 @@
+//! From a trained recogniser to the ONNX file that the daemon loads.
+
+pub mod file;
+pub mod export;

@@ -1,0 +1,246 @@
+//! From a trained recogniser to the file the daemon loads, and what that file is worth.
+//!
+//! In: a graph with its temperature, the data it learnt from, and a function that computes its
+//! probabilities as training does. Out: `hrn.onnx`, which carries check frames that the daemon
+//! must reproduce, and `evaluation.json`, which is measured on that very file.
+
+use anyhow::ensure;
+use serde_json::json;
+
+use super::file;
+use crate::frame::Frame;
+use crate::press;
+use crate::simulator::Split;
+use crate::train::data::dataset::{self, Dataset, Kind, Source};
+use crate::train::judge::metrics::{Evaluation, Judged};
+use crate::train::net::graph::Graph;
+use crate::train::run::{Description, Run};
+use crate::verdict::{Card, Check, Hrn, Range};
+
+/// Check frames a level (`docs/formats.md`).
+const CHECK_FRAMES_A_LEVEL: usize = 2;
+
+/// A recogniser as a graph.
+#[derive(Debug, Clone)]
+pub struct Recogniser {
+    /// From newtons to logits.
+    pub graph: Graph,
+    /// Name of the logits in it, before temperature.
+    pub raw_logits: String,
+    /// What they are divided by.
+    pub temperature: f32,
+}
+
+/// Writes the model and its evaluation on the test split into the run's directory. `train` are
+/// the samples learnt from, and `probabilities` computes those of frames without the file.
+///
+/// # Errors
+///
+/// If the daemon's loader refuses the file, or the directory cannot be written.
+pub fn finish(
+    run: &Run,
+    description: &Description,
+    dataset: &Dataset,
+    train: &[usize],
+    recogniser: &Recogniser,
+    probabilities: impl Fn(&[&Frame]) -> anyhow::Result<Vec<Vec<f32>>>,
+) -> anyhow::Result<Option<Evaluation>> {
+    let frames = check_frames(dataset, train);
+    let check = Check {
+        probabilities: probabilities(&frames)?,
+        frames: frames.iter().map(|frame| frame.newtons.to_vec()).collect(),
+    };
+    let mut card = Card {
+        format: "1".to_owned(),
+        levels: dataset::levels(),
+        pitch_mm: dataset.pitch_mm() as f32,
+        method: description.method.clone(),
+        data: data(&description.data)?,
+        metrics: json!({ "temperature": recogniser.temperature }),
+        validation: validation(&description.data).to_owned(),
+        range: range(dataset, train),
+    };
+    let write = |card: &Card| {
+        let Recogniser {
+            graph,
+            raw_logits,
+            temperature,
+        } = recogniser.clone();
+        file::write(graph, &raw_logits, temperature, card, &check)
+    };
+    // The metrics are measured on the file and then become part of it; the graph is the same.
+    let hrn = Hrn::load(&write(&card)?)?;
+    let evaluation = match dataset.labelled(Split::Test) {
+        Ok(test) => Some(evaluate(&hrn, dataset, &test)?),
+        Err(_) => None,
+    };
+    if let Some(evaluation) = &evaluation {
+        card.metrics["test"] = json!(evaluation);
+        if dataset.sources.len() > 1 {
+            card.metrics["test_by_source"] = evaluations_by_source(&hrn, dataset)?;
+        }
+        let json = serde_json::to_vec_pretty(evaluation)?;
+        run.write("evaluation.json", &json)?;
+    }
+    run.write("hrn.onnx", &write(&card)?)?;
+    Ok(evaluation)
+}
+
+/// Judges samples with a model and evaluates what it said.
+///
+/// # Errors
+///
+/// If the model has fewer levels than the data, or fails to judge a frame.
+pub fn evaluate(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Evaluation> {
+    let judged = judge(hrn, dataset, indices)?;
+    Ok(Evaluation::of(&judged, hrn.card().levels.len()))
+}
+
+/// Judges labelled samples with a model.
+///
+/// # Errors
+///
+/// If the model has fewer levels than the data, or fails to judge a frame.
+pub fn judge(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Vec<Judged>> {
+    let levels = hrn.card().levels.len();
+    let mut judged = Vec::with_capacity(indices.len());
+    for &index in indices {
+        let sample = &dataset.samples[index];
+        ensure!(
+            usize::from(sample.level) <= levels,
+            "the model has {levels} levels, and the data has a sample of level {}",
+            sample.level
+        );
+        let probabilities = hrn.judge(&sample.frame)?.probabilities;
+        judged.push(Judged {
+            level: sample.level,
+            probabilities,
+            object: sample.object,
+        });
+    }
+    Ok(judged)
+}
+
+fn evaluations_by_source(hrn: &Hrn, dataset: &Dataset) -> anyhow::Result<serde_json::Value> {
+    let mut by_source = serde_json::Map::new();
+    let test = dataset.labelled(Split::Test)?;
+    for (number, source) in dataset.sources.iter().enumerate() {
+        let of_source = |index: &usize| dataset.samples[*index].source == number;
+        let indices: Vec<usize> = test.iter().copied().filter(of_source).collect();
+        if !indices.is_empty() {
+            let evaluation = serde_json::to_value(evaluate(hrn, dataset, &indices)?)?;
+            by_source.insert(source.name.clone(), evaluation);
+        }
+    }
+    Ok(by_source.into())
+}
+
+/// Two frames of each level, from a third and two thirds of its samples.
+fn check_frames<'a>(dataset: &'a Dataset, train: &[usize]) -> Vec<&'a Frame> {
+    let mut frames = Vec::new();
+    for level in dataset::levels() {
+        let of_level = |index: &usize| dataset.samples[*index].level == level.level;
+        let samples: Vec<usize> = train.iter().copied().filter(of_level).collect();
+        // A level without samples is checked by those of the others.
+        let samples = if samples.is_empty() {
+            train.to_vec()
+        } else {
+            samples
+        };
+        for part in 1..=CHECK_FRAMES_A_LEVEL {
+            let place = samples.len() * part / (CHECK_FRAMES_A_LEVEL + 1);
+            frames.push(&dataset.samples[samples[place]].frame);
+        }
+    }
+    frames
+}
+
+/// `hrn.data`: name, seed and hash; a list where there are several files.
+fn data(sources: &[Source]) -> serde_json::Result<String> {
+    let one = |source: &Source| json!({ "name": source.name, "seed": source.seed, "sha256": source.sha256 });
+    match sources {
+        [source] => serde_json::to_string(&one(source)),
+        _ => serde_json::to_string(&sources.iter().map(one).collect::<Vec<_>>()),
+    }
+}
+
+/// `hrn.validation`.
+fn validation(sources: &[Source]) -> &'static str {
+    let kinds: Vec<Kind> = sources.iter().flat_map(Source::kinds).collect();
+    let [simulated, recorded, unknown] =
+        [Kind::Simulated, Kind::Recorded, Kind::Unknown].map(|kind| kinds.contains(&kind));
+    match (simulated, recorded, unknown) {
+        (true, false, false) => "simulated data only",
+        (true, true, false) => "simulated and recorded data",
+        (false, true, false) => "recorded data",
+        (false, false, _) => "data of unknown origin",
+        (_, _, true) => "data partly of unknown origin",
+    }
+}
+
+/// Total force and contact area of the frames learnt from.
+fn range(dataset: &Dataset, train: &[usize]) -> Range {
+    let threshold_n = press::Settings::default().contact_threshold_n;
+    let mut range = Range {
+        force_n: [f32::INFINITY, 0.0],
+        contact_area_taxels: [u32::MAX, 0],
+    };
+    for &index in train {
+        let frame = &dataset.samples[index].frame;
+        let (force_n, area) = (
+            frame.force_n() as f32,
+            frame.contact_area_taxels(threshold_n),
+        );
+        range.force_n = [range.force_n[0].min(force_n), range.force_n[1].max(force_n)];
+        let [least, most] = range.contact_area_taxels;
+        range.contact_area_taxels = [least.min(area), most.max(area)];
+    }
+    range
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_model_is_said_to_be_of_what_is_told_of_its_data() {
+        for (generators, expected) in [
+            (
+                &[Some("hardnessd simulator 0.1.0")][..],
+                "simulated data only",
+            ),
+            (&[Some("hrn-train collect 0.1.0")], "recorded data"),
+            (
+                &[Some("hardnessd simulator 0.1.0, hrn-train collect 0.2.0")],
+                "simulated and recorded data",
+            ),
+            (
+                &[
+                    Some("hardnessd simulator 0.1.0"),
+                    Some("hrn-train collect 0.1.0"),
+                ],
+                "simulated and recorded data",
+            ),
+            (&[None], "data of unknown origin"),
+            (&[Some("finite elements")], "data of unknown origin"),
+            (
+                &[Some("hrn-train collect 0.1.0"), None],
+                "data partly of unknown origin",
+            ),
+            (
+                &[Some("unknown, hrn-train collect 0.1.0")],
+                "data partly of unknown origin",
+            ),
+        ] {
+            let source = |generator: &Option<&str>| Source {
+                name: String::new(),
+                seed: None,
+                sha256: String::new(),
+                generator: generator.map(str::to_owned),
+                pitch_mm: None,
+            };
+            let sources: Vec<Source> = generators.iter().map(source).collect();
+            assert_eq!(validation(&sources), expected, "{generators:?}");
+        }
+    }
+}

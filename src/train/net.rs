@@ -1,0 +1,8 @@
+//! The networks: layers, weights, what they compute, and their losses.
+
+pub mod graph;
+pub mod layers;
+pub mod network;
+pub mod hrn;
+pub mod generator;
+pub mod losses;

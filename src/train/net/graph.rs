@@ -1,0 +1,193 @@
+//! A network as a graph of ONNX nodes, from newtons to logits.
+//!
+//! In: nodes and constants, one by one. Out: the graph as tract's own ONNX types, so that the
+//! exported file and the daemon's reader share one schema, or a plan that computes it here and now.
+
+use tract_onnx::pb;
+use tract_onnx::prelude::*;
+
+use crate::frame::{COLS, Frame, ROWS};
+use crate::verdict::MIN_OPSET;
+
+/// The name of the graph's input: newtons a taxel, `[1, 1, 28, 28]`.
+pub const INPUT: &str = "frame";
+/// The IR version that goes with opset 17.
+const IR_VERSION: i64 = 8;
+
+/// The nodes and constants of a graph under construction. A value is known by its name.
+#[derive(Debug, Clone, Default)]
+pub struct Graph {
+    nodes: Vec<pb::NodeProto>,
+    constants: Vec<pb::TensorProto>,
+}
+
+impl Graph {
+    /// Adds an f32 constant and gives its name back.
+    pub fn constant(&mut self, name: &str, dims: &[usize], values: &[f32]) -> String {
+        debug_assert_eq!(dims.iter().product::<usize>(), values.len(), "{name}");
+        self.raw(name, dims, pb::tensor_proto::DataType::Float, |raw| {
+            raw.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+        })
+    }
+
+    /// Adds an i64 vector, as shapes and axes are given, and gives its name back.
+    pub fn indices(&mut self, name: &str, values: &[i64]) -> String {
+        self.raw(
+            name,
+            &[values.len()],
+            pb::tensor_proto::DataType::Int64,
+            |raw| {
+                raw.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+            },
+        )
+    }
+
+    fn raw(
+        &mut self,
+        name: &str,
+        dims: &[usize],
+        data_type: pb::tensor_proto::DataType,
+        fill: impl FnOnce(&mut Vec<u8>),
+    ) -> String {
+        let mut tensor = pb::TensorProto {
+            name: name.to_owned(),
+            dims: dims.iter().map(|&length| length as i64).collect(),
+            data_type: data_type as i32,
+            ..Default::default()
+        };
+        fill(&mut tensor.raw_data);
+        self.constants.push(tensor);
+        name.to_owned()
+    }
+
+    /// Adds a node with one output, which it gives back.
+    pub fn node(
+        &mut self,
+        op: &str,
+        inputs: &[&str],
+        output: &str,
+        attributes: Vec<pb::AttributeProto>,
+    ) -> String {
+        self.nodes.push(pb::NodeProto {
+            name: format!("{op}:{output}"),
+            op_type: op.to_owned(),
+            input: inputs.iter().map(|&input| input.to_owned()).collect(),
+            output: vec![output.to_owned()],
+            attribute: attributes,
+            ..Default::default()
+        });
+        output.to_owned()
+    }
+}
+
+/// An integer attribute.
+pub fn integer(name: &str, value: i64) -> pb::AttributeProto {
+    pb::AttributeProto {
+        name: name.to_owned(),
+        r#type: pb::attribute_proto::AttributeType::Int as i32,
+        i: value,
+        ..Default::default()
+    }
+}
+
+/// A list of integers as an attribute.
+pub fn integers(name: &str, values: &[i64]) -> pb::AttributeProto {
+    pb::AttributeProto {
+        name: name.to_owned(),
+        r#type: pb::attribute_proto::AttributeType::Ints as i32,
+        ints: values.to_vec(),
+        ..Default::default()
+    }
+}
+
+/// A number as an attribute.
+pub fn number(name: &str, value: f32) -> pb::AttributeProto {
+    pb::AttributeProto {
+        name: name.to_owned(),
+        r#type: pb::attribute_proto::AttributeType::Float as i32,
+        f: value,
+        ..Default::default()
+    }
+}
+
+/// A graph that runs here and now, for what training itself needs from it.
+#[derive(Debug)]
+pub struct Plan(Arc<TypedRunnableModel>);
+
+impl Plan {
+    /// Prepares `graph` to compute `output`, an f32 of shape `dims`.
+    ///
+    /// # Errors
+    ///
+    /// If the inference library cannot run it.
+    pub fn new(graph: Graph, output: &str, dims: &[usize]) -> anyhow::Result<Self> {
+        let proto = model(graph, vec![value_info(output, dims)], Vec::new());
+        let plan = tract_onnx::onnx()
+            .model_for_proto_model(&proto)?
+            .with_input_fact(0, f32::fact([1, 1, ROWS, COLS]).into())?
+            .into_optimized()?
+            .into_runnable()?;
+        Ok(Self(plan))
+    }
+
+    /// The output for one frame, row-major.
+    ///
+    /// # Errors
+    ///
+    /// If the inference library fails.
+    pub fn run(&self, frame: &Frame) -> anyhow::Result<Vec<f32>> {
+        let input = Tensor::from_shape(&[1, 1, ROWS, COLS], &frame.newtons)?;
+        let outputs = self.0.run(tvec!(input.into()))?;
+        Ok(outputs[0].try_as_plain_ram()?.as_slice::<f32>()?.to_vec())
+    }
+}
+
+/// The graph as an ONNX model.
+pub(in crate::train) fn model(
+    graph: Graph,
+    output: Vec<pb::ValueInfoProto>,
+    metadata_props: Vec<pb::StringStringEntryProto>,
+) -> pb::ModelProto {
+    pb::ModelProto {
+        ir_version: IR_VERSION,
+        opset_import: vec![pb::OperatorSetIdProto {
+            domain: String::new(),
+            version: MIN_OPSET,
+        }],
+        producer_name: "hrn-train".to_owned(),
+        producer_version: env!("CARGO_PKG_VERSION").to_owned(),
+        graph: Some(pb::GraphProto {
+            name: "hrn".to_owned(),
+            node: graph.nodes,
+            initializer: graph.constants,
+            input: vec![value_info(INPUT, &[1, 1, ROWS, COLS])],
+            output,
+            ..Default::default()
+        }),
+        metadata_props,
+        ..Default::default()
+    }
+}
+
+/// The type of an f32 tensor in a model.
+pub(in crate::train) fn value_info(name: &str, dims: &[usize]) -> pb::ValueInfoProto {
+    use pb::tensor_shape_proto::{Dimension, dimension};
+    let dim = dims
+        .iter()
+        .map(|&length| Dimension {
+            value: Some(dimension::Value::DimValue(length as i64)),
+            ..Default::default()
+        })
+        .collect();
+    pb::ValueInfoProto {
+        name: name.to_owned(),
+        r#type: Some(pb::TypeProto {
+            value: Some(pb::type_proto::Value::TensorType(pb::type_proto::Tensor {
+                elem_type: pb::tensor_proto::DataType::Float as i32,
+                shape: Some(pb::TensorShapeProto { dim }),
+            })),
+            ..Default::default()
+        }),
+        ..Default::default()
+    }
+}

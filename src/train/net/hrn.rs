@@ -1,0 +1,292 @@
+//! The hardness recognition network: the trunk, one linear layer, softmax.
+//!
+//! In: frames with levels. Out: weights, and the graph of the exported file. 32,196 parameters
+//! for four levels.
+
+use burn::tensor::{Device, Tensor, TensorData, activation};
+
+use crate::frame::{COLS, Frame, ROWS, TAXELS};
+use crate::random::Stream;
+use crate::train::net::graph::{self, Graph};
+use crate::train::net::layers::STRIDE;
+use crate::train::net::network::{
+    self, FEATURES, LEAKY_SLOPE, Normalisation, Statistics, TRUNK, Weights,
+};
+
+/// Initial weights for `levels` levels.
+pub fn initial(levels: usize, seed: u64, device: &Device) -> Weights {
+    let stream = Stream::new(seed, "hrn weights");
+    let mut weights = Weights::default();
+    network::add_trunk(&mut weights, &stream, device);
+    network::add_head(&mut weights, [FEATURES, levels], &stream, device);
+    weights
+}
+
+/// HRN before pretraining or fine-tuning: a USTGAN's discriminator with a head for `levels` levels
+/// in place of its own, which told real from generated.
+pub fn inherited(discriminator: &Weights, levels: usize, seed: u64, device: &Device) -> Weights {
+    let mut weights = discriminator.clone();
+    weights
+        .entries
+        .retain(|weight| !weight.name.starts_with("head."));
+    let stream = Stream::new(seed, "hrn weights");
+    network::add_head(&mut weights, [FEATURES, levels], &stream, device);
+    weights
+}
+
+/// HRN of a discriminator whose first `levels` logits are the levels: further ones are cut off.
+pub fn of_levels(discriminator: &Weights, levels: usize, device: &Device) -> Weights {
+    let mut weights = discriminator.clone();
+    weights
+        .entries
+        .retain(|weight| !weight.name.starts_with("head."));
+    let outputs = discriminator.numbers("head.bias").len();
+    for (name, dims) in [
+        ("head.matrix", vec![FEATURES, levels]),
+        ("head.bias", vec![levels]),
+    ] {
+        let rows = discriminator.numbers(name);
+        let rows = rows.chunks(outputs).flat_map(|row| &row[..levels]);
+        weights.add(name, &dims, rows.copied().collect(), device);
+    }
+    weights
+}
+
+/// Frames to images `[batch, 1, 28, 28]` in [-1, 1]: 0 N is -1, `full_scale_n` is 1. One scale
+/// for all frames, because force carries hardness.
+pub fn images<'a>(
+    frames: impl ExactSizeIterator<Item = &'a Frame>,
+    full_scale_n: f64,
+    device: &Device,
+) -> Tensor<4> {
+    let batch = frames.len();
+    let mut values = Vec::with_capacity(batch * TAXELS);
+    for frame in frames {
+        values.extend(frame.newtons.map(|newtons| pixel(newtons, full_scale_n)));
+    }
+    Tensor::from_data(TensorData::new(values, [batch, 1, ROWS, COLS]), device)
+}
+
+/// A taxel of the image.
+pub fn pixel(newtons: f32, full_scale_n: f64) -> f32 {
+    newtons * (2.0 / full_scale_n) as f32 - 1.0
+}
+
+/// Logits `[batch, L]` of images `[batch, 1, 28, 28]`.
+pub fn logits(
+    weights: &Weights,
+    images: Tensor<4>,
+    normalisation: &mut Normalisation,
+) -> Tensor<2> {
+    network::head(weights, network::trunk(weights, images, normalisation))
+}
+
+/// Eq. (9): `-1/N sum_n sum_i delta(y_n = i) log P(f(x_n) in class i)`, from logits.
+///
+/// `targets` is `[batch, L]` with a 1 at each sample's level.
+pub fn cross_entropy(logits: Tensor<2>, targets: Tensor<2>) -> Tensor<1> {
+    let batch = logits.dims()[0] as f32;
+    activation::log_softmax(logits, 1)
+        .mul(targets)
+        .sum()
+        .neg()
+        .div_scalar(batch)
+}
+
+/// Levels 1..=L as rows with a 1 at the level: `[batch, L]`.
+pub fn targets(
+    levels_of: impl ExactSizeIterator<Item = u8>,
+    levels: usize,
+    device: &Device,
+) -> Tensor<2> {
+    let batch = levels_of.len();
+    let mut values = vec![0.0_f32; batch * levels];
+    for (row, level) in levels_of.enumerate() {
+        values[row * levels + usize::from(level) - 1] = 1.0;
+    }
+    Tensor::from_data(TensorData::new(values, [batch, levels]), device)
+}
+
+/// The graph from newtons to logits, and the logits' name. Batch normalisation is folded into
+/// the convolutions.
+pub fn graph(weights: &Weights, statistics: &Statistics, full_scale_n: f64) -> (Graph, String) {
+    let mut graph = Graph::default();
+    // 2 x / full scale is the image raised by 1, which the trunk's first line makes.
+    let scale = graph.constant("scale", &[], &[(2.0 / full_scale_n) as f32]);
+    let mut x = graph.node("Mul", &[graph::INPUT, &scale], "image", Vec::new());
+    for (layer, folded) in TRUNK.iter().zip(network::fold(weights, statistics)) {
+        let name = layer.name;
+        let dims = [layer.outputs, layer.inputs, layer.kernel, layer.kernel];
+        let kernel = graph.constant(&format!("{name}.kernel"), &dims, &folded.kernel);
+        let bias = graph.constant(&format!("{name}.bias"), &[layer.outputs], &folded.bias);
+        let (before, after) = (layer.padding.0 as i64, layer.padding.1 as i64);
+        let attributes = vec![
+            graph::integers("kernel_shape", &[layer.kernel as i64; 2]),
+            graph::integers("strides", &[STRIDE as i64; 2]),
+            graph::integers("pads", &[before, before, after, after]),
+        ];
+        x = graph.node(
+            "Conv",
+            &[&x, &kernel, &bias],
+            &format!("{name}.sum"),
+            attributes,
+        );
+        let slope = vec![graph::number("alpha", LEAKY_SLOPE)];
+        x = graph.node("LeakyRelu", &[&x], &format!("{name}.out"), slope);
+    }
+    let pooled = graph.node("GlobalMaxPool", &[&x], "pooled", Vec::new());
+    let flat = graph.node(
+        "Flatten",
+        &[&pooled],
+        "features",
+        vec![graph::integer("axis", 1)],
+    );
+    let bias = weights.numbers("head.bias");
+    let matrix = weights.numbers("head.matrix");
+    let matrix = graph.constant("head.matrix", &[FEATURES, bias.len()], &matrix);
+    let bias = graph.constant("head.bias", &[bias.len()], &bias);
+    let raw_logits = graph.node("Gemm", &[&flat, &matrix, &bias], "raw_logits", Vec::new());
+    (graph, raw_logits)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn device() -> Device {
+        Device::flex()
+    }
+
+    /// A frame with a Gaussian blob of `width` taxels at (row, column).
+    fn blob(row: f32, column: f32, width: f32) -> Frame {
+        let mut frame = Frame::default();
+        for (index, newtons) in frame.newtons.iter_mut().enumerate() {
+            let (r, c) = ((index / COLS) as f32 - row, (index % COLS) as f32 - column);
+            *newtons = 2.0 * (-(r * r + c * c) / (2.0 * width * width)).exp();
+        }
+        frame
+    }
+
+    #[test]
+    fn the_network_has_the_papers_number_of_parameters() {
+        assert_eq!(initial(4, 1, &device()).count(), 32_196);
+    }
+
+    #[test]
+    fn every_parameter_receives_a_gradient() {
+        let frames: Vec<Frame> = (0..8).map(|n| blob(9.0 + n as f32, 14.0, 2.0)).collect();
+        let weights = initial(4, 3, &device()).tracked();
+        let x = images(frames.iter(), 10.2, &device());
+        let y = targets((0..8).map(|n| n % 4 + 1), 4, &device());
+        let loss = cross_entropy(logits(&weights, x, &mut Normalisation::Batch), y);
+        let gradients = loss.backward();
+        for weight in &weights.entries {
+            let gradient = weight.values.grad(&gradients).expect(&weight.name);
+            let size = network::numbers(&gradient)
+                .iter()
+                .map(|g| g.abs())
+                .fold(0.0, f32::max);
+            // A bias before batch normalisation is taken away again with the mean.
+            let cancelled = matches!(weight.name.as_str(), "conv2.bias" | "conv3.bias");
+            assert!(
+                size.is_finite() && (cancelled || size > 1e-9),
+                "{}: {size}",
+                weight.name
+            );
+        }
+    }
+
+    #[test]
+    fn gradients_agree_with_finite_differences() {
+        let frames: Vec<Frame> = (0..6)
+            .map(|n| blob(8.0 + 2.0 * n as f32, 13.0, 2.5))
+            .collect();
+        let mut weights = initial(4, 5, &device());
+        let x = images(frames.iter(), 2.0, &device());
+        let y = targets((0..6).map(|n| n % 4 + 1), 4, &device());
+        let loss = |weights: &Weights| {
+            let logits = logits(weights, x.clone(), &mut Normalisation::Batch);
+            cross_entropy(logits, y.clone())
+        };
+        let tracked = weights.tracked();
+        let gradients = loss(&tracked).backward();
+        for (name, place) in [("head.matrix", 7), ("conv3.gamma", 11), ("head.bias", 2)] {
+            let index = weights.entries.iter().position(|w| w.name == name).unwrap();
+            let gradient = tracked.entries[index].values.grad(&gradients).unwrap();
+            let analytic = network::numbers(&gradient)[place];
+            let original = weights.numbers(name);
+            let mut at = |offset: f32| {
+                let mut values = original.clone();
+                values[place] += offset;
+                let length = values.len();
+                weights.entries[index].values =
+                    Tensor::from_data(TensorData::new(values, [length]), &device());
+                let value = network::numbers(&loss(&weights))[0];
+                f64::from(value)
+            };
+            let step = 0.02;
+            let numeric = (at(step) - at(-step)) / f64::from(2.0 * step);
+            at(0.0);
+            let difference = (numeric - f64::from(analytic)).abs();
+            assert!(
+                difference < 2e-3 * numeric.abs().max(1e-2),
+                "{name}: {analytic} {numeric}"
+            );
+        }
+    }
+
+    #[test]
+    fn statistics_of_a_batch_give_its_own_logits() {
+        let frames: Vec<Frame> = (0..5).map(|n| blob(9.0 + n as f32, 14.0, 2.0)).collect();
+        let weights = initial(4, 9, &device());
+        let x = images(frames.iter(), 10.2, &device());
+        let mut statistics = Statistics::default();
+        let in_batch = logits(
+            &weights,
+            x.clone(),
+            &mut Normalisation::Collect(&mut statistics),
+        );
+        let fixed = logits(&weights, x, &mut Normalisation::Fixed(&statistics));
+        let (left, right) = (network::numbers(&in_batch), network::numbers(&fixed));
+        let largest = largest_difference(&left, &right);
+        assert!(largest < 1e-5, "{largest}");
+    }
+
+    #[test]
+    fn folding_keeps_what_the_layers_compute() {
+        let frames: Vec<Frame> = (0..5).map(|n| blob(9.0 + n as f32, 14.0, 2.0)).collect();
+        let mut weights = initial(4, 9, &device());
+        // Untrained, every gamma is 1 and every beta and bias 0, which hides what is left out.
+        for weight in &mut weights.entries {
+            if weight.dims.len() == 1 {
+                let mut stream = Stream::new(9, &weight.name);
+                let moved = network::numbers(&weight.values)
+                    .iter()
+                    .map(|value| value + 0.3 * stream.normal() as f32)
+                    .collect();
+                let length = weight.dims[0];
+                weight.values = Tensor::from_data(TensorData::new(moved, [length]), &device());
+            }
+        }
+        let x = images(frames.iter(), 10.2, &device());
+        let mut statistics = Statistics::default();
+        logits(
+            &weights,
+            x.clone(),
+            &mut Normalisation::Collect(&mut statistics),
+        );
+        let fixed = logits(&weights, x, &mut Normalisation::Fixed(&statistics));
+        let (graph, name) = graph(&weights, &statistics, 10.2);
+        let plan = graph::Plan::new(graph, &name, &[1, 4]).unwrap();
+        let folded = frames.iter().flat_map(|frame| plan.run(frame).unwrap());
+        let (folded, fixed) = (folded.collect::<Vec<_>>(), network::numbers(&fixed));
+        let largest = largest_difference(&folded, &fixed);
+        assert!(largest < 1e-4, "{largest}: {folded:?} {fixed:?}");
+    }
+
+    fn largest_difference(left: &[f32], right: &[f32]) -> f32 {
+        assert_eq!(left.len(), right.len());
+        let differences = left.iter().zip(right).map(|(l, r)| (l - r).abs());
+        differences.fold(0.0, f32::max)
+    }
+}

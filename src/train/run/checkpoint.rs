@@ -1,0 +1,171 @@
+//! The state of a stage in full precision, so that a killed run goes on bit for bit.
+//!
+//! Every random choice follows from the run's seed and the step's number through counter-based
+//! streams, so the number of steps done is the position of all of them. The rest is tensors.
+
+use std::io::Cursor;
+use std::path::Path;
+
+use anyhow::{Context as _, bail, ensure};
+use burn::tensor::{Device, Tensor, TensorData};
+use ndarray::{Array1, ArrayD, ArrayView1, IxDyn};
+use ndarray_npy::{NpzReader, NpzWriter};
+use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
+
+use crate::train::data::dataset::Dataset;
+use crate::train::net::network::{Weight, Weights, numbers};
+
+/// What a stage needs to go on, beside its settings and data.
+#[derive(Debug, Clone)]
+pub struct Checkpoint {
+    /// What the stage follows from: see [`Origin`].
+    pub origin: String,
+    /// The plain part.
+    pub progress: Progress,
+    /// The weights, and the same lists of whatever else goes with them, by name: Adam's moments,
+    /// averaged weights, the best so far.
+    pub lists: Vec<(String, Weights)>,
+}
+
+/// How far a stage is.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Progress {
+    /// Epochs done.
+    pub epoch: u32,
+    /// Steps done.
+    pub step: u64,
+    /// Least validation loss so far.
+    pub best_loss: Option<f64>,
+}
+
+/// All that a stage's result follows from, as one hash: its settings, seed, frames in their order
+/// with their levels, and initial weights. Two runs whose stages have the same one need to run it
+/// once.
+#[derive(Debug)]
+pub struct Origin(Sha256);
+
+impl Origin {
+    /// Of a stage with these settings and seed.
+    pub fn new(stage: &str, settings: &impl Serialize, seed: u64) -> Self {
+        let settings = serde_json::to_vec(settings).expect("settings are plain numbers");
+        let mut hash = Sha256::new();
+        for part in [stage.as_bytes(), &seed.to_le_bytes(), &settings] {
+            hash.update((part.len() as u64).to_le_bytes());
+            hash.update(part);
+        }
+        Self(hash)
+    }
+
+    /// Adds samples.
+    #[must_use]
+    pub fn samples(mut self, dataset: &Dataset, indices: &[usize]) -> Self {
+        self.0.update((indices.len() as u64).to_le_bytes());
+        for &index in indices {
+            let sample = &dataset.samples[index];
+            self.0.update([sample.level]);
+            let newtons = sample.frame.newtons.iter();
+            let bytes: Vec<u8> = newtons.flat_map(|newtons| newtons.to_le_bytes()).collect();
+            self.0.update(bytes);
+        }
+        self
+    }
+
+    /// Adds weights.
+    #[must_use]
+    pub fn weights(mut self, weights: &Weights) -> Self {
+        for weight in &weights.entries {
+            self.0.update(&weight.name);
+            let values = numbers(&weight.values);
+            let bytes: Vec<u8> = values
+                .iter()
+                .flat_map(|value| value.to_le_bytes())
+                .collect();
+            self.0.update(bytes);
+        }
+        self
+    }
+
+    /// The hash in hexadecimal digits.
+    pub fn finish(self) -> String {
+        let bytes = self.0.finalize();
+        bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+    }
+}
+
+impl Checkpoint {
+    /// The list called `name`.
+    ///
+    /// # Errors
+    ///
+    /// If there is none.
+    pub fn list(&self, name: &str) -> anyhow::Result<&Weights> {
+        let found = self.lists.iter().find(|(list, _)| list == name);
+        found
+            .map(|(_, weights)| weights)
+            .with_context(|| format!("no `{name}` in the checkpoint"))
+    }
+
+    /// The bytes of the file: an `.npz` of f32 arrays, and `progress` as JSON.
+    ///
+    /// # Errors
+    ///
+    /// If the archive cannot be built.
+    pub fn to_bytes(&self) -> anyhow::Result<Vec<u8>> {
+        let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
+        let progress = serde_json::to_vec(&self.progress)?;
+        npz.add_array("progress", &ArrayView1::from(&progress))?;
+        npz.add_array("origin", &ArrayView1::from(self.origin.as_bytes()))?;
+        for (list, weights) in &self.lists {
+            for weight in &weights.entries {
+                let array = ArrayD::from_shape_vec(IxDyn(&weight.dims), numbers(&weight.values))?;
+                npz.add_array(format!("{list}/{}", weight.name), &array)?;
+            }
+        }
+        Ok(npz.finish()?.into_inner())
+    }
+
+    /// Reads a file that [`Checkpoint::to_bytes`] made.
+    ///
+    /// # Errors
+    ///
+    /// If it is damaged.
+    pub fn read(path: &Path, device: &Device) -> anyhow::Result<Self> {
+        let bytes = std::fs::read(path)?;
+        let mut npz = NpzReader::new(Cursor::new(bytes.as_slice()))?;
+        let progress: Array1<u8> = npz.by_name("progress")?;
+        let progress = serde_json::from_slice(&progress.to_vec())?;
+        let origin: Array1<u8> = npz.by_name("origin")?;
+        let origin = String::from_utf8(origin.to_vec())?;
+        let mut lists: Vec<(String, Weights)> = Vec::new();
+        for name in npz.names()? {
+            if ["progress", "origin"].contains(&name.as_str()) {
+                continue;
+            }
+            let Some((list, weight)) = name.split_once('/') else {
+                bail!("array `{name}` is no part of a checkpoint");
+            };
+            let array: ArrayD<f32> = npz.by_name(&name)?;
+            if lists.last().is_none_or(|(last, _)| last != list) {
+                lists.push((list.to_owned(), Weights::default()));
+            }
+            let entries = &mut lists.last_mut().expect("pushed just now").1.entries;
+            entries.push(Weight {
+                name: weight.to_owned(),
+                dims: array.shape().to_vec(),
+                values: flat(array.into_iter().collect(), device),
+            });
+        }
+        ensure!(!lists.is_empty(), "no weights in it");
+        Ok(Self {
+            origin,
+            progress,
+            lists,
+        })
+    }
+}
+
+fn flat(values: Vec<f32>, device: &Device) -> Tensor<1> {
+    let length = values.len();
+    Tensor::from_data(TensorData::new(values, [length]), device)
+}

@@ -1,0 +1,151 @@
+//! Files that are whole, and directories that are one process's.
+//!
+//! In: paths and bytes. A file is written beside its place, flushed to the disk and renamed, so that
+//! whatever stands there is whole, also after SIGKILL or a full disk.
+
+use std::fs::{self, File};
+use std::io::Write as _;
+use std::path::Path;
+
+use anyhow::{Context as _, bail};
+use rustix::fs::FlockOperation;
+
+/// Writes a file beside its place, flushes it and renames it; a link stays, and its target is
+/// written. What is no file, such as a pipe or a device, is written to as it stands.
+///
+/// # Errors
+///
+/// Those of writing; a file that stood there before then still stands.
+pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let attempt = || -> anyhow::Result<()> {
+        if path.is_symlink() && !path.exists() {
+            // A link to what is not there yet: so that there is a path to follow it to.
+            File::create(path)?;
+        }
+        match fs::metadata(path) {
+            Ok(found) if found.is_file() => replace(&fs::canonicalize(path)?, bytes),
+            Ok(_) => Ok(File::options().write(true).open(path)?.write_all(bytes)?),
+            Err(_) => replace(path, bytes),
+        }
+    };
+    attempt().with_context(|| path.display().to_string())
+}
+
+fn replace(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".part");
+    let part = path.with_file_name(name);
+    let mut file = create_anew(&part).with_context(|| part.display().to_string())?;
+    let mut attempt = || -> std::io::Result<()> {
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        fs::rename(&part, path)?;
+        // The rename itself reaches the disk with the directory.
+        let directory = path
+            .parent()
+            .filter(|parent| !parent.as_os_str().is_empty());
+        File::open(directory.unwrap_or(Path::new(".")))?.sync_all()
+    };
+    attempt().inspect_err(|_| {
+        // A part left behind would fill the disk further; its removal may fail like the rest.
+        let _ = fs::remove_file(&part);
+    })?;
+    Ok(())
+}
+
+/// A new file in the place of what a killed process left, which may not be writable; of a link,
+/// not of what it points to.
+fn create_anew(path: &Path) -> std::io::Result<File> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(error),
+        _ => File::create_new(path),
+    }
+}
+
+/// Nobody else may work in a directory while the file is open.
+///
+/// # Errors
+///
+/// If somebody does, or the directory cannot be opened.
+pub(in crate::train) fn lock(directory: &Path) -> anyhow::Result<File> {
+    let context = || directory.display().to_string();
+    let file = File::open(directory).with_context(context)?;
+    match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => Ok(file),
+        Err(rustix::io::Errno::WOULDBLOCK) => {
+            bail!("{}: another process is at work here", context())
+        }
+        Err(error) => Err(std::io::Error::from(error)).with_context(context),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_one_at_a_time_works_in_a_directory() {
+        let directory = tempfile::tempdir().unwrap();
+        let held = lock(directory.path()).unwrap();
+        let error = lock(directory.path()).unwrap_err().to_string();
+        assert!(
+            error.ends_with(": another process is at work here"),
+            "{error}"
+        );
+        drop(held);
+        lock(directory.path()).unwrap();
+    }
+
+    #[test]
+    fn whatever_has_the_name_of_the_part_loses_nothing_but_a_part() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().join(name);
+        // As a killed process leaves it, here even for reading only.
+        fs::write(path("file.part"), "longer than what is written now").unwrap();
+        let only_reading = std::os::unix::fs::PermissionsExt::from_mode(0o400);
+        fs::set_permissions(path("file.part"), only_reading).unwrap();
+        write_whole(&path("file"), b"whole").unwrap();
+        assert_eq!(fs::read(path("file")).unwrap(), b"whole");
+        assert!(!path("file.part").exists());
+
+        fs::write(path("target"), "somebody's").unwrap();
+        std::os::unix::fs::symlink("target", path("file.part")).unwrap();
+        write_whole(&path("file"), b"again").unwrap();
+        assert_eq!(fs::read(path("target")).unwrap(), b"somebody's");
+        assert!(!path("file").is_symlink());
+
+        fs::create_dir(path("file.part")).unwrap();
+        let error = write_whole(&path("file"), b"never").unwrap_err();
+        let error = format!("{error:#}");
+        assert!(error.contains("file.part: Is a directory"), "{error}");
+        assert_eq!(fs::read(path("file")).unwrap(), b"again");
+    }
+
+    #[test]
+    fn links_stay_and_what_is_no_file_is_written_to_as_it_stands() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().join(name);
+        fs::create_dir(path("elsewhere")).unwrap();
+        fs::write(path("elsewhere/file"), "before").unwrap();
+        for target in ["elsewhere/file", "elsewhere/new"] {
+            let link = path("link");
+            std::os::unix::fs::symlink(target, &link).unwrap();
+            write_whole(&link, b"after").unwrap();
+            assert!(link.is_symlink(), "{target}");
+            assert_eq!(fs::read(path(target)).unwrap(), b"after");
+            fs::remove_file(&link).unwrap();
+        }
+
+        let pipe = path("pipe");
+        let made = std::process::Command::new("mkfifo").arg(&pipe).status();
+        assert!(made.unwrap().success());
+        let reader = {
+            let pipe = pipe.clone();
+            std::thread::spawn(move || fs::read(pipe))
+        };
+        write_whole(&pipe, b"through").unwrap();
+        // Were it a file by now, the reader would still wait.
+        assert!(!pipe.is_file());
+        assert_eq!(reader.join().unwrap().unwrap(), b"through");
+    }
+}

@@ -1,0 +1,72 @@
+//! How a stage is getting on: its bar or lines, and the end of one that has diverged.
+
+use anyhow::ensure;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use crate::train::net::network::{Weights, numbers};
+
+/// Ends a stage of which something is no number any more: no further step would make it one.
+///
+/// # Errors
+///
+/// If `found`, which is `what` of it, is not finite.
+pub(in crate::train) fn ensure_finite(
+    stage: &str,
+    epoch: u32,
+    what: &str,
+    found: f64,
+) -> anyhow::Result<()> {
+    ensure!(
+        found.is_finite(),
+        "{stage}: epoch {epoch}: {what}: found {found}, expected a finite number: the training has \
+         diverged"
+    );
+    Ok(())
+}
+
+/// Ends a stage whose weights are no numbers any more; a step's loss is that of the weights before
+/// it.
+///
+/// # Errors
+///
+/// If one of `weights` is not finite.
+pub(in crate::train) fn ensure_finite_weights(
+    stage: &str,
+    epoch: u32,
+    weights: &Weights,
+) -> anyhow::Result<()> {
+    for weight in &weights.entries {
+        for value in numbers(&weight.values) {
+            ensure_finite(stage, epoch, &weight.name, value.into())?;
+        }
+    }
+    Ok(())
+}
+
+/// A bar over a stage's steps.
+pub(in crate::train) fn progress_bar(stage: &str, steps: u64, done: u64) -> ProgressBar {
+    let template = "{prefix} {bar:30} {pos}/{len} steps, {per_sec}, {eta} left {msg}";
+    let style = ProgressStyle::with_template(template).expect("the template is right");
+    // indicatif draws on a terminal only; elsewhere `report` prints lines.
+    let bar = ProgressBar::new(steps)
+        .with_style(style)
+        .with_prefix(stage.to_owned());
+    bar.set_position(done);
+    bar.reset_eta();
+    bar
+}
+
+/// The state of a stage after an epoch: beside the bar on a terminal, a line elsewhere.
+pub(in crate::train) fn report(
+    bar: &ProgressBar,
+    stage: &str,
+    epoch: u32,
+    epochs: u32,
+    message: String,
+) {
+    if bar.is_hidden() {
+        eprintln!("{stage}: epoch {epoch} of {epochs}: {message}");
+    } else {
+        bar.set_message(message);
+    }
+}

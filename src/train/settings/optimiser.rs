@@ -1,0 +1,84 @@
+//! What an optimiser can be told.
+
+use serde::{Deserialize, Serialize};
+
+use super::bounds::{SettingsError, check};
+
+/// Which rule.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Rule {
+    /// `w -= rate g`.
+    Sgd,
+    /// Kingma and Ba 2015, with decoupled weight decay.
+    Adam,
+}
+
+/// How the learning rate goes over the run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Schedule {
+    /// The same throughout.
+    Constant,
+    /// From the full rate to 0 along half a cosine.
+    Cosine,
+}
+
+/// Settings of an optimiser.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct OptimiserSettings {
+    /// `sgd` or `adam`.
+    pub rule: Rule,
+    /// At the first step.
+    pub learning_rate: f64,
+    /// `constant` or `cosine`.
+    pub schedule: Schedule,
+    /// Adam's decay of the gradient's mean.
+    pub beta1: f64,
+    /// Adam's decay of the gradient's square.
+    pub beta2: f64,
+    /// Share of a kernel taken away a step, times the learning rate; not of biases, nor
+    /// of the mixture's mu and sigma.
+    pub weight_decay: f64,
+}
+
+impl Default for OptimiserSettings {
+    fn default() -> Self {
+        Self {
+            rule: Rule::Sgd,
+            learning_rate: 1e-3,
+            schedule: Schedule::Constant,
+            beta1: 0.9,
+            beta2: 0.999,
+            weight_decay: 0.0,
+        }
+    }
+}
+
+impl OptimiserSettings {
+    /// Refuses what lies outside its range; `table` is where these settings stand.
+    pub(super) fn check(&self, table: &str) -> Result<(), SettingsError> {
+        let table = format!("{table}optimiser.");
+        let check = |key, found, fits, expected| check(&table, key, found, fits, expected);
+        let within_0_1 = |value: f64| (0.0..1.0).contains(&value);
+        let rate = self.learning_rate;
+        check("learning_rate", rate, rate > 0.0, "above 0")?;
+        for (key, beta) in [("beta1", self.beta1), ("beta2", self.beta2)] {
+            check(key, beta, within_0_1(beta), "0 to below 1")?;
+        }
+        let decay = self.weight_decay;
+        check("weight_decay", decay, decay >= 0.0, "0 or more")
+    }
+
+    /// The learning rate of step `step` of `steps`, both counted from 0.
+    pub fn rate_at(&self, step: u64, steps: u64) -> f64 {
+        match self.schedule {
+            Schedule::Constant => self.learning_rate,
+            Schedule::Cosine => {
+                let part = step as f64 / steps.max(1) as f64;
+                self.learning_rate * 0.5 * (1.0 + (std::f64::consts::PI * part).cos())
+            }
+        }
+    }
+}
