@@ -9,27 +9,42 @@
 //! 10 to 18 % lower: sponge 0.278 MPa (meant: 0.34), foam 0.763 (0.85), yoga mat 0.318 (0.38). And
 //! a rough face touches on 1.21 to 1.26 times the area of Persson's theory (meant: 1.0 to 1.15).
 
+mod body;
+mod broad;
 mod contact;
 mod course;
 mod dataset;
-#[cfg(test)]
 mod durometer;
 mod fourier;
 mod kernel;
+mod level;
 mod material;
 mod object;
 mod press;
 mod sensor;
 mod sequence;
+mod subject;
+mod substance;
 mod texture;
 mod tracked;
 
-pub use crate::tare::NEWTONS_PER_COUNT;
-pub use dataset::{DatasetSettings, LabelledSample, dataset};
+pub use broad::{LawName, Laws, NoLaw, UnknownLaw};
+pub use dataset::{DatasetSettings, LabelledSample, Materials, UnknownMaterials, dataset};
+pub use level::{Borders, LEVELS, LevelRange, level_of};
 pub use material::{Material, Split, UnknownMaterial};
 pub use object::{Shapes, UnknownShapes};
 pub use sensor::{SensorProfile, UnknownProfile};
 pub use sequence::{Sequence, SequenceFrame, SequenceSettings};
+
+pub use crate::tare::NEWTONS_PER_COUNT;
+
+/// Names of what a sample's `material` is an index of: the eight named materials, then the laws
+/// that broad materials are drawn of.
+pub fn material_names() -> Vec<&'static str> {
+    let named = Material::ALL.map(Material::name);
+    let broad = LawName::ALL.map(LawName::material_name);
+    named.into_iter().chain(broad).collect()
+}
 
 /// Of what [`dataset`] makes of the same settings and seed: to be raised with every change of its
 /// samples. A comparison names the files that it keeps by it, so that none of an older simulator is

@@ -5,9 +5,9 @@
 //! the state of each Kelvin element; pressure is taken as linear in time within a step, for which
 //! the element's update is exact.
 
-use super::material::Law;
 use super::press::{Bench, Specimen, Step, Window, touches_border};
 use super::sensor::taxel_forces;
+use super::substance::Law;
 use crate::frame::TAXELS;
 
 /// Stiffness of the arm, N/mm (assumed), and its speed (paper).
@@ -125,9 +125,8 @@ impl<'a> Run<'a> {
             window,
             gap_mm: specimen.gap_on(window),
             crept: specimen
-                .properties
-                .creep
-                .iter()
+                .substance
+                .creep()
                 .map(|_| vec![0.0; cells])
                 .collect(),
             flowed_mm: Vec::new(),
@@ -225,9 +224,8 @@ impl<'a> Run<'a> {
         let factor = 1.0
             + self
                 .specimen
-                .properties
-                .creep
-                .iter()
+                .substance
+                .creep()
                 .map(|c| c.j * share(time_s, c.tau_s))
                 .sum::<f64>();
         let mut pressure = self.pressure.clone();
@@ -261,7 +259,7 @@ impl<'a> Run<'a> {
             return (gap, Vec::new());
         }
         let mut history = vec![0.0_f32; gap.len()];
-        for (creep, crept) in self.specimen.properties.creep.iter().zip(&self.crept) {
+        for (creep, crept) in self.specimen.substance.creep().zip(&self.crept) {
             let (kept, old) = left(time_s, creep.tau_s);
             let (kept, old) = ((creep.j * kept) as f32, (creep.j * old) as f32);
             for ((history, &crept), &pressure) in history.iter_mut().zip(crept).zip(&self.pressure)
@@ -279,7 +277,7 @@ impl<'a> Run<'a> {
     }
 
     fn take(&mut self, trial: Trial) {
-        for (creep, crept) in self.specimen.properties.creep.iter().zip(&mut self.crept) {
+        for (creep, crept) in self.specimen.substance.creep().zip(&mut self.crept) {
             let (kept, old) = left(trial.time_s, creep.tau_s);
             let new = share(trial.time_s, creep.tau_s) as f32;
             let (kept, old) = (kept as f32, old as f32);
@@ -289,7 +287,7 @@ impl<'a> Run<'a> {
                 *crept = kept * *crept + old * before + new * now;
             }
         }
-        if let Law::Plastic { .. } = self.specimen.properties.law {
+        if let Law::Plastic { .. } = self.specimen.substance.law {
             self.flowed_mm.resize(trial.pressure.len(), 0.0);
             let flow = self.specimen.flow(trial.time_s);
             for (flowed, &pressure) in self.flowed_mm.iter_mut().zip(&trial.pressure) {
@@ -341,9 +339,9 @@ mod tests {
         let properties = material.properties();
         let mut stream = Stream::new(4, "course");
         let pose = Pose::draw(face, &mut stream.child(0));
-        let patch = Patch::new(&properties.texture, 1.0, 0.875, &mut stream);
+        let patch = Patch::new(&properties.substance.texture, 1.0, 0.875, &mut stream);
         Specimen::new(
-            properties,
+            properties.substance,
             properties.young_mpa(properties.shore.mean),
             face,
             &pose,

@@ -3,20 +3,49 @@
 //! Threads share the objects out; every number depends on the seed and on what is pressed, never
 //! on who pressed it.
 
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use serde::{Deserialize, Serialize};
 
+use super::body::draw_patch;
+use super::broad::Laws;
 use super::course::{ARM_N_MM, SPEED_MM_S};
+use super::level::Borders;
 use super::material::{Material, Split};
-use super::object::{Object, POSTURES, Pose, Shapes};
+use super::object::{POSTURES, Pose, Shapes};
 use super::press::{Bench, COVER_YOUNG_MPA, Specimen};
-use super::sensor::{Film, Sensor, SensorProfile, taxel_forces};
-use super::texture::Patch;
+use super::sensor::{Film, SensorProfile, taxel_forces};
+use super::subject::{Subject, shared_out, units};
 use super::tracked::{begins_press, ideal_tare};
 use crate::frame::Frame;
 use crate::random::Stream;
+
+/// Which materials the objects are of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Materials {
+    /// The eight of the paper's Table 1.
+    Named,
+    /// Each object of a material of its own.
+    Broad,
+}
+
+impl std::str::FromStr for Materials {
+    type Err = UnknownMaterials;
+
+    fn from_str(name: &str) -> Result<Self, Self::Err> {
+        match name {
+            "named" => Ok(Materials::Named),
+            "broad" => Ok(Materials::Broad),
+            _ => Err(UnknownMaterials(name.to_owned())),
+        }
+    }
+}
+
+/// A name that is no set of materials.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("no materials \"{0}\"; there are named, broad")]
+pub struct UnknownMaterials(pub String);
 
 /// What to simulate.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -24,10 +53,18 @@ use crate::random::Stream;
 pub struct DatasetSettings {
     /// Everything random follows from it.
     pub seed: u64,
-    /// Objects of each training material.
+    /// Which materials the objects are of.
+    pub materials: Materials,
+    /// Laws of which broad materials are drawn.
+    pub laws: Laws,
+    /// Whether broad materials avoid the levels' borders.
+    pub borders: Borders,
+    /// Objects of each training material; of broad materials, of each level.
     pub objects: u32,
-    /// Objects of each test material.
+    /// Objects of each test material, or of each level.
     pub test_objects: u32,
+    /// Whether all eight named materials are for test.
+    pub all_test: bool,
     /// Presses of each object. Of all postures each under all nominal forces are 48; fewer are some
     /// of those, of different postures and forces.
     pub presses: u32,
@@ -50,8 +87,12 @@ impl Default for DatasetSettings {
     fn default() -> Self {
         Self {
             seed: 0,
+            materials: Materials::Named,
+            laws: Laws::default(),
+            borders: Borders::Touching,
             objects: 50,
             test_objects: 5,
+            all_test: false,
             presses: 50,
             lowest_force_n: 1.0,
             shapes: Shapes::Matched,
@@ -68,6 +109,9 @@ impl DatasetSettings {
     /// object's draws follow from the seed, its split, material and number, so that the same
     /// objects stand in every data set of a seed in which their material has the same role.
     pub fn split(&self, material: Material) -> Split {
+        if self.all_test {
+            return Split::Test;
+        }
         let swapped = self.swapped_levels[usize::from(material.level()) - 1];
         match (material.split(), swapped) {
             (Split::Train, false) | (Split::Test, true) => Split::Train,
@@ -85,7 +129,7 @@ pub struct LabelledSample {
     pub level: u8,
     /// Number of the object, unique in the data set.
     pub object: u32,
-    /// Index of the material in [`Material::ALL`].
+    /// Index of the material among [`super::material_names`].
     pub material: u8,
     /// Force the sensor was pressed with.
     pub force_n: f32,
@@ -100,140 +144,32 @@ const FORCES: usize = 8;
 /// Presses of an object in each posture under each nominal force.
 const ROUND: usize = POSTURES * FORCES;
 const FORCE_JITTER: f64 = 0.08;
-/// Sensors that each split's objects are shared over.
-const SENSORS: u32 = 8;
 /// How much harder a press is made anew that was too light to be one.
 pub(super) const HARDER: f64 = 1.5;
 /// Times a press is made harder before it is taken as it is.
 pub(super) const TRIES: usize = 8;
 
 /// Simulates the data set on `threads` threads, with `progress` told the number of samples done.
-/// Samples stand by material (as in [`Material::ALL`]), object, posture and press. The result is the
-/// same for any number of threads.
+/// Samples stand by material (as in [`Material::ALL`]) or by split and level, then by object, posture
+/// and press. The result is the same for any number of threads.
 pub fn dataset(
     settings: &DatasetSettings,
     threads: usize,
     progress: impl Fn(usize) + Sync,
 ) -> Vec<LabelledSample> {
-    let mut units = Vec::new();
-    for material in Material::ALL {
-        let count = match settings.split(material) {
-            Split::Train => settings.objects,
-            Split::Test => settings.test_objects,
-        };
-        units.extend((0..count).map(|number| (material, number)));
-    }
-    let (next, done) = (AtomicUsize::new(0), AtomicUsize::new(0));
-    let parts: Mutex<Vec<Vec<LabelledSample>>> = Mutex::new(vec![Vec::new(); units.len()]);
-    std::thread::scope(|scope| {
-        for _ in 0..threads.max(1) {
-            scope.spawn(|| {
-                let mut bench = Bench::under(settings.cover_young_mpa);
-                loop {
-                    let index = next.fetch_add(1, Ordering::Relaxed);
-                    let Some(&(material, number)) = units.get(index) else {
-                        break;
-                    };
-                    let mut samples = Vec::with_capacity(settings.presses as usize);
-                    let subject = Subject::draw(settings, material, number);
-                    subject.press_all(settings, &mut bench, |sample| {
-                        samples.push(LabelledSample {
-                            object: index as u32,
-                            ..sample
-                        });
-                        progress(done.fetch_add(1, Ordering::Relaxed) + 1);
-                    });
-                    parts
-                        .lock()
-                        .expect("no thread panics while it holds the lock")[index] = samples;
-                }
-            });
-        }
-    });
-    let parts = parts
-        .into_inner()
-        .expect("no thread panics while it holds the lock");
-    parts.into_iter().flatten().collect()
-}
-
-/// The streams of one object: its geometry, poses and forces, and what its material adds.
-struct Draws {
-    geometry: Stream,
-    body: Stream,
-}
-
-impl Draws {
-    /// Object number `number` of a material in a data set. Geometry, poses and forces of matched
-    /// test objects do not depend on the material: that is what pairs them.
-    fn new(settings: &DatasetSettings, material: Material, number: u32) -> Self {
-        let own = u64::from(material.index());
-        let (split, geometry) = match (settings.split(material), settings.shapes) {
-            (Split::Train, _) => ("train", own),
-            (Split::Test, Shapes::Paper) => ("test", own),
-            (Split::Test, Shapes::Matched) => ("test", Material::ALL.len() as u64),
-        };
-        let root = Stream::new(settings.seed, split).child(u64::from(number));
-        Self {
-            geometry: root.child(0).child(geometry),
-            body: root.child(1).child(own),
-        }
-    }
-}
-
-/// An object with its hardness and the sensor it is pressed on.
-struct Subject {
-    material: Material,
-    split: Split,
-    object: Object,
-    shore: f64,
-    sensor: Sensor,
-    draws: Draws,
-}
-
-/// Shore hardness of an object: normal, redrawn until it lies in the material's range.
-pub(super) fn draw_shore(material: Material, stream: &mut Stream) -> f64 {
-    let shore = material.properties().shore;
-    loop {
-        let drawn = shore.mean + shore.sd * stream.normal();
-        if (shore.low..=shore.high).contains(&drawn) {
-            return drawn;
-        }
-    }
-}
-
-/// Roughness of one posture's face.
-pub(super) fn draw_patch(material: Material, roughness: f64, stream: &mut Stream) -> Patch {
-    let factor = roughness * (0.35 * stream.normal()).exp();
-    let texture = &material.properties().texture;
-    Patch::new(texture, factor, super::sensor::CELL_MM, stream)
+    let done = AtomicUsize::new(0);
+    let bench = || Bench::under(settings.cover_young_mpa);
+    shared_out(&units(settings), threads, bench, |bench, object, unit| {
+        let mut samples = Vec::with_capacity(settings.presses as usize);
+        Subject::draw(settings, unit).press_all(settings, bench, |sample| {
+            samples.push(LabelledSample { object, ..sample });
+            progress(done.fetch_add(1, Ordering::Relaxed) + 1);
+        });
+        samples
+    })
 }
 
 impl Subject {
-    fn draw(settings: &DatasetSettings, material: Material, number: u32) -> Self {
-        let draws = Draws::new(settings, material, number);
-        let object = Object::draw(settings.shapes, material, &mut draws.geometry.child(0));
-        let shore = draw_shore(material, &mut draws.body.child(0));
-        // The splits share no sensor: the streams have different names.
-        let split = settings.split(material);
-        let sensors = match split {
-            Split::Train => "train sensor",
-            Split::Test => "test sensor",
-        };
-        let sensor = Sensor::new(
-            settings.profile,
-            &Stream::new(settings.sensor_seed.unwrap_or(settings.seed), sensors)
-                .child(u64::from(number % SENSORS)),
-        );
-        Self {
-            material,
-            split,
-            object,
-            shore,
-            sensor,
-            draws,
-        }
-    }
-
     /// Every press of the object, in order; postures in the outer loop, so that a face's texture
     /// and kernels serve all its presses.
     fn press_all(
@@ -242,13 +178,12 @@ impl Subject {
         bench: &mut Bench,
         mut take: impl FnMut(LabelledSample),
     ) {
-        let properties = self.material.properties();
-        let young_mpa = properties.young_mpa(self.shore);
+        let body = &self.body;
         let presses = press_numbers(settings.presses as usize);
         for posture in 0..POSTURES {
             let face = self.object.face(posture);
             let mut roughness = self.draws.body.child(1).child(posture as u64);
-            let patch = draw_patch(self.material, face.roughness, &mut roughness);
+            let patch = draw_patch(&body.substance.texture, face.roughness, &mut roughness);
             let of_posture = |press: &usize| press % POSTURES == posture;
             for press in presses.iter().copied().filter(of_posture) {
                 let mut paired = self.draws.geometry.child(1).child(press as u64);
@@ -256,17 +191,17 @@ impl Subject {
                 let nominal = nominal_force_n(settings.lowest_force_n, press / POSTURES % FORCES);
                 let force_n = nominal * (1.0 + FORCE_JITTER * paired.normal()).clamp(0.7, 1.3);
                 let hold_s = paired.range(0.8, 1.5);
-                let specimen = Specimen::new(properties, young_mpa, &face, &pose, &patch);
+                let specimen = Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch);
                 let mut noise = self.draws.body.child(2).child(press as u64);
                 let (force_n, frame) = self.press(bench, &specimen, force_n, hold_s, &mut noise);
                 take(LabelledSample {
                     frame,
-                    level: self.material.level(),
+                    level: body.level,
                     object: 0,
-                    material: self.material.index(),
+                    material: body.material,
                     force_n: force_n as f32,
                     split: self.split,
-                    shore: self.shore as f32,
+                    shore: body.shore as f32,
                 });
             }
         }
@@ -326,6 +261,8 @@ fn nominal_force_n(lowest_n: f32, step: usize) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use super::super::level::level_of;
+    use super::super::material_names;
     use super::*;
 
     fn small(shapes: Shapes) -> DatasetSettings {
@@ -444,23 +381,6 @@ mod tests {
     }
 
     #[test]
-    fn matched_test_objects_are_paired_over_materials_and_papers_are_not() {
-        for (shapes, paired) in [(Shapes::Matched, true), (Shapes::Paper, false)] {
-            let settings = small(shapes);
-            let draw = |material, number| {
-                let draws = Draws::new(&settings, material, number);
-                format!(
-                    "{:?}",
-                    Object::draw(shapes, material, &mut draws.geometry.child(0))
-                )
-            };
-            let foam = draw(Material::Foam, 1);
-            assert_eq!(foam == draw(Material::YogaMat, 1), paired);
-            assert_ne!(foam, draw(Material::Foam, 0));
-        }
-    }
-
-    #[test]
     fn a_material_presses_the_same_objects_in_its_role_whatever_the_others_roles() {
         let swapped = |swapped_levels| DatasetSettings {
             swapped_levels,
@@ -522,6 +442,60 @@ mod tests {
         let ratio = |level| area(&softer, level) / area(&before, level);
         assert!(ratio(1) > 1.1, "{}", ratio(1));
         assert!((0.98..1.05).contains(&ratio(4)), "{}", ratio(4));
+    }
+
+    #[test]
+    fn broad_objects_are_evenly_of_all_levels_and_of_ranges() {
+        for shapes in [Shapes::Matched, Shapes::Wide] {
+            let settings = DatasetSettings {
+                materials: Materials::Broad,
+                ..small(shapes)
+            };
+            let samples = dataset(&settings, 3, |_| ());
+            assert!(samples == dataset(&settings, 1, |_| ()), "threads show");
+            assert_eq!(samples.len(), 4 * (1 + 2) * 9);
+            for sample in &samples {
+                assert_eq!(sample.level, level_of(f64::from(sample.shore)));
+                assert!(usize::from(sample.material) < material_names().len());
+                assert!(sample.material >= 8);
+                assert!(begins_press(&sample.frame), "{sample:?}");
+            }
+            // By split, then level: training objects are 0 to 3.
+            for (place, level) in (0..).zip([1, 2, 3, 4, 1, 1, 2, 2, 3, 3, 4, 4]) {
+                let own = samples.iter().filter(|sample| sample.object == place);
+                let split = if place < 4 { Split::Train } else { Split::Test };
+                let labels = own.map(|sample| (sample.level, sample.split, sample.shore.to_bits()));
+                let labels: std::collections::BTreeSet<_> = labels
+                    .map(|(level, split, shore)| (level, split as u8, shore))
+                    .collect();
+                assert_eq!(labels.len(), 1, "object {place}");
+                let first = labels.first().unwrap();
+                assert_eq!((first.0, first.1), (level, split as u8));
+            }
+            // Test objects of one number are pressed alike, whatever they are made of.
+            let forces = |object| {
+                let own = samples.iter().filter(move |sample| sample.object == object);
+                own.map(|sample| sample.force_n).collect::<Vec<_>>()
+            };
+            let softer = (forces(8), forces(10));
+            assert!(softer.0 == softer.1, "{softer:?}");
+        }
+    }
+
+    #[test]
+    fn all_eight_materials_can_be_for_test() {
+        let settings = DatasetSettings {
+            all_test: true,
+            test_objects: 1,
+            presses: 2,
+            ..small(Shapes::Wide)
+        };
+        let samples = dataset(&settings, 2, |_| ());
+        assert_eq!(samples.len(), 8 * 2);
+        assert!(samples.iter().all(|sample| sample.split == Split::Test));
+        let forces: Vec<f32> = samples.iter().map(|sample| sample.force_n).collect();
+        // Levels 2 to 4, pressed alike.
+        assert_eq!(forces[2..4], forces[10..12]);
     }
 
     #[test]

@@ -1,12 +1,12 @@
 //! A Shore OO durometer, simulated: what ties a material's hardness to its modulus.
 //!
-//! At its depths (up to 1.5 radii) small-strain theory is only a convention for labelling; it is
+//! At its depths (up to 1.8 radii) small-strain theory is only a convention for labelling; it is
 //! the same convention for every material.
 
 use super::contact::{self, Fields, Local, Problem};
 use super::fourier::Convolver;
 use super::kernel::{self, Layer};
-use super::material::{Law, Properties};
+use super::substance::{Law, Substance};
 
 /// Radius of the OO indenter's hemisphere, mm (ASTM D2240).
 const RADIUS_MM: f64 = 1.19;
@@ -16,6 +16,9 @@ const READ_S: f64 = 0.15;
 const PIECE_MM: f64 = 40.0;
 const CELL_MM: f64 = 0.04;
 const WIDTH: usize = 64;
+/// Relative error of a force found, and absolute error of a reading.
+const FORCE_TOLERANCE: f64 = 2e-4;
+const SHORE_TOLERANCE: f64 = 0.01;
 
 /// Spring force in N at Shore OO hardness `shore`.
 fn spring_force_n(shore: f64) -> f64 {
@@ -23,89 +26,154 @@ fn spring_force_n(shore: f64) -> f64 {
 }
 
 /// Indentation depth in mm at Shore OO hardness `shore`.
-fn depth_mm(shore: f64) -> f64 {
+pub(super) fn depth_mm(shore: f64) -> f64 {
     2.54 * (1.0 - shore / 100.0)
 }
 
-/// Young's modulus in MPa with which the durometer reads `shore`.
-///
-/// All stresses of the laws are relative to E, so the force at a given depth is proportional to E
-/// and one indentation with E = 1 MPa suffices.
-pub(super) fn young_mpa(material: &Properties, shore: f64) -> f64 {
-    spring_force_n(shore) / indent(material, depth_mm(shore))
+/// The durometer on a piece of one substance.
+pub(super) struct Durometer {
+    local: Local<'static>,
+    gap_mm: Vec<f32>,
+    spectrum: Vec<f32>,
+    convolver: Convolver,
+    fields: Fields,
+    pressure: Vec<f32>,
 }
 
-/// Force in N on the indenter at `depth_mm`, for E = 1 MPa.
-fn indent(material: &Properties, depth_mm: f64) -> f64 {
-    let mut convolver = Convolver::new(WIDTH);
-    let compliance = material.compliance_ratio(READ_S);
-    let unit = CELL_MM * (1.0 - material.nu * material.nu) * compliance;
-    let layer = Layer::new(material.nu);
-    let spectrum = convolver.spectrum(|i, j| {
-        let (x, y) = (i as f64, j as f64);
-        unit * match material.law {
-            Law::Foam { .. } => layer.influence(x, y, PIECE_MM / CELL_MM),
-            Law::Solid | Law::Plastic { .. } => kernel::half_space(x, y),
-        }
-    });
-    // Hemisphere; beyond its radius the indenter goes on as a cylinder.
-    let gap: Vec<f32> = (0..WIDTH * WIDTH)
-        .map(|k| {
-            let at = |i: usize| (i as f64 + 0.5 - 0.5 * WIDTH as f64) * CELL_MM;
-            let square = at(k / WIDTH).powi(2) + at(k % WIDTH).powi(2);
-            let rest = RADIUS_MM * RADIUS_MM - square;
-            if rest > 0.0 {
-                (RADIUS_MM - rest.sqrt()) as f32
-            } else {
-                1e3
+impl Durometer {
+    pub(super) fn new(substance: &Substance) -> Self {
+        let mut convolver = Convolver::new(WIDTH);
+        let compliance = substance.compliance_ratio(READ_S);
+        let unit = CELL_MM / substance.plane_strain(1.0) * compliance;
+        let layer = substance
+            .layer(PIECE_MM)
+            .map(|(base, height_mm)| (Layer::new(substance.nu, base), height_mm / CELL_MM));
+        let spectrum = convolver.spectrum(|i, j| {
+            let (x, y) = (i as f64, j as f64);
+            unit * match &layer {
+                Some((layer, height)) => layer.influence(x, y, *height),
+                None => kernel::half_space(x, y),
             }
-        })
-        .collect();
-    let local = match material.law {
-        Law::Solid => Local::None,
-        Law::Plastic { hardness } => Local::Flow {
-            hardness_mpa: hardness,
-            time_s: READ_S,
-        },
-        Law::Foam {
-            exponent,
-            plateau,
-            strain,
-        } => Local::Foam {
-            plateau_mpa: plateau,
-            exponent,
-            strain,
-            height_mm: PIECE_MM,
-            factor: compliance,
-            history_mpa: &[],
-        },
-    };
-    let mut fields = Fields::default();
-    let mut pressure = vec![0.0; WIDTH * WIDTH];
-    let mut approach = |force_n: f64| {
-        let problem = Problem {
-            gap_mm: &gap,
-            spectrum: &spectrum,
-            local,
-            force_n,
-            cell_mm: CELL_MM,
-            tolerance: 2e-4,
+        });
+        // Hemisphere; beyond its radius the indenter goes on as a cylinder.
+        let gap_mm: Vec<f32> = (0..WIDTH * WIDTH)
+            .map(|k| {
+                let at = |i: usize| (i as f64 + 0.5 - 0.5 * WIDTH as f64) * CELL_MM;
+                let square = at(k / WIDTH).powi(2) + at(k % WIDTH).powi(2);
+                let rest = RADIUS_MM * RADIUS_MM - square;
+                if rest > 0.0 {
+                    (RADIUS_MM - rest.sqrt()) as f32
+                } else {
+                    1e3
+                }
+            })
+            .collect();
+        let local = match substance.law {
+            Law::Solid | Law::Layered { .. } => Local::None,
+            Law::Plastic { hardness } => Local::Flow {
+                hardness_mpa: hardness,
+                time_s: READ_S,
+            },
+            Law::Foam {
+                exponent,
+                plateau,
+                strain,
+            } => Local::Foam {
+                plateau_mpa: plateau,
+                exponent,
+                strain,
+                height_mm: PIECE_MM,
+                factor: compliance,
+                history_mpa: &[],
+            },
         };
-        contact::solve(&mut convolver, &mut fields, &problem, &mut pressure).approach_mm
-    };
-    // Secant on ln F against ln d, where the contact is nearly a power law.
-    let mut force = [0.5, 0.6];
-    let mut error = force.map(|f| (approach(f) / depth_mm).ln());
-    for _ in 0..40 {
-        let slope = (error[1] - error[0]) / (force[1] / force[0]).ln();
-        let next = force[1] * (-error[1] / slope).clamp(-0.7, 0.7).exp();
-        force = [force[1], next];
-        error = [error[1], (approach(next) / depth_mm).ln()];
-        if error[1].abs() < 2e-4 {
-            break;
+        Self {
+            local,
+            pressure: vec![0.0; gap_mm.len()],
+            gap_mm,
+            spectrum,
+            convolver,
+            fields: Fields::default(),
         }
     }
-    force[1]
+
+    /// Young's modulus in MPa with which the durometer reads `shore`.
+    ///
+    /// All stresses and moduli of the laws are relative to E, so the force at a given depth is
+    /// proportional to E and one indentation with E = 1 MPa suffices.
+    pub(super) fn young_mpa(&mut self, shore: f64) -> f64 {
+        spring_force_n(shore) / self.force_n(depth_mm(shore))
+    }
+
+    /// What the durometer reads of this Young's modulus: 0 where it sinks in to the end.
+    pub(super) fn reading(&mut self, young_mpa: f64) -> f64 {
+        // How much deeper than the reading says the indenter is: falls from 100 to 0. Illinois.
+        let mut excess =
+            |shore: f64| self.approach_mm(spring_force_n(shore) / young_mpa) - depth_mm(shore);
+        let (mut low, mut high) = (0.0, 100.0);
+        let (mut at_low, mut at_high) = (excess(low), excess(high));
+        if at_low >= 0.0 {
+            return 0.0;
+        }
+        let mut last_was_low = None;
+        while high - low > SHORE_TOLERANCE {
+            let shore = (low * at_high - high * at_low) / (at_high - at_low);
+            let at = excess(shore);
+            if at.abs() < SHORE_TOLERANCE * depth_mm(99.0) {
+                return shore;
+            }
+            let is_low = at < 0.0;
+            if is_low {
+                (low, at_low) = (shore, at);
+                at_high *= if last_was_low == Some(true) { 0.5 } else { 1.0 };
+            } else {
+                (high, at_high) = (shore, at);
+                at_low *= if last_was_low == Some(false) {
+                    0.5
+                } else {
+                    1.0
+                };
+            }
+            last_was_low = Some(is_low);
+        }
+        0.5 * (low + high)
+    }
+
+    /// Force in N on the indenter at `depth_mm`, for E = 1 MPa.
+    fn force_n(&mut self, depth_mm: f64) -> f64 {
+        // Secant on ln F against ln d, where the contact is nearly a power law.
+        let mut force = [0.5, 0.6];
+        let mut error = force.map(|f| (self.approach_mm(f) / depth_mm).ln());
+        for _ in 0..40 {
+            let slope = (error[1] - error[0]) / (force[1] / force[0]).ln();
+            let next = force[1] * (-error[1] / slope).clamp(-0.7, 0.7).exp();
+            force = [force[1], next];
+            error = [error[1], (self.approach_mm(next) / depth_mm).ln()];
+            if error[1].abs() < FORCE_TOLERANCE {
+                break;
+            }
+        }
+        force[1]
+    }
+
+    /// Depth in mm at which a force of `force_n` holds the indenter, for E = 1 MPa.
+    fn approach_mm(&mut self, force_n: f64) -> f64 {
+        let problem = Problem {
+            gap_mm: &self.gap_mm,
+            spectrum: &self.spectrum,
+            local: self.local,
+            force_n,
+            cell_mm: CELL_MM,
+            tolerance: FORCE_TOLERANCE,
+        };
+        contact::solve(
+            &mut self.convolver,
+            &mut self.fields,
+            &problem,
+            &mut self.pressure,
+        )
+        .approach_mm
+    }
 }
 
 #[cfg(test)]
@@ -129,12 +197,104 @@ mod tests {
                 (0.5 * (s.low + s.mean), 1e-2),
                 (0.5 * (s.mean + s.high), 1e-2),
             ] {
-                let (held, found) = (properties.young_mpa(shore), young_mpa(properties, shore));
+                let held = properties.young_mpa(shore);
+                let found = Durometer::new(&properties.substance).young_mpa(shore);
                 assert!(
                     (held / found - 1.0).abs() < tolerance,
                     "{material} at Shore OO {shore}: table {held}, durometer {found}"
                 );
             }
         }
+    }
+
+    /// One substance of each law, at the ends of what is drawn and between.
+    fn substances() -> Vec<Substance> {
+        let rubber = Material::Rubber.properties().substance;
+        let of = |law, nu| Substance { law, nu, ..rubber };
+        let plastic = |hardness| of(Law::Plastic { hardness }, 0.45);
+        let foam = |exponent, plateau, strain| {
+            let law = Law::Foam {
+                exponent,
+                plateau,
+                strain,
+            };
+            of(law, 0.2)
+        };
+        let layered = |thickness_mm, core| of(Law::Layered { thickness_mm, core }, 0.4);
+        vec![
+            rubber,
+            plastic(0.05),
+            plastic(0.25),
+            foam(2.0, 0.08, 0.6),
+            foam(3.0, 0.5, 0.3),
+            layered(3.0, 20.0),
+            layered(3.0, 2000.0),
+            layered(10.0, 200.0),
+        ]
+    }
+
+    #[test]
+    fn modulus_rises_with_shore_and_reads_it_back() {
+        for substance in substances() {
+            let mut durometer = Durometer::new(&substance);
+            let mut last = 0.0;
+            for shore in [15.0, 30.0, 50.0, 60.0, 70.0, 85.0, 95.0] {
+                let young_mpa = durometer.young_mpa(shore);
+                assert!(
+                    young_mpa > 1.05 * last,
+                    "{substance:?}: {young_mpa} MPa at {shore}"
+                );
+                last = young_mpa;
+                let read = durometer.reading(young_mpa);
+                println!(
+                    "{:?} {shore} {young_mpa:.4} MPa reads {read:.2}",
+                    substance.law
+                );
+                assert!(
+                    (read - shore).abs() < 0.1,
+                    "{substance:?}: reads {read} at {shore}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn a_thick_layer_is_all_and_a_thin_one_shows_the_core() {
+        let solid = Material::SoftCandy.properties().substance;
+        let core = 3.0;
+        let layered = |thickness_mm| Substance {
+            law: Law::Layered { thickness_mm, core },
+            ..solid
+        };
+        let force_n = |substance: Substance| Durometer::new(&substance).force_n(depth_mm(60.0));
+        // From a layer thicker than any indenter is deep to half a cell.
+        let forces = [400.0, 10.0, 3.0, 1.0, 0.3, 0.02].map(|mm| force_n(layered(mm)));
+        let (thin, others) = forces.split_last().unwrap();
+        assert!(
+            others.is_sorted_by(|thick, thin| thick < thin),
+            "{forces:?}"
+        );
+        let thick = forces[0] / force_n(solid);
+        assert!((thick - 1.0).abs() < 0.01, "{thick}");
+        let thin = thin / (core * force_n(Substance { nu: 0.3, ..solid }));
+        assert!((thin - 1.0).abs() < 0.05, "{thin}");
+    }
+
+    #[test]
+    fn a_shallow_reading_is_hertzs() {
+        // d = (9 F^2 / (16 R E*^2))^(1/3), F and d by the reading: 94.5 and softer sinks in by
+        // a tenth of the radius and more.
+        let wood = Material::Wood.properties().substance;
+        let elastic = Substance {
+            creep: [super::super::substance::Creep::NONE; 2],
+            ..wood
+        };
+        let shore = 95.0;
+        let force_n = spring_force_n(shore);
+        let plane_strain =
+            (9.0 * force_n.powi(2) / (16.0 * RADIUS_MM * depth_mm(shore).powi(3))).sqrt();
+        let expected = plane_strain * (1.0 - elastic.nu.powi(2));
+        let found = Durometer::new(&elastic).young_mpa(shore);
+        assert!((found / expected - 1.0).abs() < 0.06, "{found}, {expected}");
     }
 }

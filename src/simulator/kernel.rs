@@ -1,4 +1,4 @@
-//! Surface displacement under a loaded square cell: half-space and bonded layer.
+//! Surface displacement under a loaded square cell: half-space, and a layer bonded to a base.
 //!
 //! Everything is dimensionless: lengths in cells, plane-strain modulus E* = 1. Displacement in mm
 //! is the value here times cell_mm / E* times the cell's pressure.
@@ -15,7 +15,16 @@ pub(super) fn half_space(x: f64, y: f64) -> f64 {
     (term(xp, yp, ym) - term(xm, yp, ym) + term(yp, xp, xm) - term(ym, xp, xm)) / PI
 }
 
-/// Influence of a layer bonded to a rigid base, in free space.
+/// What a layer is bonded to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Base {
+    /// It does not yield.
+    Rigid,
+    /// An elastic half-space: its Poisson's ratio, and the layer's shear modulus per its own.
+    Elastic { nu: f64, shear_ratio: f64 },
+}
+
+/// Influence of a layer bonded to a base, in free space.
 ///
 /// With `K(q) = 2 / (E* q) S(q h)` for the layer and `2 / (E* q)` for the half-space, the layer is
 /// the half-space less a smooth part, which depends on r / h alone:
@@ -23,11 +32,13 @@ pub(super) fn half_space(x: f64, y: f64) -> f64 {
 /// Taking the difference in real space keeps the kernel free of periodic images.
 pub(super) struct Layer {
     phi: Vec<f64>,
+    /// S(0): what is left far away is the base, as compliant as this part of the layer.
+    base: f64,
 }
 
 impl Layer {
-    /// The layer of Poisson's ratio `nu`.
-    pub(super) fn new(nu: f64) -> Self {
+    /// The layer of Poisson's ratio `nu` on `base`.
+    pub(super) fn new(nu: f64, base: Base) -> Self {
         // Composite Gauss-Legendre, 5 points a panel; 1 - S has fallen below 1e-9 at the end.
         const POINTS: [(f64, f64); 5] = [
             (0.0, 0.568_888_888_888_889),
@@ -43,7 +54,7 @@ impl Layer {
                 let middle = half * f64::from(2 * panel + 1);
                 POINTS.map(|(at, weight)| {
                     let x = middle + half * at;
-                    (x, weight * half * (1.0 - layer_ratio(x, nu)))
+                    (x, weight * half * (1.0 - layer_ratio(x, nu, base)))
                 })
             })
             .collect();
@@ -56,13 +67,20 @@ impl Layer {
                     .sum()
             })
             .collect();
-        Self { phi }
+        Self {
+            phi,
+            base: layer_ratio(0.0, nu, base),
+        }
     }
 
     /// Displacement at offset (`x`, `y`) cells on a layer `height` cells thick.
     pub(super) fn influence(&self, x: f64, y: f64, height: f64) -> f64 {
         if x.hypot(y) > REACH * height {
-            return 0.0;
+            return if self.base == 0.0 {
+                0.0
+            } else {
+                self.base * half_space(x, y)
+            };
         }
         // The smooth part varies over one layer height: a thin one needs its mean over the cell.
         let parts = if height < 8.0 { 4 } else { 1 };
@@ -89,11 +107,29 @@ const REACH: f64 = 12.0;
 /// Spacing of the table of phi, in layer heights; linear interpolation errs by under 1e-4 of phi.
 const STEP: f64 = 0.01;
 
-/// S(x) of the bonded layer, x = q h, k = 3 - 4 nu:
-/// `S = [k sinh 2x - 2x] / [k cosh 2x + (k^2 + 1) / 2 + 2 x^2]`.
-fn layer_ratio(x: f64, nu: f64) -> f64 {
+/// S(x) of the bonded layer, x = q h, k = 3 - 4 nu. On a rigid base
+/// `S = [k sinh 2x - 2x] / [k cosh 2x + (k^2 + 1) / 2 + 2 x^2]`. On an elastic one, with the
+/// ratio m of the shear moduli, layer to base, and k' of the base (O'Sullivan and King 1988):
+/// `S = [1 + 4 c x e - l c e^2] / [1 - (l + c + 4 c x^2) e + l c e^2]`, `e = exp(-2x)`,
+/// `c = (m - 1) / (m + k)`, `l = (m k' - k) / (m k' + 1)`.
+fn layer_ratio(x: f64, nu: f64, base: Base) -> f64 {
     let k = 3.0 - 4.0 * nu;
-    (k * (2.0 * x).sinh() - 2.0 * x) / (k * (2.0 * x).cosh() + 0.5 * (k * k + 1.0) + 2.0 * x * x)
+    match base {
+        Base::Rigid => {
+            (k * (2.0 * x).sinh() - 2.0 * x)
+                / (k * (2.0 * x).cosh() + 0.5 * (k * k + 1.0) + 2.0 * x * x)
+        }
+        Base::Elastic { nu, shear_ratio } => {
+            let own = shear_ratio * (3.0 - 4.0 * nu);
+            let (c, l) = (
+                (shear_ratio - 1.0) / (shear_ratio + k),
+                (own - k) / (own + 1.0),
+            );
+            let e = (-2.0 * x).exp();
+            (1.0 + 4.0 * c * x * e - l * c * e * e)
+                / (1.0 - (l + c + 4.0 * c * x * x) * e + l * c * e * e)
+        }
+    }
 }
 
 /// E* K(0) / h = E* / M: the layer's compliance under uniform pressure, M the confined modulus.
@@ -170,7 +206,7 @@ mod tests {
     #[test]
     fn layer_sums_to_its_confined_compliance() {
         for (nu, height) in [(0.45, 1.143), (0.1, 6.0), (0.25, 10.0), (0.15, 0.8)] {
-            let layer = Layer::new(nu);
+            let layer = Layer::new(nu, Base::Rigid);
             let reach = (REACH * height) as i32 + 1;
             let mut sum = 0.0;
             for i in -reach..=reach {
@@ -188,8 +224,48 @@ mod tests {
 
     #[test]
     fn layer_ratio_has_both_limits() {
-        assert!((layer_ratio(12.0, 0.3) - 1.0).abs() < 1e-6);
+        let ratio = |x| layer_ratio(x, 0.3, Base::Rigid);
+        assert!((ratio(12.0) - 1.0).abs() < 1e-6);
         let x = 1e-4;
-        assert!((layer_ratio(x, 0.3) * 2.0 / x / confined_compliance(0.3) - 1.0).abs() < 1e-3);
+        assert!((ratio(x) * 2.0 / x / confined_compliance(0.3) - 1.0).abs() < 1e-3);
+    }
+
+    /// A core of Poisson's ratio 0.3 whose E is `core` times that of a layer of `nu`.
+    fn core(nu: f64, core: f64) -> Base {
+        Base::Elastic {
+            nu: 0.3,
+            shear_ratio: 1.3 / ((1.0 + nu) * core),
+        }
+    }
+
+    #[test]
+    fn a_layer_is_its_core_when_thin_and_itself_when_thick() {
+        for (nu, ratio) in [(0.45, 20.0), (0.2, 500.0), (0.3, 0.1)] {
+            let layer = Layer::new(nu, core(nu, ratio));
+            // E* of the layer per that of the core.
+            let compliance = (1.0 - 0.3_f64.powi(2)) / (1.0 - nu * nu) / ratio;
+            assert!((layer.base / compliance - 1.0).abs() < 1e-12);
+            for (x, y) in [(3.0, 0.0), (5.0, 9.0)] {
+                let thin = layer.influence(x, y, 0.02);
+                assert!((thin / (compliance * half_space(x, y)) - 1.0).abs() < 1e-2);
+                let thick = layer.influence(x, y, 1e5);
+                assert!((thick / half_space(x, y) - 1.0).abs() < 1e-2, "{thick}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_core_like_its_layer_is_a_half_space_and_a_very_stiff_one_is_rigid() {
+        let (same, stiff) = (
+            Layer::new(0.3, core(0.3, 1.0)),
+            Layer::new(0.4, core(0.4, 1e9)),
+        );
+        let rigid = Layer::new(0.4, Base::Rigid);
+        for (x, y) in [(0.0, 0.0), (2.0, 1.0), (9.0, 4.0), (40.0, 3.0)] {
+            let half_space = half_space(x, y);
+            assert!((same.influence(x, y, 3.0) / half_space - 1.0).abs() < 1e-6);
+            let off = stiff.influence(x, y, 3.0) - rigid.influence(x, y, 3.0);
+            assert!(off.abs() < 1e-6 * half_space + 1e-8, "{off}");
+        }
     }
 }

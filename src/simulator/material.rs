@@ -5,6 +5,9 @@
 
 use std::str::FromStr;
 
+use super::substance::{Creep, Law, Substance, Texture};
+use crate::random::Stream;
+
 /// A reference material (paper, Table 1).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Material {
@@ -121,47 +124,12 @@ impl std::fmt::Display for Material {
     }
 }
 
-/// How the bulk answers beyond linear elasticity; stresses relative to E.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Law {
-    /// Elastic half-space.
-    Solid,
-    /// Elastic half-space that flows: p_H relative to E.
-    Plastic { hardness: f64 },
-    /// Bonded layer of the object's height, with a plateau: m, s_p relative to E, e_D.
-    Foam {
-        exponent: f64,
-        plateau: f64,
-        strain: f64,
-    },
-}
-
-/// One term of the creep compliance, `j (1 - exp(-t / tau))`.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Creep {
-    pub(super) j: f64,
-    pub(super) tau_s: f64,
-}
-
-/// Roughness of a face.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Texture {
-    pub(super) rms_um: f64,
-    pub(super) shortest_mm: f64,
-    pub(super) longest_mm: f64,
-    pub(super) hurst: f64,
-    pub(super) anisotropy: f64,
-}
-
 /// A row of the table.
 #[derive(Debug)]
 pub(super) struct Properties {
     pub(super) shore: Shore,
-    pub(super) nu: f64,
     modulus: Modulus,
-    pub(super) law: Law,
-    pub(super) creep: &'static [Creep],
-    pub(super) texture: Texture,
+    pub(super) substance: Substance,
 }
 
 /// Shore hardness over a material's objects.
@@ -171,6 +139,18 @@ pub(super) struct Shore {
     pub(super) sd: f64,
     pub(super) low: f64,
     pub(super) high: f64,
+}
+
+impl Shore {
+    /// Normal, drawn again until it lies in the range.
+    pub(super) fn draw(&self, stream: &mut Stream) -> f64 {
+        loop {
+            let drawn = self.mean + self.sd * stream.normal();
+            if (self.low..=self.high).contains(&drawn) {
+                return drawn;
+            }
+        }
+    }
 }
 
 /// Young's modulus in MPa.
@@ -198,15 +178,6 @@ impl Properties {
             + at[1] * basis(mean, low, high)
             + at[2] * basis(high, low, mean);
         ln.exp()
-    }
-
-    /// J(t) / J0 = 1 + sum j (1 - exp(-t / tau)).
-    pub(super) fn compliance_ratio(&self, time_s: f64) -> f64 {
-        1.0 + self
-            .creep
-            .iter()
-            .map(|c| c.j * -(-time_s / c.tau_s).exp_m1())
-            .sum::<f64>()
     }
 }
 
@@ -242,81 +213,97 @@ const fn texture(
 const PROPERTIES: [Properties; 8] = [
     Properties {
         shore: shore(87.0, 1.5, 82.0, 95.0),
-        nu: 0.35,
         modulus: Modulus::Fixed(600.0),
-        law: Law::Solid,
-        creep: &[creep(0.03, 1.0)],
-        texture: texture(55.0, 2.5, 18.0, 0.4, 2.0),
+        substance: Substance {
+            nu: 0.35,
+            law: Law::Solid,
+            creep: [creep(0.03, 1.0), Creep::NONE],
+            texture: texture(55.0, 2.5, 18.0, 0.4, 2.0),
+        },
     },
     Properties {
         shore: shore(66.0, 1.2, 61.5, 69.5),
-        nu: 0.49,
         modulus: Modulus::Durometer([0.4673, 0.5870, 0.7126]),
-        law: Law::Solid,
-        creep: &[creep(0.10, 0.3), creep(0.06, 3.0)],
-        texture: texture(35.0, 3.0, 40.0, 0.9, 1.0),
+        substance: Substance {
+            nu: 0.49,
+            law: Law::Solid,
+            creep: [creep(0.10, 0.3), creep(0.06, 3.0)],
+            texture: texture(35.0, 3.0, 40.0, 0.9, 1.0),
+        },
     },
     Properties {
         shore: shore(52.0, 1.0, 51.0, 56.0),
-        nu: 0.45,
         modulus: Modulus::Durometer([1.1336, 1.1638, 1.3005]),
-        law: Law::Plastic {
-            hardness: 1.0 / 12.0,
+        substance: Substance {
+            nu: 0.45,
+            law: Law::Plastic {
+                hardness: 1.0 / 12.0,
+            },
+            creep: [creep(0.10, 0.5), Creep::NONE],
+            texture: texture(90.0, 4.0, 30.0, 0.9, 1.0),
         },
-        creep: &[creep(0.10, 0.5)],
-        texture: texture(90.0, 4.0, 30.0, 0.9, 1.0),
     },
     Properties {
         shore: shore(32.0, 2.0, 25.0, 40.0),
-        nu: 0.10,
         modulus: Modulus::Durometer([0.2041, 0.2784, 0.3985]),
-        law: Law::Foam {
-            exponent: 2.5,
-            plateau: 0.12,
-            strain: 0.50,
+        substance: Substance {
+            nu: 0.10,
+            law: Law::Foam {
+                exponent: 2.5,
+                plateau: 0.12,
+                strain: 0.50,
+            },
+            creep: [creep(0.12, 0.3), creep(0.08, 3.0)],
+            texture: texture(160.0, 2.0, 10.0, 0.5, 1.0),
         },
-        creep: &[creep(0.12, 0.3), creep(0.08, 3.0)],
-        texture: texture(160.0, 2.0, 10.0, 0.5, 1.0),
     },
     Properties {
         shore: shore(88.0, 1.5, 82.0, 95.0),
-        nu: 0.38,
         modulus: Modulus::Fixed(2200.0),
-        law: Law::Solid,
-        creep: &[creep(0.03, 1.0)],
-        texture: texture(55.0, 4.0, 22.0, 0.6, 1.0),
+        substance: Substance {
+            nu: 0.38,
+            law: Law::Solid,
+            creep: [creep(0.03, 1.0), Creep::NONE],
+            texture: texture(55.0, 4.0, 22.0, 0.6, 1.0),
+        },
     },
     Properties {
         shore: shore(63.0, 1.2, 61.2, 67.0),
-        nu: 0.25,
         modulus: Modulus::Durometer([0.6990, 0.7628, 0.9340]),
-        law: Law::Foam {
-            exponent: 2.5,
-            plateau: 0.35,
-            strain: 0.35,
+        substance: Substance {
+            nu: 0.25,
+            law: Law::Foam {
+                exponent: 2.5,
+                plateau: 0.35,
+                strain: 0.35,
+            },
+            creep: [creep(0.12, 0.3), creep(0.06, 3.0)],
+            texture: texture(50.0, 3.0, 30.0, 0.7, 1.0),
         },
-        creep: &[creep(0.12, 0.3), creep(0.06, 3.0)],
-        texture: texture(50.0, 3.0, 30.0, 0.7, 1.0),
     },
     Properties {
         shore: shore(55.0, 1.2, 51.5, 59.0),
-        nu: 0.48,
         modulus: Modulus::Durometer([0.3417, 0.3971, 0.4757]),
-        law: Law::Solid,
-        creep: &[creep(0.30, 0.2), creep(0.30, 2.0)],
-        texture: texture(80.0, 5.0, 30.0, 0.9, 1.0),
+        substance: Substance {
+            nu: 0.48,
+            law: Law::Solid,
+            creep: [creep(0.30, 0.2), creep(0.30, 2.0)],
+            texture: texture(80.0, 5.0, 30.0, 0.9, 1.0),
+        },
     },
     Properties {
         shore: shore(38.0, 2.0, 32.0, 44.0),
-        nu: 0.15,
         modulus: Modulus::Durometer([0.2464, 0.3179, 0.4121]),
-        law: Law::Foam {
-            exponent: 2.0,
-            plateau: 0.15,
-            strain: 0.42,
+        substance: Substance {
+            nu: 0.15,
+            law: Law::Foam {
+                exponent: 2.0,
+                plateau: 0.15,
+                strain: 0.42,
+            },
+            creep: [creep(0.12, 0.3), creep(0.06, 3.0)],
+            texture: texture(110.0, 3.0, 8.0, 0.5, 1.0),
         },
-        creep: &[creep(0.12, 0.3), creep(0.06, 3.0)],
-        texture: texture(110.0, 3.0, 8.0, 0.5, 1.0),
     },
 ];
 

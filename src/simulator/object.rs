@@ -5,7 +5,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::material::Material;
 use super::texture::Patch;
 use crate::random::Stream;
 
@@ -16,6 +15,9 @@ pub enum Shapes {
     /// One distribution for all materials, and test objects of the same geometry, posture and
     /// force in every test material: shape cannot carry the label.
     Matched,
+    /// As `matched`, but of radii from 8 to 60 mm, edges and points among them: one frame then
+    /// says little of the hardness, because it fixes R / E* alone.
+    Wide,
     /// As the paper's pictures suggest: rigid objects mostly flat boxes, soft ones round. Part
     /// of any accuracy on these is shape.
     Paper,
@@ -27,6 +29,7 @@ impl std::str::FromStr for Shapes {
     fn from_str(name: &str) -> Result<Self, Self::Err> {
         match name {
             "matched" => Ok(Shapes::Matched),
+            "wide" => Ok(Shapes::Wide),
             "paper" => Ok(Shapes::Paper),
             _ => Err(UnknownShapes(name.to_owned())),
         }
@@ -35,7 +38,7 @@ impl std::str::FromStr for Shapes {
 
 /// A name that is no set of shapes.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("no shapes \"{0}\"; there are matched, paper")]
+#[error("no shapes \"{0}\"; there are matched, wide, paper")]
 pub struct UnknownShapes(pub String);
 
 /// Postures an object is pressed in (paper: "at least six").
@@ -72,6 +75,11 @@ enum Solid {
     Pebble {
         axes: [f64; 3],
     },
+    /// A cone, tip up.
+    Point {
+        tip: f64,
+        flank_deg: f64,
+    },
 }
 
 /// What the sensor meets in one posture.
@@ -97,6 +105,10 @@ enum Outline {
         radius: f64,
         half_length: f64,
         edge: f64,
+        flank_deg: f64,
+    },
+    Tip {
+        radius: f64,
         flank_deg: f64,
     },
     Disc {
@@ -135,33 +147,34 @@ impl Pose {
     }
 }
 
-/// Weights of ball, cylinder, box, wedge, pebble: the paper's rigid objects.
-const RIGID: [f64; 5] = [0.05, 0.15, 0.62, 0.08, 0.10];
+/// Weights of ball, cylinder, box, wedge, pebble, point: the paper's rigid objects.
+const RIGID: [f64; 6] = [0.05, 0.15, 0.62, 0.08, 0.10, 0.0];
 /// The paper's soft objects.
-const SOFT: [f64; 5] = [0.42, 0.18, 0.12, 0.03, 0.25];
+const SOFT: [f64; 6] = [0.42, 0.18, 0.12, 0.03, 0.25, 0.0];
 /// Every object of the matched shapes: the mean of the two.
-const MATCHED: [f64; 5] = [0.235, 0.165, 0.37, 0.055, 0.175];
+const MATCHED: [f64; 6] = [0.235, 0.165, 0.37, 0.055, 0.175, 0.0];
+/// Every object of the wide shapes.
+const WIDE: [f64; 6] = [0.20, 0.18, 0.26, 0.12, 0.14, 0.10];
+/// Radii of balls, cylinders and crowns of the wide shapes, mm, log-even; pebbles' axes lie within
+/// a tenth of one.
+const WIDE_RADIUS_MM: (f64, f64) = (8.0, 60.0);
+/// Radii of their edges and points, mm: sharper ones would lie between the taxels.
+const WIDE_TIP_MM: (f64, f64) = (2.0, 10.0);
 
 impl Object {
-    /// Draws an object; `material` matters for the paper's shapes only.
+    /// Draws an object; `level` matters for the paper's shapes only.
     ///
     /// Faces are crowned but for the paper's rigid objects, whose faces are flat. A single frame
     /// fixes R / E* and no more, so that only a narrow range of radii leaves hardness in it; a flat
     /// soft face touches whole, whatever its hardness.
-    pub(super) fn draw(shapes: Shapes, material: Material, stream: &mut Stream) -> Self {
+    pub(super) fn draw(shapes: Shapes, level: u8, stream: &mut Stream) -> Self {
         let (weights, flat) = match shapes {
+            Shapes::Wide => return Self::wide(stream),
             Shapes::Matched => (MATCHED, false),
-            Shapes::Paper if material.level() == 1 => (RIGID, true),
+            Shapes::Paper if level == 1 => (RIGID, true),
             Shapes::Paper => (SOFT, false),
         };
-        let mut rest = stream.uniform();
-        let family = weights
-            .iter()
-            .position(|&weight| {
-                rest -= weight;
-                rest < 0.0
-            })
-            .unwrap_or(4);
+        let family = family(&weights, stream);
         let mut pick = |low, high| stream.range(low, high);
         let solid = match family {
             0 => Solid::Ball {
@@ -171,9 +184,7 @@ impl Object {
                 radius: pick(16.0, 22.0),
                 length: pick(30.0, 60.0),
             },
-            2 => Solid::Block {
-                sides: [pick(25.0, 60.0), pick(25.0, 60.0), pick(18.0, 45.0)],
-            },
+            2 => block(stream),
             3 => Solid::Wedge {
                 length: pick(25.0, 50.0),
                 tip: pick(4.0, 10.0),
@@ -183,7 +194,7 @@ impl Object {
                 axes: [pick(23.0, 29.0), pick(23.0, 29.0), pick(23.0, 29.0)],
             },
         };
-        let edge_mm = pick(1.0, 4.0);
+        let edge_mm = stream.range(1.0, 4.0);
         let crown_mm = std::array::from_fn(|_| {
             if !flat {
                 return stream.range(31.0, 42.0);
@@ -199,6 +210,39 @@ impl Object {
             solid,
             edge_mm,
             crown_mm,
+        }
+    }
+
+    fn wide(stream: &mut Stream) -> Self {
+        let solid = match family(&WIDE, stream) {
+            0 => Solid::Ball {
+                radius: log_even(WIDE_RADIUS_MM, stream),
+            },
+            1 => Solid::Cylinder {
+                radius: log_even(WIDE_RADIUS_MM, stream),
+                length: stream.range(30.0, 60.0),
+            },
+            2 => block(stream),
+            3 => Solid::Wedge {
+                length: stream.range(25.0, 50.0),
+                tip: log_even(WIDE_TIP_MM, stream),
+                flank_deg: stream.range(30.0, 45.0),
+            },
+            4 => {
+                let radius = log_even(WIDE_RADIUS_MM, stream);
+                Solid::Pebble {
+                    axes: std::array::from_fn(|_| radius * stream.range(0.9, 1.1)),
+                }
+            }
+            _ => Solid::Point {
+                tip: log_even(WIDE_TIP_MM, stream),
+                flank_deg: stream.range(30.0, 45.0),
+            },
+        };
+        Self {
+            solid,
+            edge_mm: stream.range(1.0, 4.0),
+            crown_mm: std::array::from_fn(|_| log_even(WIDE_RADIUS_MM, stream)),
         }
     }
 
@@ -274,11 +318,41 @@ impl Object {
                 },
                 WEDGE_HEIGHT_MM,
             ),
+            Solid::Point { tip, flank_deg } => flat(
+                Outline::Tip {
+                    radius: tip,
+                    flank_deg,
+                },
+                WEDGE_HEIGHT_MM,
+            ),
         }
     }
 }
 
-/// A wedge stands on its base, tip up.
+/// Place among weights, by these.
+fn family(weights: &[f64], stream: &mut Stream) -> usize {
+    let mut rest = stream.uniform();
+    let place = weights.iter().position(|&weight| {
+        rest -= weight;
+        rest < 0.0
+    });
+    // Rounding leaves a little at the end: to the last one that there is.
+    let last = weights.iter().rposition(|&weight| weight > 0.0);
+    place.or(last).unwrap_or_default()
+}
+
+fn block(stream: &mut Stream) -> Solid {
+    Solid::Block {
+        sides: [(25.0, 60.0), (25.0, 60.0), (18.0, 45.0)]
+            .map(|(low, high)| stream.range(low, high)),
+    }
+}
+
+fn log_even((low, high): (f64, f64), stream: &mut Stream) -> f64 {
+    stream.range(low.ln(), high.ln()).exp()
+}
+
+/// Wedges and points stand on their base, tip up.
 const WEDGE_HEIGHT_MM: f64 = 30.0;
 
 impl Face {
@@ -348,18 +422,9 @@ impl Outline {
                 flank_deg,
             } => {
                 let end = rounded(u.abs() - (half_length - edge), 0.0, edge);
-                let turn = flank_deg.to_radians();
-                let v = v.abs();
-                let side = if v < 0.99 * radius * turn.sin() {
-                    cap(radius, v)
-                } else if flank_deg < 89.0 {
-                    let at = 0.99 * radius * turn.sin();
-                    cap(radius, at) + (v - at) * turn.tan()
-                } else {
-                    NOTHING_MM
-                };
-                end + side
+                end + flanked(radius, flank_deg, v.abs())
             }
+            Outline::Tip { radius, flank_deg } => flanked(radius, flank_deg, u.hypot(v)),
             Outline::Disc {
                 radius,
                 edge,
@@ -379,6 +444,19 @@ impl Outline {
             }
         }
         .min(NOTHING_MM)
+    }
+}
+
+/// Drop of a rounded tip that goes on as a flank, `v` from its middle; a flank of 90 degrees ends.
+fn flanked(radius: f64, flank_deg: f64, v: f64) -> f64 {
+    let turn = flank_deg.to_radians();
+    let at = 0.99 * radius * turn.sin();
+    if v < at {
+        cap(radius, v)
+    } else if flank_deg < 89.0 {
+        cap(radius, at) + (v - at) * turn.tan()
+    } else {
+        NOTHING_MM
     }
 }
 

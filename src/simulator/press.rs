@@ -8,10 +8,10 @@ use std::rc::Rc;
 
 use super::contact::{self, Contact, Fields, Local, Problem, TOLERANCE};
 use super::fourier::Convolver;
-use super::kernel::{self, Layer};
-use super::material::{Law, Properties};
+use super::kernel::{self, Base, Layer};
 use super::object::{Face, Pose};
 use super::sensor::{CELL_MM, CELLS};
+use super::substance::{Law, Substance};
 use super::texture::Patch;
 
 /// Windows in cells: their doubles are sizes that FFTs like.
@@ -24,7 +24,7 @@ const COVER_MM: f64 = 1.0;
 
 /// A face of an object in its pose.
 pub(super) struct Specimen {
-    pub(super) properties: &'static Properties,
+    pub(super) substance: Substance,
     pub(super) young_mpa: f64,
     height_mm: f64,
     /// Undeformed gap over the whole sensor, `[CELLS, CELLS]`.
@@ -43,7 +43,7 @@ pub(super) struct Window {
 pub(super) struct Bench {
     cover_young_mpa: f64,
     widths: BTreeMap<usize, Width>,
-    layers: Vec<(u64, Layer)>,
+    layers: Vec<((f64, Base), Layer)>,
     fields: Fields,
     combined: Vec<f32>,
 }
@@ -52,19 +52,27 @@ struct Width {
     convolver: Convolver,
     half_space: Rc<Vec<f32>>,
     cover: Vec<f32>,
-    /// The last few layers' spectra by (nu, height): one posture's presses follow each other.
+    /// The last few layers' spectra: one posture's presses follow each other.
     recent: Vec<(LayerKey, Rc<Vec<f32>>)>,
 }
 
-/// Bits of Poisson's ratio and height in cells.
-type LayerKey = (u64, u64);
+/// What a layer's spectrum depends on.
+#[derive(Clone, Copy, PartialEq)]
+struct LayerKey {
+    nu: f64,
+    base: Base,
+    /// In cells.
+    height: f64,
+}
 
 /// Layer spectra held a width; an object has up to three heights.
 const RECENT: usize = 4;
+/// Kinds of layers held, the cover among them.
+const LAYERS: usize = 8;
 
 impl Specimen {
     pub(super) fn new(
-        properties: &'static Properties,
+        substance: Substance,
         young_mpa: f64,
         face: &Face,
         pose: &Pose,
@@ -72,7 +80,7 @@ impl Specimen {
     ) -> Self {
         let gap_mm = face.gap_mm(pose, patch, CELLS, CELL_MM);
         Self {
-            properties,
+            substance,
             young_mpa,
             height_mm: face.height_mm,
             gap_mm,
@@ -81,13 +89,13 @@ impl Specimen {
 
     /// E / (1 - nu^2), MPa.
     fn plane_strain_mpa(&self) -> f64 {
-        self.young_mpa / (1.0 - self.properties.nu * self.properties.nu)
+        self.substance.plane_strain(self.young_mpa)
     }
 
     /// The local law at one step: `factor` and `history` from creep, `time_s` for flow.
     fn local<'a>(&self, factor: f64, history_mpa: &'a [f32], time_s: f64) -> Local<'a> {
-        match self.properties.law {
-            Law::Solid => Local::None,
+        match self.substance.law {
+            Law::Solid | Law::Layered { .. } => Local::None,
             Law::Plastic { hardness } => Local::Flow {
                 hardness_mpa: hardness * self.young_mpa,
                 time_s,
@@ -109,9 +117,9 @@ impl Specimen {
 
     /// Flow over a step of `time_s`, for a plastic specimen; else nothing.
     pub(super) fn flow(&self, time_s: f64) -> Local<'static> {
-        match self.properties.law {
+        match self.substance.law {
             Law::Plastic { .. } => self.local(1.0, &[], time_s),
-            Law::Solid | Law::Foam { .. } => Local::None,
+            Law::Solid | Law::Foam { .. } | Law::Layered { .. } => Local::None,
         }
     }
 
@@ -130,9 +138,9 @@ impl Specimen {
     /// With overlap volume V at depth d and radius a of half the overlap's area, a sphere and a
     /// flat punch both obey `F = 0.42 E* V / a` within 7 %; the cover adds its own compliance.
     fn closing_depth_mm(&self, force_n: f64) -> f64 {
-        let soft = match self.properties.law {
+        let soft = match self.substance.law {
             Law::Foam { .. } => 0.4,
-            Law::Solid | Law::Plastic { .. } => 0.9,
+            Law::Solid | Law::Plastic { .. } | Law::Layered { .. } => 0.9,
         };
         let stiffness = 0.42 * self.plane_strain_mpa() * soft;
         let cover = cover_compliance();
@@ -261,7 +269,7 @@ impl Bench {
                 force_n,
                 // Under a linear ramp the load is, on average, half the ramp old; flow at the
                 // fourth power of the pressure counts a fifth of it.
-                factor: specimen.properties.compliance_ratio(hold_s + 0.5 * ramp_s),
+                factor: specimen.substance.compliance_ratio(hold_s + 0.5 * ramp_s),
                 history_mpa: &[],
                 time_s: hold_s + 0.2 * ramp_s,
             };
@@ -335,49 +343,50 @@ impl Bench {
     fn object_spectrum(&mut self, specimen: &Specimen, width: usize) -> Rc<Vec<f32>> {
         if !self.widths.contains_key(&width) {
             let cover_young_mpa = self.cover_young_mpa;
-            let made = Width::new(width, self.layer(COVER_NU), cover_young_mpa);
+            let cover = self.layer(COVER_NU, Base::Rigid);
+            let made = Width::new(width, &self.layers[cover].1, cover_young_mpa);
             self.widths.insert(width, made);
         }
-        let Law::Foam { .. } = specimen.properties.law else {
+        let Some((base, height_mm)) = specimen.substance.layer(specimen.height_mm) else {
             return Rc::clone(&self.widths[&width].half_space);
         };
-        let height = specimen.height_mm / CELL_MM;
-        let key = (specimen.properties.nu.to_bits(), height.to_bits());
+        let key = LayerKey {
+            nu: specimen.substance.nu,
+            base,
+            height: height_mm / CELL_MM,
+        };
         let recent = &self.widths[&width].recent;
         if let Some((_, spectrum)) = recent.iter().find(|(held, _)| *held == key) {
             return Rc::clone(spectrum);
         }
-        self.layer(specimen.properties.nu);
-        let layer = &self
-            .layers
-            .iter()
-            .find(|(nu, _)| *nu == key.0)
-            .expect("just made")
-            .1;
+        let at = self.layer(key.nu, base);
+        let layer = &self.layers[at].1;
         let held = self.widths.get_mut(&width).expect("made above");
         let spectrum = Rc::new(
             held.convolver
-                .spectrum(|i, j| layer.influence(i as f64, j as f64, height)),
+                .spectrum(|i, j| layer.influence(i as f64, j as f64, key.height)),
         );
-        if held.recent.len() == RECENT {
-            held.recent.remove(0);
-        }
-        held.recent.push((key, Rc::clone(&spectrum)));
+        keep(&mut held.recent, (key, Rc::clone(&spectrum)), RECENT);
         spectrum
     }
 
-    fn layer(&mut self, nu: f64) -> &Layer {
-        let key = nu.to_bits();
-        let at = self
-            .layers
-            .iter()
-            .position(|(held, _)| *held == key)
-            .unwrap_or_else(|| {
-                self.layers.push((key, Layer::new(nu)));
-                self.layers.len() - 1
-            });
-        &self.layers[at].1
+    /// Where among `layers` the one of this kind is; made, if it is not there.
+    fn layer(&mut self, nu: f64, base: Base) -> usize {
+        let kind = (nu, base);
+        let held = self.layers.iter().position(|(held, _)| *held == kind);
+        held.unwrap_or_else(|| {
+            keep(&mut self.layers, (kind, Layer::new(nu, base)), LAYERS);
+            self.layers.len() - 1
+        })
     }
+}
+
+/// Adds to a list of the last few.
+fn keep<T>(list: &mut Vec<T>, item: T, most: usize) {
+    if list.len() == most {
+        list.remove(0);
+    }
+    list.push(item);
 }
 
 impl Width {
@@ -416,12 +425,13 @@ mod tests {
     /// A ball of radius 27 mm of this material, its roughness times `roughness`.
     fn ball(material: Material, roughness: f64) -> Specimen {
         let properties = material.properties();
+        let substance = properties.substance;
         let face = Face::ball(27.0);
         let mut stream = Stream::new(2, "ball");
         let pose = Pose::draw(&face, &mut stream);
-        let patch = Patch::new(&properties.texture, roughness, CELL_MM, &mut stream);
+        let patch = Patch::new(&substance.texture, roughness, CELL_MM, &mut stream);
         Specimen::new(
-            properties,
+            substance,
             properties.young_mpa(properties.shore.mean),
             &face,
             &pose,

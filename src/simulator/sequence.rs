@@ -5,8 +5,9 @@
 
 use std::collections::VecDeque;
 
+use super::body::{Body, draw_patch};
 use super::course::Course;
-use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES, draw_patch, draw_shore};
+use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
 use super::material::Material;
 use super::object::{Object, POSTURES, Pose, Shapes};
 use super::press::{Bench, Specimen};
@@ -151,15 +152,14 @@ impl Sequence {
         let delay_s = draws.range(0.0, DELAY_S);
         let drawn = draws.range(5.0, HIGHEST_FORCE_N);
         let mut force_n = self.settings.force_n.map_or(drawn, f64::from);
-        let object = Object::draw(self.settings.shapes, material, &mut draws.child(0));
+        let object = Object::draw(self.settings.shapes, material.level(), &mut draws.child(0));
         let face = object.face(draws.below(POSTURES));
-        let patch = draw_patch(material, face.roughness, &mut draws.child(1));
+        let body = Body::named(material, &mut draws.child(3));
+        let patch = draw_patch(&body.substance.texture, face.roughness, &mut draws.child(1));
         let pose = Pose::draw(&face, &mut draws.child(2));
         let rate = self.settings.frame_rate_hz;
         let hold_s = draws.range(0.8, 1.5).max(HOLD_FRAMES / rate);
-        let properties = material.properties();
-        let young_mpa = properties.young_mpa(draw_shore(material, &mut draws.child(3)));
-        let specimen = Specimen::new(properties, young_mpa, &face, &pose, &patch);
+        let specimen = Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch);
         let touch_s = self.free_s + delay_s;
         for attempt in 1.. {
             let course = Course::new(&mut self.bench, &specimen, force_n, hold_s);

@@ -3,7 +3,7 @@
 use realfft::num_complex::Complex32;
 use rustfft::FftPlanner;
 
-use super::material::Texture;
+use super::substance::Texture;
 use crate::random::Stream;
 
 /// Width of a patch in cells; periodic, and wider than the sensor (98 mm), so that a press does
@@ -115,7 +115,7 @@ mod tests {
     #[test]
     fn rms_height_and_grain_are_those_of_the_table() {
         for (material, seeds) in [(Material::Wood, 8_u64), (Material::Sponge, 4)] {
-            let texture = material.properties().texture;
+            let texture = material.properties().substance.texture;
             let (mut square, mut along, mut across) = (0.0, 0.0, 0.0);
             for seed in 0..seeds {
                 let patch = Patch::new(&texture, 1.0, 0.875, &mut Stream::new(seed, "texture"));
@@ -143,7 +143,7 @@ mod tests {
 
     #[test]
     fn interpolation_passes_through_the_grid() {
-        let texture = Material::Foam.properties().texture;
+        let texture = Material::Foam.properties().substance.texture;
         let patch = Patch::new(&texture, 1.0, 0.875, &mut Stream::new(3, "texture"));
         for (i, j) in [(0, 0), (5, 127), (77, 3)] {
             let at = patch.height_mm(0.875 * j as f64, 0.875 * i as f64);

@@ -1,7 +1,7 @@
 use std::f64::consts::PI;
 
 use super::*;
-use crate::simulator::kernel::{self, Layer};
+use crate::simulator::kernel::{self, Base, Layer};
 use crate::simulator::sensor::CELL_MM;
 
 /// Solves a gap given by radius on a half-space of this E*, or a layer of (nu, E*, height).
@@ -27,7 +27,7 @@ impl Bed {
 
     fn layer(width: usize, nu: f64, plane_strain_mpa: f64, height_mm: f64) -> Self {
         let mut convolver = Convolver::new(width);
-        let layer = Layer::new(nu);
+        let layer = Layer::new(nu, Base::Rigid);
         let unit = CELL_MM / plane_strain_mpa;
         let height = height_mm / CELL_MM;
         let spectrum =
@@ -242,7 +242,7 @@ fn rough_contact_area_is_linear_in_the_load() {
     // there (Yastrebov, Anciaux and Molinari 2017). Seen here: 1.21 to 1.26, with a finite window
     // and a slope from differences, which is some 4 % low.
     use crate::random::Stream;
-    use crate::simulator::material::Texture;
+    use crate::simulator::substance::Texture;
     use crate::simulator::texture::Patch;
     let texture = Texture {
         rms_um: 100.0,

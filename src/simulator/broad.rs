@@ -1,0 +1,381 @@
+//! A world of materials: each object is of one that is drawn for it.
+//!
+//! In: a hardness level and a stream. Out: a [`Body`] whose modulus follows from the Shore hardness
+//! by the durometer, so that the label is what a durometer reads. The ranges contain the eight
+//! named materials and are not centred on them.
+
+use serde::{Deserialize, Serialize};
+
+use super::body::Body;
+use super::durometer::{self, Durometer};
+use super::level::{Borders, LEVELS, LevelRange, level_of};
+use super::substance::{Creep, Law, Substance, Texture};
+use crate::random::Stream;
+
+/// The laws of which materials are drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum LawName {
+    /// Elastic.
+    Solid,
+    /// Elastic, and flows.
+    Plastic,
+    /// With a plateau, where its cells buckle.
+    Foam,
+    /// A thin soft layer on a stiff core.
+    Layered,
+}
+
+impl LawName {
+    /// All four.
+    pub const ALL: [LawName; 4] = [
+        LawName::Solid,
+        LawName::Plastic,
+        LawName::Foam,
+        LawName::Layered,
+    ];
+
+    /// The name used in commands and files.
+    pub fn name(self) -> &'static str {
+        match self {
+            LawName::Solid => "solid",
+            LawName::Plastic => "plastic",
+            LawName::Foam => "foam",
+            LawName::Layered => "layered",
+        }
+    }
+
+    /// What its materials are called in a data set, where `foam` is one of the named materials.
+    pub fn material_name(self) -> &'static str {
+        match self {
+            LawName::Solid => "broad-solid",
+            LawName::Plastic => "broad-plastic",
+            LawName::Foam => "broad-foam",
+            LawName::Layered => "broad-layered",
+        }
+    }
+}
+
+impl std::str::FromStr for LawName {
+    type Err = UnknownLaw;
+
+    fn from_str(name: &str) -> Result<Self, Self::Err> {
+        let law = Self::ALL.into_iter().find(|law| law.name() == name);
+        law.ok_or_else(|| UnknownLaw(name.to_owned()))
+    }
+}
+
+/// A name that is no law's.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("no law \"{0}\"; there are solid, plastic, foam, layered")]
+pub struct UnknownLaw(pub String);
+
+/// Which laws materials are drawn of, by their place in [`LawName::ALL`]; at least one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "Vec<LawName>", into = "Vec<LawName>")]
+pub struct Laws([bool; 4]);
+
+impl Default for Laws {
+    /// All of them.
+    fn default() -> Self {
+        Self([true; 4])
+    }
+}
+
+impl From<Laws> for Vec<LawName> {
+    fn from(laws: Laws) -> Self {
+        laws.iter().collect()
+    }
+}
+
+impl TryFrom<Vec<LawName>> for Laws {
+    type Error = NoLaw;
+
+    fn try_from(names: Vec<LawName>) -> Result<Self, NoLaw> {
+        let laws = Self(LawName::ALL.map(|law| names.contains(&law)));
+        if names.is_empty() {
+            Err(NoLaw)
+        } else {
+            Ok(laws)
+        }
+    }
+}
+
+/// No law to draw materials of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("found no law, expected one or more of solid, plastic, foam, layered")]
+pub struct NoLaw;
+
+impl Laws {
+    fn iter(self) -> impl Iterator<Item = LawName> {
+        let all = LawName::ALL.into_iter().zip(self.0);
+        all.filter_map(|(law, is_in)| is_in.then_some(law))
+    }
+
+    /// One of them, evenly, of those that `fits`.
+    fn draw(self, stream: &mut Stream, fits: impl Fn(LawName) -> bool) -> Option<LawName> {
+        let laws: Vec<LawName> = self.iter().filter(|&law| fits(law)).collect();
+        (!laws.is_empty()).then(|| laws[stream.below(laws.len())])
+    }
+}
+
+/// Part of level 1 that is drawn by its modulus.
+const STIFF_SHARE: f64 = 0.5;
+/// Moduli of these, MPa, log-even.
+const STIFF_MPA: (f64, f64) = (5.0, 3000.0);
+/// Poisson's ratio of solids, plastics, foams and layers.
+const NU: [(f64, f64); 4] = [(0.33, 0.49), (0.38, 0.49), (0.05, 0.30), (0.10, 0.49)];
+/// p_H of plastics relative to E, log-even.
+const HARDNESS: (f64, f64) = (1.0 / 20.0, 1.0 / 4.0);
+/// m, s_p relative to E (log-even) and e_D of foams.
+const EXPONENT: (f64, f64) = (2.0, 3.0);
+const PLATEAU: (f64, f64) = (0.08, 0.50);
+const STRAIN: (f64, f64) = (0.30, 0.60);
+/// Thickness of a layer in mm, and the core's modulus relative to the layer's, both log-even.
+const THICKNESS_MM: (f64, f64) = (1.5, 10.0);
+const CORE: (f64, f64) = (20.0, 2000.0);
+/// A layer is so much thicker than the durometer sinks in, at least: beyond that, it would have to
+/// say what the core feels through a layer squeezed to nothing.
+const LAYER_PER_DEPTH: f64 = 1.25;
+/// The two terms of creep: j even, tau log-even.
+const CREEP: [((f64, f64), (f64, f64)); 2] =
+    [((0.03, 0.35), (0.15, 0.6)), ((0.02, 0.35), (1.0, 4.0))];
+/// Texture: rms in um and wavelengths in mm log-even; Hurst's exponent and anisotropy even.
+const RMS_UM: (f64, f64) = (30.0, 170.0);
+const SHORTEST_MM: (f64, f64) = (2.0, 5.0);
+const LONGEST_MM: (f64, f64) = (8.0, 40.0);
+const HURST: (f64, f64) = (0.4, 0.9);
+const ANISOTROPY: (f64, f64) = (1.0, 2.0);
+
+/// Draws what an object of `level` is made of.
+///
+/// Its Shore hardness is even over the level's interval. Half of level 1 is stiffer than the
+/// durometer can tell well: there the modulus is log-even and the Shore hardness what the
+/// durometer reads; a soft law whose reading falls into another level is drawn again. A layer is
+/// never of the stiff half, unless there is no other law: it would not be the softer part.
+pub(super) fn draw(level: u8, laws: Laws, borders: Borders, stream: &mut Stream) -> Body {
+    let range = &LEVELS[usize::from(level) - 1];
+    let is_stiff = range.level == 1 && stream.uniform() < STIFF_SHARE;
+    if is_stiff && let Some(body) = stiff(laws, range, borders, stream) {
+        return body;
+    }
+    let (low, high) = range.shore(borders);
+    let shore = high - (high - low) * stream.uniform();
+    let law = laws
+        .draw(stream, |_| true)
+        .expect("`Laws` has at least one");
+    let substance = substance(law, shore, stream);
+    Body {
+        substance,
+        young_mpa: Durometer::new(&substance).young_mpa(shore),
+        shore,
+        level,
+        material: material_index(law),
+    }
+}
+
+fn stiff(laws: Laws, range: &LevelRange, borders: Borders, stream: &mut Stream) -> Option<Body> {
+    loop {
+        let law = laws.draw(stream, |law| law != LawName::Layered)?;
+        let young_mpa = log_even(STIFF_MPA, stream);
+        let substance = substance(law, 100.0, stream);
+        let shore = Durometer::new(&substance).reading(young_mpa);
+        if shore > range.shore(borders).0 {
+            return Some(Body {
+                substance,
+                young_mpa,
+                shore,
+                level: level_of(shore),
+                material: material_index(law),
+            });
+        }
+    }
+}
+
+/// Place of a law among the materials' names: after the eight named materials.
+fn material_index(law: LawName) -> u8 {
+    super::material::Material::ALL.len() as u8 + law as u8
+}
+
+fn substance(law: LawName, shore: f64, stream: &mut Stream) -> Substance {
+    let nu = even(NU[law as usize], stream);
+    let law = match law {
+        LawName::Solid => Law::Solid,
+        LawName::Plastic => Law::Plastic {
+            hardness: log_even(HARDNESS, stream),
+        },
+        LawName::Foam => Law::Foam {
+            exponent: even(EXPONENT, stream),
+            plateau: log_even(PLATEAU, stream),
+            strain: even(STRAIN, stream),
+        },
+        LawName::Layered => {
+            let (least, most) = THICKNESS_MM;
+            let least = least.max(LAYER_PER_DEPTH * durometer::depth_mm(shore));
+            Law::Layered {
+                thickness_mm: log_even((least, most), stream),
+                core: log_even(CORE, stream),
+            }
+        }
+    };
+    Substance {
+        nu,
+        law,
+        creep: CREEP.map(|(j, tau_s)| Creep {
+            j: even(j, stream),
+            tau_s: log_even(tau_s, stream),
+        }),
+        texture: Texture {
+            rms_um: log_even(RMS_UM, stream),
+            shortest_mm: log_even(SHORTEST_MM, stream),
+            longest_mm: log_even(LONGEST_MM, stream),
+            hurst: even(HURST, stream),
+            anisotropy: even(ANISOTROPY, stream),
+        },
+    }
+}
+
+fn even((low, high): (f64, f64), stream: &mut Stream) -> f64 {
+    stream.range(low, high)
+}
+
+fn log_even((low, high): (f64, f64), stream: &mut Stream) -> f64 {
+    stream.range(low.ln(), high.ln()).exp()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::material::Material;
+    use super::*;
+
+    fn only(law: LawName) -> Laws {
+        Laws::try_from(vec![law]).unwrap()
+    }
+
+    #[test]
+    fn a_durometer_reads_what_a_drawn_object_is_labelled_with() {
+        for law in LawName::ALL {
+            let mut stream = Stream::new(2, law.name());
+            for range in &LEVELS {
+                for borders in [Borders::Touching, Borders::Gaps] {
+                    let body = draw(range.level, only(law), borders, &mut stream);
+                    let read = Durometer::new(&body.substance).reading(body.young_mpa);
+                    assert!(
+                        (read - body.shore).abs() < 0.1,
+                        "{law:?}: reads {read}: {body:?}"
+                    );
+                    assert_eq!(
+                        (body.level, level_of(body.shore)),
+                        (range.level, range.level)
+                    );
+                    let (least, most) = range.shore(borders);
+                    let most = if range.level == 1 { 100.0 } else { most };
+                    assert!(least < body.shore && body.shore <= most, "{body:?}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn shore_is_even_over_a_level_and_laws_over_its_objects() {
+        let mut stream = Stream::new(3, "broad");
+        let count = 60;
+        for range in &LEVELS[1..] {
+            let bodies: Vec<Body> = (0..count)
+                .map(|_| {
+                    draw(
+                        range.level,
+                        only(LawName::Solid),
+                        Borders::Touching,
+                        &mut stream,
+                    )
+                })
+                .collect();
+            let (low, high) = range.shore(Borders::Touching);
+            let below = bodies
+                .iter()
+                .filter(|b| b.shore < 0.5 * (low + high))
+                .count();
+            assert!(
+                (15..45).contains(&below),
+                "{below} of {count} in the softer half"
+            );
+        }
+        let drawn: Vec<LawName> = (0..400)
+            .map(|_| Laws::default().draw(&mut stream, |_| true).unwrap())
+            .collect();
+        for law in LawName::ALL {
+            let count = drawn.iter().filter(|&&l| l == law).count();
+            assert!((70..130).contains(&count), "{law:?}: {count} of 400");
+        }
+    }
+
+    #[test]
+    fn half_of_level_1_is_stiff() {
+        let mut stream = Stream::new(4, "stiff");
+        let laws = Laws::try_from(vec![LawName::Solid, LawName::Layered]).unwrap();
+        let stiff = (0..40)
+            .map(|_| draw(1, laws, Borders::Touching, &mut stream))
+            .filter(|body| {
+                let is_stiff = body.young_mpa > 100.0;
+                assert!(!is_stiff || body.substance.law == Law::Solid);
+                is_stiff
+            })
+            .count();
+        // 53 % of the half: log(3000 / 100) / log(3000 / 5).
+        assert!((4..19).contains(&stiff), "{stiff} of 40");
+    }
+
+    #[test]
+    fn the_ranges_contain_the_named_materials() {
+        let within = |(low, high): (f64, f64), value: f64| low <= value && value <= high;
+        for material in Material::ALL {
+            let Substance {
+                nu,
+                law,
+                creep,
+                texture,
+            } = material.properties().substance;
+            let name = match law {
+                Law::Solid => LawName::Solid,
+                Law::Plastic { hardness } => {
+                    assert!(within(HARDNESS, hardness), "{material}");
+                    LawName::Plastic
+                }
+                Law::Foam {
+                    exponent,
+                    plateau,
+                    strain,
+                } => {
+                    assert!(
+                        within(EXPONENT, exponent) && within(PLATEAU, plateau),
+                        "{material}"
+                    );
+                    assert!(within(STRAIN, strain), "{material}");
+                    LawName::Foam
+                }
+                Law::Layered { .. } => panic!("no named material has a layer"),
+            };
+            assert!(within(NU[name as usize], nu), "{material}: nu");
+            // Wood, hard plastic and plasticine have one term.
+            for term in creep.into_iter().filter(|term| term.j > 0.0) {
+                let is_in = |(j, tau)| within(j, term.j) && within(tau, term.tau_s);
+                assert!(CREEP.into_iter().any(is_in), "{material}: {term:?}");
+            }
+            assert!(within(RMS_UM, texture.rms_um), "{material}");
+            assert!(within(SHORTEST_MM, texture.shortest_mm), "{material}");
+            assert!(within(LONGEST_MM, texture.longest_mm), "{material}");
+            assert!(within(HURST, texture.hurst), "{material}");
+            assert!(within(ANISOTROPY, texture.anisotropy), "{material}");
+        }
+    }
+
+    #[test]
+    fn laws_travel_as_their_names() {
+        let laws = Laws::try_from(vec![LawName::Foam, LawName::Solid]).unwrap();
+        let text = serde_json::to_string(&laws).unwrap();
+        assert_eq!(text, r#"["solid","foam"]"#);
+        assert_eq!(serde_json::from_str::<Laws>(&text).unwrap(), laws);
+        assert!(serde_json::from_str::<Laws>("[]").is_err());
+    }
+}

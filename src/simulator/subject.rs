@@ -1,0 +1,210 @@
+//! Who is pressed: objects with their bodies, the sensors they are pressed on, and the streams
+//! that all of it is drawn from.
+//!
+//! An object's draws follow from the seed, what it is and its number, so that the same objects
+//! stand in every data set of a seed, however many there are.
+
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use super::body::Body;
+use super::broad;
+use super::dataset::{DatasetSettings, Materials};
+use super::level::LEVELS;
+use super::material::{Material, Split};
+use super::object::{Object, Shapes};
+use super::press::Bench;
+use super::sensor::Sensor;
+use crate::random::Stream;
+
+/// Sensors that each split's objects are shared over.
+const SENSORS: u32 = 8;
+
+/// What an object is of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Origin {
+    Named(Material),
+    /// Any material of this level.
+    Broad(u8),
+}
+
+/// One object of a data set.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Unit {
+    origin: Origin,
+    split: Split,
+    number: u32,
+}
+
+/// The objects of a data set: by material (as in [`Material::ALL`]) or by split and level.
+pub(super) fn units(settings: &DatasetSettings) -> Vec<Unit> {
+    let count = |split| match split {
+        Split::Train => settings.objects,
+        Split::Test => settings.test_objects,
+    };
+    let of = |origin, split| {
+        (0..count(split)).map(move |number| Unit {
+            origin,
+            split,
+            number,
+        })
+    };
+    match settings.materials {
+        Materials::Named => Material::ALL
+            .into_iter()
+            .flat_map(|material| of(Origin::Named(material), settings.split(material)))
+            .collect(),
+        Materials::Broad => [Split::Train, Split::Test]
+            .into_iter()
+            .flat_map(|split| LEVELS.map(|range| (Origin::Broad(range.level), split)))
+            .flat_map(|(origin, split)| of(origin, split))
+            .collect(),
+    }
+}
+
+/// What `work` makes of each unit and its index, in their order, on `threads` threads: whichever
+/// thread does it.
+pub(super) fn shared_out<T: Send>(
+    units: &[Unit],
+    threads: usize,
+    bench: impl Fn() -> Bench + Sync,
+    work: impl Fn(&mut Bench, u32, Unit) -> Vec<T> + Sync,
+) -> Vec<T> {
+    let next = AtomicUsize::new(0);
+    let parts: Mutex<Vec<Vec<T>>> = Mutex::new(units.iter().map(|_| Vec::new()).collect());
+    std::thread::scope(|scope| {
+        for _ in 0..threads.max(1) {
+            scope.spawn(|| {
+                let mut bench = bench();
+                loop {
+                    let index = next.fetch_add(1, Ordering::Relaxed);
+                    let Some(&unit) = units.get(index) else {
+                        break;
+                    };
+                    let made = work(&mut bench, index as u32, unit);
+                    parts
+                        .lock()
+                        .expect("no thread panics while it holds the lock")[index] = made;
+                }
+            });
+        }
+    });
+    let parts = parts
+        .into_inner()
+        .expect("no thread panics while it holds the lock");
+    parts.into_iter().flatten().collect()
+}
+
+/// The streams of one object: its geometry, poses and forces, and what its material adds.
+pub(super) struct Draws {
+    pub(super) geometry: Stream,
+    pub(super) body: Stream,
+}
+
+impl Draws {
+    /// Geometry, poses and forces of test objects of the same number do not depend on the
+    /// material, but for the paper's shapes: that is what pairs them.
+    fn new(settings: &DatasetSettings, unit: Unit) -> Self {
+        let (own, [train, test]) = match unit.origin {
+            Origin::Named(material) => (material.index(), ["train", "test"]),
+            Origin::Broad(level) => (level - 1, ["broad train", "broad test"]),
+        };
+        let is_paired = unit.split == Split::Test && settings.shapes != Shapes::Paper;
+        let geometry = if is_paired {
+            Material::ALL.len() as u64
+        } else {
+            own.into()
+        };
+        let split = match unit.split {
+            Split::Train => train,
+            Split::Test => test,
+        };
+        let root = Stream::new(settings.seed, split).child(u64::from(unit.number));
+        Self {
+            geometry: root.child(0).child(geometry),
+            body: root.child(1).child(own.into()),
+        }
+    }
+}
+
+/// An object, what it is made of and the sensor it is pressed on.
+pub(super) struct Subject {
+    pub(super) split: Split,
+    pub(super) body: Body,
+    pub(super) object: Object,
+    pub(super) sensor: Sensor,
+    pub(super) draws: Draws,
+}
+
+impl Subject {
+    pub(super) fn draw(settings: &DatasetSettings, unit: Unit) -> Self {
+        let draws = Draws::new(settings, unit);
+        let mut hardness = draws.body.child(0);
+        let body = match unit.origin {
+            Origin::Named(material) => Body::named(material, &mut hardness),
+            Origin::Broad(level) => {
+                broad::draw(level, settings.laws, settings.borders, &mut hardness)
+            }
+        };
+        // The splits share no sensor: the streams have different names.
+        let sensors = match unit.split {
+            Split::Train => "train sensor",
+            Split::Test => "test sensor",
+        };
+        let sensor_seed = settings.sensor_seed.unwrap_or(settings.seed);
+        let of_sensor = Stream::new(sensor_seed, sensors).child(u64::from(unit.number % SENSORS));
+        Self {
+            split: unit.split,
+            object: Object::draw(settings.shapes, body.level, &mut draws.geometry.child(0)),
+            body,
+            sensor: Sensor::new(settings.profile, &of_sensor),
+            draws,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn test_objects_are_paired_over_materials_but_for_the_papers_shapes() {
+        for (shapes, is_paired) in [
+            (Shapes::Matched, true),
+            (Shapes::Wide, true),
+            (Shapes::Paper, false),
+        ] {
+            let settings = DatasetSettings {
+                seed: 3,
+                shapes,
+                ..DatasetSettings::default()
+            };
+            let draw = |origin, split, number| {
+                let unit = Unit {
+                    origin,
+                    split,
+                    number,
+                };
+                let stream = &mut Draws::new(&settings, unit).geometry.child(0);
+                format!("{:?}", Object::draw(shapes, 4, stream))
+            };
+            for (one, other) in [
+                (
+                    Origin::Named(Material::Foam),
+                    Origin::Named(Material::YogaMat),
+                ),
+                (Origin::Broad(2), Origin::Broad(4)),
+            ] {
+                let first = draw(one, Split::Test, 1);
+                assert_eq!(
+                    first == draw(other, Split::Test, 1),
+                    is_paired,
+                    "{shapes:?}"
+                );
+                assert_ne!(first, draw(one, Split::Test, 0));
+                let train = draw(one, Split::Train, 1);
+                assert_ne!(train, draw(other, Split::Train, 1));
+            }
+        }
+    }
+}
