@@ -162,7 +162,11 @@ fn output(settings: Settings, lines: &Lines) -> Result<Output, Error> {
         Format::Text => text.with_ansi(std::io::stderr().is_terminal()).boxed(),
         // The fields in an object of their own: a verdict has a `level`, as the line has.
         Format::Json => text.json().boxed(),
-        Format::Journald => Journal::new(lines).map_err(Error::Journal)?.boxed(),
+        Format::Journald => {
+            journal::find().map_err(Error::Journal)?;
+            let lines = lines.clone();
+            Journal(move |entry| lines.enter(entry)).boxed()
+        }
     })
 }
 

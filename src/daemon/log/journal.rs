@@ -1,9 +1,10 @@
 //! Log lines for the journal: an entry an event, with its fields.
 //!
-//! Systemd's native protocol (<https://systemd.io/JOURNAL_NATIVE_PROTOCOL>): a datagram of
-//! `FIELD=value` lines. Field names are those of the published events, in capitals after
-//! `HARDNESSD_`. The crate `tracing-journald` is not used because it waits for a journal that takes
-//! nothing; an entry goes the way of all lines, past a thread that may wait.
+//! An entry is a datagram of `FIELD=value` lines in systemd's native protocol
+//! (<https://systemd.io/JOURNAL_NATIVE_PROTOCOL>). Its field names are those of the published
+//! events, in capitals and with `HARDNESSD_` before them. The crate `tracing-journald` would wait
+//! for a journal that reads nothing, so we do not use it: an entry is given to a function that does
+//! not wait.
 
 use std::fmt::{Debug, Write as _};
 use std::io::{self, ErrorKind};
@@ -13,47 +14,31 @@ use tracing::field::{Field, Visit};
 use tracing::{Event, Level, Subscriber};
 use tracing_subscriber::layer::{Context, Layer};
 
-use super::lines::Lines;
-
 /// Where the journal listens.
 pub(super) const SOCKET: &str = "/run/systemd/journal/socket";
 
-/// Before every field of ours.
+/// What every field name of the daemon begins with.
 const PREFIX: &str = "HARDNESSD_";
 
-/// The layer that writes entries.
-pub(super) struct Journal {
-    lines: Lines,
-}
-
-impl Journal {
-    /// # Errors
-    ///
-    /// As [`find`].
-    pub(super) fn new(lines: &Lines) -> io::Result<Self> {
-        find()?;
-        Ok(Self {
-            lines: lines.clone(),
-        })
-    }
-}
+/// The layer that makes an entry of each event and gives it to a function.
+pub(super) struct Journal<F>(pub(super) F);
 
 /// Looks for the journal.
 ///
 /// # Errors
 ///
-/// If nobody listens there.
+/// If no process listens at [`SOCKET`].
 pub(super) fn find() -> io::Result<()> {
     let socket = UnixDatagram::unbound()?;
     socket.set_nonblocking(true)?;
-    // The journal passes over an entry without fields. One that is full is there.
+    // The journal ignores an entry without fields. A journal that is full is there, too.
     match socket.send_to(&[], SOCKET) {
         Err(error) if error.kind() != ErrorKind::WouldBlock => Err(error),
         _ => Ok(()),
     }
 }
 
-impl<S: Subscriber> Layer<S> for Journal {
+impl<S: Subscriber, F: Fn(Vec<u8>) + 'static> Layer<S> for Journal<F> {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
         let meta = event.metadata();
         // syslog(3): 3 error, 4 warning, 6 informational, 7 debug.
@@ -71,11 +56,11 @@ impl<S: Subscriber> Layer<S> for Journal {
             entry.put("CODE_LINE", &line.to_string());
         }
         event.record(&mut entry);
-        self.lines.enter(entry.bytes);
+        self.0(entry.bytes);
     }
 }
 
-/// That entries were lost, as one.
+/// An entry that says how many were lost.
 pub(super) fn lost(lines: u64) -> Vec<u8> {
     let mut entry = Entry::default();
     entry.put("PRIORITY", "4");
@@ -120,7 +105,7 @@ impl Visit for Entry {
     }
 }
 
-/// The journal takes capitals, digits and `_`.
+/// A field name that the journal accepts: capitals, digits and `_`.
 fn name(field: &str) -> String {
     let plain = |c: char| match c.to_ascii_uppercase() {
         c @ ('A'..='Z' | '0'..='9') => c,
