@@ -231,6 +231,35 @@ fn sighup_changes_all_or_nothing() {
 }
 
 #[test]
+fn a_line_that_repeats_without_end_is_left_out_and_counted() {
+    const TARES: u64 = 5000;
+    let bench = Bench::new();
+    let mut daemon = bench.daemon();
+    let mut control = Subscriber::connect(&bench.path("control.sock"));
+    for _ in 0..TARES {
+        // There is no sensor.
+        assert_eq!(control.ask(r#"{"tare":"forearm"}"#)["type"], "error");
+    }
+    daemon.process.signal(Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    let log = daemon.whole_log();
+    let said = |part: &str| log.lines().filter(|line| line.contains(part)).count() as u64;
+    let left_out: u64 = log
+        .lines()
+        .filter_map(|line| line.split_once("left_out=")?.1.split(' ').next())
+        .map(|count| count.parse::<u64>().unwrap())
+        .sum();
+    // A line that says how many were left out names the line, too.
+    let written = said("tare refused") - said("left_out=");
+    assert_eq!(written + left_out, TARES, "{written} written");
+    assert!(written < TARES / 10, "{written} written");
+    assert!(
+        log.contains("of=\"tare refused\" sensor=\"forearm\""),
+        "{log}"
+    );
+}
+
+#[test]
 fn a_stale_socket_is_replaced_and_a_live_one_is_not_stolen() {
     let bench = Bench::new();
     let socket = bench.path("events.sock");

@@ -5,6 +5,7 @@
 //! here goes to stdout, which belongs to events.
 
 mod journal;
+mod limit;
 mod lines;
 
 use std::io::IsTerminal;
@@ -18,8 +19,8 @@ use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{Registry, reload};
 
 use self::journal::Journal;
+use self::limit::Limit;
 use self::lines::Lines;
-
 use crate::event::{Event, LinkState, PressState, Tared, name};
 use crate::pipeline::{RetareError, Unjudged};
 
@@ -53,11 +54,13 @@ type Output = Box<dyn Layer<Registry> + Send + Sync>;
 pub struct Log {
     output: reload::Handle<Output, Registry>,
     lines: Lines,
+    limit: Limit,
 }
 
 /// The last lines are written before the process ends.
 impl Drop for Log {
     fn drop(&mut self) {
+        self.limit.report_all();
         self.lines.flush(LAST_LINES);
     }
 }
@@ -99,14 +102,20 @@ impl Log {
         let filter = filter(&std::env::var("RUST_LOG").unwrap_or_default(), level)?;
         // The filter stands beside the output, not in it: a filter of a layer's own does not
         // survive the layer's exchange.
-        let lines = Lines::start().map_err(Error::Thread)?;
+        let limit = Limit::default();
+        let lines = Lines::start(limit.clone()).map_err(Error::Thread)?;
         let (layer, output) = reload::Layer::new(output(settings, &lines)?);
         tracing_subscriber::registry()
             .with(layer)
             .with(filter)
+            .with(limit.clone())
             .try_init()
             .map_err(|_| Error::Twice)?;
-        Ok(Self { output, lines })
+        Ok(Self {
+            output,
+            lines,
+            limit,
+        })
     }
 
     /// Writes as `settings` say from now on.

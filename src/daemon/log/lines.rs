@@ -1,20 +1,22 @@
 //! Log lines on their way to stderr or the journal, through a thread of their own.
 //!
-//! Whoever reads the log may stop reading; the sensor must not wait for it. So a line that finds
-//! too many before it is dropped, and how many were is said as soon as there is room again.
+//! The program that reads the log may stop reading, and the sensor must not wait for that program.
+//! So when [`WAITING`] lines wait, further lines are dropped. As soon as one is read again, a line
+//! says how many were dropped.
 
 use std::io::{self, Write};
 use std::os::unix::net::UnixDatagram;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{self, Receiver, SyncSender, TrySendError};
-use std::time::Duration;
+use std::sync::mpsc::{self, Receiver, RecvTimeoutError, SyncSender, TrySendError};
+use std::time::{Duration, Instant};
 
 use tracing_subscriber::fmt::MakeWriter;
 
 use super::journal;
+use super::limit::Limit;
 
-/// Lines that wait at most: some 150 kB.
+/// The most lines that wait: some 150 kB.
 const WAITING: usize = 1024;
 
 enum Message {
@@ -22,11 +24,11 @@ enum Message {
     Line(Vec<u8>),
     /// To the journal.
     Entry(Vec<u8>),
-    /// To be answered when all before it is written.
+    /// An answer is due once all lines before are written.
     Flush(SyncSender<()>),
 }
 
-/// The way out; clones share it.
+/// The queue to the thread; clones share it.
 #[derive(Clone)]
 pub(super) struct Lines {
     thread: SyncSender<Message>,
@@ -34,12 +36,12 @@ pub(super) struct Lines {
 }
 
 impl Lines {
-    /// Starts the thread.
+    /// Starts the thread, which also has `limit` say what it left out.
     ///
     /// # Errors
     ///
     /// If the system has no room for a thread.
-    pub(super) fn start() -> io::Result<Self> {
+    pub(super) fn start(limit: Limit) -> io::Result<Self> {
         let (thread, messages) = mpsc::sync_channel(WAITING);
         let journal = UnixDatagram::unbound()?;
         let lost = Arc::new(AtomicU64::new(0));
@@ -49,7 +51,7 @@ impl Lines {
         };
         std::thread::Builder::new()
             .name("log".to_owned())
-            .spawn(move || write(&messages, &journal, &lost))?;
+            .spawn(move || write(&messages, &journal, &lost, &limit))?;
         Ok(lines)
     }
 
@@ -67,16 +69,29 @@ impl Lines {
     /// Waits until all lines are written, but not longer than `patience`.
     pub(super) fn flush(&self, patience: Duration) {
         let (written, answer) = mpsc::sync_channel(1);
-        // Full: nobody reads, so there is nothing to wait for.
+        // When the queue is full no program reads the log, so waiting is of no use.
         if self.thread.try_send(Message::Flush(written)).is_ok() {
             let _ = answer.recv_timeout(patience);
         }
     }
 }
 
-fn write(messages: &Receiver<Message>, journal: &UnixDatagram, lost: &AtomicU64) {
-    for message in messages {
-        // Where stderr is closed or the journal gone there is nobody to tell.
+/// The next message. Meanwhile what was left out is said when it is due.
+fn next(messages: &Receiver<Message>, limit: &Limit) -> Option<Message> {
+    loop {
+        let Some(wait) = limit.report(Instant::now()) else {
+            return messages.recv().ok();
+        };
+        match messages.recv_timeout(wait) {
+            Err(RecvTimeoutError::Timeout) => {}
+            received => return received.ok(),
+        }
+    }
+}
+
+fn write(messages: &Receiver<Message>, journal: &UnixDatagram, lost: &AtomicU64, limit: &Limit) {
+    while let Some(message) = next(messages, limit) {
+        // A write that fails cannot be logged: stderr is closed, or the journal is gone.
         match message {
             Message::Line(line) => {
                 let _ = io::stderr().write_all(&line);
@@ -107,7 +122,7 @@ impl<'a> MakeWriter<'a> for Lines {
     }
 }
 
-/// The formatter writes each event in one call.
+/// The formatter writes each line in one call.
 impl Write for &Lines {
     fn write(&mut self, line: &[u8]) -> io::Result<usize> {
         self.pass(Message::Line(line.to_vec()));

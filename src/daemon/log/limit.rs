@@ -1,0 +1,187 @@
+//! How often the same line may repeat.
+//!
+//! A program that commands the daemon can make it log as fast as that program can write. So of the
+//! lines from one place in the source about one sensor, at most [`MOST`] are written within
+//! [`WINDOW`]. The others are counted, and when the window ends one line says how many there were.
+//!
+//! Two kinds of line are never left out: numbered events (they have a `seq`), which only a sensor
+//! can cause, and lines below `info`, which somebody asked for by `RUST_LOG`.
+
+use std::collections::HashMap;
+use std::fmt::Debug;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use tracing::callsite::Identifier;
+use tracing::field::{Field, Visit};
+use tracing::{Event, Level, Subscriber, warn};
+use tracing_subscriber::layer::{Context, Layer};
+
+/// Lines of one kind that are written within a window.
+const MOST: u64 = 50;
+
+/// How long lines of one kind are counted together, from the first of them on.
+const WINDOW: Duration = Duration::from_secs(10);
+
+/// The field that marks the line which says how many were left out.
+const LEFT_OUT: &str = "left_out";
+
+/// The layer that leaves lines out; clones share the counts.
+#[derive(Clone, Default)]
+pub(super) struct Limit(Arc<Mutex<Windows>>);
+
+impl Limit {
+    /// Says what was left out in every window that is over by `now`. Returns how long the next one
+    /// still lasts, or `None` if no line is being counted.
+    pub(super) fn report(&self, now: Instant) -> Option<Duration> {
+        let over = self.windows().close(now);
+        for LeftOut { what, lines } in over {
+            let About { message, sensor } = what;
+            let within_s = WINDOW.as_secs();
+            warn!(
+                left_out = lines,
+                within_s,
+                of = message,
+                sensor,
+                "lines left out"
+            );
+        }
+        self.windows().next_end(now)
+    }
+
+    /// Says what was left out so far: no more lines will come.
+    pub(super) fn report_all(&self) {
+        self.report(Instant::now() + WINDOW);
+    }
+
+    fn windows(&self) -> MutexGuard<'_, Windows> {
+        // Counts stay usable whatever a thread did that panicked between.
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl<S: Subscriber> Layer<S> for Limit {
+    fn event_enabled(&self, event: &Event<'_>, _: Context<'_, S>) -> bool {
+        let meta = event.metadata();
+        let never_left_out = ["seq", LEFT_OUT]
+            .iter()
+            .any(|name| meta.fields().field(*name).is_some());
+        if *meta.level() > Level::INFO || never_left_out {
+            return true;
+        }
+        let mut about = About::default();
+        event.record(&mut about);
+        self.windows().admit(meta.callsite(), about, Instant::now())
+    }
+}
+
+/// What a line is about.
+#[derive(Debug, Clone, Default, PartialEq)]
+struct About {
+    message: String,
+    sensor: Option<String>,
+}
+
+impl Visit for About {
+    fn record_str(&mut self, field: &Field, value: &str) {
+        match field.name() {
+            "sensor" => self.sensor = Some(value.to_owned()),
+            "message" => value.clone_into(&mut self.message),
+            _ => {}
+        }
+    }
+
+    fn record_debug(&mut self, field: &Field, value: &dyn Debug) {
+        if field.name() == "message" {
+            self.message = format!("{value:?}");
+        }
+    }
+}
+
+/// Lines that were not written.
+#[derive(Debug, PartialEq)]
+struct LeftOut {
+    what: About,
+    lines: u64,
+}
+
+/// The windows that are open, by place in the source and sensor.
+#[derive(Default)]
+struct Windows(HashMap<(Identifier, Option<String>), Window>);
+
+struct Window {
+    since: Instant,
+    lines: u64,
+    message: String,
+}
+
+impl Windows {
+    /// Counts a line; `true`: it is to be written.
+    fn admit(&mut self, place: Identifier, about: About, now: Instant) -> bool {
+        let window = self.0.entry((place, about.sensor)).or_insert(Window {
+            since: now,
+            lines: 0,
+            message: about.message,
+        });
+        window.lines += 1;
+        window.lines <= MOST
+    }
+
+    /// Closes the windows that are over, and gives what they left out.
+    fn close(&mut self, now: Instant) -> Vec<LeftOut> {
+        let over = |window: &Window| now.saturating_duration_since(window.since) >= WINDOW;
+        let closed = self.0.extract_if(|_, window| over(window));
+        closed
+            .filter(|(_, window)| window.lines > MOST)
+            .map(|((_, sensor), Window { lines, message, .. })| LeftOut {
+                what: About { message, sensor },
+                lines: lines - MOST,
+            })
+            .collect()
+    }
+
+    /// How long it is until the next window ends.
+    fn next_end(&self, now: Instant) -> Option<Duration> {
+        let first = self.0.values().map(|window| window.since).min()?;
+        Some((first + WINDOW).saturating_duration_since(now))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn about(sensor: Option<&str>) -> About {
+        About {
+            message: "tare refused".to_owned(),
+            sensor: sensor.map(str::to_owned),
+        }
+    }
+
+    #[test]
+    fn what_repeats_is_left_out_and_counted_and_other_lines_are_not() {
+        let place =
+            tracing::callsite!(name: "one", kind: tracing::metadata::Kind::EVENT, fields: "");
+        let other =
+            tracing::callsite!(name: "two", kind: tracing::metadata::Kind::EVENT, fields: "");
+        let id = |place: &'static dyn tracing::Callsite| Identifier(place);
+        let (mut windows, start) = (Windows::default(), Instant::now());
+        let mut written = 0;
+        for _ in 0..86_000 {
+            written += u64::from(windows.admit(id(place), about(Some("forearm")), start));
+        }
+        assert_eq!(written, MOST);
+        assert!(windows.admit(id(place), about(Some("wrist")), start));
+        assert!(windows.admit(id(other), about(Some("forearm")), start));
+        assert_eq!(windows.close(start + WINDOW / 2), []);
+        assert_eq!(windows.next_end(start + WINDOW / 2), Some(WINDOW / 2));
+        let expected = LeftOut {
+            what: about(Some("forearm")),
+            lines: 86_000 - MOST,
+        };
+        assert_eq!(windows.close(start + WINDOW), [expected]);
+        assert_eq!(windows.next_end(start + WINDOW), None);
+        // From then on it is written again.
+        assert!(windows.admit(id(place), about(Some("forearm")), start + WINDOW));
+    }
+}
