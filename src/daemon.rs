@@ -15,6 +15,7 @@ pub mod publish;
 pub mod record;
 #[cfg(any(feature = "ros2", feature = "zenoh"))]
 mod relay;
+mod reload;
 mod request;
 #[cfg(feature = "ros2")]
 pub mod ros2;
@@ -31,17 +32,19 @@ use std::future::Future;
 use std::io::Read;
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::pin::{Pin, pin};
 use std::time::Duration;
 
 use tokio::sync::{mpsc, watch};
-use tokio::task::{JoinHandle, JoinSet};
+use tokio::task::JoinSet;
 use tokio::time::MissedTickBehavior;
 use tracing::{error, info, warn};
 
 use self::config::{Config, Publish, Setup};
-use self::log::Log;
 use self::publish::Publishers;
 use self::record::{EventRecorder, Recorder, SensorRecorder, Target};
+pub use self::reload::Reload;
+use self::reload::{Readers, Refusal};
 use self::sensor::{Command, Sensor, Sensors};
 use self::serial::Link;
 use crate::event::{Hello, ModelCard, PROTOCOL, SensorCard, Status};
@@ -73,16 +76,6 @@ pub enum Error {
     /// A fault of this program.
     #[error("{0} stopped by itself")]
     Stopped(&'static str),
-}
-
-/// How a running daemon is asked to read its configuration again.
-pub struct Reload {
-    /// One item a request.
-    pub requests: mpsc::Receiver<()>,
-    /// The file.
-    pub path: PathBuf,
-    /// The log, whose format may change.
-    pub log: Log,
 }
 
 /// A daemon whose sockets are bound: whoever connects from now on is served once it runs.
@@ -171,104 +164,163 @@ impl Daemon {
     pub async fn run(
         self,
         shutdown: impl Future<Output = ()>,
-        mut reload: Option<Reload>,
+        reload: Option<Reload>,
     ) -> Result<(), Error> {
+        let mut running = self.start()?;
+        let ended = running.serve(shutdown, reload).await;
+        let recorded = running.finish().await;
+        ended.and(recorded)
+    }
+
+    /// Starts a task for each sensor and each listener, and says that the daemon is ready.
+    fn start(self) -> Result<Running, Error> {
         let Self {
-            mut setup,
+            setup,
             hello,
             publishers,
             target,
         } = self;
         let run = hello.run.clone();
-        let mut recorder = target
+        let recorder = target
             .map(|target| Recorder::start(target, about(&setup, &hello)))
             .transpose()?;
         let events = recorder
             .as_ref()
             .map_or(EventRecorder::default(), Recorder::of_hub);
         let hub = hub::start(hello, events);
-
-        let mut tasks = JoinSet::new();
-        let mut commands = Vec::new();
-        for (index, sensor) in setup.config.sensors.iter().enumerate() {
-            let (sender, inbox) = mpsc::channel(QUESTIONS);
-            let pipeline = Pipeline::new(setup.pipeline(sensor), Clock::Arrival);
-            let link = Link::new(&sensor.port, sensor.baud);
-            let recorder = recorder
-                .as_ref()
-                .map_or(SensorRecorder::default(), |recorder| {
-                    recorder.of_sensor(index, setup.recorded(sensor))
-                });
-            tasks.spawn(sensor::serve(pipeline, link, recorder, hub.clone(), inbox));
-            commands.push(Sensor {
-                name: sensor.name.clone(),
-                commands: sender,
-            });
-        }
-        let sensors = Sensors(commands);
-
-        let (stop, stopped) = watch::channel(());
+        let (sensors, tasks) = start_sensors(&setup, recorder.as_ref(), &hub);
+        let (orders, receiver) = watch::channel(());
         publishers.announce();
-        let mut publishers = publishers.serve(&hub, &sensors, &stopped);
+        let publishers = publishers.serve(&hub, &sensors, &receiver);
         announce(&setup, &run);
         systemd::ready();
+        Ok(Running {
+            setup,
+            run,
+            hub,
+            sensors,
+            tasks,
+            publishers,
+            recorder,
+            orders,
+        })
+    }
+}
 
+/// Starts a task for each sensor.
+fn start_sensors(
+    setup: &Setup,
+    recorder: Option<&Recorder>,
+    hub: &hub::Handle,
+) -> (Sensors, JoinSet<()>) {
+    let mut tasks = JoinSet::new();
+    let mut sensors = Vec::new();
+    for (index, sensor) in setup.config.sensors.iter().enumerate() {
+        let (commands, inbox) = mpsc::channel(QUESTIONS);
+        let pipeline = Pipeline::new(setup.pipeline(sensor), Clock::Arrival);
+        let link = Link::new(&sensor.port, sensor.baud);
+        let recorder = recorder.map_or(SensorRecorder::default(), |recorder| {
+            recorder.of_sensor(index, setup.recorded(sensor))
+        });
+        tasks.spawn(sensor::serve(pipeline, link, recorder, hub.clone(), inbox));
+        let name = sensor.name.clone();
+        sensors.push(Sensor { name, commands });
+    }
+    (Sensors(sensors), tasks)
+}
+
+/// A daemon that serves.
+struct Running {
+    setup: Setup,
+    /// The token of this run.
+    run: String,
+    hub: hub::Handle,
+    sensors: Sensors,
+    /// One for each sensor.
+    tasks: JoinSet<()>,
+    /// One for each listener.
+    publishers: JoinSet<()>,
+    recorder: Option<Recorder>,
+    /// To the listeners.
+    orders: watch::Sender<()>,
+}
+
+/// A configuration that is being read.
+type Loading = Pin<Box<dyn Future<Output = Result<Setup, Refusal>>>>;
+
+impl Running {
+    /// Serves until `shutdown` comes, there is no more to record, or a part has stopped by itself.
+    async fn serve(
+        &mut self,
+        shutdown: impl Future<Output = ()>,
+        mut reload: Option<Reload>,
+    ) -> Result<(), Error> {
         let mut heartbeat = tokio::time::interval(systemd::heartbeat());
         heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut loading: Option<JoinHandle<Result<Setup, config::Error>>> = None;
-        let mut shutdown = std::pin::pin!(shutdown);
-        let outcome = loop {
+        let readers = Readers::default();
+        let mut loading: Option<Loading> = None;
+        let mut shutdown = pin!(shutdown);
+        loop {
             tokio::select! {
-                () = &mut shutdown => break Ok(()),
-                Some(_) = tasks.join_next() => break Err(Error::Stopped("a sensor")),
-                Some(_) = publishers.join_next() => break Err(Error::Stopped("a listener")),
-                () = record_ended(&mut recorder) => break Ok(()),
+                () = &mut shutdown => return Ok(()),
+                Some(_) = self.tasks.join_next() => return Err(Error::Stopped("a sensor")),
+                Some(_) = self.publishers.join_next() => return Err(Error::Stopped("a listener")),
+                () = record_ended(&mut self.recorder) => return Ok(()),
                 _ = heartbeat.tick() => {
-                    if let Some(statuses) = alive(&hub, &sensors).await {
+                    if let Some(statuses) = alive(&self.hub, &self.sensors).await {
                         systemd::alive(&statuses);
                     }
                 }
-                path = requested(&mut reload), if loading.is_none() => {
+                path = reload::requested(&mut reload), if loading.is_none() => {
                     systemd::reloading();
-                    // On a thread of its own: a model takes long to load beside a frame.
-                    loading = Some(tokio::task::spawn_blocking(move || Setup::load(&path)));
+                    loading = Some(Box::pin(readers.read(path)));
                 }
                 loaded = finished(&mut loading) => {
                     loading = None;
-                    match change(&setup, loaded, reload.as_ref().map(|reload| &reload.log)) {
-                        Ok(changed) => {
-                            setup = changed;
-                            hub.describe(self::hello(&setup, run.clone())).await;
-                            for (sensor, settings) in sensors.0.iter().zip(&setup.config.sensors) {
-                                let criteria = Box::new(setup.criteria(settings));
-                                // A sensor that has ended is noticed above.
-                                let _ = sensor.commands.send(Command::Reload(criteria)).await;
-                            }
-                            info!(model = short(&setup), "reloaded");
-                        }
+                    let log = reload.as_ref().map(|reload| &reload.log);
+                    match loaded.and_then(|changed| reload::change(&self.setup, changed, log)) {
+                        Ok(changed) => self.adopt(changed).await,
                         Err(reason) => error!(%reason, "reload refused, all stays as it was"),
                     }
                     systemd::ready();
                 }
             }
-        };
+        }
+    }
 
+    /// Serves by `changed` from now on.
+    async fn adopt(&mut self, changed: Setup) {
+        self.setup = changed;
+        self.hub
+            .describe(hello(&self.setup, self.run.clone()))
+            .await;
+        for (sensor, settings) in self.sensors.0.iter().zip(&self.setup.config.sensors) {
+            let criteria = Box::new(self.setup.criteria(settings));
+            // The main loop notices a sensor whose task has ended.
+            let _ = sensor.commands.send(Command::Reload(criteria)).await;
+        }
+        info!(model = short(&self.setup), "reloaded");
+    }
+
+    /// Finishes the event in hand: presses are aborted, and subscribers and the recording get
+    /// their last lines.
+    async fn finish(mut self) -> Result<(), Error> {
         systemd::stopping();
         info!("stopping");
-        for sensor in &sensors.0 {
-            // One that has ended needs no telling.
+        for sensor in &self.sensors.0 {
+            // The task may have ended by itself.
             let _ = sensor.commands.send(Command::Finish).await;
         }
-        while tasks.join_next().await.is_some() {}
-        hub.close().await;
-        drop(stop);
-        let farewell = async { while publishers.join_next().await.is_some() {} };
+        while self.tasks.join_next().await.is_some() {}
+        self.hub.close().await;
+        drop(self.orders);
+        let farewell = async { while self.publishers.join_next().await.is_some() {} };
         if tokio::time::timeout(FAREWELL, farewell).await.is_err() {
             warn!("a subscriber did not fetch its last lines");
         }
-        let recorded = match recorder {
-            // A file that was asked for by itself is worth waiting for.
-            Some(recorder) if setup.config.record.is_none() => recorder.finish().await,
+        let recorded = match self.recorder {
+            // A recording that somebody asked for by itself is worth waiting for.
+            Some(recorder) if self.setup.config.record.is_none() => recorder.finish().await,
             Some(recorder) => tokio::time::timeout(FAREWELL, recorder.finish())
                 .await
                 .unwrap_or_else(|_| {
@@ -277,7 +329,7 @@ impl Daemon {
                 }),
             None => Ok(()),
         };
-        outcome.and(recorded.map_err(Error::Record))
+        recorded.map_err(Error::Record)
     }
 }
 
@@ -296,50 +348,12 @@ async fn alive(hub: &hub::Handle, sensors: &Sensors) -> Option<Vec<Status>> {
     (all && hub.finals().await.is_ok()).then_some(statuses)
 }
 
-/// Why a reload was refused.
-#[derive(Debug, thiserror::Error)]
-enum Refusal {
-    #[error(transparent)]
-    Config(#[from] config::Error),
-    #[error("{key}: found another value, expected the one it started with: restart to change it")]
-    Fixed { key: String },
-    #[error(transparent)]
-    Log(#[from] log::Error),
-    #[error("reading it failed: {0}")]
-    Task(#[from] tokio::task::JoinError),
-}
-
-/// The next request to reload; for ever none, if none can come.
-async fn requested(reload: &mut Option<Reload>) -> PathBuf {
-    if let Some(reload) = reload
-        && reload.requests.recv().await.is_some()
-    {
-        return reload.path.clone();
-    }
-    std::future::pending().await
-}
-
-type Loaded = Result<Result<Setup, config::Error>, tokio::task::JoinError>;
-
-async fn finished(loading: &mut Option<JoinHandle<Result<Setup, config::Error>>>) -> Loaded {
+/// Waits for the configuration that is being read; never ready if none is.
+async fn finished(loading: &mut Option<Loading>) -> Result<Setup, Refusal> {
     match loading {
         Some(loading) => loading.await,
         None => std::future::pending().await,
     }
-}
-
-/// All or nothing: the new setup if every part of it can be had without a restart.
-fn change(setup: &Setup, loaded: Loaded, log: Option<&Log>) -> Result<Setup, Refusal> {
-    let changed = loaded??;
-    if let Some(key) = setup.config.fixed_difference(&changed.config) {
-        return Err(Refusal::Fixed { key });
-    }
-    if let Some(log) = log
-        && changed.config.log != setup.config.log
-    {
-        log.change(changed.config.log)?;
-    }
-    Ok(changed)
 }
 
 fn announce(setup: &Setup, run: &str) {

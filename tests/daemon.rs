@@ -231,6 +231,30 @@ fn sighup_changes_all_or_nothing() {
 }
 
 #[test]
+fn a_reload_from_what_does_not_end_is_given_up_and_the_next_one_works() {
+    let bench = Bench::new();
+    let mut daemon = bench.daemon();
+    let config = bench.path("hardnessd.toml");
+    fs::remove_file(&config).unwrap();
+    let made = Command::new("mkfifo").arg(&config).status().unwrap();
+    assert!(made.success());
+    daemon.process.signal(Signal::HUP);
+    let line = daemon.logged("refused");
+    for part in ["ERROR", "hardnessd.toml", "took over 10 s: given up"] {
+        assert!(line.contains(part), "{part} not in {line}");
+    }
+    fs::remove_file(&config).unwrap();
+    bench.configure("hardnessd.toml", "events.sock", "");
+    daemon.process.signal(Signal::HUP);
+    daemon.logged("reloaded");
+    // The thread that still waits for the pipe does not keep the daemon.
+    let start = Instant::now();
+    daemon.process.signal(Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    assert!(start.elapsed() < Duration::from_secs(5));
+}
+
+#[test]
 fn a_line_that_repeats_without_end_is_left_out_and_counted() {
     const TARES: u64 = 5000;
     let bench = Bench::new();

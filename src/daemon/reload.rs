@@ -1,0 +1,173 @@
+//! Reading the configuration again while the daemon runs (SIGHUP).
+//!
+//! In: the path of the file, and the setup in force. Out: the new setup, or the reason why all
+//! stays as it was. A thread of its own reads file and model, within [`PATIENCE`]. A thread that
+//! takes longer is given up: its file may be a pipe that no program writes to, and such a thread
+//! cannot be ended. So at most [`MOST_READERS`] may be left behind.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::{Semaphore, TryAcquireError, mpsc, oneshot};
+
+use super::config::{self, Setup};
+use super::log::{self, Log};
+
+/// How long reading the configuration and its model may take. The built-in model takes well under
+/// a second.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// Threads that may read at a time: one, and those that were given up.
+const MOST_READERS: usize = 4;
+
+/// How a running daemon is asked to read its configuration again.
+pub struct Reload {
+    /// One item for each request.
+    pub requests: mpsc::Receiver<()>,
+    /// The path of the configuration.
+    pub path: PathBuf,
+    /// The log, whose format may change.
+    pub log: Log,
+}
+
+/// Why a reload was refused.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum Refusal {
+    #[error(transparent)]
+    Config(#[from] config::Error),
+    #[error("{key}: found another value, expected the one it started with: restart to change it")]
+    Fixed { key: String },
+    #[error(transparent)]
+    Log(#[from] log::Error),
+    #[error("{path}: reading it and its model took over {} s: given up", patience.as_secs_f64())]
+    Late { path: PathBuf, patience: Duration },
+    #[error("{path}: {MOST_READERS} reloads that were given up still read: restart to reload")]
+    Stuck { path: PathBuf },
+    #[error("{path}: cannot start a thread to read it: {source}")]
+    Thread {
+        path: PathBuf,
+        source: std::io::Error,
+    },
+    #[error("{path}: the thread that read it ended without a result")]
+    Ended { path: PathBuf },
+}
+
+/// The threads that read configurations.
+pub(super) struct Readers(Arc<Semaphore>);
+
+impl Default for Readers {
+    fn default() -> Self {
+        Self(Arc::new(Semaphore::new(MOST_READERS)))
+    }
+}
+
+impl Readers {
+    /// Reads the configuration at `path` and its model.
+    pub(super) fn read(
+        &self,
+        path: PathBuf,
+    ) -> impl Future<Output = Result<Setup, Refusal>> + use<> {
+        let readers = Arc::clone(&self.0);
+        async move { load(readers, path, PATIENCE, Setup::load).await }
+    }
+}
+
+/// What `read` makes of the file at `path`, unless it takes longer than `patience`.
+async fn load<T: Send + 'static>(
+    readers: Arc<Semaphore>,
+    path: PathBuf,
+    patience: Duration,
+    read: impl FnOnce(&Path) -> Result<T, config::Error> + Send + 'static,
+) -> Result<T, Refusal> {
+    let reader = match readers.try_acquire_owned() {
+        Ok(reader) => reader,
+        Err(TryAcquireError::NoPermits | TryAcquireError::Closed) => {
+            return Err(Refusal::Stuck { path });
+        }
+    };
+    let (done, result) = oneshot::channel();
+    let thread_path = path.clone();
+    // Not one of the runtime's threads: the runtime would wait for them at its end.
+    let started = std::thread::Builder::new()
+        .name("reload".to_owned())
+        .spawn(move || {
+            let loaded = read(&thread_path);
+            drop(reader);
+            // After the time limit there is no receiver any more.
+            let _ = done.send(loaded);
+        });
+    if let Err(source) = started {
+        return Err(Refusal::Thread { path, source });
+    }
+    match tokio::time::timeout(patience, result).await {
+        Ok(Ok(loaded)) => Ok(loaded?),
+        Ok(Err(_)) => Err(Refusal::Ended { path }),
+        Err(_) => Err(Refusal::Late { path, patience }),
+    }
+}
+
+/// The next request to reload, as the path to read; never ready if no request can come.
+pub(super) async fn requested(reload: &mut Option<Reload>) -> PathBuf {
+    if let Some(reload) = reload
+        && reload.requests.recv().await.is_some()
+    {
+        return reload.path.clone();
+    }
+    std::future::pending().await
+}
+
+/// All or nothing: `changed`, if all of it can change while the daemon runs.
+pub(super) fn change(setup: &Setup, changed: Setup, log: Option<&Log>) -> Result<Setup, Refusal> {
+    if let Some(key) = setup.config.fixed_difference(&changed.config) {
+        return Err(Refusal::Fixed { key });
+    }
+    if let Some(log) = log
+        && changed.config.log != setup.config.log
+    {
+        log.change(changed.config.log)?;
+    }
+    Ok(changed)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc;
+
+    use super::*;
+
+    type Read = fn(&mpsc::Receiver<()>) -> Result<(), config::Error>;
+
+    #[tokio::test]
+    async fn a_load_that_does_not_end_is_given_up_and_later_ones_work_until_too_many_are() {
+        let readers = Arc::new(Semaphore::new(MOST_READERS));
+        let path = PathBuf::from("hardnessd.toml");
+        let load = |patience, read: Read| {
+            let (end, wait) = mpsc::channel();
+            let loaded = load(readers.clone(), path.clone(), patience, move |_| {
+                read(&wait)
+            });
+            async move { (loaded.await, end) }
+        };
+        let mut stuck = Vec::new();
+        for _ in 0..MOST_READERS {
+            let (loaded, _) = load(PATIENCE, |_| Ok(())).await;
+            assert!(loaded.is_ok(), "{loaded:?}");
+            let waits: Read = |end| Ok(end.recv().unwrap_or(()));
+            let (loaded, end) = load(Duration::from_millis(10), waits).await;
+            let reason = loaded.unwrap_err().to_string();
+            let expected = "hardnessd.toml: reading it and its model took over 0.01 s: given up";
+            assert_eq!(reason, expected);
+            stuck.push(end);
+        }
+        let (loaded, _) = load(PATIENCE, |_| Ok(())).await;
+        assert!(matches!(loaded, Err(Refusal::Stuck { .. })), "{loaded:?}");
+        // A thread that was given up makes room when it ends.
+        stuck.clear();
+        while readers.available_permits() < MOST_READERS {
+            std::thread::yield_now();
+        }
+        let (loaded, _) = load(PATIENCE, |_| Ok(())).await;
+        assert!(loaded.is_ok(), "{loaded:?}");
+    }
+}
