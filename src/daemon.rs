@@ -273,6 +273,8 @@ impl Running {
                 }
                 path = reload::requested(&mut reload), if loading.is_none() => {
                     systemd::reloading();
+                    // Listeners look whether they can still be reached.
+                    let _ = self.orders.send(());
                     loading = Some(Box::pin(readers.read(path)));
                 }
                 loaded = finished(&mut loading) => {

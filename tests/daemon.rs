@@ -255,6 +255,43 @@ fn a_reload_from_what_does_not_end_is_given_up_and_the_next_one_works() {
 }
 
 #[test]
+fn nobody_keeps_a_daemon_from_starting_by_a_lock_on_the_directory() {
+    let bench = Bench::new();
+    let directory = fs::File::open(bench.path("")).unwrap();
+    directory.lock().unwrap();
+    let _daemon = bench.daemon();
+    assert_eq!(bench.subscriber().next().unwrap()["type"], "hello");
+    let mut left: Vec<String> = fs::read_dir(bench.path(""))
+        .unwrap()
+        .map(|file| file.unwrap().file_name().into_string().unwrap())
+        .collect();
+    left.sort();
+    assert_eq!(left, ["control.sock", "events.sock", "hardnessd.toml"]);
+}
+
+#[test]
+fn a_socket_whose_file_was_deleted_is_there_again() {
+    let bench = Bench::new();
+    let mut daemon = bench.daemon();
+    let mut before = bench.subscriber();
+    for (name, mode) in [("events.sock", 0o660), ("control.sock", 0o600)] {
+        let path = bench.path(name);
+        fs::remove_file(&path).unwrap();
+        let line = daemon.logged("made it again");
+        assert!(line.contains("WARN") && line.contains(name), "{line}");
+        let mut after = Subscriber::connect(&path);
+        assert_eq!(after.next().unwrap()["type"], "hello");
+        let made = fs::metadata(&path).unwrap().permissions().mode();
+        assert_eq!(made & 0o777, mode, "{name}");
+    }
+    // A connection from before lives on.
+    assert_eq!(before.ask(r#"{"get":"last"}"#), json!({"type": "ok"}));
+    daemon.process.signal(Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    assert!(!bench.path("events.sock").exists());
+}
+
+#[test]
 fn a_line_that_repeats_without_end_is_left_out_and_counted() {
     const TARES: u64 = 5000;
     let bench = Bench::new();

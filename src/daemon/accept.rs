@@ -1,7 +1,7 @@
-//! Taking connections in: as many at a time as there is room for, until told to stop.
+//! Accepting connections: as many at a time as there is room for, until the order to stop.
 //!
-//! The one loop that every listener stands on. What is done with a connection, and what one too
-//! many is told, is the caller's.
+//! Every listener uses this one loop. The caller says what is done with a connection, and what one
+//! too many is told.
 
 use std::future::Future;
 use std::io;
@@ -14,12 +14,12 @@ use tracing::warn;
 /// Pause after the system had no room for a connection.
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// The order to stop: it has come when the other end is dropped.
+/// Orders to listeners. When the sender is dropped they stop; a value that is sent before asks them
+/// to look whether they can still be reached.
 pub(crate) type Stop = watch::Receiver<()>;
 
 /// Waits for the order to stop.
 pub(crate) async fn stopped(stop: &mut Stop) {
-    // Nothing is ever sent.
     while stop.changed().await.is_ok() {}
 }
 
@@ -29,7 +29,7 @@ pub(crate) trait Listener {
     type Stream: Send;
 
     /// The next connection. Nothing is lost if the wait is given up.
-    fn accept(&self) -> impl Future<Output = io::Result<Self::Stream>> + Send;
+    fn accept(&mut self) -> impl Future<Output = io::Result<Self::Stream>> + Send;
 }
 
 /// What is done with connections.
@@ -44,7 +44,7 @@ pub(crate) trait Serve<S> {
 /// Serves connections, at most `most` at a time. Once `stop` comes there are no new ones and the
 /// listener is gone; it ends when those there have come to their end.
 pub(crate) async fn accept<L: Listener>(
-    listener: L,
+    mut listener: L,
     most: usize,
     service: impl Serve<L::Stream>,
     mut stop: Stop,

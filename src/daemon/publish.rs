@@ -176,10 +176,12 @@ impl Publishers {
         let mut tasks = JoinSet::new();
         if let Some(socket) = socket {
             let service = service(Access::ReadOnly);
+            let socket = socket.obey(stop.clone());
             tasks.spawn(accept(socket, max_clients, service, stop.clone()));
         }
         if let Some(control) = control {
             let service = service(Access::Control);
+            let control = control.obey(stop.clone());
             tasks.spawn(accept(control, max_clients, service, stop.clone()));
         }
         if let Some(tcp) = tcp {

@@ -64,7 +64,7 @@ impl Tcp {
 impl Listener for Tcp {
     type Stream = TcpStream;
 
-    async fn accept(&self) -> io::Result<TcpStream> {
+    async fn accept(&mut self) -> io::Result<TcpStream> {
         let (stream, _) = self.listener.accept().await?;
         // A connection that is gone already is found out when it is read.
         let _ = behave(&stream);
