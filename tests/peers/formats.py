@@ -1,11 +1,14 @@
 #!/usr/bin/env python3
-"""docs/formats.md as it stands: a data set made by numpy, a model made by onnx, and our programs on both.
+"""docs/formats.md and models/README.md: a data set made by numpy, a model made by onnx, our programs on
+both, and the default model in onnxruntime.
 
     python tests/peers/formats.py target/debug
 
-Claims: every Python block runs, and every command prints what the page shows (`...`: anything).
+Claims: every Python block runs, every command prints what the page shows (`...`: anything), a data set of
+`hrn-train simulate` has the arrays that the page lists, and the card's example judges a press.
 """
 
+import json
 import os
 import pathlib
 import re
@@ -13,7 +16,11 @@ import subprocess
 import sys
 import tempfile
 
-PAGE = pathlib.Path(__file__).parents[2] / "docs/formats.md"
+import numpy as np
+
+ROOT = pathlib.Path(__file__).parents[2]
+PAGE = ROOT / "docs/formats.md"
+CARD = ROOT / "models/README.md"
 
 
 def run(command, directory, path):
@@ -47,6 +54,32 @@ def main(binaries):
             pathlib.Path(directory, name).write_text(block)
             if kind == "python":
                 run([sys.executable, name], directory, path)
+        simulated(directory, path)
+    card()
+
+
+def simulated(directory, path):
+    """What the page says of a data set, against one that `simulate` has written."""
+    few = "--objects 1 --test-objects 1 --presses 2".split()
+    run(["hrn-train", "simulate", "--out", "simulated.npz", *few], directory, path)
+    data = np.load(pathlib.Path(directory, "simulated.npz"))
+    section = PAGE.read_text().split("## A data set")[1].split("```")[0]
+    listed = dict(re.findall(r"^\| `(\w+)` \| (\w+) \| \[", section, re.M))
+    kinds = {"f32": np.float32, "u8": np.uint8, "u32": np.uint32}
+    assert {name: data[name].dtype for name in data} == {name: kinds[kind] for name, kind in listed.items()}
+    meta = json.loads(data["meta"].tobytes())
+    rows = re.findall(r"^\| `(\w+)` \| (both|`simulate`|`collect`) \|", PAGE.read_text(), re.M)
+    assert set(meta) == {key for key, by in rows if by != "`collect`"}, (sorted(meta), rows)
+
+
+def card():
+    """The example of the model's card."""
+    (example,) = re.findall(r"```python\n(.*?)```", CARD.read_text(), re.S)
+    done = subprocess.run([sys.executable, "-c", example], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done
+    print(done.stdout)
+    shares = [float(line.split()[1]) for line in done.stdout.splitlines()]
+    assert len(shares) == 4 and abs(sum(shares) - 1) < 0.01, shares
 
 
 if __name__ == "__main__":

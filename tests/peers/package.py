@@ -6,12 +6,14 @@
 
 Claims: all is root's, with the modes that lintian asks for; the configuration is a conffile and
 passes `check`; the installed binary shows a press; man pages and completions render and name every
-command; the units name what is installed; no script stumbles. machine.py installs it.
+command; the units name what is installed; every link and picture of a page is there; no script stumbles.
+machine.py installs it.
 """
 
 import argparse
 import json
 import os
+import pathlib
 import re
 import subprocess
 import tempfile
@@ -38,7 +40,8 @@ def main():
         pages(root, commands)
         completions(root, commands)
         units(root, files)
-    print(f"package: {len(files)} files, {len(commands)} commands with page and completion")
+        linked = links(root)
+    print(f"package: {len(files)} files, {len(commands)} commands with page and completion, {linked} links")
 
 
 def listing(package):
@@ -118,6 +121,18 @@ def completions(root, commands):
     for name in ["zsh/vendor-completions/_hardnessd", "fish/vendor_completions.d/hardnessd.fish"]:
         text = open(f"{root}/usr/share/{name}").read()
         assert all(command in text for command in commands), name
+
+
+def links(root):
+    folder, count = pathlib.Path(root, "usr/share/doc/hardnessd"), 0
+    for page in folder.rglob("*.md"):
+        prose = re.sub(r"^ *```.*?^ *```", "", page.read_text(), flags=re.M | re.S)
+        for target in re.findall(r"\]\(([^)#]+)[^)]*\)", prose):
+            if "://" not in target:
+                assert (page.parent / target).exists(), f"{page.relative_to(folder)}: {target}"
+                count += 1
+    assert count > 100, count
+    return count
 
 
 def units(root, files):

@@ -1,0 +1,67 @@
+#!/usr/bin/env python3
+"""Draws docs/results.png from the tables of both committed comparisons.
+
+    pip install matplotlib && python results/chart.py
+"""
+
+import pathlib
+import re
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+
+HERE = pathlib.Path(__file__).resolve().parent
+METHODS = {
+    "features, 1,500 labels": "features (18 hand-made features)",
+    "igan": "igan",
+    "sgan": "sgan",
+    "hrn15-long": "hrn15-long (no GAN, steps of ours)",
+    "hrn15-tuned": "hrn15-tuned (no GAN, Adam)",
+    "ours": "ours (the paper's method)",
+    "nihrn": "nihrn (ours without USTGAN start)",
+    "nahrn": "nahrn (ours without augmentation)",
+    "hrn15": "hrn15 (no GAN)",
+    "hrn100": "hrn100 (10,000 labels, no GAN)",
+}
+LOOKS = {"quick": ("#1f77b4", "o", "profile quick, three seeds"), "paper": ("#d62728", "D", "profile paper, one seed")}
+
+
+def accuracies(profile):
+    """Method -> accuracy and its interval, of the first table."""
+    text = (HERE / profile / "tables.md").read_text().split("## Table 2")[0]
+    found = {}
+    for line in text.splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        interval = re.fullmatch(r"([\d.]+) to ([\d.]+)", cells[3]) if len(cells) == 8 else None
+        if interval:
+            found[cells[0]] = float(cells[2].split()[0]), float(interval[1]), float(interval[2])
+    return found
+
+
+def main():
+    figure, axes = plt.subplots(figsize=(8, 4.2), layout="constrained")
+    names = list(METHODS)[::-1]
+    for shift, (profile, (colour, marker, label)) in zip((0.14, -0.14), LOOKS.items()):
+        found = accuracies(profile)
+        places = [place for place, name in enumerate(names) if name in found]
+        values = [found[names[place]] for place in places]
+        axes.errorbar(
+            [value for value, _, _ in values],
+            [place + shift for place in places],
+            xerr=[[value - low for value, low, _ in values], [high - value for value, _, high in values]],
+            fmt=marker, color=colour, label=label, capsize=3, markersize=6,
+        )
+    axes.set_yticks(range(len(names)), [METHODS[name] for name in names])
+    axes.set_xlim(20, 95)
+    axes.set_xlabel("accuracy on fresh objects of other materials, per cent (95 % interval)")
+    axes.grid(axis="x", alpha=0.3)
+    axes.axhline(0.5, color="grey", linewidth=0.8, linestyle=":")
+    axes.text(21, 0.62, "above: 1,500 labels; below: 10,000", color="grey", fontsize=8)
+    axes.legend(loc="upper left")
+    figure.savefig(HERE.parent / "docs/results.png", dpi=110)
+
+
+if __name__ == "__main__":
+    main()
