@@ -4,7 +4,7 @@
 //!     cargo run --release --example early_verdicts -- [PRESSES]
 //!
 //! PRESSES (default 200, some minutes) of each material at 5, 20 and 100 frames/s, with the settings
-//! and the model that are built in. Prints the table of `docs/daemon.md`, and how many early verdicts
+//! and the model that are built in. Prints the table of `docs/results.md`, and how many early verdicts
 //! came before the press had reached 95 % of its greatest force: none should.
 
 use std::sync::Arc;
