@@ -1,233 +1,780 @@
 """Events of hardnessd, the daemon that tells hard from soft.
 
-One file, standard library only, Python 3.9 or later: copy it beside your program.
+This module is one file, needs only the standard library, and runs on Python 3.9 or later. Copy it
+beside your program, or install it with `pip install ./clients/python`.
 
     import hardnessd
 
-    for event in hardnessd.Client("/run/hardnessd/events.sock"):
+    for event in hardnessd.Client():
         if event["type"] == "hardness" and event["phase"] == "final":
             print(event["sensor"], event["label"], event["confidence"])
 
-The client connects when it is iterated, and again when the connection breaks, where it stopped: no
-numbered event is missed or given twice as long as the daemon holds it (the last 4,096). What was
-missed is said by a `gap`. While the connection is down nothing is known of the sensor; the client
-says so with an event of its own, {"type": "disconnected", "reason": ...}.
+`Client` connects when you iterate over it. When the connection breaks, it connects again and
+continues where it stopped. It gives each numbered event once, as long as the daemon still holds the
+event (the last 4,096). A `gap` event says how many events were lost. While there is no connection,
+nothing is known of the sensor. The client then gives an event of its own:
+{"type": "disconnected", "reason": ...}.
 
-    control = hardnessd.Control("/run/hardnessd/control.sock")
+`AsyncClient` does the same for asyncio:
+
+    async with hardnessd.AsyncClient() as client:
+        async for event in client:
+            ...
+
+`Control` sends commands to the control socket:
+
+    control = hardnessd.Control()
     control.tare("forearm")
     control.context("forearm", tag="pick-17")
 
-As a program it prints events as JSON lines: python3 hardnessd.py [ADDRESS] [TYPE ...]
+An address is the path of a Unix socket, "HOST:PORT", or a pair (host, port). Without an address,
+the module looks where the daemon puts its sockets by default.
+
+As a program, the module prints events: python3 hardnessd.py --help
 """
 
+from __future__ import annotations
+
+import argparse
+import asyncio
+import datetime
+import io
 import json
 import os
+import re
 import socket
 import sys
+import threading
 import time
+from typing import (
+    Any,
+    AsyncIterator,
+    Dict,
+    Iterator,
+    List,
+    Literal,
+    Optional,
+    Sequence,
+    Set,
+    Tuple,
+    TypedDict,
+    Union,
+    cast,
+)
+
+__all__ = [
+    "Address",
+    "AsyncClient",
+    "Client",
+    "Connection",
+    "Control",
+    "Disconnected",
+    "Event",
+    "Frame",
+    "Gap",
+    "Hardness",
+    "LineTooLong",
+    "Offsets",
+    "PROTOCOL",
+    "Press",
+    "ProtocolError",
+    "Refused",
+    "Status",
+    "TYPES",
+    "Tare",
+    "default_address",
+]
 
 PROTOCOL = 1
+"""Version of the protocol that this module speaks."""
+
+TYPES = ("hardness", "press", "status", "frame")
+"""Types of events that you can subscribe to."""
+
+LONGEST_LINE_BYTES = 1 << 20
+"""No line of the daemon comes near this. What is longer does not come from hardnessd."""
+
 FIRST_PAUSE_S = 0.1
 LONGEST_PAUSE_S = 2.0
 
+HELLO_S = 5.0
+"""How long connecting, and the first line, may take. The daemon answers within 50 ms, but a service
+manager may have to start it first."""
+
+Address = Union[str, "os.PathLike[str]", Tuple[str, int]]
+"""Path of a Unix socket, "HOST:PORT", or (host, port)."""
+
+Message = Dict[str, Any]
+
+
+class _Numbered(TypedDict, total=False):
+    seq: int
+    """Place in the daemon's run. Absent in the status that comes right after connecting."""
+
+
+class Hardness(_Numbered):
+    """A verdict on a press."""
+
+    type: Literal["hardness"]
+    sensor: str
+    time: str
+    press: int
+    phase: Literal["early", "final"]
+    level: Optional[int]
+    label: Optional[str]
+    rejected: Optional[str]
+    notes: List[str]
+    probabilities: List[float]
+    confidence: float
+    frame: int
+    contact_area_taxels: int
+    contact_area_mm2: float
+    force_n: float
+    model: str
+    state: Literal["connecting", "live", "stale", "lost"]
+    context: Optional[Message]
+    mono_ns: Optional[int]
+    age_at_publish_ms: Optional[float]
+    latency_us: Optional[int]
+
+
+class Press(_Numbered):
+    """A press began, ended or was aborted."""
+
+    type: Literal["press"]
+    sensor: str
+    time: str
+    press: int
+    state: Literal["begin", "end", "aborted"]
+    frame: int
+    reason: Optional[str]
+    frames: int
+    context: Optional[Message]
+
+
+class Status(_Numbered):
+    """A sensor's link."""
+
+    type: Literal["status"]
+    sensor: str
+    time: str
+    state: Literal["connecting", "live", "stale", "lost"]
+    reason: Optional[str]
+    frames: int
+    frames_damaged: int
+    bytes_skipped: int
+    frame_rate_hz: Optional[float]
+
+
+class Frame(TypedDict):
+    """One tared frame: 784 newtons, row by row."""
+
+    type: Literal["frame"]
+    sensor: str
+    time: str
+    frame: int
+    rows: int
+    cols: int
+    newtons: List[float]
+    contact_area_taxels: int
+
+
+class Gap(TypedDict):
+    """Events that you will not get. `lost` is None when their number is not known."""
+
+    type: Literal["gap"]
+    lost: Optional[int]
+
+
+class Disconnected(TypedDict):
+    """The client has no connection. It tries again, and gives this event for each failed try."""
+
+    type: Literal["disconnected"]
+    reason: str
+
+
+Event = Union[Hardness, Press, Status, Frame, Gap, Disconnected]
+
+
+class Offsets(TypedDict):
+    """The baseline of a sensor, over its live taxels."""
+
+    mean_counts: float
+    least_counts: float
+    most_counts: float
+
+
+class Tare(TypedDict):
+    """What a tare changed."""
+
+    sensor: str
+    old: Offsets
+    new: Offsets
+
 
 class Refused(Exception):
-    """The daemon answered a request with an `error`."""
+    """The daemon answered a request with an `error`. The message is the daemon's."""
 
 
-def default_address(name="events.sock"):
-    """Where the daemon's sockets are by default."""
-    directory = os.environ.get("XDG_RUNTIME_DIR") or "/run"
-    candidates = [os.path.join("/run/hardnessd", name), os.path.join(directory, "hardnessd", name)]
-    return next((path for path in candidates if os.path.exists(path)), candidates[0])
+class ProtocolError(ConnectionError):
+    """What answers there does not speak the protocol of hardnessd."""
+
+
+class LineTooLong(ProtocolError):
+    """A line is longer than any that hardnessd sends."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            f"a line is longer than {LONGEST_LINE_BYTES} bytes: this is not hardnessd"
+        )
+
+
+def default_address(name: str = "events.sock") -> str:
+    """Where the daemon's sockets are by default.
+
+    This is the first socket that exists in $RUNTIME_DIRECTORY, $XDG_RUNTIME_DIR/hardnessd and
+    /run/hardnessd, or the last of these when none exists.
+    """
+    directories = ["/run/hardnessd"]
+    if user := os.environ.get("XDG_RUNTIME_DIR"):
+        directories.insert(0, os.path.join(user, "hardnessd"))
+    if service := os.environ.get("RUNTIME_DIRECTORY"):
+        directories.insert(0, service.split(":")[0])
+    paths = [os.path.join(directory, name) for directory in directories]
+    return next((path for path in paths if os.path.exists(path)), paths[-1])
+
+
+def _destination(address: Address) -> Union[str, Tuple[str, int]]:
+    """A path, or host and port."""
+    if isinstance(address, tuple):
+        return address
+    text = os.fspath(address)
+    host, _, port = text.rpartition(":")
+    if isinstance(address, str) and host and "/" not in text and re.fullmatch("[0-9]+", port):
+        if int(port) > 0xFFFF:
+            raise ValueError(f"found port {port}, expected at most 65535")
+        return host.strip("[]"), int(port)
+    return text
+
+
+def _parse(line: bytes) -> Message:
+    try:
+        message = json.loads(line.decode(), parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        raise ProtocolError(f"a line is not JSON: {_short(line)}") from error
+    if not isinstance(message, dict) or not isinstance(message.get("type"), str):
+        raise ProtocolError(f"a line is not an object with a type: {_short(line)}")
+    if not isinstance(message.get("seq", 0), int):
+        raise ProtocolError(f"seq is not a whole number: {_short(line)}")
+    return message
+
+
+def _no_number(text: str) -> None:
+    raise ValueError(f"{text} is not a number of JSON")
+
+
+def _short(line: bytes) -> str:
+    text = repr(line[:60])[2:-1]
+    return text + "..." if len(line) > 60 else text
 
 
 class Connection:
-    """Lines to and from the daemon. `address`: a socket's path, or (host, port)."""
+    """Lines to and from the daemon, as they are. `timeout_s` is the limit for each wait."""
 
-    def __init__(self, address, timeout_s=None):
-        if isinstance(address, (str, os.PathLike)):
+    def __init__(self, address: Address, timeout_s: Optional[float] = None) -> None:
+        destination = _destination(address)
+        patience_s = HELLO_S if timeout_s is None else timeout_s
+        if isinstance(destination, str):
             self.socket = socket.socket(socket.AF_UNIX)
-            self.socket.settimeout(timeout_s)
+            self.socket.settimeout(patience_s)
             try:
-                self.socket.connect(os.fspath(address))
+                self.socket.connect(destination)
             except OSError:
                 self.socket.close()
                 raise
         else:
-            self.socket = socket.create_connection(address, timeout_s)
-            self.socket.settimeout(timeout_s)
+            self.socket = socket.create_connection(destination, patience_s)
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        self.lines = self.socket.makefile("rb")
+        self.socket.settimeout(timeout_s)
+        self._bytes = bytearray()
 
-    def send(self, request):
+    def send(self, request: Message) -> None:
+        """Sends one request."""
         self.socket.sendall(json.dumps(request).encode() + b"\n")
 
-    def receive(self):
-        """The next line's object.
+    def receive(self) -> Message:
+        """Returns the next line's object.
 
-        Raises ConnectionError when the connection is at its end, TimeoutError when none came.
+        Raises ConnectionError when the connection is closed, ProtocolError (a ConnectionError) when
+        the line is none of hardnessd, and TimeoutError when no line came in time.
         """
-        line = self.lines.readline()
-        if not line.endswith(b"\n"):
-            raise ConnectionError("the daemon closed the connection")
-        return json.loads(line)
+        searched = 0
+        while (end := self._bytes.find(b"\n", searched)) < 0:
+            searched = len(self._bytes)
+            if searched > LONGEST_LINE_BYTES:
+                raise LineTooLong
+            try:
+                received = self.socket.recv(1 << 16)
+            except socket.timeout as error:
+                # Before Python 3.10, socket.timeout is not a TimeoutError.
+                raise TimeoutError(f"no line within {self.socket.gettimeout()} s") from error
+            if not received:
+                raise ConnectionError("the daemon closed the connection")
+            self._bytes += received
+        line = bytes(self._bytes[:end])
+        del self._bytes[: end + 1]
+        return _parse(line)
 
-    def close(self):
-        # `shutdown` wakes a reader on another thread, which `close` alone does not.
+    def close(self) -> None:
+        """Closes the connection. A thread that waits in `receive` wakes with ConnectionError."""
+        # `shutdown` wakes a reader on another thread. `close` alone does not.
         try:
             self.socket.shutdown(socket.SHUT_RDWR)
         except OSError:
             pass
-        self.lines.close()
         self.socket.close()
 
 
-class Client:
+class _Follower:
+    """What a subscriber remembers over its connections. It does no I/O."""
+
+    def __init__(self, types: Union[str, Sequence[str]], policy: str, since: Optional[str]) -> None:
+        self.types = [types] if isinstance(types, str) else list(types)
+        self.policy = policy
+        self.place = since
+        self.hello: Optional[Message] = None
+        # Numbers that came before the daemon took the subscription. The daemon does not send them
+        # again on this connection, but it would on the next.
+        self._early: Set[int] = set()
+        self._subscribed = False
+
+    def subscription(self, hello: Message) -> Message:
+        """The answer to the first line of a connection."""
+        if hello["type"] == "error":
+            raise ConnectionError(hello.get("message", "the daemon refused the connection"))
+        if hello["type"] != "hello":
+            raise ProtocolError(f"the first line is {hello['type']!r}, expected 'hello'")
+        if hello.get("protocol") != PROTOCOL:
+            raise ProtocolError(f"protocol {hello.get('protocol')}, expected {PROTOCOL}")
+        run, seq = hello.get("run"), hello.get("seq")
+        if not isinstance(run, str) or not isinstance(seq, int):
+            raise ProtocolError("hello has no run or no seq")
+        self.hello, self._run, self._subscribed = hello, run, False
+        request = {"subscribe": self.types, "policy": self.policy}
+        if self.place is None:
+            self.place = f"{run}:{seq}"
+        else:
+            request["since"] = self.place
+            if not self.place.startswith(run + ":"):
+                self._early.clear()
+        return request
+
+    def take(self, message: Message) -> Optional[Event]:
+        """The event in a later line, if it has one that was asked for and is new."""
+        kind, seq = message["type"], message.get("seq")
+        if kind == "ok":
+            self._subscribed = True
+        elif kind == "error":
+            raise Refused(message.get("message", "the daemon refused the subscription"))
+        elif kind == "gap" or (kind in self.types and seq not in self._early):
+            if seq is not None and self._subscribed:
+                self.place = f"{self._run}:{seq}"
+                self._early = {number for number in self._early if number > seq}
+            elif seq is not None:
+                self._early.add(seq)
+            return cast(Event, message)
+        return None
+
+
+def _disconnected(error: BaseException) -> Disconnected:
+    return {"type": "disconnected", "reason": str(error) or f"no answer within {HELLO_S:g} s"}
+
+
+class _Subscriber:
+    """What both clients are told, and say."""
+
+    def __init__(
+        self,
+        address: Optional[Address] = None,
+        types: Union[str, Sequence[str]] = ("hardness", "press", "status"),
+        policy: str = "queue",
+        since: Optional[str] = None,
+    ) -> None:
+        self.address = address
+        self._follower = _Follower(types, policy, since)
+
+    @property
+    def place(self) -> Optional[str]:
+        """RUN:SEQ of the last event, to continue from with `since`."""
+        return self._follower.place
+
+    @property
+    def hello(self) -> Optional[Message]:
+        """The first line of the latest connection: robot, sensors, model."""
+        return self._follower.hello
+
+
+class Client(_Subscriber):
     """An endless iterator over events.
 
-    `types`: any of "hardness", "press", "status", "frame". `policy`: "queue" keeps every event up to
-    1,024, "latest" the newest of each type and sensor. `since`: a RUN:SEQ to go on from, such as
-    `place` of an earlier client.
+    `types` is any of TYPES. With `policy` "queue" the daemon keeps up to 1,024 events for a slow
+    client, with "latest" the newest of each type and sensor. `since` is a place RUN:SEQ to continue
+    from, such as `place` of an earlier client. Raises Refused if the daemon refuses these.
     """
 
     def __init__(
         self,
-        address=None,
-        types=("hardness", "press", "status"),
-        policy="queue",
-        since=None,
-    ):
-        self.address = address or default_address()
-        self.types = list(types)
-        self.policy = policy
-        self.place = since
-        self.hello = None
-        self.connection = None
-        # Numbers given before the daemon took the subscription: it does not send them again on the
-        # same connection, but would on the next.
-        self.early = set()
-        self.closed = False
+        address: Optional[Address] = None,
+        types: Union[str, Sequence[str]] = ("hardness", "press", "status"),
+        policy: str = "queue",
+        since: Optional[str] = None,
+    ) -> None:
+        super().__init__(address, types, policy, since)
+        self.connection: Optional[Connection] = None
+        self._closed = threading.Event()
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[Event]:
         pause_s = FIRST_PAUSE_S
-        while not self.closed:
+        while not self._closed.is_set():
             try:
                 for event in self._connected():
                     pause_s = FIRST_PAUSE_S
                     yield event
-            except (OSError, ValueError) as error:
-                if self.closed:
+            except OSError as error:
+                if self._closed.is_set():
                     return
-                yield {"type": "disconnected", "reason": str(error)}
-            time.sleep(pause_s)
+                yield _disconnected(error)
+            self._closed.wait(pause_s)
             pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
 
-    def close(self):
+    def close(self) -> None:
         """Ends the iteration, also from another thread."""
-        self.closed = True
+        self._closed.set()
         if self.connection:
             self.connection.close()
 
-    def _connected(self):
-        """Events of one connection; it ends by an exception, or because the client is closed."""
-        self.connection = Connection(self.address)
+    def _connected(self) -> Iterator[Event]:
+        """Events of one connection. It ends with an exception, or when the client is closed."""
+        connection = Connection(self.address or default_address(), HELLO_S)
+        self.connection = connection
         try:
-            if self.closed:
-                # By another thread, which had no connection to close yet.
+            # Another thread may have closed the client while there was no connection to close.
+            if self._closed.is_set():
                 return
-            self.hello = self.connection.receive()
-            if self.hello.get("type") != "hello":
-                raise ConnectionError(self.hello.get("message", "no hardnessd answers there"))
-            if self.hello["protocol"] != PROTOCOL:
-                raise ConnectionError(f"protocol {self.hello['protocol']}, expected {PROTOCOL}")
-            run = self.hello["run"]
-            subscription = {"subscribe": self.types, "policy": self.policy}
-            if self.place is not None:
-                subscription["since"] = self.place
-                if not self.place.startswith(run + ":"):
-                    self.early.clear()
-            else:
-                self.place = f"{run}:{self.hello['seq']}"
-            self.connection.send(subscription)
-            subscribed = False
-            while not self.closed:
-                event = self.connection.receive()
-                kind, seq = event.get("type"), event.get("seq")
-                if kind == "ok":
-                    subscribed = True
-                elif kind == "error":
-                    raise Refused(event["message"])
-                elif kind == "gap":
-                    yield event
-                elif kind not in self.types or seq in self.early:
-                    # Unwanted, unknown, or had before.
-                    continue
-                else:
-                    if seq is not None and subscribed:
-                        self.place = f"{run}:{seq}"
-                        self.early = {number for number in self.early if number > seq}
-                    elif seq is not None:
-                        self.early.add(seq)
+            connection.send(self._follower.subscription(connection.receive()))
+            connection.socket.settimeout(None)
+            while not self._closed.is_set():
+                event = self._follower.take(connection.receive())
+                if event is not None:
                     yield event
         finally:
-            self.connection.close()
+            connection.close()
+
+
+class AsyncClient(_Subscriber):
+    """The same as `Client`, for asyncio: an endless asynchronous iterator over events.
+
+    Cancelling a wait loses nothing: `asyncio.wait_for(client.__anext__(), 0.1)` may time out as often
+    as you like. Use the client in one task at a time. Close it with `async with` or with `close`.
+    """
+
+    def __init__(
+        self,
+        address: Optional[Address] = None,
+        types: Union[str, Sequence[str]] = ("hardness", "press", "status"),
+        policy: str = "queue",
+        since: Optional[str] = None,
+    ) -> None:
+        super().__init__(address, types, policy, since)
+        self._streams: Optional[Tuple[asyncio.StreamReader, asyncio.StreamWriter]] = None
+        self._opening: Optional[asyncio.Task[None]] = None
+        self._pause_s = 0.0
+        self._try_at = 0.0
+        self._closed = False
+
+    async def __aenter__(self) -> AsyncClient:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
+    def __aiter__(self) -> AsyncIterator[Event]:
+        return self
+
+    async def __anext__(self) -> Event:
+        while not self._closed:
+            try:
+                event = await self._step()
+            except Refused:
+                self._disconnect()
+                raise
+            except (OSError, asyncio.TimeoutError) as error:
+                self._disconnect()
+                if not self._closed:
+                    return _disconnected(error)
+            else:
+                if event is not None:
+                    self._pause_s = 0.0
+                    return event
+        raise StopAsyncIteration
+
+    def close(self) -> None:
+        """Ends the iteration, also that of another task."""
+        self._closed = True
+        if self._opening:
+            self._opening.cancel()
+        self._disconnect()
+
+    async def _step(self) -> Optional[Event]:
+        """Connects, or reads a line. When it is cancelled, the next call continues where it was."""
+        if self._streams:
+            return self._follower.take(await self._receive(self._streams[0]))
+        if self._opening is None:
+            self._opening = asyncio.ensure_future(self._open())
+            # A failure that nobody waits for is no news.
+            self._opening.add_done_callback(lambda task: task.cancelled() or task.exception())
+        opening = self._opening
+        # Cancelling `wait` does not cancel what it waits for.
+        await asyncio.wait([opening])
+        self._opening = None
+        if not opening.cancelled():
+            opening.result()
+        return None
+
+    async def _open(self) -> None:
+        """Connects and subscribes, once the pause since the last connection is over."""
+        await asyncio.sleep(max(0.0, self._try_at - time.monotonic()))
+        destination = _destination(self.address or default_address())
+        connecting = (
+            asyncio.open_unix_connection(destination, limit=LONGEST_LINE_BYTES)
+            if isinstance(destination, str)
+            else asyncio.open_connection(*destination, limit=LONGEST_LINE_BYTES)
+        )
+        reader, writer = await asyncio.wait_for(connecting, HELLO_S)
+        try:
+            if not isinstance(destination, str):
+                peer = writer.get_extra_info("socket")
+                peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            hello = await asyncio.wait_for(self._receive(reader), HELLO_S)
+            writer.write(json.dumps(self._follower.subscription(hello)).encode() + b"\n")
+        except BaseException:
+            writer.close()
+            raise
+        self._streams = reader, writer
+        if self._closed:
+            self._disconnect()
+
+    async def _receive(self, reader: asyncio.StreamReader) -> Message:
+        try:
+            return _parse((await reader.readuntil(b"\n"))[:-1])
+        except asyncio.LimitOverrunError:
+            raise LineTooLong from None
+        except asyncio.IncompleteReadError:
+            raise ConnectionError("the daemon closed the connection") from None
+
+    def _disconnect(self) -> None:
+        if self._streams:
+            self._streams[1].close()
+            self._streams = None
+        self._pause_s = min(max(2 * self._pause_s, FIRST_PAUSE_S), LONGEST_PAUSE_S)
+        self._try_at = time.monotonic() + self._pause_s
 
 
 class Control:
-    """Commands, one at a time. Raises Refused with the daemon's message, OSError without one."""
+    """Commands to the daemon's control socket, one at a time.
 
-    def __init__(self, address=None, timeout_s=30.0):
+    Each raises Refused with the daemon's message if the daemon refuses it, and OSError when there is
+    no connection or no answer within `timeout_s`.
+    """
+
+    def __init__(self, address: Optional[Address] = None, timeout_s: float = 30.0) -> None:
+        self._requests = 0
         self.connection = Connection(address or default_address("control.sock"), timeout_s)
-        self.connection.send({"subscribe": []})
-        self._answer()
+        try:
+            self.request({"subscribe": []})
+        except BaseException:
+            self.connection.close()
+            raise
 
-    def tare(self, sensor):
-        """Takes another tare; returns the offsets before and after."""
-        return self._ask({"tare": sensor})[0]["tare"]
+    def __enter__(self) -> Control:
+        return self
 
-    def context(self, sensor, **fields):
-        """What is being done with the sensor: echoed in its presses and verdicts. Without fields:
-        nothing any more."""
-        self._ask({"context": {"sensor": sensor, **fields}})
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
-    def last(self):
-        """Every sensor's last final verdict."""
-        return self._ask({"get": "last"})[1]
+    def tare(self, sensor: str) -> Tare:
+        """Takes another tare. Returns the offsets before and after."""
+        return cast(Tare, self.request({"tare": sensor})[0]["tare"])
 
-    def status(self):
-        """Every sensor's status now."""
-        return self._ask({"get": "status"})[1]
+    def context(self, sensor: str, **fields: Any) -> None:
+        """Says what is being done with the sensor. Its presses and verdicts then carry it.
 
-    def close(self):
+        Without fields, they carry nothing any more.
+        """
+        self.request({"context": {"sensor": sensor, **fields}})
+
+    def blackbox(self, sensor: str) -> str:
+        """Has the daemon write the sensor's last minute to a recording. Returns the file's path."""
+        return cast(str, self.request({"blackbox": sensor})[0]["blackbox"])
+
+    def last(self) -> List[Hardness]:
+        """Returns each sensor's last final verdict."""
+        return cast("List[Hardness]", self.request({"get": "last"})[1])
+
+    def status(self) -> List[Status]:
+        """Returns each sensor's status now."""
+        return cast("List[Status]", self.request({"get": "status"})[1])
+
+    def request(self, request: Message) -> Tuple[Message, List[Message]]:
+        """Sends any request of the protocol. Returns its `ok`, and the lines sent before it."""
+        self._requests += 1
+        self.connection.send({**request, "id": self._requests})
+        lines: List[Message] = []
+        while True:
+            line = self.connection.receive()
+            if line["type"] not in ("ok", "error"):
+                lines.append(line)
+            elif "id" not in line:
+                # The daemon has no room for this connection.
+                raise ConnectionError(line.get("message", "the daemon refused the connection"))
+            elif line["id"] != self._requests:
+                # The late answer to a request that was given up.
+                lines.clear()
+            elif line["type"] == "error":
+                raise Refused(line.get("message", "no reason given"))
+            else:
+                return line, lines
+
+    def close(self) -> None:
         """Closes the connection."""
         self.connection.close()
 
-    def _ask(self, request):
-        self.connection.send(request)
-        return self._answer()
 
-    def _answer(self):
-        events = []
-        while True:
-            line = self.connection.receive()
-            if line["type"] == "ok":
-                return line, events
-            if line["type"] == "error":
-                raise Refused(line["message"])
-            if line["type"] != "hello":
-                events.append(line)
+def _readable(event: Event) -> str:
+    """An event as one line of text."""
+    if event["type"] == "disconnected":
+        return f"-- disconnected: {event['reason']} --"
+    if event["type"] == "gap":
+        lost = "an unknown number of" if event["lost"] is None else event["lost"]
+        return f"-- gap: {lost} events lost --"
+    start = f"{event['time'][11:23]}  {event['sensor']:<12}  {event['type']:<8}  "
+    if event["type"] == "frame":
+        force_n, area = sum(event["newtons"]), event["contact_area_taxels"]
+        return start + f"#{event['frame']:<4} {'':<8}  {area:>3} taxels  {force_n:>6.2f} N"
+    if event["type"] == "status":
+        rate = "" if event["frame_rate_hz"] is None else f", {event['frame_rate_hz']:.1f} frames/s"
+        text = f"{event['state']:<14}  {event['frames']} frames, {event['frames_damaged']} damaged{rate}"
+        return start + text + (f"  ({event['reason']})" if event["reason"] else "")
+    if event["type"] == "press":
+        text = f"#{event['press']:<4} {event['state']:<8}  frame {event['frame']}"
+        return start + text + (f"  ({event['reason']})" if event["reason"] else "")
+    label = f"rejected: {event['rejected']}" if event["rejected"] else f"{event['level']} {event['label']}"
+    if event["age_at_publish_ms"] is not None:
+        # `time` is that of the chosen frame. Lines are in the order in which events are published.
+        published = datetime.datetime.fromisoformat(event["time"].replace("Z", "+00:00"))
+        published += datetime.timedelta(milliseconds=event["age_at_publish_ms"])
+        start = f"{published:%H:%M:%S.%f}"[:12] + start[12:]
+    text = f"#{event['press']:<4} {event['phase']:<8}  {label:<24} {event['confidence']:>4.0%}"
+    text += f"  {event['contact_area_taxels']:>3} taxels  {event['force_n']:>6.2f} N"
+    text += f"  frame {event['frame']} at {event['time'][11:23]}"
+    return start + text + (f"  ({', '.join(event['notes'])})" if event["notes"] else "")
 
 
-def main(arguments):
-    address = arguments[0] if arguments else None
-    for event in Client(address, **({"types": arguments[1:]} if arguments[1:] else {})):
-        print(json.dumps(event), flush=True)
+def _types(text: str) -> List[str]:
+    types = text.split(",")
+    for found in types:
+        if found not in TYPES:
+            raise argparse.ArgumentTypeError(f"found {found!r}, expected {', '.join(TYPES)}")
+    return types
+
+
+def _count(text: str) -> int:
+    if not re.fullmatch("[0-9]+", text) or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number above 0")
+    return int(text)
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds <= threading.TIMEOUT_MAX:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a number of seconds above 0")
+    return seconds
+
+
+def _arguments() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python3 -m hardnessd",
+        description="Print events of a running hardnessd, one a line. It connects again when the "
+        "connection breaks, and continues where it stopped.",
+        epilog="Exit codes: 0 done, 1 timeout or refused by the daemon, 2 wrong usage, 74 stdout fails, "
+        "130 Ctrl-C.",
+    )
+    parser.add_argument(
+        "address", nargs="?", help="path of a Unix socket, or HOST:PORT [default: the daemon's socket]"
+    )
+    parser.add_argument("--json", action="store_true", help="print the events as JSON")
+    parser.add_argument(
+        "--types",
+        type=_types,
+        default=["hardness", "press", "status"],
+        metavar="T,...",
+        help="types of events: hardness, press, status, frame [default: hardness,press,status]",
+    )
+    parser.add_argument("--since", metavar="RUN:SEQ", help="continue after this event")
+    parser.add_argument("--count", type=_count, metavar="N", help="end after N events")
+    parser.add_argument(
+        "--timeout", type=_seconds, metavar="S", help="give up after S seconds, with exit code 1"
+    )
+    return parser
+
+
+def main(arguments: Optional[Sequence[str]] = None) -> int:
+    """The program. Returns its exit code."""
+    args = _arguments().parse_args(arguments)
+    client = Client(args.address, args.types, since=args.since)
+    over = threading.Timer(args.timeout or 0, client.close)
+    over.daemon = True
+    count = 0
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # A label may have letters that this terminal lacks.
+        sys.stdout.reconfigure(errors="replace")
+    try:
+        if args.timeout:
+            over.start()
+        for event in client:
+            try:
+                text = json.dumps(event) if args.json else _readable(event)
+            except (KeyError, TypeError, ValueError):
+                # No event of hardnessd.
+                text = json.dumps(event)
+            # A reason comes from the system, a label from a model file. Neither may move the cursor.
+            print("".join(c for c in text if c.isprintable()), flush=True)
+            count += event["type"] in args.types
+            if count == args.count:
+                return 0
+        print(f"timed out after {args.timeout:g} s ({count} events)", file=sys.stderr)
+        return 1
+    except Refused as error:
+        print(f"the daemon refused: {error}", file=sys.stderr)
+        return 1
+    except (ValueError, OverflowError) as error:
+        print(f"{args.address}: no address: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        # Nobody reads any more, as with `head`. Nothing is left to be written.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 0
+    except OSError as error:
+        # Connections that fail are events, so this is about stdout.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        print(f"stdout: {error.strerror}", file=sys.stderr)
+        return 74
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except (BrokenPipeError, KeyboardInterrupt):
-        # Nobody reads any more; nothing is left to be written.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    sys.exit(main())

@@ -1,0 +1,7 @@
+"""`python3 -m hardnessd`: prints events."""
+
+import sys
+
+from hardnessd import main
+
+sys.exit(main())

@@ -1,0 +1,186 @@
+"""Recordings: the MCAP files that `hardnessd record` and the daemon's [record] table write.
+
+    from hardnessd import recordings
+
+    with recordings.open("take.mcap") as take:
+        print(take.labels, take.sensors)
+        for event in take.events():
+            if event["type"] == "hardness":
+                print(event["press"], event["label"])
+        for sensor, time_ns, newtons in take.frames():
+            ...
+
+It needs mcap and mcap-ros2-support: pip install './clients/python[recordings]'
+
+Events are those of the daemon, as it published them. `hardnessd replay` computes them again.
+"""
+
+from __future__ import annotations
+
+import array
+import builtins
+import contextlib
+import json
+import math
+import os
+import sys
+from typing import Any, Dict, Iterator, List, NamedTuple, Sequence, Tuple, Union, cast
+
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from hardnessd import Event, Hardness, Press, Status
+
+_EVENTS = {"hardness": Hardness, "press": Press, "status": Status}
+
+# What a ROS message has where the event has null, because ROS knows no null. Numbers that are not
+# listed are NaN there.
+_NULL: Dict[str, Union[int, str]] = {
+    "level": 0,
+    "label": "",
+    "rejected": "",
+    "reason": "",
+    "context": "",
+    "mono_ns": 0,
+}
+
+
+# The constant BYTES of tactile_interfaces/msg/Input.
+_BYTES = 0
+
+
+class Frame(NamedTuple):
+    """What the network saw at one moment."""
+
+    sensor: str
+    time_ns: int
+    """Nanoseconds since 1970, UTC."""
+    newtons: "array.array[float]"
+    """784 newtons, row by row. numpy.asarray(newtons).reshape(28, 28) makes an image of it."""
+
+
+class Chunk(NamedTuple):
+    """Bytes that the sensor sent."""
+
+    sensor: str
+    time_ns: int
+    """When they were read, in nanoseconds since 1970, UTC."""
+    mono_ns: int
+    """The same by CLOCK_MONOTONIC."""
+    data: bytes
+
+
+class Damaged(ValueError):
+    """The file is no recording, or not a whole one."""
+
+
+class Recording:
+    """An open recording. Use it with `with`, or call `close`."""
+
+    def __init__(self, path: Union[str, "os.PathLike[str]"]) -> None:
+        self.path = os.fspath(path)
+        self._file = builtins.open(path, "rb")
+        try:
+            with self._reading():
+                self._reader = make_reader(
+                    self._file, validate_crcs=True, decoder_factories=[DecoderFactory()]
+                )
+                records = [(found.name, dict(found.metadata)) for found in self._reader.iter_metadata()]
+                sensors = [found for name, found in records if name == "hardnessd.sensor"]
+                settings = {found["name"]: json.loads(found["settings"]) for found in sensors}
+            named = dict(records)
+            if "hardnessd.recording" not in named:
+                raise ValueError(f"{self.path}: a recording, but none of hardnessd")
+        except BaseException:
+            self._file.close()
+            raise
+        self.about: Dict[str, str] = named["hardnessd.recording"]
+        """robot, run, boot_id, version."""
+        self.labels: Dict[str, str] = named.get("hardnessd.labels", {})
+        """What was given with `record --label`."""
+        self.sensors: Dict[str, Dict[str, Any]] = settings
+        """Settings of each sensor."""
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._file.close()
+
+    def events(self, types: Sequence[str] = ("hardness", "press", "status")) -> Iterator[Event]:
+        """Events in the order of their publication, with the fields that a subscriber gets."""
+        with self._reading():
+            events = [
+                {"type": topic, **{key: _value(key, getattr(message, key)) for key in _fields(topic)}}
+                for _, topic, message in self._messages(types)
+            ]
+        return iter(cast("List[Event]", sorted(events, key=lambda event: event["seq"])))
+
+    def frames(self) -> Iterator[Frame]:
+        """Frames after tare, in the order of time."""
+        for sensor, _, message in self._messages(["frame"]):
+            newtons = array.array("f", bytes(message.data))
+            if sys.byteorder == "big":
+                newtons.byteswap()
+            yield Frame(sensor, _time_ns(message), newtons)
+
+    def chunks(self) -> Iterator[Chunk]:
+        """The bytes that came from the sensors, as they were read, in the order of time."""
+        for sensor, _, message in self._messages(["input"]):
+            if message.kind == _BYTES:
+                yield Chunk(sensor, _time_ns(message), message.mono_ns, bytes(message.data))
+
+    def _messages(self, topics: Sequence[str]) -> Iterator[Tuple[str, str, Any]]:
+        """Sensor, topic and message."""
+        names = [f"/tactile/{sensor}/{topic}" for sensor in self.sensors for topic in topics]
+        with self._reading():
+            for _, channel, _, message in self._reader.iter_decoded_messages(names):
+                _, _, sensor, topic = channel.topic.split("/")
+                yield sensor, topic, message
+
+    @contextlib.contextmanager
+    def _reading(self) -> Iterator[None]:
+        """What damage leads to, in one exception: the libraries have many."""
+        try:
+            yield
+        except Damaged:
+            raise
+        except Exception as error:
+            raise self._damaged(error) from error
+
+    def _damaged(self, error: Exception) -> Damaged:
+        why = repr(error)[:80]
+        return Damaged(
+            f"{self.path}: no recording, a damaged one, or one that is still written ({why}): "
+            f"`hardnessd recover {self.path} --out GOOD.mcap` saves what is whole"
+        )
+
+
+def open(path: Union[str, "os.PathLike[str]"]) -> Recording:  # as gzip.open and others
+    """Opens a recording. Raises Damaged (a ValueError) if it is not whole, and OSError or ValueError if
+    the file cannot be opened or is none of hardnessd."""
+    return Recording(path)
+
+
+def _fields(topic: str) -> List[str]:
+    return [key for key in {**_EVENTS[topic].__annotations__, "seq": int} if key != "type"]
+
+
+def _value(key: str, value: Any) -> Any:
+    """A field of a ROS message as the field of the event."""
+    if isinstance(value, float) and math.isnan(value):
+        return None
+    if key in _NULL and value == _NULL[key]:
+        return None
+    if key == "context":
+        return json.loads(value)
+    return list(value) if key in ("notes", "probabilities") else value
+
+
+def _time_ns(message: Any) -> int:
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)

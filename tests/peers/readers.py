@@ -1,0 +1,205 @@
+#!/usr/bin/env python3
+"""The Python client's readers, on data sets and recordings that our programs write.
+
+    python3 -m venv venv && venv/bin/pip install './clients/python[datasets,recordings]' mypy
+    venv/bin/python tests/peers/readers.py target/debug
+
+Claims: a data set reads as numpy reads it, and what is none is refused with the array's name; a recording
+gives the very events that a subscriber read, the frames and the bytes; a damaged one is refused in one
+line. The type hints are strict, and a program that installs the package is checked by them.
+"""
+
+import json
+import os
+import pathlib
+import random
+import re
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+
+import hardnessd
+import numpy as np
+from bench import Bench
+from hardnessd import datasets, recordings
+
+ROOT = pathlib.Path(__file__).parents[2]
+CLIENT = ROOT / "clients/python"
+
+
+def refused(read, path, said):
+    try:
+        read(path)
+    except ValueError as error:
+        assert said in str(error) and str(path) in str(error) and "\n" not in str(error), error
+    else:
+        raise AssertionError(f"{path} is not refused: {said}")
+
+
+def data_sets(binaries, directory):
+    path = directory / "data.npz"
+    sizes = ["--objects", "2", "--test-objects", "1", "--presses", "4", "--seed", "1"]
+    subprocess.run([binaries / "hrn-train", "simulate", "--out", path, *sizes], check=True, capture_output=True)
+    presses = datasets.load(path)
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    for name in ("frames", "level", "object", "material", "force", "split", "shore"):
+        found = getattr(presses, name)
+        assert (found is None) == (name not in arrays), name
+        assert found is None or np.array_equal(found, arrays[name], equal_nan=True), name
+    assert presses.meta == json.loads(arrays["meta"].tobytes()) and "materials" in presses.meta
+    test = presses.part("test")
+    assert 0 < len(test) < len(presses) and len(test) + len(presses.part("train")) == len(presses)
+    assert test.frames.shape == (len(test), 28, 28) and len(test.labelled()) == len(test)
+
+    least = {"frames": arrays["frames"], "level": arrays["level"]}
+    np.savez(directory / "least.npz", more=np.arange(3), **least)
+    read = datasets.load(directory / "least.npz")
+    assert read.object is None and read.meta == {} and len(read.part("train")) == len(read)
+    assert list(read.others) == ["more"]
+    for name, array, said in [
+        ("level", arrays["level"].astype(np.int64), "level: found int64"),
+        ("frames", arrays["frames"][:, :14], "frames: found float32 [48, 14, 28], expected float32 [48, 28, 28]"),
+        ("split", arrays["split"][:-1], "split: found uint8 [47], expected uint8 [48]"),
+        ("meta", np.frombuffer(b"{", np.uint8), "meta: not JSON"),
+        ("frames", None, "frames: found none"),
+        ("level", np.array([object()]), "not a data set"),
+    ]:
+        given = {key: value for key, value in {**arrays, name: array}.items() if value is not None}
+        np.savez(directory / "wrong.npz", **given)
+        refused(datasets.load, directory / "wrong.npz", said)
+    for content in (b"", b"PK\x03\x04", b"frames\n", path.read_bytes()[:-200]):
+        (directory / "wrong.npz").write_bytes(content)
+        refused(datasets.load, directory / "wrong.npz", "not a data set")
+    np.save(directory / "one.npy", arrays["level"])
+    refused(datasets.load, directory / "one.npy", "not a data set")
+    return len(presses)
+
+
+def a_recording(binary, directory):
+    """The daemon's own recording, beside what a subscriber read."""
+    more = '[record]\ndir = "rec"\nkeep_free_mb = 0\n'
+    with Bench(str(binary), more=more) as bench:
+        daemon = bench.daemon()
+        client = hardnessd.Client(bench.path("events.sock"), types=hardnessd.TYPES)
+        live = []
+        reader = threading.Thread(target=lambda: live.extend(client))
+        reader.start()
+        sensor = bench.sensor("forearm", "--presses", "3", "--force", "15", "--seed", "3")
+        sensor.wait(timeout=60)
+        time.sleep(0.5)
+        daemon.terminate()
+        daemon.wait(timeout=10)
+        client.close()
+        reader.join()
+        (path,) = pathlib.Path(bench.path("rec")).glob("hardnessd-*.mcap")
+        (directory / "take.mcap").write_bytes(path.read_bytes())
+    with recordings.open(directory / "take.mcap") as take:
+        assert take.about["robot"] == "arm-7" and take.sensors["forearm"]["name"] == "forearm"
+        events = {event["seq"]: event for event in take.events()}
+        numbered = [event for event in live if "seq" in event]
+        assert len(numbered) >= 8 and list(events) == sorted(events), numbered
+        for event in numbered:
+            came = events[event["seq"]]
+            assert set(came) == set(event), set(came) ^ set(event)
+            for key, value in event.items():
+                if isinstance(value, (float, list)) and key != "notes":
+                    # JSON rounds, ROS has float32.
+                    assert np.allclose(came[key], value, rtol=1e-5, atol=0.0006), (key, came[key], value)
+                else:
+                    assert came[key] == value, (key, came[key], value)
+        verdicts = list(take.events(types=["hardness"]))
+        assert {event["type"] for event in verdicts} == {"hardness"}
+        frames = list(take.frames())
+        shown = {event["frame"]: event["newtons"] for event in live if event["type"] == "frame"}
+        assert len(shown) > 50 and len(frames) >= len(shown)
+        for number, newtons in shown.items():
+            assert np.allclose(frames[number].newtons, newtons, atol=0.0006), number
+        sent = b"".join(chunk.data for chunk in take.chunks())
+        assert 0 <= len(sent) - 790 * len(frames) < 2 * 790
+    return len(verdicts), len(frames)
+
+
+def damaged(directory):
+    """No damage does more than a ValueError that says what to do."""
+    whole = (directory / "take.mcap").read_bytes()
+    broken = directory / "broken.mcap"
+
+    def read(path):
+        with recordings.open(path) as take:
+            return len(list(take.events())) + len(list(take.frames()))
+
+    random.seed(1)
+    for content in (b"", b"not one", whole[: len(whole) // 2], whole[:-1]):
+        broken.write_bytes(content)
+        refused(read, broken, "hardnessd recover")
+    refusals = 0
+    for _ in range(150):
+        content = bytearray(whole)
+        for _ in range(random.choice([1, 20])):
+            content[random.randrange(len(content))] = random.randrange(256)
+        broken.write_bytes(content)
+        try:
+            read(broken)
+        except ValueError as error:
+            assert "hardnessd" in str(error) and "\n" not in str(error), error
+            refusals += 1
+    assert refusals > 50, refusals
+    return refusals
+
+
+def types(directory):
+    """The hints are strict, and reach whoever installs the package."""
+    mypy = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(directory / "mypy")]
+    sources = [CLIENT / "hardnessd.py", *sorted((CLIENT / "package").glob("*.py"))]
+    for source in sources:
+        options = ["--config-file", CLIENT / "pyproject.toml"]
+        checked = subprocess.run([*mypy, *options, source], capture_output=True, text=True, cwd=directory)
+        assert checked.returncode == 0, checked.stdout
+    program = directory / "program.py"
+    text = (CLIENT / "README.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", text, re.S)
+    program.write_text("\n\n".join(blocks).replace("async def main():", "async def main() -> None:"))
+    checked = subprocess.run([*mypy, program], capture_output=True, text=True, cwd=directory)
+    assert checked.returncode == 0, checked.stdout
+    program.write_text(
+        "import hardnessd\n"
+        "for event in hardnessd.Client():\n"
+        "    if event['type'] == 'hardness':\n"
+        "        reveal_type(event['force_n'])\n"
+        "        print(event['forse_n'])\n"
+    )
+    checked = subprocess.run([*mypy, program], capture_output=True, text=True, cwd=directory)
+    assert 'Revealed type is "float"' in checked.stdout.replace("builtins.", ""), checked.stdout
+    assert '"Hardness" has no key "forse_n"' in checked.stdout, checked.stdout
+    return len(sources)
+
+
+def readme(directory):
+    blocks = re.findall(r"```python\n(.*?)```", (CLIENT / "README.md").read_text(), re.S)
+    (block,) = [block for block in blocks if "recordings.open" in block]
+    subprocess.run([sys.executable, "-c", block], cwd=directory, check=True, stdout=subprocess.DEVNULL)
+
+
+def version():
+    """The package's version is the daemon's."""
+    files = (CLIENT / "pyproject.toml", ROOT / "Cargo.toml")
+    ours, theirs = (re.search(r'^version = "(.*)"$', file.read_text(), re.M)[1] for file in files)
+    assert ours == theirs, (ours, theirs)
+
+
+def main(binaries):
+    version()
+    with tempfile.TemporaryDirectory() as name:
+        directory = pathlib.Path(name)
+        print("a data set of", data_sets(binaries, directory), "presses")
+        print("a recording of %d verdicts and %d frames" % a_recording(binaries / "hardnessd", directory))
+        print("damaged recordings, refused:", damaged(directory))
+        readme(directory)
+        print("type hints of", types(directory), "files")
+
+
+if __name__ == "__main__":
+    main(pathlib.Path(sys.argv[1]).resolve())
