@@ -5,7 +5,8 @@
     venv/bin/python tests/peers/schema.py target/debug/hardnessd
 
 Claims: the frozen lines of tests/event_format.rs, all types of live lines and those of a replay are
-valid; the schema names every field there is; and it is not so loose that a wrong line passes.
+valid. The schema names every field there is, and so do the type hints of the Python client. A wrong
+line does not pass.
 """
 
 import json
@@ -110,7 +111,17 @@ def refuses_what_is_wrong():
         assert key == "seq" or not VALIDATOR.is_valid(less), f"without {key}"
 
 
+def hinted():
+    """The Python client's types have the schema's fields, required and optional alike."""
+    for kind in hardnessd.TYPES + ("gap",):
+        hint, schema = getattr(hardnessd, kind.capitalize()), SCHEMA["$defs"][kind]
+        assert set(hint.__annotations__) == set(schema["properties"]), kind
+        optional = set(schema["properties"]) - set(schema["required"])
+        assert optional <= {"seq"}, f"{kind}: mark {optional} as optional in hardnessd.py"
+
+
 def main(binary):
+    hinted()
     Draft202012Validator.check_schema(SCHEMA)
     refuses_what_is_wrong()
     print(f"{frozen()} frozen lines, {replayed(binary)} replayed lines, live: {live(binary)}")
