@@ -1,18 +1,25 @@
-//! A subscriber in Rust: verdicts as they come, over breaks of the connection.
+//! A subscriber in Rust. It prints verdicts as they come, and connects again when the connection
+//! breaks.
 //!
 //!     cargo run --example subscribe -- /run/hardnessd/events.sock
 //!
-//! It needs the standard library and a JSON parser. What it shows: a line is an event; a place in
-//! the run (`RUN:SEQ`) is kept, so that nothing is missed when the connection is made again (what
-//! came before the daemon took the subscription may come once more); and while there is none,
-//! nothing is known of the sensor.
+//! It needs the standard library and a JSON parser. It shows three things:
+//!
+//! - Each line is one event.
+//! - The subscriber keeps its place in the daemon's run (`RUN:SEQ`) and sends it when it connects
+//!   again, so that it misses nothing. An event that came before the daemon took the subscription
+//!   may come a second time.
+//! - While there is no connection, nothing is known of the sensor.
 
 use std::convert::Infallible;
-use std::io::{self, BufRead, BufReader, Write};
+use std::io::{self, BufRead, BufReader, Read, Write};
 use std::os::unix::net::UnixStream;
 use std::time::Duration;
 
 use serde_json::{Value, json};
+
+/// No line of the daemon comes near this. What is longer does not come from hardnessd.
+const LONGEST_LINE_BYTES: u64 = 1 << 20;
 
 fn main() {
     let socket = std::env::args().nth(1);
@@ -33,10 +40,11 @@ fn follow(socket: &str, place: &mut Option<String>) -> io::Result<Infallible> {
         subscription["since"] = json!(place);
     }
     writeln!(stream, "{subscription}")?;
+    let mut input = BufReader::new(stream);
     let mut run = String::new();
     let mut subscribed = false;
-    for line in BufReader::new(stream).lines() {
-        let event: Value = serde_json::from_str(&line?)?;
+    loop {
+        let event = receive(&mut input)?;
         match event["type"].as_str() {
             Some("hello") => run = event["run"].as_str().unwrap_or_default().to_owned(),
             Some("ok") => subscribed = true,
@@ -51,12 +59,26 @@ fn follow(socket: &str, place: &mut Option<String>) -> io::Result<Infallible> {
                 event["label"],
                 100.0 * event["confidence"].as_f64().unwrap_or_default()
             ),
-            // What a later version adds is passed over.
+            // A later version may send types that this program does not know.
             _ => {}
         }
         if let Some(seq) = event["seq"].as_u64().filter(|_| subscribed) {
             *place = Some(format!("{run}:{seq}"));
         }
     }
-    Err(io::Error::new(io::ErrorKind::UnexpectedEof, "closed"))
+}
+
+/// Reads the next event.
+fn receive(input: &mut BufReader<UnixStream>) -> io::Result<Value> {
+    let mut line = String::new();
+    input.take(LONGEST_LINE_BYTES).read_line(&mut line)?;
+    if !line.ends_with('\n') {
+        let what = if line.len() as u64 == LONGEST_LINE_BYTES {
+            "a line is too long: this is not hardnessd"
+        } else {
+            "the daemon closed the connection"
+        };
+        return Err(io::Error::other(what));
+    }
+    Ok(serde_json::from_str(&line)?)
 }
