@@ -1,12 +1,13 @@
-//! Bytes in, whole frames and damage out.
+//! The search for frames: bytes go in, whole frames and damage come out.
 
 use serde::{Deserialize, Serialize};
 
-use super::{Framing, Layout, text, zero_run};
+use super::layout::Layout;
+use super::scan::{Context, Scan};
 use crate::frame::RawFrame;
 
-/// A candidate frame was dropped: it had a valid sync and failed length, tail, checksum or what must
-/// follow.
+/// A candidate frame was dropped: it had a valid sync, but its length, its tail, its checksum or
+/// what must follow it was wrong.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Damage;
 
@@ -19,41 +20,33 @@ pub struct Decoded {
     pub end: u64,
 }
 
-/// What the bytes at hand amount to.
-#[expect(
-    clippy::large_enum_variant,
-    reason = "a frame is handed on by value: boxing it would allocate each one"
-)]
-pub(super) enum Scan {
-    /// More bytes are needed.
-    Wait,
-    /// So many bytes belong to no frame.
-    Skip(usize),
-    /// A candidate is damaged; so many bytes of it are passed over, and the search goes on
-    /// inside the rest.
-    Damaged(usize),
-    /// The first so many bytes are a frame.
-    Frame(usize, RawFrame),
-    /// So many bytes belong to no frame, and whether one ended with them is not known.
-    Excess(usize),
-}
-
-/// What a scan may know beside the bytes.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Context {
-    /// The input ended or paused after these bytes.
-    pub settled: bool,
-    /// The bytes begin where a frame ended.
-    pub locked: bool,
-    /// Place of the first byte in the stream.
-    pub offset: u64,
-    /// Place in the stream where the last whole frame ended, or the stream began.
-    pub anchor: u64,
-}
-
-/// Finds frames in a stream of bytes. It holds on to at most the bytes of one pending frame and the
-/// header that must follow it. Only a layout that begins with a sync, without checksum or tail, may
-/// come to hold two: after damage, where headers in the data leave it unsure of its phase.
+/// Finds frames in a stream of bytes.
+///
+/// It holds at most the bytes of one pending frame and the header that must follow it. A layout that
+/// has a sync and neither a checksum nor a tail may hold two frames: after damage, a header in the
+/// data may look like the beginning of the next one.
+///
+/// # Example
+///
+/// A frame arrives in two pieces, behind some noise.
+///
+/// ```
+/// use hardnessd::frame::RawFrame;
+/// use hardnessd::wire::{Decoder, Layout, Settings};
+///
+/// let layout = Layout::new(&Settings::default())?;
+/// let mut bytes = b"noise".to_vec();
+/// layout.encode(&RawFrame::default(), &mut bytes);
+///
+/// let mut decoder = Decoder::new(layout);
+/// decoder.push(&bytes[..300]);
+/// assert!(decoder.next_frame().is_none());
+/// decoder.push(&bytes[300..]);
+/// let decoded = decoder.next_frame().unwrap().unwrap();
+/// assert_eq!(decoded.frame, RawFrame::default());
+/// assert_eq!((decoder.skipped(), decoder.pending()), (5, 0));
+/// # Ok::<(), hardnessd::wire::LayoutError>(())
+/// ```
 #[derive(Debug)]
 pub struct Decoder {
     layout: Layout,
@@ -78,7 +71,7 @@ pub struct Memory {
 }
 
 impl Memory {
-    /// Whether a decoder can have come to this that gave so many frames, whole and damaged ones.
+    /// Whether a decoder that gave this many frames, damaged ones included, can have come to this.
     pub(crate) fn is_possible(&self, frames: u64) -> bool {
         let passed = self.received.checked_sub(self.pending.len() as u64);
         self.received < MOST_BYTES
@@ -95,7 +88,7 @@ impl Decoder {
     /// A decoder at the start of a stream.
     pub fn new(layout: Layout) -> Self {
         let capacity = 4 * layout.max_frame_bytes();
-        let locked = matches!(&layout.framing, Framing::Fixed(fixed) if fixed.has_sync());
+        let locked = layout.begins_locked();
         Self {
             layout,
             buffer: Vec::with_capacity(capacity),
@@ -120,7 +113,7 @@ impl Decoder {
         }
     }
 
-    /// Goes on where the one stood whose memory this is.
+    /// Goes on where the decoder stood whose memory this is.
     pub fn recall(&mut self, memory: Memory) {
         Memory {
             pending: self.buffer,
@@ -138,7 +131,7 @@ impl Decoder {
         &self.layout
     }
 
-    /// Takes bytes in. Never blocks and never fails; call [`Self::next_frame`] until it is `None`
+    /// Takes bytes in. It never blocks and never fails. Call [`Self::next_frame`] until it is `None`
     /// before the next push, or the buffer grows.
     pub fn push(&mut self, bytes: &[u8]) {
         if bytes.is_empty() {
@@ -153,8 +146,8 @@ impl Decoder {
         self.received += bytes.len() as u64;
     }
 
-    /// Says that the input ended or paused for half a period: a complete frame that only waited
-    /// for the next header is whole.
+    /// Says that the input ended or paused for half a period. A complete frame that only waited for
+    /// the next header is whole then.
     pub fn settle(&mut self) {
         self.settled = true;
     }
@@ -167,7 +160,7 @@ impl Decoder {
         self.start = 0;
         self.settled = false;
         self.anchor = self.received;
-        self.locked = matches!(&self.layout.framing, Framing::Fixed(fixed) if fixed.has_sync());
+        self.locked = self.layout.begins_locked();
     }
 
     /// The next frame or damaged candidate, or `None` when more bytes are needed.
@@ -181,12 +174,7 @@ impl Decoder {
                 offset,
                 anchor: self.anchor,
             };
-            let scan = match &self.layout.framing {
-                Framing::Fixed(fixed) => fixed.scan(&self.layout, bytes, context),
-                Framing::Text => text::scan(&self.layout, bytes, context),
-                Framing::ZeroRun => zero_run::scan(&self.layout, bytes, context),
-            };
-            match scan {
+            match self.layout.scan(bytes, context) {
                 Scan::Wait => return None,
                 Scan::Skip(count) => self.pass_over(count),
                 Scan::Excess(count) => {
@@ -228,10 +216,6 @@ impl Decoder {
     fn pass_over(&mut self, count: usize) {
         self.start += count;
         self.skipped += count as u64;
-        // A text or run-length frame ends where the dropped one did: there the next begins.
-        self.locked = match &self.layout.framing {
-            Framing::Fixed(_) => false,
-            Framing::Text | Framing::ZeroRun => true,
-        };
+        self.locked = self.layout.ends_with_dropped();
     }
 }

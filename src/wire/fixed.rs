@@ -1,13 +1,14 @@
 //! Frames of one length: `sync, length, cells, checksum, tail`.
 //!
-//! What a candidate needs to be whole depends on what the layout has. A length, checksum or tail
-//! is checked at its place; after a failure the search goes on one byte further, *inside* the
-//! rejected candidate. A layout with none but its header (`jq`) is whole when another header
-//! follows, because the header can stand in the data. A layout with a tail alone is whole when
-//! the tail stands at its place.
+//! What makes a candidate whole depends on the layout. A length, a checksum or a tail is checked at
+//! its place. After a failure the search goes on one byte further, *inside* the rejected candidate. A
+//! frame with nothing but its header (`jq`) is whole when another header follows, because the header
+//! can also occur in the data. A frame with nothing but a tail is whole when the tail is at its place.
 
-use super::decoder::{Context, Scan};
-use super::{Cell, Checksum, Layout, LayoutError, LengthField};
+use super::cells::Cells;
+use super::checksum::Checksum;
+use super::scan::{Context, Scan};
+use super::settings::{Cell, LayoutError, LengthField};
 use crate::frame::RawFrame;
 
 /// What a layout is made of.
@@ -110,9 +111,9 @@ impl Fixed {
         out.extend_from_slice(&self.tail);
     }
 
-    pub(super) fn scan(&self, layout: &Layout, bytes: &[u8], context: Context) -> Scan {
+    pub(super) fn scan(&self, cells: &Cells, bytes: &[u8], context: Context) -> Scan {
         if self.sync.is_empty() {
-            return self.scan_for_tail(layout, bytes, context);
+            return self.scan_for_tail(cells, bytes, context);
         }
         match find(bytes, &self.sync) {
             0 => {}
@@ -128,10 +129,10 @@ impl Fixed {
             return Scan::Wait;
         }
         if self.checksum == Checksum::None && self.tail.is_empty() {
-            return self.scan_for_follower(layout, bytes, context);
+            return self.scan_for_follower(cells, bytes, context);
         }
         if self.ends_well(bytes) {
-            self.whole(layout, bytes)
+            self.whole(cells, bytes)
         } else {
             Scan::Damaged(1)
         }
@@ -145,13 +146,13 @@ impl Fixed {
         tail == self.tail && expected.starts_with(found)
     }
 
-    fn whole(&self, layout: &Layout, bytes: &[u8]) -> Scan {
+    fn whole(&self, cells: &Cells, bytes: &[u8]) -> Scan {
         let mut frame = RawFrame::default();
         let payload = &bytes[self.header.len()..self.header.len() + self.payload_bytes];
         match self.cell {
             Cell::U8 => {
                 for (index, &cell) in payload.iter().enumerate() {
-                    layout.place(&mut frame, index, u16::from(cell));
+                    cells.place(&mut frame, index, u16::from(cell));
                 }
             }
             Cell::U16le | Cell::U16be => {
@@ -162,29 +163,29 @@ impl Fixed {
                     } else {
                         u16::from_be_bytes(pair)
                     };
-                    layout.place(&mut frame, index, cell);
+                    cells.place(&mut frame, index, cell);
                 }
             }
         }
         Scan::Frame(self.total(), frame)
     }
 
-    /// A header and nothing else: whole when another header follows.
-    fn scan_for_follower(&self, layout: &Layout, bytes: &[u8], context: Context) -> Scan {
+    /// A header and nothing else: a frame is whole when another header follows.
+    fn scan_for_follower(&self, cells: &Cells, bytes: &[u8], context: Context) -> Scan {
         match self.is_followed(bytes, context.settled) {
             None => Scan::Wait,
             Some(false) => Scan::Damaged(1),
-            Some(true) if context.locked => self.whole(layout, bytes),
+            Some(true) if context.locked => self.whole(cells, bytes),
             Some(true) => match self.nearest_in_phase(bytes, context) {
                 None => Scan::Wait,
-                Some(0) => self.whole(layout, bytes),
+                Some(0) => self.whole(cells, bytes),
                 Some(skip) => Scan::Skip(skip),
             },
         }
     }
 
-    /// Whether a header, or the settled end of input, stands where the candidate at the front of
-    /// `bytes` ends. `None`: not known yet.
+    /// Whether a header, or the settled end of the input, follows the candidate at the front of
+    /// `bytes`. `None`: not known yet.
     fn is_followed(&self, bytes: &[u8], settled: bool) -> Option<bool> {
         let Some(rest) = bytes.get(self.total()..) else {
             return if settled { Some(false) } else { None };
@@ -228,8 +229,8 @@ impl Fixed {
         Some(best)
     }
 
-    /// A tail and no sync: whole when the tail stands at its place.
-    fn scan_for_tail(&self, layout: &Layout, bytes: &[u8], context: Context) -> Scan {
+    /// A tail and no sync: a frame is whole when the tail is at its place.
+    fn scan_for_tail(&self, cells: &Cells, bytes: &[u8], context: Context) -> Scan {
         let total = self.total();
         let tail_at = total - self.tail.len();
         if self.tail_not_in_cells
@@ -244,9 +245,9 @@ impl Fixed {
             return Scan::Wait;
         }
         if self.ends_well(bytes) {
-            return self.whole(layout, bytes);
+            return self.whole(cells, bytes);
         }
-        // The next place whose tail may stand right.
+        // The next place at which a tail may be.
         lost(1 + find(&bytes[tail_at + 1..], &self.tail), context)
     }
 }
@@ -260,8 +261,8 @@ fn lost(skip: usize, context: Context) -> Scan {
     }
 }
 
-/// Where `mark` first stands in `bytes`, or may yet stand once more bytes come; `bytes.len()`
-/// when nowhere.
+/// Where `mark` first occurs in `bytes`, or where it may begin once more bytes come; `bytes.len()`
+/// if nowhere.
 fn find(bytes: &[u8], mark: &[u8]) -> usize {
     (0..bytes.len())
         .find(|&at| {

@@ -1,10 +1,10 @@
-//! What a `[sensor.frame]` table may say.
+//! The `[sensor.frame]` table, and the ways in which it can be wrong.
 
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use super::Checksum;
+use super::checksum::Checksum;
 
 /// Ready-made layouts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -79,12 +79,17 @@ pub struct Settings {
 #[serde(try_from = "String", into = "String")]
 pub struct HexBytes(pub Vec<u8>);
 
-impl TryFrom<String> for HexBytes {
-    type Error = String;
+/// Text that is no [`HexBytes`].
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("found {0:?}, expected pairs of hex digits such as \"BB AA\"")]
+pub struct HexError(String);
 
-    fn try_from(text: String) -> Result<Self, String> {
+impl TryFrom<String> for HexBytes {
+    type Error = HexError;
+
+    fn try_from(text: String) -> Result<Self, HexError> {
         let digits: String = text.chars().filter(|c| !c.is_whitespace()).collect();
-        let bad = || format!("found {text:?}, expected pairs of hex digits such as \"BB AA\"");
+        let bad = || HexError(text.clone());
         if !digits.len().is_multiple_of(2) || !digits.chars().all(|c| c.is_ascii_hexdigit()) {
             return Err(bad());
         }
@@ -143,4 +148,49 @@ pub enum Order {
     ColumnMajor,
     /// Row by row, every second row from its end.
     Serpentine,
+}
+
+/// Why a `[sensor.frame]` cannot be used. Each names its key.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum LayoutError {
+    /// Array larger than a frame, or empty.
+    #[error("{key}: found {found}, expected 1 to {max}")]
+    Size {
+        /// `rows` or `cols`.
+        key: &'static str,
+        /// As given.
+        found: usize,
+        /// Side of a frame.
+        max: usize,
+    },
+    /// Neither `sync` nor `tail`.
+    #[error("sync: found neither sync nor tail, expected at least one to find frames by")]
+    Unmarked,
+    /// A length field with nothing to find it by.
+    #[error("length: found a length field without sync, expected sync before it")]
+    LengthWithoutSync,
+    /// The cells are too many for the length field.
+    #[error("length: found {found} payload bytes, expected at most {max} for this field")]
+    LengthField {
+        /// Bytes of the cells.
+        found: usize,
+        /// Largest value of the field.
+        max: usize,
+    },
+    /// The mask has bits that the cell has not.
+    #[error("mask: found {found}, expected 1 to {max} for this cell")]
+    Mask {
+        /// As given.
+        found: u16,
+        /// All ones of the cell.
+        max: u16,
+    },
+    /// A key that this preset fixes.
+    #[error("{key}: found a value, expected none: preset {preset} fixes it")]
+    Fixed {
+        /// The key.
+        key: &'static str,
+        /// The preset.
+        preset: Preset,
+    },
 }

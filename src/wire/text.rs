@@ -1,14 +1,15 @@
 //! Frames as text: a row a line, decimals separated by spaces, tabs or commas, LF or CRLF; a
 //! blank line ends the frame.
 
-use super::Layout;
-use super::decoder::{Context, Scan};
+use super::cells::Cells;
+use super::scan::{Context, Scan};
 use crate::frame::{Array, RawFrame};
 
 /// Bytes of the longest frame looked for: every value at its widest with two separators, CRLF
 /// after each row and the blank line.
-pub(super) fn max_frame_bytes(array: Array, mask: u16) -> usize {
-    let digits = mask.to_string().len();
+pub(super) fn max_frame_bytes(cells: &Cells) -> usize {
+    let array = cells.array;
+    let digits = cells.mask.to_string().len();
     array.rows * (array.cols * (digits + 2) + 2) + 2
 }
 
@@ -29,8 +30,8 @@ pub(super) fn encode(cells: impl Iterator<Item = u16>, cols: usize, out: &mut Ve
     out.push(b'\n');
 }
 
-pub(super) fn scan(layout: &Layout, bytes: &[u8], context: Context) -> Scan {
-    let Array { rows, cols } = layout.array();
+pub(super) fn scan(cells: &Cells, bytes: &[u8], context: Context) -> Scan {
+    let Array { rows, cols } = cells.array;
     let mut lines = Lines { bytes, at: 0 };
     // Where the last `rows` lines began, newest last.
     let mut starts = [0; crate::frame::ROWS];
@@ -44,7 +45,7 @@ pub(super) fn scan(layout: &Layout, bytes: &[u8], context: Context) -> Scan {
             continue;
         }
         if count == 0 {
-            // It may be the rest of a line whose beginning was too much to keep: no frame's end.
+            // It may be the rest of a line whose beginning was too long to keep. No frame ends here.
             return Scan::Excess(lines.at);
         }
         let row = if count >= rows {
@@ -53,9 +54,9 @@ pub(super) fn scan(layout: &Layout, bytes: &[u8], context: Context) -> Scan {
             0
         };
         let first = row + row_start(&bytes[row..start], cols);
-        // What is longer would be found or not, by how much of it came at once.
-        let is_short = lines.at - first <= layout.max_frame_bytes();
-        let frame = parse(layout, &bytes[first..start], rows, cols);
+        // Whether a longer frame were found would depend on how many bytes came at once.
+        let is_short = lines.at - first <= max_frame_bytes(cells);
+        let frame = parse(cells, &bytes[first..start], rows, cols);
         return match frame.filter(|_| is_short) {
             Some(_) if first > 0 => Scan::Skip(first),
             Some(frame) => Scan::Frame(lines.at, frame),
@@ -63,7 +64,7 @@ pub(super) fn scan(layout: &Layout, bytes: &[u8], context: Context) -> Scan {
             None => Scan::Skip(lines.at),
         };
     }
-    match bytes.len().checked_sub(layout.max_frame_bytes()) {
+    match bytes.len().checked_sub(max_frame_bytes(cells)) {
         Some(excess) if excess > 0 => Scan::Excess(excess),
         _ => Scan::Wait,
     }
@@ -95,7 +96,7 @@ fn row_start(text: &[u8], cols: usize) -> usize {
     start + strange.map_or(0, |strange| strange + 1)
 }
 
-fn parse(layout: &Layout, text: &[u8], rows: usize, cols: usize) -> Option<RawFrame> {
+fn parse(cells: &Cells, text: &[u8], rows: usize, cols: usize) -> Option<RawFrame> {
     let mut frame = RawFrame::default();
     let mut index = 0;
     for line in (Lines { bytes: text, at: 0 }) {
@@ -107,7 +108,7 @@ fn parse(layout: &Layout, text: &[u8], rows: usize, cols: usize) -> Option<RawFr
             if index == row_end || index == rows * cols {
                 return None;
             }
-            layout.place(&mut frame, index, decimal(token)?);
+            cells.place(&mut frame, index, decimal(token)?);
             index += 1;
         }
         if index != row_end {

@@ -1,8 +1,8 @@
 //! Frames with their zeros packed: 1..254 is a value, `00 n` a run of n = 1..254 zeros, `FF`
 //! ends the frame.
 
-use super::Layout;
-use super::decoder::{Context, Scan};
+use super::cells::Cells;
+use super::scan::{Context, Scan};
 use crate::frame::RawFrame;
 
 const END: u8 = 0xFF;
@@ -15,8 +15,8 @@ pub(super) fn max_frame_bytes(cells: usize) -> usize {
     2 * cells + 1
 }
 
-/// Bytes of the shortest frame: runs of zeros as long as may be, and the end. What is left for the
-/// last run may be one value.
+/// Bytes of the shortest frame: the longest runs of zeros that there are, and the end. The rest may
+/// be one value.
 pub(super) fn min_frame_bytes(cells: usize) -> usize {
     let full_runs = cells / usize::from(MAX_RUN);
     let rest = (cells % usize::from(MAX_RUN)).min(2);
@@ -46,19 +46,19 @@ pub(super) fn encode(cells: impl Iterator<Item = u16>, out: &mut Vec<u8>) {
     out.push(END);
 }
 
-pub(super) fn scan(layout: &Layout, bytes: &[u8], context: Context) -> Scan {
-    let longest = layout.max_frame_bytes();
+pub(super) fn scan(cells: &Cells, bytes: &[u8], context: Context) -> Scan {
+    let longest = max_frame_bytes(cells.count());
     let Some(end) = bytes.iter().position(|&byte| byte == END) else {
         return match bytes.len().checked_sub(longest) {
             Some(excess) if excess > 0 => Scan::Excess(excess),
             _ => Scan::Wait,
         };
     };
-    // Noise may stand right before a whole frame: the frame is the longest run of bytes before
+    // Noise may be right before a whole frame: the frame is the longest run of bytes before
     // the end that unpacks to exactly its cells.
     let first = (end + 1).saturating_sub(longest);
     for start in first..end {
-        if let Some(frame) = unpack(layout, &bytes[start..end]) {
+        if let Some(frame) = unpack(cells, &bytes[start..end]) {
             return if start == 0 {
                 Scan::Frame(end + 1, frame)
             } else {
@@ -73,8 +73,8 @@ pub(super) fn scan(layout: &Layout, bytes: &[u8], context: Context) -> Scan {
     }
 }
 
-fn unpack(layout: &Layout, packed: &[u8]) -> Option<RawFrame> {
-    let cells = layout.places.len();
+fn unpack(cells: &Cells, packed: &[u8]) -> Option<RawFrame> {
+    let count = cells.count();
     let mut frame = RawFrame::default();
     let mut index = 0;
     let mut bytes = packed.iter();
@@ -84,13 +84,13 @@ fn unpack(layout: &Layout, packed: &[u8]) -> Option<RawFrame> {
         } else {
             1
         };
-        if run == 0 || index + run > cells {
+        if run == 0 || index + run > count {
             return None;
         }
         for _ in 0..run {
-            layout.place(&mut frame, index, u16::from(byte));
+            cells.place(&mut frame, index, u16::from(byte));
             index += 1;
         }
     }
-    (index == cells).then_some(frame)
+    (index == count).then_some(frame)
 }

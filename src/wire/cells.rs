@@ -1,0 +1,72 @@
+//! The cells of a frame: how a number on the wire becomes a taxel's count, and where the taxel is.
+
+use super::settings::Order;
+use crate::frame::{Array, RawFrame};
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Cells {
+    pub(super) array: Array,
+    pub(super) mask: u16,
+    pub(super) invert: bool,
+    /// The largest number that a cell can hold.
+    pub(super) largest: u16,
+    /// Wire position of a taxel -> its place in the frame.
+    places: Vec<u16>,
+}
+
+impl Cells {
+    pub(super) fn new(array: Array, order: Order, mask: u16, invert: bool, largest: u16) -> Self {
+        Self {
+            array,
+            mask,
+            invert,
+            largest,
+            places: places(array, order),
+        }
+    }
+
+    /// How many there are.
+    pub(super) fn count(&self) -> usize {
+        self.places.len()
+    }
+
+    /// Puts the `index`-th cell on the wire where its taxel is.
+    pub(super) fn place(&self, frame: &mut RawFrame, index: usize, cell: u16) {
+        let masked = cell & self.mask;
+        frame.counts[usize::from(self.places[index])] = if self.invert {
+            self.mask - masked
+        } else {
+            masked
+        };
+    }
+
+    /// The cells of `frame` in the order of the wire.
+    pub(super) fn of(&self, frame: &RawFrame) -> impl Iterator<Item = u16> {
+        self.places.iter().map(|&place| {
+            let count = frame.counts[usize::from(place)].min(self.mask);
+            let cell = if self.invert {
+                self.mask - count
+            } else {
+                count
+            };
+            cell.min(self.largest)
+        })
+    }
+}
+
+fn places(array: Array, order: Order) -> Vec<u16> {
+    let Array { rows, cols } = array;
+    (0..rows * cols)
+        .map(|index| {
+            let (row, col) = match order {
+                Order::RowMajor => (index / cols, index % cols),
+                Order::ColumnMajor => (index % rows, index / rows),
+                Order::Serpentine if (index / cols).is_multiple_of(2) => {
+                    (index / cols, index % cols)
+                }
+                Order::Serpentine => (index / cols, cols - 1 - index % cols),
+            };
+            u16::try_from(array.place(row, col)).expect("a frame has 784 places")
+        })
+        .collect()
+}
