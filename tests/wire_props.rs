@@ -397,6 +397,8 @@ fn what_stands_right_before_an_ascii_frame_costs_it_nothing() {
         b"abc".as_slice(),
         b"\xFE\xFD",
         b"noise, 3 x",
+        b"5x",
+        b"12\xFF7-",
         &first[..after_space(300)],
         &first[..after_space(1500)],
     ] {
@@ -612,6 +614,24 @@ proptest! {
         let layout = layout(PRESETS[preset]);
         let whole = decode(&layout, [bytes.as_slice()]);
         prop_assert_eq!(decode(&layout, bytes.chunks(chunk)), whole);
+    }
+
+    #[test]
+    fn an_ascii_frame_survives_any_noise_before_it_that_does_not_end_with_a_digit(
+        noise in proptest::collection::vec(any::<u8>(), 0..40),
+        last in any::<u8>().prop_filter("a digit is part of the first cell", |b| !b.is_ascii_digit()),
+        seed in any::<u64>(),
+        chunk in 1_usize..100,
+    ) {
+        let layout = layout(Preset::Ascii);
+        let sent = frames(seed, 2);
+        let mut bytes = encode(&layout, &sent[..1]);
+        bytes.extend(noise);
+        bytes.push(last);
+        layout.encode(&sent[1], &mut bytes);
+        let (found, _) = decode(&layout, bytes.chunks(chunk));
+        prop_assert_eq!(found.first(), Some(&sent[0]));
+        prop_assert_eq!(found.last(), Some(&sent[1]));
     }
 
     #[test]

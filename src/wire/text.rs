@@ -74,8 +74,13 @@ fn is_separator(byte: u8) -> bool {
     matches!(byte, b' ' | b'\t' | b',' | b'\r')
 }
 
-/// Where the row begins that ends the first line of `text`: what is left of a damaged frame, or
-/// noise, may stand right before it.
+/// Where the row begins that ends the first line of `text`. Noise, or the rest of a damaged frame,
+/// may be right before it.
+///
+/// No cell has a byte that is not a digit. So the row begins after the last such byte of its first
+/// token, and the bytes before that are noise. It might also be damage: `5x12` may be noise `5x` before
+/// a cell of 12, or a cell of 5012 with a wrong byte. These bytes hold a whole frame either way, and
+/// a frame that is whole in the bytes is never lost.
 fn row_start(text: &[u8], cols: usize) -> usize {
     let end = text.iter().position(|&byte| byte == b'\n');
     let line = &text[..end.unwrap_or(text.len())];
@@ -87,13 +92,14 @@ fn row_start(text: &[u8], cols: usize) -> usize {
         let before = line[..last].iter().rposition(|&byte| is_separator(byte));
         start = before.map_or(0, |before| before + 1);
     }
-    if line[..start].iter().all(|&byte| is_separator(byte)) && line[start].is_ascii_digit() {
-        return 0;
-    }
     let token = line[start..].iter().position(|&byte| is_separator(byte));
     let token = &line[start..token.map_or(line.len(), |length| start + length)];
-    let strange = token.iter().rposition(|byte| !byte.is_ascii_digit());
-    start + strange.map_or(0, |strange| strange + 1)
+    match token.iter().rposition(|byte| !byte.is_ascii_digit()) {
+        Some(strange) => start + strange + 1,
+        // Separators before the first cell are the frame's own.
+        None if line[..start].iter().all(|&byte| is_separator(byte)) => 0,
+        None => start,
+    }
 }
 
 fn parse(cells: &Cells, text: &[u8], rows: usize, cols: usize) -> Option<RawFrame> {
