@@ -10,7 +10,8 @@ use divan::Bencher;
 use divan::counter::{BytesCount, ItemsCount};
 use hardnessd::event::{Event, Phase};
 use hardnessd::frame::{Frame, Stamp};
-use hardnessd::pipeline::{Clock, Criteria, Pipeline, Settings};
+use hardnessd::pipeline::{Clock, Pipeline};
+use hardnessd::sensor::{Description, Sensor};
 use hardnessd::verdict::{BUILT_IN, Hrn};
 use hardnessd::wire::{self, Decoder, Layout};
 
@@ -35,13 +36,8 @@ fn hrn() -> Arc<Hrn> {
 }
 
 fn pipeline(hrn: &Arc<Hrn>) -> Pipeline {
-    let settings = Settings {
-        sensor: "sensor".to_owned(),
-        frame_rate_hz: 5.0,
-        layout: layout(),
-        criteria: Criteria::new(Arc::clone(hrn)),
-    };
-    Pipeline::new(settings, Clock::FrameRate)
+    let sensor = Sensor::new(Description::default()).expect("the default is a sensor");
+    Pipeline::new(sensor, Arc::clone(hrn), Clock::FrameRate)
 }
 
 /// Bytes to frames.

@@ -12,10 +12,10 @@ use std::time::Duration;
 
 use hardnessd::event::{Event, Hardness, Phase, PressState};
 use hardnessd::frame::Stamp;
-use hardnessd::pipeline::{Clock, Criteria, Pipeline, Settings};
+use hardnessd::pipeline::{Clock, Pipeline};
+use hardnessd::sensor::{Description, Sensor};
 use hardnessd::simulator::{Material, Sequence, SequenceSettings};
 use hardnessd::verdict::{BUILT_IN, Hrn};
-use hardnessd::wire::{self, Layout};
 
 const SEED: u64 = 1;
 /// Of a press's greatest force: from here on it no longer rises.
@@ -72,14 +72,13 @@ impl Press {
 }
 
 fn measure(sequence: Sequence, frame_rate_hz: f64, hrn: &Arc<Hrn>) -> Vec<Press> {
-    let layout = Layout::new(&wire::Settings::default()).expect("the default is a layout");
-    let settings = Settings {
-        sensor: "sensor".to_owned(),
+    let described = Description {
         frame_rate_hz,
-        layout: layout.clone(),
-        criteria: Criteria::new(Arc::clone(hrn)),
+        ..Description::default()
     };
-    let mut pipeline = Pipeline::new(settings, Clock::FrameRate);
+    let sensor = Sensor::new(described).expect("a sensor may have such a rate");
+    let layout = sensor.layout().clone();
+    let mut pipeline = Pipeline::new(sensor, Arc::clone(hrn), Clock::FrameRate);
     let mut presses: Vec<Press> = Vec::new();
     let mut bytes = Vec::new();
     for (index, frame) in sequence.enumerate() {

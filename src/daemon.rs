@@ -50,7 +50,7 @@ use self::serial::Link;
 use crate::event::{Hello, ModelCard, PROTOCOL, SensorCard, Status};
 use crate::frame::Stamp;
 use crate::pipeline::{Clock, Pipeline};
-use crate::recording::{About, Labels};
+use crate::recording::{About, Labels, RecordedSensor};
 
 /// How long subscribers may take to fetch their last lines: the daemon must be gone within 1 s.
 const FAREWELL: Duration = Duration::from_millis(300);
@@ -215,15 +215,16 @@ fn start_sensors(
 ) -> (Sensors, JoinSet<()>) {
     let mut tasks = JoinSet::new();
     let mut sensors = Vec::new();
-    for (index, sensor) in setup.config.sensors.iter().enumerate() {
+    let ports = setup.config.sensors.iter();
+    for (index, (port, sensor)) in ports.zip(&setup.sensors).enumerate() {
         let (commands, inbox) = mpsc::channel(QUESTIONS);
-        let pipeline = Pipeline::new(setup.pipeline(sensor), Clock::Arrival);
-        let link = Link::new(&sensor.port, sensor.baud);
+        let pipeline = Pipeline::new(sensor.clone(), setup.hrn.clone(), Clock::Arrival);
+        let link = Link::new(&port.port, port.baud);
         let recorder = recorder.map_or(SensorRecorder::default(), |recorder| {
-            recorder.of_sensor(index, setup.recorded(sensor))
+            recorder.of_sensor(index)
         });
         tasks.spawn(sensor::serve(pipeline, link, recorder, hub.clone(), inbox));
-        let name = sensor.name.clone();
+        let name = port.name.clone();
         sensors.push(Sensor { name, commands });
     }
     (Sensors(sensors), tasks)
@@ -296,10 +297,11 @@ impl Running {
         self.hub
             .describe(hello(&self.setup, self.run.clone()))
             .await;
-        for (sensor, settings) in self.sensors.0.iter().zip(&self.setup.config.sensors) {
-            let criteria = Box::new(self.setup.criteria(settings));
+        for (sensor, changed) in self.sensors.0.iter().zip(&self.setup.sensors) {
+            let changed = Box::new(changed.clone());
+            let command = Command::Reload(changed, self.setup.hrn.clone());
             // The main loop notices a sensor whose task has ended.
-            let _ = sensor.commands.send(Command::Reload(criteria)).await;
+            let _ = sensor.commands.send(command).await;
         }
         info!(model = short(&self.setup), "reloaded");
     }
@@ -378,14 +380,16 @@ fn short(setup: &Setup) -> &str {
 }
 
 fn about(setup: &Setup, hello: &Hello) -> About {
-    let sensors = setup.config.sensors.iter();
+    let sensors = setup.sensors.iter();
     About {
         robot: hello.robot.clone(),
         run: hello.run.clone(),
         boot_id: hello.boot_id.clone(),
         reason: None,
         labels: Labels::new(),
-        sensors: sensors.map(|sensor| setup.recorded(sensor)).collect(),
+        sensors: sensors
+            .map(|sensor| RecordedSensor::new(sensor, &setup.hrn))
+            .collect(),
     }
 }
 
@@ -402,12 +406,13 @@ fn hello(setup: &Setup, run: String) -> Hello {
         boot_id: boot_id.trim_end().to_owned(),
         seq: 0,
         sensors: setup
-            .pipelines()
-            .map(|settings| SensorCard {
-                rows: settings.layout.array().rows,
-                cols: settings.layout.array().cols,
-                pitch_mm: settings.criteria.calibration.pitch_mm,
-                name: settings.sensor,
+            .sensors
+            .iter()
+            .map(|sensor| SensorCard {
+                name: sensor.name().to_owned(),
+                rows: sensor.layout().array().rows,
+                cols: sensor.layout().array().cols,
+                pitch_mm: sensor.description().calibration.pitch_mm,
             })
             .collect(),
         model: ModelCard {

@@ -1,8 +1,8 @@
 //! What subscribers read: one JSON object a line, protocol 1.
 //!
-//! The published format has its one home here. Fields may be added within a protocol version but
-//! never change meaning, and the order of fields is part of the golden bytes. Nothing here
-//! decides anything: the pipeline fills these in, the hub numbers and publishes them.
+//! The published format is defined here alone. Within a protocol version, fields may be added but
+//! never change their meaning. The order of fields is part of the golden bytes. Nothing here decides
+//! anything: the pipeline fills events in, the hub numbers and publishes them.
 
 mod reply;
 
@@ -17,14 +17,8 @@ use crate::frame::{COLS, ROWS};
 /// Version of the format, announced in `hello`.
 pub const PROTOCOL: u32 = 1;
 
-/// A context is shorter, written as JSON without spaces.
+/// A context is shorter than this, written as JSON without spaces.
 pub const CONTEXT_BYTES: usize = 1024;
-
-/// Whether a sensor may be called so: `[a-z][a-z0-9_]*`.
-pub fn is_sensor_name(name: &str) -> bool {
-    let part = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
-    name.starts_with(|first: char| first.is_ascii_lowercase()) && name.chars().all(part)
-}
 
 /// A numbered or live event of one sensor.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -57,7 +51,7 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// All there are.
+    /// Every kind.
     pub const ALL: [Kind; 4] = [Kind::Status, Kind::Press, Kind::Hardness, Kind::Frame];
 
     /// The `type` of its events.
@@ -97,7 +91,7 @@ impl Event {
         }
     }
 
-    /// Gives the event its place in the run. A `frame` has none and is left as it is.
+    /// Gives the event its number in the run. A `frame` has none and stays as it is.
     pub fn number(&mut self, seq: u64) {
         match self {
             Event::Status(event) => event.seq = Some(seq),
@@ -107,7 +101,7 @@ impl Event {
         }
     }
 
-    /// Its place in the run, once it has one.
+    /// Its number in the run, once it has one.
     pub fn seq(&self) -> Option<u64> {
         match self {
             Event::Status(event) => event.seq,
@@ -131,7 +125,7 @@ pub enum LinkState {
     Connecting,
     /// Frames arrive.
     Live,
-    /// Open, and 2.5 periods without a frame.
+    /// Open, and silent for too long.
     Stale,
     /// Was open and is gone.
     Lost,
@@ -155,7 +149,7 @@ pub struct Status {
     pub time: Timestamp,
     /// State of the link.
     pub state: LinkState,
-    /// Why, where there is something to say.
+    /// Why the link is in this state, if that says more.
     pub reason: Option<String>,
     /// Whole frames since start.
     pub frames: u64,
@@ -340,8 +334,8 @@ fn line<T: Serialize>(value: &T) -> String {
     text
 }
 
-/// The name under which a state, phase or note is published: the log, the metrics and recordings use it
-/// too.
+/// The name under which a state, phase or note is published. The log, the metrics and recordings use
+/// it too.
 pub(crate) fn name(state: &impl Serialize) -> String {
     match serde_json::to_value(state) {
         Ok(serde_json::Value::String(name)) => name,

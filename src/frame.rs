@@ -1,7 +1,7 @@
 //! One instant of the sensor: 28x28 taxels, row-major.
 //!
-//! [`RawFrame`] is in counts, as it came off the wire; [`Frame`] is in newtons, after tare and
-//! dead-taxel replacement. Only `tare` makes the second from the first, so raw counts cannot
+//! A [`RawFrame`] is in counts, as it came off the wire. A [`Frame`] is in newtons, after tare and
+//! with dead taxels replaced. Only `tare` makes the second from the first, so raw counts cannot
 //! reach the press tracker.
 
 use serde::{Deserialize, Serialize};
@@ -28,7 +28,7 @@ impl Default for RawFrame {
     }
 }
 
-/// The sum and the peak: 784 numbers in a log or a failed assertion help nobody.
+/// Prints the sum and the peak: 784 numbers in a log or a failed assertion help nobody.
 impl std::fmt::Debug for RawFrame {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let sum: u32 = self.counts.iter().map(|&count| u32::from(count)).sum();
@@ -41,6 +41,21 @@ impl std::fmt::Debug for RawFrame {
 }
 
 /// A frame in newtons.
+///
+/// # Example
+///
+/// ```
+/// use hardnessd::frame::{Frame, TAXELS};
+///
+/// let mut newtons = vec![0.0; TAXELS];
+/// newtons[100..104].fill(0.5);
+/// let frame = Frame::try_from(newtons)?;
+/// assert_eq!(frame.contact_area_taxels(0.07), 4);
+/// assert_eq!(frame.force_n(), 2.0);
+///
+/// assert!(Frame::try_from(vec![0.0; 100]).is_err());
+/// # Ok::<(), hardnessd::frame::FrameError>(())
+/// ```
 #[derive(Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Vec<f32>", into = "Vec<f32>")]
 pub struct Frame {
@@ -72,21 +87,32 @@ impl From<Frame> for Vec<f32> {
     }
 }
 
-impl TryFrom<Vec<f32>> for Frame {
-    type Error = String;
+/// Numbers that are no frame.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum FrameError {
+    /// A force that no taxel bears.
+    #[error("found {0} N at a taxel, expected 0 or more")]
+    Newtons(f32),
+    /// Too many taxels, or too few.
+    #[error("found {0} taxels, expected {TAXELS}")]
+    Length(usize),
+}
 
-    fn try_from(newtons: Vec<f32>) -> Result<Self, String> {
-        if let Some(found) = newtons.iter().find(|&&n| !n.is_finite() || n < 0.0) {
-            return Err(format!("found {found} N at a taxel, expected 0 or more"));
+impl TryFrom<Vec<f32>> for Frame {
+    type Error = FrameError;
+
+    fn try_from(newtons: Vec<f32>) -> Result<Self, FrameError> {
+        if let Some(&found) = newtons.iter().find(|&&n| !n.is_finite() || n < 0.0) {
+            return Err(FrameError::Newtons(found));
         }
-        newtons
-            .try_into()
-            .map(|newtons| Self { newtons })
-            .map_err(|found: Vec<f32>| format!("found {} taxels, expected {TAXELS}", found.len()))
+        match newtons.try_into() {
+            Ok(newtons) => Ok(Self { newtons }),
+            Err(found) => Err(FrameError::Length(Vec::len(&found))),
+        }
     }
 }
 
-/// A value a taxel as a list, for `#[serde(with)]`: serde itself knows no arrays of this length.
+/// One value a taxel, as a list, for `#[serde(with)]`: serde itself knows no arrays of this length.
 pub(crate) mod taxels {
     use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error};
 
@@ -125,7 +151,19 @@ impl Frame {
     }
 }
 
-/// The sensor's own array and where it sits in a frame: at offset floor((28 - n) / 2).
+/// The sensor's own array. In a frame it is centred: at offset floor((28 - n) / 2).
+///
+/// # Example
+///
+/// ```
+/// use hardnessd::frame::{Array, COLS};
+///
+/// let array = Array { rows: 10, cols: 12 };
+/// let place = array.place(0, 0);
+/// assert_eq!((place / COLS, place % COLS), (9, 8));
+/// assert_eq!(array.position(place), Some((0, 0)));
+/// assert_eq!(array.position(0), None);
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Array {
     /// Rows of the array, 1 to [`ROWS`].
@@ -160,8 +198,8 @@ impl Array {
     }
 }
 
-/// When something came, on the two clocks that matter: one that never jumps, for durations, and
-/// the calendar, for people.
+/// When something came, on two clocks: one that never jumps, for durations, and the calendar, for
+/// people.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Stamp {
     /// CLOCK_MONOTONIC.

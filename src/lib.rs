@@ -11,6 +11,7 @@ pub mod wording;
 pub mod wire;
 pub mod tare;
 pub mod press;
+pub mod sensor;
 pub mod verdict;
 pub mod event;
 mod ros;

@@ -1,13 +1,11 @@
-//! All of the core in a row, for one sensor: bytes and the moment they came go in, events come
-//! out.
+//! The whole core, for one sensor: bytes and the moment they came go in, events come out.
 //!
 //! It owns the sensor's numbers (frames, presses, damage) and its link state, which go on over
 //! reconnects. It never waits, never logs and never asks the time: [`Pipeline::deadline`] says
-//! when it wants to be told that time has passed.
+//! when it must be told that time has passed.
 
 mod events;
 mod link;
-mod retare;
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -17,55 +15,13 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
 use self::link::Link;
-pub(crate) use self::link::STALE_PERIODS;
-pub use self::retare::RetareError;
 use crate::event::{self, Event, FrameEvent, LinkState, Phase, Tared};
 use crate::frame::{RawFrame, Stamp};
 use crate::press::{self, Abort, Moment, PressTracker};
-use crate::tare::{self, Contact, Offsets, Tare};
+use crate::sensor::Sensor;
+use crate::tare::{self, Aim, Contact, Offsets, RetareError, Tare};
 use crate::verdict::{Hrn, ModelError};
-use crate::wire::{self, Decoded, Decoder, Layout};
-
-/// What a pipeline is made for.
-#[derive(Debug, Clone)]
-pub struct Settings {
-    /// Name of the sensor.
-    pub sensor: String,
-    /// Expected rate.
-    pub frame_rate_hz: f64,
-    /// How its frames are written.
-    pub layout: Layout,
-    /// The parts that may change while it runs.
-    pub criteria: Criteria,
-}
-
-/// The part of the settings that a reload may change.
-#[derive(Debug, Clone)]
-pub struct Criteria {
-    /// Counts to newtons.
-    pub calibration: tare::Settings,
-    /// What a press is.
-    pub press: press::Settings,
-    /// A verdict below this confidence is rejected.
-    pub min_confidence: f32,
-    /// A verdict on less force is rejected.
-    pub min_force_n: f64,
-    /// Who judges.
-    pub hrn: Arc<Hrn>,
-}
-
-impl Criteria {
-    /// `hrn` judges, with default settings, and rejects nothing.
-    pub fn new(hrn: Arc<Hrn>) -> Self {
-        Self {
-            calibration: tare::Settings::default(),
-            press: press::Settings::default(),
-            min_confidence: 0.0,
-            min_force_n: 0.0,
-            hrn,
-        }
-    }
-}
+use crate::wire::{self, Decoded, Decoder};
 
 /// Where the times of frames come from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -76,7 +32,15 @@ pub enum Clock {
     FrameRate,
 }
 
-/// A verdict that was due and did not come: the model failed.
+/// A changed description that a running pipeline cannot take over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("{key}: found another value, expected the one it started with")]
+pub struct FixedError {
+    /// The key that differs.
+    pub key: &'static str,
+}
+
+/// A verdict that was due, but the model failed.
 #[derive(Debug)]
 pub struct Unjudged {
     /// Name of the sensor.
@@ -89,25 +53,21 @@ pub struct Unjudged {
     pub error: ModelError,
 }
 
-/// The measured rate is that over so many frames.
+/// The rate is measured over this many frames.
 const RATE_FRAMES: usize = 32;
 
 /// The state of one sensor.
 #[derive(Debug)]
 pub struct Pipeline {
-    sensor: String,
-    period: Duration,
-    frame_rate_hz: f64,
+    sensor: Sensor,
+    hrn: Arc<Hrn>,
     clock: Clock,
     decoder: Decoder,
     tare: Tare,
     tracker: PressTracker,
-    criteria: Criteria,
     seen: Seen,
     /// When the last of the bytes came that are being decoded.
     arrival: Duration,
-    /// What became of a tare that was asked for, until it is fetched.
-    retared: Option<Result<Tared, RetareError>>,
     /// Verdicts that did not come, until they are fetched.
     unjudged: Vec<Unjudged>,
 }
@@ -116,9 +76,6 @@ pub struct Pipeline {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Seen {
     link: Link,
-    tare_met_contact: bool,
-    /// The offsets before the tare that was asked for and is being taken.
-    retaring: Option<Offsets>,
     context: Option<serde_json::Value>,
     frames: u64,
     frames_damaged: u64,
@@ -132,14 +89,26 @@ struct Seen {
     told: (LinkState, Option<String>),
 }
 
-/// All that a pipeline has seen, without its settings: one of the same settings that recalls it
-/// goes on as the first would, event for event. Recordings begin with it.
+/// Everything that a pipeline has seen. A pipeline of the same sensor that recalls it gives the same
+/// events from there on. Recordings begin with it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Memory {
     decoder: wire::Memory,
     tare: tare::Memory,
     tracker: press::Memory,
-    pipeline: Seen,
+    pipeline: Noted,
+}
+
+/// What the pipeline itself knows of the past, as recordings hold it. They also hold here, and have
+/// always held here, what the tare under way is for.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Noted {
+    /// It is the first, and something touched the sensor at an earlier try.
+    tare_met_contact: bool,
+    /// It was asked for, when these offsets were in force.
+    retaring: Option<Offsets>,
+    #[serde(flatten)]
+    seen: Seen,
 }
 
 impl Memory {
@@ -151,7 +120,7 @@ impl Memory {
             recent,
             context,
             ..
-        } = &self.pipeline;
+        } = &self.pipeline.seen;
         let is_context = |context: &serde_json::Value| {
             context.is_object() && context.to_string().len() < event::CONTEXT_BYTES
         };
@@ -165,36 +134,54 @@ impl Memory {
 
     /// What the controller had said it was doing.
     pub(crate) fn context(&self) -> Option<&serde_json::Value> {
-        self.pipeline.context.as_ref()
+        self.pipeline.seen.context.as_ref()
     }
 }
 
 impl Pipeline {
-    /// A pipeline whose port has not been opened.
-    pub fn new(settings: Settings, clock: Clock) -> Self {
-        let Settings {
-            sensor,
-            frame_rate_hz,
-            layout,
-            criteria,
-        } = settings;
+    /// A pipeline of a sensor whose port has not been opened; `hrn` judges.
+    ///
+    /// # Example
+    ///
+    /// One frame goes in. Out come a status (the sensor is live) and the frame.
+    ///
+    /// ```
+    /// use std::sync::Arc;
+    /// use std::time::Duration;
+    ///
+    /// use hardnessd::event::Kind;
+    /// use hardnessd::frame::{RawFrame, Stamp};
+    /// use hardnessd::pipeline::{Clock, Pipeline};
+    /// use hardnessd::sensor::{Description, Sensor};
+    /// use hardnessd::verdict::{BUILT_IN, Hrn};
+    ///
+    /// let sensor = Sensor::new(Description::default())?;
+    /// let mut bytes = Vec::new();
+    /// sensor.layout().encode(&RawFrame::default(), &mut bytes);
+    ///
+    /// let mut pipeline = Pipeline::new(sensor, Arc::new(Hrn::load(BUILT_IN)?), Clock::Arrival);
+    /// let at = Stamp {
+    ///     mono: Duration::from_secs(1),
+    ///     wall: jiff::Timestamp::UNIX_EPOCH,
+    /// };
+    /// assert!(pipeline.opened(at).is_empty());
+    /// let kinds: Vec<Kind> = pipeline.push(&bytes, at).iter().map(|event| event.kind()).collect();
+    /// assert_eq!(kinds, [Kind::Status, Kind::Frame]);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    pub fn new(sensor: Sensor, hrn: Arc<Hrn>, clock: Clock) -> Self {
+        let described = sensor.description();
+        let layout = sensor.layout();
         Self {
-            sensor,
-            period: Duration::from_secs_f64(1.0 / frame_rate_hz),
-            frame_rate_hz,
-            clock,
             tare: Tare::new(
-                &criteria.calibration,
+                &described.calibration,
                 layout.array(),
-                contact(&criteria.press),
+                contact(&described.press),
             ),
-            tracker: PressTracker::new(criteria.press.clone()),
-            decoder: Decoder::new(layout),
-            criteria,
+            tracker: PressTracker::new(described.press.clone()),
+            decoder: Decoder::new(layout.clone()),
             seen: Seen {
                 link: Link::Closed { reason: None },
-                tare_met_contact: false,
-                retaring: None,
                 context: None,
                 frames: 0,
                 frames_damaged: 0,
@@ -204,61 +191,116 @@ impl Pipeline {
                 last_frame: None,
                 told: (LinkState::Connecting, None),
             },
+            sensor,
+            hrn,
+            clock,
             arrival: Duration::ZERO,
-            retared: None,
             unjudged: Vec::new(),
         }
     }
 
     /// All it has seen.
     pub fn memory(&self) -> Memory {
+        let aim = self.tare.aim();
         Memory {
             decoder: self.decoder.memory(),
             tare: self.tare.memory(),
             tracker: self.tracker.memory(),
-            pipeline: self.seen.clone(),
+            pipeline: Noted {
+                tare_met_contact: aim == Some(Aim::First { met_contact: true }),
+                retaring: (aim == Some(Aim::Request)).then(|| self.tare.offsets()),
+                seen: self.seen.clone(),
+            },
         }
     }
 
-    /// Goes on where the one of the same settings stood whose memory this is.
+    /// Goes on where the pipeline stood whose memory this is. It is one of the same sensor.
     pub fn recall(&mut self, memory: Memory) {
+        let Noted {
+            tare_met_contact: met_contact,
+            retaring,
+            seen,
+        } = memory.pipeline;
+        let aim = match retaring {
+            Some(_) => Aim::Request,
+            None => Aim::First { met_contact },
+        };
         self.decoder.recall(memory.decoder);
-        self.tare.recall(memory.tare);
+        self.tare.recall(memory.tare, aim);
         self.tracker.recall(memory.tracker);
-        self.seen = memory.pipeline;
-        self.retared = None;
+        self.seen = seen;
     }
 
-    /// Whole frames and damaged ones since the start.
+    /// Counts whole frames and damaged ones since the start.
     pub fn frame_counts(&self) -> (u64, u64) {
         (self.seen.frames, self.seen.frames_damaged)
     }
 
-    /// Takes over changed settings at once. The baseline and a press under way stay.
-    pub fn reload(&mut self, criteria: Criteria) {
-        if criteria.calibration.tare_frames == 0 {
-            self.abandon_retare(RetareError::NoFrames);
-            self.seen.tare_met_contact = false;
+    /// Takes over a changed description of the sensor, and the model that judges from now on. The
+    /// baseline and a press under way stay.
+    ///
+    /// # Errors
+    ///
+    /// If the description differs in what cannot change while it runs. Nothing has changed then.
+    pub fn reload(&mut self, sensor: Sensor, hrn: Arc<Hrn>) -> Result<(), FixedError> {
+        let described = sensor.description();
+        if let Some(key) = self.sensor.description().fixed_difference(described) {
+            return Err(FixedError { key });
         }
         self.tare
-            .reload(&criteria.calibration, contact(&criteria.press));
-        self.tracker.reload(criteria.press.clone());
-        self.criteria = criteria;
+            .reload(&described.calibration, contact(&described.press));
+        self.tracker.reload(described.press.clone());
+        self.sensor = sensor;
+        self.hrn = hrn;
+        Ok(())
     }
 
-    /// What the controller says it is doing: echoed in presses and verdicts until it changes.
+    /// Takes another tare from the next frames on; [`Self::retared`] says what became of it. It is
+    /// taken too when a press has timed out and is not released: that mends a drift which looks
+    /// like a press.
+    ///
+    /// # Errors
+    ///
+    /// If one cannot be taken now: see [`RetareError`]. Nothing has changed then.
+    pub fn retare(&mut self) -> Result<(), RetareError> {
+        if self.tracker.is_pressed() {
+            return Err(RetareError::Pressed);
+        }
+        if !matches!(self.seen.link, Link::Live { .. }) {
+            return Err(RetareError::NotLive);
+        }
+        self.tare.retake()
+    }
+
+    /// What became of a tare that was asked for, once.
+    pub fn retared(&mut self) -> Option<Result<Tared, RetareError>> {
+        let sensor = self.sensor.name();
+        let tared = |tare::Retaken { old, new }| Tared {
+            sensor: sensor.to_owned(),
+            old,
+            new,
+        };
+        self.tare.ended().map(|outcome| outcome.map(tared))
+    }
+
+    /// Takes what the controller says it is doing. Presses and verdicts echo it until it changes.
     pub fn set_context(&mut self, context: Option<serde_json::Value>) {
         self.seen.context = context;
     }
 
-    /// Verdicts that did not come, each told once.
+    /// Gives the verdicts that did not come, each once.
     pub fn unjudged(&mut self) -> Vec<Unjudged> {
         std::mem::take(&mut self.unjudged)
     }
 
-    /// Name of the sensor.
-    pub fn sensor(&self) -> &str {
+    /// The sensor, as it is now.
+    pub fn sensor(&self) -> &Sensor {
         &self.sensor
+    }
+
+    /// The model that judges now.
+    pub fn hrn(&self) -> &Arc<Hrn> {
+        &self.hrn
     }
 
     /// When the last whole frame came.
@@ -266,12 +308,7 @@ impl Pipeline {
         self.seen.last_frame
     }
 
-    /// What may change while it runs, as it is now.
-    pub fn criteria(&self) -> &Criteria {
-        &self.criteria
-    }
-
-    /// The port is open: what comes next does not continue what came before.
+    /// The port is open. The next bytes do not continue those that came before.
     pub fn opened(&mut self, at: Stamp) -> Vec<Event> {
         self.decoder.restart();
         self.seen.chunks.clear();
@@ -282,7 +319,7 @@ impl Pipeline {
         self.status_if_changed(at)
     }
 
-    /// The port could not be opened. Once it has been open, the loss already says so.
+    /// The port could not be opened. If it has been open before, the loss already says so.
     pub fn unavailable(&mut self, reason: String, at: Stamp) -> Vec<Event> {
         if let Link::Closed { reason: known } = &mut self.seen.link {
             *known = Some(reason);
@@ -302,7 +339,7 @@ impl Pipeline {
         events
     }
 
-    /// Time has passed: a silence settles a pending frame, and a longer one is stale.
+    /// Time has passed. A silence settles a pending frame; after a longer one the sensor is stale.
     pub fn tick(&mut self, at: Stamp) -> Vec<Event> {
         let mut events = Vec::new();
         if self.clock == Clock::FrameRate {
@@ -317,9 +354,12 @@ impl Pipeline {
         if let Some(deadline) = self.stale_deadline()
             && at.mono >= deadline
         {
-            self.seen.link = Link::Stale;
-            self.abandon_retare(RetareError::NotLive);
-            // From the last frame on, so that its time and this one are of one clock reading.
+            self.seen.link = match self.seen.link {
+                Link::Opened { .. } => Link::Silent,
+                _ => Link::Stale,
+            };
+            self.tare.give_up(RetareError::NotLive);
+            // Counted from the last frame, so that its time and this one come from one clock reading.
             let since = self.seen.last_frame.unwrap_or(at);
             let wait = deadline.saturating_sub(since.mono);
             let wall = since.wall.checked_add(wait).unwrap_or(at.wall);
@@ -338,7 +378,7 @@ impl Pipeline {
         self.decoder.restart();
         self.seen.recent.clear();
         self.seen.link = Link::Lost { reason };
-        self.abandon_retare(RetareError::NotLive);
+        self.tare.give_up(RetareError::NotLive);
         events.extend(self.status_if_changed(at));
         self.abort(Abort::Lost, &mut events);
         events
@@ -351,8 +391,8 @@ impl Pipeline {
         events
     }
 
-    /// The recording ended: what is pending is settled, and the last status carries the totals.
-    /// `at` is the recording's own last moment; without one, that of the last frame.
+    /// The recording ended. What is pending is settled, and the last status carries the totals. `at`
+    /// is the recording's last moment; without one, the last frame's is taken.
     pub fn end_of_recording(&mut self, at: Option<Stamp>) -> Vec<Event> {
         let mut events = Vec::new();
         self.settle(at.unwrap_or(EPOCH), &mut events);
@@ -361,20 +401,20 @@ impl Pipeline {
             reason: Abort::EndOfRecording.reason().to_owned(),
         };
         let at = at.or(self.seen.last_frame).unwrap_or(EPOCH);
-        // What is left over never became a frame.
+        // The bytes that are left never became a frame.
         self.decoder.restart();
         events.push(Event::Status(self.status(at)));
         events
     }
 
-    /// No byte follows for now. What is whole then was so with the last byte that came.
+    /// No byte follows for now. A frame that is whole then was whole when the last byte came.
     fn settle(&mut self, at: Stamp, events: &mut Vec<Event>) {
         self.decoder.settle();
         let arrival = self.seen.last_bytes.take().unwrap_or(at.mono);
         self.drain(arrival, events);
     }
 
-    /// Takes what is whole now that bytes have come, the last at `arrival`.
+    /// Takes the frames that are whole now. The last byte came at `arrival`.
     fn drain(&mut self, arrival: Duration, events: &mut Vec<Event>) {
         self.arrival = arrival;
         while let Some(found) = self.decoder.next_frame() {
@@ -407,7 +447,8 @@ impl Pipeline {
                 .find(|&&(chunk_end, _)| chunk_end >= end)
                 .map_or(EPOCH, |&(_, stamp)| stamp),
             Clock::FrameRate => {
-                let mono = Duration::from_secs_f64(self.seen.frames as f64 / self.frame_rate_hz);
+                let frame_rate_hz = self.sensor.description().frame_rate_hz;
+                let mono = Duration::from_secs_f64(self.seen.frames as f64 / frame_rate_hz);
                 Stamp {
                     mono,
                     wall: EPOCH.wall.checked_add(mono).unwrap_or(Timestamp::MAX),
@@ -424,8 +465,8 @@ impl Pipeline {
         };
         self.seen.frames += 1;
         self.seen.last_frame = Some(stamp);
-        // A rate is not one over a silence.
-        if self.seen.link == Link::Stale {
+        // A rate over a silence would be none.
+        if matches!(self.seen.link, Link::Silent | Link::Stale) {
             self.seen.recent.clear();
         }
         if self.seen.recent.len() == RATE_FRAMES {
@@ -435,8 +476,8 @@ impl Pipeline {
         self.seen.link = Link::Live { since: stamp.mono };
 
         let frame = self.tare.apply(raw);
-        // A baseline stands, be it that another is being taken.
-        let tared = !self.tare.is_taking() || self.seen.retaring.is_some();
+        // While another baseline is taken on request, presses are tracked with the one in force.
+        let tared = !matches!(self.tare.aim(), Some(Aim::First { .. }));
         let changes = if tared {
             let marks = self.marks(raw, &frame);
             self.tracker.push(&frame, marks, at)
@@ -444,16 +485,16 @@ impl Pipeline {
             Vec::new()
         };
         if self.tracker.is_pressed() {
-            self.abandon_retare(RetareError::Pressed);
+            self.tare.give_up(RetareError::Pressed);
         }
-        self.observe(raw);
+        self.tare.observe(raw);
         events.extend(self.status_if_changed(stamp));
         events.push(Event::Frame(FrameEvent::new(
-            self.sensor.clone(),
+            self.sensor.name().to_owned(),
             stamp.wall,
             at.frame,
             frame.newtons.to_vec(),
-            frame.contact_area_taxels(self.criteria.press.contact_threshold_n),
+            frame.contact_area_taxels(self.sensor.description().press.contact_threshold_n),
         )));
         for change in changes {
             self.publish(change, events);
@@ -467,7 +508,7 @@ impl Pipeline {
     }
 }
 
-/// Before any frame of a recording without times.
+/// The moment before the first frame of a recording without times.
 const EPOCH: Stamp = Stamp {
     mono: Duration::ZERO,
     wall: Timestamp::UNIX_EPOCH,

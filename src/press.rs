@@ -1,7 +1,7 @@
 //! Presses: one contact each, from touch to release.
 //!
-//! In: tared [`Frame`]s with their number and the moment they came. Out: [`Change`]s, each
-//! complete in itself. The tracker asks no clock: a press lasts as long as its frames say.
+//! In: tared [`Frame`]s with their numbers and the moments they came. Out: [`Change`]s. The tracker
+//! reads no clock: a press lasts as long as its frames say.
 
 mod settings;
 mod settling;
@@ -24,8 +24,8 @@ pub struct Moment {
     pub stamp: Stamp,
 }
 
-/// What else is known of a frame, by the settings that it came under: others may hold when its press
-/// is judged.
+/// What else is known of a frame. The settings under which it came decide it, because others may
+/// hold when its press is judged.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Marks {
     /// The contact touches the border of the array.
@@ -50,7 +50,7 @@ pub struct Peak {
     pub force_n: f64,
 }
 
-/// How a press came to its end with a verdict due.
+/// How a press ended that gets a verdict.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum End {
     /// Released.
@@ -59,7 +59,7 @@ pub enum End {
     Timeout,
 }
 
-/// Why a press came to nothing.
+/// Why a press gets no verdict.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Abort {
     /// Fewer than `min_frames` in contact.
@@ -109,12 +109,12 @@ pub enum Change {
         last: Moment,
         /// Frames in contact.
         frames: u64,
-        /// How.
+        /// Released, or timed out.
         end: End,
         /// Its best frame.
         peak: Box<Peak>,
     },
-    /// It came to nothing.
+    /// It is over and gets no verdict.
     Aborted {
         /// Its number.
         press: u64,
@@ -122,12 +122,40 @@ pub enum Change {
         last: Moment,
         /// Frames in contact.
         frames: u64,
-        /// Why.
+        /// Why it gets no verdict.
         reason: Abort,
     },
 }
 
 /// Follows one sensor's presses.
+///
+/// # Example
+///
+/// Three frames of a touch and two of a release are one press.
+///
+/// ```
+/// use std::time::Duration;
+///
+/// use hardnessd::frame::{Frame, Stamp};
+/// use hardnessd::press::{Change, Marks, Moment, PressTracker, Settings};
+///
+/// let mut tracker = PressTracker::new(Settings::default());
+/// let free = Frame::default();
+/// let mut touched = free;
+/// touched.newtons[400..409].fill(0.5);
+/// let mut changes = Vec::new();
+/// for (number, frame) in (0..).zip([touched, touched, touched, free, free]) {
+///     let stamp = Stamp {
+///         mono: Duration::from_millis(200 * number),
+///         wall: jiff::Timestamp::UNIX_EPOCH,
+///     };
+///     let at = Moment { frame: number, stamp };
+///     changes.extend(tracker.push(&frame, Marks::default(), at));
+/// }
+/// assert!(matches!(changes[0], Change::Begin { press: 1, .. }));
+/// assert!(matches!(changes[1], Change::Settled { press: 1, .. }));
+/// assert!(matches!(changes[2], Change::End { press: 1, frames: 3, .. }));
+/// ```
 #[derive(Debug)]
 pub struct PressTracker {
     settings: Settings,
@@ -143,7 +171,7 @@ pub struct Memory {
 }
 
 impl Memory {
-    /// Whether a tracker can have come to this in so many frames.
+    /// Whether a tracker can have come to this in this many frames.
     pub(crate) fn is_possible(&self, frames: u64) -> bool {
         let is_press = |pressed: &Pressed| {
             let peak = &pressed.peak;
@@ -166,7 +194,7 @@ impl Memory {
 enum State {
     Idle,
     Pressed(Box<Pressed>),
-    /// Timed out; so many frames without contact so far.
+    /// It timed out. Counts the frames without contact since.
     AwaitingRelease {
         released_frames: u32,
     },
@@ -207,7 +235,7 @@ impl PressTracker {
         }
     }
 
-    /// Goes on where the one stood whose memory this is.
+    /// Goes on where the tracker stood whose memory this is.
     pub fn recall(&mut self, memory: Memory) {
         Memory {
             state: self.state,
@@ -220,7 +248,7 @@ impl PressTracker {
         matches!(self.state, State::Pressed(_))
     }
 
-    /// Takes the next frame in, and tells what it changed, in order.
+    /// Takes the next frame in. Gives what it changed, in order.
     pub fn push(&mut self, frame: &Frame, marks: Marks, at: Moment) -> Vec<Change> {
         let area = frame.contact_area_taxels(self.settings.contact_threshold_n);
         let touched = area >= self.settings.end_area_taxels;
@@ -280,7 +308,7 @@ impl PressTracker {
         }
     }
 
-    /// What the press at hand amounts to after this frame: settled, released, timed out.
+    /// Adds what this frame makes of the press: settled, released or timed out.
     fn conclude(&mut self, frame: &Frame, at: Moment, area: u32, changes: &mut Vec<Change>) {
         let State::Pressed(pressed) = &mut self.state else {
             return;
@@ -319,8 +347,8 @@ impl PressTracker {
     }
 }
 
-/// By how much of itself a force differs from an equal one at most: each taxel is an f32, rounded once
-/// less its baseline and once in newtons.
+/// The largest share by which two equal forces differ. Each taxel is an f32 and is rounded twice:
+/// when the baseline is subtracted, and when counts become newtons.
 const ROUNDING: f64 = 2.0 * f32::EPSILON as f64;
 
 impl Pressed {

@@ -6,6 +6,7 @@
 //! damaged stretch costs no more than itself. Nothing here opens a file or asks the time; MCAP is
 //! named in no other module.
 
+mod labels;
 mod message;
 mod playback;
 mod reader;
@@ -14,22 +15,22 @@ mod ring;
 mod writer;
 
 use std::borrow::Cow;
-use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::io::{self, Read};
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-pub use self::playback::{Playback, PlaybackError};
+pub use self::labels::{LabelError, Labels, check_label};
+pub use self::playback::{Playback, PlaybackError, PlaybackProblem};
 pub use self::reader::{Found, Reader};
 pub use self::recover::{RecoverError, Recovered, recover};
 pub use self::ring::Ring;
 pub use self::writer::{About, Writer};
-use crate::event::{self, Event};
+use crate::event::Event;
 use crate::frame::Stamp;
-use crate::pipeline::{self, Criteria, Pipeline};
+use crate::pipeline::{self, Pipeline};
+use crate::sensor::{Description, Sensor, SensorError};
 use crate::verdict::Hrn;
-use crate::{press, tare, wire};
 
 /// One thing that happens to a pipeline. Beside these only its settings change
 /// ([`Entry::Settings`]).
@@ -97,7 +98,7 @@ pub enum Entry {
     /// Something happened to it.
     Input(Input<'static>),
     /// It was judged otherwise from then on: the configuration was read again.
-    Settings(Box<Sensor>),
+    Settings(Box<RecordedSensor>),
     /// How its pipeline stood then.
     State(Box<State>),
 }
@@ -141,94 +142,37 @@ fn heap_bytes(value: &Value) -> usize {
     }
 }
 
-/// A sensor, as far as a replay has to know it.
+/// A sensor as a recording describes it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Sensor {
-    /// Its name.
-    pub name: String,
-    /// Expected rate.
-    pub frame_rate_hz: f64,
-    /// How its frames are written.
-    pub frame: wire::Settings,
-    /// Counts to newtons.
-    pub calibration: tare::Settings,
-    /// What a press is.
-    pub press: press::Settings,
-    /// A verdict below this confidence is rejected.
-    pub min_confidence: f32,
-    /// A verdict on less force is rejected.
-    pub min_force_n: f64,
+pub struct RecordedSensor {
+    /// What is said of it.
+    #[serde(flatten)]
+    pub description: Description,
     /// SHA-256 of the model that judged.
     pub model: String,
 }
 
-/// Why a sensor's description in a recording cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum SensorError {
-    /// Its name.
-    #[error("name: found {0:?}, expected [a-z][a-z0-9_]*")]
-    Name(String),
-    /// Its layout.
-    #[error("frame.{0}")]
-    Frame(#[from] wire::LayoutError),
-    /// Its calibration.
-    #[error("calibration.{0}")]
-    Calibration(#[from] tare::SettingsError),
-    /// Its presses.
-    #[error("press.{0}")]
-    Press(#[from] press::SettingsError),
-    /// A rate no sensor has.
-    #[error("frame_rate_hz: found {0}, expected frames a second above 0")]
-    FrameRate(f64),
-    /// What its pipeline is said to have seen.
-    #[error("memory: found what no pipeline can have come to, expected the memory of one")]
-    Memory,
-}
+impl RecordedSensor {
+    /// What is to be recorded of `sensor` while `hrn` judges.
+    pub fn new(sensor: &Sensor, hrn: &Hrn) -> Self {
+        Self {
+            description: sensor.description().for_recording(sensor.stale_after()),
+            model: hrn.sha256().to_owned(),
+        }
+    }
 
-impl Sensor {
-    /// The settings of its pipeline; `hrn` judges.
+    /// Its name.
+    pub fn name(&self) -> &str {
+        &self.description.name
+    }
+
+    /// The sensor that is described.
     ///
     /// # Errors
     ///
-    /// If a value is out of its range.
-    pub fn settings(&self, hrn: &Arc<Hrn>) -> Result<pipeline::Settings, SensorError> {
-        if !event::is_sensor_name(&self.name) {
-            return Err(SensorError::Name(self.name.clone()));
-        }
-        let layout = wire::Layout::new(&self.frame)?;
-        self.calibration.check(layout.array())?;
-        self.press.check()?;
-        let hz = self.frame_rate_hz;
-        // The bounds of the configuration, with room.
-        if !(1e-3..=1e6).contains(&hz) {
-            return Err(SensorError::FrameRate(hz));
-        }
-        Ok(pipeline::Settings {
-            sensor: self.name.clone(),
-            frame_rate_hz: hz,
-            layout,
-            criteria: self.criteria(hrn),
-        })
-    }
-
-    /// The part of them that may change.
-    pub fn criteria(&self, hrn: &Arc<Hrn>) -> Criteria {
-        Criteria {
-            calibration: self.calibration.clone(),
-            press: self.press.clone(),
-            min_confidence: self.min_confidence,
-            min_force_n: self.min_force_n,
-            hrn: hrn.clone(),
-        }
-    }
-
-    /// Takes over what a reload has changed.
-    pub fn adopt(&mut self, criteria: &Criteria) {
-        self.calibration = criteria.calibration.clone();
-        self.press = criteria.press.clone();
-        self.min_confidence = criteria.min_confidence;
-        self.min_force_n = criteria.min_force_n;
-        self.model = criteria.hrn.sha256().to_owned();
+    /// As [`Sensor::new`]: a recording may say anything.
+    pub fn check(&self) -> Result<Sensor, SensorError> {
+        Sensor::new(self.description.of_recording())
     }
 }
 
@@ -236,25 +180,78 @@ impl Sensor {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct State {
     /// The sensor.
-    pub sensor: Sensor,
+    pub sensor: RecordedSensor,
     /// What its pipeline had seen.
     pub memory: pipeline::Memory,
     /// The recording's labels, said again where a checksum guards them.
     pub labels: Labels,
 }
 
+impl State {
+    /// How `pipeline` stands now.
+    pub fn of(pipeline: &Pipeline, labels: Labels) -> Self {
+        Self {
+            sensor: RecordedSensor::new(pipeline.sensor(), pipeline.hrn()),
+            memory: pipeline.memory(),
+            labels,
+        }
+    }
+}
+
 /// What every recording begins with.
 pub const MAGIC: &[u8] = mcap::MAGIC;
 
-/// What was pressed and whatever else its user wrote down, by key.
-pub type Labels = BTreeMap<String, String>;
+/// What a file holds that a sensor was recorded to. Its first bytes say so, whatever its name is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FileKind {
+    /// A recording: MCAP.
+    Recording,
+    /// What a sensor sent, back to back.
+    Raw,
+}
+
+impl FileKind {
+    /// Of a file that begins with `start`: at least as many bytes as [`MAGIC`] has, or all of a
+    /// shorter file. A file that breaks off within the magic, or is empty, is a damaged recording.
+    ///
+    /// # Example
+    ///
+    /// ```
+    /// use hardnessd::recording::{FileKind, MAGIC};
+    ///
+    /// assert_eq!(FileKind::of(MAGIC), FileKind::Recording);
+    /// assert_eq!(FileKind::of(&[0xBB, 0xAA, 0x10, 0x03, 0, 0, 0, 0, 0]), FileKind::Raw);
+    /// assert_eq!(FileKind::of(b""), FileKind::Recording);
+    /// ```
+    pub fn of(start: &[u8]) -> Self {
+        let start = &start[..start.len().min(MAGIC.len())];
+        if MAGIC.starts_with(start) {
+            FileKind::Recording
+        } else {
+            FileKind::Raw
+        }
+    }
+
+    /// Reads the kind of `source`. The reader that is given back begins where `source` began: it may
+    /// be a pipe, of which nothing can be read twice.
+    ///
+    /// # Errors
+    ///
+    /// Those of reading.
+    pub fn read<R: Read>(mut source: R) -> io::Result<(Self, impl Read)> {
+        let mut start = Vec::with_capacity(MAGIC.len());
+        let most = MAGIC.len() as u64;
+        source.by_ref().take(most).read_to_end(&mut start)?;
+        Ok((Self::of(&start), io::Cursor::new(start).chain(source)))
+    }
+}
 
 /// Why a recording cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// Reading or writing broke off.
     #[error(transparent)]
-    Io(#[from] std::io::Error),
+    Io(#[from] io::Error),
     /// It is damaged or cut off.
     #[error("{0}: `hardnessd recover` saves what is whole")]
     Damaged(String),

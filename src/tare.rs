@@ -1,8 +1,8 @@
 //! Tare: the unloaded baseline, and subtracting it.
 //!
-//! In: [`RawFrame`]s in counts. Out: [`Frame`]s in newtons, dead taxels replaced, and what became
-//! of the tare. A tare under load would zero a press away, so one is refused while the sensor is
-//! touched and tried again.
+//! In: [`RawFrame`]s in counts. Out: [`Frame`]s in newtons, with dead taxels replaced, and what
+//! became of the tare. A tare under load would zero a press away. So while the sensor is touched, no
+//! baseline is taken: the first tare is tried again, and one on request is given up.
 
 mod settings;
 
@@ -15,22 +15,23 @@ use crate::frame::{Array, COLS, Frame, ROWS, RawFrame, TAXELS, taxels};
 /// When a frame counts as touched while a tare is taken.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Contact {
-    /// A taxel that varies by so much is being touched.
+    /// A taxel that varies by this much is being touched.
     pub threshold_n: f32,
-    /// So many touched taxels are a contact.
+    /// This many touched taxels are a contact.
     pub area_taxels: u32,
 }
 
 /// What a frame did to the tare.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Progress {
-    /// None is being taken: presses may be tracked.
+    /// No tare is under way.
     Ready,
     /// This frame is one of those averaged.
     Taking,
-    /// It was the last of them: the baseline stands from the next frame on.
+    /// It was the last of them: the new baseline holds from the next frame on.
     Taken,
-    /// The sensor is touched: the frames were thrown away and another try begins.
+    /// The sensor is touched, and the frames were thrown away. A first tare begins anew; one on request
+    /// has ended.
     Contact,
 }
 
@@ -45,7 +46,67 @@ pub struct Offsets {
     pub most_counts: f32,
 }
 
-/// The baseline of one sensor and the tare being taken, if one is.
+/// Why a tare that was asked for is not taken. The offsets stay as they were.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum RetareError {
+    /// A press is under way, and the tare would zero it away.
+    #[error("found a press, expected none")]
+    Pressed,
+    /// Something rests on the sensor, and the tare would zero it away.
+    #[error("found the sensor touched, expected it free")]
+    Touched,
+    /// The sensor sends no frames to average.
+    #[error("found a sensor that is not live, expected frames")]
+    NotLive,
+    /// Another tare is under way, and has to end first.
+    #[error("found a tare under way, expected none")]
+    UnderWay,
+    /// `tare_frames` is 0.
+    #[error("found calibration.tare_frames = 0, expected 1 or more")]
+    NoFrames,
+}
+
+/// The offsets before and after a tare that was asked for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Retaken {
+    /// Those until now.
+    pub old: Offsets,
+    /// Those from the next frame on.
+    pub new: Offsets,
+}
+
+/// What a tare under way is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Aim {
+    /// The first baseline. It is tried again until nothing touches the sensor.
+    First {
+        /// Something touched it at an earlier try.
+        met_contact: bool,
+    },
+    /// Another baseline, on request. The one in force stays until this one is taken. It is given
+    /// up when something touches the sensor.
+    Request,
+}
+
+/// The baseline of one sensor, and the tare under way, if there is one.
+///
+/// # Example
+///
+/// ```
+/// use hardnessd::frame::{Array, RawFrame, TAXELS};
+/// use hardnessd::tare::{Contact, Progress, Settings, Tare};
+///
+/// let contact = Contact { threshold_n: 0.07, area_taxels: 3 };
+/// let settings = Settings { tare_frames: 1, ..Settings::default() };
+/// let mut tare = Tare::new(&settings, Array::FULL, contact);
+/// let mut raw = RawFrame { counts: [2; TAXELS] };
+/// assert_eq!(tare.observe(&raw), Progress::Taken);
+///
+/// raw.counts[0] = 27;
+/// let frame = tare.apply(&raw);
+/// assert_eq!(frame.newtons[0], 25.0 * 0.04);
+/// assert_eq!(frame.newtons[1], 0.0);
+/// ```
 #[derive(Debug, Clone)]
 pub struct Tare {
     newtons_per_count: f32,
@@ -53,7 +114,7 @@ pub struct Tare {
     frames: u32,
     /// `[ROWS, COLS]` in counts; zeros until a tare is taken.
     baseline: Box<[f32; TAXELS]>,
-    taking: Option<Taking>,
+    stage: Stage,
     contact: Contact,
     max_n: f32,
     array: Array,
@@ -61,24 +122,48 @@ pub struct Tare {
     dead: Vec<(usize, Vec<usize>)>,
 }
 
-/// What a [`Tare`] has seen, without its settings.
+/// How far a tare is.
+#[derive(Debug, Clone)]
+enum Stage {
+    /// None is under way.
+    Idle,
+    Taking {
+        aim: Aim,
+        sums: Sums,
+    },
+    /// A tare on request has ended, and its outcome has not been fetched.
+    Ended(Result<Retaken, RetareError>),
+}
+
+impl Stage {
+    /// The beginning of a tare over `frames` frames; none is taken over 0.
+    fn begin(aim: Aim, frames: u32) -> Self {
+        if frames == 0 {
+            return Self::Idle;
+        }
+        let sums = Sums::new(frames);
+        Self::Taking { aim, sums }
+    }
+}
+
+/// What a [`Tare`] has seen, without its settings and without what the tare under way is for.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Memory {
     #[serde(with = "taxels")]
     baseline: Box<[f32; TAXELS]>,
-    taking: Option<Taking>,
+    taking: Option<Sums>,
 }
 
 impl Memory {
-    /// Whether a tare can have come to this.
+    /// Whether a tare can have come to this: a recording may say anything.
     pub(crate) fn is_possible(&self) -> bool {
         // A mean of counts, with room for its rounding.
         let is_count = |mean: &f32| (0.0..=65_536.0).contains(mean);
-        let are_sums = |taking: &Taking| {
-            let most = u64::from(taking.seen) * u64::from(u16::MAX);
-            taking.seen < taking.wanted
-                && taking.wanted <= MOST_TARE_FRAMES
-                && taking.sum.iter().all(|&sum| u64::from(sum) <= most)
+        let are_sums = |sums: &Sums| {
+            let most = u64::from(sums.seen) * u64::from(u16::MAX);
+            sums.seen < sums.wanted
+                && sums.wanted <= MOST_TARE_FRAMES
+                && sums.sum.iter().all(|&sum| u64::from(sum) <= most)
         };
         self.baseline.iter().all(is_count) && self.taking.as_ref().is_none_or(are_sums)
     }
@@ -86,7 +171,7 @@ impl Memory {
 
 /// Sums over the frames of a tare.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct Taking {
+struct Sums {
     wanted: u32,
     seen: u32,
     #[serde(with = "taxels")]
@@ -97,7 +182,7 @@ struct Taking {
     most: Box<[u16; TAXELS]>,
 }
 
-impl Taking {
+impl Sums {
     fn new(wanted: u32) -> Self {
         Self {
             wanted,
@@ -123,11 +208,12 @@ impl Tare {
     ///
     /// `settings` have passed [`Settings::check`] for `array`.
     pub fn new(settings: &Settings, array: Array, contact: Contact) -> Self {
+        let first = Aim::First { met_contact: false };
         Self {
             newtons_per_count: settings.newtons_per_count,
             frames: settings.tare_frames,
             baseline: Box::new([0.0; TAXELS]),
-            taking: (settings.tare_frames > 0).then(|| Taking::new(settings.tare_frames)),
+            stage: Stage::begin(first, settings.tare_frames),
             contact,
             max_n: settings.tare_max_n,
             array,
@@ -135,14 +221,19 @@ impl Tare {
         }
     }
 
-    /// Takes over changed settings; the baseline in force stays. A tare under way begins anew if
-    /// it takes another number of frames now, or ends if it takes none.
+    /// Takes over changed settings; the baseline in force stays. If a tare takes another number of
+    /// frames now, one under way begins anew; if it takes none, the one under way ends.
     pub fn reload(&mut self, settings: &Settings, contact: Contact) {
-        if self.taking.is_some() && self.frames != settings.tare_frames {
-            self.taking = (settings.tare_frames > 0).then(|| Taking::new(settings.tare_frames));
-        }
+        let frames = settings.tare_frames;
+        self.stage = match std::mem::replace(&mut self.stage, Stage::Idle) {
+            Stage::Taking {
+                aim: Aim::Request, ..
+            } if frames == 0 => Stage::Ended(Err(RetareError::NoFrames)),
+            Stage::Taking { aim, .. } if frames != self.frames => Stage::begin(aim, frames),
+            stage => stage,
+        };
         self.newtons_per_count = settings.newtons_per_count;
-        self.frames = settings.tare_frames;
+        self.frames = frames;
         self.max_n = settings.tare_max_n;
         self.contact = contact;
         self.dead = dead(settings, self.array);
@@ -152,35 +243,60 @@ impl Tare {
     pub fn memory(&self) -> Memory {
         Memory {
             baseline: self.baseline.clone(),
-            taking: self.taking.clone(),
+            taking: match &self.stage {
+                Stage::Taking { sums, .. } => Some(sums.clone()),
+                Stage::Idle | Stage::Ended(_) => None,
+            },
         }
     }
 
-    /// Goes on where the one stood whose memory this is.
-    pub fn recall(&mut self, memory: Memory) {
-        Memory {
-            baseline: self.baseline,
-            taking: self.taking,
-        } = memory;
+    /// Goes on where the tare stood whose memory this is. If it was under way, it was for `aim`.
+    pub fn recall(&mut self, memory: Memory, aim: Aim) {
+        self.baseline = memory.baseline;
+        let taking = memory.taking.map(|sums| Stage::Taking { aim, sums });
+        self.stage = taking.unwrap_or(Stage::Idle);
     }
 
-    /// Whether a tare is being taken.
-    pub fn is_taking(&self) -> bool {
-        self.taking.is_some()
-    }
-
-    /// Begins another tare; the baseline in force stays until it is taken. `false`: the settings
-    /// say that none is to be taken.
-    pub fn retake(&mut self) -> bool {
-        if self.frames > 0 {
-            self.taking = Some(Taking::new(self.frames));
+    /// What the tare under way is for, if there is one.
+    pub fn aim(&self) -> Option<Aim> {
+        match &self.stage {
+            Stage::Taking { aim, .. } => Some(*aim),
+            Stage::Idle | Stage::Ended(_) => None,
         }
-        self.frames > 0
     }
 
-    /// Keeps the baseline in force and stops taking another.
-    pub fn give_up(&mut self) {
-        self.taking = None;
+    /// Begins another tare; the baseline in force stays until it is taken.
+    ///
+    /// # Errors
+    ///
+    /// If one is under way, or the settings say that none is to be taken. Nothing has changed then.
+    pub fn retake(&mut self) -> Result<(), RetareError> {
+        if self.aim().is_some() {
+            return Err(RetareError::UnderWay);
+        }
+        if self.frames == 0 {
+            return Err(RetareError::NoFrames);
+        }
+        self.stage = Stage::begin(Aim::Request, self.frames);
+        Ok(())
+    }
+
+    /// Ends a tare that was asked for; the baseline in force stays. A first tare goes on.
+    pub fn give_up(&mut self, reason: RetareError) {
+        if self.aim() == Some(Aim::Request) {
+            self.stage = Stage::Ended(Err(reason));
+        }
+    }
+
+    /// What became of a tare that was asked for, once.
+    pub fn ended(&mut self) -> Option<Result<Retaken, RetareError>> {
+        match self.stage {
+            Stage::Ended(outcome) => {
+                self.stage = Stage::Idle;
+                Some(outcome)
+            }
+            Stage::Idle | Stage::Taking { .. } => None,
+        }
     }
 
     /// The baseline in force.
@@ -221,36 +337,43 @@ impl Tare {
 
     /// Shows the tare a frame.
     pub fn observe(&mut self, raw: &RawFrame) -> Progress {
-        let Some(taking) = &mut self.taking else {
+        let Stage::Taking { aim, sums } = &mut self.stage else {
             return Progress::Ready;
         };
-        taking.add(raw);
-        if taking.seen < taking.wanted {
+        sums.add(raw);
+        if sums.seen < sums.wanted {
             return Progress::Taking;
         }
+        let (aim, sums) = (*aim, sums.clone());
         let mean = Box::new(std::array::from_fn(|place| {
-            taking.sum[place] as f32 / taking.seen as f32
+            sums.sum[place] as f32 / sums.seen as f32
         }));
-        let wanted = taking.wanted;
-        if self.is_touched(&mean) {
-            self.taking = Some(Taking::new(wanted));
+        if self.is_touched(&sums, &mean) {
+            self.stage = match aim {
+                Aim::First { .. } => Stage::begin(Aim::First { met_contact: true }, sums.wanted),
+                Aim::Request => Stage::Ended(Err(RetareError::Touched)),
+            };
             return Progress::Contact;
         }
+        let old = self.offsets();
         self.baseline = mean;
-        self.taking = None;
+        self.stage = match aim {
+            Aim::First { .. } => Stage::Idle,
+            Aim::Request => Stage::Ended(Ok(Retaken {
+                old,
+                new: self.offsets(),
+            })),
+        };
         Progress::Taken
     }
 
-    fn is_touched(&self, mean: &[f32; TAXELS]) -> bool {
-        let Some(taking) = &self.taking else {
-            return false;
-        };
+    fn is_touched(&self, sums: &Sums, mean: &[f32; TAXELS]) -> bool {
         let live = self.live();
         let mut sorted: Vec<f32> = live.iter().map(|&place| mean[place]).collect();
         sorted.sort_by(f32::total_cmp);
         let median = sorted.get(sorted.len() / 2).copied().unwrap_or(0.0);
         let varying = live.iter().filter(|&&place| {
-            let spread = f32::from(taking.most[place] - taking.least[place]);
+            let spread = f32::from(sums.most[place] - sums.least[place]);
             spread * self.newtons_per_count >= self.contact.threshold_n
         });
         let high = live
@@ -336,7 +459,9 @@ mod tests {
             let mut tare = Tare::new(&settings(&[]), Array::FULL, CONTACT);
             let last = (0..5).map(|frame| tare.observe(&raw(&touch(frame)))).last();
             assert_eq!(last, Some(expected));
-            assert_eq!(tare.is_taking(), expected == Progress::Contact);
+            let again = Aim::First { met_contact: true };
+            let expected = (expected == Progress::Contact).then_some(again);
+            assert_eq!(tare.aim(), expected);
         };
         check(
             &|frame| (0..3).map(|i| (i, moving[i][frame % 2])).collect(),
@@ -422,24 +547,29 @@ mod tests {
         frames(&mut tare, 2);
         let old = tare.offsets();
         assert_eq!((old.least_counts, old.most_counts), (2.0, 2.0));
-        assert!(tare.retake());
+        assert_eq!(tare.ended(), None, "nobody asked for the first");
+        assert_eq!(tare.retake(), Ok(()));
+        assert_eq!(tare.retake(), Err(RetareError::UnderWay));
         assert_eq!(tare.observe(&raw(&[(0, 9)])), Progress::Taking);
         assert_eq!(tare.offsets(), old);
-        tare.give_up();
-        assert_eq!((tare.is_taking(), tare.offsets()), (false, old));
-        assert!(tare.retake());
+        tare.give_up(RetareError::Pressed);
+        assert_eq!((tare.aim(), tare.offsets()), (None, old));
+        assert_eq!(tare.ended(), Some(Err(RetareError::Pressed)));
+        assert_eq!(tare.ended(), None, "said once");
+        assert_eq!(tare.retake(), Ok(()));
         assert_eq!(frames(&mut tare, 9), [Progress::Taking, Progress::Taken]);
         let new = tare.offsets();
+        assert_eq!(tare.ended(), Some(Ok(Retaken { old, new })));
         assert_eq!((new.least_counts, new.most_counts), (2.0, 9.0));
         assert!((new.mean_counts - (2.0 * 782.0 + 9.0) / 783.0).abs() < 1e-4);
         // A reload that leaves their number leaves those taken.
-        assert!(tare.retake());
+        assert_eq!(tare.retake(), Ok(()));
         assert_eq!(tare.observe(&raw(&[])), Progress::Taking);
         tare.reload(&settings, CONTACT);
         assert_eq!(tare.observe(&raw(&[])), Progress::Taken);
         settings.tare_frames = 0;
         tare.reload(&settings, CONTACT);
-        assert!(!tare.retake());
+        assert_eq!(tare.retake(), Err(RetareError::NoFrames));
     }
 
     #[test]

@@ -19,10 +19,12 @@ pub mod watch;
 use std::error::Error;
 use std::fs::File;
 use std::io::{self, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::ExitCode;
 
 use clap::error::ErrorKind;
+
+use crate::wording;
 
 /// What is printed of an error: one line, with the causes that it does not tell itself.
 pub fn line(error: &(dyn Error + 'static)) -> String {
@@ -42,7 +44,7 @@ pub fn line(error: &(dyn Error + 'static)) -> String {
 /// the terminal.
 fn shown(text: &str) -> String {
     let shown = |c: char| {
-        let escaped = c.is_control().then(|| c.escape_default());
+        let escaped = wording::is_hidden(c).then(|| c.escape_default());
         let plain = escaped.is_none().then_some(c);
         escaped.into_iter().flatten().chain(plain)
     };
@@ -73,18 +75,6 @@ pub fn usage(program: &str, error: &clap::Error) -> ExitCode {
     let told = told.join(" ");
     eprintln!("{program}: {}", shown(told.trim_start_matches("error: ")));
     ExitCode::from(exit::USAGE)
-}
-
-/// A recording to write. Which kind it is goes by its name when it is read, so it may not be called as
-/// the other kind is.
-fn named_unlike(name: &str, other: &str) -> Result<PathBuf, String> {
-    let path = PathBuf::from(name);
-    match path.extension() {
-        Some(extension) if extension == other => Err(format!(
-            "expected another name: .{other} is for the other kind of recording"
-        )),
-        _ => Ok(path),
-    }
 }
 
 /// Opens a file to read from. A directory is refused here: the system would do so at the first read
@@ -142,7 +132,10 @@ mod tests {
 
     #[test]
     fn an_error_is_one_line_whatever_a_file_is_called() {
-        let told = io::Error::other("a\nb\u{1b}[2J\t\u{e9}: cannot read");
-        assert_eq!(line(&told), "a\\nb\\u{1b}[2J\\t\u{e9}: cannot read");
+        let told = io::Error::other("a\nb\u{1b}[2J\t\u{e9}\u{202e}: cannot read");
+        assert_eq!(
+            line(&told),
+            "a\\nb\\u{1b}[2J\\t\u{e9}\\u{202e}: cannot read"
+        );
     }
 }

@@ -1,10 +1,23 @@
-//! What a parser says of a settings file, in words for whoever wrote the file.
+//! Words for people: what a parser says of a settings file, and which text can be shown as it is.
 
 /// Why `text` is not the TOML it should be: the line and what was found and expected.
 pub fn of_toml(text: &str, error: &toml::de::Error) -> String {
     let before = &text[..error.span().map_or(0, |span| span.start).min(text.len())];
     let line = before.matches('\n').count() + 1;
     format!("line {line}: {}", plain(error.message()))
+}
+
+/// Whether `text` looks the same wherever it is shown: it has no control characters, and none that
+/// end a line or change the direction in which what follows is read.
+pub fn is_plain(text: &str) -> bool {
+    !text.chars().any(is_hidden)
+}
+
+/// Whether a character is not shown, but changes how others are.
+pub(crate) fn is_hidden(c: char) -> bool {
+    // Unicode's Bidi_Control (PropList.txt), its line separator and its paragraph separator.
+    let bidi = matches!(c, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
+    c.is_control() || bidi || matches!(c, '\u{2028}' | '\u{2029}')
 }
 
 /// The number that was written, not the one nearest to it among the shorter ones.
@@ -60,6 +73,24 @@ pub fn plain(message: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn text_is_plain_unless_a_character_of_it_is_hidden() {
+        for text in ["arm-7", "Arm Nº 7", "рука", "手", "ذراع", "é", ""] {
+            assert!(is_plain(text), "{text:?}");
+        }
+        for hidden in [
+            "\n",
+            "\u{1b}[2J",
+            "\u{7f}",
+            "\u{85}",
+            "\u{202e}",
+            "\u{2066}",
+            "\u{2028}",
+        ] {
+            assert!(!is_plain(&format!("arm{hidden}7")), "{hidden:?}");
+        }
+    }
 
     #[test]
     fn types_are_told_in_plain_words() {

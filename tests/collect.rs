@@ -336,7 +336,7 @@ fn what_cannot_be_collected_is_said_and_nothing_is_written() {
         (&["--level", "5", fixture], 2, "5"),
         (&["--level", "1", text(&none)], 66, "none.mcap"),
         (&["--level", "1", text(&empty)], 1, "no press"),
-        (&["--level", "1", text(&noise)], 1, "no MCAP"),
+        (&["--level", "1", text(&noise)], 1, "no press"),
         (
             &["--level", "1", "--config", text(&none), fixture],
             66,

@@ -229,7 +229,7 @@ fn a_terminal_that_goes_ends_a_recording_whole_unless_it_shall_outlive_it() {
     assert_eq!(recording.exit_code(), Some(0));
     assert_eq!(replay(&out).last().unwrap()["reason"], "end of recording");
 
-    let out = bench.path("b.mcap");
+    let out = bench.path("take1");
     let mut command = Command::new("nohup");
     command
         .arg(BINARY)

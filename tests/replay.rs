@@ -11,9 +11,9 @@ use std::time::{Duration, Instant};
 
 use hardnessd::event::Event;
 use hardnessd::frame::Stamp;
-use hardnessd::pipeline::{Clock, Criteria, Pipeline, Settings};
+use hardnessd::pipeline::{Clock, Pipeline};
+use hardnessd::sensor::{Description, Sensor};
 use hardnessd::verdict::{BUILT_IN, Hrn};
-use hardnessd::wire;
 use serde_json::Value;
 
 fn fixtures() -> PathBuf {
@@ -107,6 +107,23 @@ fn recordings_give_their_golden_events_twice_the_same() {
 }
 
 #[test]
+fn what_a_file_holds_its_first_bytes_say_and_not_its_name() {
+    let directory = tempfile::tempdir().unwrap();
+    for (fixture, name) in [
+        ("earlier.mcap", "take1"),
+        ("earlier.mcap", "take1.bin"),
+        ("foam.5hz.bin", "foam"),
+        ("foam.5hz.bin", "foam.mcap"),
+    ] {
+        let path = directory.path().join(name);
+        std::fs::copy(fixtures().join(fixture), &path).unwrap();
+        let golden = fixtures().join(fixture).with_extension("jsonl");
+        let golden = std::fs::read_to_string(golden).unwrap();
+        assert_same(&replay(&path, &[]), &golden, &path);
+    }
+}
+
+#[test]
 fn bytes_without_a_whole_frame_are_said_to_have_none() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("other.bin");
@@ -116,7 +133,7 @@ fn bytes_without_a_whole_frame_are_said_to_have_none() {
     frame[400] ^= 1;
     let text = "no frame ".repeat(100).into_bytes();
     for (bytes, found) in [
-        (Vec::new(), "no whole frame in 0 bytes (0 damaged)"),
+        (vec![0], "no whole frame in 1 bytes (0 damaged)"),
         (text, "no whole frame in 900 bytes (0 damaged)"),
         (frame, "no whole frame in 790 bytes (1 damaged)"),
     ] {
@@ -179,16 +196,17 @@ fn a_frame_comes_no_earlier_than_its_time_however_long_frames_are() {
     }
 }
 
+#[test]
+fn a_recording_of_an_earlier_version_gives_the_events_it_gave_then() {
+    let recording = fixtures().join("earlier.mcap");
+    let golden = std::fs::read_to_string(fixtures().join("earlier.jsonl")).unwrap();
+    assert_same(&replay(&recording, &[]), &golden, &recording);
+}
+
 fn pipeline() -> Pipeline {
-    Pipeline::new(
-        Settings {
-            sensor: "sensor".to_owned(),
-            frame_rate_hz: 5.0,
-            layout: wire::Layout::new(&wire::Settings::default()).unwrap(),
-            criteria: Criteria::new(Arc::new(Hrn::load(BUILT_IN).unwrap())),
-        },
-        Clock::FrameRate,
-    )
+    let sensor = Sensor::new(Description::default()).unwrap();
+    let hrn = Arc::new(Hrn::load(BUILT_IN).unwrap());
+    Pipeline::new(sensor, hrn, Clock::FrameRate)
 }
 
 fn events<'a>(chunks: impl Iterator<Item = &'a [u8]>) -> Vec<Event> {

@@ -1,13 +1,14 @@
 //! The configuration file: every table composed, every value checked once, at the door.
 //!
-//! In: a TOML file. Out: a [`Config`] whose values can all be used as they are, and a [`Setup`]
-//! with the model beside it. A key that is unknown, or of a part this version does not have, is an
-//! error that names file and key, what was found and what was expected. Paths in the file are
+//! In: a TOML file. Out: a [`Setup`]: the [`Config`], the sensors it describes and its model, all
+//! checked. A key that is unknown, or of a part that this version does not have, is an error that
+//! names the file and the key, what was found and what was expected. Paths in the file are
 //! relative to its directory.
 
+mod error;
+mod publish;
 mod check;
 mod parse;
-mod publish;
 
 use std::env;
 use std::net::SocketAddr;
@@ -16,12 +17,14 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-pub use self::parse::Error;
-pub use self::publish::{Endpoint, Mode, Publish, Ros2, Tcp, Unix, Zenoh};
+pub use self::error::Error;
+pub use self::publish::{
+    Endpoint, EndpointError, Mode, ModeError, Publish, Ros2, Tcp, Unix, Zenoh,
+};
 use super::log;
-use crate::pipeline::{self, Criteria};
+use crate::sensor::{self, Description};
 use crate::verdict::Hrn;
-use crate::{press, recording, tare, wire};
+use crate::{press, tare, wire};
 
 /// The whole file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -68,6 +71,10 @@ pub struct Sensor {
     /// Expected rate.
     #[serde(default = "default_frame_rate_hz")]
     pub frame_rate_hz: f64,
+    /// A live sensor is stale after a silence of this length; by default the larger of 2.5 periods
+    /// and 50 ms.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stale_after_ms: Option<f64>,
     /// How a frame is written.
     #[serde(default)]
     pub frame: wire::Settings,
@@ -77,16 +84,15 @@ pub struct Sensor {
 }
 
 fn default_name() -> String {
-    "sensor".to_owned()
+    Description::default().name
 }
 
 fn default_baud() -> u32 {
     115_200
 }
 
-/// The JX255N's (paper, "Tactile sensor").
 fn default_frame_rate_hz() -> f64 {
-    5.0
+    Description::default().frame_rate_hz
 }
 
 impl Sensor {
@@ -97,6 +103,7 @@ impl Sensor {
             port,
             baud: default_baud(),
             frame_rate_hz: default_frame_rate_hz(),
+            stale_after_ms: None,
             frame: wire::Settings::default(),
             calibration: tare::Settings::default(),
         }
@@ -202,14 +209,38 @@ impl Config {
         }
     }
 
-    /// Reads and checks a file.
+    /// Reads a file. Whether its values can be used, [`Self::check`] says.
     ///
     /// # Errors
     ///
-    /// [`Error`], if the file cannot be read, is no TOML, or has a key or value that cannot be
-    /// used.
+    /// [`Error`], if the file cannot be read, is no TOML, or has an unknown key, a value of another
+    /// type or a path that none can be.
     pub fn load(path: &Path) -> Result<Self, Error> {
         parse::load(path)
+    }
+
+    /// Checks every value, and all of them together. Gives the sensors, in their order; `path` is
+    /// for messages.
+    ///
+    /// # Errors
+    ///
+    /// [`Error`], for the first value that cannot be used.
+    pub fn check(&self, path: &Path) -> Result<Vec<sensor::Sensor>, Error> {
+        check::check(self, path)
+    }
+
+    /// What the file says of one of its sensors, in all its tables.
+    pub(crate) fn describe(&self, sensor: &Sensor) -> Description {
+        Description {
+            name: sensor.name.clone(),
+            frame_rate_hz: sensor.frame_rate_hz,
+            stale_after_ms: sensor.stale_after_ms,
+            frame: sensor.frame.clone(),
+            calibration: sensor.calibration.clone(),
+            press: self.press.clone(),
+            min_confidence: self.model.min_confidence,
+            min_force_n: self.model.min_force_n,
+        }
     }
 
     /// The first key by which `self` and `other` differ that only a restart can change.
@@ -221,14 +252,15 @@ impl Config {
             return Some("sensor".to_owned());
         }
         for (ours, theirs) in self.sensors.iter().zip(&other.sensors) {
-            let differs = [
-                ("name", ours.name != theirs.name),
-                ("port", ours.port != theirs.port),
-                ("baud", ours.baud != theirs.baud),
-                ("frame_rate_hz", ours.frame_rate_hz != theirs.frame_rate_hz),
-                ("frame", ours.frame != theirs.frame),
-            ];
-            if let Some((key, _)) = differs.iter().find(|(_, differs)| *differs) {
+            let key = if ours.port != theirs.port {
+                Some("port")
+            } else if ours.baud != theirs.baud {
+                Some("baud")
+            } else {
+                let described = self.describe(ours);
+                described.fixed_difference(&other.describe(theirs))
+            };
+            if let Some(key) = key {
                 return Some(format!("sensor.{key} of \"{}\"", ours.name));
             }
         }
@@ -257,12 +289,14 @@ impl Config {
     }
 }
 
-/// A configuration and its model, ready to run.
+/// A configuration whose values have all been checked, and its model: ready to run.
 #[derive(Debug, Clone)]
 pub struct Setup {
     /// As read.
     pub config: Config,
-    /// The model it names.
+    /// The sensors of the configuration, in its order.
+    pub sensors: Vec<sensor::Sensor>,
+    /// The model that it names.
     pub hrn: Arc<Hrn>,
 }
 
@@ -271,51 +305,25 @@ impl Setup {
     ///
     /// # Errors
     ///
-    /// As [`Config::load`], and if the model cannot be read or is refused.
+    /// As [`Config::load`] and [`Self::of`].
     pub fn load(path: &Path) -> Result<Self, Error> {
         let config = Config::load(path)?;
         Self::of(config, path)
     }
 
-    /// Loads the model of `config`; `path` is for messages.
+    /// Checks `config` and loads its model; `path` is for messages.
     ///
     /// # Errors
     ///
-    /// If the model cannot be read or is refused.
+    /// As [`Config::check`], and if the model cannot be read or is refused.
     pub fn of(config: Config, path: &Path) -> Result<Self, Error> {
+        let sensors = config.check(path)?;
         let hrn = Arc::new(parse::model(&config.model, path)?);
-        Ok(Self { config, hrn })
-    }
-
-    /// Settings of every sensor's pipeline, in order.
-    pub fn pipelines(&self) -> impl Iterator<Item = pipeline::Settings> {
-        let sensors = self.config.sensors.iter();
-        sensors.map(|sensor| self.pipeline(sensor))
-    }
-
-    /// Settings of one sensor's pipeline.
-    pub fn pipeline(&self, sensor: &Sensor) -> pipeline::Settings {
-        let settings = self.recorded(sensor).settings(&self.hrn);
-        settings.expect("a sensor was checked when its configuration was read")
-    }
-
-    /// What a recording says of a sensor.
-    pub fn recorded(&self, sensor: &Sensor) -> recording::Sensor {
-        recording::Sensor {
-            name: sensor.name.clone(),
-            frame_rate_hz: sensor.frame_rate_hz,
-            frame: sensor.frame.clone(),
-            calibration: sensor.calibration.clone(),
-            press: self.config.press.clone(),
-            min_confidence: self.config.model.min_confidence,
-            min_force_n: self.config.model.min_force_n,
-            model: self.hrn.sha256().to_owned(),
-        }
-    }
-
-    /// What a reload may change of a sensor.
-    pub fn criteria(&self, sensor: &Sensor) -> Criteria {
-        self.recorded(sensor).criteria(&self.hrn)
+        Ok(Self {
+            config,
+            sensors,
+            hrn,
+        })
     }
 }
 

@@ -22,7 +22,8 @@ use self::journal::Journal;
 use self::limit::Limit;
 use self::lines::Lines;
 use crate::event::{Event, LinkState, PressState, Tared, name};
-use crate::pipeline::{RetareError, Unjudged};
+use crate::pipeline::Unjudged;
+use crate::tare::RetareError;
 
 /// The `[log]` table.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]

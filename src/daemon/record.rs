@@ -23,8 +23,10 @@ use self::worker::Worker;
 use super::config;
 use crate::event::{Event, Kind};
 use crate::frame::Stamp;
-use crate::pipeline::{Criteria, Pipeline};
-use crate::recording::{About, Entry, Input, Labels, Sensor, State};
+use crate::pipeline::Pipeline;
+use crate::recording::{About, Entry, Input, Labels, RecordedSensor, State};
+use crate::sensor::Sensor;
+use crate::verdict::Hrn;
 
 /// Entries and events that may wait: some 4 s of a sensor at 100 frames/s.
 const QUEUED: usize = 8192;
@@ -192,11 +194,10 @@ impl Recorder {
     }
 
     /// For the task of the `index`-th sensor.
-    pub(crate) fn of_sensor(&self, index: usize, sensor: Sensor) -> SensorRecorder {
+    pub(crate) fn of_sensor(&self, index: usize) -> SensorRecorder {
         SensorRecorder(Some(Box::new(Active {
             jobs: self.jobs.clone(),
             index,
-            sensor,
             labels: self.labels.clone(),
             noted: None,
             bytes: 0,
@@ -232,7 +233,6 @@ pub(crate) struct SensorRecorder(Option<Box<Active>>);
 struct Active {
     jobs: Jobs,
     index: usize,
-    sensor: Sensor,
     labels: Labels,
     /// When a state was last noted; `None` if what followed it is not all there.
     noted: Option<Duration>,
@@ -261,13 +261,11 @@ impl SensorRecorder {
         }
     }
 
-    /// Notes that `pipeline` is judged otherwise from now on.
-    pub(crate) fn reload(&mut self, pipeline: &Pipeline, criteria: &Criteria, at: Stamp) {
+    /// Notes how `pipeline` is about to be judged from now on.
+    pub(crate) fn reload(&mut self, pipeline: &Pipeline, sensor: &Sensor, hrn: &Hrn, at: Stamp) {
         if let Some(active) = &mut self.0 {
-            let mut sensor = active.sensor.clone();
-            sensor.adopt(criteria);
-            active.follow(pipeline, at, Entry::Settings(Box::new(sensor.clone())));
-            active.sensor = sensor;
+            let described = RecordedSensor::new(sensor, hrn);
+            active.follow(pipeline, at, Entry::Settings(Box::new(described)));
         }
     }
 
@@ -315,11 +313,7 @@ impl Active {
         }
         self.counted = counts;
         (self.noted, self.bytes) = (Some(at.mono), 0);
-        let state = State {
-            sensor: self.sensor.clone(),
-            memory: pipeline.memory(),
-            labels: self.labels.clone(),
-        };
+        let state = State::of(pipeline, self.labels.clone());
         self.tell(at, Entry::State(Box::new(state)));
     }
 

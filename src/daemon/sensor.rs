@@ -5,6 +5,7 @@
 //! other.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
 use serde_json::Value;
@@ -16,8 +17,11 @@ use super::log;
 use super::record::SensorRecorder;
 use super::serial::{Link, Turn};
 use crate::event::{Event, Kind, Status, Tared};
-use crate::pipeline::{Criteria, Pipeline, RetareError};
+use crate::pipeline::Pipeline;
 use crate::recording::Input;
+use crate::sensor;
+use crate::tare::RetareError;
+use crate::verdict::Hrn;
 
 /// What a sensor can be asked.
 #[derive(Debug)]
@@ -30,8 +34,8 @@ pub(crate) enum Command {
     Context(Option<Value>, oneshot::Sender<()>),
     /// To have its last minute written; the answer is where.
     Blackbox(oneshot::Sender<Result<PathBuf, String>>),
-    /// To judge otherwise from now on.
-    Reload(Box<Criteria>),
+    /// To judge otherwise from now on, by a description that differs in nothing that is fixed.
+    Reload(Box<sensor::Sensor>, Arc<Hrn>),
     /// To end: a press is aborted, then nothing comes any more.
     Finish,
 }
@@ -107,14 +111,14 @@ pub(crate) async fn serve(
                     match pipeline.retare() {
                         Ok(()) => taring = Some(reply),
                         Err(refusal) => {
-                            log::tare(pipeline.sensor(), &Err(refusal));
+                            log::tare(pipeline.sensor().name(), &Err(refusal));
                             let _ = reply.send(Err(refusal));
                         }
                     }
                     continue;
                 }
                 Some(Command::Context(context, reply)) => {
-                    log::context(pipeline.sensor(), context.as_ref());
+                    log::context(pipeline.sensor().name(), context.as_ref());
                     recorder.feed(&mut pipeline, Input::Context(context), super::now());
                     let _ = reply.send(());
                     continue;
@@ -123,9 +127,10 @@ pub(crate) async fn serve(
                     recorder.blackbox(reply);
                     continue;
                 }
-                Some(Command::Reload(criteria)) => {
-                    recorder.reload(&pipeline, &criteria, super::now());
-                    pipeline.reload(*criteria);
+                Some(Command::Reload(sensor, hrn)) => {
+                    recorder.reload(&pipeline, &sensor, &hrn, super::now());
+                    let reloaded = pipeline.reload(*sensor, hrn);
+                    reloaded.expect("a configuration that differs in what is fixed was refused");
                     answer(&mut pipeline, &mut taring);
                     continue;
                 }
@@ -168,7 +173,7 @@ fn answer(
     taring: &mut Option<oneshot::Sender<Result<Tared, RetareError>>>,
 ) {
     if let Some(outcome) = pipeline.retared() {
-        log::tare(pipeline.sensor(), &outcome);
+        log::tare(pipeline.sensor().name(), &outcome);
         if let Some(reply) = taring.take() {
             // The asker may have gone.
             let _ = reply.send(outcome);
@@ -183,7 +188,7 @@ fn vitals(pipeline: &Pipeline, unjudged: u64) -> Vitals {
         last_frame_age: pipeline
             .last_frame()
             .map(|frame| now.mono.saturating_sub(frame.mono)),
-        contact_threshold_n: pipeline.criteria().press.contact_threshold_n,
+        contact_threshold_n: pipeline.sensor().description().press.contact_threshold_n,
         unjudged,
     }
 }

@@ -1,12 +1,13 @@
-//! What a pipeline says of presses: press and hardness events.
+//! The press and hardness events of a pipeline.
 
-use super::{Clock, Criteria, Pipeline, Unjudged};
+use super::{Clock, Pipeline, Unjudged};
 use crate::event::{Event, Hardness, Note, Phase, Press, PressState, Rejection};
 use crate::frame::{Frame, RawFrame};
 use crate::press::{Change, End, Marks, Moment, Peak};
+use crate::sensor::Description;
 
 impl Pipeline {
-    /// What subscribers are told of a change.
+    /// Adds the events of a change.
     pub(super) fn publish(&mut self, change: Change, events: &mut Vec<Event>) {
         match change {
             Change::Begin { press, at } => {
@@ -51,7 +52,7 @@ impl Pipeline {
     ) -> Event {
         Event::Press(Press {
             seq: None,
-            sensor: self.sensor.clone(),
+            sensor: self.sensor.name().to_owned(),
             time: at.stamp.wall,
             press,
             state,
@@ -62,21 +63,22 @@ impl Pipeline {
         })
     }
 
-    /// The verdict on a press. A model that fails on its own check frames was refused at its load;
-    /// should one fail on another, the press has no verdict rather than a made-up one, and
-    /// [`Self::unjudged`] tells of it.
+    /// The verdict on a press. A model that fails on its own check frames was refused when it was
+    /// loaded. If it fails on another frame, the press gets no verdict, and [`Self::unjudged`] gives
+    /// the failure.
     fn judge(&mut self, press: u64, phase: Phase, peak: &Peak) -> Option<Event> {
-        let Criteria {
+        let Description {
             min_confidence,
             min_force_n,
-            hrn,
+            calibration,
             ..
-        } = &self.criteria;
+        } = self.sensor.description();
+        let hrn = &self.hrn;
         let verdict = match hrn.judge(&peak.frame) {
             Ok(verdict) => verdict,
             Err(error) => {
                 self.unjudged.push(Unjudged {
-                    sensor: self.sensor.clone(),
+                    sensor: self.sensor.name().to_owned(),
                     press,
                     phase,
                     error,
@@ -100,11 +102,11 @@ impl Pipeline {
                 .find(|known| known.level == level)?;
             Some(known.label.clone())
         });
-        let pitch_mm = self.criteria.calibration.pitch_mm;
+        let pitch_mm = calibration.pitch_mm;
         let Moment { frame, stamp } = peak.moment;
         Some(Event::Hardness(Hardness {
             seq: None,
-            sensor: self.sensor.clone(),
+            sensor: self.sensor.name().to_owned(),
             time: stamp.wall,
             press,
             phase,
@@ -129,7 +131,7 @@ impl Pipeline {
     }
 
     fn notes(&self, peak: &Peak) -> Vec<Note> {
-        let range = &self.criteria.hrn.card().range;
+        let range = &self.hrn.card().range;
         let [least_n, most_n] = range.force_n.map(f64::from);
         let [least_taxels, most_taxels] = range.contact_area_taxels;
         let trained = (least_n..=most_n).contains(&peak.force_n)
@@ -144,9 +146,9 @@ impl Pipeline {
         .collect()
     }
 
-    /// What is known of a frame by the settings of now.
+    /// What is known of a frame by the settings that are in force now.
     pub(super) fn marks(&self, raw: &RawFrame, frame: &Frame) -> Marks {
-        let full_scale = self.decoder.layout().full_scale();
+        let full_scale = self.sensor.layout().full_scale();
         Marks {
             at_edge: self.is_at_edge(frame),
             saturated: full_scale.is_some_and(|f| self.tare.is_saturated(raw, f)),
@@ -154,8 +156,8 @@ impl Pipeline {
     }
 
     fn is_at_edge(&self, frame: &Frame) -> bool {
-        let array = self.decoder.layout().array();
-        let threshold_n = self.criteria.press.contact_threshold_n;
+        let array = self.sensor.layout().array();
+        let threshold_n = self.sensor.description().press.contact_threshold_n;
         array.places().any(|place| {
             frame.newtons[place] >= threshold_n
                 && array.position(place).is_some_and(|(row, col)| {

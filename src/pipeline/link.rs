@@ -7,25 +7,27 @@ use serde::{Deserialize, Serialize};
 use super::{Clock, Pipeline};
 use crate::event::{Event, LinkState, Status};
 use crate::frame::Stamp;
+use crate::sensor::LATE_PERIODS;
+use crate::tare::Aim;
 
-/// A frame is late after so many periods.
-pub(crate) const STALE_PERIODS: f64 = 2.5;
-/// After a silence of so many periods the bytes that are pending are settled: none that come later
-/// belong to them.
+/// After a silence of this many periods the pending bytes are settled: later bytes do not belong to
+/// them.
 const PAUSE_PERIODS: f64 = 0.5;
 
 /// What is known of the port.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) enum Link {
-    /// Never opened; why the last try failed.
+    /// Never opened, and why the last try failed.
     Closed { reason: Option<String> },
     /// Open since then, and no frame yet.
     Opened { since: Duration },
     /// The last frame came then.
     Live { since: Duration },
-    /// Open and silent.
+    /// Open, and no frame came in time.
+    Silent,
+    /// Open, and silent after its last frame.
     Stale,
-    /// Was open and is gone, or is open again without a frame.
+    /// It was open and is gone, or it is open again and no frame has come.
     Lost { reason: String },
 }
 
@@ -43,7 +45,7 @@ impl Pipeline {
         let (state, reason) = self.state();
         Status {
             seq: None,
-            sensor: self.sensor.clone(),
+            sensor: self.sensor.name().to_owned(),
             time: at.wall,
             state,
             reason,
@@ -57,23 +59,27 @@ impl Pipeline {
     /// State and reason.
     pub(super) fn state(&self) -> (LinkState, Option<String>) {
         let tare = || {
-            self.seen
-                .tare_met_contact
-                .then(|| "tare: contact".to_owned())
+            let met_contact = self.tare.aim() == Some(Aim::First { met_contact: true });
+            met_contact.then(|| "tare: contact".to_owned())
         };
+        let no_frame_in_time = || format!("no frame for {LATE_PERIODS} periods");
         match &self.seen.link {
             Link::Closed { reason } => (LinkState::Connecting, reason.clone()),
             Link::Opened { .. } => (LinkState::Connecting, None),
             Link::Live { .. } => (LinkState::Live, tare()),
-            Link::Stale => (
-                LinkState::Stale,
-                Some("no frame for 2.5 periods".to_owned()),
-            ),
+            Link::Silent => (LinkState::Stale, Some(no_frame_in_time())),
+            Link::Stale if self.sensor.stale_after() == self.sensor.late_after() => {
+                (LinkState::Stale, Some(no_frame_in_time()))
+            }
+            Link::Stale => {
+                let ms = self.sensor.stale_after().as_nanos() as f64 / 1e6;
+                (LinkState::Stale, Some(format!("no frame for {ms} ms")))
+            }
             Link::Lost { reason } => (LinkState::Lost, Some(reason.clone())),
         }
     }
 
-    /// A status, if state or reason are others than those last told.
+    /// A status, if state or reason have changed since the last one.
     pub(super) fn status_if_changed(&mut self, at: Stamp) -> Vec<Event> {
         let state = self.state();
         if self.seen.told == state {
@@ -92,7 +98,7 @@ impl Pipeline {
             .as_secs_f64();
         match self.clock {
             _ if self.seen.recent.len() < 2 => None,
-            Clock::FrameRate => Some(self.frame_rate_hz),
+            Clock::FrameRate => Some(self.sensor.description().frame_rate_hz),
             Clock::Arrival => (span > 0.0).then(|| (self.seen.recent.len() - 1) as f64 / span),
         }
     }
@@ -103,15 +109,17 @@ impl Pipeline {
             .seen
             .last_bytes
             .filter(|_| self.decoder.pending() > 0)?;
-        Some(last_bytes.saturating_add(self.period.mul_f64(PAUSE_PERIODS)))
+        Some(last_bytes.saturating_add(self.sensor.period().mul_f64(PAUSE_PERIODS)))
     }
 
     /// When a silence makes the link stale.
     pub(super) fn stale_deadline(&self) -> Option<Duration> {
+        if self.clock == Clock::FrameRate {
+            return None;
+        }
         match self.seen.link {
-            Link::Opened { since } | Link::Live { since } if self.clock == Clock::Arrival => {
-                Some(since.saturating_add(self.period.mul_f64(STALE_PERIODS)))
-            }
+            Link::Opened { since } => Some(since.saturating_add(self.sensor.late_after())),
+            Link::Live { since } => Some(since.saturating_add(self.sensor.stale_after())),
             _ => None,
         }
     }

@@ -3,23 +3,33 @@ use tract_onnx::pb;
 
 use super::*;
 use crate::event::{Note, Rejection};
+use crate::frame::Array;
+use crate::sensor::Description;
 use crate::verdict::BUILT_IN;
-use crate::wire::{self, Preset};
+use crate::wire::Preset;
 
 const PERIOD: Duration = Duration::from_millis(200);
 
 fn pipeline(preset: Preset) -> Pipeline {
-    let settings = Settings {
-        sensor: "forearm".to_owned(),
-        frame_rate_hz: 5.0,
-        layout: Layout::new(&wire::Settings {
-            preset,
-            ..wire::Settings::default()
-        })
-        .unwrap(),
-        criteria: Criteria::new(Arc::new(Hrn::load(BUILT_IN).unwrap())),
+    pipeline_of(|described| described.frame.preset = preset)
+}
+
+/// Of a JX255N at 5 frames/s, but for what `change` does to it.
+fn pipeline_of(change: impl FnOnce(&mut Description)) -> Pipeline {
+    let mut described = Description {
+        name: "forearm".to_owned(),
+        ..Description::default()
     };
-    Pipeline::new(settings, Clock::Arrival)
+    change(&mut described);
+    let hrn = Arc::new(Hrn::load(BUILT_IN).unwrap());
+    Pipeline::new(Sensor::new(described).unwrap(), hrn, Clock::Arrival)
+}
+
+fn reload(pipeline: &mut Pipeline, change: impl FnOnce(&mut Description)) {
+    let mut described = pipeline.sensor().description().clone();
+    change(&mut described);
+    let changed = Sensor::new(described).unwrap();
+    pipeline.reload(changed, pipeline.hrn.clone()).unwrap();
 }
 
 fn at(millis: u64) -> Stamp {
@@ -39,7 +49,7 @@ fn raw(taxels: usize, counts: u16) -> RawFrame {
 
 fn bytes(pipeline: &Pipeline, raw: &RawFrame) -> Vec<u8> {
     let mut bytes = Vec::new();
-    pipeline.decoder.layout().encode(raw, &mut bytes);
+    pipeline.sensor().layout().encode(raw, &mut bytes);
     bytes
 }
 
@@ -99,20 +109,20 @@ fn a_load_during_tare_is_said_and_tracked_as_no_press() {
 fn a_reload_changes_the_tare_under_way() {
     let mut pipeline = pipeline(Preset::Jx255n);
     play(&mut pipeline, 0, &[raw(9, 50); 5]);
-    let with = |pipeline: &Pipeline, tare_frames| {
-        let mut criteria = pipeline.criteria().clone();
-        criteria.calibration.tare_frames = tare_frames;
-        criteria
+    let set = |pipeline: &mut Pipeline, frames| {
+        reload(pipeline, |described| {
+            described.calibration.tare_frames = frames
+        });
     };
-    pipeline.reload(with(&pipeline, 2));
+    set(&mut pipeline, 2);
     assert_eq!(play(&mut pipeline, 5, &[raw(0, 0); 2]), ["Live"]);
     assert_eq!(pipeline.retare(), Ok(()));
-    pipeline.reload(with(&pipeline, 0));
+    set(&mut pipeline, 0);
     assert_eq!(pipeline.retared(), Some(Err(RetareError::NoFrames)));
 
     let mut pipeline = self::pipeline(Preset::Jx255n);
     play(&mut pipeline, 0, &[raw(9, 50); 5]);
-    pipeline.reload(with(&pipeline, 0));
+    set(&mut pipeline, 0);
     assert_eq!(
         play(&mut pipeline, 5, &[raw(9, 50)]),
         ["Live", "Begin 1"],
@@ -186,7 +196,7 @@ fn a_tare_on_request_zeroes_drift_and_is_refused_or_given_up_under_load() {
     assert_eq!(pipeline.retare(), Ok(()));
     pipeline.lost("end of file".to_owned(), at(3900));
     assert_eq!(pipeline.retared(), Some(Err(RetareError::NotLive)));
-    assert!(!pipeline.tare.is_taking());
+    assert_eq!(pipeline.tare.aim(), None);
 }
 
 #[test]
@@ -246,6 +256,55 @@ fn a_port_open_without_frames_is_stale_too() {
         words(&pipeline.tick(at(700))),
         ["Stale (no frame for 2.5 periods)"]
     );
+}
+
+#[test]
+fn how_long_a_live_sensor_may_be_silent_can_be_told() {
+    let check = |hz, stale_after_ms, expected_ms: u64, reason: &str| {
+        let mut pipeline = pipeline_of(|described| {
+            described.frame_rate_hz = hz;
+            described.stale_after_ms = stale_after_ms;
+        });
+        pipeline.opened(at(0));
+        // Before the first frame it is 2.5 periods, whatever is told.
+        let first = Duration::from_secs_f64(2.5 / hz);
+        assert_eq!(pipeline.deadline(), Some(at(0).mono + first));
+        let silent = pipeline.tick(at(60_000));
+        assert_eq!(words(&silent), ["Stale (no frame for 2.5 periods)"]);
+        let bytes = bytes(&pipeline, &raw(0, 0));
+        pipeline.push(&bytes, at(100_000));
+        let due = at(100_000 + expected_ms);
+        assert_eq!(pipeline.deadline(), Some(due.mono), "{hz} Hz");
+        let stale = pipeline.tick(due);
+        assert_eq!(words(&stale), [format!("Stale (no frame for {reason})")]);
+    };
+    check(5.0, None, 500, "2.5 periods");
+    check(50.0, None, 50, "2.5 periods");
+    check(100.0, None, 50, "50 ms");
+    check(100.0, Some(25.0), 25, "2.5 periods");
+    check(100.0, Some(1500.0), 1500, "1500 ms");
+    check(5.0, Some(250.0), 250, "250 ms");
+}
+
+#[test]
+fn a_reload_changes_how_long_it_may_be_silent_but_nothing_that_is_fixed() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    play(&mut pipeline, 0, &[raw(0, 0)]);
+    reload(&mut pipeline, |described| {
+        described.stale_after_ms = Some(900.0);
+    });
+    assert_eq!(pipeline.deadline(), Some(at(900).mono));
+    let mut changed = pipeline.sensor().description().clone();
+    changed.frame_rate_hz = 6.0;
+    let changed = Sensor::new(changed).unwrap();
+    let refused = pipeline.reload(changed, pipeline.hrn.clone());
+    assert_eq!(
+        refused,
+        Err(FixedError {
+            key: "frame_rate_hz"
+        })
+    );
+    assert_eq!(pipeline.deadline(), Some(at(900).mono));
 }
 
 #[test]
@@ -336,9 +395,10 @@ fn totals_balance_with_damage() {
 #[test]
 fn verdicts_below_the_thresholds_are_rejected() {
     let check = |min_force_n: f64, min_confidence: f32, expected: Option<Rejection>| {
-        let mut pipeline = pipeline(Preset::Jx255n);
-        pipeline.criteria.min_force_n = min_force_n;
-        pipeline.criteria.min_confidence = min_confidence;
+        let mut pipeline = pipeline_of(|described| {
+            described.min_force_n = min_force_n;
+            described.min_confidence = min_confidence;
+        });
         play(&mut pipeline, 0, &[raw(0, 0); 5]);
         let mut events = Vec::new();
         for (number, raw) in (5..).zip([raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)]) {
@@ -359,48 +419,47 @@ fn verdicts_below_the_thresholds_are_rejected() {
     let verdict = check(0.0, 0.0, None);
     check(verdict.force_n, verdict.confidence, None);
     check(100.0, 0.0, Some(Rejection::LowForce));
-    check(0.0, 1.1, Some(Rejection::LowConfidence));
+    let more = verdict.confidence.next_up();
+    check(0.0, more, Some(Rejection::LowConfidence));
 }
 
 #[test]
 fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
-    let full = Layout::new(&wire::Settings::default()).unwrap().array();
-    let small = "preset = 'jx255n'\nrows = 10\ncols = 12";
-    let small = Layout::new(&toml::from_str(small).unwrap()).unwrap();
-    let check =
-        |layout: Option<&Layout>, range: [f32; 2], place: usize, count, expected: &[Note]| {
-            let mut pipeline = pipeline(Preset::Jx255n);
-            if let Some(layout) = layout {
-                pipeline.decoder = Decoder::new(layout.clone());
+    let full = Array::FULL;
+    let small = Array { rows: 10, cols: 12 };
+    let check = |array: Option<Array>, range: [f32; 2], place: usize, count, expected: &[Note]| {
+        let mut pipeline = pipeline_of(|described| {
+            described.frame.rows = array.map(|array| array.rows);
+            described.frame.cols = array.map(|array| array.cols);
+        });
+        let mut file = pb::ModelProto::decode(BUILT_IN).unwrap();
+        for entry in &mut file.metadata_props {
+            if entry.key == "hrn.range" {
+                entry.value = serde_json::json!({
+                    "force_n": range,
+                    "contact_area_taxels": [9, 10],
+                })
+                .to_string();
             }
-            let mut file = pb::ModelProto::decode(BUILT_IN).unwrap();
-            for entry in &mut file.metadata_props {
-                if entry.key == "hrn.range" {
-                    entry.value = serde_json::json!({
-                        "force_n": range,
-                        "contact_area_taxels": [9, 10],
-                    })
-                    .to_string();
-                }
-            }
-            pipeline.criteria.hrn = Arc::new(Hrn::load(&file.encode_to_vec()).unwrap());
-            play(&mut pipeline, 0, &[raw(0, 0); 5]);
-            let mut held = RawFrame::default();
-            // Three by three in the middle.
-            for taxel in [348, 376, 404].into_iter().flat_map(|row| row..row + 3) {
-                held.counts[taxel] = 50;
-            }
-            held.counts[place] = count;
-            let mut events = Vec::new();
-            for (number, raw) in (5..).zip([held, held, raw(0, 0), raw(0, 0)]) {
-                let bytes = bytes(&pipeline, &raw);
-                events.extend(pipeline.push(&bytes, at(number * 200)));
-            }
-            let Some(Event::Hardness(verdict)) = events.last() else {
-                panic!("{events:?}")
-            };
-            assert_eq!(verdict.notes, expected, "{count} at {place}, {range:?}");
+        }
+        pipeline.hrn = Arc::new(Hrn::load(&file.encode_to_vec()).unwrap());
+        play(&mut pipeline, 0, &[raw(0, 0); 5]);
+        let mut held = RawFrame::default();
+        // Three by three in the middle.
+        for taxel in [348, 376, 404].into_iter().flat_map(|row| row..row + 3) {
+            held.counts[taxel] = 50;
+        }
+        held.counts[place] = count;
+        let mut events = Vec::new();
+        for (number, raw) in (5..).zip([held, held, raw(0, 0), raw(0, 0)]) {
+            let bytes = bytes(&pipeline, &raw);
+            events.extend(pipeline.push(&bytes, at(number * 200)));
+        }
+        let Some(Event::Hardness(verdict)) = events.last() else {
+            panic!("{events:?}")
         };
+        assert_eq!(verdict.notes, expected, "{count} at {place}, {range:?}");
+    };
     let wide = [0.0, 100.0];
     check(None, wide, 348, 50, &[]);
     for (row, col) in [(0, 9), (27, 9), (9, 0), (9, 27)] {
@@ -409,8 +468,8 @@ fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
         check(None, wide, full.place(row, col), 1, &[]);
     }
     for (row, col) in [(0, 5), (9, 5), (5, 0), (5, 11)] {
-        let place = small.array().place(row, col);
-        check(Some(&small), wide, place, 10, &[Note::AtEdge]);
+        let place = small.place(row, col);
+        check(Some(small), wide, place, 10, &[Note::AtEdge]);
         check(None, wide, place, 10, &[]);
     }
     check(None, wide, 348, 255, &[Note::Saturated]);
@@ -429,10 +488,10 @@ fn the_notes_are_of_the_settings_that_the_chosen_frame_came_under() {
         let mut held = raw(9, counts);
         held.counts[0] = 5;
         play(&mut pipeline, 5, &[held, raw(3, 100)]);
-        let mut criteria = pipeline.criteria().clone();
-        criteria.calibration.newtons_per_count = newtons_per_count;
-        criteria.press.contact_threshold_n = threshold_n;
-        pipeline.reload(criteria);
+        reload(&mut pipeline, |described| {
+            described.calibration.newtons_per_count = newtons_per_count;
+            described.press.contact_threshold_n = threshold_n;
+        });
         play(&mut pipeline, 7, &[raw(0, 0)]);
         let bytes = bytes(&pipeline, &raw(0, 0));
         let events = pipeline.push(&bytes, at(1600));
@@ -532,10 +591,10 @@ fn failing_model() -> Hrn {
 fn a_press_that_the_model_fails_on_ends_without_a_verdict_and_that_is_told() {
     let mut pipeline = pipeline(Preset::Jx255n);
     play(&mut pipeline, 0, &[raw(0, 0); 5]);
-    let mut criteria = pipeline.criteria().clone();
-    criteria.hrn = Arc::new(failing_model());
-    criteria.calibration.newtons_per_count = 10.0;
-    pipeline.reload(criteria);
+    pipeline.hrn = Arc::new(failing_model());
+    reload(&mut pipeline, |described| {
+        described.calibration.newtons_per_count = 10.0;
+    });
     let press = |counts| [raw(9, counts), raw(9, counts), raw(0, 0), raw(0, 0)];
     let told = play(&mut pipeline, 5, &press(99));
     assert_eq!(told, ["Begin 1", "End 1", "Final of 5"]);

@@ -1,4 +1,4 @@
-//! What a press is, as the configuration says it.
+//! The settings that say what a press is.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,11 +15,11 @@ pub struct Settings {
     pub begin_area_taxels: u32,
     /// Frames below this contact area release the press.
     pub end_area_taxels: u32,
-    /// So many of them in a row.
+    /// How many of them in a row release it.
     pub end_frames: u32,
-    /// A press of fewer frames in contact gets no verdict.
+    /// A press with fewer frames in contact gets no verdict.
     pub min_frames: u64,
-    /// A press is over after so long.
+    /// A press that is held for this long is over.
     pub max_seconds: f64,
     /// How long the contact must have settled for an early verdict.
     pub early_settle_s: f64,

@@ -15,7 +15,7 @@ pub(super) struct Settling {
     most_force_n: f64,
 }
 
-/// What a frame bears.
+/// The contact of one frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub(super) struct Load {
     pub(super) at: Duration,
@@ -30,8 +30,8 @@ impl Settling {
         self.near.iter().all(is_less)
     }
 
-    /// Adds a frame; whether over at least `early_settle_s` and [`SETTLED_FRAMES`] frames area
-    /// and force stayed near their largest so far, with enough force.
+    /// Adds a frame. True if area and force have stayed near their largest so far, over at least
+    /// `early_settle_s` and [`SETTLED_FRAMES`] frames, and the force is enough for a verdict.
     pub(super) fn push(&mut self, load: Load, settings: &Settings) -> bool {
         self.most_area = self.most_area.max(load.contact_area_taxels);
         self.most_force_n = self.most_force_n.max(load.force_n);
@@ -57,7 +57,7 @@ impl Settling {
     }
 }
 
-/// Contract, section 4: an early verdict needs three settled frames ...
+/// An early verdict needs this many settled frames.
 const SETTLED_FRAMES: usize = 3;
-/// ... whose area and force are within 5 % of their largest so far.
+/// A settled frame's area and force are this close to their largest so far.
 const SETTLED_SHARE: f64 = 0.05;

@@ -5,7 +5,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::{Entry, Error, Input, Sensor, State};
+use super::{Entry, Error, Input, RecordedSensor, State};
 use crate::frame::Stamp;
 use crate::ros::{self, Blob, Header, Topic};
 
@@ -98,7 +98,7 @@ pub(super) fn decode_entry(bytes: &[u8]) -> Result<(String, Stamp, Entry), Error
         }
         7 => Entry::Input(Input::Shutdown),
         8 => {
-            let sensor: Sensor = serde_json::from_slice(&data).map_err(unreadable)?;
+            let sensor: RecordedSensor = serde_json::from_slice(&data).map_err(unreadable)?;
             Entry::Settings(Box::new(sensor))
         }
         9 => {

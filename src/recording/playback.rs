@@ -2,10 +2,11 @@
 
 use std::sync::Arc;
 
-use super::{Entry, Found, Labels, SensorError};
+use super::{Entry, Found, Labels};
 use crate::event::Event;
 use crate::frame::Stamp;
-use crate::pipeline::{Clock, Pipeline, Unjudged};
+use crate::pipeline::{Clock, FixedError, Pipeline, Unjudged};
+use crate::sensor::SensorError;
 use crate::verdict::Hrn;
 
 /// The pipelines of a recording's sensors, fed with what they were fed then.
@@ -29,7 +30,21 @@ struct Player {
 #[error("sensor {sensor:?}: {problem}")]
 pub struct PlaybackError {
     sensor: String,
-    problem: SensorError,
+    problem: PlaybackProblem,
+}
+
+/// Why an entry cannot be played.
+#[derive(Debug, thiserror::Error)]
+pub enum PlaybackProblem {
+    /// It describes a sensor that cannot be.
+    #[error(transparent)]
+    Sensor(#[from] SensorError),
+    /// What its pipeline is said to have seen.
+    #[error("memory: found what no pipeline can have come to, expected the memory of one")]
+    Memory,
+    /// It describes another sensor under the same name.
+    #[error(transparent)]
+    Fixed(#[from] FixedError),
 }
 
 impl Playback {
@@ -49,18 +64,28 @@ impl Playback {
     /// If the recording describes a sensor that cannot be.
     pub fn feed(&mut self, found: Found) -> Result<Vec<Event>, PlaybackError> {
         let Found { sensor, at, entry } = found;
+        let played = self.play(&sensor, at, entry);
+        let mut events = played.map_err(|problem| PlaybackError { sensor, problem })?;
+        forget_boot(&mut events);
+        Ok(events)
+    }
+
+    fn play(
+        &mut self,
+        sensor: &str,
+        at: Stamp,
+        entry: Entry,
+    ) -> Result<Vec<Event>, PlaybackProblem> {
         let mut players = self.players.iter_mut();
-        let known = players.find(|player| player.pipeline.sensor() == sensor);
-        let mut events = match (entry, known) {
+        let known = players.find(|player| player.pipeline.sensor().name() == sensor);
+        let events = match (entry, known) {
             (Entry::State(state), known) => {
-                let described = if state.memory.is_possible() {
-                    state.sensor.settings(&self.hrn)
-                } else {
-                    Err(SensorError::Memory)
-                };
-                let settings = described.map_err(|problem| PlaybackError { sensor, problem })?;
+                if !state.memory.is_possible() {
+                    return Err(PlaybackProblem::Memory);
+                }
                 // Where nothing is missing the pipeline stands so already.
-                let mut pipeline = Pipeline::new(settings, Clock::Arrival);
+                let described = state.sensor.check()?;
+                let mut pipeline = Pipeline::new(described, self.hrn.clone(), Clock::Arrival);
                 pipeline.recall(state.memory);
                 let player = Player {
                     pipeline,
@@ -75,9 +100,8 @@ impl Playback {
                 Vec::new()
             }
             (Entry::Settings(described), Some(known)) => {
-                let settings = described.settings(&self.hrn);
-                let settings = settings.map_err(|problem| PlaybackError { sensor, problem })?;
-                known.pipeline.reload(settings.criteria);
+                let sensor = described.check()?;
+                known.pipeline.reload(sensor, self.hrn.clone())?;
                 known.model = described.model;
                 Vec::new()
             }
@@ -87,7 +111,6 @@ impl Playback {
             }
             (_, None) => Vec::new(),
         };
-        forget_boot(&mut events);
         Ok(events)
     }
 

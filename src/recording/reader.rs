@@ -16,16 +16,29 @@ use crate::frame::Stamp;
 pub struct Found {
     /// The sensor's name.
     pub sensor: String,
-    /// When.
+    /// The moment it happened.
     pub at: Stamp,
-    /// What.
+    /// What happened.
     pub entry: Entry,
 }
 
-/// Longest record that is read: far above a chunk of ours, far below what would fill memory.
+/// The longest record that is read: far above any chunk of ours, far below what would fill the memory.
 const LONGEST_RECORD_BYTES: usize = 64 << 20;
 
 /// Reads a recording from its beginning: what happened, in order. It ends after the first error.
+///
+/// # Example
+///
+/// [`Writer`](super::Writer) has an example with a recording. This is none:
+///
+/// ```
+/// use hardnessd::recording::Reader;
+///
+/// let mut reader = Reader::new(&b"no recording"[..]);
+/// let error = reader.next().unwrap().unwrap_err();
+/// assert_eq!(error.to_string(), "found no MCAP file, expected a recording");
+/// assert!(reader.next().is_none());
+/// ```
 pub struct Reader<R> {
     source: R,
     linear: LinearReader,

@@ -78,14 +78,8 @@ mod tests {
     }
 
     fn state() -> Entry {
-        let hrn = tests::hrn();
-        let sensor = tests::sensor(&hrn);
-        let pipeline = Pipeline::new(sensor.settings(&hrn).unwrap(), Clock::Arrival);
-        Entry::State(Box::new(State {
-            sensor,
-            memory: pipeline.memory(),
-            labels: Labels::new(),
-        }))
+        let pipeline = Pipeline::new(tests::sensor(), tests::hrn(), Clock::Arrival);
+        Entry::State(Box::new(State::of(&pipeline, Labels::new())))
     }
 
     #[test]

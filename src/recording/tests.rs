@@ -1,4 +1,5 @@
 use std::io::Cursor;
+use std::sync::Arc;
 use std::time::Duration;
 
 use serde_json::json;
@@ -8,21 +9,20 @@ use crate::event::Rejection;
 use crate::frame::RawFrame;
 use crate::pipeline::Clock;
 use crate::verdict::BUILT_IN;
+use crate::wire;
 
 pub(crate) fn hrn() -> Arc<Hrn> {
     Arc::new(Hrn::load(BUILT_IN).unwrap())
 }
 
-pub(crate) fn sensor(hrn: &Hrn) -> Sensor {
-    Sensor {
+pub(crate) fn sensor() -> Sensor {
+    Sensor::new(described()).unwrap()
+}
+
+fn described() -> Description {
+    Description {
         name: "forearm".to_owned(),
-        frame_rate_hz: 5.0,
-        frame: wire::Settings::default(),
-        calibration: tare::Settings::default(),
-        press: press::Settings::default(),
-        min_confidence: 0.0,
-        min_force_n: 0.0,
-        model: hrn.sha256().to_owned(),
+        ..Description::default()
     }
 }
 
@@ -81,33 +81,30 @@ fn story() -> Vec<(Stamp, Input<'static>)> {
 /// inputs, a chunk ends after every `chunk`; between the presses the configuration is read again.
 fn recorded(states: usize, chunk: usize) -> (Vec<u8>, Vec<Event>) {
     let hrn = hrn();
-    let mut described = sensor(&hrn);
     let about = About {
         robot: "arm-7".to_owned(),
         run: "r".to_owned(),
         boot_id: "b".to_owned(),
         reason: None,
         labels: labels(),
-        sensors: vec![described.clone()],
+        sensors: vec![RecordedSensor::new(&sensor(), &hrn)],
     };
     let mut writer = Writer::new(Vec::new(), &about).unwrap();
-    let mut pipeline = Pipeline::new(described.settings(&hrn).unwrap(), Clock::Arrival);
+    let mut pipeline = Pipeline::new(sensor(), hrn.clone(), Clock::Arrival);
     let mut events = Vec::new();
     for (index, (at, input)) in story().into_iter().enumerate() {
         if index % states == 0 {
-            let state = State {
-                sensor: described.clone(),
-                memory: pipeline.memory(),
-                labels: labels(),
-            };
+            let state = State::of(&pipeline, labels());
             writer.entry(0, at, &Entry::State(Box::new(state))).unwrap();
         }
         if index == 120 {
-            described.min_force_n = 1e3;
-            described.press.end_frames = 1;
-            let settings = Entry::Settings(Box::new(described.clone()));
+            let mut changed = described();
+            changed.min_force_n = 1e3;
+            changed.press.end_frames = 1;
+            let changed = Sensor::new(changed).unwrap();
+            let settings = Entry::Settings(Box::new(RecordedSensor::new(&changed, &hrn)));
             writer.entry(0, at, &settings).unwrap();
-            pipeline.reload(described.criteria(&hrn));
+            pipeline.reload(changed, hrn.clone()).unwrap();
         }
         writer.entry(0, at, &Entry::Input(input.clone())).unwrap();
         let mut came = input.feed(&mut pipeline, at);
@@ -178,24 +175,30 @@ fn a_pipeline_that_recalls_another_goes_on_as_that_one() {
 #[test]
 fn a_sensor_that_cannot_be_is_refused_wherever_it_is_described() {
     let hrn = hrn();
-    let good = sensor(&hrn);
-    let pipeline = Pipeline::new(good.settings(&hrn).unwrap(), Clock::Arrival);
-    let state = |sensor: Sensor| {
+    let good = RecordedSensor::new(&sensor(), &hrn);
+    let pipeline = Pipeline::new(sensor(), hrn.clone(), Clock::Arrival);
+    let state = |sensor: RecordedSensor| {
         Entry::State(Box::new(State {
             sensor,
             memory: pipeline.memory(),
             labels: labels(),
         }))
     };
-    let (mut bad, mut nameless) = (good.clone(), good.clone());
-    bad.press.early_settle_s = -1.0;
-    nameless.name = "\u{1b}[2J\n".to_owned();
+    let [mut bad, mut nameless, mut other] = [(); 3].map(|()| good.clone());
+    bad.description.press.early_settle_s = -1.0;
+    nameless.description.name = "\u{1b}[2J\n".to_owned();
+    // A dead taxel of the smaller array would be no place of the larger one, nor the other way.
+    other.description.frame.rows = Some(2);
     let of_name = "name: found \"\\u{1b}[2J\\n\", expected [a-z]";
     let of_press = "press.early_settle_s: found -1.0";
     for (last, told) in [
         (state(bad.clone()), of_press),
         (Entry::Settings(Box::new(bad)), of_press),
         (state(nameless), of_name),
+        (
+            Entry::Settings(Box::new(other)),
+            "frame: found another value",
+        ),
     ] {
         let mut playback = Playback::new(hrn.clone());
         let mut feed = |entry| {
@@ -215,17 +218,12 @@ fn a_sensor_that_cannot_be_is_refused_wherever_it_is_described() {
 #[test]
 fn a_memory_that_no_pipeline_came_to_is_refused() {
     let hrn = hrn();
-    let sensor = sensor(&hrn);
-    let mut pipeline = Pipeline::new(sensor.settings(&hrn).unwrap(), Clock::Arrival);
+    let mut pipeline = Pipeline::new(sensor(), hrn.clone(), Clock::Arrival);
     // Some are in the first tare, some in a press.
     let (mut taring, mut pressed) = (None, None);
     for (moment, input) in story() {
         input.feed(&mut pipeline, moment);
-        let state = State {
-            sensor: sensor.clone(),
-            memory: pipeline.memory(),
-            labels: labels(),
-        };
+        let state = State::of(&pipeline, labels());
         let kept = match pipeline.frame_counts().0 {
             3 => &mut taring,
             22 => &mut pressed,

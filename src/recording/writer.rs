@@ -8,7 +8,7 @@ use mcap::write::NoSeek;
 use mcap::{Compression, WriteOptions};
 
 use super::message::{self, INPUT, TOPICS};
-use super::{Entry, Error, Labels, Sensor};
+use super::{Entry, Error, Labels, RecordedSensor};
 use crate::event::Event;
 use crate::frame::Stamp;
 use crate::ros::{self, Topic};
@@ -27,18 +27,51 @@ pub struct About {
     /// What was pressed, and the like.
     pub labels: Labels,
     /// The sensors, in the order of their channels.
-    pub sensors: Vec<Sensor>,
+    pub sensors: Vec<RecordedSensor>,
 }
 
 /// Writes one recording.
+///
+/// # Example
+///
+/// ```
+/// use std::time::Duration;
+///
+/// use hardnessd::frame::Stamp;
+/// use hardnessd::recording::{About, Entry, Input, Labels, Reader, RecordedSensor, Writer};
+/// use hardnessd::sensor::{Description, Sensor};
+/// use hardnessd::verdict::{BUILT_IN, Hrn};
+///
+/// let sensor = Sensor::new(Description::default())?;
+/// let about = About {
+///     robot: "arm-7".to_owned(),
+///     run: "1".to_owned(),
+///     boot_id: String::new(),
+///     reason: None,
+///     labels: Labels::new(),
+///     sensors: vec![RecordedSensor::new(&sensor, &Hrn::load(BUILT_IN)?)],
+/// };
+/// let at = Stamp {
+///     mono: Duration::from_secs(1),
+///     wall: jiff::Timestamp::UNIX_EPOCH,
+/// };
+/// let mut writer = Writer::new(Vec::new(), &about)?;
+/// writer.entry(0, at, &Entry::Input(Input::Opened))?;
+/// let file = writer.finish()?;
+///
+/// let found = Reader::new(&file[..]).collect::<Result<Vec<_>, _>>()?;
+/// assert_eq!(found.len(), 1);
+/// assert_eq!(found[0].entry, Entry::Input(Input::Opened));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct Writer<W: Write> {
     out: mcap::Writer<NoSeek<W>>,
     sensors: Vec<String>,
     sequence: u32,
 }
 
-/// As every recording of ours is written: whole chunks, so that one that was cut off ends with
-/// a whole one.
+/// How every recording is written: in whole chunks, so that a file that was cut off ends with a
+/// whole one.
 pub(super) fn options() -> WriteOptions {
     WriteOptions::new()
         .profile("ros2")
@@ -103,7 +136,7 @@ impl<W: Write> Writer<W> {
             let settings = serde_json::to_string(sensor)
                 .expect("plain structs of numbers and strings always serialise");
             let sensor = BTreeMap::from([
-                text("name", &sensor.name),
+                text("name", sensor.name()),
                 text("model", &sensor.model),
                 text("settings", &settings),
             ]);
@@ -119,7 +152,7 @@ impl<W: Write> Writer<W> {
         }
         for (index, sensor) in about.sensors.iter().enumerate() {
             for topic in TOPICS {
-                let name = topic_name(&sensor.name, topic);
+                let name = topic_name(sensor.name(), topic);
                 let id = channel_id(index, topic);
                 out.add_channel_with_id(id, schema_id(topic), &name, "cdr", &BTreeMap::new())?;
             }
@@ -127,7 +160,7 @@ impl<W: Write> Writer<W> {
         out.flush()?;
         Ok(Self {
             out,
-            sensors: about.sensors.iter().map(|s| s.name.clone()).collect(),
+            sensors: about.sensors.iter().map(|s| s.name().to_owned()).collect(),
             sequence: 0,
         })
     }

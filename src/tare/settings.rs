@@ -1,4 +1,4 @@
-//! What turns counts into newtons, as the configuration says it.
+//! The settings that turn counts into newtons.
 
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
@@ -28,7 +28,7 @@ pub struct Settings {
     pub dead_taxels: Vec<[usize; 2]>,
 }
 
-/// Lists of exactly two: of a longer one the TOML parser would drop the rest.
+/// Reads lists of exactly two. The TOML parser would silently drop the rest of a longer list.
 fn pairs<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<[usize; 2]>, D::Error> {
     let pair = |list: Vec<usize>| {
         let length = list.len();

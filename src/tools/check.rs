@@ -71,10 +71,8 @@ pub fn run(args: &Args) -> Result<(), Error> {
         source,
     })?;
     let mut lines = format!("robot {}\n", setup.config.robot);
-    for sensor in &setup.config.sensors {
-        let layout = Layout::new(&sensor.frame)
-            .expect("a layout was checked when its configuration was read");
-        lines += &line_of(sensor, &layout, &args.config)?;
+    for (sensor, checked) in setup.config.sensors.iter().zip(&setup.sensors) {
+        lines += &line_of(sensor, checked.layout(), &args.config)?;
         let (ours, models) = (sensor.calibration.pitch_mm, setup.hrn.card().pitch_mm);
         if (ours - f64::from(models)).abs() > PITCH_TOLERANCE_MM {
             eprintln!(

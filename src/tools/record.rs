@@ -12,6 +12,7 @@ use clap::Args as ClapArgs;
 use super::simulate::positive;
 use crate::daemon::config::Setup;
 use crate::daemon::{self, Daemon, record};
+use crate::recording::{LabelError, check_label};
 use crate::verdict::Level;
 
 /// Arguments of `record`.
@@ -20,8 +21,8 @@ pub struct Args {
     /// Configuration; its ways out are not opened
     #[arg(long, value_name = "F")]
     pub config: PathBuf,
-    /// Recording to write (.mcap); a file that exists is left alone
-    #[arg(long, value_name = "FILE", value_parser = |name: &str| super::named_unlike(name, "bin"))]
+    /// Recording to write, as MCAP; a file that exists is left alone
+    #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// What to write down in it, such as level=2 or object=7; may be repeated
     #[arg(long = "label", value_name = "KEY=VALUE", value_parser = label)]
@@ -134,9 +135,8 @@ fn check_level(labels: &[(String, String)], levels: &[Level]) -> Result<(), Erro
 }
 
 /// `KEY=VALUE`.
-fn label(text: &str) -> Result<(String, String), String> {
-    match text.split_once('=') {
-        Some((key, value)) if !key.is_empty() => Ok((key.to_owned(), value.to_owned())),
-        _ => Err("expected KEY=VALUE".to_owned()),
-    }
+fn label(text: &str) -> Result<(String, String), LabelError> {
+    let (key, value) = text.split_once('=').ok_or(LabelError::NoKey)?;
+    check_label(key, value)?;
+    Ok((key.to_owned(), value.to_owned()))
 }

@@ -3,7 +3,6 @@
 //! Times come from the recording, so the output depends on nothing else: neither on the speed nor
 //! on how the bytes are cut.
 
-use std::fs::File;
 use std::future::Future;
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
@@ -17,15 +16,15 @@ use crate::daemon::config::{self, Config, Sensor, Setup};
 use crate::daemon::now;
 use crate::event::{Event, Kind};
 use crate::pipeline::{Clock, Pipeline, Unjudged};
-use crate::recording::{self, Playback, Reader};
+use crate::recording::{self, FileKind, Playback, Reader};
 
 /// Arguments of `replay`.
 #[derive(Debug, Clone, ClapArgs)]
 pub struct Args {
-    /// Recording: .mcap, or .bin, raw bytes back to back
+    /// Recording of `record`, or raw bytes back to back
     file: PathBuf,
-    /// Configuration: its model judges; of a .bin, its first sensor is the one recorded [default:
-    /// the model built in, a JX255N by default settings]
+    /// Configuration: its model judges; raw bytes are those of its first sensor [default: the model
+    /// built in, a JX255N by default settings]
     #[arg(long, value_name = "F")]
     config: Option<PathBuf>,
     /// Play so many times as fast as the sensor did [default: as fast as it goes]
@@ -129,11 +128,13 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Error> {
         start: None,
         stopped,
     };
-    let extension = path.extension().unwrap_or_default();
-    if extension == "mcap" {
-        play_recording(path, BufReader::new(recording), setup, pace)
-    } else {
-        play_bytes(path, recording, &setup, pace)
+    let (kind, recording) = FileKind::read(recording).map_err(|source| Error::Broken {
+        path: path.clone(),
+        source,
+    })?;
+    match kind {
+        FileKind::Recording => play_recording(path, BufReader::new(recording), setup, pace),
+        FileKind::Raw => play_bytes(path, recording, &setup, pace),
     }
 }
 
@@ -226,19 +227,22 @@ fn play_entries(
 }
 
 /// Bytes back to back.
-fn play_bytes(path: &Path, mut file: File, setup: &Setup, mut pace: Pace) -> Result<(), Error> {
-    let settings = setup
-        .pipelines()
-        .next()
-        .expect("a configuration has at least one sensor");
-    let frame_rate_hz = settings.frame_rate_hz;
+fn play_bytes(
+    path: &Path,
+    mut file: impl Read,
+    setup: &Setup,
+    mut pace: Pace,
+) -> Result<(), Error> {
+    let sensor = setup.sensors.first();
+    let sensor = sensor.expect("a configuration has at least one sensor");
+    let frame_rate_hz = sensor.description().frame_rate_hz;
     let chunk_bytes = match pace.speed {
         // No two frames end in so many: each comes at its own moment.
-        Some(_) => settings.layout.min_frame_bytes(),
+        Some(_) => sensor.layout().min_frame_bytes(),
         None => CHUNK_BYTES,
     };
     let mut chunk = vec![0; chunk_bytes];
-    let mut pipeline = Pipeline::new(settings, Clock::FrameRate);
+    let mut pipeline = Pipeline::new(sensor.clone(), setup.hrn.clone(), Clock::FrameRate);
     let mut seq = 0;
     loop {
         let read = match file.read(&mut chunk) {

@@ -25,8 +25,8 @@ pub struct Args {
     /// Symbolic link to keep at the pty; an old link is replaced
     #[arg(long, value_name = "PATH")]
     link: Option<PathBuf>,
-    /// Write what the sensor sends to this .bin file instead, as fast as it goes
-    #[arg(long, value_name = "FILE", value_parser = |name: &str| super::named_unlike(name, "mcap"), conflicts_with_all = ["link", "speed", "baud"], requires = "presses")]
+    /// Write what the sensor sends to this file instead: raw bytes, as fast as it goes
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["link", "speed", "baud"], requires = "presses")]
     to: Option<PathBuf>,
     /// Layout of a frame
     #[arg(long, value_name = "P", default_value = "jx255n", value_parser = preset)]

@@ -19,14 +19,14 @@ use self::proposal::{Proposal, propose};
 use super::shown;
 use super::simulate::positive;
 use crate::daemon::serial::{Link, Turn};
-use crate::recording::{self, Entry, Input, Reader};
+use crate::recording::{self, Entry, FileKind, Input, Reader};
 use crate::wire::Settings;
 
 /// Arguments of `sniff`.
 #[derive(Debug, Clone, ClapArgs)]
 #[command(group(ArgGroup::new("source").args(["file", "port"]).required(true)))]
 pub struct Args {
-    /// Recording: .mcap, or .bin, raw bytes back to back; best with presses in it
+    /// Recording of `record`, or raw bytes back to back; best with presses in it
     file: Option<PathBuf>,
     /// Listen at this port instead; press the sensor meanwhile
     #[arg(long, value_name = "P")]
@@ -132,11 +132,13 @@ fn read(path: &Path) -> Result<Vec<u8>, Error> {
         path: path.to_owned(),
         source,
     })?;
+    let unreadable = |source| Error::Unreadable {
+        path: path.to_owned(),
+        source,
+    };
+    let (kind, file) = FileKind::read(file).map_err(unreadable)?;
     let mut bytes = Vec::new();
-    if path
-        .extension()
-        .is_some_and(|extension| extension == "mcap")
-    {
+    if kind == FileKind::Recording {
         // Of several sensors, the first one's.
         let mut sensor = None;
         for found in Reader::new(BufReader::new(file)) {
@@ -156,10 +158,7 @@ fn read(path: &Path) -> Result<Vec<u8>, Error> {
         return Ok(bytes);
     }
     let read = file.take(MOST_BYTES as u64).read_to_end(&mut bytes);
-    read.map_err(|source| Error::Unreadable {
-        path: path.to_owned(),
-        source,
-    })?;
+    read.map_err(unreadable)?;
     Ok(bytes)
 }
 

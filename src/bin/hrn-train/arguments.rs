@@ -111,10 +111,10 @@ pub(super) struct Collect {
     /// Add to the data set, if it is there
     #[arg(long)]
     pub(super) append: bool,
-    /// Configuration whose first sensor a .bin is of [default: a JX255N by default settings]
+    /// Configuration whose first sensor raw bytes are of [default: a JX255N by default settings]
     #[arg(long, value_name = "F")]
     pub(super) config: Option<PathBuf>,
-    /// Recordings: .mcap, or .bin, raw bytes back to back. If all have a label "material" or "shore",
+    /// Recordings of `record`, or raw bytes back to back. If all have a label "material" or "shore",
     /// the data set has that array; all or none must have it
     #[arg(value_name = "CAPTURE", required = true)]
     pub(super) captures: Vec<PathBuf>,

@@ -190,14 +190,12 @@ fn collect(arguments: &Collect) -> anyhow::Result<String> {
             Setup::of(defaults, Path::new("defaults"))?
         }
     };
-    let of_bytes = setup
-        .pipelines()
-        .next()
-        .context("the configuration has no sensor")?;
+    let sensor = setup.sensors.first();
+    let sensor = sensor.context("the configuration has no sensor")?;
     let captures = arguments
         .captures
         .iter()
-        .map(|path| Capture::read(path, &of_bytes))
+        .map(|path| Capture::read(path, sensor, &setup.hrn))
         .collect::<Result<Vec<_>, _>>()?;
     let before = if arguments.append {
         collect::existing(&arguments.out)?

@@ -3,12 +3,13 @@
 use std::net::{IpAddr, SocketAddr};
 use std::path::Path;
 
-use super::parse::{Error, Unusable};
+use super::error::Error;
 use super::{Config, Model, Ros2, Sensor, Zenoh};
-use crate::{event, wire};
+use crate::{sensor, wording};
 
-/// Checks a configuration whose paths are not relative to its file any more; `path` is for messages.
-pub(super) fn check(config: &Config, path: &Path) -> Result<(), Error> {
+/// Checks a configuration whose paths are not relative to its file any more, and gives its sensors;
+/// `path` is for messages.
+pub(super) fn check(config: &Config, path: &Path) -> Result<Vec<sensor::Sensor>, Error> {
     let value = |key: String, found: String, expected| Error::Value {
         path: path.to_owned(),
         key,
@@ -27,22 +28,30 @@ pub(super) fn check(config: &Config, path: &Path) -> Result<(), Error> {
             });
         }
     }
-    if config.robot.is_empty() || config.robot.chars().any(char::is_control) {
-        let found = format!("{:?}", config.robot);
-        return Err(value("robot".to_owned(), found, "a name"));
+    let robot = &config.robot;
+    let chars = robot.chars().count();
+    if chars > MOST_ROBOT_CHARS {
+        let found = format!("{chars} characters");
+        return Err(value("robot".to_owned(), found, "a name of at most 255"));
+    }
+    if robot.is_empty() || !wording::is_plain(robot) {
+        let expected = "a name without control or bidirectional characters";
+        return Err(value("robot".to_owned(), format!("{robot:?}"), expected));
     }
     if config.sensors.is_empty() {
         let expected = "at least one [[sensor]] with a port";
         return Err(value("sensor".to_owned(), "none".to_owned(), expected));
     }
-    for (index, sensor) in config.sensors.iter().enumerate() {
-        check_sensor(sensor, &config.sensors[..index], path)?;
+    let mut sensors = Vec::with_capacity(config.sensors.len());
+    for (index, given) in config.sensors.iter().enumerate() {
+        let sensor = sensor::Sensor::new(config.describe(given));
+        sensors.push(sensor.map_err(|problem| Error::Sensor {
+            path: path.to_owned(),
+            sensor: given.name.clone(),
+            problem,
+        })?);
+        check_port(given, &config.sensors[..index], path)?;
     }
-    config.press.check().map_err(|problem| Error::Table {
-        path: path.to_owned(),
-        table: "press".to_owned(),
-        problem: Unusable::Press(problem),
-    })?;
     check_model(&config.model, &value)?;
     if config.publish.unix.max_clients == 0 {
         let key = "publish.unix.max_clients".to_owned();
@@ -84,7 +93,7 @@ pub(super) fn check(config: &Config, path: &Path) -> Result<(), Error> {
             "another address or port",
         ));
     }
-    Ok(())
+    Ok(sensors)
 }
 
 fn check_zenoh(
@@ -112,7 +121,7 @@ fn check_ros2(
     let found = match ros2.chosen_domain_id() {
         Ok(id) if id > LAST_DOMAIN_ID => Some(format!("{id} (by default $ROS_DOMAIN_ID)")),
         Ok(_) => None,
-        Err(found) => Some(found),
+        Err(found) => Some(found.to_string()),
     };
     if let Some(found) = found {
         return Err(value(
@@ -145,6 +154,9 @@ fn check_ros2(
     }
 }
 
+/// As long as the longest name of a host.
+const MOST_ROBOT_CHARS: usize = 255;
+
 /// Beyond it a domain's ports are no port numbers (DDSI-RTPS 2.5, 9.6.2.3).
 const LAST_DOMAIN_ID: u16 = 232;
 
@@ -160,7 +172,8 @@ fn meet(one: SocketAddr, other: SocketAddr) -> bool {
 /// More megabytes than any disk has, few enough to be counted in bytes; 31 years.
 const MOST: u64 = 1_000_000_000;
 
-fn check_sensor(sensor: &Sensor, earlier: &[Sensor], path: &Path) -> Result<(), Error> {
+/// Whether a sensor has a name and a port of its own.
+fn check_port(sensor: &Sensor, earlier: &[Sensor], path: &Path) -> Result<(), Error> {
     let name = &sensor.name;
     let value = |key: &str, found: String, expected| {
         let key = format!("sensor.{key} of {name:?}");
@@ -171,14 +184,6 @@ fn check_sensor(sensor: &Sensor, earlier: &[Sensor], path: &Path) -> Result<(), 
             expected,
         })
     };
-    let table = |table: &str, problem| Error::Table {
-        path: path.to_owned(),
-        table: format!("sensor[{name:?}].{table}"),
-        problem,
-    };
-    if !event::is_sensor_name(name) {
-        return value("name", format!("{name:?}"), "[a-z][a-z0-9_]*");
-    }
     if earlier.iter().any(|other| other.name == *name) {
         return value(
             "name",
@@ -198,41 +203,13 @@ fn check_sensor(sensor: &Sensor, earlier: &[Sensor], path: &Path) -> Result<(), 
     if sensor.baud == 0 {
         return value("baud", "0".to_owned(), "bits a second, 1 or more");
     }
-    let hz = sensor.frame_rate_hz;
-    if !(FRAME_RATES_HZ.0..=FRAME_RATES_HZ.1).contains(&hz) {
-        return value(
-            "frame_rate_hz",
-            format!("{hz:?}"),
-            "frames a second, 0.01 to 10000",
-        );
-    }
-    let layout = wire::Layout::new(&sensor.frame)
-        .map_err(|problem| table("frame", Unusable::Frame(problem)))?;
-    sensor
-        .calibration
-        .check(layout.array())
-        .map_err(|problem| table("calibration", Unusable::Calibration(problem)))
+    Ok(())
 }
-
-/// Wider than any sensor, narrow enough that a period is a sane time to wait.
-const FRAME_RATES_HZ: (f64, f64) = (0.01, 10_000.0);
 
 fn check_model(
     model: &Model,
     value: &impl Fn(String, String, &'static str) -> Error,
 ) -> Result<(), Error> {
-    if !(0.0..=1.0).contains(&model.min_confidence) {
-        let found = format!("{:?}", model.min_confidence);
-        return Err(value("model.min_confidence".to_owned(), found, "0 to 1"));
-    }
-    if !(model.min_force_n.is_finite() && model.min_force_n >= 0.0) {
-        let found = format!("{:?}", model.min_force_n);
-        return Err(value(
-            "model.min_force_n".to_owned(),
-            found,
-            "newtons, 0 or more",
-        ));
-    }
     match &model.sha256 {
         Some(hash) if hash.len() != 64 || !hash.chars().all(|c| c.is_ascii_hexdigit()) => {
             Err(value(

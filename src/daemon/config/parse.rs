@@ -1,149 +1,15 @@
-//! Reading the file: text to [`Config`], and every way in which that can fail.
+//! Reading the file: text to [`Config`], and the model that it names.
 
-use std::fmt;
 use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use toml::de::DeTable;
 
-use super::check::check;
+use super::error::{Error, MAX_BYTES, Place};
 use super::{Config, Model};
-use crate::verdict::{self, Hrn, ModelError};
-use crate::{press, tare, wire, wording};
-
-/// Why there is no configuration. Each says file, key, what was found and what was expected.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The file itself cannot be read.
-    #[error("{path}: cannot read: {source}")]
-    Unreadable {
-        /// Of the configuration.
-        path: PathBuf,
-        /// Why not.
-        source: std::io::Error,
-    },
-    /// More than any configuration has: another file, or a device without an end.
-    #[error("{path}: found more than {MAX_BYTES} bytes, expected a configuration")]
-    TooLong {
-        /// Of the configuration.
-        path: PathBuf,
-    },
-    /// No TOML, an unknown key, or a value of the wrong type.
-    #[error("{path}:{place}: {problem}")]
-    Syntax {
-        /// Of the configuration.
-        path: PathBuf,
-        /// Where in it.
-        place: Place,
-        /// What was found and what was expected.
-        problem: String,
-    },
-    /// A value out of its range.
-    #[error("{path}: {key}: found {found}, expected {expected}")]
-    Value {
-        /// Of the configuration.
-        path: PathBuf,
-        /// As in the file.
-        key: String,
-        /// As given.
-        found: String,
-        /// What could be used.
-        expected: &'static str,
-    },
-    /// A value that the part concerned cannot use; its message begins with the key.
-    #[error("{path}: {table}.{problem}")]
-    Table {
-        /// Of the configuration.
-        path: PathBuf,
-        /// The table, and whose.
-        table: String,
-        /// What the part says.
-        problem: Unusable,
-    },
-    /// A table of a part that this program was built without: never ignored in silence.
-    #[error(
-        "{path}: publish.{feature}: found a table, expected none: built without the feature \
-         {feature:?}"
-    )]
-    NotBuilt {
-        /// Of the configuration.
-        path: PathBuf,
-        /// Of the package, and the table's name.
-        feature: &'static str,
-    },
-    /// The model file cannot be read.
-    #[error("{path}: model.path: cannot read {model}: {source}")]
-    ModelUnreadable {
-        /// Of the configuration.
-        path: PathBuf,
-        /// Of the model.
-        model: PathBuf,
-        /// Why not.
-        source: std::io::Error,
-    },
-    /// Another file than the one meant.
-    #[error("{path}: model.sha256: found a model of {found}, expected {expected}")]
-    ModelHash {
-        /// Of the configuration.
-        path: PathBuf,
-        /// Of the file there is.
-        found: String,
-        /// As given.
-        expected: String,
-    },
-    /// The model is refused.
-    #[error("{path}: model.path: {model}: {source}")]
-    Model {
-        /// Of the configuration.
-        path: PathBuf,
-        /// Of the model, or that it is the one built in.
-        model: String,
-        /// Why.
-        source: Box<ModelError>,
-    },
-}
-
-/// What a part of the core says of its table.
-#[derive(Debug, thiserror::Error)]
-pub enum Unusable {
-    /// `[sensor.frame]`
-    #[error(transparent)]
-    Frame(wire::LayoutError),
-    /// `[sensor.calibration]`
-    #[error(transparent)]
-    Calibration(tare::SettingsError),
-    /// `[press]`
-    #[error(transparent)]
-    Press(press::SettingsError),
-}
-
-/// Line and column, from 1.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Place {
-    line: usize,
-    column: usize,
-}
-
-impl fmt::Display for Place {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(out, "{}:{}", self.line, self.column)
-    }
-}
-
-impl Place {
-    fn of(text: &str, byte: usize) -> Self {
-        let before = &text[..byte.min(text.len())];
-        let line_start = before.rfind('\n').map_or(0, |newline| newline + 1);
-        Self {
-            line: before.matches('\n').count() + 1,
-            column: before[line_start..].chars().count() + 1,
-        }
-    }
-}
-
-/// Room for a hundred sensors with every taxel dead.
-const MAX_BYTES: usize = 1 << 20;
+use crate::verdict::{self, Hrn};
+use crate::wording;
 
 pub(super) fn load(path: &Path) -> Result<Config, Error> {
     let bytes = read(path, MAX_BYTES).map_err(|source| Error::Unreadable {
@@ -183,7 +49,6 @@ pub(super) fn load(path: &Path) -> Result<Config, Error> {
             resolve(given, directory, key.to_owned(), "a path", path)?;
         }
     }
-    check(&config, path)?;
     Ok(config)
 }
 

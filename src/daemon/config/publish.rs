@@ -110,15 +110,18 @@ impl fmt::Debug for Endpoint {
     }
 }
 
-impl TryFrom<String> for Endpoint {
-    type Error = String;
+/// Text that is no [`Endpoint`].
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("found {0:?}, expected an endpoint such as \"tcp/127.0.0.1:7447\"")]
+pub struct EndpointError(String);
 
-    fn try_from(text: String) -> Result<Self, String> {
+impl TryFrom<String> for Endpoint {
+    type Error = EndpointError;
+
+    fn try_from(text: String) -> Result<Self, EndpointError> {
         match Self::parse(&text) {
             Some(_) => Ok(Self(text)),
-            None => Err(format!(
-                "found {text:?}, expected an endpoint such as \"tcp/127.0.0.1:7447\""
-            )),
+            None => Err(EndpointError(text)),
         }
     }
 }
@@ -163,17 +166,20 @@ impl Ros2 {
         chosen.expect("the domain was checked when the configuration was read")
     }
 
-    /// The same before it is checked, or what stands in its place.
-    pub(super) fn chosen_domain_id(&self) -> Result<u16, String> {
+    /// The same before it is checked.
+    pub(super) fn chosen_domain_id(&self) -> Result<u16, DomainIdError> {
         match (self.domain_id, env::var("ROS_DOMAIN_ID")) {
             (Some(id), _) => Ok(id),
-            (None, Ok(text)) if !text.is_empty() => {
-                text.parse().map_err(|_| format!("$ROS_DOMAIN_ID {text:?}"))
-            }
+            (None, Ok(text)) if !text.is_empty() => text.parse().map_err(|_| DomainIdError(text)),
             (None, _) => Ok(0),
         }
     }
 }
+
+/// A `$ROS_DOMAIN_ID` that is no number.
+#[derive(Debug, thiserror::Error)]
+#[error("$ROS_DOMAIN_ID {0:?}")]
+pub(super) struct DomainIdError(String);
 
 /// The `[publish.unix]` table.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -243,15 +249,19 @@ impl Unix {
 #[serde(try_from = "String", into = "String")]
 pub struct Mode(pub u32);
 
-impl TryFrom<String> for Mode {
-    type Error = String;
+/// Text that is no [`Mode`].
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("found {0:?}, expected octal permissions such as \"0660\"")]
+pub struct ModeError(String);
 
-    fn try_from(text: String) -> Result<Self, String> {
-        u32::from_str_radix(&text, 8)
-            .ok()
-            .filter(|mode| *mode <= 0o777)
-            .map(Self)
-            .ok_or_else(|| format!("found {text:?}, expected octal permissions such as \"0660\""))
+impl TryFrom<String> for Mode {
+    type Error = ModeError;
+
+    fn try_from(text: String) -> Result<Self, ModeError> {
+        match u32::from_str_radix(&text, 8) {
+            Ok(mode) if mode <= 0o777 => Ok(Self(mode)),
+            _ => Err(ModeError(text)),
+        }
     }
 }
 

@@ -6,7 +6,12 @@ fn load(text: &str) -> Result<Config, String> {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("hardnessd.toml");
     std::fs::write(&path, text).unwrap();
-    Config::load(&path).map_err(|error| error.to_string())
+    checked(&path)
+}
+
+fn checked(path: &Path) -> Result<Config, String> {
+    let checked = Config::load(path).and_then(|config| config.check(path).map(|_| config));
+    checked.map_err(|error| error.to_string())
 }
 
 const LEAST: &str = "[[sensor]]\nport = \"/dev/ttyUSB0\"\n";
@@ -30,7 +35,7 @@ fn every_key_but_port_has_a_default() {
 
 #[test]
 fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
-    let cases: [(&str, &[&str]); 38] = [
+    let cases: [(&str, &[&str]); 41] = [
         ("[[sensor]]\nname = \"a\"", &["1:1", "sensor.port", "none"]),
         (
             "# Two.\n[[sensor]]\nport = \"p\"\n\n[[sensor]]\nname = \"b\"",
@@ -69,6 +74,14 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
              [publish.tcp]\nlisten = \"0.0.0.0:99\"",
             &["http.listen: found 127.0.0.1:99", "0.0.0.0:99", "another"],
         ),
+        (
+            "robot = \"\\u202Eevil\"\n[[sensor]]\nport = \"p\"",
+            &["robot: found \"\\u{202e}evil\"", "bidirectional characters"],
+        ),
+        (
+            "robot = \"\"\n[[sensor]]\nport = \"p\"",
+            &["robot: found \"\"", "expected a name"],
+        ),
         ("bad", &["1:"]),
         ("[log]", &["sensor", "found none"]),
         (
@@ -90,8 +103,12 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
             &["frame_rate_hz", "NaN"],
         ),
         (
+            "[[sensor]]\nport = \"p\"\nstale_after_ms = 0",
+            &["stale_after_ms: found 0.0, expected 0.1 to 3600000 milli"],
+        ),
+        (
             "[[sensor]]\nport = \"p\"\n[sensor.frame]\nrows = 29",
-            &["frame.rows", "29", "28"],
+            &["sensor[\"sensor\"].frame.rows", "29", "28"],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[sensor.frame]\nsync = \"xyz\"",
@@ -183,6 +200,24 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
 }
 
 #[test]
+fn a_name_that_is_too_long_is_refused_without_being_repeated() {
+    let long = "a".repeat(300);
+    for (text, expected) in [
+        (
+            format!("[[sensor]]\nport = \"p\"\nname = \"{long}\""),
+            "sensor.name: found 300 characters, expected at most 64",
+        ),
+        (
+            format!("robot = \"{long}\"\n[[sensor]]\nport = \"p\""),
+            "robot: found 300 characters, expected a name of at most 255",
+        ),
+    ] {
+        let error = load(&text).unwrap_err();
+        assert!(error.contains(expected) && error.len() < 200, "{error}");
+    }
+}
+
+#[test]
 fn no_message_speaks_of_types_of_a_program() {
     for (table, key, value) in [
         ("", "baud", "-1"),
@@ -256,7 +291,7 @@ fn two_names_of_one_device_are_one_port() {
     std::os::unix::fs::symlink("tty", directory.path().join("by-id")).unwrap();
     let text = "[[sensor]]\nport = \"tty\"\n[[sensor]]\nname = \"b\"\nport = \"by-id\"";
     std::fs::write(&path, text).unwrap();
-    let error = Config::load(&path).unwrap_err().to_string();
+    let error = checked(&path).unwrap_err();
     assert!(error.contains("sensor.port of \"b\""), "{error}");
 }
 
@@ -337,7 +372,8 @@ fn only_what_a_sensor_can_change_while_it_runs_may_differ_in_a_reload() {
             Some("http.listen"),
         ),
         (
-            "[[sensor]]\nport = \"/dev/ttyUSB0\"\n[sensor.calibration]\npitch_mm = 2.0\n\
+            "[[sensor]]\nport = \"/dev/ttyUSB0\"\nstale_after_ms = 900\n\
+             [sensor.calibration]\npitch_mm = 2.0\n\
              [press]\nmin_frames = 3\n[model]\nmin_force_n = 1.0\n[log]\nformat = \"json\"",
             None,
         ),

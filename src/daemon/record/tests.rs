@@ -5,16 +5,13 @@ use crate::pipeline::Clock;
 use crate::recording::{Ring, tests};
 
 fn recorder(sender: SyncSender<Job>) -> (SensorRecorder, Pipeline) {
-    let hrn = tests::hrn();
-    let sensor = tests::sensor(&hrn);
-    let pipeline = Pipeline::new(sensor.settings(&hrn).unwrap(), Clock::Arrival);
+    let pipeline = Pipeline::new(tests::sensor(), tests::hrn(), Clock::Arrival);
     let active = Active {
         jobs: Jobs {
             sender,
             dropped: Arc::default(),
         },
         index: 0,
-        sensor,
         labels: Labels::new(),
         noted: None,
         bytes: 0,

@@ -227,13 +227,13 @@ impl Worker {
                 self.sensors[sensor].is_open = Some(false);
                 let any = self.sensors.iter().any(|s| s.is_open != Some(false));
                 (!any).then(|| Error::Lost {
-                    sensor: self.about.sensors[sensor].name.clone(),
+                    sensor: self.about.sensors[sensor].name().to_owned(),
                     reason: reason.clone().into_owned(),
                 })
             }
             Entry::Input(Input::Unavailable(reason)) if self.sensors[sensor].is_open.is_none() => {
                 Some(Error::Unavailable {
-                    sensor: self.about.sensors[sensor].name.clone(),
+                    sensor: self.about.sensors[sensor].name().to_owned(),
                     reason: reason.clone().into_owned(),
                 })
             }
@@ -265,7 +265,7 @@ impl Worker {
             _ => return Ok(()),
         };
         let mut sensors = self.about.sensors.iter();
-        if let Some(sensor) = sensors.position(|sensor| sensor.name == event.sensor()) {
+        if let Some(sensor) = sensors.position(|sensor| sensor.name() == event.sensor()) {
             self.fault(sensor, fault);
         }
         Ok(())
@@ -285,7 +285,7 @@ impl Worker {
     }
 
     fn say_no_blackbox(&self, sensor: usize, reason: &str) {
-        let sensor = self.about.sensors[sensor].name.as_str();
+        let sensor = self.about.sensors[sensor].name();
         warn!(sensor, reason, "no black box");
     }
 
@@ -301,7 +301,7 @@ impl Worker {
         let Some(settings) = self.directory() else {
             return Err("found a recording into one file, expected the daemon".to_owned());
         };
-        let name = &self.about.sensors[sensor].name;
+        let name = self.about.sensors[sensor].name();
         let about = About {
             reason: Some(reason.to_owned()),
             sensors: vec![self.about.sensors[sensor].clone()],
@@ -323,7 +323,7 @@ impl Worker {
             Ok(path)
         };
         let path = written().map_err(|error| error.to_string())?;
-        info!(sensor = name.as_str(), reason, path = %path.display(), "black box");
+        info!(sensor = name, reason, path = %path.display(), "black box");
         Ok(path)
     }
 

@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use super::{items, number, plain, text};
 use crate::frame::{Array, COLS, ROWS, TAXELS};
-use crate::pipeline::STALE_PERIODS;
+use crate::sensor::LATE_PERIODS;
 
 /// How far back the curves go.
 pub(in crate::tools::watch) const WINDOW: Duration = Duration::from_secs(30);
@@ -209,7 +209,7 @@ impl Sensor {
                 *cell = Some(cell.map_or(value(load), |most| most.max(value(load))));
             }
             // It stands for the spans after it, for as long as it is current.
-            let current = rate_hz.map_or(0.0, |hz| STALE_PERIODS / hz / span);
+            let current = rate_hz.map_or(0.0, |hz| LATE_PERIODS / hz / span);
             let first = place.max(0.0) as usize;
             let last = (place + current).max(0.0) as usize;
             for cell in held.iter_mut().take(last).skip(first) {

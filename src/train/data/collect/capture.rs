@@ -9,8 +9,9 @@ use std::sync::Arc;
 use super::CollectError;
 use crate::event::{Event, Phase, PressState};
 use crate::frame::{Frame, Stamp};
-use crate::pipeline::{self, Clock, Pipeline};
-use crate::recording::{Entry, Found, Labels, Playback, Reader};
+use crate::pipeline::{Clock, Pipeline};
+use crate::recording::{Entry, FileKind, Found, Labels, Playback, Reader};
+use crate::sensor::Sensor;
 use crate::train::data::dataset;
 use crate::verdict::{Hrn, sha256_hex};
 
@@ -27,12 +28,12 @@ pub struct Capture {
 }
 
 impl Capture {
-    /// Reads a capture; `of_bytes` is the sensor of one that does not describe its own.
+    /// Reads a capture; `sensor` sent one that does not describe its own, and `hrn` judges.
     ///
     /// # Errors
     ///
     /// If it cannot be read, is damaged, or no press in it was judged.
-    pub fn read(path: &Path, of_bytes: &pipeline::Settings) -> Result<Self, CollectError> {
+    pub fn read(path: &Path, sensor: &Sensor, hrn: &Arc<Hrn>) -> Result<Self, CollectError> {
         let path = path.to_owned();
         let mut bytes = Vec::new();
         let read = File::open(&path).and_then(|file| BufReader::new(file).read_to_end(&mut bytes));
@@ -40,16 +41,13 @@ impl Capture {
             return Err(CollectError::Unreadable { path, source });
         }
         let mut selection = Selection::default();
-        let (labels, pitch_mm) = if path
-            .extension()
-            .is_some_and(|extension| extension == "mcap")
-        {
-            play(&bytes, &of_bytes.criteria.hrn, &path, &mut selection)?
+        let (labels, pitch_mm) = if FileKind::of(&bytes) == FileKind::Recording {
+            play(&bytes, hrn, &path, &mut selection)?
         } else {
-            let mut pipeline = Pipeline::new(of_bytes.clone(), Clock::FrameRate);
+            let mut pipeline = Pipeline::new(sensor.clone(), hrn.clone(), Clock::FrameRate);
             selection.take(pipeline.push(&bytes, NOT_LOOKED_AT));
             selection.take(pipeline.end_of_recording(None));
-            (Labels::new(), of_bytes.criteria.calibration.pitch_mm)
+            (Labels::new(), sensor.description().calibration.pitch_mm)
         };
         if selection.presses.is_empty() {
             return Err(CollectError::NoPress { path });
@@ -158,8 +156,8 @@ fn play(
 /// What an entry says of its sensor's taxels.
 fn pitch_of(found: &Found) -> Option<f64> {
     match &found.entry {
-        Entry::State(state) => Some(state.sensor.calibration.pitch_mm),
-        Entry::Settings(sensor) => Some(sensor.calibration.pitch_mm),
+        Entry::State(state) => Some(state.sensor.description.calibration.pitch_mm),
+        Entry::Settings(sensor) => Some(sensor.description.calibration.pitch_mm),
         Entry::Input(_) => None,
     }
 }

@@ -1,0 +1,130 @@
+//! Labels: what a recording says was pressed, in its user's words.
+
+use std::collections::BTreeMap;
+
+use crate::wording;
+
+/// What was pressed and whatever else its user wrote down, by key.
+pub type Labels = BTreeMap<String, String>;
+
+/// Why a label cannot be written down.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum LabelError {
+    /// It has no key.
+    #[error("found no key, expected KEY=VALUE")]
+    NoKey,
+    /// Its key or its value is not what its reader would see.
+    #[error("found {0:?}, expected text without control or bidirectional characters")]
+    Hidden(String),
+    /// More than anyone writes down.
+    #[error("found {found} characters, expected at most {MOST_CHARS}")]
+    Long {
+        /// Characters of its key and its value.
+        found: usize,
+    },
+    /// A number is expected under this key.
+    #[error("{key}: found {found:?}, expected {expected}")]
+    Number {
+        /// The key.
+        key: &'static str,
+        /// As given.
+        found: String,
+        /// What `hrn-train collect` reads there.
+        expected: &'static str,
+    },
+}
+
+/// A label is a note, not a document.
+const MOST_CHARS: usize = 1000;
+
+/// Checks a label before it is written: what `hrn-train collect` reads under its key, it must be able
+/// to read. Whether a `level` is one of the model's, only the model can say.
+///
+/// # Errors
+///
+/// [`LabelError`], if the key is empty, a character is hidden, the label is too long, or the value
+/// of `object` or `shore` is no such number.
+///
+/// # Example
+///
+/// ```
+/// use hardnessd::recording::check_label;
+///
+/// assert!(check_label("object", "7").is_ok());
+/// assert!(check_label("material", "oak").is_ok());
+/// let error = check_label("object", "99999999999").unwrap_err();
+/// assert!(error.to_string().ends_with("expected a whole number from 0 to 4294967295"));
+/// ```
+pub fn check_label(key: &str, value: &str) -> Result<(), LabelError> {
+    if key.is_empty() {
+        return Err(LabelError::NoKey);
+    }
+    let found = key.chars().count() + value.chars().count();
+    if found > MOST_CHARS {
+        return Err(LabelError::Long { found });
+    }
+    for text in [key, value] {
+        if !wording::is_plain(text) {
+            return Err(LabelError::Hidden(text.to_owned()));
+        }
+    }
+    let number = |key, is_one: bool, expected| match is_one {
+        true => Ok(()),
+        false => Err(LabelError::Number {
+            key,
+            found: value.to_owned(),
+            expected,
+        }),
+    };
+    match key {
+        "object" => {
+            let is_one = value.parse::<u32>().is_ok();
+            number("object", is_one, "a whole number from 0 to 4294967295")
+        }
+        "shore" => {
+            let is_one = value.parse().is_ok_and(f32::is_finite);
+            number("shore", is_one, "a number")
+        }
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_label_that_its_reader_could_not_use_is_refused() {
+        for (key, value) in [
+            ("object", "7"),
+            ("object", "4294967295"),
+            ("shore", "35.5"),
+            ("material", ""),
+            ("note", "left of the centre, 3 N"),
+        ] {
+            assert_eq!(check_label(key, value), Ok(()), "{key}={value}");
+        }
+        let long = "x".repeat(1001);
+        for (key, value, expected) in [
+            ("", "7", "found no key"),
+            (
+                "object",
+                "99999999999",
+                "object: found \"99999999999\", expected a whole",
+            ),
+            ("object", "-1", "object: found \"-1\", expected a whole"),
+            ("shore", "hard", "shore: found \"hard\", expected a number"),
+            ("shore", "NaN", "shore: found \"NaN\", expected a number"),
+            ("note", "\u{202e}7", "found \"\\u{202e}7\", expected text"),
+            ("a\nb", "7", "found \"a\\nb\", expected text"),
+            (
+                "note",
+                &long,
+                "found 1005 characters, expected at most 1000",
+            ),
+        ] {
+            let error = check_label(key, value).unwrap_err().to_string();
+            assert!(error.starts_with(expected), "{error}");
+        }
+    }
+}

@@ -1,0 +1,335 @@
+//! A sensor as its owner describes it: how it writes frames, how counts become newtons, what a
+//! press is, and when a verdict is rejected.
+//!
+//! In: a [`Description`], which a configuration or a recording holds. Out: a [`Sensor`]: every
+//! value is in its range, and the values fit each other. Nothing behind this door checks them again.
+
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use crate::wire::{self, Layout};
+use crate::{press, tare};
+
+/// What is said of a sensor. None of it has been checked.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Description {
+    /// Its name: `[a-z][a-z0-9_]*`.
+    pub name: String,
+    /// Frames a second that it is expected to send.
+    pub frame_rate_hz: f64,
+    /// A live sensor is stale after a silence of this length. `None`: the larger of 2.5 periods
+    /// and 50 ms.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stale_after_ms: Option<f64>,
+    /// How it writes a frame.
+    pub frame: wire::Settings,
+    /// Counts to newtons.
+    pub calibration: tare::Settings,
+    /// What a press is.
+    pub press: press::Settings,
+    /// A verdict below this confidence is rejected.
+    pub min_confidence: f32,
+    /// A verdict on less force is rejected.
+    pub min_force_n: f64,
+}
+
+impl Default for Description {
+    /// A JX255N (paper, "Tactile sensor") named `sensor`; nothing is rejected.
+    fn default() -> Self {
+        Self {
+            name: "sensor".to_owned(),
+            frame_rate_hz: 5.0,
+            stale_after_ms: None,
+            frame: wire::Settings::default(),
+            calibration: tare::Settings::default(),
+            press: press::Settings::default(),
+            min_confidence: 0.0,
+            min_force_n: 0.0,
+        }
+    }
+}
+
+impl Description {
+    /// The first key by which the two differ that a running pipeline cannot take over.
+    pub fn fixed_difference(&self, other: &Self) -> Option<&'static str> {
+        let differs = [
+            ("name", self.name != other.name),
+            ("frame_rate_hz", self.frame_rate_hz != other.frame_rate_hz),
+            ("frame", self.frame != other.frame),
+        ];
+        let first = differs.iter().find(|(_, differs)| *differs);
+        first.map(|(key, _)| *key)
+    }
+
+    /// The description as a recording holds it: with the silence that makes it stale, whatever the
+    /// default is when the recording is played.
+    pub(crate) fn for_recording(&self, stale_after: Duration) -> Self {
+        Self {
+            stale_after_ms: Some(stale_after.as_nanos() as f64 / 1e6),
+            ..self.clone()
+        }
+    }
+
+    /// The description as a recording means it: before recordings held the silence that makes a
+    /// sensor stale, that was 2.5 periods.
+    pub(crate) fn of_recording(&self) -> Self {
+        let late = || {
+            (FRAME_RATES_HZ.0..=FRAME_RATES_HZ.1)
+                .contains(&self.frame_rate_hz)
+                .then(|| late(self.frame_rate_hz))
+        };
+        match self.stale_after_ms {
+            Some(_) => self.clone(),
+            None => late().map_or_else(|| self.clone(), |late| self.for_recording(late)),
+        }
+    }
+}
+
+/// A value of a [`Description`] that cannot be used. The message begins with its key.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum SensorError {
+    /// A name that is no part of a topic, a file's name or a log line.
+    #[error("name: found {0:?}, expected [a-z][a-z0-9_]*")]
+    Name(String),
+    /// A longer name than any of those takes.
+    #[error("name: found {found} characters, expected at most {MOST_NAME_CHARS}")]
+    LongName {
+        /// Characters.
+        found: usize,
+    },
+    /// A rate that no sensor has.
+    #[error(
+        "frame_rate_hz: found {0:?}, expected {least} to {most} frames a second",
+        least = FRAME_RATES_HZ.0,
+        most = FRAME_RATES_HZ.1
+    )]
+    FrameRate(f64),
+    /// A silence that is too short for any sensor, or too long for any user.
+    #[error(
+        "stale_after_ms: found {0:?}, expected {least} to {most} milliseconds",
+        least = STALE_AFTER_MS.0,
+        most = STALE_AFTER_MS.1
+    )]
+    StaleAfter(f64),
+    /// Its layout.
+    #[error("frame.{0}")]
+    Frame(#[from] wire::LayoutError),
+    /// Its calibration.
+    #[error("calibration.{0}")]
+    Calibration(#[from] tare::SettingsError),
+    /// Its presses.
+    #[error("press.{0}")]
+    Press(#[from] press::SettingsError),
+    /// A confidence that no verdict has.
+    #[error("min_confidence: found {0:?}, expected 0 to 1")]
+    MinConfidence(f32),
+    /// A force that no press has.
+    #[error("min_force_n: found {0:?}, expected newtons, 0 or more")]
+    MinForce(f64),
+}
+
+/// Wider than any sensor, and narrow enough that a period is a sane time to wait.
+pub const FRAME_RATES_HZ: (f64, f64) = (0.01, 10_000.0);
+
+/// From a period of the highest rate to an hour, which is longer than anyone waits for a frame.
+const STALE_AFTER_MS: (f64, f64) = (0.1, 3_600_000.0);
+
+/// A name is part of topics, of file names and of each line of the log.
+const MOST_NAME_CHARS: usize = 64;
+
+/// A frame is late after this many periods.
+pub const LATE_PERIODS: f64 = 2.5;
+
+/// By default no shorter silence makes a sensor stale. USB adapters deliver every 16 ms, and a busy
+/// host reads some milliseconds later: with 2.5 periods, a sensor at 100 frames/s would be stale and
+/// live again all the time.
+const LEAST_STALE_AFTER: Duration = Duration::from_millis(50);
+
+/// A sensor whose description has been checked.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sensor {
+    description: Description,
+    layout: Layout,
+    stale_after: Duration,
+}
+
+impl Sensor {
+    /// Checks a description.
+    ///
+    /// # Errors
+    ///
+    /// [`SensorError`], for the first value that is out of its range or does not fit the layout.
+    ///
+    /// # Example
+    ///
+    /// ```
+    /// use hardnessd::sensor::{Description, Sensor};
+    ///
+    /// let described = |frame_rate_hz| Description {
+    ///     name: "forearm".to_owned(),
+    ///     frame_rate_hz,
+    ///     ..Description::default()
+    /// };
+    /// let sensor = Sensor::new(described(100.0))?;
+    /// assert_eq!(sensor.period().as_millis(), 10);
+    /// assert_eq!(sensor.stale_after().as_millis(), 50);
+    ///
+    /// let error = Sensor::new(described(0.0)).unwrap_err();
+    /// assert!(error.to_string().starts_with("frame_rate_hz: found 0.0, expected"));
+    /// # Ok::<(), hardnessd::sensor::SensorError>(())
+    /// ```
+    pub fn new(description: Description) -> Result<Self, SensorError> {
+        let Description {
+            name,
+            frame_rate_hz,
+            stale_after_ms,
+            frame,
+            calibration,
+            press,
+            min_confidence,
+            min_force_n,
+        } = &description;
+        let part = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
+        let found = name.chars().count();
+        if found > MOST_NAME_CHARS {
+            return Err(SensorError::LongName { found });
+        }
+        if !(name.starts_with(|first: char| first.is_ascii_lowercase()) && name.chars().all(part)) {
+            return Err(SensorError::Name(name.clone()));
+        }
+        if !(FRAME_RATES_HZ.0..=FRAME_RATES_HZ.1).contains(frame_rate_hz) {
+            return Err(SensorError::FrameRate(*frame_rate_hz));
+        }
+        let stale_after = match *stale_after_ms {
+            None => LEAST_STALE_AFTER.max(late(*frame_rate_hz)),
+            Some(ms) if (STALE_AFTER_MS.0..=STALE_AFTER_MS.1).contains(&ms) => of_ms(ms),
+            Some(ms) => return Err(SensorError::StaleAfter(ms)),
+        };
+        let layout = Layout::new(frame)?;
+        calibration.check(layout.array())?;
+        press.check()?;
+        if !(0.0..=1.0).contains(min_confidence) {
+            return Err(SensorError::MinConfidence(*min_confidence));
+        }
+        if !(min_force_n.is_finite() && *min_force_n >= 0.0) {
+            return Err(SensorError::MinForce(*min_force_n));
+        }
+        Ok(Self {
+            layout,
+            stale_after,
+            description,
+        })
+    }
+
+    /// What is said of it, every value in its range.
+    pub fn description(&self) -> &Description {
+        &self.description
+    }
+
+    /// Its name.
+    pub fn name(&self) -> &str {
+        &self.description.name
+    }
+
+    /// How it writes a frame.
+    pub fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// The time from frame to frame, as expected.
+    pub fn period(&self) -> Duration {
+        period(self.description.frame_rate_hz)
+    }
+
+    /// How long a frame may take to come before it is late: 2.5 periods.
+    pub fn late_after(&self) -> Duration {
+        late(self.description.frame_rate_hz)
+    }
+
+    /// How long a live sensor may be silent before it is stale.
+    pub fn stale_after(&self) -> Duration {
+        self.stale_after
+    }
+}
+
+fn period(frame_rate_hz: f64) -> Duration {
+    Duration::from_secs_f64(1.0 / frame_rate_hz)
+}
+
+fn late(frame_rate_hz: f64) -> Duration {
+    period(frame_rate_hz).mul_f64(LATE_PERIODS)
+}
+
+fn of_ms(ms: f64) -> Duration {
+    Duration::from_nanos((ms * 1e6).round() as u64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_value_that_no_sensor_has_is_refused_with_its_key() {
+        let check = |change: &dyn Fn(&mut Description), expected: &str| {
+            let mut described = Description::default();
+            change(&mut described);
+            let error = Sensor::new(described).unwrap_err().to_string();
+            assert!(error.starts_with(expected), "{error}");
+        };
+        check(
+            &|d| d.name = "Arm".to_owned(),
+            "name: found \"Arm\", expected [a-z]",
+        );
+        check(
+            &|d| d.name = "\u{202e}".to_owned(),
+            "name: found \"\\u{202e}\"",
+        );
+        check(&|d| d.name.clear(), "name: found \"\"");
+        let long = "name: found 300 characters, expected at most 64";
+        check(&|d| d.name = "a".repeat(300), long);
+        for hz in [0.0, -5.0, 0.009, 10_001.0, f64::NAN, f64::INFINITY] {
+            check(&|d| d.frame_rate_hz = hz, "frame_rate_hz: found");
+        }
+        for ms in [0.0, -1.0, 3.7e6, f64::NAN] {
+            check(&|d| d.stale_after_ms = Some(ms), "stale_after_ms: found");
+        }
+        check(&|d| d.frame.rows = Some(29), "frame.rows: found 29");
+        let dead = "calibration.dead_taxels: found [5, 0]";
+        check(
+            &|d| {
+                d.frame.rows = Some(5);
+                d.calibration.dead_taxels = vec![[5, 0]];
+            },
+            dead,
+        );
+        check(&|d| d.press.end_frames = 0, "press.end_frames: found 0");
+        check(&|d| d.min_confidence = 1.5, "min_confidence: found 1.5");
+        check(&|d| d.min_force_n = f64::NAN, "min_force_n: found NaN");
+    }
+
+    #[test]
+    fn a_recording_holds_how_long_a_silence_is_stale_and_an_old_one_means_2_5_periods() {
+        for (hz, ms) in [(5.0, None), (100.0, None), (3.0, None), (100.0, Some(33.3))] {
+            let described = Description {
+                frame_rate_hz: hz,
+                stale_after_ms: ms,
+                ..Description::default()
+            };
+            let sensor = Sensor::new(described).unwrap();
+            let recorded = sensor.description().for_recording(sensor.stale_after());
+            let played = Sensor::new(recorded.of_recording()).unwrap();
+            assert_eq!(
+                played.stale_after(),
+                sensor.stale_after(),
+                "{hz} Hz, {ms:?}"
+            );
+            let old = Description {
+                stale_after_ms: None,
+                ..recorded
+            };
+            let played = Sensor::new(old.of_recording()).unwrap();
+            assert_eq!(played.stale_after(), sensor.late_after());
+        }
+    }
+}
