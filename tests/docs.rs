@@ -332,6 +332,36 @@ fn the_page_on_the_command_line_has_every_option_of_the_trainer_and_no_other() {
 }
 
 #[test]
+fn the_page_on_the_protocol_has_every_field_of_the_schema_and_no_other() {
+    let schema: serde_json::Value = serde_json::from_str(&page("docs/events.schema.json")).unwrap();
+    let mut written: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
+    for row in rows(&page("docs/protocol.md")) {
+        let Some(kind) = code(&row.section) else {
+            continue;
+        };
+        let Some(fields) = row.cells.get("Field") else {
+            continue;
+        };
+        let fields = fields.split('`').skip(1).step_by(2).map(str::to_owned);
+        written.entry(kind.to_owned()).or_default().extend(fields);
+    }
+    for (kind, fields) in &written {
+        let known = schema["$defs"][kind]["properties"].as_object().unwrap();
+        let mut known: BTreeSet<String> = known.keys().cloned().collect();
+        // What all events have is in a table of its own, `hello` has a `seq` of its own meaning.
+        for shared in ["type", "sensor", "time"] {
+            known.remove(shared);
+        }
+        if kind != "hello" {
+            known.remove("seq");
+        }
+        assert_eq!(fields, &known, "{kind}");
+    }
+    let kinds: Vec<&str> = written.keys().map(String::as_str).collect();
+    assert_eq!(kinds, ["frame", "hardness", "hello", "press", "status"]);
+}
+
+#[test]
 fn the_page_on_metrics_has_every_metric_and_no_other() {
     let bench = Bench::new();
     let http = "[http]\nlisten = \"127.0.0.1:0\"\n";

@@ -155,6 +155,11 @@ fn the_guide_to_a_new_sensor_says_what_happens() {
 }
 
 #[test]
+fn the_page_on_recordings_says_what_happens() {
+    follow("recordings.md");
+}
+
+#[test]
 fn dots_stand_for_anything_and_the_rest_must_come() {
     assert!(occurs("a ... c\n...\ne", "x\na b c\nd\ne\n"));
     assert!(!occurs("a ... d", "a b c"));
