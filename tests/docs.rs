@@ -1,5 +1,5 @@
-//! The reference pages say what the programs do: every key, option and metric is in them with its
-//! default, and nothing else is. Links between pages lead somewhere.
+//! The reference pages agree with the programs: every key, option, field and metric is in them, with its
+//! default, and nothing else is. Every link between pages leads to a page or a heading.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -68,13 +68,13 @@ fn rows(text: &str) -> Vec<Row> {
     rows
 }
 
-/// What stands between backticks, if that is the whole cell.
+/// The text between backticks, if it is the whole cell.
 fn code(cell: &str) -> Option<&str> {
     let inner = cell.strip_prefix('`')?.strip_suffix('`')?;
     (!inner.contains('`')).then_some(inner)
 }
 
-/// The name of a TOML table in a heading, such as "`[publish.tcp]`" or "Events: `[press]`".
+/// The names of the TOML tables in a heading, such as "`[publish.tcp]`".
 fn tables(heading: &str) -> Vec<String> {
     let parts = heading.split('`').skip(1).step_by(2);
     parts
@@ -90,7 +90,7 @@ fn documented(chapter: &str) -> BTreeMap<String, (String, String)> {
         let Some(key) = row.cells.get("Key").and_then(|cell| code(cell)) else {
             continue;
         };
-        // A table that is about something else than keys has no unit.
+        // A table of something else than keys has no unit.
         let Some(unit) = row.cells.get("Unit") else {
             continue;
         };
@@ -141,12 +141,12 @@ fn leaves(value: &toml::Value, path: &str, found: &mut BTreeMap<String, String>)
     }
 }
 
-/// Settings as a file that is read again: with the digits of an f32, not those of an f64.
+/// Settings written and read again, so that an f32 keeps its own digits.
 fn as_file(settings: &impl serde::Serialize) -> toml::Value {
     toml::from_str(&toml::to_string(settings).unwrap()).unwrap()
 }
 
-/// What closes the name of a key says its unit.
+/// The unit that the end of a key's name gives.
 fn unit_of(key: &str) -> Option<&'static str> {
     [
         ("newtons_per_count", "N/count"),
@@ -202,8 +202,8 @@ fn the_page_on_configuration_has_every_key_of_the_daemon_and_no_other() {
     let config: Config = toml::from_str(&format!("[[sensor]]\nport = \"p\"\n{tables}")).unwrap();
     let mut defaults = BTreeMap::new();
     leaves(&as_file(&config), "", &mut defaults);
-    // What follows from the machine, the preset or nothing: the sample values of the shipped file
-    // show that they are keys.
+    // Keys whose default follows from the machine or the preset. The shipped file, which another test
+    // checks, shows that they are keys.
     let mut without: BTreeSet<String> = ["robot".to_owned(), "sensor.port".to_owned()].into();
     let mut table = String::new();
     let mut shipped = BTreeSet::new();
@@ -264,7 +264,7 @@ fn options(program: &Path, command: &str) -> BTreeMap<String, String> {
     options
 }
 
-/// The value that an option has when it is left out, where it is a value and not an explanation.
+/// The default of an option, if it is a value and not an explanation.
 fn default_of(text: &str) -> Option<&str> {
     let (_, rest) = text.split_once("[default: ")?;
     let (value, _) = rest.split_once(']')?;
@@ -348,7 +348,7 @@ fn the_page_on_the_protocol_has_every_field_of_the_schema_and_no_other() {
     for (kind, fields) in &written {
         let known = schema["$defs"][kind]["properties"].as_object().unwrap();
         let mut known: BTreeSet<String> = known.keys().cloned().collect();
-        // What all events have is in a table of its own, `hello` has a `seq` of its own meaning.
+        // The fields of all events are in a table of their own. The `seq` of `hello` has another meaning.
         for shared in ["type", "sensor", "time"] {
             known.remove(shared);
         }
@@ -370,7 +370,7 @@ fn the_page_on_metrics_has_every_metric_and_no_other() {
     let _sensor = bench.sensor(&[]);
     daemon.logged("\"live\"");
     let mut found: BTreeMap<String, (String, BTreeSet<String>)> = BTreeMap::new();
-    // The measured rate comes with the second frame.
+    // The measured rate is there from the second frame on.
     bench::wait_for("two frames", || {
         found = scrape(&get(&address.to_string(), "/metrics"));
         found.contains_key("hardnessd_frame_rate_hertz")
@@ -440,7 +440,7 @@ fn pages(directory: &Path, found: &mut Vec<PathBuf>) {
     }
 }
 
-/// The page without what stands in blocks of code.
+/// The page without its blocks of code.
 fn prose(text: &str) -> String {
     let mut is_code = false;
     let mut kept = String::new();
@@ -455,7 +455,7 @@ fn prose(text: &str) -> String {
     kept
 }
 
-/// What a page links to.
+/// The targets of a page's links.
 fn links(text: &str) -> Vec<String> {
     let text = prose(text);
     let targets = text.split("](").skip(1);

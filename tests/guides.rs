@@ -1,9 +1,9 @@
-//! The guides in `docs/` say what happens: every command in them is run as it stands, on a simulated
-//! sensor, and every line that they show must come.
+//! The guides in `docs/` are true: this test runs every command in them, unchanged, on a simulated
+//! sensor, and expects every line that they show.
 //!
-//! A `console` block is commands after `$ ` and what they print; `...` stands for anything. A `toml`
-//! or `python` block that begins with `# NAME` is a file of that name. What needs a machine of its
-//! own (`sudo`, `systemctl`) stands in `sh` blocks, which are not run.
+//! A `console` block has commands after `$ ` and their output; `...` matches anything. A `toml` or
+//! `python` block that begins with `# NAME` is a file of that name. Commands that need a machine of
+//! their own (`sudo`, `systemctl`) are in `sh` blocks. This test does not run those.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -24,7 +24,7 @@ fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// What stands between fences, and of what kind.
+/// The fenced blocks of a page: kind and content.
 fn blocks(text: &str) -> Vec<(String, String)> {
     let mut blocks = Vec::new();
     let mut lines = text.lines();
@@ -44,7 +44,7 @@ fn blocks(text: &str) -> Vec<(String, String)> {
     blocks
 }
 
-/// Whether `shown` occurs in what came, `...` standing for anything within a line or for lines.
+/// Whether `shown` occurs in the output `came`. `...` matches anything, also several lines.
 fn occurs(shown: &str, came: &str) -> bool {
     let mut rest = came;
     shown.split("...").all(|part| {
@@ -61,13 +61,13 @@ fn occurs(shown: &str, came: &str) -> bool {
 
 fn follow(guide: &str) {
     let text = fs::read_to_string(root().join("docs").join(guide)).unwrap();
-    // What the guide calls by their usual ports may be taken here.
+    // Another program may use the ports of the guide on this machine.
     let free = || {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         listener.local_addr().unwrap().port().to_string()
     };
     let text = text.replace("8255", &free()).replace("8256", &free());
-    // So is a machine that has more to do than the reader's.
+    // This machine may be busier than the reader's.
     let text = text.replace("sleep 1\n", "sleep 3\n");
     let place = tempfile::tempdir().unwrap();
     let client = root().join("clients/python/hardnessd.py");
@@ -110,7 +110,7 @@ fn follow(guide: &str) {
     }
 }
 
-/// Runs a script to its end; what it left running ends with it.
+/// Runs a script to its end, then ends every process that it left.
 fn run(script: &str, place: &Path) -> String {
     let binaries = Path::new(BINARY).parent().unwrap();
     let path = std::env::var("PATH").unwrap();
@@ -134,7 +134,7 @@ fn run(script: &str, place: &Path) -> String {
     let mut child = child.unwrap();
     child.wait().unwrap();
     let group = Pid::from_raw(i32::try_from(child.id()).unwrap()).unwrap();
-    // Nothing may be left.
+    // The group may be empty by now.
     let _ = kill_process_group(group, Signal::KILL);
     fs::read_to_string(place.join(".output")).unwrap()
 }
@@ -160,7 +160,7 @@ fn the_page_on_recordings_says_what_happens() {
 }
 
 #[test]
-fn dots_stand_for_anything_and_the_rest_must_come() {
+fn dots_match_anything_and_the_rest_must_come() {
     assert!(occurs("a ... c\n...\ne", "x\na b c\nd\ne\n"));
     assert!(!occurs("a ... d", "a b c"));
     assert!(occurs("", "anything"));
