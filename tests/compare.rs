@@ -74,6 +74,10 @@ impl Comparison {
         let output = self.command().output().unwrap();
         let errors = String::from_utf8_lossy(&output.stderr).into_owned();
         assert!(output.status.success(), "{errors}");
+        // The main table, and where the page is.
+        let printed = String::from_utf8_lossy(&output.stdout).into_owned();
+        assert!(printed.starts_with("method "), "{printed}");
+        assert!(printed.ends_with("report.html\n"), "{printed}");
         errors
     }
 

@@ -235,17 +235,17 @@ fn a_run_learns_and_leaves_what_it_promises() {
 }
 
 /// Starts or resumes a run and sends `signal` as soon as `count` checkpoints of `stage` stand,
-/// wherever the run then is; gives its exit code, if it had one.
+/// wherever the run then is; gives its exit code, if it had one, and the last line it said.
 fn interrupted(
     trial: &Trial,
     seed: &'static str,
     (stage, count): (&str, usize),
     signal: Signal,
-) -> Option<i32> {
+) -> (Option<i32>, String) {
     let mut process = Command::new(env!("CARGO_BIN_EXE_hrn-train"))
         .args(trial.arguments(seed))
         .arg("--resume")
-        .stderr(std::process::Stdio::null())
+        .stderr(std::process::Stdio::piped())
         .spawn()
         .unwrap();
     let there = || {
@@ -261,7 +261,10 @@ fn interrupted(
         std::thread::yield_now();
     }
     rustix::process::kill_process(Pid::from_child(&process), signal).unwrap();
-    process.wait().unwrap().code()
+    let output = process.wait_with_output().unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    let last = said.lines().last().unwrap_or_default().to_owned();
+    (output.status.code(), last)
 }
 
 #[test]
@@ -270,11 +273,19 @@ fn an_interrupted_run_resumes_to_the_same_weights_bit_for_bit() {
     whole.train("2", &[]);
     for (name, signal, code) in [
         ("killed", Signal::KILL, None),
-        ("terminated", Signal::TERM, Some(0)),
-        ("interrupted", Signal::INT, Some(0)),
+        ("terminated", Signal::TERM, Some(143)),
+        ("interrupted", Signal::INT, Some(130)),
     ] {
         let trial = Trial::new(name);
-        assert_eq!(interrupted(&trial, "2", ("hrn", 2), signal), code, "{name}");
+        let (ended, said) = interrupted(&trial, "2", ("hrn", 2), signal);
+        assert_eq!(ended, code, "{name}");
+        if code.is_some() {
+            assert!(
+                said.starts_with("hrn-train: interrupted; to go on: "),
+                "{said}"
+            );
+            assert!(said.ends_with(" --resume"), "{said}");
+        }
         assert!(!trial.out.join("hrn.onnx").exists(), "{name}");
         trial.train("2", &["--resume"]);
         trial.assert_same(&whole);
@@ -463,6 +474,31 @@ fn a_training_that_diverges_ends_where_it_does() {
         );
         assert_eq!(trial.checkpoints().is_empty(), name != "logit", "{name}");
     }
+}
+
+#[test]
+fn presses_are_counted_by_level_and_levels_counted_from_0_are_warned_of() {
+    let trial = Trial::new("counted");
+    let said = String::from_utf8(trial.output("1", &[]).stderr).unwrap();
+    let counts = "training presses: level 1 40, level 2 40, level 3 40, level 4 40, unlabelled";
+    assert!(said.contains(counts), "{said}");
+    assert!(!said.contains("warning"), "{said}");
+
+    let mut dataset = Dataset::read(&data().1).unwrap();
+    for sample in &mut dataset.samples {
+        sample.level -= 1;
+    }
+    let shifted = trial.out.with_extension("npz");
+    let samples = std::mem::take(&mut dataset.samples);
+    let file = std::fs::File::create(&shifted).unwrap();
+    dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+    let out = trial.out.with_extension("shifted");
+    let (data, out) = (shifted.to_str().unwrap(), out.to_str().unwrap());
+    let arguments = ["train", "--method", "features", "--profile", "smoke"];
+    let paths = ["--data", data, "--out", out];
+    let said = hrn_train(&[&arguments[..], &paths].concat()).stderr;
+    let said = String::from_utf8(said).unwrap();
+    assert!(said.contains("were the levels counted from 0?"), "{said}");
 }
 
 #[test]

@@ -1,8 +1,11 @@
 //! What is said of a model and of how well it judges, as lines of text.
 
+use std::fmt::Write as _;
 use std::path::Path;
 
-use hardnessd::train::compare::digits::rounded;
+use hardnessd::simulator::Split;
+use hardnessd::train::compare::digits::{rounded, thousands};
+use hardnessd::train::data::dataset::{self, Dataset};
 use hardnessd::train::judge::metrics::Evaluation;
 use hardnessd::verdict::Hrn;
 
@@ -83,7 +86,7 @@ pub(super) fn of_evaluation(evaluation: &Evaluation) -> String {
          kappa              {}\n\
          kappa, quadratic   {}\n\
          calibration error  {:.4}\n\
-         log-likelihood     {} nats lost a sample\n\
+         negative log-likelihood  {} nats a sample\n\
          truth \\ said  {levels}\n\
          {rows}",
         evaluation.n,
@@ -93,4 +96,44 @@ pub(super) fn of_evaluation(evaluation: &Evaluation) -> String {
         evaluation.ece,
         rounded(evaluation.nll, 4)
     )
+}
+
+/// How many presses of each level a data set has in each split, and a warning where the levels were
+/// probably counted from 0.
+pub(super) fn of_data(dataset: &Dataset) -> String {
+    let mut text = String::new();
+    let levels = dataset::levels();
+    for (split, name) in [(Split::Train, "training"), (Split::Test, "test")] {
+        let samples: Vec<_> = (dataset.samples.iter())
+            .filter(|sample| sample.split == split)
+            .collect();
+        let presses_of = |level: u8| samples.iter().filter(|s| s.level == level).count() as u64;
+        if samples.is_empty() {
+            continue;
+        }
+        let mut counts: Vec<String> = (levels.iter())
+            .map(|level| {
+                format!(
+                    "level {} {}",
+                    level.level,
+                    thousands(presses_of(level.level))
+                )
+            })
+            .collect();
+        counts.push(format!("unlabelled (level 0) {}", thousands(presses_of(0))));
+        let _ = writeln!(text, "{name} presses: {}", counts.join(", "));
+    }
+    let has = |level: u8| dataset.samples.iter().any(|sample| sample.level == level);
+    if let Some(highest) = levels.last().map(|level| level.level)
+        && has(0)
+        && !has(highest)
+        && (1..highest).all(has)
+    {
+        let _ = writeln!(
+            text,
+            "warning: the data has level 0 and no level {highest}: were the levels counted from 0? \
+             Levels go from 1 to {highest}; 0 means unlabelled"
+        );
+    }
+    text
 }

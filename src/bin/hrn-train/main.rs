@@ -2,10 +2,10 @@
 
 mod account;
 mod arguments;
+mod signals;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::Context as _;
@@ -16,7 +16,8 @@ use hardnessd::frame::RawFrame;
 use hardnessd::simulator::{DatasetSettings, Material, Sequence, SequenceSettings};
 use hardnessd::tools::{self, exit};
 use hardnessd::train::compare::report;
-use hardnessd::train::compare::{self, Plan};
+use hardnessd::train::compare::results::Comparison;
+use hardnessd::train::compare::{self, Plan, tables};
 use hardnessd::train::data::collect::{self, Capture, CollectError, Labelling};
 use hardnessd::train::data::dataset::{Dataset, DatasetError};
 use hardnessd::train::data::simulated;
@@ -25,10 +26,8 @@ use hardnessd::train::methods::{self, LabelsError, Method, Request};
 use hardnessd::train::model::export;
 use hardnessd::train::run::Run;
 use hardnessd::train::run::disk::write_whole;
-use hardnessd::train::settings::SettingsError;
+use hardnessd::train::settings::{Profile, SettingsError};
 use hardnessd::verdict::{Hrn, ModelError};
-use signal_hook::consts::{SIGINT, SIGTERM, SIGXFSZ};
-use signal_hook::iterator::Signals;
 
 use self::arguments::{
     Arguments, Collect, Command, Compare, DeviceName, Evaluate, Simulate, Train,
@@ -44,7 +43,12 @@ fn main() -> ExitCode {
         Ok(arguments) => arguments,
         Err(error) => return tools::usage("hrn-train", &error),
     };
-    if let Err(error) = end_at_signals() {
+    let how_to_go_on = match arguments.command {
+        Command::Train(_) => Some(signals::resuming(std::env::args())),
+        Command::Compare(_) => Some(signals::again(std::env::args())),
+        _ => None,
+    };
+    if let Err(error) = signals::end_at_signals(how_to_go_on) {
         eprintln!("hrn-train: signals: {error}");
         return ExitCode::from(exit::IO);
     }
@@ -67,22 +71,6 @@ fn main() -> ExitCode {
             ExitCode::from(exit_code(&error))
         }
     }
-}
-
-/// SIGINT and SIGTERM end the process at once, with 0. Whatever stands on the
-/// disk is whole at any moment, and a run goes on from its last checkpoint, so there is
-/// nothing to wait for.
-fn end_at_signals() -> std::io::Result<()> {
-    // A file that must not grow is no reason to die of: the write fails, as on a full disk.
-    signal_hook::flag::register(SIGXFSZ, Arc::default())?;
-    let mut signals = Signals::new([SIGINT, SIGTERM])?;
-    std::thread::spawn(move || {
-        if signals.forever().next().is_some() {
-            eprintln!("hrn-train: stopped by a signal; a run or comparison goes on when resumed");
-            std::process::exit(0);
-        }
-    });
-    Ok(())
 }
 
 /// A file named on the command line that cannot be read.
@@ -283,6 +271,10 @@ fn train(arguments: &Train) -> anyhow::Result<String> {
     let device = device(arguments.device)?;
     let run = Run::open(&arguments.out, &description, arguments.resume)?
         .taking_from(arguments.from.clone());
+    eprint!("{}", account::of_data(&dataset));
+    if arguments.profile == Profile::Smoke {
+        eprintln!("--profile smoke: tries the commands in seconds; too short to learn anything");
+    }
     let begun = Instant::now();
     let evaluation = methods::train(arguments.method, &dataset, &description, &run, &device)?;
     let figures = evaluation.map_or_else(
@@ -346,7 +338,12 @@ fn compare(arguments: Compare) -> anyhow::Result<String> {
         jobs: jobs.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from)),
         swaps: arguments.swaps,
     })?;
-    Ok(format!("{}\n", arguments.out.join("report.html").display()))
+    let page = arguments.out.join("report.html");
+    let found = Comparison::read(&arguments.out)?;
+    let table = found.map_or_else(String::new, |found| {
+        tables::headline(&found.rows()).text() + "\n"
+    });
+    Ok(format!("{table}{}\n", page.display()))
 }
 
 fn report_of(directory: &Path, out: &Path) -> anyhow::Result<String> {

@@ -155,7 +155,7 @@ fn start(job: Job, board: &Board) -> anyhow::Result<Running> {
 
 /// Why a run ended without its product.
 fn last_words(status: ExitStatus, log: &Path) -> String {
-    if status.success() {
+    if matches!(status.code(), Some(0 | 130 | 143)) {
         return "it was stopped; the same command goes on with it".to_owned();
     }
     let line = last_line(log);
@@ -193,14 +193,26 @@ impl Progress {
 
     /// What is left at the rate so far; `None` before the first run has ended.
     fn seconds_left(&self, waiting: &[Job], running: &[Running], at_once: usize) -> Option<f64> {
+        let begun = |child: &Running| (child.job.effort, child.since.elapsed().as_secs_f64());
+        let begun: Vec<(f64, f64)> = running.iter().map(begun).collect();
+        let waiting: Vec<f64> = waiting.iter().map(|job| job.effort).collect();
+        self.left(&waiting, &begun, at_once)
+    }
+
+    /// The same from efforts, and of what has begun also the seconds so far.
+    fn left(&self, waiting: &[f64], begun: &[(f64, f64)], at_once: usize) -> Option<f64> {
+        if self.effort <= 0.0 {
+            return None;
+        }
         let rate = self.seconds / self.effort;
-        let begun = running.iter().map(|child| {
-            let whole = rate * child.job.effort;
-            (whole - child.since.elapsed().as_secs_f64()).max(0.0)
-        });
-        let not_begun = waiting.iter().map(|job| rate * job.effort);
-        let sum: f64 = begun.chain(not_begun).sum();
-        (self.effort > 0.0).then_some(sum / at_once as f64)
+        // A run that takes longer than the others let expect is not at its end: it is given a tenth
+        // of its time so far.
+        let left_of = |(effort, so_far): &(f64, f64)| (rate * effort - so_far).max(0.1 * so_far);
+        let of_begun: Vec<f64> = begun.iter().map(left_of).collect();
+        let not_begun: f64 = waiting.iter().map(|effort| rate * effort).sum();
+        let spread = (of_begun.iter().sum::<f64>() + not_begun) / at_once as f64;
+        let longest = of_begun.iter().copied().fold(0.0, f64::max);
+        Some(spread.max(longest).max(1.0))
     }
 }
 
@@ -261,6 +273,19 @@ impl Board {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_time_left_is_never_none_while_a_run_goes_on() {
+        let mut progress = Progress::default();
+        assert_eq!(progress.left(&[1.0], &[], 2), None);
+        progress.effort = 2.0;
+        progress.seconds = 20.0;
+        // 10 s an effort: 30 s wait, and 10 of 20 are left of the one that runs.
+        assert_eq!(progress.left(&[3.0], &[(2.0, 10.0)], 2), Some(20.0));
+        // Overdue by far.
+        assert_eq!(progress.left(&[], &[(2.0, 300.0)], 2), Some(30.0));
+        assert_eq!(progress.left(&[], &[(0.01, 0.0)], 2), Some(1.0));
+    }
 
     #[test]
     fn stages_are_taken_only_from_a_run_that_is_there() {

@@ -42,6 +42,29 @@ impl Table {
         }
     }
 
+    /// Its head and rows as plain text in columns.
+    pub fn text(&self) -> String {
+        let lines: Vec<&Vec<String>> = std::iter::once(&self.head).chain(&self.rows).collect();
+        let widths: Vec<usize> = (0..self.head.len())
+            .map(|column| lines.iter().map(|line| line[column].chars().count()).max())
+            .map(Option::unwrap_or_default)
+            .collect();
+        let mut text = String::new();
+        for line in lines {
+            let mut row = String::new();
+            for (column, (cell, &width)) in line.iter().zip(&widths).enumerate() {
+                if column == 0 {
+                    let _ = write!(row, "{cell:width$}");
+                } else {
+                    let _ = write!(row, "  {cell:>width$}");
+                }
+            }
+            text += row.trim_end();
+            text.push('\n');
+        }
+        text
+    }
+
     fn markdown(&self) -> String {
         let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
         let rule: Vec<String> = (0..self.head.len())

@@ -39,7 +39,7 @@ pub(super) fn accuracies(rows: &[Row], set: &str, title: &str) -> String {
     let x = Scale::linear(((least / 5.0).floor() * 5.0 - 2.0, 101.0), (left, 700.0));
     let y = Scale::linear((0.0, 1.0), (bottom, top));
     let mut svg = Svg::new(720.0, bottom + 34.0);
-    axes(&mut svg, &x, &y, ("accuracy, %", ""), (8, 0));
+    axes(&mut svg, (&x, "accuracy, %"), (&y, ""), (8, 0));
     for (number, (row, accuracies)) in shown.iter().enumerate() {
         let at = top + line * (number as f64 + 0.5);
         svg.text("label", (left - 8.0, at + 4.0), Anchor::End, &row.title);
@@ -82,27 +82,66 @@ pub(super) fn price(rows: &[Row], set: &str) -> String {
     let mut svg = Svg::new(720.0, 330.0);
     axes(
         &mut svg,
-        &x,
-        &y,
-        ("steps, all stages", "accuracy, %"),
+        (&x, "steps, all stages"),
+        (&y, "accuracy, %"),
         (4, 6),
     );
-    // Names stand to the right in the order of the dots, moved apart, and up where they would leave
-    // the picture.
     points.sort_by(|a, b| b.2.total_cmp(&a.2));
-    let apart = 15.0;
-    let mut at = f64::NEG_INFINITY;
-    for (number, (name, steps, percent)) in points.iter().enumerate() {
-        let dot = (x.at(*steps), y.at(*percent));
-        at = dot.1.max(at + apart);
-        let below = (points.len() - 1 - number) as f64;
-        let text = (right + 40.0, at.min(bottom + 14.0 - apart * below));
-        svg.line("leader", dot, (text.0 - 4.0, text.1));
-        svg.text("label", (text.0, text.1 + 4.0), Anchor::Start, name);
+    let dots: Vec<(f64, f64)> = points.iter().map(|p| (x.at(p.1), y.at(p.2))).collect();
+    let mut placed: Vec<Label> = Vec::new();
+    for ((name, steps, percent), &dot) in points.iter().zip(&dots) {
+        let label = Label::beside(dot, name, &dots, &placed);
+        svg.text(
+            "label",
+            (label.left, label.middle + 4.0),
+            Anchor::Start,
+            name,
+        );
+        placed.push(label);
         let tip = format!("{name}: {percent:.1} % after {steps:.0} steps");
         svg.dot("mark", dot, 4.5, &tip);
     }
     svg.finish("accuracy against steps")
+}
+
+/// Where a name stands, in pixels.
+struct Label {
+    left: f64,
+    width: f64,
+    middle: f64,
+}
+
+impl Label {
+    const HEIGHT: f64 = 13.0;
+
+    /// The place nearest to `dot` that covers no other dot and no name placed before.
+    fn beside(dot: (f64, f64), name: &str, dots: &[(f64, f64)], placed: &[Self]) -> Self {
+        // Letters of the page's 12 px font are 6.5 px wide on average.
+        let width = 6.5 * name.chars().count() as f64;
+        let places = [0.0, 0.5, -0.5, 1.0, -1.0, 1.5, -1.5, 2.0, -2.0, 3.0, -3.0];
+        let places = places.iter().flat_map(|lines| {
+            [8.0, -8.0 - width].map(|aside| Self {
+                left: dot.0 + aside,
+                width,
+                middle: dot.1 + lines * Self::HEIGHT,
+            })
+        });
+        let is_free = |label: &Self| {
+            let covers = |other: &(f64, f64)| {
+                (label.left - 5.0..label.left + width + 5.0).contains(&other.0)
+                    && (other.1 - label.middle).abs() < 0.5 * Self::HEIGHT + 4.0
+            };
+            let overlaps = |other: &Self| {
+                label.left < other.left + other.width
+                    && other.left < label.left + width
+                    && (label.middle - other.middle).abs() < Self::HEIGHT
+            };
+            label.left > 0.0 && !dots.iter().any(covers) && !placed.iter().any(overlaps)
+        };
+        let mut places = places.collect::<Vec<_>>();
+        let free = places.iter().position(is_free).unwrap_or_default();
+        places.swap_remove(free)
+    }
 }
 
 /// Accuracy in training against the steps of all stages, a line a run; at the end a dot for the
@@ -126,9 +165,10 @@ pub(super) fn curve(row: &Row, set: &str) -> Option<String> {
         .unwrap_or(1)
         .max(1);
     let x = Scale::linear((0.0, longest as f64), (38.0, 244.0));
-    let y = Scale::linear((20.0, 100.0), (130.0, 24.0));
-    let mut svg = Svg::new(260.0, 165.0);
-    axes(&mut svg, &x, &y, ("steps", &row.title), (3, 4));
+    let y = Scale::linear((20.0, 100.0), (146.0, 40.0));
+    let mut svg = Svg::new(260.0, 181.0);
+    svg.text("name", (0.0, 12.0), Anchor::Start, &row.title);
+    axes(&mut svg, (&x, "steps"), (&y, "accuracy, %"), (3, 4));
     for (number, (_, details)) in row.runs.iter().enumerate() {
         let mut before = 0.0;
         for stage in &details.history.stages {
@@ -140,7 +180,7 @@ pub(super) fn curve(row: &Row, set: &str) -> Option<String> {
             let end = before + stage.steps() as f64;
             // The end of a stage, once a panel.
             if number == 0 && end < longest as f64 {
-                svg.line("stage", (x.at(end), 130.0), (x.at(end), 24.0));
+                svg.line("stage", (x.at(end), 146.0), (x.at(end), 40.0));
             }
             before = end;
         }
@@ -169,10 +209,21 @@ fn thinned(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     points.iter().step_by(every).chain(last).copied().collect()
 }
 
-/// What a run's page shows of each stage: a picture's name, and its columns with their classes.
-const PICTURES: [(&str, &[(&str, &str)]); 5] = [
+/// A picture of a stage: what it shows, its axis, by how much its columns are multiplied, and the
+/// columns with their classes.
+type Picture = (
+    &'static str,
+    &'static str,
+    f64,
+    &'static [(&'static str, &'static str)],
+);
+
+/// What a run's page shows of each stage.
+const PICTURES: [Picture; 5] = [
     (
         "losses",
+        "loss, nats",
+        1.0,
         &[
             ("loss", "train"),
             ("validation_loss", "valid"),
@@ -181,10 +232,14 @@ const PICTURES: [(&str, &[(&str, &str)]); 5] = [
     ),
     (
         "accuracy",
+        "accuracy, %",
+        100.0,
         &[("accuracy", "train"), ("validation_accuracy", "valid")],
     ),
     (
         "sigma",
+        "least, mean, greatest",
+        1.0,
         &[
             ("sigma_min", "train"),
             ("sigma_mean", "train"),
@@ -193,23 +248,34 @@ const PICTURES: [(&str, &[(&str, &str)]); 5] = [
     ),
     (
         "taxels' deviation",
+        "of images in [-1, 1]",
+        1.0,
         &[
             ("pixel_std", "train"),
             ("pixel_std_component", "valid"),
             ("pixel_std_real", "diagonal"),
         ],
     ),
-    ("distance of features", &[("feature_distance", "train")]),
+    (
+        "distance of features",
+        "share of the largest",
+        1.0,
+        &[("feature_distance", "train")],
+    ),
 ];
 
 /// What one run's stages kept, against the steps of each.
 pub(super) fn stages(history: &History) -> Vec<String> {
     let mut pictures = Vec::new();
     for stage in &history.stages {
-        for (name, columns) in PICTURES {
+        for (name, axis, factor, columns) in PICTURES {
+            let scaled = |(step, value): (f64, f64)| (step, factor * value);
             let curves: Vec<(&str, Vec<(f64, f64)>)> = columns
                 .iter()
-                .map(|(column, class)| (*class, stage.curve(column)))
+                .map(|(column, class)| {
+                    let curve = stage.curve(column).into_iter().map(scaled).collect();
+                    (*class, curve)
+                })
                 .collect();
             let values = curves
                 .iter()
@@ -223,10 +289,11 @@ pub(super) fn stages(history: &History) -> Vec<String> {
             }
             let room = (0.05 * (high - low)).max(0.02 * high.abs()).max(1e-3);
             let x = Scale::linear((0.0, (stage.steps() as f64).max(1.0)), (48.0, 244.0));
-            let y = Scale::linear((low - room, high + room), (130.0, 24.0));
-            let mut svg = Svg::new(260.0, 165.0);
+            let y = Scale::linear((low - room, high + room), (146.0, 40.0));
+            let mut svg = Svg::new(260.0, 181.0);
             let title = format!("{}: {name}", stage.name);
-            axes(&mut svg, &x, &y, ("steps", &title), (3, 4));
+            svg.text("name", (0.0, 12.0), Anchor::Start, &title);
+            axes(&mut svg, (&x, "steps"), (&y, axis), (3, 4));
             for (class, curve) in curves {
                 let points: Vec<_> = curve.iter().map(|v| (x.at(v.0), y.at(v.1))).collect();
                 svg.path(class, &thinned(&points));
@@ -239,12 +306,14 @@ pub(super) fn stages(history: &History) -> Vec<String> {
 
 /// A confusion matrix: darker is more of the truth's samples.
 pub(super) fn confusion(counts: &[Vec<f64>], title: &str) -> String {
-    let (left, top, cell) = (34.0, 40.0, 40.0);
+    let (left, top, cell) = (40.0, 48.0, 40.0);
     let levels = counts.len();
     let size = cell * levels as f64;
     let mut svg = Svg::new(left + size + 4.0, top + size + 4.0);
     svg.text("name", (left, 14.0), Anchor::Start, title);
     svg.text("tick", (left - 6.0, top - 6.0), Anchor::End, "truth");
+    let middle = left + 0.5 * size;
+    svg.text("tick", (middle, top - 20.0), Anchor::Middle, "verdict");
     for (truth, row) in counts.iter().enumerate() {
         let samples: f64 = row.iter().sum();
         let y = top + cell * truth as f64;
@@ -262,15 +331,9 @@ pub(super) fn confusion(counts: &[Vec<f64>], title: &str) -> String {
                 let name = (said + 1).to_string();
                 svg.text("tick", (x + 0.5 * cell, top - 6.0), Anchor::Middle, &name);
             }
-            svg.rectangle(
-                "cell",
-                (x, y),
-                (cell - 1.0, cell - 1.0),
-                0.06 + 0.94 * share,
-            );
-            let class = if share > 0.6 { "count strong" } else { "count" };
+            svg.rectangle("cell", (x, y), (cell - 1.0, cell - 1.0), 0.06 + 0.6 * share);
             let text = format!("{count:.0}");
-            svg.text(class, (x + 0.5 * cell, middle), Anchor::Middle, &text);
+            svg.text("count", (x + 0.5 * cell, middle), Anchor::Middle, &text);
         }
     }
     svg.finish(&format!("confusion matrix, {title}"))
@@ -279,16 +342,24 @@ pub(super) fn confusion(counts: &[Vec<f64>], title: &str) -> String {
 /// Accuracy against confidence, bin by bin; on the diagonal a model is as sure as it is right.
 /// Larger dots hold more samples.
 pub(super) fn reliability(bins: &[Bin], title: &str) -> String {
-    let x = Scale::linear((0.0, 1.0), (38.0, 190.0));
-    let y = Scale::linear((0.0, 1.0), (176.0, 24.0));
-    let mut svg = Svg::new(206.0, 210.0);
-    axes(&mut svg, &x, &y, ("confidence", title), (4, 4));
-    svg.line("diagonal", (x.at(0.0), y.at(0.0)), (x.at(1.0), y.at(1.0)));
+    let x = Scale::linear((0.0, 100.0), (38.0, 190.0));
+    let y = Scale::linear((0.0, 100.0), (192.0, 40.0));
+    let mut svg = Svg::new(206.0, 226.0);
+    svg.text("name", (0.0, 12.0), Anchor::Start, title);
+    axes(&mut svg, (&x, "confidence, %"), (&y, "right, %"), (4, 4));
+    svg.line(
+        "diagonal",
+        (x.at(0.0), y.at(0.0)),
+        (x.at(100.0), y.at(100.0)),
+    );
     let total: u64 = bins.iter().map(|bin| bin.samples).sum();
     let full: Vec<&Bin> = bins.iter().filter(|bin| bin.samples > 0).collect();
     let at = |bin: &Bin| {
         let samples = bin.samples as f64;
-        (bin.confidence / samples, bin.right as f64 / samples)
+        (
+            100.0 * bin.confidence / samples,
+            100.0 * bin.right as f64 / samples,
+        )
     };
     let points: Vec<(f64, f64)> = full
         .iter()
@@ -298,7 +369,7 @@ pub(super) fn reliability(bins: &[Bin], title: &str) -> String {
         let share = bin.samples as f64 / total as f64;
         let (confidence, right) = at(bin);
         let tip = format!(
-            "{} samples: {confidence:.2} sure, {right:.2} right",
+            "{} samples: confidence {confidence:.0} %, right {right:.0} %",
             bin.samples
         );
         svg.dot("mark", point, 2.0 + 6.0 * share.sqrt(), &tip);
@@ -332,7 +403,7 @@ pub(super) fn swaps(groups: &[Vec<&SwapEntry>]) -> String {
     let x = Scale::linear(((least / 5.0).floor() * 5.0 - 2.0, 101.0), (left, 700.0));
     let y = Scale::linear((0.0, 1.0), (bottom, top));
     let mut svg = Svg::new(720.0, bottom + 34.0);
-    axes(&mut svg, &x, &y, ("accuracy, %", ""), (8, 0));
+    axes(&mut svg, (&x, "accuracy, %"), (&y, ""), (8, 0));
     for (number, group) in groups.iter().enumerate() {
         let at = top + line * (number as f64 + 0.5);
         let name = format!(

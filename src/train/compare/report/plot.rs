@@ -179,12 +179,11 @@ pub(super) fn label(value: f64) -> String {
     }
 }
 
-/// Draws two axes with ticks, grid and names around `x` and `y`.
+/// Draws two axes, each with its name, about so many ticks, and a grid.
 pub(super) fn axes(
     svg: &mut Svg,
-    x: &Scale,
-    y: &Scale,
-    names: (&str, &str),
+    (x, x_name): (&Scale, &str),
+    (y, y_name): (&Scale, &str),
     ticks: (usize, usize),
 ) {
     let ((left, right), (bottom, top)) = (x.pixels, y.pixels);
@@ -201,8 +200,8 @@ pub(super) fn axes(
     svg.line("axis", (left, bottom), (right, bottom));
     svg.line("axis", (left, bottom), (left, top));
     let middle = 0.5 * (left + right);
-    svg.text("name", (middle, bottom + 28.0), Anchor::Middle, names.0);
-    svg.text("name", (left, top - 7.0), Anchor::Start, names.1);
+    svg.text("tick", (middle, bottom + 28.0), Anchor::Middle, x_name);
+    svg.text("tick", (left, top - 9.0), Anchor::Start, y_name);
 }
 
 /// Text for HTML and SVG, in elements and in attributes.

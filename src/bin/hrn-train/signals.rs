@@ -1,0 +1,78 @@
+//! What a signal does to the trainer.
+
+use std::sync::Arc;
+
+use signal_hook::consts::{SIGINT, SIGTERM, SIGXFSZ};
+use signal_hook::iterator::Signals;
+
+/// Ends the process at SIGINT and SIGTERM, with 130 and 143, and says how to go on.
+///
+/// Every file on the disk is whole at any moment, and a run goes on from its last checkpoint, so there
+/// is nothing to wait for.
+///
+/// # Errors
+///
+/// If the system refuses a handler.
+pub(super) fn end_at_signals(how_to_go_on: Option<String>) -> std::io::Result<()> {
+    // At the limit of a file's size the write fails, as on a full disk. It does not end the process.
+    signal_hook::flag::register(SIGXFSZ, Arc::default())?;
+    let mut signals = Signals::new([SIGINT, SIGTERM])?;
+    std::thread::spawn(move || {
+        if let Some(signal) = signals.forever().next() {
+            let hint =
+                how_to_go_on.map_or_else(String::new, |command| format!("; to go on: {command}"));
+            eprintln!("hrn-train: interrupted{hint}");
+            std::process::exit(128 + signal);
+        }
+    });
+    Ok(())
+}
+
+/// The command that goes on with an interrupted `train`: the same one with `--resume`.
+pub(super) fn resuming(arguments: impl Iterator<Item = String>) -> String {
+    let mut words: Vec<String> = arguments.map(|word| quoted(&word)).collect();
+    if !words.iter().any(|word| word == "--resume") {
+        words.push("--resume".to_owned());
+    }
+    words.join(" ")
+}
+
+/// The command that goes on with an interrupted `compare`: the same one.
+pub(super) fn again(arguments: impl Iterator<Item = String>) -> String {
+    let words: Vec<String> = arguments.map(|word| quoted(&word)).collect();
+    words.join(" ")
+}
+
+/// A word as a shell takes it.
+fn quoted(word: &str) -> String {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./=,:+@%".contains(c);
+    if !word.is_empty() && word.chars().all(is_plain) {
+        return word.to_owned();
+    }
+    format!("'{}'", word.replace('\'', r"'\''"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_to_go_on_is_one_that_a_shell_takes() {
+        let words = |words: &[&str]| {
+            let words: Vec<String> = words.iter().map(|&word| word.to_owned()).collect();
+            words.into_iter()
+        };
+        assert_eq!(
+            resuming(words(&["hrn-train", "train", "--out", "my run's"])),
+            r"hrn-train train --out 'my run'\''s' --resume"
+        );
+        assert_eq!(
+            resuming(words(&["hrn-train", "train", "--resume"])),
+            "hrn-train train --resume"
+        );
+        assert_eq!(
+            again(words(&["hrn-train", "compare", ""])),
+            "hrn-train compare ''"
+        );
+    }
+}
