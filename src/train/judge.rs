@@ -5,4 +5,5 @@ pub mod baseline;
 pub mod likeness;
 pub mod paper;
 pub mod metrics;
+mod canvas;
 pub mod sheet;

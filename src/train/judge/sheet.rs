@@ -3,30 +3,16 @@
 //! In: labelled samples and one sequence a level. Out: the bytes of a PNG, all taxels on one
 //! logarithmic colour scale in newtons. Writes no file.
 
-use anyhow::Context as _;
-use font8x8::legacy::BASIC_LEGACY;
-
-use crate::frame::{COLS, Frame, ROWS, RawFrame};
+use super::canvas::{Canvas, GAP, MARGIN, TEXT, TILE};
+use crate::frame::{Frame, RawFrame};
 use crate::press;
 use crate::simulator::{LabelledSample, Material, NEWTONS_PER_COUNT};
 
 /// Frames in a row of the sheet.
 pub const TILES: usize = 12;
-/// Pixels a taxel.
-const ZOOM: usize = 4;
-const TILE: usize = COLS * ZOOM;
-const GAP: usize = 8;
-/// Height of a line of text.
-const TEXT: usize = 12;
-/// Width of the names to the left.
-const MARGIN: usize = 112;
-const ROW: usize = ROWS * ZOOM + TEXT + GAP;
+const ROW: usize = TILE + TEXT + GAP;
 const HEAD: usize = 2 * TEXT + GAP;
 const FOOT: usize = 56;
-/// Ends of the colour scale, N: below a count, and an 8-bit taxel's full scale.
-const SCALE_N: (f32, f32) = (0.04, 10.2);
-const BACKGROUND: [u8; 3] = [250, 250, 250];
-const INK: [u8; 3] = [30, 30, 30];
 
 /// Draws up to twelve samples of each material, from the lightest press to the hardest, and up to twelve frames
 /// of each sequence, spread over its first press. Frames of a sequence are taken as of a zero
@@ -44,7 +30,7 @@ pub fn sheet(
     let mut canvas = Canvas::new(width, height);
     let threshold_n = contact_threshold_n();
     let title =
-        format!("samples: force pressed with, contact area at {threshold_n} N, greatest taxel");
+        format!("samples: force, contact area in taxels at {threshold_n} N, greatest taxel");
     canvas.text(GAP, GAP, &title);
     let mut top = HEAD;
     for material in Material::ALL {
@@ -52,12 +38,12 @@ pub fn sheet(
             .iter()
             .filter(|sample| sample.material == material.index())
             .collect();
-        canvas.name(top, material);
+        name(&mut canvas, top, material);
         of_material.sort_by(|a, b| a.force_n.total_cmp(&b.force_n));
         for (tile, sample) in spread(&of_material).enumerate() {
             let peak = sample.frame.newtons.iter().copied().fold(0.0, f32::max);
             let area = sample.frame.contact_area_taxels(threshold_n);
-            let caption = format!("{:.0}N {area} {peak:.1}N", sample.force_n);
+            let caption = format!("{:.0} N, {area}, {peak:.1} N", sample.force_n);
             canvas.tile(tile, top, &sample.frame, &caption);
         }
         top += ROW;
@@ -69,7 +55,7 @@ pub fn sheet(
     );
     top += HEAD;
     for (material, frames) in sequences {
-        canvas.name(top, *material);
+        name(&mut canvas, top, *material);
         let press = first_press(frames);
         for (tile, &(number, raw)) in spread(&press).enumerate() {
             let newtons = raw
@@ -80,7 +66,7 @@ pub fn sheet(
                 tile,
                 top,
                 &frame,
-                &format!("{number}: {:.1}N", frame.force_n()),
+                &format!("{number}: {:.1} N", frame.force_n()),
             );
         }
         top += ROW;
@@ -105,7 +91,7 @@ impl<'a> Strip<'a> {
             let peak = frame.newtons.iter().copied().fold(0.0, f32::max);
             let area = frame.contact_area_taxels(contact_threshold_n());
             let force = frame.force_n();
-            (frame, format!("{area} {force:.0}N {peak:.1}N"))
+            (frame, format!("{area}, {force:.0} N, {peak:.1} N"))
         };
         Self {
             name: name.to_owned(),
@@ -120,7 +106,10 @@ fn contact_threshold_n() -> f32 {
 
 /// What the captions of [`Strip::of`] say, for titles.
 pub fn captions() -> String {
-    format!("contact area at {} N, force, peak", contact_threshold_n())
+    format!(
+        "contact area in taxels at {} N, force, greatest taxel",
+        contact_threshold_n()
+    )
 }
 
 /// Draws rows of frames under a title.
@@ -142,6 +131,12 @@ pub fn strips(title: &str, strips: &[Strip]) -> anyhow::Result<Vec<u8>> {
     }
     canvas.colour_bar(top + GAP);
     canvas.png()
+}
+
+/// Names a row after its material.
+fn name(canvas: &mut Canvas, top: usize, material: Material) {
+    canvas.text(GAP, top + TILE / 2 - TEXT, material.name());
+    canvas.text(GAP, top + TILE / 2, &format!("level {}", material.level()));
 }
 
 /// Up to [`TILES`] of `items`, from the first to the last at even distances.
@@ -169,114 +164,6 @@ fn first_press(frames: &[RawFrame]) -> Vec<(usize, &RawFrame)> {
         .skip(first.saturating_sub(1))
         .collect()
 }
-
-/// Pixels, `[height, width, 3]`.
-struct Canvas {
-    width: usize,
-    height: usize,
-    pixels: Vec<u8>,
-}
-
-impl Canvas {
-    fn new(width: usize, height: usize) -> Self {
-        Self {
-            width,
-            height,
-            pixels: BACKGROUND.repeat(width * height),
-        }
-    }
-
-    fn fill(&mut self, x: usize, y: usize, width: usize, height: usize, colour: [u8; 3]) {
-        for y in y..y + height {
-            let at = 3 * (y * self.width + x);
-            self.pixels[at..at + 3 * width].copy_from_slice(&colour.repeat(width));
-        }
-    }
-
-    fn text(&mut self, x: usize, y: usize, text: &str) {
-        for (k, letter) in text.chars().enumerate() {
-            let glyph = BASIC_LEGACY
-                .get(letter as usize)
-                .copied()
-                .unwrap_or_default();
-            for (i, line) in glyph.into_iter().enumerate() {
-                for j in (0..8).filter(|j| line >> j & 1 == 1) {
-                    self.fill(x + 8 * k + j, y + i, 1, 1, INK);
-                }
-            }
-        }
-    }
-
-    fn name(&mut self, top: usize, material: Material) {
-        self.text(GAP, top + TILE / 2 - TEXT, material.name());
-        self.text(GAP, top + TILE / 2, &format!("level {}", material.level()));
-    }
-
-    fn tile(&mut self, tile: usize, top: usize, frame: &Frame, caption: &str) {
-        let left = MARGIN + tile * (TILE + GAP);
-        for (k, &newtons) in frame.newtons.iter().enumerate() {
-            let (x, y) = (left + k % COLS * ZOOM, top + k / COLS * ZOOM);
-            self.fill(x, y, ZOOM, ZOOM, colour_of(newtons));
-        }
-        self.text(left, top + ROWS * ZOOM + 2, caption);
-    }
-
-    fn colour_bar(&mut self, top: usize) {
-        let (left, length) = (MARGIN, 6 * (TILE + GAP));
-        let (low, high) = SCALE_N;
-        let place = |newtons: f32| (newtons / low).ln() / (high / low).ln() * length as f32;
-        for x in 0..length {
-            let newtons = low * (high / low).powf(x as f32 / length as f32);
-            self.fill(left + x, top, 1, 16, colour_of(newtons));
-        }
-        for newtons in [0.04, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0] {
-            let x = left + place(newtons) as usize;
-            self.fill(x, top + 16, 1, 4, INK);
-            self.text(x.saturating_sub(8), top + 22, &format!("{newtons}"));
-        }
-        self.text(left + length + 2 * GAP, top + 4, "N a taxel (0: darkest)");
-    }
-
-    fn png(&self) -> anyhow::Result<Vec<u8>> {
-        let mut bytes = Vec::new();
-        let mut encoder = png::Encoder::new(&mut bytes, self.width as u32, self.height as u32);
-        encoder.set_color(png::ColorType::Rgb);
-        encoder.set_depth(png::BitDepth::Eight);
-        let mut writer = encoder.write_header().context("sheet: PNG header")?;
-        writer
-            .write_image_data(&self.pixels)
-            .context("sheet: PNG pixels")?;
-        writer.finish().context("sheet: PNG end")?;
-        Ok(bytes)
-    }
-}
-
-/// The colour of a taxel: viridis over the logarithm of the force.
-fn colour_of(newtons: f32) -> [u8; 3] {
-    let (low, high) = SCALE_N;
-    let part = ((newtons.max(low) / low).ln() / (high / low).ln()).min(1.0);
-    let at = part * (VIRIDIS.len() - 1) as f32;
-    let k = (at as usize).min(VIRIDIS.len() - 2);
-    let rest = at - k as f32;
-    std::array::from_fn(|c| {
-        let (a, b) = (f32::from(VIRIDIS[k][c]), f32::from(VIRIDIS[k + 1][c]));
-        (a + rest * (b - a)).round() as u8
-    })
-}
-
-/// Ten colours of matplotlib's viridis (CC0) at even distances.
-const VIRIDIS: [[u8; 3]; 10] = [
-    [68, 1, 84],
-    [72, 40, 120],
-    [62, 74, 137],
-    [49, 104, 142],
-    [38, 130, 142],
-    [31, 158, 137],
-    [53, 183, 121],
-    [109, 205, 89],
-    [180, 222, 44],
-    [253, 231, 37],
-];
 
 #[cfg(test)]
 mod tests {
@@ -322,24 +209,16 @@ mod tests {
         // Each row's first tile holds something brighter than the darkest colour.
         let tops = (0..8).map(|k| HEAD + k * ROW).chain([2 * HEAD + 8 * ROW]);
         for top in tops {
-            let bright = (top..top + ROWS * ZOOM)
+            let bright = (top..top + TILE)
                 .flat_map(|y| (MARGIN..MARGIN + 4 * (TILE + GAP)).map(move |x| (x, y)))
                 .filter(|&(x, y)| {
                     let at = 3 * (y * size.width as usize + x);
-                    pixels[at + 1] > 60 && pixels[at..at + 3] != BACKGROUND
+                    pixels[at + 1] > 60 && pixels[at..at + 3] != [250; 3]
                 })
                 .count();
-            assert!(bright >= ZOOM * ZOOM, "nothing to be seen at {top}");
+            assert!(bright >= 16, "nothing to be seen at {top}");
         }
         assert!(sheet(&[], &[]).is_ok());
-    }
-
-    #[test]
-    fn colours_rise_with_the_force() {
-        let green = |newtons| colour_of(newtons)[1];
-        assert!(green(0.0) < green(0.1) && green(0.1) < green(1.0) && green(1.0) < green(10.0));
-        assert_eq!(colour_of(0.0), VIRIDIS[0]);
-        assert_eq!(colour_of(99.0), VIRIDIS[9]);
     }
 
     #[test]
