@@ -159,56 +159,71 @@ pub fn to_bytes(
     labelling: Labelling,
     before: Option<(Dataset, Value)>,
 ) -> anyhow::Result<Vec<u8>> {
-    let mut pitch_mm = captures.first().map(|capture| capture.pitch_mm);
-    // Where the arrays of the first samples come from.
-    let mut first = captures.first().map(|capture| capture.path.clone());
-    let mut others = String::new();
-    let (mut samples, mut meta) = match before {
-        Some((dataset, meta)) => {
-            (pitch_mm, first) = (Some(dataset.pitch_mm()), Some(dataset.path()));
-            others = meta["generator"].as_str().unwrap_or(UNKNOWN).to_owned();
-            (dataset.samples, meta)
-        }
-        None => (
-            Vec::new(),
-            json!({"materials": [], "seed": null, "captures": []}),
-        ),
-    };
-    let (pitch_mm, first) = (
-        pitch_mm.unwrap_or(dataset::PITCH_MM),
-        first.unwrap_or_default(),
-    );
-    let last = samples.iter().filter_map(|sample| sample.object).max();
-    let new_object = last.map_or(Some(0), |object| object.checked_add(1));
-    let no_new_object = || DatasetError::Array {
-        path: first.clone(),
-        array: "object",
-        found: u32::MAX.to_string(),
-        expected: "a lower number, for the next to be a new object's: --object says one".to_owned(),
-    };
-    let mut materials: Vec<String> =
-        serde_json::from_value(meta["materials"].take()).unwrap_or_default();
-    meta["levels"] = json!(dataset::levels());
-    // Models are said to be of simulated data, recorded or both by all who had a part in it.
-    let others = others
-        .split(", ")
-        .filter(|one| !["", COLLECTED].contains(one));
-    let generators: Vec<&str> = others.chain([COLLECTED]).collect();
-    meta["generator"] = json!(generators.join(", "));
-    meta["pitch_mm"] = json!(pitch_mm);
+    let mut collection = Collection::begun(captures.first(), before);
     for capture in captures {
-        capture::check_pitch(&capture.path, capture.pitch_mm, pitch_mm, &first)?;
-        let level = capture.level(labelling.level)?;
-        let object = match labelling.object {
-            Some(object) => object,
-            None => match capture.number("object", "a number")? {
-                Some(object) => object,
-                None => new_object.ok_or_else(no_new_object)?,
-            },
+        collection.add(capture, labelling)?;
+    }
+    collection.finish()
+}
+
+/// A data set in the making.
+struct Collection {
+    samples: Vec<Sample>,
+    meta: Value,
+    /// Where the arrays of the first samples come from.
+    first: PathBuf,
+    pitch_mm: f64,
+    /// The number of an object that no label names; `None` if all numbers are taken.
+    new_object: Option<u32>,
+    materials: Vec<String>,
+}
+
+impl Collection {
+    /// Before its first capture, with the samples of a data set that is added to.
+    fn begun(first: Option<&Capture>, before: Option<(Dataset, Value)>) -> Self {
+        let (samples, mut meta, others, pitch_mm, first) = match before {
+            Some((dataset, meta)) => {
+                let others = meta["generator"].as_str().unwrap_or(UNKNOWN).to_owned();
+                let (pitch_mm, path) = (dataset.pitch_mm(), dataset.path());
+                (dataset.samples, meta, others, pitch_mm, path)
+            }
+            None => (
+                Vec::new(),
+                json!({"materials": [], "seed": null, "captures": []}),
+                String::new(),
+                first.map_or(dataset::PITCH_MM, |capture| capture.pitch_mm),
+                first
+                    .map(|capture| capture.path.clone())
+                    .unwrap_or_default(),
+            ),
         };
+        let last = samples.iter().filter_map(|sample| sample.object).max();
+        // Models are said to be of simulated data, recorded or both by all who had a part in it.
+        let others = others
+            .split(", ")
+            .filter(|one| !["", COLLECTED].contains(one));
+        let generators: Vec<&str> = others.chain([COLLECTED]).collect();
+        meta["generator"] = json!(generators.join(", "));
+        meta["levels"] = json!(dataset::levels());
+        meta["pitch_mm"] = json!(pitch_mm);
+        Self {
+            new_object: last.map_or(Some(0), |object| object.checked_add(1)),
+            materials: serde_json::from_value(meta["materials"].take()).unwrap_or_default(),
+            samples,
+            meta,
+            first,
+            pitch_mm,
+        }
+    }
+
+    /// Adds the presses of a capture.
+    fn add(&mut self, capture: &Capture, labelling: Labelling) -> anyhow::Result<()> {
+        capture::check_pitch(&capture.path, capture.pitch_mm, self.pitch_mm, &self.first)?;
+        let level = capture.level(labelling.level)?;
+        let object = self.object(capture, labelling)?;
         let material = capture.labels.get("material");
         let material = material
-            .map(|name| index_of(name, &mut materials))
+            .map(|name| index_of(name, &mut self.materials))
             .transpose()?;
         let shore = capture.shore()?;
         let own: Vec<Sample> = capture
@@ -225,11 +240,11 @@ pub fn to_bytes(
                 source: 0,
             })
             .collect();
-        if let (Some(of_first), Some(of_this)) = (samples.first(), own.first()) {
-            check_arrays((of_first, &first), (of_this, &capture.path))?;
-            check_splits((&samples, &first), (of_this, &capture.path))?;
+        if let (Some(of_first), Some(of_this)) = (self.samples.first(), own.first()) {
+            check_arrays((of_first, &self.first), (of_this, &capture.path))?;
+            check_splits((&self.samples, &self.first), (of_this, &capture.path))?;
         }
-        samples.extend(own);
+        self.samples.extend(own);
         let said = json!({
             "name": capture.path.file_name().unwrap_or_default().to_string_lossy(),
             "sha256": capture.sha256,
@@ -239,13 +254,37 @@ pub fn to_bytes(
             "split": labelling.split.name(),
             "labels": capture.labels,
         });
-        match meta["captures"].as_array_mut() {
+        match self.meta["captures"].as_array_mut() {
             Some(captures) => captures.push(said),
-            None => meta["captures"] = json!([said]),
+            None => self.meta["captures"] = json!([said]),
         }
+        Ok(())
     }
-    meta["materials"] = json!(materials);
-    Ok(dataset::write(Cursor::new(Vec::new()), &samples, &meta)?.into_inner())
+
+    /// The object of a capture: as given, as its label says, or a new one.
+    fn object(&self, capture: &Capture, labelling: Labelling) -> anyhow::Result<u32> {
+        if let Some(object) = labelling.object {
+            return Ok(object);
+        }
+        if let Some(object) = capture.number("object", "a number")? {
+            return Ok(object);
+        }
+        let new_object = self.new_object.ok_or_else(|| DatasetError::Array {
+            path: self.first.clone(),
+            array: "object",
+            found: u32::MAX.to_string(),
+            expected: "a lower number, for the next to be a new object's: --object says one"
+                .to_owned(),
+        })?;
+        Ok(new_object)
+    }
+
+    /// The bytes of the file.
+    fn finish(mut self) -> anyhow::Result<Vec<u8>> {
+        self.meta["materials"] = json!(self.materials);
+        let file = Cursor::new(Vec::new());
+        Ok(dataset::write(file, &self.samples, &self.meta)?.into_inner())
+    }
 }
 
 /// Refuses samples of which some have a value for an array, and some have none.

@@ -131,6 +131,89 @@ impl Builder {
         );
         (trace, squares)
     }
+
+    /// Axes, coordinates and kernels.
+    fn constants(&mut self) {
+        let coordinate = |of: fn(usize) -> usize| -> Vec<f32> {
+            (0..TAXELS).map(|index| of(index) as f32).collect()
+        };
+        let frame = [1, 1, ROWS, COLS];
+        self.graph.indices("taxel axes", &[2, 3]);
+        self.graph.constant("tiny", &[], &[TINY]);
+        let rows = coordinate(|index| index / COLS);
+        self.graph.constant("row", &frame, &rows);
+        let columns = coordinate(|index| index % COLS);
+        self.graph.constant("column", &frame, &columns);
+        self.graph.constant("down", &[1, 1, 2, 1], &[-1.0, 1.0]);
+        self.graph.constant("right", &[1, 1, 1, 2], &[-1.0, 1.0]);
+    }
+
+    /// Five features: the contact area, and the areas above higher thresholds. Gives the contact area.
+    fn areas(&mut self, contact: &str) -> String {
+        let area = self.sum(contact, "area");
+        self.log_feature(&area);
+        for threshold_n in AREA_THRESHOLDS_N {
+            let mask = self.mask(threshold_n);
+            let count = self.sum(&mask, &format!("area of {threshold_n}"));
+            // Often 0: log(1 + count), not log(tiny).
+            let one = self
+                .graph
+                .constant(&format!("one for {threshold_n}"), &[], &[1.0]);
+            let raised = self.node("Add", &[&count, &one], &format!("{count} + 1"));
+            let log = self.node("Log", &[&raised], &format!("log of {count}"));
+            self.columns.push(log);
+        }
+        area
+    }
+
+    /// Five features: force, greatest taxel, mean, the greatest taxel's share, and the effective area
+    /// F^2 / sum p^2. Gives the force.
+    fn forces(&mut self, pressed: &str, area: &str) -> String {
+        let force = self.sum(pressed, "force");
+        self.log_feature(&force);
+        let options = vec![
+            graph::integers("axes", &[2, 3]),
+            graph::integer("keepdims", 0),
+        ];
+        let peak = self.graph.node("ReduceMax", &[pressed], "peak", options);
+        self.log_feature(&peak);
+        let mean = self.quotient(&force, area, "mean");
+        self.log_feature(&mean);
+        let share = self.quotient(&peak, &force, "peak share");
+        self.columns.push(share);
+
+        let squares = self.node("Mul", &[pressed, pressed], "pressed squared");
+        let energy = self.sum(&squares, "energy");
+        let force_squared = self.node("Mul", &[&force, &force], "force squared");
+        let effective_area = self.quotient(&force_squared, &energy, "effective area");
+        self.log_feature(&effective_area);
+        force
+    }
+
+    /// Five features: the second moments of force and of contact, and the fourth moment of force over
+    /// the square of its second. Gives a sixth, how far the force reaches beside the contact.
+    fn shape(&mut self, (pressed, force): (&str, &str), (contact, area): (&str, &str)) -> String {
+        let (spread, arm) = self.spread(pressed, force);
+        let (contact_spread, _) = self.spread(contact, area);
+        let arm_squared = self.node("Mul", &[&arm, &arm], "arm squared");
+        let weighted = self.node("Mul", &[pressed, &arm_squared], "fourth weighted");
+        let sum = self.sum(&weighted, "fourth sum");
+        let fourth = self.quotient(&sum, force, "fourth");
+        let spread_squared = self.node("Mul", &[&spread, &spread], "spread squared");
+        let tails = self.quotient(&fourth, &spread_squared, "tails");
+        self.log_feature(&tails);
+        self.quotient(&spread, &contact_spread, "reach")
+    }
+
+    /// Two features: the variation of force and of contact from taxel to taxel, each by its size.
+    fn roughness(&mut self, (pressed, force): (&str, &str), (contact, area): (&str, &str)) {
+        let variation = self.variation(pressed, "variation");
+        let roughness = self.quotient(&variation, force, "roughness");
+        self.columns.push(roughness);
+        let border = self.variation(contact, "border");
+        let raggedness = self.quotient(&border, area, "raggedness");
+        self.columns.push(raggedness);
+    }
 }
 
 /// The graph from newtons to features `[1, FEATURES]`, and their name.
@@ -139,84 +222,14 @@ pub(super) fn feature_graph() -> (Graph, String) {
         graph: Graph::default(),
         columns: Vec::new(),
     };
-    b.graph.indices("taxel axes", &[2, 3]);
-    b.graph.constant("tiny", &[], &[TINY]);
-    let coordinate = |of: fn(usize) -> usize| -> Vec<f32> {
-        (0..TAXELS).map(|index| of(index) as f32).collect()
-    };
-    b.graph.constant(
-        "row",
-        &[1, 1, ROWS, COLS],
-        &coordinate(|index| index / COLS),
-    );
-    b.graph.constant(
-        "column",
-        &[1, 1, ROWS, COLS],
-        &coordinate(|index| index % COLS),
-    );
-    b.graph.constant("down", &[1, 1, 2, 1], &[-1.0, 1.0]);
-    b.graph.constant("right", &[1, 1, 1, 2], &[-1.0, 1.0]);
-
-    // Areas: 5.
+    b.constants();
     let contact = b.mask(press::Settings::default().contact_threshold_n);
-    let area = b.sum(&contact, "area");
-    b.log_feature(&area);
-    for threshold_n in AREA_THRESHOLDS_N {
-        let mask = b.mask(threshold_n);
-        let count = b.sum(&mask, &format!("area of {threshold_n}"));
-        // Often 0: log(1 + count), not log(tiny).
-        let one = b
-            .graph
-            .constant(&format!("one for {threshold_n}"), &[], &[1.0]);
-        let raised = b.node("Add", &[&count, &one], &format!("{count} + 1"));
-        let log = b.node("Log", &[&raised], &format!("log of {count}"));
-        b.columns.push(log);
-    }
-
-    // Force, peak, mean, peak's share: 4.
+    let area = b.areas(&contact);
     let pressed = b.node("Mul", &[graph::INPUT, &contact], "pressed");
-    let force = b.sum(&pressed, "force");
-    b.log_feature(&force);
-    let options = vec![
-        graph::integers("axes", &[2, 3]),
-        graph::integer("keepdims", 0),
-    ];
-    let peak = b.graph.node("ReduceMax", &[&pressed], "peak", options);
-    b.log_feature(&peak);
-    let mean = b.quotient(&force, &area, "mean");
-    b.log_feature(&mean);
-    let share = b.quotient(&peak, &force, "peak share");
-    b.columns.push(share);
-
-    // Effective area F^2 / sum p^2: 1.
-    let squares = b.node("Mul", &[&pressed, &pressed], "pressed squared");
-    let energy = b.sum(&squares, "energy");
-    let force_squared = b.node("Mul", &[&force, &force], "force squared");
-    let effective_area = b.quotient(&force_squared, &energy, "effective area");
-    b.log_feature(&effective_area);
-
-    // Second moments of force and of contact: 4. Fourth over second squared: 1.
-    let (spread, arm) = b.spread(&pressed, &force);
-    let (contact_spread, _) = b.spread(&contact, &area);
-    let arm_squared = b.node("Mul", &[&arm, &arm], "arm squared");
-    let weighted = b.node("Mul", &[&pressed, &arm_squared], "fourth weighted");
-    let sum = b.sum(&weighted, "fourth sum");
-    let fourth = b.quotient(&sum, &force, "fourth");
-    let spread_squared = b.node("Mul", &[&spread, &spread], "spread squared");
-    let tails = b.quotient(&fourth, &spread_squared, "tails");
-    b.log_feature(&tails);
-
-    // Roughness: variation of force and of contact, each by its size: 2. How far the force
-    // reaches beside the contact: 1.
-    let variation = b.variation(&pressed, "variation");
-    let roughness = b.quotient(&variation, &force, "roughness");
-    b.columns.push(roughness);
-    let border = b.variation(&contact, "border");
-    let raggedness = b.quotient(&border, &area, "raggedness");
-    b.columns.push(raggedness);
-    let reach = b.quotient(&spread, &contact_spread, "reach");
+    let force = b.forces(&pressed, &area);
+    let reach = b.shape((&pressed, &force), (&contact, &area));
+    b.roughness((&pressed, &force), (&contact, &area));
     b.columns.push(reach);
-
     assert_eq!(
         b.columns.len(),
         FEATURES,
