@@ -15,6 +15,7 @@ use hardnessd::train::learn::{fit, gan};
 use hardnessd::train::net::losses::Game;
 use hardnessd::train::net::network::numbers;
 use hardnessd::train::net::{generator, hrn};
+use hardnessd::train::settings::network::Pooling;
 use hardnessd::train::settings::{GanSettings, OptimiserSettings};
 use ndarray::{ArrayD, IxDyn};
 use ndarray_npy::NpzWriter;
@@ -97,7 +98,7 @@ impl Networks {
             sides.map(|weights| Learner::fresh(weights, settings, 0.0))
         };
         Self {
-            hrn: Learner::fresh(hrn::initial(LEVELS, 1, &device), sgd, 0.0),
+            hrn: Learner::fresh(hrn::initial(LEVELS, Pooling::Max, 1, &device), sgd, 0.0),
             gan: sides(adversaries.optimiser),
             gan_sgd: sides(sgd),
             images,
@@ -164,6 +165,7 @@ fn gan_step(gan: &mut [Learner; 2], images: &Tensor<4>, eta: &Tensor<2>) -> f64 
         game: GAME,
         sigma_penalty: GanSettings::default().sigma_penalty,
         rate: RATE,
+        sensing: None,
     };
     let [generator, discriminator] = gan;
     let losses = gan::step(generator, discriminator, &batch, eta.clone(), rules);

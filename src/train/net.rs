@@ -1,8 +1,10 @@
 //! The networks: layers, weights, what they compute, and their losses.
 
 pub mod graph;
+pub mod image;
 pub mod layers;
 pub mod network;
+pub mod sensed;
 pub mod hrn;
 pub mod generator;
 pub mod losses;

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 pub mod augmentation;
 mod bounds;
 pub mod gan;
+pub mod network;
 pub mod optimiser;
 pub(in crate::train) mod retired;
 
@@ -16,6 +17,7 @@ use crate::wording;
 pub use augmentation::AugmentationSettings;
 pub use bounds::SettingsError;
 pub use gan::GanSettings;
+pub use network::NetworkSettings;
 pub use optimiser::OptimiserSettings;
 
 use bounds::{check, check_loop};
@@ -121,6 +123,8 @@ pub struct Settings {
     /// Newtons a taxel that become 1 in the network's image; 0 N becomes -1. 10.2 N is what
     /// 8 bits of 0.04 N hold.
     pub full_scale_n: f64,
+    /// How the networks see a frame.
+    pub network: NetworkSettings,
     /// The GAN over unlabelled samples: USTGAN, or that of SGAN and IGAN.
     pub ustgan: GanSettings,
     /// Each of the STGANs.
@@ -139,6 +143,7 @@ impl Default for Settings {
     fn default() -> Self {
         Self {
             full_scale_n: 10.2,
+            network: NetworkSettings::default(),
             ustgan: GanSettings::default(),
             stgan: GanSettings {
                 // An epoch has 4 steps there and 85 here.
@@ -215,6 +220,7 @@ impl Settings {
     pub fn checked(self) -> Result<Self, SettingsError> {
         let scale = self.full_scale_n;
         check("", "full_scale_n", scale, scale > 0.0, "above 0")?;
+        self.network.check()?;
         self.ustgan.check("ustgan.")?;
         self.stgan.check("stgan.")?;
         let generated = self.generation.samples_a_component;

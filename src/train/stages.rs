@@ -18,6 +18,7 @@ use crate::train::learn::gan::{self, Gan};
 use crate::train::model::export::{self, Recogniser};
 use crate::train::net::generator;
 use crate::train::net::hrn;
+use crate::train::net::image::Scale;
 use crate::train::net::losses::Game;
 use crate::train::net::network::Weights;
 use crate::train::run::{Description, Run};
@@ -55,6 +56,14 @@ impl Stages<'_> {
         &self.description.settings
     }
 
+    fn scale(&self) -> Scale {
+        let settings = self.settings();
+        Scale {
+            full_scale_n: settings.full_scale_n,
+            log_above_n: settings.network.log_above_n,
+        }
+    }
+
     fn gan_task<'a>(
         &'a self,
         stage: &'static str,
@@ -67,7 +76,7 @@ impl Stages<'_> {
             dataset: self.dataset,
             real: self.unlabelled,
             labelled: &[],
-            full_scale_n: self.settings().full_scale_n,
+            scale: self.scale(),
             settings,
             seed: self.description.seed,
             device: self.device,
@@ -76,13 +85,14 @@ impl Stages<'_> {
 
     /// HRN's random start.
     pub fn random(&self) -> Weights {
-        hrn::initial(levels(), self.description.seed, self.device)
+        let pooling = self.settings().network.pooling;
+        hrn::initial(levels(), pooling, self.description.seed, self.device)
     }
 
     /// HRN's start from USTGAN's discriminator.
     pub fn inherited(&self, ustgan: &Gan) -> Weights {
-        let seed = self.description.seed;
-        hrn::inherited(&ustgan.discriminator, levels(), seed, self.device)
+        let (pooling, seed) = (self.settings().network.pooling, self.description.seed);
+        hrn::inherited(&ustgan.discriminator, levels(), pooling, seed, self.device)
     }
 
     /// The GAN trained without labels.
@@ -171,13 +181,17 @@ impl Stages<'_> {
         let generator = gan::fit(&task, ustgan.clone(), self.run)?.generator;
         let batch = settings.stgan.samples_a_component;
         let statistics = generator::statistics(&generator, batch, seed, self.device);
+        let making = generator::Making {
+            weights: &generator,
+            statistics: &statistics,
+            scale: self.scale(),
+            sensor: task.sensor(),
+            device: self.device,
+        };
         Ok(generator::generate(
-            &generator,
-            &statistics,
+            &making,
             settings.generation.samples_a_component as usize,
-            settings.full_scale_n,
             &mut Stream::new(seed, &format!("{stage} generated")),
-            self.device,
         ))
     }
 
@@ -204,7 +218,7 @@ impl Stages<'_> {
             dataset: self.dataset,
             train: self.train,
             validation: (self.validation, self.settings().validation),
-            full_scale_n: self.settings().full_scale_n,
+            scale: self.scale(),
             settings: &self.settings().training,
             seed: self.description.seed,
             device: self.device,
@@ -256,16 +270,16 @@ impl Stages<'_> {
     ///
     /// If the daemon's loader refuses the model, or the run's directory cannot be written.
     pub fn finish(&self, trained: &Trained) -> anyhow::Result<Option<Evaluation>> {
-        let full_scale_n = self.settings().full_scale_n;
+        let scale = self.scale();
         self.draw_mistakes(trained)?;
-        let (graph, raw_logits) = hrn::graph(&trained.weights, &trained.statistics, full_scale_n);
+        let (graph, raw_logits) = hrn::graph(&trained.weights, &trained.statistics, scale);
         let recogniser = Recogniser {
             graph,
             raw_logits,
             temperature: trained.temperature,
         };
         let probabilities = |frames: &[&Frame]| {
-            let logits = trained.logits(frames.iter().copied(), full_scale_n, self.device);
+            let logits = trained.logits(frames.iter().copied(), scale, self.device);
             Ok(fit::probabilities(
                 &logits,
                 trained.temperature,
@@ -292,7 +306,7 @@ impl Stages<'_> {
         let frames = indices
             .iter()
             .map(|&index| &self.dataset.samples[index].frame);
-        let logits = trained.logits(frames, self.settings().full_scale_n, self.device);
+        let logits = trained.logits(frames, self.scale(), self.device);
         let probabilities = fit::probabilities(&logits, trained.temperature, self.device);
         draw_mistakes(self.run, self.dataset, (kind, indices), &probabilities)
     }

@@ -6,7 +6,7 @@
 
 use crate::frame::{Frame, TAXELS};
 use crate::train::judge::features;
-use crate::train::net::hrn;
+use crate::train::net::image::Scale;
 
 /// Generated frames beside real ones.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -33,7 +33,7 @@ pub struct Reference {
     /// Standardised features, a row each.
     rows: Vec<Vec<f64>>,
     pixel_std: f64,
-    full_scale_n: f64,
+    scale: Scale,
 }
 
 impl Reference {
@@ -42,15 +42,15 @@ impl Reference {
     /// # Errors
     ///
     /// If their features cannot be computed.
-    pub fn of(frames: &[&Frame], full_scale_n: f64) -> anyhow::Result<Self> {
+    pub fn of(frames: &[&Frame], scale: Scale) -> anyhow::Result<Self> {
         let rows = features::features(frames.iter().copied())?;
         let (mean, deviation) = features::moments(&rows);
         let mut reference = Self {
             mean,
             deviation,
             rows: Vec::new(),
-            pixel_std: pixel_std(frames.iter().copied(), full_scale_n),
-            full_scale_n,
+            pixel_std: pixel_std(frames.iter().copied(), scale),
+            scale,
         };
         reference.rows = reference.standardised(&rows);
         Ok(reference)
@@ -67,11 +67,11 @@ impl Reference {
         let within = mean_distance_within(&self.rows) + mean_distance_within(&rows);
         let of_component = |first: usize| {
             let frames = frames.iter().skip(first).step_by(components);
-            pixel_std(frames, self.full_scale_n)
+            pixel_std(frames, self.scale)
         };
         let within_components = (0..components).map(of_component).sum::<f64>();
         Ok(Likeness {
-            pixel_std: pixel_std(frames.iter(), self.full_scale_n),
+            pixel_std: pixel_std(frames.iter(), self.scale),
             pixel_std_real: self.pixel_std,
             pixel_std_component: within_components / components as f64,
             feature_distance: if across > 0.0 {
@@ -110,12 +110,12 @@ fn mean_distance_within(rows: &[Vec<f64>]) -> f64 {
     mean_distance(rows, rows) * n / (n - 1.0).max(1.0)
 }
 
-fn pixel_std<'a>(frames: impl ExactSizeIterator<Item = &'a Frame>, full_scale_n: f64) -> f64 {
+fn pixel_std<'a>(frames: impl ExactSizeIterator<Item = &'a Frame>, scale: Scale) -> f64 {
     let n = frames.len() as f64;
     let mut sums = vec![(0.0_f64, 0.0_f64); TAXELS];
     for frame in frames {
         for ((sum, squares), newtons) in sums.iter_mut().zip(frame.newtons) {
-            let value = f64::from(hrn::pixel(newtons, full_scale_n));
+            let value = f64::from(scale.pixel(newtons));
             *sum += value;
             *squares += value * value;
         }
@@ -131,6 +131,11 @@ fn pixel_std<'a>(frames: impl ExactSizeIterator<Item = &'a Frame>, full_scale_n:
 mod tests {
     use super::*;
     use crate::simulator::{DatasetSettings, dataset};
+
+    const SCALE: Scale = Scale {
+        full_scale_n: 10.2,
+        log_above_n: 0.0,
+    };
 
     fn frames(seed: u64, level: u8) -> Vec<Frame> {
         let settings = DatasetSettings {
@@ -150,7 +155,7 @@ mod tests {
     #[test]
     fn frames_of_the_same_kind_are_near_and_others_far() {
         let real = frames(1, 4);
-        let reference = Reference::of(&real.iter().collect::<Vec<_>>(), 10.2).unwrap();
+        let reference = Reference::of(&real.iter().collect::<Vec<_>>(), SCALE).unwrap();
         let same = reference.compare(&frames(2, 4), 1).unwrap();
         let hard = reference.compare(&frames(1, 1), 1).unwrap();
         assert!(same.feature_distance < 0.05, "{same:?}");
@@ -162,7 +167,7 @@ mod tests {
     #[test]
     fn a_collapse_shows_in_the_taxels_deviation() {
         let real = frames(1, 4);
-        let reference = Reference::of(&real.iter().collect::<Vec<_>>(), 10.2).unwrap();
+        let reference = Reference::of(&real.iter().collect::<Vec<_>>(), SCALE).unwrap();
         let likeness = reference.compare(&[real[0]; 20], 1).unwrap();
         assert!(likeness.pixel_std < 1e-6, "{likeness:?}");
         assert!(likeness.feature_distance > 0.3, "{likeness:?}");

@@ -15,6 +15,7 @@ use crate::train::data::augment;
 use crate::train::data::dataset::{self, Dataset};
 use crate::train::learn::learner::Learner;
 use crate::train::net::hrn;
+use crate::train::net::image::Scale;
 use crate::train::net::network::{Normalisation, Statistics, Weights, numbers};
 use crate::train::run::Run;
 use crate::train::run::checkpoint::{Checkpoint, Origin, Progress};
@@ -37,8 +38,8 @@ pub struct Task<'a> {
     pub train: &'a [usize],
     /// Samples of held-out training objects, and how they are used; may be empty.
     pub validation: (&'a [usize], Validation),
-    /// Newtons a taxel that become 1 in the image.
-    pub full_scale_n: f64,
+    /// From newtons to images.
+    pub scale: Scale,
     /// How.
     pub settings: &'a Training,
     /// Of the order of the samples and their augmentation.
@@ -63,13 +64,13 @@ impl Trained {
     pub fn logits<'a>(
         &self,
         frames: impl Iterator<Item = &'a Frame>,
-        full_scale_n: f64,
+        scale: Scale,
         device: &Device,
     ) -> Vec<Vec<f32>> {
         let frames: Vec<&Frame> = frames.collect();
         let mut rows = Vec::with_capacity(frames.len());
         for part in frames.chunks(JUDGED_AT_ONCE) {
-            let images = hrn::images(part.iter().copied(), full_scale_n, device);
+            let images = scale.images(part.iter().copied(), device);
             let mut normalisation = Normalisation::Fixed(&self.statistics);
             let logits = hrn::logits(&self.weights, images, &mut normalisation);
             let levels = logits.dims()[1];
@@ -273,7 +274,7 @@ impl State {
 
 impl Task<'_> {
     fn origin(&self, initial: &Weights) -> String {
-        let settings = (self.settings, self.validation.1, self.full_scale_n);
+        let settings = (self.settings, self.validation.1, self.scale);
         Origin::new(self.stage, &settings, self.seed)
             .samples(self.dataset, self.train)
             .samples(self.dataset, self.validation.0)
@@ -302,7 +303,7 @@ impl Task<'_> {
                 augment::vary(frame, self.settings.augmentation, &mut stream)
             })
             .collect();
-        hrn::images(frames.iter(), self.full_scale_n, self.device)
+        self.scale.images(frames.iter(), self.device)
     }
 
     fn targets(&self, indices: &[usize]) -> Tensor<2> {
@@ -366,7 +367,7 @@ impl Task<'_> {
         let frames = indices
             .iter()
             .map(|&index| &self.dataset.samples[index].frame);
-        trained.logits(frames, self.full_scale_n, self.device)
+        trained.logits(frames, self.scale, self.device)
     }
 
     /// Of a labelled sample, from 0.

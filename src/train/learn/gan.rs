@@ -16,8 +16,10 @@ use crate::train::data::dataset::Dataset;
 use crate::train::learn::learner::Learner;
 use crate::train::net::generator;
 use crate::train::net::hrn;
+use crate::train::net::image::Scale;
 use crate::train::net::losses::Game;
 use crate::train::net::network::{self, FEATURES, Weights};
+use crate::train::net::sensed::Sensor;
 use crate::train::run::Run;
 use crate::train::run::checkpoint::{Checkpoint, Origin, Progress};
 use crate::train::run::history::{Adversarial, Row};
@@ -66,8 +68,8 @@ pub struct Task<'a> {
     pub real: &'a [usize],
     /// Samples whose levels the discriminator learns; empty where the game has no levels.
     pub labelled: &'a [usize],
-    /// Newtons a taxel that become 1 in the image.
-    pub full_scale_n: f64,
+    /// From newtons to images.
+    pub scale: Scale,
     /// How.
     pub settings: &'a GanSettings,
     /// Of noise and orders.
@@ -89,9 +91,9 @@ pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
     let mut state = match run.latest(task.stage, &origin, epochs, task.device)? {
         Some(checkpoint) => {
             run.check_origin(task.stage, &checkpoint, &origin)?;
-            State::resumed(&checkpoint, task.settings)?
+            State::resumed(&checkpoint, task.settings, task.sensor())?
         }
-        None => State::fresh(initial, task.settings),
+        None => State::fresh(initial, task.settings, task.sensor()),
     };
     let mut metrics = run.metrics(task.stage, state.progress.step)?;
     let mut reference = None;
@@ -168,6 +170,7 @@ pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
 #[derive(Debug)]
 struct State {
     progress: Progress,
+    sensor: Sensor,
     generator: Learner,
     discriminator: Learner,
 }
@@ -176,7 +179,7 @@ struct State {
 const SIDES: [&str; 2] = ["generator ", "discriminator "];
 
 impl State {
-    fn fresh(initial: Gan, settings: &GanSettings) -> Self {
+    fn fresh(initial: Gan, settings: &GanSettings, sensor: Sensor) -> Self {
         let GanSettings {
             optimiser,
             averaging,
@@ -184,18 +187,24 @@ impl State {
         } = *settings;
         Self {
             progress: Progress::default(),
+            sensor,
             generator: Learner::fresh(initial.generator, optimiser, 0.0),
             discriminator: Learner::fresh(initial.discriminator, optimiser, averaging),
         }
     }
 
-    fn resumed(checkpoint: &Checkpoint, settings: &GanSettings) -> anyhow::Result<Self> {
+    fn resumed(
+        checkpoint: &Checkpoint,
+        settings: &GanSettings,
+        sensor: Sensor,
+    ) -> anyhow::Result<Self> {
         let steps = checkpoint.progress.step;
         let resumed = |prefix: &str, averaging| {
             Learner::resumed(checkpoint, prefix, steps, settings.optimiser, averaging)
         };
         Ok(Self {
             progress: checkpoint.progress,
+            sensor,
             generator: resumed(SIDES[0], 0.0)?,
             discriminator: resumed(SIDES[1], settings.averaging)?,
         })
@@ -222,6 +231,7 @@ impl State {
             game: task.game,
             sigma_penalty: settings.sigma_penalty,
             rate,
+            sensing: Some((self.sensor, task.scale)),
         };
         let mut stream = task.stream("noise").child(number);
         let eta = generator::noise(settings.samples_a_component, &mut stream, task.device);
@@ -250,8 +260,13 @@ fn sigma_range(generator: &Weights) -> [f64; 3] {
 }
 
 impl Task<'_> {
+    /// What gave the real frames.
+    pub fn sensor(&self) -> Sensor {
+        Sensor::of(self.frames(self.real).into_iter())
+    }
+
     fn origin(&self, initial: &Gan) -> String {
-        let settings = (self.settings, self.full_scale_n);
+        let settings = (self.settings, self.scale);
         Origin::new(self.stage, &settings, self.seed)
             .samples(self.dataset, self.real)
             .samples(self.dataset, self.labelled)
@@ -280,11 +295,8 @@ impl Task<'_> {
     /// again and again.
     fn batch(&self, real: &[usize], step: u64) -> Batch {
         let images = |indices: &[usize]| {
-            hrn::images(
-                self.frames(indices).into_iter(),
-                self.full_scale_n,
-                self.device,
-            )
+            self.scale
+                .images(self.frames(indices).into_iter(), self.device)
         };
         let batches = self.labelled.len().div_ceil(self.settings.batch) as u64;
         let labelled = (batches > 0).then(|| {

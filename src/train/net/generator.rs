@@ -7,11 +7,14 @@
 use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
+use crate::press;
 use crate::random::Stream;
+use crate::train::net::image::Scale;
 use crate::train::net::layers::{Geometry, STRIDE, transposed_convolution};
 use crate::train::net::network::{
     FEATURES, Normalisation, Statistics, Weights, batch_norm, numbers, truncated_normal,
 };
+use crate::train::net::sensed::Sensor;
 
 /// n: numbers of noise an image (paper, "Training of STGAN and USTGAN").
 pub const NOISE: usize = 30;
@@ -22,7 +25,7 @@ const INITIAL_SIGMA: f32 = 0.15;
 /// The first layer starts at U(-0.316, 0.316), of variance 1/30: one over its inputs (DeLiGAN's
 /// code).
 const INITIAL_LIMIT: f64 = 0.316;
-/// Batch normalisation's epsilon in the generator (DeLiGAN's code; the discriminator has 1e-3).
+/// Batch normalisation's epsilon in the generator (DeLiGAN's code).
 const BATCH_NORM_EPSILON: f32 = 1e-5;
 /// Rows and columns of the first image.
 const FIRST_SIDE: usize = 4;
@@ -30,6 +33,8 @@ const FIRST_SIDE: usize = 4;
 const STATISTICS_BATCHES: u64 = 20;
 /// Samples of each component a pass without gradients.
 const GENERATED_AT_ONCE: usize = 5;
+/// Rounds in which frames that are no press are drawn again.
+const DRAWN_AGAIN: usize = 8;
 
 /// A transposed convolution: square kernel, stride 2, cropped as TF's SAME padding is.
 #[derive(Debug, Clone, Copy)]
@@ -221,34 +226,70 @@ pub fn statistics(
     statistics
 }
 
-/// Exactly `samples_a_component` frames of every component; frame r is of component r mod 50.
-pub fn generate(
-    weights: &Weights,
-    statistics: &Statistics,
-    samples_a_component: usize,
-    full_scale_n: f64,
-    stream: &mut Stream,
-    device: &Device,
-) -> Vec<Frame> {
-    let mut frames = Vec::with_capacity(samples_a_component * COMPONENTS);
-    let mut left = samples_a_component;
-    while left > 0 {
-        let samples = left.min(GENERATED_AT_ONCE);
-        let eta = noise(samples, stream, device);
-        let images = images(weights, eta, &mut Normalisation::Fixed(statistics));
-        frames.extend(self::frames(&images, full_scale_n));
-        left -= samples;
-    }
-    frames
+/// What generated frames are made with.
+#[derive(Debug)]
+pub struct Making<'a> {
+    /// Of the generator.
+    pub weights: &'a Weights,
+    /// Of its normalised layers.
+    pub statistics: &'a Statistics,
+    /// From images to newtons.
+    pub scale: Scale,
+    /// What the sensor gives for a force.
+    pub sensor: Sensor,
+    /// Where to compute.
+    pub device: &'a Device,
 }
 
-/// Images `[batch, 1, 28, 28]` in [-1, 1] as frames in newtons.
-pub fn frames(images: &Tensor<4>, full_scale_n: f64) -> Vec<Frame> {
-    let scale = (full_scale_n / 2.0) as f32;
+/// Exactly `samples_a_component` frames of every component; frame r is of component r mod 50.
+///
+/// A frame that is no press is drawn again, as it is when presses are recorded. A component that makes
+/// none in [`DRAWN_AGAIN`] rounds keeps what it makes.
+pub fn generate(making: &Making, samples_a_component: usize, stream: &mut Stream) -> Vec<Frame> {
+    let mut of_component: Vec<Vec<Frame>> = vec![Vec::new(); COMPONENTS];
+    for round in 0..=DRAWN_AGAIN {
+        let missing = of_component
+            .iter()
+            .map(|own| samples_a_component - own.len());
+        let mut left = missing.max().unwrap_or_default();
+        while left > 0 {
+            let samples = left.min(GENERATED_AT_ONCE);
+            let eta = noise(samples, stream, making.device);
+            let images = images(
+                making.weights,
+                eta,
+                &mut Normalisation::Fixed(making.statistics),
+            );
+            for (place, frame) in frames(&images, making.scale, making.sensor)
+                .into_iter()
+                .enumerate()
+            {
+                let own = &mut of_component[place % COMPONENTS];
+                let is_taken = round == DRAWN_AGAIN || is_press(&frame);
+                if own.len() < samples_a_component && is_taken {
+                    own.push(frame);
+                }
+            }
+            left -= samples;
+        }
+    }
+    (0..samples_a_component)
+        .flat_map(|sample| of_component.iter().map(move |own| own[sample]))
+        .collect()
+}
+
+/// Whether a press would begin with the frame, by the default settings.
+fn is_press(frame: &Frame) -> bool {
+    let settings = press::Settings::default();
+    frame.contact_area_taxels(settings.contact_threshold_n) >= settings.begin_area_taxels
+}
+
+/// Images `[batch, 1, 28, 28]` in [-1, 1] as the frames that the sensor would give.
+pub fn frames(images: &Tensor<4>, scale: Scale, sensor: Sensor) -> Vec<Frame> {
     let frame = |values: &[f32]| {
         let mut frame = Frame::default();
         for (newtons, value) in frame.newtons.iter_mut().zip(values) {
-            *newtons = (value + 1.0) * scale;
+            *newtons = sensor.newtons(scale.newtons(*value));
         }
         frame
     };
@@ -303,7 +344,17 @@ mod tests {
         let statistics = statistics(&weights, 2, 1, &device());
         let mut stream = Stream::new(1, "generated");
         let samples = Generation::default().samples_a_component as usize;
-        let frames = generate(&weights, &statistics, samples, 10.2, &mut stream, &device());
+        let making = Making {
+            weights: &weights,
+            statistics: &statistics,
+            scale: Scale {
+                full_scale_n: 10.2,
+                log_above_n: 0.0,
+            },
+            sensor: Sensor::of([].iter()),
+            device: &device(),
+        };
+        let frames = generate(&making, samples, &mut stream);
         // The paper's 375 labelled samples a level, thirty for one.
         assert_eq!((samples, frames.len()), (225, 30 * 375));
         for component in 0..COMPONENTS {

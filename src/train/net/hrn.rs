@@ -5,32 +5,47 @@
 
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
-use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::random::Stream;
 use crate::train::net::graph::{self, Graph};
+use crate::train::net::image::Scale;
 use crate::train::net::layers::STRIDE;
 use crate::train::net::network::{
     self, FEATURES, LEAKY_SLOPE, Normalisation, Statistics, TRUNK, Weights,
 };
+use crate::train::settings::network::Pooling;
+
+/// How many features a pooling makes.
+fn features(pooling: Pooling) -> usize {
+    match pooling {
+        Pooling::Max => FEATURES,
+        Pooling::MaxMean => 2 * FEATURES,
+    }
+}
 
 /// Initial weights for `levels` levels.
-pub fn initial(levels: usize, seed: u64, device: &Device) -> Weights {
+pub fn initial(levels: usize, pooling: Pooling, seed: u64, device: &Device) -> Weights {
     let stream = Stream::new(seed, "hrn weights");
     let mut weights = Weights::default();
     network::add_trunk(&mut weights, &stream, device);
-    network::add_head(&mut weights, [FEATURES, levels], &stream, device);
+    network::add_head(&mut weights, [features(pooling), levels], &stream, device);
     weights
 }
 
 /// HRN before pretraining or fine-tuning: a USTGAN's discriminator with a head for `levels` levels
 /// in place of its own, which told real from generated.
-pub fn inherited(discriminator: &Weights, levels: usize, seed: u64, device: &Device) -> Weights {
+pub fn inherited(
+    discriminator: &Weights,
+    levels: usize,
+    pooling: Pooling,
+    seed: u64,
+    device: &Device,
+) -> Weights {
     let mut weights = discriminator.clone();
     weights
         .entries
         .retain(|weight| !weight.name.starts_with("head."));
     let stream = Stream::new(seed, "hrn weights");
-    network::add_head(&mut weights, [FEATURES, levels], &stream, device);
+    network::add_head(&mut weights, [features(pooling), levels], &stream, device);
     weights
 }
 
@@ -50,26 +65,6 @@ pub fn of_levels(discriminator: &Weights, levels: usize, device: &Device) -> Wei
         weights.add(name, &dims, rows.copied().collect(), device);
     }
     weights
-}
-
-/// Frames to images `[batch, 1, 28, 28]` in [-1, 1]: 0 N is -1, `full_scale_n` is 1. One scale
-/// for all frames, because force carries hardness.
-pub fn images<'a>(
-    frames: impl ExactSizeIterator<Item = &'a Frame>,
-    full_scale_n: f64,
-    device: &Device,
-) -> Tensor<4> {
-    let batch = frames.len();
-    let mut values = Vec::with_capacity(batch * TAXELS);
-    for frame in frames {
-        values.extend(frame.newtons.map(|newtons| pixel(newtons, full_scale_n)));
-    }
-    Tensor::from_data(TensorData::new(values, [batch, 1, ROWS, COLS]), device)
-}
-
-/// A taxel of the image.
-pub fn pixel(newtons: f32, full_scale_n: f64) -> f32 {
-    newtons * (2.0 / full_scale_n) as f32 - 1.0
 }
 
 /// Logits `[batch, L]` of images `[batch, 1, 28, 28]`.
@@ -109,11 +104,10 @@ pub fn targets(
 
 /// The graph from newtons to logits, and the logits' name. Batch normalisation is folded into
 /// the convolutions.
-pub fn graph(weights: &Weights, statistics: &Statistics, full_scale_n: f64) -> (Graph, String) {
+pub fn graph(weights: &Weights, statistics: &Statistics, scale: Scale) -> (Graph, String) {
     let mut graph = Graph::default();
-    // 2 x / full scale is the image raised by 1, which the trunk's first line makes.
-    let scale = graph.constant("scale", &[], &[(2.0 / full_scale_n) as f32]);
-    let mut x = graph.node("Mul", &[graph::INPUT, &scale], "image", Vec::new());
+    // The trunk's first line raises the image by 1, too.
+    let mut x = scale.nodes(&mut graph);
     for (layer, folded) in TRUNK.iter().zip(network::fold(weights, statistics)) {
         let name = layer.name;
         let dims = [layer.outputs, layer.inputs, layer.kernel, layer.kernel];
@@ -134,7 +128,14 @@ pub fn graph(weights: &Weights, statistics: &Statistics, full_scale_n: f64) -> (
         let slope = vec![graph::number("alpha", LEAKY_SLOPE)];
         x = graph.node("LeakyRelu", &[&x], &format!("{name}.out"), slope);
     }
-    let pooled = graph.node("GlobalMaxPool", &[&x], "pooled", Vec::new());
+    let mut pooled = graph.node("GlobalMaxPool", &[&x], "greatest", Vec::new());
+    let mut features = FEATURES;
+    if network::takes_means(weights) {
+        let means = graph.node("GlobalAveragePool", &[&x], "means", Vec::new());
+        let along = vec![graph::integer("axis", 1)];
+        pooled = graph.node("Concat", &[&pooled, &means], "pooled", along);
+        features *= 2;
+    }
     let flat = graph.node(
         "Flatten",
         &[&pooled],
@@ -143,7 +144,7 @@ pub fn graph(weights: &Weights, statistics: &Statistics, full_scale_n: f64) -> (
     );
     let bias = weights.numbers("head.bias");
     let matrix = weights.numbers("head.matrix");
-    let matrix = graph.constant("head.matrix", &[FEATURES, bias.len()], &matrix);
+    let matrix = graph.constant("head.matrix", &[features, bias.len()], &matrix);
     let bias = graph.constant("head.bias", &[bias.len()], &bias);
     let raw_logits = graph.node("Gemm", &[&flat, &matrix, &bias], "raw_logits", Vec::new());
     (graph, raw_logits)
@@ -152,9 +153,18 @@ pub fn graph(weights: &Weights, statistics: &Statistics, full_scale_n: f64) -> (
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::frame::{COLS, Frame};
+    use crate::simulator::{self, DatasetSettings};
 
     fn device() -> Device {
         Device::flex()
+    }
+
+    fn scale(full_scale_n: f64) -> Scale {
+        Scale {
+            full_scale_n,
+            log_above_n: 0.0,
+        }
     }
 
     /// A frame with a Gaussian blob of `width` taxels at (row, column).
@@ -169,14 +179,14 @@ mod tests {
 
     #[test]
     fn the_network_has_the_papers_number_of_parameters() {
-        assert_eq!(initial(4, 1, &device()).count(), 32_196);
+        assert_eq!(initial(4, Pooling::Max, 1, &device()).count(), 32_196);
     }
 
     #[test]
     fn every_parameter_receives_a_gradient() {
         let frames: Vec<Frame> = (0..8).map(|n| blob(9.0 + n as f32, 14.0, 2.0)).collect();
-        let weights = initial(4, 3, &device()).tracked();
-        let x = images(frames.iter(), 10.2, &device());
+        let weights = initial(4, Pooling::MaxMean, 3, &device()).tracked();
+        let x = scale(10.2).images(frames.iter(), &device());
         let y = targets((0..8).map(|n| n % 4 + 1), 4, &device());
         let loss = cross_entropy(logits(&weights, x, &mut Normalisation::Batch), y);
         let gradients = loss.backward();
@@ -201,8 +211,8 @@ mod tests {
         let frames: Vec<Frame> = (0..6)
             .map(|n| blob(8.0 + 2.0 * n as f32, 13.0, 2.5))
             .collect();
-        let mut weights = initial(4, 5, &device());
-        let x = images(frames.iter(), 2.0, &device());
+        let mut weights = initial(4, Pooling::MaxMean, 5, &device());
+        let x = scale(2.0).images(frames.iter(), &device());
         let y = targets((0..6).map(|n| n % 4 + 1), 4, &device());
         let loss = |weights: &Weights| {
             let logits = logits(weights, x.clone(), &mut Normalisation::Batch);
@@ -238,8 +248,8 @@ mod tests {
     #[test]
     fn statistics_of_a_batch_give_its_own_logits() {
         let frames: Vec<Frame> = (0..5).map(|n| blob(9.0 + n as f32, 14.0, 2.0)).collect();
-        let weights = initial(4, 9, &device());
-        let x = images(frames.iter(), 10.2, &device());
+        let weights = initial(4, Pooling::Max, 9, &device());
+        let x = scale(10.2).images(frames.iter(), &device());
         let mut statistics = Statistics::default();
         let in_batch = logits(
             &weights,
@@ -254,8 +264,18 @@ mod tests {
 
     #[test]
     fn folding_keeps_what_the_layers_compute() {
+        check_folding(Pooling::Max, scale(10.2));
+        let log_above_n = 0.1;
+        let scale = Scale {
+            log_above_n,
+            ..scale(10.2)
+        };
+        check_folding(Pooling::MaxMean, scale);
+    }
+
+    fn check_folding(pooling: Pooling, scale: Scale) {
         let frames: Vec<Frame> = (0..5).map(|n| blob(9.0 + n as f32, 14.0, 2.0)).collect();
-        let mut weights = initial(4, 9, &device());
+        let mut weights = initial(4, pooling, 9, &device());
         // Untrained, every gamma is 1 and every beta and bias 0, which hides what is left out.
         for weight in &mut weights.entries {
             if weight.dims.len() == 1 {
@@ -268,7 +288,7 @@ mod tests {
                 weight.values = Tensor::from_data(TensorData::new(moved, [length]), &device());
             }
         }
-        let x = images(frames.iter(), 10.2, &device());
+        let x = scale.images(frames.iter(), &device());
         let mut statistics = Statistics::default();
         logits(
             &weights,
@@ -276,12 +296,51 @@ mod tests {
             &mut Normalisation::Collect(&mut statistics),
         );
         let fixed = logits(&weights, x, &mut Normalisation::Fixed(&statistics));
-        let (graph, name) = graph(&weights, &statistics, 10.2);
+        let (graph, name) = graph(&weights, &statistics, scale);
         let plan = graph::Plan::new(graph, &name, &[1, 4]).unwrap();
         let folded = frames.iter().flat_map(|frame| plan.run(frame).unwrap());
         let (folded, fixed) = (folded.collect::<Vec<_>>(), network::numbers(&fixed));
         let largest = largest_difference(&folded, &fixed);
         assert!(largest < 1e-4, "{largest}: {folded:?} {fixed:?}");
+    }
+
+    #[test]
+    fn the_layers_begin_with_unit_variance() {
+        // Pressed taxels are a small part of the full scale and most taxels are 0, so the sums before
+        // a normalised layer are tiny at the start. Normalised, they must not be.
+        let samples = simulator::dataset(
+            &DatasetSettings {
+                objects: 1,
+                test_objects: 0,
+                presses: 12,
+                ..DatasetSettings::default()
+            },
+            1,
+            |_| (),
+        );
+        let weights = initial(4, Pooling::Max, 1, &device());
+        for log_above_n in [0.0, 0.1] {
+            let scale = Scale {
+                log_above_n,
+                ..scale(10.2)
+            };
+            let images = scale.images(samples.iter().map(|sample| &sample.frame), &device());
+            let mut statistics = Statistics::default();
+            logits(
+                &weights,
+                images,
+                &mut Normalisation::Collect(&mut statistics),
+            );
+            for layer in 0..2 {
+                let (_, variance) = statistics.layer(layer);
+                let variances = network::numbers(&variance);
+                let normalised = variances
+                    .iter()
+                    .map(|v| v / (v + network::BATCH_NORM_EPSILON));
+                let mean = normalised.sum::<f32>() / variances.len() as f32;
+                assert!(mean > 0.9, "layer {layer}: {mean} of {variances:?}");
+            }
+        }
     }
 
     fn largest_difference(left: &[f32], right: &[f32]) -> f32 {

@@ -13,14 +13,15 @@ use crate::frame::{COLS, ROWS};
 use crate::random::Stream;
 use crate::train::net::layers::{Geometry, convolution, leaky_relu, normalised};
 
-/// Batch normalisation's epsilon in the discriminator. It matters: weights of N(0, 0.02) give
-/// variances near 1e-3.
-const BATCH_NORM_EPSILON: f32 = 1e-3;
+/// Batch normalisation's epsilon in the discriminator. It must lie far below the variances that it
+/// is added to, or the layer normalises nothing: with weights of N(0, 0.02) they begin at 4e-7 before
+/// the second layer of a network of newtons. `the_layers_begin_with_unit_variance` measures them.
+pub(super) const BATCH_NORM_EPSILON: f32 = 1e-8;
 /// LeakyReLU below 0.
 pub const LEAKY_SLOPE: f32 = 0.2;
 /// Standard deviation of initial weights; normal, cut at two deviations.
 const INITIAL_DEVIATION: f64 = 0.02;
-/// Features after the global max-pool.
+/// Features after a global pool: one of each channel.
 pub const FEATURES: usize = 64;
 
 /// One of the trunk's convolutions: square kernel, stride 2, TF's SAME padding.
@@ -52,7 +53,7 @@ impl Convolution {
     }
 }
 
-/// 28 -> 14 -> 7 -> 4, then a global max-pool to [`FEATURES`].
+/// 28 -> 14 -> 7 -> 4, then a global pool to [`FEATURES`], or to twice as many.
 pub const TRUNK: [Convolution; 3] = [
     Convolution {
         name: "conv1",
@@ -129,6 +130,11 @@ impl Weights {
     /// The weight called `name` as numbers, row-major.
     pub fn numbers(&self, name: &str) -> Vec<f32> {
         numbers(&self.entry(name).values)
+    }
+
+    /// Lengths of the axes of the weight called `name`.
+    pub fn dims(&self, name: &str) -> &[usize] {
+        &self.entry(name).dims
     }
 
     fn entry(&self, name: &str) -> &Weight {
@@ -266,7 +272,14 @@ pub enum Normalisation<'a> {
     Fixed(&'a Statistics),
 }
 
-/// The trunk: images `[batch, 1, 28, 28]` in [-1, 1], background -1, to features `[batch, 64]`.
+/// Whether the head of `weights` takes each channel's mean beside its greatest value. A head of
+/// twice as many features does.
+pub fn takes_means(weights: &Weights) -> bool {
+    weights.dims("head.matrix")[0] == 2 * FEATURES
+}
+
+/// The trunk: images `[batch, 1, 28, 28]` in [-1, 1], background -1, to features: `[batch, 64]`, the
+/// greatest value of each channel, or `[batch, 128]`, behind which the means follow.
 pub fn trunk(weights: &Weights, images: Tensor<4>, normalisation: &mut Normalisation) -> Tensor<2> {
     let batch = images.dims()[0];
     debug_assert_eq!(images.dims(), [batch, 1, ROWS, COLS]);
@@ -308,10 +321,13 @@ pub fn trunk(weights: &Weights, images: Tensor<4>, normalisation: &mut Normalisa
     }
     // [64, 4, 4, batch] -> [batch, 64]
     let places = x.dims()[1] * x.dims()[2];
-    x.reshape([FEATURES, places, batch])
-        .max_dim(1)
-        .reshape([FEATURES, batch])
-        .transpose()
+    let x = x.reshape([FEATURES, places, batch]);
+    let greatest = x.clone().max_dim(1).reshape([FEATURES, batch]).transpose();
+    if !takes_means(weights) {
+        return greatest;
+    }
+    let means = x.mean_dim(1).reshape([FEATURES, batch]).transpose();
+    Tensor::cat(vec![greatest, means], 1)
 }
 
 /// Batch normalisation of `x` `[channels, numbers]` by channel, then LeakyReLU of `slope`;

@@ -20,7 +20,7 @@ impl Task<'_> {
     pub(super) fn reference(&self) -> anyhow::Result<Reference> {
         let order = self.order("compared", self.real, 0);
         let frames = self.frames(&order[..order.len().min(COMPARED)]);
-        Reference::of(&frames, self.full_scale_n).context("real samples")
+        Reference::of(&frames, self.scale).context("real samples")
     }
 
     /// Compares what fixed noise becomes with them.
@@ -31,13 +31,17 @@ impl Task<'_> {
     ) -> anyhow::Result<Likeness> {
         let samples = self.settings.samples_a_component;
         let statistics = generator::statistics(generator, samples, self.seed, self.device);
+        let making = generator::Making {
+            weights: generator,
+            statistics: &statistics,
+            scale: self.scale,
+            sensor: self.sensor(),
+            device: self.device,
+        };
         let frames = generator::generate(
-            generator,
-            &statistics,
+            &making,
             COMPARED / generator::COMPONENTS,
-            self.full_scale_n,
             &mut self.stream("compared noise"),
-            self.device,
         );
         real.compare(&frames, generator::COMPONENTS)
             .context("generated samples")
@@ -49,7 +53,7 @@ impl Task<'_> {
         let samples = self.settings.samples_a_component.max(2);
         let eta = generator::noise(samples, &mut self.stream("picture"), self.device);
         let images = generator::images(generator, eta, &mut Normalisation::Batch);
-        let generated = generator::frames(&images, self.full_scale_n);
+        let generated = generator::frames(&images, self.scale, self.sensor());
         let order = self.order("compared", self.real, 0);
         let real = self.frames(&order);
         let mut rows = vec![Strip::of("real", real.into_iter().take(sheet::TILES))];

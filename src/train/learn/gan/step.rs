@@ -7,8 +7,10 @@ use burn::tensor::Tensor;
 
 use crate::train::learn::learner::Learner;
 use crate::train::net::generator;
+use crate::train::net::image::Scale;
 use crate::train::net::losses::{self, Game, Judged};
 use crate::train::net::network::{self, Normalisation, Weights, numbers};
+use crate::train::net::sensed::Sensor;
 
 /// What a step goes by.
 #[derive(Debug, Clone, Copy)]
@@ -19,6 +21,9 @@ pub struct Rules {
     pub sigma_penalty: f64,
     /// Learning rate.
     pub rate: f64,
+    /// What the sensor makes of generated images, before anything judges them; `None`: they are
+    /// judged as they are.
+    pub sensing: Option<(Sensor, Scale)>,
 }
 
 /// What the discriminator is shown in a step beside generated images.
@@ -40,7 +45,7 @@ pub fn step(
 ) -> (f64, f64) {
     // The generator does not change while the discriminator takes its step, so both use the
     // same images.
-    let generated = Generated::of(generator, eta);
+    let generated = Generated::of(generator, eta, rules.sensing);
 
     let (tracked, loss) = told_apart(discriminator, batch, &generated, rules.game);
     let mut gradients = loss.backward();
@@ -58,9 +63,13 @@ struct Generated {
 }
 
 impl Generated {
-    fn of(generator: &Learner, eta: Tensor<2>) -> Self {
+    fn of(generator: &Learner, eta: Tensor<2>, sensing: Option<(Sensor, Scale)>) -> Self {
         let tracked = generator.weights.tracked();
         let images = generator::images(&tracked, eta, &mut Normalisation::Batch);
+        let images = match sensing {
+            Some((sensor, scale)) => sensor.images(images, scale),
+            None => images,
+        };
         Self { tracked, images }
     }
 }

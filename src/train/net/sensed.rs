@@ -1,0 +1,126 @@
+//! What the sensor makes of a force: generated frames go through it before anything judges them.
+//!
+//! A generator's forces are any numbers. The sensor gives multiples of a count, and nothing below a
+//! threshold. A discriminator that sees the difference tells generated frames from real ones without
+//! a look at the press.
+
+use std::collections::BTreeSet;
+
+use burn::tensor::{Tensor, TensorData};
+
+use crate::frame::Frame;
+use crate::train::net::image::Scale;
+use crate::train::net::network::numbers;
+
+/// Frames that are looked at to learn what the sensor gives.
+const FRAMES: usize = 200;
+
+/// What a sensor gives: steps and a threshold, as seen in its own frames.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sensor {
+    /// Newtons a count; 0 where the frames are no multiples of anything.
+    step_n: f32,
+    /// The least force above 0.
+    threshold_n: f32,
+    /// The greatest.
+    most_n: f32,
+}
+
+impl Sensor {
+    /// Of the sensor whose frames these are.
+    pub fn of<'a>(frames: impl Iterator<Item = &'a Frame>) -> Self {
+        let values: BTreeSet<u32> = frames
+            .take(FRAMES)
+            .flat_map(|frame| frame.newtons)
+            .filter(|newtons| *newtons > 0.0)
+            .map(f32::to_bits)
+            .collect();
+        // The bits of positive numbers are in the order of the numbers.
+        let values: Vec<f32> = values.into_iter().map(f32::from_bits).collect();
+        let (Some(&threshold_n), Some(&most_n)) = (values.first(), values.last()) else {
+            return Self {
+                step_n: 0.0,
+                threshold_n: 0.0,
+                most_n: f32::INFINITY,
+            };
+        };
+        let apart = values.windows(2).map(|pair| pair[1] - pair[0]);
+        let step_n = apart
+            .filter(|step| *step > 1e-4 * most_n)
+            .fold(threshold_n, f32::min);
+        let is_multiple = |value: &f32| {
+            let counts = value / step_n;
+            (counts - counts.round()).abs() < 0.02
+        };
+        Self {
+            step_n: if values.iter().all(is_multiple) {
+                step_n
+            } else {
+                0.0
+            },
+            threshold_n,
+            most_n,
+        }
+    }
+
+    /// What it gives for a force.
+    pub fn newtons(self, newtons: f32) -> f32 {
+        let counted = if self.step_n > 0.0 {
+            (newtons / self.step_n).round() * self.step_n
+        } else {
+            newtons
+        };
+        // Half a step of tolerance: multiples are not exact.
+        if counted < self.threshold_n - 0.5 * self.step_n {
+            0.0
+        } else {
+            counted.min(self.most_n)
+        }
+    }
+
+    /// Generated images as the sensor would give them. Gradients pass as if nothing had happened
+    /// (the straight-through estimate): a step has none of its own.
+    pub fn images(self, images: Tensor<4>, scale: Scale) -> Tensor<4> {
+        let dims = images.dims();
+        let device = images.device();
+        let given = images.clone().inner();
+        let change: Vec<f32> = numbers(&given)
+            .into_iter()
+            .map(|pixel| scale.pixel(self.newtons(scale.newtons(pixel))) - pixel)
+            .collect();
+        let change = Tensor::<4>::from_data(TensorData::new(change, dims), &device.inner());
+        images.add(Tensor::from_inner(change))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn frame(newtons: &[f32]) -> Frame {
+        let mut frame = Frame::default();
+        frame.newtons[..newtons.len()].copy_from_slice(newtons);
+        frame
+    }
+
+    #[test]
+    fn steps_and_threshold_are_read_off_the_frames() {
+        let step = 0.04_f32;
+        let counted = frame(&[2.0, 3.0, 7.0, 100.0].map(|counts| counts * step));
+        let sensor = Sensor::of([counted].iter());
+        for (force, given) in [(0.05, 0.0), (0.07, 0.08), (0.11, 0.12), (9.0, 4.0)] {
+            let found = sensor.newtons(force);
+            assert!((found - given).abs() < 1e-6, "{force}: {found}");
+        }
+        let any = frame(&[0.081, 0.1234, 0.77, 0.7701]);
+        let sensor = Sensor::of([any].iter());
+        assert_eq!(sensor.newtons(0.5), 0.5);
+        assert_eq!(sensor.newtons(0.04), 0.0);
+    }
+
+    #[test]
+    fn an_empty_data_set_changes_nothing() {
+        let sensor = Sensor::of([Frame::default()].iter());
+        assert_eq!(sensor.newtons(0.3), 0.3);
+    }
+}

@@ -1,0 +1,50 @@
+//! What the networks can be told.
+
+use serde::{Deserialize, Serialize};
+
+use super::bounds::{SettingsError, check};
+
+/// What of each channel's places reaches the recogniser's last layer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Pooling {
+    /// The greatest value, as the paper.
+    Max,
+    /// The greatest value and the mean. A mean can add up an area or a force.
+    MaxMean,
+}
+
+/// How the networks see a frame; the defaults are the paper's.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct NetworkSettings {
+    /// `max` or `max-mean`, of a recogniser with a last layer of its own: not of SGAN and IGAN, whose
+    /// discriminator is the recogniser.
+    pub pooling: Pooling,
+    /// Above 0: the image goes with log(1 + newtons / this); 0: with newtons.
+    pub log_above_n: f64,
+}
+
+impl Default for NetworkSettings {
+    fn default() -> Self {
+        Self {
+            pooling: Pooling::Max,
+            log_above_n: 0.0,
+        }
+    }
+}
+
+impl NetworkSettings {
+    /// Refuses what lies outside its range.
+    pub(super) fn check(&self) -> Result<(), SettingsError> {
+        let least = self.log_above_n;
+        let fits = least == 0.0 || (1e-3..=1e3).contains(&least);
+        check(
+            "network.",
+            "log_above_n",
+            least,
+            fits,
+            "0, or 0.001 to 1000",
+        )
+    }
+}
