@@ -4,3 +4,4 @@ pub mod dataset;
 pub mod simulated;
 pub mod collect;
 pub mod augment;
+pub mod disturb;

@@ -2,5 +2,6 @@
 
 pub mod optimiser;
 pub mod learner;
+pub mod consistency;
 pub mod fit;
 pub mod gan;

@@ -17,9 +17,11 @@ use crate::train::net::generator::COMPONENTS;
 use crate::train::net::losses::Game;
 use crate::train::run::history::Row;
 use crate::train::run::{Description, Run};
-use crate::train::settings::optimiser::Rule;
+use crate::train::settings::network::Pooling;
+use crate::train::settings::optimiser::{Rule, Schedule};
 use crate::train::settings::{
-    Keep, OptimiserSettings, Profile, Settings, SettingsError, Training, Validation,
+    AugmentationSettings, Keep, NetworkSettings, OptimiserSettings, Profile, Settings,
+    SettingsError, Training, Validation,
 };
 use crate::train::stages::{self, Stages};
 
@@ -47,8 +49,27 @@ pub enum Method {
     /// Control: HRN15 with Adam, the best of every epoch's weights on objects held out of its own
     /// labels.
     Hrn15Tuned,
+    /// Control: HRN15 by the default model's recipe: Adam, averaged weights, symmetries and shifts, a
+    /// logarithmic image, means beside greatest values.
+    Hrn15Strong,
+    /// The same, which also learns from unlabelled samples to judge them alike whatever sensor gave them
+    /// (FixMatch with an averaged teacher).
+    #[value(name = "fixmatch")]
+    FixMatch,
+    /// The same twice: the second time also on unlabelled samples as the first one judged them.
+    SelfTraining,
     /// Logistic regression on hand-made features of a frame.
     Features,
+}
+
+/// Steps of the methods without a GAN that are fit to be compared, whatever their labels: about those of
+/// the default model.
+fn strong_steps(profile: Profile) -> u64 {
+    match profile {
+        Profile::Paper => 4_800,
+        Profile::Quick => 1_200,
+        Profile::Smoke => 6,
+    }
 }
 
 impl Method {
@@ -65,8 +86,19 @@ impl Method {
             Self::Nihrn => "nihrn",
             Self::Hrn15Long => "hrn15-long",
             Self::Hrn15Tuned => "hrn15-tuned",
+            Self::Hrn15Strong => "hrn15-strong",
+            Self::FixMatch => "fixmatch",
+            Self::SelfTraining => "self-training",
             Self::Features => "features",
         }
+    }
+
+    /// Whether it takes [`strong_steps`] and the recipe that goes with them.
+    fn is_strong(self) -> bool {
+        matches!(
+            self,
+            Self::Hrn15Strong | Self::FixMatch | Self::SelfTraining
+        )
     }
 
     /// Its settings, before anything overrides them.
@@ -96,6 +128,27 @@ impl Method {
                     share: 0.25,
                     every_epochs: 1,
                     keep: Keep::Best,
+                };
+            }
+            _ if self.is_strong() => {
+                settings.network = NetworkSettings {
+                    pooling: Pooling::MaxMean,
+                    log_above_n: 0.1,
+                };
+                settings.training = Training {
+                    averaging: 0.998,
+                    checkpoint_every_epochs: 50,
+                    optimiser: OptimiserSettings {
+                        rule: Rule::Adam,
+                        learning_rate: 2e-3,
+                        schedule: Schedule::Cosine,
+                        ..settings.training.optimiser
+                    },
+                    augmentation: AugmentationSettings {
+                        symmetries: true,
+                        shift_taxels: 3,
+                    },
+                    ..settings.training
                 };
             }
             _ => {}
@@ -216,6 +269,14 @@ impl Request {
             description.settings.training.epochs =
                 epochs_as_long_as_ours(&self.settings, train.len());
         }
+        if self.method.is_strong() {
+            let labelled = chosen(dataset, &description)?;
+            let share = self.settings.validation.share;
+            let (train, _) = dataset.hold_out(&labelled, share, self.seed);
+            let an_epoch = train.len().div_ceil(self.settings.training.batch).max(1) as u64;
+            let epochs = strong_steps(self.profile).div_ceil(an_epoch);
+            description.settings.training.epochs = u32::try_from(epochs).unwrap_or(u32::MAX);
+        }
         Ok(description)
     }
 }
@@ -228,14 +289,21 @@ impl Request {
 /// any of its level, or objects are to be held out in vain.
 pub fn check(method: Method, dataset: &Dataset, description: &Description) -> anyhow::Result<()> {
     let labelled = chosen(dataset, description)?;
-    let has_gan = matches!(
+    let needs_unlabelled = matches!(
         method,
-        Method::Ours | Method::Nahrn | Method::Nihrn | Method::Sgan | Method::Igan
+        Method::Ours
+            | Method::Nahrn
+            | Method::Nihrn
+            | Method::Sgan
+            | Method::Igan
+            | Method::FixMatch
+            | Method::SelfTraining
     );
     ensure!(
-        !has_gan || !unlabelled(dataset, &labelled).is_empty(),
-        "no unlabelled training samples are left for the GAN: {} labels are used, found 0, expected \
-         1 or more",
+        !needs_unlabelled || !unlabelled(dataset, &labelled).is_empty(),
+        "no unlabelled training samples are left for {}: {} labels are used, found 0, expected 1 or \
+         more",
+        method.name(),
         description.labels
     );
     let has_stgans = matches!(method, Method::Ours | Method::Nihrn);
@@ -342,6 +410,11 @@ pub fn train(
             let generated = stages.generated(&stages.ustgan()?)?;
             let pretrained = stages.pretrained(&generated, stages.random())?;
             stages.trained("fine-tuning", pretrained)?
+        }
+        Method::FixMatch => stages.consistent("hrn", stages.random())?,
+        Method::SelfTraining => {
+            let teacher = stages.trained("teacher", stages.random())?;
+            stages.self_trained("student", &teacher, stages.random())?
         }
         Method::Sgan => stages.semi_supervised("sgan", Game::FakeLevel)?,
         Method::Igan => stages.semi_supervised("igan", Game::FeatureMatching)?,

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 pub mod augmentation;
 mod bounds;
+pub mod consistency;
 pub mod gan;
 pub mod network;
 pub mod optimiser;
@@ -16,6 +17,7 @@ use crate::wording;
 
 pub use augmentation::AugmentationSettings;
 pub use bounds::SettingsError;
+pub use consistency::ConsistencySettings;
 pub use gan::GanSettings;
 pub use network::NetworkSettings;
 pub use optimiser::OptimiserSettings;
@@ -135,6 +137,8 @@ pub struct Settings {
     pub pretraining: Training,
     /// HRN on the labelled samples: from random weights, or the fine-tuning of others.
     pub training: Training,
+    /// Unlabelled samples beside the labelled ones, without a GAN.
+    pub consistency: ConsistencySettings,
     /// Held-out objects of the labelled ones.
     pub validation: Validation,
 }
@@ -154,6 +158,7 @@ impl Default for Settings {
             generation: Generation::default(),
             pretraining: Training::default(),
             training: Training::default(),
+            consistency: ConsistencySettings::default(),
             validation: Validation::default(),
         }
     }
@@ -228,6 +233,7 @@ impl Settings {
         check("generation.", key, generated, generated > 0, "1 or more")?;
         self.pretraining.check("pretraining.")?;
         self.training.check("training.")?;
+        self.consistency.check()?;
         let Validation {
             share,
             every_epochs,

@@ -218,6 +218,7 @@ impl Stages<'_> {
             dataset: self.dataset,
             train: self.train,
             validation: (self.validation, self.settings().validation),
+            unlabelled: None,
             scale: self.scale(),
             settings: &self.settings().training,
             seed: self.description.seed,
@@ -232,6 +233,61 @@ impl Stages<'_> {
     /// If the run's directory cannot be read or written, or the training diverges.
     pub fn trained(&self, stage: &'static str, initial: Weights) -> anyhow::Result<Trained> {
         fit::fit(&self.fit_task(stage), initial, self.run)
+    }
+
+    /// HRN on the labelled samples and, by consistency, on the unlabelled ones.
+    ///
+    /// # Errors
+    ///
+    /// If the run's directory cannot be read or written, or the training diverges.
+    pub fn consistent(&self, stage: &'static str, initial: Weights) -> anyhow::Result<Trained> {
+        let task = fit::Task {
+            unlabelled: Some((self.unlabelled, self.settings().consistency)),
+            ..self.fit_task(stage)
+        };
+        fit::fit(&task, initial, self.run)
+    }
+
+    /// HRN on the labelled samples and on those unlabelled ones that `teacher` is sure of, each with the
+    /// level that the teacher sees in it.
+    ///
+    /// # Errors
+    ///
+    /// If the run's directory cannot be read or written, or the training diverges.
+    pub fn self_trained(
+        &self,
+        stage: &'static str,
+        teacher: &Trained,
+        initial: Weights,
+    ) -> anyhow::Result<Trained> {
+        let mut dataset = self.dataset.clone();
+        let frames = (self.unlabelled.iter()).map(|&index| &self.dataset.samples[index].frame);
+        let logits = teacher.logits(frames, self.scale(), self.device);
+        let probabilities = fit::probabilities(&logits, teacher.temperature, self.device);
+        let least = self.settings().consistency.confidence;
+        let mut train = self.train.to_vec();
+        for (&index, of_frame) in self.unlabelled.iter().zip(&probabilities) {
+            let (level, confidence) = argmax(of_frame);
+            if f64::from(confidence) >= least {
+                dataset.samples[index].level = level as u8 + 1;
+                train.push(index);
+            }
+        }
+        // As many steps as the teacher took.
+        let own = &self.settings().training;
+        let steps = u64::from(own.epochs) * self.train.len().div_ceil(own.batch) as u64;
+        let epochs = steps.div_ceil(train.len().div_ceil(own.batch) as u64);
+        let settings = Training {
+            epochs: u32::try_from(epochs).unwrap_or(u32::MAX),
+            ..*own
+        };
+        let task = fit::Task {
+            dataset: &dataset,
+            train: &train,
+            settings: &settings,
+            ..self.fit_task(stage)
+        };
+        fit::fit(&task, initial, self.run)
     }
 
     /// A GAN whose discriminator learns the levels too, and then is the recogniser.

@@ -13,6 +13,8 @@ use crate::frame::Frame;
 use crate::random::Stream;
 use crate::train::data::augment;
 use crate::train::data::dataset::{self, Dataset};
+use crate::train::data::disturb;
+use crate::train::learn::consistency::{self, Views};
 use crate::train::learn::learner::Learner;
 use crate::train::net::hrn;
 use crate::train::net::image::Scale;
@@ -21,11 +23,14 @@ use crate::train::run::Run;
 use crate::train::run::checkpoint::{Checkpoint, Origin, Progress};
 use crate::train::run::history::Row;
 use crate::train::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
-use crate::train::settings::{Keep, Training, Validation};
+use crate::train::settings::{ConsistencySettings, Keep, Training, Validation};
 use crate::verdict::argmax;
 
 /// Samples a pass without gradients.
 const JUDGED_AT_ONCE: usize = 250;
+
+/// Set in the number of a step, it gives the sub-streams of the step's unlabelled samples.
+const UNLABELLED: u64 = 1 << 62;
 
 /// What is to be learnt, and from what.
 #[derive(Debug)]
@@ -38,6 +43,8 @@ pub struct Task<'a> {
     pub train: &'a [usize],
     /// Samples of held-out training objects, and how they are used; may be empty.
     pub validation: (&'a [usize], Validation),
+    /// Unlabelled samples that are learnt from by consistency, and how; none for most methods.
+    pub unlabelled: Option<(&'a [usize], ConsistencySettings)>,
     /// From newtons to images.
     pub scale: Scale,
     /// How.
@@ -239,11 +246,22 @@ impl State {
     /// One step on the samples `indices`; gives the batch's mean loss, and how many of them were
     /// judged rightly before it.
     fn step(&mut self, task: &Task, indices: &[usize], rate: f64) -> (f64, usize) {
-        let (images, targets) = (
-            task.images(indices, self.progress.step),
-            task.targets(indices),
-        );
-        let (loss, judged) = step(&mut self.learner, images, targets, rate);
+        let number = self.progress.step;
+        let (images, targets) = (task.images(indices, number), task.targets(indices));
+        let (loss, judged) = match task.unlabelled_views(indices.len(), number) {
+            None => step(&mut self.learner, images, targets, rate),
+            Some((weak, strong, settings)) => {
+                let views = Views {
+                    labelled: images,
+                    targets,
+                    weak,
+                    strong,
+                };
+                let (loss, judged, _) =
+                    consistency::step(&mut self.learner, views, &settings, rate);
+                (loss, judged)
+            }
+        };
         self.progress.step += 1;
         let right = indices
             .iter()
@@ -274,9 +292,11 @@ impl State {
 
 impl Task<'_> {
     fn origin(&self, initial: &Weights) -> String {
-        let settings = (self.settings, self.validation.1, self.scale);
+        let (unlabelled, consistency) = self.unlabelled.unzip();
+        let settings = (self.settings, self.validation.1, self.scale, consistency);
         Origin::new(self.stage, &settings, self.seed)
             .samples(self.dataset, self.train)
+            .samples(self.dataset, unlabelled.unwrap_or_default())
             .samples(self.dataset, self.validation.0)
             .weights(initial)
             .finish()
@@ -304,6 +324,39 @@ impl Task<'_> {
             })
             .collect();
         self.scale.images(frames.iter(), self.device)
+    }
+
+    /// The weak and the strong view of the unlabelled samples of step `step`, so many for each of
+    /// `labelled` ones. They come in the order of passes of their own.
+    fn unlabelled_views(
+        &self,
+        labelled: usize,
+        step: u64,
+    ) -> Option<(Tensor<4>, Tensor<4>, ConsistencySettings)> {
+        let (samples, settings) = self.unlabelled?;
+        // A batch that is smaller at an epoch's end takes as many as a whole one: places follow from
+        // the step's number alone.
+        let batch = (self.settings.batch.min(self.train.len()) * settings.ratio).min(samples.len());
+        let wanted = (labelled * settings.ratio).clamp(1, batch);
+        let batches = (samples.len() / batch) as u64;
+        let mut order = samples.to_vec();
+        let pass = self.stream("unlabelled order").child(step / batches);
+        { pass }.shuffle(&mut order);
+        let first = (step % batches) as usize * batch;
+        let indices = &order[first..first + wanted];
+
+        let weak = self.images(indices, step | UNLABELLED);
+        let mut stream = self.stream("disturbance").child(step);
+        let frames: Vec<Frame> = indices
+            .iter()
+            .map(|&index| {
+                let frame = &self.dataset.samples[index].frame;
+                let turned = augment::vary(frame, self.settings.augmentation, &mut stream);
+                disturb::disturbed(&turned, &mut stream)
+            })
+            .collect();
+        let strong = self.scale.images(frames.iter(), self.device);
+        Some((weak, strong, settings))
     }
 
     fn targets(&self, indices: &[usize]) -> Tensor<2> {

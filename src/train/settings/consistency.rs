@@ -1,0 +1,40 @@
+//! What learning from unlabelled samples by consistency can be told.
+
+use serde::{Deserialize, Serialize};
+
+use super::bounds::{SettingsError, check};
+
+/// How unlabelled samples are learnt from without a GAN (FixMatch, Sohn et al. 2020, with the averaged
+/// weights as the teacher).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ConsistencySettings {
+    /// Unlabelled samples a step for each labelled one.
+    pub ratio: usize,
+    /// The teacher's confidence from which its verdict on an unlabelled sample is learnt from.
+    pub confidence: f64,
+    /// Weight of the unlabelled samples' loss beside the labelled ones'.
+    pub weight: f64,
+}
+
+impl Default for ConsistencySettings {
+    fn default() -> Self {
+        Self {
+            ratio: 3,
+            confidence: 0.95,
+            weight: 1.0,
+        }
+    }
+}
+
+impl ConsistencySettings {
+    /// Refuses what lies outside its range.
+    pub(super) fn check(&self) -> Result<(), SettingsError> {
+        let check =
+            |key, found: f64, fits, expected| check("consistency.", key, found, fits, expected);
+        check("ratio", self.ratio as f64, self.ratio > 0, "1 or more")?;
+        let fits = (0.0..=1.0).contains(&self.confidence);
+        check("confidence", self.confidence, fits, "0 to 1")?;
+        check("weight", self.weight, self.weight >= 0.0, "0 or more")
+    }
+}
