@@ -10,6 +10,7 @@ mod client;
 pub mod config;
 mod http;
 mod hub;
+pub(crate) mod lines;
 pub mod log;
 pub mod publish;
 pub mod record;

@@ -2,6 +2,8 @@
 
 pub mod args;
 pub mod check;
+pub mod configuration;
+pub mod connect;
 pub mod demo;
 pub mod doctor;
 pub mod exit;
@@ -22,7 +24,7 @@ use std::io::{self, Write};
 use std::path::Path;
 use std::process::ExitCode;
 
-use clap::error::ErrorKind;
+use clap::error::{ContextKind, ContextValue, ErrorKind};
 
 use crate::wording;
 
@@ -72,9 +74,22 @@ pub fn usage(program: &str, error: &clap::Error) -> ExitCode {
     let told = text.split("\n\nUsage:").next().unwrap_or_default();
     let told = told.split("\n\nFor more").next().unwrap_or_default();
     let told: Vec<&str> = told.split_whitespace().collect();
-    let told = told.join(" ");
-    eprintln!("{program}: {}", shown(told.trim_start_matches("error: ")));
+    let mut told = told.join(" ").trim_start_matches("error: ").to_owned();
+    if let Some(file) = configuration_in_place_of_an_option(error) {
+        told += &format!(": write --config {file}");
+    }
+    eprintln!("{program}: {}", shown(&told));
     ExitCode::from(exit::USAGE)
+}
+
+/// `hardnessd run hardnessd.toml`: a configuration without the option that it belongs to.
+fn configuration_in_place_of_an_option(error: &clap::Error) -> Option<&str> {
+    match (error.kind(), error.get(ContextKind::InvalidArg)) {
+        (ErrorKind::UnknownArgument, Some(ContextValue::String(argument))) => {
+            argument.ends_with(".toml").then_some(argument.as_str())
+        }
+        _ => None,
+    }
 }
 
 /// Opens a file to read from. A directory is refused here: the system would do so at the first read

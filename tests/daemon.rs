@@ -577,7 +577,7 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         2,
         &["--baud", "158000"],
     );
-    assert_eq!(hardnessd(&["run"]).status.code(), Some(2));
+    fails(&["run", "x.toml"], 2, &["x.toml", "write --config x.toml"]);
     for beyond_any_sensor in [
         ["simulate", "--force", "1000"],
         ["simulate", "--fps", "1e9"],
@@ -723,12 +723,14 @@ fn a_signal_ends_every_command_that_waits_for_a_file() {
     let new = bench.path("new.mcap");
     let new = new.to_str().unwrap();
     let model = bench.configure("model.toml", "x.sock", "[model]\npath = \"fifo\"\n");
-    for (arguments, said) in [
-        (&["run", "--config", fifo][..], ""),
-        (&["run", "--config", model.to_str().unwrap()], ""),
-        (&["record", "--config", fifo, "--out", new], ""),
-        (&["simulate", "--faults", fifo], ""),
-        (&["check", "--config", fifo], "hardnessd: interrupted\n"),
+    let unfinished = "hardnessd: interrupted before it had finished\n";
+    for (arguments, code, said) in [
+        (&["run", "--config", fifo][..], 0, ""),
+        (&["run", "--config", model.to_str().unwrap()], 0, ""),
+        (&["record", "--config", fifo, "--out", new], 0, ""),
+        (&["simulate", "--faults", fifo], 0, ""),
+        (&["check", "--config", fifo], 143, unfinished),
+        (&["recover", fifo, "--out", new], 143, unfinished),
     ] {
         let mut command = Command::new(BINARY);
         command.args(arguments).stderr(Stdio::piped());
@@ -736,7 +738,7 @@ fn a_signal_ends_every_command_that_waits_for_a_file() {
         // A writer gets through once somebody reads.
         let _writer = fs::File::options().write(true).open(fifo).unwrap();
         process.signal(Signal::TERM);
-        assert_eq!(process.exit_code(), Some(0), "{arguments:?}");
+        assert_eq!(process.exit_code(), Some(code), "{arguments:?}");
         let mut heard = String::new();
         let mut stderr = process.0.stderr.take().unwrap();
         stderr.read_to_string(&mut heard).unwrap();
@@ -767,14 +769,14 @@ fn a_configuration_may_be_a_pipe_but_has_an_end() {
 
 #[test]
 fn a_replay_of_any_length_ends_at_a_signal() {
-    for signal in [Signal::INT, Signal::TERM] {
+    for (signal, code) in [(Signal::INT, 130), (Signal::TERM, 143)] {
         let mut command = Command::new(BINARY);
         // There is no end to it.
         command.args(["replay", "/dev/zero"]).stdout(Stdio::null());
         let mut replay = Process(command.spawn().unwrap());
         std::thread::sleep(Duration::from_millis(300));
         replay.signal(signal);
-        assert_eq!(replay.exit_code(), Some(0), "{signal:?}");
+        assert_eq!(replay.exit_code(), Some(code), "{signal:?}");
     }
 }
 

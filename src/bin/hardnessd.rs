@@ -2,7 +2,7 @@
 
 use std::future::Future;
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::pin::pin;
 use std::process::ExitCode;
 use std::time::Duration;
@@ -12,7 +12,7 @@ use hardnessd::daemon::config::{Error as ConfigError, Setup};
 use hardnessd::daemon::log::{Log, Settings as LogSettings};
 use hardnessd::daemon::{Daemon, Reload};
 use hardnessd::tools::args::{Args, Command};
-use hardnessd::tools::exit::{self, Failure};
+use hardnessd::tools::exit::{self, Failure, Stop};
 use hardnessd::tools::{
     self, check, demo, doctor, record, recover, replay, simulate, sniff, tail, watch,
 };
@@ -33,7 +33,7 @@ fn main() -> ExitCode {
             return ExitCode::from(exit::IO);
         }
     };
-    // Before all else, be it the arguments: a signal that comes early must not kill.
+    // Before all else, the arguments included: a signal that comes early must not kill.
     let signals = {
         let _inside = runtime.enter();
         Signals::catch()
@@ -49,7 +49,7 @@ fn main() -> ExitCode {
         Ok(args) => args,
         Err(error) => return tools::usage("hardnessd", &error),
     };
-    let prints = !matches!(args.command, Command::Run { .. });
+    let prints = !matches!(args.command, Command::Run(_));
     let done = runtime.block_on(dispatch(args.command, signals));
     // A port may be stuck in its driver on a thread of its own, or nobody read stdout.
     runtime.shutdown_timeout(if prints { LAST_LINES } else { Duration::ZERO });
@@ -64,58 +64,60 @@ fn main() -> ExitCode {
 
 async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
     match command {
-        Command::Run { config } => run(config, signals).await,
+        Command::Run(config) => run(config.path()?, signals).await,
         Command::Demo(args) => {
             // The events are what is shown: the log would say each again.
-            let _log = Log::start(LogSettings::default(), "warn")?;
-            Ok(demo::run(args, signals.end()).await?)
+            let _log = Log::start(LogSettings::default(), "error")?;
+            Ok(demo::run(args, signals.told()).await?)
         }
-        Command::Simulate(args) => Ok(simulate::run(args, signals.end()).await?),
+        Command::Simulate(args) => Ok(simulate::run(args, signals.told()).await?),
         Command::Record(args) => {
-            let mut end = pin!(signals.end());
-            let Some(setup) = load(&args.config, end.as_mut()).await? else {
+            let mut end = pin!(signals.told());
+            let Some(setup) = load(args.config.path()?, end.as_mut()).await? else {
                 return Ok(());
             };
             let _log = Log::start(setup.config.log, "info")?;
             Ok(record::run(args, setup, end).await?)
         }
-        Command::Recover(args) => interruptible(signals, move || recover::run(&args)).await,
-        Command::Replay(args) => Ok(replay::run(args, signals.end()).await?),
-        Command::Tail(args) => Ok(tail::run(args, signals.end()).await?),
-        Command::Watch(args) => Ok(watch::run(args, signals.end()).await?),
-        Command::Check(args) => interruptible(signals, move || check::run(&args)).await,
-        Command::Doctor(args) => interruptible(signals, move || doctor::run(&args)).await,
-        Command::Sniff(args) => Ok(sniff::run(args, signals.end()).await?),
+        Command::Recover(args) => finish_blocking(signals, move || recover::run(&args)).await,
+        Command::Replay(args) => finish(signals, replay::run(args)).await,
+        Command::Tail(args) => Ok(tail::run(args, signals.told()).await?),
+        Command::Watch(args) => Ok(watch::run(args, signals.told()).await?),
+        Command::Check(args) => finish_blocking(signals, move || check::run(&args)).await,
+        Command::Doctor(args) => finish_blocking(signals, move || doctor::run(&args)).await,
+        Command::Sniff(args) => finish(signals, sniff::run(args)).await,
     }
 }
 
-/// Work that looks for no signal; one ends it, and that it is not done is said.
-async fn interruptible<E: Into<Failure> + Send + 'static>(
+/// Waits for work that has an end. A signal that comes before is a failure.
+async fn finish<E: Into<Failure>>(
+    signals: Signals,
+    work: impl Future<Output = Result<(), E>>,
+) -> Result<(), Failure> {
+    tokio::select! {
+        done = work => done.map_err(Into::into),
+        stop = signals.end() => Err(Failure::Stopped(stop)),
+    }
+}
+
+/// The same for work that blocks, on a thread of its own.
+async fn finish_blocking<E: Into<Failure> + Send + 'static>(
     signals: Signals,
     work: impl FnOnce() -> Result<(), E> + Send + 'static,
 ) -> Result<(), Failure> {
-    let done = until(signals.end(), work).await.map_err(Into::into)?;
-    if done.is_none() {
-        eprintln!("hardnessd: interrupted");
-    }
-    Ok(())
+    let done = tokio::task::spawn_blocking(work);
+    finish(signals, async {
+        done.await.expect("the work does not panic")
+    })
+    .await
 }
 
-/// The configuration and its model; `None`: `end` came first.
-async fn load(path: &Path, end: impl Future<Output = ()>) -> Result<Option<Setup>, ConfigError> {
-    let path = path.to_owned();
-    until(end, move || Setup::load(&path)).await
-}
-
-/// What `work` gives, on a thread of its own: a file may be a pipe that says nothing. `None`: `end`
-/// came first, and nobody waits for the thread.
-async fn until<T: Send + 'static, E: Send + 'static>(
-    end: impl Future<Output = ()>,
-    work: impl FnOnce() -> Result<T, E> + Send + 'static,
-) -> Result<Option<T>, E> {
+/// The configuration and its model; `None`: `end` came first. On a thread of its own, because a
+/// file may be a pipe that says nothing.
+async fn load(path: PathBuf, end: impl Future<Output = ()>) -> Result<Option<Setup>, ConfigError> {
     tokio::select! {
-        done = tokio::task::spawn_blocking(work) => {
-            done.expect("the work does not panic").map(Some)
+        loaded = tokio::task::spawn_blocking(move || Setup::load(&path)) => {
+            loaded.expect("a configuration is read without a panic").map(Some)
         }
         () = end => Ok(None),
     }
@@ -123,8 +125,10 @@ async fn until<T: Send + 'static, E: Send + 'static>(
 
 async fn run(path: PathBuf, signals: Signals) -> Result<(), Failure> {
     let (shutdown, mut hangup) = signals.apart();
-    let mut shutdown = pin!(shutdown);
-    let Some(setup) = load(&path, shutdown.as_mut()).await? else {
+    let mut shutdown = pin!(async {
+        shutdown.await;
+    });
+    let Some(setup) = load(path.clone(), shutdown.as_mut()).await? else {
         return Ok(());
     };
     let log = Log::start(setup.config.log, "info")?;
@@ -174,18 +178,23 @@ impl Signals {
         })
     }
 
-    /// SIGINT, SIGTERM, or SIGHUP of a terminal that has gone.
-    async fn end(self) {
+    /// Waits for SIGINT, SIGTERM, or SIGHUP of a terminal that has gone.
+    async fn end(self) -> Stop {
         let outlives_terminal = self.outlives_terminal;
         let (shutdown, mut hangup) = self.apart();
         tokio::select! {
-            () = shutdown => {}
-            _ = hangup.recv(), if !outlives_terminal => {}
+            stop = shutdown => stop,
+            _ = hangup.recv(), if !outlives_terminal => Stop::Hangup,
         }
     }
 
+    /// For what runs until it is told to stop.
+    async fn told(self) {
+        self.end().await;
+    }
+
     /// SIGINT or SIGTERM, and SIGHUP for another use.
-    fn apart(self) -> (impl Future<Output = ()>, Signal) {
+    fn apart(self) -> (impl Future<Output = Stop>, Signal) {
         let Self {
             mut interrupt,
             mut terminate,
@@ -194,8 +203,8 @@ impl Signals {
         } = self;
         let shutdown = async move {
             tokio::select! {
-                _ = interrupt.recv() => {}
-                _ = terminate.recv() => {}
+                _ = interrupt.recv() => Stop::Interrupt,
+                _ = terminate.recv() => Stop::Terminate,
             }
         };
         (shutdown, hangup)

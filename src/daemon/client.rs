@@ -8,8 +8,7 @@ use std::io;
 use std::pin::Pin;
 use std::time::Duration;
 
-use bytes::{Buf, BytesMut};
-use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, Interest};
+use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt, Interest};
 use tokio::net::{TcpStream, UnixStream, tcp, unix};
 use tokio::sync::oneshot;
 use tokio::sync::oneshot::error::TryRecvError;
@@ -17,6 +16,7 @@ use tracing::debug;
 
 use super::accept::Serve;
 use super::hub::{self, Closed, Line};
+use super::lines::{Heard, Lines};
 use super::request::{self, Change, Request};
 use super::sensor::{Command, Sensors};
 use crate::event::{Reply, Tared};
@@ -186,10 +186,8 @@ enum End {
 
 /// One connection.
 struct Client<S: Stream> {
-    input: S::Input,
+    input: Lines<S::Input>,
     output: S::Output,
-    /// What came after the last whole line.
-    unread: BytesMut,
     /// What is being written: a batch goes out in one call.
     outgoing: Vec<u8>,
     service: Service,
@@ -205,21 +203,12 @@ struct Done {
 /// A command that is being carried out; it ends with the answer.
 type Doing = Pin<Box<dyn Future<Output = Line> + Send>>;
 
-/// What a subscriber did.
-enum Heard {
-    Line(BytesMut),
-    TooLong,
-    /// It sends no more; it may still read.
-    End,
-}
-
 impl<S: Stream> Client<S> {
     fn new(stream: S, service: Service) -> Self {
         let (input, output) = stream.split();
         Self {
-            input,
+            input: Lines::new(input, LONGEST_LINE_BYTES),
             output,
-            unread: BytesMut::new(),
             outgoing: Vec::new(),
             service,
         }
@@ -259,8 +248,7 @@ impl<S: Stream> Client<S> {
                     doing = None;
                     self.send(&[answer]).await?;
                 }
-                heard = hear(&mut self.input, &mut self.unread),
-                if hearing && doing.is_none() => match heard? {
+                heard = self.input.next(), if hearing && doing.is_none() => match heard? {
                     Heard::Line(line) => doing = self.heed(id, &line, &mut next).await?,
                     Heard::TooLong => {
                         let message = format!(
@@ -269,6 +257,7 @@ impl<S: Stream> Client<S> {
                         self.send(&[error(message, None)]).await?;
                         return Err(End::TooLong);
                     }
+                    // It may still read.
                     Heard::End => {
                         hearing = false;
                         self.stay().await?;
@@ -379,29 +368,6 @@ fn answer(answered: Result<Done, String>, id: Option<serde_json::Value>) -> Line
 
 fn error(message: String, id: Option<serde_json::Value>) -> Line {
     Reply::Error { message, id }.into()
-}
-
-/// Waits for a whole line. Nothing is lost if the wait is given up.
-async fn hear(input: &mut (impl AsyncRead + Unpin), unread: &mut BytesMut) -> io::Result<Heard> {
-    let mut searched = 0;
-    loop {
-        if let Some(length) = unread[searched..].iter().position(|&byte| byte == b'\n') {
-            let length = searched + length;
-            if length > LONGEST_LINE_BYTES {
-                return Ok(Heard::TooLong);
-            }
-            let line = unread.split_to(length);
-            unread.advance(1);
-            return Ok(Heard::Line(line));
-        }
-        searched = unread.len();
-        if searched > LONGEST_LINE_BYTES {
-            return Ok(Heard::TooLong);
-        }
-        if input.read_buf(unread).await? == 0 {
-            return Ok(Heard::End);
-        }
-    }
 }
 
 #[cfg(test)]

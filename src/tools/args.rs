@@ -1,9 +1,8 @@
 //! The command line of `hardnessd`: the one definition for the program, its help and its man pages.
 
-use std::path::PathBuf;
-
 use clap::{Parser, Subcommand};
 
+use super::configuration::Configuration;
 use super::{check, demo, doctor, record, recover, replay, simulate, sniff, tail, watch};
 
 /// Hardness events from a tactile array on a serial port
@@ -19,12 +18,8 @@ pub struct Args {
 #[derive(Debug, Subcommand)]
 pub enum Command {
     /// Serve: sensors in, events out, until SIGTERM; SIGHUP reads the configuration again
-    Run {
-        /// Configuration
-        #[arg(long, value_name = "F")]
-        config: PathBuf,
-    },
-    /// Show it all on a simulated sensor: events on stdout as JSON lines
+    Run(Configuration),
+    /// Show it all on a simulated sensor: what was pressed beside the verdict, or JSON lines
     Demo(demo::Args),
     /// Play a simulated sensor at a pty
     Simulate(simulate::Args),
@@ -46,6 +41,8 @@ pub enum Command {
     Sniff(sniff::Args),
 }
 
-const EXIT_CODES: &str = "Exit codes: 0 done, also after SIGINT and SIGTERM; 1 failed or bad data; \
-    2 wrong usage; 66 a file named here is missing or unreadable; 69 device or daemon unavailable; \
-    74 I/O error; 78 bad configuration or model, or a file that the configuration names.";
+const EXIT_CODES: &str = "Exit codes: 0 done; 1 failed or bad data; 2 wrong usage; 66 a file named \
+    here is missing or unreadable; 69 device or daemon unavailable; 74 I/O error; 78 bad \
+    configuration or model, or a file that the configuration names. SIGINT and SIGTERM end `run`, \
+    `demo`, `simulate`, `record`, `tail` and `watch` with 0, and any other command that had not \
+    finished with 130 and 143.";

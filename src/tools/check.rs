@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
 
+use super::configuration::{self, Configuration};
 use super::player::BITS_A_BYTE;
 use crate::daemon;
 use crate::daemon::config::{self, Endpoint, Sensor, Setup};
@@ -14,9 +15,8 @@ use crate::wire::Layout;
 /// Arguments of `check`.
 #[derive(Debug, Clone, ClapArgs)]
 pub struct Args {
-    /// Configuration to be checked
-    #[arg(long, value_name = "F")]
-    config: PathBuf,
+    #[command(flatten)]
+    config: Configuration,
 }
 
 /// What is wrong with a configuration.
@@ -25,6 +25,9 @@ pub enum Error {
     /// It cannot be used.
     #[error(transparent)]
     Config(#[from] config::Error),
+    /// There is none.
+    #[error(transparent)]
+    Missing(#[from] configuration::Missing),
     /// What it names cannot be written to.
     #[error("{path}: {source}")]
     Daemon {
@@ -65,20 +68,21 @@ pub enum Error {
 /// [`Error`], if the configuration or its model cannot be used, a line cannot carry its frames, or
 /// what is named for sockets, log or recordings cannot be written to.
 pub fn run(args: &Args) -> Result<(), Error> {
-    let setup = Setup::load(&args.config)?;
+    let path = &args.config.path()?;
+    let setup = Setup::load(path)?;
     daemon::check(&setup.config).map_err(|source| Error::Daemon {
-        path: args.config.clone(),
+        path: path.clone(),
         source,
     })?;
     let mut lines = format!("robot {}\n", setup.config.robot);
     for (sensor, checked) in setup.config.sensors.iter().zip(&setup.sensors) {
-        lines += &line_of(sensor, checked.layout(), &args.config)?;
+        lines += &line_of(sensor, checked.layout(), path)?;
         let (ours, models) = (sensor.calibration.pitch_mm, setup.hrn.card().pitch_mm);
         if (ours - f64::from(models)).abs() > PITCH_TOLERANCE_MM {
             eprintln!(
                 "warning: {}: sensor.calibration.pitch_mm of {:?}: found {ours:?}, \
                  expected the model's {models:?}",
-                args.config.display(),
+                path.display(),
                 sensor.name
             );
         }
@@ -116,12 +120,12 @@ pub fn run(args: &Args) -> Result<(), Error> {
                 eprintln!(
                     "warning: {}: {key}: found {listen}, open to whoever reaches this machine, \
                      expected a loopback address unless that is meant",
-                    args.config.display()
+                    path.display()
                 );
             }
         }
     }
-    lines += &networks(&setup, &args.config);
+    lines += &networks(&setup, path);
     super::print(lines.as_bytes())
         .map(drop)
         .map_err(Error::Print)

@@ -1,23 +1,29 @@
 //! `hardnessd demo`: a simulated JX255N on a pty, the whole daemon on it, and a subscriber that
 //! prints what it gets.
 //!
-//! Nothing is short-circuited: bytes go through the tty, events through the socket. What stands on
-//! stdout is what a subscriber reads, `hello` first; the live page's address stands on stderr.
+//! Nothing is short-circuited: bytes go through the tty, events through the socket. On a terminal
+//! stdout shows a line a press, with what was pressed beside the verdict, and a count at the end;
+//! elsewhere what a subscriber reads, `hello` first. Stderr names the live page and the socket.
 
-use std::fs::{self, DirBuilder};
+mod account;
+mod place;
+
 use std::future::Future;
-use std::io::{self, ErrorKind};
+use std::io::{self, IsTerminal};
 use std::net::SocketAddr;
-use std::os::unix::fs::DirBuilderExt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
 
 use clap::Args as ClapArgs;
+use serde_json::Value;
 use tokio::io::{AsyncBufReadExt, BufReader};
 use tokio::net::UnixStream;
 use tokio::sync::oneshot;
 use tokio::time::Instant;
 
+use self::account::Account;
+use self::place::Place;
+pub(super) use self::place::sockets;
 use super::faults::Faults;
 use super::player::{Pace, Player};
 use super::simulate::within;
@@ -41,6 +47,9 @@ pub struct Args {
     /// Play so many times as fast, 0.01 to 100
     #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = speed)]
     speed: f64,
+    /// Print events as JSON lines on a terminal too
+    #[arg(long)]
+    json: bool,
 }
 
 /// Why the demonstration failed.
@@ -64,7 +73,7 @@ pub enum Error {
         source: io::Error,
     },
     /// Presses went by without a verdict.
-    #[error("found {found} final verdicts after {presses} presses, expected one each")]
+    #[error("only {found} of {presses} presses got a verdict")]
     Missed {
         /// Verdicts.
         found: u32,
@@ -87,7 +96,7 @@ const PATIENCE: Duration = Duration::from_secs(3);
 pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
     let io = |what| move |source| Error::Io { what, source };
     let place = Place::new().map_err(io("directory for socket and port"))?;
-    let port = place.0.join("port");
+    let port = place.port();
     let sensor = Sensor {
         name: "demo".to_owned(),
         ..Sensor::new(port.clone())
@@ -100,15 +109,22 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         presses: args.presses,
         ..SequenceSettings::default()
     };
+    let shown = if args.json || !io::stdout().is_terminal() {
+        Shown::Json
+    } else {
+        Shown::Lines(Account::new(&sequence.materials))
+    };
     let player = Player::new(Some(&port), layout, pace, Faults::none()).map_err(io("pty"))?;
 
-    let socket = place.0.join("events.sock");
+    let socket = place.socket();
     let mut config = hastened(sensor, &socket, args.speed);
     config.http = Some(Http { listen: args.http });
     let daemon = Daemon::bind(Setup::of(config, Path::new("demo"))?)?;
     if let Some(address) = daemon.http_address() {
         eprintln!("live page: http://{address}/");
     }
+    let listen = "`hardnessd watch` and `hardnessd tail` find it";
+    eprintln!("socket: {} ({listen})", socket.display());
     let subscriber = UnixStream::connect(&socket).await.map_err(io("socket"))?;
     let (stop, stopped) = oneshot::channel::<()>();
     let daemon = daemon.run(
@@ -119,7 +135,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         None,
     );
     let printing = async {
-        let printed = print(subscriber, args.presses, player, sequence, shutdown).await;
+        let printed = print(subscriber, args.presses, player, sequence, shown, shutdown).await;
         let _ = stop.send(());
         printed
     };
@@ -145,12 +161,53 @@ fn hastened(sensor: Sensor, socket: &Path, speed: f64) -> Config {
     config
 }
 
-/// Prints what the subscriber gets while the sensor plays.
+/// What is printed.
+enum Shown {
+    /// Every event as it comes.
+    Json,
+    /// A line a press.
+    Lines(Account),
+}
+
+impl Shown {
+    /// What is printed of an event, with its newline; empty, if nothing is.
+    fn of(&mut self, line: Vec<u8>, event: &Value) -> Vec<u8> {
+        match self {
+            Self::Json => line,
+            Self::Lines(account) => account
+                .line(event)
+                .map_or_else(Vec::new, |line| (line + "\n").into_bytes()),
+        }
+    }
+}
+
+/// How long a terminal may take for the last line.
+const LAST_LINE: Duration = Duration::from_millis(500);
+
+/// Prints what the subscriber gets while the sensor plays, and the count at the end.
 async fn print(
     subscriber: UnixStream,
     presses: Option<u32>,
     player: Player,
     sequence: SequenceSettings,
+    mut shown: Shown,
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), Error> {
+    let printed = print_events(subscriber, presses, player, sequence, &mut shown, shutdown).await;
+    if let Shown::Lines(account) = &shown {
+        let last = super::print_apart((account.close() + "\n").into_bytes());
+        // A terminal that takes nothing does not keep the demonstration.
+        let _ = tokio::time::timeout(LAST_LINE, last).await;
+    }
+    printed
+}
+
+async fn print_events(
+    subscriber: UnixStream,
+    presses: Option<u32>,
+    player: Player,
+    sequence: SequenceSettings,
+    shown: &mut Shown,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
     let io = |what| move |source| Error::Io { what, source };
@@ -181,9 +238,13 @@ async fn print(
                 if read.map_err(io("socket"))? == 0 {
                     return Err(Error::Closed);
                 }
-                finals += u32::from(is_final(&line));
-                missed |= is_gap(&line);
-                printing.set(Some(super::print_apart(std::mem::take(&mut line))));
+                let event = serde_json::from_slice(&line).unwrap_or_default();
+                finals += u32::from(is_final(&event));
+                missed |= event["type"] == "gap";
+                let text = shown.of(std::mem::take(&mut line), &event);
+                if !text.is_empty() {
+                    printing.set(Some(super::print_apart(text)));
+                }
             }
             ended = &mut played, if last_byte.is_none() => {
                 ended.map_err(io("pty"))?;
@@ -214,48 +275,6 @@ async fn until(moment: Option<Instant>) {
     }
 }
 
-fn is_gap(line: &[u8]) -> bool {
-    serde_json::from_slice::<serde_json::Value>(line).is_ok_and(|event| event["type"] == "gap")
-}
-
-fn is_final(line: &[u8]) -> bool {
-    serde_json::from_slice::<serde_json::Value>(line)
-        .is_ok_and(|event| event["type"] == "hardness" && event["phase"] == "final")
-}
-
-/// A directory of our own, gone with us.
-struct Place(PathBuf);
-
-impl Place {
-    /// A new one: where a container is started again one that was killed there had the same number.
-    fn new() -> io::Result<Self> {
-        let mut path = std::env::temp_dir().join(format!("hardnessd-demo-{}", std::process::id()));
-        loop {
-            match DirBuilder::new().mode(0o700).create(&path) {
-                Err(error) if error.kind() == ErrorKind::AlreadyExists => {
-                    path.as_mut_os_string().push("-");
-                }
-                made => return made.map(|()| Self(path)),
-            }
-        }
-    }
-}
-
-impl Drop for Place {
-    fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.0);
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_a_killed_demonstration_has_left_is_not_in_the_way() {
-        let left = Place::new().unwrap();
-        let place = Place::new().unwrap();
-        assert_ne!(left.0, place.0);
-        assert!(left.0.is_dir() && place.0.is_dir());
-    }
+fn is_final(event: &Value) -> bool {
+    event["type"] == "hardness" && event["phase"] == "final"
 }

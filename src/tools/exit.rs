@@ -1,6 +1,8 @@
 //! How a command fails, and the exit code that an operator's script may rely on for it.
 
-use super::{check, demo, doctor, record, recover, replay, simulate, sniff, tail, watch};
+use super::{
+    check, configuration, demo, doctor, record, recover, replay, simulate, sniff, tail, watch,
+};
 use crate::daemon;
 use crate::daemon::config::Error as ConfigError;
 use crate::daemon::publish::Error as PublishError;
@@ -20,26 +22,60 @@ pub const IO: u8 = 74;
 /// Bad configuration or model, or a file that the configuration names.
 pub const CONFIG: u8 = 78;
 
+/// A signal that ends a command.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Stop {
+    /// SIGHUP, of a terminal that has gone.
+    Hangup = 1,
+    /// SIGINT.
+    Interrupt = 2,
+    /// SIGTERM.
+    Terminate = 15,
+}
+
+impl Stop {
+    /// The exit code of a command that had not finished, as a shell has it.
+    fn code(self) -> u8 {
+        128 + self as u8
+    }
+}
+
 /// How a command of `hardnessd` failed.
 #[derive(Debug, thiserror::Error)]
-#[error(transparent)]
 #[expect(
     missing_docs,
     reason = "each is the command's own, and says what it is"
 )]
 pub enum Failure {
+    #[error("interrupted before it had finished")]
+    Stopped(Stop),
+    #[error(transparent)]
     Config(#[from] ConfigError),
+    #[error(transparent)]
+    Missing(#[from] configuration::Missing),
+    #[error(transparent)]
     Log(#[from] daemon::log::Error),
+    #[error(transparent)]
     Daemon(#[from] daemon::Error),
+    #[error(transparent)]
     Demo(#[from] demo::Error),
+    #[error(transparent)]
     Simulate(#[from] simulate::Error),
+    #[error(transparent)]
     Record(#[from] record::Error),
+    #[error(transparent)]
     Recover(#[from] recover::Error),
+    #[error(transparent)]
     Replay(#[from] replay::Error),
+    #[error(transparent)]
     Tail(#[from] tail::Error),
+    #[error(transparent)]
     Watch(#[from] watch::Error),
+    #[error(transparent)]
     Check(#[from] check::Error),
+    #[error(transparent)]
     Doctor(#[from] doctor::Error),
+    #[error(transparent)]
     Sniff(#[from] sniff::Error),
 }
 
@@ -47,6 +83,8 @@ impl Failure {
     /// The exit code.
     pub fn code(&self) -> u8 {
         match self {
+            Self::Stopped(stop) => stop.code(),
+
             Self::Config(error)
             | Self::Demo(demo::Error::Config(error))
             | Self::Replay(replay::Error::Config(error))
@@ -76,16 +114,17 @@ impl Failure {
 
             Self::Simulate(simulate::Error::Faults(error)) if error.is_unreadable() => NO_INPUT,
             Self::Simulate(simulate::Error::Faults(_)) => FAILED,
-            Self::Recover(recover::Error::Unreadable { .. })
+            Self::Missing(_)
+            | Self::Check(check::Error::Missing(_))
+            | Self::Recover(recover::Error::Unreadable { .. })
             | Self::Replay(replay::Error::Unreadable { .. })
             | Self::Sniff(sniff::Error::Unreadable { .. }) => NO_INPUT,
 
             Self::Tail(
-                tail::Error::NoDaemon { .. }
+                tail::Error::Connect(_)
                 | tail::Error::Mute { .. }
                 | tail::Error::Foreign { .. }
-                | tail::Error::Refused { .. }
-                | tail::Error::Closed { .. },
+                | tail::Error::Refused { .. },
             )
             | Self::Sniff(sniff::Error::Unavailable { .. }) => UNAVAILABLE,
 

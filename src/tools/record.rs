@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use clap::Args as ClapArgs;
 
+use super::configuration::Configuration;
 use super::simulate::positive;
 use crate::daemon::config::Setup;
 use crate::daemon::{self, Daemon, record};
@@ -18,9 +19,9 @@ use crate::verdict::Level;
 /// Arguments of `record`.
 #[derive(Debug, Clone, ClapArgs)]
 pub struct Args {
-    /// Configuration; its ways out are not opened
-    #[arg(long, value_name = "F")]
-    pub config: PathBuf,
+    #[expect(missing_docs, reason = "a comment would be taken for help")]
+    #[command(flatten)]
+    pub config: Configuration,
     /// Recording to write, as MCAP; a file that exists is left alone
     #[arg(long, value_name = "FILE")]
     out: PathBuf,

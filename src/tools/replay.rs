@@ -3,7 +3,6 @@
 //! Times come from the recording, so the output depends on nothing else: neither on the speed nor
 //! on how the bytes are cut.
 
-use std::future::Future;
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError};
@@ -91,22 +90,18 @@ pub enum Error {
 /// Bytes read at once when nothing paces them.
 const CHUNK_BYTES: usize = 64 * 1024;
 
-/// Plays to the end, until `shutdown` comes or nobody reads stdout.
+/// Plays to the end, or until nobody reads stdout. It stops if the wait is given up.
 ///
 /// # Errors
 ///
 /// [`Error`], if the recording or the configuration cannot be used.
-pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
-    // On a thread of its own: neither a recording that is a pipe nor whoever reads stdout is to be
-    // waited for at a signal.
-    let (stop, stopped) = mpsc::channel();
+pub async fn run(args: Args) -> Result<(), Error> {
+    // Dropped with the wait.
+    let (_stop, stopped) = mpsc::channel();
+    // On a thread of its own: a signal waits neither for a recording that is a pipe nor for whoever
+    // reads stdout.
     let played = tokio::task::spawn_blocking(move || play(&args, &stopped));
-    let ended = tokio::select! {
-        played = played => played.expect("a replay does not panic"),
-        () = shutdown => Ok(()),
-    };
-    drop(stop);
-    ended
+    played.await.expect("a replay does not panic")
 }
 
 /// Plays to the end, or until the other end of `stopped` is dropped.

@@ -8,7 +8,6 @@ mod proposal;
 mod tests;
 
 use std::fmt::Write;
-use std::future::Future;
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -92,14 +91,7 @@ const MOST_BYTES: usize = 16 << 20;
 /// # Errors
 ///
 /// [`Error`], if there are no bytes, or nothing explains them.
-pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
-    tokio::select! {
-        done = sniff(args) => done,
-        () = shutdown => Ok(()),
-    }
-}
-
-async fn sniff(args: Args) -> Result<(), Error> {
+pub async fn run(args: Args) -> Result<(), Error> {
     let listened = match &args.port {
         Some(port) => Some(listen(port, args.baud, args.seconds).await?),
         None => None,

@@ -8,24 +8,20 @@ mod readable;
 
 use std::future::Future;
 use std::io;
-use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args as ClapArgs;
 use serde_json::{Value, json};
-use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
-use tokio::net::UnixStream;
 
+use super::connect::{self, Address, Connection, Source};
 use super::simulate::positive;
-use crate::daemon::config::Unix;
 use crate::event::{Kind, PROTOCOL};
 
 /// Arguments of `tail`.
 #[derive(Debug, Clone, ClapArgs)]
 pub struct Args {
-    /// Socket of the daemon [default: where `run` puts it by default]
-    #[arg(long, value_name = "P")]
-    socket: Option<PathBuf>,
+    #[command(flatten)]
+    source: Source,
     /// Print the JSON lines as they are
     #[arg(long)]
     json: bool,
@@ -50,7 +46,7 @@ pub struct Args {
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The time is over.
-    #[error("found {found} events within {seconds} s, expected {}", expected(*.count))]
+    #[error("timed out after {seconds} s ({})", events(*.found, *.count))]
     Timeout {
         /// Events printed.
         found: u64,
@@ -59,41 +55,33 @@ pub enum Error {
         /// As given.
         count: Option<u64>,
     },
-    /// Nobody listens.
-    #[error("{path}: no daemon answers: {source}")]
-    NoDaemon {
-        /// Of the socket.
-        path: PathBuf,
-        /// Why not.
-        source: io::Error,
-    },
-    /// Somebody listens, and is no daemon.
-    #[error("{path}: found no hello within {} s, expected a daemon's", HELLO.as_secs())]
+    /// No daemon, or none any more.
+    #[error(transparent)]
+    Connect(#[from] connect::Error),
+    /// Somebody listens there who does not speak.
+    #[error(
+        "{address}: no answer for {} s: what listens there is no hardnessd, or it hangs",
+        HELLO.as_secs()
+    )]
     Mute {
-        /// Of the socket.
-        path: PathBuf,
+        /// Where it listens.
+        address: Address,
     },
     /// Somebody speaks, and is no daemon of this protocol.
-    #[error("{path}: found {found}, expected a hello of protocol {PROTOCOL}")]
+    #[error("{address}: found {found}, expected the hello of a daemon of protocol {PROTOCOL}")]
     Foreign {
-        /// Of the socket.
-        path: PathBuf,
+        /// Where it speaks.
+        address: Address,
         /// What it says first.
         found: String,
     },
     /// The daemon has no room.
-    #[error("{path}: the daemon says: {message}")]
+    #[error("{address}: the daemon says: {message}")]
     Refused {
-        /// Of the socket.
-        path: PathBuf,
+        /// Where it is.
+        address: Address,
         /// As it came.
         message: String,
-    },
-    /// The daemon has ended.
-    #[error("{path}: the daemon closed the connection")]
-    Closed {
-        /// Of the socket.
-        path: PathBuf,
     },
     /// Stdout fails.
     #[error("stdout: {0}")]
@@ -104,12 +92,14 @@ pub enum Error {
 /// for one that a service manager has to start first.
 const HELLO: Duration = Duration::from_secs(5);
 
-fn expected(count: Option<u64>) -> String {
-    count.map_or("to go on".to_owned(), |count| count.to_string())
+fn events(found: u64, count: Option<u64>) -> String {
+    let of = count.map_or_else(String::new, |count| format!(" of {count}"));
+    let plural = if count.unwrap_or(found) == 1 { "" } else { "s" };
+    format!("{found}{of} event{plural}")
 }
 
-fn kind(name: &str) -> Result<Kind, String> {
-    Kind::named(name).ok_or_else(|| "expected hardness, press, status or frame".to_owned())
+fn kind(name: &str) -> Result<Kind, &'static str> {
+    Kind::named(name).ok_or("expected hardness, press, status or frame")
 }
 
 /// Prints until the count is reached, `shutdown` comes or nobody reads stdout.
@@ -140,31 +130,22 @@ async fn over(timeout_s: Option<f64>) {
 }
 
 async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
-    let path = args
-        .socket
-        .clone()
-        .unwrap_or_else(|| Unix::default().path());
-    let no_daemon = |source| Error::NoDaemon {
-        path: path.clone(),
-        source,
-    };
-    let mut daemon = UnixStream::connect(&path).await.map_err(no_daemon)?;
-    let request = json!({"subscribe": args.types}).to_string() + "\n";
-    daemon
-        .write_all(request.as_bytes())
-        .await
-        .map_err(no_daemon)?;
-    let mut lines = Lines {
-        path: path.clone(),
-        input: BufReader::new(daemon),
-        line: String::new(),
-    };
-    match tokio::time::timeout(HELLO, lines.next()).await {
-        Ok(hello) => meet(&hello?, path)?,
-        Err(_) => return Err(Error::Mute { path }),
+    let mut daemon = args.source.connect().await?;
+    let address = daemon.address().clone();
+    if args.source.given().is_none() {
+        eprintln!(
+            "hardnessd: events of {}",
+            super::shown(&address.to_string())
+        );
+    }
+    let request = json!({"subscribe": args.types}).to_string();
+    daemon.send(&request).await?;
+    match tokio::time::timeout(HELLO, next(&mut daemon)).await {
+        Ok(hello) => meet(&hello?.1, address)?,
+        Err(_) => return Err(Error::Mute { address }),
     }
     loop {
-        let event = lines.next().await?;
+        let (line, event) = next(&mut daemon).await?;
         let kind = event["type"].as_str().unwrap_or_default();
         // What was queued before the subscription took effect is not meant.
         let counts = Kind::named(kind).is_some_and(|kind| args.types.contains(&kind));
@@ -172,11 +153,11 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
             continue;
         }
         let text = if args.json {
-            lines.line.clone()
+            line
         } else {
-            readable::line(&event) + "\n"
+            readable::line(&event)
         };
-        let printed = super::print_apart(text.into_bytes()).await;
+        let printed = super::print_apart((text + "\n").into_bytes()).await;
         if !printed.map_err(Error::Print)? {
             return Ok(());
         }
@@ -188,46 +169,28 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
 }
 
 /// Goes on only if this is what a daemon says first.
-fn meet(hello: &Value, path: PathBuf) -> Result<(), Error> {
+fn meet(hello: &Value, address: Address) -> Result<(), Error> {
     let kind = hello["type"].as_str().unwrap_or_default();
     let found = match (kind, &hello["protocol"]) {
         ("hello", protocol) if *protocol == PROTOCOL => return Ok(()),
         ("hello", protocol) => format!("protocol {protocol}"),
         ("error", _) => {
             let message = hello["message"].as_str().unwrap_or_default().to_owned();
-            return Err(Error::Refused { path, message });
+            return Err(Error::Refused { address, message });
         }
         (kind, _) => format!("{kind:?}"),
     };
-    Err(Error::Foreign { path, found })
+    Err(Error::Foreign { address, found })
 }
 
-/// What the daemon says.
-struct Lines {
-    path: PathBuf,
-    input: BufReader<UnixStream>,
-    /// The last one, as it came.
-    line: String,
-}
-
-impl Lines {
-    async fn next(&mut self) -> Result<Value, Error> {
-        let broken = |path: &PathBuf, source| Error::NoDaemon {
-            path: path.clone(),
-            source,
-        };
-        self.line.clear();
-        match self.input.read_line(&mut self.line).await {
-            Ok(0) => {
-                let path = self.path.clone();
-                return Err(Error::Closed { path });
-            }
-            Ok(_) => {}
-            Err(source) => return Err(broken(&self.path, source)),
-        }
-        serde_json::from_str(&self.line).map_err(|_| {
-            let source = io::Error::new(io::ErrorKind::InvalidData, "found no JSON");
-            broken(&self.path, source)
-        })
+/// What the daemon says next: as it came, and what it means.
+async fn next(daemon: &mut Connection) -> Result<(String, Value), Error> {
+    let line = daemon.next().await?;
+    match serde_json::from_str(&line) {
+        Ok(event) => Ok((line, event)),
+        Err(_) => Err(Error::Foreign {
+            address: daemon.address().clone(),
+            found: "a line that is no JSON".to_owned(),
+        }),
     }
 }

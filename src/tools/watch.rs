@@ -14,20 +14,17 @@ mod view;
 
 use std::future::Future;
 use std::io::{self, IsTerminal};
-use std::path::{Path, PathBuf};
+use std::pin::Pin;
 use std::time::Duration;
 
 use clap::Args as ClapArgs;
-use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, Lines};
-use tokio::net::UnixStream;
-use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::time::{Instant, MissedTickBehavior};
 
 use self::draw::draw;
 use self::look::Look;
 use self::screen::{Screen, keys};
 use self::view::{Key, Loss, QUESTION, View};
-use crate::daemon::config::Unix;
+use super::connect::{self, Address, Connection, Source};
 use crate::daemon::now;
 
 /// Arguments of `watch`.
@@ -37,9 +34,8 @@ use crate::daemon::now;
                         again. Without colours where NO_COLOR is set or TERM has none."
 )]
 pub struct Args {
-    /// Socket of the daemon [default: where `run` puts it by default]
-    #[arg(long, value_name = "P")]
-    socket: Option<PathBuf>,
+    #[command(flatten)]
+    source: Source,
 }
 
 /// Why there is nothing to see.
@@ -70,7 +66,13 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     }
     let look = look();
     let mut view = View::new();
-    let mut daemon = Daemon::new(args.socket.unwrap_or_else(|| Unix::default().path()));
+    let mut daemon = Daemon::new(args.source.clone());
+    if args.source.given().is_none()
+        && let Ok(connection) = args.source.connect().await
+    {
+        let address = connection.address().to_string();
+        eprintln!("hardnessd: watching {}", super::shown(&address));
+    }
     let mut screen = Screen::open().map_err(Error::Terminal)?;
     let mut keys = keys().map_err(Error::Terminal)?;
     let mut pictures = tokio::time::interval(PICTURE);
@@ -93,7 +95,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
             }
             _ = questions.tick() => daemon.ask(),
             heard = daemon.next() => match heard {
-                Ok(Heard::Connection) => view.wait(now().mono),
+                Ok(Heard::Connection(address)) => view.wait(address.to_string(), now().mono),
                 Ok(Heard::Line(line)) => view.hear(&line, now()),
                 Err(loss) => view.lose(loss),
             },
@@ -114,59 +116,85 @@ fn look() -> Look {
 
 /// The connection to the daemon, made again whenever it breaks.
 struct Daemon {
-    path: PathBuf,
-    connection: Option<(Lines<BufReader<OwnedReadHalf>>, OwnedWriteHalf)>,
-    /// No try before.
-    pause: Instant,
+    source: Source,
+    state: State,
 }
+
+enum State {
+    /// No daemon; the next try is then.
+    Waiting(Instant),
+    Connecting(Connecting),
+    Connected(Connection),
+}
+
+type Connecting = Pin<Box<dyn Future<Output = Result<Connection, connect::Error>> + Send>>;
 
 /// What comes of a daemon that is there.
 enum Heard {
-    /// It has taken the connection.
-    Connection,
+    /// It has taken the connection, there.
+    Connection(Address),
     Line(String),
 }
 
 impl Daemon {
-    fn new(path: PathBuf) -> Self {
+    fn new(source: Source) -> Self {
         Self {
-            path,
-            connection: None,
-            pause: Instant::now(),
+            source,
+            state: State::Waiting(Instant::now()),
         }
     }
 
     /// The next line, or why there is no daemon. Nothing is lost if the wait is given up.
     async fn next(&mut self) -> Result<Heard, Loss> {
-        let Some((lines, _)) = &mut self.connection else {
-            tokio::time::sleep_until(self.pause).await;
-            self.pause = Instant::now() + PAUSE;
-            let connected = connect(&self.path).await.map_err(Loss::Unreachable)?;
-            self.connection = Some(connected);
-            return Ok(Heard::Connection);
-        };
-        if let Ok(Some(line)) = lines.next_line().await {
-            return Ok(Heard::Line(line));
+        loop {
+            match &mut self.state {
+                State::Waiting(until) => {
+                    tokio::time::sleep_until(*until).await;
+                    let source = self.source.clone();
+                    let connecting = async move { introduced(source.connect().await?).await };
+                    self.state = State::Connecting(Box::pin(connecting));
+                }
+                State::Connecting(connecting) => match connecting.await {
+                    Ok(connection) => {
+                        let address = connection.address().clone();
+                        self.state = State::Connected(connection);
+                        return Ok(Heard::Connection(address));
+                    }
+                    Err(error) => {
+                        self.pause();
+                        return Err(Loss::Unreachable(error.to_string()));
+                    }
+                },
+                State::Connected(connection) => match connection.next().await {
+                    Ok(line) => return Ok(Heard::Line(line)),
+                    Err(error) => {
+                        self.pause();
+                        return Err(match error {
+                            connect::Error::TooLong { .. } => Loss::Unreachable(error.to_string()),
+                            _ => Loss::Closed,
+                        });
+                    }
+                },
+            }
         }
-        self.connection = None;
-        self.pause = Instant::now() + PAUSE;
-        Err(Loss::Closed)
     }
 
-    /// Asks for the totals. A daemon that does not take the question is found out by its silence.
+    fn pause(&mut self) {
+        self.state = State::Waiting(Instant::now() + PAUSE);
+    }
+
+    /// Asks for the totals.
     fn ask(&mut self) {
-        if let Some((_, output)) = &mut self.connection {
-            let _ = output.try_write(b"{\"get\":\"status\"}\n");
+        if let State::Connected(connection) = &self.state {
+            connection.try_send(r#"{"get":"status"}"#);
         }
     }
 }
 
-async fn connect(path: &Path) -> Result<(Lines<BufReader<OwnedReadHalf>>, OwnedWriteHalf), String> {
-    const REQUESTS: &[u8] = b"{\"subscribe\":[\"hardness\",\"press\",\"status\",\"frame\"]}\n\
-        {\"get\":\"last\"}\n";
-    let failed = |error: io::Error| format!("{}: {error}", path.display());
-    let stream = UnixStream::connect(path).await.map_err(failed)?;
-    let (input, mut output) = stream.into_split();
-    output.write_all(REQUESTS).await.map_err(failed)?;
-    Ok((BufReader::new(input).lines(), output))
+/// A connection with its subscription.
+async fn introduced(mut connection: Connection) -> Result<Connection, connect::Error> {
+    let subscription = r#"{"subscribe":["hardness","press","status","frame"]}"#;
+    connection.send(subscription).await?;
+    connection.send(r#"{"get":"last"}"#).await?;
+    Ok(connection)
 }

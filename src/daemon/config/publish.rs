@@ -212,20 +212,28 @@ impl Default for Unix {
 }
 
 impl Unix {
-    /// Where the socket is: as configured, else in the service's runtime directory, else in the
-    /// user's, else in `/run/hardnessd`.
+    /// Where the socket is: as configured, else the first of [`Unix::places`].
     pub fn path(&self) -> PathBuf {
-        if let Some(path) = &self.path {
-            return path.clone();
-        }
+        let configured = self.path.clone();
+        configured.unwrap_or_else(|| Self::places().swap_remove(0))
+    }
+
+    /// Where a socket is by default: in the service's runtime directory, else in the user's, else in
+    /// `/run/hardnessd`. Those that apply here, the first one first.
+    pub fn places() -> Vec<PathBuf> {
         let named = |variable| env::var(variable).ok().filter(|value| !value.is_empty());
-        if let Some(directories) = named("RUNTIME_DIRECTORY") {
-            // systemd separates several by colons.
+        // systemd separates several by colons.
+        let service = named("RUNTIME_DIRECTORY").map(|directories| {
             let first = directories.split(':').next().unwrap_or_default();
-            return Path::new(first).join("events.sock");
-        }
-        let directory = named("XDG_RUNTIME_DIR").unwrap_or_else(|| "/run".to_owned());
-        Path::new(&directory).join("hardnessd/events.sock")
+            PathBuf::from(first)
+        });
+        let user =
+            named("XDG_RUNTIME_DIR").map(|directory| Path::new(&directory).join("hardnessd"));
+        let directories = service.into_iter().chain(user);
+        directories
+            .chain([PathBuf::from("/run/hardnessd")])
+            .map(|directory| directory.join("events.sock"))
+            .collect()
     }
 
     /// Where the control socket is.

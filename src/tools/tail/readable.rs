@@ -1,7 +1,9 @@
 //! An event as a line for people: aligned, one event a line, nothing that is not in the event.
 
 use std::fmt::Write;
+use std::time::Duration;
 
+use jiff::Timestamp;
 use serde_json::Value;
 
 /// The line of one event, without its newline.
@@ -13,8 +15,7 @@ pub(super) fn line(event: &Value) -> String {
         let lost = lost.map_or("an unknown number of".to_owned(), |lost| lost.to_string());
         return format!("-- gap: {lost} events lost --");
     }
-    // 2026-11-21T10:00:00.123456Z: the day is known, microseconds are not read by eye.
-    let time = text("time").get(11..23).unwrap_or_default();
+    let time = clock(&published(event).unwrap_or_else(|| text("time").to_owned()));
     let mut line = format!("{time}  {:<12}  {kind:<8}  ", text("sensor"));
     match kind {
         "status" => status(&mut line, event),
@@ -27,6 +28,20 @@ pub(super) fn line(event: &Value) -> String {
     line.retain(|c| !c.is_control());
     line.truncate(line.trim_end().len());
     line
+}
+
+/// When a verdict was published: so long after the frame that it judges. A final verdict judges a
+/// frame from the middle of the press, so its `time` alone would be before that of the `end`.
+fn published(event: &Value) -> Option<String> {
+    let age_ms = event["age_at_publish_ms"].as_f64()?;
+    let age = Duration::try_from_secs_f64(age_ms / 1000.0).ok()?;
+    let frame: Timestamp = event["time"].as_str()?.parse().ok()?;
+    Some(format!("{:.6}", frame.checked_add(age).ok()?))
+}
+
+/// 10:00:00.123 of 2026-11-21T10:00:00.123456Z: the day is known, microseconds are not read by eye.
+fn clock(time: &str) -> String {
+    time.get(11..23).unwrap_or_default().to_owned()
 }
 
 fn number(event: &Value, key: &str) -> u64 {
@@ -93,6 +108,10 @@ fn hardness(line: &mut String, event: &Value) {
             event["force_n"].as_f64().unwrap_or_default(),
         ),
     );
+    if let (Some(_), Some(time)) = (published(event), event["time"].as_str()) {
+        let frame = number(event, "frame");
+        write(line, format_args!("  frame {frame} at {}", clock(time)));
+    }
     let notes: Vec<&str> = event["notes"]
         .as_array()
         .into_iter()
@@ -156,9 +175,10 @@ mod tests {
                    "phase": "final", "level": 2, "label": "firm", "rejected": null,
                    "notes": ["at_edge"], "probabilities": [0.01, 0.93, 0.05, 0.01],
                    "confidence": 0.93, "contact_area_taxels": 52, "force_n": 12.345,
-                   "context": {"tag": "pick-17"}}),
-            "10:00:00.123  wrist         hardness  #3    final     2 firm                    \
-             93 % [1 93 5 1]   52 taxels   12.35 N  (at_edge)  {\"tag\":\"pick-17\"}",
+                   "frame": 41, "age_at_publish_ms": 1400.5, "context": {"tag": "pick-17"}}),
+            "10:00:01.523  wrist         hardness  #3    final     2 firm                    \
+             93 % [1 93 5 1]   52 taxels   12.35 N  frame 41 at 10:00:00.123  (at_edge)  \
+             {\"tag\":\"pick-17\"}",
         );
         check(
             json!({"type": "hardness", "sensor": "wrist", "time": time, "press": 3,

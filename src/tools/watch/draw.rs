@@ -336,7 +336,13 @@ impl Page<'_> {
         } else {
             "q quit   Ctrl-L draw again"
         };
-        self.text(row, line, self.look.aside());
+        let rest = self.text(row, line, self.look.aside());
+        // Which daemon this is, if there is room for it.
+        let columns = view.address.chars().count();
+        if let Some(indent) = usize::from(rest.width).checked_sub(columns + 3) {
+            let address = format!("{:indent$}   {}", "", view.address);
+            self.text(rest, &address, self.look.aside());
+        }
     }
 }
 

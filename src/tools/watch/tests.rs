@@ -139,7 +139,7 @@ fn what_does_not_say_hello_is_silent_and_another_protocol_is_none() {
     let mut met = pressed_sensor();
     met.lose(Loss::Closed);
     for mut view in [View::new(), met] {
-        view.wait(at(0).mono);
+        view.wait("events.sock".to_owned(), at(0).mono);
         let text = |view: &View, ms| shown(view, ms, (80, 24), PLAIN);
         assert!(text(&view, 2_900).contains("NO DAEMON"));
         let silent = text(&view, 3_100);

@@ -27,6 +27,8 @@ pub(super) struct View {
     pub(super) sensors: Vec<Sensor>,
     /// Index of the sensor that is looked at.
     pub(super) chosen: usize,
+    /// Where the daemon is that was reached last.
+    pub(super) address: String,
     daemon: Daemon,
     /// When the daemon last said anything.
     heard: Duration,
@@ -109,6 +111,7 @@ impl View {
             hello: None,
             sensors: Vec::new(),
             chosen: 0,
+            address: String::new(),
             daemon: Daemon::Absent("connecting".to_owned()),
             heard: Duration::ZERO,
             missed: Some(0),
@@ -141,10 +144,11 @@ impl View {
         }
     }
 
-    /// Something has taken the connection at `now`: it is given as long to say what it is as a
-    /// daemon to answer.
-    pub(super) fn wait(&mut self, now: Duration) {
+    /// Something at `address` has taken the connection at `now`: it is given as long to say what it
+    /// is as a daemon to answer.
+    pub(super) fn wait(&mut self, address: String, now: Duration) {
         self.heard = now;
+        self.address = address;
         self.daemon = Daemon::Unknown(self.absence().to_owned());
     }
 

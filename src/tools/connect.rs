@@ -1,0 +1,313 @@
+//! The way to a running daemon, for `tail` and `watch`.
+//!
+//! In: the socket or address that was asked for. Without one, the places where a daemon's socket is
+//! by default are tried, then the sockets of running demonstrations. Out: a connection whose lines
+//! have a bound.
+
+use std::fmt;
+use std::fs;
+use std::io::{self, ErrorKind};
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+use clap::Args as ClapArgs;
+use tokio::io::{AsyncRead, AsyncWriteExt};
+use tokio::net::{TcpStream, UnixStream, tcp, unix};
+
+use super::demo;
+use crate::daemon::config::Unix;
+use crate::daemon::lines::{Heard, Lines};
+
+/// Which daemon is meant.
+#[derive(Debug, Clone, Default, ClapArgs)]
+pub struct Source {
+    /// Socket of the daemon [default: the first that answers: the user's own daemon, the
+    /// system's, a running demo]
+    #[arg(long, value_name = "P", conflicts_with = "connect")]
+    socket: Option<PathBuf>,
+    /// Connect over TCP instead, to what [publish.tcp] of the daemon says
+    #[arg(long, value_name = "HOST:PORT", value_parser = host_port)]
+    connect: Option<String>,
+}
+
+fn host_port(text: &str) -> Result<String, &'static str> {
+    let port = text
+        .rsplit_once(':')
+        .map(|(host, port)| (host, port.parse::<u16>()));
+    match port {
+        Some((host, Ok(_))) if !host.is_empty() => Ok(text.to_owned()),
+        _ => Err("expected HOST:PORT, such as 192.168.7.2:8255"),
+    }
+}
+
+/// Where a daemon is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Address {
+    /// At a socket on this machine.
+    Unix(PathBuf),
+    /// At a host and port.
+    Tcp(String),
+}
+
+impl fmt::Display for Address {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Unix(path) => path.display().fmt(out),
+            Self::Tcp(address) => address.fmt(out),
+        }
+    }
+}
+
+/// Why there is no daemon to listen to.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// Nobody listens there.
+    #[error("{address}: no daemon answers: {source}")]
+    NoAnswer {
+        /// As given.
+        address: Address,
+        /// Why not.
+        source: io::Error,
+    },
+    /// Nobody listens at any of the usual places.
+    #[error(
+        "no daemon answers at {places}, and no demo runs: start one with `hardnessd run` or \
+         `hardnessd demo`, or name its socket with --socket"
+    )]
+    Nowhere {
+        /// What was tried.
+        places: String,
+    },
+    /// The socket belongs to others.
+    #[error(
+        "{path}: permission denied: join the group {group} (`sudo usermod -aG {group} $USER`) and \
+         log in again"
+    )]
+    Denied {
+        /// Of the socket.
+        path: PathBuf,
+        /// Whose members may connect.
+        group: String,
+    },
+    /// The connection broke.
+    #[error("{address}: the connection broke: {source}")]
+    Broken {
+        /// Where it went to.
+        address: Address,
+        /// How.
+        source: io::Error,
+    },
+    /// The daemon has ended.
+    #[error("{address}: the daemon closed the connection")]
+    Closed {
+        /// Where it was.
+        address: Address,
+    },
+    /// Whatever sends this is no daemon.
+    #[error(
+        "{address}: closed the connection: a line is longer than {LONGEST_LINE_BYTES} bytes, which no \
+         daemon sends"
+    )]
+    TooLong {
+        /// Where it came from.
+        address: Address,
+    },
+}
+
+/// Longest line that a daemon may send: a `hello` that describes thousands of sensors. A frame takes
+/// some 6 kB.
+const LONGEST_LINE_BYTES: usize = 1 << 20;
+
+/// A connection to a daemon.
+pub(super) struct Connection {
+    address: Address,
+    lines: Lines<Box<dyn AsyncRead + Send + Unpin>>,
+    output: Output,
+}
+
+enum Output {
+    Unix(unix::OwnedWriteHalf),
+    Tcp(tcp::OwnedWriteHalf),
+}
+
+impl Source {
+    /// Connects to the daemon that is meant. If it was looked for, [`Connection::address`] says
+    /// where it was found.
+    ///
+    /// # Errors
+    ///
+    /// [`Error`], if no daemon answers.
+    pub(super) async fn connect(&self) -> Result<Connection, Error> {
+        match self.given() {
+            Some(address) => Connection::open(address).await,
+            None => find().await,
+        }
+    }
+
+    /// The address that was asked for.
+    pub(super) fn given(&self) -> Option<Address> {
+        let tcp = self.connect.clone().map(Address::Tcp);
+        tcp.or_else(|| self.socket.clone().map(Address::Unix))
+    }
+}
+
+/// The first daemon that answers at one of the usual places.
+async fn find() -> Result<Connection, Error> {
+    let places = Unix::places();
+    let mut denied = None;
+    for path in places.iter().cloned().chain(demo::sockets()) {
+        match Connection::open(Address::Unix(path)).await {
+            Ok(connection) => return Ok(connection),
+            Err(error @ Error::Denied { .. }) => denied = denied.or(Some(error)),
+            Err(_) => {}
+        }
+    }
+    let tried = || {
+        let places: Vec<String> = places
+            .iter()
+            .map(|path| path.display().to_string())
+            .collect();
+        places.join(" or ")
+    };
+    Err(denied.unwrap_or_else(|| Error::Nowhere { places: tried() }))
+}
+
+impl Connection {
+    async fn open(address: Address) -> Result<Self, Error> {
+        let opened: io::Result<(Box<dyn AsyncRead + Send + Unpin>, Output)> = match &address {
+            Address::Unix(path) => UnixStream::connect(path).await.map(|stream| {
+                let (input, output) = stream.into_split();
+                (Box::new(input) as Box<_>, Output::Unix(output))
+            }),
+            Address::Tcp(address) => TcpStream::connect(address).await.map(|stream| {
+                let (input, output) = stream.into_split();
+                (Box::new(input) as Box<_>, Output::Tcp(output))
+            }),
+        };
+        match opened {
+            Ok((input, output)) => Ok(Self {
+                address,
+                lines: Lines::new(input, LONGEST_LINE_BYTES),
+                output,
+            }),
+            Err(source) => Err(refusal(address, source)),
+        }
+    }
+
+    /// Where the daemon is.
+    pub(super) fn address(&self) -> &Address {
+        &self.address
+    }
+
+    /// The next line, without its newline. Nothing is lost if the wait is given up.
+    ///
+    /// # Errors
+    ///
+    /// [`Error`], if the connection has ended, or the line is longer than any of a daemon.
+    pub(super) async fn next(&mut self) -> Result<String, Error> {
+        let address = || self.address.clone();
+        match self.lines.next().await {
+            Ok(Heard::Line(line)) => Ok(String::from_utf8_lossy(&line).into_owned()),
+            Ok(Heard::End) => Err(Error::Closed { address: address() }),
+            Ok(Heard::TooLong) => Err(Error::TooLong { address: address() }),
+            Err(source) => Err(Error::Broken {
+                address: address(),
+                source,
+            }),
+        }
+    }
+
+    /// Sends a request.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Broken`], if it cannot be sent.
+    pub(super) async fn send(&mut self, request: &str) -> Result<(), Error> {
+        let line = format!("{request}\n");
+        let sent = match &mut self.output {
+            Output::Unix(output) => output.write_all(line.as_bytes()).await,
+            Output::Tcp(output) => output.write_all(line.as_bytes()).await,
+        };
+        sent.map_err(|source| Error::Broken {
+            address: self.address.clone(),
+            source,
+        })
+    }
+
+    /// Sends a request if there is room for it now.
+    pub(super) fn try_send(&self, request: &str) {
+        let line = format!("{request}\n");
+        // A daemon that does not take the question is noticed by its silence.
+        let _ = match &self.output {
+            Output::Unix(output) => output.try_write(line.as_bytes()),
+            Output::Tcp(output) => output.try_write(line.as_bytes()),
+        };
+    }
+}
+
+/// Why nobody took the connection.
+fn refusal(address: Address, source: io::Error) -> Error {
+    match address {
+        Address::Unix(path) if source.kind() == ErrorKind::PermissionDenied => Error::Denied {
+            group: group(&path),
+            path,
+        },
+        address => Error::NoAnswer { address, source },
+    }
+}
+
+/// The group of a socket; where it cannot be known, that of the packaged daemon.
+fn group(path: &Path) -> String {
+    let name = || {
+        let gid = fs::metadata(path).ok()?.gid().to_string();
+        let groups = fs::read_to_string("/etc/group").ok()?;
+        let mut lines = groups.lines().map(|line| line.split(':'));
+        lines.find_map(|mut fields| {
+            let name = fields.next()?;
+            (gid != "0" && fields.nth(1)? == gid).then(|| name.to_owned())
+        })
+    };
+    name().unwrap_or_else(|| "hardnessd".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_address_has_a_host_and_a_port() {
+        for good in ["localhost:8255", "192.168.7.2:1", "[::1]:65535"] {
+            assert_eq!(host_port(good).as_deref(), Ok(good));
+        }
+        for bad in ["localhost", ":8255", "host:", "host:99999", ""] {
+            assert!(host_port(bad).is_err(), "{bad:?}");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_server_without_newlines_is_left() {
+        use tokio::io::AsyncWriteExt;
+
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("hostile.sock");
+        let listener = tokio::net::UnixListener::bind(&path).unwrap();
+        let sender = tokio::spawn(async move {
+            let (mut stream, _) = listener.accept().await.unwrap();
+            let mut sent = 0;
+            while stream.write_all(&[b'x'; 65536]).await.is_ok() {
+                sent += 65536;
+            }
+            sent
+        });
+        let source = Source {
+            socket: Some(path),
+            connect: None,
+        };
+        let mut connection = source.connect().await.unwrap();
+        let error = connection.next().await.unwrap_err();
+        assert!(matches!(error, Error::TooLong { .. }), "{error}");
+        drop(connection);
+        // What the system's buffers hold comes on top.
+        assert!(sender.await.unwrap() < 4 * LONGEST_LINE_BYTES);
+    }
+}

@@ -1,0 +1,171 @@
+//! What was pressed beside what it was judged to be: a line a press, and a count at the end.
+//!
+//! In: events of the daemon. Out: lines for people.
+
+use serde_json::Value;
+
+use crate::simulator::Material;
+
+/// The presses so far.
+#[derive(Debug, Default)]
+pub(super) struct Account {
+    /// Press k is of material k - 1 of these, over and over.
+    materials: Vec<Material>,
+    /// Columns that the longest label of a level takes.
+    label_columns: usize,
+    presses: u32,
+    right: u32,
+    wrong: u32,
+}
+
+impl Account {
+    pub(super) fn new(materials: &[Material]) -> Self {
+        Self {
+            materials: materials.to_vec(),
+            ..Self::default()
+        }
+    }
+
+    /// What there is to say of an event, if anything is.
+    pub(super) fn line(&mut self, event: &Value) -> Option<String> {
+        let text = |key: &str| event[key].as_str().unwrap_or_default();
+        match (text("type"), text("phase"), text("state")) {
+            ("hello", ..) => {
+                let levels = event["model"]["levels"].as_array().into_iter().flatten();
+                let columns = |level: &Value| level["label"].as_str().map(|l| l.chars().count());
+                self.label_columns = levels.filter_map(columns).max().unwrap_or_default();
+                None
+            }
+            ("hardness", "final", _) => Some(self.verdict(event)),
+            ("press", _, "aborted") => {
+                let (number, pressed) = self.pressed(event)?;
+                self.presses += 1;
+                let reason = text("reason");
+                Some(format!(
+                    "press {number}  {pressed}  ->  no verdict ({reason})"
+                ))
+            }
+            ("gap", ..) => {
+                let lost = event["lost"].as_u64();
+                let lost = lost.map_or("some".to_owned(), |lost| lost.to_string());
+                Some(format!(
+                    "{lost} events were lost: this terminal was too slow"
+                ))
+            }
+            _ => None,
+        }
+    }
+
+    fn verdict(&mut self, event: &Value) -> String {
+        let Some((number, pressed)) = self.pressed(event) else {
+            return String::new();
+        };
+        self.presses += 1;
+        let text = |key: &str| event[key].as_str().unwrap_or_default();
+        let percent = 100.0 * event["confidence"].as_f64().unwrap_or_default();
+        let force_n = event["force_n"].as_f64().unwrap_or_default();
+        let level = event["level"].as_u64();
+        let (said, mark) = match level {
+            None => (text("rejected").replace('_', " "), "-"),
+            Some(level) => {
+                let is_right = self
+                    .material(event)
+                    .is_some_and(|m| u64::from(m.level()) == level);
+                let count = if is_right {
+                    &mut self.right
+                } else {
+                    &mut self.wrong
+                };
+                *count += 1;
+                let said = format!("{} {percent:.0} %", text("label"));
+                (said, if is_right { "ok" } else { "wrong" })
+            }
+        };
+        // A label, a blank and up to 100 per cent.
+        let columns = self.label_columns + 6;
+        format!("press {number}  {pressed}  ->  {said:<columns$}  {mark:<5}  {force_n:4.1} N")
+    }
+
+    /// Number of a press, and what was pressed.
+    fn pressed(&self, event: &Value) -> Option<(u64, String)> {
+        let material = self.material(event)?;
+        let pressed = format!("{} (level {})", material.name(), material.level());
+        let named = self.materials.iter().map(|material| material.name().len());
+        let columns = named.max().unwrap_or_default() + " (level 1)".len();
+        Some((event["press"].as_u64()?, format!("{pressed:<columns$}")))
+    }
+
+    fn material(&self, event: &Value) -> Option<Material> {
+        let before = event["press"].as_u64()?.checked_sub(1)?;
+        let index = usize::try_from(before).ok()? % self.materials.len().max(1);
+        self.materials.get(index).copied()
+    }
+
+    /// The count.
+    pub(super) fn close(&self) -> String {
+        let Self {
+            presses,
+            right,
+            wrong,
+            ..
+        } = self;
+        let plural = if *presses == 1 { "" } else { "es" };
+        let mut line = format!("{presses} press{plural}: {right} right, {wrong} wrong");
+        let without = presses - right - wrong;
+        if without > 0 {
+            line += &format!(", {without} without a verdict");
+        }
+        let judged = right + wrong;
+        if judged > 0 {
+            let share = 100.0 * f64::from(*right) / f64::from(judged);
+            line += &format!(" ({share:.0} % right, on simulated presses)");
+        }
+        line
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn each_press_stands_beside_what_it_is_and_all_are_counted() {
+        let mut account = Account::new(&[Material::HardPlastic, Material::Foam]);
+        let hello = json!({"type": "hello", "model": {"levels": [
+            {"level": 1, "label": "hard"}, {"level": 2, "label": "medium"}]}});
+        assert_eq!(account.line(&hello), None);
+        let verdict = |press: u64, level: Option<u8>, label: &str, confidence: f64| {
+            json!({"type": "hardness", "phase": "final", "press": press, "level": level,
+                "label": label, "confidence": confidence, "force_n": 7.41,
+                "rejected": level.is_none().then_some("low_force")})
+        };
+        for (event, expected) in [
+            (
+                verdict(1, Some(1), "hard", 1.0),
+                "press 1  hard-plastic (level 1)  ->  hard 100 %    ok      7.4 N",
+            ),
+            (
+                verdict(2, Some(1), "hard", 0.61),
+                "press 2  foam (level 2)          ->  hard 61 %     wrong   7.4 N",
+            ),
+            (
+                verdict(3, None, "", 0.3),
+                "press 3  hard-plastic (level 1)  ->  low force     -       7.4 N",
+            ),
+            (
+                json!({"type": "press", "state": "aborted", "press": 4, "reason": "short"}),
+                "press 4  foam (level 2)          ->  no verdict (short)",
+            ),
+        ] {
+            assert_eq!(account.line(&event).as_deref(), Some(expected));
+        }
+        let early = json!({"type": "hardness", "phase": "early", "press": 5, "level": 1});
+        assert_eq!(account.line(&early), None);
+        assert_eq!(
+            account.close(),
+            "4 presses: 1 right, 1 wrong, 2 without a verdict (50 % right, on simulated presses)"
+        );
+    }
+}

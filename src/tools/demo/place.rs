@@ -1,0 +1,106 @@
+//! Where a demonstration keeps its port and its socket, and how others find them.
+
+use std::env;
+use std::fs::{self, DirBuilder};
+use std::io::{self, ErrorKind};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::path::{Path, PathBuf};
+
+/// How the directory of every demonstration begins.
+const PREFIX: &str = "hardnessd-demo-";
+
+/// A directory of our own. It is removed with this value.
+pub(super) struct Place(PathBuf);
+
+impl Place {
+    /// A new one, in the user's runtime directory or else among the temporary files.
+    pub(super) fn new() -> io::Result<Self> {
+        let mut outcome = Err(ErrorKind::NotFound.into());
+        for directory in directories().filter(|one| one.as_os_str().len() <= LONGEST_BYTES) {
+            outcome = Self::within(&directory);
+            if outcome.is_ok() {
+                break;
+            }
+        }
+        outcome
+    }
+
+    fn within(directory: &Path) -> io::Result<Self> {
+        let mut path = directory.join(format!("{PREFIX}{}", std::process::id()));
+        loop {
+            match DirBuilder::new().mode(0o700).create(&path) {
+                // In a container that is started again, one that was killed had the same number.
+                Err(error) if error.kind() == ErrorKind::AlreadyExists => {
+                    path.as_mut_os_string().push("-");
+                }
+                made => return made.map(|()| Self(path)),
+            }
+        }
+    }
+
+    /// The link to the pty.
+    pub(super) fn port(&self) -> PathBuf {
+        self.0.join("port")
+    }
+
+    /// The daemon's socket.
+    pub(super) fn socket(&self) -> PathBuf {
+        self.0.join(SOCKET)
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+const SOCKET: &str = "events.sock";
+
+/// Longest directory to make one in: the path of a socket has a bound of 107 bytes.
+const LONGEST_BYTES: usize = 60;
+
+fn directories() -> impl Iterator<Item = PathBuf> {
+    let runtime = env::var_os("XDG_RUNTIME_DIR").filter(|directory| !directory.is_empty());
+    runtime
+        .map(PathBuf::from)
+        .into_iter()
+        .chain([env::temp_dir()])
+}
+
+/// Sockets of this user's demonstrations, the newest first. A killed one may have left its own.
+pub(in crate::tools) fn sockets() -> Vec<PathBuf> {
+    let uid = rustix::process::geteuid().as_raw();
+    let mut found = Vec::new();
+    for entry in directories()
+        .filter_map(|directory| fs::read_dir(directory).ok())
+        .flatten()
+    {
+        let Ok(entry) = entry else { continue };
+        let name = entry.file_name();
+        // Anyone may put a directory among the temporary files: only the user's own are trusted.
+        let ours = name.to_string_lossy().starts_with(PREFIX)
+            && fs::symlink_metadata(entry.path())
+                .is_ok_and(|file| file.is_dir() && file.uid() == uid);
+        let socket = entry.path().join(SOCKET);
+        if ours && let Ok(made) = fs::symlink_metadata(&socket).and_then(|file| file.modified()) {
+            found.push((made, socket));
+        }
+    }
+    found.sort_unstable_by(|a, b| b.cmp(a));
+    found.into_iter().map(|(_, socket)| socket).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_killed_demonstration_has_left_is_not_in_the_way() {
+        let directory = tempfile::tempdir().unwrap();
+        let left = Place::within(directory.path()).unwrap();
+        let place = Place::within(directory.path()).unwrap();
+        assert_ne!(left.0, place.0);
+        assert!(left.0.is_dir() && place.0.is_dir());
+    }
+}
