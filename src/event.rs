@@ -30,7 +30,7 @@ pub enum Event {
     Press(Press),
     /// A press was judged.
     Hardness(Hardness),
-    /// One tared frame; never numbered.
+    /// One frame; never numbered.
     Frame(FrameEvent),
 }
 
@@ -285,7 +285,7 @@ pub struct Hardness {
     pub arrival: Duration,
 }
 
-/// One tared frame.
+/// One frame, tared as far as the sensor is.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FrameEvent {
     /// Sensor's name.
@@ -304,6 +304,8 @@ pub struct FrameEvent {
     pub newtons: Vec<f32>,
     /// Taxels at or above the contact threshold then in force.
     pub contact_area_taxels: u32,
+    /// False until the first tare is taken: newtons then still contain the unloaded sensor's.
+    pub tared: bool,
 }
 
 impl FrameEvent {
@@ -314,6 +316,7 @@ impl FrameEvent {
         frame: u64,
         newtons: Vec<f32>,
         contact_area_taxels: u32,
+        tared: bool,
     ) -> Self {
         Self {
             sensor,
@@ -323,6 +326,7 @@ impl FrameEvent {
             cols: COLS,
             newtons,
             contact_area_taxels,
+            tared,
         }
     }
 }

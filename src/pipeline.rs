@@ -495,6 +495,7 @@ impl Pipeline {
             at.frame,
             frame.newtons.to_vec(),
             frame.contact_area_taxels(self.sensor.description().press.contact_threshold_n),
+            tared,
         )));
         for change in changes {
             self.publish(change, events);

@@ -134,11 +134,12 @@ fn frame_is_frozen_and_never_numbered() {
         5,
         vec![0.0, 0.123_456, 10.2],
         2,
+        true,
     ));
     frame.number(9);
     check(
         &frame.to_line(),
-        r#"{"type":"frame","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","frame":5,"rows":28,"cols":28,"newtons":[0.0,0.123,10.2],"contact_area_taxels":2}"#,
+        r#"{"type":"frame","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","frame":5,"rows":28,"cols":28,"newtons":[0.0,0.123,10.2],"contact_area_taxels":2,"tared":true}"#,
     );
 }
 

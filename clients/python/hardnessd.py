@@ -167,7 +167,7 @@ class Status(_Numbered):
 
 
 class Frame(TypedDict):
-    """One tared frame: 784 newtons, row by row."""
+    """One frame: 784 newtons, row by row. `tared` is false until the first tare is taken."""
 
     type: Literal["frame"]
     sensor: str
@@ -177,6 +177,7 @@ class Frame(TypedDict):
     cols: int
     newtons: List[float]
     contact_area_taxels: int
+    tared: bool
 
 
 class Gap(TypedDict):

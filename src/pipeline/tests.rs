@@ -106,6 +106,32 @@ fn a_load_during_tare_is_said_and_tracked_as_no_press() {
 }
 
 #[test]
+fn frames_say_whether_they_are_tared() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    let mut tared = |first: u64, frames: u64| {
+        let mut tared = Vec::new();
+        for number in first..first + frames {
+            let bytes = bytes(&pipeline, &raw(0, 0));
+            let events = pipeline.push(&bytes, at(number * 200));
+            tared.extend(events.iter().filter_map(|event| match event {
+                Event::Frame(frame) => Some(frame.tared),
+                _ => None,
+            }));
+        }
+        tared
+    };
+    assert_eq!(tared(0, 5), [false; 5], "the tare is made of these");
+    assert_eq!(tared(5, 2), [true; 2]);
+    pipeline.retare().unwrap();
+    let bytes = bytes(&pipeline, &raw(0, 0));
+    let events = pipeline.push(&bytes, at(1400));
+    let Some(Event::Frame(frame)) = events.last() else {
+        panic!("{events:?}")
+    };
+    assert!(frame.tared, "the old tare holds until there is another");
+}
+
+#[test]
 fn a_reload_changes_the_tare_under_way() {
     let mut pipeline = pipeline(Preset::Jx255n);
     play(&mut pipeline, 0, &[raw(9, 50); 5]);

@@ -66,6 +66,7 @@ fn frame(sensor: &str, number: u64) -> Event {
         number,
         newtons,
         0,
+        true,
     ))
 }
 
