@@ -38,12 +38,14 @@ from __future__ import annotations
 import argparse
 import asyncio
 import datetime
+import glob
 import io
 import json
 import os
 import re
 import socket
 import sys
+import tempfile
 import threading
 import time
 from typing import (
@@ -231,18 +233,41 @@ class LineTooLong(ProtocolError):
 
 
 def default_address(name: str = "events.sock") -> str:
-    """Where the daemon's sockets are by default.
+    """Finds a daemon's socket, in the places where `hardnessd tail` looks.
 
-    This is the first socket that exists in $RUNTIME_DIRECTORY, $XDG_RUNTIME_DIR/hardnessd and
-    /run/hardnessd, or the last of these when none exists.
+    These are $RUNTIME_DIRECTORY, $XDG_RUNTIME_DIR/hardnessd, /run/hardnessd, and a `hardnessd demo` of
+    this user. Returns the first socket that answers. When none does, it returns the first that exists,
+    and otherwise the first place.
     """
-    directories = ["/run/hardnessd"]
-    if user := os.environ.get("XDG_RUNTIME_DIR"):
-        directories.insert(0, os.path.join(user, "hardnessd"))
-    if service := os.environ.get("RUNTIME_DIRECTORY"):
-        directories.insert(0, service.split(":")[0])
-    paths = [os.path.join(directory, name) for directory in directories]
-    return next((path for path in paths if os.path.exists(path)), paths[-1])
+    service, user = os.environ.get("RUNTIME_DIRECTORY"), os.environ.get("XDG_RUNTIME_DIR")
+    directories = [service.split(":")[0]] if service else []
+    directories += [os.path.join(user, "hardnessd")] if user else []
+    directories += ["/run/hardnessd"]
+    # Anyone may make a directory among the temporary files: only the user's own are trusted.
+    demos = [
+        directory
+        for parent in [user, tempfile.gettempdir()]
+        for directory in glob.glob(os.path.join(glob.escape(parent or "/nowhere"), "hardnessd-demo-*"))
+        if os.lstat(directory).st_uid == os.geteuid()
+    ]
+    paths = [os.path.join(directory, name) for directory in directories + demos]
+    there = [path for path in paths if os.path.exists(path)]
+    if len(there) > 1:
+        there.sort(key=lambda path: not _answers(path))
+    return (there or paths)[0]
+
+
+def _answers(path: str) -> bool:
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(path)
+        except BlockingIOError:
+            # Many are waiting to be served.
+            return True
+        except OSError:
+            return False
+    return True
 
 
 def _destination(address: Address) -> Union[str, Tuple[str, int]]:
@@ -387,8 +412,10 @@ class _Follower:
         return None
 
 
-def _disconnected(error: BaseException) -> Disconnected:
-    return {"type": "disconnected", "reason": str(error) or f"no answer within {HELLO_S:g} s"}
+def _disconnected(address: Address, error: BaseException) -> Disconnected:
+    where = "{}:{}".format(*address) if isinstance(address, tuple) else os.fspath(address)
+    why = getattr(error, "strerror", None) or str(error) or f"no answer within {HELLO_S:g} s"
+    return {"type": "disconnected", "reason": f"{where}: {why}"}
 
 
 class _Subscriber:
@@ -403,6 +430,12 @@ class _Subscriber:
     ) -> None:
         self.address = address
         self._follower = _Follower(types, policy, since)
+        self._found: Address = ""
+
+    def _find(self) -> Address:
+        """Where to connect now: a daemon that was not there may be."""
+        self._found = self.address or default_address()
+        return self._found
 
     @property
     def place(self) -> Optional[str]:
@@ -444,7 +477,7 @@ class Client(_Subscriber):
             except OSError as error:
                 if self._closed.is_set():
                     return
-                yield _disconnected(error)
+                yield _disconnected(self._found, error)
             self._closed.wait(pause_s)
             pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
 
@@ -456,7 +489,7 @@ class Client(_Subscriber):
 
     def _connected(self) -> Iterator[Event]:
         """Events of one connection. It ends with an exception, or when the client is closed."""
-        connection = Connection(self.address or default_address(), HELLO_S)
+        connection = Connection(self._find(), HELLO_S)
         self.connection = connection
         try:
             # Another thread may have closed the client while there was no connection to close.
@@ -512,7 +545,7 @@ class AsyncClient(_Subscriber):
             except (OSError, asyncio.TimeoutError) as error:
                 self._disconnect()
                 if not self._closed:
-                    return _disconnected(error)
+                    return _disconnected(self._found, error)
             else:
                 if event is not None:
                     self._pause_s = 0.0
@@ -545,7 +578,7 @@ class AsyncClient(_Subscriber):
     async def _open(self) -> None:
         """Connects and subscribes, once the pause since the last connection is over."""
         await asyncio.sleep(max(0.0, self._try_at - time.monotonic()))
-        destination = _destination(self.address or default_address())
+        destination = _destination(self._find())
         connecting = (
             asyncio.open_unix_connection(destination, limit=LONGEST_LINE_BYTES)
             if isinstance(destination, str)

@@ -19,6 +19,7 @@ import pathlib
 import random
 import re
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -96,7 +97,8 @@ def resumes(bench, address, kind):
         assert time.monotonic() - start < PATIENCE_S, f"{len(steady.numbers())} events"
         time.sleep(random.uniform(0, 0.4))
         breaks += broken.break_connection()
-    sensor.kill()
+    sensor.terminate()
+    sensor.wait()
     wait_for("the loss", lambda: steady.of_type("status")[-1]["state"] == "lost")
     last = wait_for("the end", lambda: steady.numbers() and steady.numbers()[-1])
     wait_for("the same end", lambda: broken.numbers() and max(broken.numbers()) >= last)
@@ -163,7 +165,8 @@ def notices_a_restart(bench, daemon):
         wait_for("an unknown gap", lambda e=events: {"type": "gap", "lost": None} in list(e))
         wait_for("a verdict", lambda e=events: e.of_type("hardness"))
         events.end()
-    sensor.kill()
+    sensor.terminate()
+    sensor.wait()
     print("a daemon that came back is told apart, and its events follow")
 
 
@@ -288,8 +291,19 @@ def finds_the_socket(bench):
         try:
             os.environ.pop("RUNTIME_DIRECTORY", None)
             os.environ["XDG_RUNTIME_DIR"] = user
-            assert hardnessd.default_address() == "/run/hardnessd/events.sock"
             own = os.path.join(user, "hardnessd/events.sock")
+            assert hardnessd.default_address() == own
+            client = iter(hardnessd.Client())
+            assert next(client) == {"type": "disconnected", "reason": f"{own}: No such file or directory"}
+            # One that a dead daemon left behind is not chosen where another answers.
+            dead = socket.socket(socket.AF_UNIX)
+            dead.bind(own)
+            dead.close()
+            demo = os.path.join(user, "hardnessd-demo-1")
+            os.mkdir(demo)
+            os.symlink(bench.path("events.sock"), os.path.join(demo, "events.sock"))
+            assert hardnessd.default_address() == os.path.join(demo, "events.sock")
+            os.unlink(own)
             os.symlink(bench.path("events.sock"), own)
             assert hardnessd.default_address() == own
             assert next(iter(hardnessd.Client()))["type"] == "status"
@@ -328,19 +342,23 @@ def main(binary):
     )
     more = '[publish.tcp]\nlisten = "127.0.0.1:0"\n[record]\ndir = "rec"\nkeep_free_mb = 0\n'
     with Bench(binary, more=more) as bench:
-        daemon = bench.daemon()
-        tcp = bench.address("tcp")
-        host, port = tcp.rsplit(":", 1)
-        resumes(bench, bench.path("events.sock"), hardnessd.Client)
-        resumes(bench, (host, int(port)), hardnessd.AsyncClient)
-        resumes(bench, tcp, hardnessd.Client)
-        resumes(bench, pathlib.Path(bench.path("events.sock")), hardnessd.AsyncClient)
-        ends_when_closed(bench)
-        notices_a_restart(bench, daemon)
-        commands(bench)
-        program(bench)
-        finds_the_socket(bench)
-        readme(bench)
+        try:
+            daemon = bench.daemon()
+            tcp = bench.address("tcp")
+            host, port = tcp.rsplit(":", 1)
+            resumes(bench, bench.path("events.sock"), hardnessd.Client)
+            resumes(bench, (host, int(port)), hardnessd.AsyncClient)
+            resumes(bench, tcp, hardnessd.Client)
+            resumes(bench, pathlib.Path(bench.path("events.sock")), hardnessd.AsyncClient)
+            ends_when_closed(bench)
+            notices_a_restart(bench, daemon)
+            commands(bench)
+            program(bench)
+            finds_the_socket(bench)
+            readme(bench)
+        except AssertionError:
+            print(pathlib.Path(bench.path("log")).read_text()[-3000:], file=sys.stderr)
+            raise
     learns_what_it_lost(binary)
 
 
