@@ -1,10 +1,10 @@
 //! Bytes become frames, frames become presses, presses become verdicts, verdicts reach
 //! subscribers, and only the two ends touch the world.
 //!
-//! The modules below stand in reading order. Each from [`frame`] to [`random`] uses only those
-//! above it and opens nothing, waits for nothing and asks no clock: it is given bytes and the
-//! moment they came; [`recording`] also what to read from and write to. `daemon`, `tools` and
-//! `train` are the ends.
+//! The modules are in reading order. Each module from [`frame`] to [`random`] uses only the modules
+//! above it. These modules do no I/O, wait for nothing and ask no clock: callers pass in the bytes and
+//! the time at which they arrived. [`recording`] is also given a reader or a writer. `daemon`, `tools`
+//! and `train` are the two ends that touch the world.
 
 pub mod frame;
 pub mod wording;

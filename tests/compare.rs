@@ -118,7 +118,7 @@ fn whole() -> &'static Comparison {
 }
 
 #[test]
-fn results_have_the_contracts_fields_and_agree_with_evaluate() {
+fn results_have_the_documented_fields_and_agree_with_evaluate() {
     let results = whole().json("results.json");
     let rows: Vec<(&str, u64, u64)> = results
         .iter()

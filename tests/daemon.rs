@@ -1,8 +1,8 @@
 //! The real binary on a real pty: readiness, verdicts, unplug and replug, signals, bad input.
 //!
-//! Bounds are those of the contract, taken from the daemon's own stamps where it has one. A busy
-//! machine may delay a process by more than a bound, so what is bounded is tried three times and
-//! must be kept once.
+//! Bounds are those of `docs/protocol.md`, measured with the daemon's own stamps where it has them. A
+//! busy machine may delay a process by more than a bound, so a bounded action is tried three times and
+//! must keep its bound once.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"

@@ -4,8 +4,8 @@
     python -m venv venv && venv/bin/pip install eclipse-zenoh
     cargo build --features zenoh && venv/bin/python tests/peers/zenoh_peer.py target/debug/hardnessd
 
-Claims: a peer gets, under the keys of the contract, the very lines of the Unix socket; whoever comes
-late asks for the last verdict and status, beside 100 frames/s too; the liveliness token goes when the daemon is killed; a router
+Claims: a peer gets, under the keys of docs/protocol.md, the very lines of the Unix socket; a late peer
+asks for the last verdict and status, beside 100 frames/s too; the liveliness token goes when the daemon is killed; a router
 that comes later is found; a frozen peer costs no other subscriber an event, nor the stop its second;
 nothing listens that was not named; and an address in use is one line and 74.
 """

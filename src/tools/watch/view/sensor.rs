@@ -181,8 +181,8 @@ impl Sensor {
         });
     }
 
-    /// Newtons of the taxel at a row and column of the sensor's own array in the last frame: smaller
-    /// arrays sit in the middle of the 28x28 (contract, section 3).
+    /// Newtons of the taxel at a row and column of the sensor's own array in the last frame. A smaller
+    /// array is in the middle of the 28x28 frame (`docs/configuration.md`).
     pub(in crate::tools::watch) fn newtons(&self, row: usize, col: usize) -> Option<f32> {
         let (rows, cols) = (self.rows, self.cols);
         let frame = self.frame.as_ref()?;
