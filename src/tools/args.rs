@@ -17,27 +17,27 @@ pub struct Args {
 /// The commands of `hardnessd`.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Serve: sensors in, events out, until SIGTERM; SIGHUP reads the configuration again
+    /// Run the daemon until SIGINT or SIGTERM; SIGHUP reloads the configuration
     Run(Configuration),
-    /// Show it all on a simulated sensor: what was pressed beside the verdict, or JSON lines
+    /// Run the whole daemon on a simulated sensor and print each press beside its verdict
     Demo(demo::Args),
-    /// Play a simulated sensor at a pty
+    /// Simulate a sensor on a pty
     Simulate(simulate::Args),
-    /// Record sensors to a file, with what they were judged to be
+    /// Record sensors and their verdicts to a file
     Record(record::Args),
     /// Save what is whole in a damaged recording
     Recover(recover::Args),
-    /// Play a recording through the same pipeline: events on stdout as JSON lines
+    /// Replay a recording through the daemon's pipeline; print events as JSON lines
     Replay(replay::Args),
     /// Print events of a running daemon
     Tail(tail::Args),
     /// Show the sensors of a running daemon on the terminal
     Watch(watch::Args),
-    /// Check a configuration and say what would run
+    /// Check a configuration and print what would run
     Check(check::Args),
-    /// Say why a port will not work, and what mends it
+    /// Explain why a port does not work, and what to do
     Doctor(doctor::Args),
-    /// Look at raw bytes and propose a [sensor.frame]: TOML on stdout
+    /// Propose a [sensor.frame] for raw bytes, as TOML on stdout
     Sniff(sniff::Args),
 }
 

@@ -25,7 +25,7 @@ pub struct Source {
     /// system's, a running demo]
     #[arg(long, value_name = "P", conflicts_with = "connect")]
     socket: Option<PathBuf>,
-    /// Connect over TCP instead, to what [publish.tcp] of the daemon says
+    /// Connect over TCP instead, to the address under [publish.tcp]
     #[arg(long, value_name = "HOST:PORT", value_parser = host_port)]
     connect: Option<String>,
 }

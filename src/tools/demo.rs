@@ -35,7 +35,7 @@ use crate::wire::{Layout, LayoutError};
 /// Arguments of `demo`.
 #[derive(Debug, Clone, ClapArgs)]
 pub struct Args {
-    /// End after the final verdicts of so many presses [default: never]
+    /// End after the final verdicts of N presses [default: no limit]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     presses: Option<u32>,
     /// Seed of everything random
@@ -44,7 +44,7 @@ pub struct Args {
     /// Address of the live page
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0")]
     http: SocketAddr,
-    /// Play so many times as fast, 0.01 to 100
+    /// Play X times as fast, 0.01 to 100
     #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = speed)]
     speed: f64,
     /// Print events as JSON lines on a terminal too

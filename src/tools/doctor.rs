@@ -17,7 +17,7 @@ use super::shown;
 /// Arguments of `doctor`.
 #[derive(Debug, Clone, ClapArgs)]
 pub struct Args {
-    /// Port to be examined [default: every USB serial port]
+    /// Port to examine [default: every USB serial port]
     #[arg(long, value_name = "P")]
     port: Option<PathBuf>,
 }
@@ -26,7 +26,7 @@ pub struct Args {
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// Said on stdout.
-    #[error("found {found} fault{}, expected none", if *.found == 1 { "" } else { "s" })]
+    #[error("{found} fault{} found", if *.found == 1 { "" } else { "s" })]
     Faults {
         /// Lines printed.
         found: usize,

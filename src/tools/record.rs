@@ -25,10 +25,10 @@ pub struct Args {
     /// Recording to write, as MCAP; a file that exists is left alone
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// What to write down in it, such as level=2 or object=7; may be repeated
+    /// Label to store in the recording, such as level=2 or object=7; may be repeated
     #[arg(long = "label", value_name = "KEY=VALUE", value_parser = label)]
     labels: Vec<(String, String)>,
-    /// End after so long [default: at SIGINT or SIGTERM, or when no sensor is left]
+    /// End after S seconds [default: at SIGINT or SIGTERM, or when no sensor is left]
     #[arg(long, value_name = "S", value_parser = positive)]
     seconds: Option<f64>,
 }

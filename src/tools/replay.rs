@@ -26,7 +26,7 @@ pub struct Args {
     /// built in, a JX255N by default settings]
     #[arg(long, value_name = "F")]
     config: Option<PathBuf>,
-    /// Play so many times as fast as the sensor did [default: as fast as it goes]
+    /// Play X times as fast as the sensor did [default: as fast as possible]
     #[arg(long, value_name = "X", value_parser = positive)]
     speed: Option<f64>,
 }

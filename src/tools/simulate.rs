@@ -22,37 +22,37 @@ use crate::wire::{Layout, LayoutError, Preset, Settings as Frame};
 #[derive(Debug, Clone, ClapArgs)]
 #[command(after_long_help = faults::FORMAT)]
 pub struct Args {
-    /// Symbolic link to keep at the pty; an old link is replaced
+    /// Symbolic link to make to the pty; an old link is replaced
     #[arg(long, value_name = "PATH")]
     link: Option<PathBuf>,
-    /// Write what the sensor sends to this file instead: raw bytes, as fast as it goes
+    /// Write the sensor's raw bytes to this file instead, as fast as possible
     #[arg(long, value_name = "FILE", conflicts_with_all = ["link", "speed", "baud"], requires = "presses")]
     to: Option<PathBuf>,
     /// Layout of a frame
     #[arg(long, value_name = "P", default_value = "jx255n", value_parser = preset)]
     preset: Preset,
-    /// Frames a second
+    /// Frames per second
     #[arg(long, value_name = "F", default_value_t = 5.0, value_parser = frame_rate_hz)]
     fps: f64,
-    /// Material pressed, in turn; several may be given [default: all eight]
+    /// Material to press; repeat the option for several in turn [default: all eight]
     #[arg(long = "material", value_name = "M")]
     materials: Vec<Material>,
-    /// Peak force of a press in newtons [default: drawn from 5 to 25]
+    /// Peak force of a press in newtons [default: random, 5 to 25]
     #[arg(long, value_name = "N", value_parser = force_n)]
     force: Option<f64>,
     /// Seed of everything random
     #[arg(long, value_name = "S", default_value_t = 1)]
     seed: u64,
-    /// End after so many presses [default: never]
+    /// End after N presses [default: no limit]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     presses: Option<u32>,
-    /// Play so many times as fast
+    /// Play X times as fast
     #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = positive)]
     speed: f64,
-    /// Bits a second on the line [default: 115200, or the first usual rate that carries the frames]
+    /// Bits per second on the line [default: 115200, or the first usual rate that carries the frames]
     #[arg(long, value_name = "B", value_parser = clap::value_parser!(u32).range(1..))]
     baud: Option<u32>,
-    /// Script of faults; its format is in --help
+    /// Script of faults; --help shows its format
     #[arg(long, value_name = "FILE")]
     faults: Option<PathBuf>,
 }

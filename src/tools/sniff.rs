@@ -27,14 +27,14 @@ use crate::wire::Settings;
 pub struct Args {
     /// Recording of `record`, or raw bytes back to back; best with presses in it
     file: Option<PathBuf>,
-    /// Listen at this port instead; press the sensor meanwhile
+    /// Listen to this port instead; press the sensor meanwhile
     #[arg(long, value_name = "P")]
     port: Option<PathBuf>,
-    /// Of the port
+    /// Speed of the port in bits per second
     #[arg(long, value_name = "B", default_value_t = 115_200, conflicts_with = "file",
         value_parser = clap::value_parser!(u32).range(1..))]
     baud: u32,
-    /// How long to listen at the port
+    /// Seconds to listen to the port
     #[arg(long, value_name = "S", default_value_t = 10.0, conflicts_with = "file",
         value_parser = positive)]
     seconds: f64,

@@ -25,10 +25,10 @@ pub struct Args {
     /// Print the JSON lines as they are
     #[arg(long)]
     json: bool,
-    /// End after so many events [default: never]
+    /// End after N events [default: no limit]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     count: Option<u64>,
-    /// Give up after so many seconds, with exit code 1 [default: never]
+    /// Give up after S seconds, with exit code 1 [default: no limit]
     #[arg(long, value_name = "S", value_parser = positive)]
     timeout: Option<f64>,
     /// Types of events: hardness, press, status, frame

@@ -42,7 +42,7 @@ pub struct Args {
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// Nobody would see it.
-    #[error("found no terminal on stdin and stdout, expected one: `hardnessd tail` needs none")]
+    #[error("`watch` needs a terminal on stdin and stdout: use `hardnessd tail` instead")]
     NoTerminal,
     /// The terminal fails.
     #[error("terminal: {0}")]

@@ -20,11 +20,11 @@ pub(super) struct Arguments {
 pub(super) enum Command {
     /// Simulate a labelled data set (default: the paper's 10,000 + 1,000 samples)
     Simulate(Simulate),
-    /// Make a data set of recordings of known objects, through the daemon's own decoding
+    /// Make a data set from recordings of known objects, with the daemon's own decoding
     Collect(Collect),
     /// Train one method
     Train(Train),
-    /// Train every method under several seeds and make the paper's tables; run again to go on
+    /// Train every method under several seeds and make the paper's tables; run it again to continue
     Compare(Compare),
     /// Run an exported model on a data set
     Evaluate(Evaluate),
@@ -32,7 +32,7 @@ pub(super) enum Command {
     Report {
         /// Directory of the run or the comparison
         directory: PathBuf,
-        /// The page to write; one that is there is replaced
+        /// Page to write; an existing file is replaced
         #[arg(long, value_name = "R.html")]
         out: PathBuf,
     },
@@ -40,7 +40,7 @@ pub(super) enum Command {
     Export {
         /// Directory of the run
         run: PathBuf,
-        /// The model file to write; one that is there is replaced
+        /// Model file to write; an existing file is replaced
         #[arg(long, value_name = "M.onnx")]
         out: PathBuf,
     },
@@ -57,10 +57,10 @@ const MOST: i64 = 10_000;
 
 #[derive(Debug, clap::Args)]
 pub(super) struct Simulate {
-    /// The data set to write; one that is there is replaced
+    /// Data set to write; an existing file is replaced
     #[arg(long, value_name = "D.npz")]
     pub(super) out: PathBuf,
-    /// Everything random follows from it
+    /// Seed of everything random
     #[arg(long, default_value_t = DatasetSettings::default().seed)]
     pub(super) seed: u64,
     /// Objects of each training material
@@ -95,7 +95,7 @@ pub(super) struct Simulate {
 
 #[derive(Debug, clap::Args)]
 pub(super) struct Collect {
-    /// The data set to write; one that is there is replaced
+    /// Data set to write; an existing file is replaced
     #[arg(long, value_name = "D.npz")]
     pub(super) out: PathBuf,
     /// Hardness level, 1 (hard) to 4, or 0: unlabelled [default: the recording's label "level"]
@@ -132,25 +132,25 @@ pub(super) struct Train {
     /// Directory of the run
     #[arg(long, value_name = "RUN")]
     pub(super) out: PathBuf,
-    /// Everything random follows from it
+    /// Seed of everything random
     #[arg(long, default_value_t = 1)]
     pub(super) seed: u64,
-    /// How long it may take
+    /// Length of the training
     #[arg(long, default_value = "paper")]
     pub(super) profile: Profile,
     /// Settings that override the profile's (see config/hrn-train.toml)
     #[arg(long, value_name = "F.toml")]
     pub(super) config: Option<PathBuf>,
-    /// Go on with a run that was stopped
+    /// Continue a run that was stopped
     #[arg(long)]
     pub(super) resume: bool,
     /// Take stages that another run finished, where they are the very same; may be repeated
     #[arg(long, value_name = "RUN")]
     pub(super) from: Vec<PathBuf>,
-    /// Use so many labels instead of the method's share
+    /// Number of labels to use [default: the method's share]
     #[arg(long, value_name = "N")]
     pub(super) labels: Option<usize>,
-    /// Whether they are those of whole objects
+    /// Which samples get their labels
     #[arg(long, default_value = "object")]
     pub(super) label_choice: LabelChoice,
     /// Where to compute
@@ -169,16 +169,16 @@ pub(super) struct Compare {
     /// Directory of the comparison
     #[arg(long, value_name = "DIR")]
     pub(super) out: PathBuf,
-    /// Which methods to run; all by default. Tables also have what was finished in DIR before
+    /// Methods to run [default: all]. The tables also contain what was finished in DIR before
     #[arg(long, value_name = "M", value_delimiter = ',', num_args = 1..)]
     pub(super) methods: Vec<Method>,
-    /// Under seeds 1 to N
+    /// Train with the seeds 1 to N
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     pub(super) seeds: u64,
-    /// How long each run may take
+    /// Length of each training run
     #[arg(long, default_value = "paper")]
     pub(super) profile: Profile,
-    /// Runs at a time, each on one thread; as many as there are cores by default
+    /// Runs at a time, each on one thread [default: as many as there are cores]
     #[arg(long, value_name = "J")]
     pub(super) jobs: Option<std::num::NonZeroUsize>,
     /// Also swap the two materials of each level: 16 times features and hrn15-tuned, 4 times ours
@@ -222,7 +222,7 @@ pub(super) struct Evaluate {
     /// The data set
     #[arg(long, value_name = "D.npz")]
     pub(super) data: PathBuf,
-    /// Which of its samples
+    /// Split to evaluate
     #[arg(long, default_value = "test")]
     pub(super) split: SplitName,
     /// Print JSON
