@@ -353,7 +353,7 @@ fn data_that_a_comparison_is_no_measure_of_is_warned_of() {
 fn a_stopped_or_killed_comparison_takes_its_runs_with_it_and_goes_on() {
     let comparison = Comparison::new("killed", "hrn100,features", &["--jobs", "1"]);
     let mut finished = Vec::new();
-    for (signal, code) in [("-TERM", Some(0)), ("-KILL", None)] {
+    for (signal, code) in [("-TERM", Some(143)), ("-KILL", None)] {
         let mut process: Child = comparison.command().stderr(Stdio::null()).spawn().unwrap();
         // As soon as one run more is done.
         while comparison.models().len() == finished.len() {
