@@ -199,9 +199,10 @@ impl Progress {
         self.left(&waiting, &begun, at_once)
     }
 
-    /// The same from efforts, and of what has begun also the seconds so far.
+    /// The same from efforts, and of what has begun also the seconds so far. `None` also at the end.
     fn left(&self, waiting: &[f64], begun: &[(f64, f64)], at_once: usize) -> Option<f64> {
-        if self.effort <= 0.0 {
+        let nothing_is_left = waiting.is_empty() && begun.is_empty();
+        if self.effort <= 0.0 || nothing_is_left {
             return None;
         }
         let rate = self.seconds / self.effort;
@@ -285,6 +286,7 @@ mod tests {
         // Overdue by far.
         assert_eq!(progress.left(&[], &[(2.0, 300.0)], 2), Some(30.0));
         assert_eq!(progress.left(&[], &[(0.01, 0.0)], 2), Some(1.0));
+        assert_eq!(progress.left(&[], &[], 2), None);
     }
 
     #[test]
