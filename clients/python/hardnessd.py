@@ -314,7 +314,7 @@ class Connection:
             self.socket = socket.socket(socket.AF_UNIX)
             self.socket.settimeout(patience_s)
             try:
-                self.socket.connect(destination)
+                self._connect(destination, time.monotonic() + patience_s)
             except OSError:
                 self.socket.close()
                 raise
@@ -323,6 +323,16 @@ class Connection:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         self.socket.settimeout(timeout_s)
         self._bytes = bytearray()
+
+    def _connect(self, path: str, deadline: float) -> None:
+        while True:
+            try:
+                return self.socket.connect(path)
+            except BlockingIOError:
+                # So many wait to be served that there is no room to wait.
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.01)
 
     def send(self, request: Message) -> None:
         """Sends one request."""

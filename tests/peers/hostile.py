@@ -148,6 +148,18 @@ def main():
     by_control(b"", ConnectionError, "the daemon closed the connection")
     by_control(hello, TimeoutError, "no line within 0.5 s", stays=True)
     by_control(line({"type": "error", "message": "full"}), ConnectionError, "full")
+    with tempfile.TemporaryDirectory() as directory:
+        # Nobody is served for half a second, and one more is waiting than may.
+        listener = socket.socket(socket.AF_UNIX)
+        listener.bind(path := os.path.join(directory, "busy.sock"))
+        listener.listen(0)
+        waiting = hardnessd.Connection(path)
+        served = threading.Timer(0.5, lambda: (listener.accept(), listener.accept()))
+        served.start()
+        hardnessd.Connection(path, 10).close()
+        served.join()
+        waiting.close()
+        listener.close()
     for address in [("127.0.0.1", 1), "127.0.0.1:1", "[::1]:1", "/nowhere/events.sock", "x" * 200]:
         for follow in (by_client, by_async_client):
             assert [event["type"] for event in follow(address, 2)] == ["disconnected"] * 2, address
