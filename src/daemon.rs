@@ -46,7 +46,7 @@ use self::publish::Publishers;
 use self::record::{EventRecorder, Recorder, SensorRecorder, Target};
 pub use self::reload::Reload;
 use self::reload::{Readers, Refusal};
-use self::sensor::{Command, Sensor, Sensors};
+use self::sensor::{Command, SensorHandle, Sensors};
 use self::serial::Link;
 use crate::event::{Hello, ModelCard, PROTOCOL, SensorCard, Status};
 use crate::frame::Stamp;
@@ -226,7 +226,7 @@ fn start_sensors(
         });
         tasks.spawn(sensor::serve(pipeline, link, recorder, hub.clone(), inbox));
         let name = port.name.clone();
-        sensors.push(Sensor { name, commands });
+        sensors.push(SensorHandle { name, commands });
     }
     (Sensors(sensors), tasks)
 }

@@ -8,7 +8,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use hardnessd::daemon::config::{Config, Sensor};
+use hardnessd::daemon::config::{Config, SensorTable};
 
 fn shipped(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(name)
@@ -29,7 +29,7 @@ fn the_shipped_configuration_passes_check_and_equals_the_defaults() {
     );
     let config = Config::load(&path).unwrap();
     let port = config.sensors[0].port.clone();
-    assert_eq!(config, Config::new(vec![Sensor::new(port)]));
+    assert_eq!(config, Config::new(vec![SensorTable::new(port)]));
 }
 
 #[test]
@@ -41,7 +41,7 @@ fn the_shipped_configuration_names_every_key() {
         .map(|(key, _)| key)
         .collect();
     let mut keys = Vec::new();
-    let defaults = Config::new(vec![Sensor::new(PathBuf::from("/dev/ttyUSB0"))]);
+    let defaults = Config::new(vec![SensorTable::new(PathBuf::from("/dev/ttyUSB0"))]);
     collect(&toml::Value::try_from(defaults).unwrap(), &mut keys);
     // Those without a default value do not show in the defaults.
     let silent = "stale_after_ms sync tail length cell mask invert checksum rows cols order path sha256 control_path listen connect site domain_id namespace networks dir continuous rotate_mb rotate_s keep_free_mb";

@@ -22,7 +22,7 @@ pub use self::publish::{
     Endpoint, EndpointError, Mode, ModeError, Publish, Ros2, Tcp, Unix, Zenoh,
 };
 use super::log;
-use crate::sensor::{self, Description};
+use crate::sensor::{Description, Sensor};
 use crate::verdict::Hrn;
 use crate::{press, tare, wire};
 
@@ -35,7 +35,7 @@ pub struct Config {
     pub robot: String,
     /// The sensors served.
     #[serde(default, rename = "sensor")]
-    pub sensors: Vec<Sensor>,
+    pub sensors: Vec<SensorTable>,
     /// What a press is.
     #[serde(default)]
     pub press: press::Settings,
@@ -59,7 +59,7 @@ pub struct Config {
 /// A `[[sensor]]` table.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Sensor {
+pub struct SensorTable {
     /// Its name, unique, `[a-z][a-z0-9_]*`.
     #[serde(default = "default_name")]
     pub name: String,
@@ -95,7 +95,7 @@ fn default_frame_rate_hz() -> f64 {
     Description::default().frame_rate_hz
 }
 
-impl Sensor {
+impl SensorTable {
     /// A sensor at `port`, all else by default.
     pub fn new(port: PathBuf) -> Self {
         Self {
@@ -196,7 +196,7 @@ fn host() -> String {
 
 impl Config {
     /// The defaults, for these sensors.
-    pub fn new(sensors: Vec<Sensor>) -> Self {
+    pub fn new(sensors: Vec<SensorTable>) -> Self {
         Self {
             robot: host(),
             sensors,
@@ -225,12 +225,12 @@ impl Config {
     /// # Errors
     ///
     /// [`Error`], for the first value that cannot be used.
-    pub fn check(&self, path: &Path) -> Result<Vec<sensor::Sensor>, Error> {
+    pub fn check(&self, path: &Path) -> Result<Vec<Sensor>, Error> {
         check::check(self, path)
     }
 
     /// What the file says of one of its sensors, in all its tables.
-    pub(crate) fn describe(&self, sensor: &Sensor) -> Description {
+    pub(crate) fn describe(&self, sensor: &SensorTable) -> Description {
         Description {
             name: sensor.name.clone(),
             frame_rate_hz: sensor.frame_rate_hz,
@@ -295,7 +295,7 @@ pub struct Setup {
     /// As read.
     pub config: Config,
     /// The sensors of the configuration, in its order.
-    pub sensors: Vec<sensor::Sensor>,
+    pub sensors: Vec<Sensor>,
     /// The model that it names.
     pub hrn: Arc<Hrn>,
 }

@@ -19,7 +19,7 @@ use super::serial::{Link, Turn};
 use crate::event::{Event, Kind, Status, Tared};
 use crate::pipeline::Pipeline;
 use crate::recording::Input;
-use crate::sensor;
+use crate::sensor::Sensor;
 use crate::tare::RetareError;
 use crate::verdict::Hrn;
 
@@ -34,9 +34,9 @@ pub(crate) enum Command {
     Context(Option<Value>, oneshot::Sender<()>),
     /// To have its last minute written; the answer is where.
     Blackbox(oneshot::Sender<Result<PathBuf, String>>),
-    /// To judge otherwise from now on, by a description that differs in nothing that is fixed.
-    Reload(Box<sensor::Sensor>, Arc<Hrn>),
-    /// To end: a press is aborted, then nothing comes any more.
+    /// To judge by another description and model from now on. Nothing that is fixed may differ.
+    Reload(Box<Sensor>, Arc<Hrn>),
+    /// To end. A press under way is aborted, and no event follows.
     Finish,
 }
 
@@ -53,14 +53,14 @@ pub(crate) struct Vitals {
 
 /// A way to one sensor.
 #[derive(Debug, Clone)]
-pub(crate) struct Sensor {
+pub(crate) struct SensorHandle {
     pub(crate) name: String,
     pub(crate) commands: mpsc::Sender<Command>,
 }
 
 /// Ways to all sensors, in the order of the configuration.
 #[derive(Debug, Clone)]
-pub(crate) struct Sensors(pub(crate) Vec<Sensor>);
+pub(crate) struct Sensors(pub(crate) Vec<SensorHandle>);
 
 impl Sensors {
     /// Every sensor now; those that have ended are left out.

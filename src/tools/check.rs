@@ -9,7 +9,7 @@ use clap::Args as ClapArgs;
 use super::configuration::{self, Configuration};
 use super::player::BITS_A_BYTE;
 use crate::daemon;
-use crate::daemon::config::{self, Endpoint, Sensor, Setup};
+use crate::daemon::config::{self, Endpoint, SensorTable, Setup};
 use crate::wire::Layout;
 
 /// Arguments of `check`.
@@ -168,7 +168,7 @@ fn networks(setup: &Setup, path: &Path) -> String {
 /// Pitches closer than this are the same: datasheets give two digits.
 const PITCH_TOLERANCE_MM: f64 = 0.005;
 
-fn line_of(sensor: &Sensor, layout: &Layout, path: &Path) -> Result<String, Error> {
+fn line_of(sensor: &SensorTable, layout: &Layout, path: &Path) -> Result<String, Error> {
     let (shortest, longest) = (layout.min_frame_bytes(), layout.max_frame_bytes());
     let bytes_per_s = sensor.frame_rate_hz * longest as f64;
     let capacity = f64::from(sensor.baud) / BITS_A_BYTE;

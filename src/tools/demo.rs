@@ -27,7 +27,7 @@ pub(super) use self::place::sockets;
 use super::faults::Faults;
 use super::player::{Pace, Player};
 use super::simulate::within;
-use crate::daemon::config::{Config, Http, Sensor, Setup};
+use crate::daemon::config::{Config, Http, SensorTable, Setup};
 use crate::daemon::{self, Daemon};
 use crate::simulator::SequenceSettings;
 use crate::wire::{Layout, LayoutError};
@@ -97,9 +97,9 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let io = |what| move |source| Error::Io { what, source };
     let place = Place::new().map_err(io("directory for socket and port"))?;
     let port = place.port();
-    let sensor = Sensor {
+    let sensor = SensorTable {
         name: "demo".to_owned(),
-        ..Sensor::new(port.clone())
+        ..SensorTable::new(port.clone())
     };
     let layout = Layout::new(&sensor.frame)?;
     let pace = Pace::new(sensor.frame_rate_hz, sensor.baud, args.speed);
@@ -149,9 +149,9 @@ fn speed(text: &str) -> Result<f64, String> {
 }
 
 /// The defaults, with every time of a press shortened as the sensor is hastened.
-fn hastened(sensor: Sensor, socket: &Path, speed: f64) -> Config {
+fn hastened(sensor: SensorTable, socket: &Path, speed: f64) -> Config {
     let frame_rate_hz = sensor.frame_rate_hz * speed;
-    let mut config = Config::new(vec![Sensor {
+    let mut config = Config::new(vec![SensorTable {
         frame_rate_hz,
         ..sensor
     }]);

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use clap::Args as ClapArgs;
 
 use super::simulate::positive;
-use crate::daemon::config::{self, Config, Sensor, Setup};
+use crate::daemon::config::{self, Config, SensorTable, Setup};
 use crate::daemon::now;
 use crate::event::{Event, Kind};
 use crate::pipeline::{Clock, Pipeline, Unjudged};
@@ -109,7 +109,7 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Error> {
     let setup = match &args.config {
         Some(config) => Setup::load(config)?,
         None => {
-            let config = Config::new(vec![Sensor::new(args.file.clone())]);
+            let config = Config::new(vec![SensorTable::new(args.file.clone())]);
             Setup::of(config, Path::new("defaults"))?
         }
     };

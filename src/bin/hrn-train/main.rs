@@ -11,7 +11,7 @@ use std::time::Instant;
 use anyhow::Context as _;
 use burn::tensor::Device;
 use clap::{Parser as _, ValueEnum as _};
-use hardnessd::daemon::config::{Config, Error as ConfigError, Sensor, Setup};
+use hardnessd::daemon::config::{Config, Error as ConfigError, SensorTable, Setup};
 use hardnessd::frame::RawFrame;
 use hardnessd::simulator::{DatasetSettings, Material, Sequence, SequenceSettings};
 use hardnessd::tools::{self, exit};
@@ -174,7 +174,7 @@ fn collect(arguments: &Collect) -> anyhow::Result<String> {
     let setup = match &arguments.config {
         Some(config) => Setup::load(config)?,
         None => {
-            let defaults = Config::new(vec![Sensor::new(PathBuf::new())]);
+            let defaults = Config::new(vec![SensorTable::new(PathBuf::new())]);
             Setup::of(defaults, Path::new("defaults"))?
         }
     };

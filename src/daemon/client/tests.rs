@@ -5,7 +5,7 @@ use tokio::sync::mpsc;
 use super::*;
 use crate::daemon::hub::tests::{hello, press};
 use crate::daemon::record::EventRecorder;
-use crate::daemon::sensor::Sensor;
+use crate::daemon::sensor::SensorHandle;
 use crate::tare::RetareError;
 
 /// Far longer than anything here takes.
@@ -20,7 +20,7 @@ async fn events_go_on_and_requests_wait_while_a_command_is_carried_out() {
         access: Access::Control,
         max_clients: 1,
         hub: hub.clone(),
-        sensors: Sensors(vec![Sensor { name, commands }]),
+        sensors: Sensors(vec![SensorHandle { name, commands }]),
     };
     let (ours, theirs) = UnixStream::pair().unwrap();
     tokio::spawn(service.serve(theirs));

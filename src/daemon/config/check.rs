@@ -4,12 +4,13 @@ use std::net::{IpAddr, SocketAddr};
 use std::path::Path;
 
 use super::error::Error;
-use super::{Config, Model, Ros2, Sensor, Zenoh};
-use crate::{sensor, wording};
+use super::{Config, Model, Ros2, SensorTable, Zenoh};
+use crate::sensor::Sensor;
+use crate::wording;
 
 /// Checks a configuration whose paths are not relative to its file any more, and gives its sensors;
 /// `path` is for messages.
-pub(super) fn check(config: &Config, path: &Path) -> Result<Vec<sensor::Sensor>, Error> {
+pub(super) fn check(config: &Config, path: &Path) -> Result<Vec<Sensor>, Error> {
     let value = |key: String, found: String, expected| Error::Value {
         path: path.to_owned(),
         key,
@@ -44,7 +45,7 @@ pub(super) fn check(config: &Config, path: &Path) -> Result<Vec<sensor::Sensor>,
     }
     let mut sensors = Vec::with_capacity(config.sensors.len());
     for (index, given) in config.sensors.iter().enumerate() {
-        let sensor = sensor::Sensor::new(config.describe(given));
+        let sensor = Sensor::new(config.describe(given));
         sensors.push(sensor.map_err(|problem| Error::Sensor {
             path: path.to_owned(),
             sensor: given.name.clone(),
@@ -115,7 +116,7 @@ fn check_zenoh(
 
 fn check_ros2(
     ros2: &Ros2,
-    sensors: &[Sensor],
+    sensors: &[SensorTable],
     value: &impl Fn(String, String, &'static str) -> Error,
 ) -> Result<(), Error> {
     let found = match ros2.chosen_domain_id() {
@@ -173,7 +174,7 @@ fn meet(one: SocketAddr, other: SocketAddr) -> bool {
 const MOST: u64 = 1_000_000_000;
 
 /// Whether a sensor has a name and a port of its own.
-fn check_port(sensor: &Sensor, earlier: &[Sensor], path: &Path) -> Result<(), Error> {
+fn check_port(sensor: &SensorTable, earlier: &[SensorTable], path: &Path) -> Result<(), Error> {
     let name = &sensor.name;
     let value = |key: &str, found: String, expected| {
         let key = format!("sensor.{key} of {name:?}");
@@ -191,8 +192,8 @@ fn check_port(sensor: &Sensor, earlier: &[Sensor], path: &Path) -> Result<(), Er
             "a name of its own for each sensor",
         );
     }
-    // Several names may lead to one device, if it is there.
-    let device = |sensor: &Sensor| {
+    // A device that is there may have several names.
+    let device = |sensor: &SensorTable| {
         let port = &sensor.port;
         port.canonicalize().unwrap_or_else(|_| port.clone())
     };

@@ -21,7 +21,7 @@ fn every_key_but_port_has_a_default() {
     let config = load(LEAST).unwrap();
     assert_eq!(
         config,
-        Config::new(vec![Sensor::new(PathBuf::from("/dev/ttyUSB0"))])
+        Config::new(vec![SensorTable::new(PathBuf::from("/dev/ttyUSB0"))])
     );
     let config = load(&format!(
         "{LEAST}[publish.tcp]\n[http]\n[publish.unix]\npath = \"/x/y.sock\""
