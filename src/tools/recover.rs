@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use clap::Args as ClapArgs;
 use jiff::Timestamp;
 
-use crate::recording::{self, RecoverError, Recovered};
+use crate::recording::{self, FileKind, RecoverError, Recovered};
 
 /// Arguments of `recover`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -176,7 +176,7 @@ fn left_over(part: &Path) -> Option<File> {
     let file = File::options().read(true).write(true).open(part).ok()?;
     let mut start = [0; recording::MAGIC.len()];
     let read = file.read_at(&mut start, 0).ok()?;
-    recording::MAGIC.starts_with(&start[..read]).then_some(file)
+    (FileKind::of(&start[..read]) == FileKind::Recording).then_some(file)
 }
 
 fn save(broken: File, part: &File) -> Result<Recovered, RecoverError> {

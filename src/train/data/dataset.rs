@@ -15,8 +15,8 @@ use crate::random::Stream;
 use crate::simulator::{LabelledSample, Split};
 use crate::verdict::Level;
 
-/// Distance between the sensor's taxels where a file tells none (paper, "Tactile sensor").
-pub const PITCH_MM: f64 = 3.5;
+/// The distance between taxels, unless a file says another one.
+pub use crate::tare::PITCH_MM;
 
 /// The four hardness levels of the paper's Table 1.
 pub fn levels() -> Vec<Level> {
