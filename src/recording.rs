@@ -1,10 +1,10 @@
 //! Recordings: what sensors sent and when, as MCAP files that ROS tools open.
 //!
-//! In: what happens to a sensor's pipeline ([`Input`]) and the events that came of it. Out: bytes
-//! of a file, and back: the inputs, which a [`Playback`] turns into the very same events. A file
-//! can be played from its first [`State`] of a sensor on, and has one every few seconds, so that a
-//! damaged stretch costs no more than itself. Nothing here opens a file or asks the time; MCAP is
-//! named in no other module.
+//! In: what happens to a sensor's pipeline ([`Input`]), and the events that follow. Out: the bytes of
+//! a file. A [`Reader`] gives the inputs back, and a [`Playback`] turns them into the same events. A
+//! file can be played from the first [`State`] of a sensor on. It has one every few seconds, so
+//! damage costs the damaged stretch and no more. Nothing here opens a file or asks the time. No other
+//! module names MCAP.
 
 mod labels;
 mod message;
@@ -32,8 +32,8 @@ use crate::pipeline::{self, Pipeline};
 use crate::sensor::{Description, Sensor, SensorError};
 use crate::verdict::Hrn;
 
-/// One thing that happens to a pipeline. Beside these only its settings change
-/// ([`Entry::Settings`]).
+/// One thing that happens to a pipeline. The only other thing is that its sensor's description
+/// changes ([`Entry::Settings`]).
 #[derive(Debug, Clone, PartialEq)]
 pub enum Input<'a> {
     /// The port is open.
@@ -55,7 +55,8 @@ pub enum Input<'a> {
 }
 
 impl Input<'_> {
-    /// Passes it on to `pipeline`. Whether a tare could be taken only [`Pipeline::retare`] says.
+    /// Passes the input to `pipeline`. Only [`Pipeline::retare`] itself says whether a tare could be
+    /// taken.
     pub fn feed(self, pipeline: &mut Pipeline, at: Stamp) -> Vec<Event> {
         match self {
             Input::Opened => pipeline.opened(at),
@@ -76,7 +77,7 @@ impl Input<'_> {
         }
     }
 
-    /// The same, borrowing nothing.
+    /// A copy that borrows nothing.
     pub fn to_owned(&self) -> Input<'static> {
         let text = |text: &Cow<'_, str>| Cow::Owned(text.clone().into_owned());
         match self {
@@ -97,14 +98,14 @@ impl Input<'_> {
 pub enum Entry {
     /// Something happened to it.
     Input(Input<'static>),
-    /// It was judged otherwise from then on: the configuration was read again.
+    /// The configuration was read again, and the sensor was judged by this from then on.
     Settings(Box<RecordedSensor>),
-    /// How its pipeline stood then.
+    /// Everything that its pipeline had seen by then.
     State(Box<State>),
 }
 
 impl Entry {
-    /// About how much memory it takes with its moment, in bytes.
+    /// About how many bytes of memory it takes, its moment included.
     pub(crate) fn weight(&self) -> usize {
         let beside = match self {
             Entry::Input(Input::Bytes(bytes)) => bytes.len(),
@@ -118,12 +119,13 @@ impl Entry {
     }
 }
 
-/// As JSON: of numbers in lists, which is most of a state, about what they take in memory.
+/// The length as JSON. For lists of numbers, which are most of a state, it is near what they take in
+/// memory.
 fn text_bytes(value: &impl Serialize) -> usize {
     serde_json::to_vec(value).map_or(0, |text| text.len())
 }
 
-/// What a value takes beside itself: small objects take many times their text.
+/// The memory that a value points to. A small object takes many times the length of its text.
 fn heap_bytes(value: &Value) -> usize {
     match value {
         Value::Null | Value::Bool(_) | Value::Number(_) => 0,
@@ -176,19 +178,19 @@ impl RecordedSensor {
     }
 }
 
-/// How a sensor's pipeline stood: enough to go on from there.
+/// A sensor, and everything that its pipeline had seen: enough to go on from there.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct State {
     /// The sensor.
     pub sensor: RecordedSensor,
     /// What its pipeline had seen.
     pub memory: pipeline::Memory,
-    /// The recording's labels, said again where a checksum guards them.
+    /// The recording's labels, repeated here because a checksum covers them here.
     pub labels: Labels,
 }
 
 impl State {
-    /// How `pipeline` stands now.
+    /// The state of `pipeline` now.
     pub fn of(pipeline: &Pipeline, labels: Labels) -> Self {
         Self {
             sensor: RecordedSensor::new(pipeline.sensor(), pipeline.hrn()),
@@ -198,10 +200,10 @@ impl State {
     }
 }
 
-/// What every recording begins with.
+/// The first bytes of every recording.
 pub const MAGIC: &[u8] = mcap::MAGIC;
 
-/// What a file holds that a sensor was recorded to. Its first bytes say so, whatever its name is.
+/// What a file with a sensor's bytes is. Its first bytes decide, not its name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FileKind {
     /// A recording: MCAP.
@@ -232,8 +234,8 @@ impl FileKind {
         }
     }
 
-    /// Reads the kind of `source`. The reader that is given back begins where `source` began: it may
-    /// be a pipe, of which nothing can be read twice.
+    /// Reads the kind of `source`. The reader that you get back begins where `source` began, because
+    /// a pipe cannot be read twice.
     ///
     /// # Errors
     ///
@@ -255,7 +257,7 @@ pub enum Error {
     /// It is damaged or cut off.
     #[error("{0}: `hardnessd recover` saves what is whole")]
     Damaged(String),
-    /// MCAP, but none of ours, or of a later version.
+    /// MCAP of another program, or of a later version.
     #[error("found {found}, expected {expected}")]
     Foreign {
         /// What there is.

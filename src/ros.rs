@@ -1,8 +1,8 @@
 //! Events as ROS 2 messages: definitions, and bytes by them (CDR, little-endian).
 //!
-//! In: events. Out: the messages that recordings hold and ROS 2 subscribers get. Every message
-//! begins with a `std_msgs/Header`: the moment in UTC and the sensor's name. What is null in an
-//! event is 0, NaN or an empty string here, for a ROS message knows no null.
+//! In: events. Out: the messages that recordings hold and ROS 2 subscribers get. Every message begins
+//! with a `std_msgs/Header`: the moment in UTC and the sensor's name. A ROS message has no null. So a
+//! null of an event is 0, NaN or an empty string here.
 
 use byteorder::LittleEndian;
 use jiff::Timestamp;
@@ -13,7 +13,7 @@ use serde_json::Value;
 use crate::event::{self, Event, name};
 use crate::frame::{COLS, ROWS};
 
-/// What every message stands after: CDR, little-endian, no options (DDS-XTYPES 1.3, 7.6.3.1.2).
+/// The bytes before every message: CDR, little-endian, no options (DDS-XTYPES 1.3, 7.6.3.1.2).
 pub(crate) const ENCAPSULATION: [u8; 4] = [0, 1, 0, 0];
 
 /// A channel of a sensor: `/tactile/SENSOR/NAME`.
@@ -57,14 +57,14 @@ pub(crate) const STATUS: Topic = Topic {
 };
 
 impl Topic {
-    /// Of its schema, as a middleware has it.
+    /// Package and name of its schema, as a middleware names them.
     #[cfg(feature = "ros2")]
     pub(crate) fn package_and_name(&self) -> (&'static str, &'static str) {
         let named = self.schema.split_once("/msg/");
         named.expect("a schema is PACKAGE/msg/NAME")
     }
 
-    /// The definition with those it refers to, as `ros2msg` has it.
+    /// The definition and all definitions that it refers to, in the form of `ros2msg`.
     pub(crate) fn text(&self) -> String {
         let rule = "=".repeat(80);
         format!(
@@ -89,7 +89,7 @@ struct Time {
 
 impl Header {
     pub(crate) fn new(time: Timestamp, sensor: &str) -> Self {
-        // Seconds and nanoseconds of ROS count from the same second on; before 1970 ours do not.
+        // In ROS, nanoseconds always count up from the second; jiff's do not before 1970.
         let ns = time.as_nanosecond();
         Self {
             stamp: Time {
@@ -106,7 +106,7 @@ impl Header {
     }
 }
 
-/// Bytes as one run: an element at a time is slow.
+/// Bytes that are written in one piece: one element at a time is slow.
 #[derive(Debug)]
 pub(crate) struct Blob(pub(crate) Vec<u8>);
 

@@ -39,16 +39,16 @@ pub struct Config {
     /// What a press is.
     #[serde(default)]
     pub press: press::Settings,
-    /// Who judges.
+    /// The model that judges.
     #[serde(default)]
     pub model: Model,
-    /// Ways out.
+    /// Where events go.
     #[serde(default)]
     pub publish: Publish,
-    /// The live page and what stands beside it; off unless given.
+    /// The live page and the other HTTP routes; off unless the table is there.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub http: Option<Http>,
-    /// The daemon's own recording; off unless given.
+    /// The daemon's own recording; off unless the table is there.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub record: Option<Record>,
     /// How the log is written.
@@ -146,16 +146,16 @@ impl Default for Http {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Record {
-    /// Where to; by default as [`Record::dir`] says.
+    /// The directory; [`Record::dir`] has the default.
     #[serde(skip_serializing_if = "Option::is_none")]
     dir: Option<PathBuf>,
-    /// Whether all is recorded, or only the last minute when a fault happens.
+    /// True: everything is recorded. False: only the last minute before a fault.
     pub continuous: bool,
-    /// A file that has grown to so many million bytes is ended, and the next begun.
+    /// A file of this many million bytes is ended, and the next one begins.
     pub rotate_mb: u64,
-    /// Likewise after so long.
+    /// A file that is this old is ended, and the next one begins.
     pub rotate_s: u64,
-    /// So many million bytes stay free on the disk: below it nothing is written.
+    /// This many million bytes stay free on the disk. With less, nothing is written.
     pub keep_free_mb: u64,
 }
 
@@ -172,7 +172,7 @@ impl Default for Record {
 }
 
 impl Record {
-    /// The directory: as configured, else the service's state directory, else
+    /// The directory: the configured one, else the service's state directory, else
     /// `/var/lib/hardnessd`.
     pub fn dir(&self) -> PathBuf {
         if let Some(dir) = &self.dir {

@@ -1,7 +1,7 @@
 //! One sensor: its port at one end, the hub at the other, its pipeline between.
 //!
-//! The task waits for the port, the pipeline's deadline or a command, makes one call into the
-//! pipeline and sends what came of it. It shares nothing, so a sensor that is lost disturbs no
+//! The task waits for the port, the pipeline's deadline or a command. Then it makes one call into the
+//! pipeline and sends the events to the hub. It shares nothing, so a sensor that is lost disturbs no
 //! other.
 
 use std::path::PathBuf;
@@ -23,16 +23,16 @@ use crate::sensor::Sensor;
 use crate::tare::RetareError;
 use crate::verdict::Hrn;
 
-/// What a sensor can be asked.
+/// What a sensor's task can be asked to do.
 #[derive(Debug)]
 pub(crate) enum Command {
-    /// How it is now.
+    /// To say how the sensor is now.
     Status(oneshot::Sender<Vitals>),
-    /// To take another tare; the answer comes once it is taken or given up.
+    /// To take another tare. The answer comes when it is taken or given up.
     Tare(oneshot::Sender<Result<Tared, RetareError>>),
-    /// What the controller says it is doing; the answer comes once it holds.
+    /// To echo what the controller says it is doing. The answer comes when it is in force.
     Context(Option<Value>, oneshot::Sender<()>),
-    /// To have its last minute written; the answer is where.
+    /// To write the last minute. The answer is the path of the file.
     Blackbox(oneshot::Sender<Result<PathBuf, String>>),
     /// To judge by another description and model from now on. Nothing that is fixed may differ.
     Reload(Box<Sensor>, Arc<Hrn>),
@@ -47,18 +47,18 @@ pub(crate) struct Vitals {
     /// Age of its last whole frame.
     pub(crate) last_frame_age: Option<Duration>,
     pub(crate) contact_threshold_n: f32,
-    /// Verdicts that did not come since the start.
+    /// Verdicts since the start that did not come because the model failed.
     pub(crate) unjudged: u64,
 }
 
-/// A way to one sensor.
+/// Sends commands to the task of one sensor.
 #[derive(Debug, Clone)]
 pub(crate) struct SensorHandle {
     pub(crate) name: String,
     pub(crate) commands: mpsc::Sender<Command>,
 }
 
-/// Ways to all sensors, in the order of the configuration.
+/// Sends commands to the tasks of all sensors, in the order of the configuration.
 #[derive(Debug, Clone)]
 pub(crate) struct Sensors(pub(crate) Vec<SensorHandle>);
 
@@ -92,14 +92,14 @@ pub(crate) async fn serve(
     hub: hub::Handle,
     mut commands: mpsc::Receiver<Command>,
 ) {
-    // Who waits for a tare.
+    // The asker who waits for a tare.
     let mut taring = None;
     let mut unjudged = 0;
     loop {
         let deadline = pipeline.deadline();
         let events = tokio::select! {
-            // In no order: a sensor that never pauses must still stop when told, and questions
-            // that never pause must not keep it from its port.
+            // Not biased: a sensor that never pauses must still obey `Finish`, and commands that
+            // never pause must not keep the task from its port.
             command = commands.recv() => match command {
                 Some(Command::Status(reply)) => {
                     // The asker may have gone.
@@ -167,7 +167,7 @@ pub(crate) async fn serve(
     }
 }
 
-/// Says what became of a tare that was asked for, once that is known.
+/// Answers the asker of a tare when its outcome is known.
 fn answer(
     pipeline: &mut Pipeline,
     taring: &mut Option<oneshot::Sender<Result<Tared, RetareError>>>,
@@ -193,8 +193,8 @@ fn vitals(pipeline: &Pipeline, unjudged: u64) -> Vitals {
     }
 }
 
-/// Waits for a moment of CLOCK_MONOTONIC, which is the runtime's clock too; for ever if there is
-/// none.
+/// Waits for a moment of CLOCK_MONOTONIC, which is the runtime's clock too. Without a moment it waits
+/// for ever.
 async fn until(deadline: Option<Duration>) {
     match deadline {
         Some(deadline) => {

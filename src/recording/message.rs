@@ -1,4 +1,4 @@
-//! The messages of a recording: what happened to a sensor, beside its events as ROS 2 messages.
+//! The messages of a recording that say what happened to a sensor. Its events are ROS 2 messages.
 
 use byteorder::LittleEndian;
 use serde::de::DeserializeOwned;
@@ -9,7 +9,7 @@ use super::{Entry, Error, Input, RecordedSensor, State};
 use crate::frame::Stamp;
 use crate::ros::{self, Blob, Header, Topic};
 
-/// The channels of a sensor, in the order of their numbers. It only grows: `recover` tells the
+/// The channels of a sensor, in the order of their numbers. Only append to it: `recover` numbers the
 /// channels of a damaged file by it.
 pub(super) const TOPICS: [Topic; 5] = [INPUT, ros::FRAME, ros::HARDNESS, ros::PRESS, ros::STATUS];
 
@@ -67,7 +67,7 @@ pub(super) fn encode_entry(sensor: &str, at: Stamp, entry: &Entry) -> Vec<u8> {
     })
 }
 
-/// Back again: the sensor, the moment, and what happened.
+/// Reads the sensor, the moment and what happened from a message.
 pub(super) fn decode_entry(bytes: &[u8]) -> Result<(String, Stamp, Entry), Error> {
     let message: InputMessage = from_cdr(bytes)?;
     let foreign = |found: String| Error::Foreign {
@@ -110,7 +110,7 @@ pub(super) fn decode_entry(bytes: &[u8]) -> Result<(String, Stamp, Entry), Error
     Ok((message.header.frame_id, at, entry))
 }
 
-/// The sensor that any message of ours speaks of.
+/// The sensor of any message that this program writes.
 pub(super) fn sensor_of(bytes: &[u8]) -> Option<String> {
     from_cdr::<Header>(bytes).ok().map(|header| header.frame_id)
 }

@@ -1,4 +1,4 @@
-//! Entries of a recording back into events.
+//! Turns the entries of a recording into events again.
 
 use std::sync::Arc;
 
@@ -9,7 +9,7 @@ use crate::pipeline::{Clock, FixedError, Pipeline, Unjudged};
 use crate::sensor::SensorError;
 use crate::verdict::Hrn;
 
-/// The pipelines of a recording's sensors, fed with what they were fed then.
+/// The pipelines of a recording's sensors. They get what the recorded ones got.
 #[derive(Debug)]
 pub struct Playback {
     hrn: Arc<Hrn>,
@@ -56,12 +56,12 @@ impl Playback {
         }
     }
 
-    /// The events of one entry. What comes before a sensor's first state cannot be played and
-    /// gives none. `mono_ns` is null: the moment was another boot's.
+    /// The events of one entry. An entry before its sensor's first state cannot be played and gives
+    /// none. `mono_ns` is null, because the moment belongs to another boot.
     ///
     /// # Errors
     ///
-    /// If the recording describes a sensor that cannot be.
+    /// If the recording describes a sensor or a state that cannot be.
     pub fn feed(&mut self, found: Found) -> Result<Vec<Event>, PlaybackError> {
         let Found { sensor, at, entry } = found;
         let played = self.play(&sensor, at, entry);
@@ -83,7 +83,7 @@ impl Playback {
                 if !state.memory.is_possible() {
                     return Err(PlaybackProblem::Memory);
                 }
-                // Where nothing is missing the pipeline stands so already.
+                // If nothing is missing, the pipeline is in this state already.
                 let described = state.sensor.check()?;
                 let mut pipeline = Pipeline::new(described, self.hrn.clone(), Clock::Arrival);
                 pipeline.recall(state.memory);
@@ -124,7 +124,7 @@ impl Playback {
         events
     }
 
-    /// Verdicts that did not come, each told once.
+    /// Gives the verdicts that did not come, each once.
     pub fn unjudged(&mut self) -> Vec<Unjudged> {
         let players = self.players.iter_mut();
         players
@@ -143,7 +143,7 @@ impl Playback {
         players.map_or_else(Labels::new, |player| player.labels.clone())
     }
 
-    /// A model that judged then and is not the one that judges now.
+    /// The SHA-256 of a model that judged then, if it is not the one that judges now.
     pub fn other_model(&self) -> Option<&str> {
         let models = self.players.iter().map(|player| player.model.as_str());
         models.into_iter().find(|model| *model != self.hrn.sha256())

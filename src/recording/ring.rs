@@ -6,10 +6,11 @@ use std::time::Duration;
 use super::Entry;
 use crate::frame::Stamp;
 
-/// What is kept.
+/// The time that is kept.
 const KEPT: Duration = Duration::from_secs(60);
-/// More is not, however short a time that is: neither a device that floods its line nor a controller
-/// that floods the control socket may fill the memory. The JX255N sends 5 MB a minute at 100 frames/s.
+/// No more than this is kept, however short the time is: neither a device that floods its line nor a
+/// controller that floods the control socket may fill the memory. The JX255N sends 5 MB a minute at
+/// 100 frames/s.
 const KEPT_BYTES: usize = 32 << 20;
 
 /// Entries of one sensor, in stretches that each begin with a state.
@@ -25,8 +26,8 @@ struct Stretch {
 }
 
 impl Ring {
-    /// Adds an entry, and lets go of stretches that are not needed to go back a minute. Nothing is
-    /// kept before the first state.
+    /// Adds an entry, and drops the stretches that are older than a minute needs. Nothing is kept
+    /// before the first state.
     pub fn push(&mut self, at: Stamp, entry: Entry) {
         if matches!(entry, Entry::State(_)) {
             self.stretches.push_back(Stretch {
@@ -53,12 +54,12 @@ impl Ring {
         })
     }
 
-    /// All of it: a minute and up to a stretch more, beginning with a state.
+    /// Everything that is kept: a minute, and up to a stretch more. It begins with a state.
     pub fn all(&self) -> impl Iterator<Item = &(Stamp, Entry)> {
         self.stretches.iter().flat_map(|stretch| &stretch.entries)
     }
 
-    /// From the last state on.
+    /// The entries from the last state on.
     pub fn latest(&self) -> impl Iterator<Item = &(Stamp, Entry)> {
         self.stretches.back().into_iter().flat_map(|s| &s.entries)
     }

@@ -1,4 +1,4 @@
-//! Entries and events into bytes of an MCAP file.
+//! Writes entries and events as the bytes of an MCAP file.
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -13,16 +13,16 @@ use crate::event::Event;
 use crate::frame::Stamp;
 use crate::ros::{self, Topic};
 
-/// What a recording says of itself, for people: a replay reads the [`super::State`]s alone.
+/// What a recording says of itself to people. A replay reads only the [`super::State`]s.
 #[derive(Debug, Clone, PartialEq)]
 pub struct About {
     /// Name of the robot.
     pub robot: String,
-    /// Of this start of the daemon, as in `hello`.
+    /// The token of this start of the daemon, as in `hello`.
     pub run: String,
-    /// The kernel's boot id: within one, moments of CLOCK_MONOTONIC can be compared.
+    /// The kernel's boot id. Moments of CLOCK_MONOTONIC can be compared within one boot.
     pub boot_id: String,
-    /// Why it was written, if not to record.
+    /// The fault or request for which a black box was written; none in an ordinary recording.
     pub reason: Option<String>,
     /// What was pressed, and the like.
     pub labels: Labels,
@@ -81,14 +81,15 @@ pub(super) fn options() -> WriteOptions {
         .disable_seeking(true)
 }
 
-/// Number of a channel: the same for the same place, so that it can be told without its record.
+/// The number of a channel. It follows from the sensor's place and the topic, so `recover` knows it
+/// even if the record of the channel is lost.
 pub(super) fn channel_id(sensor: usize, topic: Topic) -> u16 {
     let place = TOPICS.iter().position(|known| *known == topic);
     let place = place.expect("every topic stands in TOPICS");
     u16::try_from(sensor * TOPICS.len() + place + 1).expect("a daemon has few sensors")
 }
 
-/// Number of a topic's schema.
+/// The number of a topic's schema.
 pub(super) fn schema_id(topic: Topic) -> u16 {
     let place = TOPICS.iter().position(|known| *known == topic);
     place.expect("every topic stands in TOPICS") as u16 + 1
@@ -99,7 +100,7 @@ pub(super) fn topic_name(sensor: &str, topic: Topic) -> String {
     format!("/tactile/{sensor}/{}", topic.name)
 }
 
-/// Whether a channel of this name may be one of ours.
+/// Whether this program may have named a channel so.
 pub(super) fn is_topic_of_ours(name: &str) -> bool {
     let parts = name
         .strip_prefix("/tactile/")
@@ -107,7 +108,7 @@ pub(super) fn is_topic_of_ours(name: &str) -> bool {
     parts.is_some_and(|(_, name)| TOPICS.iter().any(|topic| topic.name == name))
 }
 
-/// Whether it is the topic of what happened to a sensor.
+/// Whether a channel of this name holds what happened to a sensor.
 pub(super) fn is_input(name: &str) -> bool {
     is_topic_of_ours(name) && name.rsplit('/').next() == Some(INPUT.name)
 }
@@ -117,7 +118,7 @@ impl<W: Write> Writer<W> {
     ///
     /// # Errors
     ///
-    /// Those of writing to `out`.
+    /// If `out` cannot be written.
     pub fn new(out: W, about: &About) -> Result<Self, Error> {
         let mut out = options().create(NoSeek::new(out))?;
         let text = |key: &str, value: &str| (key.to_owned(), value.to_owned());
@@ -169,17 +170,17 @@ impl<W: Write> Writer<W> {
     ///
     /// # Errors
     ///
-    /// Those of writing; the writer is of no more use then.
+    /// If it cannot be written. The writer must not be used after that.
     pub fn entry(&mut self, sensor: usize, at: Stamp, entry: &Entry) -> Result<(), Error> {
         let bytes = message::encode_entry(&self.sensors[sensor], at, entry);
         self.write(channel_id(sensor, message::INPUT), at.wall, &bytes)
     }
 
-    /// Adds an event; one of a sensor that the recording does not have is left out.
+    /// Adds an event. An event of a sensor that the recording does not have is left out.
     ///
     /// # Errors
     ///
-    /// Those of writing; the writer is of no more use then.
+    /// If it cannot be written. The writer must not be used after that.
     pub fn event(&mut self, event: &Event) -> Result<(), Error> {
         let mut sensors = self.sensors.iter();
         let Some(sensor) = sensors.position(|sensor| sensor == event.sensor()) else {
@@ -201,20 +202,20 @@ impl<W: Write> Writer<W> {
         Ok(self.out.write_to_known_channel(&header, data)?)
     }
 
-    /// Ends the chunk at hand and hands it on: what is lost with the process is what came since.
+    /// Ends the current chunk and writes it. If the process dies, only what came later is lost.
     ///
     /// # Errors
     ///
-    /// Those of writing; the writer is of no more use then.
+    /// If it cannot be written. The writer must not be used after that.
     pub fn flush(&mut self) -> Result<(), Error> {
         Ok(self.out.flush()?)
     }
 
-    /// Ends the recording and hands back what it was written to.
+    /// Ends the recording and gives back what it was written to.
     ///
     /// # Errors
     ///
-    /// Those of writing.
+    /// If it cannot be written.
     pub fn finish(mut self) -> Result<W, Error> {
         self.out.finish()?;
         let mut inner = self.out.into_inner().into_inner();

@@ -1,4 +1,4 @@
-//! Whether every value can be used, and all of them together.
+//! Checks that every value can be used, and that all of them can be used together.
 
 use std::net::{IpAddr, SocketAddr};
 use std::path::Path;
@@ -102,7 +102,7 @@ fn check_zenoh(
     robot: &str,
     value: &impl Fn(String, String, &'static str) -> Error,
 ) -> Result<(), Error> {
-    // What the key expressions of zenoh keep for themselves.
+    // These characters have a meaning in zenoh's key expressions.
     let site = zenoh.site(robot);
     if site.split('/').any(str::is_empty) || site.contains(['*', '$', '?', '#']) {
         return Err(value(
@@ -158,19 +158,19 @@ fn check_ros2(
 /// As long as the longest name of a host.
 const MOST_ROBOT_CHARS: usize = 255;
 
-/// Beyond it a domain's ports are no port numbers (DDSI-RTPS 2.5, 9.6.2.3).
+/// The ports of a higher domain are no port numbers (DDSI-RTPS 2.5, 9.6.2.3).
 const LAST_DOMAIN_ID: u16 = 232;
 
-/// Whether the system lets no two listen at these. With port 0 it chooses one that is free.
+/// Whether two listeners cannot have these addresses at the same time. For port 0 the system chooses
+/// a free port.
 fn meet(one: SocketAddr, other: SocketAddr) -> bool {
-    // All addresses are also those of the older version, by the kernel's default (bindv6only of
-    // ipv6(7)).
+    // `[::]` also covers all IPv4 addresses, by the kernel's default (bindv6only of ipv6(7)).
     let covers = |all: IpAddr, ip: IpAddr| all.is_unspecified() && (all.is_ipv6() || ip.is_ipv4());
     let (a, b) = (one.ip(), other.ip());
     one.port() == other.port() && one.port() != 0 && (a == b || covers(a, b) || covers(b, a))
 }
 
-/// More megabytes than any disk has, few enough to be counted in bytes; 31 years.
+/// More megabytes than any disk has, but their bytes can be counted. As seconds: 31 years.
 const MOST: u64 = 1_000_000_000;
 
 /// Whether a sensor has a name and a port of its own.

@@ -9,29 +9,30 @@ use crate::verdict::ModelError;
 /// Room for a hundred sensors with every taxel dead.
 pub(super) const MAX_BYTES: usize = 1 << 20;
 
-/// Why there is no configuration. Each says file, key, what was found and what was expected.
+/// Why there is no configuration. Each message names the file and the key, what was found and what
+/// was expected.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The file itself cannot be read.
     #[error("{path}: cannot read: {source}")]
     Unreadable {
-        /// Of the configuration.
+        /// The configuration.
         path: PathBuf,
-        /// Why not.
+        /// What the system says.
         source: std::io::Error,
     },
-    /// More than any configuration has: another file, or a device without an end.
+    /// It is longer than any configuration: another file, or a device without an end.
     #[error("{path}: found more than {MAX_BYTES} bytes, expected a configuration")]
     TooLong {
-        /// Of the configuration.
+        /// The configuration.
         path: PathBuf,
     },
     /// No TOML, an unknown key, or a value of the wrong type.
     #[error("{path}:{place}: {problem}")]
     Syntax {
-        /// Of the configuration.
+        /// The configuration.
         path: PathBuf,
-        /// Where in it.
+        /// The line and the column.
         place: Place,
         /// What was found and what was expected.
         problem: String,
@@ -39,74 +40,74 @@ pub enum Error {
     /// A value out of its range.
     #[error("{path}: {key}: found {found}, expected {expected}")]
     Value {
-        /// Of the configuration.
+        /// The configuration.
         path: PathBuf,
-        /// As in the file.
+        /// The key, as in the file.
         key: String,
-        /// As given.
+        /// The value that was given.
         found: String,
-        /// What could be used.
+        /// Which values can be used.
         expected: &'static str,
     },
     /// A value of a sensor's description.
     #[error("{path}: {}{problem}", table_of(sensor, problem))]
     Sensor {
-        /// Of the configuration.
+        /// The configuration.
         path: PathBuf,
         /// Its name.
         sensor: String,
-        /// Which, and what it should be.
+        /// The value, and what it should be.
         problem: SensorError,
     },
-    /// A table of a part that this program was built without: never ignored in silence.
+    /// A table of a part that this program was built without. It is never ignored.
     #[error(
         "{path}: publish.{feature}: found a table, expected none: built without the feature \
          {feature:?}"
     )]
     NotBuilt {
-        /// Of the configuration.
+        /// The configuration.
         path: PathBuf,
-        /// Of the package, and the table's name.
+        /// The feature of the package, which is also the table's name.
         feature: &'static str,
     },
     /// The model file cannot be read.
     #[error("{path}: model.path: cannot read {model}: {source}")]
     ModelUnreadable {
-        /// Of the configuration.
+        /// The configuration.
         path: PathBuf,
-        /// Of the model.
+        /// The model file.
         model: PathBuf,
-        /// Why not.
+        /// What the system says.
         source: std::io::Error,
     },
-    /// Another file than the one meant.
+    /// The model file has another hash.
     #[error("{path}: model.sha256: found a model of {found}, expected {expected}")]
     ModelHash {
-        /// Of the configuration.
+        /// The configuration.
         path: PathBuf,
-        /// Of the file there is.
+        /// The hash of the file.
         found: String,
-        /// As given.
+        /// The hash that was given.
         expected: String,
     },
     /// The model is refused.
     #[error("{path}: model.path: {model}: {source}")]
     Model {
-        /// Of the configuration.
+        /// The configuration.
         path: PathBuf,
-        /// Of the model, or that it is the one built in.
+        /// The model file, or "the model built in".
         model: String,
-        /// Why.
+        /// The reason.
         source: Box<ModelError>,
     },
 }
 
-/// What stands before the key that `problem` begins with.
+/// The table before the key with which `problem` begins.
 fn table_of(sensor: &str, problem: &SensorError) -> String {
     match problem {
         SensorError::Press(_) => String::new(),
         SensorError::MinConfidence(_) | SensorError::MinForce(_) => "model.".to_owned(),
-        // The name itself is what cannot be used.
+        // The name itself cannot be used.
         SensorError::Name(_) | SensorError::LongName { .. } => "sensor.".to_owned(),
         _ => format!("sensor[{sensor:?}]."),
     }

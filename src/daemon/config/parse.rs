@@ -1,4 +1,4 @@
-//! Reading the file: text to [`Config`], and the model that it names.
+//! Reads the file into a [`Config`], and the model that it names.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -52,8 +52,9 @@ pub(super) fn load(path: &Path) -> Result<Config, Error> {
     Ok(config)
 }
 
-/// Takes a path of the file as relative to its directory. An empty one would be the directory itself,
-/// one with a control character cannot be opened or breaks a line of the log in two.
+/// Makes a path of the file relative to its directory. An empty path is refused, because it would be
+/// the directory itself, and so is one with a control character, because it would break a line of the
+/// log.
 fn resolve(
     given: &mut PathBuf,
     directory: &Path,
@@ -74,8 +75,8 @@ fn resolve(
     Ok(())
 }
 
-/// A file, or as much of it as is enough to be refused: a byte more than `most`. It may be a pipe,
-/// such as `<(...)` of a shell, and whoever writes to it is waited for.
+/// Reads a file, but no more than one byte beyond `most`, which is enough to refuse it. The file may be
+/// a pipe, such as `<(...)` of a shell. Then this waits for the program that writes to it.
 fn read(path: &Path, most: usize) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     let file = File::open(path)?;
@@ -109,7 +110,7 @@ fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Error {
         };
     }
     let start = error.span().map_or(0, |span| span.start);
-    // The parser says what was found and expected; the key stands before it on its line.
+    // The parser says what was found and expected. The key is on the same line before it.
     let line_start = text[..start].rfind('\n').map_or(0, |newline| newline + 1);
     let line = text[line_start..].lines().next().unwrap_or_default();
     let key = line
@@ -127,8 +128,8 @@ fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Error {
     }
 }
 
-/// Where the first `[[sensor]]` without a port begins: what is missing has no place of its own, and
-/// nothing but a port can be missing.
+/// Where the first `[[sensor]]` without a port begins. A missing key has no place of its own, and only
+/// a port can be missing.
 fn sensor_without_port(text: &str) -> Option<usize> {
     let file = DeTable::parse(text).ok()?;
     let mut sensors = file.get_ref().get("sensor")?.get_ref().as_array()?.iter();

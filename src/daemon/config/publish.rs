@@ -1,4 +1,4 @@
-//! The `[publish]` tables: the ways out of the daemon but HTTP.
+//! The `[publish]` tables: where events go, except by HTTP.
 
 use std::env;
 use std::fmt;
@@ -13,19 +13,19 @@ use serde::{Deserialize, Serialize};
 pub struct Publish {
     /// The Unix socket.
     pub unix: Unix,
-    /// The same protocol over TCP; off unless given.
+    /// The same protocol over TCP; off unless the table is there.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tcp: Option<Tcp>,
-    /// Keys of a zenoh session; off unless given, and only in a build that has it.
+    /// Keys of a zenoh session; off unless the table is there. Needs the feature `zenoh`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub zenoh: Option<Zenoh>,
-    /// Topics of a ROS 2 node; off unless given, and only in a build that has it.
+    /// Topics of a ROS 2 node; off unless the table is there. Needs the feature `ros2`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ros2: Option<Ros2>,
 }
 
 impl Publish {
-    /// No way out at all.
+    /// Publishes nothing at all.
     pub fn none() -> Self {
         let unix = Unix {
             enabled: false,
@@ -54,15 +54,16 @@ impl Default for Tcp {
     }
 }
 
-/// The `[publish.zenoh]` table. A session listens and connects as it says and looks for nobody.
+/// The `[publish.zenoh]` table. A session listens and connects where the table says, and does not
+/// look for other peers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Zenoh {
     /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`.
     pub listen: Vec<Endpoint>,
-    /// Endpoints of routers or peers to connect to, again and again until they are there.
+    /// Endpoints of routers or peers to connect to. The session retries until they answer.
     pub connect: Vec<Endpoint>,
-    /// What stands after `tactile/` in every key; by default the robot's name.
+    /// The part after `tactile/` in every key; by default the robot's name.
     #[serde(skip_serializing_if = "Option::is_none")]
     site: Option<String>,
 }
@@ -78,7 +79,7 @@ impl Default for Zenoh {
 }
 
 impl Zenoh {
-    /// What stands after `tactile/` in every key.
+    /// The part after `tactile/` in every key.
     pub fn site<'a>(&'a self, robot: &'a str) -> &'a str {
         self.site.as_deref().unwrap_or(robot)
     }
@@ -141,7 +142,7 @@ pub struct Ros2 {
     domain_id: Option<u16>,
     /// Namespace of the node and its topics.
     pub namespace: String,
-    /// Addresses of the interfaces to use; none: every one, as ROS 2 does.
+    /// Addresses of the interfaces to use. An empty list means every interface, as in ROS 2.
     pub networks: Vec<IpAddr>,
 }
 
@@ -156,11 +157,11 @@ impl Default for Ros2 {
 }
 
 impl Ros2 {
-    /// The domain: as configured, else that of the environment, else 0.
+    /// The domain: the configured one, else that of the environment, else 0.
     ///
     /// # Panics
     ///
-    /// If it was not checked as every configuration that is read is.
+    /// If the configuration was not checked.
     pub fn domain_id(&self) -> u16 {
         let chosen = self.chosen_domain_id();
         chosen.expect("the domain was checked when the configuration was read")
@@ -187,12 +188,12 @@ pub(super) struct DomainIdError(String);
 pub struct Unix {
     /// Whether there is one.
     pub enabled: bool,
-    /// Where; by default as [`Unix::path`] says.
+    /// The path of the socket; [`Unix::path`] has the default.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) path: Option<PathBuf>,
     /// Permissions of its file.
     pub mode: Mode,
-    /// Where the control socket is; by default `control.sock` beside the other.
+    /// The path of the control socket; by default `control.sock` beside the other socket.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) control_path: Option<PathBuf>,
     /// Subscribers at a time, on each socket and on TCP.
@@ -212,7 +213,7 @@ impl Default for Unix {
 }
 
 impl Unix {
-    /// Where the socket is: as configured, else the first of [`Unix::places`].
+    /// Where the socket is: at the configured path, else at the first of [`Unix::places`].
     pub fn path(&self) -> PathBuf {
         let configured = self.path.clone();
         configured.unwrap_or_else(|| Self::places().swap_remove(0))

@@ -1,0 +1,178 @@
+use super::*;
+
+const CONTACT: Contact = Contact {
+    threshold_n: 0.07,
+    area_taxels: 3,
+};
+
+fn raw(counts: &[(usize, u16)]) -> RawFrame {
+    let mut frame = RawFrame {
+        counts: [2; TAXELS],
+    };
+    for &(place, count) in counts {
+        frame.counts[place] = count;
+    }
+    frame
+}
+
+fn settings(dead_taxels: &[[usize; 2]]) -> Settings {
+    Settings {
+        dead_taxels: dead_taxels.to_vec(),
+        ..Settings::default()
+    }
+}
+
+#[test]
+fn baseline_is_the_mean_and_frames_before_it_are_untared() {
+    let mut tare = Tare::new(&settings(&[]), Array::FULL, CONTACT);
+    for count in [2, 3, 2, 3] {
+        assert_eq!(tare.observe(&raw(&[(0, count)])), Progress::Taking);
+    }
+    assert_eq!(tare.apply(&raw(&[])).newtons[5], 2.0 * 0.04);
+    assert_eq!(tare.observe(&raw(&[(0, 3)])), Progress::Taken);
+    let frame = tare.apply(&raw(&[(0, 12), (1, 1)]));
+    assert_eq!(frame.newtons[0], (12.0 - 13.0 / 5.0) * 0.04);
+    assert_eq!(frame.newtons[1], 0.0, "below the baseline is zero");
+    assert_eq!(tare.observe(&raw(&[])), Progress::Ready);
+}
+
+#[test]
+fn a_moving_or_a_resting_load_is_contact() {
+    let moving = [[2, 4], [2, 4], [2, 4]];
+    let check = |touch: &dyn Fn(usize) -> Vec<(usize, u16)>, expected| {
+        let mut tare = Tare::new(&settings(&[]), Array::FULL, CONTACT);
+        let last = (0..5).map(|frame| tare.observe(&raw(&touch(frame)))).last();
+        assert_eq!(last, Some(expected));
+        let again = Aim::First { met_contact: true };
+        let expected = (expected == Progress::Contact).then_some(again);
+        assert_eq!(tare.aim(), expected);
+    };
+    check(
+        &|frame| (0..3).map(|i| (i, moving[i][frame % 2])).collect(),
+        Progress::Contact,
+    );
+    check(
+        &|frame| (0..2).map(|i| (i, moving[i][frame % 2])).collect(),
+        Progress::Taken,
+    );
+    check(
+        &|_| (0..3).map(|i| (i, 2 + 13)).collect(),
+        Progress::Contact,
+    );
+    check(&|_| (0..3).map(|i| (i, 2 + 12)).collect(), Progress::Taken);
+}
+
+#[test]
+fn what_a_tare_compares_is_the_array_and_its_live_taxels() {
+    let check = |settings: &Settings, array: Array, contact, frames: [RawFrame; 2]| {
+        let mut tare = Tare::new(settings, array, contact);
+        frames.map(|raw| tare.observe(&raw))[1]
+    };
+    let settings = |dead: &[[usize; 2]]| Settings {
+        tare_frames: 2,
+        ..settings(dead)
+    };
+    let flicker = [[(0, 2), (1, 2), (2, 2)], [(0, 9), (1, 9), (2, 9)]].map(|c| raw(&c));
+    let row = [[0, 0], [0, 1], [0, 2]];
+    for (dead, expected) in [
+        (&row[..], Progress::Taken),
+        (&row[..2], Progress::Taken),
+        (&[], Progress::Contact),
+    ] {
+        let found = check(&settings(dead), Array::FULL, CONTACT, flicker);
+        assert_eq!(found, expected, "{dead:?}");
+    }
+    // What lies high is what lies above the most: some taxels may rest low, and what is outside
+    // a small array reads 0.
+    let low = raw(&[(0, 0), (1, 0), (2, 0), (3, 0)]);
+    let high = RawFrame {
+        counts: low.counts.map(|count| 15 * count),
+    };
+    assert_eq!(
+        check(&settings(&[]), Array::FULL, CONTACT, [high; 2]),
+        Progress::Taken
+    );
+    let array = Array { rows: 5, cols: 4 };
+    let mut small = RawFrame::default();
+    array.places().for_each(|place| small.counts[place] = 30);
+    assert_eq!(
+        check(&settings(&[]), array, CONTACT, [small; 2]),
+        Progress::Taken
+    );
+    // At the threshold a taxel varies: two counts are 0.08 N.
+    let two = [[(0, 2), (1, 2), (2, 2)], [(0, 4), (1, 4), (2, 4)]].map(|c| raw(&c));
+    for (threshold_n, expected) in [(0.08, Progress::Contact), (0.081, Progress::Taken)] {
+        let contact = Contact {
+            threshold_n,
+            ..CONTACT
+        };
+        let found = check(&settings(&[]), Array::FULL, contact, two);
+        assert_eq!(found, expected, "{threshold_n} N");
+    }
+}
+
+#[test]
+fn full_scale_is_read_by_live_taxels_alone() {
+    let tare = Tare::new(&settings(&[[0, 0]]), Array::FULL, CONTACT);
+    let is_saturated = |at, count| tare.is_saturated(&raw(&[(at, count)]), 255);
+    assert!(is_saturated(1, 255) && !is_saturated(1, 254));
+    assert!(!is_saturated(0, 255), "a dead one says nothing");
+}
+
+#[test]
+fn another_tare_leaves_the_baseline_until_it_is_taken_or_given_up() {
+    let mut settings = settings(&[[0, 1]]);
+    settings.tare_frames = 2;
+    let mut tare = Tare::new(&settings, Array::FULL, CONTACT);
+    let frames = |tare: &mut Tare, count| -> Vec<Progress> {
+        let drifted = raw(&[(0, count), (1, 900)]);
+        (0..2).map(|_| tare.observe(&drifted)).collect()
+    };
+    frames(&mut tare, 2);
+    let old = tare.offsets();
+    assert_eq!((old.least_counts, old.most_counts), (2.0, 2.0));
+    assert_eq!(tare.ended(), None, "nobody asked for the first");
+    assert_eq!(tare.retake(), Ok(()));
+    assert_eq!(tare.retake(), Err(RetareError::UnderWay));
+    assert_eq!(tare.observe(&raw(&[(0, 9)])), Progress::Taking);
+    assert_eq!(tare.offsets(), old);
+    tare.give_up(RetareError::Pressed);
+    assert_eq!((tare.aim(), tare.offsets()), (None, old));
+    assert_eq!(tare.ended(), Some(Err(RetareError::Pressed)));
+    assert_eq!(tare.ended(), None, "said once");
+    assert_eq!(tare.retake(), Ok(()));
+    assert_eq!(frames(&mut tare, 9), [Progress::Taking, Progress::Taken]);
+    let new = tare.offsets();
+    assert_eq!(tare.ended(), Some(Ok(Retaken { old, new })));
+    assert_eq!((new.least_counts, new.most_counts), (2.0, 9.0));
+    assert!((new.mean_counts - (2.0 * 782.0 + 9.0) / 783.0).abs() < 1e-4);
+    // A reload that leaves their number leaves those taken.
+    assert_eq!(tare.retake(), Ok(()));
+    assert_eq!(tare.observe(&raw(&[])), Progress::Taking);
+    tare.reload(&settings, CONTACT);
+    assert_eq!(tare.observe(&raw(&[])), Progress::Taken);
+    settings.tare_frames = 0;
+    tare.reload(&settings, CONTACT);
+    assert_eq!(tare.retake(), Err(RetareError::NoFrames));
+}
+
+#[test]
+fn a_dead_taxel_is_the_mean_of_its_live_neighbours() {
+    let mut settings = settings(&[[0, 0], [0, 1]]);
+    settings.tare_frames = 0;
+    let tare = Tare::new(&settings, Array::FULL, CONTACT);
+    let frame = tare.apply(&raw(&[(0, 255), (1, 255), (COLS, 10), (COLS + 1, 20)]));
+    assert!((frame.newtons[0] - 15.0 * 0.04).abs() < 1e-6);
+    let expected = (2.0 + 10.0 + 20.0 + 2.0) / 4.0 * 0.04;
+    assert!((frame.newtons[1] - expected).abs() < 1e-6);
+}
+
+#[test]
+fn a_small_array_ignores_what_lies_outside_it() {
+    let array = Array { rows: 1, cols: 2 };
+    let mut settings = settings(&[[0, 0]]);
+    settings.tare_frames = 0;
+    let tare = Tare::new(&settings, array, CONTACT);
+    let frame = tare.apply(&raw(&[(array.place(0, 1), 50)]));
+    assert_eq!(frame.newtons[array.place(0, 0)], 50.0 * 0.04);
+}
