@@ -36,7 +36,7 @@ pub enum Clock {
 
 /// A changed description that a running pipeline cannot take over.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("{key}: found another value, expected the one it started with")]
+#[error("{key} cannot change while the sensor runs")]
 pub struct FixedError {
     /// The key that differs.
     pub key: &'static str,

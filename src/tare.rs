@@ -50,19 +50,19 @@ pub struct Offsets {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum RetareError {
     /// A press is under way, and the tare would zero it away.
-    #[error("found a press, expected none")]
+    #[error("a press is under way: release the sensor and ask again")]
     Pressed,
     /// Something rests on the sensor, and the tare would zero it away.
-    #[error("found the sensor touched, expected it free")]
+    #[error("something touches the sensor: free it and ask again")]
     Touched,
     /// The sensor sends no frames to average.
-    #[error("found a sensor that is not live, expected frames")]
+    #[error("the sensor is not live: it sends no frames to average")]
     NotLive,
     /// Another tare is under way, and has to end first.
-    #[error("found a tare under way, expected none")]
+    #[error("another tare is under way: wait for its answer")]
     UnderWay,
     /// `tare_frames` is 0.
-    #[error("found calibration.tare_frames = 0, expected 1 or more")]
+    #[error("no tare is configured: set calibration.tare_frames to 1 or more")]
     NoFrames,
 }
 

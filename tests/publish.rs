@@ -83,7 +83,10 @@ fn the_control_socket_tares_and_gives_presses_their_context() {
     let begin = subscriber.until(&json!({"type": "press", "state": "begin"}));
     assert_eq!(begin["context"], context);
     // At 20 frames/s it is not over before this comes.
-    refused(&control.ask(r#"{"tare":"forearm"}"#), "found a press");
+    refused(
+        &control.ask(r#"{"tare":"forearm"}"#),
+        "a press is under way",
+    );
     let verdict = subscriber.until(&json!({"phase": "final"}));
     assert_eq!(verdict["context"], context);
 

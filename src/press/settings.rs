@@ -48,9 +48,9 @@ pub enum SettingsError {
     /// A quantity that must be positive and finite.
     #[error("{key}: found {found:?}, expected a number above 0 and at most {max}")]
     NotPositive {
-        /// Its key.
+        /// The key of the value.
         key: &'static str,
-        /// As given.
+        /// The value that was given.
         found: f64,
         /// Largest allowed.
         max: f64,
@@ -58,9 +58,9 @@ pub enum SettingsError {
     /// A quantity that must be finite and not negative.
     #[error("{key}: found {found:?}, expected 0 or more and at most {max}")]
     Negative {
-        /// Its key.
+        /// The key of the value.
         key: &'static str,
-        /// As given.
+        /// The value that was given.
         found: f64,
         /// Largest allowed.
         max: f64,
@@ -68,9 +68,9 @@ pub enum SettingsError {
     /// A count outside its range.
     #[error("{key}: found {found}, expected {least} to {most}")]
     Count {
-        /// Its key.
+        /// The key of the value.
         key: &'static str,
-        /// As given.
+        /// The value that was given.
         found: u64,
         /// Smallest allowed.
         least: u64,

@@ -27,7 +27,7 @@ pub enum LabelError {
     Number {
         /// The key.
         key: &'static str,
-        /// As given.
+        /// The value that was given.
         found: String,
         /// What `hrn-train collect` reads there.
         expected: &'static str,

@@ -197,7 +197,7 @@ fn a_sensor_that_cannot_be_is_refused_wherever_it_is_described() {
         (state(nameless), of_name),
         (
             Entry::Settings(Box::new(other)),
-            "frame: found another value",
+            "frame cannot change while the sensor runs",
         ),
     ] {
         let mut playback = Playback::new(hrn.clone());

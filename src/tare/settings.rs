@@ -57,9 +57,9 @@ pub enum SettingsError {
     /// A quantity that must be positive, and not so large that no film has it.
     #[error("{key}: found {found:?}, expected a number above 0 and at most {max}")]
     NotPositive {
-        /// Its key.
+        /// The key of the value.
         key: &'static str,
-        /// As given.
+        /// The value that was given.
         found: f64,
         /// Largest allowed.
         max: f64,
@@ -67,7 +67,7 @@ pub enum SettingsError {
     /// More frames than a sum of counts can hold.
     #[error("tare_frames: found {found}, expected 0 to {max}")]
     TareFrames {
-        /// As given.
+        /// The value that was given.
         found: u32,
         /// Largest.
         max: u32,
@@ -79,9 +79,9 @@ pub enum SettingsError {
         array.cols
     )]
     DeadTaxel {
-        /// As given.
+        /// The value that was given.
         row: usize,
-        /// As given.
+        /// The value that was given.
         col: usize,
         /// The array.
         array: Array,

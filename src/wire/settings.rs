@@ -158,7 +158,7 @@ pub enum LayoutError {
     Size {
         /// `rows` or `cols`.
         key: &'static str,
-        /// As given.
+        /// The value that was given.
         found: usize,
         /// Side of a frame.
         max: usize,
@@ -180,7 +180,7 @@ pub enum LayoutError {
     /// The mask has bits that the cell has not.
     #[error("mask: found {found}, expected 1 to {max} for this cell")]
     Mask {
-        /// As given.
+        /// The value that was given.
         found: u16,
         /// All ones of the cell.
         max: u16,
