@@ -137,7 +137,7 @@ fn a_reload_changes_the_tare_under_way() {
     play(&mut pipeline, 0, &[raw(9, 50); 5]);
     let set = |pipeline: &mut Pipeline, frames| {
         reload(pipeline, |described| {
-            described.calibration.tare_frames = frames
+            described.calibration.tare_frames = frames;
         });
     };
     set(&mut pipeline, 2);
