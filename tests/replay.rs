@@ -119,7 +119,9 @@ fn what_a_file_holds_its_first_bytes_say_and_not_its_name() {
         std::fs::copy(fixtures().join(fixture), &path).unwrap();
         let golden = fixtures().join(fixture).with_extension("jsonl");
         let golden = std::fs::read_to_string(golden).unwrap();
-        assert_same(&replay(&path, &[]), &golden, &path);
+        let config = fixtures().join("5hz.toml");
+        let events = replay(&path, &["--config", config.to_str().unwrap()]);
+        assert_same(&events, &golden, &path);
     }
 }
 
