@@ -254,9 +254,11 @@ pub struct Hardness {
     pub rejected: Option<Rejection>,
     /// What to know of the chosen frame.
     pub notes: Vec<Note>,
-    /// One a level; they sum to 1.
+    /// One a level; they sum to 1. Published with six digits after the point.
+    #[serde(serialize_with = "millionths")]
     pub probabilities: Vec<f32>,
-    /// The largest probability.
+    /// The largest probability. Published with six digits after the point.
+    #[serde(serialize_with = "rounded_6")]
     pub confidence: f32,
     /// The chosen frame: maximal contact area.
     pub frame: u64,
@@ -368,6 +370,19 @@ fn millinewtons<S: Serializer>(newtons: &[f32], serializer: S) -> Result<S::Ok, 
     serializer.collect_seq(newtons.iter().map(|&n| round_3(f64::from(n))))
 }
 
+fn rounded_6<S: Serializer>(value: &f32, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_f64(round_6(*value))
+}
+
+fn millionths<S: Serializer>(values: &[f32], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(values.iter().map(|&value| round_6(value)))
+}
+
 fn round_3(value: f64) -> f64 {
-    (value * 1000.0).round() / 1000.0
+    (value * 1e3).round() / 1e3
+}
+
+/// More digits mean nothing: an f32 has seven, and a calibrated probability is good for two or three.
+fn round_6(value: f32) -> f64 {
+    (f64::from(value) * 1e6).round() / 1e6
 }

@@ -127,6 +127,18 @@ fn hardness_is_frozen() {
 }
 
 #[test]
+fn a_probability_has_at_most_six_digits_after_the_point() {
+    let verdict = Hardness {
+        probabilities: vec![0.123_456_78, 0.876_543, 5.8e-9, 1.0 / 3.0],
+        confidence: 0.876_543_2,
+        ..hardness()
+    };
+    let line = Event::Hardness(verdict).to_line();
+    let expected = r#""probabilities":[0.123457,0.876543,0.0,0.333333],"confidence":0.876543,"#;
+    assert!(line.contains(expected), "{line}");
+}
+
+#[test]
 fn frame_is_frozen_and_never_numbered() {
     let mut frame = Event::Frame(FrameEvent::new(
         "forearm".to_owned(),
