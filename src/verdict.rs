@@ -6,8 +6,10 @@
 //! compute what was evaluated. Never reads a file itself, never prints, never trains.
 
 mod file;
+mod guard;
 
 use std::fmt::Write as _;
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -128,6 +130,14 @@ pub enum ModelError {
         /// What would be right.
         expected: String,
     },
+    /// An operator, an attribute, a tensor or a size that no model may have.
+    #[error("model {place}: {problem}")]
+    Guard {
+        /// Which node, tensor, input or output.
+        place: String,
+        /// What is wrong with it.
+        problem: String,
+    },
     /// The graph cannot be run.
     #[error("model graph cannot be run: {0}")]
     Graph(String),
@@ -162,6 +172,22 @@ pub enum ModelError {
     /// A judgement failed inside the inference library.
     #[error("model could not judge a frame: {0}")]
     Inference(String),
+    /// Refused by the process that tried it, or that process did not come to an end.
+    #[error("{0}")]
+    Trial(String),
+    /// A verdict takes so long that frames would wait.
+    #[error(
+        "model takes {:.1} ms for a verdict: expected at most {:.1} ms, a tenth of the fastest \
+         sensor's frame period (but 1 to 20 ms)",
+        .found.as_secs_f64() * 1e3,
+        .expected.as_secs_f64() * 1e3
+    )]
+    Slow {
+        /// Median of the processor time.
+        found: Duration,
+        /// What the sensors leave.
+        expected: Duration,
+    },
 }
 
 /// What an HRN says of one frame.
@@ -199,9 +225,10 @@ impl Hrn {
         if bytes.len() > MAX_FILE_BYTES {
             return Err(ModelError::TooLarge { found: bytes.len() });
         }
-        let onnx = tract_onnx::onnx();
+        // What a file says of values inside the graph is not needed, and was not checked.
+        let onnx = tract_onnx::onnx().with_ignore_value_info(true);
         let mut reader = bytes;
-        let proto = onnx
+        let mut proto = onnx
             .proto_model_for_read(&mut reader)
             .map_err(|error| ModelError::NotOnnx(root_cause(&error)))?;
         let graph = match &proto.graph {
@@ -212,6 +239,7 @@ impl Hrn {
         file::check_tensors_inside(graph)?;
         let (card, check) = file::read_metadata(&proto)?;
         file::check_signature(graph, card.levels.len())?;
+        guard::check(&proto, graph)?;
         let position = |name: &str| graph.output.iter().position(|output| output.name == name);
         let (Some(logits_output), Some(probabilities_output)) =
             (position("logits"), position("probabilities"))
@@ -220,6 +248,8 @@ impl Hrn {
         };
 
         let graph_error = |error: TractError| ModelError::Graph(root_cause(&error));
+        // The inference library would keep a copy.
+        proto.metadata_props.clear();
         let inference = onnx.model_for_proto_model(&proto).map_err(graph_error)?;
         // From here on only the plan is kept: the protobuf is as large again as the weights.
         drop(proto);

@@ -1,0 +1,555 @@
+//! What the graph of a model may be: checked before the inference library sees it.
+//!
+//! In: the graph as ONNX's own messages. Out: what it costs, or the first thing in it that is not
+//! allowed. The inference library believes a graph: some make it panic, fill the memory, never end,
+//! or write outside an array. So only the operators of [`table`] may occur, each with the attributes
+//! and sizes that it can have, and the shape of every value is computed here. Nothing here runs the
+//! model, and no value is computed but lists of integers that say a shape.
+
+mod arithmetic;
+mod layers;
+mod learners;
+mod recurrent;
+mod shapes;
+mod table;
+mod tensor;
+
+use std::collections::HashMap;
+use std::rc::Rc;
+
+use tract_onnx::pb;
+use tract_onnx::pb::attribute_proto::AttributeType;
+
+use self::table::{Allowed, Operator};
+use super::ModelError;
+
+/// Most nodes of a graph, those of its subgraphs included.
+const MOST_NODES: u64 = 2_000;
+/// Most tensors that a graph brings along.
+const MOST_TENSORS: usize = 10_000;
+/// Most dimensions of a value.
+const MOST_RANK: usize = 8;
+/// Most numbers in one value: as many as a file of the largest size holds.
+const MOST_NUMBERS: u64 = 16_000_000;
+/// Most numbers in all values that are computed.
+const MOST_NUMBERS_IN_ALL: u64 = 64_000_000;
+/// Most multiplications and additions of a verdict. What a verdict really takes is measured; this
+/// bounds how long the measurement can take.
+const MOST_WORK: u64 = 500_000_000;
+/// Longest name of a node or a value, in bytes.
+const MOST_NAME_BYTES: usize = 1_024;
+/// Longest list of integers whose values are known here.
+const MOST_KNOWN: usize = 65_536;
+
+/// What a graph costs.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Cost {
+    /// Nodes, those of subgraphs included.
+    pub(super) nodes: u64,
+    /// Numbers in all computed values.
+    pub(super) numbers: u64,
+    /// Multiplications and additions, about.
+    pub(super) work: u64,
+}
+
+/// Checks a graph with its declared inputs and outputs.
+///
+/// # Errors
+///
+/// [`ModelError::Guard`], which names the node or tensor and says what is wrong with it.
+pub(super) fn check(proto: &pb::ModelProto, graph: &pb::GraphProto) -> Result<Cost, ModelError> {
+    let whole = |problem: &str| ModelError::Guard {
+        place: "graph".to_owned(),
+        problem: problem.to_owned(),
+    };
+    if !proto.functions.is_empty() {
+        return Err(whole("functions are not supported"));
+    }
+    if !proto.training_info.is_empty() {
+        return Err(whole("training information is not supported"));
+    }
+    let opset = proto
+        .opset_import
+        .iter()
+        .find(|import| import.domain.is_empty() || import.domain == "ai.onnx")
+        .map_or(0, |import| import.version);
+    let mut walk = Walk::new(opset);
+    walk.tensors(graph)?;
+    for input in &graph.input {
+        // Before ONNX IR 4, tensors that the file brings along are listed among the inputs too.
+        if !graph.initializer.iter().any(|t| t.name == input.name) {
+            let place = || format!("input {}", quoted(&input.name));
+            let value = tensor::declared(input).map_err(|problem| guard(place(), problem))?;
+            walk.bind(&input.name, value)
+                .map_err(|problem| guard(place(), problem))?;
+        }
+    }
+    walk.nodes(graph)?;
+    for output in &graph.output {
+        let place = || format!("output {}", quoted(&output.name));
+        let declared = tensor::declared(output).map_err(|problem| guard(place(), problem))?;
+        match walk.values.get(output.name.as_str()) {
+            Some(computed) if computed.same_as(&declared) => {}
+            found => {
+                let problem = format!(
+                    "found {}, expected {declared}",
+                    found.map_or("nothing that computes it".to_owned(), ToString::to_string)
+                );
+                return Err(guard(place(), problem));
+            }
+        }
+    }
+    Ok(walk.cost)
+}
+
+fn guard(place: String, problem: String) -> ModelError {
+    ModelError::Guard { place, problem }
+}
+
+/// A name out of a file, on one line and of a readable length.
+fn quoted(name: &str) -> String {
+    if name.chars().count() <= 60 {
+        return format!("{name:?}");
+    }
+    let start: String = name.chars().take(60).collect();
+    format!("{start:?}...")
+}
+
+/// Types of numbers that a graph may use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Datum {
+    F32,
+    F64,
+    I32,
+    I64,
+    U8,
+    Bool,
+}
+
+impl Datum {
+    fn is_float(self) -> bool {
+        matches!(self, Datum::F32 | Datum::F64)
+    }
+}
+
+/// What is known of a value before anything runs.
+#[derive(Debug, Clone)]
+struct Value {
+    datum: Datum,
+    shape: Vec<usize>,
+    /// Its integers, where they are known: shapes, axes and indices.
+    ints: Option<Rc<[i64]>>,
+    /// Whether it depends on no input.
+    constant: bool,
+}
+
+impl Value {
+    fn new(datum: Datum, shape: Vec<usize>) -> Self {
+        Self {
+            datum,
+            shape,
+            ints: None,
+            constant: false,
+        }
+    }
+
+    fn known(datum: Datum, shape: Vec<usize>, ints: Vec<i64>) -> Self {
+        Self {
+            ints: (ints.len() <= MOST_KNOWN).then(|| ints.into()),
+            ..Self::new(datum, shape)
+        }
+    }
+
+    fn rank(&self) -> usize {
+        self.shape.len()
+    }
+
+    /// How many numbers, if they can be counted.
+    fn numbers(&self) -> Option<u64> {
+        count(&self.shape)
+    }
+
+    fn same_as(&self, other: &Self) -> bool {
+        self.datum == other.datum && self.shape == other.shape
+    }
+}
+
+impl std::fmt::Display for Value {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let lengths: Vec<String> = self.shape.iter().map(usize::to_string).collect();
+        let datum = format!("{:?}", self.datum).to_lowercase();
+        write!(out, "{datum} [{}]", lengths.join(","))
+    }
+}
+
+fn count(shape: &[usize]) -> Option<u64> {
+    shape
+        .iter()
+        .try_fold(1_u64, |product, &length| product.checked_mul(length as u64))
+}
+
+/// What a rule says of a node: its outputs, and the work beside reading and writing them.
+struct Computed {
+    values: Vec<Value>,
+    work: u64,
+}
+
+impl From<Value> for Computed {
+    fn from(value: Value) -> Self {
+        Self {
+            values: vec![value],
+            work: 0,
+        }
+    }
+}
+
+/// A node with what is known of its inputs. Its attributes were checked against the table.
+struct Node<'a> {
+    proto: &'a pb::NodeProto,
+    inputs: Vec<Option<Value>>,
+    opset: i64,
+}
+
+impl Node<'_> {
+    fn input(&self, index: usize) -> Result<&Value, String> {
+        self.optional(index)
+            .ok_or_else(|| format!("input {index} is missing"))
+    }
+
+    fn optional(&self, index: usize) -> Option<&Value> {
+        self.inputs.get(index).and_then(Option::as_ref)
+    }
+
+    /// All inputs, where none may be left out.
+    fn all(&self) -> impl Iterator<Item = &Value> {
+        self.inputs.iter().flatten()
+    }
+
+    /// An input of this type.
+    fn of(&self, index: usize, datum: Datum) -> Result<&Value, String> {
+        let value = self.input(index)?;
+        if value.datum == datum {
+            return Ok(value);
+        }
+        let expected = format!("{datum:?}").to_lowercase();
+        Err(format!("input {index} is {value}, expected {expected}"))
+    }
+
+    /// The integers of an input, which must be known before the model runs.
+    fn known(&self, index: usize) -> Result<&[i64], String> {
+        let value = self.input(index)?;
+        let ints = value.ints.as_deref();
+        ints.ok_or_else(|| format!("input {index} ({value}) is not a short constant of integers"))
+    }
+
+    fn attribute(&self, name: &str) -> Option<&pb::AttributeProto> {
+        let mut attributes = self.proto.attribute.iter();
+        attributes.find(|attribute| attribute.name == name)
+    }
+
+    fn int(&self, name: &str, default: i64) -> i64 {
+        self.attribute(name).map_or(default, |found| found.i)
+    }
+
+    fn ints(&self, name: &str) -> Option<&[i64]> {
+        self.attribute(name).map(|found| found.ints.as_slice())
+    }
+
+    fn text(&self, name: &str) -> Option<&str> {
+        let found = self.attribute(name)?;
+        std::str::from_utf8(&found.s).ok()
+    }
+
+    /// The axis that an attribute names, counted from the front.
+    fn axis(&self, name: &str, default: i64, rank: usize) -> Result<usize, String> {
+        axis(self.int(name, default), rank)
+    }
+}
+
+/// An axis counted from the front.
+fn axis(axis: i64, rank: usize) -> Result<usize, String> {
+    let rank = rank as i64;
+    if (-rank..rank).contains(&axis) {
+        return Ok(axis.rem_euclid(rank) as usize);
+    }
+    Err(format!("axis {axis} of a value of rank {rank}"))
+}
+
+/// Different axes counted from the front.
+fn axes(given: &[i64], rank: usize) -> Result<Vec<usize>, String> {
+    let mut found = Vec::with_capacity(given.len());
+    for &one in given.iter().take(MOST_RANK + 1) {
+        let one = axis(one, rank)?;
+        if found.contains(&one) {
+            return Err(format!("axis {one} twice"));
+        }
+        found.push(one);
+    }
+    Ok(found)
+}
+
+/// The values of a graph so far, node by node.
+struct Walk<'a> {
+    opset: i64,
+    values: HashMap<&'a str, Value>,
+    cost: Cost,
+    /// How often each node runs: more than once in the body of a loop.
+    times: u64,
+    /// Whether a node may have a graph of its own.
+    may_nest: bool,
+}
+
+impl<'a> Walk<'a> {
+    fn new(opset: i64) -> Self {
+        Self {
+            opset,
+            values: HashMap::new(),
+            cost: Cost::default(),
+            times: 1,
+            may_nest: true,
+        }
+    }
+
+    /// Takes the tensors that a graph brings along.
+    fn tensors(&mut self, graph: &'a pb::GraphProto) -> Result<(), ModelError> {
+        let whole = |problem: String| guard("graph".to_owned(), problem);
+        if !graph.sparse_initializer.is_empty() {
+            return Err(whole("sparse tensors are not supported".to_owned()));
+        }
+        if graph.initializer.len() > MOST_TENSORS {
+            let found = graph.initializer.len();
+            let problem = format!("{found} tensors: at most {MOST_TENSORS} are accepted");
+            return Err(whole(problem));
+        }
+        for proto in &graph.initializer {
+            let place = || format!("tensor {}", quoted(&proto.name));
+            let value = tensor::value(proto).map_err(|problem| guard(place(), problem))?;
+            self.bind(&proto.name, value)
+                .map_err(|problem| guard(place(), problem))?;
+        }
+        Ok(())
+    }
+
+    /// Gives a value its name.
+    fn bind(&mut self, name: &'a str, value: Value) -> Result<(), String> {
+        if name.is_empty() || name.len() > MOST_NAME_BYTES {
+            return Err(format!(
+                "a name of {} bytes, expected 1 to {MOST_NAME_BYTES}",
+                name.len()
+            ));
+        }
+        if self.values.insert(name, value).is_some() {
+            return Err("this name occurs twice".to_owned());
+        }
+        Ok(())
+    }
+
+    /// Computes what every node gives.
+    fn nodes(&mut self, graph: &'a pb::GraphProto) -> Result<(), ModelError> {
+        for proto in &graph.node {
+            self.node(proto).map_err(|problem| {
+                let name = match (&proto.name, proto.output.first()) {
+                    (name, Some(output)) if name.is_empty() => output,
+                    (name, _) => name,
+                };
+                let operator = quoted(&proto.op_type);
+                let operator = operator.trim_matches('"');
+                guard(format!("node {} ({operator})", quoted(name)), problem)
+            })?;
+        }
+        Ok(())
+    }
+
+    fn node(&mut self, proto: &'a pb::NodeProto) -> Result<(), String> {
+        self.cost.nodes += 1;
+        if self.cost.nodes > MOST_NODES {
+            return Err(format!("more than {MOST_NODES} nodes"));
+        }
+        if proto.name.len() > MOST_NAME_BYTES {
+            return Err(format!("a name of {} bytes", proto.name.len()));
+        }
+        let operator = table::find(&proto.domain, &proto.op_type)
+            .ok_or_else(|| "this operator is not supported".to_owned())?;
+        attributes(proto, operator)?;
+        let inputs = self.inputs(proto, operator)?;
+        let read: u64 = inputs.iter().flatten().filter_map(Value::numbers).sum();
+        let constant = !proto
+            .attribute
+            .iter()
+            .any(|attribute| attribute.g.is_some())
+            && inputs.iter().flatten().all(|value| value.constant);
+        let node = Node {
+            proto,
+            inputs,
+            opset: self.opset,
+        };
+        let computed = match operator.rule {
+            table::Rule::Of(rule) => rule(&node)?,
+            table::Rule::Scan => recurrent::scan(&node, self)?,
+        };
+        let outputs = proto.output.iter().filter(|name| !name.is_empty()).count();
+        let (least, most) = operator.outputs;
+        let gaps = outputs < proto.output.len() && !operator.gaps;
+        if outputs < least.max(1) || proto.output.len() > most.min(computed.values.len()) || gaps {
+            return Err(format!("{outputs} outputs: it cannot have that many"));
+        }
+        let mut work = read.saturating_add(computed.work);
+        for (name, value) in proto.output.iter().zip(computed.values) {
+            if name.is_empty() {
+                continue;
+            }
+            let numbers = self.may_hold(&value)?;
+            work = work.saturating_add(numbers);
+            self.cost.numbers = self.cost.numbers.saturating_add(numbers);
+            let constant = constant || value.ints.is_some();
+            self.bind(name, Value { constant, ..value })?;
+        }
+        if self.cost.numbers > MOST_NUMBERS_IN_ALL {
+            return Err(format!(
+                "with it more than {MOST_NUMBERS_IN_ALL} numbers are computed"
+            ));
+        }
+        self.cost.work = self
+            .cost
+            .work
+            .saturating_add(work.saturating_mul(self.times));
+        if self.cost.work > MOST_WORK {
+            return Err(format!(
+                "with it a verdict takes more than {MOST_WORK} steps"
+            ));
+        }
+        Ok(())
+    }
+
+    fn inputs(
+        &self,
+        proto: &pb::NodeProto,
+        operator: &Operator,
+    ) -> Result<Vec<Option<Value>>, String> {
+        let (least, most) = operator.inputs;
+        let found = proto.input.len();
+        if !(least..=most).contains(&found) {
+            return Err(format!("{found} inputs, expected {least} to {most}"));
+        }
+        let value = |(index, name): (usize, &String)| match self.values.get(name.as_str()) {
+            Some(value) => Ok(Some(value.clone())),
+            None if name.is_empty() && operator.gaps && index >= least => Ok(None),
+            None => Err(format!(
+                "input {} is computed by no node before it",
+                quoted(name)
+            )),
+        };
+        proto.input.iter().enumerate().map(value).collect()
+    }
+
+    /// How many numbers a value has, if it may be that large.
+    fn may_hold(&self, value: &Value) -> Result<u64, String> {
+        if value.rank() > MOST_RANK {
+            return Err(format!(
+                "an output of rank {}: at most {MOST_RANK} is accepted",
+                value.rank()
+            ));
+        }
+        let empty_list = value.ints.is_some() && value.rank() == 1;
+        if value.shape.contains(&0) && !empty_list {
+            return Err(format!("an output without numbers ({value})"));
+        }
+        match value.numbers() {
+            Some(numbers) if numbers <= MOST_NUMBERS => Ok(numbers),
+            _ => Err(format!(
+                "an output of more than {MOST_NUMBERS} numbers ({value})"
+            )),
+        }
+    }
+}
+
+/// Checks each attribute against what the table allows.
+fn attributes(proto: &pb::NodeProto, operator: &Operator) -> Result<(), String> {
+    for (index, attribute) in proto.attribute.iter().enumerate() {
+        let name = attribute.name.as_str();
+        let mut known = operator.attributes.iter();
+        let Some((_, allowed)) = known.find(|(known, _)| *known == name) else {
+            return Err(format!("attribute {} is not supported", quoted(name)));
+        };
+        if proto.attribute[..index].iter().any(|a| a.name == name) {
+            return Err(format!("attribute `{name}` twice"));
+        }
+        if !attribute.ref_attr_name.is_empty() {
+            return Err(format!("attribute `{name}` refers to another"));
+        }
+        let expected = allowed.kind();
+        if attribute.r#type != expected as i32 {
+            return Err(format!("attribute `{name}`: expected {expected}"));
+        }
+        let within = |value: i64, low: i64, high: i64| {
+            if (low..=high).contains(&value) {
+                return Ok(());
+            }
+            Err(format!(
+                "attribute `{name}`: found {value}, expected {low} to {high}"
+            ))
+        };
+        let most = |found: usize, most: usize| {
+            if found <= most {
+                return Ok(());
+            }
+            Err(format!(
+                "attribute `{name}`: {found} values, expected at most {most}"
+            ))
+        };
+        match *allowed {
+            Allowed::Int(low, high) => within(attribute.i, low, high)?,
+            Allowed::Ints(length, low, high) => {
+                most(attribute.ints.len(), length)?;
+                for &value in &attribute.ints {
+                    within(value, low, high)?;
+                }
+            }
+            Allowed::Text(texts) => {
+                if !texts.iter().any(|text| text.as_bytes() == attribute.s) {
+                    let found = String::from_utf8_lossy(&attribute.s);
+                    let expected = texts.join(", ");
+                    return Err(format!(
+                        "attribute `{name}`: found {}, expected one of {expected}",
+                        quoted(&found)
+                    ));
+                }
+            }
+            Allowed::Texts(length, texts) => {
+                most(attribute.strings.len(), length)?;
+                let known = |found: &Vec<u8>| texts.iter().any(|text| text.as_bytes() == found);
+                if !attribute.strings.iter().all(known) {
+                    let expected = texts.join(", ");
+                    return Err(format!("attribute `{name}`: expected some of {expected}"));
+                }
+            }
+            Allowed::Floats(length) => most(attribute.floats.len(), length)?,
+            Allowed::Tensor if attribute.t.is_none() => {
+                return Err(format!("attribute `{name}`: without its tensor"));
+            }
+            Allowed::Graph if attribute.g.is_none() => {
+                return Err(format!("attribute `{name}`: without its graph"));
+            }
+            Allowed::Float | Allowed::Tensor | Allowed::Graph => {}
+        }
+    }
+    Ok(())
+}
+
+impl Allowed {
+    fn kind(&self) -> AttributeType {
+        match self {
+            Allowed::Int(..) => AttributeType::Int,
+            Allowed::Ints(..) => AttributeType::Ints,
+            Allowed::Float => AttributeType::Float,
+            Allowed::Floats(_) => AttributeType::Floats,
+            Allowed::Text(_) => AttributeType::String,
+            Allowed::Texts(..) => AttributeType::Strings,
+            Allowed::Tensor => AttributeType::Tensor,
+            Allowed::Graph => AttributeType::Graph,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,160 @@
+//! Classic learners, of ONNX's domain `ai.onnx.ml`.
+//!
+//! The inference library goes through trees without looking whether a place exists: every place that
+//! a tree names is checked here.
+
+use std::collections::HashMap;
+
+use super::{Computed, Datum, Node, Value, count};
+
+/// Rows of features.
+fn rows<'a>(node: &'a Node<'_>) -> Result<(&'a Value, usize, usize), String> {
+    let value = node.of(0, Datum::F32)?;
+    match value.shape.as_slice() {
+        &[rows, features] => Ok((value, rows, features)),
+        _ => Err(format!("{value}, expected rows of features")),
+    }
+}
+
+fn floats<'a>(node: &'a Node<'_>, name: &str) -> Option<&'a [f32]> {
+    node.attribute(name).map(|found| found.floats.as_slice())
+}
+
+/// Scores, one number of which takes `each` steps.
+fn scores(rows: usize, columns: usize, each: u64) -> (Value, u64) {
+    let value = Value::new(Datum::F32, vec![rows, columns]);
+    let work = count(&value.shape).map_or(u64::MAX, |numbers| numbers.saturating_mul(each));
+    (value, work)
+}
+
+pub(super) fn normalizer(node: &Node<'_>) -> Result<Computed, String> {
+    let (value, _, _) = rows(node)?;
+    Ok(Value::new(Datum::F32, value.shape.clone()).into())
+}
+
+pub(super) fn linear_regressor(node: &Node<'_>) -> Result<Computed, String> {
+    let (value, rows, features) = rows(node)?;
+    let targets = node.int("targets", 1) as usize;
+    let coefficients = floats(node, "coefficients").unwrap_or_default().len();
+    let intercepts = floats(node, "intercepts").map(<[f32]>::len);
+    if features.checked_mul(targets) != Some(coefficients)
+        || intercepts.is_some_and(|found| found != targets)
+    {
+        return Err(format!(
+            "{coefficients} coefficients of {targets} targets with {value}"
+        ));
+    }
+    let (value, work) = scores(rows, targets, features as u64);
+    Ok(Computed {
+        values: vec![value],
+        work,
+    })
+}
+
+pub(super) fn linear_classifier(node: &Node<'_>) -> Result<Computed, String> {
+    let (value, rows, features) = rows(node)?;
+    let classes = node.ints("classlabels_ints").unwrap_or_default().len();
+    let coefficients = floats(node, "coefficients").unwrap_or_default().len();
+    let intercepts = floats(node, "intercepts").map(<[f32]>::len);
+    // Two classes may share one line between them.
+    let one_line = classes == 2 && coefficients == features && node.int("multi_class", 0) == 0;
+    let lines = if one_line { 1 } else { classes };
+    if classes < 2
+        || features.checked_mul(lines) != Some(coefficients)
+        || intercepts.is_some_and(|found| found != lines)
+        || (intercepts.is_none() && classes == 2 && !one_line)
+    {
+        return Err(format!(
+            "{coefficients} coefficients of {classes} classes with {value}"
+        ));
+    }
+    let (scores, work) = scores(rows, classes, features as u64);
+    Ok(Computed {
+        values: vec![Value::new(Datum::I64, vec![rows]), scores],
+        work,
+    })
+}
+
+/// A forest: nodes and leaves as lists, a tree after another.
+pub(super) fn trees(node: &Node<'_>) -> Result<Computed, String> {
+    let (_, rows, features) = rows(node)?;
+    let list = |name: &str| node.ints(name).unwrap_or_default();
+    let classes = list("classlabels_int64s").len();
+    if classes < 2 || floats(node, "base_values").is_some_and(|found| found.len() != classes) {
+        return Err(format!("{classes} classes"));
+    }
+    let (ids, of_tree) = (list("nodes_nodeids"), list("nodes_treeids"));
+    let (yes, no) = (list("nodes_truenodeids"), list("nodes_falsenodeids"));
+    let feature = list("nodes_featureids");
+    let modes = node
+        .attribute("nodes_modes")
+        .map(|found| found.strings.as_slice())
+        .unwrap_or_default();
+    let nodes = ids.len();
+    let lengths = [
+        of_tree.len(),
+        yes.len(),
+        no.len(),
+        feature.len(),
+        modes.len(),
+        floats(node, "nodes_values").unwrap_or_default().len(),
+        node.ints("nodes_missing_value_tracks_true")
+            .map_or(nodes, <[i64]>::len),
+    ];
+    if nodes == 0 || lengths.iter().any(|&length| length != nodes) {
+        return Err(format!("lists of {nodes} and {lengths:?} nodes"));
+    }
+    // Where each tree's nodes are: 0, 1, 2, ... in order, so that its size says which exist.
+    let mut sizes: Vec<i64> = Vec::new();
+    for (&tree, &id) in of_tree.iter().zip(ids) {
+        if tree == sizes.len() as i64 {
+            sizes.push(0);
+        }
+        let last = sizes.len() as i64 - 1;
+        match sizes.last_mut() {
+            Some(size) if tree == last && id == *size => *size += 1,
+            _ => return Err(format!("node {id} of tree {tree} is out of order")),
+        }
+    }
+    let mut leaves = HashMap::new();
+    for place in 0..nodes {
+        let (tree, id) = (of_tree[place], ids[place]);
+        if modes[place] == b"LEAF" {
+            leaves.insert((tree, id), ());
+            continue;
+        }
+        let size = sizes[tree as usize];
+        // A way through a tree that only goes forward has an end.
+        let forward = |next: i64| id < next && next < size;
+        if !forward(yes[place]) || !forward(no[place]) {
+            return Err(format!("node {id} of tree {tree} leads nowhere"));
+        }
+        if feature[place] as u64 >= features as u64 {
+            return Err(format!(
+                "node {id} of tree {tree} asks for feature {} of {features}",
+                feature[place]
+            ));
+        }
+    }
+    let (vote_class, vote_node) = (list("class_ids"), list("class_nodeids"));
+    let vote_tree = list("class_treeids");
+    let votes = vote_class.len();
+    let weights = floats(node, "class_weights").unwrap_or_default().len();
+    if votes == 0 || [vote_node.len(), vote_tree.len(), weights] != [votes; 3] {
+        return Err(format!("lists of {votes} votes that differ in length"));
+    }
+    for vote in 0..votes {
+        let (tree, id) = (vote_tree[vote], vote_node[vote]);
+        if vote_class[vote] as u64 >= classes as u64 || !leaves.contains_key(&(tree, id)) {
+            return Err(format!(
+                "a vote for class {} at node {id} of tree {tree}",
+                vote_class[vote]
+            ));
+        }
+    }
+    let (scores, _) = scores(rows, classes, 0);
+    Ok(Computed {
+        values: vec![Value::new(Datum::I64, vec![rows]), scores],
+        work: (rows as u64).saturating_mul((nodes + votes) as u64),
+    })
+}

@@ -1,0 +1,180 @@
+//! Operators that go along a sequence.
+
+use tract_onnx::pb;
+
+use super::{Computed, Datum, Node, Value, Walk, quoted, tensor};
+
+/// Most steps of a sequence.
+const MOST_STEPS: usize = 1_024;
+
+/// RNN, GRU and LSTM: `X` [steps, batch, inputs], `W` [directions, gates x hidden, inputs],
+/// `R` [directions, gates x hidden, hidden], `B` [directions, 2 x gates x hidden].
+pub(super) fn recurrent(node: &Node<'_>) -> Result<Computed, String> {
+    let gates = match node.proto.op_type.as_str() {
+        "RNN" => 1,
+        "GRU" => 3,
+        _ => 4,
+    };
+    let constant = |index: usize| match node.of(index, Datum::F32)? {
+        value if value.constant => Ok(value),
+        value => Err(format!("input {index} ({value}) is not constant")),
+    };
+    let (x, w, r) = (node.of(0, Datum::F32)?, constant(1)?, constant(2)?);
+    let (&[steps, batch, inputs], &[_, _, hidden]) = (x.shape.as_slice(), r.shape.as_slice())
+    else {
+        return Err(format!("{x} with weights {w} and {r}"));
+    };
+    let directions = match node.text("direction") {
+        Some("bidirectional") => 2,
+        _ => 1,
+    };
+    let rows = hidden.saturating_mul(gates);
+    let fits = w.shape == [directions, rows, inputs] && r.shape == [directions, rows, hidden];
+    if !fits || node.int("hidden_size", hidden as i64) != hidden as i64 || steps > MOST_STEPS {
+        return Err(format!("{x} with weights {w} and {r}"));
+    }
+    if node.optional(3).is_some() && constant(3)?.shape != [directions, rows.saturating_mul(2)] {
+        return Err(format!("a bias {}", node.input(3)?));
+    }
+    if node.optional(4).is_some() {
+        return Err("lengths of sequences are not supported".to_owned());
+    }
+    for index in 5..node.inputs.len() {
+        if node.optional(index).is_some() {
+            let start = node.of(index, Datum::F32)?;
+            if start.shape != [directions, batch, hidden] {
+                return Err(format!("a beginning of {start}"));
+            }
+        }
+    }
+    usual_activations(node, gates, directions)?;
+    let each = inputs.saturating_add(hidden).saturating_mul(rows) as u64;
+    let times = (directions * steps) as u64;
+    let last = Value::new(Datum::F32, vec![directions, batch, hidden]);
+    let all = Value::new(Datum::F32, vec![steps, directions, batch, hidden]);
+    Ok(Computed {
+        values: vec![all, last.clone(), last],
+        work: each.saturating_mul(times).saturating_mul(batch as u64),
+    })
+}
+
+/// The inference library has ONNX's default activations alone.
+fn usual_activations(node: &Node<'_>, gates: usize, directions: usize) -> Result<(), String> {
+    let Some(given) = node.attribute("activations") else {
+        return Ok(());
+    };
+    let usual: &[&[u8]] = match gates {
+        1 => &[b"Tanh"],
+        3 => &[b"Sigmoid", b"Tanh"],
+        _ => &[b"Sigmoid", b"Tanh", b"Tanh"],
+    };
+    let usual = usual.iter().copied().cycle().take(usual.len() * directions);
+    if given.strings.iter().map(Vec::as_slice).eq(usual) {
+        return Ok(());
+    }
+    Err("other activations than ONNX's defaults are not supported".to_owned())
+}
+
+/// A loop over a sequence: its body runs once a step, on the states so far and a slice of each
+/// sequence, and gives the new states and a slice of each output.
+pub(super) fn scan<'a>(node: &Node<'a>, walk: &mut Walk<'a>) -> Result<Computed, String> {
+    if !walk.may_nest {
+        return Err("a loop in a loop is not supported".to_owned());
+    }
+    let body: &'a pb::GraphProto = node
+        .proto
+        .attribute
+        .iter()
+        .find_map(|attribute| attribute.g.as_ref())
+        .ok_or("without its body")?;
+    let sequences = node.int("num_scan_inputs", 0) as usize;
+    let states = node
+        .inputs
+        .len()
+        .checked_sub(sequences)
+        .filter(|_| sequences > 0 && body.input.len() == node.inputs.len())
+        .ok_or_else(|| {
+            format!(
+                "{} inputs, a body of {} and {sequences} sequences",
+                node.inputs.len(),
+                body.input.len()
+            )
+        })?;
+    let slices = body
+        .output
+        .len()
+        .checked_sub(states)
+        .filter(|_| node.proto.output.len() == body.output.len())
+        .ok_or("other outputs than its body")?;
+    let list = |name: &str, length: usize| match node.ints(name) {
+        Some(ints) if ints.len() != length => Err(format!("`{name}`: expected {length} values")),
+        Some(ints) => Ok(ints.iter().map(|&int| int as usize).collect()),
+        None => Ok(vec![0_usize; length]),
+    };
+    let input_axes = list("scan_input_axes", sequences)?;
+    let output_axes = list("scan_output_axes", slices)?;
+    list("scan_input_directions", sequences)?;
+    list("scan_output_directions", slices)?;
+
+    let mut steps = None;
+    let mut inside = Walk::new(walk.opset);
+    inside.values = walk.values.clone();
+    inside.cost = walk.cost;
+    inside.may_nest = false;
+    for (index, declared) in body.input.iter().enumerate() {
+        let mut value = Value {
+            constant: false,
+            ints: None,
+            ..node.input(index)?.clone()
+        };
+        if let Some(sequence) = index.checked_sub(states) {
+            let axis = input_axes[sequence];
+            if axis >= value.rank() {
+                return Err(format!("axis {axis} of a sequence {value}"));
+            }
+            let length = value.shape.remove(axis);
+            if *steps.get_or_insert(length) != length || length > MOST_STEPS {
+                return Err(format!("sequences of {length} steps"));
+            }
+        }
+        if !tensor::declared(declared)?.same_as(&value) {
+            let name = quoted(&declared.name);
+            return Err(format!(
+                "its body's input {name} is not declared as {value}"
+            ));
+        }
+        inside.bind(&declared.name, value)?;
+    }
+    let steps = steps.unwrap_or(1);
+    inside.times = walk.times.saturating_mul(steps as u64);
+    inside
+        .tensors(body)
+        .and_then(|()| inside.nodes(body))
+        .map_err(|problem| format!("in its body, {problem}"))?;
+    let mut values = Vec::new();
+    for (index, output) in body.output.iter().enumerate() {
+        let name = quoted(&output.name);
+        let computed_inside = body.node.iter().any(|n| n.output.contains(&output.name));
+        let Some(value) = inside
+            .values
+            .get(output.name.as_str())
+            .filter(|_| computed_inside)
+        else {
+            return Err(format!("no node of its body computes {name}"));
+        };
+        let mut value = Value::new(value.datum, value.shape.clone());
+        match index.checked_sub(states) {
+            None if !value.same_as(node.input(index)?) => {
+                return Err(format!("state {name} becomes {value}"));
+            }
+            None => {}
+            Some(slice) if output_axes[slice] <= value.rank() => {
+                value.shape.insert(output_axes[slice], steps);
+            }
+            Some(slice) => return Err(format!("axis {} of {value}", output_axes[slice])),
+        }
+        values.push(value);
+    }
+    walk.cost = inside.cost;
+    Ok(Computed { values, work: 0 })
+}
