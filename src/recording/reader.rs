@@ -22,8 +22,9 @@ pub struct Found {
     pub entry: Entry,
 }
 
-/// The longest record that is read: far above any chunk of ours, far below what would fill the memory.
-const LONGEST_RECORD_BYTES: usize = 64 << 20;
+/// Longest record that is read, and longest chunk once it is unpacked. A chunk of ours ends with the
+/// first message after 1 MiB, and a message, of which a state is the longest, has less than 1 MiB.
+pub(super) const LONGEST_RECORD_BYTES: usize = 8 << 20;
 
 /// Reads a recording from its beginning: what happened, in order. It ends after the first error.
 ///

@@ -2,17 +2,19 @@
 //!
 //! One scan from front to back that trusts no index: each chunk is taken if its checksum fits. Where
 //! a record does not fill its length, nobody knows where the next begins: it is looked for by what
-//! every compressed chunk has at the same place.
+//! every compressed chunk has at the same place. Whatever the file is, the scan reads no more than a
+//! few times its length and holds one chunk of bounded size.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Read, Seek, SeekFrom, Write};
 
 use mcap::MAGIC;
-use mcap::records::{Channel, Record, op};
+use mcap::records::{Channel, ChunkHeader, Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::write::NoSeek;
 
 use super::message::{self, TOPICS};
+use super::reader::LONGEST_RECORD_BYTES;
 use super::{Entry, Error, writer};
 
 /// What became of a damaged recording.
@@ -49,13 +51,15 @@ pub enum RecoverError {
 
 /// Opcode and length.
 const RECORD_HEAD_BYTES: u64 = 9;
-/// No record is longer: a chunk of ours holds half a second.
-const LONGEST_RECORD_BYTES: u64 = 256 << 20;
-/// Where a chunk names its compression, from the record's beginning on: after opcode, length, two
-/// times, the size and the checksum.
-const COMPRESSION_AT: u64 = RECORD_HEAD_BYTES + 28;
+/// Where a chunk says how long it is once it is unpacked, from the record's beginning on: after
+/// opcode, length and two times.
+const UNPACKED_AT: usize = RECORD_HEAD_BYTES as usize + 16;
+/// Where a chunk names its compression: after that length and the checksum.
+const COMPRESSION_AT: usize = UNPACKED_AT + 12;
 /// The name, with its length.
 const COMPRESSION: [u8; 8] = *b"\x04\0\0\0zstd";
+/// Where the data of a compressed chunk begins: after the name and the data's length.
+const DATA_AT: usize = COMPRESSION_AT + COMPRESSION.len() + 8;
 /// Bytes searched at once.
 const BLOCK_BYTES: usize = 1 << 20;
 
@@ -88,6 +92,13 @@ struct Scan<R> {
     chunks: u64,
     lost: Vec<(u64, u64)>,
     complete: bool,
+    /// Bytes read as records that were none.
+    wasted: u64,
+    /// What was searched last, and where it begins.
+    block: (u64, Vec<u8>),
+    /// All bytes read.
+    #[cfg(test)]
+    read: u64,
 }
 
 impl<R: Read + Seek> Scan<R> {
@@ -101,6 +112,10 @@ impl<R: Read + Seek> Scan<R> {
             chunks: 0,
             lost: Vec::new(),
             complete: false,
+            wasted: 0,
+            block: (0, Vec::new()),
+            #[cfg(test)]
+            read: 0,
         })
     }
 
@@ -123,12 +138,13 @@ impl<R: Read + Seek> Scan<R> {
                 _ => {}
             }
             let Some(record) = exact(opcode, &body) else {
+                self.wasted += end - place;
                 self.place = self.skip(place)?;
                 continue;
             };
             self.place = end;
             match record {
-                Record::Chunk { .. } => match records(&body) {
+                Record::Chunk { header, .. } => match records(&header, &body) {
                     Some(records) => {
                         self.chunks += 1;
                         return Ok(Some(records));
@@ -151,8 +167,10 @@ impl<R: Read + Seek> Scan<R> {
         let length = u64::from_le_bytes(length);
         let end = place + RECORD_HEAD_BYTES + length.min(self.length);
         let known = (op::HEADER..=op::DATA_END).contains(&opcode);
-        let fits = length <= LONGEST_RECORD_BYTES && end <= self.length;
-        Ok((known && fits).then_some((opcode, end)))
+        let fits = length <= LONGEST_RECORD_BYTES as u64 && end <= self.length;
+        // Where that much was no record, only chunks are believed.
+        let hopeless = opcode != op::CHUNK && self.wasted > self.length;
+        Ok((known && fits && !hopeless).then_some((opcode, end)))
     }
 
     /// Gives up what stands at `place`; where the next chunk is, or the end.
@@ -164,20 +182,28 @@ impl<R: Read + Seek> Scan<R> {
 
     /// Where the next chunk begins, whole or not, from `place` on.
     fn next_chunk(&mut self, place: u64) -> io::Result<Option<u64>> {
-        let mut from = place + COMPRESSION_AT;
-        while from < self.length {
-            let block = self.bytes(from, from + BLOCK_BYTES as u64)?;
-            let windows = block.windows(COMPRESSION.len()).enumerate();
-            for (at, _) in windows.filter(|(_, window)| *window == COMPRESSION) {
-                let start = from + at as u64 - COMPRESSION_AT;
-                if let Some((op::CHUNK, end)) = self.record_at(start)?
-                    && exact(op::CHUNK, &self.bytes(start + RECORD_HEAD_BYTES, end)?).is_some()
-                {
-                    return Ok(Some(start));
+        let mut from = place;
+        while from + DATA_AT as u64 <= self.length {
+            let (start, block) = &self.block;
+            let inside = from
+                .checked_sub(*start)
+                .and_then(|at| block.get(at as usize..));
+            let Some(block) = inside.filter(|block| block.len() >= DATA_AT) else {
+                // The next search goes on in the same block.
+                self.block = (from, self.bytes(from, from + BLOCK_BYTES as u64)?);
+                if self.block.1.len() < DATA_AT {
+                    // The file has become shorter meanwhile.
+                    return Ok(None);
                 }
+                continue;
+            };
+            let mut heads = block.windows(DATA_AT).enumerate();
+            let left = self.length - from;
+            if let Some((at, _)) = heads.find(|(at, head)| is_chunk_head(head, left - *at as u64)) {
+                return Ok(Some(from + at as u64));
             }
-            // The pattern may stand across the border.
-            from += (BLOCK_BYTES - COMPRESSION.len() + 1) as u64;
+            // A head may stand across the border.
+            from += (block.len() - DATA_AT + 1) as u64;
         }
         Ok(None)
     }
@@ -190,8 +216,26 @@ impl<R: Read + Seek> Scan<R> {
             .by_ref()
             .take(end - start)
             .read_to_end(&mut bytes)?;
+        #[cfg(test)]
+        {
+            self.read += bytes.len() as u64;
+        }
         Ok(bytes)
     }
+}
+
+/// Whether these [`DATA_AT`] bytes begin a chunk as we write it that ends within `left` bytes. Its
+/// lengths agree with each other, so that nothing of it has to be read.
+fn is_chunk_head(head: &[u8], left: u64) -> bool {
+    let length = |at: usize| {
+        let bytes = head.get(at..at + 8).and_then(|bytes| bytes.try_into().ok());
+        bytes.map_or(u64::MAX, u64::from_le_bytes)
+    };
+    head[COMPRESSION_AT..].starts_with(&COMPRESSION)
+        && head[0] == op::CHUNK
+        && length(1) <= (LONGEST_RECORD_BYTES as u64).min(left - RECORD_HEAD_BYTES)
+        && length(1).checked_sub(length(DATA_AT - 8)) == Some(DATA_AT as u64 - RECORD_HEAD_BYTES)
+        && length(UNPACKED_AT) <= LONGEST_RECORD_BYTES as u64
 }
 
 /// A record that fills its bytes to the last one: one whose length was damaged does not, and where
@@ -221,27 +265,34 @@ fn exact(opcode: u8, body: &[u8]) -> Option<Record<'_>> {
     (bytes == body.len()).then_some(record)
 }
 
-/// The records of a chunk, if it is whole. Its checksum is asked before anything in it is believed.
-fn records(body: &[u8]) -> Option<Vec<Record<'static>>> {
+/// The records of a chunk that are copied, if it is whole. Its checksum is asked before anything in it
+/// is believed, and its unpacked length before it is unpacked.
+fn records(header: &ChunkHeader, body: &[u8]) -> Option<Vec<Record<'static>>> {
+    if header.uncompressed_size > LONGEST_RECORD_BYTES as u64 {
+        return None;
+    }
     let options = LinearReaderOptions::default()
         .with_skip_start_magic(true)
         .with_skip_end_magic(true)
         .with_prevalidate_chunk_crcs(true)
-        .with_record_length_limit(LONGEST_RECORD_BYTES as usize);
+        .with_record_length_limit(LONGEST_RECORD_BYTES);
     let mut reader = LinearReader::new_with_options(options);
-    let mut chunk = [&[op::CHUNK], &(body.len() as u64).to_le_bytes()[..], body].concat();
+    let head = [&[op::CHUNK], &(body.len() as u64).to_le_bytes()[..]].concat();
+    let mut chunk = head.as_slice().chain(body);
     let mut records = Vec::new();
     while let Some(event) = reader.next_event() {
         match event.ok()? {
             LinearReadEvent::ReadRequest(wanted) => {
-                let wanted = wanted.min(chunk.len());
-                let rest = chunk.split_off(wanted);
-                reader.insert(wanted).copy_from_slice(&chunk);
-                reader.notify_read(wanted);
-                chunk = rest;
+                let read = chunk.read(reader.insert(wanted)).ok()?;
+                reader.notify_read(read);
             }
             LinearReadEvent::Record { opcode, data } => {
-                records.push(mcap::parse_record(opcode, data).ok()?.into_owned());
+                let record = mcap::parse_record(opcode, data).ok()?;
+                // What is not copied takes no memory.
+                if let Record::Schema { .. } | Record::Channel(_) | Record::Message { .. } = record
+                {
+                    records.push(record.into_owned());
+                }
             }
         }
     }
@@ -376,4 +427,16 @@ impl Recovered {
     pub fn is_whole(&self) -> bool {
         self.complete && self.lost.is_empty() && self.messages_unknown == 0
     }
+}
+
+/// How many messages a file has, and how many bytes were read to find them.
+#[cfg(test)]
+pub(super) fn read_of(file: &[u8]) -> (u64, u64) {
+    let mut scan = Scan::new(io::Cursor::new(file)).expect("memory can be read");
+    let mut messages = 0;
+    while let Some(records) = scan.next().expect("memory can be read") {
+        let is_message = |record: &&Record<'_>| matches!(record, Record::Message { .. });
+        messages += records.iter().filter(is_message).count() as u64;
+    }
+    (messages, scan.read)
 }

@@ -371,3 +371,136 @@ fn what_is_no_recording_is_refused_in_words() {
     let (nothing, _) = recover(Cursor::new(b"no recording at all"), Vec::new()).unwrap();
     assert_eq!(nothing.messages, 0);
 }
+
+/// A chunk as we write it, with `unpacked` bytes said of it.
+fn chunk(unpacked: u64, packed: &[u8]) -> Vec<u8> {
+    let mut body = vec![0; 16];
+    body.extend(unpacked.to_le_bytes());
+    body.extend(0_u32.to_le_bytes());
+    body.extend(b"\x04\0\0\0zstd");
+    body.extend((packed.len() as u64).to_le_bytes());
+    body.extend(packed);
+    let mut record = vec![mcap::records::op::CHUNK];
+    record.extend((body.len() as u64).to_le_bytes());
+    record.extend(body);
+    record
+}
+
+#[test]
+fn every_chunk_that_a_daemon_writes_is_within_bounds() {
+    // Never flushed: each chunk ends where the writer ends one by itself.
+    let hrn = hrn();
+    let about = About {
+        robot: "arm-7".to_owned(),
+        run: "r".to_owned(),
+        boot_id: "b".to_owned(),
+        reason: None,
+        labels: labels(),
+        sensors: vec![RecordedSensor::new(&sensor(), &hrn)],
+    };
+    let mut writer = Writer::new(Vec::new(), &about).unwrap();
+    let pipeline = Pipeline::new(sensor(), hrn, Clock::Arrival);
+    let state = Entry::State(Box::new(State::of(&pipeline, labels())));
+    for index in 0..3_000 {
+        writer.entry(0, at(index), &state).unwrap();
+    }
+    let file = writer.finish().unwrap();
+    let mut chunks = 0;
+    for record in mcap::read::LinearReader::new(&file).unwrap() {
+        if let mcap::records::Record::Chunk { header, .. } = record.unwrap() {
+            let unpacked = header.uncompressed_size as usize;
+            assert!(4 * unpacked <= reader::LONGEST_RECORD_BYTES, "{unpacked}");
+            chunks += 1;
+        }
+    }
+    assert!(chunks > 3, "{chunks} chunks");
+    let (recovered, good) = recover(Cursor::new(&file), Vec::new()).unwrap();
+    assert!(recovered.is_whole(), "{recovered:?}");
+    assert_eq!(Reader::new(&good[..]).map(Result::unwrap).count(), 3_000);
+}
+
+#[test]
+fn a_chunk_that_would_fill_the_memory_is_lost_and_no_other() {
+    let (file, _) = recorded(10, 7);
+    let (whole, _) = recover(Cursor::new(&file), Vec::new()).unwrap();
+    // 250 MB of zeros in some kilobytes.
+    let zeros = mcap_zeros(250 << 20);
+    assert!(zeros.len() < 32 << 10, "{}", zeros.len());
+    let middle = chunk_starts(&file)[3];
+    let mut bomb = file[..middle].to_vec();
+    bomb.extend(chunk(250 << 20, &zeros));
+    bomb.extend(&file[middle..]);
+    let (found, good) = recover(Cursor::new(&bomb), Vec::new()).unwrap();
+    assert_eq!(found.messages, whole.messages);
+    assert_eq!(found.lost.len(), 1, "{found:?}");
+    assert_eq!(play(&good), play(&file));
+    // Who plays it is told, and unpacks nothing.
+    let error = Reader::new(&bomb[..]).find_map(Result::err).unwrap();
+    assert!(error.to_string().contains("hardnessd recover"), "{error}");
+    // One that says less than it holds is not believed either.
+    let mut lie = file[..middle].to_vec();
+    lie.extend(chunk(1 << 20, &zeros));
+    lie.extend(&file[middle..]);
+    let (found, _) = recover(Cursor::new(&lie), Vec::new()).unwrap();
+    assert_eq!(found.messages, whole.messages);
+}
+
+/// So many zeros as zstd packs them: frames of a raw header and blocks of one repeated byte.
+fn mcap_zeros(length: usize) -> Vec<u8> {
+    const BLOCK: usize = 128 << 10;
+    // Magic; a window of 128 KiB, no checksum, no length.
+    let mut packed = vec![0x28, 0xb5, 0x2f, 0xfd, 0x00, 0x38];
+    let blocks = length / BLOCK;
+    for block in 0..blocks {
+        let last = usize::from(block + 1 == blocks);
+        let head = (BLOCK << 3) | (1 << 1) | last;
+        packed.extend(&head.to_le_bytes()[..3]);
+        packed.push(0);
+    }
+    packed
+}
+
+/// Where the chunks of a whole file begin.
+fn chunk_starts(file: &[u8]) -> Vec<usize> {
+    let mut place = MAGIC.len();
+    let mut starts = Vec::new();
+    while file[place] != mcap::records::op::DATA_END {
+        if file[place] == mcap::records::op::CHUNK {
+            starts.push(place);
+        }
+        let length = u64::from_le_bytes(file[place + 1..place + 9].try_into().unwrap());
+        place += 9 + length as usize;
+    }
+    starts
+}
+
+#[test]
+fn the_worst_file_is_read_a_few_times_and_no_more() {
+    let (file, _) = recorded(10, 7);
+    let whole = recover(Cursor::new(&file), Vec::new()).unwrap().0.messages;
+    let head = |opcode: u8, length: u64| {
+        let mut head = vec![opcode];
+        head.extend(length.to_le_bytes());
+        head
+    };
+    // The beginnings of chunks, whose lengths do not agree; records that claim all that is left of
+    // the file; and both in turn, so that each search ends soon.
+    let mut heads = chunk(1 << 10, b"");
+    heads[1] = 200;
+    let claim = head(mcap::records::op::METADATA, 1 << 20);
+    let turns = [chunk(1 << 10, b""), claim.clone()].concat();
+    for (what, pattern) in [("heads", heads), ("claims", claim), ("turns", turns)] {
+        let mut hostile = MAGIC.to_vec();
+        while hostile.len() < 4 << 20 {
+            hostile.extend(&pattern);
+        }
+        hostile.extend(&file[MAGIC.len()..]);
+        let (messages, read) = recover::read_of(&hostile);
+        assert!(
+            read < 8 * hostile.len() as u64,
+            "{what}: {read} bytes read of {}",
+            hostile.len()
+        );
+        assert!(messages * 10 >= whole * 9, "{what}: {messages} of {whole}");
+    }
+}
