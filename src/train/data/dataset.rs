@@ -5,6 +5,7 @@
 //! an object's frames has as good as seen the others.
 
 mod file;
+mod npy;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

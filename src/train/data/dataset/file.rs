@@ -1,15 +1,13 @@
 //! Data sets as `.npz` files: arrays with the names, types and shapes of `docs/formats.md`.
 
-use std::io::{self, Cursor, Read, Seek, Write};
+use std::io::{Cursor, Read, Seek, Write};
 use std::path::Path;
 
-use ndarray::{ArrayD, ArrayView, ArrayView1, ArrayView3, Dimension};
-use ndarray_npy::{
-    NpzReader, NpzWriter, ReadDataError, ReadNpyError, ReadNpzError, ReadableElement,
-    WritableElement, WriteNpzError,
-};
-use py_literal::Value;
+use ndarray::{ArrayView, ArrayView1, ArrayView3};
+use ndarray_npy::{NpzWriter, WritableElement, WriteNpzError};
+use zip::ZipArchive;
 
+use super::npy::{self, Header};
 use super::{Dataset, DatasetError, Sample, Source, levels};
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::simulator::Split;
@@ -17,6 +15,12 @@ use crate::verdict::sha256_hex;
 
 /// More on a taxel than any sensor shows, and little enough that sums of squares stay finite.
 const MOST_NEWTONS: f32 = 1e6;
+
+/// How many times smaller than itself an array may be packed: frames of presses are packed to a tenth,
+/// and arrays of nothing but zeros to a thousandth.
+const MOST_PACKED: u64 = 256;
+/// An array of this size may be packed at will.
+const FREE_BYTES: u64 = 16 << 20;
 
 /// The samples in `bytes`, which are those of the file `path`.
 pub(super) fn parse(bytes: &[u8], path: &Path, name: String) -> Result<Dataset, DatasetError> {
@@ -165,63 +169,49 @@ fn add_optional<W: Write + Seek, T: WritableElement>(
 }
 
 /// An element type that our files may hold.
-trait Element: ReadableElement + Clone {
+trait Element: Copy {
+    /// As errors name it.
     const NAME: &'static str;
+    /// As numpy writes it.
+    const DESCRIPTIONS: &'static [&'static str];
+    /// Reads so many.
+    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, String>;
 }
 impl Element for f32 {
     const NAME: &'static str = "f32";
+    const DESCRIPTIONS: &'static [&'static str] = &["<f4"];
+    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, String> {
+        npy::elements(reader, count, Self::from_le_bytes)
+    }
 }
 impl Element for u32 {
     const NAME: &'static str = "u32";
+    const DESCRIPTIONS: &'static [&'static str] = &["<u4"];
+    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, String> {
+        npy::elements(reader, count, Self::from_le_bytes)
+    }
 }
 impl Element for u8 {
     const NAME: &'static str = "u8";
-}
-
-/// An element that is read before room is made for it: a header may say that there are more than fit
-/// in any memory.
-#[derive(Clone)]
-struct Met<T>(T);
-
-impl<T: ReadableElement> ReadableElement for Met<T> {
-    fn read_to_end_exact_vec<R: Read>(
-        reader: R,
-        type_desc: &Value,
-        len: usize,
-    ) -> Result<Vec<Self>, ReadDataError> {
-        // A wrong type is said before a wrong length.
-        T::read_to_end_exact_vec(io::empty(), type_desc, 0)?;
-        let expected = len.saturating_mul(size_of::<T>());
-        let mut bytes = Vec::new();
-        let one_more = (expected as u64).saturating_add(1);
-        reader
-            .take(one_more)
-            .read_to_end(&mut bytes)
-            .map_err(ReadDataError::Io)?;
-        if bytes.len() < expected {
-            return Err(ReadDataError::MissingData);
-        }
-        let values = T::read_to_end_exact_vec(bytes.as_slice(), type_desc, len)?;
-        Ok(values.into_iter().map(Self).collect())
+    const DESCRIPTIONS: &'static [&'static str] = &["|u1", "<u1", ">u1"];
+    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, String> {
+        npy::elements(reader, count, Self::from_le_bytes)
     }
 }
 
 /// An `.npz` file being read.
 struct File<'a> {
-    npz: NpzReader<Cursor<&'a [u8]>>,
-    names: Vec<String>,
+    zip: ZipArchive<Cursor<&'a [u8]>>,
     path: &'a Path,
 }
 
 impl<'a> File<'a> {
     fn open(bytes: &'a [u8], path: &'a Path) -> Result<Self, DatasetError> {
-        let not_npz = |error: ReadNpzError| DatasetError::NotNpz {
+        let zip = ZipArchive::new(Cursor::new(bytes)).map_err(|error| DatasetError::NotNpz {
             path: path.to_owned(),
             reason: error.to_string(),
-        };
-        let mut npz = NpzReader::new(Cursor::new(bytes)).map_err(not_npz)?;
-        let names = npz.names().map_err(not_npz)?;
-        Ok(Self { npz, names, path })
+        })?;
+        Ok(Self { zip, path })
     }
 
     fn error(&self, array: &'static str, found: String, expected: String) -> DatasetError {
@@ -234,38 +224,35 @@ impl<'a> File<'a> {
     }
 
     /// Reads an array of `n` (or any number of) elements of shape `inner`, row-major; `None` if
-    /// it is not there.
+    /// it is not there. Nothing is unpacked but its header unless that is as expected.
     fn read<T: Element>(
         &mut self,
         array: &'static str,
         inner: &[usize],
         n: Option<usize>,
     ) -> Result<Option<Vec<T>>, DatasetError> {
-        if !self.names.iter().any(|name| name == array) {
+        let file_name = format!("{array}.npy");
+        let mut names = self.zip.file_names();
+        let name = names.find(|name| *name == file_name || *name == array);
+        let Some(name) = name.map(str::to_owned) else {
             return Ok(None);
-        }
+        };
+        drop(names);
         let lengths: String = inner.iter().map(|length| format!(",{length}")).collect();
         let count = n.map_or_else(|| "N".to_owned(), |n| n.to_string());
         let expected = format!("{} [{count}{lengths}]", T::NAME);
-        let values: ArrayD<Met<T>> = self.npz.by_name(array).map_err(|error| {
-            let found = match error {
-                ReadNpzError::Npy(ReadNpyError::WrongDescriptor(found)) => format!("dtype {found}"),
-                other => other.to_string(),
-            };
-            self.error(array, found, expected.clone())
-        })?;
-        let shape = values.raw_dim();
-        let shape = shape.slice();
-        let fits = shape.len() == inner.len() + 1
-            && shape[1..] == *inner
-            && n.is_none_or(|n| shape[0] == n);
-        if !fits {
-            return Err(self.error(array, format!("{} {shape:?}", T::NAME), expected));
+        let read = self
+            .zip
+            .by_name(&name)
+            .map_err(|error| error.to_string())
+            .and_then(|mut reader| {
+                let packed = reader.compressed_size();
+                array_of::<T>(&mut reader, packed, inner, n)
+            });
+        match read {
+            Ok(values) => Ok(Some(values)),
+            Err(found) => Err(self.error(array, found, expected)),
         }
-        // Row-major whatever the file's order.
-        Ok(Some(
-            values.iter().map(|Met(value)| value.clone()).collect(),
-        ))
     }
 
     /// The array `meta`; null if it is not there.
@@ -302,4 +289,52 @@ impl<'a> File<'a> {
             }
         }
     }
+}
+
+/// An array of `n` (or any number of) elements of shape `inner`, row-major, out of `packed` bytes.
+fn array_of<T: Element>(
+    reader: &mut impl Read,
+    packed: u64,
+    inner: &[usize],
+    n: Option<usize>,
+) -> Result<Vec<T>, String> {
+    let Header {
+        descr,
+        fortran_order,
+        shape,
+    } = npy::header(reader)?;
+    if !T::DESCRIPTIONS.contains(&descr.as_str()) {
+        return Err(format!("dtype '{descr}'"));
+    }
+    let fits = match shape.split_first() {
+        Some((first, rest)) => rest == inner && n.is_none_or(|n| *first == n),
+        None => false,
+    };
+    let count = shape
+        .iter()
+        .try_fold(1_usize, |product, &length| product.checked_mul(length));
+    let Some(count) = count.filter(|_| fits) else {
+        return Err(format!("{} {shape:?}", T::NAME));
+    };
+    let bytes = count.saturating_mul(size_of::<T>()) as u64;
+    if bytes > FREE_BYTES.max(packed.saturating_mul(MOST_PACKED)) {
+        return Err(format!("{bytes} bytes packed into {packed}"));
+    }
+    let values = T::read(reader, count)?;
+    if !fortran_order {
+        return Ok(values);
+    }
+    // The first axis changes fastest there, the last one here.
+    let place = |mut index: usize| {
+        let mut steps = count;
+        let (mut place, mut stride) = (0, 1);
+        for &length in &shape {
+            steps /= length;
+            place += index / steps * stride;
+            index %= steps;
+            stride *= length;
+        }
+        place
+    };
+    Ok((0..count).map(|index| values[place(index)]).collect())
 }

@@ -93,6 +93,47 @@ fn more_frames_than_fit_in_memory_are_an_error() {
 }
 
 #[test]
+fn a_file_that_unpacks_to_far_more_than_it_has_is_an_error() {
+    let mut npz = NpzWriter::new_compressed(Cursor::new(Vec::new()));
+    npz.add_array("frames", &Array3::<f32>::zeros((1, ROWS, COLS)))
+        .unwrap();
+    npz.add_array("level", &Array1::from(vec![1_u8])).unwrap();
+    // 32 MB of spaces, which are JSON around a null.
+    let meta = vec![b' '; 32 << 20];
+    npz.add_array("meta", &Array1::from(meta)).unwrap();
+    let bytes = npz.finish().unwrap().into_inner();
+    assert!(bytes.len() < 64 << 10, "{}", bytes.len());
+    let error = parse(&bytes).unwrap_err().to_string();
+    assert!(
+        error.contains("array `meta`: found 33554432 bytes packed into"),
+        "{error}"
+    );
+}
+
+#[test]
+fn an_array_in_fortran_order_is_the_same_array() {
+    let frames = Array3::from_shape_fn((3, ROWS, COLS), |(n, row, col)| {
+        (n * 1000 + row * COLS + col) as f32
+    });
+    let mut other = frames.clone().reversed_axes();
+    other = other.as_standard_layout().into_owned();
+    let of = |frames: ndarray::ArrayView3<'_, f32>| {
+        let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
+        npz.add_array("frames", &frames).unwrap();
+        npz.add_array("level", &Array1::from(vec![1_u8, 2, 3]))
+            .unwrap();
+        npz.finish().unwrap().into_inner()
+    };
+    let (c, fortran) = (of(frames.view()), of(other.view().reversed_axes()));
+    let is_fortran = |bytes: &[u8]| bytes.windows(4).any(|word| word == b"True");
+    assert!(!is_fortran(&c) && is_fortran(&fortran));
+    let samples = |bytes: &[u8]| parse(bytes).unwrap().samples;
+    for (one, other) in samples(&c).iter().zip(&samples(&fortran)) {
+        assert_eq!(one.frame, other.frame);
+    }
+}
+
+#[test]
 fn what_is_not_as_agreed_is_named_with_what_was_found_and_expected() {
     fn check(fill: impl FnOnce(&mut NpzWriter<Cursor<Vec<u8>>>), expected: &str) {
         let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
