@@ -21,6 +21,8 @@ pub mod recording;
 pub mod random;
 pub mod simulator;
 
+pub mod trial;
+
 pub mod daemon;
 pub mod tools;
 #[cfg(feature = "train")]

@@ -16,6 +16,7 @@ use hardnessd::tools::exit::{self, Failure, Stop};
 use hardnessd::tools::{
     self, check, demo, doctor, record, recover, replay, simulate, sniff, tail, watch,
 };
+use hardnessd::trial;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::mpsc;
 
@@ -23,6 +24,9 @@ use tokio::sync::mpsc;
 const LAST_LINES: Duration = Duration::from_millis(200);
 
 fn main() -> ExitCode {
+    if let Some(code) = trial::entry() {
+        return code;
+    }
     let runtime = match tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()

@@ -24,7 +24,7 @@ pub use self::publish::{
 use super::log;
 use crate::sensor::{Description, Sensor};
 use crate::verdict::Hrn;
-use crate::{press, tare, wire};
+use crate::{press, tare, trial, wire};
 
 /// The whole file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -318,7 +318,9 @@ impl Setup {
     /// As [`Config::check`], and if the model cannot be read or is refused.
     pub fn of(config: Config, path: &Path) -> Result<Self, Error> {
         let sensors = config.check(path)?;
-        let hrn = Arc::new(parse::model(&config.model, path)?);
+        let rates = config.sensors.iter().map(|sensor| sensor.frame_rate_hz);
+        let most = trial::verdict_most(rates.fold(0.0, f64::max));
+        let hrn = Arc::new(parse::model(&config.model, most, path)?);
         Ok(Self {
             config,
             sensors,

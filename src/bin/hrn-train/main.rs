@@ -27,6 +27,7 @@ use hardnessd::train::model::export;
 use hardnessd::train::run::Run;
 use hardnessd::train::run::disk::write_whole;
 use hardnessd::train::settings::{Profile, SettingsError};
+use hardnessd::trial;
 use hardnessd::verdict::{Hrn, ModelError};
 
 use self::arguments::{
@@ -39,6 +40,9 @@ use self::arguments::{
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() -> ExitCode {
+    if let Some(code) = trial::entry() {
+        return code;
+    }
     let arguments = match Arguments::try_parse() {
         Ok(arguments) => arguments,
         Err(error) => return tools::usage("hrn-train", &error),
@@ -126,7 +130,7 @@ fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
 }
 
 fn load(path: &Path) -> anyhow::Result<Hrn> {
-    Hrn::load(&read(path)?).with_context(|| path.display().to_string())
+    trial::load(&read(path)?, None).with_context(|| path.display().to_string())
 }
 
 /// Nothing was asked for.

@@ -3,13 +3,14 @@
 use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use toml::de::DeTable;
 
 use super::error::{Error, MAX_BYTES, Place};
 use super::{Config, Model};
 use crate::verdict::{self, Hrn};
-use crate::wording;
+use crate::{trial, wording};
 
 pub(super) fn load(path: &Path) -> Result<Config, Error> {
     let bytes = read(path, MAX_BYTES).map_err(|source| Error::Unreadable {
@@ -140,7 +141,8 @@ fn sensor_without_port(text: &str) -> Option<usize> {
     Some(found.span().start)
 }
 
-pub(super) fn model(model: &Model, path: &Path) -> Result<Hrn, Error> {
+/// The model, tried in another process if it is a file; `most` is how long a verdict may take.
+pub(super) fn model(model: &Model, most: Duration, path: &Path) -> Result<Hrn, Error> {
     let hrn = match &model.path {
         None => Hrn::load(verdict::BUILT_IN),
         Some(file) => {
@@ -150,7 +152,7 @@ pub(super) fn model(model: &Model, path: &Path) -> Result<Hrn, Error> {
                     model: file.clone(),
                     source,
                 })?;
-            Hrn::load(&bytes)
+            trial::load(&bytes, Some(most))
         }
     };
     let hrn = hrn.map_err(|problem| Error::Model {

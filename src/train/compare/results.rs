@@ -17,7 +17,8 @@ use crate::train::run::disk::write_whole;
 use crate::train::run::history::History;
 use crate::train::run::{Description, Run};
 use crate::train::settings::Profile;
-use crate::verdict::{Hrn, sha256_hex};
+use crate::trial;
+use crate::verdict::sha256_hex;
 
 /// A finished run and what its exported model is worth: an element of `results.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -113,7 +114,7 @@ impl Worth {
         if sets.iter().all(|set| known(&worth, set)) {
             return Ok(worth);
         }
-        let hrn = Hrn::load(&bytes).with_context(|| model.display().to_string())?;
+        let hrn = trial::load(&bytes, None).with_context(|| model.display().to_string())?;
         // Every model of ours says its own; of another's that does not, 1 gives no figure before it.
         let temperature = hrn.card().metrics["temperature"].as_f64().unwrap_or(1.0);
         for set in sets {

@@ -1,0 +1,311 @@
+//! A model file is tried in a child process before this one loads it.
+//!
+//! In: the bytes of a model file, and how long a verdict may take. Out: the [`Hrn`], or why the file
+//! is refused. [`verdict`] refuses what is known to hurt before the inference library sees it; a
+//! trial catches what is not known: the child may panic, fill its memory or never end, and this
+//! process says so in one line and goes on. The child is the same program, which calls [`entry`]
+//! first thing; where nobody has called it, as in a test of the library, there is no trial.
+
+use std::io::{Read, Write};
+use std::os::unix::process::{CommandExt, ExitStatusExt};
+use std::panic::{self, PanicHookInfo};
+use std::process::{Child, Command, ExitCode, ExitStatus, Stdio};
+use std::sync::OnceLock;
+use std::sync::mpsc;
+use std::thread;
+use std::time::Duration;
+
+use rustix::process::{Resource, Rlimit, Signal};
+use rustix::time::ClockId;
+use serde::{Deserialize, Serialize};
+
+use crate::frame::Frame;
+use crate::verdict::{self, Hrn, ModelError};
+
+/// By this name (argv 0) a process of the program knows that it is a trial.
+const NAME: &str = "hardnessd-trial";
+/// Share of a frame's period that a verdict may take.
+const SHARE: f64 = 0.1;
+/// A verdict may take this long whatever the sensor's rate, and never longer than the second: the
+/// daemon does nothing else meanwhile.
+const VERDICT_MOST: [Duration; 2] = [Duration::from_millis(1), Duration::from_millis(20)];
+/// Address space of a trial, in bytes.
+const MEMORY_BYTES: u64 = 1 << 30;
+/// Processor time of a trial.
+const PROCESSOR: Duration = Duration::from_secs(10);
+/// How long a trial may take by the clock: other processes may be busy.
+const DEADLINE: Duration = Duration::from_secs(30);
+/// Verdicts that are timed.
+const VERDICTS: usize = 15;
+/// No verdict is timed after this much processor time.
+const TIMED: Duration = Duration::from_secs(1);
+/// Longest answer of a trial.
+const ANSWER_BYTES: u64 = 64 << 10;
+
+/// Whether this program can be a trial.
+static IS_TRIER: OnceLock<()> = OnceLock::new();
+
+/// What a trial says, as a line of JSON.
+#[derive(Debug, Serialize, Deserialize)]
+enum Answer {
+    /// The file is good; the median of the processor time of its verdicts.
+    Good {
+        verdict_us: f64,
+    },
+    Refused(String),
+    Panicked(String),
+}
+
+/// How long a verdict may take where the fastest sensor sends `frame_rate_hz` frames a second.
+pub fn verdict_most(frame_rate_hz: f64) -> Duration {
+    let [least, most] = VERDICT_MOST;
+    let share = Duration::try_from_secs_f64(SHARE / frame_rate_hz).unwrap_or(most);
+    share.clamp(least, most)
+}
+
+/// Lets this process try models, or is the trial of one: then its exit code.
+pub fn entry() -> Option<ExitCode> {
+    if std::env::args_os().next().is_some_and(|name| name == NAME) {
+        return Some(trial());
+    }
+    let _ = IS_TRIER.set(());
+    None
+}
+
+/// Loads a model file after a trial. A verdict may take `most`, if that is given.
+///
+/// # Errors
+///
+/// As [`Hrn::load`]; [`ModelError::Trial`] if the trial refuses the file or does not come to an end,
+/// [`ModelError::Slow`] if a verdict takes too long.
+pub fn load(bytes: &[u8], most: Option<Duration>) -> Result<Hrn, ModelError> {
+    if bytes.len() > verdict::MAX_FILE_BYTES {
+        return Err(ModelError::TooLarge { found: bytes.len() });
+    }
+    if IS_TRIER.get().is_some() {
+        let found = tried(child(), bytes, DEADLINE)?;
+        if let Some(expected) = most
+            && found > expected
+        {
+            return Err(ModelError::Slow { found, expected });
+        }
+    }
+    Hrn::load(bytes)
+}
+
+/// The same program, even if another one is installed in its place meanwhile.
+fn child() -> Command {
+    let mut command = Command::new("/proc/self/exe");
+    command.arg0(NAME);
+    command
+}
+
+/// Has a child try the file: how long a verdict takes.
+fn tried(mut command: Command, bytes: &[u8], deadline: Duration) -> Result<Duration, ModelError> {
+    let trial = |problem: String| ModelError::Trial(format!("model: {problem}"));
+    let mut child = command
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .map_err(|error| trial(format!("no process to try it in: {error}")))?;
+    let answer = ask(&mut child, bytes, deadline);
+    // It may have answered and still hang.
+    let _ = child.kill();
+    let ended = child.wait();
+    match answer {
+        Some(Answer::Good { verdict_us }) => {
+            Ok(Duration::try_from_secs_f64(verdict_us / 1e6).unwrap_or(Duration::MAX))
+        }
+        Some(Answer::Refused(problem)) => Err(ModelError::Trial(problem)),
+        Some(Answer::Panicked(problem)) => Err(trial(format!(
+            "the inference library failed on it: {problem}"
+        ))),
+        None => Err(trial(match ended {
+            Ok(status) => why_silent(status),
+            Err(error) => format!("the process that tried it is lost: {error}"),
+        })),
+    }
+}
+
+/// Gives the child the file and waits for its answer; `None`: there came none.
+fn ask(child: &mut Child, bytes: &[u8], deadline: Duration) -> Option<Answer> {
+    let (mut stdin, stdout) = (child.stdin.take()?, child.stdout.take()?);
+    thread::scope(|scope| {
+        // A child that ends early does not read all; a child that is killed ends both threads.
+        scope.spawn(move || {
+            let _ = stdin.write_all(bytes);
+        });
+        let (say, heard) = mpsc::channel();
+        scope.spawn(move || {
+            let mut line = Vec::new();
+            let read = stdout.take(ANSWER_BYTES).read_to_end(&mut line);
+            let _ = say.send(read.ok().map(|_| line));
+        });
+        let line = heard.recv_timeout(deadline).ok().flatten();
+        if line.is_none() {
+            let _ = child.kill();
+        }
+        // A panic comes first; what follows it does not count.
+        let line = line?;
+        let mut answers = serde_json::Deserializer::from_slice(&line).into_iter();
+        answers.next()?.ok()
+    })
+}
+
+/// Why a child that has ended said nothing.
+fn why_silent(status: ExitStatus) -> String {
+    let signal = status.signal().and_then(Signal::from_named_raw);
+    match signal {
+        Some(Signal::XCPU) => format!(
+            "it takes more than {} s of processor time to load",
+            PROCESSOR.as_secs()
+        ),
+        Some(Signal::KILL) => format!(
+            "it took more than {} s to load, or more memory than there is",
+            DEADLINE.as_secs()
+        ),
+        Some(Signal::ABORT) => format!(
+            "it takes more than {} MB of memory, or the inference library failed on it",
+            MEMORY_BYTES >> 20
+        ),
+        _ => format!("the inference library failed on it ({status})"),
+    }
+}
+
+/// Is the child: tries the file on stdin and answers on stdout.
+fn trial() -> ExitCode {
+    limit();
+    panic::set_hook(Box::new(|info| {
+        say(&Answer::Panicked(one_line(info)));
+    }));
+    let mut bytes = Vec::new();
+    let read = std::io::stdin()
+        .take(verdict::MAX_FILE_BYTES as u64 + 1)
+        .read_to_end(&mut bytes);
+    let answer = match read {
+        Err(error) => Answer::Refused(error.to_string()),
+        Ok(_) => match Hrn::load(&bytes).and_then(|hrn| median_us(&hrn)) {
+            Ok(verdict_us) => Answer::Good { verdict_us },
+            Err(error) => Answer::Refused(error.to_string()),
+        },
+    };
+    say(&answer);
+    ExitCode::SUCCESS
+}
+
+/// Bounds what this process can take. Where the system forbids it, the deadline is left.
+fn limit() {
+    let bound = |most: u64| Rlimit {
+        current: Some(most),
+        maximum: Some(most),
+    };
+    let _ = rustix::process::setrlimit(Resource::As, bound(MEMORY_BYTES));
+    let _ = rustix::process::setrlimit(Resource::Core, bound(0));
+    let _ = rustix::process::setrlimit(
+        Resource::Cpu,
+        Rlimit {
+            current: Some(PROCESSOR.as_secs()),
+            maximum: Some(PROCESSOR.as_secs() + 1),
+        },
+    );
+    // Where memory is short, this process goes before the daemon.
+    let _ = std::fs::write("/proc/self/oom_score_adj", "1000");
+    let _ = rustix::process::set_parent_process_death_signal(Some(Signal::KILL));
+}
+
+/// The median of the processor time of verdicts: other processes do not count in it.
+fn median_us(hrn: &Hrn) -> Result<f64, ModelError> {
+    let now = || {
+        let time = rustix::time::clock_gettime(ClockId::ThreadCPUTime);
+        Duration::try_from(time).unwrap_or_default()
+    };
+    let begun = now();
+    let mut times = Vec::new();
+    for newtons in hrn.check().frames.iter().cycle().take(VERDICTS) {
+        let mut frame = Frame::default();
+        frame.newtons.copy_from_slice(newtons);
+        let before = now();
+        hrn.judge(&frame)?;
+        times.push(now().saturating_sub(before));
+        if now().saturating_sub(begun) > TIMED {
+            break;
+        }
+    }
+    times.sort_unstable();
+    Ok(times[times.len() / 2].as_secs_f64() * 1e6)
+}
+
+fn one_line(info: &PanicHookInfo<'_>) -> String {
+    let text = info.payload_as_str().unwrap_or("a panic");
+    text.chars()
+        .map(|char| if char.is_control() { ' ' } else { char })
+        .take(200)
+        .collect()
+}
+
+fn say(answer: &Answer) {
+    // Nobody is left to hear a failure.
+    let _ = serde_json::to_writer(std::io::stdout(), answer);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_verdict_may_take_a_tenth_of_a_period_within_bounds() {
+        for (hz, ms) in [
+            (5.0, 20.0),
+            (50.0, 2.0),
+            (100.0, 1.0),
+            (1e6, 1.0),
+            (1e-3, 20.0),
+        ] {
+            let found = verdict_most(hz);
+            assert!(
+                (found.as_secs_f64() * 1e3 - ms).abs() < 1e-9,
+                "{hz}: {found:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_child_that_fails_in_any_way_is_a_line() {
+        let check = |script: &str, expected: &str| {
+            let mut command = Command::new("sh");
+            command.args(["-c", script]);
+            // More than a pipe holds: a child that does not read it is no reason to wait.
+            let bytes = vec![0; 1 << 20];
+            let error = tried(command, &bytes, Duration::from_millis(500)).unwrap_err();
+            let line = error.to_string();
+            assert!(line.contains(expected), "{script}: {line}");
+            assert!(!line.contains('\n'), "{line}");
+        };
+        check("kill -ABRT $$", "more than 1024 MB of memory, or");
+        check(
+            "kill -SEGV $$",
+            "the inference library failed on it (signal: 11",
+        );
+        check("kill -XCPU $$", "more than 10 s of processor time");
+        check("exec sleep 60", "took more than 30 s to load");
+        check("echo nonsense", "the inference library failed on it");
+        check(
+            r#"echo '{"Panicked":"at sea"}{"Refused":"so"}'"#,
+            "failed on it: at sea",
+        );
+        check(r#"echo '{"Refused":"model of clay"}'"#, "model of clay");
+        let none = tried(Command::new("/nonexistent"), b"", DEADLINE).unwrap_err();
+        assert!(
+            none.to_string().contains("no process to try it in"),
+            "{none}"
+        );
+    }
+
+    #[test]
+    fn a_file_within_its_limits_is_timed() {
+        let hrn = Hrn::load(verdict::BUILT_IN).unwrap();
+        let us = median_us(&hrn).unwrap();
+        assert!(us > 0.0 && us < 1e6, "{us}");
+    }
+}
