@@ -428,5 +428,5 @@ fn hello(setup: &Setup, run: String) -> Hello {
 fn run_token() -> std::io::Result<String> {
     let mut bytes = [0; 8];
     File::open("/dev/urandom")?.read_exact(&mut bytes)?;
-    Ok(format!("{:016x}", u64::from_be_bytes(bytes)))
+    Ok(hex::encode(bytes))
 }

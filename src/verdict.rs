@@ -8,7 +8,6 @@
 mod file;
 mod guard;
 
-use std::fmt::Write as _;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
@@ -391,11 +390,7 @@ fn largest_difference(left: &[f32], right: &[f32]) -> f32 {
 
 /// SHA-256 of `bytes` as 64 hexadecimal digits.
 pub fn sha256_hex(bytes: &[u8]) -> String {
-    let mut hex = String::with_capacity(64);
-    for byte in Sha256::digest(bytes) {
-        write!(hex, "{byte:02x}").expect("a String grows without failing");
-    }
-    hex
+    hex::encode(Sha256::digest(bytes))
 }
 
 /// The innermost message: tract's outer ones name its own stages.

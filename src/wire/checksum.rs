@@ -1,5 +1,6 @@
 //! Checksums of serial sensors.
 
+use crc::{CRC_16_IBM_3740, CRC_16_MODBUS, Crc, Table};
 use serde::{Deserialize, Serialize};
 
 /// A checksum over all bytes of the frame before it, sent little-endian.
@@ -36,55 +37,14 @@ impl Checksum {
                 u16::from(bytes.iter().fold(0_u8, |sum, &byte| sum.wrapping_add(byte)))
             }
             Checksum::Xor8 => u16::from(bytes.iter().fold(0_u8, |sum, &byte| sum ^ byte)),
-            Checksum::Crc16Modbus => bytes.iter().fold(0xFFFF, |crc, &byte| {
-                (crc >> 8) ^ MODBUS[usize::from((crc ^ u16::from(byte)) & 0xFF)]
-            }),
-            Checksum::Crc16Ccitt => bytes.iter().fold(0xFFFF, |crc: u16, &byte| {
-                (crc << 8) ^ CCITT[usize::from((crc >> 8) ^ u16::from(byte))]
-            }),
+            Checksum::Crc16Modbus => MODBUS.checksum(bytes),
+            Checksum::Crc16Ccitt => CCITT.checksum(bytes),
         }
     }
 }
 
-const MODBUS: [u16; 256] = {
-    let mut table = [0; 256];
-    let mut index = 0;
-    while index < 256 {
-        let mut crc = index as u16;
-        let mut bit = 0;
-        while bit < 8 {
-            crc = if crc & 1 == 1 {
-                (crc >> 1) ^ 0xA001
-            } else {
-                crc >> 1
-            };
-            bit += 1;
-        }
-        table[index] = crc;
-        index += 1;
-    }
-    table
-};
-
-const CCITT: [u16; 256] = {
-    let mut table = [0; 256];
-    let mut index = 0;
-    while index < 256 {
-        let mut crc = (index as u16) << 8;
-        let mut bit = 0;
-        while bit < 8 {
-            crc = if crc & 0x8000 != 0 {
-                (crc << 1) ^ 0x1021
-            } else {
-                crc << 1
-            };
-            bit += 1;
-        }
-        table[index] = crc;
-        index += 1;
-    }
-    table
-};
+static MODBUS: Crc<u16, Table<16>> = Crc::<u16, Table<16>>::new(&CRC_16_MODBUS);
+static CCITT: Crc<u16, Table<16>> = Crc::<u16, Table<16>>::new(&CRC_16_IBM_3740);
 
 #[cfg(test)]
 mod tests {

@@ -31,12 +31,10 @@ pub(super) fn wanted<B>(request: &Request<B>) -> Result<Subscription, String> {
         ..Subscription::default()
     };
     let query = request.uri().query().unwrap_or_default();
-    for pair in query.split('&').filter(|pair| !pair.is_empty()) {
-        let (key, value) = pair.split_once('=').unwrap_or((pair, ""));
-        let value = decoded(value).ok_or_else(|| format!("{key}: found no UTF-8"))?;
-        match key {
+    for (key, value) in form_urlencoded::parse(query.as_bytes()) {
+        match &*key {
             "types" => wanted.kinds = kinds(&value)?,
-            "since" => wanted.since = Some(since(key, &value)?),
+            "since" => wanted.since = Some(since(&key, &value)?),
             _ => {
                 return Err(format!("found {key:?}, expected \"types\" or \"since\""));
             }
@@ -60,27 +58,6 @@ fn kinds(names: &str) -> Result<Kinds, String> {
 
 fn since(key: &str, token: &str) -> Result<Since, String> {
     Since::parse(token).ok_or_else(|| format!("{key}: found {token:?}, expected \"RUN:SEQ\""))
-}
-
-/// Undoes percent-encoding; `None`: no UTF-8.
-fn decoded(text: &str) -> Option<String> {
-    let mut bytes = Vec::with_capacity(text.len());
-    let mut rest = text.as_bytes();
-    while let Some((&byte, tail)) = rest.split_first() {
-        let hex = tail.get(..2).and_then(|hex| std::str::from_utf8(hex).ok());
-        let code = hex.and_then(|hex| u8::from_str_radix(hex, 16).ok());
-        match (byte, code) {
-            (b'%', Some(code)) => {
-                bytes.push(code);
-                rest = &tail[2..];
-            }
-            _ => {
-                bytes.push(byte);
-                rest = tail;
-            }
-        }
-    }
-    String::from_utf8(bytes).ok()
 }
 
 /// Subscribes; the inner error is for the asker.
@@ -203,6 +180,8 @@ mod tests {
             ("/events?since=7", None, "since"),
             ("/events", Some("7"), "Last-Event-ID"),
             ("/events?types=%ff", None, "types"),
+            // A percent sign before anything but two hex digits stands for itself.
+            ("/events?types=%+1", None, "\"% 1\""),
         ] {
             let message = ask(uri, last).unwrap_err();
             assert!(message.contains(found), "{message}");

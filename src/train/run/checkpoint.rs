@@ -88,8 +88,7 @@ impl Origin {
 
     /// The hash in hexadecimal digits.
     pub fn finish(self) -> String {
-        let bytes = self.0.finalize();
-        bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+        hex::encode(self.0.finalize())
     }
 }
 
