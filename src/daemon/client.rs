@@ -17,9 +17,11 @@ use tracing::debug;
 use super::accept::Serve;
 use super::hub::{self, Closed, Line};
 use super::lines::{Heard, Lines};
+use super::record::NoBlackbox;
 use super::request::{self, Change, Request};
 use super::sensor::{Command, Sensors};
 use crate::event::{Reply, Tared};
+use crate::tare::RetareError;
 
 /// Longest line a subscriber may send (`docs/controller.md`).
 const LONGEST_LINE_BYTES: usize = 64 * 1024;
@@ -107,47 +109,38 @@ pub(crate) struct Service {
 
 impl Service {
     /// Carries a command out.
-    async fn change(&self, change: Change) -> Result<Done, String> {
+    async fn change(&self, change: Change) -> Result<Done, Refused> {
+        let key = change.key();
         if self.access == Access::ReadOnly {
-            return Err(format!(
-                "{}: found a command that changes something, expected it on the control socket",
-                change.key()
-            ));
+            return Err(Refused::ReadOnly(key));
         }
         let sensors = &self.sensors;
+        let stopping = |_| Refused::Stopping(key);
         match change {
             Change::Tare { sensor } => {
                 let (reply, outcome) = oneshot::channel();
-                tell(sensors, "tare", &sensor, Command::Tare(reply)).await?;
-                match outcome.await {
-                    Ok(Ok(tared)) => Ok(Done {
-                        tare: Some(tared),
-                        ..Done::default()
-                    }),
-                    Ok(Err(refusal)) => Err(format!("tare: {refusal}")),
-                    Err(_) => Err("tare: the daemon is stopping".to_owned()),
-                }
+                tell(sensors, key, &sensor, Command::Tare(reply)).await?;
+                let tared = outcome.await.map_err(stopping)??;
+                Ok(Done {
+                    tare: Some(tared),
+                    ..Done::default()
+                })
             }
             Change::Context { sensor, context } => {
                 let (reply, held) = oneshot::channel();
                 let command = Command::Context(context, reply);
                 tell(sensors, "context.sensor", &sensor, command).await?;
-                match held.await {
-                    Ok(()) => Ok(Done::default()),
-                    Err(_) => Err("context: the daemon is stopping".to_owned()),
-                }
+                held.await.map_err(stopping)?;
+                Ok(Done::default())
             }
             Change::Blackbox { sensor } => {
                 let (reply, written) = oneshot::channel();
-                tell(sensors, "blackbox", &sensor, Command::Blackbox(reply)).await?;
-                match written.await {
-                    Ok(Ok(path)) => Ok(Done {
-                        blackbox: Some(path.display().to_string()),
-                        ..Done::default()
-                    }),
-                    Ok(Err(reason)) => Err(format!("blackbox: {reason}")),
-                    Err(_) => Err("blackbox: the recorder has no time for it".to_owned()),
-                }
+                tell(sensors, key, &sensor, Command::Blackbox(reply)).await?;
+                let path = written.await.map_err(|_| Refused::Busy)??;
+                Ok(Done {
+                    blackbox: Some(path.display().to_string()),
+                    ..Done::default()
+                })
             }
         }
     }
@@ -169,6 +162,31 @@ impl<S: Stream> Serve<S> for Service {
         // One that does not take it learns of it by the end of the connection.
         let _ = stream.say(Reply::Error { message, id: None }.to_line().as_bytes());
     }
+}
+
+/// Why a request is answered with an `error`.
+#[derive(Debug, thiserror::Error)]
+enum Refused {
+    #[error(transparent)]
+    Unusable(#[from] request::Unusable),
+    #[error(transparent)]
+    Ahead(#[from] hub::Ahead),
+    #[error("{0}: found a command that changes something, expected it on the control socket")]
+    ReadOnly(&'static str),
+    #[error("{key}: found {found:?}, expected one of {}", names.join(", "))]
+    NoSensor {
+        key: &'static str,
+        found: String,
+        names: Vec<String>,
+    },
+    #[error("tare: {0}")]
+    Tare(#[from] RetareError),
+    #[error("blackbox: {0}")]
+    Blackbox(#[from] NoBlackbox),
+    #[error("blackbox: the recorder has no time for it")]
+    Busy,
+    #[error("{0}: the daemon is stopping")]
+    Stopping(&'static str),
 }
 
 /// Why a connection ended.
@@ -292,7 +310,7 @@ impl<S: Stream> Client<S> {
         let answered = match line.request {
             Ok(Request::Subscribe(subscription)) => {
                 let subscribed = hub.subscribe(id, subscription).await?;
-                subscribed.map(|()| Vec::new())
+                subscribed.map(|()| Vec::new()).map_err(Refused::from)
             }
             Ok(Request::Status) => Ok(statuses(&sensors).await),
             Ok(Request::Last) => Ok(hub.finals().await?),
@@ -303,7 +321,7 @@ impl<S: Stream> Client<S> {
                     answer(service.change(change).await, line.id)
                 })));
             }
-            Err(message) => Err(message),
+            Err(unusable) => Err(unusable.into()),
         };
         // What the hub gave before it answered belongs before the answer.
         let given = next.try_recv();
@@ -312,7 +330,7 @@ impl<S: Stream> Client<S> {
         }
         let (mut lines, answered) = match answered {
             Ok(lines) => (lines, Ok(Done::default())),
-            Err(message) => (Vec::new(), Err(message)),
+            Err(refused) => (Vec::new(), Err(refused)),
         };
         lines.push(answer(answered, line.id));
         self.send(&lines).await?;
@@ -333,15 +351,20 @@ impl<S: Stream> Client<S> {
 }
 
 /// Passes a command on to the sensor of that name; `key` names it in the request.
-async fn tell(sensors: &Sensors, key: &str, name: &str, command: Command) -> Result<(), String> {
+async fn tell(
+    sensors: &Sensors,
+    key: &'static str,
+    name: &str,
+    command: Command,
+) -> Result<(), Refused> {
     let Some(sensor) = sensors.0.iter().find(|sensor| sensor.name == name) else {
-        let names: Vec<&str> = sensors.0.iter().map(|s| s.name.as_str()).collect();
-        return Err(format!(
-            "{key}: found {name:?}, expected one of {}",
-            names.join(", ")
-        ));
+        return Err(Refused::NoSensor {
+            key,
+            found: name.to_owned(),
+            names: sensors.0.iter().map(|s| s.name.clone()).collect(),
+        });
     };
-    let stopping = |_| format!("{key}: the daemon is stopping");
+    let stopping = |_| Refused::Stopping(key);
     sensor.commands.send(command).await.map_err(stopping)
 }
 
@@ -359,10 +382,10 @@ async fn done(doing: &mut Option<Doing>) -> Line {
     }
 }
 
-fn answer(answered: Result<Done, String>, id: Option<serde_json::Value>) -> Line {
+fn answer(answered: Result<Done, Refused>, id: Option<serde_json::Value>) -> Line {
     match answered {
         Ok(Done { tare, blackbox }) => Reply::Ok { id, tare, blackbox }.into(),
-        Err(message) => error(message, id),
+        Err(refused) => error(refused.to_string(), id),
     }
 }
 

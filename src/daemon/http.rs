@@ -214,7 +214,7 @@ impl Http {
     async fn events(&self, request: &Request<Incoming>) -> Response<Body> {
         let wanted = match events::wanted(request) {
             Ok(wanted) => wanted,
-            Err(message) => return text(StatusCode::BAD_REQUEST, message + "\n"),
+            Err(unusable) => return text(StatusCode::BAD_REQUEST, format!("{unusable}\n")),
         };
         if request.method() == Method::HEAD {
             return typed(
@@ -225,7 +225,7 @@ impl Http {
         }
         match events::open(&self.hub, &self.sensors, wanted).await {
             Ok(Ok(events)) => typed(StatusCode::OK, events::CONTENT_TYPE, Body::Events(events)),
-            Ok(Err(message)) => text(StatusCode::BAD_REQUEST, message + "\n"),
+            Ok(Err(ahead)) => text(StatusCode::BAD_REQUEST, format!("{ahead}\n")),
             Err(hub::Closed) => stopping(),
         }
     }

@@ -185,7 +185,7 @@ impl Hub {
     }
 
     /// Changes what a subscriber gets from now on.
-    fn subscribe(&mut self, id: u64, wanted: &Subscription) -> Result<(), String> {
+    fn subscribe(&mut self, id: u64, wanted: &Subscription) -> Result<(), Ahead> {
         let (latest, oldest) = (self.hello.seq, self.oldest());
         let Some(subscriber) = self.subscribers.get_mut(&id) else {
             return Ok(());
@@ -196,10 +196,8 @@ impl Hub {
         };
         let known = since.run == self.hello.run;
         if known && since.seq > latest {
-            return Err(format!(
-                "since: found {}, expected at most {latest}",
-                since.seq
-            ));
+            let found = since.seq;
+            return Err(Ahead { found, latest });
         }
         subscriber.change(wanted.kinds, wanted.policy);
         let first = if known { since.seq + 1 } else { oldest };
@@ -258,7 +256,7 @@ enum Command {
     Subscribe {
         id: u64,
         subscription: Subscription,
-        reply: oneshot::Sender<Result<(), String>>,
+        reply: oneshot::Sender<Result<(), Ahead>>,
     },
     Finals {
         reply: oneshot::Sender<Vec<Line>>,
@@ -287,6 +285,14 @@ pub(crate) struct Survey {
 #[derive(Debug, Clone)]
 pub(crate) struct Handle {
     commands: mpsc::Sender<Command>,
+}
+
+/// A place that this run has not reached.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+#[error("since: found {found}, expected at most {latest}")]
+pub(crate) struct Ahead {
+    found: u64,
+    latest: u64,
 }
 
 /// The hub has ended: the daemon is stopping.
@@ -335,7 +341,7 @@ impl Handle {
         &self,
         id: u64,
         subscription: Subscription,
-    ) -> Result<Result<(), String>, Closed> {
+    ) -> Result<Result<(), Ahead>, Closed> {
         self.ask(|reply| Command::Subscribe {
             id,
             subscription,

@@ -93,6 +93,17 @@ pub enum Error {
     Thread(#[source] std::io::Error),
 }
 
+/// Why there is no black box.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum NoBlackbox {
+    #[error("found no [record] in the configuration, expected it: nothing is kept")]
+    NotKept,
+    #[error("found a recording into one file, expected the daemon")]
+    OneFile,
+    #[error(transparent)]
+    Write(#[from] crate::recording::Error),
+}
+
 /// Whether this process may write to the directory, or make it.
 pub(crate) fn check(settings: &config::Record) -> Result<(), Error> {
     let directory = settings.dir();
@@ -127,7 +138,7 @@ enum Job {
     /// To write the last minute of a sensor.
     Blackbox {
         sensor: usize,
-        reply: oneshot::Sender<Result<PathBuf, String>>,
+        reply: oneshot::Sender<Result<PathBuf, NoBlackbox>>,
     },
 }
 
@@ -270,7 +281,7 @@ impl SensorRecorder {
     }
 
     /// Has the last minute written; the answer comes when that is done.
-    pub(crate) fn blackbox(&self, reply: oneshot::Sender<Result<PathBuf, String>>) {
+    pub(crate) fn blackbox(&self, reply: oneshot::Sender<Result<PathBuf, NoBlackbox>>) {
         // Where there is no room for the job `reply` goes with it, and the asker sees that.
         match &self.0 {
             Some(active) => {
@@ -278,8 +289,7 @@ impl SensorRecorder {
                 active.jobs.tell(Job::Blackbox { sensor, reply });
             }
             None => {
-                let reason = "found no [record] in the configuration, expected it: nothing is kept";
-                let _ = reply.send(Err(reason.to_owned()));
+                let _ = reply.send(Err(NoBlackbox::NotKept));
             }
         }
     }

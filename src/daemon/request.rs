@@ -1,8 +1,8 @@
 //! What a subscriber may say: one JSON object a line.
 //!
-//! In: a line as it came. Out: a [`Request`], or a message saying what was found and what was
-//! expected; in both cases with the `id` to echo. Whether a [`Change`] may be asked for here is
-//! not known here: that depends on the way in.
+//! In: a line as it came. Out: a [`Request`], or what was found and what was expected instead; in
+//! both cases with the `id` to echo. Whether the connection may ask for a [`Change`] is not decided
+//! here.
 
 use serde::Serialize;
 use serde_json::{Map, Value};
@@ -126,25 +126,61 @@ impl FromIterator<Kind> for Kinds {
     }
 }
 
-/// A line, read.
+/// Why a line cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum Unusable {
+    #[error("found no JSON ({0}), expected an object")]
+    NoJson(String),
+    #[error("found JSON of another type, expected an object")]
+    NoObject,
+    #[error("found {found}, expected {expected}")]
+    Key {
+        found: String,
+        expected: &'static str,
+    },
+    #[error("{key}: found {found}, expected {expected}")]
+    Value {
+        key: &'static str,
+        found: String,
+        expected: &'static str,
+    },
+    #[error("found {0}, which this request does not take")]
+    Extra(String),
+    #[error("context: found {0} bytes, expected fewer than {CONTEXT_BYTES}")]
+    LongContext(usize),
+}
+
+impl Unusable {
+    /// Of a value in JSON.
+    fn value(key: &'static str, found: &Value, expected: &'static str) -> Self {
+        let found = short(found);
+        Self::Value {
+            key,
+            found,
+            expected,
+        }
+    }
+}
+
+/// A line that was read.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Line {
     /// To be echoed in the answer.
     pub(crate) id: Option<Value>,
     /// What it asks for, or why it cannot be used.
-    pub(crate) request: Result<Request, String>,
+    pub(crate) request: Result<Request, Unusable>,
 }
 
 /// Reads one line, without its newline.
 pub(crate) fn parse(line: &[u8]) -> Line {
-    let unusable = |message: String| Line {
+    let unusable = |reason| Line {
         id: None,
-        request: Err(message),
+        request: Err(reason),
     };
     let mut fields: Map<String, Value> = match serde_json::from_slice(line) {
         Ok(Value::Object(fields)) => fields,
-        Ok(_) => return unusable("found JSON of another type, expected an object".to_owned()),
-        Err(error) => return unusable(format!("found no JSON ({error}), expected an object")),
+        Ok(_) => return unusable(Unusable::NoObject),
+        Err(error) => return unusable(Unusable::NoJson(error.to_string())),
     };
     let id = fields.remove("id");
     Line {
@@ -153,7 +189,7 @@ pub(crate) fn parse(line: &[u8]) -> Line {
     }
 }
 
-fn request(mut fields: Map<String, Value>) -> Result<Request, String> {
+fn request(mut fields: Map<String, Value>) -> Result<Request, Unusable> {
     let request = if let Some(kinds) = fields.remove("subscribe") {
         Request::Subscribe(Subscription {
             kinds: self::kinds(&kinds)?,
@@ -169,12 +205,7 @@ fn request(mut fields: Map<String, Value>) -> Result<Request, String> {
         match what.as_str() {
             Some("status") => Request::Status,
             Some("last") => Request::Last,
-            _ => {
-                return Err(format!(
-                    "get: found {}, expected \"status\" or \"last\"",
-                    short(&what)
-                ));
-            }
+            _ => return Err(Unusable::value("get", &what, "\"status\" or \"last\"")),
         }
     } else if let Some(sensor) = fields.remove("tare") {
         let sensor = name("tare", &sensor)?;
@@ -186,43 +217,42 @@ fn request(mut fields: Map<String, Value>) -> Result<Request, String> {
         Request::Change(Change::Blackbox { sensor })
     } else {
         let found = fields.keys().next().map_or("no key".to_owned(), short);
-        return Err(format!(
-            "found {found}, expected \"subscribe\" or \"get\", or on the control socket \"tare\", \
-             \"context\" or \"blackbox\""
-        ));
+        let expected = "\"subscribe\" or \"get\", or on the control socket \"tare\", \"context\" or \
+                        \"blackbox\"";
+        return Err(Unusable::Key { found, expected });
     };
     match fields.keys().next() {
-        Some(key) => Err(format!(
-            "found {}, which this request does not take",
-            short(key)
-        )),
+        Some(key) => Err(Unusable::Extra(short(key))),
         None => Ok(request),
     }
 }
 
-fn name(key: &str, value: &Value) -> Result<String, String> {
-    value
-        .as_str()
-        .map(str::to_owned)
-        .ok_or_else(|| format!("{key}: found {}, expected a sensor's name", short(value)))
+fn name(key: &'static str, value: &Value) -> Result<String, Unusable> {
+    let name = value.as_str().map(str::to_owned);
+    name.ok_or_else(|| Unusable::value(key, value, NAME))
 }
 
-fn context(value: Value) -> Result<Change, String> {
+/// What is expected where a sensor is meant.
+const NAME: &str = "a sensor's name";
+
+fn context(value: Value) -> Result<Change, Unusable> {
     let Value::Object(fields) = &value else {
-        return Err(format!(
-            "context: found {}, expected an object",
-            short(&value)
-        ));
+        return Err(Unusable::value("context", &value, "an object"));
     };
+    let key = "context.sensor";
     let sensor = match fields.get("sensor") {
-        Some(sensor) => name("context.sensor", sensor)?,
-        None => return Err("context.sensor: found none, expected a sensor's name".to_owned()),
+        Some(sensor) => name(key, sensor)?,
+        None => {
+            return Err(Unusable::Value {
+                key,
+                found: "none".to_owned(),
+                expected: NAME,
+            });
+        }
     };
     let bytes = value.to_string().len();
     if bytes >= CONTEXT_BYTES {
-        return Err(format!(
-            "context: found {bytes} bytes, expected fewer than {CONTEXT_BYTES}"
-        ));
+        return Err(Unusable::LongContext(bytes));
     }
     let says_something = fields.len() > 1;
     Ok(Change::Context {
@@ -241,36 +271,32 @@ fn short(found: &(impl Serialize + ?Sized)) -> String {
     }
 }
 
-fn kinds(value: &Value) -> Result<Kinds, String> {
-    let expected = "expected a list of \"hardness\", \"press\", \"status\", \"frame\"";
-    let Value::Array(names) = value else {
-        return Err(format!("subscribe: found {}, {expected}", short(value)));
+fn kinds(value: &Value) -> Result<Kinds, Unusable> {
+    let unusable = |found| {
+        let expected = "a list of \"hardness\", \"press\", \"status\", \"frame\"";
+        Unusable::value("subscribe", found, expected)
     };
+    let Value::Array(names) = value else {
+        return Err(unusable(value));
+    };
+    let kind = |name: &Value| name.as_str().and_then(Kind::named);
     names
         .iter()
-        .map(|name| {
-            let named = name.as_str().and_then(Kind::named);
-            named.ok_or_else(|| format!("subscribe: found {}, {expected}", short(name)))
-        })
+        .map(|name| kind(name).ok_or_else(|| unusable(name)))
         .collect()
 }
 
-fn policy(value: &Value) -> Result<Policy, String> {
+fn policy(value: &Value) -> Result<Policy, Unusable> {
     match value.as_str() {
         Some("queue") => Ok(Policy::Queue),
         Some("latest") => Ok(Policy::Latest),
-        _ => Err(format!(
-            "policy: found {}, expected \"queue\" or \"latest\"",
-            short(value)
-        )),
+        _ => Err(Unusable::value("policy", value, "\"queue\" or \"latest\"")),
     }
 }
 
-fn since(value: &Value) -> Result<Since, String> {
-    value
-        .as_str()
-        .and_then(Since::parse)
-        .ok_or_else(|| format!("since: found {}, expected \"RUN:SEQ\"", short(value)))
+fn since(value: &Value) -> Result<Since, Unusable> {
+    let since = value.as_str().and_then(Since::parse);
+    since.ok_or_else(|| Unusable::value("since", value, "\"RUN:SEQ\""))
 }
 
 #[cfg(test)]
@@ -325,7 +351,7 @@ mod tests {
             context(&format!(r#","tag":"{}""#, "x".repeat(bytes - around)))
         };
         assert!(long(1023).is_ok());
-        assert!(long(1024).unwrap_err().contains("1024"));
+        assert_eq!(long(1024), Err(Unusable::LongContext(1024)));
     }
 
     #[test]
@@ -349,7 +375,7 @@ mod tests {
             ),
         ] {
             let read = parse(line);
-            let message = read.request.unwrap_err();
+            let message = read.request.unwrap_err().to_string();
             assert!(message.contains(found), "{message}");
             assert_eq!(read.id, Some(Value::from("a")));
         }

@@ -14,7 +14,7 @@ use tokio::time::Instant;
 
 use super::hub;
 use super::log;
-use super::record::SensorRecorder;
+use super::record::{NoBlackbox, SensorRecorder};
 use super::serial::{Link, Turn};
 use crate::event::{Event, Kind, Status, Tared};
 use crate::pipeline::Pipeline;
@@ -33,7 +33,7 @@ pub(crate) enum Command {
     /// To echo what the controller says it is doing. The answer comes when it is in force.
     Context(Option<Value>, oneshot::Sender<()>),
     /// To write the last minute. The answer is the path of the file.
-    Blackbox(oneshot::Sender<Result<PathBuf, String>>),
+    Blackbox(oneshot::Sender<Result<PathBuf, NoBlackbox>>),
     /// To judge by another description and model from now on. Nothing that is fixed may differ.
     Reload(Box<Sensor>, Arc<Hrn>),
     /// To end. A press under way is aborted, and no event follows.

@@ -6,7 +6,6 @@ use super::*;
 use crate::daemon::hub::tests::{hello, press};
 use crate::daemon::record::EventRecorder;
 use crate::daemon::sensor::SensorHandle;
-use crate::tare::RetareError;
 
 /// Far longer than anything here takes.
 const PATIENCE: Duration = Duration::from_secs(60);

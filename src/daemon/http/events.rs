@@ -10,8 +10,8 @@ use hyper::Request;
 use hyper::body::Bytes;
 use tokio::sync::{mpsc, oneshot};
 
-use crate::daemon::hub::{self, Closed, Line};
-use crate::daemon::request::{Kinds, Policy, Since, Subscription};
+use crate::daemon::hub::{self, Ahead, Closed, Line};
+use crate::daemon::request::{Kinds, Policy, Since, Subscription, Unusable};
 use crate::daemon::sensor::Sensors;
 use crate::event::Kind;
 
@@ -25,7 +25,7 @@ const RETRY: Duration = Duration::from_secs(1);
 
 /// Reads what a request asks for: `types` and `since` of its query, and `Last-Event-ID`, which is
 /// newer than the query when both are there.
-pub(super) fn wanted<B>(request: &Request<B>) -> Result<Subscription, String> {
+pub(super) fn wanted<B>(request: &Request<B>) -> Result<Subscription, Unusable> {
     let mut wanted = Subscription {
         policy: Policy::LatestFrames,
         ..Subscription::default()
@@ -34,9 +34,12 @@ pub(super) fn wanted<B>(request: &Request<B>) -> Result<Subscription, String> {
     for (key, value) in form_urlencoded::parse(query.as_bytes()) {
         match &*key {
             "types" => wanted.kinds = kinds(&value)?,
-            "since" => wanted.since = Some(since(&key, &value)?),
+            "since" => wanted.since = Some(since("since", &value)?),
             _ => {
-                return Err(format!("found {key:?}, expected \"types\" or \"since\""));
+                return Err(Unusable::Key {
+                    found: format!("{key:?}"),
+                    expected: "\"types\" or \"since\"",
+                });
             }
         }
     }
@@ -47,17 +50,23 @@ pub(super) fn wanted<B>(request: &Request<B>) -> Result<Subscription, String> {
     Ok(wanted)
 }
 
-fn kinds(names: &str) -> Result<Kinds, String> {
-    let kind = |name| {
-        Kind::named(name).ok_or_else(|| {
-            format!("types: found {name:?}, expected hardness, press, status or frame")
+fn kinds(names: &str) -> Result<Kinds, Unusable> {
+    let kind = |name: &str| {
+        Kind::named(name).ok_or_else(|| Unusable::Value {
+            key: "types",
+            found: format!("{name:?}"),
+            expected: "hardness, press, status or frame",
         })
     };
     names.split(',').map(kind).collect()
 }
 
-fn since(key: &str, token: &str) -> Result<Since, String> {
-    Since::parse(token).ok_or_else(|| format!("{key}: found {token:?}, expected \"RUN:SEQ\""))
+fn since(key: &'static str, token: &str) -> Result<Since, Unusable> {
+    Since::parse(token).ok_or_else(|| Unusable::Value {
+        key,
+        found: format!("{token:?}"),
+        expected: "\"RUN:SEQ\"",
+    })
 }
 
 /// Subscribes; the inner error is for the asker.
@@ -68,7 +77,7 @@ pub(super) async fn open(
     hub: &hub::Handle,
     sensors: &Sensors,
     wanted: Subscription,
-) -> Result<Result<mpsc::Receiver<Bytes>, String>, Closed> {
+) -> Result<Result<mpsc::Receiver<Bytes>, Ahead>, Closed> {
     let (reply, opened) = oneshot::channel();
     let (hub, sensors) = (hub.clone(), sensors.clone());
     tokio::spawn(async move {
@@ -88,7 +97,7 @@ async fn serve(
     id: u64,
     hello: Line,
     wanted: Subscription,
-    opened: oneshot::Sender<Result<mpsc::Receiver<Bytes>, String>>,
+    opened: oneshot::Sender<Result<mpsc::Receiver<Bytes>, Ahead>>,
 ) -> Option<()> {
     let run = hub.survey().await.ok()?.hello.run;
     // Where a connection that breaks before its first event is to go on.
@@ -97,8 +106,8 @@ async fn serve(
         Some(since) if since.run == run => None,
         Some(_) => Some(0),
     };
-    if let Err(message) = hub.subscribe(id, wanted).await.ok()? {
-        return opened.send(Err(message)).ok();
+    if let Err(ahead) = hub.subscribe(id, wanted).await.ok()? {
+        return opened.send(Err(ahead)).ok();
     }
     let mut first = format!("retry: {}\n", RETRY.as_millis()).into_bytes();
     write(&mut first, &run, &Line { seq: from, ..hello });
@@ -152,7 +161,7 @@ fn write(out: &mut Vec<u8>, run: &str, line: &Line) {
 mod tests {
     use super::*;
 
-    fn ask(uri: &str, last: Option<&str>) -> Result<Subscription, String> {
+    fn ask(uri: &str, last: Option<&str>) -> Result<Subscription, Unusable> {
         let mut request = Request::builder().uri(uri);
         if let Some(last) = last {
             request = request.header("Last-Event-ID", last);
@@ -183,7 +192,7 @@ mod tests {
             // A percent sign before anything but two hex digits stands for itself.
             ("/events?types=%+1", None, "\"% 1\""),
         ] {
-            let message = ask(uri, last).unwrap_err();
+            let message = ask(uri, last).unwrap_err().to_string();
             assert!(message.contains(found), "{message}");
         }
     }

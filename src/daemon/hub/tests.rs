@@ -274,7 +274,8 @@ fn since_beyond_the_latest_number_is_refused() {
     let mut hub = hub();
     let (id, _) = hub.join();
     let refused = hub.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(1)));
-    assert!(refused.unwrap_err().contains("at most 0"));
+    let expected = "since: found 1, expected at most 0";
+    assert_eq!(refused.unwrap_err().to_string(), expected);
 }
 
 #[test]

@@ -11,7 +11,7 @@ use tokio::sync::oneshot;
 use tracing::{info, warn};
 
 use super::file::{MB, Open, create, has_room};
-use super::{Error, Job, Target};
+use super::{Error, Job, NoBlackbox, Target};
 use crate::daemon::config;
 use crate::event::{Event, LinkState, PressState};
 use crate::frame::Stamp;
@@ -284,9 +284,9 @@ impl Worker {
         }
     }
 
-    fn say_no_blackbox(&self, sensor: usize, reason: &str) {
+    fn say_no_blackbox(&self, sensor: usize, reason: &NoBlackbox) {
         let sensor = self.about.sensors[sensor].name();
-        warn!(sensor, reason, "no black box");
+        warn!(sensor, %reason, "no black box");
     }
 
     fn directory(&self) -> Option<&config::Record> {
@@ -297,9 +297,9 @@ impl Worker {
     }
 
     /// Writes the last minute of a sensor to a file of its own.
-    fn blackbox(&self, sensor: usize, reason: &str) -> Result<PathBuf, String> {
+    fn blackbox(&self, sensor: usize, reason: &str) -> Result<PathBuf, NoBlackbox> {
         let Some(settings) = self.directory() else {
-            return Err("found a recording into one file, expected the daemon".to_owned());
+            return Err(NoBlackbox::OneFile);
         };
         let name = self.about.sensors[sensor].name();
         let about = About {
@@ -322,7 +322,7 @@ impl Worker {
             })?;
             Ok(path)
         };
-        let path = written().map_err(|error| error.to_string())?;
+        let path = written()?;
         info!(sensor = name, reason, path = %path.display(), "black box");
         Ok(path)
     }
