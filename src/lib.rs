@@ -7,6 +7,7 @@
 //! and `train` are the two ends that touch the world.
 
 pub mod frame;
+pub mod colour;
 pub mod wording;
 pub mod wire;
 pub mod tare;

@@ -327,4 +327,10 @@ mod tests {
             assert!(!PAGE.contains(part), "{part}");
         }
     }
+
+    #[test]
+    fn the_page_has_the_one_colour_map() {
+        let table = format!("const VIRIDIS = {:?};", crate::colour::VIRIDIS);
+        assert!(PAGE.contains(&table), "{table}");
+    }
 }

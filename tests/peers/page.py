@@ -5,11 +5,12 @@
     python -m venv venv && venv/bin/pip install selenium
     venv/bin/python tests/peers/page.py target/debug/hardnessd [--pictures DIRECTORY]
 
-Claims: events arrive and are drawn; a silent and a lost sensor show within 1 s, and no old value
-stands as a current one; what comes late, after a connection broke, is shown as old as it is, whatever
-the browser's clock says; sensors can be chosen; nothing is wider than a phone of 360 px; no console
-error and no breach of the page's policy; a daemon that goes is said, and the page finds it again by
-itself. With --pictures it leaves one of each state, light, dark and narrow.
+Claims: events arrive and are drawn; a silent and a lost sensor show within 1 s, on their tabs too, and
+no old value stands as a current one: map and verdict are grey, and the scale stays; what comes late,
+after a connection broke, is shown as old as it is, whatever the browser's clock says; sensors can be
+chosen; a phone of 360 px is wide enough, and presses are numbered on it; no console error and no
+breach of the page's policy; a daemon that goes is said, and the page finds it again by itself. With
+--pictures it leaves one of each state, light, dark and narrow.
 """
 
 import argparse
@@ -39,6 +40,17 @@ new MutationObserver(() => {
     else { delete window.seen[key]; }
   }
 }).observe(document.body, { subtree: true, childList: true, characterData: true });
+"""
+
+
+# Keeps the numbers that are drawn above presses.
+LABELS = """
+window.labels_drawn = new Set();
+const fill = CanvasRenderingContext2D.prototype.fillText;
+CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {
+  if (/^#\\d/.test(text)) { window.labels_drawn.add(text); }
+  return fill.call(this, text, ...place);
+};
 """
 
 
@@ -89,6 +101,13 @@ class Page:
             if entry["level"] != "INFO" and "willReadFrequently" not in entry["message"]
         ]
 
+    def tab(self, name):
+        """What the tab of a sensor says of it."""
+        return self.driver.find_element(By.XPATH, f"//nav/button[text()='{name}']/small").text
+
+    def colour(self, id):
+        return self.driver.find_element(By.ID, id).value_of_css_property("color")
+
     def colours(self):
         """How many colours the map has."""
         return self.run("""
@@ -117,6 +136,8 @@ def nothing_stands_as_current(page):
     for id in ["force", "area", "peak", "press", "rate"]:
         assert page.text(id) == "–", f"{id} still says {page.text(id)}"
     assert page.is_grey()
+    # The headline of the last verdict, too.
+    assert page.colour("label") == page.colour("facts")
     assert page.text("age").endswith("ago")
 
 
@@ -125,7 +146,9 @@ def events_arrive(page, bench, sensors):
     wait_for("a press", lambda: page.text("press").startswith("#"))
     wait_for("colours", lambda: page.colours() > 6)
     assert not page.shown("veil") and not page.shown("alarm")
+    assert (page.tab("forearm"), page.tab("wrist")) == ("live", "live")
     wait_for("a verdict", lambda: page.text("label") not in ("", "none yet"))
+    assert page.colour("label") != page.colour("facts")
     wait_for("several verdicts", lambda: len(page.driver.find_elements(By.CSS_SELECTOR, "#rows tr")) > 1)
     before = int(page.text("frames").replace("\u202f", ""))
     wait_for("more frames", lambda: int(page.text("frames").replace("\u202f", "")) > before)
@@ -139,6 +162,8 @@ def fits_a_phone(page):
     page.look(width=360, height=1500, scheme="light")
     wide = page.run("return document.documentElement.scrollWidth")
     assert wide <= 360, f"{wide} px wide"
+    page.run(LABELS)
+    wait_for("numbers above presses", lambda: page.run("return labels_drawn.size") > 1)
     page.picture("live-narrow")
     page.look()
 
@@ -147,11 +172,15 @@ def loss_shows_at_once(page, bench, sensors):
     forearm = sensors["forearm"]
     page.run(WATCH)
     delays = {}
+    scale = page.text("most")
     stopped = time.time()
     forearm.send_signal(signal.SIGSTOP)
     delays["stale"] = page.seen("state", "stale") - stopped
     time.sleep(0.5)
     nothing_stands_as_current(page)
+    assert (page.tab("forearm"), page.tab("wrist")) == ("stale", "live")
+    # A press may have made it larger since.
+    assert float(page.text("most").split()[0]) >= float(scale.split()[0])
     page.picture("stale-dark")
     forearm.send_signal(signal.SIGCONT)
     wait_for("live again", lambda: page.text("state") == "live")
@@ -203,11 +232,12 @@ def what_comes_late_is_as_old_as_it_is(page, bench, sensors):
 
 
 def sensors_can_be_chosen(page):
+    assert page.tab("forearm") == "lost"
     wrist = page.driver.find_element(By.XPATH, "//nav/button[text()='wrist']")
     wrist.click()
     wait_for("the wrist", lambda: page.text("state") == "live" and not page.shown("veil"))
     chosen = page.driver.find_element(By.CSS_SELECTOR, "nav [aria-pressed=true]")
-    assert chosen.text == "wrist"
+    assert chosen.text.startswith("wrist")
     wait_for("its verdict", lambda: page.text("label") not in ("", "none yet"))
 
 

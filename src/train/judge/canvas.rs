@@ -4,6 +4,7 @@ use ab_glyph::{Font as _, FontRef, ScaleFont as _, point};
 use anyhow::Context as _;
 use epaint_default_fonts::UBUNTU_LIGHT;
 
+use crate::colour::viridis;
 use crate::frame::{COLS, Frame, ROWS};
 
 /// Pixels a taxel.
@@ -126,28 +127,8 @@ impl Canvas {
 fn colour_of(newtons: f32) -> [u8; 3] {
     let (low, high) = SCALE_N;
     let part = ((newtons.max(low) / low).ln() / (high / low).ln()).min(1.0);
-    let at = part * (VIRIDIS.len() - 1) as f32;
-    let k = (at as usize).min(VIRIDIS.len() - 2);
-    let rest = at - k as f32;
-    std::array::from_fn(|c| {
-        let (a, b) = (f32::from(VIRIDIS[k][c]), f32::from(VIRIDIS[k + 1][c]));
-        (a + rest * (b - a)).round() as u8
-    })
+    viridis(part)
 }
-
-/// Ten colours of matplotlib's viridis (CC0) at even distances.
-const VIRIDIS: [[u8; 3]; 10] = [
-    [68, 1, 84],
-    [72, 40, 120],
-    [62, 74, 137],
-    [49, 104, 142],
-    [38, 130, 142],
-    [31, 158, 137],
-    [53, 183, 121],
-    [109, 205, 89],
-    [180, 222, 44],
-    [253, 231, 37],
-];
 
 #[cfg(test)]
 mod tests {
@@ -157,8 +138,8 @@ mod tests {
     fn colours_rise_with_the_force() {
         let green = |newtons| colour_of(newtons)[1];
         assert!(green(0.0) < green(0.1) && green(0.1) < green(1.0) && green(1.0) < green(10.0));
-        assert_eq!(colour_of(0.0), VIRIDIS[0]);
-        assert_eq!(colour_of(99.0), VIRIDIS[9]);
+        assert_eq!(colour_of(0.0), viridis(0.0));
+        assert_eq!(colour_of(99.0), viridis(1.0));
     }
 
     #[test]

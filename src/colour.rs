@@ -1,0 +1,49 @@
+//! The one colour map: what a share of the largest force is drawn in, on a terminal, on the live page
+//! (`page.html` repeats the table, and a test compares the two) and in pictures.
+
+/// Ten colours of matplotlib's viridis (CC0) at even distances. Lightness rises evenly, so the order
+/// shows without colour too.
+pub const VIRIDIS: [[u8; 3]; 10] = [
+    [68, 1, 84],
+    [72, 40, 120],
+    [62, 74, 137],
+    [49, 104, 142],
+    [38, 130, 142],
+    [31, 158, 137],
+    [53, 183, 121],
+    [109, 205, 89],
+    [180, 222, 44],
+    [253, 231, 37],
+];
+
+/// The colour of `share`, as red, green and blue; below 0 and above 1 it is that of the end.
+pub fn viridis(share: f32) -> [u8; 3] {
+    let at = share.clamp(0.0, 1.0) * (VIRIDIS.len() - 1) as f32;
+    let k = (at as usize).min(VIRIDIS.len() - 2);
+    let rest = at - k as f32;
+    std::array::from_fn(|channel| {
+        let (a, b) = (
+            f32::from(VIRIDIS[k][channel]),
+            f32::from(VIRIDIS[k + 1][channel]),
+        );
+        (a + rest * (b - a)).round() as u8
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_share_between_two_colours_is_between_them() {
+        for (share, expected) in [
+            (-1.0, VIRIDIS[0]),
+            (0.0, VIRIDIS[0]),
+            (1.0 / 18.0, [70, 21, 102]),
+            (1.0, VIRIDIS[9]),
+            (2.0, VIRIDIS[9]),
+        ] {
+            assert_eq!(viridis(share), expected, "{share}");
+        }
+    }
+}
