@@ -1,9 +1,9 @@
 //! The daemon: sensors at one end, subscribers at the other, the core between.
 //!
-//! In: a checked [`Setup`], a future that ends when the daemon shall, and requests to read the
-//! configuration again. Out: events on the sockets. One thread runs it all, one task a sensor, one
-//! for the hub, one a connection; nothing is shared between them but lines ready to be sent.
-//! It starts without its hardware and waits for it inside.
+//! In: a checked [`Setup`], a future that ends when the daemon must end, and requests to read the
+//! configuration again. Out: events on the sockets. One thread runs everything: one task for each
+//! sensor, one for the hub and one for each connection. The tasks share nothing but lines that are
+//! ready to be sent. The daemon starts without its sensors and waits for them.
 
 mod accept;
 mod client;
@@ -53,42 +53,42 @@ use crate::frame::Stamp;
 use crate::pipeline::{Clock, Pipeline};
 use crate::recording::{About, Labels, RecordedSensor};
 
-/// How long subscribers may take to fetch their last lines: the daemon must be gone within 1 s.
+/// How long subscribers may take to fetch their last lines: the daemon must end within 1 s.
 const FAREWELL: Duration = Duration::from_millis(300);
 
-/// Questions waiting for a sensor; more askers than that wait themselves.
+/// Questions that wait for a sensor. When there are more, the tasks that ask wait.
 const QUESTIONS: usize = 16;
 
 /// Why the daemon cannot start, or has stopped by itself.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A way out cannot be had.
+    /// A publisher could not be opened.
     #[error(transparent)]
     Publish(#[from] publish::Error),
-    /// No random numbers, without which a run cannot be told from another.
+    /// There are no random numbers, and without them runs cannot be told apart.
     #[error("/dev/urandom: {0}")]
     Random(#[source] std::io::Error),
-    /// What was to be recorded is not there, or cannot be written.
+    /// There is nothing to record, or the recording cannot be written.
     #[error(transparent)]
     Record(#[from] record::Error),
-    /// Nobody to write the log to.
+    /// There is nothing to write the log to.
     #[error(transparent)]
     Log(#[from] log::Error),
-    /// A fault of this program.
+    /// A task ended by itself, which is a fault of this program.
     #[error("{0} stopped by itself")]
     Stopped(&'static str),
 }
 
-/// A daemon whose sockets are bound: whoever connects from now on is served once it runs.
+/// A daemon whose sockets are bound. Connections wait until it runs.
 pub struct Daemon {
     setup: Setup,
     hello: Hello,
     publishers: Publishers,
-    /// Where a recording goes, if there is one.
+    /// Where the recording goes, if there is one.
     target: Option<Target>,
 }
 
-/// The moment, on both clocks.
+/// The time now, by both clocks.
 pub(crate) fn now() -> Stamp {
     let mono = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
     Stamp {
@@ -97,12 +97,12 @@ pub(crate) fn now() -> Stamp {
     }
 }
 
-/// Whether a daemon can write where `config` says, as far as looking tells: what another process
-/// holds, or a network refuses, only a try finds out.
+/// Checks that a daemon can write where `config` says. It only looks, so it cannot see what another
+/// process holds or what the network refuses.
 ///
 /// # Errors
 ///
-/// If a socket, the log or a recording cannot be where it shall.
+/// If a socket, the log or a recording cannot be where `config` says.
 pub fn check(config: &Config) -> Result<(), Error> {
     log::check(config.log)?;
     publish::check(&config.publish.unix)?;
@@ -113,12 +113,12 @@ pub fn check(config: &Config) -> Result<(), Error> {
 }
 
 impl Daemon {
-    /// Binds the sockets. Needs a runtime to be there.
+    /// Binds the sockets. Must be called inside a tokio runtime.
     ///
     /// # Errors
     ///
-    /// If a socket cannot be had: its path or address is in use, is no socket, or the system
-    /// refuses.
+    /// If a socket cannot be bound: its path or address is in use, the path holds another file, or
+    /// the system refuses.
     pub fn bind(setup: Setup) -> Result<Self, Error> {
         let hello = hello(&setup, run_token().map_err(Error::Random)?);
         let publishers = Publishers::bind(&setup.config)?;
@@ -130,8 +130,8 @@ impl Daemon {
         })
     }
 
-    /// A daemon without sockets that records into `file`, which is at `path` and empty. It ends by
-    /// itself when a sensor is not there to begin with, or all are gone.
+    /// A daemon without sockets that records into `file`, which is empty and at `path`. It ends by
+    /// itself if a sensor is missing at the start, or when all sensors are gone.
     ///
     /// # Errors
     ///
@@ -151,17 +151,17 @@ impl Daemon {
         })
     }
 
-    /// Where the live page is, if there is one.
+    /// The address of the live page, if there is one.
     pub fn http_address(&self) -> Option<SocketAddr> {
         self.publishers.http_address()
     }
 
-    /// Serves until `shutdown` comes, then finishes the event in hand: presses are aborted,
-    /// subscribers get their last lines.
+    /// Serves until `shutdown` is ready. Then presses are aborted, and subscribers get their last
+    /// lines.
     ///
     /// # Errors
     ///
-    /// If a part stops by itself, which is a fault of this program.
+    /// If a task ends by itself, which is a fault of this program, or the recording fails.
     pub async fn run(
         self,
         shutdown: impl Future<Output = ()>,
@@ -251,7 +251,7 @@ struct Running {
 type Loading = Pin<Box<dyn Future<Output = Result<Setup, Refusal>>>>;
 
 impl Running {
-    /// Serves until `shutdown` comes, there is no more to record, or a part has stopped by itself.
+    /// Serves until `shutdown` is ready, there is no more to record, or a task has ended by itself.
     async fn serve(
         &mut self,
         shutdown: impl Future<Output = ()>,
@@ -338,7 +338,7 @@ impl Running {
     }
 }
 
-/// Waits until there is no more to record; for ever, if nothing is.
+/// Waits until there is no more to record; never ready without a recorder.
 async fn record_ended(recorder: &mut Option<Recorder>) {
     match recorder {
         Some(recorder) => recorder.stopped().await,
@@ -346,7 +346,7 @@ async fn record_ended(recorder: &mut Option<Recorder>) {
     }
 }
 
-/// Whether the pipelines turn: every sensor's task and the hub answer. What feeds the watchdog.
+/// The status of every sensor, if every sensor's task and the hub answer. This feeds the watchdog.
 async fn alive(hub: &hub::Handle, sensors: &Sensors) -> Option<Vec<Status>> {
     let statuses = sensors.statuses().await;
     let all = statuses.len() == sensors.0.len();
@@ -375,7 +375,7 @@ fn announce(setup: &Setup, run: &str) {
     }
 }
 
-/// The model as events name it.
+/// The model's name in events.
 fn short(setup: &Setup) -> &str {
     &setup.hrn.sha256()[..12]
 }
@@ -395,7 +395,7 @@ fn about(setup: &Setup, hello: &Hello) -> About {
 }
 
 fn hello(setup: &Setup, run: String) -> Hello {
-    // Where /proc is hidden there is no boot id; the run token still tells starts apart.
+    // Where /proc is hidden there is no boot id. The run token still tells starts apart.
     let boot_id = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
     let card = setup.hrn.card();
     Hello {
@@ -424,7 +424,7 @@ fn hello(setup: &Setup, run: String) -> Hello {
     }
 }
 
-/// 64 random bits in hex: no two starts of all robots are likely to share one.
+/// 64 random bits in hex, so that no two starts of any robots are likely to share a token.
 fn run_token() -> std::io::Result<String> {
     let mut bytes = [0; 8];
     File::open("/dev/urandom")?.read_exact(&mut bytes)?;

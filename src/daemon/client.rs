@@ -1,8 +1,9 @@
 //! One subscriber's connection: events out, requests in.
 //!
-//! The protocol of lines, whatever they travel over: a task fetches lines from the hub and writes
-//! them, and reads requests between. Only a connection with [`Access::Control`] changes anything.
-//! While one of its commands is carried out, events go on and the next request waits.
+//! This is the protocol of lines, over Unix sockets and TCP alike. A task fetches lines from the hub
+//! and writes them, and reads requests in between. Only a connection with [`Access::Control`] can
+//! change anything. While the daemon carries out its command, events go on and the next request
+//! waits.
 
 use std::io;
 use std::pin::Pin;
@@ -23,39 +24,39 @@ use super::sensor::{Command, Sensors};
 use crate::event::{Reply, Tared};
 use crate::tare::RetareError;
 
-/// Longest line a subscriber may send (`docs/controller.md`).
+/// The longest line that a subscriber may send (`docs/controller.md`).
 const LONGEST_LINE_BYTES: usize = 64 * 1024;
 
-/// When a connection whose other end has stopped sending is looked after, first and at the least.
-/// Where it is closed altogether the runtime learns of it a moment after the last read.
+/// The first and the longest pause between checks of a connection whose other end has stopped
+/// sending. If that end is closed altogether, the runtime learns of it a moment after the last read.
 const HALF_CLOSED_CHECKS: (Duration, Duration) = (Duration::from_millis(1), Duration::from_secs(1));
 
-/// What a way in may ask for.
+/// What a connection may ask for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Access {
     /// Events and questions.
     ReadOnly,
-    /// Commands that change something, too.
+    /// Commands that change something as well.
     Control,
 }
 
-/// A connection that lines travel over.
+/// A connection for lines.
 pub(crate) trait Stream: Send + 'static {
-    /// What it is read from.
+    /// The reading direction.
     type Input: AsyncRead + Unpin + Send + Sync;
-    /// What it is written to.
+    /// The writing direction.
     type Output: Output;
 
-    /// Its two directions.
+    /// Splits it into its two directions.
     fn split(self) -> (Self::Input, Self::Output);
 
-    /// Sends a line without waiting, if there is room for it.
+    /// Sends a line if there is room for it, without waiting.
     fn say(self, line: &[u8]) -> io::Result<()>;
 }
 
 /// The writing direction.
 pub(crate) trait Output: AsyncWrite + Unpin + Send + Sync {
-    /// Whether nobody reads at the other end any more, as far as this end has heard.
+    /// Whether the other end is closed, as far as this end knows.
     fn is_closed(&self) -> impl Future<Output = io::Result<bool>> + Send;
 }
 
@@ -68,7 +69,7 @@ impl Stream for UnixStream {
     }
 
     fn say(self, line: &[u8]) -> io::Result<()> {
-        // Asked of the system itself: the runtime does not know yet that the stream is writable.
+        // Written directly: the runtime does not know yet that the stream is writable.
         io::Write::write_all(&mut self.into_std()?, line)
     }
 }
@@ -98,7 +99,7 @@ impl Output for tcp::OwnedWriteHalf {
     }
 }
 
-/// What connections of one way in are served with.
+/// What the connections of one listener are served with.
 #[derive(Debug, Clone)]
 pub(crate) struct Service {
     pub(crate) access: Access,
@@ -159,7 +160,7 @@ impl<S: Stream> Serve<S> for Service {
     fn refuse(&self, stream: S) {
         let found = self.max_clients;
         let message = format!("found {found} subscribers already, expected fewer: try later");
-        // One that does not take it learns of it by the end of the connection.
+        // A client that does not read it sees the connection end.
         let _ = stream.say(Reply::Error { message, id: None }.to_line().as_bytes());
     }
 }
@@ -206,19 +207,19 @@ enum End {
 struct Client<S: Stream> {
     input: Lines<S::Input>,
     output: S::Output,
-    /// What is being written: a batch goes out in one call.
+    /// Bytes that are being written: a batch goes out in one call.
     outgoing: Vec<u8>,
     service: Service,
 }
 
-/// What a command did that its answer tells.
+/// What the answer to a command says.
 #[derive(Default)]
 struct Done {
     tare: Option<Tared>,
     blackbox: Option<String>,
 }
 
-/// A command that is being carried out; it ends with the answer.
+/// A command that is being carried out. Its result is the answer.
 type Doing = Pin<Box<dyn Future<Output = Line> + Send>>;
 
 impl<S: Stream> Client<S> {
@@ -253,7 +254,7 @@ impl<S: Stream> Client<S> {
                 biased;
                 lines = &mut next => {
                     let Ok(lines) = lines else {
-                        // Closed: all has been sent but the answer to a command.
+                        // Closed: only the answer to a command is still to be sent.
                         if let Some(doing) = doing {
                             self.send(&[doing.await]).await?;
                         }
@@ -289,7 +290,7 @@ impl<S: Stream> Client<S> {
         }
     }
 
-    /// Goes on only if the other end still reads.
+    /// Fails if the other end is closed.
     async fn stay(&self) -> Result<(), End> {
         if self.output.is_closed().await? {
             Err(End::HungUp)
@@ -298,7 +299,7 @@ impl<S: Stream> Client<S> {
         }
     }
 
-    /// Answers a request, or begins what a command asks for. `next` is the take under way.
+    /// Answers a request, or begins to carry out a command. `next` is the take that is under way.
     async fn heed(
         &mut self,
         id: u64,
@@ -315,7 +316,7 @@ impl<S: Stream> Client<S> {
             Ok(Request::Status) => Ok(statuses(&sensors).await),
             Ok(Request::Last) => Ok(hub.finals().await?),
             Ok(Request::Change(change)) => {
-                // May take long: frames to average, a file to be written.
+                // This may take long: frames must come, or a file must be written.
                 let service = self.service.clone();
                 return Ok(Some(Box::pin(async move {
                     answer(service.change(change).await, line.id)
@@ -323,7 +324,7 @@ impl<S: Stream> Client<S> {
             }
             Err(unusable) => Err(unusable.into()),
         };
-        // What the hub gave before it answered belongs before the answer.
+        // Lines that the hub gave before it answered are sent before the answer.
         let given = next.try_recv();
         if let Ok(lines) = &given {
             self.send(lines).await?;
@@ -334,7 +335,7 @@ impl<S: Stream> Client<S> {
         };
         lines.push(answer(answered, line.id));
         self.send(&lines).await?;
-        // Another subscription ends the wait under the old one.
+        // Another subscription ended the take that was under way.
         if given != Err(TryRecvError::Empty) {
             *next = hub.take(id).await?;
         }
@@ -350,7 +351,7 @@ impl<S: Stream> Client<S> {
     }
 }
 
-/// Passes a command on to the sensor of that name; `key` names it in the request.
+/// Passes a command on to the sensor called `name`. `key` is the request's key for it.
 async fn tell(
     sensors: &Sensors,
     key: &'static str,
@@ -374,7 +375,7 @@ pub(super) async fn statuses(sensors: &Sensors) -> Vec<Line> {
     statuses.into_iter().map(Line::from).collect()
 }
 
-/// Waits for the answer to a command; for ever, if none is being carried out.
+/// Waits for the answer to a command; never ready if none is being carried out.
 async fn done(doing: &mut Option<Doing>) -> Line {
     match doing {
         Some(doing) => doing.await,

@@ -1,9 +1,9 @@
 //! Where events are numbered, kept and handed to subscribers.
 //!
-//! In: events of the sensors, in the order of their happening. Out: lines, each serialised once
-//! and shared by all who want it. One task owns all of it. Subscribers come and fetch, so one that
-//! does not come costs a bounded queue and delays nobody: when the queue is full its oldest event
-//! goes, and is counted, and a `gap` says so before the next one it does get.
+//! In: events of the sensors, in the order in which they happen. Out: lines; each is serialised
+//! once and shared by all subscribers that want it. One task owns all of this. Subscribers fetch
+//! their lines, so a slow one costs a bounded queue and delays nobody. When the queue is full its
+//! oldest event is dropped and counted, and a `gap` says so before the next event.
 
 mod subscriber;
 mod tally;
@@ -21,14 +21,14 @@ use super::record::EventRecorder;
 use super::request::{Kinds, Subscription};
 use crate::event::{Event, Hello, Kind, Reply, Status};
 
-/// A line to be sent.
+/// A line to send.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Line {
-    /// Number of the event, if it has one; of a `hello`, the latest number given.
+    /// The number of the event, if it has one. In a `hello`, the latest number given.
     pub(crate) seq: Option<u64>,
-    /// Its JSON, newline included.
+    /// Its JSON, with the newline.
     pub(crate) json: Arc<str>,
-    /// The event it tells of; none of a reply, and of a line that is held none any more.
+    /// The event that it was made from. A reply has none, and a line that is held has none left.
     pub(crate) event: Option<Arc<Event>>,
 }
 
@@ -59,13 +59,13 @@ impl From<Status> for Line {
 }
 
 impl Line {
-    /// Kind and sensor of its event.
+    /// The kind and the sensor of its event.
     fn about(&self) -> Option<(Kind, &str)> {
         let event = self.event.as_deref()?;
         Some((event.kind(), event.sensor()))
     }
 
-    /// The same for a long time: what was sent is kept, what it was made from is not.
+    /// The same line to hold for a long time: with its text, without its event.
     fn to_hold(&self) -> Self {
         Self {
             event: None,
@@ -74,7 +74,7 @@ impl Line {
     }
 }
 
-/// Numbered events held for `since` (`docs/controller.md`).
+/// The numbered events that are held for `since` (`docs/controller.md`).
 const HELD: usize = 4096;
 
 /// A numbered event as it was sent.
@@ -84,14 +84,14 @@ struct Held {
     line: Line,
 }
 
-/// The state; all of it, and no clock.
+/// The whole state. It has no clock.
 struct Hub {
     hello: Hello,
-    /// The last [`HELD`] events; the newest has number `hello.seq`.
+    /// The last [`HELD`] events. The newest has the number `hello.seq`.
     held: VecDeque<Held>,
-    /// Events no longer held, by kind.
+    /// How many events are no longer held, by kind.
     forgotten: [u64; Kinds::NUMBERED.len()],
-    /// Last final verdict, by sensor.
+    /// The last final verdict of each sensor.
     finals: BTreeMap<String, Line>,
     tally: Tally,
     recorder: EventRecorder,
@@ -113,12 +113,12 @@ impl Hub {
         }
     }
 
-    /// Numbers `event` and offers it to every subscriber that wants it, at `now` of
+    /// Numbers `event` and offers it to every subscriber that wants it. `now` is of
     /// CLOCK_MONOTONIC.
     fn publish(&mut self, mut event: Event, now: Duration) {
         let kind = event.kind();
         if let Event::Hardness(verdict) = &mut event {
-            // Rounded: more digits than the clock is good for would only be noise.
+            // Rounded to microseconds: further digits are noise of the clock.
             verdict.age_at_publish_ms = verdict.mono_ns.map(|at| {
                 let age = now.saturating_sub(Duration::from_nanos(at));
                 (age.as_secs_f64() * 1e6).round() / 1e3
@@ -163,7 +163,7 @@ impl Hub {
         self.held.push_back(held);
     }
 
-    /// Number of the oldest event held.
+    /// The number of the oldest event that is held.
     fn oldest(&self) -> u64 {
         self.hello.seq + 1 - self.held.len() as u64
     }
@@ -173,7 +173,7 @@ impl Hub {
         self.held.get(usize::try_from(place).ok()?)
     }
 
-    /// A new subscriber, with the default subscription from now on.
+    /// Adds a subscriber, with the default subscription from now on.
     fn join(&mut self) -> (u64, Line) {
         self.joined += 1;
         self.subscribers.insert(self.joined, Subscriber::default());
@@ -203,18 +203,18 @@ impl Hub {
         let first = if known { since.seq + 1 } else { oldest };
         let missing = match first.max(oldest) - first {
             0 if known => Some(0),
-            // Every numbered event is wanted, so each number gone is an event missed.
+            // Every numbered event is wanted, so each number that is gone is an event missed.
             gone if known && Kinds::NUMBERED.iter().all(|&k| wanted.kinds.contains(k)) => {
                 Some(gone)
             }
-            // From the very start, what was forgotten is what was missed.
+            // From the start of the run: all that is no longer held was missed.
             _ if known && since.seq == 0 => {
                 let wanted = Kinds::NUMBERED
                     .into_iter()
                     .filter(|&k| wanted.kinds.contains(k));
                 Some(wanted.map(|kind| self.forgotten[kind as usize]).sum())
             }
-            // Of the events forgotten nobody knows the kind any more.
+            // The kinds of the events between are no longer known.
             _ => None,
         };
         let held = (first.max(oldest)..=latest).zip(
@@ -226,7 +226,7 @@ impl Hub {
         Ok(())
     }
 
-    /// What a subscriber gets next; empty if there is nothing for it.
+    /// The next lines of a subscriber; empty if there are none.
     fn take(&mut self, id: u64) -> Vec<Line> {
         let Some(mut subscriber) = self.subscribers.remove(&id) else {
             return Vec::new();
@@ -270,12 +270,12 @@ enum Command {
     Close,
 }
 
-/// The hub as it is now.
+/// The state of the hub now.
 #[derive(Debug)]
 pub(crate) struct Survey {
-    /// With the latest number.
+    /// With the latest number given.
     pub(crate) hello: Hello,
-    /// Last final verdict, by sensor.
+    /// The last final verdict of each sensor.
     pub(crate) finals: BTreeMap<String, Line>,
     pub(crate) tally: Tally,
     pub(crate) subscribers: usize,
@@ -308,7 +308,7 @@ impl Handle {
         }
     }
 
-    /// Changes what newcomers are told; run and numbers stay.
+    /// Changes the `hello` of new subscribers. The run and the numbers stay.
     pub(crate) async fn describe(&self, hello: Hello) {
         let _ = self
             .commands
@@ -318,14 +318,15 @@ impl Handle {
             .await;
     }
 
-    /// A new subscriber: its number, and the `hello` for it. Whoever asks has to come to
-    /// [`Handle::leave`], so it may not be dropped between: it is a task, or a part of one.
+    /// Adds a subscriber, and gives its number and its `hello`. The caller must call
+    /// [`Handle::leave`] in the end, so it must not be cancelled before: call this in a task of its
+    /// own.
     pub(crate) async fn join(&self) -> Result<(u64, Line), Closed> {
         self.ask(|reply| Command::Join { reply }).await
     }
 
-    /// The next lines of a subscriber, as soon as there are any. At most one call of a subscriber
-    /// may be under way; lines in the receiver are its own to send.
+    /// The next lines of a subscriber, as soon as there are any. A subscriber may have one call
+    /// under way at a time. It must send the lines that the receiver gives.
     pub(crate) async fn take(&self, id: u64) -> Result<oneshot::Receiver<Vec<Line>>, Closed> {
         let (reply, lines) = oneshot::channel();
         self.commands
@@ -335,8 +336,8 @@ impl Handle {
         Ok(lines)
     }
 
-    /// Changes a subscription; the error is for the subscriber. A call of [`Handle::take`] that is
-    /// under way ends: with lines under the old subscription, or with none.
+    /// Changes a subscription. The inner error is for the subscriber. A call of [`Handle::take`]
+    /// that is under way ends: with lines of the old subscription, or without any.
     pub(crate) async fn subscribe(
         &self,
         id: u64,
@@ -350,22 +351,22 @@ impl Handle {
         .await
     }
 
-    /// Every sensor's last final verdict, as it was sent.
+    /// The last final verdict of each sensor, as it was sent.
     pub(crate) async fn finals(&self) -> Result<Vec<Line>, Closed> {
         self.ask(|reply| Command::Finals { reply }).await
     }
 
-    /// All there is to know without subscribing.
+    /// The state of the hub.
     pub(crate) async fn survey(&self) -> Result<Survey, Closed> {
         self.ask(|reply| Command::Survey { reply }).await
     }
 
-    /// Forgets a subscriber.
+    /// Removes a subscriber.
     pub(crate) async fn leave(&self, id: u64) {
         let _ = self.commands.send(Command::Leave { id }).await;
     }
 
-    /// No event comes any more: subscribers get what is left, then their end.
+    /// Says that no more events come. Subscribers get the lines that are left, and then their end.
     pub(crate) async fn close(&self) {
         let _ = self.commands.send(Command::Close).await;
     }
@@ -383,10 +384,10 @@ impl Handle {
     }
 }
 
-/// Commands under way; the hub never waits, so the queue is short unless the machine is.
+/// Commands that may wait. The hub never waits, so the queue is short unless the machine is busy.
 const COMMANDS: usize = 256;
 
-/// Starts the hub, which shows `recorder` what it publishes. It ends when every handle is gone.
+/// Starts the hub. It passes what it publishes on to `recorder`, and ends with the last handle.
 pub(crate) fn start(hello: Hello, recorder: EventRecorder) -> Handle {
     let (commands, inbox) = mpsc::channel(COMMANDS);
     let hub = Hub {
@@ -398,11 +399,11 @@ pub(crate) fn start(hello: Hello, recorder: EventRecorder) -> Handle {
 }
 
 async fn serve(mut hub: Hub, mut inbox: mpsc::Receiver<Command>) {
-    // Subscribers that have fetched everything and wait for more.
+    // Subscribers that have fetched everything and wait.
     let mut waiting: HashMap<u64, oneshot::Sender<Vec<Line>>> = HashMap::new();
     let mut closing = false;
     while let Some(command) = inbox.recv().await {
-        // An answer nobody waits for is a subscriber that has just gone.
+        // A reply that cannot be sent is for a subscriber that has just gone.
         match command {
             Command::Publish { events } => {
                 for event in events {
@@ -443,7 +444,7 @@ async fn serve(mut hub: Hub, mut inbox: mpsc::Receiver<Command>) {
                 subscription,
                 reply,
             } => {
-                // What is held may be due at once: the subscriber asks again once it has answered.
+                // Held events may be due at once: the subscriber takes again after its answer.
                 waiting.remove(&id);
                 let _ = reply.send(hub.subscribe(id, &subscription));
             }

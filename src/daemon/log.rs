@@ -1,8 +1,8 @@
-//! What the operator reads: one line an event, on stderr or in the journal.
+//! What the operator reads: one line for each event, on stderr or in the journal.
 //!
-//! Field names are stable: they are those of the published events. The level comes from
-//! `RUST_LOG`, levels and `TARGET=LEVEL` separated by commas, else it is `info` for the daemon. Nothing
-//! here goes to stdout, which belongs to events.
+//! Field names are stable: they are those of the published events. `RUST_LOG` sets the level, as
+//! levels and `TARGET=LEVEL` separated by commas; without it the level is `info` for the daemon.
+//! Nothing here is written to stdout, which is for events.
 
 mod journal;
 mod limit;
@@ -46,12 +46,12 @@ pub enum Format {
     Journald,
 }
 
-/// How long the end of the process waits for the last lines.
+/// How long the process waits for its last lines at the end.
 const LAST_LINES: Duration = Duration::from_millis(200);
 
 type Output = Box<dyn Layer<Registry> + Send + Sync>;
 
-/// The log of this process; its format may change while it runs.
+/// The log of this process. Its format may change while it runs.
 pub struct Log {
     output: reload::Handle<Output, Registry>,
     lines: Lines,
@@ -66,16 +66,16 @@ impl Drop for Log {
     }
 }
 
-/// Why a format cannot be had.
+/// Why there is no log in the format that was asked for.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// No journal to write to.
+    /// There is no journal.
     #[error(
         "log.format: found \"journald\", expected a journal at {}",
         journal::SOCKET
     )]
     Journal(#[source] std::io::Error),
-    /// `RUST_LOG` is not what it should be.
+    /// `RUST_LOG` is malformed.
     #[error(
         "RUST_LOG: found {found:?}, expected off, error, warn, info, debug or trace, or TARGET=LEVEL, \
          as in \"warn,hardnessd=debug\""
@@ -84,7 +84,7 @@ pub enum Error {
         /// The part of it that is wrong.
         found: String,
     },
-    /// No thread for its lines.
+    /// The thread that writes could not be started.
     #[error("log: cannot start a thread: {0}")]
     Thread(#[source] std::io::Error),
     /// There is a log already.
@@ -93,7 +93,7 @@ pub enum Error {
 }
 
 impl Log {
-    /// Starts the process's log, once; `level` is what is said where `RUST_LOG` is not set.
+    /// Starts the log of the process, once. `level` is used where `RUST_LOG` is not set.
     ///
     /// # Errors
     ///
@@ -101,8 +101,8 @@ impl Log {
     /// been started before.
     pub fn start(settings: Settings, level: &str) -> Result<Self, Error> {
         let filter = filter(&std::env::var("RUST_LOG").unwrap_or_default(), level)?;
-        // The filter stands beside the output, not in it: a filter of a layer's own does not
-        // survive the layer's exchange.
+        // The filter is a layer beside the output: a filter inside the output would be lost when the
+        // output is exchanged.
         let limit = Limit::default();
         let lines = Lines::start(limit.clone()).map_err(Error::Thread)?;
         let (layer, output) = reload::Layer::new(output(settings, &lines)?);
@@ -119,11 +119,11 @@ impl Log {
         })
     }
 
-    /// Writes as `settings` say from now on.
+    /// Writes in the format of `settings` from now on.
     ///
     /// # Errors
     ///
-    /// As [`Log::start`]; the log then stays as it is.
+    /// As for [`Log::start`]. The log then stays as it is.
     pub fn change(&self, settings: Settings) -> Result<(), Error> {
         self.output
             .reload(output(settings, &self.lines)?)
@@ -131,10 +131,10 @@ impl Log {
     }
 }
 
-/// What `directives` let through; where there are none, the daemon's own from `level` on.
+/// The filter of `directives`. Without any, it passes the daemon's own lines from `level` on.
 fn filter(directives: &str, level: &str) -> Result<Targets, Error> {
-    // Of libraries only warnings. Those of DDS warn several times a second of what nobody has to
-    // mend; what matters they return as an error.
+    // Of libraries only warnings. The DDS libraries warn several times a second of what is harmless;
+    // what matters they return as an error.
     let unasked = format!("warn,rustdds=off,ros2_client=off,hardnessd={level}");
     let parts = |directives: &str| -> Vec<String> {
         let parts = directives.split(',').map(str::trim);
@@ -147,7 +147,7 @@ fn filter(directives: &str, level: &str) -> Result<Targets, Error> {
     if asked.is_empty() {
         asked = parts(&unasked);
     }
-    // A bracket begins the name of a span, which nothing here has: it would be taken for a target's.
+    // A bracket begins the name of a span. There are no spans here, so it must be a mistake.
     let is_sound = |part: &String| !part.contains('[') && part.parse::<Targets>().is_ok();
     if let Some(found) = asked.iter().find(|part| !is_sound(part)).cloned() {
         return Err(Error::Filter { found });
@@ -156,7 +156,7 @@ fn filter(directives: &str, level: &str) -> Result<Targets, Error> {
     Ok(parsed.expect("a list of sound parts is sound"))
 }
 
-/// Whether there is something to write to.
+/// Checks that there is something to write to.
 pub(crate) fn check(settings: Settings) -> Result<(), Error> {
     match settings.format {
         Format::Text | Format::Json => Ok(()),
@@ -170,7 +170,7 @@ fn output(settings: Settings, lines: &Lines) -> Result<Output, Error> {
         .with_target(false);
     Ok(match settings.format {
         Format::Text => text.with_ansi(std::io::stderr().is_terminal()).boxed(),
-        // The fields in an object of their own: a verdict has a `level`, as the line has.
+        // Fields are in an object of their own, because a verdict has a `level` and so has the line.
         Format::Json => text.json().boxed(),
         Format::Journald => {
             journal::find().map_err(Error::Journal)?;
@@ -180,7 +180,7 @@ fn output(settings: Settings, lines: &Lines) -> Result<Output, Error> {
     })
 }
 
-/// One line for a numbered event.
+/// Writes one line for a numbered event.
 pub(crate) fn event(event: &Event) {
     match event {
         Event::Status(status) => {
@@ -229,7 +229,7 @@ pub(crate) fn event(event: &Event) {
                 );
             }
         }
-        // Rounded for the eye; the event itself carries every digit.
+        // Rounded for the reader. The event itself has every digit.
         Event::Hardness(verdict) => info!(
             seq = verdict.seq,
             sensor = verdict.sensor.as_str(),
@@ -249,7 +249,7 @@ pub(crate) fn event(event: &Event) {
     }
 }
 
-/// What became of a tare that was asked for.
+/// Says what became of a tare that a client asked for.
 pub(crate) fn tare(sensor: &str, outcome: &Result<Tared, RetareError>) {
     match outcome {
         Ok(Tared { old, new, .. }) => info!(
@@ -266,7 +266,7 @@ pub(crate) fn tare(sensor: &str, outcome: &Result<Tared, RetareError>) {
     }
 }
 
-/// A verdict that did not come.
+/// Says that the model failed on a press.
 pub(crate) fn unjudged(unjudged: &Unjudged) {
     error!(
         sensor = unjudged.sensor.as_str(),
@@ -277,7 +277,7 @@ pub(crate) fn unjudged(unjudged: &Unjudged) {
     );
 }
 
-/// What a controller says it is doing.
+/// Says what a controller reports about its work.
 pub(crate) fn context(sensor: &str, context: Option<&serde_json::Value>) {
     info!(
         sensor,

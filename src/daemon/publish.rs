@@ -1,4 +1,4 @@
-//! Every way out of the daemon: bound together, served together.
+//! Every publisher of the daemon: all are opened together and served together.
 
 use std::io;
 use std::net::SocketAddr;
@@ -25,14 +25,14 @@ use super::tcp::{self, Tcp};
 #[cfg(feature = "zenoh")]
 use super::zenoh;
 
-/// Permissions of the control socket: for the daemon's own user.
+/// The mode of the control socket's file: only the daemon's own user may connect.
 const CONTROL_MODE: u32 = 0o600;
 
-/// Keys of the sockets' paths.
+/// The keys of the sockets' paths.
 const EVENTS_KEY: &str = "publish.unix.path";
 const CONTROL_KEY: &str = "publish.unix.control_path";
 
-/// Whether the sockets can stand where they shall, as far as looking tells.
+/// Checks that the sockets can be made, without making them.
 pub(crate) fn check(unix: &Unix) -> Result<(), Error> {
     if unix.enabled {
         socket::check(EVENTS_KEY, &unix.path())?;
@@ -41,7 +41,7 @@ pub(crate) fn check(unix: &Unix) -> Result<(), Error> {
     Ok(())
 }
 
-/// Why a way out cannot be had.
+/// Why a publisher could not be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// A Unix socket.
@@ -58,20 +58,20 @@ pub enum Error {
     #[cfg(feature = "zenoh")]
     #[error(transparent)]
     Zenoh(#[from] zenoh::Error),
-    /// The service manager listens where the configuration does not.
+    /// The service manager listens at a path that the configuration does not name.
     #[error(
         "socket activation: found a socket at {found}, expected publish.unix.path or control_path"
     )]
     Unasked {
-        /// Where.
+        /// The path that it listens at.
         found: PathBuf,
     },
-    /// The service manager hands over what is no Unix socket.
+    /// The service manager handed over something else than Unix sockets.
     #[error("socket activation: {0}")]
     Passed(#[source] io::Error),
 }
 
-/// Listeners: whoever connects is served once [`Publishers::serve`] runs.
+/// The publishers. Connections wait until [`Publishers::serve`].
 pub(crate) struct Publishers {
     max_clients: usize,
     socket: Option<Socket>,
@@ -85,7 +85,7 @@ pub(crate) struct Publishers {
 }
 
 impl Publishers {
-    /// Binds all that are asked for, or none.
+    /// Opens all publishers of the configuration, or none.
     pub(crate) fn bind(config: &Config) -> Result<Self, Error> {
         let publish = &config.publish;
         let unix = &publish.unix;
@@ -135,12 +135,12 @@ impl Publishers {
         })
     }
 
-    /// Where the live page is.
+    /// The address of the live page.
     pub(crate) fn http_address(&self) -> Option<SocketAddr> {
         self.http.as_ref().map(Tcp::address)
     }
 
-    /// Where subscribers find it, for the log.
+    /// Logs where subscribers connect.
     pub(crate) fn announce(&self) {
         for (way, socket) in [("events", &self.socket), ("control", &self.control)] {
             if let Some(socket) = socket {
@@ -154,7 +154,7 @@ impl Publishers {
         }
     }
 
-    /// Serves until `stop` comes and subscribers have their last lines, a task a listener.
+    /// Serves each publisher in a task, until `stop` comes and its subscribers have their last lines.
     pub(crate) fn serve(self, hub: &hub::Handle, sensors: &Sensors, stop: &Stop) -> JoinSet<()> {
         let Self {
             max_clients,

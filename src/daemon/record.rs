@@ -1,9 +1,9 @@
-//! Recording: a thread of its own that writes what the sensors' tasks and the hub tell it.
+//! Recording: a thread of its own writes what the sensors' tasks and the hub send to it.
 //!
-//! In: what happens to the sensors, and events, over a bounded queue. Out: files. Nothing waits for
-//! it: what finds no room is dropped and counted, and the sensor's next entry is a state, from
-//! which a replay goes on. A disk that fails or is full stops the recording, not the daemon; it
-//! goes on when there is room again.
+//! In: the sensors' inputs, and events, through a bounded queue. Out: files. Nothing waits for the
+//! thread. When the queue is full, entries are dropped and counted; the sensor's next entry is then
+//! a state, from which a replay goes on. A disk that fails or is full stops the recording, not the
+//! daemon. The recording goes on when there is room again.
 
 mod file;
 mod worker;
@@ -28,32 +28,33 @@ use crate::recording::{About, Entry, Input, Labels, RecordedSensor, State};
 use crate::sensor::Sensor;
 use crate::verdict::Hrn;
 
-/// Entries and events that may wait: some 4 s of a sensor at 100 frames/s.
+/// The most entries and events that wait: some 4 s of a sensor at 100 frames/s.
 const QUEUED: usize = 8192;
-/// How often a sensor's state is noted: what a file that begins between has to take from before
-/// it, and what a damaged chunk costs a replay at the most.
+/// How often a sensor's state is noted. A new file begins with the last state and the entries since,
+/// and a damaged chunk costs a replay no more than this.
 const STATE_EVERY: Duration = Duration::from_secs(10);
-/// And after so many bytes of entries: what a flood makes the black box hold beyond its bound.
+/// A state is also noted after this many bytes of entries, so that a flood of entries cannot make the
+/// black box much larger than its bound.
 const STATE_EVERY_BYTES: usize = 4 << 20;
-/// Over the time between two states, a fault if so many frames and this share were damaged.
+/// It is a fault if this many frames and this share of them were damaged between two states.
 const DAMAGED_FRAMES: u64 = 5;
 const DAMAGED_SHARE: f64 = 0.1;
 
 /// Where a recording goes.
 #[derive(Debug)]
 pub(crate) enum Target {
-    /// Into this one file, made by whoever asks; it ends when it cannot be written or when there
-    /// is no sensor to record.
+    /// Into this one file, which the caller has made. It ends when the file cannot be written or
+    /// when there is no sensor left.
     File {
         path: PathBuf,
         file: File,
         labels: Labels,
     },
-    /// Into files of a directory, as configured.
+    /// Into files in the directory of the configuration.
     Directory(config::Record),
 }
 
-/// Why a recording into one file came to its end.
+/// Why a recording failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The file cannot be written.
@@ -88,7 +89,7 @@ pub enum Error {
         /// Why not.
         source: std::io::Error,
     },
-    /// There is no thread to be had.
+    /// The thread could not be started.
     #[error("no thread for the recording: {0}")]
     Thread(#[source] std::io::Error),
 }
@@ -104,10 +105,10 @@ pub(crate) enum NoBlackbox {
     Write(#[from] crate::recording::Error),
 }
 
-/// Whether this process may write to the directory, or make it.
+/// Checks that this process may write to the directory, or make it.
 pub(crate) fn check(settings: &config::Record) -> Result<(), Error> {
     let directory = settings.dir();
-    // What is missing of it is made.
+    // Directories that are missing will be made.
     let there = directory.ancestors().find(|place| place.exists());
     let there = there.unwrap_or(Path::new("."));
     let found = if there.is_dir() {
@@ -122,7 +123,7 @@ pub(crate) fn check(settings: &config::Record) -> Result<(), Error> {
     })
 }
 
-/// What the thread is told.
+/// What is sent to the thread.
 #[derive(Debug)]
 enum Job {
     Entry {
@@ -131,18 +132,18 @@ enum Job {
         entry: Entry,
     },
     Event(Box<Event>),
-    /// Much of what a sensor sent was damaged.
+    /// Many frames of a sensor were damaged.
     Damage {
         sensor: usize,
     },
-    /// To write the last minute of a sensor.
+    /// Asks for the last minute of a sensor as a file.
     Blackbox {
         sensor: usize,
         reply: oneshot::Sender<Result<PathBuf, NoBlackbox>>,
     },
 }
 
-/// The way to the thread.
+/// The queue to the thread.
 #[derive(Debug, Clone)]
 struct Jobs {
     sender: SyncSender<Job>,
@@ -150,11 +151,11 @@ struct Jobs {
 }
 
 impl Jobs {
-    /// Tells the thread, if there is room; `false`: there was none.
+    /// Sends a job if there is room; `false`: there was none.
     fn tell(&self, job: Job) -> bool {
         match self.sender.try_send(job) {
             Ok(()) => true,
-            // The thread has ended: so has the recording, and that is said elsewhere.
+            // The recording has ended, which is reported elsewhere.
             Err(TrySendError::Disconnected(_)) => true,
             Err(TrySendError::Full(_)) => {
                 self.dropped.fetch_add(1, Ordering::Relaxed);
@@ -170,7 +171,7 @@ pub(crate) struct Recorder {
     jobs: Jobs,
     labels: Labels,
     frames: bool,
-    /// Comes when there is no more to record.
+    /// Ready when there is no more to record.
     stop: oneshot::Receiver<()>,
     ended: oneshot::Receiver<Result<(), Error>>,
 }
@@ -221,22 +222,22 @@ impl Recorder {
         EventRecorder(Some((self.jobs.clone(), self.frames)))
     }
 
-    /// Waits until there is no more to record, be it that the thread has ended.
+    /// Waits until there is no more to record, or the thread has ended.
     pub(crate) async fn stopped(&mut self) {
-        // Gone without a word is ended, too.
+        // An error means that the thread has ended.
         let _ = (&mut self.stop).await;
     }
 
-    /// Waits for the file to be whole. All these have to be gone: the thread ends when nobody
-    /// is left to tell it anything.
+    /// Waits until the file is whole. The caller must have dropped every [`SensorRecorder`] and
+    /// [`EventRecorder`], because the thread ends when its queue has no sender left.
     pub(crate) async fn finish(self) -> Result<(), Error> {
         drop(self.jobs);
-        // A thread that panicked has said so.
+        // If the thread panicked, it has said so.
         self.ended.await.unwrap_or(Ok(()))
     }
 }
 
-/// Where one sensor's task notes what happens; nowhere, if there is no recorder.
+/// Records one sensor's inputs; does nothing without a recorder.
 #[derive(Debug, Default)]
 pub(crate) struct SensorRecorder(Option<Box<Active>>);
 
@@ -245,16 +246,16 @@ struct Active {
     jobs: Jobs,
     index: usize,
     labels: Labels,
-    /// When a state was last noted; `None` if what followed it is not all there.
+    /// When a state was last noted. `None`: entries after it were dropped.
     noted: Option<Duration>,
-    /// What was told since then takes so much memory.
+    /// Bytes of memory that the entries since then take.
     bytes: usize,
-    /// Whole and damaged frames by then.
+    /// The whole and the damaged frames up to then.
     counted: (u64, u64),
 }
 
 impl SensorRecorder {
-    /// Notes what is about to happen to `pipeline`, and lets it happen.
+    /// Records `input` and feeds it to `pipeline`.
     pub(crate) fn feed(
         &mut self,
         pipeline: &mut Pipeline,
@@ -265,14 +266,14 @@ impl SensorRecorder {
         input.feed(pipeline, at)
     }
 
-    /// Notes what is about to happen to `pipeline`.
+    /// Records `input`, which is about to be fed to `pipeline`.
     pub(crate) fn note(&mut self, pipeline: &Pipeline, input: &Input<'_>, at: Stamp) {
         if let Some(active) = &mut self.0 {
             active.follow(pipeline, at, Entry::Input(input.to_owned()));
         }
     }
 
-    /// Notes how `pipeline` is about to be judged from now on.
+    /// Records that `pipeline` will follow `sensor` and `hrn` from now on.
     pub(crate) fn reload(&mut self, pipeline: &Pipeline, sensor: &Sensor, hrn: &Hrn, at: Stamp) {
         if let Some(active) = &mut self.0 {
             let described = RecordedSensor::new(sensor, hrn);
@@ -280,9 +281,9 @@ impl SensorRecorder {
         }
     }
 
-    /// Has the last minute written; the answer comes when that is done.
+    /// Asks for the last minute as a file. The answer comes when it is written.
     pub(crate) fn blackbox(&self, reply: oneshot::Sender<Result<PathBuf, NoBlackbox>>) {
-        // Where there is no room for the job `reply` goes with it, and the asker sees that.
+        // If there is no room for the job, `reply` is dropped with it, which the caller sees.
         match &self.0 {
             Some(active) => {
                 let sensor = active.index;
@@ -296,8 +297,8 @@ impl SensorRecorder {
 }
 
 impl Active {
-    /// Tells `entry`, after a state if one is due. Where the state finds no room the entry goes
-    /// with it, be there room again: it would stand behind a gap.
+    /// Sends `entry`, after a state if one is due. If there is no room for the state, `entry` is
+    /// dropped even if there is room again: a replay could not use it without the state.
     fn follow(&mut self, pipeline: &Pipeline, at: Stamp, entry: Entry) {
         self.begin(pipeline, at);
         if self.noted.is_none() {
@@ -335,12 +336,12 @@ impl Active {
     }
 }
 
-/// Where the hub shows events; nowhere, if there is no recorder.
+/// Records events; does nothing without a recorder.
 #[derive(Debug, Default)]
 pub(crate) struct EventRecorder(Option<(Jobs, bool)>);
 
 impl EventRecorder {
-    /// Shows an event as it is published.
+    /// Records an event that is being published.
     pub(crate) fn event(&self, event: &Event) {
         if let Some((jobs, frames)) = &self.0
             && (*frames || event.kind() != Kind::Frame)

@@ -1,8 +1,8 @@
-//! A subscriber of the hub that hands on to a thread: for ways out whose library may block.
+//! A subscriber of the hub that passes lines to a thread, for publishers whose library may block.
 //!
-//! In: every kind of event, frames with policy `latest`. Out: the same lines, in order, to whoever
-//! has the other end of a short channel. While that one is busy lines wait in the hub, as for any
-//! subscriber; what finds no room there is a `gap`.
+//! In: every kind of event, frames with policy `latest`. Out: the same lines, in order, through a
+//! short channel. While the thread is busy, lines wait in the hub as for any subscriber. When the
+//! hub has no more room for them, there is a `gap`.
 
 use std::thread;
 
@@ -14,7 +14,7 @@ use super::request::{Policy, Subscription};
 use super::sensor::Sensors;
 use crate::event::Kind;
 
-/// Jobs under way to the thread: batches of lines, and questions that come between them.
+/// The most jobs that wait for the thread: batches of lines, and queries between them.
 const JOBS: usize = 8;
 
 /// A thread that takes jobs until there are no more.
@@ -24,9 +24,9 @@ pub(super) struct Worker<J> {
 }
 
 impl<J: From<Vec<Line>> + Send + 'static> Worker<J> {
-    /// Starts a thread that opens something and then works on jobs with it, and waits until it is
-    /// open. The library is never called on the daemon's own thread: what it does there with the
-    /// runtime is its affair.
+    /// Starts a thread that opens a session and then does jobs with it, and waits until the session
+    /// is open. The library is never called on the daemon's own thread, because it may have a
+    /// runtime of its own.
     pub(super) fn start<O, E>(
         name: &'static str,
         open: impl FnOnce(&mpsc::Sender<J>) -> Result<O, E> + Send + 'static,
@@ -61,10 +61,10 @@ impl<J: From<Vec<Line>> + Send + 'static> Worker<J> {
         Ok(Self { jobs, ended })
     }
 
-    /// Relays what the hub publishes until it closes and the thread has come to its end.
+    /// Passes on what the hub publishes, until the hub closes and the thread has ended.
     pub(super) async fn serve(self, hub: hub::Handle, sensors: Sensors) {
         if let Ok((id, _hello)) = hub.join().await {
-            // Unlike a subscriber on a socket it may end only with the daemon.
+            // Unlike a subscriber on a socket, it may end only with the daemon.
             let _ = relay(id, &hub, &sensors, self.jobs).await;
             hub.leave(id).await;
         }

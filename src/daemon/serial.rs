@@ -1,9 +1,9 @@
 //! One serial port: opened, read, lost, opened again.
 //!
-//! In: the configured path and baud rate. Out: a [`Turn`] at a time: bytes, or what became of the
-//! port. It never gives up and never decides what the bytes mean. The port is opened exclusively
-//! (TIOCEXCL and flock; root is bound by the second alone), stale input is flushed, and a read of
-//! nothing is a loss: after an unplug a tty gives nothing for ever.
+//! In: the configured path and baud rate. Out: one [`Turn`] at a time: bytes, or what happened to the
+//! port. It never gives up and never interprets the bytes. The port is opened exclusively (by
+//! TIOCEXCL and flock; only flock keeps root out), and stale input is flushed. A read of no bytes
+//! means that the port is lost, because a tty that was unplugged gives no bytes for ever.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -47,7 +47,7 @@ pub(crate) struct Link {
 
 #[derive(Debug)]
 enum State {
-    /// To be opened then.
+    /// Will be opened at this time.
     Waiting(Instant),
     /// Being opened, on a thread of its own: a driver may take its time over it.
     Opening(JoinHandle<Result<TTYPort, serialport::Error>>),
@@ -55,7 +55,7 @@ enum State {
 }
 
 impl Link {
-    /// A link to `path`, to be opened at once.
+    /// A link to `path`. The first turn opens it.
     pub(crate) fn new(path: &Path, baud: u32) -> Self {
         Self {
             path: path.to_owned(),
@@ -66,7 +66,7 @@ impl Link {
         }
     }
 
-    /// Waits for the next thing to happen. Nothing is lost if the wait is given up.
+    /// Waits for the next thing to happen. It may be cancelled: nothing is lost.
     pub(crate) async fn turn(&mut self) -> Turn<'_> {
         loop {
             match &mut self.state {
@@ -93,8 +93,8 @@ impl Link {
                     }
                 }
                 State::Open(port) => {
-                    // A read given up has read nothing: it is one system call, made when bytes
-                    // are there.
+                    // A read that is cancelled has read nothing: it is one system call, made when
+                    // bytes are there.
                     let lost = match AsyncReadExt::read(port, &mut self.buffer).await {
                         Ok(0) => "end of file".to_owned(),
                         Ok(read) => return Turn::Bytes(&self.buffer[..read]),
@@ -107,8 +107,8 @@ impl Link {
         }
     }
 
-    /// Says that the port is good: the next loss is answered quickly again. A port that opens and
-    /// fails at once never gets so far.
+    /// Says that the port works, so that it is opened again quickly after the next loss. A port that
+    /// opens and fails at once never gets so far.
     pub(crate) fn proven(&mut self) {
         self.pause = FIRST_PAUSE;
     }
@@ -122,14 +122,14 @@ impl Link {
 fn open(path: &Path, baud: u32) -> Result<TTYPort, serialport::Error> {
     // 8N1 without flow control, exclusive: the builder's defaults.
     let port = TTYPort::open(&serialport::new(path.to_string_lossy(), baud))?;
-    // What was sent before the port had its settings is of unknown age and perhaps garbled.
+    // Bytes from before the port had its settings are of unknown age, and may be garbled.
     port.clear(ClearBuffer::Input)?;
     lower_latency(path);
     Ok(port)
 }
 
-/// Asks an FTDI adapter to pass bytes on after 1 ms instead of 16. Best effort: most ports have no
-/// such timer, and only the udev rule may set it where the daemon is not root.
+/// Asks an FTDI adapter to pass bytes on after 1 ms instead of 16. Failure is no error: most ports
+/// have no such timer, and a daemon that is not root leaves it to the udev rule.
 fn lower_latency(path: &Path) {
     let Ok(device) = path.canonicalize() else {
         return;

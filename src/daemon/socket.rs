@@ -20,7 +20,7 @@ use tracing::warn;
 
 use super::accept::{Listener, Stop};
 
-/// Longest path of a Unix socket: `sun_path` of unix(7), without its final NUL.
+/// The longest path of a Unix socket: `sun_path` of unix(7), without its final NUL.
 const LONGEST_PATH_BYTES: usize = 107;
 
 /// How long another daemon may take to put its socket in its place.
@@ -35,36 +35,36 @@ const LOCK_FILE: &str = ".hardnessd.lock";
 /// Why there is no socket.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Somebody answers there.
+    /// A process listens there.
     #[error("{key}: found {path}, in use by another process, expected a free path")]
     InUse {
-        /// In the configuration.
+        /// The key of the configuration.
         key: &'static str,
-        /// Of the socket.
+        /// The path of the socket.
         path: PathBuf,
     },
-    /// Something else stands there.
+    /// Another kind of file is there.
     #[error("{key}: found {path}, which is no socket, expected a socket or nothing there")]
     NoSocket {
-        /// In the configuration.
+        /// The key of the configuration.
         key: &'static str,
-        /// Of the file.
+        /// The path of the file.
         path: PathBuf,
     },
-    /// No directory to put it in, and none to make that in.
+    /// Neither its directory nor the directory above exists.
     #[error("{key}: found {path} in no directory, expected one, or one to make it in")]
     NoDirectory {
-        /// In the configuration.
+        /// The key of the configuration.
         key: &'static str,
-        /// Of the socket.
+        /// The path of the socket.
         path: PathBuf,
     },
     /// The system's limit.
     #[error("{key}: found {path}, {found} bytes, expected a path of at most {max}")]
     TooLong {
-        /// In the configuration.
+        /// The key of the configuration.
         key: &'static str,
-        /// As given.
+        /// The path as given.
         path: PathBuf,
         /// Its length.
         found: usize,
@@ -74,9 +74,9 @@ pub enum Error {
     /// The system refused.
     #[error("{key}: {path}: cannot {what}: {source}")]
     Io {
-        /// In the configuration.
+        /// The key of the configuration.
         key: &'static str,
-        /// Concerned.
+        /// The path of the socket.
         path: PathBuf,
         /// What was tried.
         what: &'static str,
@@ -85,10 +85,10 @@ pub enum Error {
     },
 }
 
-/// Where a socket stands, and as the configuration says.
+/// The file of a socket, as the configuration says.
 #[derive(Debug, Clone)]
 struct Place {
-    /// In the configuration.
+    /// The key of the configuration.
     key: &'static str,
     path: PathBuf,
     mode: u32,
@@ -99,8 +99,8 @@ type Identity = (u64, u64);
 
 /// A listening socket. Its file is removed with it.
 ///
-/// A file that somebody deleted is made again: the socket looks after it every [`LOOK_EVERY`], and
-/// when an order comes.
+/// A file that was deleted is made again: the socket looks for it every [`LOOK_EVERY`], and when an
+/// order comes.
 #[derive(Debug)]
 pub(crate) struct Socket {
     listener: UnixListener,
@@ -115,8 +115,8 @@ pub(crate) struct Socket {
 }
 
 impl Socket {
-    /// Listens at `path`, whose file has `mode` from its first moment; `key` is the one that names it
-    /// in the configuration. The directory is made if it alone is missing.
+    /// Listens at `path`. The file has `mode` from its first moment. `key` is the key of the path in
+    /// the configuration. The directory is made if it alone is missing.
     pub(crate) fn bind(key: &'static str, path: &Path, mode: u32) -> Result<Self, Error> {
         let path = path.to_owned();
         let place = Place { key, path, mode };
@@ -161,7 +161,7 @@ impl Socket {
         }
     }
 
-    /// Looks after its file at every order, too.
+    /// Makes it look for its file at every order.
     pub(crate) fn obey(mut self, orders: Stop) -> Self {
         self.orders = Some(orders);
         self
@@ -172,7 +172,7 @@ impl Socket {
         &self.place.path
     }
 
-    /// Makes the file again if it is gone. What stands in the way is logged once.
+    /// Makes the file again if it is gone. If that fails, the reason is logged once.
     fn look(&mut self) {
         self.next_look = Instant::now() + LOOK_EVERY;
         let path = self.place.path.display();
@@ -182,7 +182,7 @@ impl Socket {
             (Ok(_), None) => None,
             (Ok(_), Some(_)) => Some("another file is in its place".to_owned()),
             (Err(error), Some(_)) if error.kind() == ErrorKind::NotFound => {
-                // Without patience: the sensors wait meanwhile.
+                // Without patience, because the sensors wait meanwhile.
                 match self.place.listen(Duration::ZERO) {
                     Ok((listener, identity)) => {
                         self.listener = listener;
@@ -212,7 +212,7 @@ impl Listener for Socket {
         loop {
             tokio::select! {
                 biased;
-                // Connections that wait at a file that is gone come first.
+                // Connections that wait come first: a new listener would not have them.
                 accepted = self.listener.accept() => return Ok(accepted?.0),
                 () = ordered(&mut self.orders) => self.look(),
                 () = tokio::time::sleep_until(self.next_look) => self.look(),
@@ -221,7 +221,7 @@ impl Listener for Socket {
     }
 }
 
-/// Waits for the next order to look after the file; never ready after the last one.
+/// Waits for the next order to look for the file; never ready after the last one.
 async fn ordered(orders: &mut Option<Stop>) {
     if let Some(receiver) = orders
         && receiver.changed().await.is_ok()
@@ -245,8 +245,8 @@ fn identity(path: &Path) -> io::Result<Identity> {
 }
 
 impl Place {
-    /// Listens here. Another daemon that binds in the same directory is waited for, no longer than
-    /// `patience`.
+    /// Listens here. If another daemon binds in the same directory at the moment, this waits for it,
+    /// but not longer than `patience`.
     fn listen(&self, patience: Duration) -> Result<(UnixListener, Identity), Error> {
         let Self { key, path, mode } = self;
         check(key, path)?;
@@ -262,9 +262,9 @@ impl Place {
             Lock::take(parent, patience).map_err(self.failed("make a lock file beside"))?;
         vacant(key, path)?;
 
-        // Bound in a directory of our own, given its mode, then moved into place: there is no
-        // moment with another mode, nor one without a listener. The way through the descriptor
-        // keeps the name short, whatever the length of `path`.
+        // The socket is bound in a directory of our own, gets its mode, and is then moved into
+        // place. So its file never has another mode and is never without a listener. The path
+        // through the descriptor is short, however long `path` is.
         let nursery = parent.join(format!(".hardnessd-{}", std::process::id()));
         let _ = fs::remove_dir_all(&nursery);
         DirBuilder::new()
@@ -283,9 +283,9 @@ impl Place {
     }
 }
 
-/// Held by one daemon at a time, while it binds a socket in a directory. The file of the lock is
-/// there only meanwhile, and no other user can open it: on the directory itself, which others may
-/// read, anyone could hold a lock.
+/// The right to bind a socket in a directory, which one daemon has at a time. It is a lock on a file
+/// that exists only meanwhile and that no other user can open. Other users may open the directory
+/// itself, so a lock on the directory would let each of them keep the daemon out.
 struct Lock {
     path: PathBuf,
     /// Locked for as long as it is open.
@@ -314,11 +314,11 @@ impl Lock {
             .create(true)
             .truncate(false)
             .mode(0o600)
-            // Whatever somebody put there: no link is followed, no pipe waited for.
+            // Another program may have put a link or a pipe there: do not follow it or wait for it.
             .custom_flags((OFlags::NOFOLLOW | OFlags::NONBLOCK).bits().cast_signed())
             .open(path)?;
         flock(&file, FlockOperation::NonBlockingLockExclusive)?;
-        // The daemon that held it last removed the file: then this one keeps nobody out.
+        // The last holder removed this file meanwhile: a lock on it would keep nobody out.
         let held = file.metadata()?;
         if identity(path).ok() != Some((held.dev(), held.ino())) {
             return Err(ErrorKind::WouldBlock.into());
@@ -330,7 +330,7 @@ impl Lock {
 
 impl Drop for Lock {
     fn drop(&mut self) {
-        // Before the lock is let go.
+        // This comes before the lock is released.
         let _ = fs::remove_file(&self.path);
     }
 }
@@ -344,7 +344,7 @@ fn failed(key: &'static str, path: &Path, what: &'static str, source: io::Error)
     }
 }
 
-/// Whether a socket can stand at `path`, as far as looking tells.
+/// Checks that a socket can be made at `path`, without making it.
 pub(crate) fn check(key: &'static str, path: &Path) -> Result<(), Error> {
     let found = path.as_os_str().len();
     if found > LONGEST_PATH_BYTES {
@@ -377,7 +377,7 @@ fn directory(path: &Path) -> &Path {
     }
 }
 
-/// Whether a socket stands at `path`, be it dead; anything else there is an error.
+/// Whether there is a socket at `path`, alive or dead. Any other file there is an error.
 fn is_there(key: &'static str, path: &Path) -> Result<bool, Error> {
     match fs::symlink_metadata(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(false),
@@ -390,13 +390,13 @@ fn is_there(key: &'static str, path: &Path) -> Result<bool, Error> {
     }
 }
 
-/// Makes sure that nothing alive stands at `path`.
+/// Fails if a process listens at `path`.
 fn vacant(key: &'static str, path: &Path) -> Result<(), Error> {
     if !is_there(key, path)? {
         return Ok(());
     }
-    // On a socket that nobody listens to, connect is refused; on any other outcome somebody may
-    // (a full backlog, for one, would keep a blocking connect waiting).
+    // A connection to a dead socket is refused. With any other result a process may listen there. The
+    // socket does not block, because a full backlog would keep a blocking connect waiting.
     let probe = || {
         let socket = rustix::net::socket_with(
             AddressFamily::UNIX,
@@ -455,7 +455,7 @@ mod tests {
             let made = fs::metadata(&path).unwrap();
             assert_eq!(made.permissions().mode() & 0o777, 0o620);
         }
-        // The file of another process is left alone.
+        // The file of another process stays as it is.
         fs::remove_file(&path).unwrap();
         let _other = StdListener::bind(&path).unwrap();
         let other = identity(&path).unwrap();

@@ -1,4 +1,5 @@
-//! What the service manager is told and what it hands over, where there is one.
+//! What the daemon tells systemd, and the sockets that systemd passes to it. Without systemd nothing
+//! here does anything.
 
 use std::io;
 use std::os::unix::net::UnixListener;
@@ -9,23 +10,23 @@ use sd_notify::NotifyState;
 
 use crate::event::{LinkState, Status};
 
-/// The Unix sockets that the manager listens on for us (sd_listen_fds(3)).
+/// The Unix sockets that systemd listens on for us (sd_listen_fds(3)).
 ///
 /// # Errors
 ///
-/// If it hands over anything else.
+/// If it passes anything else.
 pub(crate) fn sockets() -> io::Result<Vec<UnixListener>> {
     let mut passed = ListenFd::from_env();
     let sockets = (0..passed.len()).map(|index| passed.take_unix_listener(index));
     sockets.filter_map(Result::transpose).collect()
 }
 
-/// The daemon serves: sockets answer, ports are being opened.
+/// Says that the daemon serves: sockets answer, and ports are being opened.
 pub(crate) fn ready() {
     tell(&[NotifyState::Ready]);
 }
 
-/// The configuration is being read again; [`ready`] ends it.
+/// Says that the configuration is being read again, until [`ready`].
 pub(crate) fn reloading() {
     match NotifyState::monotonic_usec_now() {
         Ok(now) => tell(&[NotifyState::Reloading, now]),
@@ -33,12 +34,12 @@ pub(crate) fn reloading() {
     }
 }
 
-/// The daemon is on its way out.
+/// Says that the daemon is about to end.
 pub(crate) fn stopping() {
     tell(&[NotifyState::Stopping]);
 }
 
-/// Every sensor's task has answered: the pipelines turn, whatever the hardware does.
+/// Feeds the watchdog: every sensor's task has answered, whatever the hardware does.
 pub(crate) fn alive(statuses: &[Status]) {
     let live = statuses
         .iter()
@@ -48,8 +49,7 @@ pub(crate) fn alive(statuses: &[Status]) {
     tell(&[NotifyState::Watchdog, NotifyState::Status(&line)]);
 }
 
-/// How often [`alive`] is due: twice as often as the manager demands, or at leisure where it
-/// demands nothing.
+/// How often [`alive`] is due: twice as often as the watchdog demands, or every 10 s without one.
 pub(crate) fn heartbeat() -> Duration {
     const AT_LEISURE: Duration = Duration::from_secs(10);
     sd_notify::watchdog_enabled().map_or(AT_LEISURE, |timeout| timeout / 2)

@@ -1,4 +1,4 @@
-//! TCP listeners: where they stand, and how their connections behave.
+//! TCP listeners and the options of their connections.
 
 use std::io;
 use std::net::{SocketAddr, TcpListener as StdListener};
@@ -9,15 +9,15 @@ use tokio::net::{TcpListener, TcpStream};
 
 use super::accept::Listener;
 
-/// Bytes the system may hold for a subscriber that does not read, doubled by it for its own use;
-/// by default it would let them grow to megabytes. As for a Unix socket.
+/// Bytes that the system may hold for a subscriber that does not read, as for a Unix socket. The
+/// system doubles the number for its own use. Its default would grow to megabytes.
 const SEND_BUFFER_BYTES: usize = 104 * 1024;
 
-/// A connection without traffic is looked after once it has been so for this long.
+/// A connection without traffic is probed after this time,
 const KEEPALIVE: Duration = Duration::from_secs(30);
-/// Then so often,
+/// then at this interval,
 const KEEPALIVE_PAUSE: Duration = Duration::from_secs(10);
-/// and given up after so many looks without an answer.
+/// and closed after this many probes without an answer.
 const KEEPALIVE_TRIES: u32 = 3;
 
 /// Why there is no listener.
@@ -37,11 +37,11 @@ pub(crate) struct Tcp {
 }
 
 impl Tcp {
-    /// Listens on `address`; `key` is the one that names it in the configuration.
+    /// Listens on `address`. `key` is its key in the configuration.
     pub(crate) fn bind(key: &'static str, address: SocketAddr) -> Result<Self, Error> {
         let bound = || {
-            // SO_REUSEADDR is the standard library's default: connections of a daemon that has
-            // just ended are no reason not to start.
+            // The standard library sets SO_REUSEADDR, so the connections of a daemon that has just
+            // ended do not keep this one from starting.
             let listener = StdListener::bind(address)?;
             listener.set_nonblocking(true)?;
             let address = listener.local_addr()?;
@@ -55,7 +55,7 @@ impl Tcp {
         })
     }
 
-    /// Where it listens: with the port the system chose, if it was to choose.
+    /// Its address. If the configured port was 0, this has the port that the system chose.
     pub(crate) fn address(&self) -> SocketAddr {
         self.address
     }
@@ -66,7 +66,7 @@ impl Listener for Tcp {
 
     async fn accept(&mut self) -> io::Result<TcpStream> {
         let (stream, _) = self.listener.accept().await?;
-        // A connection that is gone already is found out when it is read.
+        // If the connection is gone already, the next read says so.
         let _ = behave(&stream);
         Ok(stream)
     }

@@ -1,9 +1,10 @@
-//! Against DNS rebinding: a page from elsewhere must not reach this server under its own name.
+//! Protection against DNS rebinding: a page from elsewhere must not reach this server under a name
+//! of its own.
 //!
-//! A browser names in `Host` what stands in its address bar. An attacker's name that resolves to
-//! this machine is still a name; so only addresses are taken, and `localhost`, which resolves
-//! nowhere else. Their port is not looked at: an address with another port is a tunnel's
-//! (`ssh -L`), and no way around.
+//! A browser sends in `Host` what its address bar shows. An attacker's name is a name, even if it
+//! resolves to this machine. So this accepts only addresses, and `localhost`, which always means this
+//! machine. It ignores the port: another port comes from a tunnel (`ssh -L`), and does not help an
+//! attacker.
 
 use std::net::{IpAddr, SocketAddr};
 
@@ -11,13 +12,13 @@ use hyper::Request;
 use hyper::header::HOST;
 use hyper::http::uri::Authority;
 
-/// Whether `request`, which came in at `local`, was meant for a server listening on `listen`.
+/// Whether `request` was meant for this server, which listens on `listen` and accepted it at `local`.
 pub(super) fn is_ours<B>(request: &Request<B>, listen: SocketAddr, local: SocketAddr) -> bool {
     let mut hosts = request.headers().get_all(HOST).iter();
     let (Some(host), None) = (hosts.next(), hosts.next()) else {
         return false;
     };
-    // A request line may name a host as well: it counts by RFC 9112, section 3.2.2.
+    // A host in the request line counts as well (RFC 9112, section 3.2.2).
     let named = request.uri().host();
     let host = host.to_str().ok().and_then(host_of);
     named.is_none_or(|named| accepts(named, listen, local))
@@ -27,7 +28,7 @@ pub(super) fn is_ours<B>(request: &Request<B>, listen: SocketAddr, local: Socket
 /// The host without its port.
 fn host_of(header: &str) -> Option<String> {
     let authority: Authority = header.parse().ok()?;
-    // With a user's name before it, it is no Host.
+    // A Host header has no user name.
     (!header.contains('@')).then(|| authority.host().to_owned())
 }
 

@@ -1,8 +1,8 @@
 //! `/metrics`: the state of the daemon as numbers, in the OpenMetrics text format that Prometheus
 //! reads.
 //!
-//! Every scrape asks the hub and the sensors and writes what they say: there is no second count of
-//! anything. A series is there from the start, at 0, so that its first change is seen.
+//! Every scrape asks the hub and the sensors, so nothing is counted twice. A series exists from the
+//! start with the value 0, so that its first change is seen.
 
 use prometheus_client::encoding::text;
 use prometheus_client::metrics::counter::Counter;
@@ -21,7 +21,7 @@ type Labels = Vec<(&'static str, String)>;
 type Counters = Family<Labels, Counter>;
 type Gauges = Family<Labels, Gauge<f64, std::sync::atomic::AtomicU64>>;
 
-/// The hub and the sensors in the text format. The label `robot` is on every series.
+/// The state of the hub and the sensors in the text format. Every series has the label `robot`.
 pub(super) fn encode(survey: &Survey, vitals: &[Vitals]) -> String {
     let hello = &survey.hello;
     let robot = ("robot".into(), escaped(&hello.robot).into());
@@ -63,13 +63,13 @@ pub(super) fn encode(survey: &Survey, vitals: &[Vitals]) -> String {
     text
 }
 
-/// A label's value as the format wants it, which the library leaves to its callers. Of all values
-/// only the robot's name may hold such characters; it has no line feed.
+/// A label's value with the escapes of the format, which the library leaves to its callers. Only the
+/// robot's name can hold such characters, and it has no line feed.
 fn escaped(value: &str) -> String {
     value.replace('\\', r"\\").replace('"', r#"\""#)
 }
 
-/// What the sensors say of themselves.
+/// The series of the links.
 fn links(registry: &mut Registry, vitals: &[Vitals]) {
     let (frames, damaged, skipped, unjudged) =
         <(Counters, Counters, Counters, Counters)>::default();
@@ -113,7 +113,7 @@ fn links(registry: &mut Registry, vitals: &[Vitals]) {
     registry.register_with_unit("last_frame_age", help, Unit::Seconds, age);
 }
 
-/// What was published of presses and verdicts.
+/// The series of presses and verdicts.
 fn presses(registry: &mut Registry, survey: &Survey) {
     let (presses, verdicts, rejected) = <(Counters, Counters, Counters)>::default();
     let none = Counts::default();
@@ -133,7 +133,7 @@ fn presses(registry: &mut Registry, survey: &Survey) {
             counter.inc_by(count);
         }
         for (phase, made) in [("early", &counts.early), ("final", &counts.finals)] {
-            // Levels of a model that a reload replaced are counted on.
+            // Levels of a model that a reload has replaced stay.
             let known = survey.hello.model.levels.iter().map(|level| level.level);
             let mut levels: Vec<u8> = known.chain(made.levels.keys().copied()).collect();
             levels.sort_unstable();

@@ -1,4 +1,4 @@
-//! `/api/status`: all that is true now, as one JSON object.
+//! `/api/status`: the present state as one JSON object.
 
 use serde_json::{Value, json};
 
@@ -6,9 +6,9 @@ use crate::daemon::hub::Survey;
 use crate::daemon::sensor::Vitals;
 use crate::event::{Event, Reply};
 
-/// `hello` and, by sensor, `status` and `last` (its last final verdict, or null) as on a socket;
-/// beside them `last_frame_age_s` (null before the first frame) and the `contact_threshold_n` in
-/// force; and `subscribers`.
+/// An object of `hello` as on a socket, `subscribers`, and a list of `sensors`. A sensor has its
+/// `status` and `last` (its last final verdict, or null) as on a socket, `last_frame_age_s` (null
+/// before the first frame) and the `contact_threshold_n` in force.
 pub(super) fn json(survey: &Survey, vitals: &[Vitals]) -> String {
     let read = |line: &str| -> Value {
         serde_json::from_str(line).expect("what was written as JSON can be read as JSON")
@@ -20,7 +20,7 @@ pub(super) fn json(survey: &Survey, vitals: &[Vitals]) -> String {
             json!({
                 "status": read(&Event::Status(vitals.status.clone()).to_line()),
                 "last_frame_age_s": vitals.last_frame_age.map(|age| age.as_secs_f64()),
-                // As it stands in the configuration: the digits of an f32, not those of an f64.
+                // With the digits of the configuration, which are those of an f32.
                 "contact_threshold_n": read(&vitals.contact_threshold_n.to_string()),
                 "last": last.map(|line| read(&line.json)),
             })

@@ -1,4 +1,4 @@
-//! One subscriber as the hub sees it: what it wants, what waits for it, what it has missed.
+//! One subscriber in the hub: what it wants, what waits for it, and what it has missed.
 
 use std::collections::VecDeque;
 
@@ -6,26 +6,26 @@ use super::{HELD, Line};
 use crate::daemon::request::{Kinds, Policy, Subscription};
 use crate::event::{Kind, Reply};
 
-/// Events waiting for a subscriber (`docs/controller.md`).
+/// The most events that wait for a subscriber (`docs/controller.md`).
 const QUEUE: usize = 1024;
 
-/// Bytes handed out at a time, and a line more: enough that a write carries many events, few
-/// enough that a stalled subscriber holds little beyond its queue.
+/// A batch ends with the line that reaches this many bytes. So one write carries many events, and a
+/// subscriber that has stopped reading holds little beyond its queue.
 const BATCH_BYTES: usize = 32 * 1024;
 
 /// A subscriber's state.
 pub(super) struct Subscriber {
     kinds: Kinds,
     policy: Policy,
-    /// A `gap` that is due before all else: `since` reached back too far.
+    /// A `gap` to send before all else, because `since` reached back too far.
     missing: Option<Reply>,
-    /// Held events that `since` asked for, oldest first: their numbers and kinds.
+    /// The held events that `since` asked for, oldest first, by number and kind.
     replay: VecDeque<(u64, Kind)>,
-    /// Events waiting.
+    /// The events that wait.
     queue: VecDeque<Line>,
-    /// Events of its kinds dropped since the last line it got.
+    /// How many events of its kinds were dropped since its last line.
     lost: u64,
-    /// `gap` lines told since the hub last counted them.
+    /// `gap` lines sent since the hub last counted them.
     pub(super) gaps: u64,
     handed: Handed,
 }
@@ -51,7 +51,7 @@ impl Subscriber {
         self.kinds.contains(kind)
     }
 
-    /// Another subscription: what waits and is no longer wanted goes without a `gap`.
+    /// Changes the subscription. Events that wait and are no longer wanted go without a `gap`.
     pub(super) fn change(&mut self, kinds: Kinds, policy: Policy) {
         (self.kinds, self.policy) = (kinds, policy);
         self.replay.retain(|&(_, kind)| kinds.contains(kind));
@@ -64,11 +64,11 @@ impl Subscriber {
         }
     }
 
-    /// Sends `held` again but for what this subscriber has had, before anything live. `missing`
-    /// says how many of its events are held no more; `None`: unknown.
+    /// Sends `held` before anything live, except for events that this subscriber has had. `missing`
+    /// is how many of its events are no longer held; `None`: unknown.
     pub(super) fn replay(&mut self, held: impl Iterator<Item = (u64, Kind)>, missing: Option<u64>) {
         self.missing = (missing != Some(0)).then_some(Reply::Gap { lost: missing });
-        // What waits is held too, and comes with the rest.
+        // Numbered events that wait are held too, and come again with the others.
         self.queue.retain(|line| line.seq.is_none());
         self.lost = 0;
         self.replay = held
@@ -76,7 +76,8 @@ impl Subscriber {
             .collect();
     }
 
-    /// A new event, wanted or not. Says how many it displaced that a `gap` will tell of.
+    /// Queues a new event if it is wanted. Returns how many older ones it displaced that the next
+    /// `gap` will count.
     pub(super) fn offer(&mut self, line: &Line) -> u64 {
         if let Some(seq) = line.seq {
             self.handed.remove(seq);
@@ -101,7 +102,7 @@ impl Subscriber {
         if let Some(place) = superseded
             && let Some(dropped) = self.queue.remove(place)
         {
-            // A newer frame stands for the older ones: that is what `latest` is for.
+            // With `latest`, a newer frame replaces an older one without a `gap`.
             let silent = self.policy != Policy::Queue && frame(&dropped);
             lost = u64::from(!silent);
         }
@@ -110,7 +111,7 @@ impl Subscriber {
         lost
     }
 
-    /// What it gets next; `held` looks a numbered event up.
+    /// Its next batch of lines. `held` looks a numbered event up.
     pub(super) fn take(&mut self, held: impl Fn(u64) -> Option<Line>) -> Vec<Line> {
         let mut lines = Vec::new();
         let mut bytes = 0;
@@ -128,7 +129,7 @@ impl Subscriber {
                     bytes += line.json.len();
                     lines.push(line);
                 }
-                // Forgotten while the subscriber took its time.
+                // No longer held, because the subscriber was too slow.
                 None => self.lost += 1,
             }
         }
@@ -156,7 +157,7 @@ impl Subscriber {
     }
 }
 
-/// Which of the events held this subscriber has had: one bit each.
+/// Which of the held events this subscriber has had, one bit each.
 struct Handed([u64; HELD / 64]);
 
 impl Handed {

@@ -1,4 +1,4 @@
-//! What has been published since start, counted: for metrics.
+//! How many events of each kind have been published since the start, for the metrics.
 
 use std::collections::BTreeMap;
 
@@ -7,9 +7,9 @@ use crate::event::{Event, Phase, PressState, Rejection};
 /// Counts over all sensors of a run.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Tally {
-    /// By sensor's name; one that has published nothing is not there.
+    /// By the sensor's name. A sensor that has published nothing is missing.
     pub(crate) sensors: BTreeMap<String, Counts>,
-    /// `gap` lines told.
+    /// `gap` lines sent.
     pub(crate) gaps: u64,
     /// Events dropped because a subscriber's queue was full.
     pub(crate) dropped: u64,

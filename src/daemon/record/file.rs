@@ -1,4 +1,4 @@
-//! The file being written, and the disk it lies on.
+//! The file that is being written, and the room on its disk.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, ErrorKind};
@@ -8,10 +8,10 @@ use std::time::Instant;
 
 use crate::recording::{self, About, Writer};
 
-/// As disks are sold.
+/// A megabyte as disks are sold.
 pub(super) const MB: u64 = 1_000_000;
 
-/// A file being written.
+/// A file that is being written.
 pub(super) struct Open {
     pub(super) path: PathBuf,
     pub(super) file: Arc<File>,
@@ -37,7 +37,7 @@ impl Open {
     }
 }
 
-/// Whether the disk has so many bytes free for us.
+/// Fails if fewer than this many bytes are free on the disk.
 pub(super) fn has_room(directory: &Path, floor: u64) -> io::Result<()> {
     fs::create_dir_all(directory).map_err(|error| named(directory, &error))?;
     let disk = rustix::fs::statvfs(directory).map_err(|error| named(directory, &error.into()))?;
@@ -54,7 +54,7 @@ pub(super) fn has_room(directory: &Path, floor: u64) -> io::Result<()> {
     Ok(())
 }
 
-/// A new file, named by what it is and by now.
+/// Makes a new file, named by `what` it is and by the time.
 pub(super) fn create(directory: &Path, what: &str) -> io::Result<(PathBuf, File)> {
     let now = jiff::Timestamp::now().strftime("%Y%m%dT%H%M%S%.3fZ");
     let path = directory.join(format!("{what}-{now}.mcap"));

@@ -17,16 +17,16 @@ use crate::event::{Event, LinkState, PressState};
 use crate::frame::Stamp;
 use crate::recording::{self, About, Entry, Input, Ring};
 
-/// How often what was written is handed to the system: kill -9 loses no more.
+/// How often written entries are passed to the system: kill -9 loses no more than this.
 const FLUSH_EVERY: Duration = Duration::from_millis(500);
-/// How long a disk that failed or is full is left alone.
+/// How long the recorder waits after the disk failed or was full.
 const RETRY_AFTER: Duration = Duration::from_secs(5);
-/// Faults of one sensor that come sooner after a black box write none.
+/// The shortest time between black boxes of one sensor's faults.
 const FAULT_EVERY: Duration = Duration::from_secs(60);
-/// So much more than the floor has to be free before a recording goes on: a sixteenth.
+/// Before a recording goes on, this share more than the floor must be free.
 const ROOM_SHARE: u64 = 16;
 
-/// What the thread knows.
+/// The state of the thread.
 pub(super) struct Worker {
     target: Target,
     about: About,
@@ -34,11 +34,11 @@ pub(super) struct Worker {
     dropped_said: u64,
     sensors: Vec<Watched>,
     open: Option<Open>,
-    /// Where there is no file and there should be one: when to try again.
+    /// When to try again, if a file should be open and is not.
     retry: Option<Instant>,
-    /// Whether the disk is why.
+    /// Whether the disk is the reason.
     paused: bool,
-    /// Told when there is no more to record.
+    /// Sent when there is no more to record.
     stop: Option<oneshot::Sender<()>>,
     gone: Option<Error>,
     frames: u64,
@@ -54,7 +54,7 @@ struct Watched {
     last_fault: Option<Instant>,
 }
 
-/// What a job came to, if to no good.
+/// Why a job failed.
 enum Failure {
     Write(recording::Error),
     /// No sensor is left.
@@ -90,9 +90,8 @@ impl Worker {
         }
     }
 
-    /// Writes until nobody is left to tell it anything, or there is no more to record. Only one
-    /// file that fails is an error: of a directory, which the daemon has beside its work, it is a
-    /// line in the log.
+    /// Writes until its queue has no sender left, or there is no more to record. A failure is an
+    /// error only of a recording into one file. In a directory it is a line in the log.
     pub(super) fn run(mut self, jobs: &Receiver<Job>) -> Result<(), Error> {
         self.begin()?;
         let mut flush = Instant::now() + FLUSH_EVERY;
@@ -131,7 +130,7 @@ impl Worker {
         Ok(())
     }
 
-    /// One file that fails is the end of it; in a directory the next may do.
+    /// Handles a failure: it ends a recording into one file; in a directory another file may work.
     fn settle(&mut self, done: Result<(), Failure>) -> Result<(), Error> {
         match (done, &self.target) {
             (Ok(()), _) => {}
@@ -154,7 +153,7 @@ impl Worker {
         Ok(())
     }
 
-    /// Leaves the disk alone for a while, and says why once.
+    /// Pauses the recording, and logs the reason once.
     fn pause(&mut self, reason: &recording::Error) {
         if !self.paused {
             warn!(%reason, "recording stopped; it goes on when there is room");
@@ -172,7 +171,7 @@ impl Worker {
         let mut finished = open.finish();
         if matches!(self.target, Target::File { .. }) {
             finished = finished.and_then(|()| Ok(file.sync_all()?));
-            // Of a sensor that was never there nothing is kept.
+            // Nothing is kept of a sensor that was never there.
             if !matches!(gone, Err(Error::Unavailable { .. })) {
                 info!(
                     path = %path.display(),
@@ -203,7 +202,7 @@ impl Worker {
                 if let Err(reason) = &written {
                     self.say_no_blackbox(sensor, reason);
                 }
-                // The asker may have gone.
+                // The client may have gone.
                 let _ = reply.send(written);
                 Ok(())
             }
@@ -242,7 +241,7 @@ impl Worker {
         if self.directory().is_some() {
             self.sensors[sensor].ring.push(at, entry);
         }
-        // Not before it is in the ring: the next file may do.
+        // Only after the entry is in the ring, so that the next file can have it.
         written?;
         match gone {
             Some(gone) if matches!(self.target, Target::File { .. }) => Err(Failure::Gone(gone)),
@@ -271,7 +270,7 @@ impl Worker {
         Ok(())
     }
 
-    /// Writes what led to a fault, unless it was done a moment ago.
+    /// Writes what led to a fault, unless a black box was written a moment ago.
     fn fault(&mut self, sensor: usize, fault: &str) {
         let now = Instant::now();
         let recent = |last: Instant| now.duration_since(last) < FAULT_EVERY;
@@ -311,7 +310,7 @@ impl Worker {
             let directory = settings.dir();
             has_room(&directory, settings.keep_free_mb * MB)?;
             let (path, file) = create(&directory, &format!("blackbox-{name}"))?;
-            // Whoever asked for it may be elsewhere.
+            // The client may run in another directory.
             let path = std::path::absolute(&path).unwrap_or(path);
             or_removed(&path, || {
                 let mut open = Open::new(path.clone(), file, &about)?;
@@ -327,7 +326,7 @@ impl Worker {
         Ok(path)
     }
 
-    /// What is due every half second.
+    /// Does what is due every half second.
     fn look_after(&mut self) -> Result<(), Failure> {
         let dropped = self.dropped.load(Ordering::Relaxed);
         if dropped > self.dropped_said {
@@ -342,7 +341,7 @@ impl Worker {
         Ok(())
     }
 
-    /// Ends a file that is full or old or leaves too little room, and begins the next.
+    /// Ends a file that is full or old, or when too little room is left, and begins the next.
     fn look_after_directory(&mut self) {
         let Target::Directory(settings) = &self.target else {
             return;
@@ -388,7 +387,7 @@ impl Worker {
         }
     }
 
-    /// A file that begins with every sensor's last state and what came since.
+    /// Begins a file with every sensor's last state and the entries since.
     fn next_file(&self, directory: &Path) -> Result<Open, recording::Error> {
         let (path, file) = create(directory, "hardnessd")?;
         or_removed(&path, || {
@@ -404,13 +403,13 @@ impl Worker {
     }
 }
 
-/// Fills the new file at `path`. One that cannot be filled is of no use, and the disk may be full.
+/// Fills the new file at `path`, or removes it again: the disk may be full.
 fn or_removed<T>(
     path: &Path,
     fill: impl FnOnce() -> Result<T, recording::Error>,
 ) -> Result<T, recording::Error> {
     fill().inspect_err(|_| {
-        // What cannot be removed stays.
+        // A file that cannot be removed stays.
         let _ = fs::remove_file(path);
     })
 }
