@@ -13,6 +13,7 @@ mod hub;
 pub(crate) mod lines;
 pub mod log;
 pub mod publish;
+pub mod realtime;
 pub mod record;
 #[cfg(any(feature = "ros2", feature = "zenoh"))]
 mod relay;
@@ -32,7 +33,7 @@ use std::fs::File;
 use std::future::Future;
 use std::io::Read;
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::pin::{Pin, pin};
 use std::time::Duration;
 
@@ -43,6 +44,7 @@ use tracing::{error, info, warn};
 
 use self::config::{Config, Publish, Setup};
 use self::publish::Publishers;
+use self::realtime::Standing;
 use self::record::{EventRecorder, Recorder, SensorRecorder, Target};
 pub use self::reload::Reload;
 use self::reload::{Readers, Refusal};
@@ -362,12 +364,14 @@ async fn finished(loading: &mut Option<Loading>) -> Result<Setup, Refusal> {
 }
 
 fn announce(setup: &Setup, run: &str) {
+    let standing = Standing::of(Path::new("/proc/self")).map(|standing| standing.to_string());
     info!(
         version = env!("CARGO_PKG_VERSION"),
         robot = setup.config.robot.as_str(),
         run,
         model = short(setup),
         validation = setup.hrn.card().validation.as_str(),
+        scheduling = standing,
         "started"
     );
     for sensor in &setup.config.sensors {

@@ -8,7 +8,8 @@ In a mount namespace of its own, where /run is its own too. Claims: the shipped 
 in `systemd-analyze security`; the daemon starts under the sandbox's umask with a socket from
 `systemd-socket-activate`; without a journal `format = "journald"` is refused with 78; in a real
 journal every line has its fields; a journal that takes nothing delays nobody and what is lost is
-counted; a device that is lost is one line.
+counted; a device that is lost is one line; under the unit's scheduling the daemon's main thread is in
+real time and says so, and every thread it starts is an ordinary one.
 """
 
 import argparse
@@ -42,6 +43,10 @@ def main():
     else:
         print("skipped: a real journald needs root")
     socket_activate(binary)
+    if subprocess.run(["chrt", "--reset-on-fork", "--rr", "10", "true"], stderr=subprocess.DEVNULL).returncode == 0:
+        real_time(binary)
+    else:
+        print("skipped: real-time scheduling needs root")
 
 
 def exposure():
@@ -137,6 +142,26 @@ def real_journal(binary):
     process.terminate()
     process.wait()
     print(f"a real journal: {len(verdict)} fields of a verdict, a loss is one line")
+
+
+def real_time(binary):
+    with Bench(binary, more="[record]\ndir = \"recordings\"\n") as bench:
+        command = ["chrt", "--reset-on-fork", "--rr", "10", binary, "run", "--config", bench.path("hardnessd.toml")]
+        with open(bench.path("log"), "wb") as log:
+            daemon = subprocess.Popen(command, stderr=log)
+        bench.processes.append(daemon)
+        started = wait_for("the daemon", lambda: [line for line in bench._log(0).splitlines() if b" started " in line])
+        assert b'scheduling="real time (rr, priority 10)"' in started[0], started
+        # Fields 40 and 41 of proc_pid_stat(5), the first after the name being field 3.
+        scheduled = {}
+        for thread in os.listdir(f"/proc/{daemon.pid}/task"):
+            with open(f"/proc/{daemon.pid}/task/{thread}/stat") as stat:
+                fields = stat.read().rsplit(") ", 1)[1].split()
+            scheduled[int(thread)] = (fields[37], fields[38])
+        assert scheduled.pop(daemon.pid) == ("10", "2"), scheduled
+        # Those that log and record.
+        assert len(scheduled) >= 2 and set(scheduled.values()) == {("0", "0")}, scheduled
+        print(f"real time: one thread of {len(scheduled) + 1}")
 
 
 def socket_activate(binary):

@@ -1,12 +1,16 @@
 //! `/api/status`: the present state as one JSON object.
 
+use std::path::Path;
+
 use serde_json::{Value, json};
 
 use crate::daemon::hub::Survey;
+use crate::daemon::realtime::Standing;
 use crate::daemon::sensor::Vitals;
 use crate::event::{Event, Reply};
 
-/// An object of `hello` as on a socket, `subscribers`, and a list of `sensors`. A sensor has its
+/// An object of `hello` as on a socket, `subscribers`, `process` (how the kernel runs the daemon,
+/// [`Standing`]), and a list of `sensors`. A sensor has its
 /// `status` and `last` (its last final verdict, or null) as on a socket, `last_frame_age_s` (null
 /// before the first frame) and the `contact_threshold_n` in force.
 pub(super) fn json(survey: &Survey, vitals: &[Vitals]) -> String {
@@ -30,6 +34,7 @@ pub(super) fn json(survey: &Survey, vitals: &[Vitals]) -> String {
         "hello": read(&Reply::Hello(survey.hello.clone()).to_line()),
         "sensors": sensors,
         "subscribers": survey.subscribers,
+        "process": Standing::of(Path::new("/proc/self")),
     })
     .to_string()
 }

@@ -10,6 +10,8 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::{Access, AtFlags, CWD, accessat};
 
+use crate::daemon::realtime::Standing;
+
 /// Something wrong, and what mends it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Fault {
@@ -198,8 +200,11 @@ fn held(root: &Path, device: &Path, own: u32) -> Vec<Fault> {
                 continue;
             }
             faults.push(if tool.as_deref() == Some(b"run") {
+                let standing = Standing::of(&root.join("proc").join(pid.to_string()));
+                let how =
+                    standing.map_or(String::new(), |how| format!("; its scheduling is {how}"));
                 Fault {
-                    what: format!("held by process {pid}, the daemon (hardnessd run)"),
+                    what: format!("held by process {pid}, the daemon (hardnessd run{how})"),
                     cure: format!(
                         "sudo systemctl stop hardnessd; where it is no service, kill {pid}"
                     ),

@@ -1,0 +1,139 @@
+//! How the kernel runs a process: its scheduling, and whether its memory is locked.
+//!
+//! The daemon does not ask for real-time scheduling. systemd sets it before it starts the daemon
+//! (`CPUSchedulingPolicy=` of the unit), and the sandbox then refuses any change. Threads that the
+//! daemon starts are scheduled as ordinary ones (`CPUSchedulingResetOnFork=`): they log, record and
+//! load models.
+
+use std::path::Path;
+use std::{fmt, fs};
+
+use serde::Serialize;
+
+/// How a process runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct Standing {
+    /// The scheduling of its main thread.
+    pub scheduling: Scheduling,
+    /// Its real-time priority; 0 for ordinary scheduling.
+    pub priority: u32,
+    /// Whether its pages stay in memory once they are there.
+    pub memory_locked: bool,
+}
+
+/// A scheduling policy of sched(7).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Scheduling {
+    /// The ordinary one.
+    Other,
+    /// Real time, until it waits.
+    Fifo,
+    /// Real time, in turns.
+    Rr,
+    /// For work that does not interact.
+    Batch,
+    /// When nothing else runs.
+    Idle,
+    /// By deadlines.
+    Deadline,
+}
+
+impl Standing {
+    /// Reads it from the directory of a process in /proc; `None` if that does not say.
+    pub fn of(process: &Path) -> Option<Self> {
+        let stat = fs::read_to_string(process.join("stat")).ok()?;
+        let status = fs::read_to_string(process.join("status")).ok()?;
+        Self::read(&stat, &status)
+    }
+
+    /// Reads proc_pid_stat(5) and proc_pid_status(5).
+    fn read(stat: &str, status: &str) -> Option<Self> {
+        // The name before the parenthesis may hold spaces. After it comes field 3.
+        let (_, fields) = stat.rsplit_once(") ")?;
+        let mut fields = fields.split_whitespace().skip(40 - 3);
+        let priority = fields.next()?.parse().ok()?;
+        let scheduling = match fields.next()? {
+            "0" => Scheduling::Other,
+            "1" => Scheduling::Fifo,
+            "2" => Scheduling::Rr,
+            "3" => Scheduling::Batch,
+            "5" => Scheduling::Idle,
+            "6" => Scheduling::Deadline,
+            _ => return None,
+        };
+        let locked = status
+            .lines()
+            .find_map(|line| line.strip_prefix("VmLck:"))?;
+        Some(Self {
+            scheduling,
+            priority,
+            memory_locked: locked.split_whitespace().next()? != "0",
+        })
+    }
+}
+
+impl fmt::Display for Standing {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.scheduling {
+            Scheduling::Fifo => write!(out, "real time (fifo, priority {})", self.priority)?,
+            Scheduling::Rr => write!(out, "real time (rr, priority {})", self.priority)?,
+            Scheduling::Deadline => out.write_str("real time (deadline)")?,
+            Scheduling::Other => out.write_str("ordinary")?,
+            Scheduling::Batch => out.write_str("batch")?,
+            Scheduling::Idle => out.write_str("idle")?,
+        }
+        if self.memory_locked {
+            out.write_str(", memory locked")?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_process_is_read_whatever_its_name() {
+        let numbers: Vec<String> = (4..=52).map(|field| field.to_string()).collect();
+        let stat = |priority: &str, policy: &str| {
+            let mut fields = numbers.clone();
+            fields[40 - 4] = priority.to_owned();
+            fields[41 - 4] = policy.to_owned();
+            format!("7 (a ) S b) S {}\n", fields.join(" "))
+        };
+        let status = |locked: &str| format!("VmPeak:\t 9 kB\nVmLck:\t{locked} kB\n");
+        let expected = Standing {
+            scheduling: Scheduling::Rr,
+            priority: 10,
+            memory_locked: true,
+        };
+        assert_eq!(
+            Standing::read(&stat("10", "2"), &status("  4096")),
+            Some(expected)
+        );
+        let expected = Standing {
+            scheduling: Scheduling::Other,
+            priority: 0,
+            memory_locked: false,
+        };
+        assert_eq!(
+            Standing::read(&stat("0", "0"), &status("     0")),
+            Some(expected)
+        );
+        assert_eq!(Standing::read("7 (cut) S 1", &status("0")), None);
+        // /proc is where tests run, too.
+        assert!(Standing::of(Path::new("/proc/self")).is_some());
+        assert_eq!(expected.to_string(), "ordinary");
+        let locked = Standing {
+            scheduling: Scheduling::Rr,
+            priority: 10,
+            memory_locked: true,
+        };
+        assert_eq!(
+            locked.to_string(),
+            "real time (rr, priority 10), memory locked"
+        );
+    }
+}
