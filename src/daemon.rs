@@ -167,10 +167,11 @@ impl Daemon {
     pub async fn run(
         self,
         shutdown: impl Future<Output = ()>,
-        reload: Option<Reload>,
+        mut reload: Option<Reload>,
     ) -> Result<(), Error> {
         let mut running = self.start()?;
-        let ended = running.serve(shutdown, reload).await;
+        // The log must outlive the last line.
+        let ended = running.serve(shutdown, &mut reload).await;
         let recorded = running.finish().await;
         ended.and(recorded)
     }
@@ -257,7 +258,7 @@ impl Running {
     async fn serve(
         &mut self,
         shutdown: impl Future<Output = ()>,
-        mut reload: Option<Reload>,
+        reload: &mut Option<Reload>,
     ) -> Result<(), Error> {
         let mut heartbeat = tokio::time::interval(systemd::heartbeat());
         heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -275,7 +276,7 @@ impl Running {
                         systemd::alive(&statuses);
                     }
                 }
-                path = reload::requested(&mut reload), if loading.is_none() => {
+                path = reload::requested(reload), if loading.is_none() => {
                     systemd::reloading();
                     // Listeners look whether they can still be reached.
                     let _ = self.orders.send(());
