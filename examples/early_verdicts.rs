@@ -1,11 +1,11 @@
-//! What early verdicts are worth, measured on simulated presses: how often one comes, how often it
-//! is the final one, and how much sooner.
+//! Measures early verdicts on simulated presses: how often one comes, how often it names the level of
+//! the final one, and how much sooner it comes.
 //!
 //!     cargo run --release --example early_verdicts -- [PRESSES]
 //!
-//! PRESSES (default 200, some minutes) of each material at 5, 20 and 100 frames/s, with the settings
-//! and the model that are built in. Prints the table of `docs/results.md`, and how many early verdicts
-//! came before the press had reached 95 % of its greatest force: none should.
+//! It plays PRESSES (default 200, some minutes) of each material at 5, 20 and 100 frames/s, with the
+//! built-in settings and model. It prints the table of `docs/results.md`, and how many early verdicts came
+//! before the press had reached 95 % of its greatest force: none should.
 
 use std::sync::Arc;
 use std::time::Duration;

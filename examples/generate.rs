@@ -1,10 +1,10 @@
-//! Man pages and completions of `hardnessd`, for whoever makes a package:
+//! Writes the man pages and completions of `hardnessd`, for a package:
 //!
 //! ```sh
 //! cargo run --example generate -- DIR
 //! ```
 //!
-//! Both come from the definition of the command line itself, so that there is no second one.
+//! Both are generated from the definition of the command line, so that there is only one definition.
 
 use std::fs;
 use std::io;
