@@ -4,6 +4,8 @@
     apt-get install systemd
     unshare --mount --map-root-user python3 tests/peers/service.py target/debug/hardnessd
 
+As root leave out --map-root-user: the real-time claim is then tried, too.
+
 In a mount namespace of its own, where /run is its own too. Claims: the shipped unit is at most 2.0
 in `systemd-analyze security`; the daemon starts under the sandbox's umask with a socket from
 `systemd-socket-activate`; without a journal `format = "journald"` is refused with 78; in a real
