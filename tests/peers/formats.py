@@ -50,6 +50,8 @@ def main(binaries):
             if kind == "console":
                 console(block, directory, path)
                 continue
+            if kind == "text":
+                continue
             name = block.split("\n", 1)[0].removeprefix("# ")
             pathlib.Path(directory, name).write_text(block)
             if kind == "python":
