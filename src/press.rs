@@ -5,6 +5,7 @@
 
 mod settings;
 mod settling;
+mod thin;
 
 use std::cmp::Ordering;
 use std::time::Duration;
@@ -13,6 +14,7 @@ use serde::{Deserialize, Serialize};
 
 pub use self::settings::{Settings, SettingsError};
 use self::settling::{Load, Settling};
+pub use self::thin::thinned;
 use crate::frame::{Frame, Stamp, TAXELS};
 
 /// A frame of a press: its number and when its last byte came.

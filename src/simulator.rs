@@ -13,12 +13,14 @@ mod body;
 mod broad;
 mod contact;
 mod course;
+mod courses;
 mod dataset;
 mod durometer;
 mod fourier;
 mod kernel;
 mod level;
 mod material;
+mod motion;
 mod object;
 mod press;
 mod sensor;
@@ -29,21 +31,25 @@ mod texture;
 mod tracked;
 
 pub use broad::{LawName, Laws, NoLaw, UnknownLaw};
+pub use courses::{CourseMoment, CourseSettings, LabelledCourse, MOST_FRAMES, courses};
 pub use dataset::{DatasetSettings, LabelledSample, Materials, UnknownMaterials, dataset};
 pub use level::{Borders, LEVELS, LevelRange, level_of};
 pub use material::{Material, Split, UnknownMaterial};
+pub use motion::{Approach, Motion};
 pub use object::{Shapes, UnknownShapes};
 pub use sensor::{SensorProfile, UnknownProfile};
 pub use sequence::{Sequence, SequenceFrame, SequenceSettings};
 
 pub use crate::tare::NEWTONS_PER_COUNT;
 
-/// Names of what a sample's `material` is an index of: the eight named materials, then the laws
-/// that broad materials are drawn of.
-pub fn material_names() -> Vec<&'static str> {
-    let named = Material::ALL.map(Material::name);
-    let broad = LawName::ALL.map(LawName::material_name);
-    named.into_iter().chain(broad).collect()
+/// Names of what a sample's `material` is an index of: the eight named materials, then, where there
+/// are broad ones, the laws that they are drawn of.
+pub fn material_names(materials: Materials) -> Vec<&'static str> {
+    let mut names = Material::ALL.map(Material::name).to_vec();
+    if materials == Materials::Broad {
+        names.extend(LawName::ALL.map(LawName::material_name));
+    }
+    names
 }
 
 /// Of what [`dataset`] makes of the same settings and seed: to be raised with every change of its

@@ -1,23 +1,22 @@
-//! One press in time: motion prescribed, `z(t) = d + F / k_arm` at 5 mm/s.
+//! One press in time: motion prescribed, `z(t) = d + F / k_arm`.
 //!
 //! Loading and unloading are solved at chosen forces, and the moment each is reached follows from
 //! the motion; in the hold the force is sought that keeps z. Creep is carried from step to step as
 //! the state of each Kelvin element; pressure is taken as linear in time within a step, for which
 //! the element's update is exact.
 
+use super::motion::{Arm, Motion};
 use super::press::{Bench, Specimen, Step, Window, touches_border};
 use super::sensor::taxel_forces;
 use super::substance::Law;
 use crate::frame::TAXELS;
 
-/// Stiffness of the arm, N/mm (assumed), and its speed (paper).
-pub(super) const ARM_N_MM: f64 = 10.0;
-pub(super) const SPEED_MM_S: f64 = 5.0;
-
 /// A press from touch to separation.
 pub(super) struct Course {
     /// Seconds from the touch, ascending; forces are linear in between.
     moments: Vec<Moment>,
+    /// Where the arm is meanwhile.
+    pub(super) motion: Motion,
 }
 
 #[derive(Clone)]
@@ -38,13 +37,20 @@ const HOLD_TOLERANCE: f64 = 1e-3;
 
 impl Course {
     /// Presses to `force_n`, holds the position for `hold_s` and withdraws.
-    pub(super) fn new(bench: &mut Bench, specimen: &Specimen, force_n: f64, hold_s: f64) -> Self {
-        Self::in_levels(bench, specimen, force_n, hold_s, LEVELS)
+    pub(super) fn new(
+        bench: &mut Bench,
+        specimen: &Specimen,
+        arm: Arm,
+        force_n: f64,
+        hold_s: f64,
+    ) -> Self {
+        Self::in_levels(bench, specimen, arm, force_n, hold_s, LEVELS)
     }
 
     fn in_levels(
         bench: &mut Bench,
         specimen: &Specimen,
+        arm: Arm,
         force_n: f64,
         hold_s: f64,
         levels: u32,
@@ -52,14 +58,23 @@ impl Course {
         // The contact is largest at the end of the hold, when everything has crept.
         let (mut window, _, _) = bench.press(specimen, force_n, 1.0, hold_s);
         loop {
-            let mut run = Run::new(bench, specimen, window);
+            let mut run = Run::new(bench, specimen, arm, window);
             run.load(force_n, levels);
+            let (top_mm, load_s) = (run.travel_mm, run.time_s);
             run.hold(hold_s);
             run.unload(levels);
             let Run { moments, fits, .. } = run;
             match window.wider(specimen, force_n) {
                 Some(wider) if !fits => window = wider,
-                _ => return Self { moments },
+                _ => {
+                    let motion = Motion {
+                        top_mm,
+                        load_s,
+                        hold_s,
+                        speed_mm_s: arm.speed_mm_s,
+                    };
+                    return Self { moments, motion };
+                }
             }
         }
     }
@@ -87,6 +102,7 @@ impl Course {
 struct Run<'a> {
     bench: &'a mut Bench,
     specimen: &'a Specimen,
+    arm: Arm,
     window: Window,
     gap_mm: Vec<f32>,
     /// State of each Kelvin element, MPa.
@@ -112,7 +128,7 @@ struct Trial {
 }
 
 impl<'a> Run<'a> {
-    fn new(bench: &'a mut Bench, specimen: &'a Specimen, window: Window) -> Self {
+    fn new(bench: &'a mut Bench, specimen: &'a Specimen, arm: Arm, window: Window) -> Self {
         let cells = window.width * window.width;
         let touch = Moment {
             time_s: 0.0,
@@ -122,6 +138,7 @@ impl<'a> Run<'a> {
         Self {
             bench,
             specimen,
+            arm,
             window,
             gap_mm: specimen.gap_on(window),
             crept: specimen
@@ -162,7 +179,7 @@ impl<'a> Run<'a> {
         // The last touch: the surface as it is then, creep and dents included.
         let (gap, _) = self.effective_gap(0.0);
         let end_mm = f64::from(gap.iter().copied().fold(f32::INFINITY, f32::min));
-        let last_s = ((self.travel_mm - end_mm) / SPEED_MM_S).max(LEAST_STEP_S);
+        let last_s = ((self.travel_mm - end_mm) / self.arm.speed_mm_s).max(LEAST_STEP_S);
         self.moments.push(Moment {
             time_s: self.time_s + last_s,
             force_n: 0.0,
@@ -176,8 +193,8 @@ impl<'a> Run<'a> {
         let mut time_s = guess_s.max(LEAST_STEP_S);
         for round in 1.. {
             let trial = self.attempt(goal_n, time_s);
-            let needed_s =
-                (direction * (trial.travel_mm - self.travel_mm) / SPEED_MM_S).max(LEAST_STEP_S);
+            let needed_s = (direction * (trial.travel_mm - self.travel_mm) / self.arm.speed_mm_s)
+                .max(LEAST_STEP_S);
             if round == 3 || (needed_s - time_s).abs() < 0.05 * needed_s {
                 return self.take(Trial {
                     time_s: needed_s,
@@ -195,7 +212,7 @@ impl<'a> Run<'a> {
         let count = self.moments.len();
         let mut slope = {
             let (a, b) = (&self.moments[count - 2], &self.moments[count - 1]);
-            SPEED_MM_S * (b.time_s - a.time_s) / (b.force_n - a.force_n)
+            self.arm.speed_mm_s * (b.time_s - a.time_s) / (b.force_n - a.force_n)
         };
         let until = HOLD_S.iter().copied().take_while(|&at| at < hold_s - 0.01);
         for at in until.chain([hold_s]) {
@@ -238,7 +255,7 @@ impl<'a> Run<'a> {
         let contact = self
             .bench
             .solve(self.specimen, self.window.width, &gap, step, &mut pressure);
-        let travel_mm = contact.approach_mm + force_n / ARM_N_MM;
+        let travel_mm = contact.approach_mm + force_n / self.arm.n_per_mm;
         Trial {
             force_n,
             time_s,
@@ -381,7 +398,7 @@ mod tests {
     fn force_relaxes_in_the_hold_as_creep_and_arm_say() {
         // Soft candy's compliance grows by up to 60 %; arm and growing contact share that out.
         let specimen = specimen(Material::SoftCandy, &Face::ball(27.0));
-        let course = Course::new(&mut Bench::default(), &specimen, 12.0, 1.5);
+        let course = Course::new(&mut Bench::default(), &specimen, Arm::default(), 12.0, 1.5);
         let top = course
             .moments
             .iter()
@@ -406,7 +423,7 @@ mod tests {
     fn carriage_moves_at_5_mm_a_second_and_taxels_carry_the_force() {
         for material in [Material::Rubber, Material::Plasticine, Material::YogaMat] {
             let specimen = specimen(material, &Face::ball(27.0));
-            let course = Course::new(&mut Bench::default(), &specimen, 15.0, 1.0);
+            let course = Course::new(&mut Bench::default(), &specimen, Arm::default(), 15.0, 1.0);
             let mut last = -1.0;
             for moment in &course.moments {
                 assert!(moment.time_s > last, "{material}: time stands still");
@@ -442,8 +459,9 @@ mod tests {
         ] {
             let specimen = specimen(material, &Face::ball(27.0));
             let mut bench = Bench::default();
-            let [coarse, fine] = [LEVELS, 2 * LEVELS]
-                .map(|levels| Course::in_levels(&mut bench, &specimen, 15.0, 1.0, levels));
+            let [coarse, fine] = [LEVELS, 2 * LEVELS].map(|levels| {
+                Course::in_levels(&mut bench, &specimen, Arm::default(), 15.0, 1.0, levels)
+            });
             let (mut off, mut sum) = (0.0, 0.0);
             for frame in 0..200 {
                 let time_s = f64::from(frame) * 0.01;

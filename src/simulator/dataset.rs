@@ -9,9 +9,9 @@ use serde::{Deserialize, Serialize};
 
 use super::body::draw_patch;
 use super::broad::Laws;
-use super::course::{ARM_N_MM, SPEED_MM_S};
 use super::level::Borders;
 use super::material::{Material, Split};
+use super::motion::Arm;
 use super::object::{POSTURES, Pose, Shapes};
 use super::press::{Bench, COVER_YOUNG_MPA, Specimen};
 use super::sensor::{Film, SensorProfile, taxel_forces};
@@ -105,6 +105,11 @@ impl Default for DatasetSettings {
 }
 
 impl DatasetSettings {
+    /// How many samples they make.
+    pub fn samples(&self) -> u64 {
+        units(self).len() as u64 * u64::from(self.presses)
+    }
+
     /// What a material is for: the paper's split, or the other one where its level is swapped. An
     /// object's draws follow from the seed, its split, material and number, so that the same
     /// objects stand in every data set of a seed in which their material has the same role.
@@ -216,10 +221,11 @@ impl Subject {
         hold_s: f64,
         noise: &mut Stream,
     ) -> (f64, Frame) {
+        let arm = Arm::default();
         let gain = self.sensor.press_gain(noise);
         let mut tries = 0;
         loop {
-            let ramp_s = (force_n / ARM_N_MM + TYPICAL_DEPTH_MM) / SPEED_MM_S;
+            let ramp_s = (force_n / arm.n_per_mm + TYPICAL_DEPTH_MM) / arm.speed_mm_s;
             let (window, pressure, _) = bench.press(specimen, force_n, ramp_s, hold_s);
             let forces = taxel_forces(&pressure, window.width, window.corner);
             let crept = Film::new().advance(&forces, hold_s + 0.5 * ramp_s);
@@ -262,7 +268,6 @@ fn nominal_force_n(lowest_n: f32, step: usize) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::super::level::level_of;
-    use super::super::material_names;
     use super::*;
 
     fn small(shapes: Shapes) -> DatasetSettings {
@@ -456,8 +461,7 @@ mod tests {
             assert_eq!(samples.len(), 4 * (1 + 2) * 9);
             for sample in &samples {
                 assert_eq!(sample.level, level_of(f64::from(sample.shore)));
-                assert!(usize::from(sample.material) < material_names().len());
-                assert!(sample.material >= 8);
+                assert!((8..12).contains(&sample.material));
                 assert!(begins_press(&sample.frame), "{sample:?}");
             }
             // By split, then level: training objects are 0 to 3.

@@ -9,10 +9,11 @@ use super::body::{Body, draw_patch};
 use super::course::Course;
 use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
 use super::material::Material;
+use super::motion::{Approach, Arm, Motion};
 use super::object::{Object, POSTURES, Pose, Shapes};
 use super::press::{Bench, Specimen};
 use super::sensor::{Film, Sensor, SensorProfile};
-use super::tracked::is_one_press;
+use super::tracked::one_press;
 use crate::frame::{RawFrame, TAXELS};
 use crate::random::Stream;
 
@@ -61,6 +62,8 @@ pub struct SequenceFrame {
     pub material: Option<Material>,
     /// Whether the object is being touched.
     pub loaded: bool,
+    /// Where the arm is, around this frame.
+    pub approach: Approach,
 }
 
 /// An iterator over the frames of a sequence; see [`SequenceSettings`].
@@ -82,6 +85,8 @@ pub struct Sequence {
     frames: u64,
     /// When the rest after the last press ends, s.
     free_s: f64,
+    /// The last press: when it touched, and how the arm moved.
+    last: Option<(f64, Motion)>,
 }
 
 /// Rest before the first press, s and frames.
@@ -122,13 +127,31 @@ impl Sequence {
             made: 0,
             frames: 0,
             free_s: FIRST_REST.0.max(FIRST_REST.1 / rate),
+            last: None,
         };
         sequence.rest(None);
         sequence
     }
 
+    /// What the next press is drawn from; its first draw is how late it is.
+    fn next_draws(&self) -> (f64, Stream) {
+        let mut draws = self.root.child(1).child(u64::from(self.made));
+        let delay_s = draws.range(0.0, DELAY_S);
+        (self.free_s + delay_s, draws)
+    }
+
+    fn is_done(&self) -> bool {
+        let presses = self.settings.presses;
+        presses.is_some_and(|presses| self.made >= presses)
+    }
+
     /// Frames without load until `free_s`.
     fn rest(&mut self, material: Option<Material>) {
+        let next_s = (!self.is_done()).then(|| self.next_draws().0);
+        let approach = Approach {
+            last: self.last,
+            next: next_s.map(|touch_s| (touch_s, Arm::default().speed_mm_s)),
+        };
         while self.frames as f64 / self.settings.frame_rate_hz <= self.free_s {
             self.film
                 .advance(&[0.0; TAXELS], 1.0 / self.settings.frame_rate_hz);
@@ -138,6 +161,7 @@ impl Sequence {
                 press: self.made,
                 material,
                 loaded: false,
+                approach,
             });
             self.frames += 1;
         }
@@ -145,11 +169,9 @@ impl Sequence {
 
     /// Makes the next press and the rest after it.
     fn press(&mut self) {
-        let index = self.made;
-        let material = self.settings.materials[index as usize % self.settings.materials.len()];
+        let (touch_s, mut draws) = self.next_draws();
+        let material = self.settings.materials[self.made as usize % self.settings.materials.len()];
         self.made += 1;
-        let mut draws = self.root.child(1).child(u64::from(index));
-        let delay_s = draws.range(0.0, DELAY_S);
         let drawn = draws.range(5.0, HIGHEST_FORCE_N);
         let mut force_n = self.settings.force_n.map_or(drawn, f64::from);
         let object = Object::draw(self.settings.shapes, material.level(), &mut draws.child(0));
@@ -160,21 +182,26 @@ impl Sequence {
         let rate = self.settings.frame_rate_hz;
         let hold_s = draws.range(0.8, 1.5).max(HOLD_FRAMES / rate);
         let specimen = Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch);
-        let touch_s = self.free_s + delay_s;
         for attempt in 1.. {
-            let course = Course::new(&mut self.bench, &specimen, force_n, hold_s);
+            let course = Course::new(&mut self.bench, &specimen, Arm::default(), force_n, hold_s);
             let mut noise = draws.child(4).child(attempt);
             let mut film = self.film.clone();
             let (frames, next) = self.play(&course, touch_s, &mut film, &mut noise);
             if attempt as usize == TRIES
-                || is_one_press(frames.iter().map(|(raw, _)| raw), 1.0 / rate)
+                || one_press(frames.iter().map(|(raw, _)| raw), 1.0 / rate).is_some()
             {
+                self.last = Some((touch_s, course.motion));
+                let approach = Approach {
+                    last: self.last,
+                    next: None,
+                };
                 self.ready
                     .extend(frames.into_iter().map(|(raw, loaded)| SequenceFrame {
                         raw,
                         press: self.made,
                         material: Some(material),
                         loaded,
+                        approach,
                     }));
                 self.film = film;
                 self.frames = next;
@@ -213,12 +240,7 @@ impl Iterator for Sequence {
     type Item = SequenceFrame;
 
     fn next(&mut self) -> Option<SequenceFrame> {
-        if self.ready.is_empty()
-            && self
-                .settings
-                .presses
-                .is_none_or(|presses| self.made < presses)
-        {
+        if self.ready.is_empty() && !self.is_done() {
             self.press();
         }
         self.ready.pop_front()
@@ -339,6 +361,42 @@ mod tests {
             presses: Some(3),
             ..SequenceSettings::default()
         });
+    }
+
+    #[test]
+    fn the_arm_touches_when_the_sensor_is_loaded_and_never_jumps() {
+        let rate = 50.0;
+        let settings = SequenceSettings {
+            seed: 6,
+            frame_rate_hz: rate,
+            presses: Some(3),
+            ..Default::default()
+        };
+        let frames: Vec<SequenceFrame> = Sequence::new(settings).collect();
+        let mut before = None;
+        for (number, frame) in (0_u32..).zip(&frames) {
+            // Four positions a frame.
+            for part in 0..4 {
+                let time_s = (f64::from(number) + 0.25 * f64::from(part)) / rate;
+                let now = frame.approach.mm(time_s);
+                let moved: f64 = before.replace(now).map_or(0.0, |before| now - before);
+                assert!(
+                    moved.abs() <= 1.1 * 5.0 * 0.25 / rate,
+                    "{moved} mm at {time_s} s"
+                );
+            }
+            let now = frame.approach.mm(f64::from(number) / rate);
+            assert!(!frame.loaded || now > -1e-9, "touches at {now} mm");
+            assert!(now < 15.0);
+        }
+        let top = |press| {
+            let own = (0_u32..)
+                .zip(&frames)
+                .filter(|(_, frame)| frame.press == press);
+            own.map(|(n, frame)| frame.approach.mm(f64::from(n) / rate))
+                .fold(0.0, f64::max)
+        };
+        assert!((1..=3).all(|press| top(press) > 0.4), "5 N and more");
     }
 
     #[test]

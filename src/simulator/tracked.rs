@@ -28,16 +28,24 @@ pub(super) fn begins_press(frame: &Frame) -> bool {
     frame.contact_area_taxels(contact_threshold_n) >= begin_area_taxels
 }
 
-/// Whether a press tracker without a configuration sees exactly one press in these frames, and its
-/// release, if two frames without load follow.
-pub(super) fn is_one_press<'a>(
+/// The one press in some frames, by their places.
+pub(super) struct Seen {
+    /// Frames in contact, from the one that began the press to its last.
+    pub(super) contact: Vec<usize>,
+    /// The frame that a verdict is on.
+    pub(super) best: usize,
+}
+
+/// What a press tracker without a configuration sees in these frames, if that is exactly one press
+/// and its release, when frames without load follow.
+pub(super) fn one_press<'a>(
     frames: impl IntoIterator<Item = &'a RawFrame>,
     period_s: f64,
-) -> bool {
+) -> Option<Seen> {
     let settings = Settings::default();
     let rest = std::iter::repeat_n(RawFrame::default(), settings.end_frames as usize);
-    let mut tracker = PressTracker::new(settings);
-    let mut ends = 0;
+    let mut tracker = PressTracker::new(settings.clone());
+    let (mut contact, mut best) = (Vec::new(), None);
     for (number, raw) in (0_u32..).zip(frames.into_iter().copied().chain(rest)) {
         let at = Moment {
             frame: number.into(),
@@ -46,15 +54,23 @@ pub(super) fn is_one_press<'a>(
                 wall: jiff::Timestamp::UNIX_EPOCH,
             },
         };
-        for change in tracker.push(&ideal_tare(&raw), Marks::default(), at) {
+        let frame = ideal_tare(&raw);
+        for change in tracker.push(&frame, Marks::default(), at) {
             match change {
+                Change::Begin { .. } if best.is_some() => return None,
                 Change::Begin { .. } | Change::Settled { .. } => {}
                 Change::End {
-                    end: End::Release, ..
-                } => ends += 1,
-                Change::End { .. } | Change::Aborted { .. } => return false,
+                    end: End::Release,
+                    peak,
+                    ..
+                } => best = Some(peak.moment.frame as usize),
+                Change::End { .. } | Change::Aborted { .. } => return None,
             }
         }
+        let area = frame.contact_area_taxels(settings.contact_threshold_n);
+        if tracker.is_pressed() && area >= settings.end_area_taxels {
+            contact.push(number as usize);
+        }
     }
-    ends == 1
+    best.map(|best| Seen { contact, best })
 }

@@ -1,0 +1,98 @@
+//! How the arm moves, and where it is at any moment of a press.
+
+/// The arm that presses.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Arm {
+    /// Stiffness of all behind the sensor.
+    pub(super) n_per_mm: f64,
+    pub(super) speed_mm_s: f64,
+}
+
+impl Default for Arm {
+    /// Stiffness assumed, speed of the paper.
+    fn default() -> Self {
+        Self {
+            n_per_mm: 10.0,
+            speed_mm_s: 5.0,
+        }
+    }
+}
+
+/// The arm's motion in one press: it approaches at a steady speed, holds its position and
+/// withdraws.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Motion {
+    /// How far it goes beyond the touch.
+    pub(super) top_mm: f64,
+    /// When it is there, from the touch on.
+    pub(super) load_s: f64,
+    pub(super) hold_s: f64,
+    pub(super) speed_mm_s: f64,
+}
+
+/// How far the arm starts from what it presses, and withdraws: at 5 mm/s there and back takes less
+/// than the rest between two presses.
+const CLEARANCE_MM: f64 = 2.0;
+
+impl Motion {
+    /// Where the arm is `time_s` after the touch (before it: negative), in mm along the press's
+    /// direction, 0 at the touch: what a robot knows of its hand. Its finger tip is less deep by the
+    /// force over the arm's stiffness.
+    pub fn approach_mm(&self, time_s: f64) -> f64 {
+        let loading = self.top_mm + self.speed_mm_s * (time_s - self.load_s);
+        let withdrawing = self.top_mm - self.speed_mm_s * (time_s - self.load_s - self.hold_s);
+        loading.min(self.top_mm).min(withdrawing).max(-CLEARANCE_MM)
+    }
+}
+
+/// Where the arm is in a sequence of presses, between the last one and the next.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Approach {
+    /// When the last press touched, and how the arm moved.
+    pub(super) last: Option<(f64, Motion)>,
+    /// When the next one will, and how fast the arm comes.
+    pub(super) next: Option<(f64, f64)>,
+}
+
+impl Approach {
+    /// Where the arm is `time_s` after the sequence's first frame, in mm as
+    /// [`Motion::approach_mm`]. Any moment near the frame that this came with may be asked for: a
+    /// robot sends its positions when it likes.
+    pub fn mm(&self, time_s: f64) -> f64 {
+        let last = self.last.map_or(-CLEARANCE_MM, |(touch_s, motion)| {
+            motion.approach_mm(time_s - touch_s)
+        });
+        let next = self.next.map_or(-CLEARANCE_MM, |(touch_s, speed_mm_s)| {
+            (speed_mm_s * (time_s - touch_s)).min(0.0)
+        });
+        last.max(next)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_arm_comes_holds_and_goes() {
+        let motion = Motion {
+            top_mm: 3.0,
+            load_s: 0.6,
+            hold_s: 1.0,
+            speed_mm_s: 5.0,
+        };
+        for (time_s, expected) in [
+            (-9.0, -2.0),
+            (-0.1, -0.5),
+            (0.0, 0.0),
+            (0.3, 1.5),
+            (0.6, 3.0),
+            (1.6, 3.0),
+            (1.7, 2.5),
+            (9.0, -2.0),
+        ] {
+            let found = motion.approach_mm(time_s);
+            assert!((found - expected).abs() < 1e-9, "{time_s} s: {found} mm");
+        }
+    }
+}
