@@ -45,7 +45,7 @@ use tracing::{error, info, warn};
 use self::config::{Config, Publish, Setup};
 use self::publish::Publishers;
 use self::realtime::Standing;
-use self::record::{EventRecorder, Recorder, SensorRecorder, Target};
+use self::record::{EventRecorder, Progress, Recorder, SensorRecorder, Target};
 pub use self::reload::Reload;
 use self::reload::{Readers, Refusal};
 use self::sensor::{Command, SensorHandle, Sensors};
@@ -132,8 +132,9 @@ impl Daemon {
         })
     }
 
-    /// A daemon without sockets that records into `file`, which is empty and at `path`. It ends by
-    /// itself if a sensor is missing at the start, or when all sensors are gone.
+    /// A daemon without sockets that records into `file`, which is empty and at `path`, and says in
+    /// `progress` what the file holds. It ends by itself if a sensor is missing at the start, or when
+    /// all sensors are gone.
     ///
     /// # Errors
     ///
@@ -143,12 +144,18 @@ impl Daemon {
         path: PathBuf,
         file: File,
         labels: Labels,
+        progress: watch::Sender<Progress>,
     ) -> Result<Self, Error> {
         setup.config.http = None;
         setup.config.publish = Publish::none();
         setup.config.record = None;
         Ok(Self {
-            target: Some(Target::File { path, file, labels }),
+            target: Some(Target::File {
+                path,
+                file,
+                labels,
+                progress,
+            }),
             ..Self::bind(setup)?
         })
     }

@@ -270,7 +270,7 @@ fn record_writes_a_new_file_for_as_long_as_there_is_a_sensor() {
     let twice = ["--label", "object=1", "--label", "object=2"];
     let twice = [&["record", "--config", at, "--out", to], &twice[..]].concat();
     let said = String::from_utf8(hardnessd(&twice).stderr).unwrap();
-    assert!(said.contains("--label object: found it twice"), "{said}");
+    assert!(said.contains("--label object: given twice"), "{said}");
     // Nothing to record: said, and no file left behind.
     let none = hardnessd(&["record", "--config", at, "--out", to]);
     let said = String::from_utf8(none.stderr).unwrap();

@@ -1,7 +1,7 @@
 //! The daemon's binary: arguments, log, runtime, signals, exit codes.
 
 use std::future::Future;
-use std::io;
+use std::io::{self, IsTerminal};
 use std::path::PathBuf;
 use std::pin::pin;
 use std::process::ExitCode;
@@ -80,7 +80,9 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
             let Some(setup) = load(args.config.path()?, end.as_mut()).await? else {
                 return Ok(());
             };
-            let _log = Log::start(setup.config.log, "info")?;
+            // On a terminal a line of progress says what the log would.
+            let is_shown = io::stderr().is_terminal();
+            let _log = Log::start(setup.config.log, if is_shown { "warn" } else { "info" })?;
             Ok(record::run(args, setup, end).await?)
         }
         Command::Recover(args) => finish_blocking(signals, move || recover::run(&args)).await,

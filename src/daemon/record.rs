@@ -17,7 +17,7 @@ use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
 use std::time::Duration;
 
 use rustix::fs::{Access, AtFlags, CWD};
-use tokio::sync::oneshot;
+use tokio::sync::{oneshot, watch};
 
 use self::worker::Worker;
 use super::config;
@@ -49,9 +49,19 @@ pub(crate) enum Target {
         path: PathBuf,
         file: File,
         labels: Labels,
+        progress: watch::Sender<Progress>,
     },
     /// Into files in the directory of the configuration.
     Directory(config::Record),
+}
+
+/// What one file holds so far.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Progress {
+    /// Whole frames of all sensors.
+    pub frames: u64,
+    /// Presses that have begun.
+    pub presses: u64,
 }
 
 /// Why a recording failed.
@@ -66,7 +76,7 @@ pub enum Error {
         source: crate::recording::Error,
     },
     /// A sensor is not there.
-    #[error("sensor {sensor:?}: found {reason}, expected a device to record")]
+    #[error("sensor {sensor:?}: cannot record: {reason}")]
     Unavailable {
         /// Its name.
         sensor: String,

@@ -10,6 +10,7 @@ use super::configuration::{self, Configuration};
 use super::player::BITS_A_BYTE;
 use crate::daemon;
 use crate::daemon::config::{self, Endpoint, SensorTable, Setup};
+use crate::frame::{Array, COLS, ROWS};
 use crate::wire::Layout;
 
 /// Arguments of `check`.
@@ -77,6 +78,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
     let mut lines = format!("robot {}\n", setup.config.robot);
     for (sensor, checked) in setup.config.sensors.iter().zip(&setup.sensors) {
         lines += &line_of(sensor, checked.layout(), path)?;
+        warn_of_array(sensor, checked.layout().array(), path);
         let (ours, models) = (sensor.calibration.pitch_mm, setup.hrn.card().pitch_mm);
         if (ours - f64::from(models)).abs() > PITCH_TOLERANCE_MM {
             eprintln!(
@@ -118,8 +120,8 @@ pub fn run(args: &Args) -> Result<(), Error> {
             lines += &format!("{way}{listen}\n");
             if !listen.ip().is_loopback() {
                 eprintln!(
-                    "warning: {}: {key}: found {listen}, open to whoever reaches this machine, \
-                     expected a loopback address unless that is meant",
+                    "warning: {}: {key}: {listen} is open to anyone who can reach this machine; \
+                     a loopback address, such as 127.0.0.1, is not",
                     path.display()
                 );
             }
@@ -129,6 +131,23 @@ pub fn run(args: &Args) -> Result<(), Error> {
     super::print(lines.as_bytes())
         .map(drop)
         .map_err(Error::Print)
+}
+
+/// Says where the taxels of a small array are in the model's frame.
+fn warn_of_array(sensor: &SensorTable, array: Array, path: &Path) {
+    let Array { rows, cols } = array;
+    if (rows, cols) == (ROWS, COLS) {
+        return;
+    }
+    let place = array.place(0, 0);
+    eprintln!(
+        "warning: {}: sensor.frame of {:?}: the array of {rows}x{cols} taxels begins at row {}, column {} \
+         of the model's {ROWS}x{COLS}; the model was not trained on such arrays",
+        path.display(),
+        sensor.name,
+        place / COLS,
+        place % COLS
+    );
 }
 
 /// The ways out that have their peers find each other.
@@ -148,8 +167,8 @@ fn networks(setup: &Setup, path: &Path) -> String {
         };
         for endpoint in zenoh.listen.iter().filter(open) {
             eprintln!(
-                "warning: {}: publish.zenoh.listen: found {endpoint:?}, open to whoever reaches \
-                 it, expected a loopback address unless that is meant",
+                "warning: {}: publish.zenoh.listen: {endpoint:?} is open to anyone who can reach it; \
+                 a loopback address, such as 127.0.0.1, is not",
                 path.display()
             );
         }

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
 
-use self::checks::{User, examine, ports, refused};
+use self::checks::{User, examine, in_the_way, ports, refused};
 use super::shown;
 
 /// Arguments of `doctor`.
@@ -34,6 +34,16 @@ pub enum Error {
     /// Stdout fails.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
+}
+
+/// What keeps this process from opening `port`, and what to do; `None` where nothing is seen, such as
+/// a process of another user that holds it.
+pub(super) fn obstacle(port: &Path) -> Option<String> {
+    let root = Path::new("/");
+    let port = std::path::absolute(port).unwrap_or_else(|_| port.to_owned());
+    let user = User::of_this_process(root);
+    let fault = refused(root, &port).or_else(|| in_the_way(root, &port, &user).into_iter().next());
+    fault.map(|fault| fault.to_string())
 }
 
 /// Prints what is wrong.

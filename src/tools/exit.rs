@@ -126,6 +126,7 @@ impl Failure {
                 | tail::Error::Foreign { .. }
                 | tail::Error::Refused { .. },
             )
+            | Self::Record(record::Error::Unavailable { .. })
             | Self::Sniff(sniff::Error::Unavailable { .. }) => UNAVAILABLE,
 
             Self::Demo(demo::Error::Io { .. })
@@ -137,7 +138,7 @@ impl Failure {
             | Self::Watch(watch::Error::Terminal(_))
             | Self::Check(check::Error::Print(_))
             | Self::Doctor(doctor::Error::Print(_))
-            | Self::Sniff(sniff::Error::Print(_)) => IO,
+            | Self::Sniff(sniff::Error::Print(_) | sniff::Error::Write { .. }) => IO,
 
             Self::Log(_)
             | Self::Demo(demo::Error::Layout(_))

@@ -1,17 +1,24 @@
 //! `hardnessd record`: a daemon without sockets that writes what comes to a file.
+//!
+//! On a terminal a line on stderr says how many presses the file holds so far. At the end a warning
+//! says if there were none.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::future::Future;
-use std::io;
-use std::path::PathBuf;
+use std::io::{self, IsTerminal, Write};
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args as ClapArgs;
+use tokio::sync::watch;
+use tokio::time::Instant;
 
 use super::configuration::Configuration;
+use super::doctor;
 use super::simulate::positive;
 use crate::daemon::config::Setup;
+use crate::daemon::record::Progress;
 use crate::daemon::{self, Daemon, record};
 use crate::recording::{LabelError, check_label};
 use crate::verdict::Level;
@@ -47,20 +54,30 @@ pub enum Error {
         levels: String,
     },
     /// Two labels of one key.
-    #[error("--label {key}: found it twice, expected it once")]
+    #[error("--label {key}: given twice: give it once")]
     Twice {
         /// The key.
         key: String,
     },
     /// The file cannot be made.
-    #[error("--out {path}: {source}, expected a new file")]
+    #[error("--out {path}: {source}: name a new file")]
     Create {
         /// As given.
         path: PathBuf,
         /// Why not.
         source: io::Error,
     },
-    /// Recording failed, or the sensors were not there.
+    /// A sensor is not there to begin with.
+    #[error("sensor {sensor:?}: {}: {obstacle}", port.display())]
+    Unavailable {
+        /// Its name.
+        sensor: String,
+        /// As configured.
+        port: PathBuf,
+        /// What is in the way, and what to do.
+        obstacle: String,
+    },
+    /// Recording failed, or all sensors were lost.
     #[error(transparent)]
     Daemon(#[from] daemon::Error),
 }
@@ -88,7 +105,9 @@ pub async fn run(
         path: path.clone(),
         source,
     })?;
-    let daemon = Daemon::recording(setup, path.clone(), file, labels)?;
+    let ports: BTreeMap<String, PathBuf> = setup.config.sensors.iter().map(port_of).collect();
+    let (progress, counted) = watch::channel(Progress::default());
+    let daemon = Daemon::recording(setup, path.clone(), file, labels, progress)?;
     let over = async {
         match args.seconds {
             // A time beyond counting is none.
@@ -105,12 +124,68 @@ pub async fn run(
             () = over => {}
         }
     };
-    let recorded = daemon.run(end, None).await;
-    if let Err(daemon::Error::Record(record::Error::Unavailable { .. })) = &recorded {
+    let recorded = tokio::select! {
+        recorded = daemon.run(end, None) => recorded,
+        () = show(&path, &counted) => unreachable!("it goes on as long as it is waited for"),
+    };
+    if let Err(daemon::Error::Record(record::Error::Unavailable { sensor, reason })) = recorded {
         // It holds nothing, and the next try shall find its place free.
         let _ = fs::remove_file(&path);
+        let port = ports.get(&sensor).cloned().unwrap_or_default();
+        let obstacle = doctor::obstacle(&port).unwrap_or(reason);
+        return Err(Error::Unavailable {
+            sensor,
+            port,
+            obstacle,
+        });
+    }
+    let Progress { frames, presses } = *counted.borrow();
+    if io::stderr().is_terminal() {
+        eprintln!(
+            "\r\x1b[Krecorded {frames} frames, {presses} presses: {}",
+            said(&path)
+        );
+    }
+    if recorded.is_ok() && presses == 0 {
+        let path = said(&path);
+        eprintln!(
+            "warning: {path}: no press in {frames} frames: was the sensor pressed, is it live, and \
+             is press.contact_threshold_n low enough?"
+        );
     }
     Ok(recorded?)
+}
+
+fn port_of(sensor: &crate::daemon::config::SensorTable) -> (String, PathBuf) {
+    (sensor.name.clone(), sensor.port.clone())
+}
+
+fn said(path: &Path) -> String {
+    super::shown(&path.display().to_string())
+}
+
+/// Between two lines of progress.
+const PROGRESS: Duration = Duration::from_millis(500);
+
+/// Says on a terminal what is recorded, over and over in one line.
+async fn show(path: &Path, counted: &watch::Receiver<Progress>) {
+    let mut stderr = io::stderr();
+    if !stderr.is_terminal() {
+        return std::future::pending().await;
+    }
+    let start = Instant::now();
+    loop {
+        let Progress { frames, presses } = *counted.borrow();
+        let seconds = start.elapsed().as_secs();
+        let path = said(path);
+        // A terminal that has gone ends the recording by its signal.
+        let _ = write!(
+            stderr,
+            "\r\x1b[Krecording {path}: {seconds} s, {frames} frames, {presses} presses (Ctrl-C ends it)"
+        );
+        let _ = stderr.flush();
+        tokio::time::sleep(PROGRESS).await;
+    }
 }
 
 /// What is labelled `level` becomes a data set: a level that is none is found out before anything

@@ -3,11 +3,12 @@
 use std::ffi::OsString;
 use std::fs::{self, File, Metadata, TryLockError};
 use std::io::{self, BufReader, BufWriter, ErrorKind};
-use std::os::unix::fs::{FileExt, MetadataExt};
+use std::os::unix::fs::{FileExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
 use jiff::Timestamp;
+use rustix::fs::OFlags;
 
 use crate::recording::{self, FileKind, RecoverError, Recovered};
 
@@ -41,7 +42,7 @@ pub enum Error {
         source: io::Error,
     },
     /// There is nothing to be saved.
-    #[error("{path}: found no whole chunk of messages in {bytes} bytes, expected a recording")]
+    #[error("{path}: nothing to save: no chunk of messages is whole in {bytes} bytes")]
     Nothing {
         /// As given.
         path: PathBuf,
@@ -49,10 +50,7 @@ pub enum Error {
         bytes: u64,
     },
     /// MCAP, but no recording of ours.
-    #[error(
-        "{path}: found {messages} messages of other programs and no other, expected a recording of \
-         hardnessd"
-    )]
+    #[error("{path}: nothing to save: all {messages} messages are of other programs")]
     Foreign {
         /// As given.
         path: PathBuf,
@@ -128,10 +126,10 @@ pub fn run(args: &Args) -> Result<(), Error> {
     Ok(())
 }
 
-/// Whether nothing stands at `out`.
+/// Whether nothing stands at `out`, not even a link to a file that does not exist.
 fn is_new(out: &Path) -> io::Result<()> {
-    if out.exists() {
-        let exists = "exists, expected a new file";
+    if out.symlink_metadata().is_ok() {
+        let exists = "a file or link is there already: name a new one";
         return Err(io::Error::new(ErrorKind::AlreadyExists, exists));
     }
     Ok(())
@@ -158,7 +156,7 @@ fn part(out: &Path) -> io::Result<(PathBuf, File)> {
         };
         // Where the file system has no locks nobody holds one.
         if let Err(TryLockError::WouldBlock) = file.try_lock() {
-            let held = "another hardnessd recover is writing it";
+            let held = "another `hardnessd recover` is writing it: wait for it";
             return Err(io::Error::new(ErrorKind::ResourceBusy, held));
         }
         // Whoever held it may have put it in its place meanwhile.
@@ -171,9 +169,17 @@ fn part(out: &Path) -> io::Result<(PathBuf, File)> {
     }
 }
 
-/// What stands at `part`, if that is the beginning of a recording or nothing yet.
+/// What stands at `part`, if that is the beginning of a recording or nothing yet. A link may lead to
+/// somebody's file, and is not followed.
 fn left_over(part: &Path) -> Option<File> {
-    let file = File::options().read(true).write(true).open(part).ok()?;
+    let no_link = OFlags::NOFOLLOW.bits().cast_signed();
+    let mut options = File::options();
+    let file = options
+        .read(true)
+        .write(true)
+        .custom_flags(no_link)
+        .open(part)
+        .ok()?;
     let mut start = [0; recording::MAGIC.len()];
     let read = file.read_at(&mut start, 0).ok()?;
     (FileKind::of(&start[..read]) == FileKind::Recording).then_some(file)
@@ -237,7 +243,26 @@ fn account(recovered: &Recovered) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::fs::symlink;
+
     use super::*;
+
+    #[test]
+    fn no_link_is_followed() {
+        let directory = tempfile::tempdir().unwrap();
+        let (out, theirs) = (
+            directory.path().join("good.mcap"),
+            directory.path().join("theirs"),
+        );
+        symlink(&theirs, &out).unwrap();
+        assert_eq!(is_new(&out).unwrap_err().kind(), ErrorKind::AlreadyExists);
+        // Where the part would be.
+        fs::write(&theirs, recording::MAGIC).unwrap();
+        symlink(&theirs, directory.path().join("other.mcap.part")).unwrap();
+        let (part, _file) = part(&directory.path().join("other.mcap")).unwrap();
+        assert!(part.ends_with("other.mcap.part.part"), "{}", part.display());
+        assert_eq!(fs::read(&theirs).unwrap(), recording::MAGIC);
+    }
 
     #[test]
     fn two_do_not_write_one_file() {

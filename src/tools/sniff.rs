@@ -1,6 +1,7 @@
 //! `hardnessd sniff`: raw bytes in, a proposed `[sensor.frame]` out.
 //!
-//! On stdout: TOML, to be appended below a `[[sensor]]`; how sure it is stands in its comments.
+//! On stdout: TOML, to be appended below a `[[sensor]]`. Its comments say how sure it is and why it
+//! was preferred. With `--out` a whole configuration is written to a file instead.
 
 mod candidates;
 mod proposal;
@@ -8,15 +9,16 @@ mod proposal;
 mod tests;
 
 use std::fmt::Write;
-use std::io::{self, BufReader, Read};
+use std::fs::File;
+use std::io::{self, BufReader, Read, Write as _};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::{ArgGroup, Args as ClapArgs};
 
 use self::proposal::{Proposal, propose};
-use super::shown;
 use super::simulate::positive;
+use super::{doctor, shown};
 use crate::daemon::serial::{Link, Turn};
 use crate::recording::{self, Entry, FileKind, Input, Reader};
 use crate::wire::Settings;
@@ -38,6 +40,9 @@ pub struct Args {
     #[arg(long, value_name = "S", default_value_t = 10.0, conflicts_with = "file",
         value_parser = positive)]
     seconds: f64,
+    /// Write a whole configuration to this new file, instead of a [sensor.frame] on stdout
+    #[arg(long, value_name = "TOML")]
+    out: Option<PathBuf>,
 }
 
 /// Why there is no proposal.
@@ -60,7 +65,7 @@ pub enum Error {
         source: recording::Error,
     },
     /// The port does not open, or was lost before a byte came.
-    #[error("{path}: {reason}; `hardnessd doctor --port {path}` says more")]
+    #[error("{path}: {reason}")]
     Unavailable {
         /// Of the port.
         path: PathBuf,
@@ -69,14 +74,22 @@ pub enum Error {
     },
     /// No layout explains the bytes.
     #[error(
-        "{path}: found no layout that explains half of {bytes} bytes, expected 20 frames or more \
-         of a constant length (a wrong baud rate looks like this too)"
+        "{path}: no layout explains half of the {bytes} bytes: press the sensor meanwhile, give it 20 \
+         frames or more, and try another --baud"
     )]
     Unexplained {
         /// Of the recording or the port.
         path: PathBuf,
         /// Looked at.
         bytes: usize,
+    },
+    /// The configuration cannot be written.
+    #[error("--out {path}: {source}")]
+    Write {
+        /// As given.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
     },
     /// Stdout fails.
     #[error("stdout: {0}")]
@@ -96,27 +109,76 @@ pub async fn run(args: Args) -> Result<(), Error> {
         Some(port) => Some(listen(port, args.baud, args.seconds).await?),
         None => None,
     };
-    let path = args.file.or(args.port);
-    let path = path.expect("clap asks for a port where there is no file");
-    // A file may be a pipe, and many bytes take their time: a signal is looked for here.
+    // A file may be a pipe, and many bytes take their time.
     let told = tokio::task::spawn_blocking(move || match listened {
-        Some(bytes) => tell(path, &bytes),
-        None => read(&path).and_then(|bytes| tell(path, &bytes)),
+        Some(bytes) => tell(&args, &bytes),
+        None => read(args.source()).and_then(|bytes| tell(&args, &bytes)),
     });
     told.await.expect("a proposal is made without a panic")
 }
 
+impl Args {
+    /// Where the bytes come from.
+    fn source(&self) -> &Path {
+        let source = self.file.as_ref().or(self.port.as_ref());
+        source.expect("clap asks for a port where there is no file")
+    }
+}
+
 /// Prints what explains `bytes`.
-fn tell(path: PathBuf, bytes: &[u8]) -> Result<(), Error> {
+fn tell(args: &Args, bytes: &[u8]) -> Result<(), Error> {
+    let path = args.source();
     let proposals = propose(bytes);
     let Some((best, others)) = proposals.split_first() else {
-        let bytes = bytes.len();
-        return Err(Error::Unexplained { path, bytes });
+        return Err(Error::Unexplained {
+            path: path.to_owned(),
+            bytes: bytes.len(),
+        });
     };
-    let toml = toml(&path, bytes.len(), best, others.first());
-    super::print(toml.as_bytes())
-        .map(drop)
-        .map_err(Error::Print)
+    let frame = toml(path, bytes.len(), best, others.first());
+    let Some(out) = &args.out else {
+        return super::print(frame.as_bytes())
+            .map(drop)
+            .map_err(Error::Print);
+    };
+    let listened_s = args.port.as_ref().map(|_| args.seconds);
+    let text = configuration(args, listened_s.map(|s| best.frames as f64 / s)) + &frame;
+    let written = File::create_new(out).and_then(|mut file| file.write_all(text.as_bytes()));
+    written.map_err(|source| Error::Write {
+        path: out.clone(),
+        source,
+    })?;
+    let next = if args.port.is_some() {
+        "`hardnessd check --config` says what would run"
+    } else {
+        "set its port and frame_rate_hz, which a file does not say"
+    };
+    eprintln!("wrote {}: {next}", shown(&out.display().to_string()));
+    Ok(())
+}
+
+/// All of a configuration that stands above `[sensor.frame]`.
+fn configuration(args: &Args, frame_rate_hz: Option<f64>) -> String {
+    let port = args
+        .port
+        .as_deref()
+        .unwrap_or(Path::new("/dev/serial/by-id/..."));
+    // The file may lie elsewhere.
+    let port = std::path::absolute(port).unwrap_or_else(|_| port.to_owned());
+    let port = toml::Value::String(port.display().to_string());
+    let baud = args.baud;
+    let mut text = format!("[[sensor]]\nname = \"sensor\"\nport = {port}\nbaud = {baud}\n");
+    match frame_rate_hz {
+        // Two digits are what the seconds are good for.
+        Some(hz) => {
+            text += &format!(
+                "frame_rate_hz = {:?}  # as counted\n",
+                (hz * 10.0).round().max(1.0) / 10.0
+            )
+        }
+        None => text += "# frame_rate_hz = 5.0\n",
+    }
+    text
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, Error> {
@@ -180,7 +242,7 @@ async fn listen(path: &Path, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> 
     match lost {
         Some(reason) if bytes.is_empty() => Err(Error::Unavailable {
             path: path.to_owned(),
-            reason,
+            reason: doctor::obstacle(path).unwrap_or(reason),
         }),
         _ => Ok(bytes),
     }
@@ -195,16 +257,21 @@ fn toml(path: &Path, bytes: usize, best: &Proposal, next: Option<&Proposal>) -> 
     match next {
         Some(next) => {
             let keys = keys(&next.settings).trim_end().replace('\n', ", ");
-            let margin = 100.0 * (best.share - next.share);
-            remark(format!("next, {margin:.1} points behind: {}", said(next)));
+            remark(format!(
+                "preferred to the next because {}",
+                best.reason(next)
+            ));
+            remark(format!("next: {}", said(next)));
             remark(format!("    {keys}"));
         }
-        None => remark("nothing else explains half of them".to_owned()),
+        None => remark("no other layout explains half of them".to_owned()),
     }
     if best.frames_changed == 0 {
         remark("all frames are the same: sniff again with presses to be sure".to_owned());
     }
-    remark("not seen in bytes: order, mask, invert; which side of the sensor is up".to_owned());
+    remark(
+        "bytes do not show order, mask and invert, nor which side of the sensor is up".to_owned(),
+    );
     toml + "[sensor.frame]\n" + &keys(&best.settings)
 }
 

@@ -11,7 +11,7 @@ use tokio::sync::oneshot;
 use tracing::{info, warn};
 
 use super::file::{MB, Open, create, has_room};
-use super::{Error, Job, NoBlackbox, Target};
+use super::{Error, Job, NoBlackbox, Progress, Target};
 use crate::daemon::config;
 use crate::event::{Event, LinkState, PressState};
 use crate::frame::Stamp;
@@ -41,8 +41,7 @@ pub(super) struct Worker {
     /// Sent when there is no more to record.
     stop: Option<oneshot::Sender<()>>,
     gone: Option<Error>,
-    frames: u64,
-    presses: u64,
+    progress: Progress,
 }
 
 /// A sensor, as the thread sees it.
@@ -85,8 +84,7 @@ impl Worker {
             paused: false,
             stop: Some(stop),
             gone: None,
-            frames: 0,
-            presses: 0,
+            progress: Progress::default(),
         }
     }
 
@@ -175,8 +173,8 @@ impl Worker {
             if !matches!(gone, Err(Error::Unavailable { .. })) {
                 info!(
                     path = %path.display(),
-                    frames = self.frames,
-                    presses = self.presses,
+                    frames = self.progress.frames,
+                    presses = self.progress.presses,
                     "recorded"
                 );
             }
@@ -251,9 +249,12 @@ impl Worker {
 
     fn event(&mut self, event: &Event) -> Result<(), Failure> {
         match event {
-            Event::Frame(_) => self.frames += 1,
-            Event::Press(press) if press.state == PressState::Begin => self.presses += 1,
+            Event::Frame(_) => self.progress.frames += 1,
+            Event::Press(press) if press.state == PressState::Begin => self.progress.presses += 1,
             _ => {}
+        }
+        if let Target::File { progress, .. } = &self.target {
+            progress.send_replace(self.progress);
         }
         if let Some(open) = &mut self.open {
             open.writer.event(event)?;

@@ -103,14 +103,22 @@ fn device_of_another_kind(root: &Path, number: u64) -> Option<String> {
 
 /// All that is wrong with `port`, an absolute path under `root`.
 pub(super) fn examine(root: &Path, port: &Path, user: &User) -> Vec<Fault> {
+    let mut faults = in_the_way(root, port, user);
+    if let Some(device) = device(root, port) {
+        faults.extend(modem_manager(root, &device));
+        faults.extend(latency(root, &device));
+    }
+    faults
+}
+
+/// What keeps `user` from opening `port`.
+pub(super) fn in_the_way(root: &Path, port: &Path, user: &User) -> Vec<Fault> {
     let Some(device) = device(root, port) else {
         return vec![missing(&ports(root))];
     };
-    denied(root, &device, user)
-        .into_iter()
+    let denied = denied(root, &device, user).into_iter();
+    denied
         .chain(held(root, &device, std::process::id()))
-        .chain(modem_manager(root, &device))
-        .chain(latency(root, &device))
         .collect()
 }
 

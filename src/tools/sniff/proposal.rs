@@ -51,7 +51,24 @@ pub(super) struct Proposal {
     is_preset: bool,
     overhead_bytes: usize,
     keys: usize,
+    /// Whether the bytes begin with what the layout calls a tail. Then it is a header.
+    is_headed_by_tail: bool,
+    /// What speaks for it, by the criteria of [`MERITS`] in order: the more, the better.
+    merits: [u64; MERITS.len()],
 }
+
+/// What decides between two layouts: the first of these in which they differ.
+const MERITS: [&str; 9] = [
+    "its checksum fits frames that change",
+    "it explains more of the bytes",
+    "the bytes begin with its header, which the other takes for a tail",
+    "its constant bytes are less likely to be there by chance",
+    "its length field has the right value",
+    "it is a preset as it is",
+    "it leaves fewer bytes beside the cells",
+    "it needs fewer keys",
+    "it explains a few bytes more",
+];
 
 /// Layouts that explain `bytes`, best first; none if nothing does.
 pub(super) fn propose(bytes: &[u8]) -> Vec<Proposal> {
@@ -105,6 +122,7 @@ impl Proposal {
         if tally.frames < LEAST_FRAMES || share < LEAST_SHARE {
             return None;
         }
+        let is_headed_by_tail = is_headed_by_tail(settings, bytes);
         let settings = simplest(settings, decoder.layout());
         Some(Self {
             bits,
@@ -116,6 +134,8 @@ impl Proposal {
             length_bytes: length_bytes(&settings, decoder.layout()),
             is_preset: is_preset(&settings),
             overhead_bytes: overhead_bytes(&settings, decoder.layout()),
+            is_headed_by_tail,
+            merits: Default::default(),
             settings,
             frames: tally.frames,
             frames_changed: tally.changed,
@@ -124,6 +144,13 @@ impl Proposal {
             share,
             roughness: tally.roughness as f64 / tally.frames as f64,
         })
+    }
+
+    /// Why it goes before `other`, which goes after it.
+    pub(super) fn reason(&self, other: &Self) -> &'static str {
+        let mut merits = self.merits.iter().zip(&other.merits);
+        let decisive = merits.position(|(ours, theirs)| ours > theirs);
+        decisive.map_or("nothing tells them apart", |merit| MERITS[merit])
     }
 
     /// In frames that are not the same as the one before.
@@ -163,9 +190,9 @@ impl Tally {
 
 /// Best first. A checksum that fits frames which change is no accident, whatever more another
 /// layout makes of damaged ones. Else shares within two frames or a fiftieth of the best are equal
-/// (damage in a mark costs the longer mark more), and among equals the more telling marks go first,
-/// then a length field before a longer sync, a preset as it is, few bytes beside the cells (the rest are
-/// taxels at rest), and few keys before many.
+/// (damage in a mark costs the longer mark more). What the bytes begin with is no tail. Then the more
+/// telling marks go first, a length field before a longer sync, a preset as it is, few bytes beside
+/// the cells (the rest are taxels at rest), and few keys before many.
 fn rank(proposals: &mut [Proposal]) {
     let most = |of: fn(&Proposal) -> u64| proposals.iter().map(of).max().unwrap_or_default();
     let changed = most(Proposal::bytes_changed);
@@ -173,24 +200,35 @@ fn rank(proposals: &mut [Proposal]) {
         let slack = (p.bytes_explained / 50).max(2 * p.bytes_explained / p.frames);
         p.bytes_explained - slack
     });
-    proposals.sort_by_key(|p| {
-        (
-            Reverse(p.bits == ALL_IN_ORDER || p.is_checked && 4 * p.bytes_changed() >= 3 * changed),
-            Reverse(p.bytes_explained.min(enough)),
-            Reverse(p.bits),
-            Reverse(p.length_bytes),
-            Reverse(p.is_preset),
-            p.overhead_bytes,
-            p.keys,
-            Reverse(p.bytes_explained),
-        )
-    });
+    for p in proposals.iter_mut() {
+        let is_checked = p.is_checked && 4 * p.bytes_changed() >= 3 * changed;
+        p.merits = [
+            u64::from(p.bits == ALL_IN_ORDER || is_checked),
+            p.bytes_explained.min(enough),
+            u64::from(!p.is_headed_by_tail),
+            u64::from(p.bits),
+            p.length_bytes as u64,
+            u64::from(p.is_preset),
+            u64::MAX - p.overhead_bytes as u64,
+            u64::MAX - p.keys as u64,
+            p.bytes_explained,
+        ];
+    }
+    proposals.sort_by_key(|p| Reverse(p.merits));
 }
 
 /// The layout with two-byte cells the other way round, where that makes smoother frames.
-fn smoother(proposal: &Proposal, bytes: &[u8]) -> Option<Proposal> {
-    let (settings, bits) = (&proposal.settings, proposal.bits);
-    let proposal = Proposal::of(settings, bits, bytes)?;
+fn smoother(of_sample: &Proposal, bytes: &[u8]) -> Option<Proposal> {
+    let (settings, bits) = (&of_sample.settings, of_sample.bits);
+    // The sample begins as the bytes do.
+    let proposed = |settings| {
+        let proposal = Proposal::of(settings, bits, bytes)?;
+        Some(Proposal {
+            is_headed_by_tail: of_sample.is_headed_by_tail,
+            ..proposal
+        })
+    };
+    let proposal = proposed(settings)?;
     let swapped = |cell| Settings {
         cell: Some(cell),
         ..settings.clone()
@@ -200,7 +238,7 @@ fn smoother(proposal: &Proposal, bytes: &[u8]) -> Option<Proposal> {
     if Layout::new(&swapped(Cell::U16le)) != as_is {
         return Some(proposal);
     }
-    match Proposal::of(&swapped(Cell::U16be), bits, bytes) {
+    match proposed(&swapped(Cell::U16be)) {
         Some(other) if other.roughness < proposal.roughness => Some(other),
         _ => Some(proposal),
     }
@@ -280,6 +318,17 @@ fn overhead_bytes(settings: &Settings, layout: &Layout) -> usize {
     let is_wide = has(Cell::U16le) || has(Cell::U16be);
     let Array { rows, cols } = layout.array();
     layout.max_frame_bytes() - rows * cols * if is_wide { 2 } else { 1 }
+}
+
+/// Whether `bytes` begin with what the layout calls a tail. Candidates say theirs, as sets of keys
+/// that leave nothing out; of the presets `ff-tail` has one.
+fn is_headed_by_tail(candidate: &Settings, bytes: &[u8]) -> bool {
+    let tail = match (&candidate.tail, candidate.preset) {
+        (Some(tail), _) => &tail.0[..],
+        (None, Preset::FfTail) => &[0xFF],
+        (None, _) => &[],
+    };
+    !tail.is_empty() && bytes.starts_with(tail)
 }
 
 /// Whether nothing but the size of the array differs from the preset.

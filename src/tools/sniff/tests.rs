@@ -288,3 +288,48 @@ fn noise_and_silence_are_not_explained() {
         assert!(propose(bytes).is_empty(), "{} bytes", bytes.len());
     }
 }
+
+#[test]
+fn a_header_that_the_bytes_begin_with_is_no_tail() {
+    for seed in 0..8 {
+        let mut stream = Stream::new(seed, "headed");
+        let mark = HexBytes((0..4).map(|_| 1 + stream.below(255) as u8).collect());
+        let settings = Settings {
+            preset: Preset::Jq,
+            sync: Some(mark.clone()),
+            ..Settings::default()
+        };
+        let layout = Layout::new(&settings).unwrap();
+        let mut bytes = Vec::new();
+        for frame in frames(seed) {
+            layout.encode(&frame, &mut bytes);
+        }
+        // The end of a stream that was cut off speaks for a tail: its last frame has none.
+        bytes.truncate(bytes.len() - 400);
+        let best = &propose(&bytes)[0];
+        assert_eq!(
+            best.settings.sync.as_ref(),
+            Some(&mark),
+            "{:?}",
+            best.settings
+        );
+    }
+}
+
+#[test]
+fn why_one_is_preferred_is_said_without_a_negative_lead() {
+    let layout = Layout::new(&Settings::default()).unwrap();
+    let bytes = line(&layout, &frames(1), &mut Stream::new(1, "line"));
+    let proposals = propose(&bytes);
+    assert!(proposals.len() > 1);
+    for pair in proposals.windows(2) {
+        let reason = pair[0].reason(&pair[1]);
+        let words = toml(std::path::Path::new("x.bin"), 1, &pair[0], Some(&pair[1]));
+        let said = format!("# preferred to the next because {reason}\n");
+        assert!(words.contains(&said), "{words}");
+    }
+    assert_eq!(
+        proposals[0].reason(&proposals[1]),
+        "its checksum fits frames that change"
+    );
+}
