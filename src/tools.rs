@@ -16,6 +16,7 @@ pub mod replay;
 pub mod simulate;
 pub mod sniff;
 pub mod tail;
+#[cfg(feature = "watch")]
 pub mod watch;
 
 use std::error::Error;

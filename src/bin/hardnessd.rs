@@ -13,9 +13,9 @@ use hardnessd::daemon::log::{Log, Settings as LogSettings};
 use hardnessd::daemon::{Daemon, Reload};
 use hardnessd::tools::args::{Args, Command};
 use hardnessd::tools::exit::{self, Failure, Stop};
-use hardnessd::tools::{
-    self, check, demo, doctor, record, recover, replay, simulate, sniff, tail, watch,
-};
+#[cfg(feature = "watch")]
+use hardnessd::tools::watch;
+use hardnessd::tools::{self, check, demo, doctor, record, recover, replay, simulate, sniff, tail};
 use hardnessd::trial;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::mpsc;
@@ -88,6 +88,7 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
         Command::Recover(args) => finish_blocking(signals, move || recover::run(&args)).await,
         Command::Replay(args) => finish(signals, replay::run(args)).await,
         Command::Tail(args) => Ok(tail::run(args, signals.told()).await?),
+        #[cfg(feature = "watch")]
         Command::Watch(args) => Ok(watch::run(args, signals.told()).await?),
         Command::Check(args) => finish_blocking(signals, move || check::run(&args)).await,
         Command::Doctor(args) => finish_blocking(signals, move || doctor::run(&args)).await,

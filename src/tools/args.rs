@@ -3,7 +3,9 @@
 use clap::{Parser, Subcommand};
 
 use super::configuration::Configuration;
-use super::{check, demo, doctor, record, recover, replay, simulate, sniff, tail, watch};
+#[cfg(feature = "watch")]
+use super::watch;
+use super::{check, demo, doctor, record, recover, replay, simulate, sniff, tail};
 
 /// Hardness events from a tactile array on a serial port
 #[derive(Debug, Parser)]
@@ -32,6 +34,7 @@ pub enum Command {
     /// Print events of a running daemon
     Tail(tail::Args),
     /// Show the sensors of a running daemon on the terminal
+    #[cfg(feature = "watch")]
     Watch(watch::Args),
     /// Check a configuration and print what would run
     Check(check::Args),

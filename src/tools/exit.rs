@@ -1,8 +1,8 @@
 //! How a command fails, and the exit code that an operator's script may rely on for it.
 
-use super::{
-    check, configuration, demo, doctor, record, recover, replay, simulate, sniff, tail, watch,
-};
+#[cfg(feature = "watch")]
+use super::watch;
+use super::{check, configuration, demo, doctor, record, recover, replay, simulate, sniff, tail};
 use crate::daemon;
 use crate::daemon::config::Error as ConfigError;
 use crate::daemon::publish::Error as PublishError;
@@ -69,6 +69,7 @@ pub enum Failure {
     Replay(#[from] replay::Error),
     #[error(transparent)]
     Tail(#[from] tail::Error),
+    #[cfg(feature = "watch")]
     #[error(transparent)]
     Watch(#[from] watch::Error),
     #[error(transparent)]
@@ -109,8 +110,9 @@ impl Failure {
             }
 
             Self::Simulate(simulate::Error::Layout(_) | simulate::Error::Baud { .. })
-            | Self::Record(record::Error::Level { .. } | record::Error::Twice { .. })
-            | Self::Watch(watch::Error::NoTerminal) => USAGE,
+            | Self::Record(record::Error::Level { .. } | record::Error::Twice { .. }) => USAGE,
+            #[cfg(feature = "watch")]
+            Self::Watch(watch::Error::NoTerminal) => USAGE,
 
             Self::Simulate(simulate::Error::Faults(error)) if error.is_unreadable() => NO_INPUT,
             Self::Simulate(simulate::Error::Faults(_)) => FAILED,
@@ -135,10 +137,12 @@ impl Failure {
             | Self::Recover(recover::Error::Broken { .. } | recover::Error::Write { .. })
             | Self::Replay(replay::Error::Broken { .. } | replay::Error::Print(_))
             | Self::Tail(tail::Error::Print(_))
-            | Self::Watch(watch::Error::Terminal(_))
             | Self::Check(check::Error::Print(_))
             | Self::Doctor(doctor::Error::Print(_))
             | Self::Sniff(sniff::Error::Print(_) | sniff::Error::Write { .. }) => IO,
+
+            #[cfg(feature = "watch")]
+            Self::Watch(watch::Error::Terminal(_)) => IO,
 
             Self::Log(_)
             | Self::Demo(demo::Error::Layout(_))

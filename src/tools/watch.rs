@@ -4,7 +4,6 @@
 //! daemon goes away. What is known is kept in `view`, what it looks like in `draw`; here they
 //! are brought together with the socket, the keys and the clock.
 
-mod ansi;
 mod draw;
 mod look;
 mod screen;
@@ -23,7 +22,7 @@ use tokio::time::{Instant, MissedTickBehavior};
 use self::draw::draw;
 use self::look::Look;
 use self::screen::{Screen, keys};
-use self::view::{Key, Loss, QUESTION, View};
+use self::view::{Clock, Key, Loss, QUESTION, View};
 use super::connect::{self, Address, Connection, Source};
 use crate::daemon::now;
 
@@ -85,18 +84,27 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
             // A daemon that says much must not keep a key or a picture waiting.
             biased;
             () = &mut shutdown => return Ok(()),
+            () = screen.gone() => return Ok(()),
             key = keys.recv() => match key {
                 None | Some(Key::Quit) => return Ok(()),
-                Some(Key::Redraw) => screen.forget(),
+                Some(Key::Redraw) => screen.forget().map_err(Error::Terminal)?,
                 Some(key) => view.press(key),
             },
             _ = pictures.tick() => {
-                screen.draw(|frame| draw(frame, &view, now().mono, look));
+                let drawn = screen.draw(|frame| draw(frame, &view, now().mono, look));
+                drawn.map_err(Error::Terminal)?;
             }
-            _ = questions.tick() => daemon.ask(),
+            _ = questions.tick() => daemon.say(r#"{"get":"status"}"#),
             heard = daemon.next() => match heard {
-                Ok(Heard::Connection(address)) => view.wait(address.to_string(), now().mono),
-                Ok(Heard::Line(line)) => view.hear(&line, now()),
+                Ok(Heard::Connection(address)) => {
+                    let clock = Clock::of(&address);
+                    view.wait(address.to_string(), clock, now().mono);
+                }
+                Ok(Heard::Line(line)) => {
+                    if let Some(request) = view.hear(&line, now()) {
+                        daemon.say(&request);
+                    }
+                }
                 Err(loss) => view.lose(loss),
             },
         }
@@ -151,7 +159,7 @@ impl Daemon {
                 State::Waiting(until) => {
                     tokio::time::sleep_until(*until).await;
                     let source = self.source.clone();
-                    let connecting = async move { introduced(source.connect().await?).await };
+                    let connecting = async move { source.connect().await };
                     self.state = State::Connecting(Box::pin(connecting));
                 }
                 State::Connecting(connecting) => match connecting.await {
@@ -183,18 +191,20 @@ impl Daemon {
         self.state = State::Waiting(Instant::now() + PAUSE);
     }
 
-    /// Asks for the totals.
-    fn ask(&mut self) {
+    /// Asks for something.
+    fn say(&self, request: &str) {
         if let State::Connected(connection) = &self.state {
-            connection.try_send(r#"{"get":"status"}"#);
+            connection.try_send(request);
         }
     }
 }
 
-/// A connection with its subscription.
-async fn introduced(mut connection: Connection) -> Result<Connection, connect::Error> {
-    let subscription = r#"{"subscribe":["hardness","press","status","frame"]}"#;
-    connection.send(subscription).await?;
-    connection.send(r#"{"get":"last"}"#).await?;
-    Ok(connection)
+impl Clock {
+    /// Whether a daemon there has this machine's clock.
+    fn of(address: &Address) -> Self {
+        match address {
+            Address::Unix(_) => Self::Ours,
+            Address::Tcp(_) => Self::Theirs,
+        }
+    }
 }

@@ -183,6 +183,9 @@ impl Page<'_> {
                 _ => format!(" last frame {old} ago"),
             };
         }
+        if link == Link::Lost && reason.is_some_and(is_unplugged) {
+            line.insert_str(" LOST ".len(), " unplugged: plug it in again;");
+        }
         let rate_hz = sensor.status.as_ref().and_then(|one| one.frame_rate_hz);
         if let (Link::Live, Some(rate_hz)) = (link, rate_hz) {
             line += &format!("{}{rate_hz:.1} frames/s", self.look.separator());
@@ -272,7 +275,7 @@ impl Page<'_> {
             self.press(row, sensor, link);
         }
         // Verdicts get what is left, but not less than 6 rows.
-        let curve = (rows.0.height.saturating_sub(6) / 3).clamp(2, 8);
+        let curve = (rows.0.height.saturating_sub(6) / 3).clamp(2, 12);
         if let Some(area) = rows.take(curve) {
             self.force(area, sensor, link);
         }
@@ -344,6 +347,17 @@ impl Page<'_> {
             self.text(rest, &address, self.look.aside());
         }
     }
+}
+
+/// Whether this is what a port says whose device has gone.
+fn is_unplugged(reason: &str) -> bool {
+    let gone = [
+        "end of file",
+        "Input/output error",
+        "No such device",
+        "no such device",
+    ];
+    gone.iter().any(|gone| reason.contains(gone))
 }
 
 /// Press, phase, verdict, probabilities in percent and age; force and notes where they have room.

@@ -1,94 +1,122 @@
-//! The terminal: taken over, written to, read from, given back whatever happens.
+//! The terminal: taken over, drawn on, read from, and given back whatever happens.
 //!
-//! It is written to by a thread of its own, so that one that takes nothing (Ctrl-S, a slow ssh)
-//! delays neither the reading of events nor the end: while a picture is on its way no other is
-//! drawn.
+//! Pictures are made in memory and written by a thread of their own. So a terminal that takes
+//! nothing (Ctrl-S, a slow ssh) delays neither the reading of events nor the end: while a picture
+//! is on its way no other is drawn.
 
-use std::io;
+use std::cell::RefCell;
+use std::fs::File;
+use std::io::{self, Write};
+use std::mem;
+use std::os::fd::AsFd;
 use std::panic;
-use std::sync::{OnceLock, mpsc as std_mpsc};
+use std::rc::Rc;
+use std::sync::mpsc as std_mpsc;
 use std::time::Duration;
 
-use ratatui_core::layout::Size;
-use ratatui_core::terminal::{Frame, Terminal};
-use rustix::termios::{OptionalActions, Termios};
+use ratatui_core::layout::Rect;
+use ratatui_core::terminal::{Frame, Terminal, TerminalOptions, Viewport};
+use ratatui_crossterm::CrosstermBackend;
+use ratatui_crossterm::crossterm::cursor::{Hide, MoveTo, Show};
+use ratatui_crossterm::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyModifiers};
+use ratatui_crossterm::crossterm::execute;
+use ratatui_crossterm::crossterm::style::{Attribute, SetAttribute};
+use ratatui_crossterm::crossterm::terminal::{
+    self, Clear, ClearType, EnterAlternateScreen, LeaveAlternateScreen,
+};
 use tokio::sync::mpsc;
 
-use super::ansi::{Ansi, ENTER, LEAVE};
 use super::view::Key;
 
 /// How long the terminal may take for the last bytes.
 const LAST_BYTES: Duration = Duration::from_millis(200);
 
-/// As a terminal that does not know its size is taken (a serial console).
-const USUAL: Size = Size {
-    width: 80,
-    height: 24,
-};
-
-/// How the terminal was found. Once a process: a panic must be able to find it.
-static FOUND: OnceLock<Termios> = OnceLock::new();
+/// The size of a terminal that does not know its own (a serial console).
+const USUAL: (u16, u16) = (80, 24);
 
 /// The terminal in our hands.
 pub(super) struct Screen {
-    terminal: Terminal<Ansi>,
-    out: Option<mpsc::Sender<String>>,
+    terminal: Terminal<CrosstermBackend<Picture>>,
+    area: Rect,
+    picture: Picture,
+    out: Option<mpsc::Sender<Vec<u8>>>,
     written: std_mpsc::Receiver<()>,
+}
+
+/// The bytes of a picture that is being made.
+#[derive(Clone, Default)]
+struct Picture(Rc<RefCell<Vec<u8>>>);
+
+impl Write for Picture {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.borrow_mut().write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
 }
 
 impl Screen {
     /// Takes the terminal of stdin and stdout over.
     pub(super) fn open() -> io::Result<Self> {
-        let stdin = rustix::stdio::stdin();
-        let found = rustix::termios::tcgetattr(stdin)?;
-        let mut raw = FOUND.get_or_init(|| found).clone();
-        raw.make_raw();
+        // Past the standard library's lock, which a stalled thread would hold while another panics.
+        let stdout = File::from(io::stdout().as_fd().try_clone_to_owned()?);
+        let area = area();
+        let picture = Picture::default();
+        let backend = CrosstermBackend::new(picture.clone());
+        let viewport = Viewport::Fixed(area);
+        let terminal = Terminal::with_options(backend, TerminalOptions { viewport })?;
         let before = panic::take_hook();
         panic::set_hook(Box::new(move |panic| {
-            give_back();
-            let _ = write(LEAVE.as_bytes());
+            let _ = leave(&mut io::stdout());
+            let _ = terminal::disable_raw_mode();
             before(panic);
         }));
-        rustix::termios::tcsetattr(stdin, OptionalActions::Now, &raw)?;
-        let (out, mut pictures) = mpsc::channel::<String>(1);
+        terminal::enable_raw_mode()?;
+        let (out, pictures) = mpsc::channel(1);
         let (done, written) = std_mpsc::channel();
         std::thread::Builder::new()
             .name("screen".to_owned())
             .spawn(move || {
-                let _ = write(ENTER.as_bytes());
-                while let Some(picture) = pictures.blocking_recv() {
-                    // A terminal that is gone ends the input too.
-                    let _ = write(picture.as_bytes());
-                }
-                let _ = write(LEAVE.as_bytes());
+                // A terminal that has gone is noticed by the end of this thread.
+                let _ = write_all(stdout, pictures);
                 let _ = done.send(());
             })?;
-        let terminal = Terminal::new(Ansi::new(size())).unwrap_or_else(|never| match never {});
         Ok(Self {
             terminal,
+            area,
+            picture,
             out: Some(out),
             written,
         })
     }
 
     /// Draws, unless the last picture is still on its way.
-    pub(super) fn draw(&mut self, picture: impl FnOnce(&mut Frame)) {
+    pub(super) fn draw(&mut self, picture: impl FnOnce(&mut Frame)) -> io::Result<()> {
         let Some(Ok(room)) = self.out.as_ref().map(mpsc::Sender::try_reserve) else {
-            return;
+            return Ok(());
         };
-        self.terminal.backend_mut().resize(size());
-        self.terminal
-            .draw(picture)
-            .unwrap_or_else(|never| match never {});
-        let bytes = self.terminal.backend_mut().take();
-        if !bytes.is_empty() {
-            room.send(bytes);
+        let area = area();
+        if mem::replace(&mut self.area, area) != area {
+            self.terminal.resize(area)?;
         }
+        self.terminal.draw(picture)?;
+        room.send(self.picture.0.take());
+        Ok(())
     }
 
     /// Forgets what stands there, so that the next picture is written whole.
-    pub(super) fn forget(&mut self) {
-        self.terminal.clear().unwrap_or_else(|never| match never {});
+    pub(super) fn forget(&mut self) -> io::Result<()> {
+        self.terminal.resize(self.area)
+    }
+
+    /// Waits until the terminal takes nothing any more because it has gone.
+    pub(super) async fn gone(&self) {
+        match &self.out {
+            Some(out) => out.closed().await,
+            None => std::future::pending().await,
+        }
     }
 }
 
@@ -96,31 +124,30 @@ impl Drop for Screen {
     fn drop(&mut self) {
         self.out = None;
         let _ = self.written.recv_timeout(LAST_BYTES);
-        give_back();
+        let _ = terminal::disable_raw_mode();
     }
 }
 
-fn give_back() {
-    if let Some(found) = FOUND.get() {
-        let _ = rustix::termios::tcsetattr(rustix::stdio::stdin(), OptionalActions::Now, found);
+/// Writes pictures to a terminal until no more come.
+fn write_all(mut out: File, mut pictures: mpsc::Receiver<Vec<u8>>) -> io::Result<()> {
+    let clear = Clear(ClearType::All);
+    execute!(out, EnterAlternateScreen, Hide, clear)?;
+    while let Some(picture) = pictures.blocking_recv() {
+        out.write_all(&picture)?;
     }
+    leave(&mut out)
 }
 
-/// Past the standard library's lock, which a stalled thread may hold while another panics.
-fn write(mut bytes: &[u8]) -> rustix::io::Result<()> {
-    while !bytes.is_empty() {
-        let written =
-            rustix::io::retry_on_intr(|| rustix::io::write(rustix::stdio::stdout(), bytes))?;
-        bytes = &bytes[written..];
-    }
-    Ok(())
+/// Leaves the terminal as it was. One without an alternate screen is left empty.
+fn leave(out: &mut impl Write) -> io::Result<()> {
+    let (plain, clear) = (SetAttribute(Attribute::Reset), Clear(ClearType::All));
+    execute!(out, plain, clear, MoveTo(0, 0), Show, LeaveAlternateScreen)
 }
 
-fn size() -> Size {
-    match rustix::termios::tcgetwinsize(rustix::stdio::stdout()) {
-        Ok(size) if size.ws_col > 0 && size.ws_row > 0 => Size::new(size.ws_col, size.ws_row),
-        _ => USUAL,
-    }
+fn area() -> Rect {
+    let size = terminal::size().ok();
+    let (width, height) = size.filter(|&(w, h)| w > 0 && h > 0).unwrap_or(USUAL);
+    Rect::new(0, 0, width, height)
 }
 
 /// Keys as they are pressed, until there is no more input.
@@ -129,57 +156,40 @@ pub(super) fn keys() -> io::Result<mpsc::Receiver<Key>> {
     std::thread::Builder::new()
         .name("keys".to_owned())
         .spawn(move || {
-            let mut bytes = [0; 64];
-            let read = |bytes: &mut [u8]| {
-                rustix::io::retry_on_intr(|| rustix::io::read(rustix::stdio::stdin(), &mut *bytes))
-            };
-            while let Ok(length @ 1..) = read(&mut bytes) {
-                for key in pressed(&bytes[..length]) {
-                    if sender.blocking_send(key).is_err() {
-                        return;
-                    }
+            while let Ok(event) = event::read() {
+                if let Some(key) = key(&event)
+                    && sender.blocking_send(key).is_err()
+                {
+                    return;
                 }
             }
         })?;
     Ok(keys)
 }
 
-/// The keys in what a terminal sends at a time; others mean nothing.
-pub(super) fn pressed(mut bytes: &[u8]) -> Vec<Key> {
-    let mut keys = Vec::new();
-    while let Some((&first, rest)) = bytes.split_first() {
-        bytes = rest;
-        keys.extend(match first {
-            // Ctrl-C: in raw mode it is no signal.
-            b'q' | b'Q' | 0x03 => Some(Key::Quit),
-            0x0c => Some(Key::Redraw),
-            b'\t' => Some(Key::Next),
-            b'1'..=b'9' => Some(Key::Sensor(usize::from(first - b'1'))),
-            0x1b => {
-                let escaped = escaped(&mut bytes);
-                match escaped {
-                    Some(b'C' | b'B') => Some(Key::Next),
-                    Some(b'D' | b'A' | b'Z') => Some(Key::Previous),
-                    _ => None,
-                }
-            }
-            _ => None,
-        });
-    }
-    keys
-}
-
-/// Passes over the rest of an escape sequence; its last byte, if it is one of a key without a
-/// parameter.
-fn escaped(bytes: &mut &[u8]) -> Option<u8> {
-    let is_introduced = matches!(bytes.first(), Some(b'[' | b'O'));
-    if !is_introduced {
+/// The key that an event is; others mean nothing.
+pub(super) fn key(event: &Event) -> Option<Key> {
+    let &Event::Key(KeyEvent {
+        code, modifiers, ..
+    }) = event
+    else {
         return None;
+    };
+    let is_control = modifiers == KeyModifiers::CONTROL;
+    match code {
+        // In raw mode Ctrl-C is no signal.
+        KeyCode::Char('c') if is_control => Some(Key::Quit),
+        KeyCode::Char('l') if is_control => Some(Key::Redraw),
+        _ if modifiers.intersects(KeyModifiers::CONTROL | KeyModifiers::ALT) => None,
+        KeyCode::Char('q' | 'Q') => Some(Key::Quit),
+        KeyCode::Char(digit @ '1'..='9') => {
+            let digit = digit
+                .to_digit(10)
+                .and_then(|digit| usize::try_from(digit).ok());
+            digit.map(|digit| Key::Sensor(digit - 1))
+        }
+        KeyCode::Tab | KeyCode::Right | KeyCode::Down => Some(Key::Next),
+        KeyCode::BackTab | KeyCode::Left | KeyCode::Up => Some(Key::Previous),
+        _ => None,
     }
-    let end = 1 + bytes[1..]
-        .iter()
-        .position(|byte| (0x40..0x7f).contains(byte))?;
-    let key = (end == 1).then_some(bytes[end]);
-    *bytes = &bytes[end + 1..];
-    key
 }

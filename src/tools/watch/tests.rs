@@ -3,19 +3,18 @@
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use ratatui_core::backend::{Backend, TestBackend};
+use ratatui_core::backend::TestBackend;
 use ratatui_core::buffer::Buffer;
-use ratatui_core::layout::Size;
 use ratatui_core::style::Color;
 use ratatui_core::terminal::Terminal;
+use ratatui_crossterm::crossterm::event::{Event, KeyCode, KeyEvent, KeyModifiers};
 use rustix::termios::LocalModes;
 use serde_json::{Value, json};
 
-use super::ansi::Ansi;
 use super::draw::draw;
 use super::look::Look;
-use super::screen::{Screen, pressed};
-use super::view::{Key, Link, Loss, View};
+use super::screen::{Screen, key};
+use super::view::{Clock, Key, Link, Loss, View};
 use crate::frame::{COLS, Stamp, TAXELS};
 use crate::tools::pty::pair::Pair;
 
@@ -139,7 +138,7 @@ fn what_does_not_say_hello_is_silent_and_another_protocol_is_none() {
     let mut met = pressed_sensor();
     met.lose(Loss::Closed);
     for mut view in [View::new(), met] {
-        view.wait("events.sock".to_owned(), at(0).mono);
+        view.wait("events.sock".to_owned(), Clock::Ours, at(0).mono);
         let text = |view: &View, ms| shown(view, ms, (80, 24), PLAIN);
         assert!(text(&view, 2_900).contains("NO DAEMON"));
         let silent = text(&view, 3_100);
@@ -397,32 +396,6 @@ fn without_colours_pressure_is_told_by_characters_and_nothing_but_ascii_is_writt
 }
 
 #[test]
-fn a_picture_without_styles_is_written_without_them() {
-    let written = |look| {
-        let buffer = picture(&pressed_sensor(), 300, (80, 24), look);
-        let mut ansi = Ansi::new(Size::new(80, 24));
-        let cells = buffer.content.iter().zip(0_u16..);
-        ansi.draw(cells.map(|(cell, index)| (index % 80, index / 80, cell)))
-            .unwrap();
-        ansi.take()
-    };
-    let styles = |text: &str| {
-        text.split('\x1b')
-            .skip(1)
-            .filter(|sequence| {
-                sequence
-                    .trim_start_matches([
-                        '[', ';', '0', '1', '2', '3', '4', '5', '6', '7', '8', '9',
-                    ])
-                    .starts_with('m')
-            })
-            .count()
-    };
-    assert_eq!(styles(&written(PLAIN)), 0);
-    assert!(styles(&written(COLOURS)) > 10);
-}
-
-#[test]
 fn every_size_is_drawn_and_says_what_holds() {
     let mut view = pressed_sensor();
     hear(&mut view, 2_000, status("forearm", "stale"));
@@ -462,19 +435,26 @@ fn a_small_array_is_drawn_alone() {
 }
 
 #[test]
-fn keys_are_told_from_what_a_terminal_sends() {
-    let check = |bytes: &[u8], keys: &[Key]| assert_eq!(pressed(bytes), keys, "{bytes:?}");
-    check(b"q", &[Key::Quit]);
-    check(b"\x03", &[Key::Quit]);
-    check(b"\t2x", &[Key::Next, Key::Sensor(1)]);
-    check(
-        b"\x1b[C\x1b[D\x1bOB\x1b[Z",
-        &[Key::Next, Key::Previous, Key::Next, Key::Previous],
-    );
-    check(b"\x0c", &[Key::Redraw]);
-    // Ctrl-arrow, a mouse report, a lone escape: nothing, and what follows is not misread.
-    check(b"\x1b[1;5C\x1b[<0;3;1Mq", &[Key::Quit]);
-    check(b"\x1b", &[]);
+fn keys_mean_what_the_last_row_says() {
+    let check = |code, modifiers, expected| {
+        let event = Event::Key(KeyEvent::new(code, modifiers));
+        assert_eq!(key(&event), expected, "{event:?}");
+    };
+    let none = KeyModifiers::NONE;
+    check(KeyCode::Char('q'), none, Some(Key::Quit));
+    check(KeyCode::Char('c'), KeyModifiers::CONTROL, Some(Key::Quit));
+    check(KeyCode::Char('c'), none, None);
+    check(KeyCode::Char('l'), KeyModifiers::CONTROL, Some(Key::Redraw));
+    check(KeyCode::Char('2'), none, Some(Key::Sensor(1)));
+    check(KeyCode::Char('0'), none, None);
+    for code in [KeyCode::Tab, KeyCode::Right, KeyCode::Down] {
+        check(code, none, Some(Key::Next));
+        check(code, KeyModifiers::CONTROL, None);
+    }
+    check(KeyCode::BackTab, KeyModifiers::SHIFT, Some(Key::Previous));
+    check(KeyCode::Left, none, Some(Key::Previous));
+    check(KeyCode::Esc, none, None);
+    assert_eq!(key(&Event::Resize(80, 24)), None);
 }
 
 #[test]
@@ -540,4 +520,117 @@ fn a_soft_touch_is_seen_after_a_hard_one() {
     hear(&mut view, 300, frame("forearm", 0.08, 12));
     let text = shown(&view, 400, (80, 24), PLAIN);
     assert!(text.contains("::::::::::::"), "{text}");
+}
+
+#[test]
+fn what_was_before_is_asked_for_and_stands_in_order() {
+    let mut view = View::new();
+    let mut first = hello("a", &["forearm"]);
+    first["seq"] = json!(40);
+    let asked = view.hear(&first.to_string(), at(0)).unwrap();
+    let asked: Vec<Value> = asked
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect();
+    assert_eq!(asked[0], json!({"get": "last"}));
+    assert_eq!(asked[1]["since"], "a:0");
+    assert!(
+        asked[1]["subscribe"]
+            .as_array()
+            .unwrap()
+            .contains(&json!("frame"))
+    );
+    // The last verdict comes first, then what is too old to be held, then the rest in order.
+    let numbered = |mut event: Value, seq: u64| {
+        event["seq"] = json!(seq);
+        event
+    };
+    let press = |press: u64, state: &str| json!({"type": "press", "sensor": "forearm", "press": press, "state": state});
+    for event in [
+        numbered(verdict(9, Some(2), None), 38),
+        json!({"type": "gap", "lost": 30}),
+        numbered(verdict(8, Some(2), None), 33),
+        numbered(press(9, "begin"), 34),
+        numbered(press(9, "end"), 37),
+        numbered(verdict(9, Some(2), None), 38),
+    ] {
+        hear(&mut view, 100, event);
+    }
+    let sensor = view.sensor().unwrap();
+    let presses: Vec<u64> = sensor.verdicts.iter().map(|one| one.press).collect();
+    assert_eq!(presses, [9, 8]);
+    assert_eq!(sensor.press.as_ref().unwrap().state, "end");
+    assert_eq!(view.missed, Some(0), "nobody was there to miss it");
+    // From then on a gap is one, and after a break it goes on where it was.
+    hear(&mut view, 200, numbered(press(10, "begin"), 41));
+    hear(&mut view, 200, json!({"type": "gap", "lost": 2}));
+    assert_eq!(view.missed, Some(2));
+    let asked = view.hear(&first.to_string(), at(300)).unwrap();
+    assert!(asked.contains("\"since\":\"a:41\""), "{asked}");
+}
+
+#[test]
+fn lost_says_unplugged_where_it_is() {
+    let lost = |reason: &str| {
+        let mut view = pressed_sensor();
+        let mut status = status("forearm", "lost");
+        status["reason"] = json!(reason);
+        hear(&mut view, 1_000, status);
+        shown(&view, 1_100, (80, 24), PLAIN)
+    };
+    for reason in [
+        "end of file",
+        "Input/output error (os error 5)",
+        "no such device",
+    ] {
+        let text = lost(reason);
+        assert!(
+            text.contains(" LOST  unplugged: plug it in again; last frame"),
+            "{text}"
+        );
+        assert!(text.contains(reason), "{text}");
+    }
+    let text = lost("permission denied");
+    assert!(
+        text.contains(" LOST  last frame") && !text.contains("unplugged"),
+        "{text}"
+    );
+}
+
+#[test]
+fn a_large_terminal_is_used() {
+    let view = pressed_sensor();
+    let columns_of_map = |size| {
+        let buffer = picture(&view, 300, size, COLOURS);
+        let heading = rows(&buffer)
+            .iter()
+            .position(|row| row.contains("pressure "))
+            .unwrap();
+        let width = usize::from(size.0);
+        let row = &buffer.content[(heading + 1) * width..(heading + 2) * width];
+        row.iter()
+            .take_while(|cell| cell.symbol() == "\u{2580}")
+            .count()
+    };
+    assert_eq!(columns_of_map((80, 24)), 28);
+    assert_eq!(columns_of_map((120, 50)), 56);
+    assert_eq!(columns_of_map((200, 60)), 84);
+    assert_eq!(columns_of_map((300, 90)), 140);
+}
+
+#[test]
+fn a_frame_of_a_machine_with_another_clock_is_new() {
+    let mut view = View::new();
+    view.wait("robot:8255".to_owned(), Clock::Theirs, at(0).mono);
+    hear(&mut view, 0, hello("a", &["forearm"]));
+    hear(&mut view, 0, status("forearm", "live"));
+    // Its clock is an hour behind, and the frames take 10 and 30 ms.
+    for (ms, delay) in [(200, 10), (400, 30)] {
+        let mut event = frame("forearm", 1.0, 5);
+        let there = at(ms - delay).wall - jiff::SignedDuration::from_hours(1);
+        event["time"] = json!(there.to_string());
+        hear(&mut view, ms, event);
+    }
+    let frame = view.sensor().unwrap().frame.as_ref().unwrap();
+    assert_eq!(frame.at, at(380).mono);
 }

@@ -7,7 +7,8 @@ mod sensor;
 
 use std::time::Duration;
 
-use serde_json::Value;
+use jiff::SignedDuration;
+use serde_json::{Value, json};
 
 pub(super) use self::sensor::{Frame, Load, Sensor, Verdict, WINDOW};
 use crate::event::PROTOCOL;
@@ -34,6 +35,22 @@ pub(super) struct View {
     heard: Duration,
     /// Events that it had no room for; `None`: their number is unknown.
     pub(super) missed: Option<u64>,
+    /// The last event of this run that was heard.
+    seq: u64,
+    /// While what happened up to this event is being told: what is too old for that is not missed.
+    catching_up: Option<u64>,
+    clock: Clock,
+    /// How far the daemon's clock is behind ours, as far as frames tell: they come at once.
+    behind: Option<SignedDuration>,
+}
+
+/// Whose clock the daemon has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Clock {
+    /// This machine's.
+    Ours,
+    /// That of another machine, which may be wrong.
+    Theirs,
 }
 
 /// Whether there is a daemon.
@@ -115,17 +132,21 @@ impl View {
             daemon: Daemon::Absent("connecting".to_owned()),
             heard: Duration::ZERO,
             missed: Some(0),
+            seq: 0,
+            catching_up: None,
+            clock: Clock::Ours,
+            behind: None,
         }
     }
 
-    /// Takes in a line of the daemon, read at `now`. What it does not know it passes over.
-    pub(super) fn hear(&mut self, line: &str, now: Stamp) {
-        let Ok(event) = serde_json::from_str::<Value>(line) else {
-            return;
-        };
+    /// Takes in a line of the daemon, read at `now`, and ignores a line that it does not know. What
+    /// it returns is to be sent to the daemon.
+    pub(super) fn hear(&mut self, line: &str, now: Stamp) -> Option<String> {
+        let event = serde_json::from_str::<Value>(line).ok()?;
         self.heard = now.mono;
         match text(&event, "type").as_str() {
-            "hello" => self.meet(&event),
+            "hello" => return self.meet(&event),
+            "gap" if self.catching_up.is_some() => self.catching_up = None,
             "gap" => {
                 let lost = event["lost"].as_u64();
                 self.missed = self.missed.zip(lost).map(|(sum, lost)| sum + lost);
@@ -135,29 +156,51 @@ impl View {
                 self.daemon = Daemon::Absent(text(&event, "message"));
             }
             kind => {
+                if let Some(seq) = event["seq"].as_u64() {
+                    self.seq = self.seq.max(seq);
+                    self.catching_up = self.catching_up.filter(|&past| seq <= past);
+                }
                 let name = text(&event, "sensor");
-                let at = moment(&event, now);
+                let at = self.moment(&event, kind, now);
                 if let Some(sensor) = self.sensors.iter_mut().find(|one| one.name == name) {
                     sensor.hear(kind, &event, at);
                 }
             }
         }
+        None
+    }
+
+    /// When an event happened. A daemon on another machine has another clock: by how much it is
+    /// behind is told by the frame that came soonest.
+    fn moment(&mut self, event: &Value, kind: &str, now: Stamp) -> Duration {
+        let time = text(event, "time").parse::<jiff::Timestamp>();
+        let Ok(past) = time.map(|time| now.wall.duration_since(time)) else {
+            return now.mono;
+        };
+        if self.clock == Clock::Theirs && kind == "frame" {
+            self.behind = Some(self.behind.map_or(past, |behind| behind.min(past)));
+        }
+        let past = past - self.behind.unwrap_or_default();
+        now.mono
+            .saturating_sub(Duration::try_from(past).unwrap_or_default())
     }
 
     /// Something at `address` has taken the connection at `now`: it is given as long to say what it
     /// is as a daemon to answer.
-    pub(super) fn wait(&mut self, address: String, now: Duration) {
+    pub(super) fn wait(&mut self, address: String, clock: Clock, now: Duration) {
         self.heard = now;
         self.address = address;
+        (self.clock, self.behind) = (clock, None);
         self.daemon = Daemon::Unknown(self.absence().to_owned());
     }
 
-    fn meet(&mut self, event: &Value) {
+    /// Takes in a `hello`. What it returns asks for all that happened since the last event, and on.
+    fn meet(&mut self, event: &Value) -> Option<String> {
         let protocol = &event["protocol"];
         if *protocol != PROTOCOL {
             let reason = format!("found protocol {protocol}, expected {PROTOCOL}");
             self.daemon = Daemon::Absent(reason);
-            return;
+            return None;
         }
         let hello = hello(event);
         // In another run numbers begin again, and nothing of the old one is known any more.
@@ -173,10 +216,19 @@ impl View {
                 .iter()
                 .position(|one| Some(&one.name) == name.as_ref());
             self.chosen = again.unwrap_or(0);
-            self.missed = Some(0);
+            (self.missed, self.seq) = (Some(0), 0);
+            self.catching_up = Some(number(event, "seq"));
         }
+        let since = format!("{}:{}", hello.run, self.seq);
         self.hello = Some(hello);
         self.daemon = Daemon::Met;
+        let types = ["hardness", "press", "status", "frame"];
+        // The last verdict may be older than what is held.
+        let requests = [
+            json!({"get": "last"}),
+            json!({"subscribe": types, "since": since}),
+        ];
+        Some(requests.map(|request| request.to_string()).join("\n"))
     }
 
     /// The daemon went away, or does not answer.
@@ -257,14 +309,6 @@ fn hello(event: &Value) -> Hello {
             .map(|level| text(level, "label"))
             .collect(),
     }
-}
-
-/// When it happened. Daemon and viewer share a machine and its clocks.
-fn moment(event: &Value, now: Stamp) -> Duration {
-    let time = text(event, "time").parse::<jiff::Timestamp>();
-    let past = time.map(|time| now.wall.duration_since(time));
-    let past = past.ok().and_then(|past| Duration::try_from(past).ok());
-    now.mono.saturating_sub(past.unwrap_or_default())
 }
 
 /// How long ago, to be read at a glance.

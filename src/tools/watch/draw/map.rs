@@ -7,15 +7,13 @@ use super::super::view::{Link, Sensor};
 use super::Page;
 
 impl Page<'_> {
-    /// Columns and rows of the pressure map: the largest form that fits; `(0, 0)`: none does.
+    /// Columns and rows of the pressure map: the largest that fits, with so many columns a taxel and
+    /// half as many rows, because a cell is twice as high as it is wide. `(0, 0)`: none fits.
     pub(super) fn map_size(&self, sensor: &Sensor, width: u16, height: u16) -> (u16, u16) {
-        let cols = u16::try_from(sensor.cols).unwrap_or_default();
-        let rows = u16::try_from(sensor.rows).unwrap_or_default();
-        let forms = [(2 * cols, rows), (cols, rows.div_ceil(2))];
-        let fitting = forms
-            .into_iter()
-            .find(|form| form.0 <= width && form.1 <= height);
-        fitting.unwrap_or_default()
+        let cols = u16::try_from(sensor.cols).unwrap_or(u16::MAX);
+        let rows = u16::try_from(sensor.rows).unwrap_or(u16::MAX);
+        let scale = (width / cols).min(height.saturating_mul(2) / rows);
+        (scale * cols, (scale * rows).div_ceil(2))
     }
 
     pub(super) fn map(
@@ -34,17 +32,14 @@ impl Page<'_> {
             height: rows.min(area.height - 1),
             ..area
         };
-        // Two cells a taxel, or two taxels a cell: a cell is twice as high as it is wide.
-        let is_large = usize::from(cols) > sensor.cols;
-        let (taxel_cells, cell_taxels) = if is_large { (2, 1) } else { (1, 2) };
+        let scale = (usize::from(cols) / sensor.cols).max(1);
         // By its root, or a soft touch would vanish beside a hard one.
         let shade = |row, col| sensor.newtons(row, col).map(|n| (n / top).min(1.0).sqrt());
         for y in 0..area.height {
             for x in 0..area.width {
-                let col = usize::from(x) / taxel_cells;
-                let row = usize::from(y) * cell_taxels;
-                let upper = shade(row, col);
-                let lower = if is_large { upper } else { shade(row + 1, col) };
+                let (x_of, y_of) = (usize::from(x), usize::from(y));
+                let half = |half: usize| shade((2 * y_of + half) / scale, x_of / scale);
+                let (upper, lower) = (half(0), half(1));
                 let cell = &mut self.buffer[(area.x + x, area.y + y)];
                 if self.look.colours {
                     let ramp = if link == Link::Live { &HEAT } else { &GREY };

@@ -110,12 +110,17 @@ impl Sensor {
                 });
             }
             "press" => {
-                self.press = Some(Press {
+                let press = Press {
                     at,
                     number: number(event, "press"),
                     state: text(event, "state"),
                     reason: event["reason"].as_str().map(plain),
-                });
+                };
+                // What happened before may be told after what happens now.
+                let is_older = |known: &Press| (known.number, known.at) > (press.number, press.at);
+                if !self.press.as_ref().is_some_and(is_older) {
+                    self.press = Some(press);
+                }
             }
             "hardness" => self.judge(event, at),
             "frame" => self.show(event, at),
@@ -142,11 +147,15 @@ impl Sensor {
                 .map(|note| plain(note).replace('_', " "))
                 .collect(),
         };
-        // Asked for after a break of the connection, the last one may be known.
-        let is_same =
-            |known: &Verdict| (known.press, &known.phase) == (verdict.press, &verdict.phase);
-        if !self.verdicts.iter().any(is_same) {
-            self.verdicts.push_front(verdict);
+        // The newest press first, its final verdict before its early one. What is told of the past
+        // may be known.
+        let order = |one: &Verdict| (one.press, one.phase == "final");
+        let place = self
+            .verdicts
+            .partition_point(|known| order(known) > order(&verdict));
+        let is_known = |known: &Verdict| order(known) == order(&verdict);
+        if !self.verdicts.get(place).is_some_and(is_known) {
+            self.verdicts.insert(place, verdict);
             self.verdicts.truncate(VERDICTS);
         }
     }
