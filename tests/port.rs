@@ -146,7 +146,7 @@ fn doctor_names_what_is_missing_and_who_holds_a_port() {
         let (code, stdout, _) = run(&["doctor", "--port", port]);
         assert_eq!(code, 1, "{stdout}");
         assert_eq!(stdout.lines().count(), 1, "{stdout}");
-        assert!(stdout.contains("expected a serial port"), "{stdout}");
+        assert!(stdout.contains("not a serial port"), "{stdout}");
     }
 
     let _sensor = bench.sensor(&[]);

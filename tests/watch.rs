@@ -40,8 +40,9 @@ impl Terminal {
         let Pair { master, device, .. } = Pair::open().unwrap();
         let end = || Stdio::from(device.try_clone().unwrap());
         resize(&master, size);
-        let watch = Command::new(BINARY)
-            .args(["watch", "--socket"])
+        // Without a terminal of its own, which a test may be started from.
+        let watch = Command::new("setsid")
+            .args([BINARY, "watch", "--socket"])
             .arg(socket)
             .env("TERM", "xterm-256color")
             .env("LC_ALL", "C.UTF-8")
@@ -267,6 +268,50 @@ fn a_terminal_that_takes_nothing_does_not_keep_it() {
     terminal.watch.signal(Signal::TERM);
     assert_eq!(terminal.watch.exit_code(), Some(0));
     assert!(start.elapsed() < Duration::from_secs(5));
+}
+
+#[test]
+fn a_terminal_that_goes_away_ends_it() {
+    let bench = Bench::new();
+    let Pair { master, device, .. } = Pair::open().unwrap();
+    resize(&master, (80, 24));
+    let end = || Stdio::from(device.try_clone().unwrap());
+    let mut command = Command::new("setsid");
+    command
+        .args([BINARY, "watch", "--socket"])
+        .arg(bench.path("events.sock"));
+    command
+        .env("TERM", "xterm")
+        .stdin(end())
+        .stdout(end())
+        .stderr(Stdio::null());
+    let mut watch = Process(command.spawn().unwrap());
+    drop((command, device));
+    let mut shown = [0; 4096];
+    assert!(File::from(master).read(&mut shown).unwrap() > 0);
+    // Its other end is closed now, and no signal says so: the terminal is not its own.
+    assert_eq!(watch.exit_code(), Some(0));
+}
+
+#[test]
+fn presses_from_before_are_known() {
+    let bench = Bench::new();
+    let _daemon = bench.daemon();
+    let _sensor = bench.sensor(&["--speed", "4", "--presses", "2"]);
+    let mut subscriber = bench.subscriber();
+    for press in [1, 2] {
+        let last = serde_json::json!({"type": "hardness", "phase": "final", "press": press});
+        subscriber.until(&last);
+    }
+    let mut terminal = Terminal::new(&bench.path("events.sock"), (80, 24), &[]);
+    let both = |text: &str| {
+        let shows = |part| text.lines().any(|line| line.contains(part));
+        shows("press 2 ") && shows("  2 final ") && shows("  1 final ")
+    };
+    terminal.until("both presses", both);
+    terminal.shows("LOST  unplugged");
+    terminal.press(b"q");
+    terminal.ends();
 }
 
 #[test]

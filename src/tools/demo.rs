@@ -26,7 +26,7 @@ use self::place::Place;
 pub(super) use self::place::sockets;
 use super::faults::Faults;
 use super::player::{Pace, Player};
-use super::simulate::within;
+use super::simulate::{OutOfRange, within};
 use crate::daemon::config::{Config, Http, SensorTable, Setup};
 use crate::daemon::{self, Daemon};
 use crate::simulator::SequenceSettings;
@@ -144,7 +144,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
 }
 
 /// Beyond 100 the 2 ms between frames are more than a busy machine's timers can keep.
-fn speed(text: &str) -> Result<f64, String> {
+fn speed(text: &str) -> Result<f64, OutOfRange> {
     within(text, 0.01, 100.0)
 }
 

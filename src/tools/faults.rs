@@ -46,9 +46,50 @@ pub enum Error {
     Malformed {
         /// Of the script.
         path: PathBuf,
-        /// What was found and expected.
-        problem: String,
+        /// What is wrong with it.
+        problem: Problem,
     },
+}
+
+/// What is wrong with a script.
+#[derive(Debug, thiserror::Error)]
+pub enum Problem {
+    /// No TOML, or not these tables: in the parser's words.
+    #[error("{0}")]
+    Syntax(String),
+    /// A value that cannot be used.
+    #[error("fault {number}: {value}")]
+    Value {
+        /// Of the fault, from 1.
+        number: usize,
+        /// Which value, and why not.
+        value: Unfit,
+    },
+}
+
+/// A value that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum Unfit {
+    /// A moment before the first frame, or none.
+    #[error("at_s: found {0}, expected seconds from 0")]
+    Moment(f64),
+    /// A key of other kinds.
+    #[error("{0}: this kind of fault does not have it")]
+    Misplaced(&'static str),
+    /// More bytes or bits than are struck.
+    #[error("{key}: found {found}, expected at most {MOST_STRUCK}")]
+    TooMany {
+        /// Which.
+        key: &'static str,
+        /// As given.
+        found: usize,
+    },
+    /// A time that is none.
+    #[error("for_s: found {0}, expected seconds above 0")]
+    Span(f64),
+    /// A fault that needs a time and has none.
+    #[error("for_s: this kind of fault needs it, in seconds")]
+    NoSpan,
 }
 
 impl Error {
@@ -157,17 +198,18 @@ impl Faults {
         })
     }
 
-    fn parse(text: &str, seed: u64) -> Result<Self, String> {
-        let script: Script =
-            toml::from_str(text).map_err(|error| wording::of_toml(text, &error))?;
+    fn parse(text: &str, seed: u64) -> Result<Self, Problem> {
+        let script: Script = toml::from_str(text)
+            .map_err(|error| Problem::Syntax(wording::of_toml(text, &error)))?;
         let faults = script
             .faults
             .iter()
             .enumerate()
             .map(|(index, table)| {
-                table
-                    .fault()
-                    .map_err(|problem| format!("fault {}: {problem}", index + 1))
+                table.fault().map_err(|value| Problem::Value {
+                    number: index + 1,
+                    value,
+                })
             })
             .collect::<Result<_, _>>()?;
         Ok(Self {
@@ -232,12 +274,9 @@ impl Faults {
 }
 
 impl Table {
-    fn fault(&self) -> Result<Fault, String> {
+    fn fault(&self) -> Result<Fault, Unfit> {
         if !(self.at_s.is_finite() && self.at_s >= 0.0) {
-            return Err(format!(
-                "at_s: found {}, expected seconds from 0",
-                self.at_s
-            ));
+            return Err(Unfit::Moment(self.at_s));
         }
         let of_time = matches!(self.kind, Kind::Unplug | Kind::Silence);
         let misplaced = [
@@ -250,13 +289,11 @@ impl Table {
             ),
         ];
         if let Some((key, _)) = misplaced.iter().find(|(_, misplaced)| *misplaced) {
-            return Err(format!("{key}: found a value, expected none for this kind"));
+            return Err(Unfit::Misplaced(key));
         }
         for (key, number) in [("bytes", self.bytes), ("bits", self.bits)] {
-            if let Some(number) = number.filter(|&number| number > MOST_STRUCK) {
-                return Err(format!(
-                    "{key}: found {number}, expected at most {MOST_STRUCK}"
-                ));
+            if let Some(found) = number.filter(|&number| number > MOST_STRUCK) {
+                return Err(Unfit::TooMany { key, found });
             }
         }
         let from_s = self.at_s;
@@ -264,8 +301,8 @@ impl Table {
         let frames = self.frames.unwrap_or(1);
         let to_s = || match self.for_s {
             Some(for_s) if for_s.is_finite() && for_s > 0.0 => Ok(from_s + for_s),
-            Some(for_s) => Err(format!("for_s: found {for_s}, expected seconds above 0")),
-            None => Err("for_s: found none, expected seconds above 0".to_owned()),
+            Some(for_s) => Err(Unfit::Span(for_s)),
+            None => Err(Unfit::NoSpan),
         };
         Ok(match self.kind {
             Kind::Unplug => Fault::Unplug {
@@ -391,7 +428,7 @@ mod tests {
                 "expected a number",
             ),
         ] {
-            let problem = Faults::parse(script, 1).unwrap_err();
+            let problem = Faults::parse(script, 1).unwrap_err().to_string();
             assert!(problem.contains(expected), "{problem}");
         }
     }

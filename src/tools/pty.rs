@@ -131,7 +131,7 @@ impl Drop for Pty {
 fn place(device: &Path, link: &Path) -> io::Result<()> {
     match fs::symlink_metadata(link) {
         Ok(file) if !file.file_type().is_symlink() => {
-            let found = "found a file that is no link, expected a link or nothing";
+            let found = "a file that is no link is there: remove it, or name another path";
             return Err(io::Error::new(ErrorKind::AlreadyExists, found));
         }
         Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),

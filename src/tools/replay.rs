@@ -63,8 +63,8 @@ pub enum Error {
     },
     /// Bytes of another layout, or none.
     #[error(
-        "{path}: found no whole frame in {bytes_skipped} bytes ({frames_damaged} damaged), expected \
-         those of [sensor.frame]: hardnessd sniff {path} looks for another layout"
+        "{path}: no whole frame in {bytes_skipped} bytes ({frames_damaged} damaged): the layout is not \
+         that of [sensor.frame]: `hardnessd sniff {path}` looks for another"
     )]
     NoFrame {
         /// Of the recording.

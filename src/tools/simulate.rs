@@ -31,13 +31,13 @@ pub struct Args {
     /// Layout of a frame
     #[arg(long, value_name = "P", default_value = "jx255n", value_parser = preset)]
     preset: Preset,
-    /// Frames per second
+    /// Frames per second, 0.1 to 1000
     #[arg(long, value_name = "F", default_value_t = 5.0, value_parser = frame_rate_hz)]
     fps: f64,
     /// Material to press; repeat the option for several in turn [default: all eight]
     #[arg(long = "material", value_name = "M")]
     materials: Vec<Material>,
-    /// Peak force of a press in newtons [default: random, 5 to 25]
+    /// Peak force of a press in newtons, 0.01 to 200 [default: random, 5 to 25]
     #[arg(long, value_name = "N", value_parser = force_n)]
     force: Option<f64>,
     /// Seed of everything random
@@ -46,7 +46,7 @@ pub struct Args {
     /// End after N presses [default: no limit]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     presses: Option<u32>,
-    /// Play X times as fast
+    /// Play X times as fast, 0.000001 to 1000000000
     #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = positive)]
     speed: f64,
     /// Bits per second on the line [default: 115200, or the first usual rate that carries the frames]
@@ -256,25 +256,33 @@ fn preset(name: &str) -> Result<Preset, NameError> {
 
 /// A press is computed whole, and takes as long as it takes to reach its force: what no sensor
 /// does would fill the memory.
-fn frame_rate_hz(text: &str) -> Result<f64, String> {
+fn frame_rate_hz(text: &str) -> Result<f64, OutOfRange> {
     within(text, 0.1, 1000.0)
 }
 
 /// As [`frame_rate_hz`]: the softest material takes minutes to bear 1,000 N, and the sensor shows no
 /// more than 10 N a taxel.
-fn force_n(text: &str) -> Result<f64, String> {
+fn force_n(text: &str) -> Result<f64, OutOfRange> {
     within(text, 0.01, 200.0)
 }
 
-pub(super) fn within(text: &str, least: f64, most: f64) -> Result<f64, String> {
+/// A number of the command line that cannot be used, or none.
+#[derive(Debug, thiserror::Error)]
+#[error("expected a number from {least} to {most}")]
+pub(super) struct OutOfRange {
+    least: f64,
+    most: f64,
+}
+
+pub(super) fn within(text: &str, least: f64, most: f64) -> Result<f64, OutOfRange> {
     match text.parse::<f64>() {
         Ok(number) if (least..=most).contains(&number) => Ok(number),
-        _ => Err(format!("expected a number from {least} to {most}")),
+        _ => Err(OutOfRange { least, most }),
     }
 }
 
 /// A number above 0, and not so far from 1 that seconds made of it fit no clock.
-pub(super) fn positive(text: &str) -> Result<f64, String> {
+pub(super) fn positive(text: &str) -> Result<f64, OutOfRange> {
     within(text, 1e-6, 1e9)
 }
 

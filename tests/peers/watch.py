@@ -142,6 +142,7 @@ def main():
         looks = [
             ("80x24", (80, 24), {}),
             ("wide", (120, 48), {}),
+            ("large", (220, 64), {}),
             ("narrow", (44, 40), {}),
             ("no-colour", (80, 24), {"NO_COLOR": "1"}),
             ("vt100", (80, 24), {"TERM": "vt100"}),
@@ -175,7 +176,7 @@ def observe(terminals, forearm, daemon, pictures):
     forearm.kill()
     start = time.monotonic()
     for _, terminal in terminals:
-        terminal.shows("1 forearm LOST", "force not known")
+        terminal.shows("1 forearm LOST", "LOST  unplugged", "force not known")
     delay_s = time.monotonic() - start
     assert delay_s < SHOWS_WITHIN_S, f"all show the loss after {delay_s} s"
     for name, terminal in terminals:

@@ -110,6 +110,13 @@ fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Error {
             problem: "sensor.port: found none, expected the path of a device".to_owned(),
         };
     }
+    if let Some(start) = single_brackets(text, error.message()) {
+        return Error::Syntax {
+            path: path.to_owned(),
+            place: Place::of(text, start),
+            problem: "write [[sensor]], not [sensor]: there may be several".to_owned(),
+        };
+    }
     let start = error.span().map_or(0, |span| span.start);
     // The parser says what was found and expected. The key is on the same line before it.
     let line_start = text[..start].rfind('\n').map_or(0, |newline| newline + 1);
@@ -127,6 +134,17 @@ fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Error {
             _ => message,
         },
     }
+}
+
+/// Where `[sensor]` is written for `[[sensor]]`, if that is what the parser complains of.
+fn single_brackets(text: &str, message: &str) -> Option<usize> {
+    let start = text
+        .lines()
+        .position(|line| line.trim_start().starts_with("[sensor]"))?;
+    let before = text.split_inclusive('\n').take(start);
+    message
+        .contains("expected a sequence")
+        .then(|| before.map(str::len).sum())
 }
 
 /// Where the first `[[sensor]]` without a port begins. A missing key has no place of its own, and only

@@ -200,6 +200,21 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
 }
 
 #[test]
+fn single_brackets_are_named_as_such() {
+    for (text, place) in [
+        ("# One.\n[sensor]\nport = \"p\"\n", "2:1"),
+        ("  [sensor] # x\nport = \"p\"", "1:1"),
+    ] {
+        let problem = load(text).unwrap_err();
+        assert!(
+            problem.contains("write [[sensor]], not [sensor]"),
+            "{problem}"
+        );
+        assert!(problem.contains(place), "{problem}");
+    }
+}
+
+#[test]
 fn a_name_that_is_too_long_is_refused_without_being_repeated() {
     let long = "a".repeat(300);
     for (text, expected) in [

@@ -86,7 +86,7 @@ pub(super) fn refused(root: &Path, port: &Path) -> Option<Fault> {
         _ => "a socket".to_owned(),
     };
     Some(Fault {
-        what: format!("found {found}, expected a serial port"),
+        what: format!("this is {found}, not a serial port"),
         cure: others(&ports(root)),
     })
 }

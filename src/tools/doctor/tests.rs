@@ -211,13 +211,13 @@ fn what_is_no_serial_port_is_said_to_be_none() {
     let root = Path::new("/");
     let refusal = |port: &Path| refused(root, port).map(|fault| fault.to_string());
     for (port, found) in [
-        (Path::new("/dev/null"), "found a device of the kind mem"),
-        (machine.0.path(), "found a directory"),
-        (&machine.path("etc/group"), "found a regular file"),
+        (Path::new("/dev/null"), "this is a device of the kind mem"),
+        (machine.0.path(), "this is a directory"),
+        (&machine.path("etc/group"), "this is a regular file"),
     ] {
         let said = refusal(port).unwrap();
         assert!(said.starts_with(found), "{said}");
-        assert!(said.contains("expected a serial port"), "{said}");
+        assert!(said.contains("not a serial port"), "{said}");
     }
     let pty = Pty::open(None).unwrap();
     assert_eq!(refusal(pty.path()), None);
