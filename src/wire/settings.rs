@@ -89,15 +89,8 @@ impl TryFrom<String> for HexBytes {
 
     fn try_from(text: String) -> Result<Self, HexError> {
         let digits: String = text.chars().filter(|c| !c.is_whitespace()).collect();
-        let bad = || HexError(text.clone());
-        if !digits.len().is_multiple_of(2) || !digits.chars().all(|c| c.is_ascii_hexdigit()) {
-            return Err(bad());
-        }
-        (0..digits.len())
-            .step_by(2)
-            .map(|at| u8::from_str_radix(&digits[at..at + 2], 16).map_err(|_| bad()))
-            .collect::<Result<_, _>>()
-            .map(Self)
+        let bytes = hex::decode(digits).map(Self);
+        bytes.map_err(|_| HexError(text))
     }
 }
 
