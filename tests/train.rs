@@ -10,6 +10,7 @@ use std::process::{Command, Output};
 use std::sync::OnceLock;
 
 use hardnessd::simulator::{Material, Split};
+use hardnessd::train::data::courses::Courses;
 use hardnessd::train::data::dataset::{self, Dataset};
 use hardnessd::verdict::Hrn;
 use rustix::process::{Pid, Signal};
@@ -677,6 +678,93 @@ fn swapped_levels_train_on_the_other_material() {
 }
 
 #[test]
+fn broad_data_say_their_levels_and_laws() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("broad.npz");
+    let out = path.to_str().unwrap();
+    let broad = ["--materials", "broad", "--shapes", "wide", "--presses", "2"];
+    let few = ["--objects", "2", "--test-objects", "1", "--out", out];
+    let simulate = |more: &[&str]| {
+        succeed(&[&["simulate"][..], &broad, &few, more].concat());
+        let dataset = Dataset::read(&path).unwrap();
+        (dataset.samples, dataset::meta(&path).unwrap())
+    };
+    let (samples, meta) = simulate(&[]);
+    assert_eq!(samples.len(), 4 * 3 * 2);
+    assert_eq!(meta["materials"][11], "broad-layered");
+    assert_eq!(meta["levels"][1]["shore"], "60-70");
+    for sample in &samples {
+        let shore = sample.shore.unwrap();
+        let expected = match shore {
+            70.0.. => 1,
+            60.0.. => 2,
+            50.0.. => 3,
+            _ => 4,
+        };
+        assert_eq!(sample.level, expected, "Shore {shore}");
+    }
+    let sheet = directory.path().join("sheet.png");
+    let sheet = [
+        "--gaps",
+        "--laws",
+        "solid,foam",
+        "--sheet",
+        sheet.to_str().unwrap(),
+    ];
+    let (samples, meta) = simulate(&sheet);
+    assert_eq!(meta["levels"][1]["shore"], "61-70");
+    assert_eq!(
+        meta["settings"]["laws"],
+        serde_json::json!(["solid", "foam"])
+    );
+    assert!(
+        samples
+            .iter()
+            .all(|s| [8, 10].contains(&s.material.unwrap()))
+    );
+}
+
+#[test]
+fn presses_over_time_are_data_too() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("courses.npz");
+    let sheet = directory.path().join("sheet.png");
+    let told = succeed(&[
+        "simulate",
+        "--sequences",
+        "--materials",
+        "broad",
+        "--fps",
+        "20",
+        "--objects",
+        "1",
+        "--test-objects",
+        "1",
+        "--presses",
+        "2",
+        "--out",
+        path.to_str().unwrap(),
+        "--sheet",
+        sheet.to_str().unwrap(),
+    ]);
+    assert!(told.contains("presses, "), "{told}");
+    assert!(std::fs::read(&sheet).unwrap().starts_with(b"\x89PNG"));
+    let courses = Courses::read(&path).unwrap();
+    assert!((14..=16).contains(&courses.presses.len()), "{told}");
+    for press in 0..courses.presses.len() {
+        let times = &courses.time_s[courses.rows(press)];
+        let frame_s = times[1] - times[0];
+        assert!(
+            times.len() > 48 || (frame_s - 0.05).abs() < 1e-4,
+            "{times:?}"
+        );
+    }
+    // It is no set of single frames.
+    let error = Dataset::read(&path).unwrap_err().to_string();
+    assert!(error.contains("array `frames`: found none"), "{error}");
+}
+
+#[test]
 fn bad_input_has_its_exit_code_and_one_line() {
     let path = |name: &str| data().0.path().join(name).to_str().unwrap().to_owned();
     let (data, missing, text, out) = (
@@ -762,6 +850,26 @@ fn bad_input_has_its_exit_code_and_one_line() {
             simulate(&["--swapped-levels", "25"]),
             2,
             "expected levels from 1 to 4, such as 24",
+        ),
+        (
+            simulate(&["--laws", "foam"]),
+            2,
+            "--laws: works with `--materials broad` only",
+        ),
+        (
+            simulate(&["--materials", "broad", "--all-test"]),
+            2,
+            "--all-test: works with `--materials named` only",
+        ),
+        (
+            simulate(&["--materials", "broad", "--laws", "liquid"]),
+            2,
+            "no law \"liquid\"; there are solid, plastic, foam, layered",
+        ),
+        (
+            simulate(&["--shapes", "round"]),
+            2,
+            "there are matched, wide, paper",
         ),
         (
             simulate(&["--objects", "0", "--test-objects", "0"]),

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Parser, Subcommand, ValueEnum};
-use hardnessd::simulator::{DatasetSettings, SensorProfile, Shapes, Split};
+use hardnessd::simulator::{DatasetSettings, LawName, Materials, SensorProfile, Shapes, Split};
 use hardnessd::train::data::dataset::LabelChoice;
 use hardnessd::train::methods::Method;
 use hardnessd::train::settings::Profile;
@@ -63,23 +63,35 @@ pub(super) struct Simulate {
     /// Seed of everything random
     #[arg(long, default_value_t = DatasetSettings::default().seed)]
     pub(super) seed: u64,
-    /// Objects of each training material
+    /// Materials: named (the paper's eight) or broad (each object of one drawn for it, whose level is
+    /// what a durometer reads)
+    #[arg(long, default_value = "named")]
+    pub(super) materials: Materials,
+    /// Laws that broad materials are drawn of: solid, plastic, foam, layered [default: all]
+    #[arg(long, value_name = "LAW", value_delimiter = ',', num_args = 1..)]
+    pub(super) laws: Vec<LawName>,
+    /// Leave the gaps between the levels that the paper's table has: no broad material has a Shore
+    /// hardness of 50 to 51, 60 to 61 or 70 to 71
+    #[arg(long)]
+    pub(super) gaps: bool,
+    /// Objects of each training material; of broad materials, of each level
     #[arg(long, default_value_t = DatasetSettings::default().objects,
           value_parser = clap::value_parser!(u32).range(0..=MOST))]
     pub(super) objects: u32,
-    /// Objects of each test material
+    /// Objects of each test material; of broad materials, of each level
     #[arg(long, default_value_t = DatasetSettings::default().test_objects,
           value_parser = clap::value_parser!(u32).range(0..=MOST))]
     pub(super) test_objects: u32,
-    /// Presses of each object; fewer than 48 are some of its six postures under eight forces each
-    #[arg(long, default_value_t = DatasetSettings::default().presses,
-          value_parser = clap::value_parser!(u32).range(1..=MOST))]
-    pub(super) presses: u32,
+    /// Presses of each object: by default 50, with --sequences 6. Fewer than 48 single frames are some of
+    /// its six postures under eight forces each
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=MOST))]
+    pub(super) presses: Option<u32>,
     /// The least nominal force, in newtons; the greatest is 25
     #[arg(long, value_name = "N", default_value_t = DatasetSettings::default().lowest_force_n,
           value_parser = lowest_force_n)]
     pub(super) lowest_force: f32,
-    /// Distribution of shapes: matched (the same for all materials) or paper
+    /// Distribution of shapes: matched (the same for all materials), wide (as matched, but radii from
+    /// 8 to 60 mm, edges and points) or paper (rigid objects flat, soft ones round)
     #[arg(long, default_value = "matched")]
     pub(super) shapes: Shapes,
     /// Spread of the sensor's taxels: clean or raw
@@ -88,9 +100,47 @@ pub(super) struct Simulate {
     /// Levels whose two materials change roles, such as 24: the paper's test material trains
     #[arg(long, value_name = "LEVELS", value_parser = swapped_levels)]
     pub(super) swapped_levels: Option<[bool; 4]>,
+    /// All eight named materials are for test
+    #[arg(long, conflicts_with = "swapped_levels")]
+    pub(super) all_test: bool,
     /// Also draw samples of every material and a press of every level
     #[arg(long, value_name = "S.png")]
     pub(super) sheet: Option<PathBuf>,
+    /// Whole presses over time, with the arm's positions, in place of one frame a press
+    #[arg(long)]
+    pub(super) sequences: bool,
+    #[command(flatten)]
+    pub(super) courses: Courses,
+}
+
+/// What is drawn anew for each press of `--sequences`: from two numbers, or one number.
+#[derive(Debug, clap::Args)]
+#[group(requires = "sequences")]
+pub(super) struct Courses {
+    /// Frames a second, 1 to 200 [default: 5..100]
+    #[arg(long, value_name = "LOW..HIGH", value_parser = range::<1, 200>)]
+    pub(super) fps: Option<[f64; 2]>,
+    /// Speed of the arm in mm/s, 1 to 100 [default: 2..20]
+    #[arg(long, value_name = "LOW..HIGH", value_parser = range::<1, 100>)]
+    pub(super) speed: Option<[f64; 2]>,
+    /// Stiffness of the arm in N/mm, 1 to 1000 [default: 3..30]
+    #[arg(long, value_name = "LOW..HIGH", value_parser = range::<1, 1000>)]
+    pub(super) arm: Option<[f64; 2]>,
+    /// Seconds that the arm holds its position, 0 to 10, and three frames at least [default: 0.2..1.5]
+    #[arg(long, value_name = "LOW..HIGH", value_parser = range::<0, 10>)]
+    pub(super) hold: Option<[f64; 2]>,
+    /// Positions told are off by up to this part, 0 to 0.5, the same in a press [default: 0]
+    #[arg(long, value_name = "PART", value_parser = part::<50>)]
+    pub(super) position_error: Option<f64>,
+    /// The arm's stiffness told is off by up to this part, 0 to 0.9 [default: 0]
+    #[arg(long, value_name = "PART", value_parser = part::<90>)]
+    pub(super) arm_error: Option<f64>,
+    /// Moments of positions are off by up to so many frames, 0 to 5, the same in a press [default: 0]
+    #[arg(long, value_name = "FRAMES", value_parser = part::<500>)]
+    pub(super) clock_error: Option<f64>,
+    /// Share of the presses of which nothing is told of the arm, 0 to 1 [default: 0]
+    #[arg(long, value_name = "SHARE", value_parser = part::<100>)]
+    pub(super) unknown: Option<f64>,
 }
 
 #[derive(Debug, clap::Args)]
@@ -191,6 +241,29 @@ fn lowest_force_n(text: &str) -> Result<f32, String> {
     match text.parse() {
         Ok(force_n) if (0.01..=25.0).contains(&force_n) => Ok(force_n),
         _ => Err("expected newtons from 0.01 to 25".to_owned()),
+    }
+}
+
+/// `LOW..HIGH`, or one number for both, within bounds.
+fn range<const LEAST: u32, const MOST: u32>(text: &str) -> Result<[f64; 2], String> {
+    let (low, high) = text.split_once("..").unwrap_or((text, text));
+    let bounds = f64::from(LEAST)..=f64::from(MOST);
+    match (low.parse::<f64>(), high.parse::<f64>()) {
+        (Ok(low), Ok(high)) if bounds.contains(&low) && bounds.contains(&high) && low <= high => {
+            Ok([low, high])
+        }
+        _ => Err(format!(
+            "expected a number or LOW..HIGH, from {LEAST} to {MOST}"
+        )),
+    }
+}
+
+/// A number from 0 to so many hundredths.
+fn part<const HUNDREDTHS: u32>(text: &str) -> Result<f64, String> {
+    let most = f64::from(HUNDREDTHS) / 100.0;
+    match text.parse() {
+        Ok(part) if (0.0..=most).contains(&part) => Ok(part),
+        _ => Err(format!("expected a number from 0 to {most}")),
     }
 }
 

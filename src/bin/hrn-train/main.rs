@@ -13,7 +13,9 @@ use burn::tensor::Device;
 use clap::{Parser as _, ValueEnum as _};
 use hardnessd::daemon::config::{Config, Error as ConfigError, SensorTable, Setup};
 use hardnessd::frame::RawFrame;
-use hardnessd::simulator::{DatasetSettings, Material, Sequence, SequenceSettings};
+use hardnessd::simulator::{
+    Borders, CourseSettings, DatasetSettings, Laws, Material, Materials, Sequence, SequenceSettings,
+};
 use hardnessd::tools::{self, exit};
 use hardnessd::train::compare::report;
 use hardnessd::train::compare::results::Comparison;
@@ -90,6 +92,7 @@ fn exit_code(error: &anyhow::Error) -> u8 {
     let has = |test: fn(&(dyn std::error::Error + 'static)) -> bool| error.chain().any(test);
     if has(|e| {
         e.is::<NoObjects>()
+            || e.is::<OtherMaterials>()
             || matches!(e.downcast_ref(), Some(LabelsError::Range { .. }))
             || matches!(e.downcast_ref(), Some(CollectError::NoLevel { .. }))
     }) {
@@ -138,20 +141,62 @@ fn load(path: &Path) -> anyhow::Result<Hrn> {
 #[error("--objects and --test-objects: found 0 and 0, expected one or more of either")]
 struct NoObjects;
 
-fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
-    let settings = DatasetSettings {
+/// An option that says nothing of these materials.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}: works with `--materials {1}` only")]
+struct OtherMaterials(&'static str, &'static str);
+
+/// What to simulate.
+fn simulated_settings(arguments: &Simulate) -> Result<DatasetSettings, OtherMaterials> {
+    let is_broad = arguments.materials == Materials::Broad;
+    let of_named = [
+        ("--swapped-levels", arguments.swapped_levels.is_some()),
+        ("--all-test", arguments.all_test),
+    ];
+    let of_broad = [
+        ("--laws", !arguments.laws.is_empty()),
+        ("--gaps", arguments.gaps),
+    ];
+    let (strange, usual) = if is_broad {
+        (of_named, "named")
+    } else {
+        (of_broad, "broad")
+    };
+    if let Some((option, _)) = strange.into_iter().find(|(_, is_given)| *is_given) {
+        return Err(OtherMaterials(option, usual));
+    }
+    Ok(DatasetSettings {
         seed: arguments.seed,
+        materials: arguments.materials,
+        laws: Laws::try_from(arguments.laws.clone()).unwrap_or_default(),
+        borders: if arguments.gaps {
+            Borders::Gaps
+        } else {
+            Borders::Touching
+        },
+        all_test: arguments.all_test,
         objects: arguments.objects,
         test_objects: arguments.test_objects,
-        presses: arguments.presses,
+        presses: arguments.presses.unwrap_or(if arguments.sequences {
+            CourseSettings::default().objects.presses
+        } else {
+            DatasetSettings::default().presses
+        }),
         lowest_force_n: arguments.lowest_force,
         shapes: arguments.shapes,
         profile: arguments.sensor_profile,
         swapped_levels: arguments.swapped_levels.unwrap_or_default(),
         ..DatasetSettings::default()
-    };
+    })
+}
+
+fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
+    let settings = simulated_settings(arguments)?;
     if settings.objects == 0 && settings.test_objects == 0 {
         return Err(NoObjects.into());
+    }
+    if arguments.sequences {
+        return simulate_courses(arguments, settings);
     }
     let begun = Instant::now();
     let samples = simulated::simulate(&settings);
@@ -159,7 +204,13 @@ fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
 
     let count = samples.len();
     let sheet = match &arguments.sheet {
-        Some(path) => Some((path, sheet::sheet(&samples, &one_press_a_level(&settings))?)),
+        Some(path) => {
+            let presses = match settings.materials {
+                Materials::Named => one_press_a_level(&settings),
+                Materials::Broad => Vec::new(),
+            };
+            Some((path, sheet::sheet(&samples, &presses)?))
+        }
         None => None,
     };
     // The data set first: a picture that cannot be written does not cost it.
@@ -171,6 +222,44 @@ fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
         "{}: {count} samples in {seconds:.1} s, {:.0} a second\n",
         arguments.out.display(),
         count as f64 / seconds
+    ))
+}
+
+fn simulate_courses(arguments: &Simulate, objects: DatasetSettings) -> anyhow::Result<String> {
+    let (told, usual) = (&arguments.courses, CourseSettings::default());
+    let settings = CourseSettings {
+        objects,
+        frame_rate_hz: told.fps.unwrap_or(usual.frame_rate_hz),
+        speed_mm_s: told.speed.unwrap_or(usual.speed_mm_s),
+        arm_n_per_mm: told.arm.unwrap_or(usual.arm_n_per_mm),
+        hold_s: told.hold.unwrap_or(usual.hold_s),
+        position_error: told.position_error.unwrap_or(usual.position_error),
+        arm_error: told.arm_error.unwrap_or(usual.arm_error),
+        clock_error_frames: told.clock_error.unwrap_or(usual.clock_error_frames),
+        unknown_share: told.unknown.unwrap_or(usual.unknown_share),
+    };
+    let begun = Instant::now();
+    let courses = simulated::simulate_courses(&settings);
+    let seconds = begun.elapsed().as_secs_f64();
+    let sheet = match &arguments.sheet {
+        Some(path) => Some((path, sheet::courses(&courses)?)),
+        None => None,
+    };
+    write(
+        &arguments.out,
+        &simulated::courses_to_bytes(&settings, &courses)?,
+    )?;
+    if let Some((path, picture)) = sheet {
+        write(path, &picture)?;
+    }
+    let (count, wanted) = (courses.len() as u64, settings.objects.samples());
+    let frames: usize = courses.iter().map(|course| course.moments.len()).sum();
+    Ok(format!(
+        "{}: {count} presses, {frames} frames in {seconds:.1} s, {:.0} presses a minute; {} left out: \
+         they never began, or lasted over 30 s\n",
+        arguments.out.display(),
+        60.0 * count as f64 / seconds,
+        wanted - count
     ))
 }
 

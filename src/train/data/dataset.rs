@@ -4,7 +4,7 @@
 //! not cut objects in two: presses of one object are near-copies, so a model chosen by some of
 //! an object's frames has as good as seen the others.
 
-mod file;
+pub(super) mod file;
 mod npy;
 
 use std::collections::BTreeMap;
@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 pub use self::file::{meta, write};
 use crate::frame::Frame;
 use crate::random::Stream;
-use crate::simulator::{LabelledSample, Split};
+use crate::simulator::{LEVELS, LabelledSample, LevelRange, Split};
 use crate::verdict::Level;
 
 /// The distance between taxels, unless a file says another one.
@@ -21,21 +21,19 @@ pub use crate::tare::PITCH_MM;
 
 /// The four hardness levels of the paper's Table 1.
 pub fn levels() -> Vec<Level> {
-    let level = |(index, (label, shore)): (usize, (&str, &str))| Level {
-        level: index as u8 + 1,
-        label: label.to_owned(),
+    LEVELS
+        .iter()
+        .map(|range| level(range, range.table))
+        .collect()
+}
+
+/// A level with its interval of Shore, as it is written in files.
+pub(super) fn level(range: &LevelRange, shore: &str) -> Level {
+    Level {
+        level: range.level,
+        label: range.label.to_owned(),
         shore: shore.to_owned(),
-    };
-    [
-        ("hard", ">70"),
-        ("firm", "61-70"),
-        ("soft", "51-60"),
-        ("very-soft", "<=50"),
-    ]
-    .into_iter()
-    .enumerate()
-    .map(level)
-    .collect()
+    }
 }
 
 /// How the samples are chosen whose labels may be used.

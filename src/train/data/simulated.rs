@@ -10,20 +10,51 @@ use anyhow::Context as _;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 
-use crate::simulator::{self, DatasetSettings, LabelledSample, Material};
+use crate::simulator::{
+    self, Borders, CourseSettings, DatasetSettings, LEVELS, LabelledCourse, LabelledSample,
+    LevelRange, Materials,
+};
+use crate::train::data::courses::Courses;
 use crate::train::data::dataset::{self, SIMULATOR, Sample};
+use crate::verdict::Level;
 
 /// Simulates on all cores, with a bar on a terminal.
 pub fn simulate(settings: &DatasetSettings) -> Vec<LabelledSample> {
+    with_bar(settings.samples(), "samples", |threads, progress| {
+        simulator::dataset(settings, threads, progress)
+    })
+}
+
+/// As [`simulate`], of whole presses.
+pub fn simulate_courses(settings: &CourseSettings) -> Vec<LabelledCourse> {
+    with_bar(
+        settings.objects.samples(),
+        "presses",
+        |threads, progress| simulator::courses(settings, threads, progress),
+    )
+}
+
+fn with_bar<T>(
+    total: u64,
+    what: &str,
+    make: impl FnOnce(usize, &(dyn Fn(usize) + Sync)) -> T,
+) -> T {
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
-    let objects = u64::from(settings.objects) + u64::from(settings.test_objects);
-    let total = (4 * objects).saturating_mul(settings.presses.into());
-    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} samples, {per_sec}, {eta} left")
-        .expect("the template is right");
+    let style = format!("{{bar:30}} {{pos}}/{{len}} {what}, {{per_sec}}, {{eta}} left");
+    let style = ProgressStyle::with_template(&style).expect("the template is right");
     let bar = ProgressBar::new(total).with_style(style);
-    let samples = simulator::dataset(settings, threads, |done| bar.set_position(done as u64));
+    let made = make(threads, &|done| bar.set_position(done as u64));
     bar.finish_and_clear();
-    samples
+    made
+}
+
+/// The levels with their intervals of Shore. Those of the named materials are the paper's.
+fn levels(settings: &DatasetSettings) -> Vec<Level> {
+    let touching = |range: &LevelRange| dataset::level(range, range.touching);
+    match (settings.materials, settings.borders) {
+        (Materials::Broad, Borders::Touching) => LEVELS.iter().map(touching).collect(),
+        (Materials::Named, _) | (_, Borders::Gaps) => dataset::levels(),
+    }
 }
 
 /// The bytes of a file of samples that `settings` made.
@@ -35,15 +66,33 @@ pub fn to_bytes(
     settings: &DatasetSettings,
     samples: Vec<LabelledSample>,
 ) -> anyhow::Result<Vec<u8>> {
-    let meta = json!({
-        "materials": Material::ALL.map(Material::name),
-        "levels": dataset::levels(),
-        "seed": settings.seed,
-        "generator": format!("{SIMULATOR} {}", env!("CARGO_PKG_VERSION")),
-        "settings": settings,
-    });
+    let meta = meta(settings, json!(settings));
     let samples: Vec<Sample> = samples.into_iter().map(Sample::from).collect();
     Ok(dataset::write(Cursor::new(Vec::new()), &samples, &meta)?.into_inner())
+}
+
+/// The same of whole presses.
+///
+/// # Errors
+///
+/// If the archive cannot be built.
+pub fn courses_to_bytes(
+    settings: &CourseSettings,
+    courses: &[LabelledCourse],
+) -> anyhow::Result<Vec<u8>> {
+    let meta = meta(&settings.objects, json!(settings));
+    let out = Cursor::new(Vec::new());
+    Ok(Courses::of(courses).write(out, &meta)?.into_inner())
+}
+
+fn meta(objects: &DatasetSettings, settings: serde_json::Value) -> serde_json::Value {
+    json!({
+        "materials": simulator::material_names(objects.materials),
+        "levels": levels(objects),
+        "seed": objects.seed,
+        "generator": format!("{SIMULATOR} {}", env!("CARGO_PKG_VERSION")),
+        "settings": settings,
+    })
 }
 
 /// What a file was simulated with.

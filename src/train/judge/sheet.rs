@@ -3,10 +3,15 @@
 //! In: labelled samples and one sequence a level. Out: the bytes of a PNG, all taxels on one
 //! logarithmic colour scale in newtons. Writes no file.
 
+use std::collections::BTreeMap;
+
 use super::canvas::{Canvas, GAP, MARGIN, TEXT, TILE};
 use crate::frame::{Frame, RawFrame};
 use crate::press;
-use crate::simulator::{LabelledSample, Material, NEWTONS_PER_COUNT};
+use crate::simulator::{
+    CourseMoment, LabelledCourse, LabelledSample, Material, Materials, NEWTONS_PER_COUNT,
+    material_names,
+};
 
 /// Frames in a row of the sheet.
 pub const TILES: usize = 12;
@@ -25,37 +30,41 @@ pub fn sheet(
     samples: &[LabelledSample],
     sequences: &[(Material, Vec<RawFrame>)],
 ) -> anyhow::Result<Vec<u8>> {
+    let mut materials: Vec<u8> = samples.iter().map(|sample| sample.material).collect();
+    materials.sort_unstable();
+    materials.dedup();
     let width = MARGIN + TILES * (TILE + GAP);
-    let height = HEAD + 8 * ROW + HEAD + sequences.len() * ROW + FOOT;
+    let height = HEAD + materials.len() * ROW + HEAD + sequences.len() * ROW + FOOT;
     let mut canvas = Canvas::new(width, height);
     let threshold_n = contact_threshold_n();
     let title =
-        format!("samples: force, contact area in taxels at {threshold_n} N, greatest taxel");
+        format!("samples: force, Shore hardness, contact area in taxels at {threshold_n} N");
     canvas.text(GAP, GAP, &title);
     let mut top = HEAD;
-    for material in Material::ALL {
+    for &material in &materials {
         let mut of_material: Vec<&LabelledSample> = samples
             .iter()
-            .filter(|sample| sample.material == material.index())
+            .filter(|sample| sample.material == material)
             .collect();
-        name(&mut canvas, top, material);
+        name(&mut canvas, top, usize::from(material));
         of_material.sort_by(|a, b| a.force_n.total_cmp(&b.force_n));
         for (tile, sample) in spread(&of_material).enumerate() {
-            let peak = sample.frame.newtons.iter().copied().fold(0.0, f32::max);
             let area = sample.frame.contact_area_taxels(threshold_n);
-            let caption = format!("{:.0} N, {area}, {peak:.1} N", sample.force_n);
+            let caption = format!("{:.0} N, {:.0}, {area}", sample.force_n, sample.shore);
             canvas.tile(tile, top, &sample.frame, &caption);
         }
         top += ROW;
     }
-    canvas.text(
-        GAP,
-        top + GAP,
-        "sequences: one press from touch to release, frame number, force read",
-    );
+    if !sequences.is_empty() {
+        canvas.text(
+            GAP,
+            top + GAP,
+            "sequences: one press from touch to release, frame number, force read",
+        );
+    }
     top += HEAD;
     for (material, frames) in sequences {
-        name(&mut canvas, top, *material);
+        name(&mut canvas, top, usize::from(material.index()));
         let press = first_press(frames);
         for (tile, &(number, raw)) in spread(&press).enumerate() {
             let newtons = raw
@@ -133,10 +142,55 @@ pub fn strips(title: &str, strips: &[Strip]) -> anyhow::Result<Vec<u8>> {
     canvas.png()
 }
 
-/// Names a row after its material.
-fn name(canvas: &mut Canvas, top: usize, material: Material) {
-    canvas.text(GAP, top + TILE / 2 - TEXT, material.name());
-    canvas.text(GAP, top + TILE / 2, &format!("level {}", material.level()));
+/// Names a row after its material; a named one is of one level.
+fn name(canvas: &mut Canvas, top: usize, material: usize) {
+    let name = material_names(Materials::Broad)[material];
+    canvas.text(GAP, top + TILE / 2 - TEXT, name);
+    let level = Material::ALL.get(material).map(|named| named.level());
+    let level = level.map_or_else(|| "all levels".to_owned(), |level| format!("level {level}"));
+    canvas.text(GAP, top + TILE / 2, &level);
+}
+
+/// Draws one press of each material and level over time: seconds, the arm's approach in mm, newtons
+/// read.
+///
+/// # Errors
+///
+/// If the PNG encoder fails.
+pub fn courses(courses: &[LabelledCourse]) -> anyhow::Result<Vec<u8>> {
+    let mut shown: BTreeMap<(u8, u8), &LabelledCourse> = BTreeMap::new();
+    for course in courses {
+        let key = (course.material, course.level);
+        shown.entry(key).or_insert(course);
+    }
+    let newtons = |moment: &CourseMoment| Frame {
+        newtons: moment
+            .counts
+            .map(|counts| f32::from(counts) * NEWTONS_PER_COUNT),
+    };
+    let frames: Vec<(&LabelledCourse, Vec<Frame>)> = shown
+        .into_values()
+        .map(|course| (course, course.moments.iter().map(newtons).collect()))
+        .collect();
+    let rows: Vec<Strip> = frames
+        .iter()
+        .map(|(course, frames)| {
+            let pairs: Vec<(&CourseMoment, &Frame)> = course.moments.iter().zip(frames).collect();
+            let name = material_names(Materials::Broad)[usize::from(course.material)];
+            Strip {
+                name: format!("{} {:.0}", name.trim_start_matches("broad-"), course.shore),
+                tiles: spread(&pairs)
+                    .map(|&(moment, frame)| {
+                        let (time_s, mm) = (moment.time_s, moment.approach_mm);
+                        (frame, format!("{time_s:.2} {mm:.1} {:.0}", frame.force_n()))
+                    })
+                    .collect(),
+            }
+        })
+        .collect();
+    let title =
+        "presses over time: seconds, approach in mm, newtons read; names with Shore hardness";
+    strips(title, &rows)
 }
 
 /// Up to [`TILES`] of `items`, from the first to the last at even distances.

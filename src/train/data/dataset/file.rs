@@ -108,7 +108,7 @@ pub(super) fn parse(bytes: &[u8], path: &Path, name: String) -> Result<Dataset, 
     })
 }
 
-pub(super) fn read(path: &Path) -> Result<Vec<u8>, DatasetError> {
+pub(in crate::train::data) fn read(path: &Path) -> Result<Vec<u8>, DatasetError> {
     std::fs::read(path).map_err(|source| DatasetError::Unreadable {
         path: path.to_owned(),
         source,
@@ -169,7 +169,7 @@ fn add_optional<W: Write + Seek, T: WritableElement>(
 }
 
 /// An element type that our files may hold.
-trait Element: Copy {
+pub(in crate::train::data) trait Element: Copy {
     /// As errors name it.
     const NAME: &'static str;
     /// As numpy writes it.
@@ -191,6 +191,13 @@ impl Element for u32 {
         npy::elements(reader, count, Self::from_le_bytes)
     }
 }
+impl Element for u16 {
+    const NAME: &'static str = "u16";
+    const DESCRIPTIONS: &'static [&'static str] = &["<u2"];
+    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, String> {
+        npy::elements(reader, count, Self::from_le_bytes)
+    }
+}
 impl Element for u8 {
     const NAME: &'static str = "u8";
     const DESCRIPTIONS: &'static [&'static str] = &["|u1", "<u1", ">u1"];
@@ -200,13 +207,16 @@ impl Element for u8 {
 }
 
 /// An `.npz` file being read.
-struct File<'a> {
+pub(in crate::train::data) struct File<'a> {
     zip: ZipArchive<Cursor<&'a [u8]>>,
     path: &'a Path,
 }
 
 impl<'a> File<'a> {
-    fn open(bytes: &'a [u8], path: &'a Path) -> Result<Self, DatasetError> {
+    pub(in crate::train::data) fn open(
+        bytes: &'a [u8],
+        path: &'a Path,
+    ) -> Result<Self, DatasetError> {
         let zip = ZipArchive::new(Cursor::new(bytes)).map_err(|error| DatasetError::NotNpz {
             path: path.to_owned(),
             reason: error.to_string(),
@@ -214,7 +224,12 @@ impl<'a> File<'a> {
         Ok(Self { zip, path })
     }
 
-    fn error(&self, array: &'static str, found: String, expected: String) -> DatasetError {
+    pub(in crate::train::data) fn error(
+        &self,
+        array: &'static str,
+        found: String,
+        expected: String,
+    ) -> DatasetError {
         DatasetError::Array {
             path: self.path.to_owned(),
             array,
@@ -255,6 +270,17 @@ impl<'a> File<'a> {
         }
     }
 
+    /// As [`File::read`], of an array that must be there.
+    pub(in crate::train::data) fn required<T: Element>(
+        &mut self,
+        array: &'static str,
+        inner: &[usize],
+        n: Option<usize>,
+    ) -> Result<Vec<T>, DatasetError> {
+        let found = self.read(array, inner, n)?;
+        found.ok_or_else(|| self.error(array, "none".to_owned(), T::NAME.to_owned()))
+    }
+
     /// The array `meta`; null if it is not there.
     fn meta(&mut self) -> Result<serde_json::Value, DatasetError> {
         let Some(text) = self.read::<u8>("meta", &[], None)? else {
@@ -264,7 +290,11 @@ impl<'a> File<'a> {
             .map_err(|error| self.error("meta", error.to_string(), "JSON in UTF-8".to_owned()))
     }
 
-    fn finite(&self, array: &'static str, values: &[f32]) -> Result<(), DatasetError> {
+    pub(in crate::train::data) fn finite(
+        &self,
+        array: &'static str,
+        values: &[f32],
+    ) -> Result<(), DatasetError> {
         match values.iter().position(|value| !value.is_finite()) {
             None => Ok(()),
             Some(place) => {
@@ -274,7 +304,7 @@ impl<'a> File<'a> {
         }
     }
 
-    fn within(
+    pub(in crate::train::data) fn within(
         &self,
         array: &'static str,
         values: &[u8],

@@ -1,0 +1,301 @@
+//! Presses over time as `.npz` files that numpy reads and writes.
+//!
+//! In: files, or the simulator's courses. Out: [`Courses`], one row a kept frame and one a press.
+//! `docs/formats.md` has the arrays.
+
+use std::io::{Seek, Write};
+use std::ops::Range;
+use std::path::Path;
+
+use ndarray::{ArrayView1, ArrayView3};
+use ndarray_npy::{NpzWriter, WriteNpzError};
+
+use super::dataset::file::{self, File};
+use super::dataset::{DatasetError, levels};
+use crate::frame::{COLS, Frame, ROWS, TAXELS};
+use crate::simulator::{LabelledCourse, NEWTONS_PER_COUNT, Split};
+
+/// Newtons of a unit of [`Courses::frames_mn`].
+const NEWTONS: f32 = 1e-3;
+
+/// Presses over time, a column an array of the file.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Courses {
+    /// Taxels of the kept frames in millinewtons, `[frames, 784]`.
+    pub frames_mn: Vec<u16>,
+    /// Which press each frame is of; ascending.
+    pub press: Vec<u32>,
+    /// Since the frame that began the press; before it: negative.
+    pub time_s: Vec<f32>,
+    /// How far the arm went since then; 0 where unknown.
+    pub approach_mm: Vec<f32>,
+    /// 1 where the approach is known.
+    pub known: Vec<u8>,
+    /// What is known of each press.
+    pub presses: Vec<Press>,
+}
+
+/// What is known of one press.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Press {
+    /// 1..=4, or 0: unlabelled.
+    pub level: u8,
+    /// What was pressed; unique in the file.
+    pub object: u32,
+    /// Index into `meta.materials`.
+    pub material: u8,
+    /// Train or test.
+    pub split: Split,
+    /// Shore hardness; NaN where it was not measured.
+    pub shore: f32,
+    /// Greatest force of the press.
+    pub force_n: f32,
+    /// Stiffness of the arm; 0: unknown.
+    pub arm_n_per_mm: f32,
+    /// Which frame of the file a verdict of one frame is on.
+    pub best: u32,
+}
+
+impl Courses {
+    /// The columns of simulated presses.
+    pub fn of(courses: &[LabelledCourse]) -> Self {
+        let mut all = Self::default();
+        for (number, course) in (0_u32..).zip(courses) {
+            let first = all.press.len();
+            for moment in &course.moments {
+                let millinewtons = |&counts: &u16| {
+                    (f32::from(counts) * NEWTONS_PER_COUNT / NEWTONS).round() as u16
+                };
+                all.frames_mn.extend(moment.counts.iter().map(millinewtons));
+                all.press.push(number);
+                all.time_s.push(moment.time_s);
+                all.approach_mm.push(moment.approach_mm);
+                all.known.push(moment.known.into());
+            }
+            all.presses.push(Press {
+                level: course.level,
+                object: course.object,
+                material: course.material,
+                split: course.split,
+                shore: course.shore,
+                force_n: course.force_n,
+                arm_n_per_mm: course.arm_n_per_mm,
+                best: (first + course.best) as u32,
+            });
+        }
+        all
+    }
+
+    /// The rows of press number `press`.
+    pub fn rows(&self, press: usize) -> Range<usize> {
+        let first = |press: usize| self.press.partition_point(|&of| (of as usize) < press);
+        first(press)..first(press + 1)
+    }
+
+    /// A kept frame in newtons.
+    pub fn frame(&self, row: usize) -> Frame {
+        let taxels = &self.frames_mn[row * TAXELS..][..TAXELS];
+        Frame {
+            newtons: std::array::from_fn(|k| f32::from(taxels[k]) * NEWTONS),
+        }
+    }
+
+    /// Reads a file.
+    ///
+    /// # Errors
+    ///
+    /// If it cannot be read, or an array is missing or not as agreed.
+    pub fn read(path: &Path) -> Result<Self, DatasetError> {
+        let bytes = file::read(path)?;
+        let mut file = File::open(&bytes, path)?;
+        let frames_mn: Vec<u16> = file.required("frames_mn", &[ROWS, COLS], None)?;
+        let rows = Some(frames_mn.len() / TAXELS);
+        let press: Vec<u32> = file.required("press", &[], rows)?;
+        let time_s: Vec<f32> = file.required("time_s", &[], rows)?;
+        let approach_mm: Vec<f32> = file.required("approach_mm", &[], rows)?;
+        let known: Vec<u8> = file.required("known", &[], rows)?;
+        let level: Vec<u8> = file.required("level", &[], None)?;
+        let count = Some(level.len());
+        let object: Vec<u32> = file.required("object", &[], count)?;
+        let material: Vec<u8> = file.required("material", &[], count)?;
+        let split: Vec<u8> = file.required("split", &[], count)?;
+        let shore: Vec<f32> = file.required("shore", &[], count)?;
+        let force_n: Vec<f32> = file.required("force", &[], count)?;
+        let arm_n_per_mm: Vec<f32> = file.required("arm_n_per_mm", &[], count)?;
+        let best: Vec<u32> = file.required("best", &[], count)?;
+        for (array, values) in [
+            ("time_s", &time_s),
+            ("approach_mm", &approach_mm),
+            ("force", &force_n),
+            ("arm_n_per_mm", &arm_n_per_mm),
+        ] {
+            file.finite(array, values)?;
+        }
+        file.within("level", &level, levels().len() as u8, "0 (unlabelled) to 4")?;
+        file.within("split", &split, 1, "0 (train) or 1 (test)")?;
+        file.within("known", &known, 1, "0 or 1")?;
+        let ascends = press.first() == Some(&0)
+            && press
+                .windows(2)
+                .all(|pair| pair[1] == pair[0] || pair[1] == pair[0] + 1);
+        let last = press.last().map_or(0, |&last| last as usize + 1);
+        if !ascends || last != level.len() {
+            let found = format!("{last} presses, or a step that is not 0 or 1");
+            let expected = format!("0 to {}, each at least once", level.len() as i64 - 1);
+            return Err(file.error("press", found, expected));
+        }
+        let presses = (0..level.len()).map(|k| Press {
+            level: level[k],
+            object: object[k],
+            material: material[k],
+            split: if split[k] == 0 {
+                Split::Train
+            } else {
+                Split::Test
+            },
+            shore: shore[k],
+            force_n: force_n[k],
+            arm_n_per_mm: arm_n_per_mm[k],
+            best: best[k],
+        });
+        let courses = Self {
+            presses: presses.collect(),
+            frames_mn,
+            press,
+            time_s,
+            approach_mm,
+            known,
+        };
+        for (number, press) in courses.presses.iter().enumerate() {
+            let rows = courses.rows(number);
+            if !rows.contains(&(press.best as usize)) {
+                let found = format!("{} of press {number}", press.best);
+                let expected = format!("one of its frames, {rows:?}");
+                return Err(file.error("best", found, expected));
+            }
+            let times = &courses.time_s[rows];
+            if !times.is_sorted_by(|a, b| a < b) {
+                let found = format!("times that stand still or go back in press {number}");
+                return Err(file.error("time_s", found, "ascending ones".to_owned()));
+            }
+        }
+        Ok(courses)
+    }
+
+    /// Writes the file, compressed: most taxels of a frame are 0.
+    ///
+    /// # Errors
+    ///
+    /// Those of writing to `out`.
+    pub fn write<W: Write + Seek>(
+        &self,
+        out: W,
+        meta: &serde_json::Value,
+    ) -> Result<W, WriteNpzError> {
+        let mut npz = NpzWriter::new_compressed(out);
+        let shape = (self.press.len(), ROWS, COLS);
+        let frames = ArrayView3::from_shape(shape, &self.frames_mn)
+            .expect("as many values as the shape asks for");
+        npz.add_array("frames_mn", &frames)?;
+        npz.add_array("press", &ArrayView1::from(&self.press))?;
+        npz.add_array("time_s", &ArrayView1::from(&self.time_s))?;
+        npz.add_array("approach_mm", &ArrayView1::from(&self.approach_mm))?;
+        npz.add_array("known", &ArrayView1::from(&self.known))?;
+        let bytes: [(&str, fn(&Press) -> u8); 3] = [
+            ("level", |press| press.level),
+            ("material", |press| press.material),
+            ("split", |press| press.split as u8),
+        ];
+        for (name, of) in bytes {
+            let values: Vec<u8> = self.presses.iter().map(of).collect();
+            npz.add_array(name, &ArrayView1::from(&values))?;
+        }
+        let numbers: [(&str, fn(&Press) -> u32); 2] = [
+            ("object", |press| press.object),
+            ("best", |press| press.best),
+        ];
+        for (name, of) in numbers {
+            let values: Vec<u32> = self.presses.iter().map(of).collect();
+            npz.add_array(name, &ArrayView1::from(&values))?;
+        }
+        let reals: [(&str, fn(&Press) -> f32); 3] = [
+            ("shore", |press| press.shore),
+            ("force", |press| press.force_n),
+            ("arm_n_per_mm", |press| press.arm_n_per_mm),
+        ];
+        for (name, of) in reals {
+            let values: Vec<f32> = self.presses.iter().map(of).collect();
+            npz.add_array(name, &ArrayView1::from(&values))?;
+        }
+        npz.add_array("meta", &ArrayView1::from(meta.to_string().as_bytes()))?;
+        npz.finish()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Cursor;
+
+    use serde_json::json;
+
+    use super::*;
+    use crate::simulator::{self, CourseSettings, DatasetSettings, Materials};
+
+    fn simulated() -> Courses {
+        let settings = CourseSettings {
+            objects: DatasetSettings {
+                seed: 2,
+                materials: Materials::Broad,
+                objects: 1,
+                test_objects: 0,
+                presses: 2,
+                ..DatasetSettings::default()
+            },
+            unknown_share: 0.5,
+            ..CourseSettings::default()
+        };
+        Courses::of(&simulator::courses(&settings, 2, |_| ()))
+    }
+
+    fn round_trip(courses: &Courses) -> Result<Courses, DatasetError> {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("courses.npz");
+        let bytes = courses.write(Cursor::new(Vec::new()), &json!({"seed": 2}));
+        std::fs::write(&path, bytes.unwrap().into_inner()).unwrap();
+        assert_eq!(super::super::dataset::meta(&path).unwrap()["seed"], 2);
+        Courses::read(&path)
+    }
+
+    #[test]
+    fn a_file_gives_back_what_was_written() {
+        let courses = simulated();
+        assert!(courses.presses.len() >= 6);
+        assert!(round_trip(&courses).unwrap() == courses);
+        for (number, press) in courses.presses.iter().enumerate() {
+            let area = |row: usize| courses.frame(row).contact_area_taxels(0.07);
+            let most = courses.rows(number).map(area).max();
+            assert_eq!(most, Some(area(press.best as usize)), "press {number}");
+        }
+    }
+
+    #[test]
+    fn what_contradicts_itself_is_refused() {
+        let good = simulated();
+        let check = |change: fn(&mut Courses), part: &str| {
+            let mut bad = good.clone();
+            change(&mut bad);
+            let error = round_trip(&bad).unwrap_err().to_string();
+            assert!(error.contains(part), "{error}");
+        };
+        check(|bad| bad.press[0] = 1, "array `press`");
+        check(|bad| bad.time_s[1] = -9.0, "array `time_s`: found times");
+        check(|bad| bad.time_s[1] = f32::NAN, "array `time_s`: found NaN");
+        check(
+            |bad| bad.presses[0].best = 99_999,
+            "array `best`: found 99999 of press 0",
+        );
+        check(|bad| bad.known[0] = 2, "array `known`: found 2");
+        check(|bad| bad.presses[0].level = 5, "array `level`: found 5");
+        check(|bad| bad.presses.truncate(1), "array `press`");
+    }
+}
