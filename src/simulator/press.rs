@@ -440,6 +440,36 @@ mod tests {
     }
 
     #[test]
+    fn radius_follows_from_force_and_r_over_e_as_hertz_says() {
+        // Under a cover that hardly yields, a smooth ball of a solid: a^3 = 3 F R / (4 E*), with
+        // the compliance after creep. A sphere is steeper than Hertz's paraboloid, by 1 % of a
+        // where a is a quarter of R.
+        let mut bench = Bench::under(1e4);
+        let rubber = Material::Rubber.properties().substance;
+        for (radius, young_mpa, force_n) in [
+            (12.0, 2.0, 10.0),
+            (27.0, 0.6, 10.0),
+            (27.0, 2.0, 25.0),
+            (60.0, 0.9, 5.0),
+            (60.0, 2.5, 25.0),
+        ] {
+            let face = Face::ball(radius);
+            let mut stream = Stream::new(4, "hertz");
+            let pose = Pose::draw(&face, &mut stream);
+            let patch = Patch::new(&rubber.texture, 0.0, CELL_MM, &mut stream);
+            let specimen = Specimen::new(rubber, young_mpa, &face, &pose, &patch);
+            let contact = bench.press(&specimen, force_n, 0.0, 1.0).2;
+            let softened = rubber.plane_strain(young_mpa) / rubber.compliance_ratio(1.0);
+            let expected = (0.75 * force_n * radius / softened).cbrt();
+            assert!(
+                (contact.radius_mm / expected - 1.0).abs() < 0.04,
+                "R {radius} mm, E {young_mpa} MPa, {force_n} N: {} mm, {expected} mm",
+                contact.radius_mm
+            );
+        }
+    }
+
+    #[test]
     fn taxels_carry_the_prescribed_force() {
         let mut bench = Bench::default();
         for material in Material::ALL {
