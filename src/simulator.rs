@@ -24,6 +24,7 @@ mod motion;
 mod object;
 mod press;
 mod sensor;
+mod settings;
 mod sequence;
 mod subject;
 mod substance;
@@ -32,13 +33,14 @@ mod tracked;
 
 pub use broad::{LawName, Laws, NoLaw, UnknownLaw};
 pub use courses::{CourseMoment, CourseSettings, LabelledCourse, MOST_FRAMES, courses};
-pub use dataset::{DatasetSettings, LabelledSample, Materials, UnknownMaterials, dataset};
+pub use dataset::{LabelledSample, dataset};
 pub use level::{Borders, LEVELS, LevelRange, level_of};
 pub use material::{Material, Split, UnknownMaterial};
 pub use motion::{Approach, Motion};
 pub use object::{Shapes, UnknownShapes};
 pub use sensor::{SensorProfile, UnknownProfile};
 pub use sequence::{Sequence, SequenceFrame, SequenceSettings};
+pub use settings::{DatasetSettings, Materials, UnknownMaterials};
 
 pub use crate::tare::NEWTONS_PER_COUNT;
 

@@ -10,12 +10,13 @@ use serde::{Deserialize, Serialize};
 
 use super::body::{Body, draw_patch};
 use super::course::Course;
-use super::dataset::{DatasetSettings, HARDER, HIGHEST_FORCE_N, TRIES};
+use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
 use super::material::Split;
 use super::motion::Arm;
 use super::object::{POSTURES, Pose};
 use super::press::{Bench, Specimen};
 use super::sensor::{Film, taxel_forces};
+use super::settings::DatasetSettings;
 use super::subject::{Subject, shared_out, units};
 use super::tracked::{Seen, begins_press, ideal_tare, one_press};
 use crate::frame::{RawFrame, TAXELS};
@@ -397,8 +398,8 @@ impl LabelledCourse {
 
 #[cfg(test)]
 mod tests {
-    use super::super::dataset::Materials;
     use super::super::object::Shapes;
+    use super::super::settings::Materials;
     use super::*;
 
     fn small() -> CourseSettings {

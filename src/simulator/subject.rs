@@ -9,12 +9,12 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::body::Body;
 use super::broad;
-use super::dataset::{DatasetSettings, Materials};
 use super::level::LEVELS;
 use super::material::{Material, Split};
 use super::object::{Object, Shapes};
 use super::press::Bench;
 use super::sensor::Sensor;
+use super::settings::{DatasetSettings, Materials};
 use crate::random::Stream;
 
 /// Sensors that each split's objects are shared over.
