@@ -28,35 +28,35 @@ use crate::train::stages::{self, Stages};
 /// A row of the table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum Method {
-    /// USTGAN's start, pretraining on what the STGANs generate, fine-tuning: the whole of it.
+    /// The paper's whole method: USTGAN's start, pretraining on generated samples, fine-tuning.
     Ours,
-    /// HRN from random weights on 15 % of the labels: 1,500 in the paper.
+    /// HRN from random weights on 15 % of the labels (1,500 in the paper).
     Hrn15,
-    /// The same on half of them.
+    /// HRN from random weights on half of the labels.
     Hrn50,
-    /// The same on all of them.
+    /// HRN from random weights on all labels.
     Hrn100,
     /// A GAN whose discriminator has the levels and one more for generated frames (Odena 2016).
     Sgan,
     /// A GAN with feature matching (Salimans 2016).
     Igan,
-    /// Ours without augmentation: USTGAN's start and fine-tuning.
+    /// The paper's method without augmentation: USTGAN's start and fine-tuning.
     Nahrn,
-    /// Ours without USTGAN's start: random weights, pretraining, fine-tuning.
+    /// The paper's method without USTGAN's start: random weights, pretraining, fine-tuning.
     Nihrn,
-    /// Control: HRN15 with as many steps as ours.
+    /// Control: hrn15 with as many steps as the paper's whole method.
     Hrn15Long,
-    /// Control: HRN15 with Adam, the best of every epoch's weights on objects held out of its own
-    /// labels.
+    /// Control: hrn15 with Adam. It holds a quarter of its labelled objects out and keeps the weights
+    /// that are best on them.
     Hrn15Tuned,
-    /// Control: HRN15 by the default model's recipe: Adam, averaged weights, symmetries and shifts, a
+    /// Control: hrn15 by the default model's recipe: Adam, averaged weights, symmetries and shifts, a
     /// logarithmic image, means beside greatest values.
     Hrn15Strong,
-    /// The same, which also learns from unlabelled samples to judge them alike whatever sensor gave them
-    /// (FixMatch with an averaged teacher).
+    /// hrn15-strong that also learns from unlabelled samples: it must judge them alike whatever sensor
+    /// gave them (FixMatch with an averaged teacher).
     #[value(name = "fixmatch")]
     FixMatch,
-    /// The same twice: the second time also on unlabelled samples as the first one judged them.
+    /// hrn15-strong twice: the second time also on the unlabelled samples that the first one was sure of.
     SelfTraining,
     /// Logistic regression on hand-made features of a frame.
     Features,
