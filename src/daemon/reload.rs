@@ -153,7 +153,10 @@ mod tests {
         for _ in 0..MOST_READERS {
             let (loaded, _) = load(PATIENCE, |_| Ok(())).await;
             assert!(loaded.is_ok(), "{loaded:?}");
-            let waits: Read = |end| Ok(end.recv().unwrap_or(()));
+            let waits: Read = |end| {
+                let _ = end.recv();
+                Ok(())
+            };
             let (loaded, end) = load(Duration::from_millis(10), waits).await;
             let reason = loaded.unwrap_err().to_string();
             let expected = "hardnessd.toml: reading it and its model took over 0.01 s: given up";

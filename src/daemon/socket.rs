@@ -228,7 +228,7 @@ async fn ordered(orders: &mut Option<Stop>) {
     {
         return;
     }
-    std::future::pending().await
+    std::future::pending::<()>().await;
 }
 
 impl Drop for Socket {

@@ -428,7 +428,6 @@ mod tests {
                         presses: Some(40),
                         shapes,
                         profile,
-                        ..SequenceSettings::default()
                     });
                 }
             }

@@ -174,7 +174,7 @@ fn configuration(args: &Args, frame_rate_hz: Option<f64>) -> String {
             text += &format!(
                 "frame_rate_hz = {:?}  # as counted\n",
                 (hz * 10.0).round().max(1.0) / 10.0
-            )
+            );
         }
         None => text += "# frame_rate_hz = 5.0\n",
     }

@@ -56,6 +56,9 @@ pub struct Press {
     pub best: u32,
 }
 
+/// An array with a value for each press: its name, and the value.
+type Column<T> = (&'static str, fn(&Press) -> T);
+
 impl Courses {
     /// The columns of simulated presses.
     pub fn of(courses: &[LabelledCourse]) -> Self {
@@ -201,7 +204,7 @@ impl Courses {
         npz.add_array("time_s", &ArrayView1::from(&self.time_s))?;
         npz.add_array("approach_mm", &ArrayView1::from(&self.approach_mm))?;
         npz.add_array("known", &ArrayView1::from(&self.known))?;
-        let bytes: [(&str, fn(&Press) -> u8); 3] = [
+        let bytes: [Column<u8>; 3] = [
             ("level", |press| press.level),
             ("material", |press| press.material),
             ("split", |press| press.split as u8),
@@ -210,7 +213,7 @@ impl Courses {
             let values: Vec<u8> = self.presses.iter().map(of).collect();
             npz.add_array(name, &ArrayView1::from(&values))?;
         }
-        let numbers: [(&str, fn(&Press) -> u32); 2] = [
+        let numbers: [Column<u32>; 2] = [
             ("object", |press| press.object),
             ("best", |press| press.best),
         ];
@@ -218,7 +221,7 @@ impl Courses {
             let values: Vec<u32> = self.presses.iter().map(of).collect();
             npz.add_array(name, &ArrayView1::from(&values))?;
         }
-        let reals: [(&str, fn(&Press) -> f32); 3] = [
+        let reals: [Column<f32>; 3] = [
             ("shore", |press| press.shore),
             ("force", |press| press.force_n),
             ("arm_n_per_mm", |press| press.arm_n_per_mm),

@@ -66,7 +66,7 @@ pub fn to_bytes(
     settings: &DatasetSettings,
     samples: Vec<LabelledSample>,
 ) -> anyhow::Result<Vec<u8>> {
-    let meta = meta(settings, json!(settings));
+    let meta = meta(settings, &json!(settings));
     let samples: Vec<Sample> = samples.into_iter().map(Sample::from).collect();
     Ok(dataset::write(Cursor::new(Vec::new()), &samples, &meta)?.into_inner())
 }
@@ -80,12 +80,12 @@ pub fn courses_to_bytes(
     settings: &CourseSettings,
     courses: &[LabelledCourse],
 ) -> anyhow::Result<Vec<u8>> {
-    let meta = meta(&settings.objects, json!(settings));
+    let meta = meta(&settings.objects, &json!(settings));
     let out = Cursor::new(Vec::new());
     Ok(Courses::of(courses).write(out, &meta)?.into_inner())
 }
 
-fn meta(objects: &DatasetSettings, settings: serde_json::Value) -> serde_json::Value {
+fn meta(objects: &DatasetSettings, settings: &serde_json::Value) -> serde_json::Value {
     json!({
         "materials": simulator::material_names(objects.materials),
         "levels": levels(objects),
