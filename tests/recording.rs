@@ -475,7 +475,7 @@ fn what_other_programs_recorded_is_no_recording_of_ours() {
     for (arguments, found) in [
         (
             vec!["replay".to_owned(), path("foreign.mcap")],
-            "no state of a sensor",
+            "no state of a sensor, expected a recording of hardnessd",
         ),
         (
             vec![
@@ -484,7 +484,7 @@ fn what_other_programs_recorded_is_no_recording_of_ours() {
                 "--out".to_owned(),
                 path("good.mcap"),
             ],
-            "found 1 messages of other programs",
+            "nothing to save: all 1 messages are of other programs",
         ),
     ] {
         let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
@@ -492,7 +492,6 @@ fn what_other_programs_recorded_is_no_recording_of_ours() {
         let said = String::from_utf8(output.stderr).unwrap();
         assert_eq!(output.status.code(), Some(1), "{said}");
         assert!(said.contains(found) && said.lines().count() == 1, "{said}");
-        assert!(said.contains("expected a recording of hardnessd"), "{said}");
         assert!(!bench.path("good.mcap").exists());
     }
 }

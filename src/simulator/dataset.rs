@@ -54,7 +54,7 @@ pub(super) const HARDER: f64 = 1.5;
 pub(super) const TRIES: usize = 8;
 
 /// Simulates the data set on `threads` threads, with `progress` told the number of samples done.
-/// Samples stand by material (as in [`Material::ALL`]) or by split and level, then by object, posture
+/// Samples stand by material (as in [`super::Material::ALL`]) or by split and level, then by object, posture
 /// and press. The result is the same for any number of threads.
 pub fn dataset(
     settings: &DatasetSettings,

@@ -265,16 +265,16 @@ fn a_bar_is_as_high_as_its_share_of_the_highest() {
         bars.retain(|bar| !bar.trim().is_empty() && !bar.starts_with('\u{b7}'));
         bars
     };
-    // Seven rows of eight eighths.
+    // Nine rows of eight eighths.
     assert_eq!(
         bars(COLOURS),
         [
-            "\u{2588}".repeat(7).as_str(),
-            "\u{2588}\u{2588}\u{2588}\u{2588}\u{2583}  ",
-            "\u{2588}\u{2586}     "
+            "\u{2588}".repeat(9),
+            "\u{2588}".repeat(5) + "\u{2585}   ",
+            "\u{2588}".repeat(2) + "\u{2582}      "
         ]
     );
-    assert_eq!(bars(PLAIN), ["#######", "####-  ", "#+     "]);
+    assert_eq!(bars(PLAIN), ["#########", "#####+   ", "##-      "]);
 }
 
 #[test]
@@ -576,7 +576,7 @@ fn lost_says_unplugged_where_it_is() {
         let mut status = status("forearm", "lost");
         status["reason"] = json!(reason);
         hear(&mut view, 1_000, status);
-        shown(&view, 1_100, (80, 24), PLAIN)
+        shown(&view, 1_100, (120, 24), PLAIN)
     };
     for reason in [
         "end of file",

@@ -217,7 +217,8 @@ impl View {
                 .position(|one| Some(&one.name) == name.as_ref());
             self.chosen = again.unwrap_or(0);
             (self.missed, self.seq) = (Some(0), 0);
-            self.catching_up = Some(number(event, "seq"));
+            // Nothing has happened in a run that is new.
+            self.catching_up = Some(number(event, "seq")).filter(|&past| past > 0);
         }
         let since = format!("{}:{}", hello.run, self.seq);
         self.hello = Some(hello);

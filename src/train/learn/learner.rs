@@ -122,7 +122,7 @@ impl Learner {
     /// The weights to judge with: averaged ones if they are averaged. The average began at 0,
     /// which is divided out.
     pub fn evaluated(&self) -> Weights {
-        let Some(average) = &self.average else {
+        let Some(average) = self.average.as_ref().filter(|_| self.optimiser.steps() > 0) else {
             return self.weights.clone();
         };
         let total = 1.0 - self.averaging.powf(self.optimiser.steps() as f64);

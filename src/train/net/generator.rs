@@ -244,7 +244,7 @@ pub struct Making<'a> {
 /// Exactly `samples_a_component` frames of every component; frame r is of component r mod 50.
 ///
 /// A frame that is no press is drawn again, as it is when presses are recorded. A component that makes
-/// none in [`DRAWN_AGAIN`] rounds keeps what it makes.
+/// none in eight rounds keeps what it makes.
 pub fn generate(making: &Making, samples_a_component: usize, stream: &mut Stream) -> Vec<Frame> {
     let mut of_component: Vec<Vec<Frame>> = vec![Vec::new(); COMPONENTS];
     for round in 0..=DRAWN_AGAIN {
