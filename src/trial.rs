@@ -97,6 +97,9 @@ pub fn load(bytes: &[u8], most: Option<Duration>) -> Result<Hrn, ModelError> {
 fn child() -> Command {
     let mut command = Command::new("/proc/self/exe");
     command.arg0(NAME);
+    // The trainer's allocator takes a GiB of address space at its start, which is all that a trial may
+    // have: a good model failed now and then.
+    command.env("MIMALLOC_ARENA_RESERVE", "64MiB");
     command
 }
 
