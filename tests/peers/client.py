@@ -274,7 +274,9 @@ def program(bench):
         # Ctrl-C while events come, and while nobody is there.
         for address in (events, bench.path("nobody.sock")):
             running = subprocess.Popen(
-                [*start, address, "--types", "frame"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+                [*start, address, "--types", "frame"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                # A shell in the background starts its programs with SIGINT ignored.
+                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
             )
             running.stdout.readline()
             running.send_signal(signal.SIGINT)
