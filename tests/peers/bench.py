@@ -35,7 +35,8 @@ def same(found, expected, key):
     if expected is None:
         return found == NULL[key] if key in NULL else math.isnan(found)
     if key == "probabilities":
-        return all(math.isclose(a, b, rel_tol=1e-6) for a, b in zip(found, expected, strict=True))
+        # JSON has six digits after the point.
+        return all(math.isclose(a, b, rel_tol=0, abs_tol=1e-6) for a, b in zip(found, expected, strict=True))
     if key == "notes":
         return list(found) == expected
     if isinstance(expected, float):
