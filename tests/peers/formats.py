@@ -44,7 +44,7 @@ def console(block, directory, path):
 def main(binaries):
     path = f"{os.path.abspath(binaries)}:{os.environ['PATH']}"
     blocks = re.findall(r"```(\w+)\n(.*?)```", PAGE.read_text(), re.S)
-    assert [kind for kind, _ in blocks].count("python") == 3, blocks
+    assert [kind for kind, _ in blocks].count("python") == 4, blocks
     with tempfile.TemporaryDirectory() as directory:
         for kind, block in blocks:
             if kind == "console":
@@ -52,7 +52,7 @@ def main(binaries):
                 continue
             if kind == "text":
                 continue
-            name = block.split("\n", 1)[0].removeprefix("# ")
+            name = block.split("\n", 1)[0].removeprefix("# ").split(":")[0]
             pathlib.Path(directory, name).write_text(block)
             if kind == "python":
                 run([sys.executable, name], directory, path)
