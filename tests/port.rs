@@ -164,7 +164,7 @@ fn doctor_names_what_is_missing_and_who_holds_a_port() {
         stdout.contains(": sudo systemctl stop hardnessd"),
         "{stdout}"
     );
-    assert!(stderr.contains("found"), "{stderr}");
+    assert!(stderr.contains("1 fault found"), "{stderr}");
 }
 
 #[test]

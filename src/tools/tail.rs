@@ -132,17 +132,18 @@ async fn over(timeout_s: Option<f64>) {
 async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
     let mut daemon = args.source.connect().await?;
     let address = daemon.address().clone();
+    let request = json!({"subscribe": args.types}).to_string();
+    daemon.send(&request).await?;
+    match tokio::time::timeout(HELLO, next(&mut daemon)).await {
+        Ok(hello) => meet(&hello?.1, address.clone())?,
+        Err(_) => return Err(Error::Mute { address }),
+    }
+    // Only now: where no daemon answers, the error is the one line.
     if args.source.given().is_none() {
         eprintln!(
             "hardnessd: events of {}",
             super::shown(&address.to_string())
         );
-    }
-    let request = json!({"subscribe": args.types}).to_string();
-    daemon.send(&request).await?;
-    match tokio::time::timeout(HELLO, next(&mut daemon)).await {
-        Ok(hello) => meet(&hello?.1, address)?,
-        Err(_) => return Err(Error::Mute { address }),
     }
     loop {
         let (line, event) = next(&mut daemon).await?;
