@@ -4,6 +4,8 @@
 //! with dead taxels replaced. Only `tare` makes the second from the first, so raw counts cannot
 //! reach the press tracker.
 
+pub mod sparse;
+
 use serde::{Deserialize, Serialize};
 
 /// Rows of a frame, and of the network's input (paper, "Tactile sensor").

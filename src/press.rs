@@ -3,6 +3,8 @@
 //! In: tared [`Frame`]s with their numbers and the moments they came. Out: [`Change`]s. The tracker
 //! reads no clock: a press lasts as long as its frames say.
 
+mod course;
+mod packed;
 mod settings;
 mod settling;
 mod thin;
@@ -12,6 +14,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use self::course::Course;
 pub use self::settings::{Settings, SettingsError};
 use self::settling::{Load, Settling};
 pub use self::thin::thinned;
@@ -36,7 +39,8 @@ pub struct Marks {
     pub saturated: bool,
 }
 
-/// The frame of maximal contact area so far; ties go to the greater force, then the earlier one.
+/// A frame of a press, in contact. The best one has the maximal contact area; ties go to the greater
+/// force, then the earlier one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Peak {
     /// Which frame.
@@ -115,6 +119,8 @@ pub enum Change {
         end: End,
         /// Its best frame.
         peak: Box<Peak>,
+        /// All its frames in contact.
+        course: Box<SoFar>,
     },
     /// It is over and gets no verdict.
     Aborted {
@@ -127,6 +133,27 @@ pub enum Change {
         /// Why it gets no verdict.
         reason: Abort,
     },
+}
+
+/// The frames in contact of a press, as far as it has come.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SoFar {
+    press: u64,
+    peak: Peak,
+    course: Course,
+}
+
+impl SoFar {
+    /// The press's number.
+    pub fn press(&self) -> u64 {
+        self.press
+    }
+
+    /// Its frames up to `until`, and the place of the best one among them. There are some hundred at
+    /// most, evenly over the press; of a short press all.
+    pub fn until(&self, until: Duration) -> (Vec<&Peak>, usize) {
+        self.course.until(until, &self.peak)
+    }
 }
 
 /// Follows one sensor's presses.
@@ -182,6 +209,7 @@ impl Memory {
                 && peak.moment.frame < frames
                 && peak.contact_area_taxels as usize <= TAXELS
                 && peak.force_n == peak.frame.force_n()
+                && pressed.course.is_possible(frames)
                 && pressed.settling.as_ref().is_none_or(Settling::is_possible)
         };
         self.presses <= frames
@@ -210,6 +238,9 @@ struct Pressed {
     frames: u64,
     released_frames: u32,
     peak: Peak,
+    /// Recordings have it since models judge the course of a press.
+    #[serde(default)]
+    course: Course,
     /// `None` once the early verdict has come.
     settling: Option<Settling>,
 }
@@ -247,7 +278,29 @@ impl PressTracker {
 
     /// Whether a press is under way.
     pub fn is_pressed(&self) -> bool {
-        matches!(self.state, State::Pressed(_))
+        self.pressed().is_some()
+    }
+
+    /// Counts the frames in contact of the press under way.
+    pub fn frames(&self) -> Option<u64> {
+        self.pressed().map(|pressed| pressed.frames)
+    }
+
+    /// When the press under way began.
+    pub fn began(&self) -> Option<Duration> {
+        self.pressed().map(|pressed| pressed.began)
+    }
+
+    /// The press under way.
+    pub fn so_far(&self) -> Option<SoFar> {
+        self.pressed().map(Pressed::so_far)
+    }
+
+    fn pressed(&self) -> Option<&Pressed> {
+        match &self.state {
+            State::Pressed(pressed) => Some(pressed),
+            State::Idle | State::AwaitingRelease { .. } => None,
+        }
     }
 
     /// Takes the next frame in. Gives what it changed, in order.
@@ -270,6 +323,8 @@ impl PressTracker {
                     press: self.presses,
                     at,
                 });
+                let mut course = Course::default();
+                course.push(peak.clone());
                 self.state = State::Pressed(Box::new(Pressed {
                     press: self.presses,
                     began: at.stamp.mono,
@@ -278,6 +333,7 @@ impl PressTracker {
                     released_frames: 0,
                     settling: Some(Settling::default()),
                     peak,
+                    course,
                 }));
             }
             State::Pressed(pressed) if touched => pressed.touch(frame, marks, at, area),
@@ -358,20 +414,24 @@ impl Pressed {
         self.last = at;
         self.frames += 1;
         self.released_frames = 0;
-        let force_n = frame.force_n();
-        let is_greater = match area.cmp(&self.peak.contact_area_taxels) {
-            Ordering::Less => false,
-            Ordering::Equal => force_n > self.peak.force_n * (1.0 + ROUNDING),
-            Ordering::Greater => true,
+        let touched = Peak {
+            moment: at,
+            frame: *frame,
+            marks,
+            contact_area_taxels: area,
+            force_n: frame.force_n(),
         };
-        if is_greater {
-            self.peak = Peak {
-                moment: at,
-                frame: *frame,
-                marks,
-                contact_area_taxels: area,
-                force_n,
-            };
+        if is_greater(&touched, &self.peak) {
+            self.peak = touched.clone();
+        }
+        self.course.push(touched);
+    }
+
+    fn so_far(&self) -> SoFar {
+        SoFar {
+            press: self.press,
+            peak: self.peak.clone(),
+            course: self.course.clone(),
         }
     }
 
@@ -380,6 +440,8 @@ impl Pressed {
             press,
             last,
             frames,
+            peak,
+            course,
             ..
         } = self;
         if frames < min_frames {
@@ -395,8 +457,22 @@ impl Pressed {
             last,
             frames,
             end,
-            peak: Box::new(self.peak),
+            course: Box::new(SoFar {
+                press,
+                peak: peak.clone(),
+                course,
+            }),
+            peak: Box::new(peak),
         }
+    }
+}
+
+/// Whether `one` is better than `other`, which came before it.
+fn is_greater(one: &Peak, other: &Peak) -> bool {
+    match one.contact_area_taxels.cmp(&other.contact_area_taxels) {
+        Ordering::Less => false,
+        Ordering::Equal => one.force_n > other.force_n * (1.0 + ROUNDING),
+        Ordering::Greater => true,
     }
 }
 

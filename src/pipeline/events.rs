@@ -22,6 +22,7 @@ impl Pipeline {
                 frames,
                 end,
                 peak,
+                course: _,
             } => {
                 let reason = match end {
                     End::Release => None,

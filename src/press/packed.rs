@@ -1,0 +1,39 @@
+//! Frames of a press in a recording: most taxels of them bear nothing.
+
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+use super::{Marks, Moment, Peak};
+use crate::frame::{Frame, sparse};
+
+/// A [`Peak`] as it is written.
+#[derive(Serialize, Deserialize)]
+struct Packed {
+    moment: Moment,
+    #[serde(with = "sparse")]
+    frame: Frame,
+    marks: Marks,
+    area: u32,
+}
+
+pub(super) fn serialize<S: Serializer>(frames: &[Peak], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(frames.iter().map(|held| Packed {
+        moment: held.moment,
+        frame: held.frame,
+        marks: held.marks,
+        area: held.contact_area_taxels,
+    }))
+}
+
+pub(super) fn deserialize<'de, D: Deserializer<'de>>(
+    deserializer: D,
+) -> Result<Vec<Peak>, D::Error> {
+    let packed: Vec<Packed> = Vec::deserialize(deserializer)?;
+    let unpack = |packed: Packed| Peak {
+        moment: packed.moment,
+        force_n: packed.frame.force_n(),
+        frame: packed.frame,
+        marks: packed.marks,
+        contact_area_taxels: packed.area,
+    };
+    Ok(packed.into_iter().map(unpack).collect())
+}
