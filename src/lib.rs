@@ -12,6 +12,7 @@ pub mod wording;
 pub mod wire;
 pub mod tare;
 pub mod press;
+pub mod motion;
 pub mod sensor;
 pub mod verdict;
 pub mod event;

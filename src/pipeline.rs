@@ -19,6 +19,7 @@ use self::link::Link;
 pub use self::memory::Memory;
 use crate::event::{Event, FrameEvent, LinkState, Phase, Tared};
 use crate::frame::{RawFrame, Stamp};
+use crate::motion::{Point, StepBack, Track};
 use crate::press::{self, Abort, Moment, PressTracker};
 use crate::sensor::Sensor;
 use crate::tare::{self, Aim, Contact, RetareError, Tare};
@@ -67,6 +68,7 @@ pub struct Pipeline {
     decoder: Decoder,
     tare: Tare,
     tracker: PressTracker,
+    track: Track,
     seen: Seen,
     /// When the last of the bytes came that are being decoded.
     arrival: Duration,
@@ -132,6 +134,7 @@ impl Pipeline {
                 contact(&described.press),
             ),
             tracker: PressTracker::new(described.press.clone()),
+            track: Track::default(),
             decoder: Decoder::new(layout.clone()),
             seen: Seen {
                 link: Link::Closed { reason: None },
@@ -207,6 +210,20 @@ impl Pipeline {
     /// Takes what the controller says it is doing. Presses and verdicts echo it until it changes.
     pub fn set_context(&mut self, context: Option<serde_json::Value>) {
         self.seen.context = context;
+    }
+
+    /// Takes what the robot tells of where its arm is. `points` are finite.
+    ///
+    /// # Errors
+    ///
+    /// As [`Track::push`]: the points are taken nevertheless.
+    pub fn tell(&mut self, points: &[Point]) -> Result<(), StepBack> {
+        self.track.push(points)
+    }
+
+    /// Positions told since the start, and those among them that came too late for their verdict.
+    pub fn motion_counts(&self) -> (u64, u64) {
+        self.track.counts()
     }
 
     /// Gives the verdicts that did not come, each once.

@@ -28,6 +28,7 @@ pub use self::ring::Ring;
 pub use self::writer::{About, Writer};
 use crate::event::Event;
 use crate::frame::Stamp;
+use crate::motion::Point;
 use crate::pipeline::{self, Pipeline};
 use crate::sensor::{Description, Sensor, SensorError};
 use crate::verdict::Hrn;
@@ -50,13 +51,15 @@ pub enum Input<'a> {
     Tare,
     /// What the controller says it is doing.
     Context(Option<Value>),
+    /// Where the robot says its arm is.
+    Motion(Cow<'a, [Point]>),
     /// The daemon stops.
     Shutdown,
 }
 
 impl Input<'_> {
     /// Passes the input to `pipeline`. Only [`Pipeline::retare`] itself says whether a tare could be
-    /// taken.
+    /// taken, and only [`Pipeline::tell`] whether positions were in order.
     pub fn feed(self, pipeline: &mut Pipeline, at: Stamp) -> Vec<Event> {
         match self {
             Input::Opened => pipeline.opened(at),
@@ -71,6 +74,11 @@ impl Input<'_> {
             }
             Input::Context(context) => {
                 pipeline.set_context(context);
+                Vec::new()
+            }
+            Input::Motion(points) => {
+                // A step back is taken in like the rest.
+                let _ = pipeline.tell(&points);
                 Vec::new()
             }
             Input::Shutdown => pipeline.shutdown(),
@@ -88,6 +96,7 @@ impl Input<'_> {
             Input::Lost(reason) => Input::Lost(text(reason)),
             Input::Tare => Input::Tare,
             Input::Context(context) => Input::Context(context.clone()),
+            Input::Motion(points) => Input::Motion(Cow::Owned(points.to_vec())),
             Input::Shutdown => Input::Shutdown,
         }
     }
@@ -111,6 +120,7 @@ impl Entry {
             Entry::Input(Input::Bytes(bytes)) => bytes.len(),
             Entry::Input(Input::Unavailable(reason) | Input::Lost(reason)) => reason.len(),
             Entry::Input(Input::Context(context)) => context.as_ref().map_or(0, heap_bytes),
+            Entry::Input(Input::Motion(points)) => size_of_val::<[Point]>(points),
             Entry::Input(_) => 0,
             Entry::Settings(sensor) => text_bytes(sensor),
             Entry::State(state) => text_bytes(state) + state.memory.context().map_or(0, heap_bytes),

@@ -9,7 +9,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use crate::wire::{self, Layout};
-use crate::{press, tare};
+use crate::{motion, press, tare};
 
 /// What is said of a sensor. None of it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -28,10 +28,20 @@ pub struct Description {
     pub calibration: tare::Settings,
     /// What a press is.
     pub press: press::Settings,
+    /// The arm that presses with it.
+    #[serde(default)]
+    pub arm: motion::Settings,
     /// A verdict below this confidence is rejected.
     pub min_confidence: f32,
     /// A verdict on less force is rejected.
     pub min_force_n: f64,
+    /// A model of the course gives an early verdict with this confidence.
+    #[serde(default = "early_confidence")]
+    pub early_confidence: f32,
+}
+
+fn early_confidence() -> f32 {
+    Description::default().early_confidence
 }
 
 impl Default for Description {
@@ -44,8 +54,10 @@ impl Default for Description {
             frame: wire::Settings::default(),
             calibration: tare::Settings::default(),
             press: press::Settings::default(),
+            arm: motion::Settings::default(),
             min_confidence: 0.0,
             min_force_n: 0.0,
+            early_confidence: 0.95,
         }
     }
 }
@@ -121,12 +133,18 @@ pub enum SensorError {
     /// Its presses.
     #[error("press.{0}")]
     Press(#[from] press::SettingsError),
+    /// Its arm.
+    #[error("arm.{0}")]
+    Arm(#[from] motion::SettingsError),
     /// A confidence that no verdict has.
     #[error("min_confidence: found {0:?}, expected 0 to 1")]
     MinConfidence(f32),
     /// A force that no press has.
     #[error("min_force_n: found {0:?}, expected newtons, 0 or more")]
     MinForce(f64),
+    /// A confidence that no verdict has.
+    #[error("early_confidence: found {0:?}, expected 0 to 1")]
+    EarlyConfidence(f32),
 }
 
 /// Wider than any sensor, and narrow enough that a period is a sane time to wait.
@@ -187,8 +205,10 @@ impl Sensor {
             frame,
             calibration,
             press,
+            arm,
             min_confidence,
             min_force_n,
+            early_confidence,
         } = &description;
         let part = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
         let found = name.chars().count();
@@ -209,11 +229,15 @@ impl Sensor {
         let layout = Layout::new(frame)?;
         calibration.check(layout.array())?;
         press.check()?;
+        arm.check()?;
         if !(0.0..=1.0).contains(min_confidence) {
             return Err(SensorError::MinConfidence(*min_confidence));
         }
         if !(min_force_n.is_finite() && *min_force_n >= 0.0) {
             return Err(SensorError::MinForce(*min_force_n));
+        }
+        if !(0.0..=1.0).contains(early_confidence) {
+            return Err(SensorError::EarlyConfidence(*early_confidence));
         }
         Ok(Self {
             layout,
@@ -268,6 +292,7 @@ fn of_ms(ms: f64) -> Duration {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::motion::Settings as Arm;
 
     #[test]
     fn a_value_that_no_sensor_has_is_refused_with_its_key() {
@@ -304,6 +329,35 @@ mod tests {
             dead,
         );
         check(&|d| d.press.end_frames = 0, "press.end_frames: found 0");
+        for (change, found) in [
+            (
+                Arm {
+                    stiffness_n_per_mm: Some(0.0),
+                    ..Arm::default()
+                },
+                "stiffness_n_per_mm: found 0.0",
+            ),
+            (
+                Arm {
+                    speed_mm_s: Some(-5.0),
+                    ..Arm::default()
+                },
+                "speed_mm_s: found -5.0",
+            ),
+            (
+                Arm {
+                    delay_ms: f64::NAN,
+                    ..Arm::default()
+                },
+                "delay_ms: found NaN",
+            ),
+        ] {
+            check(
+                &|d| d.arm = change.clone(),
+                &format!("arm.{found}, expected"),
+            );
+        }
+        check(&|d| d.early_confidence = 1.1, "early_confidence: found 1.1");
         check(&|d| d.min_confidence = 1.5, "min_confidence: found 1.5");
         check(&|d| d.min_force_n = f64::NAN, "min_force_n: found NaN");
     }

@@ -151,6 +151,8 @@ fn unit_of(key: &str) -> Option<&'static str> {
     [
         ("newtons_per_count", "N/count"),
         ("_hz", "Hz"),
+        ("_n_per_mm", "N/mm"),
+        ("_mm_s", "mm/s"),
         ("_mm", "mm"),
         ("_ms", "ms"),
         ("_mb", "MB"),

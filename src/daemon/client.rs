@@ -19,9 +19,10 @@ use super::accept::Serve;
 use super::hub::{self, Closed, Line};
 use super::lines::{Heard, Lines};
 use super::record::NoBlackbox;
-use super::request::{self, Change, Request};
+use super::request::{self, Change, Request, motion};
 use super::sensor::{Command, Sensors};
 use crate::event::{Reply, Tared};
+use crate::motion::StepBack;
 use crate::tare::RetareError;
 
 /// The longest line that a subscriber may send (`docs/controller.md`).
@@ -134,6 +135,15 @@ impl Service {
                 held.await.map_err(stopping)?;
                 Ok(Done::default())
             }
+            Change::Motion { sensor, points } => {
+                // By the clocks of this moment: the sensor's task may have other things to do first.
+                let points = motion::placed(&points, crate::daemon::now())?;
+                let (reply, taken) = oneshot::channel();
+                let command = Command::Motion(points, reply);
+                tell(sensors, "motion.sensor", &sensor, command).await?;
+                taken.await.map_err(stopping)??;
+                Ok(Done::default())
+            }
             Change::Blackbox { sensor } => {
                 let (reply, written) = oneshot::channel();
                 tell(sensors, key, &sensor, Command::Blackbox(reply)).await?;
@@ -182,6 +192,13 @@ enum Refused {
     },
     #[error("tare: {0}")]
     Tare(#[from] RetareError),
+    #[error("{0}")]
+    Motion(#[from] motion::Unusable),
+    #[error("motion.at[{}]: {source}", .source.index)]
+    StepBack {
+        #[from]
+        source: StepBack,
+    },
     #[error("blackbox: {0}")]
     Blackbox(#[from] NoBlackbox),
     #[error("blackbox: the recorder has no time for it")]

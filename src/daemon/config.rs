@@ -24,7 +24,7 @@ pub use self::publish::{
 use super::log;
 use crate::sensor::{Description, Sensor};
 use crate::verdict::Hrn;
-use crate::{press, tare, trial, wire};
+use crate::{motion, press, tare, trial, wire};
 
 /// The whole file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -81,6 +81,9 @@ pub struct SensorTable {
     /// Counts to newtons.
     #[serde(default)]
     pub calibration: tare::Settings,
+    /// The arm that presses with it.
+    #[serde(default)]
+    pub arm: motion::Settings,
 }
 
 fn default_name() -> String {
@@ -106,12 +109,13 @@ impl SensorTable {
             stale_after_ms: None,
             frame: wire::Settings::default(),
             calibration: tare::Settings::default(),
+            arm: motion::Settings::default(),
         }
     }
 }
 
 /// The `[model]` table.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Model {
     /// ONNX file; by default the one built in.
@@ -124,6 +128,26 @@ pub struct Model {
     pub min_confidence: f32,
     /// A verdict on less force is rejected.
     pub min_force_n: f64,
+    /// A model of the course gives an early verdict with this confidence.
+    pub early_confidence: f32,
+}
+
+impl Default for Model {
+    fn default() -> Self {
+        let Description {
+            min_confidence,
+            min_force_n,
+            early_confidence,
+            ..
+        } = Description::default();
+        Self {
+            path: None,
+            sha256: None,
+            min_confidence,
+            min_force_n,
+            early_confidence,
+        }
+    }
 }
 
 /// The `[http]` table.
@@ -238,8 +262,10 @@ impl Config {
             frame: sensor.frame.clone(),
             calibration: sensor.calibration.clone(),
             press: self.press.clone(),
+            arm: sensor.arm.clone(),
             min_confidence: self.model.min_confidence,
             min_force_n: self.model.min_force_n,
+            early_confidence: self.model.early_confidence,
         }
     }
 

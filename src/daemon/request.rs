@@ -4,13 +4,16 @@
 //! both cases with the `id` to echo. Whether the connection may ask for a [`Change`] is not decided
 //! here.
 
+pub(crate) mod motion;
+
 use serde::Serialize;
 use serde_json::{Map, Value};
 
+use self::motion::Told;
 use crate::event::{CONTEXT_BYTES, Kind};
 
 /// A usable line.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Request {
     /// What to be sent from now on.
     Subscribe(Subscription),
@@ -23,7 +26,7 @@ pub(crate) enum Request {
 }
 
 /// A command of the control socket.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Change {
     /// Take another tare.
     Tare { sensor: String },
@@ -32,6 +35,8 @@ pub(crate) enum Change {
         sensor: String,
         context: Option<Value>,
     },
+    /// Where the robot says its arm is.
+    Motion { sensor: String, points: Vec<Told> },
     /// Write the last minute of this sensor to a file.
     Blackbox { sensor: String },
 }
@@ -42,6 +47,7 @@ impl Change {
         match self {
             Change::Tare { .. } => "tare",
             Change::Context { .. } => "context",
+            Change::Motion { .. } => "motion",
             Change::Blackbox { .. } => "blackbox",
         }
     }
@@ -148,6 +154,8 @@ pub(crate) enum Unusable {
     Extra(String),
     #[error("context: found {0} bytes, expected fewer than {CONTEXT_BYTES}")]
     LongContext(usize),
+    #[error("{0}")]
+    Motion(#[from] motion::Unusable),
 }
 
 impl Unusable {
@@ -212,13 +220,15 @@ fn request(mut fields: Map<String, Value>) -> Result<Request, Unusable> {
         Request::Change(Change::Tare { sensor })
     } else if let Some(context) = fields.remove("context") {
         Request::Change(self::context(context)?)
+    } else if let Some(motion) = fields.remove("motion") {
+        Request::Change(self::motion(&motion)?)
     } else if let Some(sensor) = fields.remove("blackbox") {
         let sensor = name("blackbox", &sensor)?;
         Request::Change(Change::Blackbox { sensor })
     } else {
         let found = fields.keys().next().map_or("no key".to_owned(), short);
-        let expected = "\"subscribe\" or \"get\", or on the control socket \"tare\", \"context\" or \
-                        \"blackbox\"";
+        let expected = "\"subscribe\" or \"get\", or on the control socket \"tare\", \"context\", \
+                        \"motion\" or \"blackbox\"";
         return Err(Unusable::Key { found, expected });
     };
     match fields.keys().next() {
@@ -235,21 +245,40 @@ fn name(key: &'static str, value: &Value) -> Result<String, Unusable> {
 /// What is expected where a sensor is meant.
 const NAME: &str = "a sensor's name";
 
+/// The sensor that a command with an object is for.
+fn sensor(key: &'static str, fields: &Map<String, Value>) -> Result<String, Unusable> {
+    fields.get("sensor").map_or_else(
+        || {
+            Err(Unusable::Value {
+                key,
+                found: "none".to_owned(),
+                expected: NAME,
+            })
+        },
+        |sensor| name(key, sensor),
+    )
+}
+
+fn motion(value: &Value) -> Result<Change, Unusable> {
+    let Value::Object(fields) = value else {
+        return Err(Unusable::value("motion", value, "an object"));
+    };
+    let sensor = sensor("motion.sensor", fields)?;
+    let mut others = fields
+        .keys()
+        .filter(|key| !["sensor", "at"].contains(&key.as_str()));
+    if let Some(other) = others.next() {
+        return Err(Unusable::Extra(short(&format!("motion.{other}"))));
+    }
+    let points = motion::points(fields.get("at").unwrap_or(&Value::Null))?;
+    Ok(Change::Motion { sensor, points })
+}
+
 fn context(value: Value) -> Result<Change, Unusable> {
     let Value::Object(fields) = &value else {
         return Err(Unusable::value("context", &value, "an object"));
     };
-    let key = "context.sensor";
-    let sensor = match fields.get("sensor") {
-        Some(sensor) => name(key, sensor)?,
-        None => {
-            return Err(Unusable::Value {
-                key,
-                found: "none".to_owned(),
-                expected: NAME,
-            });
-        }
-    };
+    let sensor = sensor("context.sensor", fields)?;
     let bytes = value.to_string().len();
     if bytes >= CONTEXT_BYTES {
         return Err(Unusable::LongContext(bytes));
@@ -371,7 +400,17 @@ mod tests {
             (br#"{"id":"a"}"#, "no key"),
             (
                 br#"{"retare":"a","id":"a"}"#,
-                "\"tare\", \"context\" or \"blackbox\"",
+                "\"tare\", \"context\", \"motion\" or \"blackbox\"",
+            ),
+            (br#"{"motion":[],"id":"a"}"#, "motion: found []"),
+            (br#"{"motion":{"at":[]},"id":"a"}"#, "motion.sensor"),
+            (
+                br#"{"motion":{"sensor":"a"},"id":"a"}"#,
+                "motion.at: found null",
+            ),
+            (
+                br#"{"motion":{"sensor":"a","at":[],"mm":1},"id":"a"}"#,
+                "\"motion.mm\"",
             ),
         ] {
             let read = parse(line);

@@ -17,6 +17,7 @@ use super::log;
 use super::record::{NoBlackbox, SensorRecorder};
 use super::serial::{Link, Turn};
 use crate::event::{Event, Kind, Status, Tared};
+use crate::motion::{Point, StepBack};
 use crate::pipeline::Pipeline;
 use crate::recording::Input;
 use crate::sensor::Sensor;
@@ -32,6 +33,8 @@ pub(crate) enum Command {
     Tare(oneshot::Sender<Result<Tared, RetareError>>),
     /// To echo what the controller says it is doing. The answer comes when it is in force.
     Context(Option<Value>, oneshot::Sender<()>),
+    /// To take where the robot says its arm is. The answer comes when it is taken.
+    Motion(Vec<Point>, oneshot::Sender<Result<(), StepBack>>),
     /// To write the last minute. The answer is the path of the file.
     Blackbox(oneshot::Sender<Result<PathBuf, NoBlackbox>>),
     /// To judge by another description and model from now on. Nothing that is fixed may differ.
@@ -49,6 +52,8 @@ pub(crate) struct Vitals {
     pub(crate) contact_threshold_n: f32,
     /// Verdicts since the start that did not come because the model failed.
     pub(crate) unjudged: u64,
+    /// Positions of the arm since the start, and those among them that came too late.
+    pub(crate) motion: (u64, u64),
 }
 
 /// Sends commands to the task of one sensor.
@@ -123,6 +128,13 @@ pub(crate) async fn serve(
                     let _ = reply.send(());
                     continue;
                 }
+                Some(Command::Motion(points, reply)) => {
+                    let input = Input::Motion(points.as_slice().into());
+                    recorder.note(&pipeline, &input, super::now());
+                    // The asker may have gone.
+                    let _ = reply.send(pipeline.tell(&points));
+                    continue;
+                }
                 Some(Command::Blackbox(reply)) => {
                     recorder.blackbox(reply);
                     continue;
@@ -190,6 +202,7 @@ fn vitals(pipeline: &Pipeline, unjudged: u64) -> Vitals {
             .map(|frame| now.mono.saturating_sub(frame.mono)),
         contact_threshold_n: pipeline.sensor().description().press.contact_threshold_n,
         unjudged,
+        motion: pipeline.motion_counts(),
     }
 }
 

@@ -30,6 +30,8 @@ impl Pipeline {
                 };
                 events.push(self.press(press, PressState::End, last, frames, reason));
                 events.extend(self.judge(press, Phase::Final, &peak));
+                let delay_ms = self.sensor.description().arm.delay_ms;
+                self.track.judged(last.stamp.mono, delay_ms);
             }
             Change::Aborted {
                 press,

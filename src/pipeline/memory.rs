@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Pipeline, RATE_FRAMES, Seen};
+use crate::motion::Track;
 use crate::tare::{self, Aim, Offsets};
 use crate::{event, press, wire};
 
@@ -13,6 +14,9 @@ pub struct Memory {
     decoder: wire::Memory,
     tare: tare::Memory,
     tracker: press::Memory,
+    /// The positions that a press under way, or the next one, may need. Older recordings have none.
+    #[serde(default)]
+    track: Track,
     pipeline: Noted,
 }
 
@@ -45,6 +49,7 @@ impl Memory {
             .is_possible(frames.saturating_add(*frames_damaged))
             && self.tare.is_possible()
             && self.tracker.is_possible(*frames)
+            && self.track.is_possible()
             && recent.len() <= RATE_FRAMES
             && context.as_ref().is_none_or(is_context)
     }
@@ -59,7 +64,10 @@ impl Pipeline {
     /// All it has seen.
     pub fn memory(&self) -> Memory {
         let aim = self.tare.aim();
+        let last_frame = self.seen.last_frame.map(|frame| frame.mono);
+        let since = self.tracker.began().or(last_frame).unwrap_or_default();
         Memory {
+            track: self.track.since(since),
             decoder: self.decoder.memory(),
             tare: self.tare.memory(),
             tracker: self.tracker.memory(),
@@ -85,6 +93,7 @@ impl Pipeline {
         self.decoder.recall(memory.decoder);
         self.tare.recall(memory.tare, aim);
         self.tracker.recall(memory.tracker);
+        self.track = memory.track;
         self.seen = seen;
     }
 }

@@ -7,10 +7,11 @@ use serde_json::Value;
 
 use super::{Entry, Error, Input, RecordedSensor, State};
 use crate::frame::Stamp;
+use crate::motion::Point;
 use crate::ros::{self, Blob, Header, Topic};
 
-/// The channels of a sensor, in the order of their numbers. Only append to it: `recover` numbers the
-/// channels of a damaged file by it.
+/// The channels of a sensor, in the order of their numbers. It never changes: `recover` numbers the
+/// channels of a damaged file by it. Later channels have numbers of their own ([`MOTION`]).
 pub(super) const TOPICS: [Topic; 5] = [INPUT, ros::FRAME, ros::HARDNESS, ros::PRESS, ros::STATUS];
 
 pub(super) const INPUT: Topic = Topic {
@@ -18,6 +19,29 @@ pub(super) const INPUT: Topic = Topic {
     schema: "tactile_interfaces/msg/Input",
     definition: include_str!("../../clients/ros2/tactile_interfaces/msg/Input.msg"),
 };
+
+/// Where the robot said its arm was.
+pub(super) const MOTION: Topic = Topic {
+    name: "motion",
+    schema: "tactile_interfaces/msg/Motion",
+    definition: include_str!("../../clients/ros2/tactile_interfaces/msg/Motion.msg"),
+};
+
+/// The topic on which an entry is written.
+pub(super) fn topic_of(entry: &Entry) -> Topic {
+    match entry {
+        Entry::Input(Input::Motion(_)) => MOTION,
+        _ => INPUT,
+    }
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+struct MotionMessage {
+    header: Header,
+    mono_ns: u64,
+    at_ns: Vec<i64>,
+    approach_mm: Vec<f64>,
+}
 
 #[derive(Debug, Serialize, Deserialize)]
 struct InputMessage {
@@ -46,6 +70,8 @@ fn json(value: &impl Serialize) -> Vec<u8> {
 
 /// What happened to `sensor` at `at`.
 pub(super) fn encode_entry(sensor: &str, at: Stamp, entry: &Entry) -> Vec<u8> {
+    let header = Header::new(at.wall, sensor);
+    let mono_ns = u64::try_from(at.mono.as_nanos()).unwrap_or(u64::MAX);
     let text = |text: &str| text.as_bytes().to_vec();
     let (kind, data) = match entry {
         Entry::Input(Input::Bytes(bytes)) => (0, bytes.to_vec()),
@@ -56,32 +82,59 @@ pub(super) fn encode_entry(sensor: &str, at: Stamp, entry: &Entry) -> Vec<u8> {
         Entry::Input(Input::Tare) => (5, Vec::new()),
         Entry::Input(Input::Context(context)) => (6, json(context)),
         Entry::Input(Input::Shutdown) => (7, Vec::new()),
+        Entry::Input(Input::Motion(points)) => {
+            return ros::to_cdr(&MotionMessage {
+                header,
+                mono_ns,
+                at_ns: points.iter().map(|point| point.at_ns).collect(),
+                approach_mm: points.iter().map(|point| point.mm).collect(),
+            });
+        }
         Entry::Settings(sensor) => (8, json(sensor)),
         Entry::State(state) => (9, json(state)),
     };
     ros::to_cdr(&InputMessage {
-        header: Header::new(at.wall, sensor),
-        mono_ns: u64::try_from(at.mono.as_nanos()).unwrap_or(u64::MAX),
+        header,
+        mono_ns,
         kind,
         data: Blob(data),
     })
 }
 
+fn foreign(found: String) -> Error {
+    Error::Foreign {
+        found,
+        expected: "an input of this version",
+    }
+}
+
+fn stamp(header: &Header, mono_ns: u64) -> Result<Stamp, Error> {
+    let wall = header.time();
+    Ok(Stamp {
+        mono: std::time::Duration::from_nanos(mono_ns),
+        wall: wall.ok_or_else(|| foreign("a time that is none".to_owned()))?,
+    })
+}
+
+/// Reads the sensor, the moment and where the arm was from a message on [`MOTION`].
+pub(super) fn decode_motion(bytes: &[u8]) -> Result<(String, Stamp, Entry), Error> {
+    let message: MotionMessage = from_cdr(bytes)?;
+    let at = stamp(&message.header, message.mono_ns)?;
+    let (moments, positions) = (message.at_ns, message.approach_mm);
+    let same = moments.len() == positions.len();
+    let points = moments.into_iter().zip(positions);
+    let points: Vec<Point> = points.map(Point::from).collect();
+    if !same || !points.iter().all(Point::is_usable) {
+        return Err(foreign("positions that are none".to_owned()));
+    }
+    let motion = Input::Motion(points.into());
+    Ok((message.header.frame_id, at, Entry::Input(motion)))
+}
+
 /// Reads the sensor, the moment and what happened from a message.
 pub(super) fn decode_entry(bytes: &[u8]) -> Result<(String, Stamp, Entry), Error> {
     let message: InputMessage = from_cdr(bytes)?;
-    let foreign = |found: String| Error::Foreign {
-        found,
-        expected: "an input of this version",
-    };
-    let wall = message
-        .header
-        .time()
-        .ok_or_else(|| foreign("a time that is none".to_owned()))?;
-    let at = Stamp {
-        mono: std::time::Duration::from_nanos(message.mono_ns),
-        wall,
-    };
+    let at = stamp(&message.header, message.mono_ns)?;
     let data = message.data.0;
     let text = |data: Vec<u8>| String::from_utf8_lossy(&data).into_owned().into();
     let unreadable = |error: serde_json::Error| foreign(format!("other JSON ({error})"));

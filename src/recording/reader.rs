@@ -1,13 +1,13 @@
 //! Bytes of an MCAP file back into entries.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::io::{ErrorKind, Read};
 
 use mcap::MAGIC;
 use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
-use super::message::{self, INPUT};
+use super::message::{self, INPUT, MOTION};
 use super::{Entry, Error};
 use crate::frame::Stamp;
 
@@ -23,8 +23,12 @@ pub struct Found {
 }
 
 /// Longest record that is read, and longest chunk once it is unpacked. A chunk of ours ends with the
-/// first message after 1 MiB, and a message, of which a state is the longest, has less than 1 MiB.
+/// first message after 1 MiB, and a message, of which a state is the longest, has less than 6 MiB: a
+/// state in the middle of a long press that loads every taxel.
 pub(super) const LONGEST_RECORD_BYTES: usize = 8 << 20;
+
+/// Reads a message.
+type Decode = fn(&[u8]) -> Result<(String, Stamp, Entry), Error>;
 
 /// Reads a recording from its beginning: what happened, in order. It ends after the first error.
 ///
@@ -43,8 +47,9 @@ pub(super) const LONGEST_RECORD_BYTES: usize = 8 << 20;
 pub struct Reader<R> {
     source: R,
     linear: LinearReader,
-    schemas: BTreeSet<u16>,
-    channels: BTreeSet<u16>,
+    /// Those of messages that are read, by their numbers.
+    schemas: BTreeMap<u16, Decode>,
+    channels: BTreeMap<u16, Decode>,
     bytes: u64,
     /// No more entries: the summary, an error or the end was reached.
     done: bool,
@@ -59,8 +64,8 @@ impl<R: Read> Reader<R> {
         Self {
             source,
             linear: LinearReader::new_with_options(options),
-            schemas: BTreeSet::new(),
-            channels: BTreeSet::new(),
+            schemas: BTreeMap::new(),
+            channels: BTreeMap::new(),
             bytes: 0,
             done: false,
         }
@@ -98,14 +103,21 @@ impl<R: Read> Reader<R> {
             };
             match found {
                 Record::Schema { header, .. } if header.name == INPUT.schema => {
-                    self.schemas.insert(header.id);
+                    self.schemas.insert(header.id, message::decode_entry);
                 }
-                Record::Channel(channel) if self.schemas.contains(&channel.schema_id) => {
-                    self.channels.insert(channel.id);
+                Record::Schema { header, .. } if header.name == MOTION.schema => {
+                    self.schemas.insert(header.id, message::decode_motion);
                 }
-                Record::Message { header, data } if self.channels.contains(&header.channel_id) => {
-                    let (sensor, at, entry) = message::decode_entry(&data)?;
-                    return Ok(Some(Found { sensor, at, entry }));
+                Record::Channel(channel) => {
+                    if let Some(&decode) = self.schemas.get(&channel.schema_id) {
+                        self.channels.insert(channel.id, decode);
+                    }
+                }
+                Record::Message { header, data } => {
+                    if let Some(decode) = self.channels.get(&header.channel_id) {
+                        let (sensor, at, entry) = decode(&data)?;
+                        return Ok(Some(Found { sensor, at, entry }));
+                    }
                 }
                 _ => {}
             }

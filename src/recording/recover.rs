@@ -13,7 +13,7 @@ use mcap::records::{Channel, ChunkHeader, Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::write::NoSeek;
 
-use super::message::{self, TOPICS};
+use super::message;
 use super::reader::LONGEST_RECORD_BYTES;
 use super::{Entry, Error, writer};
 
@@ -395,7 +395,6 @@ impl<W: Write> Copy<W> {
     /// Tells a channel of ours whose record is lost: its number says which of its sensor's it is,
     /// and every message names the sensor.
     fn restore(&mut self, id: u16, message: &[u8]) -> bool {
-        let place = usize::from(id.wrapping_sub(1)) % TOPICS.len();
         let named = |name: &String| {
             let ours = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
             !name.is_empty() && name.chars().all(ours)
@@ -403,7 +402,7 @@ impl<W: Write> Copy<W> {
         let Some(sensor) = message::sensor_of(message).filter(named) else {
             return false;
         };
-        let topic = TOPICS[place];
+        let topic = writer::topic_of(id);
         let schema_id = writer::schema_id(topic);
         let text = topic.text().into_bytes();
         let schema = (topic.schema.to_owned(), "ros2msg".to_owned(), text);

@@ -66,6 +66,18 @@ fn story() -> Vec<(Stamp, Input<'static>)> {
             }
             _ => {}
         }
+        // Where the arm is, 50 ms before and 50 ms after a frame; once it jumps.
+        let point = |ms: u64, mm| Point {
+            at_ns: i64::try_from(at(ms).mono.as_nanos()).unwrap(),
+            mm,
+        };
+        let mm = if frame == 40 {
+            70.0
+        } else {
+            0.1 * frame as f64
+        };
+        let told = [point(ms.saturating_sub(50), mm), point(ms + 50, mm + 0.05)];
+        story.push((at(ms), Input::Motion(told.to_vec().into())));
         // In three pieces, as a line brings them.
         for (piece, bytes) in bytes.chunks(300).enumerate() {
             let came = at(ms + 20 * piece as u64 + 3);
@@ -97,7 +109,7 @@ fn recorded(states: usize, chunk: usize) -> (Vec<u8>, Vec<Event>) {
             let state = State::of(&pipeline, labels());
             writer.entry(0, at, &Entry::State(Box::new(state))).unwrap();
         }
-        if index == 120 {
+        if index == 160 {
             let mut changed = described();
             changed.min_force_n = 1e3;
             changed.press.end_frames = 1;

@@ -7,7 +7,7 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::write::NoSeek;
 use mcap::{Compression, WriteOptions};
 
-use super::message::{self, INPUT, TOPICS};
+use super::message::{self, INPUT, MOTION, TOPICS};
 use super::{Entry, Error, Labels, RecordedSensor};
 use crate::event::Event;
 use crate::frame::Stamp;
@@ -84,13 +84,30 @@ pub(super) fn options() -> WriteOptions {
 /// The number of a channel. It follows from the sensor's place and the topic, so `recover` knows it
 /// even if the record of the channel is lost.
 pub(super) fn channel_id(sensor: usize, topic: Topic) -> u16 {
+    if topic == MOTION {
+        return FIRST_MOTION + u16::try_from(sensor).expect("a daemon has few sensors");
+    }
     let place = TOPICS.iter().position(|known| *known == topic);
     let place = place.expect("every topic stands in TOPICS");
     u16::try_from(sensor * TOPICS.len() + place + 1).expect("a daemon has few sensors")
 }
 
+/// The number of the first sensor's [`MOTION`], after those of ten thousand sensors.
+const FIRST_MOTION: u16 = 50_000;
+
+/// The topic of a channel with this number.
+pub(super) fn topic_of(channel_id: u16) -> Topic {
+    match channel_id {
+        FIRST_MOTION.. => MOTION,
+        id => TOPICS[usize::from(id.wrapping_sub(1)) % TOPICS.len()],
+    }
+}
+
 /// The number of a topic's schema.
 pub(super) fn schema_id(topic: Topic) -> u16 {
+    if topic == MOTION {
+        return TOPICS.len() as u16 + 1;
+    }
     let place = TOPICS.iter().position(|known| *known == topic);
     place.expect("every topic stands in TOPICS") as u16 + 1
 }
@@ -105,7 +122,8 @@ pub(super) fn is_topic_of_ours(name: &str) -> bool {
     let parts = name
         .strip_prefix("/tactile/")
         .and_then(|rest| rest.split_once('/'));
-    parts.is_some_and(|(_, name)| TOPICS.iter().any(|topic| topic.name == name))
+    let mut topics = TOPICS.iter().chain([&MOTION]);
+    parts.is_some_and(|(_, name)| topics.any(|topic| topic.name == name))
 }
 
 /// Whether a channel of this name holds what happened to a sensor.
@@ -147,12 +165,13 @@ impl<W: Write> Writer<W> {
             let name = name.to_owned();
             out.write_metadata(&Metadata { name, metadata })?;
         }
-        for topic in TOPICS {
+        let topics = || TOPICS.into_iter().chain([MOTION]);
+        for topic in topics() {
             let text = topic.text();
             out.add_schema_with_id(schema_id(topic), topic.schema, "ros2msg", text.as_bytes())?;
         }
         for (index, sensor) in about.sensors.iter().enumerate() {
-            for topic in TOPICS {
+            for topic in topics() {
                 let name = topic_name(sensor.name(), topic);
                 let id = channel_id(index, topic);
                 out.add_channel_with_id(id, schema_id(topic), &name, "cdr", &BTreeMap::new())?;
@@ -173,7 +192,8 @@ impl<W: Write> Writer<W> {
     /// If it cannot be written. The writer must not be used after that.
     pub fn entry(&mut self, sensor: usize, at: Stamp, entry: &Entry) -> Result<(), Error> {
         let bytes = message::encode_entry(&self.sensors[sensor], at, entry);
-        self.write(channel_id(sensor, message::INPUT), at.wall, &bytes)
+        let topic = message::topic_of(entry);
+        self.write(channel_id(sensor, topic), at.wall, &bytes)
     }
 
     /// Adds an event. An event of a sensor that the recording does not have is left out.

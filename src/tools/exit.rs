@@ -110,12 +110,17 @@ impl Failure {
             }
 
             Self::Simulate(simulate::Error::Layout(_) | simulate::Error::Baud { .. })
+            | Self::Replay(replay::Error::OwnMotion { .. })
             | Self::Record(record::Error::Level { .. } | record::Error::Twice { .. }) => USAGE,
             #[cfg(feature = "watch")]
             Self::Watch(watch::Error::NoTerminal) => USAGE,
 
             Self::Simulate(simulate::Error::Faults(error)) if error.is_unreadable() => NO_INPUT,
             Self::Simulate(simulate::Error::Faults(_)) => FAILED,
+            Self::Replay(replay::Error::Motion { source, .. }) if source.is_unreadable() => {
+                NO_INPUT
+            }
+            Self::Replay(replay::Error::Motion { .. }) => FAILED,
             Self::Missing(_)
             | Self::Check(check::Error::Missing(_))
             | Self::Recover(recover::Error::Unreadable { .. })

@@ -3,6 +3,9 @@
 //! Times come from the recording, so the output depends on nothing else: neither on the speed nor
 //! on how the bytes are cut.
 
+mod motion;
+
+use std::collections::VecDeque;
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError};
@@ -14,6 +17,7 @@ use super::simulate::positive;
 use crate::daemon::config::{self, Config, SensorTable, Setup};
 use crate::daemon::now;
 use crate::event::{Event, Kind};
+use crate::motion::Point;
 use crate::pipeline::{Clock, Pipeline, Unjudged};
 use crate::recording::{self, FileKind, Playback, Reader};
 
@@ -29,6 +33,10 @@ pub struct Args {
     /// Play X times as fast as the sensor did [default: as fast as possible]
     #[arg(long, value_name = "X", value_parser = positive)]
     speed: Option<f64>,
+    /// Positions of the arm for raw bytes: CSV with the columns time_s, counted from the first whole
+    /// frame, and approach_mm [default: none]
+    #[arg(long, value_name = "M.csv")]
+    motion: Option<PathBuf>,
 }
 
 /// Why a recording cannot be played.
@@ -44,6 +52,20 @@ pub enum Error {
         path: PathBuf,
         /// Why not.
         source: io::Error,
+    },
+    /// The arm's positions cannot be used.
+    #[error("--motion {path}:{source}")]
+    Motion {
+        /// Of the positions.
+        path: PathBuf,
+        /// Why not.
+        source: motion::Error,
+    },
+    /// A recording has its own positions.
+    #[error("--motion: found {path}, a recording with times of its own, expected raw bytes")]
+    OwnMotion {
+        /// Of the recording.
+        path: PathBuf,
     },
     /// It is damaged, or none of ours.
     #[error("{path}: {source}")]
@@ -127,9 +149,19 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Error> {
         path: path.clone(),
         source,
     })?;
+    let motion = match &args.motion {
+        Some(_) if kind == FileKind::Recording => {
+            return Err(Error::OwnMotion { path: path.clone() });
+        }
+        Some(path) => Some(motion::load(path).map_err(|source| Error::Motion {
+            path: path.clone(),
+            source,
+        })?),
+        None => None,
+    };
     match kind {
         FileKind::Recording => play_recording(path, BufReader::new(recording), setup, pace),
-        FileKind::Raw => play_bytes(path, recording, &setup, pace),
+        FileKind::Raw => play_bytes(path, recording, motion, &setup, pace),
     }
 }
 
@@ -221,21 +253,27 @@ fn play_entries(
     Ok(true)
 }
 
-/// Bytes back to back.
+/// Positions are given to the pipeline this long before the frame of their moment.
+const AHEAD: Duration = Duration::from_secs(2);
+
+/// Bytes back to back, with the arm's positions.
 fn play_bytes(
     path: &Path,
     mut file: impl Read,
+    motion: Option<Vec<Point>>,
     setup: &Setup,
     mut pace: Pace,
 ) -> Result<(), Error> {
     let sensor = setup.sensors.first();
     let sensor = sensor.expect("a configuration has at least one sensor");
     let frame_rate_hz = sensor.description().frame_rate_hz;
-    let chunk_bytes = match pace.speed {
-        // No two frames end in so many: each comes at its own moment.
-        Some(_) => sensor.layout().min_frame_bytes(),
-        None => CHUNK_BYTES,
+    // No two frames end in so many: each comes at its own moment, between its positions.
+    let chunk_bytes = if pace.speed.is_some() || motion.is_some() {
+        sensor.layout().min_frame_bytes()
+    } else {
+        CHUNK_BYTES
     };
+    let mut motion = VecDeque::from(motion.unwrap_or_default());
     let mut chunk = vec![0; chunk_bytes];
     let mut pipeline = Pipeline::new(sensor.clone(), setup.hrn.clone(), Clock::FrameRate);
     let mut seq = 0;
@@ -262,6 +300,16 @@ fn play_bytes(
             print(end, &mut seq)?;
             return none.map_or(Ok(()), Err);
         }
+        let (frames, _) = pipeline.frame_counts();
+        let told_until = time_of(frames, frame_rate_hz)
+            .saturating_add(AHEAD)
+            .as_nanos();
+        let told = motion
+            .iter()
+            .position(|point| i128::from(point.at_ns) > told_until as i128);
+        let told: Vec<Point> = motion.drain(..told.unwrap_or(motion.len())).collect();
+        // A step back makes the approach unknown for its press.
+        let _ = pipeline.tell(&told);
         // The clock is the recording's: the moment given here is not looked at.
         let events = pipeline.push(&chunk[..read], now());
         warn(pipeline.unjudged());

@@ -24,7 +24,7 @@ from mcap_ros2.reader import read_ros2_messages
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-TOPICS = ["input", "frame", "hardness", "press", "status"]
+TOPICS = ["input", "frame", "hardness", "press", "status", "motion"]
 
 
 def by_mcap(path):

@@ -106,7 +106,9 @@ pub enum Error {
 fn table_of(sensor: &str, problem: &SensorError) -> String {
     match problem {
         SensorError::Press(_) => String::new(),
-        SensorError::MinConfidence(_) | SensorError::MinForce(_) => "model.".to_owned(),
+        SensorError::MinConfidence(_)
+        | SensorError::MinForce(_)
+        | SensorError::EarlyConfidence(_) => "model.".to_owned(),
         // The name itself cannot be used.
         SensorError::Name(_) | SensorError::LongName { .. } => "sensor.".to_owned(),
         _ => format!("sensor[{sensor:?}]."),

@@ -73,11 +73,13 @@ fn escaped(value: &str) -> String {
 fn links(registry: &mut Registry, vitals: &[Vitals]) {
     let (frames, damaged, skipped, unjudged) =
         <(Counters, Counters, Counters, Counters)>::default();
+    let (positions, late) = <(Counters, Counters)>::default();
     let (state, rate, age) = <(Gauges, Gauges, Gauges)>::default();
     for Vitals {
         status,
         last_frame_age,
         unjudged: failed,
+        motion,
         ..
     } in vitals
     {
@@ -86,6 +88,8 @@ fn links(registry: &mut Registry, vitals: &[Vitals]) {
         damaged.get_or_create(&labels).inc_by(status.frames_damaged);
         skipped.get_or_create(&labels).inc_by(status.bytes_skipped);
         unjudged.get_or_create(&labels).inc_by(*failed);
+        positions.get_or_create(&labels).inc_by(motion.0);
+        late.get_or_create(&labels).inc_by(motion.1);
         if let Some(hz) = status.frame_rate_hz {
             rate.get_or_create(&labels).set(hz);
         }
@@ -105,6 +109,10 @@ fn links(registry: &mut Registry, vitals: &[Vitals]) {
     registry.register_with_unit("skipped", help, Unit::Bytes, skipped);
     let help = "Verdicts that did not come: the model failed, the log says how";
     registry.register("verdicts_failed", help, unjudged);
+    let help = "Positions of the arm that the robot told";
+    registry.register("motion_points", help, positions);
+    let help = "Positions of the arm that came after the verdict that they belong to";
+    registry.register("motion_points_late", help, late);
     let help = "State of the link: 1 for the one that holds";
     registry.register("link_state", help, state);
     let hertz = Unit::Other("hertz".to_owned());

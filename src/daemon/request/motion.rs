@@ -1,0 +1,196 @@
+//! Where a controller says its arm is: from a line of the control socket to points on the clock of
+//! the frames.
+
+use jiff::Timestamp;
+use serde_json::Value;
+
+use super::short;
+use crate::frame::Stamp;
+use crate::motion::{FURTHEST_MM, HELD, Point};
+
+/// The most points in a line.
+const MOST_POINTS: usize = 256;
+/// A point may be this far ahead of this machine's clock: clocks of two machines differ a little.
+const AHEAD_NS: i128 = 1_000_000_000;
+
+/// A point as it was told.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Told {
+    at: Moment,
+    mm: f64,
+}
+
+/// When a point was, by one of two clocks.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Moment {
+    /// CLOCK_MONOTONIC of this machine, in nanoseconds.
+    Mono(u64),
+    /// The calendar.
+    Wall(Timestamp),
+}
+
+/// Why points cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum Unusable {
+    #[error("motion.at: found {0}, expected a list of 1 to {MOST_POINTS} points [MONO_NS, MM]")]
+    NoList(String),
+    #[error("motion.at[{index}]: found {found}, expected {expected}")]
+    Point {
+        index: usize,
+        found: String,
+        expected: &'static str,
+    },
+    #[error(
+        "motion.at[{index}]: found a moment {} s {}, expected one of the last {} s by this \
+         machine's CLOCK_MONOTONIC, or an RFC 3339 time",
+        .away_ms.unsigned_abs() as f64 / 1e3,
+        if *.away_ms > 0 { "ahead" } else { "ago" },
+        HELD.as_secs()
+    )]
+    Clock { index: usize, away_ms: i64 },
+}
+
+/// Reads the points of a line.
+pub(super) fn points(at: &Value) -> Result<Vec<Told>, Unusable> {
+    let points = match at.as_array() {
+        Some(points) if (1..=MOST_POINTS).contains(&points.len()) => points,
+        Some(points) => return Err(Unusable::NoList(format!("{} points", points.len()))),
+        None => return Err(Unusable::NoList(short(at))),
+    };
+    let point = |(index, point): (usize, &Value)| {
+        let unusable = |found: &Value, expected| Unusable::Point {
+            index,
+            found: short(found),
+            expected,
+        };
+        let [at, mm] = point.as_array().map_or(&[][..], Vec::as_slice) else {
+            return Err(unusable(point, "[MONO_NS, MM] or [\"RFC 3339\", MM]"));
+        };
+        let moment = match at {
+            Value::String(text) => text.parse().ok().map(Moment::Wall),
+            number => nanoseconds(number).map(Moment::Mono),
+        };
+        let moment = moment.ok_or_else(|| {
+            let expected = "nanoseconds of CLOCK_MONOTONIC, or an RFC 3339 time";
+            unusable(at, expected)
+        })?;
+        match mm.as_f64() {
+            Some(mm) if mm.abs() <= FURTHEST_MM => Ok(Told { at: moment, mm }),
+            _ => Err(unusable(mm, "millimetres, at most 1000000 from zero")),
+        }
+    };
+    points.iter().enumerate().map(point).collect()
+}
+
+/// A whole number of nanoseconds. Some languages write large ones as 1.2e15.
+fn nanoseconds(number: &Value) -> Option<u64> {
+    let rounded = || {
+        let number = number.as_f64()?;
+        (0.0..=1e18).contains(&number).then_some(number as u64)
+    };
+    number.as_u64().or_else(rounded)
+}
+
+/// The points on CLOCK_MONOTONIC, at `now`.
+///
+/// # Errors
+///
+/// If one is of the future, or older than a point is held.
+pub(crate) fn placed(told: &[Told], now: Stamp) -> Result<Vec<Point>, Unusable> {
+    let mono_now = now.mono.as_nanos() as i128;
+    let point = |(index, told): (usize, &Told)| {
+        let away = match told.at {
+            Moment::Mono(at) => i128::from(at) - mono_now,
+            Moment::Wall(at) => at.as_nanosecond() - now.wall.as_nanosecond(),
+        };
+        let is_near = (-(HELD.as_nanos() as i128)..=AHEAD_NS).contains(&away);
+        match i64::try_from(mono_now + away) {
+            Ok(at_ns) if is_near => Ok(Point { at_ns, mm: told.mm }),
+            _ => Err(Unusable::Clock {
+                index,
+                away_ms: i64::try_from(away / 1_000_000).unwrap_or(i64::MAX),
+            }),
+        }
+    };
+    told.iter().enumerate().map(point).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use serde_json::json;
+
+    use super::*;
+
+    fn now() -> Stamp {
+        Stamp {
+            mono: Duration::from_secs(500),
+            wall: "2026-11-21T10:00:00Z".parse().unwrap(),
+        }
+    }
+
+    fn place(at: &Value) -> Result<Vec<(i64, f64)>, String> {
+        let told = points(at).map_err(|error| error.to_string())?;
+        let placed = placed(&told, now()).map_err(|error| error.to_string())?;
+        Ok(placed.into_iter().map(Into::into).collect())
+    }
+
+    #[test]
+    fn points_by_both_clocks_become_moments_of_this_machine() {
+        let ns = 499_999_000_000_u64;
+        let placed = place(&json!([
+            [ns, 3.5],
+            [5e11, -1],
+            ["2026-11-21T11:00:00.25+01:00", 4]
+        ]));
+        let expected = [(499_999_000_000, 3.5), (500_000_000_000, -1.0)];
+        assert_eq!(placed.as_ref().unwrap()[..2], expected);
+        assert_eq!(placed.unwrap()[2], (500_250_000_000, 4.0));
+    }
+
+    #[test]
+    fn what_is_no_point_says_which_and_why() {
+        let check = |at: Value, expected: &str| {
+            let error = place(&at).unwrap_err();
+            assert!(error.starts_with(expected), "{error}\n{expected}");
+        };
+        check(
+            json!("here"),
+            "motion.at: found \"here\", expected a list of 1 to 256",
+        );
+        check(json!([]), "motion.at: found 0 points");
+        check(json!(vec![[1, 2]; 257]), "motion.at: found 257 points");
+        check(json!([7]), "motion.at[0]: found 7, expected [MONO_NS, MM]");
+        check(json!([[7]]), "motion.at[0]: found [7], expected");
+        let good = [json!(5e11), json!(1.0)];
+        check(
+            json!([good, ["soon", 1]]),
+            "motion.at[1]: found \"soon\", expected nanoseconds",
+        );
+        check(
+            json!([good, [-7, 1]]),
+            "motion.at[1]: found -7, expected nanoseconds",
+        );
+        check(json!([good, [null, 1]]), "motion.at[1]: found null");
+        check(
+            json!([good, [5e11, "1"]]),
+            "motion.at[1]: found \"1\", expected millimetres",
+        );
+        check(
+            json!([good, [5e11, 2e6]]),
+            "motion.at[1]: found 2000000.0, expected millimetres",
+        );
+        let ahead = "motion.at[1]: found a moment 1.5 s ahead, expected one of the last 60 s by";
+        check(json!([good, [501_500_000_000_u64, 1]]), ahead);
+        check(
+            json!([good, [400_000_000_000_u64, 1]]),
+            "motion.at[1]: found a moment 100 s ago",
+        );
+        check(
+            json!([["2030-01-01T00:00:00Z", 1]]),
+            "motion.at[0]: found a moment 98200800 s ahead",
+        );
+        check(json!([[u64::MAX, 1]]), "motion.at[0]: found a moment");
+    }
+}

@@ -1,0 +1,68 @@
+//! What is known of the arm that presses.
+
+use serde::{Deserialize, Serialize};
+
+/// The `[sensor.arm]` table.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Settings {
+    /// Stiffness of all behind the sensor's face; `None`: unknown.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stiffness_n_per_mm: Option<f64>,
+    /// Speed of a steady approach, where the robot tells no positions; `None`: unknown.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub speed_mm_s: Option<f64>,
+    /// The arm's stamps are this much earlier than the frames'.
+    pub delay_ms: f64,
+}
+
+/// Slowest and fastest steady approach.
+pub const SPEEDS_MM_S: (f64, f64) = (0.001, 1000.0);
+/// Softest and hardest arm.
+const STIFFNESSES_N_PER_MM: (f64, f64) = (0.001, 100_000.0);
+/// Least and greatest delay: a frame takes less than a second from the sensor to its last byte.
+pub(super) const DELAYS_MS: (f64, f64) = (-1000.0, 1000.0);
+
+/// A value of [`Settings`] that cannot be used.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("{key}: found {found:?}, expected {least} to {most} {unit}")]
+pub struct SettingsError {
+    key: &'static str,
+    found: f64,
+    least: f64,
+    most: f64,
+    unit: &'static str,
+}
+
+impl Settings {
+    /// Checks every value.
+    ///
+    /// # Errors
+    ///
+    /// If a stiffness, speed or delay is out of its range.
+    pub fn check(&self) -> Result<(), SettingsError> {
+        for (key, found, (least, most), unit) in [
+            (
+                "stiffness_n_per_mm",
+                self.stiffness_n_per_mm,
+                STIFFNESSES_N_PER_MM,
+                "N/mm",
+            ),
+            ("speed_mm_s", self.speed_mm_s, SPEEDS_MM_S, "mm/s"),
+            ("delay_ms", Some(self.delay_ms), DELAYS_MS, "ms"),
+        ] {
+            if let Some(found) = found
+                && !(least..=most).contains(&found)
+            {
+                return Err(SettingsError {
+                    key,
+                    found,
+                    least,
+                    most,
+                    unit,
+                });
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,230 @@
+use proptest::prelude::*;
+
+use super::*;
+
+const MS: i64 = 1_000_000;
+
+/// Points of an arm at a steady 10 mm/s, a position every `step_ms`.
+fn steady(from_ms: i64, to_ms: i64, step_ms: usize) -> Vec<Point> {
+    (from_ms..=to_ms)
+        .step_by(step_ms)
+        .map(|ms| Point {
+            at_ns: ms * MS,
+            mm: 0.01 * ms as f64,
+        })
+        .collect()
+}
+
+fn at(ms: u64) -> Duration {
+    Duration::from_millis(ms)
+}
+
+fn approach(points: &[Point], begin: u64, moments: &[u64]) -> Option<Vec<Option<f64>>> {
+    let mut track = Track::default();
+    let _ = track.push(points);
+    let moments: Vec<Duration> = moments.iter().map(|&ms| at(ms)).collect();
+    track.approach(at(begin), &moments, 0.0)
+}
+
+fn close(found: Option<Vec<Option<f64>>>, expected: &[Option<f64>]) {
+    let found = found.expect("the approach is known");
+    assert_eq!(found.len(), expected.len());
+    for (found, expected) in found.iter().zip(expected) {
+        match (found, expected) {
+            (Some(found), Some(expected)) => assert!((found - expected).abs() < 1e-9),
+            (found, expected) => assert_eq!(found, expected),
+        }
+    }
+}
+
+#[test]
+fn positions_are_interpolated_and_count_from_the_begin() {
+    let points = steady(0, 5000, 70);
+    let expected = [Some(0.0), Some(0.33), Some(12.0)];
+    close(approach(&points, 1001, &[1001, 1034, 2201]), &expected);
+}
+
+#[test]
+fn a_delay_looks_that_much_earlier() {
+    let mut track = Track::default();
+    let mut points = steady(0, 2000, 50);
+    // It stops at 1 s.
+    for point in &mut points {
+        point.mm = point.mm.min(10.0);
+    }
+    track.push(&points).unwrap();
+    let moments = [at(900), at(1000), at(1100), at(1200)];
+    let told = |delay_ms| track.approach(at(900), &moments, delay_ms).unwrap();
+    let values = |told: Vec<Option<f64>>| told.into_iter().map(|mm| mm.unwrap().round());
+    assert!(values(told(0.0)).eq([0.0, 1.0, 1.0, 1.0]));
+    assert!(values(told(100.0)).eq([0.0, 1.0, 2.0, 2.0]));
+    assert!(values(told(-100.0)).eq([0.0, 0.0, 0.0, 0.0]));
+}
+
+#[test]
+fn what_is_missing_jumps_or_steps_back_is_unknown_for_its_press_alone() {
+    let hole = |from: i64, to: i64| {
+        let mut points = steady(0, 10_000, 50);
+        points.retain(|p| !(from..to).contains(&(p.at_ns / MS)));
+        points
+    };
+    let presses = |points: &[Point]| {
+        [(1000, 2000), (4000, 5000), (8000, 9000)]
+            .map(|(begin, end)| approach(points, begin, &[begin, begin + 500, end]).is_some())
+    };
+    assert_eq!(presses(&hole(0, 0)), [true, true, true]);
+    // 250 ms are no gap, 300 are.
+    assert_eq!(presses(&hole(4300, 4500)), [true, true, true]);
+    assert_eq!(presses(&hole(4300, 4550)), [true, false, true]);
+    // It counts from the last position before the press's begin to the first after its end.
+    assert_eq!(presses(&hole(3750, 4050)), [true, false, true]);
+    assert_eq!(presses(&hole(4950, 5300)), [true, false, true]);
+    assert_eq!(presses(&hole(3000, 3950)), [true, true, true]);
+    assert_eq!(presses(&hole(8500, 20_000)), [true, true, false]);
+    assert_eq!(presses(&hole(0, 4010)), [false, false, true]);
+
+    let mut jump = hole(0, 0);
+    jump[90].mm += 21.0;
+    assert_eq!(presses(&jump), [true, false, true]);
+    jump[90].mm -= 2.0;
+    assert_eq!(presses(&jump), [true, true, true]);
+
+    let mut back = hole(0, 0);
+    back.insert(90, back[85]);
+    assert_eq!(presses(&back), [true, false, true]);
+    back[90] = back[89];
+    assert_eq!(presses(&back), [true, false, true]);
+}
+
+#[test]
+fn a_step_back_is_told_and_time_goes_on_from_there() {
+    let mut track = Track::default();
+    track.push(&steady(0, 5000, 50)).unwrap();
+    let again = steady(2000, 9000, 50);
+    let back = track.push(&again).unwrap_err();
+    assert_eq!((back.index, back.back_ms), (0, 3000.0));
+    // What was told twice is not believed, what came later is.
+    assert_eq!(track.approach(at(4000), &[at(4500)], 0.0), None);
+    let expected = [Some(5.0)];
+    close(track.approach(at(6000), &[at(6500)], 0.0), &expected);
+}
+
+#[test]
+fn moments_after_the_latest_position_are_unknown_by_themselves() {
+    let points = steady(0, 2000, 50);
+    let expected = [Some(0.0), Some(5.0), None];
+    close(approach(&points, 1500, &[1500, 2000, 2250]), &expected);
+    assert_eq!(approach(&points, 1500, &[1500, 2000, 2251]), None);
+    assert_eq!(approach(&points, 2100, &[2100, 2200]), None);
+    assert_eq!(approach(&[], 0, &[0]), None);
+}
+
+#[test]
+fn a_minute_is_held() {
+    let mut track = Track::default();
+    track.push(&steady(0, 61_000, 50)).unwrap();
+    assert_eq!(track.approach(at(900), &[at(1200)], 0.0), None);
+    assert!(track.approach(at(1100), &[at(1200)], 0.0).is_some());
+    assert!(track.is_told(at(120_000), 0.0));
+    assert!(!track.is_told(at(121_001), 0.0));
+    assert!(!Track::default().is_told(at(0), 0.0));
+}
+
+#[test]
+fn a_flood_is_bounded() {
+    let mut track = Track::default();
+    let flood: Vec<Point> = (0..200_000).map(|n| Point { at_ns: n, mm: 0.0 }).collect();
+    track.push(&flood).unwrap();
+    assert_eq!(track.points.len(), MOST_POINTS);
+    for n in 0..100 {
+        track
+            .push(&[Point {
+                at_ns: 300_000 - n,
+                mm: 0.0,
+            }])
+            .ok();
+    }
+    assert!(track.doubts.len() <= MOST_DOUBTS);
+    assert!(track.is_possible());
+    assert_eq!(track.counts(), (200_100, 0));
+}
+
+#[test]
+fn a_point_after_its_final_verdict_is_late() {
+    let mut track = Track::default();
+    track.push(&steady(0, 1000, 50)).unwrap();
+    track.judged(at(1200), 100.0);
+    track.push(&steady(1050, 1300, 50)).unwrap();
+    assert_eq!(track.counts(), (27, 2));
+}
+
+/// What a robot may tell: mostly in order, with gaps, jumps and steps back.
+fn told() -> impl Strategy<Value = Vec<Point>> {
+    let step = prop_oneof![
+        8 => 1..100_i64,
+        1 => 200..400_i64,
+        1 => -300..1_i64,
+    ];
+    let moved = prop_oneof![12 => -2.0..2.0_f64, 1 => -40.0..40.0_f64];
+    prop::collection::vec((step, moved), 0..200).prop_map(|steps| {
+        let (mut at_ns, mut mm) = (0, 0.0);
+        let mut point = |(step, moved): (i64, f64)| {
+            at_ns += step * MS;
+            mm += moved;
+            Point { at_ns, mm }
+        };
+        steps.into_iter().map(&mut point).collect()
+    })
+}
+
+proptest! {
+    #[test]
+    fn whatever_is_told_the_approach_is_between_told_positions_or_unknown(
+        points in told(),
+        cuts in prop::collection::vec(0..200_usize, 0..8),
+        begin in 0..6000_u64,
+        frames in prop::collection::vec(1..300_u64, 1..40),
+    ) {
+        let mut moments = vec![at(begin)];
+        for step in frames {
+            let last = moments[moments.len() - 1];
+            moments.push(last + at(step));
+        }
+        let mut whole = Track::default();
+        let _ = whole.push(&points);
+        prop_assert!(whole.is_possible());
+        // Lines of any length say the same.
+        let mut cut = Track::default();
+        let mut ends: Vec<usize> = cuts.into_iter().map(|end| end.min(points.len())).collect();
+        ends.extend([0, points.len()]);
+        ends.sort_unstable();
+        for ends in ends.windows(2) {
+            let _ = cut.push(&points[ends[0]..ends[1]]);
+        }
+        prop_assert_eq!(&whole, &cut);
+
+        let told = whole.approach(at(begin), &moments, 0.0);
+        // A recording that holds less says the same.
+        prop_assert_eq!(&whole.since(at(begin)).approach(at(begin), &moments, 0.0), &told);
+        let Some(told) = told else { return Ok(()) };
+        let last = moments[moments.len() - 1].as_nanos() as i64;
+        let near = |ns: i64| points.iter().any(|p| (p.at_ns - ns).abs() <= LONGEST_GAP_NS);
+        prop_assert!(near(begin as i64 * MS) && near(last));
+        // No step back that was told falls into the press.
+        let mut latest = i64::MIN;
+        for point in &points {
+            let falls_in = point.at_ns <= last && latest >= begin as i64 * MS;
+            prop_assert!(point.at_ns > latest || !falls_in);
+            latest = point.at_ns;
+        }
+        let (low, high) = points.iter().fold((f64::MAX, f64::MIN), |(low, high), p| {
+            (low.min(p.mm), high.max(p.mm))
+        });
+        prop_assert_eq!(told[0], Some(0.0));
+        for (moment, mm) in moments.iter().zip(&told) {
+            let is_told = whole.points.back().is_some_and(|p| p.at_ns >= moment.as_nanos() as i64);
+            prop_assert_eq!(mm.is_some(), is_told);
+            prop_assert!(mm.is_none_or(|mm| mm.abs() <= high - low + 1e-9));
+        }
+    }
+}

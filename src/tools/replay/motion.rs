@@ -1,0 +1,120 @@
+//! The arm's positions beside raw bytes: a CSV file with the columns `time_s` and `approach_mm`.
+
+use std::io::{self, Read};
+use std::path::Path;
+
+use crate::motion::{FURTHEST_MM, Point};
+
+/// More than a day of positions, 100 a second.
+const MOST_BYTES: u64 = 256 << 20;
+/// No recording is longer: 30 years.
+const LONGEST_S: f64 = 1e9;
+
+/// Why positions cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The file cannot be read.
+    #[error(" cannot read: {0}")]
+    Unreadable(#[source] io::Error),
+    /// The first line does not name the columns.
+    #[error("1: found {0:?}, expected the names of the columns, time_s and approach_mm among them")]
+    Columns(String),
+    /// A line without the two numbers.
+    #[error("{line}: {key}: found {found:?}, expected {expected}")]
+    Value {
+        /// The line, from 1.
+        line: usize,
+        /// The column.
+        key: &'static str,
+        /// What is there.
+        found: String,
+        /// What should be.
+        expected: &'static str,
+    },
+    /// Another file altogether.
+    #[error(" found more than {} MB, expected fewer", MOST_BYTES >> 20)]
+    TooLong,
+}
+
+impl Error {
+    /// Whether the file could not be read.
+    pub fn is_unreadable(&self) -> bool {
+        matches!(self, Self::Unreadable(_))
+    }
+}
+
+/// Reads all positions of a file, in its order.
+pub(super) fn load(path: &Path) -> Result<Vec<Point>, Error> {
+    let file = crate::tools::open(path).map_err(Error::Unreadable)?;
+    let mut text = String::new();
+    let read = file.take(MOST_BYTES + 1).read_to_string(&mut text);
+    read.map_err(Error::Unreadable)?;
+    if text.len() as u64 > MOST_BYTES {
+        return Err(Error::TooLong);
+    }
+    parse(&text)
+}
+
+fn parse(text: &str) -> Result<Vec<Point>, Error> {
+    let mut lines = (1..).zip(text.lines());
+    let (_, names) = lines.next().unwrap_or((1, ""));
+    // A spreadsheet may have written a mark of the byte order.
+    let names = names.trim_start_matches('\u{feff}');
+    let place = |name: &str| names.split(',').position(|found| found.trim() == name);
+    let (Some(time), Some(approach)) = (place("time_s"), place("approach_mm")) else {
+        return Err(Error::Columns(names.chars().take(60).collect()));
+    };
+    let mut points = Vec::new();
+    for (line, text) in lines.filter(|(_, text)| !text.trim().is_empty()) {
+        let cells: Vec<&str> = text.split(',').map(str::trim).collect();
+        let number = |key, column: usize, most: f64, expected| {
+            let found = cells.get(column).copied().unwrap_or_default();
+            let number = found.parse().ok().filter(|n: &f64| n.abs() <= most);
+            number.ok_or_else(|| Error::Value {
+                line,
+                key,
+                found: found.chars().take(60).collect(),
+                expected,
+            })
+        };
+        let time_s = number("time_s", time, LONGEST_S, "seconds")?;
+        let mm = number("approach_mm", approach, FURTHEST_MM, "millimetres")?;
+        let at_ns = (time_s * 1e9).round() as i64;
+        points.push(Point { at_ns, mm });
+    }
+    Ok(points)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn columns_are_found_by_their_names() {
+        let text = "\u{feff}press, approach_mm ,time_s\r\n1,-2.5,0.25\r\n\n1,1e1,-1\n";
+        let points = parse(text).unwrap();
+        let points: Vec<(i64, f64)> = points.into_iter().map(Into::into).collect();
+        assert_eq!(points, [(250_000_000, -2.5), (-1_000_000_000, 10.0)]);
+    }
+
+    #[test]
+    fn what_is_no_position_is_named_with_its_line() {
+        let check = |text: &str, expected: &str| {
+            let error = parse(text).unwrap_err().to_string();
+            assert!(error.starts_with(expected), "{error}");
+        };
+        check("", "1: found \"\", expected the names of the columns");
+        check("time,mm\n1,2", "1: found \"time,mm\"");
+        let names = "time_s,approach_mm\n1,2\n";
+        check(
+            &format!("{names}2"),
+            "3: approach_mm: found \"\", expected millimetres",
+        );
+        check(
+            &format!("{names}x,1"),
+            "3: time_s: found \"x\", expected seconds",
+        );
+        check(&format!("{names}\n1,nan"), "4: approach_mm: found \"nan\"");
+        check(&format!("{names}inf,1"), "3: time_s: found \"inf\"");
+    }
+}
