@@ -201,7 +201,7 @@ fn what_is_not_live_is_not_shown_as_present() {
             let warm = buffer
                 .content
                 .iter()
-                .any(|cell| cell.bg == Color::Indexed(230));
+                .any(|cell| cell.bg == Color::Indexed(220));
             assert!(!warm, "pressure in colours, though {word}");
         }
     }
@@ -361,12 +361,12 @@ fn a_daemon_without_room_is_quoted() {
     hear(
         &mut view,
         0,
-        json!({"type": "error", "message": "found 256 subscribers already"}),
+        json!({"type": "error", "message": "too many subscribers (256)"}),
     );
     view.lose(Loss::Closed);
     let text = shown(&view, 100, (80, 24), PLAIN);
     assert!(
-        text.contains("NO DAEMON  found 256 subscribers already"),
+        text.contains("NO DAEMON  too many subscribers (256)"),
         "{text}"
     );
 }

@@ -5,6 +5,7 @@ use ratatui_core::style::Color;
 
 use super::super::view::{Link, Sensor};
 use super::Page;
+use crate::colour::viridis;
 
 impl Page<'_> {
     /// Columns and rows of the pressure map: the largest that fits, with so many columns a taxel and
@@ -42,9 +43,9 @@ impl Page<'_> {
                 let (upper, lower) = (half(0), half(1));
                 let cell = &mut self.buffer[(area.x + x, area.y + y)];
                 if self.look.colours {
-                    let ramp = if link == Link::Live { &HEAT } else { &GREY };
                     let colour = |share: Option<f32>| match share {
-                        Some(share) => Color::Indexed(ramp[step(share, ramp.len())]),
+                        Some(share) if link == Link::Live => heat(share),
+                        Some(share) => Color::Indexed(GREY[step(share, GREY.len())]),
                         None => Color::Indexed(GREY[0]),
                     };
                     if self.look.unicode {
@@ -97,10 +98,19 @@ fn step(share: f32, steps: usize) -> usize {
 /// The map's scale reaches at least so far, in newtons a taxel: noise must not look like a touch.
 const LEAST_SCALE_N: f32 = 1.0;
 
-/// From nothing to the greatest pressure, of the 256 colours of xterm: dark, violet, red, yellow.
-const HEAT: [u8; 13] = [234, 53, 54, 90, 126, 161, 197, 203, 209, 215, 221, 227, 230];
+/// The nearest of xterm's 256 colours to that of the one colour map. 216 of them are a cube with the levels
+/// 0, 95, 135, 175, 215 and 255 of red, green and blue.
+fn heat(share: f32) -> Color {
+    let level = |value: u8| match value {
+        0..48 => 0,
+        48..115 => 1,
+        _ => (value - 35) / 40,
+    };
+    let [red, green, blue] = viridis(share).map(level);
+    Color::Indexed(16 + 36 * red + 6 * green + blue)
+}
 
-/// The same for what is no longer true.
+/// From nothing to the greatest pressure, for what is no longer true.
 const GREY: [u8; 13] = [
     234, 235, 236, 238, 240, 241, 243, 244, 246, 247, 249, 251, 253,
 ];
