@@ -111,7 +111,12 @@ impl Failure {
 
             Self::Simulate(simulate::Error::Layout(_) | simulate::Error::Baud { .. })
             | Self::Replay(replay::Error::OwnMotion { .. })
-            | Self::Record(record::Error::Level { .. } | record::Error::Twice { .. }) => USAGE,
+            | Self::Record(
+                record::Error::Level { .. }
+                | record::Error::Twice { .. }
+                | record::Error::Asked { .. }
+                | record::Error::NoTerminal,
+            ) => USAGE,
             #[cfg(feature = "watch")]
             Self::Watch(watch::Error::NoTerminal) => USAGE,
 
@@ -138,7 +143,7 @@ impl Failure {
 
             Self::Demo(demo::Error::Io { .. })
             | Self::Simulate(simulate::Error::Recording { .. } | simulate::Error::Pty { .. })
-            | Self::Record(record::Error::Create { .. })
+            | Self::Record(record::Error::Create { .. } | record::Error::Session { .. })
             | Self::Recover(recover::Error::Broken { .. } | recover::Error::Write { .. })
             | Self::Replay(replay::Error::Broken { .. } | replay::Error::Print(_))
             | Self::Tail(tail::Error::Print(_))
@@ -165,7 +170,7 @@ fn of_config(error: &ConfigError) -> u8 {
 
 fn of_daemon(error: &daemon::Error) -> u8 {
     match error {
-        // The configuration names a file that it must not.
+        // The configuration names a file that the daemon cannot use there.
         daemon::Error::Publish(PublishError::Socket(
             SocketError::NoSocket { .. }
             | SocketError::NoDirectory { .. }
@@ -173,7 +178,7 @@ fn of_daemon(error: &daemon::Error) -> u8 {
         )) => CONFIG,
         daemon::Error::Record(RecordError::Directory { .. }) | daemon::Error::Log(_) => CONFIG,
         daemon::Error::Publish(PublishError::Unasked { .. } | PublishError::Passed(_)) => CONFIG,
-        // In use or refused: another time it may work.
+        // In use or refused. It may work later.
         daemon::Error::Publish(_) | daemon::Error::Random(_) => IO,
         daemon::Error::Record(RecordError::Unavailable { .. } | RecordError::Lost { .. }) => {
             UNAVAILABLE

@@ -1,13 +1,16 @@
 //! `hardnessd record`: a daemon without sockets that writes what comes to a file.
 //!
 //! On a terminal a line on stderr says how many presses the file holds so far. At the end a warning
-//! says if there were none.
+//! says if there were none. A [`session`] records one file after another.
+
+mod session;
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::future::Future;
 use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
+use std::pin::pin;
 use std::time::Duration;
 
 use clap::Args as ClapArgs;
@@ -18,9 +21,9 @@ use super::configuration::Configuration;
 use super::doctor;
 use super::simulate::positive;
 use crate::daemon::config::Setup;
-use crate::daemon::record::Progress;
-use crate::daemon::{self, Daemon, record};
-use crate::recording::{LabelError, check_label};
+use crate::daemon::record::{Error as RecordError, Progress};
+use crate::daemon::{self, Daemon};
+use crate::recording::{LabelError, Labels, check_label};
 use crate::verdict::Level;
 
 /// Arguments of `record`.
@@ -30,8 +33,12 @@ pub struct Args {
     #[command(flatten)]
     pub config: Configuration,
     /// Recording to write, as MCAP; a file that exists is left alone
-    #[arg(long, value_name = "FILE")]
-    out: PathBuf,
+    #[arg(long, value_name = "FILE", required_unless_present = "session")]
+    out: Option<PathBuf>,
+    /// Ask on the terminal for one object after another, and write a recording of each into this directory,
+    /// labelled for `hrn-train collect`
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["out", "seconds"])]
+    session: Option<PathBuf>,
     /// Label to store in the recording, such as level=2 or object=7; may be repeated
     #[arg(long = "label", value_name = "KEY=VALUE", value_parser = label)]
     labels: Vec<(String, String)>,
@@ -48,7 +55,7 @@ pub enum Error {
         "--label level: found {found:?}, expected 0 (unlabelled) or one of the model's: {levels}"
     )]
     Level {
-        /// As given.
+        /// The value as given.
         found: String,
         /// Those of the model.
         levels: String,
@@ -59,20 +66,39 @@ pub enum Error {
         /// The key.
         key: String,
     },
-    /// The file cannot be made.
-    #[error("--out {path}: {source}: name a new file")]
-    Create {
-        /// As given.
+    /// A label that a session gives each object itself.
+    #[error("--label {key}: --session asks for it: leave it out")]
+    Asked {
+        /// The key.
+        key: String,
+    },
+    /// A session has nobody to ask.
+    #[error(
+        "`record --session` needs a terminal on stdin and stderr: use --out and --label instead"
+    )]
+    NoTerminal,
+    /// The directory of a session, or its list, cannot be used.
+    #[error("--session: {}: {source}", path.display())]
+    Session {
+        /// Of the directory or the list.
         path: PathBuf,
-        /// Why not.
+        /// The reason.
+        source: io::Error,
+    },
+    /// The file cannot be made.
+    #[error("{path}: {source}: name a new file")]
+    Create {
+        /// The value as given.
+        path: PathBuf,
+        /// The reason.
         source: io::Error,
     },
     /// A sensor is not there to begin with.
     #[error("sensor {sensor:?}: {}: {obstacle}", port.display())]
     Unavailable {
-        /// Its name.
+        /// The sensor's name.
         sensor: String,
-        /// As configured.
+        /// As in the configuration.
         port: PathBuf,
         /// What is in the way, and what to do.
         obstacle: String,
@@ -100,14 +126,18 @@ pub async fn run(
             return Err(Error::Twice { key });
         }
     }
-    let path = args.out;
-    let file = File::create_new(&path).map_err(|source| Error::Create {
-        path: path.clone(),
-        source,
-    })?;
-    let ports: BTreeMap<String, PathBuf> = setup.config.sensors.iter().map(port_of).collect();
+    if let Some(directory) = &args.session {
+        let asked = ["level", "object", "name"];
+        if let Some(key) = asked.into_iter().find(|&key| labels.contains_key(key)) {
+            let key = key.to_owned();
+            return Err(Error::Asked { key });
+        }
+        return session::run(directory, &labels, setup, pin!(shutdown)).await;
+    }
+    let path = args
+        .out
+        .expect("clap asks for it where there is no session");
     let (progress, counted) = watch::channel(Progress::default());
-    let daemon = Daemon::recording(setup, path.clone(), file, labels, progress)?;
     let over = async {
         match args.seconds {
             // A time beyond counting is none.
@@ -125,19 +155,14 @@ pub async fn run(
         }
     };
     let recorded = tokio::select! {
-        recorded = daemon.run(end, None) => recorded,
+        recorded = record(setup, &path, labels, progress, end) => recorded,
         () = show(&path, &counted) => unreachable!("it goes on as long as it is waited for"),
     };
-    if let Err(daemon::Error::Record(record::Error::Unavailable { sensor, reason })) = recorded {
-        // It holds nothing, and the next try shall find its place free.
-        let _ = fs::remove_file(&path);
-        let port = ports.get(&sensor).cloned().unwrap_or_default();
-        let obstacle = doctor::obstacle(&port).unwrap_or(reason);
-        return Err(Error::Unavailable {
-            sensor,
-            port,
-            obstacle,
-        });
+    if matches!(
+        recorded,
+        Err(Error::Create { .. } | Error::Unavailable { .. })
+    ) {
+        return recorded;
     }
     let Progress { frames, presses } = *counted.borrow();
     if io::stderr().is_terminal() {
@@ -153,7 +178,38 @@ pub async fn run(
              is press.contact_threshold_n low enough?"
         );
     }
-    Ok(recorded?)
+    recorded
+}
+
+/// Records into a new file until `end` comes or no sensor is left. The file is not there afterwards if a sensor
+/// was not there to begin with.
+async fn record(
+    setup: Setup,
+    path: &Path,
+    labels: Labels,
+    progress: watch::Sender<Progress>,
+    end: impl Future<Output = ()>,
+) -> Result<(), Error> {
+    let file = File::create_new(path).map_err(|source| Error::Create {
+        path: path.to_owned(),
+        source,
+    })?;
+    let ports: BTreeMap<String, PathBuf> = setup.config.sensors.iter().map(port_of).collect();
+    let daemon = Daemon::recording(setup, path.to_owned(), file, labels, progress)?;
+    match daemon.run(end, None).await {
+        Err(daemon::Error::Record(RecordError::Unavailable { sensor, reason })) => {
+            // It holds nothing, and the next try shall find its place free.
+            let _ = fs::remove_file(path);
+            let port = ports.get(&sensor).cloned().unwrap_or_default();
+            let obstacle = doctor::obstacle(&port).unwrap_or(reason);
+            Err(Error::Unavailable {
+                sensor,
+                port,
+                obstacle,
+            })
+        }
+        recorded => Ok(recorded?),
+    }
 }
 
 fn port_of(sensor: &crate::daemon::config::SensorTable) -> (String, PathBuf) {
@@ -199,15 +255,17 @@ fn check_level(labels: &[(String, String)], levels: &[Level]) -> Result<(), Erro
     let mut said = labels.iter().filter(|(key, _)| key == "level");
     match said.find(|(_, found)| !is_level(found)) {
         None => Ok(()),
-        Some((_, found)) => {
-            let one = |level: &Level| format!("{} ({})", level.level, level.label);
-            let levels: Vec<String> = levels.iter().map(one).collect();
-            Err(Error::Level {
-                found: found.clone(),
-                levels: levels.join(", "),
-            })
-        }
+        Some((_, found)) => Err(Error::Level {
+            found: found.clone(),
+            levels: self::levels(levels),
+        }),
     }
+}
+
+/// Such as `1 (hard), 2 (firm)`.
+fn levels(levels: &[Level]) -> String {
+    let one = |level: &Level| format!("{} ({})", level.level, level.label);
+    levels.iter().map(one).collect::<Vec<_>>().join(", ")
 }
 
 /// `KEY=VALUE`.

@@ -1,0 +1,182 @@
+//! `hardnessd record --session` on a real pty, with a simulated sensor: what it asks, and what it leaves.
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy knows no helper of a test as a test"
+)]
+
+mod bench;
+#[path = "../src/tools/pty/pair.rs"]
+#[allow(dead_code, reason = "nobody here asks where the device is")]
+mod pair;
+
+use std::fs::{self, File};
+use std::io::Read;
+use std::os::fd::OwnedFd;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::sync::mpsc::{self, Receiver};
+use std::time::{Duration, Instant};
+
+use bench::{BINARY, Bench, PATIENCE, Process, hardnessd};
+use pair::Pair;
+
+/// A session, and the terminal that it runs on.
+struct Session {
+    process: Process,
+    master: OwnedFd,
+    bytes: Receiver<Vec<u8>>,
+    /// What it has written and the test has not looked at.
+    written: String,
+}
+
+impl Session {
+    fn start(config: &Path, directory: &Path) -> Self {
+        let Pair { master, device, .. } = Pair::open().unwrap();
+        let end = || Stdio::from(device.try_clone().unwrap());
+        // Without a terminal of its own, which a test may be started from.
+        let process = Command::new("setsid")
+            .args([BINARY, "record", "--config"])
+            .arg(config)
+            .arg("--session")
+            .arg(directory)
+            .stdin(end())
+            .stdout(end())
+            .stderr(end())
+            .spawn()
+            .unwrap();
+        let mut output = File::from(master.try_clone().unwrap());
+        let (sender, bytes) = mpsc::channel();
+        std::thread::spawn(move || {
+            let mut read = [0; 4096];
+            while let Ok(length @ 1..) = output.read(&mut read) {
+                if sender.send(read[..length].to_vec()).is_err() {
+                    return;
+                }
+            }
+        });
+        Self {
+            process: Process(process),
+            master,
+            bytes,
+            written: String::new(),
+        }
+    }
+
+    /// Waits until it has written `part` after what was looked at before.
+    fn says(&mut self, part: &str) {
+        let start = Instant::now();
+        loop {
+            if let Some(at) = self.written.find(part) {
+                self.written.drain(..at + part.len());
+                return;
+            }
+            let left = PATIENCE.saturating_sub(start.elapsed());
+            assert!(left > Duration::ZERO, "{part:?} not in {:?}", self.written);
+            if let Ok(bytes) = self.bytes.recv_timeout(left) {
+                self.written += &String::from_utf8_lossy(&bytes);
+            }
+        }
+    }
+
+    fn answer(&self, line: &str) {
+        rustix::io::write(&self.master, format!("{line}\n").as_bytes()).unwrap();
+    }
+}
+
+#[test]
+fn a_session_asks_for_each_object_and_labels_its_recording() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let own = bench.path("own");
+    let _sensor = bench.sensor(&[]);
+
+    let mut session = Session::start(&config, &own);
+    session.says("object 1: its name: ");
+    session.answer("");
+    session.says("the name is empty");
+    session.answer("Yoga mat");
+    session.says("its level, 1 (hard)");
+    session.answer("7");
+    session.says("there is no level");
+    session.answer("4");
+    session.says("presses: 1");
+    session.answer("r");
+    session.says("again: Yoga mat");
+    session.says("presses: 2");
+    session.answer("");
+    session.says("object 2: its name: ");
+    session.answer("a \"b\", c");
+    session.says("its level");
+    session.answer("0");
+    session.says("presses: 1");
+    session.answer("q");
+    session.says("recorded 2 objects");
+    assert_eq!(session.process.exit_code(), Some(0));
+
+    let list = fs::read_to_string(own.join("session.csv")).unwrap();
+    let lines: Vec<&str> = list.lines().collect();
+    let [heading, first, second] = lines[..] else {
+        panic!("{list}");
+    };
+    assert_eq!(heading, "object,name,level,presses,file");
+    assert!(first.starts_with("1,\"Yoga mat\",4,"), "{first}");
+    assert!(second.starts_with("2,\"a \"\"b\"\", c\",0,"), "{second}");
+    let mut files: Vec<_> = fs::read_dir(&own)
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect();
+    files.sort();
+    assert_eq!(
+        files,
+        ["001-yoga-mat.mcap", "002-a--b---c.mcap", "session.csv"]
+    );
+    #[cfg(feature = "train")]
+    assert_collects(&bench, &own);
+
+    // The next session goes on, and one without a press leaves nothing.
+    let mut session = Session::start(&config, &own);
+    session.says("object 3: its name: ");
+    session.answer("q");
+    session.says("recorded 0 objects");
+    assert_eq!(session.process.exit_code(), Some(0));
+    assert_eq!(fs::read_dir(&own).unwrap().count(), 3);
+}
+
+/// `hrn-train` takes the recordings as they are.
+#[cfg(feature = "train")]
+fn assert_collects(bench: &Bench, own: &Path) {
+    let out = bench.path("own.npz");
+    let collected = Command::new(env!("CARGO_BIN_EXE_hrn-train"))
+        .args(["collect", "--out"])
+        .arg(&out)
+        .args([own.join("001-yoga-mat.mcap"), own.join("002-a--b---c.mcap")])
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&collected.stderr);
+    assert_eq!(collected.status.code(), Some(0), "{said}");
+    assert!(out.exists());
+}
+
+#[test]
+fn a_session_needs_a_terminal_and_asks_for_its_labels_itself() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let own = bench.path("own");
+    let check = |more: &[&str], part: &str| {
+        let arguments = [
+            "record",
+            "--config",
+            config.to_str().unwrap(),
+            "--session",
+            own.to_str().unwrap(),
+        ];
+        let output = hardnessd(&[&arguments[..], more].concat());
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(said.contains(part) && said.lines().count() == 1, "{said}");
+    };
+    check(&[], "needs a terminal");
+    check(&["--label", "level=2"], "--session asks for it");
+    check(&["--out", "x.mcap"], "cannot be used with");
+    assert!(!own.exists());
+}
