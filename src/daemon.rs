@@ -21,6 +21,7 @@ mod reload;
 mod request;
 #[cfg(feature = "ros2")]
 pub mod ros2;
+mod running;
 mod sensor;
 pub(crate) mod serial;
 pub mod socket;
@@ -34,29 +35,24 @@ use std::future::Future;
 use std::io::Read;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::pin::{Pin, pin};
 use std::time::Duration;
 
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
-use tokio::time::MissedTickBehavior;
-use tracing::{error, info, warn};
+use tracing::info;
 
 use self::config::{Config, Publish, Setup};
 use self::publish::Publishers;
 use self::realtime::Standing;
 use self::record::{EventRecorder, Progress, Recorder, SensorRecorder, Target};
 pub use self::reload::Reload;
-use self::reload::{Readers, Refusal};
-use self::sensor::{Command, SensorHandle, Sensors};
+use self::running::Running;
+use self::sensor::{SensorHandle, Sensors};
 use self::serial::Link;
 use crate::event::{Hello, ModelCard, PROTOCOL, SensorCard, Status};
 use crate::frame::Stamp;
 use crate::pipeline::{Clock, Pipeline};
 use crate::recording::{About, Labels, RecordedSensor};
-
-/// How long subscribers may take to fetch their last lines: the daemon must end within 1 s.
-const FAREWELL: Duration = Duration::from_millis(300);
 
 /// Questions that wait for a sensor. When there are more, the tasks that ask wait.
 const QUESTIONS: usize = 16;
@@ -241,134 +237,11 @@ fn start_sensors(
     (Sensors(sensors), tasks)
 }
 
-/// A daemon that serves.
-struct Running {
-    setup: Setup,
-    /// The token of this run.
-    run: String,
-    hub: hub::Handle,
-    sensors: Sensors,
-    /// One for each sensor.
-    tasks: JoinSet<()>,
-    /// One for each listener.
-    publishers: JoinSet<()>,
-    recorder: Option<Recorder>,
-    /// To the listeners.
-    orders: watch::Sender<()>,
-}
-
-/// A configuration that is being read.
-type Loading = Pin<Box<dyn Future<Output = Result<Setup, Refusal>>>>;
-
-impl Running {
-    /// Serves until `shutdown` is ready, there is no more to record, or a task has ended by itself.
-    async fn serve(
-        &mut self,
-        shutdown: impl Future<Output = ()>,
-        reload: &mut Option<Reload>,
-    ) -> Result<(), Error> {
-        let mut heartbeat = tokio::time::interval(systemd::heartbeat());
-        heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let readers = Readers::default();
-        let mut loading: Option<Loading> = None;
-        let mut shutdown = pin!(shutdown);
-        loop {
-            tokio::select! {
-                () = &mut shutdown => return Ok(()),
-                Some(_) = self.tasks.join_next() => return Err(Error::Stopped("a sensor")),
-                Some(_) = self.publishers.join_next() => return Err(Error::Stopped("a listener")),
-                () = record_ended(&mut self.recorder) => return Ok(()),
-                _ = heartbeat.tick() => {
-                    if let Some(statuses) = alive(&self.hub, &self.sensors).await {
-                        systemd::alive(&statuses);
-                    }
-                }
-                path = reload::requested(reload), if loading.is_none() => {
-                    systemd::reloading();
-                    // Listeners look whether they can still be reached.
-                    let _ = self.orders.send(());
-                    loading = Some(Box::pin(readers.read(path)));
-                }
-                loaded = finished(&mut loading) => {
-                    loading = None;
-                    let log = reload.as_ref().map(|reload| &reload.log);
-                    match loaded.and_then(|changed| reload::change(&self.setup, changed, log)) {
-                        Ok(changed) => self.adopt(changed).await,
-                        Err(reason) => error!(%reason, "reload refused, all stays as it was"),
-                    }
-                    systemd::ready();
-                }
-            }
-        }
-    }
-
-    /// Serves by `changed` from now on.
-    async fn adopt(&mut self, changed: Setup) {
-        self.setup = changed;
-        self.hub
-            .describe(hello(&self.setup, self.run.clone()))
-            .await;
-        for (sensor, changed) in self.sensors.0.iter().zip(&self.setup.sensors) {
-            let changed = Box::new(changed.clone());
-            let command = Command::Reload(changed, self.setup.hrn.clone());
-            // The main loop notices a sensor whose task has ended.
-            let _ = sensor.commands.send(command).await;
-        }
-        info!(model = short(&self.setup), "reloaded");
-    }
-
-    /// Finishes the event in hand: presses are aborted, and subscribers and the recording get
-    /// their last lines.
-    async fn finish(mut self) -> Result<(), Error> {
-        systemd::stopping();
-        info!("stopping");
-        for sensor in &self.sensors.0 {
-            // The task may have ended by itself.
-            let _ = sensor.commands.send(Command::Finish).await;
-        }
-        while self.tasks.join_next().await.is_some() {}
-        self.hub.close().await;
-        drop(self.orders);
-        let farewell = async { while self.publishers.join_next().await.is_some() {} };
-        if tokio::time::timeout(FAREWELL, farewell).await.is_err() {
-            warn!("a subscriber did not fetch its last lines");
-        }
-        let recorded = match self.recorder {
-            // A recording that somebody asked for by itself is worth waiting for.
-            Some(recorder) if self.setup.config.record.is_none() => recorder.finish().await,
-            Some(recorder) => tokio::time::timeout(FAREWELL, recorder.finish())
-                .await
-                .unwrap_or_else(|_| {
-                    warn!("the disk did not take the end of the recording");
-                    Ok(())
-                }),
-            None => Ok(()),
-        };
-        recorded.map_err(Error::Record)
-    }
-}
-
-/// Waits until there is no more to record; never ready without a recorder.
-async fn record_ended(recorder: &mut Option<Recorder>) {
-    match recorder {
-        Some(recorder) => recorder.stopped().await,
-        None => std::future::pending().await,
-    }
-}
-
 /// The status of every sensor, if every sensor's task and the hub answer. This feeds the watchdog.
 async fn alive(hub: &hub::Handle, sensors: &Sensors) -> Option<Vec<Status>> {
     let statuses = sensors.statuses().await;
     let all = statuses.len() == sensors.0.len();
     (all && hub.finals().await.is_ok()).then_some(statuses)
-}
-
-/// Waits for the configuration that is being read; never ready if none is.
-async fn finished(loading: &mut Option<Loading>) -> Result<Setup, Refusal> {
-    match loading {
-        Some(loading) => loading.await,
-        None => std::future::pending().await,
-    }
 }
 
 fn announce(setup: &Setup, run: &str) {
