@@ -8,6 +8,7 @@
 mod accept;
 mod client;
 pub mod config;
+pub mod descriptors;
 mod http;
 mod hub;
 pub(crate) mod lines;
@@ -39,7 +40,7 @@ use std::time::Duration;
 
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
-use tracing::info;
+use tracing::{info, warn};
 
 use self::config::{Config, Publish, Setup};
 use self::publish::Publishers;
@@ -187,6 +188,10 @@ impl Daemon {
             publishers,
             target,
         } = self;
+        descriptors::raise();
+        if let Some(shortage) = descriptors::shortage(&setup.config) {
+            warn!("{shortage}");
+        }
         let run = hello.run.clone();
         let recorder = target
             .map(|target| Recorder::start(target, about(&setup, &hello)))

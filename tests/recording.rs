@@ -508,6 +508,8 @@ fn the_last_minute_is_written_on_request_and_at_a_fault() {
     let mut control = Subscriber::connect(&bench.path("control.sock"));
     let answer = control.ask(r#"{"blackbox":"forearm","id":1}"#);
     assert_eq!(answer["type"], "ok", "{answer}");
+    let again = control.ask(r#"{"blackbox":"forearm","id":2}"#);
+    assert_eq!((&again["type"], &again["id"]), (&"error".into(), &2.into()));
     let written = PathBuf::from(answer["blackbox"].as_str().unwrap());
     let events = replay(&written);
     let verdict = events
@@ -591,6 +593,33 @@ fn files_end_in_time_and_each_can_be_played_by_itself() {
         assert!(!same.is_empty(), "press {press} is in no file");
         assert!(same.iter().all(|(_, event)| *event == live));
     }
+}
+
+#[test]
+fn a_recording_that_is_deleted_begins_anew() {
+    let bench = Bench::new();
+    let record = "[record]\ndir = \"rec\"\nkeep_free_mb = 0\n";
+    let config = bench.configure("hardnessd.toml", "events.sock", record);
+    let mut daemon = Daemon::start(&config);
+    let _sensor = bench.sensor(&[]);
+    let mut subscriber = bench.subscriber();
+    subscriber.until(&json!({"phase": "final"}));
+    let directory = bench.path("rec");
+    let first = recordings_in(&directory, "hardnessd-").remove(0);
+    fs::remove_dir_all(&directory).unwrap();
+    let line = daemon.logged("the recording was deleted");
+    assert!(line.contains(first.to_str().unwrap()), "{line}");
+    daemon.logged("recording path=");
+    subscriber.until(&json!({"phase": "final"}));
+    daemon.process.signal(Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    let recordings = recordings_in(&directory, "hardnessd-");
+    assert_eq!(recordings.len(), 1, "{recordings:?}");
+    assert!(
+        replay(&recordings[0])
+            .iter()
+            .any(|event| event["phase"] == "final")
+    );
 }
 
 #[test]

@@ -13,6 +13,7 @@ use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt, Interest};
 use tokio::net::{TcpStream, UnixStream, tcp, unix};
 use tokio::sync::oneshot;
 use tokio::sync::oneshot::error::TryRecvError;
+use tokio::time::Instant;
 use tracing::debug;
 
 use super::accept::Serve;
@@ -27,6 +28,12 @@ use crate::tare::RetareError;
 
 /// The longest line that a subscriber may send (`docs/controller.md`).
 const LONGEST_LINE_BYTES: usize = 64 * 1024;
+
+/// A connection may send this many requests at once, and one in every [`REQUEST_EVERY`] after that. The
+/// rest waits in the system's buffers, so that one who asks without end does not delay the sensors, which
+/// share the daemon's thread.
+const REQUESTS_AT_ONCE: u32 = 64;
+const REQUEST_EVERY: Duration = Duration::from_micros(500);
 
 /// The first and the longest pause between checks of a connection whose other end has stopped
 /// sending. If that end is closed altogether, the runtime learns of it a moment after the last read.
@@ -169,7 +176,9 @@ impl<S: Stream> Serve<S> for Service {
 
     fn refuse(&self, stream: S) {
         let found = self.max_clients;
-        let message = format!("found {found} subscribers already, expected fewer: try later");
+        let message = format!(
+            "too many subscribers ({found}): try later, or raise max_clients in the configuration"
+        );
         // A client that does not read it sees the connection end.
         let _ = stream.say(Reply::Error { message, id: None }.to_line().as_bytes());
     }
@@ -182,9 +191,9 @@ enum Refused {
     Unusable(#[from] request::Unusable),
     #[error(transparent)]
     Ahead(#[from] hub::Ahead),
-    #[error("{0}: found a command that changes something, expected it on the control socket")]
+    #[error("{0}: this socket changes nothing: send it to the control socket")]
     ReadOnly(&'static str),
-    #[error("{key}: found {found:?}, expected one of {}", names.join(", "))]
+    #[error("{key}: found {found}, expected one of {}", names.join(", "))]
     NoSensor {
         key: &'static str,
         found: String,
@@ -229,6 +238,33 @@ struct Client<S: Stream> {
     service: Service,
 }
 
+/// When the next request of a connection is read.
+struct Pace {
+    /// When all requests so far would have been answered at an even pace.
+    due: Instant,
+}
+
+impl Pace {
+    fn new() -> Self {
+        Self {
+            due: Instant::now(),
+        }
+    }
+
+    /// Waits until another request may be read. Nothing is lost if the wait is given up.
+    async fn wait(&self) {
+        let ahead = REQUESTS_AT_ONCE * REQUEST_EVERY;
+        if self.due > Instant::now() + ahead {
+            tokio::time::sleep_until(self.due - ahead).await;
+        }
+    }
+
+    /// Counts a request.
+    fn count(&mut self) {
+        self.due = self.due.max(Instant::now()) + REQUEST_EVERY;
+    }
+}
+
 /// What the answer to a command says.
 #[derive(Default)]
 struct Done {
@@ -266,6 +302,7 @@ impl<S: Stream> Client<S> {
         let mut hearing = true;
         let mut doing: Option<Doing> = None;
         let mut pause = HALF_CLOSED_CHECKS.0;
+        let mut pace = Pace::new();
         loop {
             tokio::select! {
                 biased;
@@ -284,8 +321,11 @@ impl<S: Stream> Client<S> {
                     doing = None;
                     self.send(&[answer]).await?;
                 }
-                heard = self.input.next(), if hearing && doing.is_none() => match heard? {
-                    Heard::Line(line) => doing = self.heed(id, &line, &mut next).await?,
+                heard = hear(&mut self.input, &pace), if hearing && doing.is_none() => match heard? {
+                    Heard::Line(line) => {
+                        pace.count();
+                        doing = self.heed(id, &line, &mut next).await?;
+                    }
                     Heard::TooLong => {
                         let message = format!(
                             "found a line over {LONGEST_LINE_BYTES} bytes, expected a shorter one"
@@ -368,6 +408,12 @@ impl<S: Stream> Client<S> {
     }
 }
 
+/// The next line, when another may be read.
+async fn hear<I: AsyncRead + Unpin>(lines: &mut Lines<I>, pace: &Pace) -> io::Result<Heard> {
+    pace.wait().await;
+    lines.next().await
+}
+
 /// Passes a command on to the sensor called `name`. `key` is the request's key for it.
 async fn tell(
     sensors: &Sensors,
@@ -378,7 +424,7 @@ async fn tell(
     let Some(sensor) = sensors.0.iter().find(|sensor| sensor.name == name) else {
         return Err(Refused::NoSensor {
             key,
-            found: name.to_owned(),
+            found: request::short(name),
             names: sensors.0.iter().map(|s| s.name.clone()).collect(),
         });
     };

@@ -60,7 +60,7 @@ pub(crate) enum Target {
 pub struct Progress {
     /// Whole frames of all sensors.
     pub frames: u64,
-    /// Presses that have begun.
+    /// Presses that have ended by themselves, so that they have a verdict.
     pub presses: u64,
 }
 
@@ -107,10 +107,12 @@ pub enum Error {
 /// Why there is no black box.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum NoBlackbox {
-    #[error("found no [record] in the configuration, expected it: nothing is kept")]
+    #[error("nothing is kept: the configuration has no [record]")]
     NotKept,
-    #[error("found a recording into one file, expected the daemon")]
+    #[error("`hardnessd record` keeps none: ask a daemon that has [record]")]
     OneFile,
+    #[error("one was written less than a second ago: ask again in a second")]
+    TooSoon,
     #[error(transparent)]
     Write(#[from] crate::recording::Error),
 }

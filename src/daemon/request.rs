@@ -291,7 +291,7 @@ fn context(value: Value) -> Result<Change, Unusable> {
 }
 
 /// What was found, as JSON, short enough for a message.
-fn short(found: &(impl Serialize + ?Sized)) -> String {
+pub(crate) fn short(found: &(impl Serialize + ?Sized)) -> String {
     const CHARS: usize = 60;
     let text = serde_json::to_string(found).expect("what was read as JSON can be written as JSON");
     match text.char_indices().nth(CHARS) {

@@ -23,41 +23,41 @@ pub struct Args {
 /// What is wrong with a configuration.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// It cannot be used.
+    /// The configuration cannot be used.
     #[error(transparent)]
     Config(#[from] config::Error),
-    /// There is none.
+    /// There is no configuration.
     #[error(transparent)]
     Missing(#[from] configuration::Missing),
-    /// What it names cannot be written to.
+    /// A path that it names cannot be written to.
     #[error("{path}: {source}")]
     Daemon {
-        /// Of the configuration.
+        /// Path of the configuration.
         path: PathBuf,
-        /// What and why.
+        /// Which path, and the reason.
         source: daemon::Error,
     },
-    /// More frames than the line carries.
+    /// The line cannot carry that many frames.
     #[error(
         "{path}: sensor.frame_rate_hz of {sensor:?}: found {frame_rate_hz} frames/s of \
          {frame_bytes} bytes, expected at most {most:.2} over {baud} baud at 10 bits a byte \
          (a pty or USB CDC port has no such limit)"
     )]
     FrameRate {
-        /// Of the configuration.
+        /// Path of the configuration.
         path: PathBuf,
-        /// Its name.
+        /// The sensor's name.
         sensor: String,
-        /// As given.
+        /// The value as given.
         frame_rate_hz: f64,
-        /// Of its layout.
+        /// Bytes of a frame of its layout.
         frame_bytes: usize,
-        /// What the line carries.
+        /// The highest rate that the line carries.
         most: f64,
-        /// As given.
+        /// The value as given.
         baud: u32,
     },
-    /// Stdout fails.
+    /// Stdout cannot be written to.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
 }
@@ -128,6 +128,9 @@ pub fn run(args: &Args) -> Result<(), Error> {
         }
     }
     lines += &networks(&setup, path);
+    if let Some(shortage) = daemon::descriptors::shortage(&setup.config) {
+        eprintln!("warning: {}: {shortage}", path.display());
+    }
     super::print(lines.as_bytes())
         .map(drop)
         .map_err(Error::Print)
@@ -150,7 +153,7 @@ fn warn_of_array(sensor: &SensorTable, array: Array, path: &Path) {
     );
 }
 
-/// The ways out that have their peers find each other.
+/// Lines about zenoh and ROS 2.
 fn networks(setup: &Setup, path: &Path) -> String {
     let publish = &setup.config.publish;
     let mut lines = String::new();
@@ -184,7 +187,7 @@ fn networks(setup: &Setup, path: &Path) -> String {
     lines
 }
 
-/// Pitches closer than this are the same: datasheets give two digits.
+/// Pitches closer than this count as equal, because datasheets give two digits.
 const PITCH_TOLERANCE_MM: f64 = 0.005;
 
 fn line_of(sensor: &SensorTable, layout: &Layout, path: &Path) -> Result<String, Error> {
@@ -203,7 +206,7 @@ fn line_of(sensor: &SensorTable, layout: &Layout, path: &Path) -> Result<String,
     if paced && sensor.frame_rate_hz * shortest as f64 > capacity {
         return Err(error(shortest));
     }
-    // How long frames are that vary, only the sensor knows.
+    // Frames of these layouts vary in length, so this is only a warning.
     if paced && bytes_per_s > capacity {
         eprintln!("warning: {}", error(longest));
     }

@@ -17,6 +17,8 @@ use crate::event::Kind;
 
 pub(super) const CONTENT_TYPE: &str = "text/event-stream";
 
+const LAST_EVENT_ID: &str = "Last-Event-ID";
+
 /// A silence this long is broken by a comment: without it a lost connection would not be noticed.
 const HEARTBEAT: Duration = Duration::from_secs(15);
 
@@ -43,9 +45,13 @@ pub(super) fn wanted<B>(request: &Request<B>) -> Result<Subscription, Unusable> 
             }
         }
     }
-    if let Some(last) = request.headers().get("last-event-id") {
-        let last = last.to_str().unwrap_or_default();
-        wanted.since = Some(since("Last-Event-ID", last)?);
+    if let Some(last) = request.headers().get(LAST_EVENT_ID) {
+        let last = last.to_str().map_err(|_| Unusable::Value {
+            key: LAST_EVENT_ID,
+            found: "bytes that are not ASCII".to_owned(),
+            expected: "\"RUN:SEQ\"",
+        })?;
+        wanted.since = Some(since(LAST_EVENT_ID, last)?);
     }
     Ok(wanted)
 }
@@ -161,7 +167,7 @@ fn write(out: &mut Vec<u8>, run: &str, line: &Line) {
 mod tests {
     use super::*;
 
-    fn ask(uri: &str, last: Option<&str>) -> Result<Subscription, Unusable> {
+    fn ask(uri: &str, last: Option<&[u8]>) -> Result<Subscription, Unusable> {
         let mut request = Request::builder().uri(uri);
         if let Some(last) = last {
             request = request.header("Last-Event-ID", last);
@@ -177,7 +183,7 @@ mod tests {
         let asked = ask("/events?types=press%2Cframe&since=ab%3A7", None).unwrap();
         assert!(asked.kinds.contains(Kind::Frame) && !asked.kinds.contains(Kind::Status));
         assert_eq!(asked.since.unwrap().seq, 7);
-        let newer = ask("/events?since=ab:7", Some("ab:9")).unwrap();
+        let newer = ask("/events?since=ab:7", Some(b"ab:9")).unwrap();
         assert_eq!(newer.since.unwrap().seq, 9);
     }
 
@@ -187,7 +193,12 @@ mod tests {
             ("/events?types=touch", None, "touch"),
             ("/events?type=press", None, "type"),
             ("/events?since=7", None, "since"),
-            ("/events", Some("7"), "Last-Event-ID"),
+            ("/events", Some(&b"7"[..]), "Last-Event-ID"),
+            (
+                "/events",
+                Some(b"\xff\xfe"),
+                "found bytes that are not ASCII",
+            ),
             ("/events?types=%ff", None, "types"),
             // A percent sign before anything but two hex digits stands for itself.
             ("/events?types=%+1", None, "\"% 1\""),

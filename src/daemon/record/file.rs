@@ -2,6 +2,7 @@
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, ErrorKind};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -29,6 +30,16 @@ impl Open {
             writer,
             since: Instant::now(),
         })
+    }
+
+    /// Whether the file is not at its path any more. What is written to it then is lost.
+    pub(super) fn is_deleted(&self) -> bool {
+        let identity = |file: fs::Metadata| (file.dev(), file.ino());
+        match (self.file.metadata(), fs::symlink_metadata(&self.path)) {
+            (Ok(ours), Ok(there)) => identity(ours) != identity(there),
+            (_, Err(error)) => error.kind() == ErrorKind::NotFound,
+            (Err(_), _) => false,
+        }
     }
 
     pub(super) fn finish(self) -> Result<(), recording::Error> {

@@ -23,6 +23,8 @@ const FLUSH_EVERY: Duration = Duration::from_millis(500);
 const RETRY_AFTER: Duration = Duration::from_secs(5);
 /// The shortest time between black boxes of one sensor's faults.
 const FAULT_EVERY: Duration = Duration::from_secs(60);
+/// The shortest time between black boxes of one sensor that are asked for: each takes the disk a moment.
+const ASKED_EVERY: Duration = Duration::from_secs(1);
 /// Before a recording goes on, this share more than the floor must be free.
 const ROOM_SHARE: u64 = 16;
 
@@ -51,6 +53,7 @@ struct Watched {
     /// Whether its port is open, once that is known.
     is_open: Option<bool>,
     last_fault: Option<Instant>,
+    last_asked: Option<Instant>,
 }
 
 /// Why a job failed.
@@ -196,12 +199,8 @@ impl Worker {
                 Ok(())
             }
             Job::Blackbox { sensor, reply } => {
-                let written = self.blackbox(sensor, "asked for");
-                if let Err(reason) = &written {
-                    self.say_no_blackbox(sensor, reason);
-                }
                 // The client may have gone.
-                let _ = reply.send(written);
+                let _ = reply.send(self.asked(sensor));
                 Ok(())
             }
         }
@@ -250,7 +249,7 @@ impl Worker {
     fn event(&mut self, event: &Event) -> Result<(), Failure> {
         match event {
             Event::Frame(_) => self.progress.frames += 1,
-            Event::Press(press) if press.state == PressState::Begin => self.progress.presses += 1,
+            Event::Press(press) if press.state == PressState::End => self.progress.presses += 1,
             _ => {}
         }
         if let Target::File { progress, .. } = &self.target {
@@ -269,6 +268,21 @@ impl Worker {
             self.fault(sensor, fault);
         }
         Ok(())
+    }
+
+    /// Writes what a client asks for, unless it asked a moment ago.
+    fn asked(&mut self, sensor: usize) -> Result<PathBuf, NoBlackbox> {
+        let now = Instant::now();
+        let last = self.sensors[sensor].last_asked;
+        if last.is_some_and(|last| now.duration_since(last) < ASKED_EVERY) {
+            return Err(NoBlackbox::TooSoon);
+        }
+        let written = self.blackbox(sensor, "asked for");
+        match &written {
+            Ok(_) => self.sensors[sensor].last_asked = Some(now),
+            Err(reason) => self.say_no_blackbox(sensor, reason),
+        }
+        written
     }
 
     /// Writes what led to a fault, unless a black box was written a moment ago.
@@ -350,6 +364,12 @@ impl Worker {
         let settings = settings.clone();
         let directory = settings.dir();
         let floor = settings.keep_free_mb * MB;
+        if self.open.as_ref().is_some_and(Open::is_deleted) {
+            let path = self.open.take().map(|open| open.path);
+            let path = path.as_deref().unwrap_or(&directory).display();
+            warn!(%path, "the recording was deleted or moved while it was written: a new one begins");
+            self.retry = Some(Instant::now());
+        }
         if let Some(open) = &self.open {
             let full = open.file.metadata();
             let full = full.is_ok_and(|file| file.len() >= settings.rotate_mb * MB);
