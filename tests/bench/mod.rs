@@ -23,6 +23,9 @@ pub const BINARY: &str = env!("CARGO_BIN_EXE_hardnessd");
 /// How long anything may take before a test has failed: long, for a busy machine.
 pub const PATIENCE: Duration = Duration::from_secs(60);
 
+/// How long a process may take to end by itself.
+const FAREWELL: Duration = Duration::from_secs(2);
+
 /// A directory with a port, a socket and a configuration.
 pub struct Bench {
     directory: tempfile::TempDir,
@@ -115,6 +118,15 @@ impl Process {
 
 impl Drop for Process {
     fn drop(&mut self) {
+        // A simulator takes its link with it, if it can. The pty of a link that stays may become another
+        // test's.
+        if matches!(self.0.try_wait(), Ok(None)) {
+            self.signal(Signal::TERM);
+            let start = Instant::now();
+            while matches!(self.0.try_wait(), Ok(None)) && start.elapsed() < FAREWELL {
+                std::thread::sleep(Duration::from_millis(2));
+            }
+        }
         let _ = self.0.kill();
         let _ = self.0.wait();
     }

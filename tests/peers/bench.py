@@ -69,10 +69,15 @@ class Bench:
 
     def __exit__(self, *_):
         for process in self.processes:
+            # A simulator takes its link with it. The pty of a link that stays may become another test's.
             if process.poll() is None:
+                process.terminate()
                 process.send_signal(signal.SIGCONT)
+            try:
+                process.wait(2)
+            except subprocess.TimeoutExpired:
                 process.kill()
-            process.wait()
+                process.wait()
         self.directory.cleanup()
 
     def _start(self, arguments, log):
