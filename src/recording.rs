@@ -285,7 +285,7 @@ impl From<mcap::McapError> for Error {
                 found: "no MCAP file".to_owned(),
                 expected: "a recording",
             },
-            other => Error::Damaged(format!("found a damaged recording ({other})")),
+            other => Error::Damaged(format!("the recording is damaged ({other})")),
         }
     }
 }

@@ -40,7 +40,22 @@ pub fn line(error: &(dyn Error + 'static)) -> String {
         }
         cause = error.source();
     }
-    shown(&line)
+    shown(&without_numbers(&line))
+}
+
+/// Without the numbers that the system has for its errors: its words are there beside them.
+fn without_numbers(text: &str) -> String {
+    let mut parts = text.split(" (os error ");
+    let mut told = parts.next().unwrap_or_default().to_owned();
+    for part in parts {
+        match part.split_once(')') {
+            Some((number, rest)) if number.bytes().all(|digit| digit.is_ascii_digit()) => {
+                told += rest;
+            }
+            _ => told = told + " (os error " + part,
+        }
+    }
+    told
 }
 
 /// One line of text. Whatever a file or a process in it is called, it cannot break the line or speak to
@@ -76,11 +91,34 @@ pub fn usage(program: &str, error: &clap::Error) -> ExitCode {
     let told = told.split("\n\nFor more").next().unwrap_or_default();
     let told: Vec<&str> = told.split_whitespace().collect();
     let mut told = told.join(" ").trim_start_matches("error: ").to_owned();
+    if error.kind() == ErrorKind::ValueValidation
+        && let Some((value, reason)) = told.split_once("': ")
+    {
+        told = format!("{value}': {}", wording::of_argument(reason));
+    }
     if let Some(file) = configuration_in_place_of_an_option(error) {
         told += &format!(": write --config {file}");
+    } else if let Some(command) = where_to_look(error, &text) {
+        told += &format!(": see `{command} --help`");
     }
     eprintln!("{program}: {}", shown(&told));
     ExitCode::from(exit::USAGE)
+}
+
+/// The command whose help lists what is missing or unknown.
+fn where_to_look(error: &clap::Error, text: &str) -> Option<String> {
+    let is_of_help = matches!(
+        error.kind(),
+        ErrorKind::MissingRequiredArgument
+            | ErrorKind::InvalidSubcommand
+            | ErrorKind::UnknownArgument
+    );
+    let (_, usage) = text.split_once("\n\nUsage: ").filter(|_| is_of_help)?;
+    let words = usage.split_whitespace();
+    let command: Vec<&str> = words
+        .take_while(|word| word.starts_with(|c: char| c.is_ascii_lowercase()))
+        .collect();
+    Some(command.join(" "))
 }
 
 /// `hardnessd run hardnessd.toml`: a configuration without the option that it belongs to.
@@ -144,6 +182,23 @@ mod tests {
         }
         let told = Told::Within(cause());
         assert_eq!(line(&told), "x: no such file, expected a new file");
+    }
+
+    #[test]
+    fn the_number_of_an_error_is_not_told() {
+        let cause = |errno| io::Error::from_raw_os_error(errno);
+        assert_eq!(
+            line(&Told::Bare(cause(2))),
+            "x: cannot read: No such file or directory"
+        );
+        let two = format!("{}, then {}", cause(2), cause(13));
+        assert_eq!(
+            without_numbers(&two),
+            "No such file or directory, then Permission denied"
+        );
+        for other in ["a (os error x) b", "a (os error 2"] {
+            assert_eq!(without_numbers(other), other);
+        }
     }
 
     #[test]

@@ -203,6 +203,20 @@ pub struct Verdict {
 }
 
 /// A hardness recognition network, ready to judge.
+///
+/// # Example
+///
+/// The built-in model judges one of the frames that it carries as a check.
+///
+/// ```
+/// use hardnessd::verdict::{BUILT_IN, Hrn};
+///
+/// let hrn = Hrn::load(BUILT_IN)?;
+/// let verdict = hrn.judge(&hrn.check().frames[0])?;
+/// assert_eq!(verdict.probabilities.len(), hrn.card().levels.len());
+/// assert_eq!(verdict.confidence, verdict.probabilities[usize::from(verdict.level) - 1]);
+/// # Ok::<(), hardnessd::verdict::ModelError>(())
+/// ```
 #[derive(Debug)]
 pub struct Hrn {
     plan: Arc<TypedRunnableModel>,

@@ -27,6 +27,23 @@ pub(crate) fn as_written(value: f32) -> f64 {
         .expect("a number's own text is a number's text")
 }
 
+/// What is wrong with the value of an option: the command line's parser says it for programmers.
+pub(crate) fn of_argument(message: &str) -> String {
+    if message == "invalid digit found in string" {
+        return "expected a whole number".to_owned();
+    }
+    let Some((_, range)) = message.split_once(" is not in ") else {
+        return plain(message);
+    };
+    match range.split_once("..") {
+        Some((least, most)) => match most.trim_start_matches('=').parse::<u64>() {
+            Ok(u64::MAX) | Err(_) => format!("expected a whole number from {least}"),
+            Ok(most) => format!("expected a whole number from {least} to {most}"),
+        },
+        None => message.to_owned(),
+    }
+}
+
 /// `message` on one line, and without the names that Rust has for types.
 pub fn plain(message: &str) -> String {
     let message = message.trim().replace('\n', ": ");
@@ -44,6 +61,9 @@ pub fn plain(message: &str) -> String {
         }
         _ => {}
     }
+    // A key, to the author of a settings file. Where a name is one of several, it is a variant.
+    let message = message.replace("unknown field ", "unknown key ");
+    let message = message.replace("unknown variant ", "found ");
     let Some((found, expected)) = message.rsplit_once(", expected ") else {
         return message;
     };
@@ -93,6 +113,27 @@ mod tests {
     }
 
     #[test]
+    fn the_range_of_an_option_is_told_in_plain_words() {
+        for (message, expected) in [
+            (
+                "0 is not in 1..18446744073709551615",
+                "expected a whole number from 1",
+            ),
+            (
+                "0 is not in 1..=4294967295",
+                "expected a whole number from 1 to 4294967295",
+            ),
+            ("invalid digit found in string", "expected a whole number"),
+            (
+                "expected newtons from 1 to 2",
+                "expected newtons from 1 to 2",
+            ),
+        ] {
+            assert_eq!(of_argument(message), expected);
+        }
+    }
+
+    #[test]
     fn types_are_told_in_plain_words() {
         for (message, expected) in [
             (
@@ -121,7 +162,11 @@ mod tests {
             ),
             (
                 "unknown field `bit`, expected one of `at_s`, `kind`",
-                "unknown field `bit`, expected one of `at_s`, `kind`",
+                "unknown key `bit`, expected one of `at_s`, `kind`",
+            ),
+            (
+                "unknown variant `x`, expected `u8` or `u16le`",
+                "found `x`, expected `u8` or `u16le`",
             ),
             (
                 "expected newline\nfound `u8`",

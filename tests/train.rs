@@ -831,7 +831,7 @@ fn bad_input_has_its_exit_code_and_one_line() {
         (
             train(&["--data", &data, "--config", &text]),
             78,
-            "line 1: unknown field `epoch`",
+            "line 1: unknown key `epoch`",
         ),
         (train(&["--data", &data, "--from", &missing]), 66, "missing"),
         (
@@ -908,7 +908,7 @@ fn bad_input_has_its_exit_code_and_one_line() {
         (
             hrn_train(&["export", &corrupt, "--out", &out]),
             66,
-            "the run has no model yet",
+            "it was stopped: `hrn-train train --resume`",
         ),
         (
             hrn_train(&["evaluate", "--model", &text, "--data", &data]),

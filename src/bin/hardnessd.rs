@@ -20,7 +20,7 @@ use hardnessd::trial;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::mpsc;
 
-/// How long what is being written may take to be whole.
+/// How long a write that is under way may take to finish.
 const LAST_LINES: Duration = Duration::from_millis(200);
 
 fn main() -> ExitCode {
@@ -37,7 +37,7 @@ fn main() -> ExitCode {
             return ExitCode::from(exit::IO);
         }
     };
-    // Before all else, the arguments included: a signal that comes early must not kill.
+    // First of all, even before the arguments: an early signal must not kill the process.
     let signals = {
         let _inside = runtime.enter();
         Signals::catch()
@@ -55,7 +55,7 @@ fn main() -> ExitCode {
     };
     let prints = !matches!(args.command, Command::Run(_));
     let done = runtime.block_on(dispatch(args.command, signals));
-    // A port may be stuck in its driver on a thread of its own, or nobody read stdout.
+    // A thread may still wait for a port's driver or for the reader of stdout.
     runtime.shutdown_timeout(if prints { LAST_LINES } else { Duration::ZERO });
     match done {
         Ok(()) => ExitCode::SUCCESS,
@@ -70,7 +70,7 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
     match command {
         Command::Run(config) => run(config.path()?, signals).await,
         Command::Demo(args) => {
-            // The events are what is shown: the log would say each again.
+            // The events are the output. The log would repeat each of them.
             let _log = Log::start(LogSettings::default(), "error")?;
             Ok(demo::run(args, signals.told()).await?)
         }
@@ -80,7 +80,7 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
             let Some(setup) = load(args.config.path()?, end.as_mut()).await? else {
                 return Ok(());
             };
-            // On a terminal a line of progress says what the log would.
+            // On a terminal the progress line replaces the log.
             let is_shown = io::stderr().is_terminal();
             let _log = Log::start(setup.config.log, if is_shown { "warn" } else { "info" })?;
             Ok(record::run(args, setup, end).await?)
@@ -96,7 +96,7 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
     }
 }
 
-/// Waits for work that has an end. A signal that comes before is a failure.
+/// Waits until `work` ends. A signal before its end is a failure.
 async fn finish<E: Into<Failure>>(
     signals: Signals,
     work: impl Future<Output = Result<(), E>>,
@@ -107,7 +107,7 @@ async fn finish<E: Into<Failure>>(
     }
 }
 
-/// The same for work that blocks, on a thread of its own.
+/// As [`finish`], for work that blocks. It runs on another thread.
 async fn finish_blocking<E: Into<Failure> + Send + 'static>(
     signals: Signals,
     work: impl FnOnce() -> Result<(), E> + Send + 'static,
@@ -143,7 +143,7 @@ async fn run(path: PathBuf, signals: Signals) -> Result<(), Failure> {
     let (request, requests) = mpsc::channel(1);
     tokio::spawn(async move {
         while hangup.recv().await.is_some() {
-            // A request that waits already will see this change too.
+            // If a request waits already, that request will see this change too.
             let _ = request.try_send(());
         }
     });
@@ -159,21 +159,21 @@ async fn run(path: PathBuf, signals: Signals) -> Result<(), Failure> {
         .await?)
 }
 
-/// The signals that this process takes.
+/// The signals that this process handles.
 struct Signals {
     interrupt: Signal,
     terminate: Signal,
     hangup: Signal,
-    /// Whether whoever started it wants it to outlive the terminal, as nohup(1) does.
+    /// Whether the process was started with SIGHUP ignored, as nohup(1) does.
     outlives_terminal: bool,
 }
 
 impl Signals {
-    /// From now on none of them kills.
+    /// Catches them: from now on none of them kills the process.
     fn catch() -> io::Result<Self> {
-        // Which it was is known only before one is caught.
+        // This can be seen only before the signal is caught.
         let outlives_terminal = ignores_hangup();
-        // A file that must not grow is no reason to die of: the write fails, as on a full disk.
+        // At the limit of a file's size the write fails, as on a full disk. The process goes on.
         drop(signal(SignalKind::from_raw(
             rustix::process::Signal::XFSZ.as_raw(),
         ))?);
@@ -195,12 +195,12 @@ impl Signals {
         }
     }
 
-    /// For what runs until it is told to stop.
+    /// As [`Signals::end`], for a command that runs until a signal ends it.
     async fn told(self) {
         self.end().await;
     }
 
-    /// SIGINT or SIGTERM, and SIGHUP for another use.
+    /// A future for SIGINT and SIGTERM, and SIGHUP by itself.
     fn apart(self) -> (impl Future<Output = Stop>, Signal) {
         let Self {
             mut interrupt,

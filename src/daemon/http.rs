@@ -43,8 +43,12 @@ const HEAD_PATIENCE: Duration = Duration::from_secs(15);
 /// Bytes that wait in a connection, either way.
 const BUFFER_BYTES: usize = 64 * 1024;
 
-/// How long the pipelines may take to say that they turn.
+/// How long the pipelines may take to answer.
 const PATIENCE: Duration = Duration::from_secs(1);
+
+/// The answer to a path that there is not.
+const NOT_FOUND: &str =
+    "not found: the paths are /, /events, /api/status, /metrics, /livez and /readyz\n";
 
 /// On every answer: what it is may not be guessed, kept, or used by a page from elsewhere.
 const HEADERS: [(HeaderName, &str); 5] = [
@@ -141,12 +145,12 @@ impl Http {
     async fn route(&self, request: &Request<Incoming>, local: SocketAddr) -> Response<Body> {
         let reads = [Method::GET, Method::HEAD].contains(request.method());
         if !host::is_ours(request, self.listen, local) {
-            let message = "found a Host that is no address of this machine, expected \
-                           localhost or the address itself\n";
+            let message = "the Host header is not an address of this machine: use localhost or \
+                           the address in [http] listen\n";
             return text(StatusCode::MISDIRECTED_REQUEST, message.to_owned());
         }
         if !reads {
-            let message = "found a method that changes something, expected GET\n";
+            let message = "method not allowed: this server is read-only: use GET or HEAD\n";
             let mut response = text(StatusCode::METHOD_NOT_ALLOWED, message.to_owned());
             let allow = HeaderValue::from_static("GET, HEAD");
             response.headers_mut().insert(header::ALLOW, allow);
@@ -178,14 +182,14 @@ impl Http {
                 Err(hub::Closed) => stopping(),
             },
             "/livez" => match tokio::time::timeout(PATIENCE, self.alive()).await {
-                Ok(true) => text(StatusCode::OK, "the pipelines turn\n".to_owned()),
+                Ok(true) => text(StatusCode::OK, "ok: every pipeline answers\n".to_owned()),
                 _ => text(
                     StatusCode::SERVICE_UNAVAILABLE,
-                    "a pipeline does not turn\n".to_owned(),
+                    "a pipeline does not answer\n".to_owned(),
                 ),
             },
             "/readyz" => self.ready().await,
-            _ => text(StatusCode::NOT_FOUND, "found no such page\n".to_owned()),
+            _ => text(StatusCode::NOT_FOUND, NOT_FOUND.to_owned()),
         }
     }
 

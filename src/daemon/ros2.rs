@@ -1,8 +1,8 @@
 //! ROS 2 over DDS: the messages of a recording as topics, `NAMESPACE/tactile/SENSOR/KIND`.
 //!
-//! In: lines of the hub. Out: samples of a node `hardnessd`, with no ROS installed. Verdicts and
-//! statuses are reliable and the last of each is kept for whoever comes later; frames are best
-//! effort. There is no service and no parameter: nothing is taken in.
+//! In: lines of the hub. Out: samples of the node `hardnessd`. ROS need not be installed. Verdicts and
+//! statuses are reliable, and a subscriber that comes later gets the last of each. Frames are best
+//! effort. The node has no service and no parameter, so nothing comes in.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -25,28 +25,28 @@ use crate::ros;
 /// Why there is no node.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The domain, or a topic in it.
+    /// The domain or a topic could not be made.
     #[error("publish.ros2: {0}")]
     Create(#[from] CreateError),
-    /// The node itself.
+    /// The node could not be made.
     #[error("publish.ros2: {0}")]
     Node(#[from] ros2_client::NodeCreateError),
-    /// A name that ROS does not take.
+    /// ROS does not allow this name.
     #[error("publish.ros2.namespace: {0}")]
     Name(#[from] ros2_client::names::NameError),
-    /// There is no thread to be had.
+    /// The system gave no thread.
     #[error("no thread for publish.ros2: {0}")]
     Thread(#[from] io::Error),
 }
 
-/// Press events that wait for a subscriber that has missed one.
+/// Press events that are kept for a subscriber that missed some.
 const PRESSES_KEPT: usize = 16;
 
 /// Joins the domain as `settings` say and makes the topics of `sensors`.
 ///
 /// # Errors
 ///
-/// If the domain cannot be joined, such as for want of a free port.
+/// If the domain cannot be joined, for example because no port is free.
 pub(super) fn open(
     settings: &config::Ros2,
     sensors: Vec<String>,
@@ -61,7 +61,7 @@ pub(super) fn open(
 struct Ros2 {
     /// By sensor and name.
     topics: BTreeMap<(String, &'static str), Publisher<Message>>,
-    // Its topics end with it.
+    // Must be dropped last: its topics end with it.
     _node: Node,
 }
 
@@ -138,20 +138,20 @@ fn publisher(
     Ok(node.create_publisher(&made, Some(qos.clone()))?)
 }
 
-/// The last sample is for late comers too.
+/// A subscriber that comes later gets the last sample.
 fn latched() -> QosProfile {
     kept(1).durability(Durability::TransientLocal)
 }
 
-/// Samples are sent again to a subscriber that has missed them.
+/// A subscriber that missed samples gets them again.
 fn kept(depth: usize) -> QosProfile {
     QosProfile::publisher_default()
         .reliability_reliable(WhenFull::DEFAULT)
         .history(History::KeepLast { depth })
 }
 
-/// A message as [`ros::encode`] makes it. The library writes the encapsulation of its own; what
-/// follows it goes out as it is.
+/// A message as [`ros::encode`] makes it. The library writes the encapsulation header; the bytes after it
+/// are sent unchanged.
 struct Message(Vec<u8>);
 
 impl Serialize for Message {

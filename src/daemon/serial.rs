@@ -156,6 +156,15 @@ fn reason(error: &serialport::Error) -> String {
         ErrorKind::NoDevice => "port held by another process".to_owned(),
         ErrorKind::Io(std::io::ErrorKind::NotFound) => "no such device".to_owned(),
         ErrorKind::Io(std::io::ErrorKind::PermissionDenied) => "permission denied".to_owned(),
-        _ => error.to_string(),
+        _ => of_system(&error.to_string()),
+    }
+}
+
+/// What the system says of a port, in plain words where its own are not.
+fn of_system(text: &str) -> String {
+    match text {
+        // ENOTTY.
+        "Not a typewriter" | "Inappropriate ioctl for device" => "not a serial port".to_owned(),
+        text => text.to_owned(),
     }
 }

@@ -1,9 +1,8 @@
-//! Zenoh: every event under a key of its own, `tactile/SITE/SENSOR/KIND`, as the JSON of a socket.
+//! Zenoh: each event is put under the key `tactile/SITE/SENSOR/KIND`, as the JSON of a socket.
 //!
-//! In: lines of the hub. Out: puts on a session that talks to nobody the configuration does not
-//! name; the last final verdict and status of each sensor to whoever asks for their key; and a
-//! liveliness token `tactile/SITE`, by which a daemon that has ended is told from one that is
-//! silent. Nothing is taken in that changes anything.
+//! In: lines of the hub. Out: puts, the last final verdict and status of each sensor as answers to
+//! queries, and the liveliness token `tactile/SITE`, which ends with the daemon. The session talks only
+//! to addresses that the configuration names. Nothing that comes in changes anything.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -26,7 +25,7 @@ use crate::event::{Event, Kind, Phase};
 /// Why there is no session.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// An address cannot be listened on.
+    /// The daemon cannot listen on an address.
     #[error("publish.zenoh.listen: cannot listen on {endpoint:?}: {source}")]
     Listen {
         /// As configured.
@@ -34,15 +33,15 @@ pub enum Error {
         /// Why not.
         source: io::Error,
     },
-    /// The library's own words.
+    /// The library refused. The text is its own.
     #[error("publish.zenoh: {0}")]
     Session(#[from] zenoh::Error),
-    /// There is no thread to be had.
+    /// The system gave no thread.
     #[error("no thread for publish.zenoh: {0}")]
     Thread(#[from] io::Error),
 }
 
-/// What the thread is given.
+/// What the thread does next.
 pub(super) enum Job {
     Lines(Vec<Line>),
     Query(Query),
@@ -58,14 +57,14 @@ impl From<Vec<Line>> for Job {
 ///
 /// # Errors
 ///
-/// If an address to listen on cannot be had, or the session not be opened for another reason. A
-/// peer that cannot be reached is no error: it is tried again.
+/// If the daemon cannot listen on an address, or the library refuses. A peer that cannot be reached is
+/// no error: the library tries again.
 pub(super) fn open(
     settings: &config::Zenoh,
     robot: &str,
     sensors: Vec<String>,
 ) -> Result<Worker<Job>, Error> {
-    // Asked here first: the library's words for it are a page, with the paths of its sources.
+    // Tried here first, because the library's error is a page long and names paths of its sources.
     for endpoint in &settings.listen {
         TcpListener::bind(endpoint.address()).map_err(|source| Error::Listen {
             endpoint: endpoint.clone(),
@@ -87,9 +86,9 @@ pub(super) fn open(
 struct Zenoh {
     publishers: BTreeMap<String, Publisher<'static>>,
     site: String,
-    /// By key, what is answered to a query.
+    /// The answers to queries, by key.
     last: BTreeMap<String, Line>,
-    // Undeclared when dropped, and the session closed last.
+    // Dropping these ends them. The session must be the last.
     _queries: Queryable<()>,
     _alive: LivelinessToken,
     _session: Session,
@@ -107,8 +106,8 @@ impl Zenoh {
         for sensor in sensors {
             for kind in Kind::ALL {
                 let key = key(&site, sensor, kind);
-                // A frame is soon out of date; anything else is worth waiting for a while, on a
-                // thread where nobody else waits.
+                // A frame is soon out of date. Any other event may wait for the network a while,
+                // because nothing else waits for this thread.
                 let publisher = session
                     .declare_publisher(key.clone())
                     .encoding(Encoding::APPLICATION_JSON)
@@ -123,7 +122,7 @@ impl Zenoh {
         }
         let queries = session
             .declare_queryable(format!("tactile/{site}/**"))
-            // One that finds the thread busy is answered with nothing, and may ask again.
+            // When the thread is busy, a query gets no answer. The peer may ask again.
             .callback(move |query| {
                 if let Some(jobs) = jobs.upgrade() {
                     drop(jobs.try_send(Job::Query(query)));
@@ -195,13 +194,13 @@ fn key(site: &str, sensor: &str, kind: Kind) -> String {
     format!("tactile/{site}/{sensor}/{}", kind.name())
 }
 
-/// A message is no line of many.
+/// The JSON without its newline: each message is one event.
 fn text(line: &Line) -> &str {
     line.json.trim_end()
 }
 
-/// By default zenoh listens on every interface and looks for peers by multicast; this one does
-/// only what it is told.
+/// By default zenoh listens on every interface and looks for peers by multicast. This configuration
+/// does neither.
 fn configuration(settings: &config::Zenoh) -> Result<zenoh::Config, Error> {
     let json = |endpoints: &[config::Endpoint]| {
         serde_json::to_string(endpoints).expect("a list of strings is JSON")
@@ -211,11 +210,12 @@ fn configuration(settings: &config::Zenoh) -> Result<zenoh::Config, Error> {
         ("mode", "\"peer\"".to_owned()),
         ("listen/endpoints", json(&settings.listen)),
         ("connect/endpoints", json(&settings.connect)),
-        // An address that is in use is an error, a router that is not there yet is not.
+        // An address in use is an error. A router that is not there yet is none.
         ("listen/exit_on_failure", "true".to_owned()),
         ("connect/exit_on_failure", "false".to_owned()),
         ("scouting/multicast/enabled", "false".to_owned()),
-        // Without gossip a peer behind a router gets things twice; with it, none is connected to.
+        // Without gossip, a peer behind a router gets events twice. Autoconnect would connect to peers
+        // that the configuration does not name.
         ("scouting/gossip/autoconnect", "[]".to_owned()),
     ] {
         config.insert_json5(key, &value)?;

@@ -7,7 +7,6 @@ use serde::{Deserialize, Serialize};
 use super::{Clock, Pipeline};
 use crate::event::{Event, LinkState, Status};
 use crate::frame::Stamp;
-use crate::sensor::LATE_PERIODS;
 use crate::tare::Aim;
 
 /// After a silence of this many periods the pending bytes are settled: later bytes do not belong to
@@ -62,19 +61,16 @@ impl Pipeline {
             let met_contact = self.tare.aim() == Some(Aim::First { met_contact: true });
             met_contact.then(|| "tare: contact".to_owned())
         };
-        let no_frame_in_time = || format!("no frame for {LATE_PERIODS} periods");
+        let no_frame_for = |silence: Duration| {
+            let ms = (silence.as_nanos() as f64 / 1e5).round() / 10.0;
+            Some(format!("no frame for {ms} ms"))
+        };
         match &self.seen.link {
             Link::Closed { reason } => (LinkState::Connecting, reason.clone()),
             Link::Opened { .. } => (LinkState::Connecting, None),
             Link::Live { .. } => (LinkState::Live, tare()),
-            Link::Silent => (LinkState::Stale, Some(no_frame_in_time())),
-            Link::Stale if self.sensor.stale_after() == self.sensor.late_after() => {
-                (LinkState::Stale, Some(no_frame_in_time()))
-            }
-            Link::Stale => {
-                let ms = self.sensor.stale_after().as_nanos() as f64 / 1e6;
-                (LinkState::Stale, Some(format!("no frame for {ms} ms")))
-            }
+            Link::Silent => (LinkState::Stale, no_frame_for(self.sensor.late_after())),
+            Link::Stale => (LinkState::Stale, no_frame_for(self.sensor.stale_after())),
             Link::Lost { reason } => (LinkState::Lost, Some(reason.clone())),
         }
     }

@@ -1,4 +1,4 @@
-//! Which configuration a command takes, where the command line may leave it out.
+//! Which configuration a command uses when the command line names none.
 
 use std::path::{Path, PathBuf};
 
@@ -12,7 +12,7 @@ pub struct Configuration {
     config: Option<PathBuf>,
 }
 
-/// There is no configuration to be found.
+/// No configuration was named, and none was found.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "no configuration: there is neither {} nor {}: name one with --config",
@@ -21,11 +21,11 @@ pub struct Configuration {
 )]
 pub struct Missing;
 
-/// Where a configuration is looked for.
+/// Where to look for a configuration, in this order.
 const PLACES: [&str; 2] = ["./hardnessd.toml", "/etc/hardnessd.toml"];
 
 impl Configuration {
-    /// The file that was named, else the first that there is; which one is then said on stderr.
+    /// The named file, else the first that exists. In the second case stderr says which.
     ///
     /// # Errors
     ///
@@ -34,7 +34,7 @@ impl Configuration {
         if let Some(config) = &self.config {
             return Ok(config.clone());
         }
-        // One that is there and cannot be read must not be passed over.
+        // A file that exists but cannot be read is an error, not a reason to try the next.
         let there = |path: &&str| Path::new(path).symlink_metadata().is_ok();
         let found = PLACES.into_iter().find(there).ok_or(Missing)?;
         eprintln!("hardnessd: configuration {found}");

@@ -18,7 +18,7 @@ use super::demo;
 use crate::daemon::config::Unix;
 use crate::daemon::lines::{Heard, Lines};
 
-/// Which daemon is meant.
+/// Options that name a daemon.
 #[derive(Debug, Clone, Default, ClapArgs)]
 pub struct Source {
     /// Socket of the daemon [default: the first that answers: the user's own daemon, the
@@ -64,35 +64,35 @@ pub enum Error {
     /// Nobody listens there.
     #[error("{address}: no daemon answers: {source}")]
     NoAnswer {
-        /// As given.
+        /// The value as given.
         address: Address,
-        /// Why not.
+        /// The reason.
         source: io::Error,
     },
-    /// Nobody listens at any of the usual places.
+    /// No daemon listens at any of the usual places.
     #[error(
         "no daemon answers at {places}, and no demo runs: start one with `hardnessd run` or \
          `hardnessd demo`, or name its socket with --socket"
     )]
     Nowhere {
-        /// What was tried.
+        /// What the program tried.
         places: String,
     },
-    /// The socket belongs to others.
+    /// This user may not connect to the socket.
     #[error(
         "{path}: permission denied: join the group {group} (`sudo usermod -aG {group} $USER`) and \
          log in again"
     )]
     Denied {
-        /// Of the socket.
+        /// Path of the socket.
         path: PathBuf,
-        /// Whose members may connect.
+        /// The group whose members may connect.
         group: String,
     },
     /// The connection broke.
     #[error("{address}: the connection broke: {source}")]
     Broken {
-        /// Where it went to.
+        /// The address.
         address: Address,
         /// How.
         source: io::Error,
@@ -103,7 +103,7 @@ pub enum Error {
         /// Where it was.
         address: Address,
     },
-    /// Whatever sends this is no daemon.
+    /// The other end does not speak like a daemon.
     #[error(
         "{address}: closed the connection: a line is longer than {LONGEST_LINE_BYTES} bytes, which no \
          daemon sends"
@@ -199,7 +199,7 @@ impl Connection {
         &self.address
     }
 
-    /// The next line, without its newline. Nothing is lost if the wait is given up.
+    /// The next line, without its newline. If you stop waiting, nothing is lost.
     ///
     /// # Errors
     ///
@@ -237,7 +237,7 @@ impl Connection {
     /// Sends a request if there is room for it now.
     pub(super) fn try_send(&self, request: &str) {
         let line = format!("{request}\n");
-        // A daemon that does not take the question is noticed by its silence.
+        // If the daemon does not take the question, its silence shows it later.
         let _ = match &self.output {
             Output::Unix(output) => output.try_write(line.as_bytes()),
             Output::Tcp(output) => output.try_write(line.as_bytes()),
@@ -245,7 +245,7 @@ impl Connection {
     }
 }
 
-/// Why nobody took the connection.
+/// Why the connection was not accepted.
 fn refusal(address: Address, source: io::Error) -> Error {
     match address {
         Address::Unix(path) if source.kind() == ErrorKind::PermissionDenied => Error::Denied {
@@ -307,7 +307,7 @@ mod tests {
         let error = connection.next().await.unwrap_err();
         assert!(matches!(error, Error::TooLong { .. }), "{error}");
         drop(connection);
-        // What the system's buffers hold comes on top.
+        // The system's buffers hold more.
         assert!(sender.await.unwrap() < 4 * LONGEST_LINE_BYTES);
     }
 }

@@ -67,25 +67,25 @@ pub enum Error {
     /// The pty, the socket or stdout.
     #[error("{what}: {source}")]
     Io {
-        /// What was tried.
+        /// What the program tried.
         what: &'static str,
-        /// Why not.
+        /// The reason.
         source: io::Error,
     },
     /// Presses went by without a verdict.
     #[error("only {found} of {presses} presses got a verdict")]
     Missed {
-        /// Verdicts.
+        /// Verdicts that came.
         found: u32,
-        /// Presses.
+        /// Presses that were made.
         presses: u32,
     },
-    /// The daemon went away.
+    /// The daemon closed the connection.
     #[error("the daemon closed the connection")]
     Closed,
 }
 
-/// How long the last verdict may take after the last byte.
+/// How long the last verdict may come after the last byte.
 const PATIENCE: Duration = Duration::from_secs(3);
 
 /// Runs until the presses have their verdicts, `shutdown` comes or nobody reads stdout.
@@ -129,7 +129,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let (stop, stopped) = oneshot::channel::<()>();
     let daemon = daemon.run(
         async {
-            // Dropped is as good as sent.
+            // Dropping the sender has the same effect as sending.
             let _ = stopped.await;
         },
         None,
@@ -161,16 +161,16 @@ fn hastened(sensor: SensorTable, socket: &Path, speed: f64) -> Config {
     config
 }
 
-/// What is printed.
+/// What stdout gets.
 enum Shown {
     /// Every event as it comes.
     Json,
-    /// A line a press.
+    /// One line for each press.
     Lines(Account),
 }
 
 impl Shown {
-    /// What is printed of an event, with its newline; empty, if nothing is.
+    /// The text for an event, with its newline. Empty if the event has no text.
     fn of(&mut self, line: Vec<u8>, event: &Value) -> Vec<u8> {
         match self {
             Self::Json => line,
@@ -196,7 +196,7 @@ async fn print(
     let printed = print_events(subscriber, presses, player, sequence, &mut shown, shutdown).await;
     if let Shown::Lines(account) = &shown {
         let last = super::print_apart((account.close() + "\n").into_bytes());
-        // A terminal that takes nothing does not keep the demonstration.
+        // A blocked terminal does not hold the demonstration up.
         let _ = tokio::time::timeout(LAST_LINE, last).await;
     }
     printed
@@ -214,17 +214,17 @@ async fn print_events(
     let mut lines = BufReader::new(subscriber);
     let mut line = Vec::new();
     let mut finals = 0;
-    // Whether a slow reader has missed events, verdicts maybe among them.
+    // Whether a slow reader missed events. Verdicts may be among them.
     let mut missed = false;
     let mut played = std::pin::pin!(player.play(sequence));
     let mut shutdown = std::pin::pin!(shutdown);
     let mut last_byte: Option<Instant> = None;
-    // The line on its way to stdout: the sensor and the daemon wait for no reader.
+    // The line that is being written: the sensor and the daemon do not wait for the reader of stdout.
     let mut printing = std::pin::pin!(None);
     loop {
         let patience = last_byte.map(|at| at + PATIENCE);
         tokio::select! {
-            // What there is to read counts before the patience with it.
+            // Read what is there before looking at the time.
             biased;
             () = &mut shutdown => return Ok(()),
             printed = wait(printing.as_mut().as_pin_mut()) => {

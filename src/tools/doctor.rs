@@ -1,6 +1,6 @@
-//! `hardnessd doctor`: why a port will not work, a line a finding, each with what mends it.
+//! `hardnessd doctor`: why a port does not work. One line per finding, each with the remedy.
 //!
-//! It opens no device: opening resets boards in the manner of Arduino.
+//! It opens no device, because opening one resets boards like an Arduino.
 
 mod checks;
 #[cfg(test)]
@@ -22,16 +22,16 @@ pub struct Args {
     port: Option<PathBuf>,
 }
 
-/// How it ended.
+/// Why it ended with an error.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Said on stdout.
+    /// Faults were found, and stdout names them.
     #[error("{found} fault{} found", if *.found == 1 { "" } else { "s" })]
     Faults {
         /// Lines printed.
         found: usize,
     },
-    /// Stdout fails.
+    /// Stdout cannot be written to.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
 }
@@ -46,7 +46,7 @@ pub(super) fn obstacle(port: &Path) -> Option<String> {
     fault.map(|fault| fault.to_string())
 }
 
-/// Prints what is wrong.
+/// Prints what is wrong, and the remedy.
 ///
 /// # Errors
 ///

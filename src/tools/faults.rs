@@ -1,4 +1,4 @@
-//! Faults of a simulated line, as a script that plays the same each time.
+//! Faults of a simulated line, from a script. The same script and seed give the same faults.
 //!
 //! In: a TOML file of `[[fault]]` tables. Out: what becomes of each frame. Times are in seconds of
 //! the sensor since it started; which bytes and bits are hit follows from the seed.
@@ -36,15 +36,15 @@ pub enum Error {
     /// The file cannot be read.
     #[error("{path}: cannot read: {source}")]
     Unreadable {
-        /// Of the script.
+        /// Path of the script.
         path: PathBuf,
-        /// Why not.
+        /// The reason.
         source: std::io::Error,
     },
     /// No TOML, or a key or value that cannot be used.
     #[error("{path}: {problem}")]
     Malformed {
-        /// Of the script.
+        /// Path of the script.
         path: PathBuf,
         /// What is wrong with it.
         problem: Problem,
@@ -60,7 +60,7 @@ pub enum Problem {
     /// A value that cannot be used.
     #[error("fault {number}: {value}")]
     Value {
-        /// Of the fault, from 1.
+        /// Number of the fault, from 1.
         number: usize,
         /// Which value, and why not.
         value: Unfit,
@@ -70,21 +70,21 @@ pub enum Problem {
 /// A value that cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum Unfit {
-    /// A moment before the first frame, or none.
+    /// The moment is before the first frame, or not a number.
     #[error("at_s: found {0}, expected seconds from 0")]
     Moment(f64),
-    /// A key of other kinds.
+    /// The key belongs to other kinds of faults.
     #[error("{0}: this kind of fault does not have it")]
     Misplaced(&'static str),
-    /// More bytes or bits than are struck.
+    /// More bytes or bits than the limit.
     #[error("{key}: found {found}, expected at most {MOST_STRUCK}")]
     TooMany {
-        /// Which.
+        /// The key.
         key: &'static str,
-        /// As given.
+        /// The value as given.
         found: usize,
     },
-    /// A time that is none.
+    /// The time is not a number of seconds above 0.
     #[error("for_s: found {0}, expected seconds above 0")]
     Span(f64),
     /// A fault that needs a time and has none.
@@ -93,7 +93,7 @@ pub enum Unfit {
 }
 
 impl Error {
-    /// Whether the file itself is what fails.
+    /// Whether the file cannot be read.
     pub fn is_unreadable(&self) -> bool {
         matches!(self, Error::Unreadable { .. })
     }
@@ -127,7 +127,7 @@ enum Kind {
     Flip,
 }
 
-/// What becomes of the line for a time, or of frames.
+/// What happens to the line for a time, or to frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Fault {
     Unplug {
@@ -155,18 +155,18 @@ enum Fault {
     },
 }
 
-/// What is to be done with a frame.
+/// What to do with a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Line {
-    /// Send it, as it is now.
+    /// Send it as it is now.
     Up,
-    /// Keep it.
+    /// Do not send it.
     Silent,
-    /// Keep it, and the port is gone.
+    /// Do not send it: the port is gone.
     Unplugged,
 }
 
-/// A script being played.
+/// A script that is being played.
 #[derive(Debug)]
 pub(crate) struct Faults {
     faults: Vec<Fault>,
@@ -259,7 +259,7 @@ impl Faults {
                     frames,
                 } if time_s >= *from_s && *frames > 0 => {
                     *frames -= 1;
-                    // Where all bytes were dropped there is none to invert.
+                    // If all bytes were dropped, there is none to invert.
                     let bits = if frame.is_empty() { 0 } else { *bits };
                     for _ in 0..bits {
                         let bit = stream.below(frame.len() * 8);

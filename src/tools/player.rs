@@ -1,4 +1,4 @@
-//! A simulated sensor at a pty: presses in real time, bytes at the pace of the line.
+//! A simulated sensor on a pty: presses in real time, bytes at the speed of the line.
 //!
 //! Frames are computed on a thread of their own, a little ahead, so that the physics never delays
 //! a byte. Nobody reading is no reason to wait: the sensor does not know.
@@ -15,7 +15,7 @@ use super::pty::Pty;
 use crate::simulator::{Sequence, SequenceFrame, SequenceSettings};
 use crate::wire::Layout;
 
-/// Bits of a byte on the line: start, eight, stop.
+/// Bits on the line for a byte: a start bit, eight data bits, a stop bit.
 pub(crate) const BITS_A_BYTE: f64 = 10.0;
 
 /// How often bytes are passed on: finer than a UART's FIFO is emptied, coarse enough to be cheap.
@@ -29,9 +29,9 @@ const AHEAD: usize = 32;
 pub(crate) struct Pace {
     /// Time between frames.
     pub(crate) period: Duration,
-    /// The line's.
+    /// Bytes per second that the line carries.
     pub(crate) bytes_per_s: f64,
-    /// Sensor seconds a second.
+    /// Seconds of the sensor per second.
     pub(crate) speed: f64,
 }
 
@@ -78,7 +78,7 @@ impl Player {
         })
     }
 
-    /// The device to be opened.
+    /// Path of the device that a reader opens.
     pub(crate) fn path(&self) -> &Path {
         self.pty
             .as_ref()
@@ -86,7 +86,7 @@ impl Player {
             .path()
     }
 
-    /// Plays to the end of the sequence; the port is gone afterwards.
+    /// Plays to the end of the sequence. Afterwards the port is gone.
     ///
     /// # Errors
     ///
@@ -96,7 +96,7 @@ impl Player {
         let start = Instant::now();
         let mut bytes = Vec::with_capacity(self.layout.max_frame_bytes());
         let mut index = 0_u32;
-        // When the line has room again: a long frame delays the next.
+        // When the line is free again: a long frame delays the next one.
         let mut free = start;
         while let Some(frame) = frames.recv().await {
             let due = start + self.pace.period * index;
@@ -122,7 +122,7 @@ impl Player {
         }
     }
 
-    /// Sends from this moment on; when the last byte is there.
+    /// Sends from this moment on. Returns when the last byte has arrived.
     async fn send(&mut self, bytes: &[u8], from: Instant) -> io::Result<Instant> {
         let mut at = from;
         let Some(pty) = &mut self.pty else {
@@ -134,7 +134,7 @@ impl Player {
         let mut sent = 0.0;
         for slice in bytes.chunks(slice as usize) {
             sent += slice.len() as f64;
-            // A byte is there when its last bit is.
+            // A byte has arrived when its last bit has.
             at = from + Duration::from_secs_f64(sent / self.pace.bytes_per_s);
             tokio::time::sleep_until(at).await;
             pty.write(slice)?;

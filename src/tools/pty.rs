@@ -22,7 +22,7 @@ use self::pair::Pair;
 /// reader left (TIOCEXCL outlives it here) is opened.
 const ABSENT: Duration = Duration::from_millis(500);
 
-/// How long the last bytes may wait for their reader.
+/// How long the last bytes may wait for a reader.
 const LINGER: Duration = Duration::from_millis(500);
 
 /// The pair.
@@ -51,7 +51,7 @@ impl Pty {
             path,
         } = Pair::open()?;
         rustix::io::ioctl_fionbio(&master, true)?;
-        // A fresh tty echoes and edits lines: not what a sensor does.
+        // A new tty echoes and edits lines. A sensor does neither.
         let mut settings = rustix::termios::tcgetattr(&device)?;
         settings.make_raw();
         rustix::termios::tcsetattr(&device, OptionalActions::Now, &settings)?;
@@ -69,12 +69,12 @@ impl Pty {
         })
     }
 
-    /// The device to be opened.
+    /// Path of the device that a reader opens.
     pub(crate) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Writes what there is room for; the rest is lost, as on a line that nobody listens to.
+    /// Writes as much as there is room for. The rest is lost, as on a line without a reader.
     ///
     /// # Errors
     ///
@@ -102,10 +102,10 @@ impl Pty {
         Ok(())
     }
 
-    /// Waits until the last bytes are read, but not for ever.
+    /// Waits until the last bytes are read, up to a limit.
     pub(crate) async fn linger(&self) -> io::Result<()> {
         let end = Instant::now() + LINGER;
-        // What was written is not at the device at once: nothing there once says little.
+        // Written bytes reach the device a moment later, so one look at an empty device is not enough.
         let mut empty = 0;
         while empty < 3 && Instant::now() < end {
             tokio::time::sleep(Duration::from_millis(5)).await;
@@ -118,7 +118,7 @@ impl Pty {
 
 impl Drop for Pty {
     fn drop(&mut self) {
-        // Another may have put its own link there meanwhile.
+        // Another process may have put its own link there meanwhile.
         if let Some(link) = &self.link
             && fs::read_link(link).is_ok_and(|target| target == self.path)
         {
@@ -127,7 +127,7 @@ impl Drop for Pty {
     }
 }
 
-/// Points `link` at `device`, at one stroke.
+/// Makes `link` point to `device`, in one atomic step.
 fn place(device: &Path, link: &Path) -> io::Result<()> {
     match fs::symlink_metadata(link) {
         Ok(file) if !file.file_type().is_symlink() => {

@@ -1,4 +1,4 @@
-//! `hardnessd recover`: what is whole in a damaged recording, into a new one.
+//! `hardnessd recover`: saves the whole parts of a damaged recording in a new one.
 
 use std::ffi::OsString;
 use std::fs::{self, File, Metadata, TryLockError};
@@ -28,46 +28,46 @@ pub enum Error {
     /// The damaged file cannot be read.
     #[error("{path}: cannot read: {source}")]
     Unreadable {
-        /// As given.
+        /// The value as given.
         path: PathBuf,
-        /// Why not.
+        /// The reason.
         source: io::Error,
     },
-    /// Its disk failed while it was read.
+    /// Reading the damaged file failed halfway.
     #[error("{path}: {source}")]
     Broken {
-        /// As given.
+        /// The value as given.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: io::Error,
     },
-    /// There is nothing to be saved.
-    #[error("{path}: nothing to save: no chunk of messages is whole in {bytes} bytes")]
+    /// There is nothing to save.
+    #[error("{path}: not a recording, or no chunk of messages in it is whole ({bytes} bytes read)")]
     Nothing {
-        /// As given.
+        /// The value as given.
         path: PathBuf,
-        /// All of it.
+        /// Size of the file.
         bytes: u64,
     },
-    /// MCAP, but no recording of ours.
+    /// The file is MCAP, but all its messages are of other programs.
     #[error("{path}: nothing to save: all {messages} messages are of other programs")]
     Foreign {
-        /// As given.
+        /// The value as given.
         path: PathBuf,
-        /// Whole ones.
+        /// Whole messages.
         messages: u64,
     },
     /// The new file cannot be written.
     #[error("--out {path}: {source}")]
     Write {
-        /// As given.
+        /// The value as given.
         path: PathBuf,
-        /// Why not.
+        /// The reason.
         source: recording::Error,
     },
 }
 
-/// Saves what is whole; says on stderr what that is, and what is lost.
+/// Saves what is whole. Stderr says what was saved and what was lost.
 ///
 /// # Errors
 ///
@@ -100,7 +100,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
     let recovered = match saved {
         Ok(recovered) if has_ours(&recovered) => recovered,
         other => {
-            // It may be in its place already.
+            // The file may have its final name already.
             let _ = fs::remove_file(&part);
             return Err(match other {
                 Ok(Recovered { messages, .. }) if messages > 0 => Error::Foreign {
@@ -126,7 +126,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
     Ok(())
 }
 
-/// Whether nothing stands at `out`, not even a link to a file that does not exist.
+/// Fails if anything is at `out`, even a link to a file that does not exist.
 fn is_new(out: &Path) -> io::Result<()> {
     if out.symlink_metadata().is_ok() {
         let exists = "a file or link is there already: name a new one";
@@ -154,12 +154,12 @@ fn part(out: &Path) -> io::Result<(PathBuf, File)> {
             },
             made => made?,
         };
-        // Where the file system has no locks nobody holds one.
+        // On a file system without locks, nobody holds one.
         if let Err(TryLockError::WouldBlock) = file.try_lock() {
             let held = "another `hardnessd recover` is writing it: wait for it";
             return Err(io::Error::new(ErrorKind::ResourceBusy, held));
         }
-        // Whoever held it may have put it in its place meanwhile.
+        // The process that held the lock may have renamed the file meanwhile.
         let ours = file.metadata()?;
         let is_ours = |there: Metadata| (there.dev(), there.ino()) == (ours.dev(), ours.ino());
         if fs::metadata(&part).is_ok_and(is_ours) {
@@ -193,18 +193,18 @@ fn save(broken: File, part: &File) -> Result<Recovered, RecoverError> {
     Ok(recovered)
 }
 
-/// A name is on the disk when its directory is.
+/// Flushes the directory: only then is the file's name on the disk.
 fn sync_directory(file: &Path) -> io::Result<()> {
     let directory = file.parent().filter(|path| !path.as_os_str().is_empty());
     File::open(directory.unwrap_or(Path::new(".")))?.sync_all()
 }
 
-/// Whether anything of ours was saved.
+/// Whether any message of this program was saved.
 fn has_ours(recovered: &Recovered) -> bool {
     recovered.messages > recovered.messages_foreign
 }
 
-/// What was saved and what was lost, in lines.
+/// Lines that say what was saved and what was lost.
 fn account(recovered: &Recovered) -> String {
     let Recovered {
         messages,

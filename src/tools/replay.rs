@@ -48,9 +48,9 @@ pub enum Error {
     /// The recording cannot be read.
     #[error("{path}: cannot read: {source}")]
     Unreadable {
-        /// Of the recording.
+        /// Path of the recording.
         path: PathBuf,
-        /// Why not.
+        /// The reason.
         source: io::Error,
     },
     /// The arm's positions cannot be used.
@@ -67,10 +67,10 @@ pub enum Error {
         /// Of the recording.
         path: PathBuf,
     },
-    /// It is damaged, or none of ours.
+    /// The recording is damaged, or another program's.
     #[error("{path}: {source}")]
     Recording {
-        /// Of the recording.
+        /// Path of the recording.
         path: PathBuf,
         /// What is wrong with it.
         source: recording::Error,
@@ -78,7 +78,7 @@ pub enum Error {
     /// It describes a sensor that cannot be.
     #[error("{path}: {source}")]
     Sensor {
-        /// Of the recording.
+        /// Path of the recording.
         path: PathBuf,
         /// What is wrong with it.
         source: recording::PlaybackError,
@@ -89,22 +89,22 @@ pub enum Error {
          that of [sensor.frame]: `hardnessd sniff {path}` looks for another"
     )]
     NoFrame {
-        /// Of the recording.
+        /// Path of the recording.
         path: PathBuf,
-        /// All there are.
+        /// All bytes of the file.
         bytes_skipped: u64,
-        /// Candidates.
+        /// Candidates that were damaged.
         frames_damaged: u64,
     },
     /// Reading broke off.
     #[error("{path}: {source}")]
     Broken {
-        /// Of the recording.
+        /// Path of the recording.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: io::Error,
     },
-    /// Stdout fails.
+    /// Stdout cannot be written to.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
 }

@@ -57,35 +57,35 @@ pub struct Args {
     faults: Option<PathBuf>,
 }
 
-/// Why there is no simulated sensor.
+/// Why the sensor cannot be simulated.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The script of faults.
     #[error(transparent)]
     Faults(#[from] faults::Error),
-    /// A layout that needs more than its preset.
+    /// The layout needs more than a preset.
     #[error("--preset: {0}")]
     Layout(#[from] LayoutError),
-    /// More bytes than the line carries.
+    /// The frames have more bytes than the line carries.
     #[error(
         "--baud: found {baud}, expected at least {needed} to carry {fps} frames/s of {bytes} bytes"
     )]
     Baud {
-        /// As given.
+        /// The value as given.
         baud: u32,
-        /// Least that would do.
+        /// The lowest rate that carries the frames.
         needed: u32,
-        /// As given.
+        /// The value as given.
         fps: f64,
-        /// Of a frame.
+        /// Bytes of a frame.
         bytes: usize,
     },
     /// The recording cannot be written.
     #[error("{path}: {source}")]
     Recording {
-        /// Of the recording.
+        /// Path of the recording.
         path: PathBuf,
-        /// Why not.
+        /// The reason.
         source: std::io::Error,
     },
     /// The pty, or its link.
@@ -93,7 +93,7 @@ pub enum Error {
     Pty {
         /// Path of the link, or that it is the pty.
         what: String,
-        /// Why not.
+        /// The reason.
         source: std::io::Error,
     },
 }
@@ -111,7 +111,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let mut shutdown = pin!(shutdown);
     let faults = match args.faults.clone() {
         Some(path) => {
-            // The script may be a pipe that says nothing.
+            // The script may be a pipe without a writer.
             let seed = args.seed;
             let loaded = tokio::task::spawn_blocking(move || Faults::load(&path, seed));
             tokio::select! {
@@ -123,7 +123,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     };
     if let Some(path) = args.to.clone() {
         let settings = sequence(&args);
-        // On a thread of its own: neither the physics nor a slow disk is to be waited for at a signal.
+        // On another thread, so that a signal need not wait for the physics or a slow disk.
         let to = path.clone();
         let (stop, stopped) = mpsc::channel();
         let mut recorded =
@@ -157,7 +157,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let line = format!("{}\n", player.path().display());
     let settings = sequence(&args);
     let play = async {
-        // Nobody may want to know the path: the link says it too.
+        // It is no error if nobody reads the path: the link shows it too.
         let told = super::print_apart(line.into_bytes());
         tokio::try_join!(told, player.play(settings)).map(|_| ())
     };
@@ -194,7 +194,7 @@ fn record(
     mut faults: Faults,
     stopped: &mpsc::Receiver<()>,
 ) -> std::io::Result<()> {
-    // Frame by frame: stopped at any moment, it holds what was played until then.
+    // Frame by frame, so that the file holds what was played whenever it is stopped.
     let mut recording = File::create(path)?;
     let frame_rate_hz = settings.frame_rate_hz;
     let mut bytes = Vec::with_capacity(layout.max_frame_bytes());
@@ -204,7 +204,7 @@ fn record(
         if faults.strike(f64::from(index) / frame_rate_hz, &mut bytes) == Line::Up {
             recording.write_all(&bytes)?;
         }
-        // A process that ends in the middle of a write may leave a part of it.
+        // A process that ends during a write may leave a part of a frame.
         if stopped.try_recv() == Err(TryRecvError::Disconnected) {
             return Ok(());
         }
@@ -249,7 +249,7 @@ fn baud(args: &Args, layout: &Layout) -> Result<(u32, Option<String>), Error> {
     Ok((baud, warning))
 }
 
-/// A preset by the name it has in the configuration.
+/// A preset, by its name in the configuration.
 fn preset(name: &str) -> Result<Preset, NameError> {
     Preset::deserialize(name.into_deserializer())
 }
@@ -266,7 +266,7 @@ fn force_n(text: &str) -> Result<f64, OutOfRange> {
     within(text, 0.01, 200.0)
 }
 
-/// A number of the command line that cannot be used, or none.
+/// The option's value is not a number, or is out of range.
 #[derive(Debug, thiserror::Error)]
 #[error("expected a number from {least} to {most}")]
 pub(super) struct OutOfRange {

@@ -45,53 +45,53 @@ pub struct Args {
     out: Option<PathBuf>,
 }
 
-/// Why there is no proposal.
+/// Why `sniff` proposes nothing.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The recording cannot be read.
     #[error("{path}: cannot read: {source}")]
     Unreadable {
-        /// Of the recording.
+        /// Path of the recording.
         path: PathBuf,
-        /// Why not.
+        /// The reason.
         source: io::Error,
     },
-    /// It is damaged, or none of ours.
+    /// The recording is damaged, or another program's.
     #[error("{path}: {source}")]
     Recording {
-        /// Of the recording.
+        /// Path of the recording.
         path: PathBuf,
         /// What is wrong with it.
         source: recording::Error,
     },
-    /// The port does not open, or was lost before a byte came.
+    /// The port does not open, or it was lost before the first byte.
     #[error("{path}: {reason}")]
     Unavailable {
-        /// Of the port.
+        /// Path of the port.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         reason: String,
     },
     /// No layout explains the bytes.
     #[error(
-        "{path}: no layout explains half of the {bytes} bytes: press the sensor meanwhile, give it 20 \
-         frames or more, and try another --baud"
+        "{path}: no layout explains half of the {bytes} bytes with at most a tenth of its frames damaged: \
+         press the sensor meanwhile, give it 20 frames or more, and try another --baud"
     )]
     Unexplained {
-        /// Of the recording or the port.
+        /// Path of the recording or the port.
         path: PathBuf,
-        /// Looked at.
+        /// How many bytes there are.
         bytes: usize,
     },
     /// The configuration cannot be written.
     #[error("--out {path}: {source}")]
     Write {
-        /// As given.
+        /// The value as given.
         path: PathBuf,
-        /// Why not.
+        /// The reason.
         source: io::Error,
     },
-    /// Stdout fails.
+    /// Stdout cannot be written to.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
 }
@@ -109,7 +109,7 @@ pub async fn run(args: Args) -> Result<(), Error> {
         Some(port) => Some(listen(port, args.baud, args.seconds).await?),
         None => None,
     };
-    // A file may be a pipe, and many bytes take their time.
+    // On another thread: the file may be a pipe, and many bytes take long.
     let told = tokio::task::spawn_blocking(move || match listened {
         Some(bytes) => tell(&args, &bytes),
         None => read(args.source()).and_then(|bytes| tell(&args, &bytes)),
@@ -118,14 +118,14 @@ pub async fn run(args: Args) -> Result<(), Error> {
 }
 
 impl Args {
-    /// Where the bytes come from.
+    /// The file or the port.
     fn source(&self) -> &Path {
         let source = self.file.as_ref().or(self.port.as_ref());
         source.expect("clap asks for a port where there is no file")
     }
 }
 
-/// Prints what explains `bytes`.
+/// Prints the layout that explains `bytes`.
 fn tell(args: &Args, bytes: &[u8]) -> Result<(), Error> {
     let path = args.source();
     let proposals = propose(bytes);
@@ -157,19 +157,19 @@ fn tell(args: &Args, bytes: &[u8]) -> Result<(), Error> {
     Ok(())
 }
 
-/// All of a configuration that stands above `[sensor.frame]`.
+/// The part of a configuration above `[sensor.frame]`.
 fn configuration(args: &Args, frame_rate_hz: Option<f64>) -> String {
     let port = args
         .port
         .as_deref()
         .unwrap_or(Path::new("/dev/serial/by-id/..."));
-    // The file may lie elsewhere.
+    // The configuration may be in another directory.
     let port = std::path::absolute(port).unwrap_or_else(|_| port.to_owned());
     let port = toml::Value::String(port.display().to_string());
     let baud = args.baud;
     let mut text = format!("[[sensor]]\nname = \"sensor\"\nport = {port}\nbaud = {baud}\n");
     match frame_rate_hz {
-        // Two digits are what the seconds are good for.
+        // The duration is not exact enough for more digits.
         Some(hz) => {
             text += &format!(
                 "frame_rate_hz = {:?}  # as counted\n",
@@ -193,7 +193,7 @@ fn read(path: &Path) -> Result<Vec<u8>, Error> {
     let (kind, file) = FileKind::read(file).map_err(unreadable)?;
     let mut bytes = Vec::new();
     if kind == FileKind::Recording {
-        // Of several sensors, the first one's.
+        // If there are several sensors, take the bytes of the first.
         let mut sensor = None;
         for found in Reader::new(BufReader::new(file)) {
             let found = found.map_err(|source| Error::Recording {
@@ -216,12 +216,12 @@ fn read(path: &Path) -> Result<Vec<u8>, Error> {
     Ok(bytes)
 }
 
-/// What comes from the port in `seconds`; less if it is lost.
+/// The bytes that come from the port in `seconds`. Fewer if the port is lost.
 async fn listen(path: &Path, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> {
     let mut link = Link::new(path, baud);
     let mut bytes = Vec::new();
     let mut lost = None;
-    // Longer than there is time: until the port is lost or the bytes are many.
+    // A duration that is too long to count ends when the port is lost or the bytes are many.
     let listened = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
     let _ = tokio::time::timeout(listened, async {
         while bytes.len() < MOST_BYTES {

@@ -42,40 +42,40 @@ pub struct Args {
     types: Vec<Kind>,
 }
 
-/// Why it ended before it was done.
+/// Why it ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The time is over.
+    /// The time limit has passed.
     #[error("timed out after {seconds} s ({})", events(*.found, *.count))]
     Timeout {
-        /// Events printed.
+        /// Events that were printed.
         found: u64,
-        /// As given.
+        /// The value as given.
         seconds: f64,
-        /// As given.
+        /// The value as given.
         count: Option<u64>,
     },
-    /// No daemon, or none any more.
+    /// No daemon answers, or it has ended.
     #[error(transparent)]
     Connect(#[from] connect::Error),
-    /// Somebody listens there who does not speak.
+    /// The other end accepts the connection and sends nothing.
     #[error(
         "{address}: no answer for {} s: what listens there is no hardnessd, or it hangs",
         HELLO.as_secs()
     )]
     Mute {
-        /// Where it listens.
+        /// The address.
         address: Address,
     },
-    /// Somebody speaks, and is no daemon of this protocol.
+    /// The other end is not a daemon of this protocol.
     #[error("{address}: found {found}, expected the hello of a daemon of protocol {PROTOCOL}")]
     Foreign {
-        /// Where it speaks.
+        /// The address.
         address: Address,
-        /// What it says first.
+        /// Its first line.
         found: String,
     },
-    /// The daemon has no room.
+    /// The daemon has too many subscribers.
     #[error("{address}: the daemon says: {message}")]
     Refused {
         /// Where it is.
@@ -83,7 +83,7 @@ pub enum Error {
         /// As it came.
         message: String,
     },
-    /// Stdout fails.
+    /// Stdout cannot be written to.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
 }
@@ -124,7 +124,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
 async fn over(timeout_s: Option<f64>) {
     match timeout_s.map(Duration::try_from_secs_f64) {
         Some(Ok(timeout)) => tokio::time::sleep(timeout).await,
-        // Longer than there is time.
+        // A duration that is too long to count never ends.
         Some(Err(_)) | None => std::future::pending().await,
     }
 }
@@ -138,7 +138,7 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
         Ok(hello) => meet(&hello?.1, address.clone())?,
         Err(_) => return Err(Error::Mute { address }),
     }
-    // Only now: where no daemon answers, the error is the one line.
+    // Only after the connection is made: if no daemon answers, the error must be the only line.
     if args.source.given().is_none() {
         eprintln!(
             "hardnessd: events of {}",
@@ -148,7 +148,7 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
     loop {
         let (line, event) = next(&mut daemon).await?;
         let kind = event["type"].as_str().unwrap_or_default();
-        // What was queued before the subscription took effect is not meant.
+        // Events that were queued before the subscription took effect are left out.
         let counts = Kind::named(kind).is_some_and(|kind| args.types.contains(&kind));
         if !counts && kind != "gap" {
             continue;
@@ -169,7 +169,7 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
     }
 }
 
-/// Goes on only if this is what a daemon says first.
+/// Fails unless this is a daemon's first line.
 fn meet(hello: &Value, address: Address) -> Result<(), Error> {
     let kind = hello["type"].as_str().unwrap_or_default();
     let found = match (kind, &hello["protocol"]) {
@@ -184,7 +184,7 @@ fn meet(hello: &Value, address: Address) -> Result<(), Error> {
     Err(Error::Foreign { address, found })
 }
 
-/// What the daemon says next: as it came, and what it means.
+/// The daemon's next line, as text and as JSON.
 async fn next(daemon: &mut Connection) -> Result<(String, Value), Error> {
     let line = daemon.next().await?;
     match serde_json::from_str(&line) {

@@ -37,24 +37,24 @@ pub struct Args {
     source: Source,
 }
 
-/// Why there is nothing to see.
+/// Why `watch` ended with an error.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Nobody would see it.
+    /// Stdin or stdout is not a terminal.
     #[error("`watch` needs a terminal on stdin and stdout: use `hardnessd tail` instead")]
     NoTerminal,
-    /// The terminal fails.
+    /// The terminal cannot be read from or written to.
     #[error("terminal: {0}")]
     Terminal(#[source] io::Error),
 }
 
-/// Between two pictures: as often as a frame of the fastest array that eyes can follow.
+/// Time between two pictures: as fast as eyes can follow.
 const PICTURE: Duration = Duration::from_millis(100);
 
-/// Between two tries to connect.
+/// Time between two tries to connect.
 const PAUSE: Duration = Duration::from_millis(500);
 
-/// Shows until a key or `shutdown` ends it, or the terminal goes away.
+/// Shows the sensors until a key or `shutdown` ends it, or the terminal goes away.
 ///
 /// # Errors
 ///
@@ -81,7 +81,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let mut shutdown = std::pin::pin!(shutdown);
     loop {
         tokio::select! {
-            // A daemon that says much must not keep a key or a picture waiting.
+            // Many lines from the daemon must not delay a key or a picture.
             biased;
             () = &mut shutdown => return Ok(()),
             () = screen.gone() => return Ok(()),
@@ -122,14 +122,14 @@ fn look() -> Look {
     )
 }
 
-/// The connection to the daemon, made again whenever it breaks.
+/// The connection to the daemon. When it breaks, it is made again.
 struct Daemon {
     source: Source,
     state: State,
 }
 
 enum State {
-    /// No daemon; the next try is then.
+    /// There is no daemon. The next try is at this time.
     Waiting(Instant),
     Connecting(Connecting),
     Connected(Connection),
@@ -137,9 +137,9 @@ enum State {
 
 type Connecting = Pin<Box<dyn Future<Output = Result<Connection, connect::Error>> + Send>>;
 
-/// What comes of a daemon that is there.
+/// What comes from the daemon.
 enum Heard {
-    /// It has taken the connection, there.
+    /// It accepted the connection at this address.
     Connection(Address),
     Line(String),
 }
@@ -152,7 +152,7 @@ impl Daemon {
         }
     }
 
-    /// The next line, or why there is no daemon. Nothing is lost if the wait is given up.
+    /// The next line, or why there is no daemon. If you stop waiting, nothing is lost.
     async fn next(&mut self) -> Result<Heard, Loss> {
         loop {
             match &mut self.state {
@@ -191,7 +191,7 @@ impl Daemon {
         self.state = State::Waiting(Instant::now() + PAUSE);
     }
 
-    /// Asks for something.
+    /// Sends a request.
     fn say(&self, request: &str) {
         if let State::Connected(connection) = &self.state {
             connection.try_send(request);
@@ -200,7 +200,7 @@ impl Daemon {
 }
 
 impl Clock {
-    /// Whether a daemon there has this machine's clock.
+    /// Whether a daemon at this address has this machine's clock.
     fn of(address: &Address) -> Self {
         match address {
             Address::Unix(_) => Self::Ours,

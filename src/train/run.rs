@@ -155,7 +155,7 @@ impl Run {
                 return Ok(run);
             }
             Some(_) => bail!(
-                "{}: holds a run already; --resume goes on with it",
+                "{}: has a run already: continue it with --resume, or choose another --out",
                 directory.display()
             ),
             None => {}

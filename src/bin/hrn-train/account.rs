@@ -1,4 +1,4 @@
-//! What is said of a model and of how well it judges, as lines of text.
+//! Text about a model, about an evaluation and about a data set.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -55,7 +55,7 @@ pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
     )
 }
 
-/// The figures of an evaluation; last its confusion matrix, a row a true level.
+/// The figures of an evaluation, and its confusion matrix with a row for each true level.
 pub(super) fn of_evaluation(evaluation: &Evaluation) -> String {
     let percent = |share: f64| share * 100.0;
     let interval = evaluation.accuracy_interval_by_object.map_or_else(

@@ -1,4 +1,4 @@
-//! What the trainer can be asked for.
+//! The command line of the trainer.
 
 use std::path::PathBuf;
 
@@ -10,11 +10,15 @@ use hardnessd::train::settings::Profile;
 
 /// Trains and evaluates the hardness recognition network.
 #[derive(Debug, Parser)]
-#[command(name = "hrn-train", version)]
+#[command(name = "hrn-train", version, after_long_help = EXIT_CODES)]
 pub(super) struct Arguments {
     #[command(subcommand)]
     pub(super) command: Command,
 }
+
+const EXIT_CODES: &str = "Exit codes: 0 done; 1 failed or bad data; 2 wrong usage; 66 a file named \
+    here is missing or unreadable; 69 no CUDA device; 74 I/O error; 78 bad settings, model or \
+    configuration; 130 and 143 after SIGINT and SIGTERM.";
 
 #[derive(Debug, Subcommand)]
 pub(super) enum Command {
@@ -113,7 +117,7 @@ pub(super) struct Simulate {
     pub(super) courses: Courses,
 }
 
-/// What is drawn anew for each press of `--sequences`: from two numbers, or one number.
+/// Options of `--sequences`. Each press draws its own value between two numbers, or takes the one number.
 #[derive(Debug, clap::Args)]
 #[group(requires = "sequences")]
 pub(super) struct Courses {
@@ -258,7 +262,7 @@ fn range<const LEAST: u32, const MOST: u32>(text: &str) -> Result<[f64; 2], Stri
     }
 }
 
-/// A number from 0 to so many hundredths.
+/// A number from 0 to `HUNDREDTHS` / 100.
 fn part<const HUNDREDTHS: u32>(text: &str) -> Result<f64, String> {
     let most = f64::from(HUNDREDTHS) / 100.0;
     match text.parse() {

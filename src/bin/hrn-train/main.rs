@@ -87,7 +87,13 @@ struct Unreadable {
     source: std::io::Error,
 }
 
-/// 2 wrong usage, 66 unreadable input, 69 no such device, 78 bad configuration or model, 74 other I/O, else 1.
+/// A directory named on the command line that has no model to take.
+#[derive(Debug, thiserror::Error)]
+#[error("{}: no finished run: {}", .0.display(), .1)]
+struct NoRun(PathBuf, &'static str);
+
+/// The exit code: 2 wrong usage, 66 unreadable input, 69 no such device, 78 bad configuration or model, 74
+/// other I/O error, else 1.
 fn exit_code(error: &anyhow::Error) -> u8 {
     let has = |test: fn(&(dyn std::error::Error + 'static)) -> bool| error.chain().any(test);
     if has(|e| {
@@ -99,6 +105,7 @@ fn exit_code(error: &anyhow::Error) -> u8 {
         exit::USAGE
     } else if has(|e| {
         e.is::<Unreadable>()
+            || e.is::<NoRun>()
             || matches!(e.downcast_ref(), Some(DatasetError::Unreadable { .. }))
             || matches!(e.downcast_ref(), Some(CollectError::Unreadable { .. }))
             || matches!(e.downcast_ref(), Some(ConfigError::Unreadable { .. }))
@@ -122,7 +129,7 @@ fn read(path: &Path) -> Result<Vec<u8>, Unreadable> {
     })
 }
 
-/// Writes what was asked for. What stood there is replaced, at one stroke, and that is said.
+/// Writes a file at once and as a whole. If it replaces a file, stderr says so.
 fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let is_replaced = path.is_file();
     write_whole(path, bytes)?;
@@ -136,12 +143,12 @@ fn load(path: &Path) -> anyhow::Result<Hrn> {
     trial::load(&read(path)?, None).with_context(|| path.display().to_string())
 }
 
-/// Nothing was asked for.
+/// No objects at all were asked for.
 #[derive(Debug, thiserror::Error)]
 #[error("--objects and --test-objects: found 0 and 0, expected one or more of either")]
 struct NoObjects;
 
-/// An option that says nothing of these materials.
+/// An option that has no meaning for these materials.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}: works with `--materials {1}` only")]
 struct OtherMaterials(&'static str, &'static str);
@@ -213,7 +220,7 @@ fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
         }
         None => None,
     };
-    // The data set first: a picture that cannot be written does not cost it.
+    // The data set comes first, so that a picture that cannot be written does not lose it.
     write(&arguments.out, &simulated::to_bytes(&settings, samples)?)?;
     if let Some((path, picture)) = sheet {
         write(path, &picture)?;
@@ -402,7 +409,7 @@ fn device(name: DeviceName) -> Result<Device, NoCuda> {
     }
 }
 
-/// Has the system end this process when its parent does, whatever ends that.
+/// Asks the system to end this process when its parent ends, for whatever reason.
 fn end_with(parent: i32) -> anyhow::Result<()> {
     rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::TERM))
         .map_err(std::io::Error::from)
@@ -470,11 +477,15 @@ fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
 
 fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {
     let model = run.join("hrn.onnx");
-    let mut loaded = load(&model);
-    if run.join("settings.toml").exists() && !model.exists() {
-        loaded = loaded.context("the run has no model yet; train --resume finishes it");
+    if run.is_dir() && !model.exists() {
+        let hint = if run.join("settings.toml").exists() {
+            "it was stopped: `hrn-train train --resume` with its options finishes it"
+        } else {
+            "it has no hrn.onnx"
+        };
+        return Err(NoRun(run.to_owned(), hint).into());
     }
-    let hrn = loaded?;
+    let hrn = load(&model)?;
     write(out, &read(&model)?)?;
     Ok(format!("{}: sha256 {}\n", out.display(), hrn.sha256()))
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use signal_hook::consts::{SIGINT, SIGTERM, SIGXFSZ};
 use signal_hook::iterator::Signals;
 
-/// Ends the process at SIGINT and SIGTERM, with 130 and 143, and says how to go on.
+/// Ends the process at SIGINT and SIGTERM, with 130 and 143, and prints the command that continues.
 ///
 /// Every file on the disk is whole at any moment, and a run goes on from its last checkpoint, so there
 /// is nothing to wait for.
@@ -28,7 +28,7 @@ pub(super) fn end_at_signals(how_to_go_on: Option<String>) -> std::io::Result<()
     Ok(())
 }
 
-/// The command that goes on with an interrupted `train`: the same one with `--resume`.
+/// The command that continues an interrupted `train`: the same one with `--resume`.
 pub(super) fn resuming(arguments: impl Iterator<Item = String>) -> String {
     let mut words: Vec<String> = arguments.map(|word| quoted(&word)).collect();
     if !words.iter().any(|word| word == "--resume") {
@@ -37,7 +37,7 @@ pub(super) fn resuming(arguments: impl Iterator<Item = String>) -> String {
     words.join(" ")
 }
 
-/// The command that goes on with an interrupted `compare`: the same one.
+/// The command that continues an interrupted `compare`: the same one.
 pub(super) fn again(arguments: impl Iterator<Item = String>) -> String {
     let words: Vec<String> = arguments.map(|word| quoted(&word)).collect();
     words.join(" ")

@@ -26,7 +26,7 @@ impl Account {
         }
     }
 
-    /// What there is to say of an event, if anything is.
+    /// The line for an event, if it has one.
     pub(super) fn line(&mut self, event: &Value) -> Option<String> {
         let text = |key: &str| event[key].as_str().unwrap_or_default();
         match (text("type"), text("phase"), text("state")) {
@@ -86,7 +86,7 @@ impl Account {
         format!("press {number}  {pressed}  ->  {said:<columns$}  {mark:<5}  {force_n:4.1} N")
     }
 
-    /// Number of a press, and what was pressed.
+    /// Number of a press, and the material that was pressed.
     fn pressed(&self, event: &Value) -> Option<(u64, String)> {
         let material = self.material(event)?;
         let pressed = format!("{} (level {})", material.name(), material.level());

@@ -9,11 +9,11 @@ use std::path::{Path, PathBuf};
 /// How the directory of every demonstration begins.
 const PREFIX: &str = "hardnessd-demo-";
 
-/// A directory of our own. It is removed with this value.
+/// The demonstration's own directory. Dropping this value removes it.
 pub(super) struct Place(PathBuf);
 
 impl Place {
-    /// A new one, in the user's runtime directory or else among the temporary files.
+    /// Makes a directory in the user's runtime directory, else in the directory for temporary files.
     pub(super) fn new() -> io::Result<Self> {
         let mut outcome = Err(ErrorKind::NotFound.into());
         for directory in directories().filter(|one| one.as_os_str().len() <= LONGEST_BYTES) {
@@ -68,7 +68,7 @@ fn directories() -> impl Iterator<Item = PathBuf> {
         .chain([env::temp_dir()])
 }
 
-/// Sockets of this user's demonstrations, the newest first. A killed one may have left its own.
+/// Sockets of this user's demonstrations, the newest first. A killed demonstration may have left one.
 pub(in crate::tools) fn sockets() -> Vec<PathBuf> {
     let uid = rustix::process::geteuid().as_raw();
     let mut found = Vec::new();

@@ -21,6 +21,8 @@ const FINALISTS: usize = 4;
 const LEAST_SHARE: f64 = 0.5;
 /// Whole frames below which nothing is.
 const LEAST_FRAMES: u64 = 3;
+/// Without a checksum, at most one of so many candidates may be damaged: marks repeat in a text, too.
+const CANDIDATES_A_DAMAGED: u64 = 10;
 
 /// What marks tell where every byte of a frame must be in order, as good as a checksum.
 const ALL_IN_ORDER: u32 = u32::MAX;
@@ -100,6 +102,8 @@ pub(super) fn propose(bytes: &[u8]) -> Vec<Proposal> {
     proposals = proposals
         .iter()
         .filter_map(|proposal| smoother(proposal, bytes))
+        // Not of the sample, whose pieces begin and end within frames.
+        .filter(|p| p.is_checked || is_little_damaged(p))
         .collect();
     rank(&mut proposals);
     proposals
@@ -215,6 +219,15 @@ fn rank(proposals: &mut [Proposal]) {
         ];
     }
     proposals.sort_by_key(|p| Reverse(p.merits));
+}
+
+fn is_little_damaged(proposal: &Proposal) -> bool {
+    let Proposal {
+        frames,
+        frames_damaged,
+        ..
+    } = proposal;
+    CANDIDATES_A_DAMAGED * frames_damaged <= frames + frames_damaged
 }
 
 /// The layout with two-byte cells the other way round, where that makes smoother frames.

@@ -125,7 +125,9 @@ pub enum CollectError {
         first: PathBuf,
     },
     /// Nothing was pressed, or no press was judged.
-    #[error("{path}: found no press with a verdict, expected one or more")]
+    #[error(
+        "{path}: no press found: was the sensor pressed, and is this its layout? (`hardnessd replay {path}`)"
+    )]
     NoPress {
         /// The capture.
         path: PathBuf,

@@ -4,7 +4,7 @@
 //! whatever stands there is whole, also after SIGKILL or a full disk.
 
 use std::fs::{self, File};
-use std::io::Write as _;
+use std::io::{self, ErrorKind, Write as _};
 use std::path::Path;
 
 use anyhow::{Context as _, bail};
@@ -18,6 +18,13 @@ use rustix::fs::FlockOperation;
 /// Those of writing; a file that stood there before then still stands.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let attempt = || -> anyhow::Result<()> {
+        if let Some(directory) = path.parent()
+            && !directory.as_os_str().is_empty()
+            && !directory.exists()
+        {
+            let text = format!("the directory {} does not exist", directory.display());
+            return Err(io::Error::new(ErrorKind::NotFound, text).into());
+        }
         if path.is_symlink() && !path.exists() {
             // A link to what is not there yet: so that there is a path to follow it to.
             File::create(path)?;
@@ -36,7 +43,7 @@ fn replace(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     name.push(".part");
     let part = path.with_file_name(name);
     let mut file = create_anew(&part).with_context(|| part.display().to_string())?;
-    let mut attempt = || -> std::io::Result<()> {
+    let mut attempt = || -> io::Result<()> {
         file.write_all(bytes)?;
         file.sync_all()?;
         fs::rename(&part, path)?;
@@ -55,9 +62,9 @@ fn replace(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
 
 /// A new file in the place of what a killed process left, which may not be writable; of a link,
 /// not of what it points to.
-fn create_anew(path: &Path) -> std::io::Result<File> {
+fn create_anew(path: &Path) -> io::Result<File> {
     match fs::remove_file(path) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(error),
+        Err(error) if error.kind() != ErrorKind::NotFound => Err(error),
         _ => File::create_new(path),
     }
 }
@@ -75,7 +82,7 @@ pub(in crate::train) fn lock(directory: &Path) -> anyhow::Result<File> {
         Err(rustix::io::Errno::WOULDBLOCK) => {
             bail!("{}: another process is at work here", context())
         }
-        Err(error) => Err(std::io::Error::from(error)).with_context(context),
+        Err(error) => Err(io::Error::from(error)).with_context(context),
     }
 }
 
@@ -113,6 +120,10 @@ mod tests {
         write_whole(&path("file"), b"again").unwrap();
         assert_eq!(fs::read(path("target")).unwrap(), b"somebody's");
         assert!(!path("file").is_symlink());
+
+        let error = write_whole(&path("none/file"), b"never").unwrap_err();
+        let error = format!("{error:#}");
+        assert!(error.ends_with("none does not exist"), "{error}");
 
         fs::create_dir(path("file.part")).unwrap();
         let error = write_whole(&path("file"), b"never").unwrap_err();
