@@ -40,12 +40,12 @@ fn host_port(text: &str) -> Result<String, &'static str> {
     }
 }
 
-/// Where a daemon is.
+/// The address of a daemon.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Address {
-    /// At a socket on this machine.
+    /// A socket on this machine.
     Unix(PathBuf),
-    /// At a host and port.
+    /// A host and port, over TCP.
     Tcp(String),
 }
 
@@ -58,10 +58,10 @@ impl fmt::Display for Address {
     }
 }
 
-/// Why there is no daemon to listen to.
+/// Why there is no connection to a daemon.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Nobody listens there.
+    /// No daemon listens at the address.
     #[error("{address}: no daemon answers: {source}")]
     NoAnswer {
         /// The value as given.
@@ -94,13 +94,13 @@ pub enum Error {
     Broken {
         /// The address.
         address: Address,
-        /// How.
+        /// The system's reason.
         source: io::Error,
     },
     /// The daemon has ended.
     #[error("{address}: the daemon closed the connection")]
     Closed {
-        /// Where it was.
+        /// The address.
         address: Address,
     },
     /// The other end does not speak like a daemon.
@@ -109,7 +109,7 @@ pub enum Error {
          daemon sends"
     )]
     TooLong {
-        /// Where it came from.
+        /// The address.
         address: Address,
     },
 }
@@ -194,7 +194,7 @@ impl Connection {
         }
     }
 
-    /// Where the daemon is.
+    /// The daemon's address.
     pub(super) fn address(&self) -> &Address {
         &self.address
     }
@@ -256,7 +256,7 @@ fn refusal(address: Address, source: io::Error) -> Error {
     }
 }
 
-/// The group of a socket; where it cannot be known, that of the packaged daemon.
+/// The group of a socket. If it is unknown, the group of the packaged daemon.
 fn group(path: &Path) -> String {
     let name = || {
         let gid = fs::metadata(path).ok()?.gid().to_string();

@@ -1,4 +1,4 @@
-//! The checks: what the trees under a root (`/`, but for tests) say of a port.
+//! The checks of a port. They read the file trees under a root, which is `/` except in tests.
 
 use std::ffi::OsStr;
 use std::fmt;
@@ -12,7 +12,7 @@ use rustix::fs::{Access, AtFlags, CWD, accessat};
 
 use crate::daemon::realtime::Standing;
 
-/// Something wrong, and what mends it.
+/// A fault and its remedy.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Fault {
     what: String,
@@ -25,14 +25,14 @@ impl fmt::Display for Fault {
     }
 }
 
-/// Who wants to use the port.
+/// The user who wants to use the port.
 #[derive(Debug, Clone)]
 pub(super) struct User {
     pub(super) name: String,
     pub(super) uid: u32,
-    /// That the process has, not those of the files.
+    /// The groups of the process. `/etc/group` may list others.
     pub(super) gids: Vec<u32>,
-    /// What the kernel says to reading and writing: it knows access lists and containers, too.
+    /// Asks the kernel whether this user may read and write. The kernel also knows access lists and containers.
     pub(super) access: fn(&Path) -> io::Result<()>,
 }
 
@@ -57,7 +57,7 @@ fn access(path: &Path) -> io::Result<()> {
     Ok(accessat(CWD, path, wanted, AtFlags::EACCESS)?)
 }
 
-/// Every USB serial port: by its lasting name where it has one.
+/// Every USB serial port, by its persistent name if it has one.
 pub(super) fn ports(root: &Path) -> Vec<PathBuf> {
     let lasting = names(root, "dev/serial/by-id");
     let mut ports: Vec<PathBuf> = if lasting.is_empty() {
@@ -74,7 +74,7 @@ pub(super) fn ports(root: &Path) -> Vec<PathBuf> {
     ports
 }
 
-/// That `port` is there and can be no serial port at all: nothing else is to be said of it.
+/// The fault if `port` exists but cannot be a serial port. Then no other check makes sense.
 pub(super) fn refused(root: &Path, port: &Path) -> Option<Fault> {
     let file = fs::metadata(port).ok()?;
     let found = match file.file_type() {
@@ -111,7 +111,7 @@ pub(super) fn examine(root: &Path, port: &Path, user: &User) -> Vec<Fault> {
     faults
 }
 
-/// What keeps `user` from opening `port`.
+/// The faults that keep `user` from opening `port`.
 pub(super) fn in_the_way(root: &Path, port: &Path, user: &User) -> Vec<Fault> {
     let Some(device) = device(root, port) else {
         return vec![missing(&ports(root))];
@@ -136,7 +136,7 @@ fn missing(ports: &[PathBuf]) -> Fault {
     }
 }
 
-/// What could be meant instead.
+/// Other ports that the user could mean.
 fn others(ports: &[PathBuf]) -> String {
     if ports.is_empty() {
         return "no other is there either: plug the sensor in, then see `sudo dmesg | grep tty`"
@@ -203,7 +203,7 @@ fn held(root: &Path, device: &Path, own: u32) -> Vec<Fault> {
             |file: fs::DirEntry| fs::read_link(file.path()).is_ok_and(|target| target == device);
         if files.flatten().any(is_device) {
             let tool = subcommand(root, pid);
-            // It made the port, and whoever wants it may open it.
+            // A simulator made the port and does not keep others from opening it.
             if matches!(tool.as_deref(), Some(b"simulate" | b"demo")) {
                 continue;
             }
@@ -228,7 +228,7 @@ fn held(root: &Path, device: &Path, own: u32) -> Vec<Fault> {
     faults
 }
 
-/// Which of `hardnessd`'s subcommands a process is.
+/// The subcommand of `hardnessd` that a process runs.
 fn subcommand(root: &Path, pid: u32) -> Option<Vec<u8>> {
     let line = fs::read(root.join("proc").join(pid.to_string()).join("cmdline")).ok()?;
     let mut words = line.split(|&byte| byte == 0);
@@ -271,7 +271,7 @@ fn modem_manager(root: &Path, device: &Path) -> Option<Fault> {
     })
 }
 
-/// An FTDI adapter holds bytes back for as long as its timer says.
+/// An FTDI adapter holds bytes back until its latency timer expires.
 fn latency(root: &Path, device: &Path) -> Option<Fault> {
     let timer = Path::new("sys/class/tty")
         .join(device.file_name()?)
@@ -290,7 +290,7 @@ fn latency(root: &Path, device: &Path) -> Option<Fault> {
     })
 }
 
-/// The shipped rule does for ModemManager and the latency timer.
+/// The shipped udev rule, which mends ModemManager and the latency timer.
 const UDEV_RULE: &str = "sudo cp systemd/99-hardnessd.rules /etc/udev/rules.d/ && \
     sudo udevadm control --reload && sudo udevadm trigger";
 

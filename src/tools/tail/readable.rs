@@ -1,4 +1,4 @@
-//! An event as a line for people: aligned, one event a line, nothing that is not in the event.
+//! An event as an aligned line for people. The line holds nothing that is not in the event.
 
 use std::fmt::Write;
 use std::time::Duration;
@@ -24,7 +24,7 @@ pub(super) fn line(event: &Value) -> String {
         "frame" => frame(&mut line, event),
         _ => line += &event.to_string(),
     }
-    // A reason comes from the system, a label from a model file: neither may move the cursor.
+    // A reason comes from the system and a label from a model file. Neither may move the cursor.
     line.retain(|c| !c.is_control());
     line.truncate(line.trim_end().len());
     line

@@ -1,4 +1,4 @@
-//! A view as a picture, for whatever room there is.
+//! Draws a view into the room that there is.
 //!
 //! What a sensor's link is and how old its frame is stands above all else. Where the link is not
 //! live, the last frame is shown without its colours and under the word for what it is, the curves
@@ -18,13 +18,13 @@ use ratatui_core::terminal::Frame;
 use super::look::Look;
 use super::view::{Link, Sensor, Verdict, View, age};
 
-/// Widest picture that is one column.
+/// Pictures up to this width have one column.
 const NARROW: u16 = 64;
 
 /// Columns between two columns.
 const GAP: u16 = 2;
 
-/// Draws all there is room for.
+/// Draws as much as there is room for.
 pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
     let area = frame.area();
     let page = &mut Page {
@@ -72,7 +72,7 @@ pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
     page.keys(foot, view);
 }
 
-/// What a picture is drawn with.
+/// A picture that is being drawn.
 struct Page<'a> {
     buffer: &'a mut Buffer,
     look: Look,
@@ -83,7 +83,7 @@ struct Page<'a> {
 struct Rows(Rect);
 
 impl Rows {
-    /// The next rows, if there are so many.
+    /// The next `height` rows, if there are that many.
     fn take(&mut self, height: u16) -> Option<Rect> {
         if height == 0 || self.0.height < height {
             return None;
@@ -112,7 +112,7 @@ impl Page<'_> {
     fn text(&mut self, area: Rect, text: &str, style: Style) -> Rect {
         let width = usize::from(area.width);
         let shown = |c: char| if c.is_ascii() { c } else { '?' };
-        // Names are whatever they are configured as.
+        // A configured name may hold any character.
         let text = match self.look.unicode {
             true => Cow::Borrowed(text),
             false => text.chars().map(shown).collect(),
@@ -125,7 +125,7 @@ impl Page<'_> {
         }
     }
 
-    /// The text in a row that has the style to its end.
+    /// Writes a text into a row and gives the whole row its style.
     fn band(&mut self, row: Rect, text: &str, style: Style) {
         self.buffer.set_style(row, style);
         self.text(row, text, style);
@@ -155,7 +155,7 @@ impl Page<'_> {
             )
         };
         let tabs: Vec<(String, Link)> = view.sensors.iter().enumerate().map(tab).collect();
-        // The chosen one must be among those there is room for.
+        // The chosen sensor must be visible.
         let mut first = 0;
         let width = |tabs: &[(String, Link)]| tabs.iter().map(|tab| tab.0.len() + 2).sum::<usize>();
         while first < view.chosen && width(&tabs[first..=view.chosen]) > usize::from(row.width) {
@@ -173,7 +173,7 @@ impl Page<'_> {
         }
     }
 
-    /// One row: what the link is, how old the frame, how many a second.
+    /// One row: the state of the link, the age of the last frame, and the frame rate.
     fn link(&mut self, row: Rect, sensor: &Sensor, link: Link, reason: Option<&str>) {
         let mut line = format!(" {} ", link.name());
         if let Some(frame) = &sensor.frame {
@@ -196,7 +196,7 @@ impl Page<'_> {
         self.band(row, &line, self.look.link(link));
     }
 
-    /// One column: what matters most first, the rest as far as there is room.
+    /// One column. The most important parts come first; the rest as far as there is room.
     fn stack(&mut self, body: Rect, view: &View, sensor: &Sensor, link: Link) {
         let mut rows = Rows(body);
         if let Some(row) = rows.take(1) {
@@ -241,7 +241,7 @@ impl Page<'_> {
         let missed = view
             .missed
             .map_or("?".to_owned(), |missed| missed.to_string());
-        // Damage is to be seen; that there is none is not.
+        // Damage is shown only if there is any.
         let plain = self.look.aside();
         let alarm = |count: u64| match count {
             0 => plain,
@@ -274,7 +274,7 @@ impl Page<'_> {
         if let Some(row) = rows.take(1) {
             self.press(row, sensor, link);
         }
-        // Verdicts get what is left, but not less than 6 rows.
+        // Verdicts get the rest, but at least 6 rows.
         let curve = (rows.0.height.saturating_sub(6) / 3).clamp(2, 12);
         if let Some(area) = rows.take(curve) {
             self.force(area, sensor, link);
@@ -340,7 +340,7 @@ impl Page<'_> {
             "q quit   Ctrl-L draw again"
         };
         let rest = self.text(row, line, self.look.aside());
-        // Which daemon this is, if there is room for it.
+        // The daemon's name, if there is room for it.
         let columns = view.address.chars().count();
         if let Some(indent) = usize::from(rest.width).checked_sub(columns + 3) {
             let address = format!("{:indent$}   {}", "", view.address);
@@ -349,7 +349,7 @@ impl Page<'_> {
     }
 }
 
-/// Whether this is what a port says whose device has gone.
+/// Whether this reason means that the device was unplugged.
 fn is_unplugged(reason: &str) -> bool {
     let gone = [
         "end of file",
@@ -360,7 +360,7 @@ fn is_unplugged(reason: &str) -> bool {
     gone.iter().any(|gone| reason.contains(gone))
 }
 
-/// Press, phase, verdict, probabilities in percent and age; force and notes where they have room.
+/// Press, phase, verdict, probabilities in per cent and age. Force and notes if there is room.
 fn verdict_line(verdict: &Verdict, old: &str, width: usize) -> String {
     let level = match &verdict.level {
         Ok((level, label)) => format!("{level} {label}"),

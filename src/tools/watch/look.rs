@@ -1,4 +1,4 @@
-//! What a terminal can show, and what things look like on it.
+//! What a terminal can show, and the styles that follow from that.
 
 use ratatui_core::style::{Color, Modifier, Style};
 
@@ -7,11 +7,11 @@ use super::view::Link;
 /// What the terminal can show.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Look {
-    /// 256 of them.
+    /// It has 256 colours.
     pub(super) colours: bool,
-    /// Bold and reversed.
+    /// It has bold and reversed text.
     pub(super) attributes: bool,
-    /// More than ASCII.
+    /// It shows more than ASCII.
     pub(super) unicode: bool,
 }
 
@@ -49,7 +49,7 @@ impl Look {
         self.style(Style::new().add_modifier(Modifier::BOLD), Modifier::BOLD)
     }
 
-    /// Of the word for a link: what is not live must not look like it.
+    /// The style of the word for a link. Other states must not look like live.
     pub(super) fn link(self, link: Link) -> Style {
         let (fg, bg) = match link {
             Link::Live => (16, 40),

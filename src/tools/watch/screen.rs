@@ -1,4 +1,4 @@
-//! The terminal: taken over, drawn on, read from, and given back whatever happens.
+//! The terminal: takes it over, draws, reads keys, and always restores it.
 //!
 //! Pictures are made in memory and written by a thread of their own. So a terminal that takes
 //! nothing (Ctrl-S, a slow ssh) delays neither the reading of events nor the end: while a picture
@@ -34,7 +34,7 @@ const LAST_BYTES: Duration = Duration::from_millis(200);
 /// The size of a terminal that does not know its own (a serial console).
 const USUAL: (u16, u16) = (80, 24);
 
-/// The terminal in our hands.
+/// A terminal that was taken over.
 pub(super) struct Screen {
     terminal: Terminal<CrosstermBackend<Picture>>,
     area: Rect,
@@ -60,7 +60,7 @@ impl Write for Picture {
 impl Screen {
     /// Takes the terminal of stdin and stdout over.
     pub(super) fn open() -> io::Result<Self> {
-        // Past the standard library's lock, which a stalled thread would hold while another panics.
+        // Without the standard library's lock: a stalled thread could hold it while another one panics.
         let stdout = File::from(io::stdout().as_fd().try_clone_to_owned()?);
         let area = area();
         let picture = Picture::default();
@@ -79,7 +79,7 @@ impl Screen {
         std::thread::Builder::new()
             .name("screen".to_owned())
             .spawn(move || {
-                // A terminal that has gone is noticed by the end of this thread.
+                // If the terminal has gone, this thread ends, and the caller notices that.
                 let _ = write_all(stdout, pictures);
                 let _ = done.send(());
             })?;
@@ -92,7 +92,7 @@ impl Screen {
         })
     }
 
-    /// Draws, unless the last picture is still on its way.
+    /// Draws, unless the last picture is still being written.
     pub(super) fn draw(&mut self, picture: impl FnOnce(&mut Frame)) -> io::Result<()> {
         let Some(Ok(room)) = self.out.as_ref().map(mpsc::Sender::try_reserve) else {
             return Ok(());
@@ -106,12 +106,12 @@ impl Screen {
         Ok(())
     }
 
-    /// Forgets what stands there, so that the next picture is written whole.
+    /// Forgets what the terminal shows, so that the next picture is written as a whole.
     pub(super) fn forget(&mut self) -> io::Result<()> {
         self.terminal.resize(self.area)
     }
 
-    /// Waits until the terminal takes nothing any more because it has gone.
+    /// Waits until the terminal has gone.
     pub(super) async fn gone(&self) {
         match &self.out {
             Some(out) => out.closed().await,
@@ -138,7 +138,7 @@ fn write_all(mut out: File, mut pictures: mpsc::Receiver<Vec<u8>>) -> io::Result
     leave(&mut out)
 }
 
-/// Leaves the terminal as it was. One without an alternate screen is left empty.
+/// Restores the terminal. A terminal without an alternate screen is left empty.
 fn leave(out: &mut impl Write) -> io::Result<()> {
     let (plain, clear) = (SetAttribute(Attribute::Reset), Clear(ClearType::All));
     execute!(out, plain, clear, MoveTo(0, 0), Show, LeaveAlternateScreen)
@@ -150,7 +150,7 @@ fn area() -> Rect {
     Rect::new(0, 0, width, height)
 }
 
-/// Keys as they are pressed, until there is no more input.
+/// Sends keys as they are pressed, until the input ends.
 pub(super) fn keys() -> io::Result<mpsc::Receiver<Key>> {
     let (sender, keys) = mpsc::channel(16);
     std::thread::Builder::new()
@@ -167,7 +167,7 @@ pub(super) fn keys() -> io::Result<mpsc::Receiver<Key>> {
     Ok(keys)
 }
 
-/// The key that an event is; others mean nothing.
+/// The key of an event, if `watch` knows it.
 pub(super) fn key(event: &Event) -> Option<Key> {
     let &Event::Key(KeyEvent {
         code, modifiers, ..
@@ -177,7 +177,7 @@ pub(super) fn key(event: &Event) -> Option<Key> {
     };
     let is_control = modifiers == KeyModifiers::CONTROL;
     match code {
-        // In raw mode Ctrl-C is no signal.
+        // In raw mode Ctrl-C sends no signal.
         KeyCode::Char('c') if is_control => Some(Key::Quit),
         KeyCode::Char('l') if is_control => Some(Key::Redraw),
         _ if modifiers.intersects(KeyModifiers::CONTROL | KeyModifiers::ALT) => None,

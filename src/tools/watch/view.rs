@@ -17,25 +17,25 @@ use crate::frame::Stamp;
 /// How often the daemon is asked for the totals, which it tells by itself only with a change.
 pub(super) const QUESTION: Duration = Duration::from_secs(1);
 
-/// A daemon that has answered nothing for three questions is taken for dead.
+/// After three questions without an answer, the daemon counts as dead.
 const SILENCE: Duration = Duration::from_secs(3);
 
-/// All that is shown.
+/// Everything that `watch` shows.
 #[derive(Debug)]
 pub(super) struct View {
-    /// Of the daemon that was met last.
+    /// The daemon of the last connection.
     pub(super) hello: Option<Hello>,
     pub(super) sensors: Vec<Sensor>,
-    /// Index of the sensor that is looked at.
+    /// Index of the sensor that is shown.
     pub(super) chosen: usize,
-    /// Where the daemon is that was reached last.
+    /// Address of the last connection.
     pub(super) address: String,
     daemon: Daemon,
     /// When the daemon last said anything.
     heard: Duration,
-    /// Events that it had no room for; `None`: their number is unknown.
+    /// Number of events that the daemon dropped. `None`: unknown.
     pub(super) missed: Option<u64>,
-    /// The last event of this run that was heard.
+    /// The last event of this run that was received.
     seq: u64,
     /// While what happened up to this event is being told: what is too old for that is not missed.
     catching_up: Option<u64>,
@@ -44,26 +44,26 @@ pub(super) struct View {
     behind: Option<SignedDuration>,
 }
 
-/// Whose clock the daemon has.
+/// The clock that the daemon's times come from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Clock {
-    /// This machine's.
+    /// The clock of this machine.
     Ours,
-    /// That of another machine, which may be wrong.
+    /// The clock of another machine, which may be wrong.
     Theirs,
 }
 
 /// Whether there is a daemon.
 #[derive(Debug, PartialEq, Eq)]
 enum Daemon {
-    /// There is none, and why.
+    /// There is none, for this reason.
     Absent(String),
     /// Something has taken the connection and not said what it is; why there was none before.
     Unknown(String),
     Met,
 }
 
-/// Who speaks.
+/// The daemon, as its `hello` describes it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Hello {
     pub(super) robot: String,
@@ -72,7 +72,7 @@ pub(super) struct Hello {
     /// First digits of the model's hash.
     pub(super) model: String,
     pub(super) validation: String,
-    /// Of the levels, in order.
+    /// The labels of the levels, in order.
     pub(super) labels: Vec<String>,
 }
 
@@ -83,7 +83,7 @@ pub(super) enum Link {
     Connecting,
     Stale,
     Lost,
-    /// The daemon is there and says nothing.
+    /// The daemon is connected and sends nothing.
     Silent,
     NoDaemon,
 }
@@ -101,7 +101,7 @@ impl Link {
     }
 }
 
-/// What the user asks for.
+/// What a key asks for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Key {
     Quit,
@@ -117,7 +117,7 @@ pub(super) enum Key {
 pub(super) enum Loss {
     /// It closed the connection.
     Closed,
-    /// It cannot be reached, and why.
+    /// It cannot be reached, for this reason.
     Unreachable(String),
 }
 
@@ -151,7 +151,7 @@ impl View {
                 let lost = event["lost"].as_u64();
                 self.missed = self.missed.zip(lost).map(|(sum, lost)| sum + lost);
             }
-            // Before a hello: there is no room.
+            // Before a `hello`, an error means that the daemon has no room.
             "error" if self.daemon != Daemon::Met => {
                 self.daemon = Daemon::Absent(text(&event, "message"));
             }
@@ -217,14 +217,14 @@ impl View {
                 .position(|one| Some(&one.name) == name.as_ref());
             self.chosen = again.unwrap_or(0);
             (self.missed, self.seq) = (Some(0), 0);
-            // Nothing has happened in a run that is new.
+            // In a new run nothing has happened yet.
             self.catching_up = Some(number(event, "seq")).filter(|&past| past > 0);
         }
         let since = format!("{}:{}", hello.run, self.seq);
         self.hello = Some(hello);
         self.daemon = Daemon::Met;
         let types = ["hardness", "press", "status", "frame"];
-        // The last verdict may be older than what is held.
+        // The last verdict may be older than the events that the daemon holds.
         let requests = [
             json!({"get": "last"}),
             json!({"subscribe": types, "since": since}),
@@ -232,17 +232,17 @@ impl View {
         Some(requests.map(|request| request.to_string()).join("\n"))
     }
 
-    /// The daemon went away, or does not answer.
+    /// The daemon has gone, or does not answer.
     pub(super) fn lose(&mut self, loss: Loss) {
         match loss {
             Loss::Unreachable(reason) => self.daemon = Daemon::Absent(reason),
-            // Where it never said hello, why it did not is known already.
+            // If there was no `hello`, the reason is known already.
             Loss::Closed if matches!(self.daemon, Daemon::Absent(_)) => {}
             Loss::Closed => self.daemon = Daemon::Absent("it closed the connection".to_owned()),
         }
     }
 
-    /// Does what the key asks for, if that is about sensors.
+    /// Does what the key asks for, if it concerns sensors.
     pub(super) fn press(&mut self, key: Key) {
         let count = self.sensors.len().max(1);
         self.chosen = match key {
@@ -253,12 +253,12 @@ impl View {
         };
     }
 
-    /// The sensor that is looked at.
+    /// The sensor that is shown.
     pub(super) fn sensor(&self) -> Option<&Sensor> {
         self.sensors.get(self.chosen)
     }
 
-    /// What holds for a sensor, and why.
+    /// The state of a sensor, with its reason.
     pub(super) fn link(&self, sensor: &Sensor, now: Duration) -> (Link, Option<String>) {
         if let Some((link, reason)) = self.trouble(now) {
             return (link, Some(reason));
@@ -275,7 +275,7 @@ impl View {
         (link, status.reason.clone())
     }
 
-    /// What keeps the daemon from telling of any sensor, and why.
+    /// The state that holds for all sensors because of the daemon, with its reason.
     pub(super) fn trouble(&self, now: Duration) -> Option<(Link, String)> {
         let silence = now.saturating_sub(self.heard);
         match &self.daemon {
@@ -312,7 +312,7 @@ fn hello(event: &Value) -> Hello {
     }
 }
 
-/// How long ago, to be read at a glance.
+/// A time span as a short text.
 pub(super) fn age(age: Duration) -> String {
     let seconds = age.as_secs_f64();
     match seconds {
@@ -335,7 +335,8 @@ fn text(event: &Value, key: &str) -> String {
     event[key].as_str().map(plain).unwrap_or_default()
 }
 
-/// A reason comes from the system, a label from a model file: neither may move the cursor.
+/// Text without control characters. A reason comes from the system and a label from a model file: neither may
+/// move the cursor.
 fn plain(text: &str) -> String {
     text.chars().filter(|c| !c.is_control()).collect()
 }
