@@ -78,8 +78,7 @@ fn positions_are_checked_counted_and_recorded() {
     let mut events = bench.subscriber();
     let point = json!({"motion": {"sensor": "forearm", "at": [[now, 1]]}});
     let answer = events.ask(&point.to_string());
-    let expected =
-        "motion: found a command that changes something, expected it on the control socket";
+    let expected = "motion: this socket changes nothing: send it to the control socket";
     assert_eq!(answer["message"], expected);
 
     let address = daemon.address("http").to_string();
