@@ -9,7 +9,7 @@ use std::sync::Arc;
 use divan::Bencher;
 use divan::counter::{BytesCount, ItemsCount};
 use hardnessd::event::{Event, Phase};
-use hardnessd::frame::{Frame, Stamp};
+use hardnessd::frame::Stamp;
 use hardnessd::pipeline::{Clock, Pipeline};
 use hardnessd::sensor::{Description, Sensor};
 use hardnessd::verdict::{BUILT_IN, Hrn};
@@ -97,9 +97,7 @@ fn bytes_to_events(bencher: Bencher) {
 #[divan::bench]
 fn judge(bencher: Bencher) {
     let hrn = hrn();
-    let mut frame = Frame::default();
-    frame.newtons.copy_from_slice(&hrn.check().frames[2]);
-    bencher.bench_local(|| hrn.judge(&frame));
+    bencher.bench_local(|| hrn.judge_check(2));
 }
 
 /// A model file to something that judges, its check frames reproduced: start and reload.

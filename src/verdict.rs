@@ -1,10 +1,11 @@
-//! A frame becomes a verdict: loads an HRN from ONNX bytes and judges frames with it.
+//! A press becomes a verdict: loads an HRN from ONNX bytes and judges presses with it.
 //!
-//! In: the bytes of a model file as `hrn-train export` writes them, then frames in newtons. Out:
-//! [`Verdict`]s. A file is refused unless all of it is as agreed and it
+//! In: the bytes of a model file as `hrn-train export` writes them, then frames in newtons (format 1)
+//! or the course of a press (format 2). Out: [`Verdict`]s. A file is refused unless all of it is as agreed and it
 //! reproduces the probabilities that its trainer wrote into it, so a loaded [`Hrn`] is known to
 //! compute what was evaluated. Never reads a file itself, never prints, never trains.
 
+mod course;
 mod file;
 mod guard;
 
@@ -14,6 +15,8 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use tract_onnx::prelude::*;
 
+use self::course::Input;
+pub use self::course::{COURSE_FRAMES, CheckedCourse, Course, CourseCheck, CourseMoment, Shore};
 use crate::frame::{COLS, Frame, ROWS};
 
 /// The default model, built into the binary; `models/README.md` is its card.
@@ -25,6 +28,8 @@ pub const MAX_FILE_BYTES: usize = 64_000_000;
 pub const MIN_OPSET: i64 = 17;
 /// The check frames' probabilities must be reproduced within this.
 pub const CHECK_TOLERANCE: f32 = 1e-4;
+/// The check presses' Shore hardness must be reproduced within this.
+pub const SHORE_TOLERANCE: f32 = 1e-2;
 
 /// One hardness level as `hello` tells it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -51,7 +56,7 @@ pub struct Range {
 /// What a model file says of itself: its `hrn.*` metadata.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Card {
-    /// `hrn.format`; always "1" here.
+    /// `hrn.format`: "1" or "2".
     pub format: String,
     /// `hrn.levels`: 1 to L in order.
     pub levels: Vec<Level>,
@@ -67,9 +72,69 @@ pub struct Card {
     pub validation: String,
     /// `hrn.range`.
     pub range: Range,
+    /// `hrn.conformal`, of format 2 alone.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub conformal: Option<Conformal>,
 }
 
-/// `hrn.check`: frames and the probabilities that the trainer computed for them.
+/// `hrn.conformal`: which levels a verdict cannot tell apart.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Conformal {
+    /// The set misses the true level in at most this share of presses.
+    pub alpha: f32,
+    /// The set holds every level of at least this probability, and the most likely one.
+    pub threshold: f32,
+}
+
+impl Conformal {
+    /// The levels of the set, ascending.
+    pub fn set(self, probabilities: &[f32]) -> Vec<u8> {
+        let (best, _) = argmax(probabilities);
+        let levels = (1..).zip(probabilities.iter().enumerate());
+        levels
+            .filter(|&(_, (place, &p))| place == best || p >= self.threshold)
+            .map(|(level, _)| level)
+            .collect()
+    }
+}
+
+/// What a file carries to be checked by.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Checks {
+    /// Of format 1.
+    Frames(Check),
+    /// Of format 2.
+    Courses(CourseCheck),
+}
+
+impl Checks {
+    /// Counts the frames or presses.
+    pub fn count(&self) -> usize {
+        match self {
+            Self::Frames(check) => check.frames.len(),
+            Self::Courses(check) => check.presses.len(),
+        }
+    }
+
+    /// The probabilities that the trainer computed for one of them.
+    fn probabilities(&self, index: usize) -> &[f32] {
+        match self {
+            Self::Frames(check) => &check.probabilities[index],
+            Self::Courses(check) => &check.presses[index].probabilities,
+        }
+    }
+
+    /// Likewise the Shore hardness.
+    fn shore(&self, index: usize) -> Option<Shore> {
+        match self {
+            Self::Frames(_) => None,
+            Self::Courses(check) => Some(check.presses[index].shore),
+        }
+    }
+}
+
+/// `hrn.check` of format 1: frames and the probabilities that the trainer computed for them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Check {
@@ -151,6 +216,17 @@ pub enum ModelError {
         /// The largest difference in that frame.
         difference: f32,
     },
+    /// Another Shore hardness than the trainer's.
+    #[error(
+        "check press {press}: `shore` differs from the trainer's by up to {difference:.4}: expected \
+         at most {SHORE_TOLERANCE}"
+    )]
+    ShoreDiffers {
+        /// Index in `hrn.check`.
+        press: usize,
+        /// The largest difference of its three numbers.
+        difference: f32,
+    },
     /// `probabilities` is not the softmax of `logits`.
     #[error(
         "check frame {frame}: `probabilities` differs from softmax(`logits`) by up to \
@@ -189,7 +265,7 @@ pub enum ModelError {
     },
 }
 
-/// What an HRN says of one frame.
+/// What an HRN says of a press.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Verdict {
     /// 1-based argmax of the probabilities (Eq. 10); equal ones go to the lower level.
@@ -200,6 +276,22 @@ pub struct Verdict {
     pub probabilities: Vec<f32>,
     /// The largest probability.
     pub confidence: f32,
+    /// Format 2 alone.
+    pub shore: Option<Shore>,
+    /// The conformal set, where the file has a threshold.
+    pub levels: Option<Vec<u8>>,
+}
+
+/// What a model judges.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// Format 1: the frame of the largest contact area.
+    Frame,
+    /// Format 2: the course of a press.
+    Course {
+        /// Frames at most.
+        most_frames: usize,
+    },
 }
 
 /// A hardness recognition network, ready to judge.
@@ -220,10 +312,15 @@ pub struct Verdict {
 #[derive(Debug)]
 pub struct Hrn {
     plan: Arc<TypedRunnableModel>,
+    format: Format,
+    /// Of format 2, in the order of the file.
+    inputs: Vec<Input>,
     logits_output: usize,
     probabilities_output: usize,
+    /// Of format 2.
+    shore_output: Option<usize>,
     card: Card,
-    check: Check,
+    checks: Checks,
     sha256: String,
 }
 
@@ -250,10 +347,11 @@ impl Hrn {
         };
         file::check_opset(&proto)?;
         file::check_tensors_inside(graph)?;
-        let (card, check) = file::read_metadata(&proto)?;
-        file::check_signature(graph, card.levels.len())?;
+        let (card, checks) = file::read_metadata(&proto)?;
+        let (format, inputs) = file::check_signature(graph, &card, &checks)?;
         guard::check(&proto, graph)?;
         let position = |name: &str| graph.output.iter().position(|output| output.name == name);
+        let shore_output = position("shore").filter(|_| format != Format::Frame);
         let (Some(logits_output), Some(probabilities_output)) =
             (position("logits"), position("probabilities"))
         else {
@@ -266,13 +364,27 @@ impl Hrn {
         let inference = onnx.model_for_proto_model(&proto).map_err(graph_error)?;
         // From here on only the plan is kept: the protobuf is as large again as the weights.
         drop(proto);
+        let shapes = match format {
+            Format::Frame => vec![vec![1, 1, ROWS, COLS]],
+            Format::Course { most_frames } => inputs
+                .iter()
+                .map(|input| input.shape(most_frames))
+                .collect(),
+        };
+        let inference = shapes
+            .iter()
+            .enumerate()
+            .try_fold(inference, |model, (at, shape)| {
+                model.with_input_fact(at, f32::fact(shape).into())
+            });
         let optimized = inference
-            .with_input_fact(0, f32::fact([1, 1, ROWS, COLS]).into())
             .and_then(InferenceModelExt::into_optimized)
             .map_err(graph_error)?;
         // The inference library does not hold a graph to the shapes it declares.
-        let agreed = f32::fact([1, card.levels.len()]);
-        for output in [logits_output, probabilities_output] {
+        let of_levels = |output| (output, f32::fact([1, card.levels.len()]));
+        let agreed = [of_levels(logits_output), of_levels(probabilities_output)];
+        let of_shore = shore_output.map(|output| (output, f32::fact([1, 3])));
+        for (output, agreed) in agreed.into_iter().chain(of_shore) {
             let computed = optimized.output_fact(output).map_err(graph_error)?;
             if computed.without_value() != agreed {
                 return Err(ModelError::Signature {
@@ -286,10 +398,13 @@ impl Hrn {
 
         let hrn = Self {
             plan,
+            format,
+            inputs,
             logits_output,
             probabilities_output,
+            shore_output,
             card,
-            check,
+            checks,
             sha256: sha256_hex(bytes),
         };
         hrn.reproduce_check()?;
@@ -306,25 +421,78 @@ impl Hrn {
         &self.card
     }
 
-    /// The frames that the file carries to be checked by, with their probabilities.
-    pub fn check(&self) -> &Check {
-        &self.check
+    /// What it judges.
+    pub fn format(&self) -> Format {
+        self.format
     }
 
-    /// Judges one frame.
+    /// What the file carries to be checked by.
+    pub fn checks(&self) -> &Checks {
+        &self.checks
+    }
+
+    /// Judges one frame. A model of format 2 judges it as a press of which nothing else is known.
     ///
     /// # Errors
     ///
     /// [`ModelError::NotFinite`] if an output is NaN or infinite, [`ModelError::Inference`] if
     /// the inference library fails.
     pub fn judge(&self, frame: &Frame) -> Result<Verdict, ModelError> {
-        let inference_error = |error: TractError| ModelError::Inference(root_cause(&error));
-        let input =
-            Tensor::from_shape(&[1, 1, ROWS, COLS], &frame.newtons).map_err(inference_error)?;
-        let outputs = self
-            .plan
-            .run(tvec!(input.into()))
-            .map_err(inference_error)?;
+        match self.format {
+            Format::Frame => {
+                let input = Tensor::from_shape(&[1, 1, ROWS, COLS], &frame.newtons);
+                self.run(tvec!(input.map_err(inference_error)?.into()))
+            }
+            Format::Course { .. } => self.judge_course(&Course {
+                moments: vec![CourseMoment {
+                    time_s: 0.0,
+                    approach_mm: None,
+                    frame: *frame,
+                }],
+                arm_n_per_mm: 0.0,
+            }),
+        }
+    }
+
+    /// Judges the course of a press. A model of format 1 judges its last frame.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::judge`].
+    ///
+    /// # Panics
+    ///
+    /// If the course has no frame, or more than the model takes.
+    pub fn judge_course(&self, course: &Course) -> Result<Verdict, ModelError> {
+        let last = course.moments.last().expect("a press has a frame");
+        let Format::Course { most_frames } = self.format else {
+            return self.judge(&last.frame);
+        };
+        let found = course.moments.len();
+        assert!(found <= most_frames, "{found} frames of {most_frames}");
+        let tensor = |input: &Input| Ok(input.tensor(course, most_frames)?.into());
+        let inputs: TractResult<TVec<TValue>> = self.inputs.iter().map(tensor).collect();
+        self.run(inputs.map_err(inference_error)?)
+    }
+
+    /// Judges one of [`Self::checks`].
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::judge`].
+    pub fn judge_check(&self, index: usize) -> Result<Verdict, ModelError> {
+        match &self.checks {
+            Checks::Frames(check) => {
+                let mut frame = Frame::default();
+                frame.newtons.copy_from_slice(&check.frames[index]);
+                self.judge(&frame)
+            }
+            Checks::Courses(check) => self.judge_course(&check.presses[index].course),
+        }
+    }
+
+    fn run(&self, inputs: TVec<TValue>) -> Result<Verdict, ModelError> {
+        let outputs = self.plan.run(inputs).map_err(inference_error)?;
         let read = |index: usize, output: &'static str| {
             let view = outputs[index].try_as_plain_ram().map_err(inference_error)?;
             let values = view.as_slice::<f32>().map_err(inference_error)?.to_vec();
@@ -338,26 +506,33 @@ impl Hrn {
         let probabilities = read(self.probabilities_output, "probabilities")?;
         let (best, confidence) = argmax(&probabilities);
         let level = self.card.levels[best].level;
+        let shore = match self.shore_output {
+            Some(output) => match read(output, "shore")?[..] {
+                // An interval that does not hold the value is none.
+                [value, low, high] => Some(Shore {
+                    value,
+                    low: low.min(value),
+                    high: high.max(value),
+                }),
+                _ => None,
+            },
+            None => None,
+        };
         Ok(Verdict {
             level,
             logits,
+            shore,
+            levels: self.card.conformal.map(|set| set.set(&probabilities)),
             probabilities,
             confidence,
         })
     }
 
-    /// Judges every check frame; the first judgement is also the plan's warm-up.
+    /// Judges every check frame or press; the first judgement is also the plan's warm-up.
     fn reproduce_check(&self) -> Result<(), ModelError> {
-        for (index, (newtons, expected)) in self
-            .check
-            .frames
-            .iter()
-            .zip(&self.check.probabilities)
-            .enumerate()
-        {
-            let mut frame = Frame::default();
-            frame.newtons.copy_from_slice(newtons);
-            let verdict = self.judge(&frame)?;
+        for index in 0..self.checks.count() {
+            let verdict = self.judge_check(index)?;
+            let expected = self.checks.probabilities(index);
             let difference = largest_difference(&verdict.probabilities, expected);
             if difference > CHECK_TOLERANCE {
                 return Err(ModelError::CheckDiffers {
@@ -372,9 +547,24 @@ impl Hrn {
                     difference,
                 });
             }
+            if let (Some(found), Some(expected)) = (verdict.shore, self.checks.shore(index)) {
+                let [found, expected] = [found, expected].map(<[f32; 3]>::from);
+                let difference = largest_difference(&found, &expected);
+                if difference > SHORE_TOLERANCE {
+                    return Err(ModelError::ShoreDiffers {
+                        press: index,
+                        difference,
+                    });
+                }
+            }
         }
         Ok(())
     }
+}
+
+#[expect(clippy::needless_pass_by_value, reason = "for `map_err`")]
+fn inference_error(error: TractError) -> ModelError {
+    ModelError::Inference(root_cause(&error))
 }
 
 /// Index and value of the largest; the first of equal ones.
@@ -412,5 +602,8 @@ fn root_cause(error: &TractError) -> String {
     error.root_cause().to_string()
 }
 
+#[cfg(test)]
+#[path = "../tests/bench/course_model.rs"]
+pub(crate) mod course_model;
 #[cfg(test)]
 mod tests;

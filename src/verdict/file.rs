@@ -6,7 +6,11 @@
 use serde::Deserialize;
 use tract_onnx::pb;
 
-use super::{Card, Check, Level, MIN_OPSET, ModelError, Range};
+use super::course::Input;
+use super::{
+    COURSE_FRAMES, Card, Check, CheckedCourse, Checks, Conformal, CourseCheck, Format, Level,
+    MIN_OPSET, ModelError, Range,
+};
 use crate::frame::{COLS, ROWS, TAXELS};
 
 pub(super) fn check_opset(proto: &pb::ModelProto) -> Result<(), ModelError> {
@@ -64,8 +68,14 @@ pub(super) fn check_tensors_inside(graph: &pb::GraphProto) -> Result<(), ModelEr
     Ok(())
 }
 
-/// Refuses other inputs and outputs than the agreed ones.
-pub(super) fn check_signature(graph: &pb::GraphProto, levels: usize) -> Result<(), ModelError> {
+/// Refuses other inputs and outputs than the agreed ones. Gives the format, and of format 2 the
+/// inputs in their order.
+pub(super) fn check_signature(
+    graph: &pb::GraphProto,
+    card: &Card,
+    checks: &Checks,
+) -> Result<(Format, Vec<Input>), ModelError> {
+    let levels = card.levels.len();
     let describe = |values: &[&pb::ValueInfoProto]| {
         values
             .iter()
@@ -84,18 +94,31 @@ pub(super) fn check_signature(graph: &pb::GraphProto, levels: usize) -> Result<(
                 .all(|tensor| tensor.name != input.name)
         })
         .collect();
-    let (found, expected) = (describe(&inputs), format!("frame f32 [1,1,{ROWS},{COLS}]"));
-    if found != expected {
-        return Err(ModelError::Signature {
-            what: "input",
-            found,
-            expected,
-        });
-    }
+    let (format, inputs) = match checks {
+        Checks::Frames(_) => {
+            let (found, expected) = (describe(&inputs), format!("frame f32 [1,1,{ROWS},{COLS}]"));
+            if found != expected {
+                return Err(ModelError::Signature {
+                    what: "input",
+                    found,
+                    expected,
+                });
+            }
+            (Format::Frame, Vec::new())
+        }
+        Checks::Courses(check) => {
+            let (most_frames, inputs) = check_course_inputs(&inputs)?;
+            check_lengths(check, most_frames)?;
+            (Format::Course { most_frames }, inputs)
+        }
+    };
     let mut outputs: Vec<&pb::ValueInfoProto> = graph.output.iter().collect();
     outputs.sort_by(|left, right| left.name.cmp(&right.name));
     let found = describe(&outputs);
-    let expected = format!("logits f32 [1,{levels}], probabilities f32 [1,{levels}]");
+    let mut expected = format!("logits f32 [1,{levels}], probabilities f32 [1,{levels}]");
+    if format != Format::Frame {
+        expected += ", shore f32 [1,3]";
+    }
     if found != expected {
         return Err(ModelError::Signature {
             what: "outputs",
@@ -116,7 +139,54 @@ pub(super) fn check_signature(graph: &pb::GraphProto, levels: usize) -> Result<(
             )));
         }
     }
-    Ok(())
+    Ok((format, inputs))
+}
+
+/// The inputs of a model of format 2, in their order, and how many frames it takes.
+fn check_course_inputs(inputs: &[&pb::ValueInfoProto]) -> Result<(usize, Vec<Input>), ModelError> {
+    let (least, most) = COURSE_FRAMES;
+    let agreed = |input: Input, frames: &dyn std::fmt::Display| {
+        let shape = match input {
+            Input::Frames => format!("[1,{frames},{ROWS},{COLS}]"),
+            Input::ArmNPerMm => "[1,1]".to_owned(),
+            _ => format!("[1,{frames}]"),
+        };
+        format!("{} f32 {shape}", input.name())
+    };
+    let found: Vec<String> = inputs.iter().map(|input| describe_value(input)).collect();
+    for frames in least..=most {
+        let of = |described: &String| {
+            let mut all = Input::ALL.into_iter();
+            all.find(|&input| agreed(input, &frames) == *described)
+        };
+        let Some(read) = found.iter().map(of).collect::<Option<Vec<Input>>>() else {
+            continue;
+        };
+        if Input::ALL.iter().all(|input| read.contains(input)) && read.len() == Input::ALL.len() {
+            return Ok((frames, read));
+        }
+    }
+    Err(ModelError::Signature {
+        what: "inputs",
+        found: found.join(", "),
+        expected: format!(
+            "{}, T {least} to {most}",
+            Input::ALL.map(|input| agreed(input, &"T")).join(", ")
+        ),
+    })
+}
+
+/// Refuses check presses that are longer than the model takes.
+fn check_lengths(check: &CourseCheck, most: usize) -> Result<(), ModelError> {
+    let mut lengths = check.presses.iter().map(|press| press.course.moments.len());
+    match lengths.find(|&found| found > most) {
+        Some(found) => Err(ModelError::KeyInvalid {
+            key: "hrn.check",
+            found: format!("a press of {found} frames"),
+            expected: format!("at most {most}, as the input `frames` has"),
+        }),
+        None => Ok(()),
+    }
 }
 
 /// A graph input or output as `name type [shape]`.
@@ -146,7 +216,7 @@ fn describe_value(value: &pb::ValueInfoProto) -> String {
 }
 
 /// Reads and checks all `hrn.*` keys.
-pub(super) fn read_metadata(proto: &pb::ModelProto) -> Result<(Card, Check), ModelError> {
+pub(super) fn read_metadata(proto: &pb::ModelProto) -> Result<(Card, Checks), ModelError> {
     let text = |key: &'static str| {
         let mut entries = proto.metadata_props.iter().filter(|entry| entry.key == key);
         let first = entries.next().ok_or(ModelError::KeyMissing { key })?;
@@ -173,8 +243,8 @@ pub(super) fn read_metadata(proto: &pb::ModelProto) -> Result<(Card, Check), Mod
     };
 
     let format = text("hrn.format")?.to_owned();
-    if format != "1" {
-        let (found, expected) = (format!("{format:?}"), "\"1\"".to_owned());
+    if !["1", "2"].contains(&format.as_str()) {
+        let (found, expected) = (format!("{format:?}"), "\"1\" or \"2\"".to_owned());
         return Err(ModelError::KeyInvalid {
             key: "hrn.format",
             found,
@@ -198,8 +268,20 @@ pub(super) fn read_metadata(proto: &pb::ModelProto) -> Result<(Card, Check), Mod
     };
     let range: Range = json("hrn.range", text("hrn.range")?, "trained force and area")?;
     check_range(&range)?;
-    let check: Check = json("hrn.check", text("hrn.check")?, "frames and probabilities")?;
-    check_check(&check, levels.len())?;
+    let check = text("hrn.check")?;
+    let (checks, conformal) = if format == "1" {
+        let check: Check = json("hrn.check", check, "frames and probabilities")?;
+        check_check(&check, levels.len())?;
+        (Checks::Frames(check), None)
+    } else {
+        let check: CourseCheck = json("hrn.check", check, "presses with what the trainer says")?;
+        check_course_check(&check, levels.len())?;
+        let conformal = match text("hrn.conformal") {
+            Err(ModelError::KeyMissing { .. }) => None,
+            found => Some(read_conformal(found?)?),
+        };
+        (Checks::Courses(check), conformal)
+    };
     let card = Card {
         format,
         levels,
@@ -209,8 +291,57 @@ pub(super) fn read_metadata(proto: &pb::ModelProto) -> Result<(Card, Check), Mod
         metrics: json("hrn.metrics", text("hrn.metrics")?, "JSON")?,
         validation: line("hrn.validation")?,
         range,
+        conformal,
     };
-    Ok((card, check))
+    Ok((card, checks))
+}
+
+fn read_conformal(text: &str) -> Result<Conformal, ModelError> {
+    let key = "hrn.conformal";
+    let expected = "`alpha` between 0 and 1, and `threshold`, 0 to 1";
+    let conformal: Conformal = json(key, text, expected)?;
+    let Conformal { alpha, threshold } = conformal;
+    if alpha > 0.0 && alpha < 1.0 && (0.0..=1.0).contains(&threshold) {
+        return Ok(conformal);
+    }
+    Err(ModelError::KeyInvalid {
+        key,
+        found: format!("{conformal:?}"),
+        expected: expected.to_owned(),
+    })
+}
+
+fn check_course_check(check: &CourseCheck, levels: usize) -> Result<(), ModelError> {
+    let invalid = |found: String, expected: String| {
+        Err(ModelError::KeyInvalid {
+            key: "hrn.check",
+            found,
+            expected,
+        })
+    };
+    let count = check.presses.len();
+    if ![8, 2 * levels].contains(&count) {
+        return invalid(format!("{count} presses"), "8, or two a level".to_owned());
+    }
+    for CheckedCourse {
+        course,
+        probabilities,
+        ..
+    } in &check.presses
+    {
+        if probabilities.len() != levels {
+            let found = format!("{} probabilities of a press", probabilities.len());
+            return invalid(found, format!("{levels}"));
+        }
+        let numbers = course.moments.iter();
+        let mut numbers = numbers.flat_map(|m| [m.time_s, m.approach_mm.unwrap_or(0.0)]);
+        if !numbers.all(f32::is_finite) || course.arm_n_per_mm.is_nan() || course.arm_n_per_mm < 0.0
+        {
+            let expected = "finite times and positions, and an arm of 0 N/mm or more";
+            return invalid("another number in a press".to_owned(), expected.to_owned());
+        }
+    }
+    Ok(())
 }
 
 fn json<T: for<'a> Deserialize<'a>>(

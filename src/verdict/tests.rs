@@ -4,6 +4,8 @@ use tract_onnx::pb;
 
 use super::*;
 
+mod course;
+
 fn proto() -> pb::ModelProto {
     pb::ModelProto::decode(BUILT_IN).unwrap()
 }
@@ -33,7 +35,10 @@ fn the_built_in_model_loads_and_judges() {
     let labels: Vec<&str> = hrn.card().levels.iter().map(|l| l.label.as_str()).collect();
     assert_eq!(labels, ["hard", "firm", "soft", "very-soft"]);
     assert_eq!(hrn.sha256().len(), 64);
-    for (newtons, expected) in hrn.check().frames.iter().zip(&hrn.check().probabilities) {
+    let Checks::Frames(check) = hrn.checks() else {
+        panic!("the model judges frames");
+    };
+    for (newtons, expected) in check.frames.iter().zip(&check.probabilities) {
         let mut frame = Frame::default();
         frame.newtons.copy_from_slice(newtons);
         let verdict = hrn.judge(&frame).unwrap();
@@ -157,7 +162,11 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
         move |p: &mut pb::ModelProto| *value(p, key) = text.into()
     };
     check(
-        "`hrn.format`: found \"2\", expected \"1\"",
+        "`hrn.format`: found \"3\", expected \"1\" or \"2\"",
+        set("hrn.format", "3"),
+    );
+    check(
+        "`hrn.check`: found unknown field `frames`, expected `presses`",
         set("hrn.format", "2"),
     );
     check(

@@ -44,7 +44,7 @@ def console(block, directory, path):
 def main(binaries):
     path = f"{os.path.abspath(binaries)}:{os.environ['PATH']}"
     blocks = re.findall(r"```(\w+)\n(.*?)```", PAGE.read_text(), re.S)
-    assert [kind for kind, _ in blocks].count("python") == 4, blocks
+    assert [kind for kind, _ in blocks].count("python") == 5, blocks
     with tempfile.TemporaryDirectory() as directory:
         for kind, block in blocks:
             if kind == "console":

@@ -51,7 +51,7 @@ pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
         card.pitch_mm,
         card.data,
         card.metrics,
-        hrn.check().frames.len()
+        hrn.checks().count()
     )
 }
 

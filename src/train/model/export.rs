@@ -59,6 +59,7 @@ pub fn finish(
         metrics: json!({ "temperature": recogniser.temperature }),
         validation: validation(&description.data).to_owned(),
         range: range(dataset, train),
+        conformal: None,
     };
     let write = |card: &Card| {
         let Recogniser {

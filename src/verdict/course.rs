@@ -1,0 +1,224 @@
+//! The course of a press, as a model of format 2 is given it.
+//!
+//! In: a press's frames with their times, and what is known of the arm. Out: the model's inputs, as
+//! tensors; and presses as text, for `hrn.check`.
+
+use serde::{Deserialize, Serialize};
+use tract_onnx::prelude::*;
+
+use crate::frame::sparse::{self, SparseError};
+use crate::frame::{COLS, Frame, ROWS, TAXELS};
+
+/// Fewest and most frames that a model of format 2 may take.
+pub const COURSE_FRAMES: (usize, usize) = (3, 48);
+
+/// One frame of a press.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CourseMoment {
+    /// Since the frame that began the press.
+    pub time_s: f32,
+    /// How far the arm went since then; `None`: unknown.
+    pub approach_mm: Option<f32>,
+    /// The taxels.
+    pub frame: Frame,
+}
+
+/// A press over time.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Course {
+    /// Its frames in contact, from the one that began it, ascending in time.
+    pub moments: Vec<CourseMoment>,
+    /// Stiffness of the arm; 0: unknown.
+    pub arm_n_per_mm: f32,
+}
+
+/// An input of a model of format 2.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Input {
+    Frames,
+    TimeS,
+    ApproachMm,
+    Known,
+    Mask,
+    ArmNPerMm,
+}
+
+impl Input {
+    pub(super) const ALL: [Self; 6] = [
+        Self::Frames,
+        Self::TimeS,
+        Self::ApproachMm,
+        Self::Known,
+        Self::Mask,
+        Self::ArmNPerMm,
+    ];
+
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::Frames => "frames",
+            Self::TimeS => "time_s",
+            Self::ApproachMm => "approach_mm",
+            Self::Known => "known",
+            Self::Mask => "mask",
+            Self::ArmNPerMm => "arm_n_per_mm",
+        }
+    }
+
+    /// Its shape in a model of `most` frames.
+    pub(super) fn shape(self, most: usize) -> Vec<usize> {
+        match self {
+            Self::Frames => vec![1, most, ROWS, COLS],
+            Self::ArmNPerMm => vec![1, 1],
+            Self::TimeS | Self::ApproachMm | Self::Known | Self::Mask => vec![1, most],
+        }
+    }
+
+    /// What it is of `course`. Frames that are not there are 0.
+    pub(super) fn tensor(self, course: &Course, most: usize) -> TractResult<Tensor> {
+        let each = |value: fn(&CourseMoment) -> f32| {
+            let mut values: Vec<f32> = course.moments.iter().map(value).collect();
+            values.resize(most, 0.0);
+            values
+        };
+        let values = match self {
+            Self::Frames => {
+                let mut values = Vec::with_capacity(most * TAXELS);
+                for moment in &course.moments {
+                    values.extend_from_slice(&moment.frame.newtons);
+                }
+                values.resize(most * TAXELS, 0.0);
+                values
+            }
+            Self::TimeS => each(|moment| moment.time_s),
+            Self::ApproachMm => each(|moment| moment.approach_mm.unwrap_or(0.0)),
+            Self::Known => each(|moment| f32::from(u8::from(moment.approach_mm.is_some()))),
+            Self::Mask => each(|_| 1.0),
+            Self::ArmNPerMm => vec![course.arm_n_per_mm],
+        };
+        Tensor::from_shape(&self.shape(most), &values)
+    }
+}
+
+/// The Shore hardness that a model of format 2 gives.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(into = "[f32; 3]", from = "[f32; 3]")]
+pub struct Shore {
+    /// The most likely one.
+    pub value: f32,
+    /// Where its 90 % interval begins.
+    pub low: f32,
+    /// Where it ends.
+    pub high: f32,
+}
+
+impl From<[f32; 3]> for Shore {
+    fn from([value, low, high]: [f32; 3]) -> Self {
+        Self { value, low, high }
+    }
+}
+
+impl From<Shore> for [f32; 3] {
+    fn from(shore: Shore) -> Self {
+        [shore.value, shore.low, shore.high]
+    }
+}
+
+/// `hrn.check` of format 2: presses, and what the trainer's own software says of them.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CourseCheck {
+    /// Two a level.
+    pub presses: Vec<CheckedCourse>,
+}
+
+/// A press of [`CourseCheck`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(into = "Written", try_from = "Written")]
+pub struct CheckedCourse {
+    /// The press.
+    pub course: Course,
+    /// `[L]`.
+    pub probabilities: Vec<f32>,
+    /// Value, low and high.
+    pub shore: Shore,
+}
+
+/// A press as it is written: a list for each input, and each frame as [`sparse`] text.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Written {
+    time_s: Vec<f32>,
+    /// Null: unknown.
+    approach_mm: Vec<Option<f32>>,
+    arm_n_per_mm: f32,
+    frames: Vec<String>,
+    probabilities: Vec<f32>,
+    shore: Shore,
+}
+
+impl From<CheckedCourse> for Written {
+    fn from(checked: CheckedCourse) -> Self {
+        let Course {
+            moments,
+            arm_n_per_mm,
+        } = &checked.course;
+        Self {
+            time_s: moments.iter().map(|moment| moment.time_s).collect(),
+            approach_mm: moments.iter().map(|moment| moment.approach_mm).collect(),
+            arm_n_per_mm: *arm_n_per_mm,
+            frames: moments.iter().map(|m| sparse::write(&m.frame)).collect(),
+            probabilities: checked.probabilities,
+            shore: checked.shore,
+        }
+    }
+}
+
+/// Lists that are no press.
+#[derive(Debug, thiserror::Error)]
+enum Unwritten {
+    #[error(
+        "{times} times, {positions} positions and {frames} frames in a press: as many of each, 1 to {}",
+        COURSE_FRAMES.1
+    )]
+    Lengths {
+        times: usize,
+        positions: usize,
+        frames: usize,
+    },
+    #[error("frame {0} of a press: {1}")]
+    Frame(usize, #[source] SparseError),
+}
+
+impl TryFrom<Written> for CheckedCourse {
+    type Error = Unwritten;
+
+    fn try_from(written: Written) -> Result<Self, Unwritten> {
+        let (times, positions) = (written.time_s.len(), written.approach_mm.len());
+        let frames = written.frames.len();
+        if times != frames || positions != frames || !(1..=COURSE_FRAMES.1).contains(&frames) {
+            return Err(Unwritten::Lengths {
+                times,
+                positions,
+                frames,
+            });
+        }
+        let rows = written.time_s.iter().zip(&written.approach_mm);
+        let moments = rows.zip(&written.frames).enumerate();
+        let moment = |(place, ((&time_s, &approach_mm), frame)): (usize, ((&f32, _), &String))| {
+            let frame = sparse::read(frame).map_err(|error| Unwritten::Frame(place, error))?;
+            Ok(CourseMoment {
+                time_s,
+                approach_mm,
+                frame,
+            })
+        };
+        Ok(Self {
+            course: Course {
+                moments: moments.map(moment).collect::<Result<_, _>>()?,
+                arm_n_per_mm: written.arm_n_per_mm,
+            },
+            probabilities: written.probabilities,
+            shore: written.shore,
+        })
+    }
+}
