@@ -13,6 +13,7 @@ use serde::{Serialize, Serializer};
 
 pub use self::reply::{Hello, ModelCard, Reply, SensorCard, Tared};
 use crate::frame::{COLS, ROWS};
+use crate::verdict::Shore;
 
 /// Version of the format, announced in `hello`.
 pub const PROTOCOL: u32 = 1;
@@ -21,6 +22,10 @@ pub const PROTOCOL: u32 = 1;
 pub const CONTEXT_BYTES: usize = 1024;
 
 /// A numbered or live event of one sensor.
+#[expect(
+    clippy::large_enum_variant,
+    reason = "a few hundred bytes, beside a frame's three thousand on the heap"
+)]
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "type", rename_all = "lowercase")]
 pub enum Event {
@@ -158,7 +163,7 @@ pub struct Status {
     /// Bytes since start that belonged to no whole frame.
     pub bytes_skipped: u64,
     /// Measured over the last frames; null before two.
-    #[serde(serialize_with = "rounded_hz")]
+    #[serde(serialize_with = "rounded_or_null")]
     pub frame_rate_hz: Option<f64>,
 }
 
@@ -217,6 +222,20 @@ pub enum Rejection {
     LowConfidence,
     /// Force below `model.min_force_n`.
     LowForce,
+    /// The conformal set holds more than one level.
+    Ambiguous,
+}
+
+/// What was known of the arm's approach.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Course {
+    /// Where the arm was, frame by frame.
+    Positions,
+    /// A constant speed while the contact was loaded.
+    Speed,
+    /// Nothing.
+    None,
 }
 
 /// What a user should know of the chosen frame.
@@ -282,6 +301,16 @@ pub struct Hardness {
     pub age_at_publish_ms: Option<f64>,
     /// From the arrival of the byte that made the decision possible; null in a replay.
     pub latency_us: Option<u64>,
+    /// Shore hardness with its 90 % interval; null unless the model judges courses.
+    #[serde(serialize_with = "shore")]
+    pub shore: Option<Shore>,
+    /// The levels that the model cannot tell apart; null without a conformal threshold.
+    pub levels: Option<Vec<u8>>,
+    /// What was known of the approach; null unless the model judges courses.
+    pub course: Option<Course>,
+    /// Slope of force against indentation at the end of loading; null where unknown.
+    #[serde(serialize_with = "rounded_or_null")]
+    pub stiffness_n_per_mm: Option<f64>,
     /// When that byte came, on CLOCK_MONOTONIC; not published.
     #[serde(skip)]
     pub arrival: Duration,
@@ -362,8 +391,22 @@ fn rounded_3<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Erro
     serializer.serialize_f64(round_3(*value))
 }
 
-fn rounded_hz<S: Serializer>(value: &Option<f64>, serializer: S) -> Result<S::Ok, S::Error> {
+fn rounded_or_null<S: Serializer>(value: &Option<f64>, serializer: S) -> Result<S::Ok, S::Error> {
     value.map(round_3).serialize(serializer)
+}
+
+fn shore<S: Serializer>(shore: &Option<Shore>, serializer: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Rounded {
+        value: f64,
+        low: f64,
+        high: f64,
+    }
+    let rounded = |Shore { value, low, high }: Shore| {
+        let [value, low, high] = [value, low, high].map(|n| round_3(f64::from(n)));
+        Rounded { value, low, high }
+    };
+    shore.map(rounded).serialize(serializer)
 }
 
 fn millinewtons<S: Serializer>(newtons: &[f32], serializer: S) -> Result<S::Ok, S::Error> {

@@ -4,6 +4,7 @@
 //! reconnects. It never waits, never logs and never asks the time: [`Pipeline::deadline`] says
 //! when it must be told that time has passed.
 
+mod course;
 mod events;
 mod link;
 mod memory;
@@ -81,6 +82,13 @@ pub struct Pipeline {
 struct Seen {
     link: Link,
     context: Option<serde_json::Value>,
+    /// Speed of the approach when the press under way, or the last one, began.
+    #[serde(default)]
+    speed_mm_s: Option<f64>,
+    /// A model of the course judges the press under way when it has this many frames in contact;
+    /// the greatest number once its early verdict has come.
+    #[serde(default)]
+    next_look: u64,
     frames: u64,
     frames_damaged: u64,
     /// Ends of recent chunks in the stream, and when they came.
@@ -139,6 +147,8 @@ impl Pipeline {
             seen: Seen {
                 link: Link::Closed { reason: None },
                 context: None,
+                speed_mm_s: None,
+                next_look: 0,
                 frames: 0,
                 frames_damaged: 0,
                 chunks: VecDeque::new(),
@@ -438,6 +448,7 @@ impl Pipeline {
         for change in changes {
             self.publish(change, events);
         }
+        self.look(events);
     }
 
     fn abort(&mut self, reason: Abort, events: &mut Vec<Event>) {

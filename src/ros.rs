@@ -169,6 +169,12 @@ struct HardnessMessage<'a> {
     mono_ns: u64,
     age_at_publish_ms: f64,
     latency_us: u64,
+    shore: f64,
+    shore_low: f64,
+    shore_high: f64,
+    levels: Blob,
+    course: String,
+    stiffness_n_per_mm: f64,
 }
 
 #[derive(Debug, Serialize)]
@@ -227,6 +233,7 @@ pub(crate) fn encode(event: &Event) -> (Topic, Timestamp, Vec<u8>) {
             (FRAME, frame.time, to_cdr(&message))
         }
         Event::Hardness(verdict) => {
+            let shore = verdict.shore;
             let message = HardnessMessage {
                 header: Header::new(verdict.time, &verdict.sensor),
                 seq: verdict.seq.unwrap_or(0),
@@ -250,6 +257,12 @@ pub(crate) fn encode(event: &Event) -> (Topic, Timestamp, Vec<u8>) {
                 mono_ns: verdict.mono_ns.unwrap_or(0),
                 age_at_publish_ms: verdict.age_at_publish_ms.unwrap_or(f64::NAN),
                 latency_us: verdict.latency_us.unwrap_or(0),
+                shore: shore.map_or(f64::NAN, |shore| shore.value.into()),
+                shore_low: shore.map_or(f64::NAN, |shore| shore.low.into()),
+                shore_high: shore.map_or(f64::NAN, |shore| shore.high.into()),
+                levels: Blob(verdict.levels.clone().unwrap_or_default()),
+                course: verdict.course.as_ref().map_or_else(String::new, name),
+                stiffness_n_per_mm: verdict.stiffness_n_per_mm.unwrap_or(f64::NAN),
             };
             (HARDNESS, verdict.time, to_cdr(&message))
         }

@@ -81,6 +81,7 @@ __all__ = [
     "Press",
     "ProtocolError",
     "Refused",
+    "Shore",
     "Status",
     "TYPES",
     "Tare",
@@ -114,6 +115,14 @@ class _Numbered(TypedDict, total=False):
     """Place in the daemon's run. Absent in the status that comes right after connecting."""
 
 
+class Shore(TypedDict):
+    """Shore hardness with its 90 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
 class Hardness(_Numbered):
     """A verdict on a press."""
 
@@ -138,6 +147,10 @@ class Hardness(_Numbered):
     mono_ns: Optional[int]
     age_at_publish_ms: Optional[float]
     latency_us: Optional[int]
+    shore: Optional[Shore]
+    levels: Optional[List[int]]
+    course: Optional[Literal["positions", "speed", "none"]]
+    stiffness_n_per_mm: Optional[float]
 
 
 class Press(_Numbered):
@@ -656,6 +669,14 @@ class Control:
         Without fields, they carry nothing any more.
         """
         self.request({"context": {"sensor": sensor, **fields}})
+
+    def motion(self, sensor: str, at: Sequence[Tuple[Union[int, str], float]]) -> None:
+        """Says where the arm is: pairs of a moment and a position in mm, growing towards the object.
+
+        A moment is `time.monotonic_ns()` on the daemon's machine, or an RFC 3339 time. At most 256
+        pairs, in order.
+        """
+        self.request({"motion": {"sensor": sensor, "at": [list(point) for point in at]}})
 
     def blackbox(self, sensor: str) -> str:
         """Has the daemon write the sensor's last minute to a recording. Returns the file's path."""

@@ -1,20 +1,41 @@
 //! The press and hardness events of a pipeline.
 
 use super::{Clock, Pipeline, Unjudged};
-use crate::event::{Event, Hardness, Note, Phase, Press, PressState, Rejection};
+use crate::event::{self, Event, Hardness, Note, Phase, Press, PressState, Rejection};
 use crate::frame::{Frame, RawFrame};
-use crate::press::{Change, End, Marks, Moment, Peak};
+use crate::press::{Change, End, Marks, Moment, Peak, SoFar};
 use crate::sensor::Description;
+use crate::verdict::{Format, ModelError, Verdict};
+
+/// An early verdict on the course needs this many frames in contact.
+const FIRST_LOOK: u64 = 3;
+/// The course is judged again when the press has this share more frames, at least one: a verdict at
+/// each of a thousand frames would cost more than it brings.
+const LOOK_SHARE: u64 = 8;
+/// The early verdict has come.
+const NO_LOOK: u64 = u64::MAX;
+
+/// What a verdict on the course says besides.
+struct Told {
+    rests_on: event::Course,
+    stiffness_n_per_mm: Option<f64>,
+}
 
 impl Pipeline {
     /// Adds the events of a change.
     pub(super) fn publish(&mut self, change: Change, events: &mut Vec<Event>) {
         match change {
             Change::Begin { press, at } => {
+                self.seen.speed_mm_s = self.speed_mm_s();
+                self.seen.next_look = FIRST_LOOK;
                 events.push(self.press(press, PressState::Begin, at, 1, None));
             }
             Change::Settled { press, peak } => {
-                events.extend(self.judge(press, Phase::Early, &peak));
+                if self.hrn.format() == Format::Frame && self.seen.next_look != NO_LOOK {
+                    self.seen.next_look = NO_LOOK;
+                    let verdict = self.hrn.judge(&peak.frame);
+                    events.extend(self.judged(press, Phase::Early, &peak, verdict, None));
+                }
             }
             Change::End {
                 press,
@@ -22,14 +43,14 @@ impl Pipeline {
                 frames,
                 end,
                 peak,
-                course: _,
+                course,
             } => {
                 let reason = match end {
                     End::Release => None,
                     End::Timeout => Some("timeout"),
                 };
                 events.push(self.press(press, PressState::End, last, frames, reason));
-                events.extend(self.judge(press, Phase::Final, &peak));
+                events.extend(self.judge(Phase::Final, &course, &peak));
                 let delay_ms = self.sensor.description().arm.delay_ms;
                 self.track.judged(last.stamp.mono, delay_ms);
             }
@@ -66,10 +87,63 @@ impl Pipeline {
         })
     }
 
-    /// The verdict on a press. A model that fails on its own check frames was refused when it was
+    /// Judges the press under way, if a model of the course is due to look at it, and gives the early
+    /// verdict once that is sure.
+    pub(super) fn look(&mut self, events: &mut Vec<Event>) {
+        let is_due = |frames: &u64| *frames >= self.seen.next_look;
+        let Some(frames) = self.tracker.frames().filter(is_due) else {
+            return;
+        };
+        if self.hrn.format() == Format::Frame {
+            return;
+        }
+        let Some(so_far) = self.tracker.so_far() else {
+            return;
+        };
+        self.seen.next_look = frames + (frames / LOOK_SHARE).max(1);
+        let known = self.known(&so_far, Phase::Early);
+        if (known.frames.len() as u64) < FIRST_LOOK {
+            return;
+        }
+        let peak = known.frames[known.best].clone();
+        let Some(Event::Hardness(verdict)) = self.judge(Phase::Early, &so_far, &peak) else {
+            return;
+        };
+        if verdict.confidence >= self.sensor.description().early_confidence {
+            self.seen.next_look = NO_LOOK;
+            events.push(Event::Hardness(verdict));
+        }
+    }
+
+    /// The verdict on a press as far as it has come; `peak` is its best frame.
+    fn judge(&mut self, phase: Phase, so_far: &SoFar, peak: &Peak) -> Option<Event> {
+        let press = so_far.press();
+        let Format::Course { most_frames } = self.hrn.format() else {
+            let verdict = self.hrn.judge(&peak.frame);
+            return self.judged(press, phase, peak, verdict, None);
+        };
+        let known = self.known(so_far, phase);
+        let arm_n_per_mm = self.sensor.description().arm.stiffness_n_per_mm;
+        let course = known.course(arm_n_per_mm, most_frames);
+        let told = Told {
+            rests_on: known.rests_on,
+            stiffness_n_per_mm: known.stiffness_n_per_mm(arm_n_per_mm),
+        };
+        let verdict = self.hrn.judge_course(&course);
+        self.judged(press, phase, peak, verdict, Some(told))
+    }
+
+    /// The event of a verdict. A model that fails on its own check frames was refused when it was
     /// loaded. If it fails on another frame, the press gets no verdict, and [`Self::unjudged`] gives
     /// the failure.
-    fn judge(&mut self, press: u64, phase: Phase, peak: &Peak) -> Option<Event> {
+    fn judged(
+        &mut self,
+        press: u64,
+        phase: Phase,
+        peak: &Peak,
+        verdict: Result<Verdict, ModelError>,
+        told: Option<Told>,
+    ) -> Option<Event> {
         let Description {
             min_confidence,
             min_force_n,
@@ -77,7 +151,7 @@ impl Pipeline {
             ..
         } = self.sensor.description();
         let hrn = &self.hrn;
-        let verdict = match hrn.judge(&peak.frame) {
+        let verdict = match verdict {
             Ok(verdict) => verdict,
             Err(error) => {
                 self.unjudged.push(Unjudged {
@@ -93,6 +167,8 @@ impl Pipeline {
             Some(Rejection::LowForce)
         } else if verdict.confidence < *min_confidence {
             Some(Rejection::LowConfidence)
+        } else if verdict.levels.as_ref().is_some_and(|set| set.len() > 1) {
+            Some(Rejection::Ambiguous)
         } else {
             None
         };
@@ -129,6 +205,10 @@ impl Pipeline {
             mono_ns: (self.clock == Clock::Arrival).then_some(stamp.mono.as_nanos() as u64),
             age_at_publish_ms: None,
             latency_us: None,
+            shore: verdict.shore,
+            levels: verdict.levels,
+            course: told.as_ref().map(|told| told.rests_on),
+            stiffness_n_per_mm: told.and_then(|told| told.stiffness_n_per_mm),
             arrival: self.arrival,
         }))
     }

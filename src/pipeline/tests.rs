@@ -2,6 +2,8 @@ use prost::Message as _;
 use tract_onnx::pb;
 
 use super::*;
+
+mod course;
 use crate::event::{Note, Rejection};
 use crate::frame::Array;
 use crate::sensor::Description;

@@ -23,13 +23,17 @@ def wait_for(what, there):
 
 
 # What stands in a ROS message where an event has null, if it is not NaN.
-NULL = {"level": 0, "label": "", "rejected": "", "context": "", "mono_ns": 0, "reason": ""}
+NULL = {"level": 0, "label": "", "rejected": "", "context": "", "mono_ns": 0, "reason": "", "course": ""}
 
 
 def same(found, expected, key):
     """A field of a ROS message is that of the JSON event."""
     if key == "age_at_publish_ms":
         return math.isclose(found, expected)
+    if key == "levels":
+        return list(found) == (expected or [])
+    if key == "shore" and expected:
+        return math.isclose(found, expected["value"], abs_tol=0.0005 + 1e-6)
     if key == "context":
         return (json.loads(found) if found else None) == expected
     if expected is None:

@@ -154,9 +154,14 @@ fn presses(registry: &mut Registry, survey: &Survey) {
             let Verdicts {
                 low_confidence,
                 low_force,
+                ambiguous,
                 ..
             } = *made;
-            for (reason, count) in [("low_confidence", low_confidence), ("low_force", low_force)] {
+            for (reason, count) in [
+                ("low_confidence", low_confidence),
+                ("low_force", low_force),
+                ("ambiguous", ambiguous),
+            ] {
                 let labels = with(&[("phase", phase), ("reason", reason)]);
                 rejected.get_or_create(&labels).inc_by(count);
             }

@@ -31,6 +31,7 @@ pub(crate) struct Verdicts {
     pub(crate) levels: BTreeMap<u8, u64>,
     pub(crate) low_confidence: u64,
     pub(crate) low_force: u64,
+    pub(crate) ambiguous: u64,
 }
 
 impl Tally {
@@ -51,6 +52,7 @@ impl Tally {
                 match verdict.rejected {
                     Some(Rejection::LowConfidence) => verdicts.low_confidence += 1,
                     Some(Rejection::LowForce) => verdicts.low_force += 1,
+                    Some(Rejection::Ambiguous) => verdicts.ambiguous += 1,
                     None => {
                         if let Some(level) = verdict.level {
                             *verdicts.levels.entry(level).or_default() += 1;

@@ -108,6 +108,13 @@ fn hardness(line: &mut String, event: &Value) {
             event["force_n"].as_f64().unwrap_or_default(),
         ),
     );
+    let shore = |key: &str| event["shore"][key].as_f64();
+    if let (Some(value), Some(low), Some(high)) = (shore("value"), shore("low"), shore("high")) {
+        write(
+            line,
+            format_args!("  Shore {value:.0} ({low:.0} to {high:.0})"),
+        );
+    }
     if let (Some(_), Some(time)) = (published(event), event["time"].as_str()) {
         let frame = number(event, "frame");
         write(line, format_args!("  frame {frame} at {}", clock(time)));
@@ -179,6 +186,15 @@ mod tests {
             "10:00:01.523  wrist         hardness  #3    final     2 firm                    \
              93 % [1 93 5 1]   52 taxels   12.35 N  frame 41 at 10:00:00.123  (at_edge)  \
              {\"tag\":\"pick-17\"}",
+        );
+        check(
+            json!({"type": "hardness", "sensor": "wrist", "time": time, "press": 3,
+                   "phase": "final", "level": 2, "label": "firm", "rejected": null,
+                   "notes": [], "probabilities": [0.1, 0.9], "confidence": 0.9,
+                   "contact_area_taxels": 52, "force_n": 12.345, "context": null,
+                   "shore": {"value": 63.6, "low": 58.2, "high": 70.0}}),
+            "10:00:00.123  wrist         hardness  #3    final     2 firm                    \
+             90 % [10 90]   52 taxels   12.35 N  Shore 64 (58 to 70)",
         );
         check(
             json!({"type": "hardness", "sensor": "wrist", "time": time, "press": 3,

@@ -1,0 +1,177 @@
+//! What is known of a press's course: its frames, and how far the arm went at each.
+
+use std::time::Duration;
+
+use super::Pipeline;
+use crate::event::{self, Phase};
+use crate::motion::SPEEDS_MM_S;
+use crate::press::{Peak, SoFar, thinned};
+use crate::verdict;
+
+/// The contact is loaded up to the first frame that has this share of the greatest force. A steady
+/// approach may end there.
+const LOADED_SHARE: f64 = 0.95;
+/// The end of loading begins with this share of its last force, so that the slope is that of the
+/// deepest part.
+const END_SHARE: f64 = 0.5;
+/// The end of loading has this many frames, if there are so many.
+const END_FRAMES: usize = 3;
+/// A slope over a smaller spread of indentations (their standard deviation, mm) would be noise.
+const LEAST_SPREAD_MM: f64 = 0.005;
+
+/// A press, with the approach at each of its frames.
+pub(super) struct Known<'a> {
+    pub(super) frames: Vec<&'a Peak>,
+    /// Place of the best frame.
+    pub(super) best: usize,
+    /// Where it is known.
+    approach_mm: Vec<Option<f64>>,
+    /// What it rests on.
+    pub(super) rests_on: event::Course,
+}
+
+impl<'a> Known<'a> {
+    fn moments(&self) -> Vec<Duration> {
+        let moments = self.frames.iter().map(|frame| frame.moment.stamp.mono);
+        moments.collect()
+    }
+
+    /// The place of the last frame of loading.
+    fn loaded(&self) -> usize {
+        let forces = self.frames.iter().map(|frame| frame.force_n);
+        let enough = LOADED_SHARE * forces.clone().fold(0.0, f64::max);
+        let mut forces = forces;
+        forces.position(|force| force >= enough).unwrap_or(0)
+    }
+
+    /// Leaves out the frames after the last one whose approach is known.
+    fn cut(self, so_far: &'a SoFar) -> Self {
+        let Some(last) = self.approach_mm.iter().rposition(Option::is_some) else {
+            return self;
+        };
+        let (frames, best) = so_far.until(self.frames[last].moment.stamp.mono);
+        let mut approach_mm = self.approach_mm;
+        approach_mm.truncate(frames.len());
+        Self {
+            frames,
+            best,
+            approach_mm,
+            rests_on: self.rests_on,
+        }
+    }
+
+    /// As a model of `most` frames gets it.
+    pub(super) fn course(&self, arm_n_per_mm: Option<f64>, most: usize) -> verdict::Course {
+        let begin = self.frames[0].moment.stamp.mono;
+        let moment = |place: usize| {
+            let frame = self.frames[place];
+            let since = frame.moment.stamp.mono.saturating_sub(begin);
+            verdict::CourseMoment {
+                time_s: since.as_secs_f32(),
+                approach_mm: self.approach_mm[place].map(|mm| mm as f32),
+                frame: frame.frame,
+            }
+        };
+        let places = thinned(self.frames.len(), self.best, most);
+        let is_known = self.rests_on != event::Course::None;
+        verdict::Course {
+            moments: places.into_iter().map(moment).collect(),
+            arm_n_per_mm: arm_n_per_mm.filter(|_| is_known).unwrap_or(0.0) as f32,
+        }
+    }
+
+    /// The slope of force against indentation at the end of loading, in N/mm, by least squares.
+    pub(super) fn stiffness_n_per_mm(&self, arm_n_per_mm: Option<f64>) -> Option<f64> {
+        let arm_n_per_mm = arm_n_per_mm?;
+        let loaded = self.loaded();
+        let enough = END_SHARE * self.frames[loaded].force_n;
+        let steep = self.frames[..=loaded]
+            .iter()
+            .rposition(|f| f.force_n < enough);
+        let first = steep.map_or(0, |below| below + 1);
+        let first = first.min((loaded + 1).saturating_sub(END_FRAMES));
+        let end = (first..=loaded).filter_map(|place| {
+            let force_n = self.frames[place].force_n;
+            let indentation_mm = self.approach_mm[place]? - force_n / arm_n_per_mm;
+            Some((indentation_mm, force_n))
+        });
+        slope(&end.collect::<Vec<_>>())
+    }
+}
+
+/// Of the line through points that has the least squares; `None`, if they hardly differ in x or it
+/// falls.
+fn slope(points: &[(f64, f64)]) -> Option<f64> {
+    let count = points.len() as f64;
+    let mean = |of: fn(&(f64, f64)) -> f64| points.iter().map(of).sum::<f64>() / count;
+    let (x, y) = (mean(|p| p.0), mean(|p| p.1));
+    let sum = |of: &dyn Fn(&(f64, f64)) -> f64| points.iter().map(of).sum::<f64>();
+    let squares = sum(&|p| (p.0 - x).powi(2));
+    let slope = sum(&|p| (p.0 - x) * (p.1 - y)) / squares;
+    let is_spread = points.len() > 1 && (squares / count).sqrt() >= LEAST_SPREAD_MM;
+    (is_spread && slope.is_finite() && slope > 0.0).then_some(slope)
+}
+
+impl Pipeline {
+    /// What is known of a press up to now.
+    pub(super) fn known<'a>(&self, so_far: &'a SoFar, phase: Phase) -> Known<'a> {
+        let (frames, best) = so_far.until(Duration::MAX);
+        let mut known = Known {
+            approach_mm: vec![None; frames.len()],
+            frames,
+            best,
+            rests_on: event::Course::None,
+        };
+        let moments = known.moments();
+        let (begin, last) = (moments[0], moments[moments.len() - 1]);
+        let delay_ms = self.sensor.description().arm.delay_ms;
+        if self.track.is_told(last, delay_ms) {
+            if let Some(approach_mm) = self.track.approach(begin, &moments, delay_ms) {
+                known.approach_mm = approach_mm;
+                known.rests_on = event::Course::Positions;
+            }
+            // The latest positions may still be on their way. The final verdict waits for none.
+            return match phase {
+                Phase::Early => known.cut(so_far),
+                Phase::Final => known,
+            };
+        }
+        if let Some(speed_mm_s) = self.seen.speed_mm_s {
+            let loaded = known.loaded();
+            for (approach_mm, moment) in known.approach_mm[..=loaded].iter_mut().zip(moments) {
+                *approach_mm = Some(speed_mm_s * (moment.saturating_sub(begin)).as_secs_f64());
+            }
+            known.rests_on = event::Course::Speed;
+        }
+        known
+    }
+
+    /// The speed of a steady approach: what the context says, else the configuration.
+    pub(super) fn speed_mm_s(&self) -> Option<f64> {
+        let context = self.seen.context.as_ref();
+        let said = context.and_then(|context| context.get("speed_mm_s")?.as_f64());
+        let configured = self.sensor.description().arm.speed_mm_s;
+        let (least, most) = SPEEDS_MM_S;
+        said.or(configured)
+            .filter(|speed| (least..=most).contains(speed))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_slope_is_that_of_the_line_or_none() {
+        let points = [(0.0, 1.0), (0.1, 1.5), (0.2, 2.0)];
+        assert!((slope(&points).unwrap() - 5.0).abs() < 1e-9);
+        for points in [
+            &points[..1],
+            &[],
+            &[(0.0, 1.0), (0.004, 1.5)],
+            &[(0.0, 2.0), (0.1, 1.0)],
+        ] {
+            assert_eq!(slope(points), None, "{points:?}");
+        }
+    }
+}
