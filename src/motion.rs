@@ -187,7 +187,7 @@ impl Track {
     ) -> Option<Vec<Option<f64>>> {
         let begin = of_arm(begin, delay_ms);
         let moments = moments.iter().map(|&moment| of_arm(moment, delay_ms));
-        let last = moments.clone().last()?.max(begin);
+        let last = moments.clone().next_back()?.max(begin);
         let first = self.points.partition_point(|p| p.at_ns <= begin);
         let first = first.checked_sub(1)?;
         let end = self.points.partition_point(|p| p.at_ns < last);

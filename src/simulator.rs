@@ -36,7 +36,7 @@ pub use courses::{CourseMoment, CourseSettings, LabelledCourse, MOST_FRAMES, cou
 pub use dataset::{LabelledSample, dataset};
 pub use level::{Borders, LEVELS, LevelRange, level_of};
 pub use material::{Material, Split, UnknownMaterial};
-pub use motion::{Approach, Motion};
+pub use motion::{ARM_N_PER_MM, Approach, Motion};
 pub use object::{Shapes, UnknownShapes};
 pub use sensor::{SensorProfile, UnknownProfile};
 pub use sequence::{Sequence, SequenceFrame, SequenceSettings};

@@ -13,6 +13,7 @@ mod pty;
 pub mod record;
 pub mod recover;
 pub mod replay;
+mod robot;
 pub mod simulate;
 pub mod sniff;
 pub mod tail;

@@ -155,6 +155,11 @@ fn the_guide_to_a_new_sensor_says_what_happens() {
 }
 
 #[test]
+fn the_guide_to_the_arms_motion_says_what_happens() {
+    follow("motion.md");
+}
+
+#[test]
 fn the_page_on_recordings_says_what_happens() {
     follow("recordings.md");
 }

@@ -13,8 +13,13 @@ use std::path::Path;
 use std::time::Duration;
 
 use bench::{Bench, Daemon, Subscriber, hardnessd};
+use hardnessd::frame::Frame;
 use hardnessd::recording::{Entry, Input, Reader};
-use serde_json::json;
+use hardnessd::verdict::{CheckedCourse, Course, CourseCheck, CourseMoment};
+use serde_json::{Value, json};
+
+#[path = "bench/course_model.rs"]
+mod course_model;
 
 fn mono_ns() -> u64 {
     let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
@@ -45,7 +50,7 @@ fn positions_are_checked_counted_and_recorded() {
         .subscriber()
         .until(&json!({"type": "status", "state": "live"}));
     let mut control = Subscriber::connect(&bench.path("control.sock"));
-    let mut tell = |sensor: &str, at: serde_json::Value| {
+    let mut tell = |sensor: &str, at: Value| {
         control.ask(&json!({"motion": {"sensor": sensor, "at": at}, "id": 7}).to_string())
     };
     let now = mono_ns();
@@ -57,7 +62,7 @@ fn positions_are_checked_counted_and_recorded() {
     let wall = jiff::Timestamp::now().to_string();
     assert_eq!(tell("forearm", json!([[wall, 4]])), ok);
 
-    let refused = |answer: serde_json::Value, expected: &str| {
+    let refused = |answer: Value, expected: &str| {
         assert_eq!(
             (&answer["type"], &answer["id"]),
             (&json!("error"), &json!(7))
@@ -141,4 +146,93 @@ fn positions_of_raw_bytes_come_from_a_table() {
     fs::write(table, "time_s,approach_mm\n0,0\n0.1,1\n").unwrap();
     let events = check(&[], 0, "");
     assert_eq!(check(&["--speed", "1e6"], 0, ""), events);
+}
+
+/// An event without what only a live one has.
+fn timeless(mut event: Value) -> Value {
+    for key in ["mono_ns", "age_at_publish_ms", "latency_us"] {
+        event[key] = Value::Null;
+    }
+    event
+}
+
+#[test]
+fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_repeats_them() {
+    let bench = Bench::new();
+    fs::write(bench.path("sums.onnx"), course_model::course_model(48, &[])).unwrap();
+    let model = "[model]\npath = \"sums.onnx\"\nearly_confidence = 0.5\n";
+    let record = "[record]\ndir = \"tape\"\nkeep_free_mb = 0\n";
+    let config = bench.configure("hardnessd.toml", "events.sock", &format!("{model}{record}"));
+    let text = fs::read_to_string(&config).unwrap();
+    let arm = "frame_rate_hz = 20.0\narm = { stiffness_n_per_mm = 10.0, delay_ms = 34.3 }";
+    fs::write(&config, text.replace("frame_rate_hz = 20.0", arm)).unwrap();
+    let mut daemon = Daemon::start(&config);
+    let mut events = bench.subscriber();
+    let control = bench.path("control.sock");
+    let control = control.to_str().unwrap();
+    // At 230,400 baud a frame takes 34.3 ms.
+    let _sensor = bench.sensor(&["--material", "yoga-mat", "--motion", control]);
+    let mut finals = Vec::new();
+    let mut earlies = 0;
+    while finals.len() < 2 {
+        let verdict = events.until(&json!({"type": "hardness"}));
+        assert_eq!(verdict["course"], "positions", "{verdict}");
+        if verdict["phase"] == "early" {
+            earlies += 1;
+            continue;
+        }
+        // Of hard plastic, nearly all of the way is the arm's own. The second press is of a yoga mat.
+        let stiffness = verdict["stiffness_n_per_mm"].as_f64();
+        let is_told = stiffness.is_some_and(|n_per_mm| (0.5..60.0).contains(&n_per_mm));
+        assert!(finals.is_empty() || is_told, "{verdict}");
+        let shore = |key: &str| verdict["shore"][key].as_f64().unwrap();
+        assert!(
+            (shore("high") - shore("value") - 10.0).abs() < 0.01,
+            "{verdict}"
+        );
+        // 15 N are 1.5 mm of the arm, and what is pressed gives way too.
+        let frames = shore("value") - shore("low");
+        let mean_mm = shore("value") / frames;
+        assert!((0.8..8.0).contains(&mean_mm), "{verdict}");
+        finals.push(timeless(verdict));
+    }
+    assert!(earlies >= 1);
+    daemon.process.signal(rustix::process::Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+
+    let tape = fs::read_dir(bench.path("tape"))
+        .unwrap()
+        .next()
+        .unwrap()
+        .unwrap()
+        .path();
+    let replay = |more: &[&str]| {
+        let command = [
+            "replay",
+            tape.to_str().unwrap(),
+            "--config",
+            config.to_str().unwrap(),
+        ];
+        let output = hardnessd(&[&command[..], more].concat());
+        assert!(output.status.success(), "{output:?}");
+        output.stdout
+    };
+    let replayed = replay(&[]);
+    assert_eq!(replayed, replay(&["--speed", "1000"]));
+    let lines = replayed
+        .split(|&byte| byte == b'\n')
+        .filter(|line| !line.is_empty());
+    let found: Vec<Value> = lines
+        .map(|line| serde_json::from_slice(line).unwrap())
+        .filter(|event: &Value| event["type"] == "hardness" && event["phase"] == "final")
+        .take(2)
+        .collect();
+    assert_eq!(found.len(), 2);
+    for (mut found, mut live) in found.into_iter().zip(finals) {
+        // Statuses before the first state of the recording are counted live alone.
+        for event in [&mut found, &mut live] {
+            event.as_object_mut().unwrap().remove("seq");
+        }
+        assert_eq!(found, live);
+    }
 }

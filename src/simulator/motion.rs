@@ -8,11 +8,14 @@ pub(super) struct Arm {
     pub(super) speed_mm_s: f64,
 }
 
+/// Stiffness of the arm of a sequence.
+pub const ARM_N_PER_MM: f64 = 10.0;
+
 impl Default for Arm {
     /// Stiffness assumed, speed of the paper.
     fn default() -> Self {
         Self {
-            n_per_mm: 10.0,
+            n_per_mm: ARM_N_PER_MM,
             speed_mm_s: 5.0,
         }
     }

@@ -25,11 +25,12 @@ use self::account::Account;
 use self::place::Place;
 pub(super) use self::place::sockets;
 use super::faults::Faults;
-use super::player::{Pace, Player};
+use super::player::{BITS_A_BYTE, Pace, Player};
 use super::simulate::{OutOfRange, within};
 use crate::daemon::config::{Config, Http, SensorTable, Setup};
 use crate::daemon::{self, Daemon};
-use crate::simulator::SequenceSettings;
+use crate::motion;
+use crate::simulator::{ARM_N_PER_MM, SequenceSettings};
 use crate::wire::{Layout, LayoutError};
 
 /// Arguments of `demo`.
@@ -97,11 +98,18 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let io = |what| move |source| Error::Io { what, source };
     let place = Place::new().map_err(io("directory for socket and port"))?;
     let port = place.port();
-    let sensor = SensorTable {
+    let mut sensor = SensorTable {
         name: "demo".to_owned(),
         ..SensorTable::new(port.clone())
     };
     let layout = Layout::new(&sensor.frame)?;
+    let line_s = layout.max_frame_bytes() as f64 * BITS_A_BYTE / f64::from(sensor.baud);
+    sensor.arm = motion::Settings {
+        stiffness_n_per_mm: Some(ARM_N_PER_MM),
+        // A frame is stamped when its last byte has come, and the arm when it moves.
+        delay_ms: (1e3 * line_s / args.speed).min(1e3),
+        ..motion::Settings::default()
+    };
     let pace = Pace::new(sensor.frame_rate_hz, sensor.baud, args.speed);
     let sequence = SequenceSettings {
         seed: args.seed,
@@ -119,6 +127,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let socket = place.socket();
     let mut config = hastened(sensor, &socket, args.speed);
     config.http = Some(Http { listen: args.http });
+    let robot = player.robot(config.publish.unix.control_path(), None);
     let daemon = Daemon::bind(Setup::of(config, Path::new("demo"))?)?;
     if let Some(address) = daemon.http_address() {
         eprintln!("live page: http://{address}/");
@@ -135,7 +144,11 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         None,
     );
     let printing = async {
-        let printed = print(subscriber, args.presses, player, sequence, shown, shutdown).await;
+        let printed = print(subscriber, args.presses, player, sequence, shown, shutdown);
+        let printed = tokio::select! {
+            printed = printed => printed,
+            () = robot.run() => Ok(()),
+        };
         let _ = stop.send(());
         printed
     };

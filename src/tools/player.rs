@@ -7,12 +7,13 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 
 use super::faults::{Faults, Line};
 use super::pty::Pty;
-use crate::simulator::{Sequence, SequenceFrame, SequenceSettings};
+use super::robot::{Moving, Robot};
+use crate::simulator::{Approach, Sequence, SequenceFrame, SequenceSettings};
 use crate::wire::Layout;
 
 /// Bits on the line for a byte: a start bit, eight data bits, a stop bit.
@@ -54,6 +55,8 @@ pub(crate) struct Player {
     layout: Layout,
     pace: Pace,
     faults: Faults,
+    /// To the robot whose arm presses.
+    moving: watch::Sender<Option<Moving>>,
 }
 
 impl Player {
@@ -75,6 +78,7 @@ impl Player {
             layout,
             pace,
             faults,
+            moving: watch::Sender::new(None),
         })
     }
 
@@ -84,6 +88,15 @@ impl Player {
             .as_ref()
             .expect("a player starts with its pty")
             .path()
+    }
+
+    /// The robot whose arm presses, to tell the daemon at `socket` of its motion.
+    pub(crate) fn robot(&self, socket: PathBuf, sensor: Option<String>) -> Robot {
+        Robot {
+            socket,
+            sensor,
+            moving: self.moving.subscribe(),
+        }
     }
 
     /// Plays to the end of the sequence. Afterwards the port is gone.
@@ -98,9 +111,15 @@ impl Player {
         let mut index = 0_u32;
         // When the line is free again: a long frame delays the next one.
         let mut free = start;
-        while let Some(frame) = frames.recv().await {
+        while let Some((frame, approach)) = frames.recv().await {
             let due = start + self.pace.period * index;
             tokio::time::sleep_until(due).await;
+            let speed = self.pace.speed;
+            self.moving.send_replace(Some(Moving {
+                start,
+                speed,
+                approach,
+            }));
             bytes.clear();
             self.layout.encode(&frame.raw, &mut bytes);
             let time_s = (self.pace.period * index).as_secs_f64() * self.pace.speed;
@@ -143,11 +162,14 @@ impl Player {
     }
 }
 
-fn compute(settings: SequenceSettings) -> mpsc::Receiver<SequenceFrame> {
+/// The frames, each with how the arm moves until the next one.
+fn compute(settings: SequenceSettings) -> mpsc::Receiver<(SequenceFrame, Approach)> {
     let (frames, played) = mpsc::channel(AHEAD);
     std::thread::spawn(move || {
-        for frame in Sequence::new(settings) {
-            if frames.blocking_send(frame).is_err() {
+        let mut sequence = Sequence::new(settings).peekable();
+        while let Some(frame) = sequence.next() {
+            let approach = sequence.peek().unwrap_or(&frame).approach;
+            if frames.blocking_send((frame, approach)).is_err() {
                 return;
             }
         }

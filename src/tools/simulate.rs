@@ -52,6 +52,12 @@ pub struct Args {
     /// Bits per second on the line [default: 115200, or the first usual rate that carries the frames]
     #[arg(long, value_name = "B", value_parser = clap::value_parser!(u32).range(1..))]
     baud: Option<u32>,
+    /// Control socket of a daemon, to tell it where the arm is, as a robot would
+    #[arg(long, value_name = "SOCKET", conflicts_with = "to")]
+    motion: Option<PathBuf>,
+    /// The daemon's sensor on the arm [default: its first]
+    #[arg(long, value_name = "NAME", requires = "motion")]
+    motion_sensor: Option<String>,
     /// Script of faults; --help shows its format
     #[arg(long, value_name = "FILE")]
     faults: Option<PathBuf>,
@@ -156,6 +162,15 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let player = Player::new(args.link.as_deref(), layout, pace, faults).map_err(failed)?;
     let line = format!("{}\n", player.path().display());
     let settings = sequence(&args);
+    let robot = args
+        .motion
+        .map(|socket| player.robot(socket, args.motion_sensor));
+    let robot = async {
+        match robot {
+            Some(robot) => robot.run().await,
+            None => std::future::pending().await,
+        }
+    };
     let play = async {
         // It is no error if nobody reads the path: the link shows it too.
         let told = super::print_apart(line.into_bytes());
@@ -163,6 +178,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     };
     tokio::select! {
         played = play => played.map_err(failed),
+        () = robot => Ok(()),
         () = shutdown => Ok(()),
     }
 }
