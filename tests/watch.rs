@@ -1,5 +1,6 @@
 //! `hardnessd watch` on a real pty, beside a real daemon: what a terminal shows, and that it is given
 //! back.
+#![cfg(feature = "watch")]
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -250,7 +251,12 @@ fn a_terminal_without_colours_gets_none() {
         terminal.ends();
     };
     check(&[], &[]);
-    check(&[("NO_COLOR", "1")], &["38;5", "48;5"]);
+    check(&[("COLORTERM", "")], &["38;2", "48;2"]);
+    check(&[("COLORTERM", "truecolor")], &["48;5;53"]);
+    check(
+        &[("COLORTERM", "truecolor"), ("NO_COLOR", "1")],
+        &["38;2", "38;5", "48;5"],
+    );
     check(&[("TERM", "vt100")], &["38;5", "48;5", "\u{2580}"]);
     check(&[("TERM", "dumb")], &["38;5", ";1m", ";7m", "\u{2580}"]);
 }

@@ -117,6 +117,7 @@ fn look() -> Look {
     let locale = locale.into_iter().find(|value| !value.is_empty());
     Look::new(
         &variable("TERM"),
+        &variable("COLORTERM"),
         &variable("NO_COLOR"),
         &locale.unwrap_or_default(),
     )

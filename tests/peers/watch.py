@@ -34,7 +34,7 @@ class Terminal:
         self.master, device = pty.openpty()
         fcntl.ioctl(device, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
         environment = {
-            **os.environ, "TERM": "xterm-256color", "LC_ALL": "C.UTF-8", "NO_COLOR": "", **variables,
+            **os.environ, "TERM": "xterm-256color", "LC_ALL": "C.UTF-8", "NO_COLOR": "", "COLORTERM": "", **variables,
         }
         self.process = subprocess.Popen(
             [bench.binary, "watch", "--socket", bench.path("events.sock")],
@@ -140,7 +140,7 @@ def main():
         forearm = bench.sensor("forearm", "--seed", "3")
         bench.sensor("wrist", "--seed", "4")
         looks = [
-            ("80x24", (80, 24), {}),
+            ("80x24", (80, 24), {"COLORTERM": "truecolor"}),
             ("wide", (120, 48), {}),
             ("large", (220, 64), {}),
             ("narrow", (44, 40), {}),

@@ -3,12 +3,15 @@
 use ratatui_core::style::{Color, Modifier, Style};
 
 use super::view::Link;
+use crate::colour::viridis;
 
 /// What the terminal can show.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Look {
     /// It has 256 colours.
     pub(super) colours: bool,
+    /// It has 24 bits of colour.
+    pub(super) true_colours: bool,
     /// It has bold and reversed text.
     pub(super) attributes: bool,
     /// It shows more than ASCII.
@@ -16,14 +19,16 @@ pub(super) struct Look {
 }
 
 impl Look {
-    /// By the variables `TERM`, `NO_COLOR` (<https://no-color.org>), and the first that is set of
-    /// `LC_ALL`, `LC_CTYPE` and `LANG`.
-    pub(super) fn new(term: &str, no_color: &str, locale: &str) -> Self {
+    /// By the variables `TERM`, `COLORTERM`, `NO_COLOR` (<https://no-color.org>), and the first that is set
+    /// of `LC_ALL`, `LC_CTYPE` and `LANG`.
+    pub(super) fn new(term: &str, color_term: &str, no_color: &str, locale: &str) -> Self {
         let is_plain = ["", "dumb", "unknown"].contains(&term);
         let is_old = term.starts_with("vt") || term.ends_with("-m") || term.ends_with("-mono");
         let locale = locale.to_ascii_lowercase();
+        let colours = !is_plain && !is_old && no_color.is_empty();
         Self {
-            colours: !is_plain && !is_old && no_color.is_empty(),
+            colours,
+            true_colours: colours && ["truecolor", "24bit"].contains(&color_term),
             attributes: !is_plain,
             unicode: !is_plain && !is_old && (locale.contains("utf-8") || locale.contains("utf8")),
         }
@@ -34,6 +39,15 @@ impl Look {
             (true, _) => colour,
             (false, true) => Style::new().add_modifier(without),
             (false, false) => Style::new(),
+        }
+    }
+
+    /// The colour of a share of the greatest pressure.
+    pub(super) fn heat(self, share: f32) -> Color {
+        let [red, green, blue] = viridis(share);
+        match self.true_colours {
+            true => Color::Rgb(red, green, blue),
+            false => indexed([red, green, blue]),
         }
     }
 
@@ -71,4 +85,16 @@ impl Look {
     pub(super) fn separator(self) -> &'static str {
         if self.unicode { " · " } else { " | " }
     }
+}
+
+/// The nearest of xterm's 256 colours. 216 of them are a cube with the levels 0, 95, 135, 175, 215 and 255 of
+/// red, green and blue.
+fn indexed(colour: [u8; 3]) -> Color {
+    let level = |value: u8| match value {
+        0..48 => 0,
+        48..115 => 1,
+        _ => (value - 35) / 40,
+    };
+    let [red, green, blue] = colour.map(level);
+    Color::Indexed(16 + 36 * red + 6 * green + blue)
 }

@@ -20,11 +20,13 @@ use crate::tools::pty::pair::Pair;
 
 const COLOURS: Look = Look {
     colours: true,
+    true_colours: false,
     attributes: true,
     unicode: true,
 };
 const PLAIN: Look = Look {
     colours: false,
+    true_colours: false,
     attributes: false,
     unicode: false,
 };
@@ -460,7 +462,9 @@ fn keys_mean_what_the_last_row_says() {
 #[test]
 fn the_look_follows_the_terminal() {
     let check = |term, no_color, locale, expected: (bool, bool, bool)| {
-        let look = Look::new(term, no_color, locale);
+        let look = Look::new(term, "truecolor", no_color, locale);
+        assert_eq!(look.true_colours, look.colours);
+        assert!(!Look::new(term, "", no_color, locale).true_colours);
         let found = (look.colours, look.attributes, look.unicode);
         assert_eq!(found, expected, "{term} {no_color} {locale}");
     };

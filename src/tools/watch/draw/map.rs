@@ -5,7 +5,6 @@ use ratatui_core::style::Color;
 
 use super::super::view::{Link, Sensor};
 use super::Page;
-use crate::colour::viridis;
 
 impl Page<'_> {
     /// Columns and rows of the pressure map: the largest that fits, with so many columns a taxel and
@@ -41,10 +40,11 @@ impl Page<'_> {
                 let (x_of, y_of) = (usize::from(x), usize::from(y));
                 let half = |half: usize| shade((2 * y_of + half) / scale, x_of / scale);
                 let (upper, lower) = (half(0), half(1));
+                let look = self.look;
                 let cell = &mut self.buffer[(area.x + x, area.y + y)];
                 if self.look.colours {
                     let colour = |share: Option<f32>| match share {
-                        Some(share) if link == Link::Live => heat(share),
+                        Some(share) if link == Link::Live => look.heat(share),
                         Some(share) => Color::Indexed(GREY[step(share, GREY.len())]),
                         None => Color::Indexed(GREY[0]),
                     };
@@ -97,18 +97,6 @@ fn step(share: f32, steps: usize) -> usize {
 
 /// The map's scale reaches at least so far, in newtons a taxel: noise must not look like a touch.
 const LEAST_SCALE_N: f32 = 1.0;
-
-/// The nearest of xterm's 256 colours to that of the one colour map. 216 of them are a cube with the levels
-/// 0, 95, 135, 175, 215 and 255 of red, green and blue.
-fn heat(share: f32) -> Color {
-    let level = |value: u8| match value {
-        0..48 => 0,
-        48..115 => 1,
-        _ => (value - 35) / 40,
-    };
-    let [red, green, blue] = viridis(share).map(level);
-    Color::Indexed(16 + 36 * red + 6 * green + blue)
-}
 
 /// From nothing to the greatest pressure, for what is no longer true.
 const GREY: [u8; 13] = [
