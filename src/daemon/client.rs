@@ -5,6 +5,8 @@
 //! change anything. While the daemon carries out its command, events go on and the next request
 //! waits.
 
+mod pace;
+
 use std::io;
 use std::pin::Pin;
 use std::time::Duration;
@@ -13,9 +15,9 @@ use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt, Interest};
 use tokio::net::{TcpStream, UnixStream, tcp, unix};
 use tokio::sync::oneshot;
 use tokio::sync::oneshot::error::TryRecvError;
-use tokio::time::Instant;
 use tracing::debug;
 
+use self::pace::Pace;
 use super::accept::Serve;
 use super::hub::{self, Closed, Line};
 use super::lines::{Heard, Lines};
@@ -28,12 +30,6 @@ use crate::tare::RetareError;
 
 /// The longest line that a subscriber may send (`docs/controller.md`).
 const LONGEST_LINE_BYTES: usize = 64 * 1024;
-
-/// A connection may send this many requests at once, and one in every [`REQUEST_EVERY`] after that. The
-/// rest waits in the system's buffers, so that one who asks without end does not delay the sensors, which
-/// share the daemon's thread.
-const REQUESTS_AT_ONCE: u32 = 64;
-const REQUEST_EVERY: Duration = Duration::from_micros(500);
 
 /// The first and the longest pause between checks of a connection whose other end has stopped
 /// sending. If that end is closed altogether, the runtime learns of it a moment after the last read.
@@ -236,33 +232,6 @@ struct Client<S: Stream> {
     /// Bytes that are being written: a batch goes out in one call.
     outgoing: Vec<u8>,
     service: Service,
-}
-
-/// When the next request of a connection is read.
-struct Pace {
-    /// When all requests so far would have been answered at an even pace.
-    due: Instant,
-}
-
-impl Pace {
-    fn new() -> Self {
-        Self {
-            due: Instant::now(),
-        }
-    }
-
-    /// Waits until another request may be read. Nothing is lost if the wait is given up.
-    async fn wait(&self) {
-        let ahead = REQUESTS_AT_ONCE * REQUEST_EVERY;
-        if self.due > Instant::now() + ahead {
-            tokio::time::sleep_until(self.due - ahead).await;
-        }
-    }
-
-    /// Counts a request.
-    fn count(&mut self) {
-        self.due = self.due.max(Instant::now()) + REQUEST_EVERY;
-    }
 }
 
 /// What the answer to a command says.
