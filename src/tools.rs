@@ -91,7 +91,10 @@ pub fn usage(program: &str, error: &clap::Error) -> ExitCode {
     let told = text.split("\n\nUsage:").next().unwrap_or_default();
     let told = told.split("\n\nFor more").next().unwrap_or_default();
     let told: Vec<&str> = told.split_whitespace().collect();
-    let mut told = told.join(" ").trim_start_matches("error: ").to_owned();
+    let mut told = told
+        .join(" ")
+        .trim_start_matches("error: ")
+        .replace(" tip: ", ": ");
     if error.kind() == ErrorKind::ValueValidation
         && let Some((value, reason)) = told.split_once("': ")
     {

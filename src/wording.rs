@@ -32,6 +32,13 @@ pub(crate) fn of_argument(message: &str) -> String {
     if message == "invalid digit found in string" {
         return "expected a whole number".to_owned();
     }
+    // The value itself stands before this.
+    if let Some((_, expected)) = message
+        .strip_prefix("unknown variant ")
+        .and_then(|rest| rest.split_once(", "))
+    {
+        return expected.to_owned();
+    }
     let Some((_, range)) = message.split_once(" is not in ") else {
         return plain(message);
     };
@@ -124,6 +131,10 @@ mod tests {
                 "expected a whole number from 1 to 4294967295",
             ),
             ("invalid digit found in string", "expected a whole number"),
+            (
+                "unknown variant `x`, expected one of `a`, `b`",
+                "expected one of `a`, `b`",
+            ),
             (
                 "expected newtons from 1 to 2",
                 "expected newtons from 1 to 2",

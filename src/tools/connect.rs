@@ -235,6 +235,7 @@ impl Connection {
     }
 
     /// Sends a request if there is room for it now.
+    #[cfg(feature = "watch")]
     pub(super) fn try_send(&self, request: &str) {
         let line = format!("{request}\n");
         // If the daemon does not take the question, its silence shows it later.
