@@ -78,6 +78,15 @@ pub enum Error {
     Stopped(&'static str),
 }
 
+/// The sockets of a daemon that records into one file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Sockets {
+    /// None: it is a tool for one person.
+    None,
+    /// Those of `[publish.unix]`: a robot tells where its arm is.
+    Configured,
+}
+
 /// A daemon whose sockets are bound. Connections wait until it runs.
 pub struct Daemon {
     setup: Setup,
@@ -129,22 +138,29 @@ impl Daemon {
         })
     }
 
-    /// A daemon without sockets that records into `file`, which is empty and at `path`, and says in
+    /// A daemon with `sockets` that records into `file`, which is empty and at `path`, and says in
     /// `progress` what the file holds. It ends by itself if a sensor is missing at the start, or when
     /// all sensors are gone.
     ///
     /// # Errors
     ///
-    /// If there are no random numbers.
+    /// If there are no random numbers, or a socket cannot be bound.
     pub fn recording(
         mut setup: Setup,
         path: PathBuf,
         file: File,
         labels: Labels,
         progress: watch::Sender<Progress>,
+        sockets: Sockets,
     ) -> Result<Self, Error> {
         setup.config.http = None;
-        setup.config.publish = Publish::none();
+        setup.config.publish = match sockets {
+            Sockets::None => Publish::none(),
+            Sockets::Configured => Publish {
+                unix: setup.config.publish.unix,
+                ..Publish::none()
+            },
+        };
         setup.config.record = None;
         Ok(Self {
             target: Some(Target::File {

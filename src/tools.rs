@@ -1,6 +1,7 @@
 //! What stands around the daemon: a sensor to try it on, recordings played again, eyes on a terminal.
 
 pub mod args;
+pub mod calibrate;
 pub mod check;
 pub mod configuration;
 pub mod connect;

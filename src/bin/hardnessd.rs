@@ -15,7 +15,9 @@ use hardnessd::tools::args::{Args, Command};
 use hardnessd::tools::exit::{self, Failure, Stop};
 #[cfg(feature = "watch")]
 use hardnessd::tools::watch;
-use hardnessd::tools::{self, check, demo, doctor, record, recover, replay, simulate, sniff, tail};
+use hardnessd::tools::{
+    self, calibrate, check, demo, doctor, record, recover, replay, simulate, sniff, tail,
+};
 use hardnessd::trial;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::mpsc;
@@ -91,9 +93,28 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
         #[cfg(feature = "watch")]
         Command::Watch(args) => Ok(watch::run(args, signals.told()).await?),
         Command::Check(args) => finish_blocking(signals, move || check::run(&args)).await,
+        Command::Calibrate(args) => calibrate(args, signals).await,
         Command::Doctor(args) => finish_blocking(signals, move || doctor::run(&args)).await,
         Command::Sniff(args) => finish(signals, sniff::run(args)).await,
     }
+}
+
+/// Calibrates. The daemon in it ends in order at a signal, which is then a failure.
+async fn calibrate(args: calibrate::Args, signals: Signals) -> Result<(), Failure> {
+    let path = args.config.path()?;
+    let mut end = pin!(signals.end());
+    let setup = tokio::select! {
+        loaded = load(path, std::future::pending()) => loaded?,
+        stop = &mut end => return Err(Failure::Stopped(stop)),
+    };
+    let Some(setup) = setup else {
+        return Ok(());
+    };
+    let _log = Log::start(setup.config.log, "warn")?;
+    let mut stopped = None;
+    let shutdown = async { stopped = Some(end.await) };
+    calibrate::run(args, setup, shutdown).await?;
+    stopped.map_or(Ok(()), |stop| Err(Failure::Stopped(stop)))
 }
 
 /// Waits until `work` ends. A signal before its end is a failure.

@@ -5,7 +5,7 @@ use clap::{Parser, Subcommand};
 use super::configuration::Configuration;
 #[cfg(feature = "watch")]
 use super::watch;
-use super::{check, demo, doctor, record, recover, replay, simulate, sniff, tail};
+use super::{calibrate, check, demo, doctor, record, recover, replay, simulate, sniff, tail};
 
 /// Hardness events from a tactile array on a serial port
 #[derive(Debug, Parser)]
@@ -38,6 +38,8 @@ pub enum Command {
     Watch(watch::Args),
     /// Check a configuration and print what would run
     Check(check::Args),
+    /// Measure what the configuration should say of the arm
+    Calibrate(calibrate::Args),
     /// Explain why a port does not work, and what to do
     Doctor(doctor::Args),
     /// Propose a [sensor.frame] for raw bytes, as TOML on stdout

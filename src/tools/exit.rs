@@ -2,7 +2,9 @@
 
 #[cfg(feature = "watch")]
 use super::watch;
-use super::{check, configuration, demo, doctor, record, recover, replay, simulate, sniff, tail};
+use super::{
+    calibrate, check, configuration, demo, doctor, record, recover, replay, simulate, sniff, tail,
+};
 use crate::daemon;
 use crate::daemon::config::Error as ConfigError;
 use crate::daemon::publish::Error as PublishError;
@@ -75,6 +77,8 @@ pub enum Failure {
     #[error(transparent)]
     Check(#[from] check::Error),
     #[error(transparent)]
+    Calibrate(#[from] calibrate::Error),
+    #[error(transparent)]
     Doctor(#[from] doctor::Error),
     #[error(transparent)]
     Sniff(#[from] sniff::Error),
@@ -94,6 +98,7 @@ impl Failure {
             Self::Daemon(error)
             | Self::Demo(demo::Error::Daemon(error))
             | Self::Record(record::Error::Daemon(error))
+            | Self::Calibrate(calibrate::Error::Daemon(error))
             | Self::Check(check::Error::Daemon { source: error, .. }) => of_daemon(error),
 
             Self::Demo(demo::Error::Missed { .. } | demo::Error::Closed)
@@ -104,6 +109,7 @@ impl Failure {
                 | replay::Error::NoFrame { .. },
             )
             | Self::Tail(tail::Error::Timeout { .. })
+            | Self::Calibrate(calibrate::Error::Unfit(_) | calibrate::Error::Playback(_))
             | Self::Doctor(doctor::Error::Faults { .. })
             | Self::Sniff(sniff::Error::Recording { .. } | sniff::Error::Unexplained { .. }) => {
                 FAILED
@@ -111,6 +117,7 @@ impl Failure {
 
             Self::Simulate(simulate::Error::Layout(_) | simulate::Error::Baud { .. })
             | Self::Replay(replay::Error::OwnMotion { .. })
+            | Self::Calibrate(calibrate::Error::NoSensor { .. })
             | Self::Record(
                 record::Error::Level { .. }
                 | record::Error::Twice { .. }
@@ -148,6 +155,11 @@ impl Failure {
             | Self::Replay(replay::Error::Broken { .. } | replay::Error::Print(_))
             | Self::Tail(tail::Error::Print(_))
             | Self::Check(check::Error::Print(_))
+            | Self::Calibrate(
+                calibrate::Error::Temporary { .. }
+                | calibrate::Error::Recording(_)
+                | calibrate::Error::Print(_),
+            )
             | Self::Doctor(doctor::Error::Print(_))
             | Self::Sniff(sniff::Error::Print(_) | sniff::Error::Write { .. }) => IO,
 

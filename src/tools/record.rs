@@ -1,4 +1,4 @@
-//! `hardnessd record`: a daemon without sockets that writes what comes to a file.
+//! `hardnessd record`: a daemon that writes what comes to a file, without sockets unless asked for.
 //!
 //! On a terminal a line on stderr says how many presses the file holds so far. At the end a warning
 //! says if there were none. A [`session`] records one file after another.
@@ -22,7 +22,7 @@ use super::doctor;
 use super::simulate::positive;
 use crate::daemon::config::Setup;
 use crate::daemon::record::{Error as RecordError, Progress};
-use crate::daemon::{self, Daemon};
+use crate::daemon::{self, Daemon, Sockets};
 use crate::recording::{LabelError, Labels, check_label};
 use crate::verdict::Level;
 
@@ -42,6 +42,9 @@ pub struct Args {
     /// Label to store in the recording, such as level=2 or object=7; may be repeated
     #[arg(long = "label", value_name = "KEY=VALUE", value_parser = label)]
     labels: Vec<(String, String)>,
+    /// Open the sockets of [publish.unix] too, so that a robot can tell where its arm is
+    #[arg(long)]
+    sockets: bool,
     /// End after S seconds [default: at SIGINT or SIGTERM, or when no sensor is left]
     #[arg(long, value_name = "S", value_parser = positive)]
     seconds: Option<f64>,
@@ -126,13 +129,18 @@ pub async fn run(
             return Err(Error::Twice { key });
         }
     }
+    let sockets = if args.sockets {
+        Sockets::Configured
+    } else {
+        Sockets::None
+    };
     if let Some(directory) = &args.session {
         let asked = ["level", "object", "name"];
         if let Some(key) = asked.into_iter().find(|&key| labels.contains_key(key)) {
             let key = key.to_owned();
             return Err(Error::Asked { key });
         }
-        return session::run(directory, &labels, setup, pin!(shutdown)).await;
+        return session::run(directory, &labels, setup, sockets, pin!(shutdown)).await;
     }
     let path = args
         .out
@@ -155,7 +163,7 @@ pub async fn run(
         }
     };
     let recorded = tokio::select! {
-        recorded = record(setup, &path, labels, progress, end) => recorded,
+        recorded = record(setup, sockets, &path, labels, progress, end) => recorded,
         () = show(&path, &counted) => unreachable!("it goes on as long as it is waited for"),
     };
     if matches!(
@@ -185,6 +193,7 @@ pub async fn run(
 /// was not there to begin with.
 async fn record(
     setup: Setup,
+    sockets: Sockets,
     path: &Path,
     labels: Labels,
     progress: watch::Sender<Progress>,
@@ -195,7 +204,7 @@ async fn record(
         source,
     })?;
     let ports: BTreeMap<String, PathBuf> = setup.config.sensors.iter().map(port_of).collect();
-    let daemon = Daemon::recording(setup, path.to_owned(), file, labels, progress)?;
+    let daemon = Daemon::recording(setup, path.to_owned(), file, labels, progress, sockets)?;
     match daemon.run(end, None).await {
         Err(daemon::Error::Record(RecordError::Unavailable { sensor, reason })) => {
             // It holds nothing, and the next try shall find its place free.

@@ -13,6 +13,7 @@ use std::time::Duration;
 use tokio::sync::{mpsc, watch};
 
 use super::{Error, check_level, levels, record, said};
+use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::record::Progress;
 use crate::recording::{LabelError, Labels, check_label};
@@ -117,6 +118,7 @@ pub(super) async fn run(
     directory: &Path,
     labels: &Labels,
     setup: Setup,
+    sockets: Sockets,
     shutdown: Pin<&mut dyn Future<Output = ()>>,
 ) -> Result<(), Error> {
     if !(io::stdin().is_terminal() && io::stderr().is_terminal()) {
@@ -127,7 +129,11 @@ pub(super) async fn run(
     let mut user = User::at_terminal(shutdown);
     say("One recording for each object. `q` ends the session.\n");
     while let Some(object) = ask_for_object(&mut user, list.next, &setup).await {
-        if !record_object(&mut user, &object, directory, labels, &setup, &mut list).await? {
+        if !record_object(
+            &mut user, &object, directory, labels, &setup, sockets, &mut list,
+        )
+        .await?
+        {
             break;
         }
     }
@@ -172,6 +178,7 @@ async fn record_object(
     directory: &Path,
     labels: &Labels,
     setup: &Setup,
+    sockets: Sockets,
     list: &mut List,
 ) -> Result<bool, Error> {
     let file = format!("{:03}-{}.mcap", object.number, slug(&object.name));
@@ -195,7 +202,7 @@ async fn record_object(
             let end = async {
                 next = wait_for_user(user, &mut counted, tare_frames).await;
             };
-            record(setup.clone(), &path, labels.clone(), progress, end).await
+            record(setup.clone(), sockets, &path, labels.clone(), progress, end).await
         };
         let presses = counted.borrow().presses;
         if presses == 0 || matches!(next, Next::Redo) {

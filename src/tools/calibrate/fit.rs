@@ -1,0 +1,366 @@
+//! From presses on something rigid to the arm's stiffness and the delay of its stamps.
+//!
+//! The way of the arm is a curve over force: mostly a line, whose slope is what gives way behind the
+//! sensor's face; a little bent, because the sensor's cover stiffens. With the right delay the arm
+//! goes back on the curve that it came on. With another delay there is a loop.
+
+use std::time::Duration;
+
+use crate::motion::Track;
+
+/// One press.
+pub(super) struct Press {
+    /// Of its frames in contact.
+    pub(super) moments: Vec<Duration>,
+    /// Total force in each.
+    pub(super) forces_n: Vec<f64>,
+    /// Where the arm was.
+    pub(super) track: Track,
+}
+
+/// A value, and the least and greatest of the presses one by one.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Spread {
+    pub(super) value: f64,
+    pub(super) least: f64,
+    pub(super) most: f64,
+}
+
+/// What presses say.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Fit {
+    /// How many there were.
+    pub(super) presses: usize,
+    /// Least and greatest of their greatest forces.
+    pub(super) force_n: [f64; 2],
+    pub(super) n_per_mm: Spread,
+    pub(super) delay_ms: Spread,
+    /// Root mean square of the distance from the curve.
+    pub(super) residual_mm: f64,
+}
+
+/// Why presses say nothing.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Unfit {
+    /// Positions are missing.
+    #[error(
+        "only {known} of {presses} presses have positions of the arm from before their begin until \
+         after their end: does the robot send them to the control socket of this configuration?"
+    )]
+    Unknown {
+        /// With positions.
+        known: usize,
+        /// All.
+        presses: usize,
+    },
+    /// Too few frames.
+    #[error(
+        "only {found} frames with a fair force in {presses} presses: press more slowly, harder or \
+         more often"
+    )]
+    Few {
+        /// Frames.
+        found: usize,
+        /// Presses.
+        presses: usize,
+    },
+    /// The force does not grow with the way.
+    #[error(
+        "the force does not grow with the way of the arm: do positions grow towards the object?"
+    )]
+    Falling,
+    /// All delays fit alike.
+    #[error(
+        "the delay cannot be told: the arm went {moved_mm:.2} mm while the sensor was pressed. Press \
+         deeper, and keep the arm moving"
+    )]
+    NoDelay {
+        /// The way of the arm.
+        moved_mm: f64,
+    },
+}
+
+/// Delays that are tried.
+const DELAYS_MS: (f64, f64) = (-300.0, 600.0);
+/// First and second step between them.
+const STEPS_MS: [f64; 2] = [10.0, 0.5];
+/// Frames with a smaller share of a press's greatest force tell of the cover alone.
+const FAIR_SHARE: f64 = 0.2;
+/// The slope is that of frames with at least this share.
+const STEEP_SHARE: f64 = 0.5;
+/// Fewer frames than this cannot say four numbers and a spread.
+const LEAST_FRAMES: usize = 8;
+/// At a delay this far from the best one, the distance from the curve must have grown by this part.
+const WRONG_MS: f64 = 150.0;
+const GROWN: f64 = 1.3;
+
+impl Press {
+    /// Way and force of its frames with at least `share` of its greatest force, if positions are known
+    /// at all of its frames.
+    fn points(&self, delay_ms: f64, share: f64) -> Option<Vec<(f64, f64)>> {
+        let begin = *self.moments.first()?;
+        let way = self.track.approach(begin, &self.moments, delay_ms)?;
+        let enough = share * self.force_n();
+        let known = way.into_iter().collect::<Option<Vec<f64>>>()?;
+        let points = known.into_iter().zip(self.forces_n.iter().copied());
+        Some(points.filter(|&(_, force)| force >= enough).collect())
+    }
+
+    fn force_n(&self) -> f64 {
+        self.forces_n.iter().copied().fold(0.0, f64::max)
+    }
+
+    fn is_known(&self) -> bool {
+        [DELAYS_MS.0, DELAYS_MS.1]
+            .into_iter()
+            .all(|delay_ms| self.points(delay_ms, 0.0).is_some())
+    }
+}
+
+impl Fit {
+    /// What `presses` say.
+    pub(super) fn of(presses: &[Press]) -> Result<Self, Unfit> {
+        let known: Vec<&Press> = presses.iter().filter(|press| press.is_known()).collect();
+        if known.len() < 2 {
+            return Err(Unfit::Unknown {
+                known: known.len(),
+                presses: presses.len(),
+            });
+        }
+        let fair = |press: &&Press| {
+            press
+                .points(0.0, FAIR_SHARE)
+                .map_or(0, |points| points.len())
+        };
+        let found = known.iter().map(fair).sum();
+        if found < LEAST_FRAMES {
+            return Err(Unfit::Few {
+                found,
+                presses: known.len(),
+            });
+        }
+        let (delay_ms, residual_mm) = best_delay(&known);
+        let wrong = [delay_ms - WRONG_MS, delay_ms + WRONG_MS]
+            .into_iter()
+            .filter_map(|delay_ms| residual_mm_at(&known, delay_ms))
+            .fold(f64::INFINITY, f64::min);
+        if wrong <= GROWN * residual_mm {
+            let way = known
+                .iter()
+                .filter_map(|press| press.points(delay_ms, 0.0))
+                .flatten();
+            let moved_mm = way.map(|(mm, _)| mm).fold(0.0, f64::max);
+            return Err(Unfit::NoDelay { moved_mm });
+        }
+        let n_per_mm = slope(&known, delay_ms).ok_or(Unfit::Falling)?;
+        let one = |press: &&Press| {
+            let alone = [*press];
+            let is_enough = fair(press) >= LEAST_FRAMES;
+            let delay_ms = if is_enough {
+                best_delay(&alone).0
+            } else {
+                delay_ms
+            };
+            (delay_ms, slope(&alone, delay_ms).unwrap_or(n_per_mm))
+        };
+        let alone: Vec<(f64, f64)> = known.iter().map(one).collect();
+        let spread = |value, of: fn(&(f64, f64)) -> f64| Spread {
+            value,
+            least: alone.iter().map(of).fold(f64::INFINITY, f64::min),
+            most: alone.iter().map(of).fold(f64::NEG_INFINITY, f64::max),
+        };
+        let forces = known.iter().map(|press| press.force_n());
+        Ok(Self {
+            presses: known.len(),
+            force_n: [
+                forces.clone().fold(f64::INFINITY, f64::min),
+                forces.fold(0.0, f64::max),
+            ],
+            n_per_mm: spread(n_per_mm, |one| one.1),
+            delay_ms: spread(delay_ms, |one| one.0),
+            residual_mm,
+        })
+    }
+}
+
+/// The delay with which the presses are nearest to one curve, and how near.
+fn best_delay(presses: &[&Press]) -> (f64, f64) {
+    let mut best = (0.0, f64::INFINITY);
+    let (mut from, mut to) = DELAYS_MS;
+    for step in STEPS_MS {
+        for count in 0..=((to - from) / step).round() as u32 {
+            let delay_ms = from + f64::from(count) * step;
+            if let Some(residual) = residual_mm_at(presses, delay_ms)
+                && residual < best.1
+            {
+                best = (delay_ms, residual);
+            }
+        }
+        (from, to) = (best.0 - step, best.0 + step);
+    }
+    best
+}
+
+/// Root mean square distance of the way from a + b force + c force^2, each press with an a of its own.
+fn residual_mm_at(presses: &[&Press], delay_ms: f64) -> Option<f64> {
+    // Sums over all frames, of differences from the press's means.
+    let [mut ff, mut fq, mut qq, mut fx, mut qx, mut xx] = [0.0; 6];
+    let mut count = 0.0;
+    for press in presses {
+        let points = press.points(delay_ms, FAIR_SHARE)?;
+        let own = points.len() as f64;
+        let mean = |of: fn(&(f64, f64)) -> f64| points.iter().map(of).sum::<f64>() / own;
+        let (x, f, q) = (mean(|p| p.0), mean(|p| p.1), mean(|p| p.1 * p.1));
+        for (way, force) in &points {
+            let (x, f, q) = (way - x, force - f, force * force - q);
+            ff += f * f;
+            fq += f * q;
+            qq += q * q;
+            fx += f * x;
+            qx += q * x;
+            xx += x * x;
+        }
+        count += own;
+    }
+    let determinant = ff * qq - fq * fq;
+    // All forces alike, or two of them: the line alone.
+    let explained = if determinant > 1e-9 * ff * qq {
+        let (b, c) = (
+            (fx * qq - qx * fq) / determinant,
+            (qx * ff - fx * fq) / determinant,
+        );
+        b * fx + c * qx
+    } else if ff > 0.0 {
+        fx * fx / ff
+    } else {
+        0.0
+    };
+    Some(((xx - explained).max(0.0) / count).sqrt())
+}
+
+/// The slope of force over way, in N/mm; each press has a zero of its own.
+fn slope(presses: &[&Press], delay_ms: f64) -> Option<f64> {
+    let (mut ff, mut fx) = (0.0, 0.0);
+    for press in presses {
+        let points = press.points(delay_ms, STEEP_SHARE)?;
+        let own = points.len() as f64;
+        let mean = |of: fn(&(f64, f64)) -> f64| points.iter().map(of).sum::<f64>() / own;
+        let (x, f) = (mean(|p| p.0), mean(|p| p.1));
+        for (way, force) in &points {
+            ff += (force - f) * (force - f);
+            fx += (force - f) * (way - x);
+        }
+    }
+    (fx > 0.0 && ff > 0.0).then(|| ff / fx)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::motion::Point;
+
+    /// A press of an arm of `n_per_mm` at 5 mm/s, to `depth_mm` and back, held for 0.4 s, whose stamps
+    /// are `delay_ms` early; frames at `hz`, positions at 100 Hz.
+    fn press(n_per_mm: f64, delay_ms: f64, depth_mm: f64, hz: f64) -> Press {
+        let way = |time_s: f64| {
+            let load_s = depth_mm / 5.0;
+            let gone = 5.0 * (time_s - load_s - 0.4);
+            (5.0 * time_s).min(depth_mm).min(depth_mm - gone)
+        };
+        // The cover gives way by 0.1 mm at 4 N, and by twice as much at 16 N.
+        let force = |mm: f64| {
+            let (mut low, mut high) = (0.0, 100.0);
+            for _ in 0..60 {
+                let middle: f64 = 0.5 * (low + high);
+                let needs = middle / n_per_mm + 0.05 * middle.sqrt();
+                if needs < mm {
+                    low = middle
+                } else {
+                    high = middle
+                }
+            }
+            low
+        };
+        let start_s = 10.0;
+        let mut track = Track::default();
+        for step in -100..400 {
+            let time_s = f64::from(step) / 100.0;
+            let at_ns = ((start_s + time_s - delay_ms / 1e3) * 1e9) as i64;
+            track
+                .push(&[Point {
+                    at_ns,
+                    mm: 7.0 + way(time_s),
+                }])
+                .unwrap();
+        }
+        let frames = (0..400).map(|n| (f64::from(n) + 0.3) / hz);
+        let pressed = frames.take_while(|&time_s| way(time_s) > 0.0);
+        let (moments, forces_n) = pressed
+            .map(|time_s| {
+                (
+                    Duration::from_secs_f64(start_s + time_s),
+                    force(way(time_s)),
+                )
+            })
+            .unzip();
+        Press {
+            moments,
+            forces_n,
+            track,
+        }
+    }
+
+    #[test]
+    fn stiffness_and_delay_are_found_at_any_rate() {
+        for (n_per_mm, delay_ms, hz) in [
+            (10.0, 68.6, 20.0),
+            (3.0, 0.0, 100.0),
+            (30.0, -40.0, 50.0),
+            (8.0, 220.0, 5.0),
+        ] {
+            let presses =
+                [1.0, 1.7, 2.4, 2.0].map(|mm| press(n_per_mm, delay_ms, mm * 10.0 / n_per_mm, hz));
+            let fit = Fit::of(&presses).unwrap();
+            assert_eq!(fit.presses, 4);
+            assert!((fit.delay_ms.value - delay_ms).abs() < 5.0, "{fit:?}");
+            // What the cover gives way at half of 24 N counts too.
+            let ratio = fit.n_per_mm.value / n_per_mm;
+            assert!((0.75..1.01).contains(&ratio), "{fit:?}");
+            assert!(
+                fit.n_per_mm.least <= fit.n_per_mm.value && fit.n_per_mm.value <= fit.n_per_mm.most
+            );
+            assert!(fit.residual_mm < 0.02, "{fit:?}");
+        }
+    }
+
+    #[test]
+    fn presses_that_say_nothing_are_told_why() {
+        let good = || press(10.0, 50.0, 2.0, 20.0);
+        let mut mute = good();
+        mute.track = Track::default();
+        let unknown = Unfit::Unknown {
+            known: 1,
+            presses: 2,
+        };
+        assert_eq!(Fit::of(&[good(), mute]), Err(unknown));
+        let mut short = [good(), good()];
+        for press in &mut short {
+            press.moments.truncate(3);
+            press.forces_n.truncate(3);
+        }
+        assert!(matches!(
+            Fit::of(&short),
+            Err(Unfit::Few { presses: 2, .. })
+        ));
+        // The arm stands while the force comes and goes.
+        let mut still = [good(), good()];
+        for press in &mut still {
+            press.track = Track::default();
+            for step in 0..1000 {
+                let at_ns = 8_000_000_000 + step * 10_000_000;
+                press.track.push(&[Point { at_ns, mm: 1.0 }]).unwrap();
+            }
+        }
+        assert_eq!(Fit::of(&still), Err(Unfit::NoDelay { moved_mm: 0.0 }));
+    }
+}

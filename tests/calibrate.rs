@@ -1,0 +1,96 @@
+//! `hardnessd calibrate` on a simulated arm that presses wood, over a real pty and a real socket.
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy knows no helper of a test as a test"
+)]
+
+mod bench;
+
+use std::fs;
+use std::process::{Command, Stdio};
+
+use bench::{Bench, Process, by_terminal, hardnessd};
+use rustix::process::Signal;
+
+fn calibrate(bench: &Bench, more: &[&str]) -> Command {
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let mut command = by_terminal();
+    command
+        .args(["calibrate", "arm", "--config"])
+        .arg(config)
+        .args(more);
+    command.stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+/// The number after `key = ` in a configuration.
+fn value(text: &str, key: &str) -> f64 {
+    let line = text
+        .lines()
+        .find_map(|line| line.strip_prefix(key)?.strip_prefix(" = "));
+    line.unwrap_or_else(|| panic!("no {key} in {text}"))
+        .parse()
+        .unwrap()
+}
+
+#[test]
+fn presses_on_wood_say_the_arms_stiffness_and_delay() {
+    let bench = Bench::new();
+    let control = bench.path("control.sock");
+    let control = control.to_str().unwrap();
+    // The first press of the bench's sensor is of hard plastic.
+    let more = ["--material", "wood", "--motion", control];
+    let _sensor = bench.sensor(&more);
+    let output = calibrate(&bench, &["--presses", "4"]).output().unwrap();
+    assert!(output.status.success(), "{output:?}");
+    let text = String::from_utf8(output.stdout).unwrap();
+    // The simulated arm has 10 N/mm; the cover in series, and the sensor's own scale, make it less or
+    // a little more.
+    let n_per_mm = value(&text, "stiffness_n_per_mm");
+    assert!((8.0..11.0).contains(&n_per_mm), "{text}");
+    // A frame takes 34.3 ms at 230,400 baud. A busy machine adds some.
+    let delay_ms = value(&text, "delay_ms");
+    assert!((15.0..90.0).contains(&delay_ms), "{text}");
+    // What it prints is a configuration.
+    let lines = text
+        .split_once("\n\n")
+        .unwrap()
+        .1
+        .replace("[sensor.arm]", "[sensor.arm] # measured");
+    let config = format!("[[sensor]]\nport = \"port\"\n{lines}");
+    let path = bench.path("calibrated.toml");
+    fs::write(&path, config).unwrap();
+    let checked = hardnessd(&["check", "--config", path.to_str().unwrap()]);
+    assert!(checked.status.success(), "{checked:?}");
+}
+
+#[test]
+fn without_positions_there_are_no_values() {
+    let bench = Bench::new();
+    let _sensor = bench.sensor(&[]);
+    let output = calibrate(&bench, &["--presses", "2"]).output().unwrap();
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let errors = String::from_utf8(output.stderr).unwrap();
+    assert!(
+        errors.contains("only 0 of 2 presses have positions"),
+        "{errors}"
+    );
+    assert!(output.stdout.is_empty());
+
+    let output = calibrate(&bench, &["--sensor", "foot"]).output().unwrap();
+    assert_eq!(output.status.code(), Some(2), "{output:?}");
+    let output = calibrate(&bench, &["--presses", "1"]).output().unwrap();
+    assert_eq!(output.status.code(), Some(2), "{output:?}");
+}
+
+#[test]
+fn a_signal_ends_it_and_its_sockets() {
+    let bench = Bench::new();
+    let _sensor = bench.sensor(&[]);
+    let mut process = Process(calibrate(&bench, &[]).spawn().unwrap());
+    let socket = bench.path("control.sock");
+    bench::wait_for("the socket", || socket.exists());
+    process.signal(Signal::INT);
+    assert_eq!(process.exit_code(), Some(130));
+    assert!(!socket.exists());
+}
