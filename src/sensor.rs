@@ -328,6 +328,10 @@ mod tests {
             },
             dead,
         );
+        check(
+            &|d| d.calibration.exponent = 5.0,
+            "calibration.exponent: found 5.0, expected 0.25 to 4",
+        );
         check(&|d| d.press.end_frames = 0, "press.end_frames: found 0");
         for (change, found) in [
             (

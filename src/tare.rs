@@ -9,7 +9,7 @@ mod settings;
 use serde::{Deserialize, Serialize};
 
 use self::settings::MOST_TARE_FRAMES;
-pub use self::settings::{NEWTONS_PER_COUNT, PITCH_MM, Settings, SettingsError};
+pub use self::settings::{EXPONENTS, NEWTONS_PER_COUNT, PITCH_MM, Settings, SettingsError};
 use crate::frame::{Array, COLS, Frame, ROWS, RawFrame, TAXELS, taxels};
 
 /// When a frame counts as touched while a tare is taken.
@@ -109,7 +109,7 @@ pub enum Aim {
 /// ```
 #[derive(Debug, Clone)]
 pub struct Tare {
-    newtons_per_count: f32,
+    scale: Scale,
     /// Frames of a tare.
     frames: u32,
     /// `[ROWS, COLS]` in counts; zeros until a tare is taken.
@@ -120,6 +120,33 @@ pub struct Tare {
     array: Array,
     /// Each dead taxel's place and those of its live neighbours.
     dead: Vec<(usize, Vec<usize>)>,
+}
+
+/// From counts to newtons.
+#[derive(Debug, Clone, Copy)]
+struct Scale {
+    newtons_per_count: f32,
+    exponent: f32,
+}
+
+impl Scale {
+    fn new(settings: &Settings) -> Self {
+        Self {
+            newtons_per_count: settings.newtons_per_count,
+            exponent: settings.exponent,
+        }
+    }
+
+    fn newtons(self, counts: f32) -> f32 {
+        let counts = counts.max(0.0);
+        // A line gives the very same bits as before there was an exponent.
+        let raised = if self.exponent == 1.0 {
+            counts
+        } else {
+            counts.powf(self.exponent)
+        };
+        raised * self.newtons_per_count
+    }
 }
 
 /// How far a tare is.
@@ -210,7 +237,7 @@ impl Tare {
     pub fn new(settings: &Settings, array: Array, contact: Contact) -> Self {
         let first = Aim::First { met_contact: false };
         Self {
-            newtons_per_count: settings.newtons_per_count,
+            scale: Scale::new(settings),
             frames: settings.tare_frames,
             baseline: Box::new([0.0; TAXELS]),
             stage: Stage::begin(first, settings.tare_frames),
@@ -232,7 +259,7 @@ impl Tare {
             Stage::Taking { aim, .. } if frames != self.frames => Stage::begin(aim, frames),
             stage => stage,
         };
-        self.newtons_per_count = settings.newtons_per_count;
+        self.scale = Scale::new(settings);
         self.frames = frames;
         self.max_n = settings.tare_max_n;
         self.contact = contact;
@@ -310,13 +337,13 @@ impl Tare {
         }
     }
 
-    /// Counts to newtons: `max(0, counts - baseline) x newtons_per_count`, dead taxels replaced
-    /// by the mean of their live neighbours.
+    /// Counts to newtons: `newtons_per_count x max(0, counts - baseline)^exponent`, dead taxels
+    /// replaced by the mean of their live neighbours.
     pub fn apply(&self, raw: &RawFrame) -> Frame {
         let mut frame = Frame::default();
         for (place, newtons) in frame.newtons.iter_mut().enumerate() {
             let counts = f32::from(raw.counts[place]) - self.baseline[place];
-            *newtons = counts.max(0.0) * self.newtons_per_count;
+            *newtons = self.scale.newtons(counts);
         }
         for (place, neighbours) in &self.dead {
             let sum: f32 = neighbours
@@ -374,11 +401,11 @@ impl Tare {
         let median = sorted.get(sorted.len() / 2).copied().unwrap_or(0.0);
         let varying = live.iter().filter(|&&place| {
             let spread = f32::from(sums.most[place] - sums.least[place]);
-            spread * self.newtons_per_count >= self.contact.threshold_n
+            self.scale.newtons(spread) >= self.contact.threshold_n
         });
         let high = live
             .iter()
-            .filter(|&&place| (mean[place] - median) * self.newtons_per_count > self.max_n);
+            .filter(|&&place| self.scale.newtons(mean[place] - median) > self.max_n);
         let limit = self.contact.area_taxels as usize;
         varying.count() >= limit || high.count() >= limit
     }

@@ -15,8 +15,13 @@ use rustix::process::Signal;
 fn calibrate(bench: &Bench, more: &[&str]) -> Command {
     let config = bench.configure("hardnessd.toml", "events.sock", "");
     let mut command = by_terminal();
+    let what = if more.contains(&"--newtons") {
+        "force"
+    } else {
+        "arm"
+    };
     command
-        .args(["calibrate", "arm", "--config"])
+        .args(["calibrate", what, "--config"])
         .arg(config)
         .args(more);
     command.stdout(Stdio::piped()).stderr(Stdio::piped());
@@ -93,4 +98,37 @@ fn a_signal_ends_it_and_its_sockets() {
     process.signal(Signal::INT);
     assert_eq!(process.exit_code(), Some(130));
     assert!(!socket.exists());
+}
+
+#[test]
+fn known_weights_say_the_newtons_of_a_count() {
+    let bench = Bench::new();
+    // Slowly, so that the first press comes when a busy machine has taken the tare.
+    let _sensor = bench.sensor(&["--force", "5", "--force", "20", "--speed", "0.5"]);
+    let output = calibrate(&bench, &["--newtons", "15", "5", "20"])
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{output:?}");
+    let text = String::from_utf8(output.stdout).unwrap();
+    // The simulated film has 0.04 N a count, and each sensor a scale of its own.
+    let newtons_per_count = value(&text, "newtons_per_count");
+    assert!((0.034..0.046).contains(&newtons_per_count), "{text}");
+    assert_eq!(value(&text, "exponent"), 1.0, "{text}");
+    for weight in ["15.000 N", "5.000 N", "20.000 N"] {
+        assert!(text.contains(weight), "{text}");
+    }
+    let asked = String::from_utf8(output.stderr).unwrap();
+    assert!(
+        asked.contains("put 5 N on the sensor, wait until it rests"),
+        "{asked}"
+    );
+
+    let output = calibrate(&bench, &["--newtons", "0"]).output().unwrap();
+    assert_eq!(output.status.code(), Some(2), "{output:?}");
+    let path = bench.path("hardnessd.toml");
+    let of_arm = ["calibrate", "arm", "--newtons", "5", "--config"];
+    let of_arm = hardnessd(&[&of_arm[..], &[path.to_str().unwrap()]].concat());
+    assert_eq!(of_arm.status.code(), Some(2), "{of_arm:?}");
+    let without = hardnessd(&["calibrate", "force"]);
+    assert_eq!(without.status.code(), Some(2), "{without:?}");
 }

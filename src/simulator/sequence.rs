@@ -26,8 +26,8 @@ pub struct SequenceSettings {
     pub frame_rate_hz: f64,
     /// Press k is of `materials[(k - 1) % n]`, each time another object.
     pub materials: Vec<Material>,
-    /// Greatest force of every press; `None`: drawn from 5 to 25 N.
-    pub force_n: Option<f32>,
+    /// Greatest forces of the presses, in turn; where there are none, they are drawn from 5 to 25 N.
+    pub forces_n: Vec<f32>,
     /// Presses to make; `None`: without end.
     pub presses: Option<u32>,
     /// Distribution of shapes.
@@ -43,7 +43,7 @@ impl Default for SequenceSettings {
             seed: 0,
             frame_rate_hz: 5.0,
             materials: Material::ALL[4..].to_vec(),
-            force_n: None,
+            forces_n: Vec::new(),
             presses: None,
             shapes: Shapes::Matched,
             profile: SensorProfile::Clean,
@@ -173,7 +173,8 @@ impl Sequence {
         let material = self.settings.materials[self.made as usize % self.settings.materials.len()];
         self.made += 1;
         let drawn = draws.range(5.0, HIGHEST_FORCE_N);
-        let mut force_n = self.settings.force_n.map_or(drawn, f64::from);
+        let in_turn = (self.made as usize - 1).checked_rem(self.settings.forces_n.len());
+        let mut force_n = in_turn.map_or(drawn, |place| self.settings.forces_n[place].into());
         let object = Object::draw(self.settings.shapes, material.level(), &mut draws.child(0));
         let face = object.face(draws.below(POSTURES));
         let body = Body::named(material, &mut draws.child(3));
@@ -357,7 +358,7 @@ mod tests {
         check(&SequenceSettings {
             seed: 4,
             materials: vec![Material::Sponge, Material::Wood, Material::YogaMat],
-            force_n: Some(0.3),
+            forces_n: vec![0.3],
             presses: Some(3),
             ..SequenceSettings::default()
         });
@@ -416,15 +417,15 @@ mod tests {
     fn a_tracker_sees_every_one_of_many_presses_once() {
         for seed in 0..6 {
             for frame_rate_hz in [5.0, 100.0] {
-                for (force_n, profile, shapes) in [
-                    (None, SensorProfile::Clean, Shapes::Matched),
-                    (Some(1.0), SensorProfile::Raw, Shapes::Paper),
+                for (forces_n, profile, shapes) in [
+                    (vec![], SensorProfile::Clean, Shapes::Matched),
+                    (vec![1.0], SensorProfile::Raw, Shapes::Paper),
                 ] {
                     check(&SequenceSettings {
                         seed,
                         frame_rate_hz,
                         materials: Material::ALL.to_vec(),
-                        force_n,
+                        forces_n,
                         presses: Some(40),
                         shapes,
                         profile,

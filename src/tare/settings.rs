@@ -17,6 +17,8 @@ pub const PITCH_MM: f64 = 3.5;
 pub struct Settings {
     /// Force of one count.
     pub newtons_per_count: f32,
+    /// Force grows with this power of the counts.
+    pub exponent: f32,
     /// Distance of taxel centres.
     pub pitch_mm: f64,
     /// Frames averaged at start; 0: no tare.
@@ -43,6 +45,7 @@ impl Default for Settings {
     fn default() -> Self {
         Self {
             newtons_per_count: NEWTONS_PER_COUNT,
+            exponent: 1.0,
             pitch_mm: PITCH_MM,
             tare_frames: 5,
             tare_max_n: 0.5,
@@ -63,6 +66,12 @@ pub enum SettingsError {
         found: f64,
         /// Largest allowed.
         max: f64,
+    },
+    /// A power that no film has.
+    #[error("exponent: found {found:?}, expected {least} to {most}", least = EXPONENTS.0, most = EXPONENTS.1)]
+    Exponent {
+        /// The value that was given.
+        found: f64,
     },
     /// More frames than a sum of counts can hold.
     #[error("tare_frames: found {found}, expected 0 to {max}")]
@@ -92,6 +101,8 @@ pub enum SettingsError {
 /// JX255N is 0.04 N, its taxels are 3.5 mm apart, and 1 MN rests on no taxel.
 const MOST_NEWTONS_PER_COUNT: f64 = 1e3;
 const MOST_PITCH_MM: f64 = 1e3;
+/// Least and greatest power. 65535 counts to the power of 4 are 1.8e19, which a frame's sum still holds.
+pub const EXPONENTS: (f64, f64) = (0.25, 4.0);
 const MOST_TARE_N: f64 = 1e6;
 
 /// 65535 counts x 65536 frames stay below 2^32.
@@ -103,7 +114,7 @@ impl Settings {
     /// # Errors
     ///
     /// If `newtons_per_count`, `pitch_mm` or `tare_max_n` is not above 0 or is beyond any film,
-    /// `tare_frames` is above 65,536, or a dead taxel lies outside `array`.
+    /// `exponent` is out of its range, `tare_frames` is above 65,536, or a dead taxel lies outside `array`.
     pub fn check(&self, array: Array) -> Result<(), SettingsError> {
         for (key, found, max) in [
             (
@@ -117,6 +128,10 @@ impl Settings {
             if !(found > 0.0 && found <= max) {
                 return Err(SettingsError::NotPositive { key, found, max });
             }
+        }
+        let exponent = as_written(self.exponent);
+        if !(EXPONENTS.0..=EXPONENTS.1).contains(&exponent) {
+            return Err(SettingsError::Exponent { found: exponent });
         }
         if self.tare_frames > MOST_TARE_FRAMES {
             return Err(SettingsError::TareFrames {

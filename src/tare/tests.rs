@@ -23,6 +23,32 @@ fn settings(dead_taxels: &[[usize; 2]]) -> Settings {
 }
 
 #[test]
+fn force_grows_with_a_power_of_the_counts() {
+    let newtons = |exponent, counts: u16| {
+        let settings = Settings {
+            exponent,
+            tare_frames: 1,
+            ..Settings::default()
+        };
+        let contact = Contact {
+            threshold_n: 0.07,
+            area_taxels: 3,
+        };
+        let mut tare = Tare::new(&settings, Array::FULL, contact);
+        let mut raw = RawFrame {
+            counts: [2; TAXELS],
+        };
+        tare.observe(&raw);
+        raw.counts[7] = counts;
+        tare.apply(&raw).newtons[7]
+    };
+    assert_eq!(newtons(1.0, 27), 1.0);
+    assert!((newtons(2.0, 27) - 25.0).abs() < 1e-4);
+    assert!((newtons(0.5, 27) - 0.2).abs() < 1e-6);
+    assert_eq!((newtons(0.5, 2), newtons(0.5, 0)), (0.0, 0.0));
+}
+
+#[test]
 fn baseline_is_the_mean_and_frames_before_it_are_untared() {
     let mut tare = Tare::new(&settings(&[]), Array::FULL, CONTACT);
     for count in [2, 3, 2, 3] {

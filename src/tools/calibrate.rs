@@ -4,7 +4,8 @@
 //! as it always does. Afterwards the recording is read, and stdout gets the values, their spread and the
 //! lines for the configuration.
 
-mod fit;
+mod arm;
+mod force;
 mod gather;
 
 use std::fs::{self, File};
@@ -17,9 +18,9 @@ use std::time::Duration;
 use clap::{Args as ClapArgs, ValueEnum};
 use tokio::sync::watch;
 
-use self::fit::{Fit, Unfit};
 use self::gather::Gathered;
 use super::configuration::Configuration;
+use super::simulate::{OutOfRange, within};
 use crate::daemon::config::Setup;
 use crate::daemon::record::Progress;
 use crate::daemon::{self, Daemon, Sockets};
@@ -28,7 +29,8 @@ use crate::recording::{Labels, PlaybackError};
 /// Arguments of `calibrate`.
 #[derive(Debug, Clone, ClapArgs)]
 pub struct Args {
-    /// What to calibrate. arm: press something rigid a few times, while the robot tells where its arm is
+    /// arm: press something rigid a few times, while the robot tells where its arm is. force: put known
+    /// weights on the sensor
     what: What,
     #[expect(missing_docs, reason = "a comment would be taken for help")]
     #[command(flatten)]
@@ -36,7 +38,10 @@ pub struct Args {
     /// Sensor to calibrate [default: the first]
     #[arg(long, value_name = "NAME")]
     sensor: Option<String>,
-    /// Presses to make, 2 to 1000
+    /// force: the weights, in newtons, in the order in which they are put on (1 kg is 9.81 N)
+    #[arg(long, value_name = "N", num_args = 1.., required_if_eq("what", "force"), value_parser = newtons)]
+    newtons: Vec<f64>,
+    /// arm: presses to make, 2 to 1000
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u64).range(2..=1000))]
     presses: u64,
 }
@@ -46,6 +51,8 @@ pub struct Args {
 pub enum What {
     /// Stiffness of the arm, and the delay of its stamps.
     Arm,
+    /// Newtons of a count.
+    Force,
 }
 
 /// Why there are no values.
@@ -59,6 +66,9 @@ pub enum Error {
         /// Those of the configuration.
         names: Vec<String>,
     },
+    /// Weights for the arm.
+    #[error("--newtons: found weights, expected none: they are for `calibrate force`")]
+    Unasked,
     /// The daemon cannot serve, or has stopped.
     #[error(transparent)]
     Daemon(#[from] daemon::Error),
@@ -78,7 +88,18 @@ pub enum Error {
     Playback(#[from] PlaybackError),
     /// The presses do not say it.
     #[error(transparent)]
-    Unfit(#[from] Unfit),
+    Arm(#[from] arm::Unfit),
+    /// The weights do not say it.
+    #[error(transparent)]
+    Force(#[from] force::Unfit),
+    /// Presses were made that are no presses of a weight.
+    #[error("found {found} presses, expected {expected}: put each weight on once")]
+    Count {
+        /// As recorded.
+        found: usize,
+        /// Weights.
+        expected: usize,
+    },
     /// Stdout fails.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
@@ -98,8 +119,13 @@ pub async fn run(
     setup: Setup,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
-    let What::Arm = args.what;
+    if matches!(args.what, What::Arm) && !args.newtons.is_empty() {
+        return Err(Error::Unasked);
+    }
     let sensor = chosen(&args, &setup)?;
+    let described = setup.sensors.iter().find(|known| known.name() == sensor);
+    let calibration = described.map(|known| known.description().calibration.clone());
+    let calibration = calibration.unwrap_or_default();
     let hrn = setup.hrn.clone();
     let path =
         std::env::temp_dir().join(format!("hardnessd-calibrate-{}.mcap", std::process::id()));
@@ -121,17 +147,18 @@ pub async fn run(
     let labels = Labels::new();
     let sockets = Sockets::Configured;
     let daemon = Daemon::recording(setup, path.clone(), file, labels, progress, sockets)?;
-    eprintln!(
-        "press something rigid {} times, while the robot tells where its arm is",
-        args.presses
-    );
+    let wanted = match args.what {
+        What::Arm => args.presses,
+        What::Force => args.newtons.len() as u64,
+    };
+    say_next(&args, 0);
     let enough = async {
         let mut seen = 0;
-        while seen < args.presses && counted.changed().await.is_ok() {
+        while seen < wanted && counted.changed().await.is_ok() {
             let presses = counted.borrow_and_update().presses;
             if presses > seen {
                 seen = presses;
-                eprintln!("press {seen} of {}", args.presses);
+                say_next(&args, seen);
             }
         }
         tokio::time::sleep(LAST_POSITIONS).await;
@@ -150,8 +177,17 @@ pub async fn run(
     }
     recorded.seek(SeekFrom::Start(0)).map_err(temporary)?;
     let gathered = Gathered::read(recorded, &sensor, hrn)?;
-    let fit = Fit::of(&gathered.presses)?;
-    let text = described(&fit);
+    let text = match args.what {
+        What::Arm => of_arm(&arm::Fit::of(&gathered.presses)?),
+        What::Force => {
+            let (found, expected) = (gathered.presses.len(), args.newtons.len());
+            if found != expected {
+                return Err(Error::Count { found, expected });
+            }
+            let weights = args.newtons.iter().copied().zip(&gathered.presses);
+            of_force(&force::Fit::of(&weights.collect::<Vec<_>>(), &calibration)?)
+        }
+    };
     super::print_apart(text.into_bytes())
         .await
         .map_err(Error::Print)?;
@@ -170,9 +206,67 @@ fn chosen(args: &Args, setup: &Setup) -> Result<String, Error> {
     }
 }
 
+/// Says on stderr what to do next, after so many presses.
+fn say_next(args: &Args, seen: u64) {
+    match args.what {
+        What::Arm if seen == 0 => eprintln!(
+            "press something rigid {} times, while the robot tells where its arm is",
+            args.presses
+        ),
+        What::Arm => eprintln!("press {seen} of {}", args.presses),
+        What::Force => match args.newtons.get(seen as usize) {
+            Some(newtons) => {
+                eprintln!("put {newtons} N on the sensor, wait until it rests, and take it off");
+            }
+            None => eprintln!("done"),
+        },
+    }
+}
+
+/// A weight of the command line.
+fn newtons(text: &str) -> Result<f64, OutOfRange> {
+    within(text, 0.001, 1e6)
+}
+
 /// The values, their spread and the lines for the configuration.
-fn described(fit: &Fit) -> String {
-    let Fit {
+fn of_force(fit: &force::Fit) -> String {
+    let mut text = String::from("weight        read          error\n");
+    for (newtons, read) in &fit.weights {
+        let error = 100.0 * (read / newtons - 1.0);
+        let [newtons, read] = [newtons, read].map(|n| format!("{n:.3} N"));
+        text += &format!("{newtons:<13} {read:<13} {error:+.1} %\n");
+    }
+    let force::Fit {
+        newtons_per_count,
+        alone: [least, most],
+        exponent,
+        line_error,
+        power,
+        ..
+    } = fit;
+    text += &format!(
+        "\nnewtons_per_count  {newtons_per_count:.5} (weight by weight {least:.5} to {most:.5})\n\
+         line               error {:.1} %\n",
+        100.0 * line_error
+    );
+    text += &match power {
+        Some((exponent, error)) => {
+            format!(
+                "power law          exponent {exponent:.2}, error {:.1} %\n",
+                100.0 * error
+            )
+        }
+        None => "power law          needs three different weights, one twice another\n".to_owned(),
+    };
+    text += &format!(
+        "\n[sensor.calibration]\nnewtons_per_count = {newtons_per_count:.5}\nexponent = {exponent:.2}\n"
+    );
+    text
+}
+
+/// The values, their spread and the lines for the configuration.
+fn of_arm(fit: &arm::Fit) -> String {
+    let arm::Fit {
         presses,
         force_n,
         n_per_mm,

@@ -109,7 +109,12 @@ impl Failure {
                 | replay::Error::NoFrame { .. },
             )
             | Self::Tail(tail::Error::Timeout { .. })
-            | Self::Calibrate(calibrate::Error::Unfit(_) | calibrate::Error::Playback(_))
+            | Self::Calibrate(
+                calibrate::Error::Arm(_)
+                | calibrate::Error::Force(_)
+                | calibrate::Error::Count { .. }
+                | calibrate::Error::Playback(_),
+            )
             | Self::Doctor(doctor::Error::Faults { .. })
             | Self::Sniff(sniff::Error::Recording { .. } | sniff::Error::Unexplained { .. }) => {
                 FAILED
@@ -117,7 +122,7 @@ impl Failure {
 
             Self::Simulate(simulate::Error::Layout(_) | simulate::Error::Baud { .. })
             | Self::Replay(replay::Error::OwnMotion { .. })
-            | Self::Calibrate(calibrate::Error::NoSensor { .. })
+            | Self::Calibrate(calibrate::Error::NoSensor { .. } | calibrate::Error::Unasked)
             | Self::Record(
                 record::Error::Level { .. }
                 | record::Error::Twice { .. }

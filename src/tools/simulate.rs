@@ -37,9 +37,10 @@ pub struct Args {
     /// Material to press; repeat the option for several in turn [default: all eight]
     #[arg(long = "material", value_name = "M")]
     materials: Vec<Material>,
-    /// Peak force of a press in newtons, 0.01 to 200 [default: random, 5 to 25]
-    #[arg(long, value_name = "N", value_parser = force_n)]
-    force: Option<f64>,
+    /// Peak force of a press in newtons, 0.01 to 200; repeat the option for several in turn [default:
+    /// random, 5 to 25]
+    #[arg(long = "force", value_name = "N", value_parser = force_n)]
+    forces: Vec<f64>,
     /// Seed of everything random
     #[arg(long, value_name = "S", default_value_t = 1)]
     seed: u64,
@@ -192,7 +193,7 @@ fn sequence(args: &Args) -> SequenceSettings {
         } else {
             args.materials.clone()
         },
-        force_n: args.force.map(|force| force as f32),
+        forces_n: args.forces.iter().map(|&force| force as f32).collect(),
         presses: args.presses,
         ..SequenceSettings::default()
     }

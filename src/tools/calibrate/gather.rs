@@ -5,12 +5,24 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::Error;
-use super::fit::Press;
 use crate::event::{Event, PressState};
 use crate::frame::Stamp;
 use crate::motion::Track;
 use crate::recording::{Entry, Input, Playback, Reader};
 use crate::verdict::Hrn;
+
+/// One press.
+#[derive(Debug, Default)]
+pub(super) struct Press {
+    /// Of its frames in contact.
+    pub(super) moments: Vec<Duration>,
+    /// Newtons on each taxel in them.
+    pub(super) frames: Vec<Vec<f32>>,
+    /// Total force in them.
+    pub(super) forces_n: Vec<f64>,
+    /// Where the arm was.
+    pub(super) track: Track,
+}
 
 /// What was recorded of one sensor.
 pub(super) struct Gathered {
@@ -21,7 +33,7 @@ pub(super) struct Gathered {
 struct Taken {
     number: u64,
     mono: Duration,
-    force_n: f64,
+    newtons: Vec<f32>,
 }
 
 /// So long after a press its positions have come.
@@ -38,13 +50,17 @@ impl Gathered {
         let mut ended: Vec<(u64, u64, Duration)> = Vec::new();
         let mut presses = Vec::new();
         let press = |frames: &[Taken], first: u64, last: u64, track: &Track| {
-            let own = frames.iter().filter(|f| (first..=last).contains(&f.number));
-            let (moments, forces_n) = own.map(|f| (f.mono, f.force_n)).unzip();
-            Press {
-                moments,
-                forces_n,
+            let mut press = Press {
                 track: track.clone(),
+                ..Press::default()
+            };
+            for frame in frames.iter().filter(|f| (first..=last).contains(&f.number)) {
+                press.moments.push(frame.mono);
+                let newtons = frame.newtons.iter().map(|&n| f64::from(n));
+                press.forces_n.push(newtons.sum());
+                press.frames.push(frame.newtons.clone());
             }
+            press
         };
         for found in Reader::new(BufReader::new(file)) {
             let found = found?;
@@ -67,7 +83,7 @@ impl Gathered {
                     Event::Frame(frame) if frame.tared => frames.push(Taken {
                         number: frame.frame,
                         mono: moment(at, frame.time),
-                        force_n: frame.newtons.iter().map(|&n| f64::from(n)).sum(),
+                        newtons: frame.newtons,
                     }),
                     Event::Press(press) if press.state == PressState::Begin => {
                         began = Some(press.frame);

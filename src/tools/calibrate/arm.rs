@@ -4,19 +4,7 @@
 //! sensor's face; a little bent, because the sensor's cover stiffens. With the right delay the arm
 //! goes back on the curve that it came on. With another delay there is a loop.
 
-use std::time::Duration;
-
-use crate::motion::Track;
-
-/// One press.
-pub(super) struct Press {
-    /// Of its frames in contact.
-    pub(super) moments: Vec<Duration>,
-    /// Total force in each.
-    pub(super) forces_n: Vec<f64>,
-    /// Where the arm was.
-    pub(super) track: Track,
-}
+use super::gather::Press;
 
 /// A value, and the least and greatest of the presses one by one.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -256,8 +244,10 @@ fn slope(presses: &[&Press], delay_ms: f64) -> Option<f64> {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
-    use crate::motion::Point;
+    use crate::motion::{Point, Track};
 
     /// A press of an arm of `n_per_mm` at 5 mm/s, to `depth_mm` and back, held for 0.4 s, whose stamps
     /// are `delay_ms` early; frames at `hz`, positions at 100 Hz.
@@ -307,6 +297,7 @@ mod tests {
             moments,
             forces_n,
             track,
+            ..Press::default()
         }
     }
 
