@@ -264,9 +264,9 @@ mod tests {
                 let middle: f64 = 0.5 * (low + high);
                 let needs = middle / n_per_mm + 0.05 * middle.sqrt();
                 if needs < mm {
-                    low = middle
+                    low = middle;
                 } else {
-                    high = middle
+                    high = middle;
                 }
             }
             low
