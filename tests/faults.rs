@@ -140,7 +140,7 @@ impl Rig {
         let mut rig = Self::connect(tables);
         rig.cable.wake();
         rig.cable.play(&rest(), 8);
-        rig.sees(json!({"state": "live", "reason": null}));
+        rig.sees(&json!({"state": "live", "reason": null}));
         rig
     }
 
@@ -159,8 +159,8 @@ impl Rig {
         }
     }
 
-    fn sees(&mut self, fields: Value) -> Value {
-        self.subscriber.until(&fields)
+    fn sees(&mut self, fields: &Value) -> Value {
+        self.subscriber.until(fields)
     }
 
     /// What became of all bytes so far.
@@ -168,18 +168,18 @@ impl Rig {
         self.cable.drain();
         self.subscriber.say(r#"{"get":"status"}"#);
         // Of an event it has a number.
-        self.sees(json!({"type": "status", "seq": null}))
+        self.sees(&json!({"type": "status", "seq": null}))
     }
 
     /// Ends the press in hand: it is number `press`, and has a verdict.
     fn release(&mut self, press: u64) -> Value {
         self.cable.play(&rest(), 4);
-        let end = self.sees(json!({"type": "press", "state": "end"}));
+        let end = self.sees(&json!({"type": "press", "state": "end"}));
         assert_eq!(
             (&end["press"], &end["reason"]),
             (&json!(press), &json!(null))
         );
-        let verdict = self.sees(json!({"phase": "final"}));
+        let verdict = self.sees(&json!({"phase": "final"}));
         assert_eq!(verdict["press"], press);
         end
     }
@@ -187,7 +187,7 @@ impl Rig {
     /// The next press is number `press`.
     fn press(&mut self, press: u64) -> Value {
         self.cable.play(&pressed(), 10);
-        let begin = self.sees(json!({"type": "press", "state": "begin"}));
+        let begin = self.sees(&json!({"type": "press", "state": "begin"}));
         assert_eq!(begin["press"], press);
         self.release(press)
     }
@@ -227,8 +227,8 @@ fn unplugged_after_any_byte_of_a_frame_a_press_is_aborted_and_no_frame_is_made_u
         rig.cable.play(&pressed(), 5);
         rig.cable.write(&rig.cable.bytes(&pressed())[..byte]);
         let unplugged = rig.cable.unplug();
-        let lost = rig.sees(json!({"type": "status", "state": "lost"}));
-        let aborted = rig.sees(json!({"type": "press", "state": "aborted"}));
+        let lost = rig.sees(&json!({"type": "status", "state": "lost"}));
+        let aborted = rig.sees(&json!({"type": "press", "state": "aborted"}));
         assert_eq!(
             (&aborted["press"], &aborted["reason"], &aborted["frames"]),
             (&json!(press), &json!("lost"), &json!(5))
@@ -243,7 +243,7 @@ fn unplugged_after_any_byte_of_a_frame_a_press_is_aborted_and_no_frame_is_made_u
         shortest = shortest.min(since(unplugged, &lost));
         rig.cable.replug();
         rig.cable.wake();
-        rig.sees(json!({"type": "status", "state": "live"}));
+        rig.sees(&json!({"type": "status", "state": "live"}));
     }
     assert!(shortest < Duration::from_millis(100), "{shortest:?}");
 }
@@ -258,9 +258,9 @@ fn plugged_in_elsewhere_behind_its_link_a_sensor_is_read_on_within_its_pause() {
         let replugged = SystemTime::now();
         rig.cable.replug();
         assert_ne!(fs::read_link(&rig.cable.link).unwrap(), before);
-        rig.sees(json!({"type": "status", "state": "lost"}));
+        rig.sees(&json!({"type": "status", "state": "lost"}));
         rig.cable.wake();
-        let live = rig.sees(json!({"type": "status", "state": "live"}));
+        let live = rig.sees(&json!({"type": "status", "state": "live"}));
         shortest = shortest.min(since(replugged, &live));
         rig.press(press);
     }
@@ -272,7 +272,7 @@ fn plugged_in_elsewhere_behind_its_link_a_sensor_is_read_on_within_its_pause() {
     let replugged = SystemTime::now();
     rig.cable.replug();
     rig.cable.wake();
-    let live = rig.sees(json!({"type": "status", "state": "live"}));
+    let live = rig.sees(&json!({"type": "status", "state": "live"}));
     let away = since(replugged, &live);
     assert!(away < Duration::from_millis(2500), "{away:?}");
     rig.press(5);
@@ -328,23 +328,23 @@ fn half_a_frame_and_silence_are_stale_and_its_other_half_makes_it_whole() {
     let (head, tail) = frame.split_at(400);
     rig.cable.play(&pressed(), 5);
     rig.cable.write(head);
-    let begin = rig.sees(json!({"type": "press", "state": "begin"}));
+    let begin = rig.sees(&json!({"type": "press", "state": "begin"}));
     let last = begin["frame"].as_u64().unwrap() + 4;
-    let last = rig.sees(json!({"type": "frame", "frame": last}));
+    let last = rig.sees(&json!({"type": "frame", "frame": last}));
     let last: jiff::Timestamp = last["time"].as_str().unwrap().parse().unwrap();
-    let stale = rig.sees(json!({"type": "status", "state": "stale"}));
+    let stale = rig.sees(&json!({"type": "status", "state": "stale"}));
     assert_eq!(stale["reason"], "no frame for 300 ms");
     let silent = since(last.into(), &stale);
     assert_eq!(silent.as_millis(), 300, "stamped when it became so");
     rig.cable.write(tail);
-    rig.sees(json!({"type": "status", "state": "live"}));
+    rig.sees(&json!({"type": "status", "state": "live"}));
 
     // Without its other half it is skipped.
     let before = rig.status();
     rig.cable.write(head);
-    rig.sees(json!({"type": "status", "state": "stale"}));
+    rig.sees(&json!({"type": "status", "state": "stale"}));
     rig.cable.write(&frame);
-    rig.sees(json!({"type": "status", "state": "live"}));
+    rig.sees(&json!({"type": "status", "state": "live"}));
     let after = rig.status();
     let more = |key: &str| after[key].as_u64().unwrap() - before[key].as_u64().unwrap();
     assert_eq!((more("frames"), more("bytes_skipped")), (1, 400));
@@ -358,9 +358,9 @@ fn a_burst_after_a_stall_loses_no_frame_and_no_press() {
     let frames = rig.status()["frames"].as_u64().unwrap();
     rig.cable.play(&pressed(), 5);
     let held = rig.cable.bytes(&pressed()).repeat(40);
-    rig.sees(json!({"type": "status", "state": "stale"}));
+    rig.sees(&json!({"type": "status", "state": "stale"}));
     rig.cable.write(&held);
-    rig.sees(json!({"type": "status", "state": "live"}));
+    rig.sees(&json!({"type": "status", "state": "live"}));
     assert_eq!(rig.release(1)["frames"], 45);
     let status = rig.status();
     assert_eq!(status["frames"], frames + 49);
@@ -416,7 +416,7 @@ fn at_a_wrong_baud_rate_there_is_no_frame_no_press_and_a_stale_sensor() {
     );
     // At the right one it is live and has pressed nothing yet.
     rig.cable.play(&rest(), 8);
-    let live = rig.sees(json!({"type": "status", "state": "live"}));
+    let live = rig.sees(&json!({"type": "status", "state": "live"}));
     assert_eq!(live["seq"], 2, "one event before: it was stale");
     rig.press(1);
 }
@@ -431,15 +431,15 @@ fn a_taxel_that_sticks_begins_no_press_but_holds_one_until_it_is_named() {
     };
     rig.cable.play(&stuck(rest()), 30);
     rig.cable.play(&stuck(pressed()), 10);
-    let begin = rig.sees(json!({"type": "press"}));
+    let begin = rig.sees(&json!({"type": "press"}));
     assert_eq!(
         (&begin["press"], &begin["state"]),
         (&json!(1), &json!("begin"))
     );
     rig.cable.play(&stuck(rest()), 60);
-    let end = rig.sees(json!({"type": "press", "state": "end"}));
+    let end = rig.sees(&json!({"type": "press", "state": "end"}));
     assert_eq!(end["reason"], "timeout");
-    let verdict = rig.sees(json!({"phase": "final"}));
+    let verdict = rig.sees(&json!({"phase": "final"}));
     assert!(
         verdict["notes"]
             .as_array()
@@ -452,7 +452,7 @@ fn a_taxel_that_sticks_begins_no_press_but_holds_one_until_it_is_named() {
     rig.cable.play(&stuck(rest()), 4);
     rig.cable.play(&stuck(pressed()), 10);
     rig.cable.play(&stuck(rest()), 4);
-    let end = rig.sees(json!({"type": "press", "state": "end"}));
+    let end = rig.sees(&json!({"type": "press", "state": "end"}));
     assert_eq!((&end["press"], &end["reason"]), (&json!(2), &json!(null)));
 }
 
@@ -466,7 +466,7 @@ fn a_dead_row_is_missing_in_the_contact_until_it_is_named() {
     for _ in 0..2 {
         rig.cable.play(&dead, 10);
         rig.cable.play(&rest(), 4);
-        let verdict = rig.sees(json!({"phase": "final"}));
+        let verdict = rig.sees(&json!({"phase": "final"}));
         areas.push(verdict["contact_area_taxels"].as_u64().unwrap());
         rig.reload(&format!("[sensor.calibration]\ndead_taxels = {row:?}\n"));
     }
@@ -485,17 +485,17 @@ fn drift_is_no_press_below_the_threshold_and_above_it_one_that_ends_by_the_clock
     // A count is 0.04 N, the threshold 0.07 N.
     rig.cable.play(&drifted(1), 60);
     rig.cable.play(&drifted(2), 60);
-    let begin = rig.sees(json!({"type": "press"}));
+    let begin = rig.sees(&json!({"type": "press"}));
     assert_eq!(
         (&begin["press"], &begin["state"]),
         (&json!(1), &json!("begin"))
     );
-    let end = rig.sees(json!({"type": "press", "state": "end"}));
+    let end = rig.sees(&json!({"type": "press", "state": "end"}));
     assert_eq!(end["reason"], "timeout");
     let begun: jiff::Timestamp = begin["time"].as_str().unwrap().parse().unwrap();
     let held = since(begun.into(), &end);
     assert!((450..1000).contains(&held.as_millis()), "{held:?}");
-    let verdict = rig.sees(json!({"phase": "final"}));
+    let verdict = rig.sees(&json!({"phase": "final"}));
     assert!(
         verdict["notes"]
             .as_array()
@@ -518,12 +518,12 @@ fn drift_is_no_press_below_the_threshold_and_above_it_one_that_ends_by_the_clock
     pressed.counts.iter_mut().for_each(|count| *count += 2);
     rig.cable.play(&pressed, 10);
     rig.cable.play(&drifted(2), 4);
-    let begin = rig.sees(json!({"type": "press"}));
+    let begin = rig.sees(&json!({"type": "press"}));
     assert_eq!(
         (&begin["press"], &begin["state"]),
         (&json!(2), &json!("begin"))
     );
-    let end = rig.sees(json!({"type": "press", "state": "end"}));
+    let end = rig.sees(&json!({"type": "press", "state": "end"}));
     assert_eq!(end["reason"], Value::Null);
 }
 
@@ -531,7 +531,7 @@ fn drift_is_no_press_below_the_threshold_and_above_it_one_that_ends_by_the_clock
 fn pressed_while_it_tares_a_sensor_says_so_and_tares_when_it_is_released() {
     let mut rig = Rig::connect("");
     rig.cable.play(&pressed(), 30);
-    let told = rig.sees(json!({"type": "status", "reason": "tare: contact"}));
+    let told = rig.sees(&json!({"type": "status", "reason": "tare: contact"}));
     assert_eq!(
         (&told["state"], &told["frames"]),
         (&json!("live"), &json!(5))

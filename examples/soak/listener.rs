@@ -1,0 +1,101 @@
+//! Subscribers.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::os::unix::net::UnixStream;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::thread::sleep;
+use std::time::Duration;
+
+use hardnessd::random::Stream;
+use serde_json::Value;
+
+use crate::Failure;
+
+/// How often a subscriber has heard of a sensor that it is live, and lost.
+#[derive(Default)]
+pub(crate) struct Link {
+    pub(crate) lives: AtomicU64,
+    pub(crate) losses: AtomicU64,
+}
+
+/// What a subscriber heard.
+#[derive(Default)]
+pub(crate) struct Heard {
+    pub(crate) events: u64,
+    /// For each sensor and press, how it ended; empty: not.
+    pub(crate) ends: Vec<Vec<String>>,
+    pub(crate) problems: Vec<String>,
+}
+
+/// Reads to the end. Events must be consecutive, and presses too.
+pub(crate) fn hear(connection: UnixStream, links: &[Arc<Link>]) -> Result<Heard, Failure> {
+    let mut heard = Heard::default();
+    heard.ends.resize(links.len(), Vec::new());
+    let mut last = None;
+    for line in BufReader::new(connection).lines() {
+        let event: Value = serde_json::from_str(&line?)?;
+        if event["type"] == "gap" {
+            heard.problems.push(format!("a gap after event {last:?}"));
+        }
+        let name = event["sensor"]
+            .as_str()
+            .and_then(|name| name.strip_prefix('s'));
+        let sensor = name.and_then(|number| number.parse::<usize>().ok());
+        match (sensor, event["state"].as_str()) {
+            _ if event["type"] != "status" => {}
+            (Some(sensor), Some("live")) => drop(links[sensor].lives.fetch_add(1, Relaxed)),
+            (Some(sensor), Some("lost")) => drop(links[sensor].losses.fetch_add(1, Relaxed)),
+            _ => {}
+        }
+        // A hello has the number of the last event before.
+        let Some(seq) = event["seq"].as_u64() else {
+            continue;
+        };
+        if last.is_some_and(|last| seq != last + 1) {
+            heard.problems.push(format!("event {seq} after {last:?}"));
+        }
+        last = Some(seq);
+        heard.events += u64::from(event["type"] != "hello");
+        let Some(sensor) = sensor else {
+            continue;
+        };
+        let ends = &mut heard.ends[sensor];
+        let press = event["press"].as_u64().unwrap_or_default() as usize;
+        match (event["type"].as_str(), event["state"].as_str()) {
+            (Some("press"), Some("begin")) => {
+                if press != ends.len() + 1 {
+                    heard
+                        .problems
+                        .push(format!("s{sensor}: press {press} after {}", ends.len()));
+                }
+                ends.push(String::new());
+            }
+            (Some("press"), Some("aborted")) | (Some("hardness"), _)
+                if event["phase"] != "early" =>
+            {
+                if let Some(end) = press.checked_sub(1).and_then(|place| ends.get_mut(place)) {
+                    *end += event["phase"]
+                        .as_str()
+                        .or(event["reason"].as_str())
+                        .unwrap_or("?");
+                }
+            }
+            _ => {}
+        }
+    }
+    Ok(heard)
+}
+
+/// Connects, listens for a moment, goes, again and again.
+pub(crate) fn come_and_go(socket: &Path, seed: u64, over: &AtomicBool) -> Result<(), Failure> {
+    let mut stream = Stream::new(seed, "guest");
+    while !over.load(Relaxed) {
+        let mut connection = UnixStream::connect(socket)?;
+        connection.write_all(b"{\"subscribe\":[\"frame\",\"press\"]}\n")?;
+        let _ = connection.read(&mut [0; 4096])?;
+        sleep(Duration::from_secs_f64(stream.range(0.1, 2.0)));
+    }
+    Ok(())
+}

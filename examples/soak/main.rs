@@ -1,0 +1,307 @@
+//! Plays sensors with faults to a daemon for a long time, and accounts for every press.
+//!
+//!     cargo run --release --example soak -- --minutes 120
+//!
+//! The daemon is a child process with the code of `hardnessd run`. Each sensor sends simulated presses over
+//! a pty of its own, with a fault in every second press. There are subscribers of all kinds, recordings, and a
+//! reload every ten seconds. At the end every press that was sent must have its verdict, or was lost with
+//! the link, by its number. Memory, descriptors and threads must not have grown. It ends with 1 otherwise.
+
+mod account;
+mod listener;
+#[path = "../../src/tools/pty/pair.rs"]
+mod pair;
+mod player;
+
+use std::fmt::Write as _;
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitCode, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::thread::{self, sleep};
+use std::time::{Duration, Instant};
+
+use account::{account, growth, usage};
+use clap::Parser;
+use hardnessd::daemon::config::Setup;
+use hardnessd::daemon::log::Log;
+use hardnessd::daemon::{Daemon, Reload};
+use hardnessd::random::Stream;
+use hardnessd::recording::Reader;
+use hardnessd::trial;
+use listener::{Link, come_and_go, hear};
+use player::{FAULTS, Player, library, plug};
+use rustix::process::{Pid, Signal, kill_process};
+use tokio::signal::unix::{SignalKind, signal};
+
+type Failure = Box<dyn std::error::Error + Send + Sync>;
+
+const FRAMES_PER_S: f64 = 100.0;
+const PERIOD: Duration = Duration::from_millis(10);
+/// How long the daemon may take for anything.
+const PATIENCE: Duration = Duration::from_secs(60);
+/// Recordings that are kept.
+const KEPT: usize = 16;
+
+#[derive(Parser)]
+struct Args {
+    /// How long to play, at least 2
+    #[arg(long, default_value_t = 120.0)]
+    minutes: f64,
+    /// Sensors
+    #[arg(long, default_value_t = 8)]
+    sensors: usize,
+    /// Seed of the faults
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Be the daemon
+    #[arg(long, hide = true)]
+    daemon: Option<PathBuf>,
+}
+
+fn main() -> ExitCode {
+    if let Some(code) = trial::entry() {
+        return code;
+    }
+    let args = Args::parse();
+    let done = match &args.daemon {
+        Some(config) => serve(config).map(|()| Vec::new()),
+        None => soak(&args),
+    };
+    let problems = done.unwrap_or_else(|error| vec![error.to_string()]);
+    for problem in &problems {
+        eprintln!("soak: {problem}");
+    }
+    ExitCode::from(u8::from(!problems.is_empty()))
+}
+
+/// The daemon, as `hardnessd run` is one.
+fn serve(config: &Path) -> Result<(), Failure> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()?;
+    runtime.block_on(async {
+        let mut hangup = signal(SignalKind::hangup())?;
+        let mut terminate = signal(SignalKind::terminate())?;
+        let setup = Setup::load(config)?;
+        let log = Log::start(setup.config.log, "warn")?;
+        let daemon = Daemon::bind(setup)?;
+        let (request, requests) = tokio::sync::mpsc::channel(1);
+        tokio::spawn(async move {
+            while hangup.recv().await.is_some() {
+                let _ = request.try_send(());
+            }
+        });
+        let path = config.to_owned();
+        let reload = Reload {
+            requests,
+            path,
+            log,
+        };
+        let shutdown = async move {
+            terminate.recv().await;
+        };
+        Ok(daemon.run(shutdown, Some(reload)).await?)
+    })
+}
+
+fn configure(path: &Path, sensors: usize, min_confidence: f64) -> io::Result<()> {
+    let mut text = String::from("robot = \"soak\"\n");
+    for sensor in 0..sensors {
+        let _ = write!(
+            text,
+            "[[sensor]]\nname = \"s{sensor}\"\nport = \"s{sensor}\"\nbaud = 1000000\n\
+             frame_rate_hz = {FRAMES_PER_S:.1}\n"
+        );
+    }
+    let _ = write!(
+        text,
+        "[publish.unix]\npath = \"events.sock\"\n[model]\nmin_confidence = {min_confidence}\n\
+         [record]\ndir = \"rec\"\nrotate_s = 20\nkeep_free_mb = 0\n"
+    );
+    let born = path.with_extension("new");
+    fs::write(&born, text)?;
+    fs::rename(born, path)
+}
+
+/// All recordings, oldest first.
+fn recordings(directory: &Path) -> io::Result<Vec<PathBuf>> {
+    let mut found = Vec::new();
+    for entry in fs::read_dir(directory)? {
+        let entry = entry?;
+        found.push((entry.metadata()?.modified()?, entry.path()));
+    }
+    found.sort();
+    Ok(found.into_iter().map(|(_, path)| path).collect())
+}
+
+fn soak(args: &Args) -> Result<Vec<String>, Failure> {
+    if !(2.0..=100_000.0).contains(&args.minutes) || !(1..=100).contains(&args.sensors) {
+        return Err("expected at least 2 minutes and 1 to 100 sensors".into());
+    }
+    let directory = tempfile::tempdir()?;
+    let at = |name: &str| directory.path().join(name);
+    let (presses, rest) = library()?;
+    let (presses, rest) = (Arc::new(presses), Arc::new(rest));
+    let root = Stream::new(args.seed, "soak");
+    let links: Vec<Arc<Link>> = (0..args.sensors).map(|_| Arc::default()).collect();
+    let mut players = Vec::new();
+    for (index, link) in links.iter().enumerate() {
+        let port = at(&format!("s{index}"));
+        players.push(Player {
+            pair: plug(&port)?,
+            port,
+            presses: Arc::clone(&presses),
+            rest: Arc::clone(&rest),
+            stream: root.child(index as u64),
+            link: Arc::clone(link),
+            sent: Vec::new(),
+            faults: [0; FAULTS.len()],
+            due: Instant::now(),
+        });
+    }
+    let (config, socket) = (at("soak.toml"), at("events.sock"));
+    configure(&config, args.sensors, 0.0)?;
+    let mut daemon = Command::new(std::env::current_exe()?)
+        .arg("--daemon")
+        .arg(&config)
+        .stderr(File::create(at("log"))?)
+        .stdin(Stdio::null())
+        .spawn()?;
+    let played = attend(args, &mut daemon, players, &links, &socket, &config);
+    // It has ended, unless something failed.
+    let _ = daemon.kill();
+    let _ = daemon.wait();
+    let log = fs::read_to_string(at("log"))?;
+    let mut problems = played.inspect_err(|_| eprintln!("{log}"))?;
+    // Of a reload that was refused, above all.
+    let errors = log.lines().filter(|line| line.contains("ERROR"));
+    problems.extend(errors.map(str::to_owned));
+    let mut records = 0;
+    for path in recordings(&at("rec"))? {
+        for found in Reader::new(File::open(&path)?) {
+            match found {
+                Ok(_) => records += 1,
+                Err(error) => problems.push(format!("{}: {error}", path.display())),
+            }
+        }
+    }
+    println!("recordings: the last {KEPT} have {records} whole entries");
+    Ok(problems)
+}
+
+fn attend(
+    args: &Args,
+    daemon: &mut Child,
+    players: Vec<Player>,
+    links: &[Arc<Link>],
+    socket: &Path,
+    config: &Path,
+) -> Result<Vec<String>, Failure> {
+    let pid = Pid::from_raw(i32::try_from(daemon.id())?).ok_or("no process")?;
+    let start = Instant::now();
+    while UnixStream::connect(socket).is_err() {
+        if start.elapsed() > PATIENCE || daemon.try_wait()?.is_some() {
+            return Err("the daemon does not start".into());
+        }
+        sleep(PERIOD);
+    }
+    let over = Arc::new(AtomicBool::new(false));
+    let mut listening = Vec::new();
+    for number in 0..17 {
+        // The first tells the players what it hears.
+        let links: Vec<_> = links
+            .iter()
+            .map(|link| {
+                if number == 0 {
+                    Arc::clone(link)
+                } else {
+                    Arc::default()
+                }
+            })
+            .collect();
+        let connection = UnixStream::connect(socket)?;
+        listening.push(thread::spawn(move || hear(connection, &links)));
+    }
+    let mut guests = Vec::new();
+    for seed in 0..2 {
+        let (socket, over) = (socket.to_owned(), Arc::clone(&over));
+        guests.push(thread::spawn(move || come_and_go(&socket, seed, &over)));
+    }
+    let mut deaf = UnixStream::connect(socket)?;
+    deaf.write_all(b"{\"subscribe\":[\"frame\",\"press\",\"hardness\",\"status\"]}\n")?;
+
+    let start = Instant::now();
+    let length = Duration::from_secs_f64(60.0 * args.minutes);
+    let playing: Vec<_> = players
+        .into_iter()
+        .map(|player| thread::spawn(move || player.play(start + length)))
+        .collect();
+    let (mut samples, mut reloads, mut recorded) = (Vec::new(), 0, 0);
+    while playing.iter().any(|player| !player.is_finished()) {
+        if daemon.try_wait()?.is_some() {
+            return Err("the daemon has ended".into());
+        }
+        let second = start.elapsed().as_secs();
+        if second / 10 > reloads {
+            reloads += 1;
+            configure(config, args.sensors, 0.001 * (reloads % 2) as f64)?;
+            kill_process(pid, Signal::HUP)?;
+            let files = recordings(&config.with_file_name("rec"))?;
+            for old in files.iter().rev().skip(KEPT) {
+                fs::remove_file(old)?;
+                recorded += 1;
+            }
+        }
+        samples.push((start.elapsed(), usage(daemon)?));
+        sleep(Duration::from_secs(1));
+    }
+    let mut sent = Vec::new();
+    for player in playing {
+        sent.push(player.join().map_err(|_| "a player panicked")??);
+    }
+    over.store(true, Relaxed);
+    for guest in guests {
+        guest.join().map_err(|_| "a guest panicked")??;
+    }
+    // Subscribers have what was said before.
+    sleep(Duration::from_secs(1));
+    kill_process(pid, Signal::TERM)?;
+    let ended = daemon.wait()?;
+    let mut problems = Vec::new();
+    if !ended.success() {
+        problems.push(format!("the daemon ended with {ended}"));
+    }
+    for (number, listener) in listening.into_iter().enumerate() {
+        let heard = listener.join().map_err(|_| "a subscriber panicked")??;
+        problems.extend(
+            heard
+                .problems
+                .iter()
+                .map(|problem| format!("subscriber {number}: {problem}")),
+        );
+        if number == 0 {
+            println!(
+                "{} sensors for {:.1} minutes, {} events",
+                args.sensors, args.minutes, heard.events
+            );
+        }
+        for problem in account(&sent, &heard.ends, number == 0) {
+            // All subscribers hear the same.
+            if !problems.contains(&problem) {
+                problems.push(problem);
+            }
+        }
+    }
+    let faults = FAULTS.iter().enumerate().map(|(kind, name)| {
+        let count: u64 = sent.iter().map(|player| player.faults[kind]).sum();
+        format!("{count} {name}")
+    });
+    println!("faults: {}", faults.collect::<Vec<_>>().join(", "));
+    println!("reloads: {reloads}; recordings removed meanwhile: {recorded}");
+    problems.extend(growth(&samples));
+    Ok(problems)
+}
