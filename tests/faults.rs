@@ -14,9 +14,10 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use bench::{Bench, Daemon, Subscriber, wait_for};
+use bench::{Bench, Daemon, Subscriber, hardnessd, wait_for};
 use hardnessd::frame::{RawFrame, Stamp};
 use hardnessd::pipeline::{Clock, Pipeline};
+use hardnessd::random::Stream;
 use hardnessd::sensor::{Description, Sensor};
 use hardnessd::verdict::{BUILT_IN, Hrn};
 use hardnessd::wire::{Layout, Settings};
@@ -596,4 +597,54 @@ fn a_wall_clock_that_jumps_changes_the_times_of_events_and_nothing_else() {
         play(&[(30, year_s), (59, -2 * year_s), (70, -1), (90, 3600)]),
         steady
     );
+}
+
+/// It takes minutes: `.ci/peers` runs it.
+#[test]
+#[ignore = "heavy"]
+fn a_daemon_killed_a_hundred_times_starts_each_time_and_its_recordings_can_be_saved() {
+    let bench = Bench::new();
+    let config = configure(&bench, "[record]\ndir = \"rec\"\nkeep_free_mb = 0\n");
+    let _sensor = bench.sensor_at("port", 100, &[]);
+    let mut moments = Stream::new(1, "moments of death");
+    let mut lives = Vec::new();
+    for round in 1..=100 {
+        let mut daemon = Daemon::start(&config);
+        let start = Instant::now();
+        let mut subscriber = bench.subscriber();
+        let hello = subscriber.next().unwrap();
+        assert_eq!(hello["type"], "hello", "round {round}");
+        subscriber.until(&json!({"type": "status", "state": "live"}));
+        std::thread::sleep(Duration::from_secs_f64(1.5 * moments.uniform()));
+        lives.push(start.elapsed());
+        daemon.process.signal(Signal::KILL);
+        daemon.process.exit_code();
+    }
+    let files = fs::read_dir(bench.path("rec")).unwrap();
+    let mut files: Vec<PathBuf> = files.map(|file| file.unwrap().path()).collect();
+    // Their names are the times of their beginnings.
+    files.sort();
+    assert_eq!(files.len(), lives.len());
+    let mut saved = 0;
+    for (damaged, lived) in files.iter().zip(lives) {
+        let good = bench.path("good.mcap");
+        let [from, to] = [damaged, &good].map(|path| path.to_str().unwrap());
+        let output = hardnessd(&["recover", from, "--out", to]);
+        let said = String::from_utf8(output.stderr).unwrap();
+        if !output.status.success() {
+            // Less than a second may be lost, and so all of a shorter life.
+            assert!(lived < Duration::from_secs(1), "{lived:?}: {said}");
+            assert!(
+                said.contains("no chunk of messages in it is whole"),
+                "{said}"
+            );
+            continue;
+        }
+        let output = hardnessd(&["replay", to]);
+        assert!(output.status.success(), "{output:?}");
+        saved += 1;
+        fs::remove_file(good).unwrap();
+    }
+    println!("{saved} of 100 recordings saved, the others less than a second long");
+    assert!(saved > 30, "{saved}");
 }
