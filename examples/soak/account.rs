@@ -8,7 +8,8 @@ use std::time::Duration;
 use crate::Failure;
 use crate::player::Player;
 
-/// The black boxes hold a minute, and up to a stretch of ten seconds more. They are full after this.
+/// The black boxes hold a minute, and up to a stretch of ten seconds more. They are full after this. The
+/// events that are held for `since` fill in minutes more: a longer run leaves out its first quarter.
 const WARM: Duration = Duration::from_secs(75);
 
 /// Memory in kB, descriptors, threads.
@@ -58,9 +59,10 @@ pub(crate) fn account(sent: &[Player], ends: &[Vec<String>], is_told: bool) -> V
 
 /// Compares the medians of the two halves after the start.
 pub(crate) fn growth(samples: &[(Duration, [u64; 3])]) -> Vec<String> {
+    let length = samples.last().map_or(Duration::ZERO, |(at, _)| *at);
     let warm: Vec<[u64; 3]> = samples
         .iter()
-        .filter(|(at, _)| *at > WARM)
+        .filter(|(at, _)| *at > WARM.max(length / 4))
         .map(|(_, s)| *s)
         .collect();
     let (first, second) = warm.split_at(warm.len() / 2);
