@@ -57,4 +57,4 @@ pub fn material_names(materials: Materials) -> Vec<&'static str> {
 /// Of what [`dataset`] makes of the same settings and seed: to be raised with every change of its
 /// samples. A comparison names the files that it keeps by it, so that none of an older simulator is
 /// taken for one of this.
-pub const VERSION: u32 = 2;
+pub const VERSION: u32 = 3;

@@ -1,6 +1,6 @@
 //! A world of materials: each object is of one that is drawn for it.
 //!
-//! In: a hardness level and a stream. Out: a [`Body`] whose modulus follows from the Shore hardness
+//! In: a stream. Out: a [`Body`] whose modulus follows from the Shore hardness
 //! by the durometer, so that the label is what a durometer reads. The ranges contain the eight
 //! named materials and are not centred on them.
 
@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::body::Body;
 use super::durometer::{self, Durometer};
-use super::level::{Borders, LEVELS, LevelRange, level_of};
+use super::level::{self, Borders, LEVELS, level_of};
 use super::substance::{Creep, Law, Substance, Texture};
 use crate::random::Stream;
 
@@ -119,7 +119,7 @@ impl Laws {
     }
 }
 
-/// Part of level 1 that is drawn by its modulus.
+/// Part of level 1's objects that is drawn by the modulus.
 const STIFF_SHARE: f64 = 0.5;
 /// Moduli of these, MPa, log-even.
 const STIFF_MPA: (f64, f64) = (5.0, 3000.0);
@@ -147,20 +147,20 @@ const LONGEST_MM: (f64, f64) = (8.0, 40.0);
 const HURST: (f64, f64) = (0.4, 0.9);
 const ANISOTROPY: (f64, f64) = (1.0, 2.0);
 
-/// Draws what an object of `level` is made of.
+/// Draws what an object is made of.
 ///
-/// Its Shore hardness is even over the level's interval. Half of level 1 is stiffer than the
-/// durometer can tell well: there the modulus is log-even and the Shore hardness what the
-/// durometer reads; a soft law whose reading falls into another level is drawn again. A layer is
-/// never of the stiff half, unless there is no other law: it would not be the softer part.
-pub(super) fn draw(level: u8, laws: Laws, borders: Borders, stream: &mut Stream) -> Body {
-    let range = &LEVELS[usize::from(level) - 1];
-    let is_stiff = range.level == 1 && stream.uniform() < STIFF_SHARE;
-    if is_stiff && let Some(body) = stiff(laws, range, borders, stream) {
+/// Its Shore hardness is even from 15 to 95, but for the gaps that `borders` leaves. Half of what
+/// falls into level 1 is stiffer than the durometer can tell well: there the modulus is log-even and
+/// the Shore hardness what the durometer reads; a soft law whose reading falls into another level is
+/// drawn again. A layer is never of the stiff half, unless there is no other law: it would not be the
+/// softer part.
+pub(super) fn draw(laws: Laws, borders: Borders, stream: &mut Stream) -> Body {
+    let shore = level::draw_shore(borders, stream);
+    let level = level_of(shore);
+    let is_stiff = level == 1 && stream.uniform() < STIFF_SHARE;
+    if is_stiff && let Some(body) = stiff(laws, borders, stream) {
         return body;
     }
-    let (low, high) = range.shore(borders);
-    let shore = high - (high - low) * stream.uniform();
     let law = laws
         .draw(stream, |_| true)
         .expect("`Laws` has at least one");
@@ -174,13 +174,14 @@ pub(super) fn draw(level: u8, laws: Laws, borders: Borders, stream: &mut Stream)
     }
 }
 
-fn stiff(laws: Laws, range: &LevelRange, borders: Borders, stream: &mut Stream) -> Option<Body> {
+fn stiff(laws: Laws, borders: Borders, stream: &mut Stream) -> Option<Body> {
+    let (least, _) = LEVELS[0].shore(borders);
     loop {
         let law = laws.draw(stream, |law| law != LawName::Layered)?;
         let young_mpa = log_even(STIFF_MPA, stream);
         let substance = substance(law, 100.0, stream);
         let shore = Durometer::new(&substance).reading(young_mpa);
-        if shore > range.shore(borders).0 {
+        if shore > least {
             return Some(Body {
                 substance,
                 young_mpa,
@@ -256,18 +257,16 @@ mod tests {
     fn a_durometer_reads_what_a_drawn_object_is_labelled_with() {
         for law in LawName::ALL {
             let mut stream = Stream::new(2, law.name());
-            for range in &LEVELS {
-                for borders in [Borders::Touching, Borders::Gaps] {
-                    let body = draw(range.level, only(law), borders, &mut stream);
+            for borders in [Borders::Touching, Borders::Gaps] {
+                for _ in 0..8 {
+                    let body = draw(only(law), borders, &mut stream);
                     let read = Durometer::new(&body.substance).reading(body.young_mpa);
                     assert!(
                         (read - body.shore).abs() < 0.1,
                         "{law:?}: reads {read}: {body:?}"
                     );
-                    assert_eq!(
-                        (body.level, level_of(body.shore)),
-                        (range.level, range.level)
-                    );
+                    assert_eq!(body.level, level_of(body.shore));
+                    let range = &LEVELS[usize::from(body.level) - 1];
                     let (least, most) = range.shore(borders);
                     let most = if range.level == 1 { 100.0 } else { most };
                     assert!(least < body.shore && body.shore <= most, "{body:?}");
@@ -277,30 +276,25 @@ mod tests {
     }
 
     #[test]
-    fn shore_is_even_over_a_level_and_laws_over_its_objects() {
+    fn shore_is_even_and_laws_are_over_the_objects() {
         let mut stream = Stream::new(3, "broad");
-        let count = 60;
-        for range in &LEVELS[1..] {
-            let bodies: Vec<Body> = (0..count)
-                .map(|_| {
-                    draw(
-                        range.level,
-                        only(LawName::Solid),
-                        Borders::Touching,
-                        &mut stream,
-                    )
-                })
-                .collect();
-            let (low, high) = range.shore(Borders::Touching);
-            let below = bodies
+        let count = 400;
+        let shores: Vec<f64> = (0..count)
+            .map(|_| level::draw_shore(Borders::Touching, &mut stream))
+            .collect();
+        for from in [15.0, 35.0, 55.0, 75.0] {
+            let within = shores
                 .iter()
-                .filter(|b| b.shore < 0.5 * (low + high))
+                .filter(|&&shore| from < shore && shore <= from + 20.0)
                 .count();
-            assert!(
-                (15..45).contains(&below),
-                "{below} of {count} in the softer half"
-            );
+            assert!((70..130).contains(&within), "{within} from {from}");
         }
+        let gaps = (0..count).map(|_| level::draw_shore(Borders::Gaps, &mut stream));
+        assert!(gaps.into_iter().all(|shore| {
+            [50.0, 60.0, 70.0]
+                .iter()
+                .all(|&b| shore <= b || shore > b + 1.0)
+        }));
         let drawn: Vec<LawName> = (0..400)
             .map(|_| Laws::default().draw(&mut stream, |_| true).unwrap())
             .collect();
@@ -314,16 +308,16 @@ mod tests {
     fn half_of_level_1_is_stiff() {
         let mut stream = Stream::new(4, "stiff");
         let laws = Laws::try_from(vec![LawName::Solid, LawName::Layered]).unwrap();
-        let stiff = (0..40)
-            .map(|_| draw(1, laws, Borders::Touching, &mut stream))
+        let stiff = (0..130)
+            .map(|_| draw(laws, Borders::Touching, &mut stream))
             .filter(|body| {
                 let is_stiff = body.young_mpa > 100.0;
                 assert!(!is_stiff || body.substance.law == Law::Solid);
                 is_stiff
             })
             .count();
-        // 53 % of the half: log(3000 / 100) / log(3000 / 5).
-        assert!((4..19).contains(&stiff), "{stiff} of 40");
+        // 53 % of the half of 25 of 80: log(3000 / 100) / log(3000 / 5).
+        assert!((4..19).contains(&stiff), "{stiff} of 130");
     }
 
     #[test]

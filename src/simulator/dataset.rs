@@ -353,7 +353,7 @@ mod tests {
     }
 
     #[test]
-    fn broad_objects_are_evenly_of_all_levels_and_of_ranges() {
+    fn broad_objects_are_labelled_by_their_shore_and_paired() {
         for shapes in [Shapes::Matched, Shapes::Wide] {
             let settings = DatasetSettings {
                 materials: Materials::Broad,
@@ -367,25 +367,28 @@ mod tests {
                 assert!((8..12).contains(&sample.material));
                 assert!(begins_press(&sample.frame), "{sample:?}");
             }
-            // By split, then level: training objects are 0 to 3.
-            for (place, level) in (0..).zip([1, 2, 3, 4, 1, 1, 2, 2, 3, 3, 4, 4]) {
-                let own = samples.iter().filter(|sample| sample.object == place);
-                let split = if place < 4 { Split::Train } else { Split::Test };
-                let labels = own.map(|sample| (sample.level, sample.split, sample.shore.to_bits()));
-                let labels: std::collections::BTreeSet<_> = labels
-                    .map(|(level, split, shore)| (level, split as u8, shore))
-                    .collect();
-                assert_eq!(labels.len(), 1, "object {place}");
-                let first = labels.first().unwrap();
-                assert_eq!((first.0, first.1), (level, split as u8));
+            // Training objects are 0 to 3.
+            for object in 0..12 {
+                let own = samples.iter().filter(|sample| sample.object == object);
+                let split = if object < 4 {
+                    Split::Train
+                } else {
+                    Split::Test
+                };
+                let labels = own.map(|sample| (sample.split as u8, sample.shore.to_bits()));
+                let labels: std::collections::BTreeSet<_> = labels.collect();
+                assert_eq!(labels.len(), 1, "object {object}");
+                assert_eq!(labels.first().unwrap().0, split as u8);
             }
-            // Test objects of one number are pressed alike, whatever they are made of.
+            // Test objects of one number are pressed alike, whatever they are made of, but for presses
+            // that had to be harder to begin.
             let forces = |object| {
                 let own = samples.iter().filter(move |sample| sample.object == object);
                 own.map(|sample| sample.force_n).collect::<Vec<_>>()
             };
-            let softer = (forces(8), forces(10));
-            assert!(softer.0 == softer.1, "{softer:?}");
+            let (first, third) = (forces(4), forces(8));
+            let alike = first.iter().zip(&third).filter(|(a, b)| a == b).count();
+            assert!(alike >= 6, "{first:?} {third:?}");
         }
     }
 

@@ -1,5 +1,7 @@
 //! The hardness levels as intervals of Shore OO.
 
+use crate::random::Stream;
+
 /// A hardness level, and what its objects read on a Shore OO durometer.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LevelRange {
@@ -81,6 +83,23 @@ impl LevelRange {
             Borders::Gaps => (self.low + self.gap, self.high),
         }
     }
+}
+
+/// A Shore hardness, even over all levels' intervals together.
+pub(super) fn draw_shore(borders: Borders, stream: &mut Stream) -> f64 {
+    let widths = LEVELS.map(|range| {
+        let (low, high) = range.shore(borders);
+        high - low
+    });
+    // From the hardest down; the upper border belongs to the level.
+    let mut left = widths.iter().sum::<f64>() * stream.uniform();
+    for (range, width) in LEVELS.iter().zip(widths) {
+        if left < width {
+            return range.shore(borders).1 - left;
+        }
+        left -= width;
+    }
+    LEAST_SHORE
 }
 
 /// The level of what reads `shore`.

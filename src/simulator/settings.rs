@@ -48,9 +48,9 @@ pub struct DatasetSettings {
     pub laws: Laws,
     /// Whether broad materials avoid the levels' borders.
     pub borders: Borders,
-    /// Objects of each training material; of broad materials, of each level.
+    /// Objects of each training material; of broad materials four times as many, each of its own.
     pub objects: u32,
-    /// Objects of each test material, or of each level.
+    /// Objects of each test material; of broad materials four times as many.
     pub test_objects: u32,
     /// Whether all eight named materials are for test.
     pub all_test: bool,

@@ -17,6 +17,9 @@ use super::sensor::Sensor;
 use super::settings::{DatasetSettings, Materials};
 use crate::random::Stream;
 
+/// Groups of broad objects: as many as the levels, so that named and broad materials make equally
+/// many samples.
+const GROUPS: u8 = LEVELS.len() as u8;
 /// Sensors that each split's objects are shared over.
 const SENSORS: u32 = 8;
 
@@ -24,7 +27,7 @@ const SENSORS: u32 = 8;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Origin {
     Named(Material),
-    /// Any material of this level.
+    /// Any material; objects of one number share their geometry over these groups.
     Broad(u8),
 }
 
@@ -36,7 +39,7 @@ pub(super) struct Unit {
     number: u32,
 }
 
-/// The objects of a data set: by material (as in [`Material::ALL`]) or by split and level.
+/// The objects of a data set: by material (as in [`Material::ALL`]) or by split and group.
 pub(super) fn units(settings: &DatasetSettings) -> Vec<Unit> {
     let count = |split| match split {
         Split::Train => settings.objects,
@@ -56,7 +59,7 @@ pub(super) fn units(settings: &DatasetSettings) -> Vec<Unit> {
             .collect(),
         Materials::Broad => [Split::Train, Split::Test]
             .into_iter()
-            .flat_map(|split| LEVELS.map(|range| (Origin::Broad(range.level), split)))
+            .flat_map(|split| (0..GROUPS).map(move |group| (Origin::Broad(group), split)))
             .flat_map(|(origin, split)| of(origin, split))
             .collect(),
     }
@@ -107,7 +110,7 @@ impl Draws {
     fn new(settings: &DatasetSettings, unit: Unit) -> Self {
         let (own, [train, test]) = match unit.origin {
             Origin::Named(material) => (material.index(), ["train", "test"]),
-            Origin::Broad(level) => (level - 1, ["broad train", "broad test"]),
+            Origin::Broad(group) => (group, ["broad train", "broad test"]),
         };
         let is_paired = unit.split == Split::Test && settings.shapes != Shapes::Paper;
         let geometry = if is_paired {
@@ -142,9 +145,7 @@ impl Subject {
         let mut hardness = draws.body.child(0);
         let body = match unit.origin {
             Origin::Named(material) => Body::named(material, &mut hardness),
-            Origin::Broad(level) => {
-                broad::draw(level, settings.laws, settings.borders, &mut hardness)
-            }
+            Origin::Broad(_) => broad::draw(settings.laws, settings.borders, &mut hardness),
         };
         // The splits share no sensor: the streams have different names.
         let sensors = match unit.split {

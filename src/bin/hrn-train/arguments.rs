@@ -78,11 +78,11 @@ pub(super) struct Simulate {
     /// hardness of 50 to 51, 60 to 61 or 70 to 71
     #[arg(long)]
     pub(super) gaps: bool,
-    /// Objects of each training material; of broad materials, of each level
+    /// Objects of each training material; of broad materials, four times as many
     #[arg(long, default_value_t = DatasetSettings::default().objects,
           value_parser = clap::value_parser!(u32).range(0..=MOST))]
     pub(super) objects: u32,
-    /// Objects of each test material; of broad materials, of each level
+    /// Objects of each test material; of broad materials, four times as many
     #[arg(long, default_value_t = DatasetSettings::default().test_objects,
           value_parser = clap::value_parser!(u32).range(0..=MOST))]
     pub(super) test_objects: u32,
