@@ -16,7 +16,9 @@ use sha2::{Digest, Sha256};
 use tract_onnx::prelude::*;
 
 use self::course::Input;
-pub use self::course::{COURSE_FRAMES, CheckedCourse, Course, CourseCheck, CourseMoment, Shore};
+pub use self::course::{
+    COURSE_FRAMES, CheckedCourse, Course, CourseCheck, CourseMoment, Shore, course_inputs,
+};
 use crate::frame::{COLS, Frame, ROWS};
 
 /// The default model, built into the binary; `models/README.md` is its card.

@@ -4,4 +4,5 @@ pub mod optimiser;
 pub mod learner;
 pub mod consistency;
 pub mod fit;
+pub mod course;
 pub mod gan;

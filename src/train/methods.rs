@@ -1,5 +1,7 @@
 //! The methods of the table, as recipes over the same parts.
 
+pub mod course;
+
 use std::collections::BTreeSet;
 use std::time::Instant;
 
@@ -60,6 +62,9 @@ pub enum Method {
     SelfTraining,
     /// Logistic regression on hand-made features of a frame.
     Features,
+    /// Judges the course of a press, with what the arm told, and gives its Shore hardness: a temporal
+    /// convolution. Takes data of `simulate --sequences`.
+    Course,
 }
 
 /// Steps of the methods without a GAN that are fit to be compared, whatever their labels: about those of
@@ -73,6 +78,12 @@ fn strong_steps(profile: Profile) -> u64 {
 }
 
 impl Method {
+    /// Those that judge a frame, in the order of the tables.
+    pub fn of_frames() -> impl Iterator<Item = Self> {
+        let all = <Self as clap::ValueEnum>::value_variants().iter().copied();
+        all.filter(|&method| method != Self::Course)
+    }
+
     /// Its name in commands, files and tables.
     pub fn name(self) -> &'static str {
         match self {
@@ -90,6 +101,7 @@ impl Method {
             Self::FixMatch => "fixmatch",
             Self::SelfTraining => "self-training",
             Self::Features => "features",
+            Self::Course => "course",
         }
     }
 
@@ -130,6 +142,30 @@ impl Method {
                     keep: Keep::Best,
                 };
             }
+            Self::Course => {
+                settings.training = Training {
+                    batch: 128,
+                    epochs: match profile {
+                        Profile::Paper => 150,
+                        Profile::Quick => 60,
+                        Profile::Smoke => 1,
+                    },
+                    averaging: match profile {
+                        Profile::Smoke => 0.0,
+                        Profile::Paper | Profile::Quick => 0.998,
+                    },
+                    checkpoint_every_epochs: 10,
+                    optimiser: OptimiserSettings {
+                        rule: Rule::Adam,
+                        learning_rate: 2e-3,
+                        schedule: Schedule::Cosine,
+                        weight_decay: 1e-2,
+                        ..settings.training.optimiser
+                    },
+                    ..settings.training
+                };
+                settings.validation.share = 0.15;
+            }
             _ if self.is_strong() => {
                 settings.network = NetworkSettings {
                     pooling: Pooling::MaxMean,
@@ -159,7 +195,7 @@ impl Method {
     /// Labels it may use of `labelled` samples, unless told otherwise.
     fn labels(self, labelled: usize) -> usize {
         let percent = match self {
-            Self::Hrn100 | Self::Features => 100,
+            Self::Hrn100 | Self::Features | Self::Course => 100,
             Self::Hrn50 => 50,
             _ => 15,
         };

@@ -6,5 +6,6 @@ pub mod layers;
 pub mod network;
 pub mod sensed;
 pub mod hrn;
+pub mod course;
 pub mod generator;
 pub mod losses;

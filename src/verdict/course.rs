@@ -99,6 +99,11 @@ impl Input {
     }
 }
 
+/// Names and shapes of the inputs of a model of format 2 that takes so many frames.
+pub fn course_inputs(most: usize) -> [(&'static str, Vec<usize>); 6] {
+    Input::ALL.map(|input| (input.name(), input.shape(most)))
+}
+
 /// The Shore hardness that a model of format 2 gives.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(into = "[f32; 3]", from = "[f32; 3]")]

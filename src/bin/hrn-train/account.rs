@@ -7,6 +7,7 @@ use hardnessd::simulator::Split;
 use hardnessd::train::compare::digits::{rounded, thousands};
 use hardnessd::train::data::dataset::{self, Dataset};
 use hardnessd::train::judge::metrics::Evaluation;
+use hardnessd::train::model::course::CourseEvaluation;
 use hardnessd::verdict::Hrn;
 
 /// The card of the model read from `path`.
@@ -56,6 +57,42 @@ pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
 }
 
 /// The figures of an evaluation, and its confusion matrix with a row for each true level.
+/// The same of whole presses.
+pub(super) fn of_courses(evaluation: &CourseEvaluation) -> String {
+    let percent = |share: f64| share * 100.0;
+    let mut text = of_evaluation(&evaluation.levels);
+    let _ = writeln!(
+        text,
+        "level off by more than one  {:.1} %",
+        percent(evaluation.beyond_neighbour)
+    );
+    if let Some(shore) = &evaluation.shore {
+        let levels = shore.rmse_by_level.iter();
+        let levels: Vec<String> = levels
+            .map(|rmse| rmse.map_or("-".to_owned(), |rmse| format!("{rmse:.1}")))
+            .collect();
+        let _ = writeln!(
+            text,
+            "Shore OO           rmse {:.2} (by level {}); 90 % interval holds {:.1} %, {:.1} wide",
+            shore.rmse,
+            levels.join(", "),
+            percent(shore.coverage),
+            shore.width
+        );
+    }
+    if let Some(sets) = &evaluation.sets {
+        let others = sets.accuracy_of_others;
+        let others = others.map_or("-".to_owned(), |share| format!("{:.1} %", percent(share)));
+        let _ = writeln!(
+            text,
+            "sets of levels     hold {:.1} %; {:.1} % of presses ambiguous, {others} of the others right",
+            percent(sets.coverage),
+            percent(sets.ambiguous)
+        );
+    }
+    text
+}
+
 pub(super) fn of_evaluation(evaluation: &Evaluation) -> String {
     let percent = |share: f64| share * 100.0;
     let interval = evaluation.accuracy_interval_by_object.map_or_else(

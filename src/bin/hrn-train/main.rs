@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use burn::tensor::Device;
-use clap::{Parser as _, ValueEnum as _};
+use clap::Parser as _;
 use hardnessd::daemon::config::{Config, Error as ConfigError, SensorTable, Setup};
 use hardnessd::frame::RawFrame;
 use hardnessd::simulator::{
@@ -21,14 +21,15 @@ use hardnessd::train::compare::report;
 use hardnessd::train::compare::results::Comparison;
 use hardnessd::train::compare::{self, Plan, tables};
 use hardnessd::train::data::collect::{self, Capture, CollectError, Labelling};
+use hardnessd::train::data::courses::Courses;
 use hardnessd::train::data::dataset::{Dataset, DatasetError};
 use hardnessd::train::data::simulated;
 use hardnessd::train::judge::sheet;
 use hardnessd::train::methods::{self, LabelsError, Method, Request};
-use hardnessd::train::model::export;
+use hardnessd::train::model::{course, export};
 use hardnessd::train::run::Run;
 use hardnessd::train::run::disk::write_whole;
-use hardnessd::train::settings::{Profile, SettingsError};
+use hardnessd::train::settings::{Profile, Settings, SettingsError};
 use hardnessd::trial;
 use hardnessd::verdict::{Hrn, ModelError};
 
@@ -99,6 +100,7 @@ fn exit_code(error: &anyhow::Error) -> u8 {
     if has(|e| {
         e.is::<NoObjects>()
             || e.is::<OtherMaterials>()
+            || e.is::<NotOfFrames>()
             || matches!(e.downcast_ref(), Some(LabelsError::Range { .. }))
             || matches!(e.downcast_ref(), Some(CollectError::NoLevel { .. }))
     }) {
@@ -334,13 +336,10 @@ fn train(arguments: &Train) -> anyhow::Result<String> {
     if let Some(parent) = arguments.parent {
         end_with(parent)?;
     }
-    let mut settings = arguments.method.settings(arguments.profile);
-    if let Some(path) = &arguments.config {
-        let text = String::from_utf8_lossy(&read(path)?).into_owned();
-        settings = settings
-            .overridden(&text)
-            .with_context(|| path.display().to_string())?;
+    if arguments.method == Method::Course {
+        return train_course(arguments);
     }
+    let settings = settings(arguments)?;
     let parts: Result<Vec<Dataset>, DatasetError> = arguments
         .data
         .iter()
@@ -388,6 +387,37 @@ fn train(arguments: &Train) -> anyhow::Result<String> {
     ))
 }
 
+fn train_course(arguments: &Train) -> anyhow::Result<String> {
+    let settings = settings(arguments)?;
+    let (courses, sources) = Courses::read_all(&arguments.data)?;
+    let told = (arguments.profile, arguments.seed, settings);
+    let description = methods::course::description(&courses, sources, told)?;
+    let device = device(arguments.device)?;
+    let run = Run::open(&arguments.out, &description, arguments.resume)?;
+    let begun = Instant::now();
+    let evaluation = methods::course::train(&courses, &description, &run, &device)?;
+    let figures = evaluation.map_or_else(
+        || "not evaluated: the data has no labelled test presses\n".to_owned(),
+        |evaluation| account::of_courses(&evaluation),
+    );
+    Ok(format!(
+        "trained in {:.1} s: {}\n{figures}",
+        begun.elapsed().as_secs_f64(),
+        run.path("hrn.onnx").display()
+    ))
+}
+
+/// Those of the method, and what a file overrides.
+fn settings(arguments: &Train) -> anyhow::Result<Settings> {
+    let settings = arguments.method.settings(arguments.profile);
+    let Some(path) = &arguments.config else {
+        return Ok(settings);
+    };
+    let text = String::from_utf8_lossy(&read(path)?).into_owned();
+    let overridden = settings.overridden(&text);
+    overridden.with_context(|| path.display().to_string())
+}
+
 /// A CUDA device was asked for.
 #[derive(Debug, thiserror::Error)]
 #[error(
@@ -422,9 +452,17 @@ fn end_with(parent: i32) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// `compare` is of methods that judge a frame.
+#[derive(Debug, thiserror::Error)]
+#[error("--methods: found course, which judges presses, expected methods that judge a frame")]
+struct NotOfFrames;
+
 fn compare(arguments: Compare) -> anyhow::Result<String> {
+    if arguments.methods.contains(&Method::Course) {
+        return Err(NotOfFrames.into());
+    }
     let methods = if arguments.methods.is_empty() {
-        Method::value_variants().to_vec()
+        Method::of_frames().collect()
     } else {
         arguments.methods
     };
@@ -457,6 +495,9 @@ fn report_of(directory: &Path, out: &Path) -> anyhow::Result<String> {
 
 fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     let hrn = load(&arguments.model)?;
+    if Courses::is_at(&arguments.data)? {
+        return evaluate_courses(arguments, &hrn);
+    }
     let dataset = Dataset::read(&arguments.data)?;
     let (of_model, of_data) = (hrn.card().pitch_mm, dataset.pitch_mm() as f32);
     if of_model != of_data {
@@ -472,6 +513,22 @@ fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
         serde_json::to_string(&evaluation)? + "\n"
     } else {
         account::of_evaluation(&evaluation)
+    })
+}
+
+fn evaluate_courses(arguments: &Evaluate, hrn: &Hrn) -> anyhow::Result<String> {
+    let courses = Courses::read(&arguments.data)?;
+    let evaluation = course::evaluate(hrn, &courses, arguments.split.into())?;
+    let evaluation = evaluation.with_context(|| {
+        format!(
+            "{}: no labelled presses in this split: found 0, expected 1 or more",
+            arguments.data.display()
+        )
+    })?;
+    Ok(if arguments.json {
+        serde_json::to_string(&evaluation)? + "\n"
+    } else {
+        account::of_courses(&evaluation)
     })
 }
 

@@ -7,7 +7,6 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail};
-use clap::ValueEnum as _;
 
 use super::children::Job;
 use crate::train::data::dataset::{Dataset, LabelChoice};
@@ -53,7 +52,8 @@ pub(super) struct Recipe {
 /// The rows that there can be, those of the plan's methods first.
 pub(super) fn recipes(plan: &Plan, dataset: &Dataset) -> anyhow::Result<Vec<Recipe>> {
     let few = methods::labels(Method::Hrn15, dataset, None)?;
-    let methods = [&plan.methods, Method::value_variants()].concat();
+    let mut methods = plan.methods.clone();
+    methods.extend(Method::of_frames());
     let mut recipes = Vec::new();
     for (number, &method) in methods.iter().enumerate() {
         if methods[..number].contains(&method) {
@@ -171,6 +171,8 @@ impl Recipe {
             Method::Hrn15 | Method::Nahrn => 3.0,
             Method::Hrn15Strong => 5.0,
             Method::Features => 0.5,
+            // Judges presses, which no comparison of frames has.
+            Method::Course => 0.0,
         }
     }
 }

@@ -5,13 +5,13 @@
 
 use std::io::{Seek, Write};
 use std::ops::Range;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use ndarray::{ArrayView1, ArrayView3};
 use ndarray_npy::{NpzWriter, WriteNpzError};
 
 use super::dataset::file::{self, File};
-use super::dataset::{DatasetError, levels};
+use super::dataset::{DatasetError, Source, levels};
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::simulator::{LabelledCourse, NEWTONS_PER_COUNT, Split};
 
@@ -103,14 +103,63 @@ impl Courses {
         }
     }
 
+    /// Whether the file has presses over time, and not single frames.
+    ///
+    /// # Errors
+    ///
+    /// If it cannot be read.
+    pub fn is_at(path: &Path) -> Result<bool, DatasetError> {
+        let bytes = file::read(path)?;
+        Ok(File::open(&bytes, path)?.has("frames_mn"))
+    }
+
+    /// Reads several files as one, and tells where each came from; their objects stay apart.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`Courses::read`].
+    pub fn read_all(paths: &[PathBuf]) -> Result<(Self, Vec<Source>), DatasetError> {
+        let (mut all, mut sources) = (Self::default(), Vec::new());
+        for path in paths {
+            let bytes = file::read(path)?;
+            let mut file = File::open(&bytes, path)?;
+            let meta = file.meta()?;
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            sources.push(file::source(&bytes, &file, name.into_owned(), &meta)?);
+            all.append(Self::parse(&bytes, path)?);
+        }
+        Ok((all, sources))
+    }
+
+    fn append(&mut self, other: Self) {
+        let (rows, presses) = (self.press.len() as u32, self.presses.len() as u32);
+        let objects = self.presses.iter().map(|press| press.object + 1).max();
+        let objects = objects.unwrap_or_default();
+        self.frames_mn.extend(other.frames_mn);
+        self.press
+            .extend(other.press.iter().map(|press| press + presses));
+        self.time_s.extend(other.time_s);
+        self.approach_mm.extend(other.approach_mm);
+        self.known.extend(other.known);
+        self.presses
+            .extend(other.presses.into_iter().map(|press| Press {
+                object: press.object + objects,
+                best: press.best + rows,
+                ..press
+            }));
+    }
+
     /// Reads a file.
     ///
     /// # Errors
     ///
     /// If it cannot be read, or an array is missing or not as agreed.
     pub fn read(path: &Path) -> Result<Self, DatasetError> {
-        let bytes = file::read(path)?;
-        let mut file = File::open(&bytes, path)?;
+        Self::parse(&file::read(path)?, path)
+    }
+
+    fn parse(bytes: &[u8], path: &Path) -> Result<Self, DatasetError> {
+        let mut file = File::open(bytes, path)?;
         let frames_mn: Vec<u16> = file.required("frames_mn", &[ROWS, COLS], None)?;
         let rows = Some(frames_mn.len() / TAXELS);
         let press: Vec<u32> = file.required("press", &[], rows)?;

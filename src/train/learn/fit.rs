@@ -441,7 +441,7 @@ fn mean_loss(judged: &[(usize, Vec<f32>)], temperature: f64) -> f64 {
 
 /// The temperature of least loss, between 1/8 and 8: the loss is convex in 1/T, so shrinking a
 /// bracket around the least finds it.
-fn temperature(judged: &[(usize, Vec<f32>)]) -> f32 {
+pub fn temperature(judged: &[(usize, Vec<f32>)]) -> f32 {
     let (mut low, mut high) = (0.125_f64, 8.0_f64);
     for _ in 0..60 {
         let (left, right) = (low + (high - low) / 3.0, high - (high - low) / 3.0);

@@ -15,7 +15,7 @@ use crate::train::data::dataset::{self, Dataset, Kind, Source};
 use crate::train::judge::metrics::{Evaluation, Judged};
 use crate::train::net::graph::Graph;
 use crate::train::run::{Description, Run};
-use crate::verdict::{Card, Check, Hrn, Range};
+use crate::verdict::{Card, Check, Checks, Hrn, Range};
 
 /// Check frames a level (`docs/formats.md`).
 const CHECK_FRAMES_A_LEVEL: usize = 2;
@@ -46,10 +46,10 @@ pub fn finish(
     probabilities: impl Fn(&[&Frame]) -> anyhow::Result<Vec<Vec<f32>>>,
 ) -> anyhow::Result<Option<Evaluation>> {
     let frames = check_frames(dataset, train);
-    let check = Check {
+    let checks = Checks::Frames(Check {
         probabilities: probabilities(&frames)?,
         frames: frames.iter().map(|frame| frame.newtons.to_vec()).collect(),
-    };
+    });
     let mut card = Card {
         format: "1".to_owned(),
         levels: dataset::levels(),
@@ -67,7 +67,12 @@ pub fn finish(
             raw_logits,
             temperature,
         } = recogniser.clone();
-        file::write(graph, &raw_logits, temperature, card, &check)
+        let outputs = file::Outputs {
+            raw_logits,
+            temperature,
+            shore: None,
+        };
+        file::write(graph, &outputs, card, &checks)
     };
     // The metrics are measured on the file and then become part of it; the graph is the same.
     let hrn = Hrn::load(&write(&card)?)?;
@@ -157,7 +162,7 @@ fn check_frames<'a>(dataset: &'a Dataset, train: &[usize]) -> Vec<&'a Frame> {
 }
 
 /// `hrn.data`: name, seed and hash; a list where there are several files.
-fn data(sources: &[Source]) -> serde_json::Result<String> {
+pub(super) fn data(sources: &[Source]) -> serde_json::Result<String> {
     let one = |source: &Source| json!({ "name": source.name, "seed": source.seed, "sha256": source.sha256 });
     match sources {
         [source] => serde_json::to_string(&one(source)),
@@ -166,7 +171,7 @@ fn data(sources: &[Source]) -> serde_json::Result<String> {
 }
 
 /// `hrn.validation`.
-fn validation(sources: &[Source]) -> &'static str {
+pub(super) fn validation(sources: &[Source]) -> &'static str {
     let kinds: Vec<Kind> = sources.iter().flat_map(Source::kinds).collect();
     let [simulated, recorded, unknown] =
         [Kind::Simulated, Kind::Recorded, Kind::Unknown].map(|kind| kinds.contains(&kind));

@@ -1,34 +1,50 @@
 //! Writes a recogniser as an ONNX file and takes it only if the daemon would.
 //!
-//! In: a [`Graph`] from newtons to logits, the temperature, the card, and check frames with the
-//! trainer's probabilities. Out: the bytes of the file, already read back through
+//! In: a [`Graph`] from newtons to logits, the temperature, the card, and check frames or presses with
+//! the trainer's probabilities. Out: the bytes of the file, already read back through
 //! [`verdict::Hrn`](crate::verdict::Hrn), which reproduces the check frames or refuses.
 
 use anyhow::{Context as _, ensure};
 use prost::Message as _;
 use tract_onnx::pb;
 
-use crate::train::net::graph::{Graph, integer, model, value_info};
-use crate::verdict::{Card, Check, Hrn};
+use crate::train::net::graph::{Graph, frame_input, integer, model, value_info};
+use crate::verdict::{COURSE_FRAMES, Card, Checks, Hrn, course_inputs};
 
-/// Writes the file: `raw_logits` (`[1, L]`) over `temperature`, their softmax, and the metadata.
+/// What a graph computes.
+#[derive(Debug, Clone)]
+pub struct Outputs {
+    /// Name of the logits `[1, L]` in it, before temperature.
+    pub raw_logits: String,
+    /// What they are divided by.
+    pub temperature: f32,
+    /// Name of the Shore hardness `[1, 3]` in it; of format 2 alone.
+    pub shore: Option<String>,
+}
+
+/// Writes the file: the logits over the temperature, their softmax, and the metadata.
 ///
 /// # Errors
 ///
 /// If the daemon's loader refuses the file, or reads another card from it.
 pub fn write(
     mut graph: Graph,
-    raw_logits: &str,
-    temperature: f32,
+    outputs: &Outputs,
     card: &Card,
-    check: &Check,
+    checks: &Checks,
 ) -> anyhow::Result<Vec<u8>> {
+    let temperature = outputs.temperature;
     ensure!(
         temperature.is_finite() && temperature > 0.0,
         "temperature {temperature}: above 0"
     );
     let temperature = graph.constant("temperature", &[], &[temperature]);
-    graph.node("Div", &[raw_logits, &temperature], "logits", Vec::new());
+    graph.node(
+        "Div",
+        &[&outputs.raw_logits, &temperature],
+        "logits",
+        Vec::new(),
+    );
     graph.node(
         "Softmax",
         &["logits"],
@@ -37,11 +53,19 @@ pub fn write(
     );
 
     let levels = card.levels.len();
-    let output = vec![
+    let mut output = vec![
         value_info("logits", &[1, levels]),
         value_info("probabilities", &[1, levels]),
     ];
-    let proto = model(graph, output, metadata(card, check)?);
+    output.extend(outputs.shore.iter().map(|name| value_info(name, &[1, 3])));
+    let input = match checks {
+        Checks::Frames(_) => vec![frame_input()],
+        Checks::Courses(_) => course_inputs(COURSE_FRAMES.1)
+            .iter()
+            .map(|(name, dims)| value_info(name, dims))
+            .collect(),
+    };
+    let proto = model(graph, input, output, metadata(card, checks)?);
     let bytes = proto.encode_to_vec();
     let read_back = Hrn::load(&bytes).context("the exported model does not pass the daemon's")?;
     ensure!(
@@ -51,8 +75,12 @@ pub fn write(
     Ok(bytes)
 }
 
-fn metadata(card: &Card, check: &Check) -> anyhow::Result<Vec<pb::StringStringEntryProto>> {
-    let entries = [
+fn metadata(card: &Card, checks: &Checks) -> anyhow::Result<Vec<pb::StringStringEntryProto>> {
+    let check = match checks {
+        Checks::Frames(check) => serde_json::to_string(check)?,
+        Checks::Courses(check) => serde_json::to_string(check)?,
+    };
+    let mut entries = vec![
         ("hrn.format", card.format.clone()),
         ("hrn.levels", serde_json::to_string(&card.levels)?),
         ("hrn.pitch_mm", card.pitch_mm.to_string()),
@@ -61,8 +89,11 @@ fn metadata(card: &Card, check: &Check) -> anyhow::Result<Vec<pb::StringStringEn
         ("hrn.metrics", serde_json::to_string(&card.metrics)?),
         ("hrn.validation", card.validation.clone()),
         ("hrn.range", serde_json::to_string(&card.range)?),
-        ("hrn.check", serde_json::to_string(check)?),
+        ("hrn.check", check),
     ];
+    if let Some(conformal) = &card.conformal {
+        entries.push(("hrn.conformal", serde_json::to_string(conformal)?));
+    }
     let entry = |(key, value): (&str, String)| pb::StringStringEntryProto {
         key: key.to_owned(),
         value,

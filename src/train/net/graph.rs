@@ -112,7 +112,10 @@ pub fn number(name: &str, value: f32) -> pb::AttributeProto {
 
 /// A graph that runs here and now, for what training itself needs from it.
 #[derive(Debug)]
-pub struct Plan(Arc<TypedRunnableModel>);
+pub struct Plan {
+    plan: Arc<TypedRunnableModel>,
+    shape: Vec<usize>,
+}
 
 impl Plan {
     /// Prepares `graph` to compute `output`, an f32 of shape `dims`.
@@ -121,13 +124,31 @@ impl Plan {
     ///
     /// If the inference library cannot run it.
     pub fn new(graph: Graph, output: &str, dims: &[usize]) -> anyhow::Result<Self> {
-        let proto = model(graph, vec![value_info(output, dims)], Vec::new());
+        let input = (INPUT, vec![1, 1, ROWS, COLS]);
+        Self::over(graph, &input, &(output, dims.to_vec()))
+    }
+
+    /// The same of another input than a frame; both have a name and a shape.
+    ///
+    /// # Errors
+    ///
+    /// If the inference library cannot run it.
+    pub fn over(
+        graph: Graph,
+        input: &(&str, Vec<usize>),
+        output: &(&str, Vec<usize>),
+    ) -> anyhow::Result<Self> {
+        let [inputs, outputs] = [input, output].map(|(name, dims)| vec![value_info(name, dims)]);
+        let proto = model(graph, inputs, outputs, Vec::new());
         let plan = tract_onnx::onnx()
             .model_for_proto_model(&proto)?
-            .with_input_fact(0, f32::fact([1, 1, ROWS, COLS]).into())?
+            .with_input_fact(0, f32::fact(&input.1).into())?
             .into_optimized()?
             .into_runnable()?;
-        Ok(Self(plan))
+        Ok(Self {
+            plan,
+            shape: input.1.clone(),
+        })
     }
 
     /// The output for one frame, row-major.
@@ -136,8 +157,17 @@ impl Plan {
     ///
     /// If the inference library fails.
     pub fn run(&self, frame: &Frame) -> anyhow::Result<Vec<f32>> {
-        let input = Tensor::from_shape(&[1, 1, ROWS, COLS], &frame.newtons)?;
-        let outputs = self.0.run(tvec!(input.into()))?;
+        self.run_on(&frame.newtons)
+    }
+
+    /// The output for the input's numbers, both row-major.
+    ///
+    /// # Errors
+    ///
+    /// If they are not as many as the input's shape says, or the inference library fails.
+    pub fn run_on(&self, numbers: &[f32]) -> anyhow::Result<Vec<f32>> {
+        let input = Tensor::from_shape(&self.shape, numbers)?;
+        let outputs = self.plan.run(tvec!(input.into()))?;
         Ok(outputs[0].try_as_plain_ram()?.as_slice::<f32>()?.to_vec())
     }
 }
@@ -145,6 +175,7 @@ impl Plan {
 /// The graph as an ONNX model.
 pub(in crate::train) fn model(
     graph: Graph,
+    input: Vec<pb::ValueInfoProto>,
     output: Vec<pb::ValueInfoProto>,
     metadata_props: Vec<pb::StringStringEntryProto>,
 ) -> pb::ModelProto {
@@ -160,13 +191,18 @@ pub(in crate::train) fn model(
             name: "hrn".to_owned(),
             node: graph.nodes,
             initializer: graph.constants,
-            input: vec![value_info(INPUT, &[1, 1, ROWS, COLS])],
+            input,
             output,
             ..Default::default()
         }),
         metadata_props,
         ..Default::default()
     }
+}
+
+/// The input of a model that judges one frame.
+pub(in crate::train) fn frame_input() -> pb::ValueInfoProto {
+    value_info(INPUT, &[1, 1, ROWS, COLS])
 }
 
 /// The type of an f32 tensor in a model.

@@ -127,6 +127,11 @@ impl Weights {
         weight.values.clone().reshape(dims)
     }
 
+    /// The weight called `name`, row-major.
+    pub fn values(&self, name: &str) -> Tensor<1> {
+        self.entry(name).values.clone()
+    }
+
     /// The weight called `name` as numbers, row-major.
     pub fn numbers(&self, name: &str) -> Vec<f32> {
         numbers(&self.entry(name).values)

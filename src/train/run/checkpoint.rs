@@ -71,6 +71,15 @@ impl Origin {
         self
     }
 
+    /// Adds numbers.
+    #[must_use]
+    pub fn numbers(mut self, numbers: impl Iterator<Item = f32>) -> Self {
+        let bytes: Vec<u8> = numbers.flat_map(f32::to_le_bytes).collect();
+        self.0.update((bytes.len() as u64).to_le_bytes());
+        self.0.update(bytes);
+        self
+    }
+
     /// Adds weights.
     #[must_use]
     pub fn weights(mut self, weights: &Weights) -> Self {

@@ -85,22 +85,7 @@ pub(super) fn parse(bytes: &[u8], path: &Path, name: String) -> Result<Dataset, 
             source: 0,
         }
     };
-    let pitch = &meta["pitch_mm"];
-    let pitch_mm = pitch.as_f64().filter(|&mm| mm > 0.0);
-    if !pitch.is_null() && pitch_mm.is_none() {
-        let (found, expected) = (
-            format!("pitch_mm {pitch}"),
-            "millimetres above 0".to_owned(),
-        );
-        return Err(file.error("meta", found, expected));
-    }
-    let source = Source {
-        name,
-        seed: meta["seed"].as_u64(),
-        sha256: sha256_hex(bytes),
-        generator: meta["generator"].as_str().map(str::to_owned),
-        pitch_mm,
-    };
+    let source = source(bytes, &file, name, &meta)?;
     Ok(Dataset {
         samples: (0..n).map(sample).collect(),
         sources: vec![source],
@@ -112,6 +97,31 @@ pub(in crate::train::data) fn read(path: &Path) -> Result<Vec<u8>, DatasetError>
     std::fs::read(path).map_err(|source| DatasetError::Unreadable {
         path: path.to_owned(),
         source,
+    })
+}
+
+/// Where the samples or presses of a file came from.
+pub(in crate::train::data) fn source(
+    bytes: &[u8],
+    file: &File,
+    name: String,
+    meta: &serde_json::Value,
+) -> Result<Source, DatasetError> {
+    let pitch = &meta["pitch_mm"];
+    let pitch_mm = pitch.as_f64().filter(|&mm| mm > 0.0);
+    if !pitch.is_null() && pitch_mm.is_none() {
+        let (found, expected) = (
+            format!("pitch_mm {pitch}"),
+            "millimetres above 0".to_owned(),
+        );
+        return Err(file.error("meta", found, expected));
+    }
+    Ok(Source {
+        name,
+        seed: meta["seed"].as_u64(),
+        sha256: sha256_hex(bytes),
+        generator: meta["generator"].as_str().map(str::to_owned),
+        pitch_mm,
     })
 }
 
@@ -270,6 +280,13 @@ impl<'a> File<'a> {
         }
     }
 
+    /// Whether there is such an array.
+    pub(in crate::train::data) fn has(&self, array: &str) -> bool {
+        self.zip
+            .file_names()
+            .any(|name| name.strip_suffix(".npy") == Some(array))
+    }
+
     /// As [`File::read`], of an array that must be there.
     pub(in crate::train::data) fn required<T: Element>(
         &mut self,
@@ -282,7 +299,7 @@ impl<'a> File<'a> {
     }
 
     /// The array `meta`; null if it is not there.
-    fn meta(&mut self) -> Result<serde_json::Value, DatasetError> {
+    pub(in crate::train::data) fn meta(&mut self) -> Result<serde_json::Value, DatasetError> {
         let Some(text) = self.read::<u8>("meta", &[], None)? else {
             return Ok(serde_json::Value::Null);
         };

@@ -1,0 +1,181 @@
+//! What a robot may tell wrongly: presses are learnt from with these errors, because a network that
+//! was only ever told the truth believes everything.
+
+use serde::{Deserialize, Serialize};
+
+use super::Press;
+use crate::random::Stream;
+
+/// Errors of what the arm tells, drawn for each press.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Told {
+    /// Share of presses of which nothing is known of the arm.
+    pub unknown: f64,
+    /// Share of the others of which the stiffness is not known.
+    pub unknown_arm: f64,
+    /// Share of the others that are told without an error.
+    pub exact: f64,
+    /// Positions are off by up to this part.
+    pub position: f64,
+    /// The stiffness is off by up to this part.
+    pub arm: f64,
+    /// The moments are off by up to so many frames.
+    pub clock_frames: f64,
+    /// Share of presses that are judged before their end.
+    pub early: f64,
+}
+
+impl Default for Told {
+    fn default() -> Self {
+        Self {
+            unknown: 0.3,
+            unknown_arm: 0.1,
+            exact: 0.5,
+            position: 0.1,
+            arm: 0.3,
+            clock_frames: 1.0,
+            early: 0.25,
+        }
+    }
+}
+
+/// Frames at least of a press that is judged before its end.
+const LEAST_FRAMES: usize = 3;
+
+impl Told {
+    /// The press as a robot might tell it.
+    pub fn varied(&self, press: &Press, stream: &mut Stream) -> Press {
+        let mut press = press.clone();
+        if stream.uniform() < self.early && press.moments.len() > LEAST_FRAMES {
+            let frames = LEAST_FRAMES + stream.below(press.moments.len() - LEAST_FRAMES);
+            press.moments.truncate(frames);
+            press
+                .features
+                .truncate(frames * crate::train::net::course::FEATURES);
+        }
+        if stream.uniform() < self.unknown {
+            press.arm_n_per_mm = 0.0;
+            press
+                .moments
+                .iter_mut()
+                .for_each(|moment| moment.approach_mm = None);
+            return press;
+        }
+        if stream.uniform() < self.unknown_arm {
+            press.arm_n_per_mm = 0.0;
+        }
+        if stream.uniform() < self.exact {
+            return press;
+        }
+        let mut off = |most: f64| stream.range(-most, most);
+        let (position, arm) = (1.0 + off(self.position), 1.0 + off(self.arm));
+        let late_frames = off(self.clock_frames);
+        press.arm_n_per_mm *= arm as f32;
+        let late_s = (late_frames * press.period_s()) as f32;
+        let told: Vec<(f32, f32)> = press
+            .moments
+            .iter()
+            .filter_map(|moment| Some((moment.time_s, moment.approach_mm?)))
+            .collect();
+        let Some(begin) = told.first().map(|_| at(&told, late_s)) else {
+            return press;
+        };
+        for moment in &mut press.moments {
+            if moment.approach_mm.is_some() {
+                let late = at(&told, moment.time_s + late_s);
+                moment.approach_mm = Some((late - begin) * position as f32);
+            }
+        }
+        press
+    }
+}
+
+impl Press {
+    /// The least time between its frames.
+    fn period_s(&self) -> f64 {
+        let steps = self
+            .moments
+            .windows(2)
+            .map(|pair| pair[1].time_s - pair[0].time_s);
+        f64::from(steps.fold(f32::INFINITY, f32::min).min(1.0))
+    }
+}
+
+/// The approach at a moment between, before or after those told; before the first and after the last
+/// it goes on as it did.
+fn at(told: &[(f32, f32)], time_s: f32) -> f32 {
+    let [_, .., last] = told else {
+        return told.first().map_or(0.0, |&(_, mm)| mm);
+    };
+    if time_s >= last.0 {
+        return last.1;
+    }
+    // Before the begin the arm was on its way at the speed of the first two.
+    let next = told
+        .partition_point(|&(moment_s, _)| moment_s <= time_s)
+        .clamp(1, told.len() - 1);
+    let (before, after) = (told[next - 1], told[next]);
+    before.1 + (after.1 - before.1) * (time_s - before.0) / (after.0 - before.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::train::net::course::{FEATURES, Moment};
+
+    fn press() -> Press {
+        let moment = |n: u8| Moment {
+            time_s: 0.1 * f32::from(n),
+            approach_mm: Some(0.5 * f32::from(n)),
+            force_n: 1.0,
+        };
+        Press {
+            features: vec![0.0; 10 * FEATURES],
+            moments: (0..10).map(moment).collect(),
+            arm_n_per_mm: 10.0,
+            level: 1,
+            shore: Some(80.0),
+            object: 0,
+        }
+    }
+
+    #[test]
+    fn errors_stay_within_what_was_asked_for() {
+        let told = Told {
+            unknown: 0.0,
+            unknown_arm: 0.0,
+            exact: 0.0,
+            early: 0.0,
+            ..Told::default()
+        };
+        let mut stream = Stream::new(1, "told");
+        let mut moved = 0.0_f32;
+        for _ in 0..200 {
+            let press = told.varied(&press(), &mut stream);
+            assert!((7.0..=13.0).contains(&press.arm_n_per_mm));
+            assert_eq!(press.moments[0].approach_mm, Some(0.0));
+            let top = press.moments[9].approach_mm.unwrap();
+            // 4.5 mm, a tenth and a frame more or less.
+            assert!((3.5..=5.5).contains(&top), "{top}");
+            moved = moved.max((top - 4.5).abs());
+        }
+        assert!(moved > 0.4, "{moved}");
+    }
+
+    #[test]
+    fn shares_are_kept_and_an_early_press_has_three_frames() {
+        let mut stream = Stream::new(2, "told");
+        let drawn: Vec<Press> = (0..1000)
+            .map(|_| Told::default().varied(&press(), &mut stream))
+            .collect();
+        let share = |is: fn(&Press) -> bool| drawn.iter().filter(|press| is(press)).count();
+        assert!((240..360).contains(&share(|p| p.moments[0].approach_mm.is_none())));
+        assert!((200..300).contains(&share(|p| p.moments.len() < 10)));
+        assert!(
+            drawn
+                .iter()
+                .all(|p| p.moments.len() >= 3 && p.features.len() == p.moments.len() * FEATURES)
+        );
+    }
+}

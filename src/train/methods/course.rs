@@ -1,0 +1,96 @@
+//! The method `course`: the network that judges whole presses.
+
+use anyhow::ensure;
+use burn::tensor::Device;
+
+use super::Method;
+use crate::random::Stream;
+use crate::simulator::Split;
+use crate::train::data::courses::Courses;
+use crate::train::data::dataset::{self, LabelChoice, Source};
+use crate::train::learn::course::{self, Press, Task, Told};
+use crate::train::model::course::{CourseEvaluation, finish};
+use crate::train::run::{Description, Run};
+use crate::train::settings::{Profile, Settings};
+
+/// Labelled training presses of a file.
+fn labelled(courses: &Courses) -> Vec<usize> {
+    let presses = courses.presses.iter().enumerate();
+    let wanted = presses.filter(|(_, press)| press.split == Split::Train && press.level > 0);
+    wanted.map(|(place, _)| place).collect()
+}
+
+/// What a run is told: all labels are used.
+///
+/// # Errors
+///
+/// If the data has no labelled training presses.
+pub fn description(
+    courses: &Courses,
+    sources: Vec<Source>,
+    (profile, seed, settings): (Profile, u64, Settings),
+) -> anyhow::Result<Description> {
+    let labels = labelled(courses).len();
+    ensure!(
+        labels > 0,
+        "{}: no labelled training presses: found 0, expected 1 or more",
+        sources.first().map_or("", |source| &source.name)
+    );
+    Ok(Description {
+        method: Method::Course.name().to_owned(),
+        profile,
+        seed,
+        labels,
+        label_choice: LabelChoice::Object,
+        settings,
+        data: sources,
+    })
+}
+
+/// Runs the method to its model and evaluation in the run's directory; takes up what is there.
+///
+/// # Errors
+///
+/// If the training diverges, or the directory cannot be read or written.
+pub fn train(
+    courses: &Courses,
+    description: &Description,
+    run: &Run,
+    device: &Device,
+) -> anyhow::Result<Option<CourseEvaluation>> {
+    let presses = course::presses(courses)?;
+    let all = labelled(courses);
+    let Description { settings, seed, .. } = description;
+    let (train, held_out) = hold_out(&presses, &all, settings.validation.share, *seed);
+    let task = Task {
+        presses: &presses,
+        train: &train,
+        held_out: &held_out,
+        levels: dataset::levels().len(),
+        told: Told::default(),
+        settings: &settings.training,
+        seed: *seed,
+        device,
+    };
+    let trained = course::fit(&task, run)?;
+    finish(
+        run,
+        description,
+        courses,
+        (&presses, &train),
+        &trained,
+        device,
+    )
+}
+
+/// Parts presses by their objects: those to learn from, and `share` of the objects to calibrate on.
+fn hold_out(presses: &[Press], all: &[usize], share: f64, seed: u64) -> (Vec<usize>, Vec<usize>) {
+    let mut objects: Vec<u32> = all.iter().map(|&place| presses[place].object).collect();
+    objects.sort_unstable();
+    objects.dedup();
+    Stream::new(seed, "held-out objects").shuffle(&mut objects);
+    let count = (share * objects.len() as f64).round() as usize;
+    let held = &objects[..count];
+    all.iter()
+        .partition(|&&place| !held.contains(&presses[place].object))
+}

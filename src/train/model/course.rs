@@ -1,0 +1,300 @@
+//! From a trained network of courses to a model file of format 2, and how good the file is.
+
+use anyhow::ensure;
+use burn::tensor::Device;
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+
+use super::export::{data, validation};
+use super::file;
+use crate::press;
+use crate::simulator::Split;
+use crate::train::data::courses::{self, Courses};
+use crate::train::data::dataset;
+use crate::train::judge::metrics::{Evaluation, Judged};
+use crate::train::learn::course::{ALPHA, Press, Trained};
+use crate::train::learn::fit;
+use crate::train::net::course::{self, FRAMES};
+use crate::train::run::{Description, Run};
+use crate::verdict::{
+    Card, CheckedCourse, Checks, Conformal, Course, CourseCheck, CourseMoment, Format, Hrn, Range,
+    Shore, Verdict,
+};
+
+/// Check presses a level (`docs/formats.md`).
+const CHECKS_A_LEVEL: usize = 2;
+
+/// How good a model is on whole presses: what `evaluate --json` prints of such a file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CourseEvaluation {
+    /// Of the levels.
+    #[serde(flatten)]
+    pub levels: Evaluation,
+    /// Share of presses whose level is off by more than one.
+    pub beyond_neighbour: f64,
+    /// Of the Shore hardness; null for a model or data without it.
+    pub shore: Option<ShoreEvaluation>,
+    /// Of the sets of levels; null for a model without them.
+    pub sets: Option<SetEvaluation>,
+}
+
+/// How good the Shore hardness is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ShoreEvaluation {
+    /// Root of the mean squared error, Shore OO.
+    pub rmse: f64,
+    /// The same of each level; null for an absent one.
+    pub rmse_by_level: Vec<Option<f64>>,
+    /// Share of presses whose interval holds the truth: 0.9 is promised.
+    pub coverage: f64,
+    /// Mean width of the intervals, Shore OO.
+    pub width: f64,
+}
+
+/// How good the sets of levels are.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SetEvaluation {
+    /// Share of presses whose set holds the true level: 0.9 is promised.
+    pub coverage: f64,
+    /// Share of presses whose set is more than one level: such verdicts are rejected as ambiguous.
+    pub ambiguous: f64,
+    /// Accuracy on the others.
+    pub accuracy_of_others: Option<f64>,
+}
+
+/// Writes the model and its evaluation on the test split into the run's directory. `train` are
+/// the presses learnt from.
+///
+/// # Errors
+///
+/// If the daemon's loader refuses the file, or the directory cannot be written.
+pub fn finish(
+    run: &Run,
+    description: &Description,
+    courses: &Courses,
+    (presses, train): (&[Press], &[usize]),
+    trained: &Trained,
+    device: &Device,
+) -> anyhow::Result<Option<CourseEvaluation>> {
+    let levels = dataset::levels();
+    let checked: Vec<usize> = check_presses(courses, train);
+    let of_checked: Vec<Press> = checked
+        .iter()
+        .map(|&place| presses[place].clone())
+        .collect();
+    let judged = trained.judge(&of_checked, levels.len(), device);
+    let logits: Vec<Vec<f32>> = judged.iter().map(|(logits, _)| logits.clone()).collect();
+    let probabilities = fit::probabilities(&logits, trained.temperature, device);
+    let check = |((&place, probabilities), (_, shore)): ((&usize, Vec<f32>), &(_, [f32; 3]))| {
+        CheckedCourse {
+            course: course_of(courses, place),
+            probabilities,
+            shore: Shore::from(*shore),
+        }
+    };
+    let presses_checked = checked.iter().zip(probabilities).zip(&judged).map(check);
+    let checks = Checks::Courses(CourseCheck {
+        presses: presses_checked.collect(),
+    });
+    let mut card = Card {
+        format: "2".to_owned(),
+        levels: levels.clone(),
+        pitch_mm: dataset::PITCH_MM as f32,
+        method: description.method.clone(),
+        data: data(&description.data)?,
+        metrics: json!({ "temperature": trained.temperature }),
+        validation: validation(&description.data).to_owned(),
+        range: range(courses, train),
+        conformal: (trained.threshold > 0.0).then_some(Conformal {
+            alpha: ALPHA,
+            threshold: trained.threshold,
+        }),
+    };
+    let write = |card: &Card| {
+        let (graph, raw_logits, shore) = course::graph(
+            &trained.weights,
+            &trained.standard,
+            levels.len(),
+            trained.widths,
+        );
+        let outputs = file::Outputs {
+            raw_logits,
+            temperature: trained.temperature,
+            shore: Some(shore),
+        };
+        file::write(graph, &outputs, card, &checks)
+    };
+    let hrn = Hrn::load(&write(&card)?)?;
+    let evaluation = evaluate(&hrn, courses, Split::Test)?;
+    if let Some(evaluation) = &evaluation {
+        card.metrics["test"] = json!(evaluation);
+        let json = serde_json::to_vec_pretty(evaluation)?;
+        run.write("evaluation.json", &json)?;
+    }
+    run.write("hrn.onnx", &write(&card)?)?;
+    Ok(evaluation)
+}
+
+/// Judges the labelled presses of a split with a model, and evaluates what it said; a model of
+/// format 1 judges each press's best frame. `None` without such presses.
+///
+/// # Errors
+///
+/// If the model has fewer levels than the data, or fails to judge a press.
+pub fn evaluate(
+    hrn: &Hrn,
+    courses: &Courses,
+    split: Split,
+) -> anyhow::Result<Option<CourseEvaluation>> {
+    let of_split = |(_, press): &(usize, &courses::Press)| press.split == split && press.level > 0;
+    let all = courses.presses.iter().enumerate().filter(of_split);
+    let mut verdicts = Vec::new();
+    for (place, press) in all {
+        ensure!(
+            usize::from(press.level) <= hrn.card().levels.len(),
+            "the model has {} levels, and the data has a press of level {}",
+            hrn.card().levels.len(),
+            press.level
+        );
+        let verdict = match hrn.format() {
+            Format::Frame => hrn.judge(&courses.frame(press.best as usize))?,
+            Format::Course { .. } => hrn.judge_course(&course_of(courses, place))?,
+        };
+        verdicts.push((*press, verdict));
+    }
+    Ok((!verdicts.is_empty()).then(|| evaluation(&verdicts, hrn.card().levels.len())))
+}
+
+fn evaluation(verdicts: &[(courses::Press, Verdict)], levels: usize) -> CourseEvaluation {
+    let judged: Vec<Judged> = verdicts
+        .iter()
+        .map(|(press, verdict)| Judged {
+            level: press.level,
+            probabilities: verdict.probabilities.clone(),
+            object: Some(press.object),
+        })
+        .collect();
+    let n = verdicts.len() as f64;
+    let far = verdicts
+        .iter()
+        .filter(|(press, verdict)| press.level.abs_diff(verdict.level) > 1);
+    CourseEvaluation {
+        levels: Evaluation::of(&judged, levels),
+        beyond_neighbour: far.count() as f64 / n,
+        shore: shore(verdicts, levels),
+        sets: sets(verdicts),
+    }
+}
+
+fn shore(verdicts: &[(courses::Press, Verdict)], levels: usize) -> Option<ShoreEvaluation> {
+    let both = |(press, verdict): &(courses::Press, Verdict)| {
+        let shore = verdict.shore?;
+        press
+            .shore
+            .is_finite()
+            .then_some((press.level, f64::from(press.shore), shore))
+    };
+    let told: Vec<(u8, f64, Shore)> = verdicts.iter().filter_map(both).collect();
+    if told.is_empty() {
+        return None;
+    }
+    let rmse = |of: &dyn Fn(u8) -> bool| {
+        let errors: Vec<f64> = told
+            .iter()
+            .filter(|(level, ..)| of(*level))
+            .map(|(_, truth, shore)| (f64::from(shore.value) - truth).powi(2))
+            .collect();
+        (!errors.is_empty()).then(|| (errors.iter().sum::<f64>() / errors.len() as f64).sqrt())
+    };
+    let n = told.len() as f64;
+    let held = told
+        .iter()
+        .filter(|(_, truth, shore)| (f64::from(shore.low)..=f64::from(shore.high)).contains(truth));
+    Some(ShoreEvaluation {
+        rmse: rmse(&|_| true).expect("there are presses"),
+        rmse_by_level: (1..=levels as u8)
+            .map(|level| rmse(&|of| of == level))
+            .collect(),
+        coverage: held.count() as f64 / n,
+        width: told
+            .iter()
+            .map(|(.., shore)| f64::from(shore.high - shore.low))
+            .sum::<f64>()
+            / n,
+    })
+}
+
+fn sets(verdicts: &[(courses::Press, Verdict)]) -> Option<SetEvaluation> {
+    let of = |(press, verdict): &(courses::Press, Verdict)| {
+        let set = verdict.levels.clone()?;
+        Some((set.contains(&press.level), set.len() > 1))
+    };
+    let sets: Vec<(bool, bool)> = verdicts.iter().filter_map(of).collect();
+    if sets.is_empty() {
+        return None;
+    }
+    let n = sets.len() as f64;
+    let share = |count: usize| count as f64 / n;
+    let single: Vec<bool> = sets.iter().filter(|set| !set.1).map(|set| set.0).collect();
+    let right = single.iter().filter(|&&holds| holds).count();
+    Some(SetEvaluation {
+        coverage: share(sets.iter().filter(|set| set.0).count()),
+        ambiguous: share(sets.len() - single.len()),
+        accuracy_of_others: (!single.is_empty()).then(|| right as f64 / single.len() as f64),
+    })
+}
+
+/// A press as the daemon would give it to a model.
+pub fn course_of(courses: &Courses, press: usize) -> Course {
+    let rows = courses
+        .rows(press)
+        .filter(|&row| courses.time_s[row] >= 0.0);
+    let moment = |row: usize| CourseMoment {
+        time_s: courses.time_s[row],
+        approach_mm: (courses.known[row] == 1).then_some(courses.approach_mm[row]),
+        frame: courses.frame(row),
+    };
+    Course {
+        moments: rows.take(FRAMES).map(moment).collect(),
+        arm_n_per_mm: courses.presses[press].arm_n_per_mm,
+    }
+}
+
+/// Two presses of each level, from a third and two thirds of its presses.
+fn check_presses(courses: &Courses, train: &[usize]) -> Vec<usize> {
+    let mut checked = Vec::new();
+    for level in dataset::levels() {
+        let of_level = |press: &usize| courses.presses[*press].level == level.level;
+        let presses: Vec<usize> = train.iter().copied().filter(of_level).collect();
+        // A level without presses is checked by those of the others.
+        let presses = if presses.is_empty() {
+            train.to_vec()
+        } else {
+            presses
+        };
+        for part in 1..=CHECKS_A_LEVEL {
+            checked.push(presses[presses.len() * part / (CHECKS_A_LEVEL + 1)]);
+        }
+    }
+    checked
+}
+
+/// Total force and contact area of the best frames of the presses learnt from.
+fn range(courses: &Courses, train: &[usize]) -> Range {
+    let threshold_n = press::Settings::default().contact_threshold_n;
+    let mut range = Range {
+        force_n: [f32::INFINITY, 0.0],
+        contact_area_taxels: [u32::MAX, 0],
+    };
+    for &press in train {
+        let frame = courses.frame(courses.presses[press].best as usize);
+        let (force_n, area) = (
+            frame.force_n() as f32,
+            frame.contact_area_taxels(threshold_n),
+        );
+        range.force_n = [range.force_n[0].min(force_n), range.force_n[1].max(force_n)];
+        let [least, most] = range.contact_area_taxels;
+        range.contact_area_taxels = [least.min(area), most.max(area)];
+    }
+    range
+}

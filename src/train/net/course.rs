@@ -1,0 +1,304 @@
+//! The network that judges the course of a press: a temporal convolution over hand-made features of
+//! each frame and the arm's approach.
+//!
+//! In: the features of a press's frames, their times and what the arm told. Out: weights, and the
+//! graph of the exported file of format 2. A frame fixes only the ratio of radius and modulus; force
+//! against approach fixes both (`docs/method.md`).
+
+use burn::tensor::{Device, Tensor, TensorData, activation};
+
+use crate::random::Stream;
+use crate::train::net::network::Weights;
+use crate::verdict::COURSE_FRAMES;
+
+pub use frames::{FEATURES, Features, force_n};
+pub use graph::graph;
+
+mod builder;
+mod frames;
+mod graph;
+
+/// Frames that a model takes.
+pub const FRAMES: usize = COURSE_FRAMES.1;
+/// Columns beside a frame's features.
+pub const MOTION: usize = 7;
+/// Columns of a moment.
+pub const COLUMNS: usize = FEATURES + MOTION;
+/// Width of the hidden layers, and of the layer before the outputs.
+const HIDDEN: usize = 48;
+const LAST: usize = 64;
+/// Moments under a kernel, and the distance between them in each convolution.
+const KERNEL: usize = 5;
+const DILATIONS: [usize; 3] = [1, 2, 4];
+/// A press's pools: mean, greatest, and mean weighted by force.
+const POOLS: usize = 3;
+/// Outputs beside the levels: Shore OO, and the ends of its interval.
+pub const SHORE: usize = 3;
+/// Shore OO of an output of 0, and of a unit more.
+pub const SHORE_MIDDLE: f32 = 55.0;
+/// Likewise.
+pub const SHORE_UNIT: f32 = 25.0;
+/// Columns are clipped at so many standard deviations from their mean: beyond what was trained on,
+/// a network extrapolates.
+const CLIP: f32 = 4.0;
+
+/// What a press tells at one moment, beside the frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Moment {
+    /// Since the frame that began the press.
+    pub time_s: f32,
+    /// How far the arm went since then; `None`: unknown.
+    pub approach_mm: Option<f32>,
+    /// Total force of the frame's taxels in contact.
+    pub force_n: f32,
+}
+
+/// The columns beside the features, a row a moment; `arm_n_per_mm` is 0 where it is unknown.
+///
+/// With d the approach and k the arm's stiffness, d - F/k is how far object and cover gave way; by
+/// Hertz F = 4/3 E* R^(1/2) (d - F/k)^(3/2), so logarithms make a power law a sum.
+pub fn motion(moments: &[Moment], arm_n_per_mm: f32) -> Vec<[f32; MOTION]> {
+    let is_arm_known = if arm_n_per_mm > 0.0 { 1.0 } else { 0.0 };
+    let arm = arm_n_per_mm.max(graph::LEAST_ARM);
+    let mut before_s = moments.first().map_or(0.0, |moment| moment.time_s);
+    let row = |moment: &Moment| {
+        let known = if moment.approach_mm.is_some() {
+            1.0
+        } else {
+            0.0
+        };
+        let approach = moment.approach_mm.unwrap_or(0.0);
+        let step_s = moment.time_s - before_s;
+        before_s = moment.time_s;
+        let logarithm = |mm: f32| (mm.clamp(0.0, graph::MOST_MM) + graph::MM).ln();
+        let indentation = approach - moment.force_n / arm;
+        let both = known * is_arm_known;
+        [
+            (moment.time_s.clamp(0.0, graph::MOST_S) + graph::TIME_S).ln(),
+            (step_s.clamp(0.0, graph::MOST_STEP_S) + graph::STEP_S).ln(),
+            known,
+            known * logarithm(approach),
+            both * logarithm(indentation),
+            both * indentation.clamp(0.0, graph::MOST_MM),
+            is_arm_known * arm.ln(),
+        ]
+    };
+    moments.iter().map(row).collect()
+}
+
+/// Mean and standard deviation of each column over the moments learnt from.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Standard {
+    /// `[COLUMNS]`.
+    pub mean: Vec<f32>,
+    /// `[COLUMNS]`.
+    pub deviation: Vec<f32>,
+}
+
+impl Standard {
+    /// Of rows of [`COLUMNS`].
+    pub fn of<'a>(rows: impl Iterator<Item = &'a [f32]> + Clone) -> Self {
+        let count = rows.clone().count().max(1) as f64;
+        let mut mean = [0.0; COLUMNS];
+        for row in rows.clone() {
+            mean.iter_mut()
+                .zip(row)
+                .for_each(|(sum, &x)| *sum += f64::from(x) / count);
+        }
+        let mut variance = [0.0; COLUMNS];
+        for row in rows {
+            for ((sum, &x), mean) in variance.iter_mut().zip(row).zip(&mean) {
+                *sum += (f64::from(x) - mean).powi(2) / count;
+            }
+        }
+        Self {
+            mean: mean.iter().map(|&mean| mean as f32).collect(),
+            // A column that never varies is no divisor.
+            deviation: variance.iter().map(|v| v.sqrt().max(1e-3) as f32).collect(),
+        }
+    }
+
+    /// A column's number as the network takes it.
+    pub fn apply(&self, column: usize, x: f32) -> f32 {
+        ((x - self.mean[column]) / self.deviation[column]).clamp(-CLIP, CLIP)
+    }
+}
+
+/// A batch of presses as the network takes them.
+#[derive(Debug, Clone)]
+pub struct Batch {
+    /// Standardised columns, 0 where there is no frame: `[batch, FRAMES, COLUMNS]`.
+    pub columns: Tensor<3>,
+    /// 1 where there is a frame: `[batch, FRAMES, 1]`.
+    pub mask: Tensor<3>,
+    /// Each frame's part of the press's force: `[batch, FRAMES, 1]`.
+    pub weights: Tensor<3>,
+}
+
+impl Batch {
+    /// Of presses: each one's columns, standardised, and the forces of its frames.
+    pub fn new(presses: &[(Vec<f32>, Vec<f32>)], device: &Device) -> Self {
+        let batch = presses.len();
+        let mut columns = vec![0.0; batch * FRAMES * COLUMNS];
+        let (mut mask, mut weights) = (vec![0.0; batch * FRAMES], vec![0.0; batch * FRAMES]);
+        for (press, (rows, forces)) in presses.iter().enumerate() {
+            columns[press * FRAMES * COLUMNS..][..rows.len()].copy_from_slice(rows);
+            let sum = forces.iter().sum::<f32>() + graph::TINY_N;
+            for (place, &force_n) in forces.iter().enumerate() {
+                mask[press * FRAMES + place] = 1.0;
+                weights[press * FRAMES + place] = force_n / sum;
+            }
+        }
+        let tensor = |values, dims: [usize; 3]| {
+            Tensor::<3>::from_data(TensorData::new(values, dims), device)
+        };
+        Self {
+            columns: tensor(columns, [batch, FRAMES, COLUMNS]),
+            mask: tensor(mask, [batch, FRAMES, 1]),
+            weights: tensor(weights, [batch, FRAMES, 1]),
+        }
+    }
+}
+
+/// Initial weights for `levels` levels: N(0, 2 / inputs) before a ReLU.
+pub fn initial(levels: usize, seed: u64, device: &Device) -> Weights {
+    let root = Stream::new(seed, "course weights");
+    let mut weights = Weights::default();
+    let mut add = |name: &str, dims: &[usize], gain: f64| {
+        let (outputs, count) = (dims[dims.len() - 1], dims.iter().product::<usize>());
+        let deviation = (gain * outputs as f64 / count as f64).sqrt();
+        let mut stream = root.child(weights.entries.len() as u64);
+        let values = (0..count).map(|_| (deviation * stream.normal()) as f32);
+        weights.add(&format!("{name}.matrix"), dims, values.collect(), device);
+        weights.add(
+            &format!("{name}.bias"),
+            &[outputs],
+            vec![0.0; outputs],
+            device,
+        );
+    };
+    add("embed", &[COLUMNS, HIDDEN], 2.0);
+    for layer in 0..DILATIONS.len() {
+        // Half: what a residual layer adds.
+        add(
+            &format!("conv{}", layer + 1),
+            &[KERNEL, HIDDEN, HIDDEN],
+            1.0,
+        );
+    }
+    add("joint", &[POOLS * HIDDEN, LAST], 2.0);
+    add("head", &[LAST, levels + SHORE], 0.5);
+    weights
+}
+
+/// Logits and Shore outputs `[batch, L + 3]`.
+pub fn outputs(weights: &Weights, batch: &Batch) -> Tensor<2> {
+    let [presses, frames, _] = batch.mask.dims();
+    let mask = || batch.mask.clone();
+    let rows = presses * frames;
+    let flat = batch.columns.clone().reshape([rows, COLUMNS]);
+    let x = activation::relu(dense(weights, "embed", flat));
+    let mut x = x.reshape([presses, frames, HIDDEN]).mul(mask());
+    for (layer, dilation) in (1..).zip(DILATIONS) {
+        let name = format!("conv{layer}");
+        let zeros = Tensor::<3>::zeros([presses, KERNEL / 2 * dilation, HIDDEN], &x.device());
+        let padded = Tensor::cat(vec![zeros.clone(), x.clone(), zeros], 1);
+        let shifted = (0..KERNEL).map(|tap| {
+            let first = tap * dilation;
+            padded
+                .clone()
+                .slice([0..presses, first..first + frames, 0..HIDDEN])
+        });
+        let patches = Tensor::cat(shifted.collect(), 2).reshape([rows, KERNEL * HIDDEN]);
+        let added = activation::relu(dense(weights, &name, patches));
+        x = x.add(added.reshape([presses, frames, HIDDEN])).mul(mask());
+    }
+    let mean = x.clone().sum_dim(1).div(mask().sum_dim(1));
+    let greatest = x.clone().max_dim(1);
+    let weighted = x.mul(batch.weights.clone()).sum_dim(1);
+    let pooled = Tensor::cat(vec![mean, greatest, weighted], 2).reshape([presses, POOLS * HIDDEN]);
+    let joint = activation::relu(dense(weights, "joint", pooled));
+    dense(weights, "head", joint)
+}
+
+fn dense(weights: &Weights, name: &str, x: Tensor<2>) -> Tensor<2> {
+    let bias = weights.tensor::<1>(&format!("{name}.bias"));
+    let (inputs, outputs) = (x.dims()[1], bias.dims()[0]);
+    let matrix = weights
+        .values(&format!("{name}.matrix"))
+        .reshape([inputs, outputs]);
+    x.matmul(matrix).add(bias.reshape([1, outputs]))
+}
+
+/// Pinball losses of the median and of the ends of a 90 % interval, summed and averaged over presses.
+/// `outputs` are the three of each press; `shore` is `[batch, 1]` on their scale, `known` 1 where it was
+/// measured.
+pub fn interval_loss(outputs: Tensor<2>, shore: Tensor<2>, known: Tensor<2>) -> Tensor<1> {
+    let batch = outputs.dims()[0] as f32;
+    let quantiles =
+        Tensor::<1>::from_floats([0.5, 0.05, 0.95], &outputs.device()).reshape([1, SHORE]);
+    let error = shore.sub(outputs);
+    let above = activation::relu(error.clone()).mul(quantiles.clone());
+    let below = activation::relu(error.neg()).mul(quantiles.neg().add_scalar(1.0));
+    above.add(below).mul(known).sum().div_scalar(batch)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn motion_is_0_where_nothing_is_known() {
+        let moment = |time_s, approach_mm| Moment {
+            time_s,
+            approach_mm,
+            force_n: 5.0,
+        };
+        let rows = motion(&[moment(0.0, None), moment(0.2, None)], 0.0);
+        assert_eq!(rows[1][2..], [0.0; 5]);
+        assert_eq!(rows[1][0], 0.25_f32.ln());
+        assert_eq!(rows[1][1], 0.21_f32.ln());
+        // 4 mm less the 0.5 mm that 10 N/mm give under 5 N.
+        let rows = motion(&[moment(0.0, Some(0.0)), moment(0.2, Some(4.0))], 10.0);
+        assert_eq!(rows[1][3], 4.3_f32.ln());
+        assert_eq!(rows[1][4], 3.8_f32.ln());
+        assert_eq!(rows[1][5], 3.5);
+    }
+
+    #[test]
+    fn the_network_begins_with_activations_of_unit_size() {
+        let device = Device::flex();
+        let weights = initial(4, 1, &device);
+        let mut stream = Stream::new(2, "columns");
+        let press = |frames: usize, stream: &mut Stream| {
+            let rows = (0..frames * COLUMNS).map(|_| stream.normal() as f32);
+            (rows.collect::<Vec<f32>>(), vec![1.0; frames])
+        };
+        let presses: Vec<_> = (3..35).map(|frames| press(frames, &mut stream)).collect();
+        let outputs = outputs(&weights, &Batch::new(&presses, &device));
+        let values = crate::train::net::network::numbers(&outputs);
+        let variance = values.iter().map(|x| x * x).sum::<f32>() / values.len() as f32;
+        assert!((0.1..10.0).contains(&variance), "{variance}");
+    }
+
+    #[test]
+    fn what_lies_beyond_the_last_frame_does_not_count() {
+        let device = Device::flex();
+        let weights = initial(4, 1, &device);
+        let rows: Vec<f32> = (0..5 * COLUMNS).map(|k| (k % 7) as f32 - 3.0).collect();
+        let other = (vec![2.0; FRAMES * COLUMNS], vec![3.0; FRAMES]);
+        let alone = outputs(
+            &weights,
+            &Batch::new(&[(rows.clone(), vec![1.0; 5])], &device),
+        );
+        let beside = outputs(
+            &weights,
+            &Batch::new(&[other, (rows, vec![1.0; 5])], &device),
+        );
+        let alone = crate::train::net::network::numbers(&alone);
+        let beside = crate::train::net::network::numbers(&beside);
+        for (a, b) in alone.iter().zip(&beside[alone.len()..]) {
+            assert!((a - b).abs() < 1e-5, "{a} {b}");
+        }
+    }
+}

@@ -1,0 +1,190 @@
+//! The same network as ONNX nodes: from the inputs of format 2 to logits and Shore.
+
+use tract_onnx::pb;
+
+use super::builder::Builder;
+use super::frames;
+use super::{
+    CLIP, COLUMNS, DILATIONS, FRAMES, HIDDEN, KERNEL, LAST, POOLS, SHORE, SHORE_MIDDLE, SHORE_UNIT,
+    Standard,
+};
+use crate::train::net::graph::{Graph, integer, integers};
+use crate::train::net::network::Weights;
+
+/// Keep logarithms finite: added to mm, s and s between frames.
+pub(super) const MM: f32 = 0.3;
+pub(super) const TIME_S: f32 = 0.05;
+pub(super) const STEP_S: f32 = 0.01;
+/// What lies beyond is taken as this.
+pub(super) const MOST_MM: f32 = 30.0;
+pub(super) const MOST_S: f32 = 30.0;
+pub(super) const MOST_STEP_S: f32 = 1.0;
+pub(super) const LEAST_ARM: f32 = 0.1;
+/// Keeps the quotient by a press's force finite.
+pub(super) const TINY_N: f32 = 1e-4;
+
+impl Builder {
+    /// The columns of [`super::motion`], `[FRAMES, 1]` each.
+    fn motion(&mut self, force: &str) -> Vec<String> {
+        let time = self.logarithm("time_s", MOST_S, TIME_S);
+        let [zero, one, last] = [0, 1, FRAMES as i64 - 1]
+            .map(|index| self.0.indices(&format!("place {index}"), &[index]));
+        let first = self.node("Slice", &["time_s", &zero, &one, &one], "first time");
+        let others = self.node(
+            "Slice",
+            &["time_s", &zero, &last, &one],
+            "times but the last",
+        );
+        let along = vec![integer("axis", 1)];
+        let before = self.with("Concat", &[&first, &others], "time before", along);
+        let step = self.node("Sub", &["time_s", &before], "step");
+        let step = self.logarithm(&step, MOST_STEP_S, STEP_S);
+
+        let nothing = self.scalar("unknown arm", 0.0);
+        let is_known = self.node("Greater", &["arm_n_per_mm", &nothing], "is arm known");
+        let to = integer("to", pb::tensor_proto::DataType::Float as i64);
+        let is_known = self.with("Cast", &[&is_known], "arm known", vec![to]);
+        let least = self.scalar("least arm", LEAST_ARM);
+        let arm = self.node("Max", &["arm_n_per_mm", &least], "arm");
+        let given = self.node("Div", &[force, &arm], "arm gave way");
+        let indentation = self.node("Sub", &["approach_mm", &given], "indentation");
+        let both = self.node("Mul", &["known", &is_known], "both known");
+
+        let approach = self.logarithm("approach_mm", MOST_MM, MM);
+        let approach = self.node("Mul", &["known", &approach], "known approach");
+        let depth = self.logarithm(&indentation, MOST_MM, MM);
+        let depth = self.node("Mul", &[&both, &depth], "known depth");
+        let linear = self.node(
+            "Mul",
+            &[&both, &format!("{indentation} clipped")],
+            "linear depth",
+        );
+        let stiffness = self.node("Log", &[&arm], "log arm");
+        let stiffness = self.node("Mul", &[&stiffness, &is_known], "known stiffness");
+        // A row of as many as there are frames.
+        let stiffness = self.node("Mul", &["mask", &stiffness], "stiffness");
+
+        let rows = [
+            time,
+            step,
+            "known".to_owned(),
+            approach,
+            depth,
+            linear,
+            stiffness,
+        ];
+        rows.iter()
+            .map(|row| self.reshaped(row, &[FRAMES, 1], &format!("column {row}")))
+            .collect()
+    }
+
+    /// A residual convolution over time of `x` `[1, HIDDEN, FRAMES]`.
+    fn convolution(&mut self, weights: &Weights, layer: usize, x: &str, mask: &str) -> String {
+        let (name, dilation) = (format!("conv{layer}"), DILATIONS[layer - 1]);
+        let rows = weights.numbers(&format!("{name}.matrix"));
+        // From [tap, in, out] to [out, in, tap].
+        let mut kernel = vec![0.0; rows.len()];
+        for (place, value) in rows.into_iter().enumerate() {
+            let (tap, rest) = (place / (HIDDEN * HIDDEN), place % (HIDDEN * HIDDEN));
+            let (input, output) = (rest / HIDDEN, rest % HIDDEN);
+            kernel[(output * HIDDEN + input) * KERNEL + tap] = value;
+        }
+        let kernel = self.0.constant(
+            &format!("{name}.kernel"),
+            &[HIDDEN, HIDDEN, KERNEL],
+            &kernel,
+        );
+        let bias = weights.numbers(&format!("{name}.bias"));
+        let bias = self.0.constant(&format!("{name}.bias"), &[HIDDEN], &bias);
+        let padding = (KERNEL / 2 * dilation) as i64;
+        let attributes = vec![
+            integers("kernel_shape", &[KERNEL as i64]),
+            integers("dilations", &[dilation as i64]),
+            integers("pads", &[padding; 2]),
+        ];
+        let sum = self.with(
+            "Conv",
+            &[x, &kernel, &bias],
+            &format!("{name}.sum"),
+            attributes,
+        );
+        let added = self.node("Relu", &[&sum], &format!("{name}.added"));
+        let all = self.node("Add", &[x, &added], &format!("{name}.all"));
+        self.node("Mul", &[&all, mask], &format!("{name}.out"))
+    }
+}
+
+/// The graph from the inputs of format 2 to raw logits `[1, levels]` and Shore OO `[1, 3]`, and their
+/// names. `widths` are added below and above to the ends of the interval.
+pub fn graph(
+    weights: &Weights,
+    standard: &Standard,
+    levels: usize,
+    widths: [f32; 2],
+) -> (Graph, String, String) {
+    let mut b = Builder(Graph::default());
+    let (mut columns, force) = frames::nodes(&mut b, FRAMES);
+    let force = b.reshaped(&force, &[1, FRAMES], "forces");
+    columns.extend(b.motion(&force));
+    let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
+    let along = |axis| vec![integer("axis", axis)];
+    let all = b.with("Concat", &columns, "columns", along(1));
+    let mean = b.0.constant("column means", &[COLUMNS], &standard.mean);
+    let deviation =
+        b.0.constant("column deviations", &[COLUMNS], &standard.deviation);
+    let centred = b.node("Sub", &[&all, &mean], "centred");
+    let scaled = b.node("Div", &[&centred, &deviation], "scaled");
+    let x = b.clipped(&scaled, -CLIP, CLIP);
+
+    let x = b.dense(weights, "embed", [COLUMNS, HIDDEN], &x);
+    let x = b.node("Relu", &[&x], "embedded");
+    let x = b.with(
+        "Transpose",
+        &[&x],
+        "by channel",
+        vec![integers("perm", &[1, 0])],
+    );
+    let x = b.reshaped(&x, &[1, HIDDEN, FRAMES], "over time");
+    let mask = b.reshaped("mask", &[1, 1, FRAMES], "mask over time");
+    let mut x = b.node("Mul", &[&x, &mask], "first");
+    for layer in 1..=DILATIONS.len() {
+        x = b.convolution(weights, layer, &x, &mask);
+    }
+
+    let axis = b.0.indices("time axis", &[2]);
+    let summed = |b: &mut Builder, x: &str, name: &str| {
+        b.with("ReduceSum", &[x, &axis], name, vec![integer("keepdims", 0)])
+    };
+    let sum = summed(&mut b, &x, "sum over time");
+    let count = summed(&mut b, &mask, "frames there");
+    let mean = b.node("Div", &[&sum, &count], "mean over time");
+    let options = vec![integers("axes", &[2]), integer("keepdims", 0)];
+    let greatest = b.with("ReduceMax", &[&x], "greatest over time", options);
+    let over_time = b.reshaped(&force, &[1, 1, FRAMES], "forces over time");
+    let there = b.node("Mul", &[&over_time, &mask], "forces there");
+    let weighted = b.node("Mul", &[&x, &there], "weighted");
+    let weighted = summed(&mut b, &weighted, "weighted sum");
+    let total = summed(&mut b, &there, "force of all");
+    let tiny = b.scalar("tiny force", TINY_N);
+    let total = b.node("Add", &[&total, &tiny], "force of all raised");
+    let weighted = b.node("Div", &[&weighted, &total], "weighted mean");
+    let pooled = b.with("Concat", &[&mean, &greatest, &weighted], "pooled", along(1));
+
+    let joint = b.dense(weights, "joint", [POOLS * HIDDEN, LAST], &pooled);
+    let joint = b.node("Relu", &[&joint], "joint");
+    let outputs = b.dense(weights, "head", [LAST, levels + SHORE], &joint);
+    let ends = [0, levels, levels + SHORE].map(|end| end as i64);
+    let [zero, first, last] = ends.map(|end| b.0.indices(&format!("output {end}"), &[end]));
+    let axis = b.0.indices("output axis", &[1]);
+    let raw_logits = b.node("Slice", &[&outputs, &zero, &first, &axis], "raw_logits");
+    let raw = b.node("Slice", &[&outputs, &first, &last, &axis], "raw shore");
+    let unit = b.scalar("shore unit", SHORE_UNIT);
+    let [below, above] = widths;
+    let middles = [SHORE_MIDDLE, SHORE_MIDDLE - below, SHORE_MIDDLE + above];
+    let middles = b.0.constant("shore middles", &[1, SHORE], &middles);
+    let scaled = b.node("Mul", &[&raw, &unit], "shore scaled");
+    let moved = b.node("Add", &[&scaled, &middles], "shore moved");
+    let (least, most) = (b.scalar("least shore", 0.0), b.scalar("most shore", 100.0));
+    let shore = b.node("Clip", &[&moved, &least, &most], "shore");
+    (b.0, raw_logits, shore)
+}

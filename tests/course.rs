@@ -1,0 +1,115 @@
+//! The method `course` on a few presses: it learns, resumes exactly, and the daemon's own code judges
+//! whole presses with its file.
+#![cfg(feature = "train")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy knows no helper of a test as a test"
+)]
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use hardnessd::train::data::courses::Courses;
+use hardnessd::train::model::course::course_of;
+use hardnessd::verdict::{Format, Hrn};
+use serde_json::Value;
+
+fn hrn_train(directory: &Path, arguments: &str) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_hrn-train"))
+        .args(arguments.split_whitespace())
+        .current_dir(directory)
+        .output()
+        .expect("cargo built the binary")
+}
+
+fn succeed(directory: &Path, arguments: &str) -> String {
+    let output = hrn_train(directory, arguments);
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{arguments}: {errors}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+const SETTINGS: &str = "
+    [training]
+    epochs = 4
+    checkpoint_every_epochs = 1
+    batch = 16
+    averaging = 0.9
+";
+
+#[test]
+fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
+    let directory = tempfile::tempdir().unwrap();
+    let at = directory.path();
+    std::fs::write(at.join("settings.toml"), SETTINGS).unwrap();
+    let simulate = "simulate --sequences --materials broad --shapes wide --objects 5 --test-objects 2 \
+                    --presses 3 --fps 5..20 --seed 3 --out d.npz";
+    succeed(at, simulate);
+    let train = "train --method course --data d.npz --config settings.toml --seed 1";
+    let said = succeed(at, &format!("{train} --out whole"));
+    assert!(said.contains("Shore OO"), "{said}");
+
+    // A run that lost its end and its last checkpoint goes on to the same file.
+    succeed(at, &format!("{train} --out cut"));
+    let checkpoints = at.join("cut/checkpoints");
+    let mut names: Vec<_> = std::fs::read_dir(&checkpoints)
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .collect();
+    names.sort();
+    std::fs::remove_file(names.last().unwrap()).unwrap();
+    std::fs::remove_file(at.join("cut/hrn.onnx")).unwrap();
+    succeed(at, &format!("{train} --out cut --resume"));
+    let [whole, cut] =
+        ["whole", "cut"].map(|run| std::fs::read(at.join(run).join("hrn.onnx")).unwrap());
+    assert!(whole == cut, "the resumed run has another model");
+
+    // The daemon's own code takes the file, and the approach matters to it.
+    let hrn = Hrn::load(&whole).unwrap();
+    assert_eq!(hrn.format(), Format::Course { most_frames: 48 });
+    let courses = Courses::read(&at.join("d.npz")).unwrap();
+    let mut course = course_of(&courses, 0);
+    let told = hrn.judge_course(&course).unwrap();
+    assert!(told.shore.is_some() && told.levels.is_some());
+    course
+        .moments
+        .iter_mut()
+        .for_each(|moment| moment.approach_mm = None);
+    course.arm_n_per_mm = 0.0;
+    let untold = hrn.judge_course(&course).unwrap();
+    assert_ne!(told.probabilities, untold.probabilities);
+
+    let json = succeed(at, "evaluate --model whole/hrn.onnx --data d.npz --json");
+    let evaluation: Value = serde_json::from_str(&json).unwrap();
+    let told: Value =
+        serde_json::from_slice(&std::fs::read(at.join("whole/evaluation.json")).unwrap()).unwrap();
+    assert_eq!(evaluation["accuracy"], told["accuracy"]);
+    assert!(evaluation["shore"]["rmse"].as_f64().unwrap() < 60.0);
+    // A model of one frame judges each press's best frame of the same file.
+    let json = succeed(
+        at,
+        "evaluate --model ../../models/hrn.onnx --data d.npz --json"
+            .replace("../..", env!("CARGO_MANIFEST_DIR"))
+            .as_str(),
+    );
+    let evaluation: Value = serde_json::from_str(&json).unwrap();
+    assert_eq!(evaluation["shore"], Value::Null);
+    assert_eq!(evaluation["n"], told["n"]);
+}
+
+#[test]
+fn what_does_not_go_together_is_wrong_usage() {
+    let directory = tempfile::tempdir().unwrap();
+    let at = directory.path();
+    let output = hrn_train(at, "compare --data d.npz --out c --methods course");
+    assert_eq!(output.status.code(), Some(2));
+    let simulate = "simulate --objects 1 --test-objects 1 --presses 2 --out frames.npz";
+    succeed(at, simulate);
+    let output = hrn_train(at, "train --method course --data frames.npz --out r");
+    assert_eq!(output.status.code(), Some(1));
+    let errors = String::from_utf8(output.stderr).unwrap();
+    assert!(
+        errors.contains("frames_mn") && errors.lines().count() == 1,
+        "{errors}"
+    );
+}
