@@ -113,3 +113,12 @@ fn what_does_not_go_together_is_wrong_usage() {
         "{errors}"
     );
 }
+
+#[test]
+fn the_committed_model_is_the_one_of_its_card() {
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
+    let hrn = Hrn::load(&std::fs::read(models.join("course.onnx")).unwrap()).unwrap();
+    assert_eq!(hrn.format(), Format::Course { most_frames: 48 });
+    let card = std::fs::read_to_string(models.join("course.md")).unwrap();
+    assert!(card.contains(hrn.sha256()), "{}", hrn.sha256());
+}
