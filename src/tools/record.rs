@@ -1,7 +1,7 @@
 //! `hardnessd record`: a daemon that writes what comes to a file, without sockets unless asked for.
 //!
 //! On a terminal a line on stderr says how many presses the file holds so far. At the end a warning
-//! says if there were none. A [`session`] records one file after another.
+//! says if there were none. A session records one file after another.
 
 mod session;
 
