@@ -306,7 +306,7 @@ pub enum Format {
 /// use hardnessd::verdict::{BUILT_IN, Hrn};
 ///
 /// let hrn = Hrn::load(BUILT_IN)?;
-/// let verdict = hrn.judge(&hrn.check().frames[0])?;
+/// let verdict = hrn.judge_check(0)?;
 /// assert_eq!(verdict.probabilities.len(), hrn.card().levels.len());
 /// assert_eq!(verdict.confidence, verdict.probabilities[usize::from(verdict.level) - 1]);
 /// # Ok::<(), hardnessd::verdict::ModelError>(())

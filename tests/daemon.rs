@@ -730,7 +730,6 @@ fn a_signal_ends_every_command_that_waits_for_a_file() {
         (&["record", "--config", fifo, "--out", new], 0, ""),
         (&["simulate", "--faults", fifo], 0, ""),
         (&["check", "--config", fifo], 143, unfinished),
-        (&["recover", fifo, "--out", new], 143, unfinished),
     ] {
         let mut command = Command::new(BINARY);
         command.args(arguments).stderr(Stdio::piped());

@@ -609,7 +609,7 @@ fn another_seed_gives_other_weights_and_a_run_is_not_overwritten() {
         assert_eq!(output.status.code(), Some(1), "{error}");
         assert!(error.contains(expected), "{error}");
     };
-    refused("3", &[], "--resume goes on with it");
+    refused("3", &[], "continue it with --resume");
     refused("5", &["--resume"], "`seed`: found 5, expected 3");
     // Nor is it gone on with by two at once.
     let other_process = std::fs::File::open(&first.out).unwrap();
@@ -844,8 +844,8 @@ fn bad_input_has_its_exit_code_and_one_line() {
             1,
             &empty_split,
         ),
-        (simulate(&["--objects", "4294967295"]), 2, "0..=10000"),
-        (simulate(&["--presses", "0"]), 2, "1..=10000"),
+        (simulate(&["--objects", "4294967295"]), 2, "from 0 to 10000"),
+        (simulate(&["--presses", "0"]), 2, "from 1 to 10000"),
         (
             simulate(&["--swapped-levels", "25"]),
             2,
