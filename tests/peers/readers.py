@@ -78,9 +78,11 @@ def data_sets(binaries, directory):
     return len(presses)
 
 
-def a_recording(binary, directory):
+def a_recording(binary, directory, model=None):
     """The daemon's own recording, beside what a subscriber read."""
     more = '[record]\ndir = "rec"\nkeep_free_mb = 0\n'
+    if model:
+        more += f'[model]\npath = "{model}"\n'
     with Bench(str(binary), more=more) as bench:
         daemon = bench.daemon()
         client = hardnessd.Client(bench.path("events.sock"), types=hardnessd.TYPES)
@@ -105,6 +107,8 @@ def a_recording(binary, directory):
             came = events[event["seq"]]
             assert set(came) == set(event), set(came) ^ set(event)
             for key, value in event.items():
+                if key == "shore" and value:
+                    value, came[key] = list(value.values()), [came[key][end] for end in value]
                 if isinstance(value, (float, list)) and key != "notes":
                     # JSON rounds, ROS has float32.
                     assert np.allclose(came[key], value, rtol=1e-5, atol=0.0006), (key, came[key], value)
@@ -112,6 +116,9 @@ def a_recording(binary, directory):
                     assert came[key] == value, (key, came[key], value)
         verdicts = list(take.events(types=["hardness"]))
         assert {event["type"] for event in verdicts} == {"hardness"}
+        judged = [event for event in verdicts if event["probabilities"]]
+        whole = [event for event in judged if event["shore"] and event["levels"] and event["course"] == "none"]
+        assert judged and len(whole) == (len(judged) if model else 0), verdicts
         frames = list(take.frames())
         shown = {event["frame"]: event["newtons"] for event in live if event["type"] == "frame"}
         assert len(shown) > 50 and len(frames) >= len(shown)
@@ -195,6 +202,8 @@ def main(binaries):
     with tempfile.TemporaryDirectory() as name:
         directory = pathlib.Path(name)
         print("a data set of", data_sets(binaries, directory), "presses")
+        course = ROOT / "models/course.onnx"
+        print("a recording of %d verdicts and %d frames" % a_recording(binaries / "hardnessd", directory, course))
         print("a recording of %d verdicts and %d frames" % a_recording(binaries / "hardnessd", directory))
         print("damaged recordings, refused:", damaged(directory))
         readme(directory)

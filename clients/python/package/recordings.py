@@ -35,13 +35,15 @@ _EVENTS = {"hardness": Hardness, "press": Press, "status": Status}
 
 # What a ROS message has where the event has null, because ROS knows no null. Numbers that are not
 # listed are NaN there.
-_NULL: Dict[str, Union[int, str]] = {
+_NULL: Dict[str, Union[int, str, bytes]] = {
     "level": 0,
     "label": "",
     "rejected": "",
     "reason": "",
     "context": "",
     "mono_ns": 0,
+    "levels": b"",
+    "course": "",
 }
 
 
@@ -115,7 +117,7 @@ class Recording:
         """Events in the order of their publication, with the fields that a subscriber gets."""
         with self._reading():
             events = [
-                {"type": topic, **{key: _value(key, getattr(message, key)) for key in _fields(topic)}}
+                {"type": topic, **{key: _value(key, message) for key in _fields(topic)}}
                 for _, topic, message in self._messages(types)
             ]
         return iter(cast("List[Event]", sorted(events, key=lambda event: event["seq"])))
@@ -170,15 +172,18 @@ def _fields(topic: str) -> List[str]:
     return [key for key in {**_EVENTS[topic].__annotations__, "seq": int} if key != "type"]
 
 
-def _value(key: str, value: Any) -> Any:
-    """A field of a ROS message as the field of the event."""
+def _value(key: str, message: Any) -> Any:
+    """A field of the event, from the ROS message."""
+    value = getattr(message, key)
     if isinstance(value, float) and math.isnan(value):
         return None
     if key in _NULL and value == _NULL[key]:
         return None
     if key == "context":
         return json.loads(value)
-    return list(value) if key in ("notes", "probabilities") else value
+    if key == "shore":
+        return {"value": value, "low": message.shore_low, "high": message.shore_high}
+    return list(value) if key in ("notes", "probabilities", "levels") else value
 
 
 def _time_ns(message: Any) -> int:
