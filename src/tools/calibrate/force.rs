@@ -36,15 +36,15 @@ pub enum Unfit {
 
 /// The weight rests while the sum of counts has at least this share of its greatest.
 const RESTING_SHARE: f64 = 0.8;
-/// An exponent needs so many different weights,
+/// An exponent is proposed from this number of different weights on.
 const LEAST_WEIGHTS: usize = 3;
-/// the heaviest so much heavier than the lightest,
+/// The heaviest of them is this many times the lightest, at least.
 const LEAST_RATIO: f64 = 2.0;
-/// a line that is wrong by this part,
+/// No exponent is proposed where a line is wrong by less than this part.
 const LEAST_ERROR: f64 = 0.02;
-/// and this share of the line's error left.
+/// The exponent leaves this share of the line's error, at most.
 const MOST_LEFT: f64 = 0.5;
-/// Between two exponents that are tried.
+/// The step between the exponents that are tried.
 const STEP: f64 = 0.01;
 
 impl Fit {
