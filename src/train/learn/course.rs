@@ -15,7 +15,7 @@ use crate::train::data::courses::Courses;
 use crate::train::learn::fit;
 use crate::train::learn::learner::Learner;
 use crate::train::net::course::{
-    self, Batch, COLUMNS, FEATURES, FRAMES, Features, MOTION, Moment, SHORE, Standard,
+    self, Batch, COLUMNS, FEATURES, FRAMES, Features, Moment, SHORE, Standard,
 };
 use crate::train::net::hrn;
 use crate::train::net::network::{Weights, numbers};
@@ -416,8 +416,6 @@ fn quantile(objects: &[Vec<f32>], stream: &mut Stream) -> Option<f32> {
     }
     Some(sum / DRAWS as f32)
 }
-
-const _: () = assert!(COLUMNS == FEATURES + MOTION);
 
 #[cfg(test)]
 mod tests {

@@ -5,9 +5,8 @@ use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
-use super::export::{data, validation};
+use super::export::{data, range, validation};
 use super::file;
-use crate::press;
 use crate::simulator::Split;
 use crate::train::data::courses::{self, Courses};
 use crate::train::data::dataset;
@@ -17,8 +16,8 @@ use crate::train::learn::fit;
 use crate::train::net::course::{self, FRAMES};
 use crate::train::run::{Description, Run};
 use crate::verdict::{
-    Card, CheckedCourse, Checks, Conformal, Course, CourseCheck, CourseMoment, Format, Hrn, Range,
-    Shore, Verdict,
+    Card, CheckedCourse, Checks, Conformal, Course, CourseCheck, CourseMoment, Format, Hrn, Shore,
+    Verdict,
 };
 
 /// Check presses a level (`docs/formats.md`).
@@ -96,6 +95,7 @@ pub fn finish(
     let checks = Checks::Courses(CourseCheck {
         presses: presses_checked.collect(),
     });
+    let best_frame = |&press: &usize| courses.frame(courses.presses[press].best as usize);
     let mut card = Card {
         format: "2".to_owned(),
         levels: levels.clone(),
@@ -104,7 +104,7 @@ pub fn finish(
         data: data(&description.data)?,
         metrics: json!({ "temperature": trained.temperature }),
         validation: validation(&description.data).to_owned(),
-        range: range(courses, train),
+        range: range(train.iter().map(best_frame)),
         conformal: (trained.threshold > 0.0).then_some(Conformal {
             alpha: ALPHA,
             threshold: trained.threshold,
@@ -277,24 +277,4 @@ fn check_presses(courses: &Courses, train: &[usize]) -> Vec<usize> {
         }
     }
     checked
-}
-
-/// Total force and contact area of the best frames of the presses learnt from.
-fn range(courses: &Courses, train: &[usize]) -> Range {
-    let threshold_n = press::Settings::default().contact_threshold_n;
-    let mut range = Range {
-        force_n: [f32::INFINITY, 0.0],
-        contact_area_taxels: [u32::MAX, 0],
-    };
-    for &press in train {
-        let frame = courses.frame(courses.presses[press].best as usize);
-        let (force_n, area) = (
-            frame.force_n() as f32,
-            frame.contact_area_taxels(threshold_n),
-        );
-        range.force_n = [range.force_n[0].min(force_n), range.force_n[1].max(force_n)];
-        let [least, most] = range.contact_area_taxels;
-        range.contact_area_taxels = [least.min(area), most.max(area)];
-    }
-    range
 }

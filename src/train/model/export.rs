@@ -58,7 +58,7 @@ pub fn finish(
         data: data(&description.data)?,
         metrics: json!({ "temperature": recogniser.temperature }),
         validation: validation(&description.data).to_owned(),
-        range: range(dataset, train),
+        range: range(train.iter().map(|&index| dataset.samples[index].frame)),
         conformal: None,
     };
     let write = |card: &Card| {
@@ -185,14 +185,13 @@ pub(super) fn validation(sources: &[Source]) -> &'static str {
 }
 
 /// Total force and contact area of the frames learnt from.
-fn range(dataset: &Dataset, train: &[usize]) -> Range {
+pub(super) fn range(frames: impl Iterator<Item = Frame>) -> Range {
     let threshold_n = press::Settings::default().contact_threshold_n;
     let mut range = Range {
         force_n: [f32::INFINITY, 0.0],
         contact_area_taxels: [u32::MAX, 0],
     };
-    for &index in train {
-        let frame = &dataset.samples[index].frame;
+    for frame in frames {
         let (force_n, area) = (
             frame.force_n() as f32,
             frame.contact_area_taxels(threshold_n),
