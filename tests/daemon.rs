@@ -714,6 +714,48 @@ fn check_looks_and_changes_nothing() {
 }
 
 #[test]
+fn a_signal_ends_recover_while_it_waits_for_a_writer() {
+    let bench = Bench::new();
+    let fifo = bench.path("fifo");
+    assert!(
+        Command::new("mkfifo")
+            .arg(&fifo)
+            .status()
+            .unwrap()
+            .success()
+    );
+    let mut command = Command::new(BINARY);
+    command
+        .arg("recover")
+        .arg(&fifo)
+        .arg("--out")
+        .arg(bench.path("new.mcap"));
+    let mut process = Process(command.stderr(Stdio::piped()).spawn().unwrap());
+    // Without a writer it cannot get further than to open the pipe. Signals must be caught by then.
+    let status = format!("/proc/{}/status", process.0.id());
+    let are_caught = || {
+        let text = fs::read_to_string(&status).unwrap();
+        let caught = text.lines().find_map(|line| line.strip_prefix("SigCgt:"));
+        let bits = u64::from_str_radix(caught.unwrap().trim(), 16).unwrap();
+        bits & (1 << (Signal::TERM.as_raw() - 1)) != 0
+    };
+    let begun = Instant::now();
+    while !are_caught() {
+        assert!(
+            begun.elapsed() < Duration::from_secs(20),
+            "no signal is caught"
+        );
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    process.signal(Signal::TERM);
+    assert_eq!(process.exit_code(), Some(143));
+    let mut heard = String::new();
+    let mut stderr = process.0.stderr.take().unwrap();
+    stderr.read_to_string(&mut heard).unwrap();
+    assert_eq!(heard, "hardnessd: interrupted before it had finished\n");
+}
+
+#[test]
 fn a_signal_ends_every_command_that_waits_for_a_file() {
     let bench = Bench::new();
     let fifo = bench.path("fifo");
