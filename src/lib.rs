@@ -9,6 +9,7 @@
 pub mod frame;
 pub mod colour;
 pub mod wording;
+pub mod npy;
 pub mod wire;
 pub mod tare;
 pub mod press;

@@ -5,7 +5,6 @@
 //! an object's frames has as good as seen the others.
 
 pub(super) mod file;
-mod npy;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -6,10 +6,11 @@ use std::path::Path;
 use ndarray::{ArrayView, ArrayView1, ArrayView3};
 use ndarray_npy::{NpzWriter, WritableElement, WriteNpzError};
 use zip::ZipArchive;
+use zip::result::ZipError;
 
-use super::npy::{self, Header};
 use super::{Dataset, DatasetError, Sample, Source, levels};
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
+use crate::npy::{self, Header, NpyError};
 use crate::simulator::Split;
 use crate::verdict::sha256_hex;
 
@@ -185,33 +186,33 @@ pub(in crate::train::data) trait Element: Copy {
     /// As numpy writes it.
     const DESCRIPTIONS: &'static [&'static str];
     /// Reads so many.
-    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, String>;
+    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, NpyError>;
 }
 impl Element for f32 {
     const NAME: &'static str = "f32";
     const DESCRIPTIONS: &'static [&'static str] = &["<f4"];
-    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, String> {
+    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, NpyError> {
         npy::elements(reader, count, Self::from_le_bytes)
     }
 }
 impl Element for u32 {
     const NAME: &'static str = "u32";
     const DESCRIPTIONS: &'static [&'static str] = &["<u4"];
-    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, String> {
+    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, NpyError> {
         npy::elements(reader, count, Self::from_le_bytes)
     }
 }
 impl Element for u16 {
     const NAME: &'static str = "u16";
     const DESCRIPTIONS: &'static [&'static str] = &["<u2"];
-    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, String> {
+    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, NpyError> {
         npy::elements(reader, count, Self::from_le_bytes)
     }
 }
 impl Element for u8 {
     const NAME: &'static str = "u8";
     const DESCRIPTIONS: &'static [&'static str] = &["|u1", "<u1", ">u1"];
-    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, String> {
+    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, NpyError> {
         npy::elements(reader, count, Self::from_le_bytes)
     }
 }
@@ -269,14 +270,14 @@ impl<'a> File<'a> {
         let read = self
             .zip
             .by_name(&name)
-            .map_err(|error| error.to_string())
+            .map_err(ArrayError::from)
             .and_then(|mut reader| {
                 let packed = reader.compressed_size();
                 array_of::<T>(&mut reader, packed, inner, n)
             });
         match read {
             Ok(values) => Ok(Some(values)),
-            Err(found) => Err(self.error(array, found, expected)),
+            Err(found) => Err(self.error(array, found.to_string(), expected)),
         }
     }
 
@@ -338,20 +339,38 @@ impl<'a> File<'a> {
     }
 }
 
+/// What was found in place of an array. Each message continues "found".
+#[derive(Debug, thiserror::Error)]
+enum ArrayError {
+    #[error(transparent)]
+    Zip(#[from] ZipError),
+    #[error(transparent)]
+    Npy(#[from] NpyError),
+    /// Of the right type and another shape.
+    #[error("{name} {shape:?}")]
+    Shape {
+        name: &'static str,
+        shape: Vec<usize>,
+    },
+    /// Few bytes that would become very many.
+    #[error("{bytes} bytes packed into {packed}")]
+    Packed { bytes: u64, packed: u64 },
+}
+
 /// An array of `n` (or any number of) elements of shape `inner`, row-major, out of `packed` bytes.
 fn array_of<T: Element>(
     reader: &mut impl Read,
     packed: u64,
     inner: &[usize],
     n: Option<usize>,
-) -> Result<Vec<T>, String> {
+) -> Result<Vec<T>, ArrayError> {
     let Header {
         descr,
         fortran_order,
         shape,
     } = npy::header(reader)?;
     if !T::DESCRIPTIONS.contains(&descr.as_str()) {
-        return Err(format!("dtype '{descr}'"));
+        return Err(NpyError::Type(descr).into());
     }
     let fits = match shape.split_first() {
         Some((first, rest)) => rest == inner && n.is_none_or(|n| *first == n),
@@ -361,11 +380,12 @@ fn array_of<T: Element>(
         .iter()
         .try_fold(1_usize, |product, &length| product.checked_mul(length));
     let Some(count) = count.filter(|_| fits) else {
-        return Err(format!("{} {shape:?}", T::NAME));
+        let name = T::NAME;
+        return Err(ArrayError::Shape { name, shape });
     };
     let bytes = count.saturating_mul(size_of::<T>()) as u64;
     if bytes > FREE_BYTES.max(packed.saturating_mul(MOST_PACKED)) {
-        return Err(format!("{bytes} bytes packed into {packed}"));
+        return Err(ArrayError::Packed { bytes, packed });
     }
     let values = T::read(reader, count)?;
     if !fortran_order {
