@@ -412,7 +412,7 @@ impl Pipeline {
             stamp,
         };
         self.seen.frames += 1;
-        self.seen.last_frame = Some(stamp);
+        let before = self.seen.last_frame.replace(stamp);
         // A rate over a silence would be none.
         if matches!(self.seen.link, Link::Silent | Link::Stale) {
             self.seen.recent.clear();
@@ -434,6 +434,11 @@ impl Pipeline {
         };
         if self.tracker.is_pressed() {
             self.tare.give_up(RetareError::Pressed);
+        }
+        // With the seconds of the clock: a pipeline that is recalled keeps the same pace.
+        let is_due = before.is_some_and(|b| b.mono.as_secs() != stamp.mono.as_secs());
+        if is_due && tared && self.tracker.is_idle() {
+            self.tare.follow(raw);
         }
         self.tare.observe(raw);
         events.extend(self.status_if_changed(stamp));

@@ -281,6 +281,11 @@ impl PressTracker {
         self.pressed().is_some()
     }
 
+    /// Whether no press is under way, and none that timed out waits for its release.
+    pub fn is_idle(&self) -> bool {
+        matches!(self.state, State::Idle)
+    }
+
     /// Counts the frames in contact of the press under way.
     pub fn frames(&self) -> Option<u64> {
         self.pressed().map(|pressed| pressed.frames)

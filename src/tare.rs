@@ -9,7 +9,9 @@ mod settings;
 use serde::{Deserialize, Serialize};
 
 use self::settings::MOST_TARE_FRAMES;
-pub use self::settings::{EXPONENTS, NEWTONS_PER_COUNT, PITCH_MM, Settings, SettingsError};
+pub use self::settings::{
+    EXPONENTS, GAINS, Gains, NEWTONS_PER_COUNT, PITCH_MM, Settings, SettingsError,
+};
 use crate::frame::{Array, COLS, Frame, ROWS, RawFrame, TAXELS, taxels};
 
 /// When a frame counts as touched while a tare is taken.
@@ -20,6 +22,11 @@ pub struct Contact {
     /// This many touched taxels are a contact.
     pub area_taxels: u32,
 }
+
+/// Force by which [`Tare::follow`] moves a taxel's baseline at most: once a second, 1 N in an hour.
+/// Film arrays drift by half as much. A touch that is too light for a press, below 0.07 N on a taxel, takes
+/// four minutes to disappear.
+pub const MOST_STEP_N: f32 = 1.0 / 3600.0;
 
 /// What a frame did to the tare.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -117,27 +124,39 @@ pub struct Tare {
     stage: Stage,
     contact: Contact,
     max_n: f32,
+    /// Whether the baseline follows drift.
+    follows: bool,
     array: Array,
     /// Each dead taxel's place and those of its live neighbours.
     dead: Vec<(usize, Vec<usize>)>,
 }
 
 /// From counts to newtons.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 struct Scale {
     newtons_per_count: f32,
     exponent: f32,
+    /// Of each taxel.
+    gains: Box<[f32; TAXELS]>,
 }
 
 impl Scale {
-    fn new(settings: &Settings) -> Self {
+    fn new(settings: &Settings, array: Array) -> Self {
+        let mut gains = Box::new([1.0; TAXELS]);
+        if let Some(Gains::Taxels(rows)) = &settings.gains {
+            for (place, &gain) in array.places().zip(rows.iter().flatten()) {
+                gains[place] = gain;
+            }
+        }
         Self {
             newtons_per_count: settings.newtons_per_count,
             exponent: settings.exponent,
+            gains,
         }
     }
 
-    fn newtons(self, counts: f32) -> f32 {
+    /// Of this many counts above the baseline, at a taxel.
+    fn newtons(&self, counts: f32, place: usize) -> f32 {
         let counts = counts.max(0.0);
         // A line gives the very same bits as before there was an exponent.
         let raised = if self.exponent == 1.0 {
@@ -145,7 +164,12 @@ impl Scale {
         } else {
             counts.powf(self.exponent)
         };
-        raised * self.newtons_per_count
+        raised * self.newtons_per_count * self.gains[place]
+    }
+
+    /// The counts above the baseline that are `newtons`, where an exponent bends nothing.
+    fn counts(&self, newtons: f32, place: usize) -> f32 {
+        newtons / (self.newtons_per_count * self.gains[place])
     }
 }
 
@@ -237,12 +261,13 @@ impl Tare {
     pub fn new(settings: &Settings, array: Array, contact: Contact) -> Self {
         let first = Aim::First { met_contact: false };
         Self {
-            scale: Scale::new(settings),
+            scale: Scale::new(settings, array),
             frames: settings.tare_frames,
             baseline: Box::new([0.0; TAXELS]),
             stage: Stage::begin(first, settings.tare_frames),
             contact,
             max_n: settings.tare_max_n,
+            follows: settings.auto_tare,
             array,
             dead: dead(settings, array),
         }
@@ -259,9 +284,10 @@ impl Tare {
             Stage::Taking { aim, .. } if frames != self.frames => Stage::begin(aim, frames),
             stage => stage,
         };
-        self.scale = Scale::new(settings);
+        self.scale = Scale::new(settings, self.array);
         self.frames = frames;
         self.max_n = settings.tare_max_n;
+        self.follows = settings.auto_tare;
         self.contact = contact;
         self.dead = dead(settings, self.array);
     }
@@ -337,13 +363,13 @@ impl Tare {
         }
     }
 
-    /// Counts to newtons: `newtons_per_count x max(0, counts - baseline)^exponent`, dead taxels
+    /// Counts to newtons: `newtons_per_count x max(0, counts - baseline)^exponent x gain`, dead taxels
     /// replaced by the mean of their live neighbours.
     pub fn apply(&self, raw: &RawFrame) -> Frame {
         let mut frame = Frame::default();
         for (place, newtons) in frame.newtons.iter_mut().enumerate() {
             let counts = f32::from(raw.counts[place]) - self.baseline[place];
-            *newtons = self.scale.newtons(counts);
+            *newtons = self.scale.newtons(counts, place);
         }
         for (place, neighbours) in &self.dead {
             let sum: f32 = neighbours
@@ -353,6 +379,23 @@ impl Tare {
             frame.newtons[*place] = sum / neighbours.len().max(1) as f32;
         }
         frame
+    }
+
+    /// Lets the baseline follow drift, where the settings say so: by [`MOST_STEP_N`] at most towards
+    /// `raw`. A taxel that reads the contact threshold or more stays as it is.
+    ///
+    /// Call it once a second at most, and never during a press.
+    pub fn follow(&mut self, raw: &RawFrame) {
+        if !self.follows {
+            return;
+        }
+        for (place, baseline) in self.baseline.iter_mut().enumerate() {
+            let above = f32::from(raw.counts[place]) - *baseline;
+            if self.scale.newtons(above, place) < self.contact.threshold_n {
+                let most = self.scale.counts(MOST_STEP_N, place);
+                *baseline += above.clamp(-most, most);
+            }
+        }
     }
 
     /// Whether a live taxel reads `full_scale` counts.
@@ -401,11 +444,11 @@ impl Tare {
         let median = sorted.get(sorted.len() / 2).copied().unwrap_or(0.0);
         let varying = live.iter().filter(|&&place| {
             let spread = f32::from(sums.most[place] - sums.least[place]);
-            self.scale.newtons(spread) >= self.contact.threshold_n
+            self.scale.newtons(spread, place) >= self.contact.threshold_n
         });
         let high = live
             .iter()
-            .filter(|&&place| self.scale.newtons(mean[place] - median) > self.max_n);
+            .filter(|&&place| self.scale.newtons(mean[place] - median, place) > self.max_n);
         let limit = self.contact.area_taxels as usize;
         varying.count() >= limit || high.count() >= limit
     }

@@ -4,6 +4,7 @@ use tract_onnx::pb;
 use super::*;
 
 mod course;
+mod drift;
 use crate::event::{Note, Rejection};
 use crate::frame::Array;
 use crate::sensor::Description;

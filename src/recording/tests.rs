@@ -6,8 +6,9 @@ use serde_json::json;
 
 use super::*;
 use crate::event::Rejection;
-use crate::frame::RawFrame;
+use crate::frame::{COLS, ROWS, RawFrame};
 use crate::pipeline::Clock;
+use crate::tare::{self, Gains};
 use crate::verdict::BUILT_IN;
 use crate::wire;
 
@@ -22,6 +23,16 @@ pub(crate) fn sensor() -> Sensor {
 fn described() -> Description {
     Description {
         name: "forearm".to_owned(),
+        calibration: tare::Settings {
+            gains: Some(Gains::Taxels(vec![
+                (1..=COLS)
+                    .map(|n| n as f32 / 14.3)
+                    .collect();
+                ROWS
+            ])),
+            auto_tare: true,
+            ..tare::Settings::default()
+        },
         ..Description::default()
     }
 }
@@ -44,7 +55,8 @@ fn story() -> Vec<(Stamp, Input<'static>)> {
     let mut story = vec![(at(0), Input::Opened)];
     for frame in 0..80_u64 {
         let mut raw = RawFrame::default();
-        raw.counts.fill(3);
+        // It drifts by a count.
+        raw.counts.fill(3 + frame as u16 / 40);
         if [20..28, 50..58].iter().any(|press| press.contains(&frame)) {
             for place in 300..300 + 4 * (frame % 10) as usize {
                 raw.counts[place] = 60 + frame as u16;
@@ -113,6 +125,7 @@ fn recorded(states: usize, chunk: usize) -> (Vec<u8>, Vec<Event>) {
             let mut changed = described();
             changed.min_force_n = 1e3;
             changed.press.end_frames = 1;
+            changed.calibration.gains = None;
             let changed = Sensor::new(changed).unwrap();
             let settings = Entry::Settings(Box::new(RecordedSensor::new(&changed, &hrn)));
             writer.entry(0, at, &settings).unwrap();
@@ -201,6 +214,7 @@ fn a_sensor_that_cannot_be_is_refused_wherever_it_is_described() {
     nameless.description.name = "\u{1b}[2J\n".to_owned();
     // A dead taxel of the smaller array would be no place of the larger one, nor the other way.
     other.description.frame.rows = Some(2);
+    other.description.calibration.gains = None;
     let of_name = "name: found \"\\u{1b}[2J\\n\", expected [a-z]";
     let of_press = "press.early_settle_s: found -1.0";
     for (last, told) in [

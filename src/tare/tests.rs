@@ -48,6 +48,102 @@ fn force_grows_with_a_power_of_the_counts() {
     assert_eq!((newtons(0.5, 2), newtons(0.5, 0)), (0.0, 0.0));
 }
 
+fn gains(rows: usize, cols: usize, gain: impl Fn(usize, usize) -> f32) -> Option<Gains> {
+    let row = |row| (0..cols).map(|col| gain(row, col)).collect();
+    Some(Gains::Taxels((0..rows).map(row).collect()))
+}
+
+#[test]
+fn a_gain_multiplies_the_newtons_of_its_own_taxel() {
+    let array = Array { rows: 5, cols: 4 };
+    let gain = |row, col| 1.0 + 0.1 * (4 * row + col) as f32;
+    let settings = Settings {
+        gains: gains(5, 4, gain),
+        tare_frames: 1,
+        ..Settings::default()
+    };
+    settings.check(array).unwrap();
+    let mut tare = Tare::new(&settings, array, CONTACT);
+    tare.observe(&raw(&[]));
+    for place in array.places() {
+        let (row, col) = array.position(place).unwrap();
+        let newtons = tare.apply(&raw(&[(place, 27)])).newtons;
+        assert_eq!(
+            newtons[place],
+            gain(row, col),
+            "25 counts are 1 N, times the gain"
+        );
+        assert_eq!(newtons.iter().filter(|&&n| n > 0.0).count(), 1);
+    }
+    tare.reload(&Settings::default(), CONTACT);
+    assert_eq!(tare.apply(&raw(&[(array.place(4, 3), 27)])).force_n(), 1.0);
+}
+
+#[test]
+fn gains_of_another_array_or_beyond_any_film_are_refused() {
+    let array = Array { rows: 5, cols: 4 };
+    let bad = |row: usize, col: usize, value: f32| {
+        gains(
+            5,
+            4,
+            move |r, c| if (r, c) == (row, col) { value } else { 1.0 },
+        )
+    };
+    for (gains, expected) in [
+        (
+            gains(4, 5, |_, _| 1.0),
+            "gains: found 4 rows of 5, expected 5 of 4",
+        ),
+        (
+            gains(0, 0, |_, _| 1.0),
+            "gains: found 0 rows of 0, expected 5 of 4",
+        ),
+        (
+            bad(1, 2, 0.0),
+            "gains: found 0.0 at [1, 2], expected 0.001 to 1000",
+        ),
+        (bad(4, 3, f32::NAN), "gains: found NaN at [4, 3]"),
+        (bad(0, 0, 1001.0), "gains: found 1001.0 at [0, 0]"),
+        (bad(0, 1, -1.0), "gains: found -1.0 at [0, 1]"),
+        (
+            Some(Gains::File("g.npy".into())),
+            "gains: found the path of a file",
+        ),
+    ] {
+        let settings = Settings {
+            gains,
+            ..Settings::default()
+        };
+        let error = settings.check(array).unwrap_err().to_string();
+        assert!(error.starts_with(expected), "{error}");
+    }
+}
+
+#[test]
+fn a_baseline_follows_by_its_bound_where_nothing_is_in_contact() {
+    let settings = |auto_tare| Settings {
+        auto_tare,
+        tare_frames: 1,
+        gains: gains(ROWS, COLS, |_, col| if col == 1 { 2.0 } else { 1.0 }),
+        ..Settings::default()
+    };
+    // One count above: 0.04 N, and 0.08 N at column 1, which is a contact.
+    let drifted = RawFrame {
+        counts: [3; TAXELS],
+    };
+    let newtons = |auto_tare, seconds| {
+        let mut tare = Tare::new(&settings(auto_tare), Array::FULL, CONTACT);
+        tare.observe(&raw(&[]));
+        (0..seconds).for_each(|_| tare.follow(&drifted));
+        tare.apply(&drifted).newtons
+    };
+    assert_eq!(newtons(false, 36_000)[0], 0.04);
+    let after_a_minute = newtons(true, 60);
+    assert!((after_a_minute[0] - (0.04 - 60.0 / 3600.0)).abs() < 1e-5);
+    assert_eq!(after_a_minute[1], 0.08);
+    assert_eq!(newtons(true, 150)[0], 0.0);
+}
+
 #[test]
 fn baseline_is_the_mean_and_frames_before_it_are_untared() {
     let mut tare = Tare::new(&settings(&[]), Array::FULL, CONTACT);

@@ -11,6 +11,7 @@ use super::player::BITS_A_BYTE;
 use crate::daemon;
 use crate::daemon::config::{self, Endpoint, SensorTable, Setup};
 use crate::frame::{Array, COLS, ROWS};
+use crate::tare::{self, Gains};
 use crate::wire::Layout;
 
 /// Arguments of `check`.
@@ -225,13 +226,25 @@ fn line_of(sensor: &SensorTable, layout: &Layout, path: &Path) -> Result<String,
         format!("{bytes_per_s:.0} bytes/s, whatever the baud rate")
     };
     Ok(format!(
-        "sensor {}: {}, {}x{} taxels in {frame_bytes} bytes, {} frames/s: {load}\n",
+        "sensor {}: {}, {}x{} taxels in {frame_bytes} bytes, {} frames/s: {load}{}\n",
         sensor.name,
         sensor.port.display(),
         array.rows,
         array.cols,
-        sensor.frame_rate_hz
+        sensor.frame_rate_hz,
+        gains(&sensor.calibration)
     ))
+}
+
+/// The spread of a sensor's gains, if it has any.
+fn gains(calibration: &tare::Settings) -> String {
+    let Some(Gains::Taxels(rows)) = &calibration.gains else {
+        return String::new();
+    };
+    let gains = rows.iter().flatten().copied();
+    let least = gains.clone().fold(f32::INFINITY, f32::min);
+    let most = gains.fold(0.0, f32::max);
+    format!(", gains {least:.2} to {most:.2}")
 }
 
 /// Whether the baud rate limits what the port carries: not on a pty, nor on USB CDC, where it is a

@@ -1,8 +1,9 @@
 //! Every way in which a configuration can fail. Each error names the file, and the line or the key.
 
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
+use crate::npy::NpyError;
 use crate::sensor::SensorError;
 use crate::verdict::ModelError;
 
@@ -70,6 +71,21 @@ pub enum Error {
         /// The feature of the package, which is also the table's name.
         feature: &'static str,
     },
+    /// A file of gains cannot be read, or holds something else.
+    #[error(
+        "{path}: sensor.calibration.gains of {sensor:?}: {}",
+        of_gains(file, source)
+    )]
+    Gains {
+        /// The configuration.
+        path: PathBuf,
+        /// Name of the sensor.
+        sensor: String,
+        /// The file.
+        file: PathBuf,
+        /// What is wrong with it.
+        source: NpyError,
+    },
     /// The model file cannot be read.
     #[error("{path}: model.path: cannot read {model}: {source}")]
     ModelUnreadable {
@@ -100,6 +116,15 @@ pub enum Error {
         /// The reason.
         source: Box<ModelError>,
     },
+}
+
+/// What is wrong with a file of gains.
+fn of_gains(file: &Path, source: &NpyError) -> String {
+    let file = file.display();
+    match source {
+        NpyError::Io(error) => format!("cannot read {file}: {error}"),
+        found => format!("{file}: found {found}, expected f32 [rows, cols]"),
+    }
 }
 
 /// The table before the key with which `problem` begins.

@@ -9,6 +9,8 @@ use toml::de::DeTable;
 
 use super::error::{Error, MAX_BYTES, Place};
 use super::{Config, Model};
+use crate::npy::{self, NpyError};
+use crate::tare::Gains;
 use crate::verdict::{self, Hrn};
 use crate::{trial, wording};
 
@@ -34,6 +36,9 @@ pub(super) fn load(path: &Path) -> Result<Config, Error> {
             "the path of a device",
             path,
         )?;
+        if let Some(given) = &mut sensor.calibration.gains {
+            *given = gains(given, directory, &sensor.name, path)?;
+        }
     }
     let unix = &mut config.publish.unix;
     let paths = [
@@ -51,6 +56,30 @@ pub(super) fn load(path: &Path) -> Result<Config, Error> {
         }
     }
     Ok(config)
+}
+
+/// The gains in the file that a configuration names.
+fn gains(given: &Gains, directory: &Path, sensor: &str, path: &Path) -> Result<Gains, Error> {
+    let key = format!("sensor.calibration.gains of {sensor:?}");
+    let Gains::File(file) = given else {
+        return Err(Error::Value {
+            path: path.to_owned(),
+            key,
+            found: "a list".to_owned(),
+            expected: "the path of an .npy file",
+        });
+    };
+    let mut file = file.clone();
+    resolve(&mut file, directory, key, "the path of an .npy file", path)?;
+    let refused = |source| Error::Gains {
+        path: path.to_owned(),
+        sensor: sensor.to_owned(),
+        file: file.clone(),
+        source,
+    };
+    let bytes = read(&file, MAX_BYTES).map_err(|source| refused(NpyError::Io(source)))?;
+    let rows = npy::table(&mut bytes.as_slice()).map_err(refused)?;
+    Ok(Gains::Taxels(rows))
 }
 
 /// Makes a path of the file relative to its directory. An empty path is refused, because it would be

@@ -1,6 +1,7 @@
 use std::path::Path;
 
 use super::*;
+use crate::npy;
 
 fn load(text: &str) -> Result<Config, String> {
     let directory = tempfile::tempdir().unwrap();
@@ -233,6 +234,64 @@ fn a_name_that_is_too_long_is_refused_without_being_repeated() {
 }
 
 #[test]
+fn gains_are_read_from_a_file_beside_the_configuration() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("hardnessd.toml");
+    let text = format!(
+        "{LEAST}[sensor.frame]\nrows = 2\ncols = 3\n[sensor.calibration]\ngains = \"gains.npy\"\n"
+    );
+    std::fs::write(&path, &text).unwrap();
+    let write = |bytes: &[u8]| std::fs::write(directory.path().join("gains.npy"), bytes).unwrap();
+    let gains = [1.0, 1.1, 0.9, 1.0, 0.5, 2.0];
+    let error = checked(&path).unwrap_err();
+    let expected = "hardnessd.toml: sensor.calibration.gains of \"sensor\": cannot read ";
+    assert!(
+        error.contains(expected) && error.contains("gains.npy: No such file"),
+        "{error}"
+    );
+    write(&npy::to_bytes(&gains, 2, 3));
+    let rows = vec![gains[..3].to_vec(), gains[3..].to_vec()];
+    let read = checked(&path).unwrap();
+    assert_eq!(
+        read.sensors[0].calibration.gains,
+        Some(tare::Gains::Taxels(rows))
+    );
+    // It may change while the daemon runs.
+    write(&npy::to_bytes(&gains.map(|gain| 2.0 * gain), 2, 3));
+    let changed = checked(&path).unwrap();
+    assert_ne!(read, changed);
+    assert_eq!(read.fixed_difference(&changed), None);
+    for (bytes, expected) in [
+        (
+            b"[[1.0]]".to_vec(),
+            "gains.npy: found an array that is cut off, expected f32 [rows, cols]",
+        ),
+        (
+            vec![b'#'; 99],
+            "gains.npy: found no .npy array, expected f32 [rows, cols]",
+        ),
+        (
+            npy::to_bytes(&gains, 3, 2),
+            "sensor[\"sensor\"].calibration.gains: found 3 rows of 2, expected 2 of 3",
+        ),
+        (
+            npy::to_bytes(&[0.0; 6], 2, 3),
+            "calibration.gains: found 0.0 at [0, 0], expected 0.001 to 1000",
+        ),
+    ] {
+        write(&bytes);
+        let error = checked(&path).unwrap_err();
+        assert!(error.contains(expected) && !error.contains('\n'), "{error}");
+    }
+    let list = text.replace("\"gains.npy\"", "[[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]");
+    let error = load(&list).unwrap_err();
+    assert!(
+        error.contains("found a list, expected the path of an .npy file"),
+        "{error}"
+    );
+}
+
+#[test]
 fn no_message_speaks_of_types_of_a_program() {
     for (table, key, value) in [
         ("", "baud", "-1"),
@@ -244,6 +303,8 @@ fn no_message_speaks_of_types_of_a_program() {
         ("[sensor.frame]", "mask", "99999999999"),
         ("[sensor.frame]", "invert", "1"),
         ("[sensor.calibration]", "tare_frames", "-5"),
+        ("[sensor.calibration]", "gains", "3"),
+        ("[sensor.calibration]", "gains", "true"),
         ("[sensor.calibration]", "dead_taxels", "3"),
         ("[sensor.calibration]", "dead_taxels", "[3]"),
         ("[sensor.calibration]", "dead_taxels", "[[1]]"),

@@ -1,0 +1,122 @@
+//! The baseline follows slow drift, and nothing else.
+
+use super::*;
+use crate::frame::TAXELS;
+
+/// In seconds.
+const HOUR: u64 = 3600;
+
+/// Newtons of a count.
+const COUNT_N: f64 = 0.04;
+
+fn following(auto_tare: bool) -> Pipeline {
+    let mut pipeline = pipeline_of(|described| {
+        described.frame_rate_hz = 2.0;
+        described.calibration.auto_tare = auto_tare;
+    });
+    pipeline.opened(at(0));
+    play_at_2_hz(&mut pipeline, 0, 10, |_| 0.0, &[]);
+    pipeline
+}
+
+/// Plays `seconds` of a sensor all of whose taxels rest at `rest_n`, after so many seconds; `touched`
+/// taxels read 1 N more. Gives the words, and the greatest mean of a frame's 12 most loaded taxels.
+fn play_at_2_hz(
+    pipeline: &mut Pipeline,
+    from_s: u64,
+    seconds: u64,
+    rest_n: impl Fn(u64) -> f64,
+    touched: &[usize],
+) -> (Vec<String>, f64) {
+    let (mut told, mut most_n) = (Vec::new(), 0.0_f64);
+    for half in 2 * from_s..2 * (from_s + seconds) {
+        let rest = rest_n(half / 2) / COUNT_N;
+        let mut raw = RawFrame {
+            counts: [rest.round() as u16; TAXELS],
+        };
+        for &place in touched {
+            raw.counts[place] += 25;
+        }
+        let bytes = bytes(pipeline, &raw);
+        let events = pipeline.push(&bytes, at(500 * half));
+        for event in &events {
+            if let Event::Frame(frame) = event {
+                let mut newtons = frame.newtons.clone();
+                newtons.sort_by(f32::total_cmp);
+                let loaded = newtons[TAXELS - TOUCHED.len()..].iter();
+                most_n = most_n.max(loaded.map(|&n| f64::from(n)).sum::<f64>() / 12.0);
+            }
+        }
+        told.extend(words(&events));
+    }
+    (told, most_n)
+}
+
+/// 0.5 N an hour.
+fn drift(second: u64) -> f64 {
+    0.5 * second as f64 / HOUR as f64
+}
+
+const TOUCHED: [usize; 12] = [400, 401, 402, 403, 428, 429, 430, 431, 456, 457, 458, 459];
+
+#[test]
+fn a_baseline_that_follows_keeps_drift_from_being_a_press() {
+    let mut fixed = following(false);
+    let (told, most_n) = play_at_2_hz(&mut fixed, 10, HOUR, drift, &[]);
+    assert!(told.contains(&"Begin 1".to_owned()), "{told:?}");
+    assert!(most_n > 0.45, "{most_n}");
+
+    let mut pipeline = following(true);
+    let (told, most_n) = play_at_2_hz(&mut pipeline, 10, HOUR, drift, &[]);
+    assert_eq!(told, Vec::<String>::new());
+    assert!(most_n <= COUNT_N, "{most_n}");
+    // Then a press reads what it would have read an hour ago, to a count.
+    let (told, most_n) = play_at_2_hz(&mut pipeline, HOUR + 10, 3, drift, &TOUCHED);
+    assert_eq!(told[0], "Begin 1", "{told:?}");
+    assert!((most_n - 1.0).abs() <= COUNT_N, "{most_n}");
+}
+
+#[test]
+fn a_press_is_never_followed_however_slow_or_long() {
+    // Held for an hour: far beyond the timeout, until when it waits for its release.
+    let mut pipeline = following(true);
+    let (told, _) = play_at_2_hz(&mut pipeline, 10, HOUR, |_| 0.0, &TOUCHED);
+    assert!(told.contains(&"End 1 (timeout)".to_owned()), "{told:?}");
+    let (_, most_n) = play_at_2_hz(&mut pipeline, HOUR + 10, 1, |_| 0.0, &TOUCHED);
+    assert!((most_n - 1.0).abs() < 1e-4, "{most_n}");
+
+    // A load that grows by 2 N an hour on each taxel, twice the bound: after 252 s it is 0.07 N above a
+    // baseline that has followed by 0.07 N. From then on the baseline stays.
+    let mut pipeline = following(true);
+    let slow = |second: u64| 2.0 * (second - 10) as f64 / HOUR as f64;
+    let (told, most_n) = play_at_2_hz(&mut pipeline, 10, HOUR, slow, &[]);
+    assert_eq!(told[0], "Begin 1");
+    let lost_n = 2.0 - most_n;
+    assert!(
+        (0.03..0.11).contains(&lost_n),
+        "{lost_n} N a taxel are lost"
+    );
+}
+
+#[test]
+fn a_gap_and_a_busy_sensor_do_not_speed_it_up() {
+    let mut pipeline = following(true);
+    let raised = RawFrame {
+        counts: [1; TAXELS],
+    };
+    let bytes = bytes(&pipeline, &raised);
+    let newtons = |events: Vec<Event>| match events.into_iter().next_back() {
+        Some(Event::Frame(frame)) => frame.newtons[0],
+        other => panic!("{other:?}"),
+    };
+    // An hour without a frame is one step, and a hundred frames within a second are none.
+    newtons(pipeline.push(&bytes, at(HOUR * 1000)));
+    for ms in 0..100 {
+        newtons(pipeline.push(&bytes, at(HOUR * 1000 + ms)));
+    }
+    let left = newtons(pipeline.push(&bytes, at(HOUR * 1000 + 100)));
+    assert!(
+        (f64::from(left) - (COUNT_N - 1.0 / 3600.0)).abs() < 1e-3,
+        "{left}"
+    );
+}
