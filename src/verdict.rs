@@ -278,7 +278,7 @@ pub struct Verdict {
     pub probabilities: Vec<f32>,
     /// The largest probability.
     pub confidence: f32,
-    /// Format 2 alone.
+    /// A model of format 2 has it, and one of format 1 may.
     pub shore: Option<Shore>,
     /// The conformal set, where the file has a threshold.
     pub levels: Option<Vec<u8>>,
@@ -319,7 +319,7 @@ pub struct Hrn {
     inputs: Vec<Input>,
     logits_output: usize,
     probabilities_output: usize,
-    /// Of format 2.
+    /// A model of format 2 has it, and one of format 1 may.
     shore_output: Option<usize>,
     card: Card,
     checks: Checks,
@@ -353,7 +353,7 @@ impl Hrn {
         let (format, inputs) = file::check_signature(graph, &card, &checks)?;
         guard::check(&proto, graph)?;
         let position = |name: &str| graph.output.iter().position(|output| output.name == name);
-        let shore_output = position("shore").filter(|_| format != Format::Frame);
+        let shore_output = position("shore");
         let (Some(logits_output), Some(probabilities_output)) =
             (position("logits"), position("probabilities"))
         else {

@@ -4,5 +4,5 @@ pub mod dataset;
 pub mod courses;
 pub mod simulated;
 pub mod collect;
-pub mod augment;
 pub mod disturb;
+pub mod augment;

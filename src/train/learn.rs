@@ -4,5 +4,8 @@ pub mod optimiser;
 pub mod learner;
 pub mod consistency;
 pub mod fit;
+pub mod epochs;
+pub mod conformal;
+pub mod frame;
 pub mod course;
 pub mod gan;

@@ -1,23 +1,19 @@
 //! The methods of the table, as recipes over the same parts.
 
 pub mod course;
+pub mod features;
+pub mod frame;
 
 use std::collections::BTreeSet;
-use std::time::Instant;
 
-use anyhow::{Context as _, ensure};
+use anyhow::ensure;
 use burn::tensor::Device;
 
-use crate::frame::Frame;
 use crate::simulator::Split;
 use crate::train::data::dataset::{Dataset, DatasetError, LabelChoice};
-use crate::train::judge::baseline::Baseline;
-use crate::train::judge::features;
 use crate::train::judge::metrics::Evaluation;
-use crate::train::model::export::{self, Recogniser};
 use crate::train::net::generator::COMPONENTS;
 use crate::train::net::losses::Game;
-use crate::train::run::history::Row;
 use crate::train::run::{Description, Run};
 use crate::train::settings::network::Pooling;
 use crate::train::settings::optimiser::{Rule, Schedule};
@@ -25,7 +21,7 @@ use crate::train::settings::{
     AugmentationSettings, Keep, NetworkSettings, OptimiserSettings, Profile, Settings,
     SettingsError, Training, Validation,
 };
-use crate::train::stages::{self, Stages};
+use crate::train::stages::Stages;
 
 /// A row of the table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -62,10 +58,19 @@ pub enum Method {
     SelfTraining,
     /// Logistic regression on hand-made features of a frame.
     Features,
+    /// Judges a frame and gives its Shore hardness: convolutions beside hand-made features, on all labels.
+    /// The default model is of this method.
+    Frame,
+    /// `hrn-train adapt`: goes on from a model of `frame`.
+    #[value(skip)]
+    Adapt,
     /// Judges the course of a press, with what the arm told, and gives its Shore hardness: a temporal
     /// convolution. Takes data of `simulate --sequences`.
     Course,
 }
+
+/// Steps of `adapt`, whatever its labels.
+const ADAPT_STEPS: u64 = 1_500;
 
 /// Steps of the methods without a GAN that are fit to be compared, whatever their labels: about those of
 /// the default model.
@@ -101,6 +106,8 @@ impl Method {
             Self::FixMatch => "fixmatch",
             Self::SelfTraining => "self-training",
             Self::Features => "features",
+            Self::Frame => "frame",
+            Self::Adapt => "adapt",
             Self::Course => "course",
         }
     }
@@ -141,6 +148,54 @@ impl Method {
                     every_epochs: 1,
                     keep: Keep::Best,
                 };
+            }
+            Self::Frame => {
+                settings.training = Training {
+                    epochs: match profile {
+                        Profile::Paper => 60,
+                        Profile::Quick => 20,
+                        Profile::Smoke => 1,
+                    },
+                    averaging: match profile {
+                        Profile::Smoke => 0.0,
+                        Profile::Paper | Profile::Quick => 0.998,
+                    },
+                    optimiser: OptimiserSettings {
+                        rule: Rule::Adam,
+                        learning_rate: 2e-3,
+                        schedule: Schedule::Cosine,
+                        weight_decay: 1e-2,
+                        ..settings.training.optimiser
+                    },
+                    augmentation: AugmentationSettings {
+                        symmetries: true,
+                        shift_taxels: 3,
+                        other_sensors: true,
+                    },
+                    ..settings.training
+                };
+                settings.validation.share = 0.15;
+            }
+            Self::Adapt => {
+                settings.training = Training {
+                    batch: 50,
+                    averaging: 0.99,
+                    checkpoint_every_epochs: 10,
+                    optimiser: OptimiserSettings {
+                        rule: Rule::Adam,
+                        learning_rate: 5e-4,
+                        schedule: Schedule::Cosine,
+                        weight_decay: 1e-2,
+                        ..settings.training.optimiser
+                    },
+                    augmentation: AugmentationSettings {
+                        symmetries: true,
+                        shift_taxels: 3,
+                        other_sensors: false,
+                    },
+                    ..settings.training
+                };
+                settings.consistency.ratio = 1;
             }
             Self::Course => {
                 settings.training = Training {
@@ -183,6 +238,7 @@ impl Method {
                     augmentation: AugmentationSettings {
                         symmetries: true,
                         shift_taxels: 3,
+                        other_sensors: false,
                     },
                     ..settings.training
                 };
@@ -195,7 +251,7 @@ impl Method {
     /// Labels it may use of `labelled` samples, unless told otherwise.
     fn labels(self, labelled: usize) -> usize {
         let percent = match self {
-            Self::Hrn100 | Self::Features | Self::Course => 100,
+            Self::Hrn100 | Self::Features | Self::Frame | Self::Adapt | Self::Course => 100,
             Self::Hrn50 => 50,
             _ => 15,
         };
@@ -305,12 +361,16 @@ impl Request {
             description.settings.training.epochs =
                 epochs_as_long_as_ours(&self.settings, train.len());
         }
-        if self.method.is_strong() {
+        let steps = match self.method {
+            Method::Adapt => Some(ADAPT_STEPS),
+            method => method.is_strong().then(|| strong_steps(self.profile)),
+        };
+        if let Some(steps) = steps {
             let labelled = chosen(dataset, &description)?;
             let share = self.settings.validation.share;
             let (train, _) = dataset.hold_out(&labelled, share, self.seed);
             let an_epoch = train.len().div_ceil(self.settings.training.batch).max(1) as u64;
-            let epochs = strong_steps(self.profile).div_ceil(an_epoch);
+            let epochs = steps.div_ceil(an_epoch);
             description.settings.training.epochs = u32::try_from(epochs).unwrap_or(u32::MAX);
         }
         Ok(description)
@@ -418,10 +478,19 @@ pub fn train(
 ) -> anyhow::Result<Option<Evaluation>> {
     let labelled = chosen(dataset, description)?;
     if method == Method::Features {
-        return baseline(dataset, &labelled, description, run);
+        return features::train(dataset, &labelled, description, run);
     }
     let Description { settings, seed, .. } = description;
     let (train, validation) = dataset.hold_out(&labelled, settings.validation.share, *seed);
+    if method == Method::Frame {
+        let samples = frame::Samples {
+            dataset,
+            train: &train,
+            held_out: &validation,
+            unlabelled: &[],
+        };
+        return frame::train("frame", &samples, None, description, run, device);
+    }
     let stages = Stages {
         dataset,
         train: &train,
@@ -465,57 +534,6 @@ fn unlabelled(dataset: &Dataset, labelled: &[usize]) -> Vec<usize> {
     let wanted =
         |index: &usize| dataset.samples[*index].split == Split::Train && !labelled.contains(index);
     (0..dataset.samples.len()).filter(wanted).collect()
-}
-
-/// Logistic regression on features.
-fn baseline(
-    dataset: &Dataset,
-    labelled: &[usize],
-    description: &Description,
-    run: &Run,
-) -> anyhow::Result<Option<Evaluation>> {
-    let begun = Instant::now();
-    let frames = labelled.iter().map(|&index| &dataset.samples[index].frame);
-    let rows = features::features(frames).context("features")?;
-    let level_of: Vec<usize> = labelled
-        .iter()
-        .map(|&index| usize::from(dataset.samples[index].level) - 1)
-        .collect();
-    let baseline = Baseline::fit(
-        &rows,
-        &level_of,
-        crate::train::data::dataset::levels().len(),
-    );
-    run.metrics("features", 0)?.add(&Row {
-        step: baseline.steps.into(),
-        epoch: baseline.steps,
-        loss: baseline.loss,
-        learning_rate: 1.0,
-        accuracy: None,
-        validation: None,
-        seconds: begun.elapsed().as_secs_f64(),
-        adversarial: None,
-    })?;
-    let said: Vec<Vec<f32>> = rows.iter().map(|row| baseline.probabilities(row)).collect();
-    stages::draw_mistakes(run, dataset, ("training", labelled), &said)?;
-    let (graph, raw_logits) = baseline.graph();
-    let recogniser = Recogniser {
-        graph,
-        raw_logits,
-        temperature: 1.0,
-    };
-    let probabilities = |frames: &[&Frame]| {
-        let rows = features::features(frames.iter().copied())?;
-        Ok(rows.iter().map(|row| baseline.probabilities(row)).collect())
-    };
-    export::finish(
-        run,
-        description,
-        dataset,
-        labelled,
-        &recogniser,
-        probabilities,
-    )
 }
 
 #[cfg(test)]

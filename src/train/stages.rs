@@ -332,6 +332,7 @@ impl Stages<'_> {
         let recogniser = Recogniser {
             graph,
             raw_logits,
+            shore: None,
             temperature: trained.temperature,
         };
         let probabilities = |frames: &[&Frame]| {

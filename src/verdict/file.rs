@@ -116,10 +116,13 @@ pub(super) fn check_signature(
     outputs.sort_by(|left, right| left.name.cmp(&right.name));
     let found = describe(&outputs);
     let mut expected = format!("logits f32 [1,{levels}], probabilities f32 [1,{levels}]");
-    if format != Format::Frame {
-        expected += ", shore f32 [1,3]";
+    let with_shore = format!("{expected}, shore f32 [1,3]");
+    let may_lack_shore = format == Format::Frame;
+    let is_agreed = found == with_shore || (may_lack_shore && found == expected);
+    if !may_lack_shore {
+        expected = with_shore;
     }
-    if found != expected {
+    if !is_agreed {
         return Err(ModelError::Signature {
             what: "outputs",
             found,

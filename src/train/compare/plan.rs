@@ -167,12 +167,12 @@ impl Recipe {
             Method::Hrn15Tuned => 15.0,
             Method::FixMatch => 20.0,
             Method::SelfTraining => 10.0,
-            Method::Hrn50 => 10.0,
+            Method::Hrn50 | Method::Frame => 10.0,
             Method::Hrn15 | Method::Nahrn => 3.0,
             Method::Hrn15Strong => 5.0,
             Method::Features => 0.5,
-            // Judges presses, which no comparison of frames has.
-            Method::Course => 0.0,
+            // No row of a comparison.
+            Method::Course | Method::Adapt => 0.0,
         }
     }
 }

@@ -1,10 +1,13 @@
 //! Augmentation that keeps the physics: the 8 symmetries of the square and integer shifts.
 //!
+//! And, if it is asked for, another sensor of the kind (`disturb`).
+//!
 //! No zoom, no shear, no intensity jitter and no normalisation by a frame's own maximum: contact
 //! width and force are what carries hardness.
 
 use crate::frame::{COLS, Frame, ROWS};
 use crate::random::Stream;
+use crate::train::data::disturb;
 use crate::train::settings::AugmentationSettings;
 
 /// Symmetries of the square: mirror rows, mirror columns, transpose.
@@ -20,7 +23,11 @@ pub fn vary(frame: &Frame, settings: AugmentationSettings, stream: &mut Stream) 
     let reach = isize::from(settings.shift_taxels);
     let mut shift = || stream.below(2 * settings.shift_taxels as usize + 1) as isize - reach;
     let (rows, columns) = (shift(), shift());
-    shifted(&turned(frame, symmetry), rows, columns)
+    let moved = shifted(&turned(frame, symmetry), rows, columns);
+    if settings.other_sensors && stream.below(2) == 1 {
+        return disturb::disturbed(&moved, stream);
+    }
+    moved
 }
 
 /// The image of `frame` under symmetry 0..8; 0 is the identity.

@@ -11,7 +11,8 @@ use crate::simulator::Split;
 use crate::train::data::courses::{self, Courses};
 use crate::train::data::dataset;
 use crate::train::judge::metrics::{Evaluation, Judged};
-use crate::train::learn::course::{ALPHA, Press, Trained};
+use crate::train::learn::conformal::{ALPHA, Calibration};
+use crate::train::learn::course::{Press, Trained};
 use crate::train::learn::fit;
 use crate::train::net::course::{self, FRAMES};
 use crate::train::run::{Description, Run};
@@ -76,6 +77,11 @@ pub fn finish(
     device: &Device,
 ) -> anyhow::Result<Option<CourseEvaluation>> {
     let levels = dataset::levels();
+    let Calibration {
+        temperature,
+        widths,
+        threshold,
+    } = trained.calibration;
     let checked: Vec<usize> = check_presses(courses, train);
     let of_checked: Vec<Press> = checked
         .iter()
@@ -83,7 +89,7 @@ pub fn finish(
         .collect();
     let judged = trained.judge(&of_checked, levels.len(), device);
     let logits: Vec<Vec<f32>> = judged.iter().map(|(logits, _)| logits.clone()).collect();
-    let probabilities = fit::probabilities(&logits, trained.temperature, device);
+    let probabilities = fit::probabilities(&logits, temperature, device);
     let check = |((&place, probabilities), (_, shore)): ((&usize, Vec<f32>), &(_, [f32; 3]))| {
         CheckedCourse {
             course: course_of(courses, place),
@@ -102,24 +108,20 @@ pub fn finish(
         pitch_mm: dataset::PITCH_MM as f32,
         method: description.method.clone(),
         data: data(&description.data)?,
-        metrics: json!({ "temperature": trained.temperature }),
+        metrics: json!({ "temperature": temperature }),
         validation: validation(&description.data).to_owned(),
         range: range(train.iter().map(best_frame)),
-        conformal: (trained.threshold > 0.0).then_some(Conformal {
+        conformal: (threshold > 0.0).then_some(Conformal {
             alpha: ALPHA,
-            threshold: trained.threshold,
+            threshold,
         }),
     };
     let write = |card: &Card| {
-        let (graph, raw_logits, shore) = course::graph(
-            &trained.weights,
-            &trained.standard,
-            levels.len(),
-            trained.widths,
-        );
+        let (graph, raw_logits, shore) =
+            course::graph(&trained.weights, &trained.standard, levels.len(), widths);
         let outputs = file::Outputs {
             raw_logits,
-            temperature: trained.temperature,
+            temperature,
             shore: Some(shore),
         };
         file::write(graph, &outputs, card, &checks)

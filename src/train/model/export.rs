@@ -27,7 +27,9 @@ pub struct Recogniser {
     pub graph: Graph,
     /// Name of the logits in it, before temperature.
     pub raw_logits: String,
-    /// What they are divided by.
+    /// Name of the Shore hardness in it, if it gives one.
+    pub shore: Option<String>,
+    /// What the logits are divided by.
     pub temperature: f32,
 }
 
@@ -65,12 +67,13 @@ pub fn finish(
         let Recogniser {
             graph,
             raw_logits,
+            shore,
             temperature,
         } = recogniser.clone();
         let outputs = file::Outputs {
             raw_logits,
             temperature,
-            shore: None,
+            shore,
         };
         file::write(graph, &outputs, card, &checks)
     };

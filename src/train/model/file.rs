@@ -4,9 +4,12 @@
 //! the trainer's probabilities. Out: the bytes of the file, already read back through
 //! [`verdict::Hrn`](crate::verdict::Hrn), which reproduces the check frames or refuses.
 
+use std::collections::BTreeMap;
+
 use anyhow::{Context as _, ensure};
 use prost::Message as _;
 use tract_onnx::pb;
+use tract_onnx::prelude::Framework as _;
 
 use crate::train::net::graph::{Graph, frame_input, integer, model, value_info};
 use crate::verdict::{COURSE_FRAMES, Card, Checks, Hrn, course_inputs};
@@ -18,7 +21,7 @@ pub struct Outputs {
     pub raw_logits: String,
     /// What they are divided by.
     pub temperature: f32,
-    /// Name of the Shore hardness `[1, 3]` in it; of format 2 alone.
+    /// Name of the Shore hardness `[1, 3]` in it; a model of format 2 has one.
     pub shore: Option<String>,
 }
 
@@ -99,4 +102,24 @@ fn metadata(card: &Card, checks: &Checks) -> anyhow::Result<Vec<pb::StringString
         value,
     };
     Ok(entries.into_iter().map(entry).collect())
+}
+
+/// The f32 constants of a file that [`write`] wrote: shape and numbers of each by its name.
+///
+/// # Errors
+///
+/// If the bytes are no ONNX model.
+pub fn constants(bytes: &[u8]) -> anyhow::Result<BTreeMap<String, (Vec<usize>, Vec<f32>)>> {
+    let mut reader = bytes;
+    let proto = tract_onnx::onnx().proto_model_for_read(&mut reader)?;
+    let tensors = proto.graph.into_iter().flat_map(|graph| graph.initializer);
+    let floats =
+        tensors.filter(|tensor| tensor.data_type == pb::tensor_proto::DataType::Float as i32);
+    let constant = |tensor: pb::TensorProto| {
+        let dims = tensor.dims.iter().map(|&length| length as usize).collect();
+        let (numbers, _) = tensor.raw_data.as_chunks();
+        let numbers = numbers.iter().map(|&bytes| f32::from_le_bytes(bytes));
+        (tensor.name, (dims, numbers.collect()))
+    };
+    Ok(floats.map(constant).collect())
 }

@@ -8,14 +8,13 @@
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
 use crate::random::Stream;
-use crate::train::net::network::Weights;
+use crate::train::net::frames::FEATURES;
+use crate::train::net::network::{Weights, dense};
+use crate::train::net::shore;
 use crate::verdict::COURSE_FRAMES;
 
-pub use frames::{FEATURES, Features, force_n};
 pub use graph::graph;
 
-mod builder;
-mod frames;
 mod graph;
 
 /// Frames that a model takes.
@@ -32,16 +31,6 @@ const KERNEL: usize = 5;
 const DILATIONS: [usize; 3] = [1, 2, 4];
 /// A press's pools: mean, greatest, and mean weighted by force.
 const POOLS: usize = 3;
-/// Outputs beside the levels: Shore OO, and the ends of its interval.
-pub const SHORE: usize = 3;
-/// Shore OO of an output of 0, and of a unit more.
-pub const SHORE_MIDDLE: f32 = 55.0;
-/// Likewise.
-pub const SHORE_UNIT: f32 = 25.0;
-/// Columns are clipped at so many standard deviations from their mean: beyond what was trained on,
-/// a network extrapolates.
-const CLIP: f32 = 4.0;
-
 /// What a press tells at one moment, beside the frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Moment {
@@ -84,44 +73,6 @@ pub fn motion(moments: &[Moment], arm_n_per_mm: f32) -> Vec<[f32; MOTION]> {
         ]
     };
     moments.iter().map(row).collect()
-}
-
-/// Mean and standard deviation of each column over the moments learnt from.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Standard {
-    /// `[COLUMNS]`.
-    pub mean: Vec<f32>,
-    /// `[COLUMNS]`.
-    pub deviation: Vec<f32>,
-}
-
-impl Standard {
-    /// Of rows of [`COLUMNS`].
-    pub fn of<'a>(rows: impl Iterator<Item = &'a [f32]> + Clone) -> Self {
-        let count = rows.clone().count().max(1) as f64;
-        let mut mean = [0.0; COLUMNS];
-        for row in rows.clone() {
-            mean.iter_mut()
-                .zip(row)
-                .for_each(|(sum, &x)| *sum += f64::from(x) / count);
-        }
-        let mut variance = [0.0; COLUMNS];
-        for row in rows {
-            for ((sum, &x), mean) in variance.iter_mut().zip(row).zip(&mean) {
-                *sum += (f64::from(x) - mean).powi(2) / count;
-            }
-        }
-        Self {
-            mean: mean.iter().map(|&mean| mean as f32).collect(),
-            // A column that never varies is no divisor.
-            deviation: variance.iter().map(|v| v.sqrt().max(1e-3) as f32).collect(),
-        }
-    }
-
-    /// A column's number as the network takes it.
-    pub fn apply(&self, column: usize, x: f32) -> f32 {
-        ((x - self.mean[column]) / self.deviation[column]).clamp(-CLIP, CLIP)
-    }
 }
 
 /// A batch of presses as the network takes them.
@@ -187,7 +138,7 @@ pub fn initial(levels: usize, seed: u64, device: &Device) -> Weights {
         );
     }
     add("joint", &[POOLS * HIDDEN, LAST], 2.0);
-    add("head", &[LAST, levels + SHORE], 0.5);
+    add("head", &[LAST, levels + shore::OUTPUTS], 0.5);
     weights
 }
 
@@ -219,28 +170,6 @@ pub fn outputs(weights: &Weights, batch: &Batch) -> Tensor<2> {
     let pooled = Tensor::cat(vec![mean, greatest, weighted], 2).reshape([presses, POOLS * HIDDEN]);
     let joint = activation::relu(dense(weights, "joint", pooled));
     dense(weights, "head", joint)
-}
-
-fn dense(weights: &Weights, name: &str, x: Tensor<2>) -> Tensor<2> {
-    let bias = weights.tensor::<1>(&format!("{name}.bias"));
-    let (inputs, outputs) = (x.dims()[1], bias.dims()[0]);
-    let matrix = weights
-        .values(&format!("{name}.matrix"))
-        .reshape([inputs, outputs]);
-    x.matmul(matrix).add(bias.reshape([1, outputs]))
-}
-
-/// Pinball losses of the median and of the ends of a 90 % interval, summed and averaged over presses.
-/// `outputs` are the three of each press; `shore` is `[batch, 1]` on their scale, `known` 1 where it was
-/// measured.
-pub fn interval_loss(outputs: Tensor<2>, shore: Tensor<2>, known: Tensor<2>) -> Tensor<1> {
-    let batch = outputs.dims()[0] as f32;
-    let quantiles =
-        Tensor::<1>::from_floats([0.5, 0.05, 0.95], &outputs.device()).reshape([1, SHORE]);
-    let error = shore.sub(outputs);
-    let above = activation::relu(error.clone()).mul(quantiles.clone());
-    let below = activation::relu(error.neg()).mul(quantiles.neg().add_scalar(1.0));
-    above.add(below).mul(known).sum().div_scalar(batch)
 }
 
 #[cfg(test)]

@@ -106,9 +106,29 @@ pub fn targets(
 /// the convolutions.
 pub fn graph(weights: &Weights, statistics: &Statistics, scale: Scale) -> (Graph, String) {
     let mut graph = Graph::default();
+    let means = network::takes_means(weights);
+    let folded = network::fold(weights, statistics);
+    let flat = trunk_nodes(&mut graph, &folded, scale, means);
+    let features = weights.dims("head.matrix")[0];
+    let bias = weights.numbers("head.bias");
+    let matrix = weights.numbers("head.matrix");
+    let matrix = graph.constant("head.matrix", &[features, bias.len()], &matrix);
+    let bias = graph.constant("head.bias", &[bias.len()], &bias);
+    let raw_logits = graph.node("Gemm", &[&flat, &matrix, &bias], "raw_logits", Vec::new());
+    (graph, raw_logits)
+}
+
+/// Adds the nodes from newtons to each channel's greatest value, with the means behind them: `[1, 64]` or
+/// `[1, 128]`. Gives their output's name.
+pub(super) fn trunk_nodes(
+    graph: &mut Graph,
+    folded: &[network::Folded],
+    scale: Scale,
+    with_means: bool,
+) -> String {
     // The trunk's first line raises the image by 1, too.
-    let mut x = scale.nodes(&mut graph);
-    for (layer, folded) in TRUNK.iter().zip(network::fold(weights, statistics)) {
+    let mut x = scale.nodes(graph);
+    for (layer, folded) in TRUNK.iter().zip(folded) {
         let name = layer.name;
         let dims = [layer.outputs, layer.inputs, layer.kernel, layer.kernel];
         let kernel = graph.constant(&format!("{name}.kernel"), &dims, &folded.kernel);
@@ -119,35 +139,19 @@ pub fn graph(weights: &Weights, statistics: &Statistics, scale: Scale) -> (Graph
             graph::integers("strides", &[STRIDE as i64; 2]),
             graph::integers("pads", &[before, before, after, after]),
         ];
-        x = graph.node(
-            "Conv",
-            &[&x, &kernel, &bias],
-            &format!("{name}.sum"),
-            attributes,
-        );
+        let sum = format!("{name}.sum");
+        x = graph.node("Conv", &[&x, &kernel, &bias], &sum, attributes);
         let slope = vec![graph::number("alpha", LEAKY_SLOPE)];
         x = graph.node("LeakyRelu", &[&x], &format!("{name}.out"), slope);
     }
     let mut pooled = graph.node("GlobalMaxPool", &[&x], "greatest", Vec::new());
-    let mut features = FEATURES;
-    if network::takes_means(weights) {
+    if with_means {
         let means = graph.node("GlobalAveragePool", &[&x], "means", Vec::new());
         let along = vec![graph::integer("axis", 1)];
         pooled = graph.node("Concat", &[&pooled, &means], "pooled", along);
-        features *= 2;
     }
-    let flat = graph.node(
-        "Flatten",
-        &[&pooled],
-        "features",
-        vec![graph::integer("axis", 1)],
-    );
-    let bias = weights.numbers("head.bias");
-    let matrix = weights.numbers("head.matrix");
-    let matrix = graph.constant("head.matrix", &[features, bias.len()], &matrix);
-    let bias = graph.constant("head.bias", &[bias.len()], &bias);
-    let raw_logits = graph.node("Gemm", &[&flat, &matrix, &bias], "raw_logits", Vec::new());
-    (graph, raw_logits)
+    let axis = vec![graph::integer("axis", 1)];
+    graph.node("Flatten", &[&pooled], "features", axis)
 }
 
 #[cfg(test)]

@@ -295,15 +295,7 @@ pub fn trunk(weights: &Weights, images: Tensor<4>, normalisation: &mut Normalisa
     let mut normalised_index = 0;
     for layer in &TRUNK {
         let part = |part: &str| format!("{}.{part}", layer.name);
-        let geometry = layer.geometry(x.dims()[1]);
-        let taps = layer.inputs * layer.kernel * layer.kernel;
-        let kernels = weights.tensor::<4>(&part("kernel"));
-        let bias = weights.tensor::<1>(&part("bias"));
-        // [inputs, size, size, batch] -> [outputs, numbers]
-        let small = geometry.small();
-        let sums = convolution(x, kernels.reshape([layer.outputs, taps]), geometry)
-            .reshape([layer.outputs, small * small * batch])
-            .add(bias.reshape([layer.outputs, 1]));
+        let sums = sums(weights, layer, x);
         let rows = if layer.normalised {
             let gamma = weights.tensor::<1>(&part("gamma"));
             let beta = weights.tensor::<1>(&part("beta"));
@@ -319,16 +311,40 @@ pub fn trunk(weights: &Weights, images: Tensor<4>, normalisation: &mut Normalisa
         } else {
             leaky_relu(sums, LEAKY_SLOPE)
         };
-        x = rows.reshape([layer.outputs, small, small, batch]);
+        x = as_images(rows, batch);
     }
     if let Normalisation::Collect(statistics) = normalisation {
         statistics.batch_collected();
     }
-    // [64, 4, 4, batch] -> [batch, 64]
-    let places = x.dims()[1] * x.dims()[2];
-    let x = x.reshape([FEATURES, places, batch]);
+    pooled(x, takes_means(weights))
+}
+
+/// A layer's convolution with its bias: `x` `[inputs, size, size, batch]` to `[outputs, numbers]`.
+pub(super) fn sums(weights: &Weights, layer: &Convolution, x: Tensor<4>) -> Tensor<2> {
+    let geometry = layer.geometry(x.dims()[1]);
+    let numbers = geometry.small() * geometry.small() * x.dims()[3];
+    let taps = layer.inputs * layer.kernel * layer.kernel;
+    let kernels = weights.tensor::<4>(&format!("{}.kernel", layer.name));
+    let bias = weights.tensor::<1>(&format!("{}.bias", layer.name));
+    convolution(x, kernels.reshape([layer.outputs, taps]), geometry)
+        .reshape([layer.outputs, numbers])
+        .add(bias.reshape([layer.outputs, 1]))
+}
+
+/// `[outputs, numbers]` as `[outputs, size, size, batch]`.
+pub(super) fn as_images(rows: Tensor<2>, batch: usize) -> Tensor<4> {
+    let [outputs, numbers] = rows.dims();
+    let size = (numbers / batch).isqrt();
+    rows.reshape([outputs, size, size, batch])
+}
+
+/// The last layer's images `[64, 4, 4, batch]` to `[batch, 64]`, each channel's greatest value, or
+/// `[batch, 128]`, behind which the means follow.
+pub(super) fn pooled(x: Tensor<4>, with_means: bool) -> Tensor<2> {
+    let [_, rows, columns, batch] = x.dims();
+    let x = x.reshape([FEATURES, rows * columns, batch]);
     let greatest = x.clone().max_dim(1).reshape([FEATURES, batch]).transpose();
-    if !takes_means(weights) {
+    if !with_means {
         return greatest;
     }
     let means = x.mean_dim(1).reshape([FEATURES, batch]).transpose();
@@ -376,6 +392,16 @@ pub fn head(weights: &Weights, features: Tensor<2>) -> Tensor<2> {
     let bias = weights.tensor::<1>("head.bias");
     let outputs = bias.dims()[0];
     features.matmul(matrix).add(bias.reshape([1, outputs]))
+}
+
+/// `x` `[rows, inputs]` through the layer `name`.
+pub(super) fn dense(weights: &Weights, name: &str, x: Tensor<2>) -> Tensor<2> {
+    let bias = weights.tensor::<1>(&format!("{name}.bias"));
+    let (inputs, outputs) = (x.dims()[1], bias.dims()[0]);
+    let matrix = weights
+        .values(&format!("{name}.matrix"))
+        .reshape([inputs, outputs]);
+    x.matmul(matrix).add(bias.reshape([1, outputs]))
 }
 
 /// A convolution with batch normalisation folded into it, as it is exported.

@@ -11,4 +11,6 @@ pub struct AugmentationSettings {
     pub symmetries: bool,
     /// Shift by up to this many taxels along each axis; what comes in is background.
     pub shift_taxels: u8,
+    /// Half of the frames as another sensor of the kind would have given them.
+    pub other_sensors: bool,
 }

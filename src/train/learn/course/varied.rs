@@ -52,7 +52,7 @@ impl Told {
             press.moments.truncate(frames);
             press
                 .features
-                .truncate(frames * crate::train::net::course::FEATURES);
+                .truncate(frames * crate::train::net::frames::FEATURES);
         }
         if stream.uniform() < self.unknown {
             press.arm_n_per_mm = 0.0;
@@ -122,7 +122,8 @@ fn at(told: &[(f32, f32)], time_s: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::train::net::course::{FEATURES, Moment};
+    use crate::train::net::course::Moment;
+    use crate::train::net::frames::FEATURES;
 
     fn press() -> Press {
         let moment = |n: u8| Moment {

@@ -2,14 +2,13 @@
 
 use tract_onnx::pb;
 
-use super::builder::Builder;
-use super::frames;
-use super::{
-    CLIP, COLUMNS, DILATIONS, FRAMES, HIDDEN, KERNEL, LAST, POOLS, SHORE, SHORE_MIDDLE, SHORE_UNIT,
-    Standard,
-};
+use super::{COLUMNS, DILATIONS, FRAMES, HIDDEN, KERNEL, LAST, POOLS};
+use crate::train::net::builder::Builder;
+use crate::train::net::frames;
 use crate::train::net::graph::{Graph, integer, integers};
 use crate::train::net::network::Weights;
+use crate::train::net::shore;
+use crate::train::net::standard::Standard;
 
 /// Keep logarithms finite: added to mm, s and s between frames.
 pub(super) const MM: f32 = 0.3;
@@ -123,18 +122,13 @@ pub fn graph(
     widths: [f32; 2],
 ) -> (Graph, String, String) {
     let mut b = Builder(Graph::default());
-    let (mut columns, force) = frames::nodes(&mut b, FRAMES);
+    let (mut columns, force) = frames::nodes(&mut b, "frames", FRAMES);
     let force = b.reshaped(&force, &[1, FRAMES], "forces");
     columns.extend(b.motion(&force));
     let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
     let along = |axis| vec![integer("axis", axis)];
     let all = b.with("Concat", &columns, "columns", along(1));
-    let mean = b.0.constant("column means", &[COLUMNS], &standard.mean);
-    let deviation =
-        b.0.constant("column deviations", &[COLUMNS], &standard.deviation);
-    let centred = b.node("Sub", &[&all, &mean], "centred");
-    let scaled = b.node("Div", &[&centred, &deviation], "scaled");
-    let x = b.clipped(&scaled, -CLIP, CLIP);
+    let x = standard.nodes(&mut b, &all);
 
     let x = b.dense(weights, "embed", [COLUMNS, HIDDEN], &x);
     let x = b.node("Relu", &[&x], "embedded");
@@ -172,19 +166,7 @@ pub fn graph(
 
     let joint = b.dense(weights, "joint", [POOLS * HIDDEN, LAST], &pooled);
     let joint = b.node("Relu", &[&joint], "joint");
-    let outputs = b.dense(weights, "head", [LAST, levels + SHORE], &joint);
-    let ends = [0, levels, levels + SHORE].map(|end| end as i64);
-    let [zero, first, last] = ends.map(|end| b.0.indices(&format!("output {end}"), &[end]));
-    let axis = b.0.indices("output axis", &[1]);
-    let raw_logits = b.node("Slice", &[&outputs, &zero, &first, &axis], "raw_logits");
-    let raw = b.node("Slice", &[&outputs, &first, &last, &axis], "raw shore");
-    let unit = b.scalar("shore unit", SHORE_UNIT);
-    let [below, above] = widths;
-    let middles = [SHORE_MIDDLE, SHORE_MIDDLE - below, SHORE_MIDDLE + above];
-    let middles = b.0.constant("shore middles", &[1, SHORE], &middles);
-    let scaled = b.node("Mul", &[&raw, &unit], "shore scaled");
-    let moved = b.node("Add", &[&scaled, &middles], "shore moved");
-    let (least, most) = (b.scalar("least shore", 0.0), b.scalar("most shore", 100.0));
-    let shore = b.node("Clip", &[&moved, &least, &most], "shore");
+    let outputs = b.dense(weights, "head", [LAST, levels + shore::OUTPUTS], &joint);
+    let (raw_logits, shore) = shore::nodes(&mut b, &outputs, levels, widths);
     (b.0, raw_logits, shore)
 }

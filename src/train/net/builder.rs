@@ -1,4 +1,4 @@
-//! Nodes of a graph one by one, with what the frames' and the press's part have in common.
+//! Nodes of a graph one by one: what the networks of frames and of courses have in common.
 
 use tract_onnx::pb;
 
@@ -24,7 +24,8 @@ impl Builder {
     }
 
     pub(super) fn scalar(&mut self, name: &str, value: f32) -> String {
-        self.0.constant(&format!("{name} of course"), &[], &[value])
+        self.0
+            .constant(&format!("{name} as a number"), &[], &[value])
     }
 
     pub(super) fn reshaped(&mut self, x: &str, dims: &[usize], output: &str) -> String {

@@ -1,16 +1,18 @@
-//! Features of each frame of a press, as nodes of the exported graph: areas, force, peak, moments and
-//! roughness. Training computes them by running that graph.
+//! Hand-made features of frames, as nodes of an exported graph: areas, force, peak, moments and
+//! roughness. Training computes them by running those nodes.
 //!
 //! A verdict computes them of up to 48 frames, so sums over taxels are matrix products: one pass over
 //! the taxels gives all moments.
 
 use tract_onnx::pb;
 
-use super::builder::Builder;
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::press;
+use crate::train::net::builder::Builder;
 use crate::train::net::graph::{Graph, Plan, integer, integers};
 
+/// Frames that are computed in one pass.
+const FRAMES_AT_ONCE: usize = 48;
 /// Features of a frame.
 pub const FEATURES: usize = 13;
 /// Thresholds, beside the contact threshold, above which taxels are counted, in newtons.
@@ -25,10 +27,10 @@ const FORCE: usize = 5;
 /// Sums over taxels: 1, row, column, and their products.
 const SUMS: usize = 6;
 
-/// Adds the nodes from `frames` `[1, frames, 28, 28]` to features, `[frames, 1]` each. Gives their
+/// Adds the nodes from `input`, of `frames` frames, to features, `[frames, 1]` each. Gives their
 /// names, and that of the frames' forces `[frames, 1]`.
-pub(super) fn nodes(b: &mut Builder, frames: usize) -> (Vec<String>, String) {
-    let taxels = b.reshaped("frames", &[frames, TAXELS], "taxels");
+pub(super) fn nodes(b: &mut Builder, input: &str, frames: usize) -> (Vec<String>, String) {
+    let taxels = b.reshaped(input, &[frames, TAXELS], "taxels");
     let of_taxel = |place: usize| {
         let middle = |length: usize| (length as f32 - 1.0) / 2.0;
         let (row, column) = ((place / COLS) as f32, (place % COLS) as f32);
@@ -173,26 +175,28 @@ impl Features {
     /// If the inference library cannot run it.
     pub fn new() -> anyhow::Result<Self> {
         let mut b = Builder(Graph::default());
-        let (columns, _) = nodes(&mut b, super::FRAMES);
+        let (columns, _) = nodes(&mut b, "frames", FRAMES_AT_ONCE);
         let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
         let features = b.with("Concat", &columns, "features", vec![integer("axis", 1)]);
-        let input = ("frames", vec![1, super::FRAMES, ROWS, COLS]);
-        let output = (features.as_str(), vec![super::FRAMES, FEATURES]);
+        let input = ("frames", vec![1, FRAMES_AT_ONCE, ROWS, COLS]);
+        let output = (features.as_str(), vec![FRAMES_AT_ONCE, FEATURES]);
         Ok(Self(Plan::over(b.0, &input, &output)?))
     }
 
-    /// A row of [`FEATURES`] a frame, of at most [`super::FRAMES`] frames.
+    /// A row of [`FEATURES`] a frame.
     ///
     /// # Errors
     ///
     /// If the inference library fails.
     pub fn of(&self, frames: &[Frame]) -> anyhow::Result<Vec<f32>> {
-        let mut newtons = vec![0.0; super::FRAMES * TAXELS];
-        for (frame, place) in frames.iter().zip(newtons.chunks_mut(TAXELS)) {
-            place.copy_from_slice(&frame.newtons);
+        let mut features = Vec::with_capacity(frames.len() * FEATURES);
+        for part in frames.chunks(FRAMES_AT_ONCE) {
+            let mut newtons = vec![0.0; FRAMES_AT_ONCE * TAXELS];
+            for (frame, place) in part.iter().zip(newtons.chunks_mut(TAXELS)) {
+                place.copy_from_slice(&frame.newtons);
+            }
+            features.extend(&self.0.run_on(&newtons)?[..part.len() * FEATURES]);
         }
-        let mut features = self.0.run_on(&newtons)?;
-        features.truncate(frames.len() * FEATURES);
         Ok(features)
     }
 }

@@ -1,0 +1,129 @@
+//! The epochs of a network that is trained in one stage: the order of the samples, the rate of each
+//! step, checks, metrics and checkpoints. A killed run goes on bit for bit.
+
+use std::time::Instant;
+
+use burn::tensor::Device;
+
+use crate::random::Stream;
+use crate::train::learn::learner::Learner;
+use crate::train::net::network::Weights;
+use crate::train::run::Run;
+use crate::train::run::checkpoint::{Checkpoint, Progress};
+use crate::train::run::history::Row;
+use crate::train::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
+use crate::train::settings::Training;
+
+/// What is trained, and how.
+#[derive(Debug)]
+pub struct Stage<'a> {
+    /// Of its checkpoints and of its rows in `metrics.csv`.
+    pub name: &'static str,
+    /// What the weights follow from; a checkpoint of another origin is refused.
+    pub origin: String,
+    /// Samples to learn from.
+    pub train: &'a [usize],
+    /// How.
+    pub settings: &'a Training,
+    /// Of the order of the samples.
+    pub seed: u64,
+}
+
+/// One step's batch.
+#[derive(Debug, Clone, Copy)]
+pub struct Batch<'a> {
+    /// Its samples.
+    pub samples: &'a [usize],
+    /// Number of the step, from 0.
+    pub step: u64,
+    /// Learning rate.
+    pub rate: f64,
+}
+
+/// Trains `initial`, or goes on from the stage's last checkpoint in `run`. `step` takes a step and gives
+/// the batch's mean loss, and how many of its samples were judged rightly before it.
+///
+/// # Errors
+///
+/// If the run's directory cannot be read or written, its checkpoint is of another origin, or the loss or
+/// a weight is no number any more.
+pub fn run(
+    stage: &Stage,
+    initial: Weights,
+    run: &Run,
+    device: &Device,
+    mut step: impl FnMut(&mut Learner, Batch) -> (f64, usize),
+) -> anyhow::Result<Weights> {
+    let Training {
+        batch,
+        epochs,
+        optimiser,
+        averaging,
+        checkpoint_every_epochs,
+        ..
+    } = *stage.settings;
+    let (name, origin) = (stage.name, &stage.origin);
+    let (mut progress, mut learner) = match run.latest(name, origin, epochs, device)? {
+        Some(checkpoint) => {
+            run.check_origin(name, &checkpoint, origin)?;
+            let steps = checkpoint.progress.step;
+            let learner = Learner::resumed(&checkpoint, "", steps, optimiser, averaging)?;
+            (checkpoint.progress, learner)
+        }
+        None => (
+            Progress::default(),
+            Learner::fresh(initial, optimiser, averaging),
+        ),
+    };
+    let count = stage.train.len();
+    let steps = u64::from(epochs) * count.div_ceil(batch) as u64;
+    let mut metrics = run.metrics(name, progress.step)?;
+    let bar = progress_bar(name, steps, progress.step);
+    let begun = Instant::now();
+    while progress.epoch < epochs {
+        let mut order = stage.train.to_vec();
+        let stream = Stream::new(stage.seed, &format!("{name} order"));
+        { stream.child(progress.epoch.into()) }.shuffle(&mut order);
+        let (mut loss_sum, mut right, mut rate) = (0.0, 0, 0.0);
+        for samples in order.chunks(batch) {
+            rate = optimiser.rate_at(progress.step, steps);
+            let batch = Batch {
+                samples,
+                step: progress.step,
+                rate,
+            };
+            let (loss, of_batch) = step(&mut learner, batch);
+            loss_sum += loss * samples.len() as f64;
+            right += of_batch;
+            progress.step += 1;
+            bar.inc(1);
+        }
+        progress.epoch += 1;
+        let Progress { epoch, step, .. } = progress;
+        let loss = loss_sum / count as f64;
+        ensure_finite(name, epoch, "loss", loss)?;
+        ensure_finite_weights(name, epoch, &learner.weights)?;
+        let accuracy = right as f64 / count as f64;
+        metrics.add(&Row {
+            step,
+            epoch,
+            loss,
+            learning_rate: rate,
+            accuracy: Some(accuracy),
+            seconds: begun.elapsed().as_secs_f64(),
+            ..Row::default()
+        })?;
+        let message = format!("loss {loss:.4}, accuracy {:.1} %", 100.0 * accuracy);
+        report(&bar, name, epoch, epochs, message);
+        if epoch == epochs || epoch.is_multiple_of(checkpoint_every_epochs) {
+            let checkpoint = Checkpoint {
+                origin: origin.clone(),
+                progress,
+                lists: learner.lists(""),
+            };
+            run.save(name, &checkpoint)?;
+        }
+    }
+    bar.finish_and_clear();
+    Ok(learner.evaluated())
+}

@@ -1,0 +1,287 @@
+//! The training loop of the network that judges a frame, with Shore hardness.
+//!
+//! In: labelled frames, those of held-out objects, and unlabelled ones if there are any. Out: weights, and
+//! what makes verdicts hold what they promise. Training begins from random weights, or goes on from those
+//! of an exported file.
+
+use burn::tensor::{Device, Tensor, TensorData, activation};
+
+use crate::frame::Frame;
+use crate::random::Stream;
+use crate::train::data::augment;
+use crate::train::data::dataset::Dataset;
+use crate::train::data::disturb;
+use crate::train::learn::conformal::{Calibration, Judged};
+use crate::train::learn::epochs::{self, Batch};
+use crate::train::learn::learner::Learner;
+use crate::train::net::frame::{self, Start};
+use crate::train::net::frames::{FEATURES, Features};
+use crate::train::net::hrn;
+use crate::train::net::network::{Weights, numbers};
+use crate::train::net::shore;
+use crate::train::net::standard::Standard;
+use crate::train::run::Run;
+use crate::train::run::checkpoint::Origin;
+use crate::train::settings::{ConsistencySettings, Training};
+use crate::verdict::argmax;
+
+/// How much the intervals' loss counts beside the levels'.
+const SHORE_WEIGHT: f32 = 1.5;
+/// Frames a pass without gradients.
+const JUDGED_AT_ONCE: usize = 250;
+
+/// What is to be learnt, and from what.
+#[derive(Debug)]
+pub struct Task<'a> {
+    /// Name of the stage.
+    pub stage: &'static str,
+    /// Where the samples are.
+    pub dataset: &'a Dataset,
+    /// Labelled samples to learn from.
+    pub train: &'a [usize],
+    /// Labelled samples of held-out objects; may be empty.
+    pub held_out: &'a [usize],
+    /// Samples without labels, and how they are learnt from; may be empty.
+    pub unlabelled: (&'a [usize], ConsistencySettings),
+    /// How many levels there are.
+    pub levels: usize,
+    /// How.
+    pub settings: &'a Training,
+    /// Everything random follows from it.
+    pub seed: u64,
+    /// Where.
+    pub device: &'a Device,
+}
+
+/// A trained network.
+#[derive(Debug)]
+pub struct Trained {
+    /// Of all layers.
+    pub weights: Weights,
+    /// Of the features.
+    pub standard: Standard,
+    /// What its verdicts promise.
+    pub calibration: Calibration,
+}
+
+impl Trained {
+    /// Logits, before temperature, and Shore OO (value, low, high) of frames.
+    ///
+    /// # Errors
+    ///
+    /// If features cannot be computed.
+    pub fn judge(
+        &self,
+        frames: &[Frame],
+        plan: &Features,
+        levels: usize,
+        device: &Device,
+    ) -> anyhow::Result<Vec<(Vec<f32>, [f32; 3])>> {
+        let mut judged = Vec::with_capacity(frames.len());
+        for part in frames.chunks(JUDGED_AT_ONCE) {
+            let batch = frame::Batch::new(part, plan, &self.standard, device)?;
+            let outputs = frame::outputs(&self.weights, &batch);
+            for row in numbers(&outputs).chunks(levels + shore::OUTPUTS) {
+                let (logits, of_shore) = row.split_at(levels);
+                let shore = shore::of_outputs(of_shore, self.calibration.widths);
+                judged.push((logits.to_vec(), shore));
+            }
+        }
+        Ok(judged)
+    }
+}
+
+/// Trains from random weights, or from `start`; goes on from the last checkpoint in `run`.
+///
+/// # Errors
+///
+/// If the run's directory cannot be read or written, its checkpoint is of another stage than this,
+/// features cannot be computed, or the loss or a weight is no number any more.
+pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Trained> {
+    let plan = Features::new()?;
+    let start = match start {
+        Some(start) => start,
+        None => {
+            let rows = plan.of(&task.frames(task.train))?;
+            Start {
+                weights: frame::initial(task.levels, task.seed, task.device),
+                standard: Standard::of(FEATURES, rows.chunks(FEATURES)),
+                temperature: 1.0,
+                widths: [0.0; 2],
+            }
+        }
+    };
+    let mut calibration = Calibration {
+        temperature: start.temperature,
+        widths: start.widths,
+        threshold: 0.0,
+    };
+    let (initial, standard) = (start.weights, start.standard);
+    let (unlabelled, consistency) = task.unlabelled;
+    let stage = epochs::Stage {
+        name: task.stage,
+        origin: Origin::new(task.stage, &(task.settings, consistency), task.seed)
+            .samples(task.dataset, task.train)
+            .samples(task.dataset, task.held_out)
+            .samples(task.dataset, unlabelled)
+            .numbers(standard.mean.iter().chain(&standard.deviation).copied())
+            .weights(&initial)
+            .finish(),
+        train: task.train,
+        settings: task.settings,
+        seed: task.seed,
+    };
+    let mut failed = None;
+    let weights = epochs::run(&stage, initial, run, task.device, |learner, batch| {
+        // A failure of the features is told at the end: the loop knows none.
+        match task.step(learner, &plan, &standard, batch) {
+            Ok(learnt) => learnt,
+            Err(error) => {
+                failed.get_or_insert(error);
+                (0.0, 0)
+            }
+        }
+    })?;
+    if let Some(error) = failed {
+        return Err(error);
+    }
+    if !task.held_out.is_empty() {
+        calibration = task.calibration(&weights, &standard, &plan)?;
+    }
+    Ok(Trained {
+        weights,
+        standard,
+        calibration,
+    })
+}
+
+impl Task<'_> {
+    fn stream(&self, name: &str) -> Stream {
+        Stream::new(self.seed, &format!("{} {name}", self.stage))
+    }
+
+    fn frames(&self, samples: &[usize]) -> Vec<Frame> {
+        let frame = |&sample: &usize| self.dataset.samples[sample].frame;
+        samples.iter().map(frame).collect()
+    }
+
+    /// Samples, each varied as the settings say.
+    fn varied(&self, samples: &[usize], stream: &mut Stream) -> Vec<Frame> {
+        let vary = |frame| augment::vary(&frame, self.settings.augmentation, stream);
+        self.frames(samples).into_iter().map(vary).collect()
+    }
+
+    /// One step; gives the batch's mean loss, and how many of its samples were judged rightly before it.
+    fn step(
+        &self,
+        learner: &mut Learner,
+        plan: &Features,
+        standard: &Standard,
+        batch: Batch,
+    ) -> anyhow::Result<(f64, usize)> {
+        let of = |frames: &[Frame]| frame::Batch::new(frames, plan, standard, self.device);
+        let mut stream = self.stream("augmentation").child(batch.step);
+        let images = of(&self.varied(batch.samples, &mut stream))?;
+        let pseudo = self.unlabelled_views(batch, &mut stream);
+        let pseudo = match pseudo {
+            Some((weak, strong)) => {
+                let outputs = frame::outputs(&learner.evaluated(), &of(&weak)?);
+                Some((self.sure_targets(&outputs), of(&strong)?))
+            }
+            None => None,
+        };
+
+        let count = batch.samples.len();
+        let column = |value: &dyn Fn(Option<f32>) -> f32| {
+            let shore = |&sample: &usize| value(self.dataset.samples[sample].shore);
+            let values: Vec<f32> = batch.samples.iter().map(shore).collect();
+            Tensor::<2>::from_data(TensorData::new(values, [count, 1]), self.device)
+        };
+        let known = column(&|shore| f32::from(u8::from(shore.is_some())));
+        let measured = column(&|shore| shore.map_or(0.0, shore::on_scale));
+        let level_of = |&sample: &usize| self.dataset.samples[sample].level;
+        let targets = hrn::targets(batch.samples.iter().map(level_of), self.levels, self.device);
+
+        let tracked = learner.weights.tracked();
+        let outputs = frame::outputs(&tracked, &images);
+        let logits = outputs.clone().slice([0..count, 0..self.levels]);
+        let of_shore = outputs.slice([0..count, self.levels..self.levels + shore::OUTPUTS]);
+        let judged = numbers(&logits);
+        let mut loss = hrn::cross_entropy(logits, targets)
+            .add(shore::interval_loss(of_shore, measured, known).mul_scalar(SHORE_WEIGHT));
+        if let Some((targets, strong)) = pseudo {
+            let outputs = frame::outputs(&tracked, &strong);
+            let logits = outputs.slice([0..targets.dims()[0], 0..self.levels]);
+            let weight = self.unlabelled.1.weight;
+            loss = loss.add(hrn::cross_entropy(logits, targets).mul_scalar(weight));
+        }
+        let mut gradients = loss.backward();
+        learner.step(&tracked, &mut gradients, batch.rate);
+        let right = batch.samples.iter().zip(judged.chunks(self.levels));
+        let right =
+            right.filter(|(sample, logits)| argmax(logits).0 + 1 == usize::from(level_of(sample)));
+        Ok((f64::from(numbers(&loss)[0]), right.count()))
+    }
+
+    /// The weak and the strong view of as many unlabelled samples as the batch has labelled ones.
+    fn unlabelled_views(
+        &self,
+        batch: Batch,
+        stream: &mut Stream,
+    ) -> Option<(Vec<Frame>, Vec<Frame>)> {
+        let (all, settings) = self.unlabelled;
+        if all.is_empty() || batch.step == 0 {
+            return None;
+        }
+        let count = batch.samples.len() * settings.ratio;
+        let drawn: Vec<usize> = (0..count).map(|_| all[stream.below(all.len())]).collect();
+        let weak = self.varied(&drawn, stream);
+        let strong = self.varied(&drawn, stream);
+        let strong = strong.iter().map(|frame| disturb::disturbed(frame, stream));
+        Some((weak, strong.collect()))
+    }
+
+    /// A 1 at the level that the averaged weights see in each weak view, where they are sure enough.
+    fn sure_targets(&self, outputs: &Tensor<2>) -> Tensor<2> {
+        let count = outputs.dims()[0];
+        let logits = outputs.clone().slice([0..count, 0..self.levels]);
+        let mut rows = numbers(&activation::softmax(logits, 1));
+        for row in rows.chunks_mut(self.levels) {
+            let (level, probability) = argmax(row);
+            row.fill(0.0);
+            if f64::from(probability) >= self.unlabelled.1.confidence {
+                row[level] = 1.0;
+            }
+        }
+        Tensor::from_data(TensorData::new(rows, [count, self.levels]), self.device)
+    }
+
+    /// From the held-out objects' frames, varied as those learnt from.
+    fn calibration(
+        &self,
+        weights: &Weights,
+        standard: &Standard,
+        plan: &Features,
+    ) -> anyhow::Result<Calibration> {
+        let trained = Trained {
+            weights: weights.clone(),
+            standard: standard.clone(),
+            calibration: Calibration::NONE,
+        };
+        let mut stream = self.stream("calibration");
+        let frames = self.varied(self.held_out, &mut stream);
+        let said = trained.judge(&frames, plan, self.levels, self.device)?;
+        let judged = |(&sample, (logits, said)): (&usize, (Vec<f32>, [f32; 3]))| {
+            let sample = &self.dataset.samples[sample];
+            Judged {
+                object: sample.object.unwrap_or(0),
+                level: usize::from(sample.level) - 1,
+                shore: sample.shore,
+                logits,
+                said,
+            }
+        };
+        let judged: Vec<Judged> = self.held_out.iter().zip(said).map(judged).collect();
+        Ok(Calibration::of(&judged, &mut stream, self.device))
+    }
+}

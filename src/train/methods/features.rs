@@ -1,0 +1,67 @@
+//! The method `features`: logistic regression on hand-made features of a frame.
+
+use std::time::Instant;
+
+use anyhow::Context as _;
+
+use crate::frame::Frame;
+use crate::train::data::dataset::{self, Dataset};
+use crate::train::judge::baseline::Baseline;
+use crate::train::judge::features;
+use crate::train::judge::metrics::Evaluation;
+use crate::train::model::export::{self, Recogniser};
+use crate::train::run::history::Row;
+use crate::train::run::{Description, Run};
+use crate::train::stages;
+
+/// Fits it to its model and evaluation in the run's directory.
+///
+/// # Errors
+///
+/// If features cannot be computed, or the directory cannot be written.
+pub fn train(
+    dataset: &Dataset,
+    labelled: &[usize],
+    description: &Description,
+    run: &Run,
+) -> anyhow::Result<Option<Evaluation>> {
+    let begun = Instant::now();
+    let frames = labelled.iter().map(|&index| &dataset.samples[index].frame);
+    let rows = features::features(frames).context("features")?;
+    let level_of: Vec<usize> = labelled
+        .iter()
+        .map(|&index| usize::from(dataset.samples[index].level) - 1)
+        .collect();
+    let baseline = Baseline::fit(&rows, &level_of, dataset::levels().len());
+    run.metrics("features", 0)?.add(&Row {
+        step: baseline.steps.into(),
+        epoch: baseline.steps,
+        loss: baseline.loss,
+        learning_rate: 1.0,
+        accuracy: None,
+        validation: None,
+        seconds: begun.elapsed().as_secs_f64(),
+        adversarial: None,
+    })?;
+    let said: Vec<Vec<f32>> = rows.iter().map(|row| baseline.probabilities(row)).collect();
+    stages::draw_mistakes(run, dataset, ("training", labelled), &said)?;
+    let (graph, raw_logits) = baseline.graph();
+    let recogniser = Recogniser {
+        graph,
+        raw_logits,
+        shore: None,
+        temperature: 1.0,
+    };
+    let probabilities = |frames: &[&Frame]| {
+        let rows = features::features(frames.iter().copied())?;
+        Ok(rows.iter().map(|row| baseline.probabilities(row)).collect())
+    };
+    export::finish(
+        run,
+        description,
+        dataset,
+        labelled,
+        &recogniser,
+        probabilities,
+    )
+}

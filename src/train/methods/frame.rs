@@ -1,0 +1,168 @@
+//! The methods `frame` and `adapt`: the network of frames with Shore hardness, from random weights or from
+//! those of a model file.
+
+use anyhow::Context as _;
+use burn::tensor::Device;
+
+use crate::frame::Frame;
+use crate::simulator::Split;
+use crate::train::data::dataset::{self, Dataset};
+use crate::train::judge::metrics::Evaluation;
+use crate::train::learn::fit;
+use crate::train::learn::frame::{self, Task, Trained};
+use crate::train::model::export::{self, Recogniser};
+use crate::train::model::file;
+use crate::train::net::frame::{Start, graph};
+use crate::train::net::frames::Features;
+use crate::train::run::{Description, Run};
+use crate::train::stages;
+use crate::verdict::Hrn;
+
+/// Which samples are used, and how.
+#[derive(Debug)]
+pub struct Samples<'a> {
+    /// Where they are.
+    pub dataset: &'a Dataset,
+    /// Labelled ones to learn from.
+    pub train: &'a [usize],
+    /// Labelled ones of held-out objects; may be empty.
+    pub held_out: &'a [usize],
+    /// Those without labels that are learnt from; may be empty.
+    pub unlabelled: &'a [usize],
+}
+
+/// Trains to a model and its evaluation in the run's directory, from random weights or from `start`; takes
+/// up what is there.
+///
+/// # Errors
+///
+/// If the training diverges, or the directory cannot be read or written.
+pub fn train(
+    stage: &'static str,
+    samples: &Samples,
+    start: Option<Start>,
+    description: &Description,
+    run: &Run,
+    device: &Device,
+) -> anyhow::Result<Option<Evaluation>> {
+    let levels = dataset::levels().len();
+    let settings = &description.settings;
+    let task = Task {
+        stage,
+        dataset: samples.dataset,
+        train: samples.train,
+        held_out: samples.held_out,
+        unlabelled: (samples.unlabelled, settings.consistency),
+        levels,
+        settings: &settings.training,
+        seed: description.seed,
+        device,
+    };
+    let trained = frame::fit(&task, start, run)?;
+    finish(samples, &trained, description, run, device)
+}
+
+/// A model file that `adapt` cannot go on from.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "adapt goes on from models of the methods frame and adapt with {expected} levels: this one is of \
+     {method}, with {levels} levels"
+)]
+pub struct NoStart {
+    method: String,
+    levels: usize,
+    expected: usize,
+}
+
+/// What `adapt` goes on from: a model file that the daemon's loader has taken.
+///
+/// # Errors
+///
+/// [`NoStart`] if it is of another network.
+pub fn start(hrn: &Hrn, bytes: &[u8], device: &Device) -> anyhow::Result<Start> {
+    let levels = dataset::levels().len();
+    let constants = file::constants(bytes)?;
+    let start = Start::of_constants(|name| constants.get(name), levels, device);
+    Ok(start.ok_or_else(|| NoStart {
+        method: hrn.card().method.clone(),
+        levels: hrn.card().levels.len(),
+        expected: levels,
+    })?)
+}
+
+/// Goes on from `start` on all labelled training samples and, by consistency, on the others.
+///
+/// # Errors
+///
+/// If the data has no labelled training samples, the training diverges, or the directory cannot be read
+/// or written.
+pub fn adapt(
+    dataset: &Dataset,
+    start: Start,
+    description: &Description,
+    run: &Run,
+    device: &Device,
+) -> anyhow::Result<Option<Evaluation>> {
+    let labelled = dataset.labelled(Split::Train)?;
+    let share = description.settings.validation.share;
+    let (kept, held_out) = dataset.hold_out(&labelled, share, description.seed);
+    let samples = Samples {
+        dataset,
+        train: &kept,
+        held_out: &held_out,
+        unlabelled: &super::unlabelled(dataset, &labelled),
+    };
+    train("adapt", &samples, Some(start), description, run, device)
+}
+
+/// Writes the model, what it is worth and what it still gets wrong.
+fn finish(
+    samples: &Samples,
+    trained: &Trained,
+    description: &Description,
+    run: &Run,
+    device: &Device,
+) -> anyhow::Result<Option<Evaluation>> {
+    let levels = dataset::levels().len();
+    let plan = Features::new().context("features")?;
+    let calibration = trained.calibration;
+    let probabilities = |frames: &[&Frame]| {
+        let frames: Vec<Frame> = frames.iter().copied().copied().collect();
+        let judged = trained.judge(&frames, &plan, levels, device)?;
+        let logits: Vec<Vec<f32>> = judged.into_iter().map(|(logits, _)| logits).collect();
+        Ok(fit::probabilities(&logits, calibration.temperature, device))
+    };
+    let (kind, shown) = if samples.held_out.is_empty() {
+        ("training", samples.train)
+    } else {
+        ("held-out", samples.held_out)
+    };
+    let frames: Vec<&Frame> = shown
+        .iter()
+        .map(|&index| &samples.dataset.samples[index].frame)
+        .collect();
+    let said: Vec<Vec<f32>> = probabilities(&frames)?;
+    stages::draw_mistakes(run, samples.dataset, (kind, shown), &said)?;
+    let (graph, raw_logits, shore) = graph(
+        &trained.weights,
+        &trained.standard,
+        levels,
+        calibration.widths,
+    );
+    // Without measured hardness the second head learnt nothing, or unlearnt what it knew.
+    let has_shore = |&index: &usize| samples.dataset.samples[index].shore.is_some();
+    let recogniser = Recogniser {
+        graph,
+        raw_logits,
+        shore: samples.train.iter().any(has_shore).then_some(shore),
+        temperature: calibration.temperature,
+    };
+    export::finish(
+        run,
+        description,
+        samples.dataset,
+        samples.train,
+        &recogniser,
+        probabilities,
+    )
+}

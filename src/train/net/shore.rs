@@ -1,0 +1,111 @@
+//! The second head: Shore hardness with the ends of a 90 % interval, beside the levels.
+//!
+//! A network's outputs are `[batch, L + 3]`: logits, then the median and the two ends, on a scale on
+//! which a unit is [`UNIT`] Shore OO.
+
+use burn::tensor::{Tensor, activation};
+
+use crate::train::net::builder::Builder;
+
+/// Outputs beside the levels: Shore OO, and the low and high end of its interval.
+pub const OUTPUTS: usize = 3;
+/// Their quantiles.
+const QUANTILES: [f32; OUTPUTS] = [0.5, 0.05, 0.95];
+/// Shore OO of an output of 0.
+const MIDDLE: f32 = 55.0;
+/// Shore OO of a unit more.
+const UNIT: f32 = 25.0;
+
+/// Measured hardness on the outputs' scale.
+pub fn on_scale(shore: f32) -> f32 {
+    (shore - MIDDLE) / UNIT
+}
+
+/// Shore OO (value, low, high) of a press's three outputs; `widths` are added below and above to the
+/// ends of the interval.
+pub fn of_outputs(outputs: &[f32], [below, above]: [f32; 2]) -> [f32; OUTPUTS] {
+    let of = |place: usize| outputs[place] * UNIT + MIDDLE;
+    [of(0), of(1) - below, of(2) + above].map(|shore| shore.clamp(0.0, 100.0))
+}
+
+/// Pinball losses of the median and of the ends of a 90 % interval, summed and averaged over presses.
+/// `outputs` are the three of each press; `shore` is `[batch, 1]` on their scale, `known` 1 where it was
+/// measured.
+pub fn interval_loss(outputs: Tensor<2>, shore: Tensor<2>, known: Tensor<2>) -> Tensor<1> {
+    let batch = outputs.dims()[0] as f32;
+    let quantiles = Tensor::<1>::from_floats(QUANTILES, &outputs.device()).reshape([1, OUTPUTS]);
+    let error = shore.sub(outputs);
+    let above = activation::relu(error.clone()).mul(quantiles.clone());
+    let below = activation::relu(error.neg()).mul(quantiles.neg().add_scalar(1.0));
+    above.add(below).mul(known).sum().div_scalar(batch)
+}
+
+/// Adds the nodes from a network's outputs `[1, levels + 3]` to raw logits `[1, levels]` and Shore OO
+/// `[1, 3]`, and gives their names.
+pub(super) fn nodes(
+    b: &mut Builder,
+    outputs: &str,
+    levels: usize,
+    [below, above]: [f32; 2],
+) -> (String, String) {
+    let ends = [0, levels, levels + OUTPUTS].map(|end| end as i64);
+    let [zero, first, last] = ends.map(|end| b.0.indices(&format!("output {end}"), &[end]));
+    let axis = b.0.indices("output axis", &[1]);
+    let raw_logits = b.node("Slice", &[outputs, &zero, &first, &axis], "raw_logits");
+    let raw = b.node("Slice", &[outputs, &first, &last, &axis], "raw shore");
+    let unit = b.scalar("shore unit", UNIT);
+    let middles = [MIDDLE, MIDDLE - below, MIDDLE + above];
+    let middles = b.0.constant("shore middles", &[1, OUTPUTS], &middles);
+    let scaled = b.node("Mul", &[&raw, &unit], "shore scaled");
+    let moved = b.node("Add", &[&scaled, &middles], "shore moved");
+    let (least, most) = (b.scalar("least shore", 0.0), b.scalar("most shore", 100.0));
+    let shore = b.node("Clip", &[&moved, &least, &most], "shore");
+    (raw_logits, shore)
+}
+
+/// The widths in the constant `shore middles` of an exported graph.
+pub(super) fn widths(middles: Vec<f32>) -> [f32; 2] {
+    let [_, low, high] = middles[..] else {
+        return [0.0; 2];
+    };
+    [MIDDLE - low, high - MIDDLE]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::train::net::network::numbers;
+    use burn::tensor::{Device, TensorData};
+
+    #[test]
+    fn the_loss_is_least_at_the_quantiles_and_counts_only_what_was_measured() {
+        let device = Device::flex();
+        let column = |values: &[f32]| {
+            let data = TensorData::new(values.to_vec(), [values.len(), 1]);
+            Tensor::<2>::from_data(data, &device)
+        };
+        // Twenty presses of 0, 0.05, ..., 0.95, and one that was not measured.
+        let mut shore: Vec<f32> = (0..20_u8).map(|n| f32::from(n) / 20.0).collect();
+        let mut known = vec![1.0; 20];
+        shore.push(50.0);
+        known.push(0.0);
+        let loss = |outputs: [f32; OUTPUTS]| {
+            let rows = TensorData::new(outputs.repeat(21), [21, OUTPUTS]);
+            let rows = Tensor::<2>::from_data(rows, &device);
+            numbers(&interval_loss(rows, column(&shore), column(&known)))[0]
+        };
+        let best = loss([0.475, 0.025, 0.925]);
+        for (place, moved) in [
+            (0, 0.1),
+            (0, -0.1),
+            (1, 0.1),
+            (1, -0.1),
+            (2, 0.1),
+            (2, -0.1),
+        ] {
+            let mut outputs = [0.475, 0.025, 0.925];
+            outputs[place] += moved;
+            assert!(loss(outputs) > best + 1e-4, "{place} {moved}");
+        }
+    }
+}
