@@ -65,6 +65,8 @@ pub struct DatasetSettings {
     pub profile: SensorProfile,
     /// Of the sensors' gains, thresholds and dead taxels; `None`: `seed`.
     pub sensor_seed: Option<u64>,
+    /// Whether all presses, of both splits, are on one sensor.
+    pub one_sensor: bool,
     /// Young's modulus of the sensors' cover, MPa.
     pub cover_young_mpa: f64,
     /// Levels, from 1, whose two materials change roles: the paper's test material trains.
@@ -87,6 +89,7 @@ impl Default for DatasetSettings {
             shapes: Shapes::Matched,
             profile: SensorProfile::Clean,
             sensor_seed: None,
+            one_sensor: false,
             cover_young_mpa: COVER_YOUNG_MPA,
             swapped_levels: [false; 4],
         }

@@ -147,13 +147,14 @@ impl Subject {
             Origin::Named(material) => Body::named(material, &mut hardness),
             Origin::Broad(_) => broad::draw(settings.laws, settings.borders, &mut hardness),
         };
-        // The splits share no sensor: the streams have different names.
-        let sensors = match unit.split {
-            Split::Train => "train sensor",
-            Split::Test => "test sensor",
+        // The splits share no sensor, unless there is one alone: the streams have different names.
+        let (sensors, number) = match (settings.one_sensor, unit.split) {
+            (true, _) => ("one sensor", 0),
+            (false, Split::Train) => ("train sensor", unit.number % SENSORS),
+            (false, Split::Test) => ("test sensor", unit.number % SENSORS),
         };
         let sensor_seed = settings.sensor_seed.unwrap_or(settings.seed);
-        let of_sensor = Stream::new(sensor_seed, sensors).child(u64::from(unit.number % SENSORS));
+        let of_sensor = Stream::new(sensor_seed, sensors).child(u64::from(number));
         Self {
             split: unit.split,
             object: Object::draw(settings.shapes, body.level, &mut draws.geometry.child(0)),

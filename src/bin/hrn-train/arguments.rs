@@ -28,6 +28,8 @@ pub(super) enum Command {
     Collect(Collect),
     /// Train one method
     Train(Train),
+    /// Go on from a model on a few presses of your own sensor: labelled ones, and any without labels
+    Adapt(Adapt),
     /// Train every method under several seeds and make the paper's tables; run it again to continue
     Compare(Compare),
     /// Run an exported model on a data set
@@ -101,6 +103,13 @@ pub(super) struct Simulate {
     /// Spread of the sensor's taxels: clean or raw
     #[arg(long, default_value = "clean")]
     pub(super) sensor_profile: SensorProfile,
+    /// Press all objects on one sensor, drawn with this seed: one that you have on the bench
+    #[arg(long, value_name = "SEED")]
+    pub(super) one_sensor: Option<u64>,
+    /// Young's modulus of the sensor's cover in MPa, 0.05 to 100
+    #[arg(long, value_name = "MPA", default_value_t = DatasetSettings::default().cover_young_mpa,
+          value_parser = cover_mpa)]
+    pub(super) cover: f64,
     /// Levels whose two materials change roles, such as 24: the paper's test material trains
     #[arg(long, value_name = "LEVELS", value_parser = swapped_levels)]
     pub(super) swapped_levels: Option<[bool; 4]>,
@@ -216,6 +225,31 @@ pub(super) struct Train {
 }
 
 #[derive(Debug, clap::Args)]
+pub(super) struct Adapt {
+    /// Presses of your sensor; those of level 0 are unlabelled. Several files are joined
+    #[arg(long, value_name = "D.npz", required = true)]
+    pub(super) data: Vec<PathBuf>,
+    /// Directory of the run
+    #[arg(long, value_name = "RUN")]
+    pub(super) out: PathBuf,
+    /// Model to go on from, of `train --method frame` or `adapt` [default: the built-in one]
+    #[arg(long, value_name = "M.onnx")]
+    pub(super) start: Option<PathBuf>,
+    /// Seed of everything random
+    #[arg(long, default_value_t = 1)]
+    pub(super) seed: u64,
+    /// Settings that override the default ones (see config/hrn-train.toml)
+    #[arg(long, value_name = "F.toml")]
+    pub(super) config: Option<PathBuf>,
+    /// Continue a run that was stopped
+    #[arg(long)]
+    pub(super) resume: bool,
+    /// Where to compute
+    #[arg(long, default_value = "cpu")]
+    pub(super) device: DeviceName,
+}
+
+#[derive(Debug, clap::Args)]
 pub(super) struct Compare {
     /// The data set to learn from
     #[arg(long, value_name = "D.npz")]
@@ -245,6 +279,14 @@ fn lowest_force_n(text: &str) -> Result<f32, String> {
     match text.parse() {
         Ok(force_n) if (0.01..=25.0).contains(&force_n) => Ok(force_n),
         _ => Err("expected newtons from 0.01 to 25".to_owned()),
+    }
+}
+
+/// From a gel to a hard plastic.
+fn cover_mpa(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(mpa) if (0.05..=100.0).contains(&mpa) => Ok(mpa),
+        _ => Err("expected MPa from 0.05 to 100".to_owned()),
     }
 }
 

@@ -22,19 +22,21 @@ use hardnessd::train::compare::results::Comparison;
 use hardnessd::train::compare::{self, Plan, tables};
 use hardnessd::train::data::collect::{self, Capture, CollectError, Labelling};
 use hardnessd::train::data::courses::Courses;
-use hardnessd::train::data::dataset::{Dataset, DatasetError};
+use hardnessd::train::data::dataset::{Dataset, DatasetError, LabelChoice};
 use hardnessd::train::data::simulated;
+use hardnessd::train::judge::metrics::Evaluation;
 use hardnessd::train::judge::sheet;
+use hardnessd::train::methods::frame::NoStart;
 use hardnessd::train::methods::{self, LabelsError, Method, Request};
 use hardnessd::train::model::{course, export};
 use hardnessd::train::run::Run;
 use hardnessd::train::run::disk::write_whole;
 use hardnessd::train::settings::{Profile, Settings, SettingsError};
 use hardnessd::trial;
-use hardnessd::verdict::{Hrn, ModelError};
+use hardnessd::verdict::{BUILT_IN, Hrn, ModelError};
 
 use self::arguments::{
-    Arguments, Collect, Command, Compare, DeviceName, Evaluate, Simulate, Train,
+    Adapt, Arguments, Collect, Command, Compare, DeviceName, Evaluate, Simulate, Train,
 };
 
 /// A training step frees and asks for the same large buffers over and over. The system's allocator
@@ -51,7 +53,7 @@ fn main() -> ExitCode {
         Err(error) => return tools::usage("hrn-train", &error),
     };
     let how_to_go_on = match arguments.command {
-        Command::Train(_) => Some(signals::resuming(std::env::args())),
+        Command::Train(_) | Command::Adapt(_) => Some(signals::resuming(std::env::args())),
         Command::Compare(_) => Some(signals::again(std::env::args())),
         _ => None,
     };
@@ -65,6 +67,7 @@ fn main() -> ExitCode {
         // On a thread of the pool: from outside, every operation on several threads would first
         // wake one of them.
         Command::Train(arguments) => rayon::scope(|_| train(&arguments)),
+        Command::Adapt(arguments) => rayon::scope(|_| adapt(&arguments)),
         Command::Compare(arguments) => compare(arguments),
         Command::Evaluate(arguments) => evaluate(&arguments),
         Command::Report { directory, out } => report_of(&directory, &out),
@@ -115,7 +118,12 @@ fn exit_code(error: &anyhow::Error) -> u8 {
         exit::NO_INPUT
     } else if has(<dyn std::error::Error>::is::<NoCuda>) {
         exit::UNAVAILABLE
-    } else if has(|e| e.is::<ModelError>() || e.is::<SettingsError>() || e.is::<ConfigError>()) {
+    } else if has(|e| {
+        e.is::<ModelError>()
+            || e.is::<NoStart>()
+            || e.is::<SettingsError>()
+            || e.is::<ConfigError>()
+    }) {
         exit::CONFIG
     } else if has(<dyn std::error::Error>::is::<std::io::Error>) {
         exit::IO
@@ -194,6 +202,9 @@ fn simulated_settings(arguments: &Simulate) -> Result<DatasetSettings, OtherMate
         lowest_force_n: arguments.lowest_force,
         shapes: arguments.shapes,
         profile: arguments.sensor_profile,
+        sensor_seed: arguments.one_sensor,
+        one_sensor: arguments.one_sensor.is_some(),
+        cover_young_mpa: arguments.cover,
         swapped_levels: arguments.swapped_levels.unwrap_or_default(),
         ..DatasetSettings::default()
     })
@@ -339,17 +350,12 @@ fn train(arguments: &Train) -> anyhow::Result<String> {
     if arguments.method == Method::Course {
         return train_course(arguments);
     }
-    let settings = settings(arguments)?;
-    let parts: Result<Vec<Dataset>, DatasetError> = arguments
-        .data
-        .iter()
-        .map(|path| Dataset::read(path))
-        .collect();
-    let parts = parts?;
-    for part in &parts {
-        part.warn_of_object_in_both_splits();
-    }
-    let dataset = Dataset::joined(parts)?;
+    let settings = settings(
+        arguments.method,
+        arguments.profile,
+        arguments.config.as_deref(),
+    )?;
+    let dataset = dataset_of(&arguments.data)?;
     for other in &arguments.from {
         let unreadable = |source| Unreadable {
             path: other.clone(),
@@ -376,19 +382,70 @@ fn train(arguments: &Train) -> anyhow::Result<String> {
     }
     let begun = Instant::now();
     let evaluation = methods::train(arguments.method, &dataset, &description, &run, &device)?;
+    Ok(account_of_run(begun, &run, evaluation.as_ref()))
+}
+
+/// The data of several files, joined.
+fn dataset_of(paths: &[PathBuf]) -> anyhow::Result<Dataset> {
+    let parts: Result<Vec<Dataset>, DatasetError> =
+        paths.iter().map(|path| Dataset::read(path)).collect();
+    let parts = parts?;
+    for part in &parts {
+        part.warn_of_object_in_both_splits();
+    }
+    Ok(Dataset::joined(parts)?)
+}
+
+fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
+    let (method, profile) = (Method::Adapt, Profile::Paper);
+    let settings = settings(method, profile, arguments.config.as_deref())?;
+    let device = device(arguments.device)?;
+    let start = match &arguments.start {
+        Some(path) => {
+            let bytes = read(path)?;
+            methods::frame::start(&load(path)?, &bytes, &device)
+                .with_context(|| path.display().to_string())?
+        }
+        None => methods::frame::start(&Hrn::load(BUILT_IN)?, BUILT_IN, &device)
+            .context("the built-in model")?,
+    };
+    let dataset = dataset_of(&arguments.data)?;
+    let request = Request {
+        method,
+        profile,
+        seed: arguments.seed,
+        labels: None,
+        label_choice: LabelChoice::Object,
+        settings,
+    };
+    let description = request.description(&dataset)?;
+    methods::check(method, &dataset, &description)?;
+    let run = Run::open(&arguments.out, &description, arguments.resume)?;
+    eprint!("{}", account::of_data(&dataset));
+    let begun = Instant::now();
+    let evaluation = methods::frame::adapt(&dataset, start, &description, &run, &device)?;
+    Ok(account_of_run(begun, &run, evaluation.as_ref()))
+}
+
+/// How long it took, where the model is and what it is worth.
+fn account_of_run(begun: Instant, run: &Run, evaluation: Option<&Evaluation>) -> String {
     let figures = evaluation.map_or_else(
         || "not evaluated: the data has no labelled test samples\n".to_owned(),
-        |evaluation| account::of_evaluation(&evaluation),
+        account::of_evaluation,
     );
-    Ok(format!(
+    format!(
         "trained in {:.1} s: {}\n{figures}",
         begun.elapsed().as_secs_f64(),
         run.path("hrn.onnx").display()
-    ))
+    )
 }
 
 fn train_course(arguments: &Train) -> anyhow::Result<String> {
-    let settings = settings(arguments)?;
+    let settings = settings(
+        arguments.method,
+        arguments.profile,
+        arguments.config.as_deref(),
+    )?;
     let (courses, sources) = Courses::read_all(&arguments.data)?;
     let told = (arguments.profile, arguments.seed, settings);
     let description = methods::course::description(&courses, sources, told)?;
@@ -408,9 +465,9 @@ fn train_course(arguments: &Train) -> anyhow::Result<String> {
 }
 
 /// Those of the method, and what a file overrides.
-fn settings(arguments: &Train) -> anyhow::Result<Settings> {
-    let settings = arguments.method.settings(arguments.profile);
-    let Some(path) = &arguments.config else {
+fn settings(method: Method, profile: Profile, file: Option<&Path>) -> anyhow::Result<Settings> {
+    let settings = method.settings(profile);
+    let Some(path) = file else {
         return Ok(settings);
     };
     let text = String::from_utf8_lossy(&read(path)?).into_owned();
