@@ -205,6 +205,7 @@ impl Daemon {
             target,
         } = self;
         descriptors::raise();
+        realtime::lock_memory();
         if let Some(shortage) = descriptors::shortage(&setup.config) {
             warn!("{shortage}");
         }

@@ -3,12 +3,39 @@
 //! The daemon does not ask for real-time scheduling. systemd sets it before it starts the daemon
 //! (`CPUSchedulingPolicy=` of the unit), and the sandbox then refuses any change. Threads that the
 //! daemon starts are scheduled as ordinary ones (`CPUSchedulingResetOnFork=`): they log, record and
-//! load models.
+//! load models. The daemon locks its memory itself, because systemd cannot. It does so where the unit
+//! has taken the limit away (`LimitMEMLOCK=`), or where it may ignore the limit.
 
 use std::path::Path;
 use std::{fmt, fs};
 
+use rustix::mm::MlockAllFlags;
+use rustix::process::{Resource, getrlimit};
 use serde::Serialize;
+use tracing::warn;
+
+/// Keeps the pages of this process in memory, each from its first use on. It takes no more memory than
+/// before. Where the process may lock only so much, it locks nothing: at the limit, memory that it needs
+/// later would be refused.
+pub(super) fn lock_memory() {
+    let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
+    if getrlimit(Resource::Memlock).current.is_some() && !may_lock(&status) {
+        return;
+    }
+    let flags = MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT;
+    if let Err(error) = rustix::mm::mlockall(flags) {
+        warn!(%error, "the memory is not locked: a busy machine may delay events");
+    }
+}
+
+/// Whether no limit holds for a process, by its proc_pid_status(5): it has CAP_IPC_LOCK.
+fn may_lock(status: &str) -> bool {
+    const IPC_LOCK: u32 = 14;
+    let mut lines = status.lines();
+    let capabilities = lines.find_map(|line| line.strip_prefix("CapEff:"));
+    let bits = capabilities.and_then(|hex| u64::from_str_radix(hex.trim(), 16).ok());
+    bits.is_some_and(|bits| bits >> IPC_LOCK & 1 == 1)
+}
 
 /// How a process runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -93,6 +120,18 @@ impl fmt::Display for Standing {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn only_who_may_lock_everything_locks() {
+        assert!(may_lock(
+            "CapPrm:\t0000000000000000\nCapEff:\t0000000000004000\n"
+        ));
+        assert!(may_lock("CapEff:\t000001ffffffffff\n"));
+        assert!(!may_lock(
+            "CapPrm:\t000001ffffffffff\nCapEff:\t0000000000000000\n"
+        ));
+        assert!(!may_lock("CapEff:\t000001ffffffbfff\n") && !may_lock(""));
+    }
 
     #[test]
     fn a_process_is_read_whatever_its_name() {
