@@ -334,6 +334,17 @@ impl Hrn {
     /// If anything in the file is not as agreed, which the [`ModelError`] names, or if one of its check
     /// frames cannot be judged: as [`Hrn::judge`].
     pub fn load(bytes: &[u8]) -> Result<Self, ModelError> {
+        let hrn = Self::read(bytes)?;
+        hrn.reproduce_check()?;
+        Ok(hrn)
+    }
+
+    /// Loads a model file whose check frames nobody has computed yet: for who is about to write them.
+    ///
+    /// # Errors
+    ///
+    /// As [`Hrn::load`], but for the check frames.
+    pub fn read(bytes: &[u8]) -> Result<Self, ModelError> {
         if bytes.len() > MAX_FILE_BYTES {
             return Err(ModelError::TooLarge { found: bytes.len() });
         }
@@ -398,7 +409,7 @@ impl Hrn {
         }
         let plan = optimized.into_runnable().map_err(graph_error)?;
 
-        let hrn = Self {
+        Ok(Self {
             plan,
             format,
             inputs,
@@ -408,9 +419,7 @@ impl Hrn {
             card,
             checks,
             sha256: sha256_hex(bytes),
-        };
-        hrn.reproduce_check()?;
-        Ok(hrn)
+        })
     }
 
     /// SHA-256 of the whole file, 64 hexadecimal digits.

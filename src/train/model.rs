@@ -3,3 +3,5 @@
 pub mod file;
 pub mod export;
 pub mod course;
+pub mod adopt;
+pub mod review;

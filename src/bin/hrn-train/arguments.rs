@@ -50,6 +50,13 @@ pub(super) enum Command {
         #[arg(long, value_name = "M.onnx")]
         out: PathBuf,
     },
+    /// Say line by line what the model format wants of an ONNX file of someone else's making
+    CheckModel {
+        /// The model file
+        model: PathBuf,
+    },
+    /// Make a model that the daemon loads of an ONNX file of someone else's making
+    Adopt(Adopt),
     /// Check a model file as the daemon does and print its card
     Inspect {
         /// The model file
@@ -347,6 +354,24 @@ pub(super) struct Evaluate {
     /// Print JSON
     #[arg(long)]
     pub(super) json: bool,
+}
+
+#[derive(Debug, clap::Args)]
+pub(super) struct Adopt {
+    /// The ONNX file
+    pub(super) model: PathBuf,
+    /// The data set that it learnt from
+    #[arg(long, value_name = "D.npz")]
+    pub(super) data: PathBuf,
+    /// Model file to write; an existing file is replaced
+    #[arg(long, value_name = "H.onnx")]
+    pub(super) out: PathBuf,
+    /// How it was made, in a few words [default: "adopted from" and the file's name]
+    #[arg(long, value_name = "TEXT")]
+    pub(super) method: Option<String>,
+    /// What it was tried on, in a few words [default: by the origin of the data]
+    #[arg(long, value_name = "TEXT")]
+    pub(super) validation: Option<String>,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]

@@ -28,7 +28,8 @@ use hardnessd::train::judge::metrics::Evaluation;
 use hardnessd::train::judge::sheet;
 use hardnessd::train::methods::frame::NoStart;
 use hardnessd::train::methods::{self, LabelsError, Method, Request};
-use hardnessd::train::model::{course, export};
+use hardnessd::train::model::adopt::{self, Foreign, Told};
+use hardnessd::train::model::{course, export, review};
 use hardnessd::train::run::Run;
 use hardnessd::train::run::disk::write_whole;
 use hardnessd::train::settings::{Profile, Settings, SettingsError};
@@ -36,7 +37,7 @@ use hardnessd::trial;
 use hardnessd::verdict::{BUILT_IN, Hrn, ModelError};
 
 use self::arguments::{
-    Adapt, Arguments, Collect, Command, Compare, DeviceName, Evaluate, Simulate, Train,
+    Adapt, Adopt, Arguments, Collect, Command, Compare, DeviceName, Evaluate, Simulate, Train,
 };
 
 /// A training step frees and asks for the same large buffers over and over. The system's allocator
@@ -72,6 +73,8 @@ fn main() -> ExitCode {
         Command::Evaluate(arguments) => evaluate(&arguments),
         Command::Report { directory, out } => report_of(&directory, &out),
         Command::Export { run, out } => export_run(&run, &out),
+        Command::CheckModel { model } => return check_model(&model),
+        Command::Adopt(arguments) => adopt_model(&arguments),
         Command::Inspect { model } => inspect(&model),
     };
     match done.and_then(|account| Ok(tools::print(account.as_bytes())?)) {
@@ -121,6 +124,7 @@ fn exit_code(error: &anyhow::Error) -> u8 {
     } else if has(|e| {
         e.is::<ModelError>()
             || e.is::<NoStart>()
+            || e.is::<Foreign>()
             || e.is::<SettingsError>()
             || e.is::<ConfigError>()
     }) {
@@ -606,4 +610,72 @@ fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {
 
 fn inspect(path: &Path) -> anyhow::Result<String> {
     Ok(account::of_model(path, &load(path)?))
+}
+
+/// The time that a sensor of 5 frames/s leaves for a verdict.
+const SLOWEST_HZ: f64 = 5.0;
+
+/// Its lines are what was asked for, so they go to stdout even if the model does not pass.
+fn check_model(path: &Path) -> ExitCode {
+    let checked = read(path).map_err(anyhow::Error::from).and_then(|bytes| {
+        let findings = review::review(&bytes);
+        let mut lines = format!("{}: {}\n", path.display(), review::wanted());
+        for finding in &findings {
+            lines += &format!("{finding}\n");
+        }
+        let mut passes = findings.iter().all(|finding| finding.problem.is_none());
+        if passes {
+            // Memory and time, as the daemon tries them.
+            let most = trial::verdict_most(SLOWEST_HZ);
+            match trial::load(&bytes, Some(most)) {
+                Ok(_) => lines += "ok       memory and time of a verdict\n",
+                Err(error) => {
+                    passes = false;
+                    lines += &format!("missing  memory and time of a verdict: {error}\n");
+                }
+            }
+        } else if findings.iter().all(|f| f.problem.is_none() || f.is_mended) {
+            lines += &format!(
+                "`hrn-train adopt {} --data D.npz --out H.onnx` adds what is missing\n",
+                path.display()
+            );
+        }
+        tools::print(lines.as_bytes())?;
+        Ok(passes)
+    });
+    match checked {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(exit::CONFIG),
+        Err(error) => {
+            eprintln!("hrn-train: {}", tools::line(error.as_ref()));
+            ExitCode::from(exit_code(&error))
+        }
+    }
+}
+
+fn adopt_model(arguments: &Adopt) -> anyhow::Result<String> {
+    let bytes = read(&arguments.model)?;
+    let dataset = Dataset::read(&arguments.data)?;
+    let name = arguments.model.file_name().unwrap_or_default();
+    let told = Told {
+        method: arguments
+            .method
+            .clone()
+            .unwrap_or_else(|| format!("adopted from {}", name.display())),
+        validation: arguments.validation.clone(),
+    };
+    let adopted = adopt::adopt(&bytes, &dataset, &told);
+    let (model, done, evaluation) =
+        adopted.with_context(|| arguments.model.display().to_string())?;
+    write(&arguments.out, &model)?;
+    let hrn = load(&arguments.out)?;
+    let mut account = String::new();
+    for change in done {
+        account += &format!("changed  {change}\n");
+    }
+    account += &format!("{}: sha256 {}\n", arguments.out.display(), hrn.sha256());
+    if let Some(evaluation) = evaluation {
+        account += &account::of_evaluation(&evaluation);
+    }
+    Ok(account)
 }

@@ -145,7 +145,7 @@ fn evaluations_by_source(hrn: &Hrn, dataset: &Dataset) -> anyhow::Result<serde_j
 }
 
 /// Two frames of each level, from a third and two thirds of its samples.
-fn check_frames<'a>(dataset: &'a Dataset, train: &[usize]) -> Vec<&'a Frame> {
+pub(super) fn check_frames<'a>(dataset: &'a Dataset, train: &[usize]) -> Vec<&'a Frame> {
     let mut frames = Vec::new();
     for level in dataset::levels() {
         let of_level = |index: &usize| dataset.samples[*index].level == level.level;

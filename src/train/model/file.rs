@@ -78,7 +78,10 @@ pub fn write(
     Ok(bytes)
 }
 
-fn metadata(card: &Card, checks: &Checks) -> anyhow::Result<Vec<pb::StringStringEntryProto>> {
+pub(super) fn metadata(
+    card: &Card,
+    checks: &Checks,
+) -> anyhow::Result<Vec<pb::StringStringEntryProto>> {
     let check = match checks {
         Checks::Frames(check) => serde_json::to_string(check)?,
         Checks::Courses(check) => serde_json::to_string(check)?,

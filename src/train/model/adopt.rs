@@ -1,0 +1,285 @@
+//! Makes a model that the daemon loads of an ONNX file of someone else's making.
+//!
+//! In: the file, with a graph from newtons to logits or probabilities, and the data set that it learnt
+//! from. Out: the same graph with the metadata, and what it is worth on the test split. Nothing in the
+//! graph is changed but names, a batch of any size, and the last step between logits and probabilities.
+
+use anyhow::{Context as _, ensure};
+use prost::Message as _;
+use serde_json::json;
+use tract_onnx::pb;
+
+use super::export;
+use super::file;
+use crate::frame::{COLS, Frame, ROWS};
+use crate::simulator::Split;
+use crate::train::data::dataset::{self, Dataset};
+use crate::train::judge::metrics::Evaluation;
+use crate::train::net::graph::{INPUT, frame_input, integer, value_info};
+use crate::verdict::{Card, Check, Checks, Hrn};
+
+/// The least probability of which a logarithm is taken: the file's own may round to 0.
+const LEAST_PROBABILITY: f32 = 1e-30;
+
+/// Why the graph cannot be adopted.
+#[derive(Debug, thiserror::Error)]
+pub enum Foreign {
+    /// Not an ONNX file.
+    #[error("not an ONNX model: {0}")]
+    NotOnnx(String),
+    /// Other inputs than one frame.
+    #[error("inputs: found {found}, expected one, f32 [1,1,{ROWS},{COLS}]")]
+    Inputs {
+        /// As the file has them.
+        found: String,
+    },
+    /// Neither logits nor probabilities by name.
+    #[error(
+        "outputs: found {found}, expected `logits` or `probabilities` or both, f32 [1,L], by these \
+         names"
+    )]
+    Outputs {
+        /// As the file has them.
+        found: String,
+    },
+}
+
+/// What is told of a model besides its data.
+#[derive(Debug, Clone)]
+pub struct Told {
+    /// `hrn.method`.
+    pub method: String,
+    /// `hrn.validation`; else by the origin of the data.
+    pub validation: Option<String>,
+}
+
+/// Reads an ONNX file.
+///
+/// # Errors
+///
+/// [`Foreign::NotOnnx`].
+pub fn decode(bytes: &[u8]) -> Result<pb::ModelProto, Foreign> {
+    let proto = pb::ModelProto::decode(bytes);
+    let proto = proto.map_err(|error| Foreign::NotOnnx(error.to_string()))?;
+    match &proto.graph {
+        Some(_) if proto.ir_version > 0 => Ok(proto),
+        _ => Err(Foreign::NotOnnx("no graph in it".to_owned())),
+    }
+}
+
+/// Gives the graph the agreed input and outputs: their names, a batch of one, and of logits and
+/// probabilities the one that is missing. Says what it changed, and the number of levels.
+///
+/// # Errors
+///
+/// [`Foreign::Inputs`] and [`Foreign::Outputs`], if it is not clear what is what.
+pub fn mend(proto: &mut pb::ModelProto) -> Result<(Vec<String>, usize), Foreign> {
+    let mut done = Vec::new();
+    mend_input(proto, &mut done)?;
+    let levels = mend_outputs(proto, &mut done)?;
+    Ok((done, levels))
+}
+
+/// The input alone.
+pub(super) fn mend_input(
+    proto: &mut pb::ModelProto,
+    done: &mut Vec<String>,
+) -> Result<(), Foreign> {
+    let graph = proto.graph.get_or_insert_default();
+    let is_weight = |name: &str| graph.initializer.iter().any(|tensor| tensor.name == name);
+    let inputs: Vec<&pb::ValueInfoProto> = graph
+        .input
+        .iter()
+        .filter(|input| !is_weight(&input.name))
+        .collect();
+    let found = || describe(&inputs);
+    let [input] = inputs[..] else {
+        return Err(Foreign::Inputs { found: found() });
+    };
+    match dims(input).as_deref() {
+        Some([batch, Some(1), Some(rows), Some(cols)])
+            if batch.is_none_or(|batch| batch == 1) && (*rows, *cols) == (ROWS, COLS) =>
+        {
+            if batch.is_none() {
+                done.push(format!("input {:?}: a batch of one", input.name));
+            }
+        }
+        _ => return Err(Foreign::Inputs { found: found() }),
+    }
+    let name = input.name.clone();
+    graph.input = vec![frame_input()];
+    if name != INPUT {
+        done.push(format!("input {name:?}: it is called `{INPUT}`"));
+        graph.node.insert(0, node("Identity", &[INPUT], &name));
+    }
+    Ok(())
+}
+
+/// The outputs alone.
+pub(super) fn mend_outputs(
+    proto: &mut pb::ModelProto,
+    done: &mut Vec<String>,
+) -> Result<usize, Foreign> {
+    let graph = proto.graph.get_or_insert_default();
+    let outputs: Vec<&pb::ValueInfoProto> = graph.output.iter().collect();
+    let found = describe(&outputs);
+    let levels_of = |name: &str| {
+        let output = outputs.iter().find(|output| output.name == name)?;
+        match dims(output).as_deref() {
+            Some([batch, Some(levels)]) if batch.is_none_or(|batch| batch == 1) => Some(*levels),
+            _ => None,
+        }
+    };
+    let others = outputs
+        .iter()
+        .map(|output| &output.name)
+        .filter(|name| !["logits", "probabilities"].contains(&name.as_str()));
+    done.extend(others.map(|name| format!("output {name:?}: left out")));
+    let levels = match (levels_of("logits"), levels_of("probabilities")) {
+        (Some(levels), Some(same)) if levels == same => levels,
+        (Some(levels), None) => {
+            done.push("output `probabilities`: the softmax of `logits`".to_owned());
+            let mut softmax = node("Softmax", &["logits"], "probabilities");
+            softmax.attribute.push(integer("axis", 1));
+            graph.node.push(softmax);
+            levels
+        }
+        (None, Some(levels)) => {
+            done.push("output `logits`: the logarithm of `probabilities`".to_owned());
+            let least = "hrn.least_probability";
+            graph.initializer.push(pb::TensorProto {
+                name: least.to_owned(),
+                data_type: pb::tensor_proto::DataType::Float as i32,
+                float_data: vec![LEAST_PROBABILITY],
+                ..Default::default()
+            });
+            let above = "hrn.above_least";
+            graph
+                .node
+                .push(node("Max", &["probabilities", least], above));
+            graph.node.push(node("Log", &[above], "logits"));
+            levels
+        }
+        _ => return Err(Foreign::Outputs { found }),
+    };
+    graph.output = ["logits", "probabilities"]
+        .map(|name| value_info(name, &[1, levels]))
+        .to_vec();
+    Ok(levels)
+}
+
+fn node(operator: &str, inputs: &[&str], output: &str) -> pb::NodeProto {
+    pb::NodeProto {
+        name: format!("hrn.{output}"),
+        op_type: operator.to_owned(),
+        input: inputs.iter().map(|&name| name.to_owned()).collect(),
+        output: vec![output.to_owned()],
+        ..Default::default()
+    }
+}
+
+/// The dimensions of an f32 value, `None` where the file does not say one; `None` for another type.
+fn dims(value: &pb::ValueInfoProto) -> Option<Vec<Option<usize>>> {
+    use pb::tensor_shape_proto::dimension::Value;
+    let Some(pb::type_proto::Value::TensorType(tensor)) = &value.r#type.as_ref()?.value else {
+        return None;
+    };
+    (tensor.elem_type == pb::tensor_proto::DataType::Float as i32).then_some(())?;
+    let dims = tensor.shape.as_ref()?.dim.iter();
+    Some(
+        dims.map(|dim| match dim.value {
+            Some(Value::DimValue(length)) => usize::try_from(length).ok().filter(|&l| l > 0),
+            _ => None,
+        })
+        .collect(),
+    )
+}
+
+fn describe(values: &[&pb::ValueInfoProto]) -> String {
+    let one = |value: &&pb::ValueInfoProto| {
+        let name: String = value.name.chars().take(60).collect();
+        match dims(value) {
+            Some(dims) => {
+                let text = |dim: &Option<usize>| dim.map_or("?".to_owned(), |dim| dim.to_string());
+                let dims: Vec<String> = dims.iter().map(text).collect();
+                format!("{name:?} f32 [{}]", dims.join(","))
+            }
+            None => format!("{name:?} of another type"),
+        }
+    };
+    let all: Vec<String> = values.iter().map(one).collect();
+    if all.is_empty() {
+        "none".to_owned()
+    } else {
+        all.join(", ")
+    }
+}
+
+/// Sets the metadata of a file, in place of what it has under `hrn.`.
+pub(super) fn set(proto: &mut pb::ModelProto, card: &Card, checks: &Checks) -> anyhow::Result<()> {
+    proto
+        .metadata_props
+        .retain(|entry| !entry.key.starts_with("hrn."));
+    proto.metadata_props.extend(file::metadata(card, checks)?);
+    Ok(())
+}
+
+/// The file with its metadata, what was changed in its graph, and what it is worth on the test split,
+/// if the data set has one. The probabilities of the check frames are those that the daemon's own
+/// inference library computes here.
+///
+/// # Errors
+///
+/// If the graph is not clear, the data set has no labelled samples to learn from, or the daemon's
+/// loader refuses the file.
+pub fn adopt(
+    bytes: &[u8],
+    dataset: &Dataset,
+    told: &Told,
+) -> anyhow::Result<(Vec<u8>, Vec<String>, Option<Evaluation>)> {
+    let mut proto = decode(bytes)?;
+    let (done, found) = mend(&mut proto)?;
+    let levels = dataset::levels();
+    let expected = levels.len();
+    ensure!(
+        found == expected,
+        "outputs: found {found} levels, expected {expected}, those of the data set"
+    );
+    let train = dataset.labelled(Split::Train)?;
+    let learnt = train.iter().map(|&index| dataset.samples[index].frame);
+    let mut card = Card {
+        format: "1".to_owned(),
+        levels,
+        pitch_mm: dataset.pitch_mm() as f32,
+        method: told.method.clone(),
+        data: export::data(&dataset.sources)?,
+        metrics: json!({}),
+        validation: told
+            .validation
+            .clone()
+            .unwrap_or_else(|| export::validation(&dataset.sources).to_owned()),
+        range: export::range(learnt),
+        conformal: None,
+    };
+    let frames = export::check_frames(dataset, &train);
+    let mut check = Check {
+        frames: frames.iter().map(|frame| frame.newtons.to_vec()).collect(),
+        probabilities: vec![vec![0.0; expected]; frames.len()],
+    };
+    set(&mut proto, &card, &Checks::Frames(check.clone()))?;
+    let hrn = Hrn::read(&proto.encode_to_vec())?;
+    let computed = |frame: &&Frame| Ok(hrn.judge(frame)?.probabilities);
+    let computed: anyhow::Result<Vec<Vec<f32>>> = frames.iter().map(computed).collect();
+    check.probabilities = computed?;
+    let evaluation = match dataset.labelled(Split::Test) {
+        Ok(test) => Some(export::evaluate(&hrn, dataset, &test)?),
+        Err(_) => None,
+    };
+    if let Some(evaluation) = &evaluation {
+        card.metrics["test"] = json!(evaluation);
+    }
+    set(&mut proto, &card, &Checks::Frames(check))?;
+    let adopted = proto.encode_to_vec();
+    Hrn::load(&adopted).context("the adopted model")?;
+    Ok((adopted, done, evaluation))
+}
