@@ -3,7 +3,7 @@
 //! Times come from the recording, so the output depends on nothing else: neither on the speed nor
 //! on how the bytes are cut.
 
-mod motion;
+pub mod motion;
 
 use std::collections::VecDeque;
 use std::io::{self, BufReader, Read};

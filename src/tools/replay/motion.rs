@@ -55,7 +55,12 @@ pub(super) fn load(path: &Path) -> Result<Vec<Point>, Error> {
     parse(&text)
 }
 
-fn parse(text: &str) -> Result<Vec<Point>, Error> {
+/// Reads the text of such a file.
+///
+/// # Errors
+///
+/// If the first line does not name the columns, or another line has no number in one of them.
+pub fn parse(text: &str) -> Result<Vec<Point>, Error> {
     let mut lines = (1..).zip(text.lines());
     let (_, names) = lines.next().unwrap_or((1, ""));
     // A spreadsheet may have written a mark of the byte order.
