@@ -1,0 +1,225 @@
+//! Clients: what they hear, and how long after it was sent.
+
+use std::fmt;
+use std::io;
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::net::{TcpStream, UnixStream};
+use tokio::task::JoinSet;
+
+use crate::sensors::{Sent, now_ns, number};
+use crate::server::Place;
+use crate::{Args, Failure, Kind, What};
+
+/// How long the server may take to start, and to answer a client.
+const PATIENCE: Duration = Duration::from_secs(30);
+/// What comes before the forces of a frame.
+pub(crate) const FORCES: &str = "\"newtons\":[";
+
+/// What all clients heard.
+#[derive(Default)]
+pub(crate) struct Heard {
+    /// Clients that are connected and have been answered.
+    ready: AtomicUsize,
+    /// What is sent from this moment on is measured; 0: nothing yet.
+    since_ns: AtomicU64,
+    /// Microseconds of each event.
+    late: Mutex<Vec<f32>>,
+}
+
+impl Heard {
+    /// Measures what is sent from now on.
+    pub(crate) fn begin(&self) {
+        self.since_ns.store(now_ns(), Relaxed);
+    }
+
+    fn add(&self, sent_ns: u64, now_ns: u64) {
+        let since_ns = self.since_ns.load(Relaxed);
+        if since_ns > 0 && sent_ns >= since_ns {
+            let mut late = self.late.lock().unwrap_or_else(PoisonError::into_inner);
+            late.push(now_ns.saturating_sub(sent_ns) as f32 / 1e3);
+        }
+    }
+
+    pub(crate) fn figures(&self, args: &Args, sent: &Sent) -> Figures {
+        let mut late = self.late.lock().unwrap_or_else(PoisonError::into_inner);
+        late.sort_by(f32::total_cmp);
+        let of = |share: f64| {
+            let place = (share * late.len() as f64) as usize;
+            late.get(place.min(late.len().saturating_sub(1))).copied()
+        };
+        let expected = sent.count(args.event, self.since_ns.load(Relaxed)) * args.clients;
+        Figures {
+            events: late.len(),
+            lost: expected as i64 - late.len() as i64,
+            us: [0.5, 0.99, 0.999, 1.0].map(|share| of(share).unwrap_or(f32::NAN)),
+        }
+    }
+}
+
+/// What is said of a run.
+pub(crate) struct Figures {
+    events: usize,
+    lost: i64,
+    us: [f32; 4],
+}
+
+impl fmt::Display for Figures {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [p50, p99, p999, most] = self.us;
+        let Self { events, lost, .. } = self;
+        write!(
+            out,
+            "{events} events, {lost} lost; us p50 {p50:.0} p99 {p99:.0} p99.9 {p999:.0} max {most:.0}"
+        )
+    }
+}
+
+/// Waits until all clients are there.
+pub(crate) fn wait(heard: &Heard, clients: usize) -> Result<(), Failure> {
+    let start = Instant::now();
+    while heard.ready.load(Relaxed) < clients {
+        if start.elapsed() > PATIENCE {
+            return Err("the server does not answer all clients".into());
+        }
+        sleep(Duration::from_millis(5));
+    }
+    Ok(())
+}
+
+/// Reads until the server ends: what went wrong.
+pub(crate) fn listen(
+    args: &Args,
+    place: &Place,
+    sent: &Arc<Sent>,
+    heard: &Arc<Heard>,
+) -> Option<String> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build();
+    let runtime = match runtime {
+        Ok(runtime) => runtime,
+        Err(error) => return Some(error.to_string()),
+    };
+    runtime.block_on(async {
+        let mut clients = JoinSet::new();
+        for _ in 0..args.clients {
+            let (args, place) = (args.clone(), place.clone());
+            let (sent, heard) = (Arc::clone(sent), Arc::clone(heard));
+            clients.spawn(async move {
+                let start = Instant::now();
+                loop {
+                    let done = match &place {
+                        Place::Unix(path) => match UnixStream::connect(path).await {
+                            Ok(stream) => client(&args, stream, &sent, &heard).await,
+                            Err(error) => Err(error),
+                        },
+                        Place::Tcp(port) => match TcpStream::connect(("127.0.0.1", *port)).await {
+                            Ok(stream) => client(&args, stream, &sent, &heard).await,
+                            Err(error) => Err(error),
+                        },
+                    };
+                    let is_not_there = done.as_ref().is_err_and(|error| {
+                        use io::ErrorKind::{ConnectionRefused, NotFound, WouldBlock};
+                        [ConnectionRefused, NotFound, WouldBlock].contains(&error.kind())
+                    });
+                    if !is_not_there || start.elapsed() > PATIENCE {
+                        return done;
+                    }
+                    tokio::time::sleep(Duration::from_millis(20)).await;
+                }
+            });
+        }
+        let mut problem = None;
+        while let Some(done) = clients.join_next().await {
+            match done {
+                Ok(Ok(())) => {}
+                Ok(Err(error)) if error.kind() == io::ErrorKind::ConnectionReset => {}
+                Ok(Err(error)) => problem = Some(error.to_string()),
+                Err(error) => problem = Some(error.to_string()),
+            }
+        }
+        problem
+    })
+}
+
+async fn client<S: AsyncRead + AsyncWrite + Unpin>(
+    args: &Args,
+    mut stream: S,
+    sent: &Sent,
+    heard: &Heard,
+) -> io::Result<()> {
+    let request: &[u8] = match (args.server, args.event) {
+        (Kind::Gpsd, _) => b"?WATCH={\"enable\":true,\"json\":true};\n",
+        (Kind::Hardnessd, What::Frame) => b"{\"subscribe\":[\"frame\"]}\n",
+        (Kind::Hardnessd, What::Verdict) => b"{\"subscribe\":[\"hardness\"]}\n",
+        (Kind::Bare, _) => b"",
+    };
+    stream.write_all(request).await?;
+    let (mut unread, mut is_ready) = (Vec::new(), false);
+    loop {
+        if stream.read_buf(&mut unread).await? == 0 {
+            return Ok(());
+        }
+        let now = now_ns();
+        if !is_ready {
+            is_ready = true;
+            heard.ready.fetch_add(1, Relaxed);
+        }
+        let mut rest = unread.as_slice();
+        while let Some(end) = rest.iter().position(|&byte| byte == b'\n') {
+            let sent = match args.server {
+                Kind::Gpsd => fix(&rest[..end]).and_then(|cycle| sent.frame(0, cycle)),
+                _ => sent_at(args.event, &rest[..end], sent),
+            };
+            if let Some(sent) = sent {
+                heard.add(sent, now);
+            }
+            rest = &rest[end + 1..];
+        }
+        let done = unread.len() - rest.len();
+        unread.drain(..done);
+    }
+}
+
+/// When the frame was sent that `line` is of.
+fn sent_at(what: What, line: &[u8], sent: &Sent) -> Option<u64> {
+    // What is looked for comes first.
+    let head = std::str::from_utf8(&line[..line.len().min(400)]).ok()?;
+    let sensor = value(head, "\"sensor\":\"s")?;
+    match what {
+        What::Frame => {
+            head.starts_with("{\"type\":\"frame\"").then_some(())?;
+            let (_, forces) = head.split_once(FORCES)?;
+            let mut forces = forces.split(',').map(str::parse);
+            let mut force = || forces.next()?.ok();
+            sent.frame(sensor, number(&[force()?, force()?, force()?]))
+        }
+        What::Verdict => {
+            head.contains("\"phase\":\"final\"").then_some(())?;
+            sent.end(sensor, value(head, "\"press\":")?)
+        }
+    }
+}
+
+fn value(text: &str, key: &str) -> Option<usize> {
+    let (_, rest) = text.split_once(key)?;
+    let end = rest.find(|found: char| !found.is_ascii_digit())?;
+    rest[..end].parse().ok()
+}
+
+/// The cycle that a line of gpsd is of, by its time.
+fn fix(line: &[u8]) -> Option<usize> {
+    let line = std::str::from_utf8(line).ok()?;
+    line.starts_with("{\"class\":\"TPV\"").then_some(())?;
+    let (_, time) = line.split_once("\"time\":\"")?;
+    let (_, time) = time.split_once('T')?;
+    let mut parts = time.get(..12)?.split([':', '.']);
+    let mut part = || parts.next()?.parse::<usize>().ok();
+    let (hours, minutes, seconds, thousandths) = (part()?, part()?, part()?, part()?);
+    Some(((hours * 60 + minutes) * 60 + seconds) * 100 + thousandths / 10)
+}

@@ -1,0 +1,202 @@
+//! Sensors on ptys: what they send, and when they sent it.
+
+use std::fmt::Write as _;
+use std::io;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::time::{Duration, Instant};
+
+use hardnessd::frame::RawFrame;
+use hardnessd::wire::{Layout, Settings};
+use rustix::termios::OptionalActions;
+
+use crate::pair::Pair;
+use crate::{Args, Failure, Kind, What};
+
+/// A press every so many frames: half of them loaded. The second frame without load ends it.
+const CYCLE: usize = 40;
+const LOADED: usize = 20;
+/// As configured by default.
+const NEWTONS_PER_COUNT: f64 = 0.04;
+/// An NMEA cycle of about the bytes of a frame.
+const SENTENCES: usize = 767;
+
+/// When a frame was sent, in ns of the clock of [`now_ns`]: for each sensor a list.
+pub(crate) struct Sent(Vec<Vec<AtomicU64>>);
+
+impl Sent {
+    /// When frame `number` of `sensor` was sent; the first has number 0.
+    pub(crate) fn frame(&self, sensor: usize, number: usize) -> Option<u64> {
+        let at = self.0.get(sensor)?.get(number)?;
+        Some(at.load(Relaxed)).filter(|&at| at > 0)
+    }
+
+    /// How many events are to come of what was sent at `since_ns` or later.
+    pub(crate) fn count(&self, what: What, since_ns: u64) -> usize {
+        let of = |(sensor, frames): (usize, &Vec<AtomicU64>)| {
+            let sent = frames.iter().enumerate();
+            let is_meant = |number| what == What::Frame || ends(sensor, number);
+            sent.filter(|(number, at)| at.load(Relaxed) >= since_ns && is_meant(*number))
+                .count()
+        };
+        self.0.iter().enumerate().map(of).sum()
+    }
+
+    /// When the frame was sent that ended press `number` of `sensor`.
+    pub(crate) fn end(&self, sensor: usize, number: usize) -> Option<u64> {
+        let frame = number * CYCLE + LOADED + 1;
+        self.frame(sensor, frame.checked_sub(phase(sensor))?)
+    }
+}
+
+/// Whether a sensor's frame ends a press.
+fn ends(sensor: usize, frame: usize) -> bool {
+    let cycle = frame + phase(sensor);
+    cycle >= CYCLE && cycle % CYCLE == LOADED + 1
+}
+
+/// How far into its cycle a sensor begins, so that not all end a press at once.
+fn phase(sensor: usize) -> usize {
+    sensor * 7 % CYCLE
+}
+
+/// Nanoseconds since the first call.
+pub(crate) fn now_ns() -> u64 {
+    static START: std::sync::OnceLock<Instant> = std::sync::OnceLock::new();
+    let start = START.get_or_init(Instant::now);
+    start.elapsed().as_nanos() as u64 + 1
+}
+
+pub(crate) struct Sensors {
+    pairs: Vec<Pair>,
+    sent: Arc<Sent>,
+    rate: f64,
+    kind: Kind,
+}
+
+impl Sensors {
+    pub(crate) fn plug(args: &Args, length: Duration) -> Result<Self, Failure> {
+        let frames = (length.as_secs_f64() * args.rate) as usize + 1;
+        let list = || (0..frames).map(|_| AtomicU64::new(0)).collect();
+        let pairs: io::Result<Vec<Pair>> = (0..args.sensors).map(|_| plug()).collect();
+        Ok(Self {
+            pairs: pairs?,
+            sent: Arc::new(Sent((0..args.sensors).map(|_| list()).collect())),
+            rate: args.rate,
+            kind: args.server,
+        })
+    }
+
+    pub(crate) fn devices(&self) -> Vec<PathBuf> {
+        self.pairs.iter().map(|pair| pair.path.clone()).collect()
+    }
+
+    pub(crate) fn sent(&self) -> Arc<Sent> {
+        Arc::clone(&self.sent)
+    }
+
+    /// Sends for `length`; how late the latest was.
+    pub(crate) fn play(self, length: Duration) -> Result<(Self, Duration), Failure> {
+        let layout = Layout::new(&Settings::default())?;
+        let start = Instant::now();
+        let period = Duration::from_secs_f64(1.0 / self.rate);
+        let count = self.pairs.len();
+        let mut latest = Duration::ZERO;
+        for number in 0.. {
+            let due = start + period.mul_f64(f64::from(number));
+            if due >= start + length {
+                break;
+            }
+            // All sensors send the same.
+            let encode = |is_loaded| {
+                let mut bytes = Vec::new();
+                match self.kind {
+                    Kind::Gpsd => bytes.extend(sentences(number).as_bytes()),
+                    _ => layout.encode(&frame(number, is_loaded), &mut bytes),
+                }
+                bytes
+            };
+            let (rest, loaded) = (encode(false), encode(true));
+            for (sensor, pair) in self.pairs.iter().enumerate() {
+                // The sensors of one machine do not send at the same moment.
+                let due = due + period.mul_f64(sensor as f64 / count as f64);
+                std::thread::sleep(due.saturating_duration_since(Instant::now()));
+                latest = latest.max(due.elapsed());
+                let cycle = number as usize + phase(sensor);
+                let is_loaded = cycle >= CYCLE && cycle % CYCLE < LOADED;
+                let at = &self.sent.0[sensor][number as usize];
+                // It may be heard of before the write returns.
+                at.store(now_ns(), Relaxed);
+                let mut left = if is_loaded { &loaded } else { &rest }.as_slice();
+                while !left.is_empty() {
+                    let written = rustix::io::write(&pair.master, left)?;
+                    left = &left[written..];
+                }
+            }
+        }
+        Ok((self, latest))
+    }
+}
+
+fn plug() -> io::Result<Pair> {
+    let pair = Pair::open()?;
+    let mut settings = rustix::termios::tcgetattr(&pair.device)?;
+    settings.make_raw();
+    rustix::termios::tcsetattr(&pair.device, OptionalActions::Now, &settings)?;
+    Ok(pair)
+}
+
+/// Frame `number`, which it carries in its first taxels: fewer than make a contact.
+fn frame(number: i32, is_loaded: bool) -> RawFrame {
+    let mut frame = RawFrame::default();
+    for (count, byte) in frame.counts.iter_mut().zip(number.to_le_bytes()) {
+        *count = u16::from(byte);
+    }
+    if is_loaded {
+        for row in 12..16 {
+            for col in 12..16 {
+                frame.counts[row * 28 + col] = 60;
+            }
+        }
+    }
+    frame
+}
+
+/// The number that the first forces of a frame carry, in newtons.
+pub(crate) fn number(forces: &[f64; 3]) -> usize {
+    let byte = |force: f64| (force / NEWTONS_PER_COUNT).round() as usize;
+    forces
+        .iter()
+        .rev()
+        .fold(0, |number, &force| number << 8 | byte(force))
+}
+
+/// One cycle of a GPS receiver, a hundredth of a second after the one before.
+fn sentences(number: i32) -> String {
+    let (seconds, hundredths) = (number / 100, number % 100);
+    let time = format!(
+        "{:02}{:02}{:02}.{hundredths:02}",
+        seconds / 3600 % 24,
+        seconds / 60 % 60,
+        seconds % 60
+    );
+    let mut cycle = String::with_capacity(SENTENCES + 80);
+    let mut add = |body: &str| {
+        let sum = body.bytes().fold(0, |sum, byte| sum ^ byte);
+        let _ = write!(cycle, "${body}*{sum:02X}\r\n");
+    };
+    add(&format!(
+        "GPRMC,{time},A,4807.0380,N,01131.0000,E,000.5,054.7,010126,,,A"
+    ));
+    for _ in 0..9 {
+        add("GPVTG,054.7,T,034.4,M,000.5,N,001.0,K,A");
+    }
+    add(&format!("GPGLL,4807.0380,N,01131.0000,E,{time},A,A"));
+    add(&format!("GPGST,{time},2.0,3.0,2.0,45.0,2.0,2.0,3.0"));
+    add("GPGSA,A,3,04,05,,09,12,,,24,,,,,2.5,1.3,2.1");
+    add(&format!(
+        "GPGGA,{time},4807.0380,N,01131.0000,E,1,08,0.9,545.4,M,46.9,M,,"
+    ));
+    cycle
+}
