@@ -69,9 +69,6 @@ pub enum Method {
     Course,
 }
 
-/// Steps of `adapt`, whatever its labels.
-const ADAPT_STEPS: u64 = 1_500;
-
 /// Steps of the methods without a GAN that are fit to be compared, whatever their labels: about those of
 /// the default model.
 fn strong_steps(profile: Profile) -> u64 {
@@ -170,7 +167,7 @@ impl Method {
                     augmentation: AugmentationSettings {
                         symmetries: true,
                         shift_taxels: 3,
-                        other_sensors: true,
+                        other_sensors: false,
                     },
                     ..settings.training
                 };
@@ -179,6 +176,7 @@ impl Method {
             Self::Adapt => {
                 settings.training = Training {
                     batch: 50,
+                    epochs: 100,
                     averaging: 0.99,
                     checkpoint_every_epochs: 10,
                     optimiser: OptimiserSettings {
@@ -361,16 +359,12 @@ impl Request {
             description.settings.training.epochs =
                 epochs_as_long_as_ours(&self.settings, train.len());
         }
-        let steps = match self.method {
-            Method::Adapt => Some(ADAPT_STEPS),
-            method => method.is_strong().then(|| strong_steps(self.profile)),
-        };
-        if let Some(steps) = steps {
+        if self.method.is_strong() {
             let labelled = chosen(dataset, &description)?;
             let share = self.settings.validation.share;
             let (train, _) = dataset.hold_out(&labelled, share, self.seed);
             let an_epoch = train.len().div_ceil(self.settings.training.batch).max(1) as u64;
-            let epochs = steps.div_ceil(an_epoch);
+            let epochs = strong_steps(self.profile).div_ceil(an_epoch);
             description.settings.training.epochs = u32::try_from(epochs).unwrap_or(u32::MAX);
         }
         Ok(description)

@@ -131,10 +131,11 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
         settings: task.settings,
         seed: task.seed,
     };
+    let weights_of_levels = task.weights_of_levels();
     let mut failed = None;
     let weights = epochs::run(&stage, initial, run, task.device, |learner, batch| {
         // A failure of the features is told at the end: the loop knows none.
-        match task.step(learner, &plan, &standard, batch) {
+        match task.step(learner, &plan, (&standard, &weights_of_levels), batch) {
             Ok(learnt) => learnt,
             Err(error) => {
                 failed.get_or_insert(error);
@@ -171,12 +172,28 @@ impl Task<'_> {
         self.frames(samples).into_iter().map(vary).collect()
     }
 
+    /// What a sample of each level counts, `[1, L]`: less where there are many, by the root of their
+    /// number, and 1 on average. Even Shore hardness gives few samples of the narrow levels, and a network
+    /// that weighs samples alike hardly ever names those.
+    fn weights_of_levels(&self) -> Tensor<2> {
+        let mut weights = vec![0.0_f32; self.levels];
+        for &sample in self.train {
+            weights[usize::from(self.dataset.samples[sample].level) - 1] += 1.0;
+        }
+        let roots: f32 = weights.iter().map(|count| count.sqrt()).sum();
+        let mean = self.train.len() as f32 / roots;
+        weights
+            .iter_mut()
+            .for_each(|count| *count = mean / count.sqrt().max(1.0));
+        Tensor::from_data(TensorData::new(weights, [1, self.levels]), self.device)
+    }
+
     /// One step; gives the batch's mean loss, and how many of its samples were judged rightly before it.
     fn step(
         &self,
         learner: &mut Learner,
         plan: &Features,
-        standard: &Standard,
+        (standard, weights): (&Standard, &Tensor<2>),
         batch: Batch,
     ) -> anyhow::Result<(f64, usize)> {
         let of = |frames: &[Frame]| frame::Batch::new(frames, plan, standard, self.device);
@@ -200,7 +217,8 @@ impl Task<'_> {
         let known = column(&|shore| f32::from(u8::from(shore.is_some())));
         let measured = column(&|shore| shore.map_or(0.0, shore::on_scale));
         let level_of = |&sample: &usize| self.dataset.samples[sample].level;
-        let targets = hrn::targets(batch.samples.iter().map(level_of), self.levels, self.device);
+        let targets = hrn::targets(batch.samples.iter().map(level_of), self.levels, self.device)
+            .mul(weights.clone());
 
         let tracked = learner.weights.tracked();
         let outputs = frame::outputs(&tracked, &images);
