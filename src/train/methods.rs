@@ -176,7 +176,7 @@ impl Method {
             Self::Adapt => {
                 settings.training = Training {
                     batch: 50,
-                    epochs: 100,
+                    epochs: 60,
                     averaging: 0.99,
                     checkpoint_every_epochs: 10,
                     optimiser: OptimiserSettings {

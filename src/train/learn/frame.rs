@@ -27,6 +27,10 @@ use crate::verdict::argmax;
 
 /// How much the intervals' loss counts beside the levels'.
 const SHORE_WEIGHT: f32 = 1.5;
+/// Training that goes on from a start ends this far from it, on the line to what was learnt: a few objects
+/// tell what the sensor is like, and little of other materials, which the start knows (Wortsman et al. 2022,
+/// "Robust fine-tuning of zero-shot models").
+const LEARNT_SHARE: f32 = 0.5;
 /// Frames a pass without gradients.
 const JUDGED_AT_ONCE: usize = 250;
 
@@ -99,6 +103,7 @@ impl Trained {
 /// features cannot be computed, or the loss or a weight is no number any more.
 pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Trained> {
     let plan = Features::new()?;
+    let is_continued = start.is_some();
     let start = match start {
         Some(start) => start,
         None => {
@@ -116,7 +121,12 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
         widths: start.widths,
         threshold: 0.0,
     };
-    let (initial, standard) = (start.weights, start.standard);
+    let Start {
+        weights: initial,
+        standard,
+        ..
+    } = start;
+    let kept = is_continued.then(|| initial.clone());
     let (unlabelled, consistency) = task.unlabelled;
     let stage = epochs::Stage {
         name: task.stage,
@@ -146,6 +156,10 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
     if let Some(error) = failed {
         return Err(error);
     }
+    let weights = match &kept {
+        Some(start) => weights.between(start, LEARNT_SHARE),
+        None => weights,
+    };
     if !task.held_out.is_empty() {
         calibration = task.calibration(&weights, &standard, &plan)?;
     }
@@ -172,19 +186,17 @@ impl Task<'_> {
         self.frames(samples).into_iter().map(vary).collect()
     }
 
-    /// What a sample of each level counts, `[1, L]`: less where there are many, by the root of their
-    /// number, and 1 on average. Even Shore hardness gives few samples of the narrow levels, and a network
-    /// that weighs samples alike hardly ever names those.
+    /// What a sample of each level counts, `[1, L]`, so that all levels that are there weigh the same, and
+    /// samples 1 on average. Even Shore hardness gives few samples of the narrow levels, and a network that
+    /// weighs samples alike hardly ever names those.
     fn weights_of_levels(&self) -> Tensor<2> {
-        let mut weights = vec![0.0_f32; self.levels];
+        let mut counts = vec![0.0_f32; self.levels];
         for &sample in self.train {
-            weights[usize::from(self.dataset.samples[sample].level) - 1] += 1.0;
+            counts[usize::from(self.dataset.samples[sample].level) - 1] += 1.0;
         }
-        let roots: f32 = weights.iter().map(|count| count.sqrt()).sum();
-        let mean = self.train.len() as f32 / roots;
-        weights
-            .iter_mut()
-            .for_each(|count| *count = mean / count.sqrt().max(1.0));
+        let present = counts.iter().filter(|&&count| count > 0.0).count();
+        let mean = self.train.len() as f32 / present as f32;
+        let weights: Vec<f32> = counts.iter().map(|count| mean / count.max(1.0)).collect();
         Tensor::from_data(TensorData::new(weights, [1, self.levels]), self.device)
     }
 

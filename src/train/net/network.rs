@@ -161,6 +161,22 @@ impl Weights {
         }
     }
 
+    /// The weights that lie `share` of the way from `start` to these; both are of one network.
+    #[must_use]
+    pub fn between(&self, start: &Self, share: f32) -> Self {
+        let between = |(weight, start): (&Weight, &Weight)| {
+            let way = weight.values.clone().sub(start.values.clone());
+            Weight {
+                values: start.values.clone().add(way.mul_scalar(share)),
+                ..weight.clone()
+            }
+        };
+        let pairs = self.entries.iter().zip(&start.entries);
+        Self {
+            entries: pairs.map(between).collect(),
+        }
+    }
+
     /// How many numbers there are.
     #[cfg(test)]
     pub(super) fn count(&self) -> usize {
