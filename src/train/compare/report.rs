@@ -102,6 +102,8 @@ pub fn comparison(comparison: &Comparison) -> anyhow::Result<String> {
     page.panels(reliabilities(&rows));
     page.subtitle("Another sensor");
     page.table(&tables::shifts(&rows));
+    page.subtitle("Other shapes and materials");
+    page.table(&tables::worlds(&rows));
 
     page.section("price", "Price");
     page.table(&tables::price(&rows));

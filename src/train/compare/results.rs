@@ -9,7 +9,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use super::digits::thousands;
-use super::sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS, TestSet};
+use super::sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS, TestSet, WORLDS};
 use crate::train::data::dataset::LabelChoice;
 use crate::train::judge::metrics::{self, Bin, Evaluation, Judged, ObjectCount};
 use crate::train::model::export;
@@ -43,7 +43,8 @@ pub struct Entry {
     pub fresh: Evaluation,
     /// On fresh objects of `matched` shapes.
     pub matched: Evaluation,
-    /// On the fresh objects of `paper` shapes under other sensors.
+    /// On the fresh objects of `paper` shapes under other sensors, and on those of other shapes and
+    /// materials.
     pub shifts: BTreeMap<String, Evaluation>,
     /// The run's directory under `runs/`.
     pub run: String,
@@ -148,6 +149,7 @@ impl Entry {
         let simulated = "every comparison has the simulated sets";
         let shifts = SHIFTS
             .iter()
+            .chain(&WORLDS)
             .filter_map(|(name, _)| Some(((*name).to_owned(), worth.evaluation(name)?)));
         Ok(Self {
             method: told.method.clone(),

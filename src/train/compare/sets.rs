@@ -1,22 +1,22 @@
 //! What every model of a comparison is judged on.
 //!
 //! In: the data set that the models learn from. Out: its own test split, 20 fresh objects of each
-//! test material, and the same objects under other sensors. The fresh ones are simulated once and
+//! test material, the same objects under other sensors, and objects of other shapes and materials. The fresh ones are simulated once and
 //! kept; no model may ever learn from their seeds.
 
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, ensure};
 
-use crate::simulator::{self, DatasetSettings, SensorProfile, Shapes, Split};
+use crate::simulator::{self, Borders, DatasetSettings, Materials, SensorProfile, Shapes, Split};
 use crate::train::data::dataset::{Dataset, PITCH_MM};
 use crate::train::data::simulated;
 use crate::train::run::disk::write_whole;
 use crate::train::settings::Profile;
 use crate::verdict::sha256_hex;
 
-/// Seeds of the fresh objects, of `paper` and of `matched` shapes.
-const FRESH_SEEDS: [u64; 2] = [2_019_001, 2_019_002];
+/// Seeds of the fresh objects: of `paper` and of `matched` shapes, and of other worlds.
+const FRESH_SEEDS: [u64; 3] = [2_019_001, 2_019_002, 2_019_004];
 /// Seed of the other gain map.
 const OTHER_SENSORS_SEED: u64 = 2_019_003;
 /// Fresh objects of each test material.
@@ -53,6 +53,22 @@ pub(super) const SHIFTS: [(&str, &str); 3] = [
     ("gain_map", "other gains, thresholds and dead taxels"),
     ("soft_cover", "a cover half as stiff"),
     ("raw", "taxels as uneven as on a raw film array"),
+];
+
+/// Keys of fresh objects of other shapes and materials than the paper's, and what they are.
+pub(super) const WORLDS: [(&str, &str); 3] = [
+    (
+        "wide",
+        "the test materials with radii from 8 to 60 mm, edges and points",
+    ),
+    (
+        "broad",
+        "as many random materials, Shore OO even from 15 to 95",
+    ),
+    (
+        "broad_wide",
+        "random materials with those radii, edges and points",
+    ),
 ];
 
 /// Makes sure that no model learns from the fresh objects.
@@ -116,7 +132,7 @@ pub(super) fn all(
 }
 
 /// What is simulated for all comparisons of a profile.
-fn simulations(profile: Profile) -> [(&'static str, DatasetSettings); 5] {
+fn simulations(profile: Profile) -> [(&'static str, DatasetSettings); 8] {
     let fresh = |seed, shapes| DatasetSettings {
         seed,
         shapes,
@@ -128,8 +144,14 @@ fn simulations(profile: Profile) -> [(&'static str, DatasetSettings); 5] {
         },
         ..DatasetSettings::default()
     };
-    let [paper_seed, matched_seed] = FRESH_SEEDS;
+    let [paper_seed, matched_seed, worlds_seed] = FRESH_SEEDS;
     let paper = fresh(paper_seed, Shapes::Paper);
+    let [(wide, _), (broad, _), (broad_wide, _)] = WORLDS;
+    let of_broad = |shapes| DatasetSettings {
+        materials: Materials::Broad,
+        borders: Borders::Gaps,
+        ..fresh(worlds_seed, shapes)
+    };
     let [(gain_map, _), (soft_cover, _), (raw, _)] = SHIFTS;
     [
         (FRESH, paper),
@@ -155,6 +177,9 @@ fn simulations(profile: Profile) -> [(&'static str, DatasetSettings); 5] {
                 ..paper
             },
         ),
+        (wide, fresh(worlds_seed, Shapes::Wide)),
+        (broad, of_broad(Shapes::Matched)),
+        (broad_wide, of_broad(Shapes::Wide)),
     ]
 }
 

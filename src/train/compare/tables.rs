@@ -9,7 +9,7 @@ use std::fmt::Write as _;
 
 use super::digits::{number, thousands};
 use crate::train::compare::results::{Comparison, Row, SwapEntry};
-use crate::train::compare::sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS};
+use crate::train::compare::sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS, WORLDS};
 use crate::train::judge::metrics::{self, Evaluation};
 use crate::train::run::history::{History, Stage};
 use cells::{
@@ -129,7 +129,12 @@ fn all(comparison: &Comparison) -> Vec<Table> {
     let mut tables = vec![headline(&rows), table_2(&rows)];
     tables.extend(fresh(&rows));
     tables.extend([table_3(&rows), confusions(&rows)]);
-    tables.extend([calibration(&rows), shifts(&rows), price(&rows)]);
+    tables.extend([
+        calibration(&rows),
+        shifts(&rows),
+        worlds(&rows),
+        price(&rows),
+    ]);
     if !comparison.swaps.is_empty() {
         tables.push(swaps(&comparison.swaps));
     }
@@ -319,21 +324,50 @@ pub fn calibration(rows: &[Row]) -> Table {
 
 /// The same objects under other sensors.
 pub fn shifts(rows: &[Row]) -> Table {
-    let what: Vec<String> = SHIFTS
-        .iter()
-        .map(|(name, what)| format!("{}: {what}", name.replace('_', " ")))
-        .collect();
     let note = format!(
         "The fresh objects of the paper's shapes, pressed again on other sensors: accuracy in per \
          cent and expected calibration error. {}.",
-        what.join("; ")
+        described(&SHIFTS)
     );
+    elsewhere(
+        rows,
+        ("Another sensor", &note),
+        (FRESH, "as before"),
+        &SHIFTS,
+    )
+}
+
+/// Objects of other shapes and materials.
+pub fn worlds(rows: &[Row]) -> Table {
+    let note = format!(
+        "Fresh objects of other shapes and materials: accuracy in per cent and expected calibration \
+         error. One frame fixes only the ratio of radius and modulus, so shapes that vary cost every \
+         method much. {}.",
+        described(&WORLDS)
+    );
+    let title = "Other shapes and materials";
+    elsewhere(rows, (title, &note), (MATCHED, "matched shapes"), &WORLDS)
+}
+
+/// Sets and what they are, in one line.
+fn described(sets: &[(&str, &str)]) -> String {
+    let one = |(name, what): &(&str, &str)| format!("{}: {what}", name.replace('_', " "));
+    sets.iter().map(one).collect::<Vec<_>>().join("; ")
+}
+
+/// Accuracy and calibration on a set, and on others beside it. Runs of earlier programs lack some.
+fn elsewhere(
+    rows: &[Row],
+    (title, note): (&str, &str),
+    (base, called): (&str, &str),
+    others: &[(&str, &str)],
+) -> Table {
     let mut head = vec![
         "method".to_owned(),
-        "as before: accuracy".to_owned(),
+        format!("{called}: accuracy"),
         "ECE".to_owned(),
     ];
-    for (name, _) in SHIFTS {
+    for (name, _) in others {
         head.extend([
             format!("{}: accuracy", name.replace('_', " ")),
             "ECE".to_owned(),
@@ -341,11 +375,11 @@ pub fn shifts(rows: &[Row]) -> Table {
     }
     let mut table = Table {
         head,
-        ..Table::new("Another sensor", &note, &[])
+        ..Table::new(title, note, &[])
     };
     for row in rows {
         let mut cells = vec![row.title.clone()];
-        for set in std::iter::once(FRESH).chain(SHIFTS.map(|(name, _)| name)) {
+        for set in std::iter::once(base).chain(others.iter().map(|(name, _)| *name)) {
             cells.push(with_spread(row, set, |e| Some(100.0 * e.accuracy), 1));
             cells.push(with_spread(row, set, |e| Some(e.ece), 3));
         }
