@@ -6,7 +6,7 @@
 
 Claims: all is root's, with the modes that lintian asks for; the configuration is a conffile and
 passes `check`; the installed binary shows a press; man pages and completions render and name every
-command; the units name what is installed; every link and picture of a page is there; no script stumbles.
+command; the units name what is installed; every link and picture of a page is there; the crates that it is built of are listed; no script stumbles.
 machine.py installs it.
 """
 
@@ -41,7 +41,22 @@ def main():
         completions(root, commands)
         units(root, files)
         linked = links(root)
-    print(f"package: {len(files)} files, {len(commands)} commands with page and completion, {linked} links")
+        crates = parts(root)
+    print(f"package: {len(files)} files, {len(commands)} commands with page and completion, {linked} links, {crates} crates")
+
+
+def parts(root):
+    """The crates that it is built of are those of Cargo.lock, and none of the trainer's."""
+    with open(os.path.join(root, "usr/share/doc/hardnessd/hardnessd.cdx.json")) as file:
+        sbom = json.load(file)
+    assert sbom["bomFormat"] == "CycloneDX" and "serialNumber" not in sbom
+    found = {(crate["name"], crate["version"]) for crate in sbom["components"]}
+    lock = pathlib.Path(__file__).parent.parent.parent.joinpath("Cargo.lock").read_text()
+    locked = set(re.findall(r'^name = "(.+)"\nversion = "(.+)"$', lock, re.MULTILINE))
+    assert found <= locked, found - locked
+    names = {name for name, _ in found}
+    assert {"tract-onnx", "tokio", "mcap"} <= names and not {"burn-core", "zenoh", "ros2-client"} & names, names
+    return len(found)
 
 
 def listing(package):
