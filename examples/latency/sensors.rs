@@ -19,8 +19,8 @@ const CYCLE: usize = 40;
 const LOADED: usize = 20;
 /// As configured by default.
 const NEWTONS_PER_COUNT: f64 = 0.04;
-/// An NMEA cycle of about the bytes of a frame.
-const SENTENCES: usize = 767;
+/// Bytes of an NMEA cycle: about those of a frame.
+const SENTENCES: usize = 791;
 
 /// When a frame was sent, in ns of the clock of [`now_ns`]: for each sensor a list.
 pub(crate) struct Sent(Vec<Vec<AtomicU64>>);
@@ -186,17 +186,12 @@ fn sentences(number: i32) -> String {
         let sum = body.bytes().fold(0, |sum, byte| sum ^ byte);
         let _ = write!(cycle, "${body}*{sum:02X}\r\n");
     };
-    add(&format!(
-        "GPRMC,{time},A,4807.0380,N,01131.0000,E,000.5,054.7,010126,,,A"
-    ));
-    for _ in 0..9 {
+    // Without a time of their own, so that gpsd sends one message a cycle.
+    for _ in 0..16 {
         add("GPVTG,054.7,T,034.4,M,000.5,N,001.0,K,A");
     }
-    add(&format!("GPGLL,4807.0380,N,01131.0000,E,{time},A,A"));
-    add(&format!("GPGST,{time},2.0,3.0,2.0,45.0,2.0,2.0,3.0"));
-    add("GPGSA,A,3,04,05,,09,12,,,24,,,,,2.5,1.3,2.1");
     add(&format!(
-        "GPGGA,{time},4807.0380,N,01131.0000,E,1,08,0.9,545.4,M,46.9,M,,"
+        "GPRMC,{time},A,4807.0380,N,01131.0000,E,000.5,054.7,010126,,,A"
     ));
     cycle
 }
