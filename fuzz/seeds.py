@@ -9,6 +9,7 @@ found to reach more code.
 """
 
 import io
+import json
 import os
 import pathlib
 import struct
@@ -74,6 +75,7 @@ def http():
         "POST / HTTP/1.1\r\nhost: localhost\r\ntransfer-encoding: chunked\r\n\r\n3\r\nabc\r\n0\r\n\r\n",
         "GET http://localhost/readyz HTTP/1.1\r\nhost: localhost\r\n\r\n",
         "GET /livez HTTP/1.0\r\nHost: evil.example\r\n\r\n",
+        "GET /events?types=frame HTTP/1.1\r\nhost: localhost\r\n\r\nGET /metrics HTTP\nhost\n\n",
         "OPTIONS * HTTP/1.1\r\nhost: a@localhost\r\nconnection: upgrade\r\nupgrade: h2c\r\n\r\n",
     ]
     for index, head in enumerate(heads):
@@ -122,42 +124,46 @@ def recording():
 
 
 def model():
-    taken = (TOP / "models/hrn.onnx").read_bytes()
-    original = onnx.load_from_string(taken)
-    # The same metadata on a graph of two nodes: a file that can be changed quickly.
-    ends = original.graph
-    shape = [dim.dim_value or 1 for dim in ends.input[0].type.tensor_type.shape.dim]
-    inputs = 1
-    for size in shape[1:]:
-        inputs *= size
-    weights = numpy.zeros((inputs, 4), dtype=numpy.float32)
-    nodes = [
-        helper.make_node("Flatten", [ends.input[0].name], ["flat"]),
-        helper.make_node("MatMul", ["flat", "w"], [ends.output[0].name]),
-    ]
-    graph = helper.make_graph(
-        nodes, "g", list(ends.input), list(ends.output), [numpy_helper.from_array(weights, "w")]
+    """Two small graphs that the loader takes, and one that it refuses."""
+    original = onnx.load(TOP / "models/hrn.onnx")
+    # All weights are zero, so all levels are equally likely.
+    check = {"frames": [[0] * 784] * 8, "probabilities": [[0.25] * 4] * 8}
+    value = helper.make_tensor_value_info
+    ends = (
+        [value("frame", TensorProto.FLOAT, [1, 1, 28, 28])],
+        [value(name, TensorProto.FLOAT, [1, 4]) for name in ("logits", "probabilities")],
     )
-    small = helper.make_model(graph, opset_imports=original.opset_import)
-    small.ir_version = original.ir_version
-    for entry in original.metadata_props:
-        if len(entry.value) < 2000:
-            small.metadata_props.add(key=entry.key, value=entry.value)
-    keep("model", "two-nodes", small.SerializeToString())
-    layers = [
-        helper.make_node("Conv", [ends.input[0].name, "k"], ["c"], kernel_shape=[3, 3], pads=[1, 1, 1, 1]),
+    softmax = helper.make_node("Softmax", ["logits"], ["probabilities"], axis=1)
+
+    def keep_graph(name, nodes, weights):
+        weights = [numpy_helper.from_array(weight, key) for key, weight in weights.items()]
+        small = helper.make_model(
+            helper.make_graph([*nodes, softmax], "g", *ends, weights),
+            opset_imports=original.opset_import,
+            ir_version=original.ir_version,
+        )
+        for entry in original.metadata_props:
+            text = json.dumps(check, separators=(",", ":")) if entry.key == "hrn.check" else entry.value
+            text = "{}" if entry.key == "hrn.metrics" else text
+            small.metadata_props.add(key=entry.key, value=text)
+        keep("model", name, small.SerializeToString())
+
+    zeros = lambda *shape: numpy.zeros(shape, dtype=numpy.float32)  # noqa: E731
+    linear = [
+        helper.make_node("Flatten", ["frame"], ["flat"]),
+        helper.make_node("MatMul", ["flat", "w"], ["logits"]),
+    ]
+    keep_graph("linear", linear, {"w": zeros(784, 4)})
+    convolution = [
+        helper.make_node("Conv", ["frame", "k"], ["c"], kernel_shape=[3, 3], pads=[1, 1, 1, 1], strides=[2, 2]),
         helper.make_node("LeakyRelu", ["c"], ["r"], alpha=0.2),
         helper.make_node("GlobalAveragePool", ["r"], ["p"]),
-        helper.make_node("Reshape", ["p", "s"], [ends.output[0].name]),
+        helper.make_node("Reshape", ["p", "s"], ["logits"]),
     ]
-    weights = [
-        numpy_helper.from_array(numpy.zeros((4, 1, 3, 3), dtype=numpy.float32), "k"),
-        numpy_helper.from_array(numpy.array([-1, 4], dtype=numpy.int64), "s"),
-    ]
-    graph = helper.make_graph(layers, "g", list(ends.input), list(ends.output), weights)
-    small.graph.CopyFrom(graph)
-    keep("model", "convolution", small.SerializeToString())
-    keep("model", "empty", b"")
+    weights = {"k": zeros(4, 1, 3, 3), "s": numpy.array([-1, 4], dtype=numpy.int64)}
+    keep_graph("convolution", convolution, weights)
+    wrong = [helper.make_node("Hardmax", ["frame"], ["logits"])]
+    keep_graph("refused", wrong, {})
 
 
 def npz():
