@@ -132,3 +132,89 @@ fn known_weights_say_the_newtons_of_a_count() {
     let without = hardnessd(&["calibrate", "force"]);
     assert_eq!(without.status.code(), Some(2), "{without:?}");
 }
+
+#[test]
+fn presses_of_a_recording_say_the_gains_and_a_recording_holds_them() {
+    let bench = Bench::new();
+    let path = |name: &str| bench.path(name).to_str().unwrap().to_owned();
+    let raw = ["--sensor-profile", "raw", "--presses", "80", "--to"];
+    let simulated = hardnessd(&[&["simulate"], &raw[..], &[path("raw.bin").as_str()]].concat());
+    assert!(simulated.status.success(), "{simulated:?}");
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let config = config.to_str().unwrap();
+    let (from, out) = (path("raw.bin"), path("gains.npy"));
+    let taxels = |from: &str| {
+        hardnessd(&[
+            "calibrate",
+            "taxels",
+            "--config",
+            config,
+            "--from",
+            from,
+            "--out",
+            &out,
+        ])
+    };
+    let output = taxels(&from);
+    assert!(output.status.success(), "{output:?}");
+    let text = String::from_utf8(output.stdout).unwrap();
+    assert!(text.contains("gains = \"gains.npy\"\n"), "{text}");
+    assert!(text.contains(" of 784 measured, each in "), "{text}");
+
+    // What it prints is a configuration, and a daemon with it records the gains themselves.
+    let (_, lines) = text.split_once("\n[sensor.calibration]\n").unwrap();
+    let calibrated = path("calibrated.toml");
+    let table = format!("[[sensor]]\nname = \"forearm\"\nport = \"port\"\nframe_rate_hz = 20.0\n");
+    fs::write(&calibrated, format!("{table}[sensor.calibration]\n{lines}")).unwrap();
+    let checked = hardnessd(&["check", "--config", &calibrated]);
+    let told = String::from_utf8(checked.stdout).unwrap();
+    assert!(
+        told.contains("baud, gains 0.") || told.contains("rate, gains 0."),
+        "{told}"
+    );
+    let _sensor = bench.sensor(&[]);
+    let recording = path("gains.mcap");
+    let record = [
+        "record",
+        "--config",
+        &calibrated,
+        "--seconds",
+        "8",
+        "--out",
+        &recording,
+    ];
+    assert!(hardnessd(&record).status.success());
+    let replay = || hardnessd(&["replay", &recording]);
+    let before = replay();
+    assert!(
+        String::from_utf8_lossy(&before.stdout).contains("\"phase\":\"final\""),
+        "{before:?}"
+    );
+    fs::remove_file(&out).unwrap();
+    assert_eq!(replay().stdout, before.stdout);
+    let missing = hardnessd(&["check", "--config", &calibrated]);
+    assert_eq!(missing.status.code(), Some(78), "{missing:?}");
+    let why = String::from_utf8(missing.stderr).unwrap();
+    assert!(
+        why.contains("sensor.calibration.gains of \"forearm\": cannot read"),
+        "{why}"
+    );
+
+    // No presses: no file, and the exit code of what was asked.
+    fs::write(path("none.bin"), [0; 2000]).unwrap();
+    let output = taxels(&path("none.bin"));
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let left: Vec<_> = fs::read_dir(bench.path("")).unwrap().collect();
+    let is_gains = |entry: &std::io::Result<fs::DirEntry>| {
+        entry
+            .as_ref()
+            .unwrap()
+            .file_name()
+            .to_string_lossy()
+            .contains(".npy")
+    };
+    assert!(!left.iter().any(is_gains), "{left:?}");
+    assert_eq!(taxels(&path("nowhere.bin")).status.code(), Some(66));
+    let without = hardnessd(&["calibrate", "taxels", "--config", config, "--from", &from]);
+    assert_eq!(without.status.code(), Some(2), "{without:?}");
+}

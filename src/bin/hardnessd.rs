@@ -104,7 +104,7 @@ async fn calibrate(args: calibrate::Args, signals: Signals) -> Result<(), Failur
     let path = args.config.path()?;
     let mut end = pin!(signals.end());
     let setup = tokio::select! {
-        loaded = load(path, std::future::pending()) => loaded?,
+        loaded = load(path.clone(), std::future::pending()) => loaded?,
         stop = &mut end => return Err(Failure::Stopped(stop)),
     };
     let Some(setup) = setup else {
@@ -113,7 +113,7 @@ async fn calibrate(args: calibrate::Args, signals: Signals) -> Result<(), Failur
     let _log = Log::start(setup.config.log, "warn")?;
     let mut stopped = None;
     let shutdown = async { stopped = Some(end.await) };
-    calibrate::run(args, setup, shutdown).await?;
+    calibrate::run(args, setup, &path, shutdown).await?;
     stopped.map_or(Ok(()), |stop| Err(Failure::Stopped(stop)))
 }
 

@@ -132,6 +132,11 @@ impl Sensor {
         }
     }
 
+    /// Of each taxel; 0 where it is dead.
+    pub(super) fn gains(&self) -> &[f32] {
+        &self.gain
+    }
+
     /// The factor common to all taxels in one press.
     pub(super) fn press_gain(&self, stream: &mut Stream) -> f32 {
         (1.0 + self.press_spread * stream.normal()).max(0.3) as f32

@@ -133,6 +133,11 @@ impl Sequence {
         sequence
     }
 
+    /// The true gain of each taxel, which a calibration is to find; 0 where it is dead.
+    pub fn gains(&self) -> &[f32] {
+        self.sensor.gains()
+    }
+
     /// What the next press is drawn from; its first draw is how late it is.
     fn next_draws(&self) -> (f64, Stream) {
         let mut draws = self.root.child(1).child(u64::from(self.made));

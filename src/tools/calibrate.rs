@@ -2,35 +2,42 @@
 //!
 //! A daemon with sockets serves the sensor and records in the meantime, so the robot's controller runs
 //! as it always does. Afterwards the recording is read, and stdout gets the values, their spread and the
-//! lines for the configuration.
+//! lines for the configuration. Recordings made earlier serve as well.
 
 mod arm;
 mod force;
 mod gather;
+mod taxels;
 
 use std::fs::{self, File};
 use std::future::Future;
 use std::io::{self, Seek, SeekFrom};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::pin::pin;
+use std::sync::Arc;
 use std::time::Duration;
 
 use clap::{Args as ClapArgs, ValueEnum};
 use tokio::sync::watch;
 
-use self::gather::Gathered;
+use self::gather::{Press, Unreadable};
 use super::configuration::Configuration;
 use super::simulate::{OutOfRange, within};
 use crate::daemon::config::Setup;
 use crate::daemon::record::Progress;
 use crate::daemon::{self, Daemon, Sockets};
-use crate::recording::{Labels, PlaybackError};
+use crate::frame::Array;
+use crate::npy;
+use crate::recording::Labels;
+use crate::sensor::Sensor;
+use crate::tare::Gains;
+use crate::verdict::Hrn;
 
 /// Arguments of `calibrate`.
 #[derive(Debug, Clone, ClapArgs)]
 pub struct Args {
     /// arm: press something rigid a few times, while the robot tells where its arm is. force: put known
-    /// weights on the sensor
+    /// weights on the sensor. taxels: press something wide and soft at many places, or the whole array evenly
     what: What,
     #[expect(missing_docs, reason = "a comment would be taken for help")]
     #[command(flatten)]
@@ -41,9 +48,15 @@ pub struct Args {
     /// force: the weights, in newtons, in the order in which they are put on (1 kg is 9.81 N)
     #[arg(long, value_name = "N", num_args = 1.., required_if_eq("what", "force"), value_parser = newtons)]
     newtons: Vec<f64>,
-    /// arm: presses to make, 2 to 1000
-    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u64).range(2..=1000))]
-    presses: u64,
+    /// arm, taxels: presses to make, 2 to 1000 [default: arm 5, taxels 200]
+    #[arg(long, value_name = "N", conflicts_with = "from", value_parser = clap::value_parser!(u64).range(2..=1000))]
+    presses: Option<u64>,
+    /// Take the presses from these recordings, and leave the sensor alone
+    #[arg(long, value_name = "FILE", num_args = 1..)]
+    from: Vec<PathBuf>,
+    /// taxels: write the gains to this file, which `gains` of the configuration names
+    #[arg(long, value_name = "FILE.npy", required_if_eq("what", "taxels"))]
+    out: Option<PathBuf>,
 }
 
 /// What can be calibrated.
@@ -53,6 +66,8 @@ pub enum What {
     Arm,
     /// Newtons of a count.
     Force,
+    /// A gain for each taxel.
+    Taxels,
 }
 
 /// Why there are no values.
@@ -66,9 +81,12 @@ pub enum Error {
         /// Those of the configuration.
         names: Vec<String>,
     },
-    /// Weights for the arm.
+    /// Weights for something else.
     #[error("--newtons: found weights, expected none: they are for `calibrate force`")]
     Unasked,
+    /// A file for something else.
+    #[error("--out: found a file, expected none: it is for `calibrate taxels`")]
+    NoFile,
     /// The daemon cannot serve, or has stopped.
     #[error(transparent)]
     Daemon(#[from] daemon::Error),
@@ -80,18 +98,31 @@ pub enum Error {
         /// Why not.
         source: io::Error,
     },
-    /// What was recorded cannot be read.
-    #[error("what was recorded: {0}")]
-    Recording(#[from] crate::recording::Error),
-    /// What was recorded cannot be played.
-    #[error("what was recorded: {0}")]
-    Playback(#[from] PlaybackError),
+    /// A recording that was named is not there.
+    #[error("{path}: {source}")]
+    Missing {
+        /// As given.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
+    /// A recording cannot be read.
+    #[error("{path}: {source}")]
+    Recording {
+        /// As given, or that it is what was recorded just now.
+        path: String,
+        /// Why not.
+        source: Unreadable,
+    },
     /// The presses do not say it.
     #[error(transparent)]
     Arm(#[from] arm::Unfit),
     /// The weights do not say it.
     #[error(transparent)]
     Force(#[from] force::Unfit),
+    /// The presses do not say it.
+    #[error(transparent)]
+    Taxels(#[from] taxels::Unfit),
     /// Presses were made that are no presses of a weight.
     #[error("found {found} presses, expected {expected}: put each weight on once")]
     Count {
@@ -99,6 +130,14 @@ pub enum Error {
         found: usize,
         /// Weights.
         expected: usize,
+    },
+    /// The gains cannot be written.
+    #[error("{path}: {source}")]
+    Out {
+        /// As given.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
     },
     /// Stdout fails.
     #[error("stdout: {0}")]
@@ -108,24 +147,92 @@ pub enum Error {
 /// Positions are awaited for this long after the last press.
 const LAST_POSITIONS: Duration = Duration::from_secs(1);
 
-/// Serves the sensor until there are enough presses, and prints what they say. It ends early, without
-/// values, when `shutdown` comes.
+/// Presses where `--presses` does not say it.
+const ARM_PRESSES: u64 = 5;
+const TAXEL_PRESSES: u64 = 200;
+
+impl Args {
+    /// How many presses are to be made.
+    fn wanted(&self) -> u64 {
+        match self.what {
+            What::Arm => self.presses.unwrap_or(ARM_PRESSES),
+            What::Taxels => self.presses.unwrap_or(TAXEL_PRESSES),
+            What::Force => self.newtons.len() as u64,
+        }
+    }
+}
+
+/// Serves the sensor until there are enough presses, or reads recordings, and prints what they say. It
+/// ends early, without values, when `shutdown` comes. `config` is the path of the configuration.
 ///
 /// # Errors
 ///
-/// [`Error`], if the daemon cannot serve, or the presses do not say what is asked.
+/// [`Error`], if the daemon cannot serve, a recording cannot be read, or the presses do not say what is
+/// asked.
 pub async fn run(
     args: Args,
     setup: Setup,
+    config: &Path,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
-    if matches!(args.what, What::Arm) && !args.newtons.is_empty() {
+    if !matches!(args.what, What::Force) && !args.newtons.is_empty() {
         return Err(Error::Unasked);
     }
+    if !matches!(args.what, What::Taxels) && args.out.is_some() {
+        return Err(Error::NoFile);
+    }
     let sensor = chosen(&args, &setup)?;
-    let described = setup.sensors.iter().find(|known| known.name() == sensor);
-    let calibration = described.map(|known| known.description().calibration.clone());
-    let calibration = calibration.unwrap_or_default();
+    // Before anybody presses two hundred times.
+    let out = args.out.clone().map(Out::begin).transpose()?;
+    let presses = if args.from.is_empty() {
+        match live(&args, setup, &sensor, shutdown).await? {
+            Some(presses) => presses,
+            None => return Ok(()),
+        }
+    } else {
+        let (files, sensor, hrn) = (args.from.clone(), sensor.clone(), setup.hrn.clone());
+        let read = tokio::task::spawn_blocking(move || recorded(&files, &sensor, &hrn));
+        tokio::select! {
+            read = read => read.expect("recordings are read without a panic")?,
+            () = shutdown => return Ok(()),
+        }
+    };
+    let text = match args.what {
+        What::Arm => of_arm(&arm::Fit::of(&presses)?),
+        What::Force => {
+            let (found, expected) = (presses.len(), args.newtons.len());
+            if found != expected {
+                return Err(Error::Count { found, expected });
+            }
+            let weights = args.newtons.iter().copied().zip(&presses);
+            let calibration = &sensor.description().calibration;
+            of_force(&force::Fit::of(&weights.collect::<Vec<_>>(), calibration)?)
+        }
+        What::Taxels => {
+            let plain: Vec<taxels::Plain> = presses.iter().map(plain).collect();
+            let dead = &sensor.description().calibration.dead_taxels;
+            let array = sensor.layout().array();
+            let fit = taxels::Fit::of(&plain, array, dead)?;
+            let bytes = npy::to_bytes(&fit.gains, array.rows, array.cols);
+            let out = out.expect("the command line demands --out of taxels");
+            let path = as_in(config, &out.path);
+            out.finish(&bytes)?;
+            of_taxels(&fit, array, dead, &path)
+        }
+    };
+    super::print_apart(text.into_bytes())
+        .await
+        .map_err(Error::Print)?;
+    Ok(())
+}
+
+/// The presses that the sensor sends from now on; `None` if `shutdown` comes first.
+async fn live(
+    args: &Args,
+    setup: Setup,
+    sensor: &Sensor,
+    shutdown: impl Future<Output = ()>,
+) -> Result<Option<Vec<Press>>, Error> {
     let hrn = setup.hrn.clone();
     let path =
         std::env::temp_dir().join(format!("hardnessd-calibrate-{}.mcap", std::process::id()));
@@ -147,18 +254,15 @@ pub async fn run(
     let labels = Labels::new();
     let sockets = Sockets::Configured;
     let daemon = Daemon::recording(setup, path.clone(), file, labels, progress, sockets)?;
-    let wanted = match args.what {
-        What::Arm => args.presses,
-        What::Force => args.newtons.len() as u64,
-    };
-    say_next(&args, 0);
+    let wanted = args.wanted();
+    say_next(args, 0);
     let enough = async {
         let mut seen = 0;
         while seen < wanted && counted.changed().await.is_ok() {
             let presses = counted.borrow_and_update().presses;
             if presses > seen {
                 seen = presses;
-                say_next(&args, seen);
+                say_next(args, seen);
             }
         }
         tokio::time::sleep(LAST_POSITIONS).await;
@@ -173,37 +277,111 @@ pub async fn run(
     };
     daemon.run(end, None).await?;
     if stopped {
-        return Ok(());
+        return Ok(None);
     }
     recorded.seek(SeekFrom::Start(0)).map_err(temporary)?;
-    let gathered = Gathered::read(recorded, &sensor, hrn)?;
-    let text = match args.what {
-        What::Arm => of_arm(&arm::Fit::of(&gathered.presses)?),
-        What::Force => {
-            let (found, expected) = (gathered.presses.len(), args.newtons.len());
-            if found != expected {
-                return Err(Error::Count { found, expected });
-            }
-            let weights = args.newtons.iter().copied().zip(&gathered.presses);
-            of_force(&force::Fit::of(&weights.collect::<Vec<_>>(), &calibration)?)
-        }
-    };
-    super::print_apart(text.into_bytes())
-        .await
-        .map_err(Error::Print)?;
-    Ok(())
+    let read = gather::presses(recorded, sensor, hrn);
+    read.map(Some).map_err(|source| Error::Recording {
+        path: "what was recorded".to_owned(),
+        source,
+    })
 }
 
-fn chosen(args: &Args, setup: &Setup) -> Result<String, Error> {
-    let names: Vec<String> = setup.sensors.iter().map(|s| s.name().to_owned()).collect();
-    match &args.sensor {
-        None => Ok(names[0].clone()),
-        Some(found) if names.contains(found) => Ok(found.clone()),
-        Some(found) => Err(Error::NoSensor {
-            found: found.clone(),
-            names,
-        }),
+/// The presses that recordings hold.
+fn recorded(files: &[PathBuf], sensor: &Sensor, hrn: &Arc<Hrn>) -> Result<Vec<Press>, Error> {
+    let mut presses = Vec::new();
+    for path in files {
+        let file = super::open(path).map_err(|source| Error::Missing {
+            path: path.clone(),
+            source,
+        })?;
+        let read = gather::presses(file, sensor, hrn.clone());
+        presses.extend(read.map_err(|source| Error::Recording {
+            path: path.display().to_string(),
+            source,
+        })?);
     }
+    Ok(presses)
+}
+
+/// A press with the gains taken off that were in force.
+fn plain(press: &Press) -> taxels::Plain {
+    let mut frames = press.frames.clone();
+    if let Some(described) = &press.described
+        && let Some(Gains::Taxels(rows)) = &described.calibration.gains
+    {
+        let array = Array {
+            rows: rows.len(),
+            cols: rows.first().map_or(0, Vec::len),
+        };
+        for frame in &mut frames {
+            for (place, gain) in array.places().zip(rows.iter().flatten()) {
+                frame[place] /= gain;
+            }
+        }
+    }
+    taxels::Plain { frames }
+}
+
+/// A file being made, at a path of its own until it is whole.
+struct Out {
+    path: PathBuf,
+    part: PathBuf,
+}
+
+impl Out {
+    /// Shows that the file can be made.
+    fn begin(path: PathBuf) -> Result<Self, Error> {
+        let mut part = path.clone().into_os_string();
+        part.push(format!(".{}.part", std::process::id()));
+        let out = Self {
+            path,
+            part: part.into(),
+        };
+        out.tried(File::create_new(&out.part).map(drop))?;
+        Ok(out)
+    }
+
+    fn finish(self, bytes: &[u8]) -> Result<(), Error> {
+        self.tried(fs::write(&self.part, bytes))?;
+        self.tried(fs::rename(&self.part, &self.path))
+    }
+
+    fn tried(&self, result: io::Result<()>) -> Result<(), Error> {
+        result.map_err(|source| Error::Out {
+            path: self.path.clone(),
+            source,
+        })
+    }
+}
+
+impl Drop for Out {
+    fn drop(&mut self) {
+        // It is gone where all went well.
+        let _ = fs::remove_file(&self.part);
+    }
+}
+
+/// A path as the configuration may name it: relative, if it lies beside the configuration.
+fn as_in(config: &Path, path: &Path) -> String {
+    let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    let (config, path) = (absolute(config), absolute(path));
+    let beside = config
+        .parent()
+        .and_then(|directory| path.strip_prefix(directory).ok());
+    beside.unwrap_or(&path).display().to_string()
+}
+
+fn chosen(args: &Args, setup: &Setup) -> Result<Sensor, Error> {
+    let Some(found) = &args.sensor else {
+        return Ok(setup.sensors[0].clone());
+    };
+    let mut sensors = setup.sensors.iter();
+    let chosen = sensors.find(|sensor| sensor.name() == found);
+    chosen.cloned().ok_or_else(|| Error::NoSensor {
+        found: found.clone(),
+        names: setup.sensors.iter().map(|s| s.name().to_owned()).collect(),
+    })
 }
 
 /// Says on stderr what to do next, after so many presses.
@@ -211,9 +389,14 @@ fn say_next(args: &Args, seen: u64) {
     match args.what {
         What::Arm if seen == 0 => eprintln!(
             "press something rigid {} times, while the robot tells where its arm is",
-            args.presses
+            args.wanted()
         ),
-        What::Arm => eprintln!("press {seen} of {}", args.presses),
+        What::Taxels if seen == 0 => eprintln!(
+            "press something wide and soft {} times, each time at another place, up to the edges; or press \
+             the whole array evenly",
+            args.wanted()
+        ),
+        What::Arm | What::Taxels => eprintln!("press {seen} of {}", args.wanted()),
         What::Force => match args.newtons.get(seen as usize) {
             Some(newtons) => {
                 eprintln!("put {newtons} N on the sensor, wait until it rests, and take it off");
@@ -293,4 +476,58 @@ fn of_arm(fit: &arm::Fit) -> String {
         n_per_mm.value,
         delay_ms.value,
     )
+}
+
+/// The values, their spread and the lines for the configuration.
+fn of_taxels(fit: &taxels::Fit, array: Array, known_dead: &[[usize; 2]], path: &str) -> String {
+    let measured: Vec<usize> = (0..fit.gains.len())
+        .filter(|&k| fit.presses[k] > 1)
+        .collect();
+    let gains = measured.iter().map(|&k| fit.gains[k]);
+    let least = gains.clone().fold(f32::INFINITY, f32::min);
+    let most = gains.fold(0.0, f32::max);
+    let mut counts: Vec<usize> = measured.iter().map(|&k| fit.presses[k]).collect();
+    counts.sort_unstable();
+    let median = counts.get(counts.len() / 2).copied().unwrap_or(0);
+    let list = |taxels: &[[usize; 2]]| {
+        let taxels: Vec<String> = taxels
+            .iter()
+            .map(|[row, col]| format!("[{row}, {col}]"))
+            .collect();
+        taxels.join(", ")
+    };
+    let mut text = String::from("gains, in percent; . where fewer than two presses tell of it:\n");
+    for row in 0..array.rows {
+        for col in 0..array.cols {
+            let k = row * array.cols + col;
+            text += &match fit.presses[k] {
+                0 | 1 => "   .".to_owned(),
+                _ => format!(" {:3.0}", 100.0 * fit.gains[k]),
+            };
+        }
+        text.push('\n');
+    }
+    text += &format!(
+        "\ntaxels  {} of {} measured, each in {median} presses (median); {} presses loaded the whole array\n\
+         gains   {least:.2} to {most:.2}, spread {:.1} %\n\
+         error   {:.1} % of a gain\n\
+         dead    {}\n",
+        measured.len(),
+        fit.gains.len(),
+        fit.even,
+        100.0 * fit.spread,
+        100.0 * fit.error,
+        if fit.dead.is_empty() {
+            "none looks dead".to_owned()
+        } else {
+            list(&fit.dead)
+        }
+    );
+    text += "\n[sensor.calibration]\n";
+    text += &format!("gains = {}\n", toml::Value::from(path));
+    let all: Vec<[usize; 2]> = known_dead.iter().chain(&fit.dead).copied().collect();
+    if !all.is_empty() {
+        text += &format!("dead_taxels = [{}]\n", list(&all));
+    }
+    text
 }

@@ -112,8 +112,9 @@ impl Failure {
             | Self::Calibrate(
                 calibrate::Error::Arm(_)
                 | calibrate::Error::Force(_)
+                | calibrate::Error::Taxels(_)
                 | calibrate::Error::Count { .. }
-                | calibrate::Error::Playback(_),
+                | calibrate::Error::Recording { .. },
             )
             | Self::Doctor(doctor::Error::Faults { .. })
             | Self::Sniff(sniff::Error::Recording { .. } | sniff::Error::Unexplained { .. }) => {
@@ -122,7 +123,11 @@ impl Failure {
 
             Self::Simulate(simulate::Error::Layout(_) | simulate::Error::Baud { .. })
             | Self::Replay(replay::Error::OwnMotion { .. })
-            | Self::Calibrate(calibrate::Error::NoSensor { .. } | calibrate::Error::Unasked)
+            | Self::Calibrate(
+                calibrate::Error::NoSensor { .. }
+                | calibrate::Error::Unasked
+                | calibrate::Error::NoFile,
+            )
             | Self::Record(
                 record::Error::Level { .. }
                 | record::Error::Twice { .. }
@@ -140,6 +145,7 @@ impl Failure {
             Self::Replay(replay::Error::Motion { .. }) => FAILED,
             Self::Missing(_)
             | Self::Check(check::Error::Missing(_))
+            | Self::Calibrate(calibrate::Error::Missing { .. })
             | Self::Recover(recover::Error::Unreadable { .. })
             | Self::Replay(replay::Error::Unreadable { .. })
             | Self::Sniff(sniff::Error::Unreadable { .. }) => NO_INPUT,
@@ -162,7 +168,7 @@ impl Failure {
             | Self::Check(check::Error::Print(_))
             | Self::Calibrate(
                 calibrate::Error::Temporary { .. }
-                | calibrate::Error::Recording(_)
+                | calibrate::Error::Out { .. }
                 | calibrate::Error::Print(_),
             )
             | Self::Doctor(doctor::Error::Print(_))

@@ -15,7 +15,7 @@ use serde::de::value::Error as NameError;
 
 use super::faults::{self, Faults, Line};
 use super::player::{BITS_A_BYTE, Pace, Player};
-use crate::simulator::{Material, Sequence, SequenceSettings};
+use crate::simulator::{Material, SensorProfile, Sequence, SequenceSettings};
 use crate::wire::{Layout, LayoutError, Preset, Settings as Frame};
 
 /// Arguments of `simulate`.
@@ -41,6 +41,9 @@ pub struct Args {
     /// random, 5 to 25]
     #[arg(long = "force", value_name = "N", value_parser = force_n)]
     forces: Vec<f64>,
+    /// How alike the taxels are: clean, as after a calibration, or raw, with a gain of their own each
+    #[arg(long, value_name = "PROFILE", default_value = "clean")]
+    sensor_profile: SensorProfile,
     /// Seed of everything random
     #[arg(long, value_name = "S", default_value_t = 1)]
     seed: u64,
@@ -195,6 +198,7 @@ fn sequence(args: &Args) -> SequenceSettings {
         },
         forces_n: args.forces.iter().map(|&force| force as f32).collect(),
         presses: args.presses,
+        profile: args.sensor_profile,
         ..SequenceSettings::default()
     }
 }

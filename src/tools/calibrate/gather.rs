@@ -4,11 +4,14 @@ use std::io::{BufReader, Read};
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::Error;
+use jiff::Timestamp;
+
 use crate::event::{Event, PressState};
 use crate::frame::Stamp;
 use crate::motion::Track;
-use crate::recording::{Entry, Input, Playback, Reader};
+use crate::pipeline::{Clock, Pipeline};
+use crate::recording::{self, Entry, FileKind, Input, Playback, PlaybackError, Reader};
+use crate::sensor::{Description, Sensor};
 use crate::verdict::Hrn;
 
 /// One press.
@@ -22,11 +25,8 @@ pub(super) struct Press {
     pub(super) forces_n: Vec<f64>,
     /// Where the arm was.
     pub(super) track: Track,
-}
-
-/// What was recorded of one sensor.
-pub(super) struct Gathered {
-    pub(super) presses: Vec<Press>,
+    /// What was said of the sensor then; `None` where nobody said it.
+    pub(super) described: Option<Arc<Description>>,
 }
 
 /// A frame of the sensor.
@@ -36,75 +36,164 @@ struct Taken {
     newtons: Vec<f32>,
 }
 
+/// Why a recording cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum Unreadable {
+    /// It is damaged, or none of ours.
+    #[error(transparent)]
+    Recording(#[from] recording::Error),
+    /// It describes what cannot be.
+    #[error(transparent)]
+    Playback(#[from] PlaybackError),
+}
+
+impl From<std::io::Error> for Unreadable {
+    fn from(error: std::io::Error) -> Self {
+        Self::Recording(error.into())
+    }
+}
+
 /// So long after a press its positions have come.
 const AFTER: Duration = Duration::from_millis(800);
 
+/// The presses that a file holds of a sensor: of the one of this name, or of this one where the file has
+/// bytes alone.
+pub(super) fn presses(
+    file: impl Read,
+    sensor: &Sensor,
+    hrn: Arc<Hrn>,
+) -> Result<Vec<Press>, Unreadable> {
+    let (kind, file) = FileKind::read(file)?;
+    match kind {
+        FileKind::Recording => of_recording(BufReader::new(file), sensor.name(), hrn),
+        FileKind::Raw => Ok(of_bytes(file, sensor, hrn)?),
+    }
+}
+
+fn of_recording(file: impl Read, sensor: &str, hrn: Arc<Hrn>) -> Result<Vec<Press>, Unreadable> {
+    let mut playback = Playback::new(hrn);
+    let mut gathered = Gathered::default();
+    for found in Reader::new(file) {
+        let found = found?;
+        if found.sensor != sensor {
+            continue;
+        }
+        let at = found.at;
+        match &found.entry {
+            Entry::Input(Input::Motion(points)) => {
+                // A step back makes the approach of its press unknown.
+                let _ = gathered.track.push(points);
+            }
+            Entry::Settings(sensor) => gathered.describe(&sensor.description),
+            Entry::State(state) => gathered.describe(&state.sensor.description),
+            Entry::Input(_) => {}
+        }
+        gathered.settle(at.mono);
+        gathered.take(playback.feed(found)?, at);
+    }
+    Ok(gathered.end())
+}
+
+fn of_bytes(mut file: impl Read, sensor: &Sensor, hrn: Arc<Hrn>) -> std::io::Result<Vec<Press>> {
+    let mut bytes = Vec::new();
+    file.read_to_end(&mut bytes)?;
+    // Its frames have times of their own, which count from here.
+    let start = Stamp {
+        mono: Duration::ZERO,
+        wall: Timestamp::UNIX_EPOCH,
+    };
+    let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::FrameRate);
+    let mut gathered = Gathered::default();
+    gathered.describe(sensor.description());
+    for chunk in bytes.chunks(CHUNK_BYTES) {
+        gathered.take(pipeline.push(chunk, start), start);
+        gathered.settle(Duration::MAX);
+    }
+    gathered.take(pipeline.end_of_recording(None), start);
+    Ok(gathered.end())
+}
+
+/// Bytes whose frames are held at a time.
+const CHUNK_BYTES: usize = 1 << 16;
+
+/// What has been read so far.
+#[derive(Default)]
+struct Gathered {
+    presses: Vec<Press>,
+    track: Track,
+    described: Option<Arc<Description>>,
+    /// Those of a press under way or of one in `ended`, and the newest.
+    frames: Vec<Taken>,
+    /// First frame of the press under way.
+    began: Option<u64>,
+    /// First and last frame of presses that wait for their last positions, and when each ended.
+    ended: Vec<(u64, u64, Duration)>,
+}
+
 impl Gathered {
-    /// Reads what was recorded of `sensor`.
-    pub(super) fn read(file: impl Read, sensor: &str, hrn: Arc<Hrn>) -> Result<Self, Error> {
-        let mut playback = Playback::new(hrn);
-        let mut track = Track::default();
-        let mut frames: Vec<Taken> = Vec::new();
-        let mut began = None;
-        // First and last frame of presses that wait for their last positions.
-        let mut ended: Vec<(u64, u64, Duration)> = Vec::new();
-        let mut presses = Vec::new();
-        let press = |frames: &[Taken], first: u64, last: u64, track: &Track| {
+    fn describe(&mut self, description: &Description) {
+        if self.described.as_deref() != Some(description) {
+            self.described = Some(Arc::new(description.clone()));
+        }
+    }
+
+    fn take(&mut self, events: Vec<Event>, at: Stamp) {
+        for event in events {
+            match event {
+                Event::Frame(frame) if frame.tared => {
+                    if self.began.is_none() && self.ended.is_empty() {
+                        self.frames.clear();
+                    }
+                    self.frames.push(Taken {
+                        number: frame.frame,
+                        mono: moment(at, frame.time),
+                        newtons: frame.newtons,
+                    });
+                }
+                Event::Press(press) => match press.state {
+                    PressState::Begin => self.began = Some(press.frame),
+                    PressState::End => {
+                        let first = self.began.take().unwrap_or(press.frame);
+                        let end = moment(at, press.time);
+                        self.ended.push((first, press.frame, end));
+                    }
+                    PressState::Aborted => self.began = None,
+                },
+                _ => {}
+            }
+        }
+    }
+
+    /// Takes the presses whose positions have come by `now`.
+    fn settle(&mut self, now: Duration) {
+        while let Some(&(first, last, end)) = self.ended.first()
+            && now >= end.saturating_add(AFTER)
+        {
+            self.ended.remove(0);
             let mut press = Press {
-                track: track.clone(),
+                track: self.track.clone(),
+                described: self.described.clone(),
                 ..Press::default()
             };
-            for frame in frames.iter().filter(|f| (first..=last).contains(&f.number)) {
+            let own = self.frames.iter();
+            for frame in own.filter(|frame| (first..=last).contains(&frame.number)) {
                 press.moments.push(frame.mono);
                 let newtons = frame.newtons.iter().map(|&n| f64::from(n));
                 press.forces_n.push(newtons.sum());
                 press.frames.push(frame.newtons.clone());
             }
-            press
-        };
-        for found in Reader::new(BufReader::new(file)) {
-            let found = found?;
-            if found.sensor != sensor {
-                continue;
-            }
-            let at = found.at;
-            if let Entry::Input(Input::Motion(points)) = &found.entry {
-                // A step back makes the approach of its press unknown.
-                let _ = track.push(points);
-            }
-            while let Some(&(first, last, end)) = ended.first()
-                && at.mono >= end + AFTER
-            {
-                presses.push(press(&frames, first, last, &track));
-                ended.remove(0);
-            }
-            for event in playback.feed(found)? {
-                match event {
-                    Event::Frame(frame) if frame.tared => frames.push(Taken {
-                        number: frame.frame,
-                        mono: moment(at, frame.time),
-                        newtons: frame.newtons,
-                    }),
-                    Event::Press(press) if press.state == PressState::Begin => {
-                        began = Some(press.frame);
-                    }
-                    Event::Press(press) if press.state == PressState::End => {
-                        let first = began.take().unwrap_or(press.frame);
-                        ended.push((first, press.frame, moment(at, press.time)));
-                    }
-                    _ => {}
-                }
-            }
+            self.presses.push(press);
         }
-        for (first, last, _) in ended {
-            presses.push(press(&frames, first, last, &track));
-        }
-        Ok(Self { presses })
+    }
+
+    fn end(mut self) -> Vec<Press> {
+        self.settle(Duration::MAX);
+        self.presses
     }
 }
 
 /// The moment of an event by the clock of the positions.
-fn moment(at: Stamp, time: jiff::Timestamp) -> Duration {
+fn moment(at: Stamp, time: Timestamp) -> Duration {
     let ago = at.wall.as_nanosecond() - time.as_nanosecond();
     let mono = at.mono.as_nanos() as i128 - ago;
     Duration::from_nanos(u64::try_from(mono).unwrap_or(0))

@@ -1,0 +1,378 @@
+//! From presses at many places, or from an even pressure, to a gain for each taxel.
+//!
+//! Under a smooth pressure the logarithm of a taxel's reading is the mean of its two neighbours' along a
+//! row or a column; what differs is the gains of the three. Each such trio counts once a press, in the
+//! middle of the contact. Under a pressure on the whole array a taxel is also compared with the array's
+//! median. The gains that fit all of it best are found by least squares, and drawn towards 1 where there
+//! are few presses.
+
+use crate::frame::{Array, TAXELS};
+
+/// A press with the gains taken off.
+pub(super) struct Plain {
+    /// Newtons on each taxel of each frame, as they would read with gains of 1.
+    pub(super) frames: Vec<Vec<f32>>,
+}
+
+/// What is compared with what.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Compared {
+    /// A taxel with two on either side of it: places in the frame.
+    Trio(usize, [usize; 2]),
+    /// A taxel with the array's median.
+    Array(usize),
+}
+
+/// One comparison, over all presses.
+struct Row {
+    compared: Compared,
+    /// Median over the presses.
+    value: f64,
+    presses: usize,
+}
+
+/// What presses say.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Fit {
+    /// By what each taxel's newtons are multiplied, `[rows, cols]` of the array; 1 where nothing is known.
+    pub(super) gains: Vec<f32>,
+    /// Presses in which each taxel was compared, likewise.
+    pub(super) presses: Vec<usize>,
+    /// Presses that loaded the whole array.
+    pub(super) even: usize,
+    /// Standard deviation of the logarithm of the gains that were measured.
+    pub(super) spread: f64,
+    /// How wrong such a gain is, as a part of it: half of what two halves of the presses differ by.
+    pub(super) error: f64,
+    /// Taxels that read nothing while all around them did, `[row, col]`.
+    pub(super) dead: Vec<[usize; 2]>,
+}
+
+/// Why presses say nothing.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Unfit {
+    /// Too few taxels were loaded well.
+    #[error(
+        "only {found} of {taxels} taxels were in the middle of two presses or more: press harder, at \
+         more places, or with something wide and soft ({presses} presses found)"
+    )]
+    Few {
+        /// Taxels.
+        found: usize,
+        /// Taxels that are alive.
+        taxels: usize,
+        /// Presses.
+        presses: usize,
+    },
+}
+
+/// A taxel is loaded well with so much: five counts of 0.04 N.
+const LEAST_N: f32 = 0.2;
+/// An array of which this share is loaded well is under an even pressure.
+const EVEN_SHARE: f64 = 0.9;
+/// A taxel is dead that reads nothing in this share of the presses around it,
+const DEAD_SHARE: f64 = 0.5;
+/// if there are so many.
+const DEAD_PRESSES: usize = 3;
+/// Gains are expected to spread by this much (standard deviation of the logarithm). On a public film
+/// array it was 0.16 between taxels, 0.03 between rows and 0.055 between columns.
+const EXPECTED_SPREAD: f64 = 0.18;
+/// No press says a comparison more exactly than this.
+const LEAST_NOISE: f64 = 0.02;
+/// A pressure is never as smooth as supposed, however many presses there are: a comparison with two sides is
+/// wrong by this much, and one with an even array by less. Between 0.05 and 0.2 simulated presses hardly
+/// care; without it, slow waves over the array would be taken for gains.
+const UNEVEN: f64 = 0.1;
+const EVEN: f64 = 0.02;
+/// So many taxels must have been reached.
+const LEAST_TAXELS: usize = 16;
+/// Of the method of conjugate gradients. 784 would solve it exactly, were there no rounding.
+const STEPS: usize = 400;
+
+impl Fit {
+    /// What presses on `array` say. `dead` are the taxels whose newtons are no measurement.
+    pub(super) fn of(presses: &[Plain], array: Array, dead: &[[usize; 2]]) -> Result<Self, Unfit> {
+        let mut is_dead = vec![false; TAXELS];
+        for &[row, col] in dead {
+            is_dead[array.place(row, col)] = true;
+        }
+        let all: Vec<&Plain> = presses.iter().collect();
+        let (logs, reached) = solve(&all, array, &is_dead);
+        let places: Vec<usize> = array.places().collect();
+        let taxels = places.iter().filter(|&&place| !is_dead[place]).count();
+        let measured: Vec<usize> = places.iter().copied().filter(|&p| reached[p] > 1).collect();
+        if measured.len() < LEAST_TAXELS {
+            return Err(Unfit::Few {
+                found: measured.len(),
+                taxels,
+                presses: presses.len(),
+            });
+        }
+        let halves = [0, 1].map(|half| {
+            let half: Vec<&Plain> = all.iter().copied().skip(half).step_by(2).collect();
+            solve(&half, array, &is_dead).0
+        });
+        let apart = measured.iter().map(|&p| halves[0][p] - halves[1][p]);
+        let own = measured.iter().map(|&p| logs[p]);
+        let dead = places
+            .iter()
+            .filter(|&&p| !is_dead[p] && looks_dead(presses, array, &is_dead, p));
+        let position = |&place: &usize| {
+            let (row, col) = array.position(place)?;
+            Some([row, col])
+        };
+        Ok(Self {
+            gains: places.iter().map(|&p| (-logs[p]).exp() as f32).collect(),
+            presses: places.iter().map(|&p| reached[p]).collect(),
+            even: presses
+                .iter()
+                .filter(|press| is_even(press, array, &is_dead))
+                .count(),
+            spread: deviation(own),
+            error: 0.5 * deviation(apart),
+            dead: dead.filter_map(position).collect(),
+        })
+    }
+}
+
+/// The logarithm of each taxel's sensitivity, 0 in the mean, and how many presses tell of it.
+fn solve(presses: &[&Plain], array: Array, is_dead: &[bool]) -> (Vec<f64>, Vec<usize>) {
+    let (rows, noise) = compare(presses, array, is_dead);
+    let mut reached = vec![0; TAXELS];
+    for row in &rows {
+        let (Compared::Trio(place, _) | Compared::Array(place)) = row.compared;
+        reached[place] = reached[place].max(row.presses);
+    }
+    // With D the comparisons, W their weights, y their values and s the expected spread:
+    // (D' W D + 1/s^2) logs = D' W y.
+    let weight = |row: &Row| {
+        let always = match row.compared {
+            Compared::Trio(..) => UNEVEN,
+            Compared::Array(_) => EVEN,
+        };
+        1.0 / (noise * noise / row.presses as f64 + always * always)
+    };
+    let across = |logs: &[f64], compared: Compared| match compared {
+        Compared::Trio(place, [one, other]) => logs[place] - 0.5 * (logs[one] + logs[other]),
+        Compared::Array(place) => logs[place],
+    };
+    let back = |into: &mut [f64], compared: Compared, value: f64| match compared {
+        Compared::Trio(place, sides) => {
+            into[place] += value;
+            sides.iter().for_each(|&side| into[side] -= 0.5 * value);
+        }
+        Compared::Array(place) => into[place] += value,
+    };
+    let prior = 1.0 / (EXPECTED_SPREAD * EXPECTED_SPREAD);
+    let apply = |logs: &[f64]| {
+        let mut applied: Vec<f64> = logs.iter().map(|log| prior * log).collect();
+        for row in &rows {
+            back(
+                &mut applied,
+                row.compared,
+                weight(row) * across(logs, row.compared),
+            );
+        }
+        applied
+    };
+    let mut wanted = vec![0.0; TAXELS];
+    for row in &rows {
+        back(&mut wanted, row.compared, weight(row) * row.value);
+    }
+    let mut logs = conjugate_gradients(apply, &wanted);
+    // The scale of all of them is that of newtons_per_count.
+    let measured: Vec<usize> = (0..TAXELS).filter(|&place| reached[place] > 0).collect();
+    let mean = measured.iter().map(|&p| logs[p]).sum::<f64>() / measured.len().max(1) as f64;
+    measured.iter().for_each(|&place| logs[place] -= mean);
+    (logs, reached)
+}
+
+/// All comparisons, and the noise of one press in one of them.
+fn compare(presses: &[&Plain], array: Array, is_dead: &[bool]) -> (Vec<Row>, f64) {
+    let trios = trios(array, is_dead);
+    let mut values: Vec<Vec<f64>> = vec![Vec::new(); trios.len()];
+    let mut evens: Vec<Vec<f64>> = vec![Vec::new(); TAXELS];
+    for press in presses {
+        let even = is_even(press, array, is_dead);
+        let frames = press.frames.iter();
+        let loaded: Vec<Vec<f64>> = frames.map(|frame| logs(frame)).collect();
+        let mut own = Vec::new();
+        for (&(place, sides), values) in trios.iter().zip(&mut values) {
+            own.clear();
+            own.extend(loaded.iter().filter_map(|logs| {
+                let value = logs[place] - 0.5 * (logs[sides[0]] + logs[sides[1]]);
+                value.is_finite().then_some(value)
+            }));
+            values.extend(median(&mut own));
+        }
+        if !even {
+            continue;
+        }
+        let middles: Vec<f64> = loaded
+            .iter()
+            .map(|logs| {
+                let mut well: Vec<f64> = array.places().map(|p| logs[p]).collect();
+                well.retain(|log| log.is_finite());
+                median(&mut well).unwrap_or(f64::NAN)
+            })
+            .collect();
+        for place in array.places().filter(|&place| !is_dead[place]) {
+            let values = loaded
+                .iter()
+                .zip(&middles)
+                .map(|(logs, middle)| logs[place] - middle);
+            let mut values: Vec<f64> = values.filter(|value| value.is_finite()).collect();
+            evens[place].extend(median(&mut values));
+        }
+    }
+    let mut rows = Vec::new();
+    let mut rests = Vec::new();
+    let mut add = |compared, mut values: Vec<f64>| {
+        let presses = values.len();
+        if let Some(value) = median(&mut values) {
+            if presses > 2 {
+                rests.extend(values.iter().map(|one| (one - value).abs()));
+            }
+            rows.push(Row {
+                compared,
+                value,
+                presses,
+            });
+        }
+    };
+    for (&(place, sides), values) in trios.iter().zip(values) {
+        add(Compared::Trio(place, sides), values);
+    }
+    for (place, values) in evens.into_iter().enumerate() {
+        add(Compared::Array(place), values);
+    }
+    // A dome is higher in its middle than around it, wherever it is.
+    let is_trio = |row: &&mut Row| matches!(row.compared, Compared::Trio(..));
+    let mut curved: Vec<f64> = rows
+        .iter()
+        .filter(|r| matches!(r.compared, Compared::Trio(..)))
+        .map(|r| r.value)
+        .collect();
+    let curved = median(&mut curved).unwrap_or(0.0);
+    rows.iter_mut()
+        .filter(is_trio)
+        .for_each(|row| row.value -= curved);
+    // Of a normal distribution the median distance from the median is 0.6745 standard deviations.
+    let noise = median(&mut rests).map_or(LEAST_NOISE, |rest| (rest / 0.6745).max(LEAST_NOISE));
+    (rows, noise)
+}
+
+/// The logarithm of each taxel's newtons; NaN where it is not loaded well.
+fn logs(frame: &[f32]) -> Vec<f64> {
+    let log = |&newtons: &f32| match newtons >= LEAST_N {
+        true => f64::from(newtons).ln(),
+        false => f64::NAN,
+    };
+    frame.iter().map(log).collect()
+}
+
+/// Every live taxel between two live ones, along rows and columns.
+fn trios(array: Array, is_dead: &[bool]) -> Vec<(usize, [usize; 2])> {
+    let mut trios = Vec::new();
+    for row in 0..array.rows {
+        for col in 0..array.cols {
+            if row > 0 && row + 1 < array.rows {
+                let sides = [array.place(row - 1, col), array.place(row + 1, col)];
+                trios.push((array.place(row, col), sides));
+            }
+            if col > 0 && col + 1 < array.cols {
+                let sides = [array.place(row, col - 1), array.place(row, col + 1)];
+                trios.push((array.place(row, col), sides));
+            }
+        }
+    }
+    trios.retain(|&(place, [one, other])| !is_dead[place] && !is_dead[one] && !is_dead[other]);
+    trios
+}
+
+/// Whether a press loads the whole array.
+fn is_even(press: &Plain, array: Array, is_dead: &[bool]) -> bool {
+    let live = || array.places().filter(|&place| !is_dead[place]);
+    press.frames.iter().any(|frame| {
+        let well = live().filter(|&place| frame[place] >= LEAST_N).count();
+        well as f64 >= EVEN_SHARE * live().count() as f64
+    })
+}
+
+/// Whether a taxel reads nothing while all that touch it along its row and column are loaded well.
+fn looks_dead(presses: &[Plain], array: Array, is_dead: &[bool], place: usize) -> bool {
+    let Some((row, col)) = array.position(place) else {
+        return false;
+    };
+    let beside = [
+        (row.wrapping_sub(1), col),
+        (row + 1, col),
+        (row, col.wrapping_sub(1)),
+        (row, col + 1),
+    ];
+    let beside = beside
+        .into_iter()
+        .filter(|&(r, c)| r < array.rows && c < array.cols);
+    let beside: Vec<usize> = beside
+        .map(|(r, c)| array.place(r, c))
+        .filter(|&p| !is_dead[p])
+        .collect();
+    let (mut around, mut silent) = (0, 0);
+    for press in presses {
+        let is_around = |frame: &&Vec<f32>| beside.iter().all(|&p| frame[p] >= LEAST_N);
+        let mut frames = press.frames.iter().filter(is_around).peekable();
+        if frames.peek().is_some() {
+            around += 1;
+            silent += usize::from(frames.all(|frame| frame[place] <= 0.0));
+        }
+    }
+    around >= DEAD_PRESSES && silent as f64 >= DEAD_SHARE * around as f64
+}
+
+/// Solves `apply(x) = wanted` for a symmetric positive `apply`.
+fn conjugate_gradients(apply: impl Fn(&[f64]) -> Vec<f64>, wanted: &[f64]) -> Vec<f64> {
+    let dot =
+        |one: &[f64], other: &[f64]| -> f64 { one.iter().zip(other).map(|(a, b)| a * b).sum() };
+    let mut found = vec![0.0; wanted.len()];
+    let mut rest = wanted.to_vec();
+    let mut direction = rest.clone();
+    let mut square = dot(&rest, &rest);
+    let enough = 1e-16 * square;
+    for _ in 0..STEPS {
+        if square <= enough {
+            break;
+        }
+        let applied = apply(&direction);
+        let step = square / dot(&direction, &applied);
+        for place in 0..found.len() {
+            found[place] += step * direction[place];
+            rest[place] -= step * applied[place];
+        }
+        let next = dot(&rest, &rest);
+        let turn = next / square;
+        square = next;
+        for (direction, rest) in direction.iter_mut().zip(&rest) {
+            *direction = rest + turn * *direction;
+        }
+    }
+    found
+}
+
+fn median(values: &mut [f64]) -> Option<f64> {
+    values.sort_by(f64::total_cmp);
+    let middle = values.len() / 2;
+    match values.len() {
+        0 => None,
+        odd if odd % 2 == 1 => Some(values[middle]),
+        _ => Some(0.5 * (values[middle - 1] + values[middle])),
+    }
+}
+
+fn deviation(values: impl Iterator<Item = f64> + Clone) -> f64 {
+    let count = values.clone().count().max(1) as f64;
+    let mean = values.clone().sum::<f64>() / count;
+    (values.map(|value| (value - mean).powi(2)).sum::<f64>() / count).sqrt()
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,262 @@
+use std::sync::Arc;
+
+use super::super::{gather, plain};
+use super::*;
+use crate::event::{Event, Phase};
+use crate::pipeline::{Clock, Pipeline};
+use crate::random::Stream;
+use crate::sensor::{Description, Sensor};
+use crate::simulator::{Material, SensorProfile, Sequence, SequenceSettings};
+use crate::tare::Gains;
+use crate::verdict::{BUILT_IN, Hrn};
+
+/// Presses of 20 N a taxel in the middle on every taxel in turn, round and smooth, as an array of `gains`
+/// reads them; with noise.
+fn domes(array: Array, gains: impl Fn(usize, usize) -> f32) -> Vec<Plain> {
+    let mut noise = Stream::new(4, "noise");
+    let mut presses = Vec::new();
+    for centre in array.places() {
+        let (row, col) = array.position(centre).unwrap();
+        let mut frame = vec![0.0; TAXELS];
+        for place in array.places() {
+            let (r, c) = array.position(place).unwrap();
+            let square = r.abs_diff(row).pow(2) + c.abs_diff(col).pow(2);
+            let newtons =
+                4.0 * (-(square as f32) / 12.0).exp() * (1.0 + 0.01 * noise.normal() as f32);
+            frame[place] = newtons * gains(r, c);
+        }
+        presses.push(Plain {
+            frames: vec![frame.clone(), frame],
+        });
+    }
+    presses
+}
+
+fn uneven(row: usize, col: usize) -> f32 {
+    let mut own = Stream::new(5, "gains").child((100 * row + col) as u64);
+    (1.0 + 0.15 * own.normal()) as f32
+}
+
+#[test]
+fn gains_are_found_from_presses_at_many_places() {
+    let array = Array { rows: 12, cols: 10 };
+    let fit = Fit::of(&domes(array, uneven), array, &[]).unwrap();
+    assert_eq!((fit.even, fit.dead.len()), (0, 0));
+    let left: Vec<f64> = (0..120)
+        .filter(|&k| fit.presses[k] > 1)
+        .map(|k| f64::from(fit.gains[k] * uneven(k / 10, k % 10)).ln())
+        .collect();
+    assert!(left.len() > 100, "{}", left.len());
+    let left = deviation(left.iter().copied());
+    assert!(left < 0.08, "{left} of 0.15 are left");
+    assert!((0.1..0.2).contains(&fit.spread), "{}", fit.spread);
+    assert!(
+        fit.error > 1e-4 && fit.error < left,
+        "{} said, {left} true",
+        fit.error
+    );
+}
+
+#[test]
+fn an_even_pressure_says_all_gains_and_the_dead_taxels() {
+    let array = Array { rows: 12, cols: 10 };
+    let dead = [[3, 4], [7, 7]];
+    let frame = |level: f32| {
+        let mut frame = vec![0.0; TAXELS];
+        for place in array.places() {
+            let (row, col) = array.position(place).unwrap();
+            frame[place] = if dead.contains(&[row, col]) {
+                0.0
+            } else {
+                level * uneven(row, col)
+            };
+        }
+        frame
+    };
+    let press = || Plain {
+        frames: vec![frame(1.0), frame(2.0)],
+    };
+    let presses: Vec<Plain> = (0..6).map(|_| press()).collect();
+    let known = [dead[1]];
+    let fit = Fit::of(&presses, array, &known).unwrap();
+    assert_eq!((fit.even, fit.dead.as_slice()), (6, &dead[..1]));
+    let live = (0..120).filter(|k| !dead.contains(&[k / 10, k % 10]));
+    let left = live.map(|k| f64::from(fit.gains[k] * uneven(k / 10, k % 10)).ln());
+    let left = deviation(left.collect::<Vec<_>>().into_iter());
+    assert!(left < 0.01, "{left}");
+    assert!(
+        dead.iter()
+            .all(|[row, col]| fit.gains[10 * row + col] == 1.0)
+    );
+}
+
+#[test]
+fn too_few_presses_say_nothing() {
+    let array = Array { rows: 12, cols: 10 };
+    let presses = &domes(array, uneven)[..1];
+    let Err(error) = Fit::of(presses, array, &[]) else {
+        panic!("one press says no gains");
+    };
+    let error = error.to_string();
+    assert!(
+        error.contains("only 0 of 120 taxels") && error.contains("(1 presses found)"),
+        "{error}"
+    );
+}
+
+/// Bytes of presses on one raw sensor: the first `for_gains`, and those after them, with their levels.
+struct Played {
+    first: Vec<u8>,
+    then: Vec<u8>,
+    levels: Vec<u8>,
+    gains: Vec<f32>,
+}
+
+fn sensor(gains: Option<Gains>, dead_taxels: Vec<[usize; 2]>) -> Sensor {
+    let mut described = Description::default();
+    described.calibration.gains = gains;
+    described.calibration.dead_taxels = dead_taxels;
+    Sensor::new(described).unwrap()
+}
+
+fn play(seed: u64, for_gains: u32, for_verdicts: u32, profile: SensorProfile) -> Played {
+    let layout = sensor(None, Vec::new());
+    let settings = SequenceSettings {
+        seed,
+        materials: Material::ALL.to_vec(),
+        presses: Some(for_gains + for_verdicts),
+        profile,
+        ..SequenceSettings::default()
+    };
+    let sequence = Sequence::new(settings);
+    let mut played = Played {
+        first: Vec::new(),
+        then: Vec::new(),
+        levels: Vec::new(),
+        gains: sequence.gains().to_vec(),
+    };
+    let mut last = 0;
+    for frame in sequence {
+        let is_first = frame.press <= for_gains;
+        let bytes = if is_first {
+            &mut played.first
+        } else {
+            &mut played.then
+        };
+        layout.layout().encode(&frame.raw, bytes);
+        if !is_first && frame.press != last {
+            last = frame.press;
+            played.levels.push(frame.material.unwrap().level());
+        }
+    }
+    played
+}
+
+/// The share of right verdicts, on test materials alone.
+fn right(played: &Played, sensor: Sensor, hrn: &Arc<Hrn>) -> f64 {
+    let mut pipeline = Pipeline::new(sensor, hrn.clone(), Clock::FrameRate);
+    let start = crate::frame::Stamp {
+        mono: std::time::Duration::ZERO,
+        wall: jiff::Timestamp::UNIX_EPOCH,
+    };
+    let mut events = pipeline.push(&played.then, start);
+    events.extend(pipeline.end_of_recording(None));
+    let (mut right, mut all) = (0, 0);
+    for event in events {
+        if let Event::Hardness(verdict) = event
+            && verdict.phase == Phase::Final
+        {
+            let number = verdict.press as usize - 1;
+            // Four materials to train on, four to test on, in turn.
+            if number % 8 >= 4 {
+                all += 1;
+                right += u32::from(verdict.level == Some(played.levels[number]));
+            }
+        }
+    }
+    f64::from(right) / f64::from(all)
+}
+
+/// Correlation of the gains found with the true ones, over the taxels that were measured.
+fn correlation(fit: &Fit, truth: &[f32]) -> f64 {
+    let pairs: Vec<(f64, f64)> = (0..TAXELS)
+        .filter(|&k| fit.presses[k] > 1 && truth[k] > 0.0)
+        .map(|k| (-f64::from(fit.gains[k]).ln(), f64::from(truth[k]).ln()))
+        .collect();
+    let count = pairs.len() as f64;
+    let mean = |of: fn(&(f64, f64)) -> f64| pairs.iter().map(of).sum::<f64>() / count;
+    let (x, y) = (mean(|p| p.0), mean(|p| p.1));
+    let sum = |of: &dyn Fn(&(f64, f64)) -> f64| pairs.iter().map(of).sum::<f64>();
+    let squares = sum(&|p| (p.0 - x).powi(2)) * sum(&|p| (p.1 - y).powi(2));
+    sum(&|p| (p.0 - x) * (p.1 - y)) / squares.sqrt()
+}
+
+fn fitted(played: &Played, hrn: &Arc<Hrn>) -> Fit {
+    let plain_sensor = sensor(None, Vec::new());
+    let presses = gather::presses(played.first.as_slice(), &plain_sensor, hrn.clone()).unwrap();
+    let plain: Vec<Plain> = presses.iter().map(plain).collect();
+    Fit::of(&plain, Array::FULL, &[]).unwrap()
+}
+
+#[test]
+fn gains_of_a_raw_simulated_sensor_are_found_from_its_presses() {
+    let hrn = Arc::new(Hrn::load(BUILT_IN).unwrap());
+    let played = play(7, 300, 0, SensorProfile::Raw);
+    let fit = fitted(&played, &hrn);
+    let correlation = correlation(&fit, &played.gains);
+    assert!(correlation > 0.7, "{correlation}");
+    let are_dead = fit
+        .dead
+        .iter()
+        .all(|[row, col]| played.gains[28 * row + col] < 0.3);
+    assert!(are_dead, "{:?}", fit.dead);
+}
+
+/// Prints what the calibration is worth: docs/new-sensor.md has the figures.
+#[test]
+#[ignore = "minutes: cargo test --features train --lib worth_of_gains -- --ignored --nocapture"]
+fn print_the_worth_of_gains() {
+    let hrn = Arc::new(Hrn::load(BUILT_IN).unwrap());
+    let rows = |gains: &[f32]| {
+        Some(Gains::Taxels(
+            gains.chunks(28).map(<[f32]>::to_vec).collect(),
+        ))
+    };
+    for presses in [100, 300, 1000] {
+        let (mut lines, sensors) = (Vec::new(), 3);
+        for seed in 0..sensors {
+            let played = play(100 + seed, presses, 800, SensorProfile::Raw);
+            let clean = play(100 + seed, presses, 800, SensorProfile::Clean);
+            let fit = fitted(&played, &hrn);
+            let truth: Vec<f32> = played
+                .gains
+                .iter()
+                .map(|g| if *g > 0.1 { 1.0 / g } else { 1.0 })
+                .collect();
+            let dead = (0..TAXELS)
+                .filter(|&k| played.gains[k] < 0.1)
+                .map(|k| [k / 28, k % 28]);
+            lines.push([
+                fit.presses.iter().filter(|&&n| n > 1).count() as f64,
+                correlation(&fit, &played.gains),
+                fit.error,
+                right(&played, sensor(None, Vec::new()), &hrn),
+                right(&played, sensor(rows(&fit.gains), fit.dead.clone()), &hrn),
+                right(&played, sensor(rows(&truth), dead.collect()), &hrn),
+                right(&clean, sensor(None, Vec::new()), &hrn),
+            ]);
+        }
+        let mean = |at: usize| lines.iter().map(|line| line[at]).sum::<f64>() / sensors as f64;
+        println!(
+            "{presses} presses: {:.0} taxels, correlation {:.2}, error {:.3}; right without {:.3}, with {:.3}, \
+             with the true gains {:.3}, clean {:.3}",
+            mean(0),
+            mean(1),
+            mean(2),
+            mean(3),
+            mean(4),
+            mean(5),
+            mean(6)
+        );
+    }
+}
