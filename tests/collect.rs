@@ -12,6 +12,7 @@ use std::process::{Command, Output};
 
 use bench::{BINARY, Bench, hardnessd};
 use hardnessd::simulator::{self, DatasetSettings, Split};
+use hardnessd::train::data::courses::Courses;
 use hardnessd::train::data::dataset::{self, Dataset, Kind, Sample, meta};
 use hardnessd::train::data::simulated;
 use hardnessd::verdict::{Card, Hrn};
@@ -79,7 +80,7 @@ fn samples_are_the_frames_that_the_daemon_judges() {
     let capture = bench.path("a.mcap");
     let _sensor = bench.sensor(&[]);
     let labels = ["level=1", "object=7", "material=oak", "shore=95"];
-    record(&config, &capture, &labels);
+    record(&config, &capture, &labels, &[]);
     let out = bench.path("own.npz");
     let samples = collected(&out, &[text(&capture)]);
     assert!(samples.iter().all(|s| s.level == 1 && s.object == Some(7)));
@@ -156,14 +157,105 @@ fn samples_are_the_frames_that_the_daemon_judges() {
 }
 
 /// Records the sensor of `config` for 12 s.
-fn record(config: &Path, out: &Path, labels: &[&str]) {
+fn record(config: &Path, out: &Path, labels: &[&str], more: &[&str]) {
     let recorded = Command::new(BINARY)
         .args(["record", "--config", text(config), "--out", text(out)])
         .args(["--seconds", "12"])
         .args(labels.iter().flat_map(|label| ["--label", label]))
+        .args(more)
         .output()
         .unwrap();
     assert!(recorded.status.success(), "{recorded:?}");
+}
+
+#[test]
+fn whole_presses_with_the_arms_approach_are_evaluated() {
+    let bench = Bench::new();
+    let arm = "[sensor.arm]\nstiffness_n_per_mm = 10.0\ndelay_ms = 40.0\n";
+    let config = bench.configure("record.toml", "events.sock", arm);
+    let control = bench.path("control.sock");
+    let capture = bench.path("a.mcap");
+    let _sensor = bench.sensor(&["--motion", text(&control)]);
+    record(
+        &config,
+        &capture,
+        &["level=1", "object=7", "shore=95"],
+        &["--sockets"],
+    );
+    let judged = judged(&capture);
+    let out = bench.path("courses.npz");
+    let sequences = ["--sequences", "--split", "test", text(&capture)];
+    let output = collect(&out, &sequences);
+    assert!(output.status.success(), "{output:?}");
+    let courses = Courses::read(&out).unwrap();
+    assert_eq!(courses.presses.len(), judged.len());
+    for (number, (press, (area, force_n))) in courses.presses.iter().zip(&judged).enumerate() {
+        assert_eq!((press.level, press.object, press.shore), (1, 7, 95.0));
+        assert_eq!((press.split, press.arm_n_per_mm), (Split::Test, 10.0));
+        let best = courses.frame(press.best as usize);
+        assert!(
+            (best.force_n() - force_n).abs() < 0.5,
+            "{force_n} N, to a millinewton a taxel"
+        );
+        assert_eq!(u64::from(best.contact_area_taxels(0.07)), *area);
+        let rows = courses.rows(number);
+        assert!(rows.len() >= 3 && courses.time_s[rows.start] == 0.0);
+        assert!(courses.known[rows.clone()].iter().all(|&known| known == 1));
+        // The simulated arm comes at 5 mm/s, and on hard plastic it goes a millimetre or two.
+        let way = &courses.approach_mm[rows.clone()];
+        let most = way.iter().copied().fold(0.0, f32::max);
+        assert!(way[0] == 0.0 && (0.5..8.0).contains(&most), "{way:?}");
+        let (time_s, mm) = (courses.time_s[rows.start + 2], way[2]);
+        assert!((mm / time_s - 5.0).abs() < 1.5, "{mm} mm in {time_s} s");
+    }
+    // A press more of another object, of which nobody told the arm.
+    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/foam.5hz.bin");
+    let more = [
+        "--sequences",
+        "--append",
+        "--split",
+        "test",
+        "--level",
+        "2",
+        text(&fixture),
+    ];
+    let output = collect(&out, &more);
+    assert!(output.status.success(), "{output:?}");
+    let both = Courses::read(&out).unwrap();
+    let added = &both.presses[courses.presses.len()..];
+    assert!(
+        !added.is_empty()
+            && added
+                .iter()
+                .all(|press| press.object == 8 && press.shore.is_nan())
+    );
+    assert_eq!(both.known[courses.known.len()..].iter().max(), Some(&0));
+    assert_eq!(
+        meta(&out).unwrap()["materials"],
+        serde_json::json!(["unknown"])
+    );
+
+    let model = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/course.onnx");
+    let evaluated = Command::new(env!("CARGO_BIN_EXE_hrn-train"))
+        .args([
+            "evaluate",
+            "--json",
+            "--model",
+            text(&model),
+            "--data",
+            text(&out),
+        ])
+        .output()
+        .unwrap();
+    assert!(evaluated.status.success(), "{evaluated:?}");
+    let figures: Value = serde_json::from_slice(&evaluated.stdout).unwrap();
+    assert_eq!(figures["n"], both.presses.len());
+
+    // Single frames and presses over time are no one file.
+    let bytes = std::fs::read(&out).unwrap();
+    let output = collect(&out, &["--append", "--level", "1", text(&capture)]);
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    assert!(std::fs::read(&out).unwrap() == bytes);
 }
 
 /// Refused with 1 and one line that has this in it, and nothing is written.
@@ -204,7 +296,7 @@ fn a_model_is_of_the_pitch_of_its_recordings_and_pitches_do_not_mix() {
     let config = bench.configure("narrow.toml", "events.sock", NARROW);
     let capture = bench.path("narrow.mcap");
     let sensor = bench.sensor(&[]);
-    record(&config, &capture, &[]);
+    record(&config, &capture, &[], &[]);
     drop(sensor);
 
     let out = bench.path("narrow.npz");

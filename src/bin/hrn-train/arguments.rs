@@ -178,6 +178,10 @@ pub(super) struct Collect {
     /// For training or for test
     #[arg(long, default_value = "train")]
     pub(super) split: SplitName,
+    /// Collect whole presses over time, with the arm's approach where the recording has it, and not
+    /// single frames
+    #[arg(long)]
+    pub(super) sequences: bool,
     /// Add to the data set, if it is there
     #[arg(long)]
     pub(super) append: bool,

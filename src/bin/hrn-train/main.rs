@@ -302,6 +302,9 @@ fn collect(arguments: &Collect) -> anyhow::Result<String> {
         .iter()
         .map(|path| Capture::read(path, sensor, &setup.hrn))
         .collect::<Result<Vec<_>, _>>()?;
+    if arguments.sequences {
+        return collect_courses(arguments, &captures);
+    }
     let before = if arguments.append {
         collect::existing(&arguments.out)?
     } else {
@@ -312,13 +315,8 @@ fn collect(arguments: &Collect) -> anyhow::Result<String> {
         .as_ref()
         .map_or(0, |(dataset, _)| dataset.samples.len())
         + presses;
-    let labelling = Labelling {
-        level: arguments.level,
-        object: arguments.object,
-        split: arguments.split.into(),
-    };
     let is_added_to = before.is_some();
-    let bytes = collect::to_bytes(&captures, labelling, before)?;
+    let bytes = collect::to_bytes(&captures, labelling(arguments), before)?;
     if is_added_to {
         write_whole(&arguments.out, &bytes)?;
     } else {
@@ -328,6 +326,48 @@ fn collect(arguments: &Collect) -> anyhow::Result<String> {
     Ok(format!(
         "{out}: {presses} presses collected, {all} in all; an object's further presses belong into \
          this file, not another\n"
+    ))
+}
+
+fn labelling(arguments: &Collect) -> Labelling {
+    Labelling {
+        level: arguments.level,
+        object: arguments.object,
+        split: arguments.split.into(),
+    }
+}
+
+fn collect_courses(arguments: &Collect, captures: &[Capture]) -> anyhow::Result<String> {
+    let before = if arguments.append {
+        collect::existing_courses(&arguments.out)?
+    } else {
+        None
+    };
+    let is_added_to = before.is_some();
+    let before_count = before
+        .as_ref()
+        .map_or(0, |(courses, ..)| courses.presses.len());
+    let (mut whole, mut known) = (0, 0);
+    for capture in captures {
+        let of_capture = capture.courses();
+        (whole, known) = (whole + of_capture.0, known + of_capture.1);
+    }
+    let left_out = captures.iter().map(Capture::presses).sum::<usize>() - whole;
+    if whole == 0 {
+        anyhow::bail!("found no press from its begin on, expected at least one: record longer");
+    }
+    let bytes = collect::courses_to_bytes(captures, labelling(arguments), before)?;
+    if is_added_to {
+        write_whole(&arguments.out, &bytes)?;
+    } else {
+        write(&arguments.out, &bytes)?;
+    }
+    Ok(format!(
+        "{}: {whole} presses collected, {known} of them with the arm's approach, {left_out} left out \
+         because the recording lacks their begin, {} in all; an object's further presses belong into this \
+         file, not another\n",
+        arguments.out.display(),
+        before_count + whole
     ))
 }
 

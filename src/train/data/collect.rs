@@ -1,9 +1,11 @@
 //! Recordings of known objects as samples of a data set.
 //!
-//! In: captures, `.mcap` or `.bin`. Out: the chosen frame of every press that was judged. The
-//! daemon's own pipeline decodes, tares and selects, so what is learnt from is what will be judged.
+//! In: captures, `.mcap` or `.bin`. Out: the chosen frame of every press that was judged, or all its
+//! frames with the arm's approach. The daemon's own pipeline decodes, tares and selects, so what is
+//! learnt from is what will be judged.
 
 mod capture;
+mod selection;
 
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
@@ -14,7 +16,10 @@ use serde_json::{Value, json};
 pub use self::capture::Capture;
 use crate::recording::{self, PlaybackError};
 use crate::simulator::Split;
+use crate::train::data::courses::{Courses, Press};
 use crate::train::data::dataset::{self, Dataset, DatasetError, Sample};
+
+use self::selection::Judged;
 
 /// What a data set says of who made it.
 const COLLECTED: &str = concat!("hrn-train collect ", env!("CARGO_PKG_VERSION"));
@@ -161,6 +166,12 @@ pub fn to_bytes(
     labelling: Labelling,
     before: Option<(Dataset, Value)>,
 ) -> anyhow::Result<Vec<u8>> {
+    let before = before.map(|(dataset, meta)| Before {
+        pitch_mm: dataset.pitch_mm(),
+        path: dataset.path(),
+        samples: dataset.samples,
+        meta,
+    });
     let mut collection = Collection::begun(captures.first(), before);
     for capture in captures {
         collection.add(capture, labelling)?;
@@ -168,9 +179,72 @@ pub fn to_bytes(
     collection.finish()
 }
 
+/// As [`to_bytes`], with all frames of each press. A press whose begin the recording has not is left out.
+///
+/// # Errors
+///
+/// As [`to_bytes`]. A material or a measured hardness may be missing here.
+pub fn courses_to_bytes(
+    captures: &[Capture],
+    labelling: Labelling,
+    before: Option<(Courses, Value, PathBuf)>,
+) -> anyhow::Result<Vec<u8>> {
+    let (before, courses) = match before {
+        Some((courses, meta, path)) => {
+            let before = Before {
+                pitch_mm: meta["pitch_mm"].as_f64().unwrap_or(dataset::PITCH_MM),
+                path,
+                samples: courses
+                    .presses
+                    .iter()
+                    .map(|press| sample_of(press, &courses))
+                    .collect(),
+                meta,
+            };
+            (Some(before), courses)
+        }
+        None => (None, Courses::default()),
+    };
+    let mut collection = Collection {
+        courses: Some(courses),
+        ..Collection::begun(captures.first(), before)
+    };
+    for capture in captures {
+        collection.add(capture, labelling)?;
+    }
+    collection.finish()
+}
+
+/// A press over time as a sample of a data set of single frames.
+fn sample_of(press: &Press, courses: &Courses) -> Sample {
+    Sample {
+        frame: courses.frame(press.best as usize),
+        level: press.level,
+        object: Some(press.object),
+        material: Some(press.material),
+        force_n: Some(press.force_n),
+        split: press.split,
+        shore: None,
+        source: 0,
+    }
+}
+
+/// A data set that is added to.
+struct Before {
+    samples: Vec<Sample>,
+    meta: Value,
+    pitch_mm: f64,
+    path: PathBuf,
+}
+
+/// The material of presses over time whose recording does not say it.
+const NO_MATERIAL: &str = "unknown";
+
 /// A data set in the making.
 struct Collection {
     samples: Vec<Sample>,
+    /// The same presses over time, if these are asked for.
+    courses: Option<Courses>,
     meta: Value,
     /// Where the arrays of the first samples come from.
     first: PathBuf,
@@ -182,12 +256,18 @@ struct Collection {
 
 impl Collection {
     /// Before its first capture, with the samples of a data set that is added to.
-    fn begun(first: Option<&Capture>, before: Option<(Dataset, Value)>) -> Self {
+    fn begun(first: Option<&Capture>, before: Option<Before>) -> Self {
         let (samples, mut meta, others, pitch_mm, first) = match before {
-            Some((dataset, meta)) => {
-                let others = meta["generator"].as_str().unwrap_or(UNKNOWN).to_owned();
-                let (pitch_mm, path) = (dataset.pitch_mm(), dataset.path());
-                (dataset.samples, meta, others, pitch_mm, path)
+            Some(before) => {
+                let others = before.meta["generator"].as_str().unwrap_or(UNKNOWN);
+                let others = others.to_owned();
+                (
+                    before.samples,
+                    before.meta,
+                    others,
+                    before.pitch_mm,
+                    before.path,
+                )
             }
             None => (
                 Vec::new(),
@@ -212,6 +292,7 @@ impl Collection {
             new_object: last.map_or(Some(0), |object| object.checked_add(1)),
             materials: serde_json::from_value(meta["materials"].take()).unwrap_or_default(),
             samples,
+            courses: None,
             meta,
             first,
             pitch_mm,
@@ -223,22 +304,31 @@ impl Collection {
         capture::check_pitch(&capture.path, capture.pitch_mm, self.pitch_mm, &self.first)?;
         let level = capture.level(labelling.level)?;
         let object = self.object(capture, labelling)?;
-        let material = capture.labels.get("material");
+        let material = capture.labels.get("material").map(String::as_str);
+        let none = self.courses.is_some().then_some(NO_MATERIAL);
         let material = material
+            .or(none)
             .map(|name| index_of(name, &mut self.materials))
             .transpose()?;
         let shore = capture.shore()?;
-        let own: Vec<Sample> = capture
-            .presses
+        let presses: Vec<&Judged> = match self.courses {
+            Some(_) => capture
+                .presses
+                .iter()
+                .filter(|press| press.is_whole())
+                .collect(),
+            None => capture.presses.iter().collect(),
+        };
+        let own: Vec<Sample> = presses
             .iter()
-            .map(|(frame, force_n)| Sample {
-                frame: *frame,
+            .map(|press| Sample {
+                frame: press.frame,
                 level,
                 object: Some(object),
                 material,
-                force_n: Some(*force_n),
+                force_n: Some(press.force_n),
                 split: labelling.split,
-                shore,
+                shore: shore.filter(|_| self.courses.is_none()),
                 source: 0,
             })
             .collect();
@@ -246,13 +336,19 @@ impl Collection {
             check_arrays((of_first, &self.first), (of_this, &capture.path))?;
             check_splits((&self.samples, &self.first), (of_this, &capture.path))?;
         }
+        if let Some(courses) = &mut self.courses {
+            for (press, sample) in presses.iter().zip(&own) {
+                push_course(courses, press, sample, shore);
+            }
+        }
+        let count = own.len();
         self.samples.extend(own);
         let said = json!({
             "name": capture.path.file_name().unwrap_or_default().to_string_lossy(),
             "sha256": capture.sha256,
             "level": level,
             "object": object,
-            "presses": capture.presses.len(),
+            "presses": count,
             "split": labelling.split.name(),
             "labels": capture.labels,
         });
@@ -285,8 +381,31 @@ impl Collection {
     fn finish(mut self) -> anyhow::Result<Vec<u8>> {
         self.meta["materials"] = json!(self.materials);
         let file = Cursor::new(Vec::new());
-        Ok(dataset::write(file, &self.samples, &self.meta)?.into_inner())
+        let written = match &self.courses {
+            Some(courses) => courses.write(file, &self.meta)?,
+            None => dataset::write(file, &self.samples, &self.meta)?,
+        };
+        Ok(written.into_inner())
     }
+}
+
+/// Adds a press over time; `sample` says what is known of it.
+fn push_course(courses: &mut Courses, judged: &Judged, sample: &Sample, shore: Option<f32>) {
+    let press = Press {
+        level: sample.level,
+        object: sample.object.unwrap_or_default(),
+        material: sample.material.unwrap_or_default(),
+        split: sample.split,
+        shore: shore.unwrap_or(f32::NAN),
+        force_n: judged.force_n,
+        arm_n_per_mm: judged.arm_n_per_mm,
+        best: judged.best as u32,
+    };
+    let moments = judged.moments.iter();
+    courses.push(
+        press,
+        moments.map(|moment| (moment.time_s, moment.approach_mm, &moment.frame)),
+    );
 }
 
 /// Refuses samples of which some have a value for an array, and some have none.
@@ -345,6 +464,22 @@ fn index_of(name: &str, materials: &mut Vec<String>) -> anyhow::Result<u8> {
     u8::try_from(index).with_context(|| {
         format!("label material: found {name:?} beside 256 others, expected no more than those")
     })
+}
+
+/// As [`existing`], of presses over time.
+///
+/// # Errors
+///
+/// If the file is there and has no presses over time.
+pub fn existing_courses(path: &Path) -> Result<Option<(Courses, Value, PathBuf)>, DatasetError> {
+    if !path.exists() {
+        return Ok(None);
+    }
+    let meta = match dataset::meta(path)? {
+        meta @ Value::Object(_) => meta,
+        _ => json!({}),
+    };
+    Ok(Some((Courses::read(path)?, meta, path.to_owned())))
 }
 
 /// What is in the file to be appended to; nothing, if it is not there yet.

@@ -89,6 +89,30 @@ impl Courses {
         all
     }
 
+    /// Adds a press: `moments` are time since its begin in s, approach in mm where known, and frame.
+    /// `press.best` counts from the first of them.
+    pub fn push<'a>(
+        &mut self,
+        press: Press,
+        moments: impl Iterator<Item = (f32, Option<f32>, &'a Frame)>,
+    ) {
+        let (first, number) = (self.press.len() as u32, self.presses.len() as u32);
+        for (time_s, approach_mm, frame) in moments {
+            // What is beyond 65 N on a taxel is beyond any film.
+            let millinewtons = |newtons: &f32| (newtons / NEWTONS).round() as u16;
+            self.frames_mn
+                .extend(frame.newtons.iter().map(millinewtons));
+            self.press.push(number);
+            self.time_s.push(time_s);
+            self.approach_mm.push(approach_mm.unwrap_or(0.0));
+            self.known.push(approach_mm.is_some().into());
+        }
+        self.presses.push(Press {
+            best: first + press.best,
+            ..press
+        });
+    }
+
     /// The rows of press number `press`.
     pub fn rows(&self, press: usize) -> Range<usize> {
         let first = |press: usize| self.press.partition_point(|&of| (of as usize) < press);

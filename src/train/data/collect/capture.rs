@@ -1,14 +1,13 @@
 //! One recording of a known object, and the presses in it.
 
-use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::CollectError;
-use crate::event::{Event, Phase, PressState};
-use crate::frame::{Frame, Stamp};
+use super::selection::{Judged, Selection};
+use crate::frame::Stamp;
 use crate::pipeline::{Clock, Pipeline};
 use crate::recording::{Entry, FileKind, Found, Labels, Playback, Reader};
 use crate::sensor::Sensor;
@@ -23,8 +22,7 @@ pub struct Capture {
     pub(super) labels: Labels,
     /// Of the sensor's taxels.
     pub(super) pitch_mm: f64,
-    /// Chosen frame and force of each press.
-    pub(super) presses: Vec<(Frame, f32)>,
+    pub(super) presses: Vec<Judged>,
 }
 
 impl Capture {
@@ -45,8 +43,9 @@ impl Capture {
             play(&bytes, hrn, &path, &mut selection)?
         } else {
             let mut pipeline = Pipeline::new(sensor.clone(), hrn.clone(), Clock::FrameRate);
-            selection.take(pipeline.push(&bytes, NOT_LOOKED_AT));
-            selection.take(pipeline.end_of_recording(None));
+            selection.describe(sensor.name(), sensor.description());
+            selection.take(pipeline.push(&bytes, NOT_LOOKED_AT), NOT_LOOKED_AT);
+            selection.take(pipeline.end_of_recording(None), NOT_LOOKED_AT);
             (Labels::new(), sensor.description().calibration.pitch_mm)
         };
         if selection.presses.is_empty() {
@@ -64,6 +63,13 @@ impl Capture {
     /// How many presses it has.
     pub fn presses(&self) -> usize {
         self.presses.len()
+    }
+
+    /// How many of them it has from their begin on, and of how many of those the approach is known.
+    pub fn courses(&self) -> (usize, usize) {
+        let whole = self.presses.iter().filter(|press| press.is_whole());
+        let known = whole.clone().filter(|press| press.is_known());
+        (whole.count(), known.count())
     }
 
     /// The label `key`, if there is one.
@@ -142,13 +148,17 @@ fn play(
             let expected = *pitch_mm.get_or_insert(found);
             check_pitch(path, found, expected, path)?;
         }
+        let at = found.at;
+        selection.note(&found);
         let events = playback.feed(found);
-        selection.take(events.map_err(|source| CollectError::Sensor {
+        let events = events.map_err(|source| CollectError::Sensor {
             path: path.to_owned(),
             source,
-        })?);
+        })?;
+        selection.take(events, at);
     }
-    selection.take(playback.end());
+    // What was under way gets no verdict.
+    selection.take(playback.end(), NOT_LOOKED_AT);
     // Without a sensor there is no press either.
     Ok((playback.labels(), pitch_mm.unwrap_or(dataset::PITCH_MM)))
 }
@@ -177,44 +187,4 @@ pub(super) fn check_pitch(
         expected,
         first: first.to_owned(),
     })
-}
-
-/// The frames of presses under way, by sensor, until one is chosen.
-#[derive(Debug, Default)]
-struct Selection {
-    held: BTreeMap<String, Held>,
-    presses: Vec<(Frame, f32)>,
-}
-
-#[derive(Debug, Default)]
-struct Held {
-    frames: BTreeMap<u64, Vec<f32>>,
-    is_pressed: bool,
-}
-
-impl Selection {
-    fn take(&mut self, events: Vec<Event>) {
-        for event in events {
-            let held = self.held.entry(event.sensor().to_owned()).or_default();
-            match event {
-                Event::Frame(frame) => {
-                    if !held.is_pressed {
-                        held.frames.clear();
-                    }
-                    held.frames.insert(frame.frame, frame.newtons);
-                }
-                // Its first frame came just before.
-                Event::Press(press) => held.is_pressed = press.state == PressState::Begin,
-                Event::Hardness(verdict) if verdict.phase == Phase::Final => {
-                    // One that began before the recording did may have its frame there.
-                    if let Some(newtons) = held.frames.remove(&verdict.frame)
-                        && let Ok(frame) = Frame::try_from(newtons)
-                    {
-                        self.presses.push((frame, verdict.force_n as f32));
-                    }
-                }
-                Event::Hardness(_) | Event::Status(_) => {}
-            }
-        }
-    }
 }

@@ -1,0 +1,194 @@
+//! The presses that were judged, with all their frames, from the daemon's own events.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use jiff::Timestamp;
+
+use crate::event::{Event, Hardness, Phase, PressState};
+use crate::frame::{Frame, Stamp};
+use crate::motion::Track;
+use crate::press::thinned;
+use crate::recording::{Entry, Found, Input};
+use crate::sensor::Description;
+use crate::simulator::MOST_FRAMES;
+
+/// A press that was judged.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Judged {
+    /// The chosen frame.
+    pub(super) frame: Frame,
+    /// Its total force.
+    pub(super) force_n: f32,
+    /// Its frames in contact, thinned; none, if the recording has not all of them.
+    pub(super) moments: Vec<Moment>,
+    /// Place of the chosen frame among them.
+    pub(super) best: usize,
+    /// Stiffness of the arm; 0: unknown, or the approach is.
+    pub(super) arm_n_per_mm: f32,
+}
+
+/// A frame of a press.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Moment {
+    /// Since the begin.
+    pub(super) time_s: f32,
+    /// Since the begin, where it is known.
+    pub(super) approach_mm: Option<f32>,
+    pub(super) frame: Frame,
+}
+
+impl Judged {
+    pub(super) fn is_whole(&self) -> bool {
+        !self.moments.is_empty()
+    }
+
+    pub(super) fn is_known(&self) -> bool {
+        self.moments
+            .iter()
+            .any(|moment| moment.approach_mm.is_some())
+    }
+}
+
+/// What has been read so far.
+#[derive(Debug, Default)]
+pub(super) struct Selection {
+    held: BTreeMap<String, Held>,
+    pub(super) presses: Vec<Judged>,
+}
+
+/// Of one sensor.
+#[derive(Debug, Default)]
+struct Held {
+    /// Those of a press under way, or the newest.
+    frames: BTreeMap<u64, Shown>,
+    is_pressed: bool,
+    /// First and last frame of the press.
+    began: Option<u64>,
+    last: u64,
+    track: Track,
+    described: Description,
+}
+
+#[derive(Debug)]
+struct Shown {
+    mono: Duration,
+    area: u32,
+    newtons: Vec<f32>,
+}
+
+impl Selection {
+    /// Takes what a recording says besides the sensor's bytes.
+    pub(super) fn note(&mut self, found: &Found) {
+        match &found.entry {
+            Entry::Input(Input::Motion(points)) => {
+                let held = self.held.entry(found.sensor.clone()).or_default();
+                // A step back makes the approach of its press unknown.
+                let _ = held.track.push(points);
+            }
+            Entry::Settings(sensor) => self.describe(&found.sensor, &sensor.description),
+            Entry::State(state) => self.describe(&found.sensor, &state.sensor.description),
+            Entry::Input(_) => {}
+        }
+    }
+
+    pub(super) fn describe(&mut self, sensor: &str, description: &Description) {
+        let held = self.held.entry(sensor.to_owned()).or_default();
+        if held.described != *description {
+            held.described = description.clone();
+        }
+    }
+
+    /// Takes the events of what came at `at`.
+    pub(super) fn take(&mut self, events: Vec<Event>, at: Stamp) {
+        for event in events {
+            let held = self.held.entry(event.sensor().to_owned()).or_default();
+            match event {
+                Event::Frame(frame) => {
+                    if !held.is_pressed {
+                        held.frames.clear();
+                    }
+                    let shown = Shown {
+                        mono: moment(at, frame.time),
+                        area: frame.contact_area_taxels,
+                        newtons: frame.newtons,
+                    };
+                    held.frames.insert(frame.frame, shown);
+                }
+                // Its first frame came just before.
+                Event::Press(press) => {
+                    held.is_pressed = press.state == PressState::Begin;
+                    match press.state {
+                        PressState::Begin => held.began = Some(press.frame),
+                        PressState::End | PressState::Aborted => held.last = press.frame,
+                    }
+                }
+                Event::Hardness(verdict) if verdict.phase == Phase::Final => {
+                    self.presses.extend(held.judged(&verdict));
+                }
+                Event::Hardness(_) | Event::Status(_) => {}
+            }
+        }
+    }
+}
+
+impl Held {
+    /// The press that has just ended.
+    fn judged(&mut self, verdict: &Hardness) -> Option<Judged> {
+        // One that began before the recording did may have its frame there.
+        let chosen = self.frames.get(&verdict.frame)?;
+        let mut judged = Judged {
+            frame: Frame::try_from(chosen.newtons.clone()).ok()?,
+            force_n: verdict.force_n as f32,
+            moments: Vec::new(),
+            best: 0,
+            arm_n_per_mm: 0.0,
+        };
+        let Some(first) = self.began.take() else {
+            return Some(judged);
+        };
+        let least = self.described.press.end_area_taxels;
+        let pressed = self.frames.range(first..=self.last.max(first));
+        let pressed: Vec<(u64, &Shown)> = pressed
+            .filter(|(_, shown)| shown.area >= least)
+            .map(|(&number, shown)| (number, shown))
+            .collect();
+        let Some(best) = pressed
+            .iter()
+            .position(|&(number, _)| number == verdict.frame)
+        else {
+            return Some(judged);
+        };
+        let moments: Vec<Duration> = pressed.iter().map(|(_, shown)| shown.mono).collect();
+        let arm = &self.described.arm;
+        let (begin, end) = (moments[0], moments[moments.len() - 1]);
+        let told = self.track.is_told(end, arm.delay_ms);
+        let way = told.then(|| self.track.approach(begin, &moments, arm.delay_ms));
+        let way = way.flatten().unwrap_or_else(|| vec![None; moments.len()]);
+        let mut before_s = -1.0_f32;
+        for place in thinned(pressed.len(), best, MOST_FRAMES) {
+            // Two frames may have come at once, and times in a file ascend.
+            let time_s = moments[place].saturating_sub(begin).as_secs_f32();
+            before_s = time_s.max(before_s.next_up());
+            if place == best {
+                judged.best = judged.moments.len();
+            }
+            judged.moments.push(Moment {
+                time_s: before_s,
+                approach_mm: way[place].map(|mm| mm as f32),
+                frame: Frame::try_from(pressed[place].1.newtons.clone()).ok()?,
+            });
+        }
+        if judged.is_known() {
+            judged.arm_n_per_mm = arm.stiffness_n_per_mm.unwrap_or(0.0) as f32;
+        }
+        Some(judged)
+    }
+}
+
+/// The moment of an event by the clock of the positions.
+fn moment(at: Stamp, time: Timestamp) -> Duration {
+    let ago = at.wall.as_nanosecond() - time.as_nanosecond();
+    let mono = at.mono.as_nanos() as i128 - ago;
+    Duration::from_nanos(u64::try_from(mono).unwrap_or(0))
+}
