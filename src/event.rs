@@ -337,6 +337,10 @@ pub struct FrameEvent {
     pub contact_area_taxels: u32,
     /// False until the first tare is taken: newtons then still contain the unloaded sensor's.
     pub tared: bool,
+    /// During a press: how far the arm went since its begin, by what was told up to now. For views; the
+    /// verdict knows more exactly.
+    #[serde(serialize_with = "rounded")]
+    pub approach_mm: Option<f64>,
 }
 
 impl FrameEvent {
@@ -358,6 +362,7 @@ impl FrameEvent {
             newtons,
             contact_area_taxels,
             tared,
+            approach_mm: None,
         }
     }
 }
@@ -381,6 +386,11 @@ pub(crate) fn name(state: &impl Serialize) -> String {
 /// RFC 3339 in UTC with microseconds, so that every time has one width.
 pub(crate) fn time_text(time: Timestamp) -> String {
     format!("{time:.6}")
+}
+
+/// To a micrometre.
+fn rounded<S: Serializer>(mm: &Option<f64>, serializer: S) -> Result<S::Ok, S::Error> {
+    mm.map(|mm| (mm * 1e3).round() / 1e3).serialize(serializer)
 }
 
 fn rfc3339<S: Serializer>(time: &Timestamp, serializer: S) -> Result<S::Ok, S::Error> {

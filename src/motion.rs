@@ -208,6 +208,13 @@ impl Track {
         Some(moments.map(|at| Some(self.at(at)? - zero)).collect())
     }
 
+    /// How far the arm had gone since `begin` by what was told up to `now`. It is behind `now` by as much
+    /// as positions are late, 250 ms at most. `None`, where [`Self::approach`] knows nothing.
+    pub fn latest(&self, begin: Duration, now: Duration, delay_ms: f64) -> Option<f64> {
+        let known = self.approach(begin, &[now], delay_ms)?;
+        known[0].or_else(|| Some(self.points.back()?.mm - self.at(of_arm(begin, delay_ms))?))
+    }
+
     /// Where the arm was, between two points or at one.
     fn at(&self, at_ns: i64) -> Option<f64> {
         let next = self.points.partition_point(|p| p.at_ns < at_ns);

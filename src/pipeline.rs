@@ -442,14 +442,22 @@ impl Pipeline {
         }
         self.tare.observe(raw);
         events.extend(self.status_if_changed(stamp));
-        events.push(Event::Frame(FrameEvent::new(
+        let approach_mm = self.tracker.began().and_then(|began| {
+            let delay_ms = self.sensor.description().arm.delay_ms;
+            self.track.latest(began, stamp.mono, delay_ms)
+        });
+        let shown = FrameEvent::new(
             self.sensor.name().to_owned(),
             stamp.wall,
             at.frame,
             frame.newtons.to_vec(),
             frame.contact_area_taxels(self.sensor.description().press.contact_threshold_n),
             tared,
-        )));
+        );
+        events.push(Event::Frame(FrameEvent {
+            approach_mm,
+            ..shown
+        }));
         for change in changes {
             self.publish(change, events);
         }

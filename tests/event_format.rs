@@ -155,7 +155,7 @@ fn frame_is_frozen_and_never_numbered() {
     frame.number(9);
     check(
         &frame.to_line(),
-        r#"{"type":"frame","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","frame":5,"rows":28,"cols":28,"newtons":[0.0,0.123,10.2],"contact_area_taxels":2,"tared":true}"#,
+        r#"{"type":"frame","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","frame":5,"rows":28,"cols":28,"newtons":[0.0,0.123,10.2],"contact_area_taxels":2,"tared":true,"approach_mm":null}"#,
     );
 }
 

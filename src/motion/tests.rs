@@ -228,3 +228,30 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn the_latest_approach_is_behind_by_no_more_than_a_gap() {
+    let mut track = Track::default();
+    track.push(&steady(0, 1000, 10)).unwrap();
+    let latest = |begin, now| track.latest(at(begin), at(now), 0.0);
+    for (now, expected) in [
+        (500, Some(3.0)),
+        (1000, Some(8.0)),
+        (1200, Some(8.0)),
+        (1300, None),
+    ] {
+        let found = latest(200, now);
+        let is_close = found
+            .zip(expected)
+            .is_none_or(|(a, b)| f64::abs(a - b) < 1e-9);
+        assert!(
+            is_close && found.is_some() == expected.is_some(),
+            "{now}: {found:?}"
+        );
+    }
+    assert_eq!(
+        latest(1100, 1200),
+        None,
+        "nobody knows where it was at the begin"
+    );
+}

@@ -275,12 +275,17 @@ impl Page<'_> {
             self.press(row, sensor, link);
         }
         // Verdicts get the rest, but at least 6 rows.
-        let curve = (rows.0.height.saturating_sub(6) / 3).clamp(2, 12);
+        let is_way = sensor.way(1).is_some() && rows.0.height >= 16;
+        let curves = if is_way { 4 } else { 3 };
+        let curve = (rows.0.height.saturating_sub(6) / curves).clamp(2, 12);
         if let Some(area) = rows.take(curve) {
             self.force(area, sensor, link);
         }
         if let Some(area) = rows.take(curve) {
             self.contact(area, sensor, link);
+        }
+        if is_way && let Some(area) = rows.take(curve) {
+            self.way(area, sensor);
         }
         self.verdicts(rows.0, view, sensor, link);
     }

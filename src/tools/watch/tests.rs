@@ -638,3 +638,45 @@ fn a_frame_of_a_machine_with_another_clock_is_new() {
     let frame = view.sensor().unwrap().frame.as_ref().unwrap();
     assert_eq!(frame.at, at(380).mono);
 }
+
+#[test]
+fn force_stands_against_approach_where_the_robot_tells_it() {
+    let mut view = told(&[
+        (0, hello("r", &["forearm"])),
+        (0, status("forearm", "live")),
+    ]);
+    let press = |state| json!({"type": "press", "sensor": "forearm", "press": 1, "state": state, "reason": null});
+    let at_mm = |newtons, mm: Value| {
+        let mut event = frame("forearm", newtons, 9);
+        event["approach_mm"] = mm;
+        event
+    };
+    let size = (100, 40);
+    hear(&mut view, 200, at_mm(0.5, json!(null)));
+    assert!(!shown(&view, 200, size, COLOURS).contains("approach"));
+    hear(&mut view, 400, at_mm(0.5, json!(0.0)));
+    hear(&mut view, 400, press("begin"));
+    hear(&mut view, 600, at_mm(1.0, json!(1.2)));
+    hear(&mut view, 800, at_mm(2.0, json!(2.4)));
+    hear(&mut view, 900, press("end"));
+    let expected = "force against approach  to 2.4 mm, to 18 N";
+    let text = shown(&view, 900, size, COLOURS);
+    assert!(text.contains(expected), "{text}");
+    // Another press begins anew, and the last one stays until then.
+    hear(&mut view, 3000, at_mm(0.5, json!(null)));
+    assert!(shown(&view, 3000, size, PLAIN).contains(expected));
+    hear(&mut view, 3200, at_mm(0.1, json!(0.0)));
+    hear(&mut view, 3200, press("begin"));
+    hear(&mut view, 3400, at_mm(0.2, json!(0.5)));
+    assert!(shown(&view, 3400, size, PLAIN).contains("to 0.5 mm, to 2 N"));
+    every_size_of(&view);
+}
+
+/// Draws a view in every size.
+fn every_size_of(view: &View) {
+    for width in [1, 20, 64, 65, 80, 200] {
+        for height in [1, 5, 11, 24, 60] {
+            shown(view, 3400, (width, height), COLOURS);
+        }
+    }
+}

@@ -18,6 +18,22 @@ impl Page<'_> {
         self.curve(area, "contact area", sensor, link, present, area_taxels);
     }
 
+    /// Force over the arm's way in the present or last press, if somebody tells where the arm is.
+    pub(super) fn way(&mut self, area: Rect, sensor: &Sensor) {
+        let mut rows = Rows(area);
+        let Some((forces, far)) = sensor.way(usize::from(area.width)) else {
+            return;
+        };
+        let Some(row) = rows.take(1) else { return };
+        let most = forces.iter().flatten().copied().fold(0.0, f32::max);
+        let rest = self.text(row, "force against approach ", self.look.heading());
+        let scale = format!(" to {far:.1} mm, to {most:.0} N");
+        self.text(rest, &scale, self.look.aside());
+        for (x, force) in (area.x..area.right()).zip(forces) {
+            self.bar(x, rows.0, force.map(|force| force / most));
+        }
+    }
+
     /// A heading with the present value, if there is one, and the last 30 s.
     fn curve(
         &mut self,

@@ -12,6 +12,9 @@ use crate::sensor::LATE_PERIODS;
 /// How far back the curves go.
 pub(in crate::tools::watch) const WINDOW: Duration = Duration::from_secs(30);
 
+/// Frames of a press whose approach is kept: 30 s at 1000 frames/s.
+const MOST_WAY: usize = 30_000;
+
 /// Verdicts kept of a sensor: more than a tall terminal shows.
 const VERDICTS: usize = 100;
 
@@ -25,6 +28,8 @@ pub(in crate::tools::watch) struct Sensor {
     /// Its last frame.
     pub(in crate::tools::watch) frame: Option<Frame>,
     trace: VecDeque<Load>,
+    /// Approach in mm and force of the frames of the present or last press, where the approach is known.
+    way: Vec<(f32, f32)>,
     pub(in crate::tools::watch) press: Option<Press>,
     /// The newest first.
     pub(in crate::tools::watch) verdicts: VecDeque<Verdict>,
@@ -116,6 +121,11 @@ impl Sensor {
                     state: text(event, "state"),
                     reason: event["reason"].as_str().map(plain),
                 };
+                if press.state == "begin" {
+                    // Its first frame has just come.
+                    let first = self.way.len().saturating_sub(1);
+                    self.way.drain(..first);
+                }
                 // What happened before may be told after what happens now.
                 let is_older = |known: &Press| (known.number, known.at) > (press.number, press.at);
                 if !self.press.as_ref().is_some_and(is_older) {
@@ -182,6 +192,11 @@ impl Sensor {
             self.trace.pop_front();
         }
         self.trace.push_back(load);
+        if let Some(mm) = event["approach_mm"].as_f64()
+            && self.way.len() < MOST_WAY
+        {
+            self.way.push((mm as f32, load.force_n));
+        }
         self.frame = Some(Frame {
             at,
             newtons,
@@ -227,6 +242,28 @@ impl Sensor {
         }
         let filled = curve.into_iter().zip(held);
         filled.map(|(own, held)| own.or(held)).collect()
+    }
+
+    /// The greatest force in each of so many equal parts of the arm's way in the present or last press, and
+    /// how far the arm went; `None` where nobody told it.
+    pub(in crate::tools::watch) fn way(&self, parts: usize) -> Option<(Vec<Option<f32>>, f32)> {
+        let far = self.way.iter().map(|&(mm, _)| mm).fold(0.0, f32::max);
+        if self.way.len() < 2 || far <= 0.0 || parts == 0 {
+            return None;
+        }
+        let mut forces = vec![None; parts];
+        for &(mm, force) in &self.way {
+            let part = (mm.max(0.0) / far * parts as f32) as usize;
+            let known: &mut Option<f32> = &mut forces[part.min(parts - 1)];
+            *known = Some(known.map_or(force, |most| most.max(force)));
+        }
+        // A slow sensor leaves parts without a frame.
+        let mut before = None;
+        for force in &mut forces {
+            *force = force.or(before);
+            before = *force;
+        }
+        Some((forces, far))
     }
 
     /// The greatest taxel of the last frame.
