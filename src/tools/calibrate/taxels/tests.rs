@@ -114,6 +114,8 @@ struct Played {
 
 fn sensor(gains: Option<Gains>, dead_taxels: Vec<[usize; 2]>) -> Sensor {
     let mut described = Description::default();
+    // The sensor reads 0 at rest, and the bytes may begin with a press.
+    described.calibration.tare_frames = 0;
     described.calibration.gains = gains;
     described.calibration.dead_taxels = dead_taxels;
     Sensor::new(described).unwrap()
