@@ -44,6 +44,10 @@ pub(super) fn scan(cells: &Cells, bytes: &[u8], context: Context) -> Scan {
             count += 1;
             continue;
         }
+        // What comes a byte at a time is cut to this before its end is there. So what comes at once is, too.
+        if let Some(excess @ 1..) = lines.at.checked_sub(max_frame_bytes(cells) + 1) {
+            return Scan::Excess(excess);
+        }
         if count == 0 {
             // It may be the rest of a line whose beginning was too long to keep. No frame ends here.
             return Scan::Excess(lines.at);
