@@ -93,7 +93,8 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
             .as_str(),
     );
     let evaluation: Value = serde_json::from_str(&json).unwrap();
-    assert_eq!(evaluation["shore"], Value::Null);
+    assert!(evaluation["shore"]["rmse"].as_f64().unwrap() < 60.0);
+    assert_eq!(evaluation["sets"], Value::Null);
     assert_eq!(evaluation["n"], told["n"]);
 }
 

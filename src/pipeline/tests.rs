@@ -600,12 +600,12 @@ fn failing_model() -> Hrn {
     let place = graph.node.iter().position(makes_logits).unwrap();
     graph.node[place].output = vec!["finite".to_owned()];
     let nodes = [
-        ("GlobalMaxPool", &["frame"][..], "most"),
-        ("Flatten", &["most"], "flat"),
-        ("Sub", &["limit", "flat"], "left"),
-        ("Sqrt", &["left"], "root"),
-        ("Div", &["root", "root"], "one"),
-        ("Mul", &["finite", "one"], "logits"),
+        ("GlobalMaxPool", &["frame"][..], "limit.most"),
+        ("Flatten", &["limit.most"], "limit.flat"),
+        ("Sub", &["limit", "limit.flat"], "limit.left"),
+        ("Sqrt", &["limit.left"], "limit.root"),
+        ("Div", &["limit.root", "limit.root"], "limit.one"),
+        ("Mul", &["finite", "limit.one"], "logits"),
     ];
     let nodes = nodes.map(|(op, input, output)| pb::NodeProto {
         op_type: op.to_owned(),

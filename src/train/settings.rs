@@ -298,16 +298,6 @@ mod tests {
     }
 
     #[test]
-    fn the_default_models_settings_are_usable() {
-        let text = include_str!("../../config/default-model.toml");
-        let settings = Settings::default().overridden(text).unwrap();
-        assert!(
-            settings.validation.share > 0.0,
-            "its temperature was fitted"
-        );
-    }
-
-    #[test]
     fn a_file_overrides_only_what_it_names() {
         let smoke = Settings::of(Profile::Smoke);
         let settings = smoke

@@ -100,11 +100,14 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
         },
     );
     check(
-        "model outputs logits f32 [1,4]: expected logits f32 [1,4], probabilities",
+        "model outputs logits f32 [1,4], shore f32 [1,3]: expected logits f32 [1,4], probabilities",
         |p| {
             graph(p).output.remove(1);
         },
     );
+    check("hardness f32 [1,3]: expected logits f32 [1,4]", |p| {
+        graph(p).output[2].name = "hardness".into();
+    });
     check("expected logits f32 [1,3], probabilities f32 [1,3]", |p| {
         let levels = r#"[{"level":1,"label":"a","shore":">70"},
             {"level":2,"label":"b","shore":"60"},{"level":3,"label":"c","shore":"50"}]"#;
