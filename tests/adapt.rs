@@ -1,0 +1,216 @@
+//! `train --method frame` and `adapt` on tiny data: what the model says, that a killed run goes on bit for
+//! bit, and what is refused.
+#![cfg(feature = "train")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy knows no helper of a test as a test"
+)]
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+use hardnessd::train::data::dataset::{self, Dataset};
+use hardnessd::verdict::Hrn;
+use rustix::process::{Pid, Signal, kill_process};
+
+const SETTINGS: &str = "
+    [training]
+    epochs = 8
+    batch = 16
+    checkpoint_every_epochs = 1
+";
+
+fn command(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_hrn-train"));
+    command.args(arguments);
+    command
+}
+
+fn succeed(arguments: &[&str]) -> String {
+    let output = command(arguments).output().unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{arguments:?}: {errors}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// A directory with `own.npz`, half of whose training presses are unlabelled, `start.onnx` of the method
+/// `frame`, and settings.
+fn bench() -> &'static Path {
+    static BENCH: OnceLock<tempfile::TempDir> = OnceLock::new();
+    let directory = BENCH.get_or_init(|| {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().join(name).to_str().unwrap().to_owned();
+        let (wide, own) = (path("wide.npz"), path("own.npz"));
+        let simulate = [
+            "simulate",
+            "--lowest-force",
+            "5",
+            "--presses",
+            "6",
+            "--seed",
+            "5",
+        ];
+        let broad = [
+            "--materials",
+            "broad",
+            "--objects",
+            "6",
+            "--test-objects",
+            "1",
+        ];
+        succeed(&[&simulate[..], &broad, &["--out", &wide]].concat());
+        let few = [
+            "--objects",
+            "2",
+            "--test-objects",
+            "1",
+            "--one-sensor",
+            "3",
+            "--cover",
+            "1",
+        ];
+        succeed(&[&simulate[..], &few, &["--out", &own]].concat());
+        let mut samples = Dataset::read(Path::new(&own)).unwrap().samples;
+        for (number, sample) in samples.iter_mut().enumerate() {
+            sample.level *= u8::from(number % 2 == 0);
+        }
+        let file = std::fs::File::create(&own).unwrap();
+        dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+        std::fs::write(path("settings.toml"), SETTINGS).unwrap();
+        let run = path("run");
+        succeed(&[
+            "train",
+            "--method",
+            "frame",
+            "--data",
+            &wide,
+            "--out",
+            &run,
+            "--config",
+            &path("settings.toml"),
+        ]);
+        succeed(&["export", &run, "--out", &path("start.onnx")]);
+        directory
+    });
+    directory.path()
+}
+
+fn place(name: &str) -> String {
+    bench().join(name).to_str().unwrap().to_owned()
+}
+
+fn adapt(out: &str, more: &[&str]) -> Command {
+    let fixed = [
+        "adapt",
+        "--data",
+        &place("own.npz"),
+        "--start",
+        &place("start.onnx"),
+        "--config",
+        &place("settings.toml"),
+        "--out",
+        &place(out),
+    ]
+    .map(str::to_owned);
+    let fixed: Vec<&str> = fixed.iter().map(String::as_str).collect();
+    command(&[&fixed[..], more].concat())
+}
+
+fn done(command: &mut Command) -> Output {
+    let output = command.output().unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{errors}");
+    output
+}
+
+#[test]
+fn a_model_of_frames_gives_shore_hardness_with_its_interval() {
+    let hrn = Hrn::load(&std::fs::read(place("start.onnx")).unwrap()).unwrap();
+    assert_eq!(
+        (hrn.card().method.as_str(), hrn.card().format.as_str()),
+        ("frame", "1")
+    );
+    let samples = Dataset::read(Path::new(&place("wide.npz")))
+        .unwrap()
+        .samples;
+    for sample in samples.iter().step_by(7) {
+        let verdict = hrn.judge(&sample.frame).unwrap();
+        let shore = verdict.shore.unwrap();
+        assert!(
+            shore.low <= shore.value && shore.value <= shore.high,
+            "{shore:?}"
+        );
+        assert!(shore.low >= 0.0 && shore.high <= 100.0, "{shore:?}");
+    }
+}
+
+#[test]
+fn adapt_killed_at_any_moment_goes_on_bit_for_bit() {
+    done(&mut adapt("whole", &[]));
+    let mut process = adapt("cut", &[]).stderr(Stdio::null()).spawn().unwrap();
+    let checkpoints = PathBuf::from(place("cut")).join("checkpoints");
+    let begun = Instant::now();
+    let count = || std::fs::read_dir(&checkpoints).map_or(0, Iterator::count);
+    while count() == 0 && process.try_wait().unwrap().is_none() {
+        assert!(begun.elapsed() < Duration::from_secs(100), "no checkpoint");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    kill_process(Pid::from_child(&process), Signal::KILL).unwrap();
+    process.wait().unwrap();
+    done(&mut adapt("cut", &["--resume"]));
+    let model = |run: &str| std::fs::read(Path::new(&place(run)).join("hrn.onnx")).unwrap();
+    assert!(model("whole") == model("cut"), "models differ");
+    assert!(model("whole") != std::fs::read(place("start.onnx")).unwrap());
+    assert_eq!(Hrn::load(&model("whole")).unwrap().card().method, "adapt");
+}
+
+#[test]
+fn adapt_goes_on_from_the_built_in_model_and_from_what_it_made() {
+    let first = place("first");
+    let (data, settings) = (place("own.npz"), place("settings.toml"));
+    let fixed = ["adapt", "--data", &data, "--config", &settings];
+    succeed(&[&fixed[..], &["--out", &first]].concat());
+    let model = Path::new(&first).join("hrn.onnx");
+    let again = ["--start", model.to_str().unwrap(), "--out", &place("again")].map(str::to_owned);
+    let again: Vec<&str> = again.iter().map(String::as_str).collect();
+    succeed(&[&fixed[..], &again].concat());
+}
+
+#[test]
+fn a_model_of_another_network_is_no_start() {
+    for (start, code, said) in [
+        (
+            "models/features.onnx",
+            78,
+            "this one is of features, with 4 levels",
+        ),
+        (
+            "models/course.onnx",
+            78,
+            "this one is of course, with 4 levels",
+        ),
+        ("Cargo.toml", 78, "not an ONNX model"),
+        ("missing.onnx", 66, "No such file"),
+    ] {
+        let start = Path::new(env!("CARGO_MANIFEST_DIR")).join(start);
+        let output = command(&[
+            "adapt",
+            "--data",
+            &place("own.npz"),
+            "--out",
+            &place("none"),
+        ])
+        .args(["--start", start.to_str().unwrap()])
+        .output()
+        .unwrap();
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(code), "{error}");
+        assert!(
+            error.contains(said) && error.lines().count() == 1,
+            "{error}"
+        );
+        assert!(!Path::new(&place("none")).exists(), "{error}");
+    }
+}
