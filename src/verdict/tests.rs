@@ -105,7 +105,7 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
             graph(p).output.remove(1);
         },
     );
-    check("hardness f32 [1,3]: expected logits f32 [1,4]", |p| {
+    check("model outputs hardness f32 [1,3], logits f32 [1,4]", |p| {
         graph(p).output[2].name = "hardness".into();
     });
     check("expected logits f32 [1,3], probabilities f32 [1,3]", |p| {
