@@ -164,7 +164,7 @@ fn presses_of_a_recording_say_the_gains_and_a_recording_holds_them() {
     // What it prints is a configuration, and a daemon with it records the gains themselves.
     let (_, lines) = text.split_once("\n[sensor.calibration]\n").unwrap();
     let calibrated = path("calibrated.toml");
-    let table = format!("[[sensor]]\nname = \"forearm\"\nport = \"port\"\nframe_rate_hz = 20.0\n");
+    let table = "[[sensor]]\nname = \"forearm\"\nport = \"port\"\nframe_rate_hz = 20.0\n";
     fs::write(&calibrated, format!("{table}[sensor.calibration]\n{lines}")).unwrap();
     let _sensor = bench.sensor(&[]);
     let checked = hardnessd(&["check", "--config", &calibrated]);

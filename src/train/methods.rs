@@ -191,7 +191,6 @@ impl Method {
                         shift_taxels: 3,
                         other_sensors: false,
                     },
-                    ..settings.training
                 };
                 settings.consistency.ratio = 1;
             }

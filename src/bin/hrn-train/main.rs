@@ -210,7 +210,6 @@ fn simulated_settings(arguments: &Simulate) -> Result<DatasetSettings, OtherMate
         one_sensor: arguments.one_sensor.is_some(),
         cover_young_mpa: arguments.cover,
         swapped_levels: arguments.swapped_levels.unwrap_or_default(),
-        ..DatasetSettings::default()
     })
 }
 

@@ -107,12 +107,15 @@ pub(super) fn metadata(
     Ok(entries.into_iter().map(entry).collect())
 }
 
-/// The f32 constants of a file that [`write`] wrote: shape and numbers of each by its name.
+/// Shape and numbers of constants, by their names.
+pub type Constants = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
+
+/// The f32 constants of a file that [`write()`] wrote: shape and numbers of each by its name.
 ///
 /// # Errors
 ///
 /// If the bytes are no ONNX model.
-pub fn constants(bytes: &[u8]) -> anyhow::Result<BTreeMap<String, (Vec<usize>, Vec<f32>)>> {
+pub fn constants(bytes: &[u8]) -> anyhow::Result<Constants> {
     let mut reader = bytes;
     let proto = tract_onnx::onnx().proto_model_for_read(&mut reader)?;
     let tensors = proto.graph.into_iter().flat_map(|graph| graph.initializer);

@@ -179,7 +179,8 @@ impl Start {
                 deviation: numbers("column deviations", FEATURES)?,
             },
             temperature: numbers("temperature", 1)?[0],
-            widths: numbers("shore middles", shore::OUTPUTS).map_or([0.0; 2], shore::widths),
+            widths: numbers("shore middles", shore::OUTPUTS)
+                .map_or([0.0; 2], |middles| shore::widths(&middles)),
         })
     }
 }

@@ -1,7 +1,7 @@
 //! The second head: Shore hardness with the ends of a 90 % interval, beside the levels.
 //!
 //! A network's outputs are `[batch, L + 3]`: logits, then the median and the two ends, on a scale on
-//! which a unit is [`UNIT`] Shore OO.
+//! which a unit is 25 Shore OO.
 
 use burn::tensor::{Tensor, activation};
 
@@ -64,8 +64,8 @@ pub(super) fn nodes(
 }
 
 /// The widths in the constant `shore middles` of an exported graph.
-pub(super) fn widths(middles: Vec<f32>) -> [f32; 2] {
-    let [_, low, high] = middles[..] else {
+pub(super) fn widths(middles: &[f32]) -> [f32; 2] {
+    let &[_, low, high] = middles else {
         return [0.0; 2];
     };
     [MIDDLE - low, high - MIDDLE]
