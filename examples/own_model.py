@@ -97,7 +97,8 @@ with torch.no_grad():
     mine = (net(frames)[1].argmax(1) == levels).double().mean().item()
 print(f"PyTorch {torch.__version__}: {mine:.1%} of {len(test)} presses of the test materials recognised")
 
-# %% 5. Export it: one frame in, logits and probabilities out. This exporter needs no further package
+# %% 5. Export it: one frame in, logits and probabilities out. This exporter needs no further package. PyTorch calls
+# it the legacy one. The new one needs `pip install onnxscript`, dynamo=True and external_data=False
 torch.onnx.export(
     net,
     (torch.zeros(1, 1, 28, 28),),
