@@ -193,6 +193,7 @@ class Frame(TypedDict):
     newtons: List[float]
     contact_area_taxels: int
     tared: bool
+    approach_mm: Optional[float]
 
 
 class Gap(TypedDict):
