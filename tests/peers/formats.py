@@ -42,7 +42,8 @@ def console(block, directory, path):
 
 
 def main(binaries):
-    path = f"{os.path.abspath(binaries)}:{os.environ['PATH']}"
+    # `python3` of the page's commands is this one, which has numpy.
+    path = f"{os.path.abspath(binaries)}:{os.path.dirname(sys.executable)}:{os.environ['PATH']}"
     blocks = re.findall(r"```(\w+)\n(.*?)```", PAGE.read_text(), re.S)
     assert [kind for kind, _ in blocks].count("python") == 5, blocks
     with tempfile.TemporaryDirectory() as directory:
@@ -80,7 +81,10 @@ def card():
     done = subprocess.run([sys.executable, "-c", example], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done
     print(done.stdout)
-    shares = [float(line.split()[1]) for line in done.stdout.splitlines()]
+    shore, *levels = done.stdout.splitlines()
+    low, value, high = (float(re.fullmatch(r"Shore (\d+) \((\d+) to (\d+)\)", shore)[n]) for n in (2, 1, 3))
+    assert 0 <= low <= value <= high <= 100, shore
+    shares = [float(line.split()[1]) for line in levels]
     assert len(shares) == 4 and abs(sum(shares) - 1) < 0.01, shares
 
 
