@@ -149,6 +149,7 @@ def events_arrive(page, bench, sensors):
     assert (page.tab("forearm"), page.tab("wrist")) == ("live", "live")
     wait_for("a verdict", lambda: page.text("label") not in ("", "none yet"))
     assert page.colour("label") != page.colour("facts")
+    assert re.match(r"Shore \d+ \(\d+ to \d+\), \d+ taxels", page.text("facts")), page.text("facts")
     wait_for("several verdicts", lambda: len(page.driver.find_elements(By.CSS_SELECTOR, "#rows tr")) > 1)
     before = int(page.text("frames").replace("\u202f", ""))
     wait_for("more frames", lambda: int(page.text("frames").replace("\u202f", "")) > before)
