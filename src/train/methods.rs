@@ -79,6 +79,17 @@ fn strong_steps(profile: Profile) -> u64 {
     }
 }
 
+/// Adam from `learning_rate` down to 0 by a cosine, with weight decay: for the networks that are not the paper's.
+fn adam(others: OptimiserSettings, learning_rate: f64) -> OptimiserSettings {
+    OptimiserSettings {
+        rule: Rule::Adam,
+        learning_rate,
+        schedule: Schedule::Cosine,
+        weight_decay: 1e-2,
+        ..others
+    }
+}
+
 impl Method {
     /// Those that judge a frame, in the order of the tables.
     pub fn of_frames() -> impl Iterator<Item = Self> {
@@ -157,13 +168,7 @@ impl Method {
                         Profile::Smoke => 0.0,
                         Profile::Paper | Profile::Quick => 0.998,
                     },
-                    optimiser: OptimiserSettings {
-                        rule: Rule::Adam,
-                        learning_rate: 2e-3,
-                        schedule: Schedule::Cosine,
-                        weight_decay: 1e-2,
-                        ..settings.training.optimiser
-                    },
+                    optimiser: adam(settings.training.optimiser, 2e-3),
                     augmentation: AugmentationSettings {
                         symmetries: true,
                         shift_taxels: 3,
@@ -179,13 +184,7 @@ impl Method {
                     epochs: 60,
                     averaging: 0.99,
                     checkpoint_every_epochs: 10,
-                    optimiser: OptimiserSettings {
-                        rule: Rule::Adam,
-                        learning_rate: 5e-4,
-                        schedule: Schedule::Cosine,
-                        weight_decay: 1e-2,
-                        ..settings.training.optimiser
-                    },
+                    optimiser: adam(settings.training.optimiser, 5e-4),
                     augmentation: AugmentationSettings {
                         symmetries: true,
                         shift_taxels: 3,
@@ -207,13 +206,7 @@ impl Method {
                         Profile::Paper | Profile::Quick => 0.998,
                     },
                     checkpoint_every_epochs: 10,
-                    optimiser: OptimiserSettings {
-                        rule: Rule::Adam,
-                        learning_rate: 2e-3,
-                        schedule: Schedule::Cosine,
-                        weight_decay: 1e-2,
-                        ..settings.training.optimiser
-                    },
+                    optimiser: adam(settings.training.optimiser, 2e-3),
                     ..settings.training
                 };
                 settings.validation.share = 0.15;
