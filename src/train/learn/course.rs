@@ -4,7 +4,7 @@
 //! levels and intervals of Shore hold what they promise on objects held out. Metrics and checkpoints
 //! are written on the way; a killed run goes on bit for bit.
 
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::Device;
 
 use crate::frame::Frame;
 use crate::random::Stream;
@@ -29,10 +29,9 @@ pub use varied::Told;
 
 /// Name of the stage.
 const STAGE: &str = "course";
-/// How much the intervals' loss counts beside the levels'.
-const SHORE_WEIGHT: f32 = 1.5;
 /// Presses a pass without gradients.
 const JUDGED_AT_ONCE: usize = 250;
+
 /// A press, ready to be learnt from.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Press {
@@ -155,13 +154,7 @@ impl Trained {
                 .map(|press| press.inputs(&self.standard))
                 .collect();
             let outputs = course::outputs(&self.weights, &course::Batch::new(&inputs, device));
-            for row in numbers(&outputs).chunks(levels + shore::OUTPUTS) {
-                let (logits, shore) = row.split_at(levels);
-                judged.push((
-                    logits.to_vec(),
-                    shore::of_outputs(shore, self.calibration.widths),
-                ));
-            }
+            judged.extend(shore::of_outputs(&outputs, levels, self.calibration.widths));
         }
         judged
     }
@@ -190,7 +183,7 @@ pub fn fit(task: &Task, run: &Run) -> anyhow::Result<Trained> {
         seed: task.seed,
     };
     let weights = epochs::run(&stage, initial, run, task.device, |learner, batch| {
-        task.step(learner, &standard, batch)
+        Ok(task.step(learner, &standard, batch))
     })?;
     Ok(task.calibrated(weights, standard))
 }
@@ -239,26 +232,16 @@ impl Task<'_> {
                     .inputs(standard)
             })
             .collect();
-        let batch = places.len();
-        let column = |value: fn(&Press) -> f32| {
-            let values: Vec<f32> = places
-                .iter()
-                .map(|&place| value(&self.presses[place]))
-                .collect();
-            Tensor::<2>::from_data(TensorData::new(values, [batch, 1]), self.device)
-        };
-        let on_scale = |press: &Press| press.shore.map_or(0.0, shore::on_scale);
-        let known = column(|press| f32::from(u8::from(press.shore.is_some())));
         let levels_of = places.iter().map(|&place| self.presses[place].level);
         let targets = hrn::targets(levels_of, self.levels, self.device);
+        let measured: Vec<Option<f32>> = places
+            .iter()
+            .map(|&place| self.presses[place].shore)
+            .collect();
 
         let tracked = learner.weights.tracked();
         let outputs = course::outputs(&tracked, &course::Batch::new(&inputs, self.device));
-        let logits = outputs.clone().slice([0..batch, 0..self.levels]);
-        let of_shore = outputs.slice([0..batch, self.levels..self.levels + shore::OUTPUTS]);
-        let judged = numbers(&logits);
-        let loss = hrn::cross_entropy(logits, targets)
-            .add(shore::interval_loss(of_shore, column(on_scale), known).mul_scalar(SHORE_WEIGHT));
+        let (loss, judged) = shore::loss(outputs, targets, &measured);
         let mut gradients = loss.backward();
         learner.step(&tracked, &mut gradients, rate);
         let right = places

@@ -46,13 +46,13 @@ pub struct Batch<'a> {
 /// # Errors
 ///
 /// If the run's directory cannot be read or written, its checkpoint is of another origin, or the loss or
-/// a weight is no number any more.
+/// a weight is no number any more; those of `step`.
 pub fn run(
     stage: &Stage,
     initial: Weights,
     run: &Run,
     device: &Device,
-    mut step: impl FnMut(&mut Learner, Batch) -> (f64, usize),
+    mut step: impl FnMut(&mut Learner, Batch) -> anyhow::Result<(f64, usize)>,
 ) -> anyhow::Result<Weights> {
     let Training {
         batch,
@@ -92,7 +92,7 @@ pub fn run(
                 step: progress.step,
                 rate,
             };
-            let (loss, of_batch) = step(&mut learner, batch);
+            let (loss, of_batch) = step(&mut learner, batch)?;
             loss_sum += loss * samples.len() as f64;
             right += of_batch;
             progress.step += 1;

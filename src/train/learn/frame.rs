@@ -25,8 +25,6 @@ use crate::train::run::checkpoint::Origin;
 use crate::train::settings::{ConsistencySettings, Training};
 use crate::verdict::argmax;
 
-/// How much the intervals' loss counts beside the levels'.
-const SHORE_WEIGHT: f32 = 1.5;
 /// Training that goes on from a start ends this far from it, on the line to what was learnt: a few objects
 /// tell what the sensor is like, and little of other materials, which the start knows (Wortsman et al. 2022,
 /// "Robust fine-tuning of zero-shot models").
@@ -85,11 +83,7 @@ impl Trained {
         for part in frames.chunks(JUDGED_AT_ONCE) {
             let batch = frame::Batch::new(part, plan, &self.standard, device)?;
             let outputs = frame::outputs(&self.weights, &batch);
-            for row in numbers(&outputs).chunks(levels + shore::OUTPUTS) {
-                let (logits, of_shore) = row.split_at(levels);
-                let shore = shore::of_outputs(of_shore, self.calibration.widths);
-                judged.push((logits.to_vec(), shore));
-            }
+            judged.extend(shore::of_outputs(&outputs, levels, self.calibration.widths));
         }
         Ok(judged)
     }
@@ -103,7 +97,7 @@ impl Trained {
 /// features cannot be computed, or the loss or a weight is no number any more.
 pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Trained> {
     let plan = Features::new()?;
-    let is_continued = start.is_some();
+    let kept = start.as_ref().map(|start| start.weights.clone());
     let start = match start {
         Some(start) => start,
         None => {
@@ -126,7 +120,6 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
         standard,
         ..
     } = start;
-    let kept = is_continued.then(|| initial.clone());
     let (unlabelled, consistency) = task.unlabelled;
     let stage = epochs::Stage {
         name: task.stage,
@@ -142,20 +135,9 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
         seed: task.seed,
     };
     let weights_of_levels = task.weights_of_levels();
-    let mut failed = None;
     let weights = epochs::run(&stage, initial, run, task.device, |learner, batch| {
-        // A failure of the features is told at the end: the loop knows none.
-        match task.step(learner, &plan, (&standard, &weights_of_levels), batch) {
-            Ok(learnt) => learnt,
-            Err(error) => {
-                failed.get_or_insert(error);
-                (0.0, 0)
-            }
-        }
+        task.step(learner, &plan, (&standard, &weights_of_levels), batch)
     })?;
-    if let Some(error) = failed {
-        return Err(error);
-    }
     let weights = match &kept {
         Some(start) => weights.between(start, LEARNT_SHARE),
         None => weights,
@@ -220,25 +202,15 @@ impl Task<'_> {
             None => None,
         };
 
-        let count = batch.samples.len();
-        let column = |value: &dyn Fn(Option<f32>) -> f32| {
-            let shore = |&sample: &usize| value(self.dataset.samples[sample].shore);
-            let values: Vec<f32> = batch.samples.iter().map(shore).collect();
-            Tensor::<2>::from_data(TensorData::new(values, [count, 1]), self.device)
-        };
-        let known = column(&|shore| f32::from(u8::from(shore.is_some())));
-        let measured = column(&|shore| shore.map_or(0.0, shore::on_scale));
         let level_of = |&sample: &usize| self.dataset.samples[sample].level;
         let targets = hrn::targets(batch.samples.iter().map(level_of), self.levels, self.device)
             .mul(weights.clone());
+        let shore_of = |&sample: &usize| self.dataset.samples[sample].shore;
+        let measured: Vec<Option<f32>> = batch.samples.iter().map(shore_of).collect();
 
         let tracked = learner.weights.tracked();
         let outputs = frame::outputs(&tracked, &images);
-        let logits = outputs.clone().slice([0..count, 0..self.levels]);
-        let of_shore = outputs.slice([0..count, self.levels..self.levels + shore::OUTPUTS]);
-        let judged = numbers(&logits);
-        let mut loss = hrn::cross_entropy(logits, targets)
-            .add(shore::interval_loss(of_shore, measured, known).mul_scalar(SHORE_WEIGHT));
+        let (mut loss, judged) = shore::loss(outputs, targets, &measured);
         if let Some((targets, strong)) = pseudo {
             let outputs = frame::outputs(&tracked, &strong);
             let logits = outputs.slice([0..targets.dims()[0], 0..self.levels]);

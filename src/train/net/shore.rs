@@ -3,9 +3,11 @@
 //! A network's outputs are `[batch, L + 3]`: logits, then the median and the two ends, on a scale on
 //! which a unit is 25 Shore OO.
 
-use burn::tensor::{Tensor, activation};
+use burn::tensor::{Tensor, TensorData, activation};
 
 use crate::train::net::builder::Builder;
+use crate::train::net::hrn;
+use crate::train::net::network::numbers;
 
 /// Outputs beside the levels: Shore OO, and the low and high end of its interval.
 pub const OUTPUTS: usize = 3;
@@ -16,22 +18,56 @@ const MIDDLE: f32 = 55.0;
 /// Shore OO of a unit more.
 const UNIT: f32 = 25.0;
 
-/// Measured hardness on the outputs' scale.
-pub fn on_scale(shore: f32) -> f32 {
-    (shore - MIDDLE) / UNIT
+/// How much the intervals' loss counts beside the levels'.
+const WEIGHT: f32 = 1.5;
+
+/// Logits and Shore OO (value, low, high) of each press, from the outputs `[batch, levels + 3]`. `widths`
+/// are added below and above to the ends of the interval.
+pub fn of_outputs(
+    outputs: &Tensor<2>,
+    levels: usize,
+    [below, above]: [f32; 2],
+) -> Vec<(Vec<f32>, [f32; OUTPUTS])> {
+    let of_press = |row: &[f32]| {
+        let of = |place: usize| row[levels + place] * UNIT + MIDDLE;
+        let shore = [of(0), of(1) - below, of(2) + above].map(|shore| shore.clamp(0.0, 100.0));
+        (row[..levels].to_vec(), shore)
+    };
+    numbers(outputs)
+        .chunks(levels + OUTPUTS)
+        .map(of_press)
+        .collect()
 }
 
-/// Shore OO (value, low, high) of a press's three outputs; `widths` are added below and above to the
-/// ends of the interval.
-pub fn of_outputs(outputs: &[f32], [below, above]: [f32; 2]) -> [f32; OUTPUTS] {
-    let of = |place: usize| outputs[place] * UNIT + MIDDLE;
-    [of(0), of(1) - below, of(2) + above].map(|shore| shore.clamp(0.0, 100.0))
+/// The loss of both heads: Eq. (9) of the levels, and that of the intervals where the hardness was
+/// `measured`. Also gives the logits, row by row. `targets` is `[batch, L]`.
+pub fn loss(
+    outputs: Tensor<2>,
+    targets: Tensor<2>,
+    measured: &[Option<f32>],
+) -> (Tensor<1>, Vec<f32>) {
+    let [batch, levels] = targets.dims();
+    let device = targets.device();
+    let column = |value: fn(Option<f32>) -> f32| {
+        let values: Vec<f32> = measured.iter().map(|&shore| value(shore)).collect();
+        Tensor::<2>::from_data(TensorData::new(values, [batch, 1]), &device)
+    };
+    let known = column(|shore| f32::from(u8::from(shore.is_some())));
+    let on_scale = column(|shore| shore.map_or(0.0, |shore| (shore - MIDDLE) / UNIT));
+    let logits = outputs.clone().slice([0..batch, 0..levels]);
+    let of_shore = outputs.slice([0..batch, levels..levels + OUTPUTS]);
+    let judged = numbers(&logits);
+    let of_intervals = interval_loss(of_shore, on_scale, known).mul_scalar(WEIGHT);
+    (
+        hrn::cross_entropy(logits, targets).add(of_intervals),
+        judged,
+    )
 }
 
 /// Pinball losses of the median and of the ends of a 90 % interval, summed and averaged over presses.
 /// `outputs` are the three of each press; `shore` is `[batch, 1]` on their scale, `known` 1 where it was
 /// measured.
-pub fn interval_loss(outputs: Tensor<2>, shore: Tensor<2>, known: Tensor<2>) -> Tensor<1> {
+fn interval_loss(outputs: Tensor<2>, shore: Tensor<2>, known: Tensor<2>) -> Tensor<1> {
     let batch = outputs.dims()[0] as f32;
     let quantiles = Tensor::<1>::from_floats(QUANTILES, &outputs.device()).reshape([1, OUTPUTS]);
     let error = shore.sub(outputs);
@@ -74,8 +110,7 @@ pub(super) fn widths(middles: &[f32]) -> [f32; 2] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::train::net::network::numbers;
-    use burn::tensor::{Device, TensorData};
+    use burn::tensor::Device;
 
     #[test]
     fn the_loss_is_least_at_the_quantiles_and_counts_only_what_was_measured() {
