@@ -22,7 +22,8 @@ const UNIT: f32 = 25.0;
 const WEIGHT: f32 = 1.5;
 
 /// Logits and Shore OO (value, low, high) of each press, from the outputs `[batch, levels + 3]`. `widths`
-/// are added below and above to the ends of the interval.
+/// are added below and above to the ends of the interval, which then are moved to the value where they do
+/// not hold it, as the daemon does: a network that has learnt little may put them anywhere.
 pub fn of_outputs(
     outputs: &Tensor<2>,
     levels: usize,
@@ -30,7 +31,9 @@ pub fn of_outputs(
 ) -> Vec<(Vec<f32>, [f32; OUTPUTS])> {
     let of_press = |row: &[f32]| {
         let of = |place: usize| row[levels + place] * UNIT + MIDDLE;
-        let shore = [of(0), of(1) - below, of(2) + above].map(|shore| shore.clamp(0.0, 100.0));
+        let [value, low, high] =
+            [of(0), of(1) - below, of(2) + above].map(|shore| shore.clamp(0.0, 100.0));
+        let shore = [value, low.min(value), high.max(value)];
         (row[..levels].to_vec(), shore)
     };
     numbers(outputs)
@@ -111,6 +114,20 @@ pub(super) fn widths(middles: &[f32]) -> [f32; 2] {
 mod tests {
     use super::*;
     use burn::tensor::Device;
+
+    #[test]
+    fn an_interval_holds_its_value() {
+        let row = |outputs: [f32; 4]| {
+            let data = TensorData::new(outputs.to_vec(), [1, 4]);
+            let outputs = Tensor::<2>::from_data(data, &Device::flex());
+            of_outputs(&outputs, 1, [1.0, 2.0])[0].clone()
+        };
+        let inside = row([7.0, 0.0, -1.0, 1.0]);
+        assert_eq!(inside, (vec![7.0], [55.0, 29.0, 82.0]));
+        // Ends on the wrong sides, and beyond the scale.
+        assert_eq!(row([7.0, 0.0, 1.0, -1.0]).1, [55.0, 55.0, 55.0]);
+        assert_eq!(row([7.0, 9.0, -9.0, 9.0]).1, [100.0, 0.0, 100.0]);
+    }
 
     #[test]
     fn the_loss_is_least_at_the_quantiles_and_counts_only_what_was_measured() {
