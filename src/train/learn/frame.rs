@@ -29,6 +29,9 @@ use crate::verdict::argmax;
 /// tell what the sensor is like, and little of other materials, which the start knows (Wortsman et al. 2022,
 /// "Robust fine-tuning of zero-shot models").
 const LEARNT_SHARE: f32 = 0.5;
+/// How far levels with few samples are lifted: wholly. Even Shore hardness gives few samples of the narrow
+/// levels, and a network that weighs samples alike hardly ever names those.
+const BALANCE: f32 = 1.0;
 /// Frames a pass without gradients.
 const JUDGED_AT_ONCE: usize = 250;
 
@@ -134,9 +137,15 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
         settings: task.settings,
         seed: task.seed,
     };
-    let weights_of_levels = task.weights_of_levels();
+    let level_of = |&sample: &usize| task.dataset.samples[sample].level;
+    let level_weights = hrn::level_weights(
+        task.train.iter().map(level_of),
+        task.levels,
+        BALANCE,
+        task.device,
+    );
     let weights = epochs::run(&stage, initial, run, task.device, |learner, batch| {
-        task.step(learner, &plan, (&standard, &weights_of_levels), batch)
+        task.step(learner, &plan, (&standard, &level_weights), batch)
     })?;
     let weights = match &kept {
         Some(start) => weights.between(start, LEARNT_SHARE),
@@ -166,20 +175,6 @@ impl Task<'_> {
     fn varied(&self, samples: &[usize], stream: &mut Stream) -> Vec<Frame> {
         let vary = |frame| augment::vary(&frame, self.settings.augmentation, stream);
         self.frames(samples).into_iter().map(vary).collect()
-    }
-
-    /// What a sample of each level counts, `[1, L]`, so that all levels that are there weigh the same, and
-    /// samples 1 on average. Even Shore hardness gives few samples of the narrow levels, and a network that
-    /// weighs samples alike hardly ever names those.
-    fn weights_of_levels(&self) -> Tensor<2> {
-        let mut counts = vec![0.0_f32; self.levels];
-        for &sample in self.train {
-            counts[usize::from(self.dataset.samples[sample].level) - 1] += 1.0;
-        }
-        let present = counts.iter().filter(|&&count| count > 0.0).count();
-        let mean = self.train.len() as f32 / present as f32;
-        let weights: Vec<f32> = counts.iter().map(|count| mean / count.max(1.0)).collect();
-        Tensor::from_data(TensorData::new(weights, [1, self.levels]), self.device)
     }
 
     /// One step; gives the batch's mean loss, and how many of its samples were judged rightly before it.

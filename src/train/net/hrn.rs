@@ -88,6 +88,23 @@ pub fn cross_entropy(logits: Tensor<2>, targets: Tensor<2>) -> Tensor<1> {
         .div_scalar(batch)
 }
 
+/// What a sample of each level weighs, `[1, L]`: its number of samples to the power of `-share`, and 1 on
+/// average over the samples. With a share of 1 all levels that are there count the same, with 0 all samples.
+pub fn level_weights(
+    levels_of: impl Iterator<Item = u8>,
+    levels: usize,
+    share: f32,
+    device: &Device,
+) -> Tensor<2> {
+    let mut counts = vec![0.0_f32; levels];
+    levels_of.for_each(|level| counts[usize::from(level) - 1] += 1.0);
+    let raw: Vec<f32> = counts.iter().map(|n| n.max(1.0).powf(-share)).collect();
+    let sum: f32 = raw.iter().zip(&counts).map(|(weight, n)| weight * n).sum();
+    let scale = counts.iter().sum::<f32>() / sum;
+    let weights = raw.into_iter().map(|weight| weight * scale).collect();
+    Tensor::from_data(TensorData::new(weights, [1, levels]), device)
+}
+
 /// Levels 1..=L as rows with a 1 at the level: `[batch, L]`.
 pub fn targets(
     levels_of: impl ExactSizeIterator<Item = u8>,
