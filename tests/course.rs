@@ -96,6 +96,48 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
     assert!(evaluation["shore"]["rmse"].as_f64().unwrap() < 60.0);
     assert_eq!(evaluation["sets"], Value::Null);
     assert_eq!(evaluation["n"], told["n"]);
+
+    compare(at, &told);
+}
+
+/// The tables of a model of whole presses, one of a frame, and the controls, on the same presses.
+fn compare(at: &Path, told: &Value) {
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/hrn.onnx");
+    let command = format!(
+        "compare --course --data d.npz --test d.npz --model whole/hrn.onnx {} --out c",
+        models.display()
+    );
+    let table = succeed(at, &command);
+    let json = std::fs::read(at.join("c/course.json")).unwrap();
+    let rows: Vec<Value> = serde_json::from_slice(&json).unwrap();
+    let name = |row: &Value| row["name"].as_str().unwrap().to_owned();
+    let names: Vec<String> = rows.iter().map(name).collect();
+    assert_eq!(names.len(), 7, "{names:?}");
+    assert!(names.iter().all(|name| table.contains(name)), "{table}");
+    let set_of = |name: &str| {
+        let row = rows.iter().find(|row| row["name"] == name).unwrap();
+        row["sets"][0].clone()
+    };
+    let model = set_of("whole/hrn.onnx");
+    assert_eq!(model["levels"]["accuracy"], told["accuracy"]);
+    assert_eq!(model["less_first"], Value::Null);
+    let less = set_of("Hertz's fit");
+    let difference = less["levels"]["accuracy"].as_f64().unwrap()
+        - model["levels"]["accuracy"].as_f64().unwrap();
+    assert!((less["less_first"]["mean"].as_f64().unwrap() - difference).abs() < 1e-12);
+    // Most presses have ended after 6.4 s: what is said then is what is said at last.
+    let so_far = model["so_far"]["after"].as_array().unwrap();
+    let going_on = |after: &Value| after["going_on"].as_f64().unwrap();
+    assert!(
+        going_on(&so_far[0]) > 0.9 && going_on(&so_far[6]) < 0.5,
+        "{so_far:?}"
+    );
+    assert!(so_far.is_sorted_by(|a, b| going_on(a) >= going_on(b)));
+
+    let output = hrn_train(at, "compare --course --data d.npz --out c");
+    assert_eq!(output.status.code(), Some(2));
+    let output = hrn_train(at, "compare --data d.npz d.npz --out c");
+    assert_eq!(output.status.code(), Some(1));
 }
 
 #[test]

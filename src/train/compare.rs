@@ -7,9 +7,11 @@
 //! resumed and spread as it likes, and what is finished is not done again.
 
 mod children;
+pub mod courses;
 pub mod digits;
 mod plan;
 mod sets;
+mod so_far;
 pub mod results;
 mod swaps;
 pub mod tables;

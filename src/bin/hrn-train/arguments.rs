@@ -262,9 +262,9 @@ pub(super) struct Adapt {
 
 #[derive(Debug, clap::Args)]
 pub(super) struct Compare {
-    /// The data set to learn from
-    #[arg(long, value_name = "D.npz")]
-    pub(super) data: PathBuf,
+    /// The data set to learn from. With --course, several may be named
+    #[arg(long, value_name = "D.npz", num_args = 1.., required = true)]
+    pub(super) data: Vec<PathBuf>,
     /// Directory of the comparison
     #[arg(long, value_name = "DIR")]
     pub(super) out: PathBuf,
@@ -283,6 +283,17 @@ pub(super) struct Compare {
     /// Also swap the two materials of each level: 16 times features and hrn15-tuned, 4 times ours
     #[arg(long)]
     pub(super) swaps: bool,
+    /// Compare models of whole presses instead, with simpler controls that are fitted on --data. Nothing else is
+    /// trained. All data are of `simulate --sequences`
+    #[arg(long, requires = "test", requires = "model",
+        conflicts_with_all = ["methods", "seeds", "profile", "jobs", "swaps"])]
+    pub(super) course: bool,
+    /// Test presses; may be given several times
+    #[arg(long, value_name = "T.npz", num_args = 1.., requires = "course")]
+    pub(super) test: Vec<PathBuf>,
+    /// Model files, of either format. The others are compared with the first
+    #[arg(long, value_name = "M.onnx", num_args = 1.., requires = "course")]
+    pub(super) model: Vec<PathBuf>,
 }
 
 /// From the least of `hardnessd simulate --force` to the greatest nominal force.

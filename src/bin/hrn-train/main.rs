@@ -17,6 +17,7 @@ use hardnessd::simulator::{
     Borders, CourseSettings, DatasetSettings, Laws, Material, Materials, Sequence, SequenceSettings,
 };
 use hardnessd::tools::{self, exit};
+use hardnessd::train::compare::courses::{CoursePlan, compare_courses};
 use hardnessd::train::compare::report;
 use hardnessd::train::compare::results::Comparison;
 use hardnessd::train::compare::{self, Plan, tables};
@@ -558,6 +559,18 @@ fn end_with(parent: i32) -> anyhow::Result<()> {
 struct NotOfFrames;
 
 fn compare(arguments: Compare) -> anyhow::Result<String> {
+    if arguments.course {
+        let table = compare_courses(&CoursePlan {
+            data: arguments.data,
+            tests: arguments.test,
+            models: arguments.model,
+            out: arguments.out.clone(),
+        })?;
+        let page = arguments.out.join("course.md");
+        return Ok(format!("{table}\n{}\n", page.display()));
+    }
+    let [data] = <[PathBuf; 1]>::try_from(arguments.data)
+        .map_err(|all| anyhow::anyhow!("--data: found {} files, expected 1", all.len()))?;
     if arguments.methods.contains(&Method::Course) {
         return Err(NotOfFrames.into());
     }
@@ -568,7 +581,7 @@ fn compare(arguments: Compare) -> anyhow::Result<String> {
     };
     let jobs = arguments.jobs.map(std::num::NonZeroUsize::get);
     compare::compare(&Plan {
-        data: arguments.data,
+        data,
         out: arguments.out.clone(),
         methods,
         seeds: arguments.seeds,

@@ -13,11 +13,14 @@ use crate::train::compare::sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS, WORLDS};
 use crate::train::judge::metrics::{self, Evaluation};
 use crate::train::run::history::{History, Stage};
 use cells::{
-    before_temperature, beside, deviation, interval, interval_text, least, less_features,
-    less_reference, mean_over_seeds, most, of_entries, percent_of, with_spread,
+    before_temperature, beside, deviation, interval, least, less_features, less_reference,
+    mean_over_seeds, most, of_entries, percent_of, with_spread,
 };
 
-pub use cells::{REFERENCE, accuracy, evaluations, mean, mean_confusion, paper_row, swap_groups};
+pub use cells::{
+    REFERENCE, accuracy, difference_text, evaluations, interval_text, mean, mean_confusion,
+    paper_row, swap_groups,
+};
 
 /// A table.
 #[derive(Debug, Clone, PartialEq)]
@@ -65,6 +68,11 @@ impl Table {
         text
     }
 
+    /// A section of a page: its title, how to read it, and the table.
+    pub fn section(&self) -> String {
+        format!("## {}\n\n{}", self.title, self.markdown())
+    }
+
     fn markdown(&self) -> String {
         let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
         let rule: Vec<String> = (0..self.head.len())
@@ -79,7 +87,7 @@ impl Table {
 pub fn markdown(comparison: &Comparison) -> String {
     let mut text = format!("# Comparison\n\n{}\n", provenance(comparison));
     for table in all(comparison) {
-        let _ = write!(text, "\n## {}\n\n{}", table.title, table.markdown());
+        let _ = write!(text, "\n{}", table.section());
     }
     text
 }

@@ -1,4 +1,4 @@
-//! The trivial baseline: multinomial logistic regression on the hand-made features of a frame.
+//! The trivial baseline: multinomial logistic regression on hand-made features, of a frame or of a press.
 //!
 //! What it reaches is what area, force and spread alone tell, and every table carries it.
 
@@ -16,7 +16,7 @@ pub struct Baseline {
     mean: Vec<f64>,
     /// Standard deviation of each.
     deviation: Vec<f64>,
-    /// `[L][FEATURES + 1]`: a coefficient each, and the bias.
+    /// `[L][features + 1]`: a coefficient each, and the bias.
     coefficients: Vec<Vec<f64>>,
     /// Newton steps that the fit took.
     pub steps: u32,
@@ -28,7 +28,7 @@ impl Baseline {
     /// Fits by Newton's method: rows of features with their level, from 0.
     pub fn fit(rows: &[Vec<f32>], level_of: &[usize], levels: usize) -> Self {
         let (mean, deviation) = moments(rows);
-        let coefficients = vec![vec![0.0; FEATURES + 1]; levels];
+        let coefficients = vec![vec![0.0; mean.len() + 1]; levels];
         let mut baseline = Self {
             mean,
             deviation,
@@ -106,7 +106,7 @@ impl Baseline {
 
     /// Gradient and Hessian of the loss, solved for the step downhill.
     fn newton_step(&self, rows: &[Vec<f64>], level_of: &[usize]) -> Vec<f64> {
-        let (levels, width) = (self.coefficients.len(), FEATURES + 1);
+        let (levels, width) = (self.coefficients.len(), self.mean.len() + 1);
         let size = levels * width;
         let flat: Vec<f64> = self.coefficients.concat();
         let mut gradient: Vec<f64> = flat.iter().map(|c| RIDGE * c).collect();
@@ -145,7 +145,8 @@ impl Baseline {
         moved
     }
 
-    /// The graph from newtons to logits, and the logits' name. Standardisation is inside.
+    /// The graph from newtons to logits, and the logits' name, of a fit to a frame's features.
+    /// Standardisation is inside.
     pub fn graph(&self) -> (Graph, String) {
         let (mut graph, features) = feature_graph();
         let levels = self.coefficients.len();

@@ -256,14 +256,14 @@ pub fn features<'a>(frames: impl Iterator<Item = &'a Frame>) -> anyhow::Result<V
     frames.map(|frame| plan.run(frame)).collect()
 }
 
-/// Mean and standard deviation of each feature over `rows`.
+/// Mean and standard deviation of each feature over `rows`, of which there is one at least.
 pub fn moments(rows: &[Vec<f32>]) -> (Vec<f64>, Vec<f64>) {
-    let n = rows.len() as f64;
+    let (n, width) = (rows.len() as f64, rows[0].len());
     let column = |index: usize| rows.iter().map(move |row| f64::from(row[index]));
-    let mean: Vec<f64> = (0..FEATURES)
+    let mean: Vec<f64> = (0..width)
         .map(|index| column(index).sum::<f64>() / n)
         .collect();
-    let deviation: Vec<f64> = (0..FEATURES)
+    let deviation: Vec<f64> = (0..width)
         .map(|index| {
             let squares = column(index).map(|x| (x - mean[index]).powi(2));
             // A feature that never varies is no divisor.

@@ -137,8 +137,8 @@ pub fn finish(
     Ok(evaluation)
 }
 
-/// Judges the labelled presses of a split with a model, and evaluates what it said; a model of
-/// format 1 judges each press's best frame. `None` without such presses.
+/// Judges the labelled presses of a split with a model, and evaluates what it said. `None` without such
+/// presses.
 ///
 /// # Errors
 ///
@@ -148,6 +148,22 @@ pub fn evaluate(
     courses: &Courses,
     split: Split,
 ) -> anyhow::Result<Option<CourseEvaluation>> {
+    let judged = verdicts(hrn, courses, split, |course| course)?;
+    Ok((!judged.is_empty()).then(|| CourseEvaluation::of(&judged, hrn.card().levels.len())))
+}
+
+/// What a model says of the labelled presses of a split, after `told` changed what it is told of each; a
+/// model of format 1 judges each press's best frame.
+///
+/// # Errors
+///
+/// If the model has fewer levels than the data, or fails to judge a press.
+pub fn verdicts(
+    hrn: &Hrn,
+    courses: &Courses,
+    split: Split,
+    told: impl Fn(Course) -> Course,
+) -> anyhow::Result<Vec<(courses::Press, Verdict)>> {
     let of_split = |(_, press): &(usize, &courses::Press)| press.split == split && press.level > 0;
     let all = courses.presses.iter().enumerate().filter(of_split);
     let mut verdicts = Vec::new();
@@ -160,31 +176,36 @@ pub fn evaluate(
         );
         let verdict = match hrn.format() {
             Format::Frame => hrn.judge(&courses.frame(press.best as usize))?,
-            Format::Course { .. } => hrn.judge_course(&course_of(courses, place))?,
+            Format::Course { .. } => hrn.judge_course(&told(course_of(courses, place)))?,
         };
         verdicts.push((*press, verdict));
     }
-    Ok((!verdicts.is_empty()).then(|| evaluation(&verdicts, hrn.card().levels.len())))
+    Ok(verdicts)
 }
 
-fn evaluation(verdicts: &[(courses::Press, Verdict)], levels: usize) -> CourseEvaluation {
-    let judged: Vec<Judged> = verdicts
-        .iter()
-        .map(|(press, verdict)| Judged {
-            level: press.level,
-            probabilities: verdict.probabilities.clone(),
-            object: Some(press.object),
-        })
-        .collect();
-    let n = verdicts.len() as f64;
-    let far = verdicts
-        .iter()
-        .filter(|(press, verdict)| press.level.abs_diff(verdict.level) > 1);
-    CourseEvaluation {
-        levels: Evaluation::of(&judged, levels),
-        beyond_neighbour: far.count() as f64 / n,
-        shore: shore(verdicts, levels),
-        sets: sets(verdicts),
+/// The verdicts as metrics take them.
+pub fn judged(verdicts: &[(courses::Press, Verdict)]) -> Vec<Judged> {
+    let judged = |(press, verdict): &(courses::Press, Verdict)| Judged {
+        level: press.level,
+        probabilities: verdict.probabilities.clone(),
+        object: Some(press.object),
+    };
+    verdicts.iter().map(judged).collect()
+}
+
+impl CourseEvaluation {
+    /// Of verdicts on labelled presses; there must be one at least.
+    pub fn of(verdicts: &[(courses::Press, Verdict)], levels: usize) -> Self {
+        let n = verdicts.len() as f64;
+        let far = verdicts
+            .iter()
+            .filter(|(press, verdict)| press.level.abs_diff(verdict.level) > 1);
+        Self {
+            levels: Evaluation::of(&judged(verdicts), levels),
+            beyond_neighbour: far.count() as f64 / n,
+            shore: shore(verdicts, levels),
+            sets: sets(verdicts),
+        }
     }
 }
 

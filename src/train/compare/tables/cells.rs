@@ -76,7 +76,7 @@ pub(super) fn interval(row: &Row, set: &str) -> String {
 }
 
 /// In per cent; a dash where there is none.
-pub(super) fn interval_text(interval: Option<[f64; 2]>) -> String {
+pub fn interval_text(interval: Option<[f64; 2]>) -> String {
     interval.map_or("-".to_owned(), |[low, high]| {
         format!("{:.1} to {:.1}", 100.0 * low, 100.0 * high)
     })
@@ -119,7 +119,7 @@ pub(super) fn less_features(group: &[&SwapEntry], swaps: &[SwapEntry]) -> String
 }
 
 /// In points.
-fn difference_text(difference: Estimate) -> String {
+pub fn difference_text(difference: Estimate) -> String {
     let points = |share: f64| match rounded(100.0 * share, 1) {
         text if text == "0.0" || text.starts_with('-') => text,
         more => format!("+{more}"),

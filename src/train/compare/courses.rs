@@ -1,0 +1,389 @@
+//! How models of whole presses, models of one frame and simpler controls judge the same presses:
+//! `hrn-train compare --course`.
+//!
+//! In: presses to fit the controls on, sets of test presses, model files. Out, in a directory: `course.json`
+//! and `course.md`: accuracy with its interval, the difference to the first model on the same presses,
+//! and what a model of format 2 says of a press so far.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, ensure};
+use serde::{Deserialize, Serialize};
+
+use super::so_far::{self, SoFar};
+use super::tables::{self, Table};
+use crate::simulator::Split;
+use crate::train::data::courses::Courses;
+use crate::train::data::dataset;
+use crate::train::judge::baseline::Baseline;
+use crate::train::judge::metrics::{self, Evaluation, Judged, ObjectCount};
+use crate::train::judge::press_features::{self, PressOf};
+use crate::train::learn::course::{self, Press};
+use crate::train::model::course as model;
+use crate::train::net::frames::FEATURES;
+use crate::train::run::disk::write_whole;
+use crate::verdict::{Course, Format, Hrn, argmax};
+
+/// What is to be compared.
+#[derive(Debug)]
+pub struct CoursePlan {
+    /// Presses that the controls are fitted on.
+    pub data: Vec<PathBuf>,
+    /// Sets to judge.
+    pub tests: Vec<PathBuf>,
+    /// Model files, the first of which the others are compared with.
+    pub models: Vec<PathBuf>,
+    /// Where tables go.
+    pub out: PathBuf,
+}
+
+/// A row of the tables: who judged, and how well on each set.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CourseRow {
+    /// A control's name, or the model's file.
+    pub name: String,
+    /// On each set, in the order of the plan.
+    pub sets: Vec<OnSet>,
+}
+
+/// How well a set was judged.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct OnSet {
+    /// The set's file, without folder and suffix.
+    pub set: String,
+    /// Of the levels.
+    pub levels: Evaluation,
+    /// Share of presses whose level is off by more than one.
+    pub beyond_neighbour: f64,
+    /// Root of the mean squared error of the Shore hardness; null for a control.
+    pub shore_rmse: Option<f64>,
+    /// Presses judged rightly, by object.
+    pub objects: Vec<ObjectCount>,
+    /// Accuracy less that of the first model on the same presses, with its 95 % interval by object; null for
+    /// that model itself.
+    pub less_first: Option<Difference>,
+    /// What is said before a press's end; null but for models of format 2.
+    pub so_far: Option<SoFar>,
+}
+
+/// A difference of two accuracies.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Difference {
+    /// In shares of the presses.
+    pub mean: f64,
+    /// 95 %, by a bootstrap over objects.
+    pub interval: Option<[f64; 2]>,
+}
+
+/// What a control takes of a press.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Control {
+    Frame,
+    Hertz,
+    Press,
+    PressAlone,
+}
+
+impl Control {
+    const ALL: [Self; 4] = [Self::Frame, Self::Hertz, Self::PressAlone, Self::Press];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Frame => "features of the best frame",
+            Self::Hertz => "Hertz's fit",
+            Self::PressAlone => "features of the press, arm not told",
+            Self::Press => "features of the press",
+        }
+    }
+
+    fn row(self, press: &Press) -> Vec<f32> {
+        let of = PressOf {
+            frames: &press.features,
+            moments: &press.moments,
+            arm_n_per_mm: press.arm_n_per_mm,
+        };
+        match self {
+            Self::Frame => press_features::of_press(&of)[..FEATURES].to_vec(),
+            Self::Hertz => press_features::of_hertz(&of),
+            Self::Press => press_features::of_press(&of),
+            Self::PressAlone => press_features::of_press(&PressOf {
+                arm_n_per_mm: 0.0,
+                ..of
+            }),
+        }
+    }
+}
+
+/// A set of test presses.
+struct TestSet {
+    name: String,
+    courses: Courses,
+    presses: Vec<Press>,
+}
+
+impl TestSet {
+    fn read(path: &Path) -> anyhow::Result<Self> {
+        let courses = read(std::slice::from_ref(&path.to_owned()))?;
+        let is_there = |press: &crate::train::data::courses::Press| {
+            press.split == Split::Test && press.level > 0
+        };
+        ensure!(
+            courses.presses.iter().any(is_there),
+            "{}: no labelled test presses: found 0, expected 1 or more",
+            path.display()
+        );
+        let name = path.file_stem().unwrap_or(path.as_os_str());
+        Ok(Self {
+            name: name.to_string_lossy().into_owned(),
+            presses: course::presses(&courses)?,
+            courses,
+        })
+    }
+
+    /// Places of its labelled test presses.
+    fn judged(&self) -> impl Iterator<Item = usize> {
+        let presses = self.courses.presses.iter().enumerate();
+        presses
+            .filter(|(_, press)| press.split == Split::Test && press.level > 0)
+            .map(|(place, _)| place)
+    }
+}
+
+fn read(paths: &[PathBuf]) -> anyhow::Result<Courses> {
+    for path in paths {
+        ensure!(
+            Courses::is_at(path)?,
+            "{}: found single frames, expected presses over time (simulate --sequences)",
+            path.display()
+        );
+    }
+    Ok(Courses::read_all(paths)?.0)
+}
+
+/// Judges every set by every control and model, writes the tables and gives the first as text.
+///
+/// # Errors
+///
+/// If a file cannot be read or judged, or the directory cannot be written.
+pub fn compare_courses(plan: &CoursePlan) -> anyhow::Result<String> {
+    let models: Vec<(String, Hrn)> = plan
+        .models
+        .iter()
+        .map(|path| {
+            let name = path.display().to_string();
+            let bytes = std::fs::read(path).with_context(|| name.clone())?;
+            Ok((name.clone(), Hrn::load(&bytes).context(name)?))
+        })
+        .collect::<anyhow::Result<_>>()?;
+    let sets: Vec<TestSet> = plan
+        .tests
+        .iter()
+        .map(|path| TestSet::read(path))
+        .collect::<anyhow::Result<_>>()?;
+    std::fs::create_dir_all(&plan.out).with_context(|| plan.out.display().to_string())?;
+
+    let mut rows = controls(&plan.data, &sets)?;
+    for (name, hrn) in &models {
+        rows.extend(of_model(name, hrn, &sets)?);
+    }
+    compare_with_first(&mut rows, &models[0].0);
+    let json = serde_json::to_vec_pretty(&rows)?;
+    write_whole(&plan.out.join("course.json"), &json)?;
+    let tables = tables(&rows);
+    let text: Vec<String> = tables.iter().map(Table::section).collect();
+    write_whole(&plan.out.join("course.md"), text.join("\n").as_bytes())?;
+    Ok(tables[0].text())
+}
+
+/// Fits the controls and judges the sets.
+fn controls(data: &[PathBuf], sets: &[TestSet]) -> anyhow::Result<Vec<CourseRow>> {
+    let courses = read(data)?;
+    let presses = course::presses(&courses)?;
+    let is_learnt =
+        |press: &crate::train::data::courses::Press| press.split == Split::Train && press.level > 0;
+    let learnt: Vec<&Press> = presses
+        .iter()
+        .zip(&courses.presses)
+        .filter(|(_, press)| is_learnt(press))
+        .map(|(press, _)| press)
+        .collect();
+    ensure!(
+        !learnt.is_empty(),
+        "--data: no labelled training presses: found 0, expected 1 or more"
+    );
+    let levels = dataset::levels().len();
+    let level_of: Vec<usize> = learnt
+        .iter()
+        .map(|press| usize::from(press.level) - 1)
+        .collect();
+    // Levels with few presses are lifted halfway, as the method `course` lifts them.
+    let lifts: Vec<f32> = (0..levels)
+        .map(|level| level_of.iter().filter(|&&of| of == level).count())
+        .map(|count| (count.max(1) as f32).powf(-0.5))
+        .collect();
+    let row_of = |control: Control| {
+        let rows: Vec<Vec<f32>> = learnt.iter().map(|press| control.row(press)).collect();
+        let fitted = Baseline::fit(&rows, &level_of, levels);
+        let on = |set: &TestSet| {
+            let judged: Vec<Judged> = set
+                .judged()
+                .map(|place| Judged {
+                    level: set.presses[place].level,
+                    probabilities: lifted(
+                        fitted.probabilities(&control.row(&set.presses[place])),
+                        &lifts,
+                    ),
+                    object: Some(set.presses[place].object),
+                })
+                .collect();
+            on_set(&set.name, &judged, levels, None)
+        };
+        CourseRow {
+            name: control.name().to_owned(),
+            sets: sets.iter().map(on).collect(),
+        }
+    };
+    Ok(Control::ALL.into_iter().map(row_of).collect())
+}
+
+/// Each probability times its level's lift, brought to a sum of 1.
+fn lifted(mut probabilities: Vec<f32>, lifts: &[f32]) -> Vec<f32> {
+    probabilities
+        .iter_mut()
+        .zip(lifts)
+        .for_each(|(p, lift)| *p *= lift);
+    let sum: f32 = probabilities.iter().sum();
+    probabilities.iter_mut().for_each(|p| *p /= sum);
+    probabilities
+}
+
+/// A model's row; of one of format 2 also the row of what it says where the arm is not told.
+fn of_model(name: &str, hrn: &Hrn, sets: &[TestSet]) -> anyhow::Result<Vec<CourseRow>> {
+    let row = |name: String, told: &dyn Fn(Course) -> Course, is_whole: bool| {
+        let on = |set: &TestSet| {
+            let verdicts = model::verdicts(hrn, &set.courses, Split::Test, told)?;
+            let levels = hrn.card().levels.len();
+            let rmse = model::CourseEvaluation::of(&verdicts, levels).shore;
+            let rmse = rmse.map(|shore| shore.rmse);
+            let mut on = on_set(&set.name, &model::judged(&verdicts), levels, rmse);
+            if is_whole {
+                on.so_far = Some(so_far::of(hrn, &set.courses, set.judged(), &verdicts)?);
+            }
+            Ok(on)
+        };
+        anyhow::Ok(CourseRow {
+            name,
+            sets: sets.iter().map(on).collect::<anyhow::Result<_>>()?,
+        })
+    };
+    match hrn.format() {
+        Format::Frame => Ok(vec![row(name.to_owned(), &|course| course, false)?]),
+        Format::Course { .. } => Ok(vec![
+            row(format!("{name}, arm not told"), &untold, false)?,
+            row(name.to_owned(), &|course| course, true)?,
+        ]),
+    }
+}
+
+/// The press, as a robot gives it that says nothing of its arm.
+fn untold(mut course: Course) -> Course {
+    course.arm_n_per_mm = 0.0;
+    for moment in &mut course.moments {
+        moment.approach_mm = None;
+    }
+    course
+}
+
+fn on_set(set: &str, judged: &[Judged], levels: usize, shore_rmse: Option<f64>) -> OnSet {
+    let is_far =
+        |one: &&Judged| (argmax(&one.probabilities).0 + 1).abs_diff(usize::from(one.level)) > 1;
+    OnSet {
+        set: set.to_owned(),
+        levels: Evaluation::of(judged, levels),
+        beyond_neighbour: judged.iter().filter(is_far).count() as f64 / judged.len() as f64,
+        shore_rmse,
+        objects: metrics::by_object(judged).unwrap_or_default(),
+        less_first: None,
+        so_far: None,
+    }
+}
+
+/// Fills in the differences to the row called `first`.
+fn compare_with_first(rows: &mut [CourseRow], first: &str) {
+    let Some(reference) = rows.iter().find(|row| row.name == first).cloned() else {
+        return;
+    };
+    for row in rows.iter_mut().filter(|row| row.name != first) {
+        for (own, others) in row.sets.iter_mut().zip(&reference.sets) {
+            let pair = (own.objects.as_slice(), others.objects.as_slice());
+            let difference = metrics::difference_by_object(&[pair]);
+            own.less_first = difference.map(|estimate| Difference {
+                mean: estimate.mean,
+                interval: estimate.interval,
+            });
+        }
+    }
+}
+
+fn tables(rows: &[CourseRow]) -> Vec<Table> {
+    let sets: Vec<&str> = rows[0].sets.iter().map(|on| on.set.as_str()).collect();
+    let of = |title: &str, note: &str, cell: &dyn Fn(&OnSet) -> String| Table {
+        title: title.to_owned(),
+        note: format!("{note}\n\n"),
+        head: std::iter::once("judged by")
+            .chain(sets.iter().copied())
+            .map(str::to_owned)
+            .collect(),
+        rows: rows
+            .iter()
+            .map(|row| {
+                let cells = row.sets.iter().map(cell);
+                std::iter::once(row.name.clone()).chain(cells).collect()
+            })
+            .collect(),
+    };
+    let percent = |share: f64| format!("{:.1}", 100.0 * share);
+    let mut all = vec![
+        of(
+            "Accuracy",
+            "Per cent of the presses whose level is right, with a 95 % interval by object.",
+            &|on| {
+                let interval = tables::interval_text(on.levels.accuracy_interval_by_object);
+                format!("{} ({interval})", percent(on.levels.accuracy))
+            },
+        ),
+        of(
+            "Beside the first model",
+            "Points of accuracy more than the first model on the same presses, with a 95 % interval by object.",
+            &|on| {
+                on.less_first.map_or("-".to_owned(), |difference| {
+                    tables::difference_text(metrics::Estimate {
+                        mean: difference.mean,
+                        interval: difference.interval,
+                    })
+                })
+            },
+        ),
+        of(
+            "Beyond the neighbour",
+            "Per cent of the presses whose level is off by more than one.",
+            &|on| percent(on.beyond_neighbour),
+        ),
+        of(
+            "Shore hardness",
+            "Root of the mean squared error, Shore OO.",
+            &|on| {
+                on.shore_rmse
+                    .map_or("-".to_owned(), |rmse| format!("{rmse:.1}"))
+            },
+        ),
+    ];
+    for row in rows {
+        for on in &row.sets {
+            if let Some(so_far) = &on.so_far {
+                all.push(so_far::table(&row.name, &on.set, so_far));
+            }
+        }
+    }
+    all
+}

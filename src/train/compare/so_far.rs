@@ -1,0 +1,152 @@
+//! What a model of format 2 says of a press before its end.
+
+use serde::{Deserialize, Serialize};
+
+use super::tables::Table;
+use crate::train::data::courses::{Courses, Press};
+use crate::train::judge::metrics::{self, Judged};
+use crate::train::model::course as model;
+use crate::verdict::{Course, Hrn, Verdict};
+
+/// Seconds since the begin of a press at which the press so far is judged.
+const SECONDS: [f32; 7] = [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4];
+/// An early verdict comes at this confidence: the default of `[model] early_confidence`.
+const CONFIDENCE: f32 = 0.95;
+/// Frames that an early verdict needs.
+const LEAST_FRAMES: usize = 3;
+
+/// Verdicts before the end of presses.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SoFar {
+    /// After so many seconds.
+    pub after: Vec<After>,
+    /// Share of presses with an early verdict before their last frame.
+    pub early: f64,
+    /// Share of these whose early level is right; null without any.
+    pub early_accuracy: Option<f64>,
+    /// Share of these whose final level is another one; null without any.
+    pub changed: Option<f64>,
+    /// How long before the last frame it came, the median in seconds; null without any.
+    pub ahead_s: Option<f64>,
+}
+
+/// Verdicts at one moment of the presses, on the frames that were there; of a press that had ended, the
+/// final one.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct After {
+    /// Since the begin of the press.
+    pub seconds: f32,
+    /// Share of presses that were still going on.
+    pub going_on: f64,
+    /// Share whose level is right.
+    pub accuracy: f64,
+    /// Expected calibration error.
+    pub ece: f64,
+}
+
+/// The press up to its frame number `frames`.
+fn until(course: &Course, frames: usize) -> Course {
+    Course {
+        moments: course.moments[..frames].to_vec(),
+        arm_n_per_mm: course.arm_n_per_mm,
+    }
+}
+
+/// Judges presses so far; `finals` are what was said of the same presses at their end.
+///
+/// # Errors
+///
+/// If the model fails to judge a press.
+pub(super) fn of(
+    hrn: &Hrn,
+    courses: &Courses,
+    places: impl Iterator<Item = usize>,
+    finals: &[(Press, Verdict)],
+) -> anyhow::Result<SoFar> {
+    let mut at: Vec<(usize, Vec<Judged>)> = vec![(0, Vec::new()); SECONDS.len()];
+    let (mut early, mut right, mut changed, mut ahead) = (0, 0, 0, Vec::new());
+    for (place, (press, last)) in places.zip(finals) {
+        let course = model::course_of(courses, place);
+        let frames = course.moments.len();
+        let mut is_early = false;
+        // What was said after each number of frames; the end is known.
+        let mut said = Vec::with_capacity(frames);
+        for count in 1..frames {
+            let verdict = hrn.judge_course(&until(&course, count))?;
+            if !is_early && count >= LEAST_FRAMES && verdict.confidence >= CONFIDENCE {
+                is_early = true;
+                early += 1;
+                right += usize::from(verdict.level == press.level);
+                changed += usize::from(verdict.level != last.level);
+                let moments = &course.moments;
+                ahead.push(moments[frames - 1].time_s - moments[count - 1].time_s);
+            }
+            said.push(verdict.probabilities);
+        }
+        said.push(last.probabilities.clone());
+        for (seconds, (going_on, judged)) in SECONDS.into_iter().zip(&mut at) {
+            let there = course
+                .moments
+                .iter()
+                .filter(|moment| moment.time_s <= seconds);
+            let there = there.count().max(1);
+            *going_on += usize::from(there < frames);
+            judged.push(Judged {
+                level: press.level,
+                probabilities: said[there - 1].clone(),
+                object: Some(press.object),
+            });
+        }
+    }
+    let (n, levels) = (finals.len() as f64, hrn.card().levels.len());
+    let after = |(seconds, (going_on, judged)): (f32, (usize, Vec<Judged>))| After {
+        seconds,
+        going_on: going_on as f64 / n,
+        accuracy: metrics::Evaluation::of(&judged, levels).accuracy,
+        ece: metrics::calibration_error(&judged),
+    };
+    ahead.sort_by(f32::total_cmp);
+    let of_early = |count: usize| (early > 0).then(|| count as f64 / early as f64);
+    Ok(SoFar {
+        after: SECONDS.into_iter().zip(at).map(after).collect(),
+        early: early as f64 / n,
+        early_accuracy: of_early(right),
+        changed: of_early(changed),
+        ahead_s: ahead.get(ahead.len() / 2).map(|&s| f64::from(s)),
+    })
+}
+
+/// Of a model on a set.
+pub(super) fn table(model: &str, set: &str, so_far: &SoFar) -> Table {
+    let percent = |share: f64| format!("{:.1}", 100.0 * share);
+    let or_dash = |share: Option<f64>| share.map_or("-".to_owned(), percent);
+    let early = format!(
+        "An early verdict (confidence {CONFIDENCE}) came in {} % of the presses, in the median {} s before the \
+         last frame. {} % of them were right; in {} % the final verdict named another level.",
+        percent(so_far.early),
+        so_far.ahead_s.map_or("-".to_owned(), |s| format!("{s:.1}")),
+        or_dash(so_far.early_accuracy),
+        or_dash(so_far.changed),
+    );
+    let row = |after: &After| {
+        vec![
+            format!("{} s", after.seconds),
+            percent(after.going_on),
+            percent(after.accuracy),
+            format!("{:.3}", after.ece),
+        ]
+    };
+    Table {
+        title: format!("{model} on {set}, before the end"),
+        note: format!("{early}\n\n"),
+        head: [
+            "after",
+            "still pressed, %",
+            "accuracy, %",
+            "calibration error",
+        ]
+        .map(str::to_owned)
+        .to_vec(),
+        rows: so_far.after.iter().map(row).collect(),
+    }
+}
