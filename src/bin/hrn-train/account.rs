@@ -8,7 +8,7 @@ use hardnessd::train::compare::digits::{rounded, thousands};
 use hardnessd::train::data::dataset::{self, Dataset};
 use hardnessd::train::judge::metrics::Evaluation;
 use hardnessd::train::model::course::CourseEvaluation;
-use hardnessd::verdict::Hrn;
+use hardnessd::verdict::{Hrn, Verdict};
 
 /// The card of the model read from `path`.
 pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
@@ -171,6 +171,38 @@ pub(super) fn of_data(dataset: &Dataset) -> String {
             "warning: the data has level 0 and no level {highest}: were the levels counted from 0? \
              Levels go from 1 to {highest}; 0 means unlabelled"
         );
+    }
+    text
+}
+
+/// Verdicts as CSV, a line each after the head: object, true level, verdict's level, probabilities, and Shore OO
+/// with its interval. What is not known is left empty.
+pub(super) fn csv<'a>(verdicts: impl Iterator<Item = (Option<u32>, u8, &'a Verdict)>) -> String {
+    let mut text = String::new();
+    for (object, level, verdict) in verdicts {
+        if text.is_empty() {
+            text += "object,level,judged";
+            for level in 1..=verdict.probabilities.len() {
+                let _ = write!(text, ",probability_{level}");
+            }
+            text += ",shore,shore_low,shore_high\n";
+        }
+        let object = object.map(|object| object.to_string()).unwrap_or_default();
+        let _ = write!(text, "{object},{level},{}", verdict.level);
+        for probability in &verdict.probabilities {
+            let _ = write!(text, ",{probability:.6}");
+        }
+        match verdict.shore {
+            Some(shore) => {
+                let _ = write!(
+                    text,
+                    ",{:.3},{:.3},{:.3}",
+                    shore.value, shore.low, shore.high
+                );
+            }
+            None => text += ",,,",
+        }
+        text.push('\n');
     }
     text
 }

@@ -366,6 +366,9 @@ pub(super) struct Evaluate {
     /// Split to evaluate
     #[arg(long, default_value = "test")]
     pub(super) split: SplitName,
+    /// Also write every verdict as a line of CSV; an existing file is replaced
+    #[arg(long, value_name = "V.csv")]
+    pub(super) verdicts: Option<PathBuf>,
     /// Print JSON
     #[arg(long)]
     pub(super) json: bool,

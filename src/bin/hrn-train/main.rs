@@ -30,7 +30,8 @@ use hardnessd::train::judge::sheet;
 use hardnessd::train::methods::frame::NoStart;
 use hardnessd::train::methods::{self, LabelsError, Method, Request};
 use hardnessd::train::model::adopt::{self, Foreign, Told};
-use hardnessd::train::model::{course, export, review};
+use hardnessd::train::model::course::{self, CourseEvaluation};
+use hardnessd::train::model::{export, review};
 use hardnessd::train::run::Run;
 use hardnessd::train::run::disk::write_whole;
 use hardnessd::train::settings::{Profile, Settings, SettingsError};
@@ -622,6 +623,15 @@ fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     dataset.warn_of_object_in_both_splits();
     let indices = dataset.labelled(arguments.split.into())?;
     let evaluation = export::evaluate(&hrn, &dataset, &indices)?;
+    if let Some(path) = &arguments.verdicts {
+        let samples = indices.iter().map(|&index| &dataset.samples[index]);
+        let verdicts = samples.map(|sample| Ok((sample, hrn.judge(&sample.frame)?)));
+        let verdicts: Vec<_> = verdicts.collect::<anyhow::Result<_>>()?;
+        let rows = verdicts
+            .iter()
+            .map(|(sample, verdict)| (sample.object, sample.level, verdict));
+        write(path, account::csv(rows).as_bytes())?;
+    }
     Ok(if arguments.json {
         serde_json::to_string(&evaluation)? + "\n"
     } else {
@@ -631,13 +641,18 @@ fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
 
 fn evaluate_courses(arguments: &Evaluate, hrn: &Hrn) -> anyhow::Result<String> {
     let courses = Courses::read(&arguments.data)?;
-    let evaluation = course::evaluate(hrn, &courses, arguments.split.into())?;
-    let evaluation = evaluation.with_context(|| {
-        format!(
-            "{}: no labelled presses in this split: found 0, expected 1 or more",
-            arguments.data.display()
-        )
-    })?;
+    let verdicts = course::verdicts(hrn, &courses, arguments.split.into(), |course| course)?;
+    anyhow::ensure!(
+        !verdicts.is_empty(),
+        "{}: no labelled presses in this split: found 0, expected 1 or more",
+        arguments.data.display()
+    );
+    if let Some(path) = &arguments.verdicts {
+        let rows = verdicts.iter();
+        let rows = rows.map(|(press, verdict)| (Some(press.object), press.level, verdict));
+        write(path, account::csv(rows).as_bytes())?;
+    }
+    let evaluation = CourseEvaluation::of(&verdicts, hrn.card().levels.len());
     Ok(if arguments.json {
         serde_json::to_string(&evaluation)? + "\n"
     } else {

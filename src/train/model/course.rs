@@ -127,7 +127,8 @@ pub fn finish(
         file::write(graph, &outputs, card, &checks)
     };
     let hrn = Hrn::load(&write(&card)?)?;
-    let evaluation = evaluate(&hrn, courses, Split::Test)?;
+    let test = verdicts(&hrn, courses, Split::Test, |course| course)?;
+    let evaluation = (!test.is_empty()).then(|| CourseEvaluation::of(&test, levels.len()));
     if let Some(evaluation) = &evaluation {
         card.metrics["test"] = json!(evaluation);
         let json = serde_json::to_vec_pretty(evaluation)?;
@@ -135,21 +136,6 @@ pub fn finish(
     }
     run.write("hrn.onnx", &write(&card)?)?;
     Ok(evaluation)
-}
-
-/// Judges the labelled presses of a split with a model, and evaluates what it said. `None` without such
-/// presses.
-///
-/// # Errors
-///
-/// If the model has fewer levels than the data, or fails to judge a press.
-pub fn evaluate(
-    hrn: &Hrn,
-    courses: &Courses,
-    split: Split,
-) -> anyhow::Result<Option<CourseEvaluation>> {
-    let judged = verdicts(hrn, courses, split, |course| course)?;
-    Ok((!judged.is_empty()).then(|| CourseEvaluation::of(&judged, hrn.card().levels.len())))
 }
 
 /// What a model says of the labelled presses of a split, after `told` changed what it is told of each; a
