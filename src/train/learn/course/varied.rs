@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::Press;
 use crate::random::Stream;
+use crate::train::net::frames::FEATURES;
 
 /// Errors of what the arm tells, drawn for each press.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -24,6 +25,8 @@ pub struct Told {
     pub clock_frames: f64,
     /// Share of presses that are judged before their end.
     pub early: f64,
+    /// Share of presses that a slower sensor sees: every second to eighth frame of them.
+    pub slower: f64,
 }
 
 impl Default for Told {
@@ -36,23 +39,27 @@ impl Default for Told {
             arm: 0.3,
             clock_frames: 1.0,
             early: 0.25,
+            slower: 0.3,
         }
     }
 }
 
-/// Frames at least of a press that is judged before its end.
+/// Frames at least of a press that is judged before its end, or that a slower sensor sees.
 const LEAST_FRAMES: usize = 3;
+/// The slowest sensor sees one frame of so many.
+const MOST_FRAMES_A_STEP: usize = 8;
 
 impl Told {
     /// The press as a robot might tell it.
     pub fn varied(&self, press: &Press, stream: &mut Stream) -> Press {
         let mut press = press.clone();
+        if stream.uniform() < self.slower {
+            press.slow_down(stream);
+        }
         if stream.uniform() < self.early && press.moments.len() > LEAST_FRAMES {
             let frames = LEAST_FRAMES + stream.below(press.moments.len() - LEAST_FRAMES);
             press.moments.truncate(frames);
-            press
-                .features
-                .truncate(frames * crate::train::net::frames::FEATURES);
+            press.features.truncate(frames * FEATURES);
         }
         if stream.uniform() < self.unknown {
             press.arm_n_per_mm = 0.0;
@@ -92,6 +99,31 @@ impl Told {
 }
 
 impl Press {
+    /// Keeps every k-th frame from a chance one on. The first one kept is the press's begin: times and the
+    /// approach count from it.
+    fn slow_down(&mut self, stream: &mut Stream) {
+        let most = (self.moments.len() / LEAST_FRAMES).min(MOST_FRAMES_A_STEP);
+        if most < 2 {
+            return;
+        }
+        let step = 2 + stream.below(most - 1);
+        let first = stream.below(step);
+        let begin = self.moments[first];
+        let kept = |of: usize| of >= first && (of - first).is_multiple_of(step);
+        let rows = self.features.chunks(FEATURES).enumerate();
+        self.features = rows
+            .filter(|(of, _)| kept(*of))
+            .flat_map(|(_, row)| row.iter().copied())
+            .collect();
+        let mut of = 0..;
+        self.moments.retain(|_| of.next().is_some_and(kept));
+        for moment in &mut self.moments {
+            moment.time_s -= begin.time_s;
+            let way = moment.approach_mm.zip(begin.approach_mm);
+            moment.approach_mm = way.map(|(mm, first)| mm - first);
+        }
+    }
+
     /// The least time between its frames.
     fn period_s(&self) -> f64 {
         let steps = self
@@ -123,7 +155,6 @@ fn at(told: &[(f32, f32)], time_s: f32) -> f32 {
 mod tests {
     use super::*;
     use crate::train::net::course::Moment;
-    use crate::train::net::frames::FEATURES;
 
     fn press() -> Press {
         let moment = |n: u8| Moment {
@@ -148,6 +179,7 @@ mod tests {
             unknown_arm: 0.0,
             exact: 0.0,
             early: 0.0,
+            slower: 0.0,
             ..Told::default()
         };
         let mut stream = Stream::new(1, "told");
@@ -165,6 +197,34 @@ mod tests {
     }
 
     #[test]
+    fn a_slower_sensor_sees_the_press_from_its_own_first_frame() {
+        let told = Told {
+            unknown: 0.0,
+            unknown_arm: 0.0,
+            exact: 1.0,
+            early: 0.0,
+            slower: 1.0,
+            ..Told::default()
+        };
+        let mut stream = Stream::new(3, "told");
+        let mut steps = std::collections::BTreeSet::new();
+        for _ in 0..100 {
+            let slow = told.varied(&press(), &mut stream);
+            let step_s = slow.moments[1].time_s;
+            steps.insert((10.0 * step_s).round() as u32);
+            assert!((3..=5).contains(&slow.moments.len()), "{slow:?}");
+            assert_eq!(slow.features.len(), slow.moments.len() * FEATURES);
+            for (place, moment) in (0_u8..).zip(&slow.moments) {
+                let time_s = f32::from(place) * step_s;
+                assert!((moment.time_s - time_s).abs() < 1e-5, "{slow:?}");
+                // The arm goes 5 mm/s.
+                assert!((moment.approach_mm.unwrap() - 5.0 * time_s).abs() < 1e-4);
+            }
+        }
+        assert_eq!(steps.into_iter().collect::<Vec<_>>(), [2, 3]);
+    }
+
+    #[test]
     fn shares_are_kept_and_an_early_press_has_three_frames() {
         let mut stream = Stream::new(2, "told");
         let drawn: Vec<Press> = (0..1000)
@@ -172,7 +232,8 @@ mod tests {
             .collect();
         let share = |is: fn(&Press) -> bool| drawn.iter().filter(|press| is(press)).count();
         assert!((240..360).contains(&share(|p| p.moments[0].approach_mm.is_none())));
-        assert!((200..300).contains(&share(|p| p.moments.len() < 10)));
+        // A quarter is early; of the others three in ten are slower.
+        assert!((410..540).contains(&share(|p| p.moments.len() < 10)));
         assert!(
             drawn
                 .iter()
