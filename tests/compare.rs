@@ -282,6 +282,68 @@ fn a_finished_comparison_does_nothing_again() {
 }
 
 #[test]
+fn a_plan_runs_in_any_shell_and_the_comparison_finds_what_it_made() {
+    let comparison = Comparison::new(
+        "planned",
+        "features,hrn15,nihrn,ours",
+        &["--labels", "8", "--plan"],
+    );
+    let planned = comparison.command_of("1").output().unwrap();
+    assert!(planned.status.success(), "{planned:?}");
+    let lines = String::from_utf8(planned.stdout).unwrap();
+    assert!(!comparison.out.join("results.json").exists());
+    // `nihrn` takes stages of `ours`, so it stands behind it; `features` and `hrn15` have three rows each.
+    let first = lines.lines().next().unwrap();
+    assert!(
+        first.contains("--method ours") && first.contains("&& "),
+        "{first}"
+    );
+    assert!(
+        first.contains("--method nihrn") && first.contains("--from"),
+        "{first}"
+    );
+    assert_eq!(lines.matches("-8-1 --seed").count(), 4, "{lines}");
+
+    // The cheap ones, two at a time, by another program.
+    let cheap: Vec<&str> = lines
+        .lines()
+        .filter(|line| line.contains("--method features"))
+        .collect();
+    assert_eq!(cheap.len(), 3, "{lines}");
+    let folder = Path::new(env!("CARGO_BIN_EXE_hrn-train")).parent().unwrap();
+    let path = format!("{}:{}", folder.display(), std::env::var("PATH").unwrap());
+    let mut parallel = Command::new("xargs")
+        .args(["-d", "\\n", "-P", "2", "-I", "{}", "sh", "-c", "{}"])
+        .env("PATH", path)
+        .stdin(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let stdin = parallel.stdin.take().unwrap();
+    std::io::Write::write_all(&mut &stdin, cheap.join("\n").as_bytes()).unwrap();
+    drop(stdin);
+    assert!(parallel.wait().unwrap().success());
+
+    let merged = Comparison::new("planned", "features", &["--labels", "8"]);
+    let said = merged.command_of("1").output().unwrap();
+    assert!(said.status.success(), "{said:?}");
+    let said = String::from_utf8(said.stderr).unwrap();
+    assert!(!said.contains("done"), "a run was done again: {said}");
+    let labels: Vec<Value> = merged
+        .json("results.json")
+        .iter()
+        .map(|run| run["labels"].clone())
+        .collect();
+    assert_eq!(labels, [160, 24, 8]);
+    // Not asked for, a row of extra labels stays.
+    let less = Comparison::new("planned", "features", &[])
+        .command_of("1")
+        .output()
+        .unwrap();
+    assert!(less.status.success(), "{less:?}");
+    assert_eq!(merged.json("results.json").len(), 3);
+}
+
+#[test]
 fn data_that_will_not_do_is_refused_before_anything_is_made() {
     let path = |name: &str| data().0.path().join(name);
     let samples = Dataset::read(&data().1).unwrap().samples;

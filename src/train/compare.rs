@@ -23,15 +23,61 @@ use anyhow::{Context as _, bail, ensure};
 
 pub use plan::Plan;
 
-use children::Failure;
+use children::{Failure, Job};
 use plan::{PlannedRun, planned, recipes, unfinished};
 use results::{Comparison, Entry};
 use sets::TestSet;
 use swaps::Swaps;
 
 use crate::train::data::dataset::Dataset;
+use crate::train::methods::{self, Method};
 use crate::train::run::Run;
 use crate::train::run::disk::{lock, write_whole};
+
+/// The command lines of the runs that are not finished, the longest first: what [`compare`] would run. What
+/// they leave in the directory, [`compare`] finds.
+///
+/// # Errors
+///
+/// Those of [`compare`] before its first run.
+pub fn plan(plan: &Plan) -> anyhow::Result<String> {
+    let dataset = checked(plan)?;
+    let recipes = recipes(plan, &dataset)?;
+    make_directories(plan)?;
+    let runs = planned(plan, &recipes, &dataset)?;
+    let jobs: Vec<Job> = in_order(unfinished(&runs, &plan.out)?);
+    plan::command_lines(&jobs)
+}
+
+/// The plan's data. Nothing is made before it is known that it will do.
+fn checked(plan: &Plan) -> anyhow::Result<Dataset> {
+    let dataset = Dataset::read(&plan.data)?;
+    sets::check_seed(&dataset)?;
+    sets::warn_of_pitch(&dataset);
+    dataset.warn_of_object_in_both_splits();
+    for &labels in &plan.labels {
+        methods::labels(Method::Hrn100, &dataset, Some(labels))?;
+    }
+    Ok(dataset)
+}
+
+fn make_directories(plan: &Plan) -> anyhow::Result<()> {
+    for part in ["data", "runs", "logs"] {
+        let part = plan.out.join(part);
+        std::fs::create_dir_all(&part).with_context(|| part.display().to_string())?;
+    }
+    Ok(())
+}
+
+/// The longest first, but every method once before any method twice.
+fn in_order(mut open: Vec<(&PlannedRun, Job)>) -> Vec<Job> {
+    open.sort_by(|(a, first), (b, second)| {
+        (a.told.seed)
+            .cmp(&b.told.seed)
+            .then(second.effort.total_cmp(&first.effort))
+    });
+    open.into_iter().map(|(_, job)| job).collect()
+}
 
 /// Runs what is not finished, and writes results and tables of all that is.
 ///
@@ -40,30 +86,18 @@ use crate::train::run::disk::{lock, write_whole};
 /// If the data cannot be read, the directory cannot be written, holds runs that were told otherwise
 /// or is being worked on by another process, or at the end if a run failed.
 pub fn compare(plan: &Plan) -> anyhow::Result<()> {
-    // Nothing is made before it is known that the data will do.
-    let dataset = Dataset::read(&plan.data)?;
-    sets::check_seed(&dataset)?;
-    sets::warn_of_pitch(&dataset);
-    dataset.warn_of_object_in_both_splits();
+    let dataset = checked(plan)?;
     let recipes = recipes(plan, &dataset)?;
     let swaps = Swaps::of(plan, &recipes)?;
-    for part in ["data", "runs", "logs"] {
-        let part = plan.out.join(part);
-        std::fs::create_dir_all(&part).with_context(|| part.display().to_string())?;
-    }
+    make_directories(plan)?;
     let _lock = lock(&plan.out)?;
     let runs = planned(plan, &recipes, &dataset)?;
-    let mut open = unfinished(&runs, &plan.out)?;
+    let open = unfinished(&runs, &plan.out)?;
     let sets = sets::all(dataset, plan.profile, &plan.out.join("data"))?;
     write_results(plan, &runs, &sets)?;
-    // The longest first, but every method once before any method twice.
-    open.sort_by(|(a, first), (b, second)| {
-        (a.told.seed)
-            .cmp(&b.told.seed)
-            .then(second.effort.total_cmp(&first.effort))
-    });
-    let jobs = open.into_iter().map(|(_, job)| job).collect();
-    let mut failures = children::run(jobs, plan.jobs, |_| write_results(plan, &runs, &sets))?;
+    let mut failures = children::run(in_order(open), plan.jobs, |_| {
+        write_results(plan, &runs, &sets)
+    })?;
     let swapped = swaps.map_or(Ok(()), |swaps| {
         failures.extend(swaps.run(plan)?);
         write_tables(&plan.out)

@@ -271,12 +271,18 @@ pub(super) struct Compare {
     /// Methods to run [default: all]. The tables also contain what was finished in DIR before
     #[arg(long, value_name = "M", value_delimiter = ',', num_args = 1..)]
     pub(super) methods: Vec<Method>,
+    /// Also run every method with so many labels, for a curve of accuracy against labels
+    #[arg(long, value_name = "N", value_delimiter = ',', num_args = 1..)]
+    pub(super) labels: Vec<usize>,
     /// Train with the seeds 1 to N
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     pub(super) seeds: u64,
     /// Length of each training run
     #[arg(long, default_value = "paper")]
     pub(super) profile: Profile,
+    /// Run nothing: print a command line for each run that is not finished, to spread over machines
+    #[arg(long, conflicts_with = "swaps")]
+    pub(super) plan: bool,
     /// Runs at a time, each on one thread [default: as many as there are cores]
     #[arg(long, value_name = "J")]
     pub(super) jobs: Option<std::num::NonZeroUsize>,
@@ -286,7 +292,7 @@ pub(super) struct Compare {
     /// Compare models of whole presses instead, with simpler controls that are fitted on --data. Nothing else is
     /// trained. All data are of `simulate --sequences`
     #[arg(long, requires = "test", requires = "model",
-        conflicts_with_all = ["methods", "seeds", "profile", "jobs", "swaps"])]
+        conflicts_with_all = ["methods", "labels", "seeds", "profile", "plan", "jobs", "swaps"])]
     pub(super) course: bool,
     /// Test presses; may be given several times
     #[arg(long, value_name = "T.npz", num_args = 1.., requires = "course")]

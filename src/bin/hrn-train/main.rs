@@ -581,15 +581,20 @@ fn compare(arguments: Compare) -> anyhow::Result<String> {
         arguments.methods
     };
     let jobs = arguments.jobs.map(std::num::NonZeroUsize::get);
-    compare::compare(&Plan {
+    let plan = Plan {
         data,
         out: arguments.out.clone(),
         methods,
+        labels: arguments.labels,
         seeds: arguments.seeds,
         profile: arguments.profile,
         jobs: jobs.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from)),
         swaps: arguments.swaps,
-    })?;
+    };
+    if arguments.plan {
+        return compare::plan(&plan);
+    }
+    compare::compare(&plan)?;
     let page = arguments.out.join("report.html");
     let found = Comparison::read(&arguments.out)?;
     let table = found.map_or_else(String::new, |found| {

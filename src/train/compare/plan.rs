@@ -23,6 +23,8 @@ pub struct Plan {
     pub out: PathBuf,
     /// Which methods to run.
     pub methods: Vec<Method>,
+    /// Numbers of labels to run each of them with, beside its own; those that a method has anyway change nothing.
+    pub labels: Vec<usize>,
     /// To run under seeds 1 to this one.
     pub seeds: u64,
     /// How long each run may take.
@@ -36,7 +38,11 @@ pub struct Plan {
 impl Plan {
     /// Whether it has a recipe's runs done.
     pub(super) fn asks(&self, recipe: &Recipe) -> bool {
-        self.methods.contains(&recipe.method)
+        self.methods.contains(&recipe.method) && (!recipe.is_extra || self.wants(recipe.labels))
+    }
+
+    fn wants(&self, labels: Option<usize>) -> bool {
+        labels.is_some_and(|labels| self.labels.contains(&labels))
     }
 }
 
@@ -47,6 +53,8 @@ pub(super) struct Recipe {
     /// Labels other than the method's own share.
     pub(super) labels: Option<usize>,
     pub(super) choice: LabelChoice,
+    /// Whether the tables have it only where its number of labels was asked for.
+    pub(super) is_extra: bool,
 }
 
 /// The rows that there can be, those of the plan's methods first.
@@ -63,6 +71,7 @@ pub(super) fn recipes(plan: &Plan, dataset: &Dataset) -> anyhow::Result<Vec<Reci
             method,
             labels: None,
             choice: LabelChoice::Object,
+            is_extra: false,
         };
         recipes.push(own);
         match method {
@@ -78,8 +87,37 @@ pub(super) fn recipes(plan: &Plan, dataset: &Dataset) -> anyhow::Result<Vec<Reci
             }),
             _ => {}
         }
+        let mut budgets: BTreeSet<usize> = plan.labels.iter().copied().collect();
+        budgets.extend(budgets_in(&plan.out.join("runs"), method));
+        for labels in budgets {
+            let has = |recipe: &Recipe| {
+                recipe.method == method
+                    && recipe.choice == LabelChoice::Object
+                    && methods::labels(method, dataset, recipe.labels).ok() == Some(labels)
+            };
+            if !recipes.iter().any(has) {
+                recipes.push(Recipe {
+                    labels: Some(labels),
+                    is_extra: true,
+                    ..own
+                });
+            }
+        }
     }
     Ok(recipes)
+}
+
+/// Numbers of labels that a method was run with before: of the runs called `METHOD-LABELS-SEED`.
+fn budgets_in(runs: &Path, method: Method) -> BTreeSet<usize> {
+    let prefix = format!("{}-", method.name());
+    let names = std::fs::read_dir(runs).into_iter().flatten().flatten();
+    let budget = |entry: std::fs::DirEntry| {
+        let name = entry.file_name();
+        let (labels, seed) = name.to_str()?.strip_prefix(&prefix)?.split_once('-')?;
+        seed.parse::<u64>().ok()?;
+        labels.parse().ok()
+    };
+    names.filter_map(budget).collect()
 }
 
 /// Every run that the plan asks for, and those that another finished before.
@@ -102,7 +140,7 @@ pub(super) fn planned(
                 directory: directory.join(format!("{}-{seed}", recipe.name())),
                 // USTGAN is the same, and what the STGANs generate.
                 shares_with: matches!(recipe.method, Method::Nahrn | Method::Nihrn)
-                    .then(|| format!("{}-{seed}", Method::Ours.name())),
+                    .then(|| format!("{}-{seed}", recipe.as_ours().name())),
             };
             if (1..=asked).contains(&seed) || run.counts() {
                 runs.push(run);
@@ -113,6 +151,14 @@ pub(super) fn planned(
 }
 
 impl Recipe {
+    /// The paper's whole method with the same labels.
+    fn as_ours(&self) -> Self {
+        Self {
+            method: Method::Ours,
+            ..*self
+        }
+    }
+
     /// Of its runs' directories.
     pub(super) fn name(&self) -> String {
         let mut name = self.method.name().to_owned();
@@ -271,6 +317,35 @@ impl PlannedRun {
             name,
         }
     }
+}
+
+/// A command line for each run that is not finished, for a shell. A run that takes stages of another one
+/// stands behind it on the same line.
+pub(super) fn command_lines(jobs: &[Job]) -> anyhow::Result<String> {
+    let line = |job: &Job, from: Option<&Path>| {
+        let mut words = vec!["hrn-train".to_owned()];
+        words.extend(job.arguments.iter().cloned());
+        if let Some(from) = from {
+            words.extend(["--from".to_owned(), from.to_string_lossy().into_owned()]);
+        }
+        let words = shlex::try_join(words.iter().map(String::as_str));
+        Ok::<_, shlex::QuoteError>(format!("RAYON_NUM_THREADS=1 {}", words?))
+    };
+    let mut lines = String::new();
+    let waits_for = |job: &Job, other: &Job| job.after.as_ref() == Some(&other.name);
+    for job in jobs {
+        if jobs.iter().any(|other| waits_for(job, other)) {
+            continue;
+        }
+        let from = job.from.as_deref().filter(|from| from.is_dir());
+        lines += &line(job, from)?;
+        for next in jobs.iter().filter(|next| waits_for(next, job)) {
+            lines += " && ";
+            lines += &line(next, next.from.as_deref())?;
+        }
+        lines.push('\n');
+    }
+    Ok(lines)
 }
 
 /// What is still to be run.

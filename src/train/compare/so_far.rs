@@ -64,7 +64,7 @@ pub(super) fn of(
     finals: &[(Press, Verdict)],
 ) -> anyhow::Result<SoFar> {
     let mut at: Vec<(usize, Vec<Judged>)> = vec![(0, Vec::new()); SECONDS.len()];
-    let (mut early, mut right, mut changed, mut ahead) = (0, 0, 0, Vec::new());
+    let (mut early, mut right, mut changed, mut ahead) = (0_usize, 0, 0, Vec::new());
     for (place, (press, last)) in places.zip(finals) {
         let course = model::course_of(courses, place);
         let frames = course.moments.len();
