@@ -137,7 +137,28 @@ fn compare(at: &Path, told: &Value) {
     let output = hrn_train(at, "compare --course --data d.npz --out c");
     assert_eq!(output.status.code(), Some(2));
     let output = hrn_train(at, "compare --data d.npz d.npz --out c");
-    assert_eq!(output.status.code(), Some(1));
+    assert_eq!(output.status.code(), Some(2));
+}
+
+#[test]
+fn a_model_for_one_robot_takes_no_notice_of_the_arm() {
+    let directory = tempfile::tempdir().unwrap();
+    let at = directory.path();
+    std::fs::write(at.join("settings.toml"), SETTINGS).unwrap();
+    let simulate = "simulate --sequences --materials broad --objects 3 --test-objects 1 --presses 2 --fps 10 \
+                    --speed 8 --arm 10 --seed 4 --out d.npz";
+    succeed(at, simulate);
+    succeed(
+        at,
+        "train --method course --one-robot --data d.npz --config settings.toml --out one",
+    );
+    let told = std::fs::read_to_string(at.join("one/settings.toml")).unwrap();
+    assert!(told.contains("unknown = 1.0"), "{told}");
+    let output = hrn_train(
+        at,
+        "train --method frame --one-robot --data d.npz --out two",
+    );
+    assert_eq!(output.status.code(), Some(2));
 }
 
 #[test]

@@ -12,6 +12,7 @@ pub mod gan;
 pub mod network;
 pub mod optimiser;
 pub(in crate::train) mod retired;
+pub mod told;
 
 use crate::wording;
 
@@ -21,6 +22,7 @@ pub use consistency::ConsistencySettings;
 pub use gan::GanSettings;
 pub use network::NetworkSettings;
 pub use optimiser::OptimiserSettings;
+pub use told::Told;
 
 use bounds::{check, check_loop};
 
@@ -139,6 +141,8 @@ pub struct Settings {
     pub training: Training,
     /// Unlabelled samples beside the labelled ones, without a GAN.
     pub consistency: ConsistencySettings,
+    /// What a robot may tell of its arm, for networks of whole presses.
+    pub told: Told,
     /// Held-out objects of the labelled ones.
     pub validation: Validation,
 }
@@ -159,6 +163,7 @@ impl Default for Settings {
             pretraining: Training::default(),
             training: Training::default(),
             consistency: ConsistencySettings::default(),
+            told: Told::default(),
             validation: Validation::default(),
         }
     }
@@ -234,6 +239,7 @@ impl Settings {
         self.pretraining.check("pretraining.")?;
         self.training.check("training.")?;
         self.consistency.check()?;
+        self.told.check()?;
         let Validation {
             share,
             every_epochs,

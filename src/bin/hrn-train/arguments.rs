@@ -227,6 +227,9 @@ pub(super) struct Train {
     /// Which samples get their labels
     #[arg(long, default_value = "object")]
     pub(super) label_choice: LabelChoice,
+    /// With --method course: the model of a robot that always moves alike and tells nothing of its arm
+    #[arg(long)]
+    pub(super) one_robot: bool,
     /// Where to compute
     #[arg(long, default_value = "cpu")]
     pub(super) device: DeviceName,

@@ -34,7 +34,7 @@ use hardnessd::train::model::course::{self, CourseEvaluation};
 use hardnessd::train::model::{export, review};
 use hardnessd::train::run::Run;
 use hardnessd::train::run::disk::write_whole;
-use hardnessd::train::settings::{Profile, Settings, SettingsError};
+use hardnessd::train::settings::{Profile, Settings, SettingsError, Told as Robot};
 use hardnessd::trial;
 use hardnessd::verdict::{BUILT_IN, Hrn, ModelError};
 
@@ -108,7 +108,7 @@ fn exit_code(error: &anyhow::Error) -> u8 {
     if has(|e| {
         e.is::<NoObjects>()
             || e.is::<OtherMaterials>()
-            || e.is::<NotOfFrames>()
+            || e.is::<WrongUsage>()
             || matches!(e.downcast_ref(), Some(LabelsError::Range { .. }))
             || matches!(e.downcast_ref(), Some(CollectError::NoLevel { .. }))
     }) {
@@ -395,6 +395,9 @@ fn train(arguments: &Train) -> anyhow::Result<String> {
     if arguments.method == Method::Course {
         return train_course(arguments);
     }
+    if arguments.one_robot {
+        return Err(WrongUsage::NotOneRobot.into());
+    }
     let settings = settings(
         arguments.method,
         arguments.profile,
@@ -486,11 +489,14 @@ fn account_of_run(begun: Instant, run: &Run, evaluation: Option<&Evaluation>) ->
 }
 
 fn train_course(arguments: &Train) -> anyhow::Result<String> {
-    let settings = settings(
+    let mut settings = settings(
         arguments.method,
         arguments.profile,
         arguments.config.as_deref(),
     )?;
+    if arguments.one_robot {
+        settings.told = Robot::ONE_ROBOT;
+    }
     let (courses, sources) = Courses::read_all(&arguments.data)?;
     let told = (arguments.profile, arguments.seed, settings);
     let description = methods::course::description(&courses, sources, told)?;
@@ -554,10 +560,16 @@ fn end_with(parent: i32) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// `compare` is of methods that judge a frame.
+/// Options that do not go together.
 #[derive(Debug, thiserror::Error)]
-#[error("--methods: found course, which judges presses, expected methods that judge a frame")]
-struct NotOfFrames;
+enum WrongUsage {
+    #[error("--methods: found course, which judges presses, expected methods that judge a frame")]
+    NotOfFrames,
+    #[error("--data: found {0} files, expected 1 without --course")]
+    ManyFiles(usize),
+    #[error("--one-robot: found another method, expected course")]
+    NotOneRobot,
+}
 
 fn compare(arguments: Compare) -> anyhow::Result<String> {
     if arguments.course {
@@ -570,10 +582,10 @@ fn compare(arguments: Compare) -> anyhow::Result<String> {
         let page = arguments.out.join("course.md");
         return Ok(format!("{table}\n{}\n", page.display()));
     }
-    let [data] = <[PathBuf; 1]>::try_from(arguments.data)
-        .map_err(|all| anyhow::anyhow!("--data: found {} files, expected 1", all.len()))?;
+    let [data] =
+        <[PathBuf; 1]>::try_from(arguments.data).map_err(|all| WrongUsage::ManyFiles(all.len()))?;
     if arguments.methods.contains(&Method::Course) {
-        return Err(NotOfFrames.into());
+        return Err(WrongUsage::NotOfFrames.into());
     }
     let methods = if arguments.methods.is_empty() {
         Method::of_frames().collect()

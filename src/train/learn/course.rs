@@ -20,12 +20,10 @@ use crate::train::net::shore;
 use crate::train::net::standard::Standard;
 use crate::train::run::Run;
 use crate::train::run::checkpoint::Origin;
-use crate::train::settings::Training;
+use crate::train::settings::{Told, Training};
 use crate::verdict::argmax;
 
 mod varied;
-
-pub use varied::Told;
 
 /// Name of the stage.
 const STAGE: &str = "course";

@@ -8,7 +8,7 @@ use crate::random::Stream;
 use crate::simulator::Split;
 use crate::train::data::courses::Courses;
 use crate::train::data::dataset::{self, LabelChoice, Source};
-use crate::train::learn::course::{self, Press, Task, Told};
+use crate::train::learn::course::{self, Press, Task};
 use crate::train::model::course::{CourseEvaluation, finish};
 use crate::train::run::{Description, Run};
 use crate::train::settings::{Profile, Settings};
@@ -67,7 +67,7 @@ pub fn train(
         train: &train,
         held_out: &held_out,
         levels: dataset::levels().len(),
-        told: Told::default(),
+        told: settings.told,
         settings: &settings.training,
         seed: *seed,
         device,

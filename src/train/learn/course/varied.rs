@@ -1,48 +1,10 @@
 //! What a robot may tell wrongly: presses are learnt from with these errors, because a network that
 //! was only ever told the truth believes everything.
 
-use serde::{Deserialize, Serialize};
-
 use super::Press;
 use crate::random::Stream;
 use crate::train::net::frames::FEATURES;
-
-/// Errors of what the arm tells, drawn for each press.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Told {
-    /// Share of presses of which nothing is known of the arm.
-    pub unknown: f64,
-    /// Share of the others of which the stiffness is not known.
-    pub unknown_arm: f64,
-    /// Share of the others that are told without an error.
-    pub exact: f64,
-    /// Positions are off by up to this part.
-    pub position: f64,
-    /// The stiffness is off by up to this part.
-    pub arm: f64,
-    /// The moments are off by up to so many frames.
-    pub clock_frames: f64,
-    /// Share of presses that are judged before their end.
-    pub early: f64,
-    /// Share of presses that a slower sensor sees: every second to eighth frame of them.
-    pub slower: f64,
-}
-
-impl Default for Told {
-    fn default() -> Self {
-        Self {
-            unknown: 0.3,
-            unknown_arm: 0.1,
-            exact: 0.5,
-            position: 0.1,
-            arm: 0.3,
-            clock_frames: 1.0,
-            early: 0.25,
-            slower: 0.3,
-        }
-    }
-}
+use crate::train::settings::Told;
 
 /// Frames at least of a press that is judged before its end, or that a slower sensor sees.
 const LEAST_FRAMES: usize = 3;
@@ -51,7 +13,7 @@ const MOST_FRAMES_A_STEP: usize = 8;
 
 impl Told {
     /// The press as a robot might tell it.
-    pub fn varied(&self, press: &Press, stream: &mut Stream) -> Press {
+    pub(super) fn varied(&self, press: &Press, stream: &mut Stream) -> Press {
         let mut press = press.clone();
         if stream.uniform() < self.slower {
             press.slow_down(stream);
