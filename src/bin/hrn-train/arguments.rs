@@ -201,7 +201,7 @@ pub(super) struct Train {
     pub(super) method: Method,
     /// Data to learn from; several files are joined, and no object of one is taken for one of
     /// another: all presses of an object belong into one file
-    #[arg(long, value_name = "D.npz", required = true)]
+    #[arg(long, value_name = "D.npz", required = true, num_args = 1..)]
     pub(super) data: Vec<PathBuf>,
     /// Directory of the run
     #[arg(long, value_name = "RUN")]
@@ -241,7 +241,7 @@ pub(super) struct Train {
 #[derive(Debug, clap::Args)]
 pub(super) struct Adapt {
     /// Presses of your sensor; those of level 0 are unlabelled. Several files are joined
-    #[arg(long, value_name = "D.npz", required = true)]
+    #[arg(long, value_name = "D.npz", required = true, num_args = 1..)]
     pub(super) data: Vec<PathBuf>,
     /// Directory of the run
     #[arg(long, value_name = "RUN")]
