@@ -98,6 +98,56 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
     assert_eq!(evaluation["n"], told["n"]);
 
     compare(at, &told);
+    adapt(at, &whole);
+}
+
+/// Going on from a model: with no step taken it stays the same, and it goes on from its own.
+fn adapt(at: &Path, start: &[u8]) {
+    let simulate = "simulate --sequences --one-sensor 5 --cover 1 --objects 2 --test-objects 1 --presses 3 \
+                    --fps 20 --seed 6 --out own.npz";
+    succeed(at, simulate);
+    let adapt = "adapt --data own.npz --config settings.toml --start whole/hrn.onnx";
+    succeed(at, &format!("{adapt} --out own"));
+    let own = std::fs::read(at.join("own/hrn.onnx")).unwrap();
+    let (before, after) = (Hrn::load(start).unwrap(), Hrn::load(&own).unwrap());
+    assert_eq!(after.card().method, "adapt");
+    assert_eq!(after.card().conformal, before.card().conformal);
+    succeed(
+        at,
+        "adapt --data own.npz --config settings.toml --start own/hrn.onnx --out again",
+    );
+
+    // A step so small that no weight moves.
+    std::fs::write(
+        at.join("still.toml"),
+        "[training]\nepochs = 1\n[training.optimiser]\nlearning_rate = 1e-30\nweight_decay = 0.0\n",
+    )
+    .unwrap();
+    succeed(
+        at,
+        "adapt --data own.npz --config still.toml --start whole/hrn.onnx --out still",
+    );
+    let still = Hrn::load(&std::fs::read(at.join("still/hrn.onnx")).unwrap()).unwrap();
+    let courses = Courses::read(&at.join("own.npz")).unwrap();
+    for press in 0..courses.presses.len() {
+        let course = course_of(&courses, press);
+        let [before, after] = [&before, &still].map(|hrn| hrn.judge_course(&course).unwrap());
+        // The running average of weights that stand still rounds.
+        let pairs = before.probabilities.iter().zip(&after.probabilities);
+        assert!(pairs.into_iter().all(|(a, b)| (a - b).abs() < 1e-5));
+        let [before, after] = [before, after].map(|verdict| verdict.shore.unwrap());
+        assert!((before.value - after.value).abs() < 1e-3 && (before.low - after.low).abs() < 1e-3);
+    }
+
+    let output = hrn_train(at, "adapt --data own.npz --out none");
+    assert_eq!(output.status.code(), Some(2), "{output:?}");
+    let output = hrn_train(
+        at,
+        "adapt --data own.npz --start ../../models/hrn.onnx --out none"
+            .replace("../..", env!("CARGO_MANIFEST_DIR"))
+            .as_str(),
+    );
+    assert_eq!(output.status.code(), Some(78), "{output:?}");
 }
 
 /// The tables of a model of whole presses, one of a frame, and the controls, on the same presses.

@@ -445,6 +445,9 @@ fn dataset_of(paths: &[PathBuf]) -> anyhow::Result<Dataset> {
 }
 
 fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
+    if Courses::is_at(&arguments.data[0])? {
+        return adapt_course(arguments);
+    }
     let (method, profile) = (Method::Adapt, Profile::Paper);
     let settings = settings(method, profile, arguments.config.as_deref())?;
     let device = device(arguments.device)?;
@@ -499,20 +502,47 @@ fn train_course(arguments: &Train) -> anyhow::Result<String> {
     }
     let (courses, sources) = Courses::read_all(&arguments.data)?;
     let told = (arguments.profile, arguments.seed, settings);
-    let description = methods::course::description(&courses, sources, told)?;
+    let description = methods::course::description(Method::Course, &courses, sources, told)?;
     let device = device(arguments.device)?;
     let run = Run::open(&arguments.out, &description, arguments.resume)?;
     let begun = Instant::now();
-    let evaluation = methods::course::train(&courses, &description, &run, &device)?;
+    let evaluation = methods::course::train(&courses, None, &description, &run, &device)?;
+    Ok(account_of_course_run(begun, &run, evaluation.as_ref()))
+}
+
+/// How long it took, where the model is and what it is worth.
+fn account_of_course_run(
+    begun: Instant,
+    run: &Run,
+    evaluation: Option<&CourseEvaluation>,
+) -> String {
     let figures = evaluation.map_or_else(
         || "not evaluated: the data has no labelled test presses\n".to_owned(),
-        |evaluation| account::of_courses(&evaluation),
+        account::of_courses,
     );
-    Ok(format!(
+    format!(
         "trained in {:.1} s: {}\n{figures}",
         begun.elapsed().as_secs_f64(),
         run.path("hrn.onnx").display()
-    ))
+    )
+}
+
+/// Goes on from a model of whole presses.
+fn adapt_course(arguments: &Adapt) -> anyhow::Result<String> {
+    let path = arguments.start.as_ref().ok_or(WrongUsage::NoStart)?;
+    let (method, profile) = (Method::Adapt, Profile::Paper);
+    let settings = settings(method, profile, arguments.config.as_deref())?;
+    let device = device(arguments.device)?;
+    let bytes = read(path)?;
+    let start = methods::course::start(&load(path)?, &bytes, &device)
+        .with_context(|| path.display().to_string())?;
+    let (courses, sources) = Courses::read_all(&arguments.data)?;
+    let told = (profile, arguments.seed, settings);
+    let description = methods::course::description(method, &courses, sources, told)?;
+    let run = Run::open(&arguments.out, &description, arguments.resume)?;
+    let begun = Instant::now();
+    let evaluation = methods::course::train(&courses, Some(start), &description, &run, &device)?;
+    Ok(account_of_course_run(begun, &run, evaluation.as_ref()))
 }
 
 /// Those of the method, and what a file overrides.
@@ -567,6 +597,10 @@ enum WrongUsage {
     NotOfFrames,
     #[error("--data: found {0} files, expected 1 without --course")]
     ManyFiles(usize),
+    #[error(
+        "--start: found none, expected a model of whole presses, such as models/course.onnx, for such data"
+    )]
+    NoStart,
     #[error("--one-robot: found another method, expected course")]
     NotOneRobot,
 }

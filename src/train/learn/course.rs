@@ -18,6 +18,7 @@ use crate::train::net::hrn;
 use crate::train::net::network::{Weights, numbers};
 use crate::train::net::shore;
 use crate::train::net::standard::Standard;
+use crate::train::net::start::Start;
 use crate::train::run::Run;
 use crate::train::run::checkpoint::Origin;
 use crate::train::settings::{Told, Training};
@@ -25,8 +26,6 @@ use crate::verdict::argmax;
 
 mod varied;
 
-/// Name of the stage.
-const STAGE: &str = "course";
 /// How far levels with few samples are lifted: halfway. Even Shore hardness gives few samples of the narrow
 /// levels. The course tells them well enough that half of the way costs nothing where samples count alike, and
 /// most of what is to be won where levels do (`models/course.md`).
@@ -112,6 +111,8 @@ impl Press {
 /// What is to be learnt, and from what.
 #[derive(Debug)]
 pub struct Task<'a> {
+    /// Name of the stage.
+    pub stage: &'static str,
     /// All presses of the training split.
     pub presses: &'a [Press],
     /// Places of labelled presses to learn from.
@@ -162,48 +163,72 @@ impl Trained {
     }
 }
 
-/// Trains, or goes on from the last checkpoint in `run`.
+/// Trains from random weights, or from `start` with what its verdicts promise; goes on from the last
+/// checkpoint in `run`.
 ///
 /// # Errors
 ///
 /// If the run's directory cannot be read or written, its checkpoint is of another stage than this,
 /// or the loss or a weight is no number any more.
-pub fn fit(task: &Task, run: &Run) -> anyhow::Result<Trained> {
-    let rows: Vec<Vec<f32>> = task
-        .train
-        .iter()
-        .map(|&place| task.presses[place].columns())
-        .collect();
-    let standard = Standard::of(COLUMNS, rows.iter().flat_map(|rows| rows.chunks(COLUMNS)));
-    drop(rows);
-    let initial = course::initial(task.levels, task.seed, task.device);
-    let stage = epochs::Stage {
-        name: STAGE,
-        origin: task.origin(&initial),
-        train: task.train,
-        settings: task.settings,
-        seed: task.seed,
+pub fn fit(task: &Task, start: Option<(Start, Calibration)>, run: &Run) -> anyhow::Result<Trained> {
+    let Some((start, calibration)) = start else {
+        let initial = course::initial(task.levels, task.seed, task.device);
+        let (weights, standard) = task.learnt(initial, task.standard(), run)?;
+        return Ok(task.calibrated(weights, standard));
     };
-    let level_of = |&place: &usize| task.presses[place].level;
-    let level_weights = hrn::level_weights(
-        task.train.iter().map(level_of),
-        task.levels,
-        BALANCE,
-        task.device,
-    );
-    let weights = epochs::run(&stage, initial, run, task.device, |learner, batch| {
-        Ok(task.step(learner, (&standard, &level_weights), batch))
-    })?;
+    let (weights, standard) = task.learnt(start.weights.clone(), start.standard, run)?;
+    let weights = weights.between(&start.weights, epochs::LEARNT_SHARE);
+    if task.held_out.is_empty() {
+        return Ok(Trained {
+            weights,
+            standard,
+            calibration,
+        });
+    }
     Ok(task.calibrated(weights, standard))
 }
 
 impl Task<'_> {
     fn stream(&self, name: &str) -> Stream {
-        Stream::new(self.seed, &format!("{STAGE} {name}"))
+        Stream::new(self.seed, &format!("{} {name}", self.stage))
+    }
+
+    /// Of the presses learnt from.
+    fn standard(&self) -> Standard {
+        let presses = self.train.iter().map(|&place| &self.presses[place]);
+        let rows: Vec<Vec<f32>> = presses.map(Press::columns).collect();
+        Standard::of(COLUMNS, rows.iter().flat_map(|rows| rows.chunks(COLUMNS)))
+    }
+
+    /// The epochs.
+    fn learnt(
+        &self,
+        initial: Weights,
+        standard: Standard,
+        run: &Run,
+    ) -> anyhow::Result<(Weights, Standard)> {
+        let stage = epochs::Stage {
+            name: self.stage,
+            origin: self.origin(&initial),
+            train: self.train,
+            settings: self.settings,
+            seed: self.seed,
+        };
+        let level_of = |&place: &usize| self.presses[place].level;
+        let level_weights = hrn::level_weights(
+            self.train.iter().map(level_of),
+            self.levels,
+            BALANCE,
+            self.device,
+        );
+        let weights = epochs::run(&stage, initial, run, self.device, |learner, batch| {
+            Ok(self.step(learner, (&standard, &level_weights), batch))
+        })?;
+        Ok((weights, standard))
     }
 
     fn origin(&self, initial: &Weights) -> String {
-        let mut origin = Origin::new(STAGE, &(self.settings, self.told), self.seed);
+        let mut origin = Origin::new(self.stage, &(self.settings, self.told), self.seed);
         for &place in self.train.iter().chain(self.held_out) {
             let press = &self.presses[place];
             let known = press

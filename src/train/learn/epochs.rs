@@ -14,6 +14,11 @@ use crate::train::run::history::Row;
 use crate::train::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
 use crate::train::settings::Training;
 
+/// Training that goes on from a start ends this far from it, on the line to what was learnt: a few objects
+/// tell what the sensor is like, and little of other materials, which the start knows (Wortsman et al. 2022,
+/// "Robust fine-tuning of zero-shot models").
+pub const LEARNT_SHARE: f32 = 0.5;
+
 /// What is trained, and how.
 #[derive(Debug)]
 pub struct Stage<'a> {

@@ -14,21 +14,18 @@ use crate::train::data::disturb;
 use crate::train::learn::conformal::{Calibration, Judged};
 use crate::train::learn::epochs::{self, Batch};
 use crate::train::learn::learner::Learner;
-use crate::train::net::frame::{self, Start};
+use crate::train::net::frame;
 use crate::train::net::frames::{FEATURES, Features};
 use crate::train::net::hrn;
 use crate::train::net::network::{Weights, numbers};
 use crate::train::net::shore;
 use crate::train::net::standard::Standard;
+use crate::train::net::start::Start;
 use crate::train::run::Run;
 use crate::train::run::checkpoint::Origin;
 use crate::train::settings::{ConsistencySettings, Training};
 use crate::verdict::argmax;
 
-/// Training that goes on from a start ends this far from it, on the line to what was learnt: a few objects
-/// tell what the sensor is like, and little of other materials, which the start knows (Wortsman et al. 2022,
-/// "Robust fine-tuning of zero-shot models").
-const LEARNT_SHARE: f32 = 0.5;
 /// How far levels with few samples are lifted: wholly. Even Shore hardness gives few samples of the narrow
 /// levels, and a network that weighs samples alike hardly ever names those.
 const BALANCE: f32 = 1.0;
@@ -148,7 +145,7 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
         task.step(learner, &plan, (&standard, &level_weights), batch)
     })?;
     let weights = match &kept {
-        Some(start) => weights.between(start, LEARNT_SHARE),
+        Some(start) => weights.between(start, epochs::LEARNT_SHARE),
         None => weights,
     };
     if !task.held_out.is_empty() {

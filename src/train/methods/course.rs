@@ -1,17 +1,24 @@
-//! The method `course`: the network that judges whole presses.
+//! The method `course`, and `adapt` on presses: the network that judges whole presses, from random weights or
+//! from those of a model file.
 
 use anyhow::ensure;
 use burn::tensor::Device;
 
 use super::Method;
+use super::frame::NoStart;
 use crate::random::Stream;
 use crate::simulator::Split;
 use crate::train::data::courses::Courses;
 use crate::train::data::dataset::{self, LabelChoice, Source};
+use crate::train::learn::conformal::Calibration;
 use crate::train::learn::course::{self, Press, Task};
 use crate::train::model::course::{CourseEvaluation, finish};
+use crate::train::model::file;
+use crate::train::net::course as network;
+use crate::train::net::start::Start;
 use crate::train::run::{Description, Run};
 use crate::train::settings::{Profile, Settings};
+use crate::verdict::Hrn;
 
 /// Labelled training presses of a file.
 fn labelled(courses: &Courses) -> Vec<usize> {
@@ -20,12 +27,13 @@ fn labelled(courses: &Courses) -> Vec<usize> {
     wanted.map(|(place, _)| place).collect()
 }
 
-/// What a run is told: all labels are used.
+/// What a run of a method is told: all labels are used.
 ///
 /// # Errors
 ///
 /// If the data has no labelled training presses.
 pub fn description(
+    method: Method,
     courses: &Courses,
     sources: Vec<Source>,
     (profile, seed, settings): (Profile, u64, Settings),
@@ -37,7 +45,7 @@ pub fn description(
         sources.first().map_or("", |source| &source.name)
     );
     Ok(Description {
-        method: Method::Course.name().to_owned(),
+        method: method.name().to_owned(),
         profile,
         seed,
         labels,
@@ -47,13 +55,15 @@ pub fn description(
     })
 }
 
-/// Runs the method to its model and evaluation in the run's directory; takes up what is there.
+/// Trains to a model and its evaluation in the run's directory, from random weights or from `start`; takes
+/// up what is there.
 ///
 /// # Errors
 ///
 /// If the training diverges, or the directory cannot be read or written.
 pub fn train(
     courses: &Courses,
+    start: Option<(Start, Calibration)>,
     description: &Description,
     run: &Run,
     device: &Device,
@@ -63,6 +73,10 @@ pub fn train(
     let Description { settings, seed, .. } = description;
     let (train, held_out) = hold_out(&presses, &all, settings.validation.share, *seed);
     let task = Task {
+        stage: match start {
+            Some(_) => "adapt",
+            None => "course",
+        },
         presses: &presses,
         train: &train,
         held_out: &held_out,
@@ -72,7 +86,7 @@ pub fn train(
         seed: *seed,
         device,
     };
-    let trained = course::fit(&task, run)?;
+    let trained = course::fit(&task, start, run)?;
     finish(
         run,
         description,
@@ -81,6 +95,24 @@ pub fn train(
         &trained,
         device,
     )
+}
+
+/// What `adapt` goes on from: a model file that the daemon's loader has taken, and what its verdicts promise.
+///
+/// # Errors
+///
+/// [`NoStart`] if it is of another network.
+pub fn start(hrn: &Hrn, bytes: &[u8], device: &Device) -> anyhow::Result<(Start, Calibration)> {
+    let constants = file::constants(bytes)?;
+    let start = network::start(|name| constants.get(name), dataset::levels().len(), device);
+    let start = start.ok_or_else(|| NoStart::of(hrn, "presses (course, adapt)"))?;
+    let conformal = hrn.card().conformal;
+    let calibration = Calibration {
+        temperature: start.temperature,
+        widths: start.widths,
+        threshold: conformal.map_or(0.0, |conformal| conformal.threshold),
+    };
+    Ok((start, calibration))
 }
 
 /// Parts presses by their objects: those to learn from, and `share` of the objects to calibrate on.

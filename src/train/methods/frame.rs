@@ -12,8 +12,9 @@ use crate::train::learn::fit;
 use crate::train::learn::frame::{self, Task, Trained};
 use crate::train::model::export::{self, Recogniser};
 use crate::train::model::file;
-use crate::train::net::frame::{Start, graph};
+use crate::train::net::frame as network;
 use crate::train::net::frames::Features;
+use crate::train::net::start::Start;
 use crate::train::run::{Description, Run};
 use crate::train::stages;
 use crate::verdict::Hrn;
@@ -65,13 +66,26 @@ pub fn train(
 /// A model file that `adapt` cannot go on from.
 #[derive(Debug, thiserror::Error)]
 #[error(
-    "adapt goes on from models of the methods frame and adapt with {expected} levels: this one is of \
-     {method}, with {levels} levels"
+    "with such data adapt goes on from models of {from} with {expected} levels: this one is of {method}, with \
+     {levels} levels"
 )]
 pub struct NoStart {
+    from: &'static str,
     method: String,
     levels: usize,
     expected: usize,
+}
+
+impl NoStart {
+    /// Of a file that is of another network than those of `from`.
+    pub(super) fn of(hrn: &Hrn, from: &'static str) -> Self {
+        Self {
+            from,
+            method: hrn.card().method.clone(),
+            levels: hrn.card().levels.len(),
+            expected: dataset::levels().len(),
+        }
+    }
 }
 
 /// What `adapt` goes on from: a model file that the daemon's loader has taken.
@@ -82,12 +96,8 @@ pub struct NoStart {
 pub fn start(hrn: &Hrn, bytes: &[u8], device: &Device) -> anyhow::Result<Start> {
     let levels = dataset::levels().len();
     let constants = file::constants(bytes)?;
-    let start = Start::of_constants(|name| constants.get(name), levels, device);
-    Ok(start.ok_or_else(|| NoStart {
-        method: hrn.card().method.clone(),
-        levels: hrn.card().levels.len(),
-        expected: levels,
-    })?)
+    let start = network::start(|name| constants.get(name), levels, device);
+    Ok(start.ok_or_else(|| NoStart::of(hrn, "frames (frame, adapt)"))?)
 }
 
 /// Goes on from `start` on all labelled training samples and, by consistency, on the others.
@@ -143,7 +153,7 @@ fn finish(
         .collect();
     let said: Vec<Vec<f32>> = probabilities(&frames)?;
     stages::draw_mistakes(run, samples.dataset, (kind, shown), &said)?;
-    let (graph, raw_logits, shore) = graph(
+    let (graph, raw_logits, shore) = network::graph(
         &trained.weights,
         &trained.standard,
         levels,

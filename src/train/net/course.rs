@@ -11,6 +11,7 @@ use crate::random::Stream;
 use crate::train::net::frames::FEATURES;
 use crate::train::net::network::{Weights, dense};
 use crate::train::net::shore;
+use crate::train::net::start::{Constant, Start};
 use crate::verdict::COURSE_FRAMES;
 
 pub use graph::graph;
@@ -140,6 +141,16 @@ pub fn initial(levels: usize, seed: u64, device: &Device) -> Weights {
     add("joint", &[POOLS * HIDDEN, LAST], 2.0);
     add("head", &[LAST, levels + shore::OUTPUTS], 0.2);
     weights
+}
+
+/// What training goes on from, of an exported graph's constants; `None` if they are of another network.
+pub fn start<'a>(
+    constant: impl Fn(&str) -> Option<&'a Constant>,
+    levels: usize,
+    device: &Device,
+) -> Option<Start> {
+    let weight = |name: &str| graph::weight(name, &constant);
+    Start::of_constants(initial(levels, 0, device), COLUMNS, weight, device)
 }
 
 /// Logits and Shore outputs `[batch, L + 3]`.

@@ -20,6 +20,7 @@ use crate::train::net::network::{
 };
 use crate::train::net::shore;
 use crate::train::net::standard::Standard;
+use crate::train::net::start::{Constant, Start};
 
 /// From newtons to an image: the light taxels of a contact's edge count as much as the heavy ones.
 pub const SCALE: Scale = Scale {
@@ -108,6 +109,16 @@ pub fn outputs(weights: &Weights, batch: &Batch) -> Tensor<2> {
     dense(weights, "head", joint)
 }
 
+/// What training goes on from, of an exported graph's constants; `None` if they are of another network.
+pub fn start<'a>(
+    constant: impl Fn(&str) -> Option<&'a Constant>,
+    levels: usize,
+    device: &Device,
+) -> Option<Start> {
+    let constant = |name: &str| constant(name).cloned();
+    Start::of_constants(initial(levels, 0, device), FEATURES, constant, device)
+}
+
 /// The graph from newtons to raw logits `[1, levels]` and Shore OO `[1, 3]`, and their names. `widths` are
 /// added below and above to the ends of the interval.
 pub fn graph(
@@ -136,53 +147,6 @@ pub fn graph(
     let outputs = b.dense(weights, "head", [LAST, levels + shore::OUTPUTS], &joint);
     let (raw_logits, shore) = shore::nodes(&mut b, &outputs, levels, widths);
     (b.0, raw_logits, shore)
-}
-
-/// A network that training goes on from.
-#[derive(Debug, Clone)]
-pub struct Start {
-    /// Of all layers.
-    pub weights: Weights,
-    /// Of the features.
-    pub standard: Standard,
-    /// What the logits are divided by.
-    pub temperature: f32,
-    /// What is added below and above the interval of Shore, in Shore OO.
-    pub widths: [f32; 2],
-}
-
-impl Start {
-    /// From an exported graph's constants; `None` if they are of another network. `constant` gives shape
-    /// and numbers of a constant by its name.
-    pub fn of_constants<'a>(
-        constant: impl Fn(&str) -> Option<&'a (Vec<usize>, Vec<f32>)>,
-        levels: usize,
-        device: &Device,
-    ) -> Option<Self> {
-        let mut weights = initial(levels, 0, device);
-        for weight in &mut weights.entries {
-            let (dims, values) = constant(&weight.name)?;
-            if *dims != weight.dims {
-                return None;
-            }
-            let data = TensorData::new(values.clone(), [values.len()]);
-            weight.values = Tensor::from_data(data, device);
-        }
-        let numbers = |name: &str, count: usize| {
-            let (_, values) = constant(name)?;
-            (values.len() == count).then(|| values.clone())
-        };
-        Some(Self {
-            weights,
-            standard: Standard {
-                mean: numbers("column means", FEATURES)?,
-                deviation: numbers("column deviations", FEATURES)?,
-            },
-            temperature: numbers("temperature", 1)?[0],
-            widths: numbers("shore middles", shore::OUTPUTS)
-                .map_or([0.0; 2], |middles| shore::widths(&middles)),
-        })
-    }
 }
 
 #[cfg(test)]

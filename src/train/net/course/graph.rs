@@ -9,6 +9,7 @@ use crate::train::net::graph::{Graph, integer, integers};
 use crate::train::net::network::Weights;
 use crate::train::net::shore;
 use crate::train::net::standard::Standard;
+use crate::train::net::start::Constant;
 
 /// Keep logarithms finite: added to mm, s and s between frames.
 pub(super) const MM: f32 = 0.3;
@@ -81,12 +82,9 @@ impl Builder {
     fn convolution(&mut self, weights: &Weights, layer: usize, x: &str, mask: &str) -> String {
         let (name, dilation) = (format!("conv{layer}"), DILATIONS[layer - 1]);
         let rows = weights.numbers(&format!("{name}.matrix"));
-        // From [tap, in, out] to [out, in, tap].
         let mut kernel = vec![0.0; rows.len()];
         for (place, value) in rows.into_iter().enumerate() {
-            let (tap, rest) = (place / (HIDDEN * HIDDEN), place % (HIDDEN * HIDDEN));
-            let (input, output) = (rest / HIDDEN, rest % HIDDEN);
-            kernel[(output * HIDDEN + input) * KERNEL + tap] = value;
+            kernel[in_kernel(place)] = value;
         }
         let kernel = self.0.constant(
             &format!("{name}.kernel"),
@@ -111,6 +109,35 @@ impl Builder {
         let all = self.node("Add", &[x, &added], &format!("{name}.all"));
         self.node("Mul", &[&all, mask], &format!("{name}.out"))
     }
+}
+
+/// Where the number at `place` of a matrix `[tap, in, out]` lies in the kernel `[out, in, tap]`.
+fn in_kernel(place: usize) -> usize {
+    let (tap, rest) = (place / (HIDDEN * HIDDEN), place % (HIDDEN * HIDDEN));
+    let (input, output) = (rest / HIDDEN, rest % HIDDEN);
+    (output * HIDDEN + input) * KERNEL + tap
+}
+
+/// A weight of [`super::initial`] from the constants of an exported graph, which holds the convolutions as
+/// kernels.
+pub(super) fn weight<'a>(
+    name: &str,
+    constant: impl Fn(&str) -> Option<&'a Constant>,
+) -> Option<Constant> {
+    let Some(layer) = name
+        .strip_suffix(".matrix")
+        .filter(|layer| layer.starts_with("conv"))
+    else {
+        return constant(name).cloned();
+    };
+    let (dims, kernel) = constant(&format!("{layer}.kernel"))?;
+    let is_kernel = *dims == [HIDDEN, HIDDEN, KERNEL] && kernel.len() == HIDDEN * HIDDEN * KERNEL;
+    let matrix = |kernel: &[f32]| {
+        (0..kernel.len())
+            .map(|place| kernel[in_kernel(place)])
+            .collect()
+    };
+    is_kernel.then(|| (vec![KERNEL, HIDDEN, HIDDEN], matrix(kernel)))
 }
 
 /// The graph from the inputs of format 2 to raw logits `[1, levels]` and Shore OO `[1, 3]`, and their
