@@ -326,11 +326,25 @@ fn record_writes_a_new_file_for_as_long_as_there_is_a_sensor() {
 
 #[test]
 fn killed_at_any_moment_less_than_a_second_is_lost() {
+    kill_recordings(10);
+}
+
+/// It takes minutes: run it by hand.
+#[test]
+#[ignore = "heavy"]
+fn killed_a_hundred_times_less_than_a_second_is_lost_each_time() {
+    let worst = kill_recordings(100);
+    println!("100 recordings killed, at most {worst:?} lost");
+}
+
+/// Kills `record` at chance moments, and gives the most that one lost.
+fn kill_recordings(rounds: u32) -> Duration {
+    let mut worst = Duration::ZERO;
     let bench = Bench::new();
     let config = configure(&bench, 100);
     let _sensor = bench.sensor_at("port", 100, &[]);
     let mut moments = Stream::new(1, "moments of death");
-    for round in 0..10 {
+    for round in 0..rounds {
         let out = bench.path(&format!("{round}.mcap"));
         let good = bench.path(&format!("{round}.good.mcap"));
         let mut recording = record(&config, &out, &[]);
@@ -355,13 +369,17 @@ fn killed_at_any_moment_less_than_a_second_is_lost() {
             lost < Duration::from_secs(1),
             "{lost:?} lost in round {round}"
         );
+        worst = worst.max(lost);
         // Nothing is missing between: bytes came every 4 ms or so.
         let moments: Vec<Duration> = found.iter().map(|found| found.at.mono).collect();
         let gap = moments.windows(2).map(|two| two[1] - two[0]).max().unwrap();
         assert!(gap < Duration::from_millis(500), "{gap:?} in round {round}");
         let events = replay(&good);
         assert_eq!(events.last().unwrap()["reason"], "end of recording");
+        fs::remove_file(out).unwrap();
+        fs::remove_file(good).unwrap();
     }
+    worst
 }
 
 #[test]

@@ -6,9 +6,11 @@
 )]
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 use std::sync::OnceLock;
+use std::time::Duration;
 
+use hardnessd::random::Stream;
 use hardnessd::simulator::{Material, Split};
 use hardnessd::train::data::courses::Courses;
 use hardnessd::train::data::dataset::{self, Dataset};
@@ -950,4 +952,70 @@ fn bad_input_has_its_exit_code_and_one_line() {
     assert!(!Path::new(&no_gan).exists());
     // A picture that cannot be written does not cost the data set.
     assert!(Dataset::read(Path::new(&beside)).is_ok());
+}
+
+/// It takes minutes: run it by hand.
+#[test]
+#[ignore = "heavy"]
+fn a_training_killed_a_hundred_times_ends_with_the_same_bits() {
+    let (directory, data) = data();
+    let path = |name: &str| directory.path().join(name).to_str().unwrap().to_owned();
+    let settings = "[training]\nepochs = 400\nbatch = 16\ncheckpoint_every_epochs = 1\n";
+    std::fs::write(path("killed.toml"), settings).unwrap();
+    let arguments = |out: &str| {
+        let told = [
+            "train",
+            "--method",
+            "frame",
+            "--resume",
+            "--data",
+            data.to_str().unwrap(),
+        ];
+        let told = told.into_iter().map(str::to_owned);
+        let more = [
+            "--config".to_owned(),
+            path("killed.toml"),
+            "--out".to_owned(),
+            path(out),
+        ];
+        told.chain(more).collect::<Vec<String>>()
+    };
+    let model = |out: &str| std::fs::read(Path::new(&path(out)).join("hrn.onnx")).unwrap();
+    let whole: Vec<String> = arguments("never killed");
+    succeed(&whole.iter().map(String::as_str).collect::<Vec<_>>());
+
+    let mut moments = Stream::new(2, "moments of death");
+    let (mut kills, mut run) = (0, 0);
+    while kills < 100 {
+        let out = format!("killed {run}");
+        let mut training = Command::new(env!("CARGO_BIN_EXE_hrn-train"))
+            .args(arguments(&out))
+            .stderr(Stdio::null())
+            .stdout(Stdio::null())
+            .spawn()
+            .unwrap();
+        std::thread::sleep(Duration::from_secs_f64(1.5 * moments.uniform()));
+        if let Some(status) = training.try_wait().unwrap() {
+            assert!(status.success(), "{status:?} after {kills} kills");
+            assert!(
+                model(&out) == model("never killed"),
+                "models differ after {kills} kills"
+            );
+            run += 1;
+            continue;
+        }
+        rustix::process::kill_process(Pid::from_child(&training), Signal::KILL).unwrap();
+        training.wait().unwrap();
+        kills += 1;
+    }
+    let last: Vec<String> = arguments(&format!("killed {run}"));
+    succeed(&last.iter().map(String::as_str).collect::<Vec<_>>());
+    assert!(
+        model(&format!("killed {run}")) == model("never killed"),
+        "models differ"
+    );
+    println!(
+        "100 kills over {} runs: all end with the same bits",
+        run + 1
+    );
 }
