@@ -9,6 +9,7 @@
 mod arithmetic;
 mod layers;
 mod learners;
+mod problem;
 mod recurrent;
 mod shapes;
 mod table;
@@ -20,6 +21,7 @@ use std::rc::Rc;
 use tract_onnx::pb;
 use tract_onnx::pb::attribute_proto::AttributeType;
 
+use self::problem::{AttributeProblem, Form, Problem};
 use self::table::{Allowed, Operator};
 use super::ModelError;
 
@@ -58,15 +60,12 @@ pub(super) struct Cost {
 ///
 /// [`ModelError::Guard`], which names the node or tensor and says what is wrong with it.
 pub(super) fn check(proto: &pb::ModelProto, graph: &pb::GraphProto) -> Result<Cost, ModelError> {
-    let whole = |problem: &str| ModelError::Guard {
-        place: "graph".to_owned(),
-        problem: problem.to_owned(),
-    };
+    let unsupported = |what| guard("graph", &Problem::Unsupported(what));
     if !proto.functions.is_empty() {
-        return Err(whole("functions are not supported"));
+        return Err(unsupported("functions are"));
     }
     if !proto.training_info.is_empty() {
-        return Err(whole("training information is not supported"));
+        return Err(unsupported("training information is"));
     }
     let opset = proto
         .opset_import
@@ -78,32 +77,32 @@ pub(super) fn check(proto: &pb::ModelProto, graph: &pb::GraphProto) -> Result<Co
     for input in &graph.input {
         // Before ONNX IR 4, tensors that the file brings along are listed among the inputs too.
         if !graph.initializer.iter().any(|t| t.name == input.name) {
-            let place = || format!("input {}", quoted(&input.name));
-            let value = tensor::declared(input).map_err(|problem| guard(place(), problem))?;
-            walk.bind(&input.name, value)
-                .map_err(|problem| guard(place(), problem))?;
+            tensor::declared(input)
+                .and_then(|value| walk.bind(&input.name, value))
+                .map_err(|problem| guard(format!("input {}", quoted(&input.name)), &problem))?;
         }
     }
     walk.nodes(graph)?;
     for output in &graph.output {
-        let place = || format!("output {}", quoted(&output.name));
-        let declared = tensor::declared(output).map_err(|problem| guard(place(), problem))?;
-        match walk.values.get(output.name.as_str()) {
-            Some(computed) if computed.same_as(&declared) => {}
-            found => {
-                let problem = format!(
-                    "found {}, expected {declared}",
-                    found.map_or("nothing that computes it".to_owned(), ToString::to_string)
-                );
-                return Err(guard(place(), problem));
-            }
-        }
+        tensor::declared(output)
+            .and_then(|declared| match walk.values.get(output.name.as_str()) {
+                Some(computed) if computed.same_as(&declared) => Ok(()),
+                Some(computed) => Err(Problem::Found {
+                    found: computed.into(),
+                    expected: Form::from(&declared).to_string(),
+                }),
+                None => Err(Problem::NothingComputes((&declared).into())),
+            })
+            .map_err(|problem| guard(format!("output {}", quoted(&output.name)), &problem))?;
     }
     Ok(walk.cost)
 }
 
-fn guard(place: String, problem: String) -> ModelError {
-    ModelError::Guard { place, problem }
+fn guard(place: impl Into<String>, problem: &Problem) -> ModelError {
+    ModelError::Guard {
+        place: place.into(),
+        problem: problem.to_string(),
+    }
 }
 
 /// A name out of a file, on one line and of a readable length.
@@ -129,6 +128,17 @@ enum Datum {
 impl Datum {
     fn is_float(self) -> bool {
         matches!(self, Datum::F32 | Datum::F64)
+    }
+
+    fn name(self) -> &'static str {
+        match self {
+            Datum::F32 => "f32",
+            Datum::F64 => "f64",
+            Datum::I32 => "i32",
+            Datum::I64 => "i64",
+            Datum::U8 => "u8",
+            Datum::Bool => "bool",
+        }
     }
 }
 
@@ -174,14 +184,6 @@ impl Value {
     }
 }
 
-impl std::fmt::Display for Value {
-    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let lengths: Vec<String> = self.shape.iter().map(usize::to_string).collect();
-        let datum = format!("{:?}", self.datum).to_lowercase();
-        write!(out, "{datum} [{}]", lengths.join(","))
-    }
-}
-
 fn count(shape: &[usize]) -> Option<u64> {
     shape
         .iter()
@@ -211,9 +213,8 @@ struct Node<'a> {
 }
 
 impl Node<'_> {
-    fn input(&self, index: usize) -> Result<&Value, String> {
-        self.optional(index)
-            .ok_or_else(|| format!("input {index} is missing"))
+    fn input(&self, index: usize) -> Result<&Value, Problem> {
+        self.optional(index).ok_or(Problem::Missing(index))
     }
 
     fn optional(&self, index: usize) -> Option<&Value> {
@@ -226,20 +227,23 @@ impl Node<'_> {
     }
 
     /// An input of this type.
-    fn of(&self, index: usize, datum: Datum) -> Result<&Value, String> {
+    fn of(&self, index: usize, datum: Datum) -> Result<&Value, Problem> {
         let value = self.input(index)?;
         if value.datum == datum {
             return Ok(value);
         }
-        let expected = format!("{datum:?}").to_lowercase();
-        Err(format!("input {index} is {value}, expected {expected}"))
+        Err(Problem::Input {
+            index,
+            found: value.into(),
+            expected: datum.name(),
+        })
     }
 
     /// The integers of an input, which must be known before the model runs.
-    fn known(&self, index: usize) -> Result<&[i64], String> {
+    fn known(&self, index: usize) -> Result<&[i64], Problem> {
         let value = self.input(index)?;
         let ints = value.ints.as_deref();
-        ints.ok_or_else(|| format!("input {index} ({value}) is not a short constant of integers"))
+        ints.ok_or_else(|| Problem::Unknown(index, value.into()))
     }
 
     fn attribute(&self, name: &str) -> Option<&pb::AttributeProto> {
@@ -261,27 +265,27 @@ impl Node<'_> {
     }
 
     /// The axis that an attribute names, counted from the front.
-    fn axis(&self, name: &str, default: i64, rank: usize) -> Result<usize, String> {
+    fn axis(&self, name: &str, default: i64, rank: usize) -> Result<usize, Problem> {
         axis(self.int(name, default), rank)
     }
 }
 
 /// An axis counted from the front.
-fn axis(axis: i64, rank: usize) -> Result<usize, String> {
-    let rank = rank as i64;
-    if (-rank..rank).contains(&axis) {
-        return Ok(axis.rem_euclid(rank) as usize);
+fn axis(axis: i64, rank: usize) -> Result<usize, Problem> {
+    let all = rank as i64;
+    if (-all..all).contains(&axis) {
+        return Ok(axis.rem_euclid(all) as usize);
     }
-    Err(format!("axis {axis} of a value of rank {rank}"))
+    Err(Problem::Axis { axis, rank })
 }
 
 /// Different axes counted from the front.
-fn axes(given: &[i64], rank: usize) -> Result<Vec<usize>, String> {
+fn axes(given: &[i64], rank: usize) -> Result<Vec<usize>, Problem> {
     let mut found = Vec::with_capacity(given.len());
     for &one in given.iter().take(MOST_RANK + 1) {
         let one = axis(one, rank)?;
         if found.contains(&one) {
-            return Err(format!("axis {one} twice"));
+            return Err(Problem::AxisTwice(one));
         }
         found.push(one);
     }
@@ -312,34 +316,27 @@ impl<'a> Walk<'a> {
 
     /// Takes the tensors that a graph brings along.
     fn tensors(&mut self, graph: &'a pb::GraphProto) -> Result<(), ModelError> {
-        let whole = |problem: String| guard("graph".to_owned(), problem);
         if !graph.sparse_initializer.is_empty() {
-            return Err(whole("sparse tensors are not supported".to_owned()));
+            return Err(guard("graph", &Problem::Unsupported("sparse tensors are")));
         }
         if graph.initializer.len() > MOST_TENSORS {
-            let found = graph.initializer.len();
-            let problem = format!("{found} tensors: at most {MOST_TENSORS} are accepted");
-            return Err(whole(problem));
+            return Err(guard("graph", &Problem::Tensors(graph.initializer.len())));
         }
         for proto in &graph.initializer {
-            let place = || format!("tensor {}", quoted(&proto.name));
-            let value = tensor::value(proto).map_err(|problem| guard(place(), problem))?;
-            self.bind(&proto.name, value)
-                .map_err(|problem| guard(place(), problem))?;
+            tensor::value(proto)
+                .and_then(|value| self.bind(&proto.name, value))
+                .map_err(|problem| guard(format!("tensor {}", quoted(&proto.name)), &problem))?;
         }
         Ok(())
     }
 
     /// Gives a value its name.
-    fn bind(&mut self, name: &'a str, value: Value) -> Result<(), String> {
+    fn bind(&mut self, name: &'a str, value: Value) -> Result<(), Problem> {
         if name.is_empty() || name.len() > MOST_NAME_BYTES {
-            return Err(format!(
-                "a name of {} bytes, expected 1 to {MOST_NAME_BYTES}",
-                name.len()
-            ));
+            return Err(Problem::Name(name.len()));
         }
         if self.values.insert(name, value).is_some() {
-            return Err("this name occurs twice".to_owned());
+            return Err(Problem::NameTwice);
         }
         Ok(())
     }
@@ -354,22 +351,22 @@ impl<'a> Walk<'a> {
                 };
                 let operator = quoted(&proto.op_type);
                 let operator = operator.trim_matches('"');
-                guard(format!("node {} ({operator})", quoted(name)), problem)
+                guard(format!("node {} ({operator})", quoted(name)), &problem)
             })?;
         }
         Ok(())
     }
 
-    fn node(&mut self, proto: &'a pb::NodeProto) -> Result<(), String> {
+    fn node(&mut self, proto: &'a pb::NodeProto) -> Result<(), Problem> {
         self.cost.nodes += 1;
         if self.cost.nodes > MOST_NODES {
-            return Err(format!("more than {MOST_NODES} nodes"));
+            return Err(Problem::Nodes);
         }
         if proto.name.len() > MOST_NAME_BYTES {
-            return Err(format!("a name of {} bytes", proto.name.len()));
+            return Err(Problem::Name(proto.name.len()));
         }
         let operator = table::find(&proto.domain, &proto.op_type)
-            .ok_or_else(|| "this operator is not supported".to_owned())?;
+            .ok_or(Problem::Unsupported("this operator is"))?;
         attributes(proto, operator)?;
         let inputs = self.inputs(proto, operator)?;
         let read: u64 = inputs.iter().flatten().filter_map(Value::numbers).sum();
@@ -391,7 +388,7 @@ impl<'a> Walk<'a> {
         let (least, most) = operator.outputs;
         let gaps = outputs < proto.output.len() && !operator.gaps;
         if outputs < least.max(1) || proto.output.len() > most.min(computed.values.len()) || gaps {
-            return Err(format!("{outputs} outputs: it cannot have that many"));
+            return Err(Problem::Outputs(outputs));
         }
         let mut work = read.saturating_add(computed.work);
         for (name, value) in proto.output.iter().zip(computed.values) {
@@ -405,18 +402,14 @@ impl<'a> Walk<'a> {
             self.bind(name, Value { constant, ..value })?;
         }
         if self.cost.numbers > MOST_NUMBERS_IN_ALL {
-            return Err(format!(
-                "with it more than {MOST_NUMBERS_IN_ALL} numbers are computed"
-            ));
+            return Err(Problem::NumbersInAll);
         }
         self.cost.work = self
             .cost
             .work
             .saturating_add(work.saturating_mul(self.times));
         if self.cost.work > MOST_WORK {
-            return Err(format!(
-                "with it a verdict takes more than {MOST_WORK} steps"
-            ));
+            return Err(Problem::Work);
         }
         Ok(())
     }
@@ -425,118 +418,101 @@ impl<'a> Walk<'a> {
         &self,
         proto: &pb::NodeProto,
         operator: &Operator,
-    ) -> Result<Vec<Option<Value>>, String> {
+    ) -> Result<Vec<Option<Value>>, Problem> {
         let (least, most) = operator.inputs;
         let found = proto.input.len();
         if !(least..=most).contains(&found) {
-            return Err(format!("{found} inputs, expected {least} to {most}"));
+            return Err(Problem::Inputs { found, least, most });
         }
         let value = |(index, name): (usize, &String)| match self.values.get(name.as_str()) {
             Some(value) => Ok(Some(value.clone())),
             None if name.is_empty() && operator.gaps && index >= least => Ok(None),
-            None => Err(format!(
-                "input {} is computed by no node before it",
-                quoted(name)
-            )),
+            None => Err(Problem::Uncomputed(quoted(name))),
         };
         proto.input.iter().enumerate().map(value).collect()
     }
 
     /// How many numbers a value has, if it may be that large.
-    fn may_hold(&self, value: &Value) -> Result<u64, String> {
+    fn may_hold(&self, value: &Value) -> Result<u64, Problem> {
         if value.rank() > MOST_RANK {
-            return Err(format!(
-                "an output of rank {}: at most {MOST_RANK} is accepted",
-                value.rank()
-            ));
+            return Err(Problem::OutputRank(value.rank()));
         }
         let empty_list = value.ints.is_some() && value.rank() == 1;
         if value.shape.contains(&0) && !empty_list {
-            return Err(format!("an output without numbers ({value})"));
+            return Err(Problem::EmptyOutput(value.into()));
         }
         match value.numbers() {
             Some(numbers) if numbers <= MOST_NUMBERS => Ok(numbers),
-            _ => Err(format!(
-                "an output of more than {MOST_NUMBERS} numbers ({value})"
-            )),
+            _ => Err(Problem::LargeOutput(value.into())),
         }
     }
 }
 
 /// Checks each attribute against what the table allows.
-fn attributes(proto: &pb::NodeProto, operator: &Operator) -> Result<(), String> {
+fn attributes(proto: &pb::NodeProto, operator: &Operator) -> Result<(), Problem> {
     for (index, attribute) in proto.attribute.iter().enumerate() {
         let name = attribute.name.as_str();
         let mut known = operator.attributes.iter();
         let Some((_, allowed)) = known.find(|(known, _)| *known == name) else {
-            return Err(format!("attribute {} is not supported", quoted(name)));
+            return Err(Problem::UnknownAttribute(quoted(name)));
         };
-        if proto.attribute[..index].iter().any(|a| a.name == name) {
-            return Err(format!("attribute `{name}` twice"));
-        }
-        if !attribute.ref_attr_name.is_empty() {
-            return Err(format!("attribute `{name}` refers to another"));
-        }
-        let expected = allowed.kind();
-        if attribute.r#type != expected as i32 {
-            return Err(format!("attribute `{name}`: expected {expected}"));
-        }
-        let within = |value: i64, low: i64, high: i64| {
-            if (low..=high).contains(&value) {
-                return Ok(());
-            }
-            Err(format!(
-                "attribute `{name}`: found {value}, expected {low} to {high}"
-            ))
+        let twice = proto.attribute[..index].iter().any(|a| a.name == name);
+        let checked = if twice {
+            Err(AttributeProblem::Twice)
+        } else {
+            allowed.check(attribute)
         };
-        let most = |found: usize, most: usize| {
-            if found <= most {
-                return Ok(());
-            }
-            Err(format!(
-                "attribute `{name}`: {found} values, expected at most {most}"
-            ))
-        };
-        match *allowed {
-            Allowed::Int(low, high) => within(attribute.i, low, high)?,
-            Allowed::Ints(length, low, high) => {
-                most(attribute.ints.len(), length)?;
-                for &value in &attribute.ints {
-                    within(value, low, high)?;
-                }
-            }
-            Allowed::Text(texts) => {
-                if !texts.iter().any(|text| text.as_bytes() == attribute.s) {
-                    let found = String::from_utf8_lossy(&attribute.s);
-                    let expected = texts.join(", ");
-                    return Err(format!(
-                        "attribute `{name}`: found {}, expected one of {expected}",
-                        quoted(&found)
-                    ));
-                }
-            }
-            Allowed::Texts(length, texts) => {
-                most(attribute.strings.len(), length)?;
-                let known = |found: &Vec<u8>| texts.iter().any(|text| text.as_bytes() == found);
-                if !attribute.strings.iter().all(known) {
-                    let expected = texts.join(", ");
-                    return Err(format!("attribute `{name}`: expected some of {expected}"));
-                }
-            }
-            Allowed::Floats(length) => most(attribute.floats.len(), length)?,
-            Allowed::Tensor if attribute.t.is_none() => {
-                return Err(format!("attribute `{name}`: without its tensor"));
-            }
-            Allowed::Graph if attribute.g.is_none() => {
-                return Err(format!("attribute `{name}`: without its graph"));
-            }
-            Allowed::Float | Allowed::Tensor | Allowed::Graph => {}
-        }
+        checked.map_err(|problem| Problem::Attribute {
+            name: name.to_owned(),
+            problem,
+        })?;
     }
     Ok(())
 }
 
 impl Allowed {
+    fn check(&self, attribute: &pb::AttributeProto) -> Result<(), AttributeProblem> {
+        if !attribute.ref_attr_name.is_empty() {
+            return Err(AttributeProblem::Reference);
+        }
+        if attribute.r#type != self.kind() as i32 {
+            return Err(AttributeProblem::Kind(self.kind()));
+        }
+        let within = |found: i64, low: i64, high: i64| match (low..=high).contains(&found) {
+            true => Ok(()),
+            false => Err(AttributeProblem::Range { found, low, high }),
+        };
+        let most = |found: usize, most: usize| match found <= most {
+            true => Ok(()),
+            false => Err(AttributeProblem::Long { found, most }),
+        };
+        let known =
+            |texts: &[&str], found: &[u8]| texts.iter().any(|text| text.as_bytes() == found);
+        match *self {
+            Allowed::Int(low, high) => within(attribute.i, low, high),
+            Allowed::Ints(length, low, high) => {
+                most(attribute.ints.len(), length)?;
+                let mut ints = attribute.ints.iter();
+                ints.try_for_each(|&value| within(value, low, high))
+            }
+            Allowed::Text(texts) if !known(texts, &attribute.s) => Err(AttributeProblem::Text {
+                found: quoted(&String::from_utf8_lossy(&attribute.s)),
+                expected: texts.join(", "),
+            }),
+            Allowed::Texts(length, texts) => {
+                most(attribute.strings.len(), length)?;
+                match attribute.strings.iter().all(|text| known(texts, text)) {
+                    true => Ok(()),
+                    false => Err(AttributeProblem::Texts(texts.join(", "))),
+                }
+            }
+            Allowed::Floats(length) => most(attribute.floats.len(), length),
+            Allowed::Tensor if attribute.t.is_none() => Err(AttributeProblem::NoTensor),
+            Allowed::Graph if attribute.g.is_none() => Err(AttributeProblem::NoGraph),
+            Allowed::Text(_) | Allowed::Float | Allowed::Tensor | Allowed::Graph => Ok(()),
+        }
+    }
+
     fn kind(&self) -> AttributeType {
         match self {
             Allowed::Int(..) => AttributeType::Int,

@@ -1,9 +1,10 @@
 //! Operators that work number by number.
 
+use super::problem::Problem;
 use super::{Computed, Datum, Node, Value, tensor};
 
 /// The shape that values of these shapes have together, as numpy broadcasts them.
-pub(super) fn broadcast(left: &[usize], right: &[usize]) -> Result<Vec<usize>, String> {
+pub(super) fn broadcast(left: &[usize], right: &[usize]) -> Result<Vec<usize>, Problem> {
     let rank = left.len().max(right.len());
     let length = |shape: &[usize], axis: usize| {
         let missing = rank - shape.len();
@@ -17,7 +18,7 @@ pub(super) fn broadcast(left: &[usize], right: &[usize]) -> Result<Vec<usize>, S
         .map(|axis| match (length(left, axis), length(right, axis)) {
             (left, right) if left == right => Ok(left),
             (1, other) | (other, 1) => Ok(other),
-            _ => Err(format!("shapes {left:?} and {right:?} do not go together")),
+            _ => Err(Problem::Shapes(left.to_vec(), right.to_vec())),
         })
         .collect()
 }
@@ -26,38 +27,44 @@ fn same(value: &Value) -> Value {
     Value::new(value.datum, value.shape.clone())
 }
 
-fn is_float(value: &Value) -> Result<&Value, String> {
+fn is_float(value: &Value) -> Result<&Value, Problem> {
     if value.datum.is_float() {
         return Ok(value);
     }
-    Err(format!("found {value}, expected f32 or f64"))
+    Err(Problem::Found {
+        found: value.into(),
+        expected: "f32 or f64".to_owned(),
+    })
 }
 
-fn is_number(value: &Value) -> Result<&Value, String> {
+fn is_number(value: &Value) -> Result<&Value, Problem> {
     match value.datum {
         Datum::F32 | Datum::F64 | Datum::I32 | Datum::I64 => Ok(value),
-        Datum::U8 | Datum::Bool => Err(format!("found {value}, expected f32, f64, i32 or i64")),
+        Datum::U8 | Datum::Bool => Err(Problem::Found {
+            found: value.into(),
+            expected: "f32, f64, i32 or i64".to_owned(),
+        }),
     }
 }
 
-pub(super) fn float(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn float(node: &Node<'_>) -> Result<Computed, Problem> {
     Ok(same(is_float(node.input(0)?)?).into())
 }
 
-pub(super) fn signed(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn signed(node: &Node<'_>) -> Result<Computed, Problem> {
     Ok(same(is_number(node.input(0)?)?).into())
 }
 
-pub(super) fn question(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn question(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = is_float(node.input(0)?)?;
     Ok(Value::new(Datum::Bool, value.shape.clone()).into())
 }
 
-pub(super) fn not(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn not(node: &Node<'_>) -> Result<Computed, Problem> {
     Ok(same(node.of(0, Datum::Bool)?).into())
 }
 
-pub(super) fn cast(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn cast(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.input(0)?;
     let to = tensor::datum(node.int("to", 0) as i32)?;
     let ints = match to {
@@ -70,15 +77,15 @@ pub(super) fn cast(node: &Node<'_>) -> Result<Computed, String> {
 }
 
 /// Two values of one type.
-fn pair<'a>(node: &'a Node<'_>) -> Result<(&'a Value, &'a Value, Vec<usize>), String> {
+fn pair<'a>(node: &'a Node<'_>) -> Result<(&'a Value, &'a Value, Vec<usize>), Problem> {
     let (left, right) = (node.input(0)?, node.input(1)?);
     if left.datum != right.datum {
-        return Err(format!("{left} and {right} are of different types"));
+        return Err(Problem::Types(left.into(), right.into()));
     }
     Ok((left, right, broadcast(&left.shape, &right.shape)?))
 }
 
-pub(super) fn binary(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn binary(node: &Node<'_>) -> Result<Computed, Problem> {
     let (left, right, shape) = pair(node)?;
     is_number(left)?;
     let computed = Value::new(left.datum, shape);
@@ -91,21 +98,21 @@ pub(super) fn binary(node: &Node<'_>) -> Result<Computed, String> {
             left.iter()
                 .zip(right.iter())
                 .map(|(&left, &right)| whole(operator, left, right))
-                .collect::<Result<Vec<i64>, String>>()?,
+                .collect::<Result<Vec<i64>, Problem>>()?,
         ),
         (Some(left), Some(right)) if right.len() == 1 => Some(
             left.iter()
                 .map(|&left| whole(operator, left, right[0]))
-                .collect::<Result<Vec<i64>, String>>()?,
+                .collect::<Result<Vec<i64>, Problem>>()?,
         ),
         (Some(left), Some(right)) if left.len() == 1 => Some(
             right
                 .iter()
                 .map(|&right| whole(operator, left[0], right))
-                .collect::<Result<Vec<i64>, String>>()?,
+                .collect::<Result<Vec<i64>, Problem>>()?,
         ),
         _ if operator == "Div" => {
-            return Err("a quotient of integers that are not known".to_owned());
+            return Err(Problem::Quotient);
         }
         _ => None,
     };
@@ -117,7 +124,7 @@ pub(super) fn binary(node: &Node<'_>) -> Result<Computed, String> {
 }
 
 /// One operation on integers that say a shape: they stay small.
-fn whole(operator: &str, left: i64, right: i64) -> Result<i64, String> {
+fn whole(operator: &str, left: i64, right: i64) -> Result<i64, Problem> {
     let result = match operator {
         "Add" => left.checked_add(right),
         "Sub" => left.checked_sub(right),
@@ -127,63 +134,67 @@ fn whole(operator: &str, left: i64, right: i64) -> Result<i64, String> {
         _ => None,
     };
     let small = result.filter(|result| result.unsigned_abs() <= 1 << 31);
-    small.ok_or_else(|| format!("{operator} of {left} and {right}"))
+    small.ok_or_else(|| Problem::Integers {
+        operator: operator.to_owned(),
+        left,
+        right,
+    })
 }
 
-pub(super) fn several(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn several(node: &Node<'_>) -> Result<Computed, Problem> {
     let first = is_float(node.input(0)?)?;
     let mut shape = first.shape.clone();
     for value in node.all() {
         if value.datum != first.datum {
-            return Err(format!("{first} and {value} are of different types"));
+            return Err(Problem::Types(first.into(), value.into()));
         }
         shape = broadcast(&shape, &value.shape)?;
     }
     Ok(Value::new(first.datum, shape).into())
 }
 
-pub(super) fn power(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn power(node: &Node<'_>) -> Result<Computed, Problem> {
     // The inference library panics on an exponent that it takes for a length.
     let (base, _, shape) = pair(node)?;
     Ok(Value::new(is_float(base)?.datum, shape).into())
 }
 
-pub(super) fn prelu(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn prelu(node: &Node<'_>) -> Result<Computed, Problem> {
     let (value, slope, shape) = pair(node)?;
     is_float(value)?;
     if shape != value.shape || slope.rank() > value.rank() {
-        return Err(format!("slopes {slope} of values {value}"));
+        return Err(Problem::Slopes(slope.into(), value.into()));
     }
     Ok(same(value).into())
 }
 
-pub(super) fn compare(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn compare(node: &Node<'_>) -> Result<Computed, Problem> {
     let (left, _, shape) = pair(node)?;
     is_number(left)?;
     Ok(Value::new(Datum::Bool, shape).into())
 }
 
-pub(super) fn logic(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn logic(node: &Node<'_>) -> Result<Computed, Problem> {
     let (_, _, shape) = pair(node)?;
     node.of(0, Datum::Bool)?;
     Ok(Value::new(Datum::Bool, shape).into())
 }
 
-pub(super) fn choose(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn choose(node: &Node<'_>) -> Result<Computed, Problem> {
     let condition = node.of(0, Datum::Bool)?;
     let (yes, no) = (node.input(1)?, node.input(2)?);
     if yes.datum != no.datum {
-        return Err(format!("{yes} and {no} are of different types"));
+        return Err(Problem::Types(yes.into(), no.into()));
     }
     let shape = broadcast(&condition.shape, &broadcast(&yes.shape, &no.shape)?)?;
     Ok(Value::new(yes.datum, shape).into())
 }
 
-pub(super) fn clip(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn clip(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = is_float(node.input(0)?)?;
     for bound in [node.optional(1), node.optional(2)].into_iter().flatten() {
         if bound.datum != value.datum || bound.numbers() != Some(1) || bound.rank() > value.rank() {
-            return Err(format!("a bound {bound} of values {value}"));
+            return Err(Problem::Bound(bound.into(), value.into()));
         }
     }
     Ok(same(value).into())

@@ -1,6 +1,7 @@
 //! Operators that combine many numbers into one.
 
 use super::arithmetic::broadcast;
+use super::problem::Problem;
 use super::{Computed, Datum, Node, Value, axes, count};
 
 fn f32(shape: Vec<usize>) -> Value {
@@ -17,82 +18,98 @@ fn products(shape: Vec<usize>, each: usize) -> Computed {
 }
 
 /// A constant input of type f32: weights.
-fn weights<'a>(node: &'a Node<'_>, index: usize) -> Result<&'a Value, String> {
+fn weights<'a>(node: &'a Node<'_>, index: usize) -> Result<&'a Value, Problem> {
     let value = node.of(index, Datum::F32)?;
     if value.constant {
         return Ok(value);
     }
-    Err(format!("input {index} ({value}) is not constant"))
+    Err(Problem::NotConstant(index, value.into()))
 }
 
 /// Weights that are one number a channel.
-fn per_channel(node: &Node<'_>, index: usize, channels: usize) -> Result<(), String> {
+fn per_channel(node: &Node<'_>, index: usize, channels: usize) -> Result<(), Problem> {
     let value = weights(node, index)?;
     if value.shape == [channels] {
         return Ok(());
     }
-    Err(format!(
-        "input {index} ({value}), expected f32 [{channels}]"
-    ))
+    Err(Problem::PerChannel {
+        index,
+        found: value.into(),
+        channels,
+    })
 }
 
-pub(super) fn matmul(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn matmul(node: &Node<'_>) -> Result<Computed, Problem> {
     let (left, right) = (node.of(0, Datum::F32)?, node.of(1, Datum::F32)?);
     if left.rank() < 2 || right.rank() < 2 {
-        return Err(format!("{left} by {right}: expected rank 2 or more"));
+        return Err(Problem::ProductRank(left.into(), right.into()));
     }
     let (left_batch, left_matrix) = left.shape.split_at(left.rank() - 2);
     let (right_batch, right_matrix) = right.shape.split_at(right.rank() - 2);
     let inner = left_matrix[1];
     if inner != right_matrix[0] {
-        return Err(format!("{left} by {right}"));
+        return Err(Problem::Product(left.into(), right.into()));
     }
     let mut shape = broadcast(left_batch, right_batch)?;
     shape.extend([left_matrix[0], right_matrix[1]]);
     Ok(products(shape, inner))
 }
 
-pub(super) fn gemm(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn gemm(node: &Node<'_>) -> Result<Computed, Problem> {
     let matrix = |index: usize, transposed: &str| {
         let value = node.of(index, Datum::F32)?;
         match (value.shape.as_slice(), node.int(transposed, 0)) {
             (&[rows, columns], 0) => Ok((rows, columns)),
             (&[rows, columns], _) => Ok((columns, rows)),
-            _ => Err(format!("input {index} is {value}, expected a matrix")),
+            _ => Err(Problem::Input {
+                index,
+                found: value.into(),
+                expected: "a matrix",
+            }),
         }
     };
     let ((rows, inner), (right_inner, columns)) = (matrix(0, "transA")?, matrix(1, "transB")?);
     if inner != right_inner {
-        return Err(format!("{} by {}", node.input(0)?, node.input(1)?));
+        let (left, right) = (node.input(0)?, node.input(1)?);
+        return Err(Problem::Product(left.into(), right.into()));
     }
     let shape = vec![rows, columns];
     if node.optional(2).is_some() {
         let bias = node.of(2, Datum::F32)?;
         if bias.rank() > 2 || broadcast(&bias.shape, &shape).ok().as_ref() != Some(&shape) {
-            return Err(format!("a bias {bias} of f32 [{rows},{columns}]"));
+            let bias = bias.into();
+            return Err(Problem::MatrixBias {
+                bias,
+                rows,
+                columns,
+            });
         }
     }
     Ok(products(shape, inner))
 }
 
 /// The window of a convolution or a pool over `spatial` lengths, and what it leaves of them.
-fn windows(node: &Node<'_>, spatial: &[usize], kernel: &[usize]) -> Result<Vec<usize>, String> {
+fn windows(node: &Node<'_>, spatial: &[usize], kernel: &[usize]) -> Result<Vec<usize>, Problem> {
     let rank = spatial.len();
-    let list = |name: &str, length: usize, default: i64| {
+    let list = |name: &'static str, length: usize, default: i64| {
         let found = node
             .ints(name)
             .map_or(vec![default; length], <[i64]>::to_vec);
         if found.len() == length {
             return Ok(found.into_iter().map(|int| int as usize).collect());
         }
-        Err(format!("`{name}` {found:?}, expected {length} values"))
+        Err(Problem::Values {
+            name,
+            found,
+            expected: length,
+        })
     };
     let strides: Vec<usize> = list("strides", rank, 1)?;
     let dilations: Vec<usize> = list("dilations", rank, 1)?;
     let pads: Vec<usize> = list("pads", 2 * rank, 0)?;
     let auto = node.text("auto_pad").unwrap_or("NOTSET");
     if auto != "NOTSET" && node.ints("pads").is_some() {
-        return Err("`auto_pad` and `pads`: expected one of them".to_owned());
+        return Err(Problem::Both("auto_pad", "pads"));
     }
     let is_pool = node.proto.op_type != "Conv";
     let window = |axis: usize| {
@@ -106,9 +123,12 @@ fn windows(node: &Node<'_>, spatial: &[usize], kernel: &[usize]) -> Result<Vec<u
         // A window of padding alone has no largest number.
         let empty = is_pool && (before >= span || after >= span);
         if padded < span || empty || span > length.max(1) + before + after {
-            return Err(format!(
-                "a window of {span} on a length of {length} with pads of {before} and {after}"
-            ));
+            return Err(Problem::Window {
+                span,
+                length,
+                before,
+                after,
+            });
         }
         let steps = padded - span;
         Ok(1 + match node.int("ceil_mode", 0) {
@@ -119,10 +139,10 @@ fn windows(node: &Node<'_>, spatial: &[usize], kernel: &[usize]) -> Result<Vec<u
     (0..rank).map(window).collect()
 }
 
-pub(super) fn conv(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn conv(node: &Node<'_>) -> Result<Computed, Problem> {
     let (value, kernels) = (node.of(0, Datum::F32)?, weights(node, 1)?);
     if !(3..=4).contains(&value.rank()) || kernels.rank() != value.rank() {
-        return Err(format!("{value} with kernels {kernels}"));
+        return Err(Problem::Kernels(value.into(), kernels.into()));
     }
     let (outputs, inputs_each) = (kernels.shape[0], kernels.shape[1]);
     let kernel = &kernels.shape[2..];
@@ -137,7 +157,7 @@ pub(super) fn conv(node: &Node<'_>) -> Result<Computed, String> {
         || !said.is_none_or(as_said)
         || kernel.iter().any(|&length| length > 64)
     {
-        return Err(format!("{value} with kernels {kernels} in {groups} groups"));
+        return Err(Problem::Groups(value.into(), kernels.into(), groups));
     }
     if node.optional(2).is_some() {
         per_channel(node, 2, outputs)?;
@@ -148,22 +168,22 @@ pub(super) fn conv(node: &Node<'_>) -> Result<Computed, String> {
     Ok(products(shape, each))
 }
 
-pub(super) fn pool(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn pool(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.of(0, Datum::F32)?;
     let kernel = node.ints("kernel_shape").unwrap_or_default();
     let kernel: Vec<usize> = kernel.iter().map(|&length| length as usize).collect();
     if kernel.is_empty() || value.rank() != 2 + kernel.len() {
-        return Err(format!("{value} with a window of {kernel:?}"));
+        return Err(Problem::Pool(value.into(), kernel));
     }
     let mut shape = value.shape[..2].to_vec();
     shape.extend(windows(node, &value.shape[2..], &kernel)?);
     Ok(products(shape, kernel.iter().product()))
 }
 
-pub(super) fn global_pool(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn global_pool(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.of(0, Datum::F32)?;
     if value.rank() < 3 {
-        return Err(format!("{value}, expected rank 3 or more"));
+        return Err(Problem::LowRank(value.into(), 3));
     }
     let mut shape = vec![1; value.rank()];
     shape[..2].copy_from_slice(&value.shape[..2]);
@@ -171,15 +191,15 @@ pub(super) fn global_pool(node: &Node<'_>) -> Result<Computed, String> {
 }
 
 /// Channels of a value whose second axis they are.
-fn channels<'a>(node: &'a Node<'_>, least: usize) -> Result<(&'a Value, usize), String> {
+fn channels<'a>(node: &'a Node<'_>, least: usize) -> Result<(&'a Value, usize), Problem> {
     let value = node.of(0, Datum::F32)?;
     match value.shape.get(1) {
         Some(&channels) if value.rank() >= least => Ok((value, channels)),
-        _ => Err(format!("{value}, expected rank {least} or more")),
+        _ => Err(Problem::LowRank(value.into(), least)),
     }
 }
 
-pub(super) fn batch_norm(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn batch_norm(node: &Node<'_>) -> Result<Computed, Problem> {
     let (value, channels) = channels(node, 2)?;
     for index in 1..=4 {
         per_channel(node, index, channels)?;
@@ -187,26 +207,31 @@ pub(super) fn batch_norm(node: &Node<'_>) -> Result<Computed, String> {
     Ok(f32(value.shape.clone()).into())
 }
 
-pub(super) fn instance_norm(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn instance_norm(node: &Node<'_>) -> Result<Computed, Problem> {
     let (value, channels) = channels(node, 3)?;
     per_channel(node, 1, channels)?;
     per_channel(node, 2, channels)?;
     Ok(f32(value.shape.clone()).into())
 }
 
-pub(super) fn layer_norm(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn layer_norm(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.of(0, Datum::F32)?;
     let axis = node.axis("axis", -1, value.rank())?;
     for index in 1..node.inputs.len() {
         let scale = weights(node, index)?;
         if scale.shape != value.shape[axis..] {
-            return Err(format!("input {index} ({scale}) with {value}"));
+            let (scale, value) = (scale.into(), value.into());
+            return Err(Problem::Scale {
+                index,
+                scale,
+                value,
+            });
         }
     }
     Ok(f32(value.shape.clone()).into())
 }
 
-pub(super) fn softmax(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn softmax(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.of(0, Datum::F32)?;
     node.axis("axis", -1, value.rank())?;
     Ok(f32(value.shape.clone()).into())
@@ -223,13 +248,13 @@ fn reduced(shape: &[usize], gone: &[usize], keep: bool) -> Vec<usize> {
         .collect()
 }
 
-pub(super) fn reduce(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn reduce(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.input(0)?;
     let operator = node.proto.op_type.as_str();
     let whole = matches!(value.datum, Datum::I32 | Datum::I64);
     let of_whole = ["ReduceSum", "ReduceMax", "ReduceMin"].contains(&operator);
     if value.datum != Datum::F32 && !(whole && of_whole) {
-        return Err(format!("of {value}"));
+        return Err(Problem::Of(value.into()));
     }
     // ONNX moved the axes from an attribute to an input: for sums with opset 13, else with 18.
     let by_input = operator == "ReduceSum" || node.opset >= 18;
@@ -239,7 +264,8 @@ pub(super) fn reduce(node: &Node<'_>) -> Result<Computed, String> {
         (None, Some(axes)) if !by_input => Some(axes),
         _ => {
             let place = if by_input { "an input" } else { "an attribute" };
-            return Err(format!("in opset {} its axes are {place}", node.opset));
+            let opset = node.opset;
+            return Err(Problem::Axes { opset, place });
         }
     };
     let noop = by_input && node.int("noop_with_empty_axes", 0) == 1;
@@ -252,7 +278,7 @@ pub(super) fn reduce(node: &Node<'_>) -> Result<Computed, String> {
     Ok(Value::new(value.datum, shape).into())
 }
 
-pub(super) fn arg(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn arg(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.of(0, Datum::F32)?;
     let axis = node.axis("axis", 0, value.rank())?;
     let shape = reduced(&value.shape, &[axis], node.int("keepdims", 1) == 1);

@@ -5,14 +5,15 @@
 
 use std::collections::HashMap;
 
+use super::problem::Problem;
 use super::{Computed, Datum, Node, Value, count};
 
 /// Rows of features.
-fn rows<'a>(node: &'a Node<'_>) -> Result<(&'a Value, usize, usize), String> {
+fn rows<'a>(node: &'a Node<'_>) -> Result<(&'a Value, usize, usize), Problem> {
     let value = node.of(0, Datum::F32)?;
     match value.shape.as_slice() {
         &[rows, features] => Ok((value, rows, features)),
-        _ => Err(format!("{value}, expected rows of features")),
+        _ => Err(Problem::Rows(value.into())),
     }
 }
 
@@ -27,12 +28,12 @@ fn scores(rows: usize, columns: usize, each: u64) -> (Value, u64) {
     (value, work)
 }
 
-pub(super) fn normalizer(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn normalizer(node: &Node<'_>) -> Result<Computed, Problem> {
     let (value, _, _) = rows(node)?;
     Ok(Value::new(Datum::F32, value.shape.clone()).into())
 }
 
-pub(super) fn linear_regressor(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn linear_regressor(node: &Node<'_>) -> Result<Computed, Problem> {
     let (value, rows, features) = rows(node)?;
     let targets = node.int("targets", 1) as usize;
     let coefficients = floats(node, "coefficients").unwrap_or_default().len();
@@ -40,9 +41,12 @@ pub(super) fn linear_regressor(node: &Node<'_>) -> Result<Computed, String> {
     if features.checked_mul(targets) != Some(coefficients)
         || intercepts.is_some_and(|found| found != targets)
     {
-        return Err(format!(
-            "{coefficients} coefficients of {targets} targets with {value}"
-        ));
+        return Err(Problem::Coefficients {
+            coefficients,
+            lines: targets,
+            of: "targets",
+            value: value.into(),
+        });
     }
     let (value, work) = scores(rows, targets, features as u64);
     Ok(Computed {
@@ -51,7 +55,7 @@ pub(super) fn linear_regressor(node: &Node<'_>) -> Result<Computed, String> {
     })
 }
 
-pub(super) fn linear_classifier(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn linear_classifier(node: &Node<'_>) -> Result<Computed, Problem> {
     let (value, rows, features) = rows(node)?;
     let classes = node.ints("classlabels_ints").unwrap_or_default().len();
     let coefficients = floats(node, "coefficients").unwrap_or_default().len();
@@ -64,9 +68,12 @@ pub(super) fn linear_classifier(node: &Node<'_>) -> Result<Computed, String> {
         || intercepts.is_some_and(|found| found != lines)
         || (intercepts.is_none() && classes == 2 && !one_line)
     {
-        return Err(format!(
-            "{coefficients} coefficients of {classes} classes with {value}"
-        ));
+        return Err(Problem::Coefficients {
+            coefficients,
+            lines: classes,
+            of: "classes",
+            value: value.into(),
+        });
     }
     let (scores, work) = scores(rows, classes, features as u64);
     Ok(Computed {
@@ -76,12 +83,12 @@ pub(super) fn linear_classifier(node: &Node<'_>) -> Result<Computed, String> {
 }
 
 /// A forest: nodes and leaves as lists, a tree after another.
-pub(super) fn trees(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn trees(node: &Node<'_>) -> Result<Computed, Problem> {
     let (_, rows, features) = rows(node)?;
     let list = |name: &str| node.ints(name).unwrap_or_default();
     let classes = list("classlabels_int64s").len();
     if classes < 2 || floats(node, "base_values").is_some_and(|found| found.len() != classes) {
-        return Err(format!("{classes} classes"));
+        return Err(Problem::Classes(classes));
     }
     let (ids, of_tree) = (list("nodes_nodeids"), list("nodes_treeids"));
     let (yes, no) = (list("nodes_truenodeids"), list("nodes_falsenodeids"));
@@ -102,7 +109,7 @@ pub(super) fn trees(node: &Node<'_>) -> Result<Computed, String> {
             .map_or(nodes, <[i64]>::len),
     ];
     if nodes == 0 || lengths.iter().any(|&length| length != nodes) {
-        return Err(format!("lists of {nodes} and {lengths:?} nodes"));
+        return Err(Problem::TreeLists(nodes, lengths));
     }
     // Where each tree's nodes are: 0, 1, 2, ... in order, so that its size says which exist.
     let mut sizes: Vec<i64> = Vec::new();
@@ -113,7 +120,7 @@ pub(super) fn trees(node: &Node<'_>) -> Result<Computed, String> {
         let last = sizes.len() as i64 - 1;
         match sizes.last_mut() {
             Some(size) if tree == last && id == *size => *size += 1,
-            _ => return Err(format!("node {id} of tree {tree} is out of order")),
+            _ => return Err(Problem::TreeOrder { id, tree }),
         }
     }
     let mut leaves = HashMap::new();
@@ -127,13 +134,16 @@ pub(super) fn trees(node: &Node<'_>) -> Result<Computed, String> {
         // A way through a tree that only goes forward has an end.
         let forward = |next: i64| id < next && next < size;
         if !forward(yes[place]) || !forward(no[place]) {
-            return Err(format!("node {id} of tree {tree} leads nowhere"));
+            return Err(Problem::TreeEnd { id, tree });
         }
         if feature[place] as u64 >= features as u64 {
-            return Err(format!(
-                "node {id} of tree {tree} asks for feature {} of {features}",
-                feature[place]
-            ));
+            let feature = feature[place];
+            return Err(Problem::TreeFeature {
+                id,
+                tree,
+                feature,
+                features,
+            });
         }
     }
     let (vote_class, vote_node) = (list("class_ids"), list("class_nodeids"));
@@ -141,15 +151,13 @@ pub(super) fn trees(node: &Node<'_>) -> Result<Computed, String> {
     let votes = vote_class.len();
     let weights = floats(node, "class_weights").unwrap_or_default().len();
     if votes == 0 || [vote_node.len(), vote_tree.len(), weights] != [votes; 3] {
-        return Err(format!("lists of {votes} votes that differ in length"));
+        return Err(Problem::VoteLists(votes));
     }
     for vote in 0..votes {
         let (tree, id) = (vote_tree[vote], vote_node[vote]);
         if vote_class[vote] as u64 >= classes as u64 || !leaves.contains_key(&(tree, id)) {
-            return Err(format!(
-                "a vote for class {} at node {id} of tree {tree}",
-                vote_class[vote]
-            ));
+            let class = vote_class[vote];
+            return Err(Problem::Vote { class, id, tree });
         }
     }
     let (scores, _) = scores(rows, classes, 0);

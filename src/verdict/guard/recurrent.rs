@@ -2,6 +2,7 @@
 
 use tract_onnx::pb;
 
+use super::problem::Problem;
 use super::{Computed, Datum, Node, Value, Walk, quoted, tensor};
 
 /// Most steps of a sequence.
@@ -9,7 +10,7 @@ const MOST_STEPS: usize = 1_024;
 
 /// RNN, GRU and LSTM: `X` [steps, batch, inputs], `W` [directions, gates x hidden, inputs],
 /// `R` [directions, gates x hidden, hidden], `B` [directions, 2 x gates x hidden].
-pub(super) fn recurrent(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn recurrent(node: &Node<'_>) -> Result<Computed, Problem> {
     let gates = match node.proto.op_type.as_str() {
         "RNN" => 1,
         "GRU" => 3,
@@ -17,12 +18,12 @@ pub(super) fn recurrent(node: &Node<'_>) -> Result<Computed, String> {
     };
     let constant = |index: usize| match node.of(index, Datum::F32)? {
         value if value.constant => Ok(value),
-        value => Err(format!("input {index} ({value}) is not constant")),
+        value => Err(Problem::NotConstant(index, value.into())),
     };
     let (x, w, r) = (node.of(0, Datum::F32)?, constant(1)?, constant(2)?);
     let (&[steps, batch, inputs], &[_, _, hidden]) = (x.shape.as_slice(), r.shape.as_slice())
     else {
-        return Err(format!("{x} with weights {w} and {r}"));
+        return Err(Problem::Weights(x.into(), w.into(), r.into()));
     };
     let directions = match node.text("direction") {
         Some("bidirectional") => 2,
@@ -31,19 +32,19 @@ pub(super) fn recurrent(node: &Node<'_>) -> Result<Computed, String> {
     let rows = hidden.saturating_mul(gates);
     let fits = w.shape == [directions, rows, inputs] && r.shape == [directions, rows, hidden];
     if !fits || node.int("hidden_size", hidden as i64) != hidden as i64 || steps > MOST_STEPS {
-        return Err(format!("{x} with weights {w} and {r}"));
+        return Err(Problem::Weights(x.into(), w.into(), r.into()));
     }
     if node.optional(3).is_some() && constant(3)?.shape != [directions, rows.saturating_mul(2)] {
-        return Err(format!("a bias {}", node.input(3)?));
+        return Err(Problem::Bias(node.input(3)?.into()));
     }
     if node.optional(4).is_some() {
-        return Err("lengths of sequences are not supported".to_owned());
+        return Err(Problem::Unsupported("lengths of sequences are"));
     }
     for index in 5..node.inputs.len() {
         if node.optional(index).is_some() {
             let start = node.of(index, Datum::F32)?;
             if start.shape != [directions, batch, hidden] {
-                return Err(format!("a beginning of {start}"));
+                return Err(Problem::Start(start.into()));
             }
         }
     }
@@ -59,7 +60,7 @@ pub(super) fn recurrent(node: &Node<'_>) -> Result<Computed, String> {
 }
 
 /// The inference library has ONNX's default activations alone.
-fn usual_activations(node: &Node<'_>, gates: usize, directions: usize) -> Result<(), String> {
+fn usual_activations(node: &Node<'_>, gates: usize, directions: usize) -> Result<(), Problem> {
     let Some(given) = node.attribute("activations") else {
         return Ok(());
     };
@@ -72,42 +73,42 @@ fn usual_activations(node: &Node<'_>, gates: usize, directions: usize) -> Result
     if given.strings.iter().map(Vec::as_slice).eq(usual) {
         return Ok(());
     }
-    Err("other activations than ONNX's defaults are not supported".to_owned())
+    Err(Problem::Unsupported(
+        "other activations than ONNX's defaults are",
+    ))
 }
 
 /// A loop over a sequence: its body runs once a step, on the states so far and a slice of each
 /// sequence, and gives the new states and a slice of each output.
-pub(super) fn scan<'a>(node: &Node<'a>, walk: &mut Walk<'a>) -> Result<Computed, String> {
+pub(super) fn scan<'a>(node: &Node<'a>, walk: &mut Walk<'a>) -> Result<Computed, Problem> {
     if !walk.may_nest {
-        return Err("a loop in a loop is not supported".to_owned());
+        return Err(Problem::Unsupported("a loop in a loop is"));
     }
     let body: &'a pb::GraphProto = node
         .proto
         .attribute
         .iter()
         .find_map(|attribute| attribute.g.as_ref())
-        .ok_or("without its body")?;
+        .ok_or(Problem::NoBody)?;
     let sequences = node.int("num_scan_inputs", 0) as usize;
     let states = node
         .inputs
         .len()
         .checked_sub(sequences)
         .filter(|_| sequences > 0 && body.input.len() == node.inputs.len())
-        .ok_or_else(|| {
-            format!(
-                "{} inputs, a body of {} and {sequences} sequences",
-                node.inputs.len(),
-                body.input.len()
-            )
+        .ok_or(Problem::LoopInputs {
+            inputs: node.inputs.len(),
+            body: body.input.len(),
+            sequences,
         })?;
     let slices = body
         .output
         .len()
         .checked_sub(states)
         .filter(|_| node.proto.output.len() == body.output.len())
-        .ok_or("other outputs than its body")?;
-    let list = |name: &str, length: usize| match node.ints(name) {
-        Some(ints) if ints.len() != length => Err(format!("`{name}`: expected {length} values")),
+        .ok_or(Problem::LoopOutputs)?;
+    let list = |name: &'static str, length: usize| match node.ints(name) {
+        Some(ints) if ints.len() != length => Err(Problem::LoopAxes(name, length)),
         Some(ints) => Ok(ints.iter().map(|&int| int as usize).collect()),
         None => Ok(vec![0_usize; length]),
     };
@@ -130,18 +131,16 @@ pub(super) fn scan<'a>(node: &Node<'a>, walk: &mut Walk<'a>) -> Result<Computed,
         if let Some(sequence) = index.checked_sub(states) {
             let axis = input_axes[sequence];
             if axis >= value.rank() {
-                return Err(format!("axis {axis} of a sequence {value}"));
+                return Err(Problem::SequenceAxis(axis, (&value).into()));
             }
             let length = value.shape.remove(axis);
             if *steps.get_or_insert(length) != length || length > MOST_STEPS {
-                return Err(format!("sequences of {length} steps"));
+                return Err(Problem::Steps(length));
             }
         }
         if !tensor::declared(declared)?.same_as(&value) {
             let name = quoted(&declared.name);
-            return Err(format!(
-                "its body's input {name} is not declared as {value}"
-            ));
+            return Err(Problem::BodyInput(name, (&value).into()));
         }
         inside.bind(&declared.name, value)?;
     }
@@ -150,7 +149,7 @@ pub(super) fn scan<'a>(node: &Node<'a>, walk: &mut Walk<'a>) -> Result<Computed,
     inside
         .tensors(body)
         .and_then(|()| inside.nodes(body))
-        .map_err(|problem| format!("in its body, {problem}"))?;
+        .map_err(|problem| Problem::InBody(Box::new(problem)))?;
     let mut values = Vec::new();
     for (index, output) in body.output.iter().enumerate() {
         let name = quoted(&output.name);
@@ -160,18 +159,20 @@ pub(super) fn scan<'a>(node: &Node<'a>, walk: &mut Walk<'a>) -> Result<Computed,
             .get(output.name.as_str())
             .filter(|_| computed_inside)
         else {
-            return Err(format!("no node of its body computes {name}"));
+            return Err(Problem::BodyOutput(name));
         };
         let mut value = Value::new(value.datum, value.shape.clone());
         match index.checked_sub(states) {
             None if !value.same_as(node.input(index)?) => {
-                return Err(format!("state {name} becomes {value}"));
+                return Err(Problem::State(name, (&value).into()));
             }
             None => {}
             Some(slice) if output_axes[slice] <= value.rank() => {
                 value.shape.insert(output_axes[slice], steps);
             }
-            Some(slice) => return Err(format!("axis {} of {value}", output_axes[slice])),
+            Some(slice) => {
+                return Err(Problem::OutputAxis(output_axes[slice], (&value).into()));
+            }
         }
         values.push(value);
     }

@@ -1,23 +1,24 @@
 //! Operators that rearrange numbers and compute none.
 
 use super::arithmetic::broadcast;
+use super::problem::Problem;
 use super::{Computed, Datum, MOST_RANK, Node, Value, axes, count, tensor};
 
-pub(super) fn identity(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn identity(node: &Node<'_>) -> Result<Computed, Problem> {
     Ok(node.input(0)?.clone().into())
 }
 
-pub(super) fn dropout(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn dropout(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.input(0)?;
     if let Some(ratio) = node.optional(1)
         && ratio.rank() > 0
     {
-        return Err(format!("a ratio {ratio}"));
+        return Err(Problem::Ratio(ratio.into()));
     }
     if let Some(training) = node.optional(2)
         && (training.datum != Datum::Bool || training.ints.as_deref() != Some(&[0]))
     {
-        return Err("it is set to training".to_owned());
+        return Err(Problem::Training);
     }
     let mask = Value::new(Datum::Bool, value.shape.clone());
     Ok(Computed {
@@ -26,12 +27,12 @@ pub(super) fn dropout(node: &Node<'_>) -> Result<Computed, String> {
     })
 }
 
-pub(super) fn constant(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn constant(node: &Node<'_>) -> Result<Computed, Problem> {
     let [attribute] = node.proto.attribute.as_slice() else {
-        return Err("expected one value".to_owned());
+        return Err(Problem::OneValue);
     };
     let value = match attribute.name.as_str() {
-        "value" => tensor::value(attribute.t.as_ref().ok_or("no tensor")?)?,
+        "value" => tensor::value(attribute.t.as_ref().ok_or(Problem::NoTensor)?)?,
         "value_float" => Value::new(Datum::F32, Vec::new()),
         "value_floats" => Value::new(Datum::F32, vec![attribute.floats.len()]),
         "value_int" => Value::known(Datum::I64, Vec::new(), vec![attribute.i]),
@@ -44,14 +45,14 @@ pub(super) fn constant(node: &Node<'_>) -> Result<Computed, String> {
     Ok(value.into())
 }
 
-pub(super) fn constant_of_shape(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn constant_of_shape(node: &Node<'_>) -> Result<Computed, Problem> {
     let shape = lengths(node.known(0)?)?;
     let datum = match node.attribute("value").and_then(|value| value.t.as_ref()) {
         None => Datum::F32,
         Some(proto) => {
             let value = tensor::value(proto)?;
             if value.numbers() != Some(1) {
-                return Err(format!("a value {value}"));
+                return Err(Problem::FillValue((&value).into()));
             }
             value.datum
         }
@@ -60,24 +61,24 @@ pub(super) fn constant_of_shape(node: &Node<'_>) -> Result<Computed, String> {
 }
 
 /// Integers as a shape, none of them 0 or less.
-fn lengths(ints: &[i64]) -> Result<Vec<usize>, String> {
+fn lengths(ints: &[i64]) -> Result<Vec<usize>, Problem> {
     if ints.len() > MOST_RANK {
-        return Err(format!("a shape of {} lengths", ints.len()));
+        return Err(Problem::ShapeRank(ints.len()));
     }
     let length = |&int: &i64| match usize::try_from(int) {
         Ok(length) if length > 0 => Ok(length),
-        _ => Err(format!("a shape of {ints:?}")),
+        _ => Err(Problem::Shape(ints.to_vec())),
     };
     ints.iter().map(length).collect()
 }
 
-pub(super) fn shape(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn shape(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.input(0)?;
     let rank = value.rank() as i64;
     let clamp = |place: i64| (if place < 0 { place + rank } else { place }).clamp(0, rank);
     let (start, end) = (clamp(node.int("start", 0)), clamp(node.int("end", rank)));
     if start >= end {
-        return Err("no length is asked for".to_owned());
+        return Err(Problem::NoLength);
     }
     let lengths = &value.shape[start as usize..end as usize];
     let ints = lengths.iter().map(|&length| length as i64).collect();
@@ -85,22 +86,23 @@ pub(super) fn shape(node: &Node<'_>) -> Result<Computed, String> {
 }
 
 /// The same numbers in another shape.
-fn reshaped(value: &Value, shape: Vec<usize>) -> Result<Computed, String> {
+fn reshaped(value: &Value, shape: Vec<usize>) -> Result<Computed, Problem> {
     if count(&shape) != value.numbers() {
-        return Err(format!("{value} does not fill the shape {shape:?}"));
+        let shape = shape.iter().map(|&length| length as i64).collect();
+        return Err(Problem::Fill(value.into(), shape));
     }
     let ints = value.ints.clone();
     let reshaped = Value::new(value.datum, shape);
     Ok(Value { ints, ..reshaped }.into())
 }
 
-pub(super) fn reshape(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn reshape(node: &Node<'_>) -> Result<Computed, Problem> {
     let (value, given) = (node.input(0)?, node.known(1)?);
     let copies = node.int("allowzero", 0) == 0;
     let mut shape = Vec::new();
     let mut open = None;
     if given.len() > MOST_RANK {
-        return Err(format!("a shape of {} lengths", given.len()));
+        return Err(Problem::ShapeRank(given.len()));
     }
     for (axis, &length) in given.iter().enumerate() {
         shape.push(match length {
@@ -110,61 +112,62 @@ pub(super) fn reshape(node: &Node<'_>) -> Result<Computed, String> {
             }
             0 if copies && axis < value.rank() => value.shape[axis],
             length if length > 0 => length as usize,
-            _ => return Err(format!("a shape of {given:?}")),
+            _ => return Err(Problem::Shape(given.to_vec())),
         });
     }
     if let Some(axis) = open {
         let (all, rest) = (value.numbers().unwrap_or(0), count(&shape).unwrap_or(0));
         if rest == 0 || all % rest != 0 {
-            return Err(format!("{value} does not fill the shape {given:?}"));
+            return Err(Problem::Fill(value.into(), given.to_vec()));
         }
         shape[axis] = (all / rest) as usize;
     }
     reshaped(value, shape)
 }
 
-pub(super) fn flatten(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn flatten(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.input(0)?;
     let rank = value.rank() as i64;
     let axis = node.int("axis", 1);
     if !(-rank..=rank).contains(&axis) {
-        return Err(format!("axis {axis} of a value of rank {rank}"));
+        let rank = value.rank();
+        return Err(Problem::Axis { axis, rank });
     }
     let axis = if axis < 0 { axis + rank } else { axis } as usize;
     let (before, after) = value.shape.split_at(axis);
     reshaped(value, vec![before.iter().product(), after.iter().product()])
 }
 
-pub(super) fn transpose(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn transpose(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.input(0)?;
     let order = match node.ints("perm") {
         Some(perm) if perm.len() == value.rank() => axes(perm, value.rank())?,
-        Some(perm) => return Err(format!("`perm` {perm:?} of {value}")),
+        Some(perm) => return Err(Problem::Order(perm.to_vec(), value.into())),
         None => (0..value.rank()).rev().collect(),
     };
     let shape = order.iter().map(|&axis| value.shape[axis]).collect();
     Ok(Value::new(value.datum, shape).into())
 }
 
-pub(super) fn squeeze(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn squeeze(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.input(0)?;
     let gone = match node.optional(1) {
         Some(_) => axes(node.known(1)?, value.rank())?,
         None => (0..value.rank()).filter(|&a| value.shape[a] == 1).collect(),
     };
     if gone.iter().any(|&axis| value.shape[axis] != 1) {
-        return Err(format!("axes {gone:?} of {value} are longer than 1"));
+        return Err(Problem::LongAxes(gone, value.into()));
     }
     let left = (0..value.rank()).filter(|axis| !gone.contains(axis));
     reshaped(value, left.map(|axis| value.shape[axis]).collect())
 }
 
-pub(super) fn unsqueeze(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn unsqueeze(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.input(0)?;
     let given = node.known(1)?;
     let rank = value.rank() + given.len();
     if rank > MOST_RANK {
-        return Err(format!("an output of rank {rank}"));
+        return Err(Problem::OutputRank(rank));
     }
     let new = axes(given, rank)?;
     let mut old = value.shape.iter();
@@ -177,10 +180,10 @@ pub(super) fn unsqueeze(node: &Node<'_>) -> Result<Computed, String> {
     reshaped(value, shape)
 }
 
-pub(super) fn concat(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn concat(node: &Node<'_>) -> Result<Computed, Problem> {
     let first = node.input(0)?;
     if node.attribute("axis").is_none() {
-        return Err("without `axis`".to_owned());
+        return Err(Problem::NoAxis);
     }
     let axis = node.axis("axis", 0, first.rank())?;
     let mut shape = first.shape.clone();
@@ -191,7 +194,7 @@ pub(super) fn concat(node: &Node<'_>) -> Result<Computed, String> {
             && value.rank() == first.rank()
             && (0..shape.len()).all(|a| a == axis || value.shape[a] == first.shape[a]);
         if !fits {
-            return Err(format!("{first} and {value} do not go together"));
+            return Err(Problem::Together(first.into(), value.into()));
         }
         shape[axis] = shape[axis].saturating_add(value.shape[axis]);
         ints = match (ints, &value.ints) {
@@ -209,13 +212,13 @@ pub(super) fn concat(node: &Node<'_>) -> Result<Computed, String> {
     .into())
 }
 
-pub(super) fn split(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn split(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.input(0)?;
     let axis = node.axis("axis", 0, value.rank())?;
     let (length, parts) = (value.shape[axis], node.proto.output.len());
     let sizes: Vec<usize> = match node.optional(1) {
         Some(_) if node.attribute("num_outputs").is_some() => {
-            return Err("`split` and `num_outputs`: expected one of them".to_owned());
+            return Err(Problem::Both("split", "num_outputs"));
         }
         Some(sizes) if sizes.shape == [parts] => {
             let known = node.known(1)?.iter();
@@ -225,13 +228,13 @@ pub(super) fn split(node: &Node<'_>) -> Result<Computed, String> {
         None if node.int("num_outputs", parts as i64) == parts as i64 && length % parts == 0 => {
             vec![length / parts; parts]
         }
-        _ => return Err(format!("{value} into {parts} parts")),
+        _ => return Err(Problem::Parts(value.into(), parts)),
     };
     let sum = sizes
         .iter()
         .try_fold(0_usize, |sum, &size| sum.checked_add(size));
     if sum != Some(length) || sizes.contains(&0) {
-        return Err(format!("{value} into parts of other lengths"));
+        return Err(Problem::PartLengths(value.into()));
     }
     let part = |size: usize| {
         let mut shape = value.shape.clone();
@@ -244,7 +247,7 @@ pub(super) fn split(node: &Node<'_>) -> Result<Computed, String> {
     })
 }
 
-pub(super) fn slice(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn slice(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.input(0)?;
     let (starts, ends) = (node.known(1)?, node.known(2)?);
     let along = match node.optional(3) {
@@ -261,7 +264,7 @@ pub(super) fn slice(node: &Node<'_>) -> Result<Computed, String> {
         || starts.len() > value.rank()
         || lists.any(|list| list.rank() != 1)
     {
-        return Err("starts, ends, axes and steps do not go together".to_owned());
+        return Err(Problem::SliceLists);
     }
     let mut shape = value.shape.clone();
     let mut ints = value.ints.as_deref().filter(|_| value.rank() == 1);
@@ -285,7 +288,7 @@ pub(super) fn slice(node: &Node<'_>) -> Result<Computed, String> {
 }
 
 /// The places that `start..end` by `step` picks of `length`, at least one.
-fn places(length: usize, start: i64, end: i64, step: i64) -> Result<Vec<usize>, String> {
+fn places(length: usize, start: i64, end: i64, step: i64) -> Result<Vec<usize>, Problem> {
     let long = length as i64;
     // Exporters write "to the end" as the largest integer there is.
     let last = [i64::MAX, i64::MIN, i64::MIN + 1].contains(&end) || end.unsigned_abs() < 1 << 31;
@@ -311,22 +314,28 @@ fn places(length: usize, start: i64, end: i64, step: i64) -> Result<Vec<usize>, 
         }
     }
     if places.is_empty() {
-        return Err(format!("{start} to {end} by {step} of {length}"));
+        return Err(Problem::Slice {
+            start,
+            end,
+            step,
+            length,
+        });
     }
     Ok(places)
 }
 
-pub(super) fn gather(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn gather(node: &Node<'_>) -> Result<Computed, Problem> {
     let (value, indices) = (node.input(0)?, node.input(1)?);
     if !matches!(indices.datum, Datum::I32 | Datum::I64) {
-        return Err(format!("indices {indices}"));
+        return Err(Problem::Indices(indices.into()));
     }
     let axis = node.axis("axis", 0, value.rank())?;
     let length = value.shape[axis] as i64;
     let picked = node.known(1)?;
     let outside = |index: &&i64| !(-length..length).contains(*index);
     if let Some(index) = picked.iter().find(outside) {
-        return Err(format!("index {index} into axis {axis} of {value}"));
+        let (index, value) = (*index, value.into());
+        return Err(Problem::Index { index, axis, value });
     }
     let (before, after) = (&value.shape[..axis], &value.shape[axis + 1..]);
     let shape = [before, &indices.shape, after].concat();
@@ -340,12 +349,12 @@ pub(super) fn gather(node: &Node<'_>) -> Result<Computed, String> {
     .into())
 }
 
-pub(super) fn pad(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn pad(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.of(0, Datum::F32)?;
     if let Some(fill) = node.optional(2)
         && (fill.rank() > 0 || fill.datum != value.datum || !fill.constant)
     {
-        return Err(format!("a fill of {fill}"));
+        return Err(Problem::PadFill(fill.into()));
     }
     let along = match node.optional(3) {
         Some(_) => axes(node.known(3)?, value.rank())?,
@@ -353,7 +362,7 @@ pub(super) fn pad(node: &Node<'_>) -> Result<Computed, String> {
     };
     let pads = node.known(1)?;
     if pads.len() != 2 * along.len() || node.input(1)?.rank() != 1 {
-        return Err(format!("{} pads of {value}", pads.len()));
+        return Err(Problem::Pads(pads.len(), value.into()));
     }
     let mirrored = node.text("mode") == Some("reflect");
     let mut shape = value.shape.clone();
@@ -366,24 +375,27 @@ pub(super) fn pad(node: &Node<'_>) -> Result<Computed, String> {
         for pad in [pads[index], pads[index + along.len()]] {
             match usize::try_from(pad) {
                 Ok(pad) if pad <= most => shape[axis] += pad,
-                _ => return Err(format!("a pad of {pad} on axis {axis} of {value}")),
+                _ => {
+                    let value = value.into();
+                    return Err(Problem::Pad { pad, axis, value });
+                }
             }
         }
     }
     Ok(Value::new(value.datum, shape).into())
 }
 
-pub(super) fn expand(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn expand(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.input(0)?;
     let shape = broadcast(&value.shape, &lengths(node.known(1)?)?)?;
     Ok(Value::new(value.datum, shape).into())
 }
 
-pub(super) fn tile(node: &Node<'_>) -> Result<Computed, String> {
+pub(super) fn tile(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.input(0)?;
     let repeats = lengths(node.known(1)?)?;
     if repeats.len() != value.rank() {
-        return Err(format!("repeats {repeats:?} of {value}"));
+        return Err(Problem::Repeats(repeats, value.into()));
     }
     let lengths = value.shape.iter().zip(&repeats);
     let shape = lengths.map(|(length, times)| length.saturating_mul(*times));

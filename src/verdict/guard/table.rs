@@ -3,6 +3,7 @@
 //! To allow another one, add a line here, with a rule that computes the shapes of its outputs and
 //! refuses what the inference library cannot take.
 
+use super::problem::Problem;
 use super::{Computed, Node, arithmetic, layers, learners, recurrent, shapes};
 
 /// What an attribute may be.
@@ -26,7 +27,7 @@ pub(super) enum Allowed {
 /// How the outputs of a node are computed.
 pub(super) enum Rule {
     /// From the node alone.
-    Of(fn(&Node<'_>) -> Result<Computed, String>),
+    Of(fn(&Node<'_>) -> Result<Computed, Problem>),
     /// A loop: from its body too.
     Scan,
 }
@@ -50,7 +51,7 @@ impl Operator {
         names: &'static [&'static str],
         inputs: (usize, usize),
         attributes: &'static [(&'static str, Allowed)],
-        rule: fn(&Node<'_>) -> Result<Computed, String>,
+        rule: fn(&Node<'_>) -> Result<Computed, Problem>,
     ) -> Self {
         Self {
             domain: "",

@@ -3,26 +3,24 @@
 use tract_onnx::pb;
 use tract_onnx::pb::tensor_proto::DataType;
 
+use super::problem::Problem;
 use super::{Datum, MOST_NUMBERS, MOST_RANK, Value, count};
 
 /// What a tensor is, if its data is whole.
-pub(super) fn value(proto: &pb::TensorProto) -> Result<Value, String> {
+pub(super) fn value(proto: &pb::TensorProto) -> Result<Value, Problem> {
     let datum = datum(proto.data_type)?;
     let shape = proto
         .dims
         .iter()
-        .map(|&length| usize::try_from(length).map_err(|_| format!("a length of {length}")))
-        .collect::<Result<Vec<usize>, String>>()?;
+        .map(|&length| usize::try_from(length).map_err(|_| Problem::Length(length)))
+        .collect::<Result<Vec<usize>, Problem>>()?;
     if shape.len() > MOST_RANK {
-        return Err(format!(
-            "rank {}: at most {MOST_RANK} is accepted",
-            shape.len()
-        ));
+        return Err(Problem::Rank(shape.len()));
     }
     let numbers = count(&shape).filter(|numbers| *numbers <= MOST_NUMBERS);
-    let numbers = numbers.ok_or_else(|| format!("more than {MOST_NUMBERS} numbers"))? as usize;
+    let numbers = numbers.ok_or(Problem::LargeTensor)? as usize;
     if numbers == 0 && !(datum == Datum::I64 && shape.len() == 1) {
-        return Err("a tensor without numbers".to_owned());
+        return Err(Problem::EmptyTensor);
     }
     let lists = [
         proto.float_data.len(),
@@ -48,9 +46,11 @@ pub(super) fn value(proto: &pb::TensorProto) -> Result<Value, String> {
     if !whole || others > 0 {
         let found = if raw > 0 { raw } else { lists[place] };
         let unit = if raw > 0 { "bytes" } else { "numbers" };
-        return Err(format!(
-            "found {found} {unit} of data, expected those of {numbers} numbers"
-        ));
+        return Err(Problem::Data {
+            found,
+            unit,
+            numbers,
+        });
     }
     let ints: Option<Vec<i64>> = match (datum, raw) {
         (Datum::I64, 0) => Some(proto.int64_data.clone()),
@@ -82,7 +82,7 @@ pub(super) fn value(proto: &pb::TensorProto) -> Result<Value, String> {
 }
 
 /// The type that a number stands for, if it is one that a graph may use.
-pub(super) fn datum(data_type: i32) -> Result<Datum, String> {
+pub(super) fn datum(data_type: i32) -> Result<Datum, Problem> {
     match DataType::try_from(data_type) {
         Ok(DataType::Float) => Ok(Datum::F32),
         Ok(DataType::Double) => Ok(Datum::F64),
@@ -90,17 +90,17 @@ pub(super) fn datum(data_type: i32) -> Result<Datum, String> {
         Ok(DataType::Int64) => Ok(Datum::I64),
         Ok(DataType::Uint8) => Ok(Datum::U8),
         Ok(DataType::Bool) => Ok(Datum::Bool),
-        Ok(other) => Err(format!("numbers of type {other:?} are not supported")),
-        Err(_) => Err(format!("numbers of type {data_type} are not supported")),
+        Ok(other) => Err(Problem::Numbers(format!("{other:?}"))),
+        Err(_) => Err(Problem::Numbers(data_type.to_string())),
     }
 }
 
 /// A graph's input or output as declared; every length must be a number.
-pub(super) fn declared(info: &pb::ValueInfoProto) -> Result<Value, String> {
+pub(super) fn declared(info: &pb::ValueInfoProto) -> Result<Value, Problem> {
     use pb::tensor_shape_proto::dimension::Value as Length;
     use pb::type_proto::Value as Type;
     let Some(Type::TensorType(tensor)) = info.r#type.as_ref().and_then(|t| t.value.as_ref()) else {
-        return Err("no tensor".to_owned());
+        return Err(Problem::NoTensor);
     };
     let datum = datum(tensor.elem_type)?;
     let dims = tensor.shape.iter().flat_map(|shape| &shape.dim);
@@ -109,11 +109,11 @@ pub(super) fn declared(info: &pb::ValueInfoProto) -> Result<Value, String> {
             Some(Length::DimValue(length)) if (1..=1 << 24).contains(&length) => {
                 Ok(length as usize)
             }
-            _ => Err("a length that is no number above 0".to_owned()),
+            _ => Err(Problem::OpenLength),
         })
-        .collect::<Result<Vec<usize>, String>>()?;
+        .collect::<Result<Vec<usize>, Problem>>()?;
     if shape.len() > MOST_RANK {
-        return Err(format!("rank {}", shape.len()));
+        return Err(Problem::Rank(shape.len()));
     }
     Ok(Value::new(datum, shape))
 }
