@@ -12,10 +12,11 @@ mod parse;
 
 use std::env;
 use std::net::SocketAddr;
+use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 
 pub use self::error::Error;
 pub use self::publish::{
@@ -66,7 +67,7 @@ pub struct SensorTable {
     /// Its device file.
     pub port: PathBuf,
     /// Bits a second on the line; a pty and USB CDC ignore it.
-    #[serde(default = "default_baud")]
+    #[serde(default = "default_baud", deserialize_with = "above_zero")]
     pub baud: u32,
     /// Expected rate.
     #[serde(default = "default_frame_rate_hz")]
@@ -92,6 +93,10 @@ fn default_name() -> String {
 
 fn default_baud() -> u32 {
     115_200
+}
+
+fn above_zero<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u32, D::Error> {
+    NonZeroU32::deserialize(deserializer).map(NonZeroU32::get)
 }
 
 fn default_frame_rate_hz() -> f64 {

@@ -91,9 +91,12 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
         ),
         (
             "[[sensor]]\nport = \"p\"\nbaud = \"9\"",
-            &["3:8", "baud: found string \"9\"", "0 to 4294967295"],
+            &["3:8", "baud: found string \"9\"", "from 1 to 4294967295"],
         ),
-        ("[[sensor]]\nport = \"p\"\nbaud = 0", &["sensor.baud", "0"]),
+        (
+            "[[sensor]]\nport = \"p\"\nbaud = 0",
+            &["3:8", "baud: found integer `0`", "from 1 to 4294967295"],
+        ),
         ("[[sensor]]\nport = \"p\"\nname = \"Arm\"", &["name", "Arm"]),
         (
             "[[sensor]]\nport = \"p\"\n[[sensor]]\nport = \"q\"",
