@@ -42,7 +42,7 @@ impl Account {
                 self.presses += 1;
                 let reason = text("reason");
                 Some(format!(
-                    "press {number}  {pressed}  ->  no verdict ({reason})"
+                    "press {number:<2} {pressed}  ->  no verdict ({reason})"
                 ))
             }
             ("gap", ..) => {
@@ -83,7 +83,7 @@ impl Account {
         };
         // A label, a blank and up to 100 per cent.
         let columns = self.label_columns + 6;
-        format!("press {number}  {pressed}  ->  {said:<columns$}  {mark:<5}  {force_n:4.1} N")
+        format!("press {number:<2} {pressed}  ->  {said:<columns$}  {mark:<5}  {force_n:4.1} N")
     }
 
     /// Number of a press, and the material that was pressed.
@@ -155,8 +155,8 @@ mod tests {
                 "press 3  hard-plastic (level 1)  ->  low force     -       7.4 N",
             ),
             (
-                json!({"type": "press", "state": "aborted", "press": 4, "reason": "short"}),
-                "press 4  foam (level 2)          ->  no verdict (short)",
+                json!({"type": "press", "state": "aborted", "press": 10, "reason": "short"}),
+                "press 10 foam (level 2)          ->  no verdict (short)",
             ),
         ] {
             assert_eq!(account.line(&event).as_deref(), Some(expected));
