@@ -240,6 +240,32 @@ fn a_simulated_sensor_ends_at_a_signal_and_takes_its_link_along() {
 }
 
 #[test]
+fn a_recording_that_does_not_fit_the_disk_leaves_nothing_behind() {
+    let bench = Bench::new();
+    let path = bench.path("long.bin").to_str().unwrap().to_owned();
+    // A file ends at this limit as on a full disk.
+    let script = "ulimit -f 8; exec \"$@\"";
+    let mut simulate = Command::new("sh");
+    simulate.args(["-c", script, "sh", BINARY]);
+    let output = simulate
+        .args(["simulate", "--presses", "1", "--to", &path])
+        .output()
+        .unwrap();
+    let error = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(74), "{error}");
+    assert!(
+        error.starts_with(&format!("hardnessd: {path}: ")),
+        "{error}"
+    );
+    assert_eq!(error.lines().count(), 1, "{error}");
+    assert!(!Path::new(&path).exists());
+    // A device stays.
+    let (code, _, error) = run(&["simulate", "--presses", "1", "--to", "/dev/full"]);
+    assert_eq!(code, 74, "{error}");
+    assert!(Path::new("/dev/full").exists());
+}
+
+#[test]
 fn a_reader_gets_the_last_frame_of_a_simulated_sensor_whole() {
     let bench = Bench::new();
     let mut sensor = bench.sensor(&["--presses", "1"]);

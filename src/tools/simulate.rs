@@ -206,31 +206,47 @@ fn sequence(args: &Args) -> SequenceSettings {
 /// How long a signal waits for the frame that is being written.
 const LAST_FRAME: Duration = Duration::from_millis(500);
 
-/// The bytes a sensor sends, back to back, until the presses are over or the other end of `stopped`
-/// is dropped. While it is silent or unplugged it sends none.
+/// Writes the bytes that a sensor sends, back to back, until the presses are over or the other end of
+/// `stopped` is dropped. A file that cannot be written to its end is removed; a device is not.
 fn record(
     path: &Path,
+    layout: &Layout,
+    settings: SequenceSettings,
+    faults: Faults,
+    stopped: &mpsc::Receiver<()>,
+) -> std::io::Result<()> {
+    let file = File::create(path)?;
+    let written = write(&file, layout, settings, faults, stopped);
+    if written.is_err() && file.metadata().is_ok_and(|file| file.is_file()) {
+        // The first error says more than a second one.
+        let _ = std::fs::remove_file(path);
+    }
+    written
+}
+
+/// Writes frame by frame, so that the file holds what was played whenever the simulation is stopped.
+/// While the sensor is silent or unplugged it sends nothing.
+fn write(
+    mut file: &File,
     layout: &Layout,
     settings: SequenceSettings,
     mut faults: Faults,
     stopped: &mpsc::Receiver<()>,
 ) -> std::io::Result<()> {
-    // Frame by frame, so that the file holds what was played whenever it is stopped.
-    let mut recording = File::create(path)?;
     let frame_rate_hz = settings.frame_rate_hz;
     let mut bytes = Vec::with_capacity(layout.max_frame_bytes());
     for (index, frame) in (0_u32..).zip(Sequence::new(settings)) {
         bytes.clear();
         layout.encode(&frame.raw, &mut bytes);
         if faults.strike(f64::from(index) / frame_rate_hz, &mut bytes) == Line::Up {
-            recording.write_all(&bytes)?;
+            file.write_all(&bytes)?;
         }
         // A process that ends during a write may leave a part of a frame.
         if stopped.try_recv() == Err(TryRecvError::Disconnected) {
             return Ok(());
         }
     }
-    recording.sync_all()
+    file.sync_all()
 }
 
 /// The rate of the line: as given, if it carries the shortest frames; else the first usual one that
