@@ -38,7 +38,7 @@ pub enum Command {
     Watch(watch::Args),
     /// Check a configuration and print what would run
     Check(check::Args),
-    /// Measure what the configuration should say of the arm, or of newtons
+    /// Measure values for the configuration: the arm, newtons, gains of taxels
     Calibrate(calibrate::Args),
     /// Explain why a port does not work, and what to do
     Doctor(doctor::Args),

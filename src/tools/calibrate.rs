@@ -36,8 +36,8 @@ use crate::verdict::Hrn;
 /// Arguments of `calibrate`.
 #[derive(Debug, Clone, ClapArgs)]
 pub struct Args {
-    /// arm: press something rigid a few times, while the robot tells where its arm is. force: put known
-    /// weights on the sensor. taxels: press something wide and soft at many places, or the whole array evenly
+    /// arm: press something rigid a few times, while the robot sends the positions of its arm. force: put
+    /// known weights on the sensor. taxels: press something wide and soft at many places, or the whole array evenly
     what: What,
     #[expect(missing_docs, reason = "a comment would be taken for help")]
     #[command(flatten)]
@@ -64,7 +64,7 @@ pub struct Args {
 pub enum What {
     /// Stiffness of the arm, and the delay of its stamps.
     Arm,
-    /// Newtons of a count.
+    /// Newtons per count.
     Force,
     /// A gain for each taxel.
     Taxels,

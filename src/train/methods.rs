@@ -34,7 +34,8 @@ pub enum Method {
     Hrn50,
     /// HRN from random weights on all labels.
     Hrn100,
-    /// A GAN whose discriminator has the levels and one more for generated frames (Odena 2016).
+    /// A GAN whose discriminator also tells the levels apart, with one more class for generated
+    /// frames (Odena 2016).
     Sgan,
     /// A GAN with feature matching (Salimans 2016).
     Igan,
@@ -47,8 +48,8 @@ pub enum Method {
     /// Control: hrn15 with Adam. It holds a quarter of its labelled objects out and keeps the weights
     /// that are best on them.
     Hrn15Tuned,
-    /// Control: hrn15 by the default model's recipe: Adam, averaged weights, symmetries and shifts, a
-    /// logarithmic image, means beside greatest values.
+    /// Control: hrn15 with the default model's recipe: Adam, averaged weights, symmetries and shifts, a
+    /// logarithmic image, mean pooling beside max pooling.
     Hrn15Strong,
     /// hrn15-strong that also learns from unlabelled samples: it must judge them alike whatever sensor
     /// gave them (FixMatch with an averaged teacher).
@@ -64,7 +65,7 @@ pub enum Method {
     /// `hrn-train adapt`: goes on from a model of `frame`.
     #[value(skip)]
     Adapt,
-    /// Judges the course of a press, with what the arm told, and gives its Shore hardness: a temporal
+    /// Judges the course of a press with the arm's motion, and gives its Shore hardness: a temporal
     /// convolution. Takes data of `simulate --sequences`.
     Course,
 }

@@ -28,7 +28,7 @@ pub(super) enum Command {
     Collect(Collect),
     /// Train one method
     Train(Train),
-    /// Go on from a model on a few presses of your own sensor: labelled ones, and any without labels
+    /// Continue to train a model on a few presses of your own sensor, labelled or not
     Adapt(Adapt),
     /// Train every method under several seeds and make the paper's tables; run it again to continue
     Compare(Compare),
@@ -50,12 +50,12 @@ pub(super) enum Command {
         #[arg(long, value_name = "M.onnx")]
         out: PathBuf,
     },
-    /// Say line by line what the model format wants of an ONNX file of someone else's making
+    /// Check an ONNX file that was made elsewhere against the model format, line by line
     CheckModel {
         /// The model file
         model: PathBuf,
     },
-    /// Make a model that the daemon loads of an ONNX file of someone else's making
+    /// Turn an ONNX file that was made elsewhere into a model that the daemon loads
     Adopt(Adopt),
     /// Check a model file as the daemon does and print its card
     Inspect {
@@ -76,27 +76,27 @@ pub(super) struct Simulate {
     /// Seed of everything random
     #[arg(long, default_value_t = DatasetSettings::default().seed)]
     pub(super) seed: u64,
-    /// Materials: named (the paper's eight) or broad (each object of one drawn for it, whose level is
-    /// what a durometer reads)
+    /// Materials: named (the paper's eight) or broad (each object has a random one, and its level is
+    /// what a simulated durometer reads)
     #[arg(long, default_value = "named")]
     pub(super) materials: Materials,
-    /// Laws that broad materials are drawn of: solid, plastic, foam, layered [default: all]
+    /// Laws that broad materials are drawn from: solid, plastic, foam, layered [default: all]
     #[arg(long, value_name = "LAW", value_delimiter = ',', num_args = 1..)]
     pub(super) laws: Vec<LawName>,
     /// Leave the gaps between the levels that the paper's table has: no broad material has a Shore
     /// hardness of 50 to 51, 60 to 61 or 70 to 71
     #[arg(long)]
     pub(super) gaps: bool,
-    /// Objects of each training material; of broad materials, four times as many
+    /// Objects of each training material; with broad materials, four times as many in all
     #[arg(long, default_value_t = DatasetSettings::default().objects,
           value_parser = clap::value_parser!(u32).range(0..=MOST))]
     pub(super) objects: u32,
-    /// Objects of each test material; of broad materials, four times as many
+    /// Objects of each test material; with broad materials, four times as many in all
     #[arg(long, default_value_t = DatasetSettings::default().test_objects,
           value_parser = clap::value_parser!(u32).range(0..=MOST))]
     pub(super) test_objects: u32,
-    /// Presses of each object: by default 50, with --sequences 6. Fewer than 48 single frames are some of
-    /// its six postures under eight forces each
+    /// Presses of each object: by default 50, with --sequences 6. The first 48 are six postures under eight
+    /// forces each; a smaller number takes some of these
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=MOST))]
     pub(super) presses: Option<u32>,
     /// The least nominal force, in newtons; the greatest is 25
@@ -110,7 +110,7 @@ pub(super) struct Simulate {
     /// Spread of the sensor's taxels: clean or raw
     #[arg(long, default_value = "clean")]
     pub(super) sensor_profile: SensorProfile,
-    /// Press all objects on one sensor, drawn with this seed: one that you have on the bench
+    /// Press all objects on the same sensor, which is drawn with this seed
     #[arg(long, value_name = "SEED")]
     pub(super) one_sensor: Option<u64>,
     /// Young's modulus of the sensor's cover in MPa, 0.05 to 100
@@ -120,7 +120,7 @@ pub(super) struct Simulate {
     /// Levels whose two materials change roles, such as 24: the paper's test material trains
     #[arg(long, value_name = "LEVELS", value_parser = swapped_levels)]
     pub(super) swapped_levels: Option<[bool; 4]>,
-    /// All eight named materials are for test
+    /// Put all eight named materials into the test split
     #[arg(long, conflicts_with = "swapped_levels")]
     pub(super) all_test: bool,
     /// Also draw samples of every material and a press of every level
@@ -149,16 +149,16 @@ pub(super) struct Courses {
     /// Seconds that the arm holds its position, 0 to 10, and three frames at least [default: 0.2..1.5]
     #[arg(long, value_name = "LOW..HIGH", value_parser = range::<0, 10>)]
     pub(super) hold: Option<[f64; 2]>,
-    /// Positions told are off by up to this part, 0 to 0.5, the same in a press [default: 0]
-    #[arg(long, value_name = "PART", value_parser = part::<50>)]
+    /// Reported positions are off by up to this share, 0 to 0.5, constant within a press [default: 0]
+    #[arg(long, value_name = "SHARE", value_parser = part::<50>)]
     pub(super) position_error: Option<f64>,
-    /// The arm's stiffness told is off by up to this part, 0 to 0.9 [default: 0]
-    #[arg(long, value_name = "PART", value_parser = part::<90>)]
+    /// The reported stiffness of the arm is off by up to this share, 0 to 0.9 [default: 0]
+    #[arg(long, value_name = "SHARE", value_parser = part::<90>)]
     pub(super) arm_error: Option<f64>,
-    /// Moments of positions are off by up to so many frames, 0 to 5, the same in a press [default: 0]
+    /// Times of positions are off by up to this many frames, 0 to 5, constant within a press [default: 0]
     #[arg(long, value_name = "FRAMES", value_parser = part::<500>)]
     pub(super) clock_error: Option<f64>,
-    /// Share of the presses of which nothing is told of the arm, 0 to 1 [default: 0]
+    /// Share of the presses in which the arm reports nothing, 0 to 1 [default: 0]
     #[arg(long, value_name = "SHARE", value_parser = part::<100>)]
     pub(super) unknown: Option<f64>,
 }
@@ -171,21 +171,21 @@ pub(super) struct Collect {
     /// Hardness level, 1 (hard) to 4, or 0: unlabelled [default: the recording's label "level"]
     #[arg(long, value_name = "L", value_parser = clap::value_parser!(u8).range(0..=4))]
     pub(super) level: Option<u8>,
-    /// What was pressed; all its presses belong into one split of one data set [default: the
-    /// recording's label "object", else a new one]
+    /// Number of the object that was pressed. All its presses must be in one split of one data set
+    /// [default: the recording's label "object", else a new number]
     #[arg(long, value_name = "K")]
     pub(super) object: Option<u32>,
     /// For training or for test
     #[arg(long, default_value = "train")]
     pub(super) split: SplitName,
-    /// Collect whole presses over time, with the arm's approach where the recording has it, and not
-    /// single frames
+    /// Collect whole presses over time, not single frames; with the arm's approach where the recording
+    /// has it
     #[arg(long)]
     pub(super) sequences: bool,
     /// Add to the data set, if it is there
     #[arg(long)]
     pub(super) append: bool,
-    /// Configuration whose first sensor raw bytes are of [default: a JX255N by default settings]
+    /// Configuration whose first sensor describes raw bytes [default: a JX255N with default settings]
     #[arg(long, value_name = "F")]
     pub(super) config: Option<PathBuf>,
     /// Recordings of `record`, or raw bytes back to back. If all have a label "material" or "shore",
@@ -199,8 +199,8 @@ pub(super) struct Train {
     /// What to train
     #[arg(long)]
     pub(super) method: Method,
-    /// Data to learn from; several files are joined, and no object of one is taken for one of
-    /// another: all presses of an object belong into one file
+    /// Data to learn from; several files may be named. The files are joined, and objects of different files stay
+    /// different: all presses of an object must be in one file
     #[arg(long, value_name = "D.npz", required = true, num_args = 1..)]
     pub(super) data: Vec<PathBuf>,
     /// Directory of the run
@@ -218,7 +218,7 @@ pub(super) struct Train {
     /// Continue a run that was stopped
     #[arg(long)]
     pub(super) resume: bool,
-    /// Take stages that another run finished, where they are the very same; may be repeated
+    /// Reuse finished stages of another run where they are identical; may be repeated
     #[arg(long, value_name = "RUN")]
     pub(super) from: Vec<PathBuf>,
     /// Number of labels to use [default: the method's share]
@@ -240,14 +240,14 @@ pub(super) struct Train {
 
 #[derive(Debug, clap::Args)]
 pub(super) struct Adapt {
-    /// Presses of your sensor; those of level 0 are unlabelled. Several files are joined
+    /// Presses of your sensor, those of level 0 unlabelled; several files may be named
     #[arg(long, value_name = "D.npz", required = true, num_args = 1..)]
     pub(super) data: Vec<PathBuf>,
     /// Directory of the run
     #[arg(long, value_name = "RUN")]
     pub(super) out: PathBuf,
-    /// Model to go on from, of `train --method frame` or `adapt` [default: the built-in one]. For presses over time
-    /// one of `train --method course`
+    /// Model to start from, made by `train --method frame` or `adapt` [default: the built-in one]. For
+    /// presses over time, one of `train --method course`
     #[arg(long, value_name = "M.onnx")]
     pub(super) start: Option<PathBuf>,
     /// Seed of everything random

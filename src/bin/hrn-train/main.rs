@@ -325,7 +325,7 @@ fn collect(arguments: &Collect) -> anyhow::Result<String> {
     }
     let out = arguments.out.display();
     Ok(format!(
-        "{out}: {presses} presses collected, {all} in all; an object's further presses belong into \
+        "{out}: {presses} presses collected, {all} in all; an object's further presses must go into \
          this file, not another\n"
     ))
 }
@@ -365,7 +365,7 @@ fn collect_courses(arguments: &Collect, captures: &[Capture]) -> anyhow::Result<
     }
     Ok(format!(
         "{}: {whole} presses collected, {known} of them with the arm's approach, {left_out} left out \
-         because the recording lacks their begin, {} in all; an object's further presses belong into this \
+         because the recording lacks their begin, {} in all; an object's further presses must go into this \
          file, not another\n",
         arguments.out.display(),
         before_count + whole
