@@ -1,33 +1,59 @@
 //! `/events`: what a subscriber on a socket reads, as server-sent events.
 //!
-//! An event's id is `RUN:SEQ`, so that a browser that comes back names in `Last-Event-ID` where it
-//! stopped, which is the hub's `since`. Frames come only when asked for, and only the newest: who
-//! looks on wants the present.
+//! The id of an event is `RUN:SEQ`. A browser that connects again names in `Last-Event-ID` where it
+//! stopped, which is the hub's `since`. Frames come only when they are asked for, and only the
+//! newest: a page shows the present.
 
+use std::convert::Infallible;
 use std::time::Duration;
 
-use hyper::Request;
-use hyper::body::Bytes;
+use axum::extract::{Request, State};
+use axum::response::sse::{Event, KeepAlive, Sse};
+use axum::response::{IntoResponse, Response};
+use futures_util::stream::{self, StreamExt};
+use hyper::StatusCode;
 use tokio::sync::{mpsc, oneshot};
 
-use crate::daemon::hub::{self, Ahead, Closed, Line};
+use super::{Sources, refusal};
+use crate::daemon::hub::{Ahead, Closed, Line};
 use crate::daemon::request::{Kinds, Policy, Since, Subscription, Unusable};
-use crate::daemon::sensor::Sensors;
 use crate::event::Kind;
-
-pub(super) const CONTENT_TYPE: &str = "text/event-stream";
 
 const LAST_EVENT_ID: &str = "Last-Event-ID";
 
 /// A silence this long is broken by a comment: without it a lost connection would not be noticed.
 const HEARTBEAT: Duration = Duration::from_secs(15);
 
-/// How soon a browser that has lost the connection comes back.
+/// How soon a browser that has lost the connection connects again.
 const RETRY: Duration = Duration::from_secs(1);
+
+/// Events that go to the connection together. What it does not take stays in the hub, whose queue
+/// is bounded.
+type Batch = Vec<Event>;
+
+/// Answers a request.
+pub(super) async fn answer(
+    State(sources): State<Sources>,
+    request: Request,
+) -> Result<Response, Closed> {
+    let wanted = match wanted(&request) {
+        Ok(wanted) => wanted,
+        Err(unusable) => return Ok(refusal(StatusCode::BAD_REQUEST, unusable)),
+    };
+    Ok(match open(sources, wanted).await? {
+        Ok(mut batches) => {
+            let batches = stream::poll_fn(move |context| batches.poll_recv(context));
+            let events = batches.flat_map(stream::iter).map(Ok::<_, Infallible>);
+            let beat = KeepAlive::new().interval(HEARTBEAT);
+            Sse::new(events).keep_alive(beat).into_response()
+        }
+        Err(ahead) => refusal(StatusCode::BAD_REQUEST, ahead),
+    })
+}
 
 /// Reads what a request asks for: `types` and `since` of its query, and `Last-Event-ID`, which is
 /// newer than the query when both are there.
-pub(super) fn wanted<B>(request: &Request<B>) -> Result<Subscription, Unusable> {
+fn wanted<B>(request: &Request<B>) -> Result<Subscription, Unusable> {
     let mut wanted = Subscription {
         policy: Policy::LatestFrames,
         ..Subscription::default()
@@ -75,35 +101,33 @@ fn since(key: &'static str, token: &str) -> Result<Since, Unusable> {
     })
 }
 
-/// Subscribes; the inner error is for the asker.
+/// Subscribes; the inner error is for the client.
 ///
-/// All of it is a task of its own: a request whose browser goes away is dropped wherever it waits,
-/// and a subscriber that has joined the hub must leave it.
-pub(super) async fn open(
-    hub: &hub::Handle,
-    sensors: &Sensors,
+/// All of it is a task of its own: a request is dropped wherever it waits when its browser goes
+/// away, and a subscriber that has joined the hub must leave it.
+async fn open(
+    sources: Sources,
     wanted: Subscription,
-) -> Result<Result<mpsc::Receiver<Bytes>, Ahead>, Closed> {
+) -> Result<Result<mpsc::Receiver<Batch>, Ahead>, Closed> {
     let (reply, opened) = oneshot::channel();
-    let (hub, sensors) = (hub.clone(), sensors.clone());
     tokio::spawn(async move {
-        if let Ok((id, hello)) = hub.join().await {
-            // Any end of it is a reason to stop: the asker's, the hub's, or the connection's.
-            let _ = serve(&hub, &sensors, id, hello, wanted, reply).await;
-            hub.leave(id).await;
+        if let Ok((id, hello)) = sources.hub.join().await {
+            // The client, the hub and the connection may each end it.
+            let _ = serve(&sources, id, hello, wanted, reply).await;
+            sources.hub.leave(id).await;
         }
     });
     opened.await.map_err(|_| Closed)
 }
 
-/// Serves one that has joined, from the answer to its request on.
+/// Serves a subscriber that has joined, from the answer to its request on, until its connection is
+/// gone or the hub has ended.
 async fn serve(
-    hub: &hub::Handle,
-    sensors: &Sensors,
+    Sources { hub, sensors }: &Sources,
     id: u64,
     hello: Line,
     wanted: Subscription,
-    opened: oneshot::Sender<Result<mpsc::Receiver<Bytes>, Ahead>>,
+    opened: oneshot::Sender<Result<mpsc::Receiver<Batch>, Ahead>>,
 ) -> Option<()> {
     let run = hub.survey().await.ok()?.hello.run;
     // Where a connection that breaks before its first event is to go on.
@@ -115,52 +139,30 @@ async fn serve(
     if let Err(ahead) = hub.subscribe(id, wanted).await.ok()? {
         return opened.send(Err(ahead)).ok();
     }
-    let mut first = format!("retry: {}\n", RETRY.as_millis()).into_bytes();
-    write(&mut first, &run, &Line { seq: from, ..hello });
-    for status in sensors.statuses().await {
-        write(&mut first, &run, &Line::from(status));
-    }
-    // What the connection does not take stays in the hub, whose queue is bounded.
-    let (sender, events) = mpsc::channel(1);
-    opened.send(Ok(events)).ok()?;
-    pass_on(hub, id, &run, first, &sender).await
-}
-
-/// Hands events to the connection until it is gone or the hub has ended.
-async fn pass_on(
-    hub: &hub::Handle,
-    id: u64,
-    run: &str,
-    first: Vec<u8>,
-    connection: &mpsc::Sender<Bytes>,
-) -> Option<()> {
-    connection.send(first.into()).await.ok()?;
+    let hello = event(&run, &Line { seq: from, ..hello }).retry(RETRY);
+    let statuses = sensors.statuses().await.into_iter().map(Line::from);
+    let mut batch = vec![hello];
+    batch.extend(statuses.map(|line| event(&run, &line)));
+    let (connection, batches) = mpsc::channel(1);
+    opened.send(Ok(batches)).ok()?;
     let mut next = hub.take(id).await.ok()?;
     loop {
-        let mut chunk = Vec::new();
-        tokio::select! {
-            lines = &mut next => {
-                for line in lines.ok()? {
-                    write(&mut chunk, run, &line);
-                }
-                next = hub.take(id).await.ok()?;
-            }
+        connection.send(batch).await.ok()?;
+        let lines = tokio::select! {
+            lines = &mut next => lines.ok()?,
             () = connection.closed() => return None,
-            () = tokio::time::sleep(HEARTBEAT) => chunk.extend_from_slice(b":\n\n"),
-        }
-        connection.send(chunk.into()).await.ok()?;
+        };
+        batch = lines.iter().map(|line| event(&run, line)).collect();
+        next = hub.take(id).await.ok()?;
     }
 }
 
-/// One event, in the format of the HTML standard, section 9.2.6.
-fn write(out: &mut Vec<u8>, run: &str, line: &Line) {
-    if let Some(seq) = line.seq {
-        out.extend_from_slice(format!("id: {run}:{seq}\n").as_bytes());
-    }
-    out.extend_from_slice(b"data: ");
-    // It ends with its newline; another ends the event.
-    out.extend_from_slice(line.json.as_bytes());
-    out.push(b'\n');
+fn event(run: &str, line: &Line) -> Event {
+    let event = match line.seq {
+        Some(seq) => Event::default().id(format!("{run}:{seq}")),
+        None => Event::default(),
+    };
+    event.data(line.json.trim_end())
 }
 
 #[cfg(test)]
