@@ -9,6 +9,8 @@ mod accept;
 mod client;
 pub mod config;
 pub mod descriptors;
+#[cfg(feature = "foxglove")]
+pub mod foxglove;
 mod http;
 mod hub;
 pub(crate) mod lines;
@@ -16,7 +18,7 @@ pub mod log;
 pub mod publish;
 pub mod realtime;
 pub mod record;
-#[cfg(any(feature = "ros2", feature = "zenoh"))]
+#[cfg(any(feature = "foxglove", feature = "ros2", feature = "zenoh"))]
 mod relay;
 mod reload;
 mod request;

@@ -4,14 +4,18 @@
 //! with a `std_msgs/Header`: the moment in UTC and the sensor's name. A ROS message has no null. So a
 //! null of an event is 0, NaN or an empty string here.
 
+mod frame;
+
 use byteorder::LittleEndian;
 use jiff::Timestamp;
 use serde::de::Visitor;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::Value;
 
+#[cfg(feature = "ros2")]
+pub(crate) use self::frame::contact;
+pub(crate) use self::frame::{CONTACT, FRAME, GRID};
 use crate::event::{self, Event, name};
-use crate::frame::{COLS, ROWS};
 
 /// The bytes before every message: CDR, little-endian, no options (DDS-XTYPES 1.3, 7.6.3.1.2).
 pub(crate) const ENCAPSULATION: [u8; 4] = [0, 1, 0, 0];
@@ -23,20 +27,6 @@ pub(crate) struct Topic {
     pub(crate) schema: &'static str,
     pub(crate) definition: &'static str,
 }
-
-pub(crate) const FRAME: Topic = Topic {
-    name: "frame",
-    schema: "sensor_msgs/msg/Image",
-    definition: "\
-std_msgs/Header header
-uint32 height
-uint32 width
-string encoding
-uint8 is_bigendian
-uint32 step
-uint8[] data
-",
-};
 
 pub(crate) const HARDNESS: Topic = Topic {
     name: "hardness",
@@ -87,15 +77,21 @@ struct Time {
     nanosec: u32,
 }
 
-impl Header {
-    pub(crate) fn new(time: Timestamp, sensor: &str) -> Self {
+impl Time {
+    fn new(time: Timestamp) -> Self {
         // In ROS, nanoseconds always count up from the second; jiff's do not before 1970.
         let ns = time.as_nanosecond();
         Self {
-            stamp: Time {
-                sec: ns.div_euclid(1_000_000_000) as i32,
-                nanosec: ns.rem_euclid(1_000_000_000) as u32,
-            },
+            sec: ns.div_euclid(1_000_000_000) as i32,
+            nanosec: ns.rem_euclid(1_000_000_000) as u32,
+        }
+    }
+}
+
+impl Header {
+    pub(crate) fn new(time: Timestamp, sensor: &str) -> Self {
+        Self {
+            stamp: Time::new(time),
             frame_id: sensor.to_owned(),
         }
     }
@@ -132,17 +128,6 @@ impl<'de> Deserialize<'de> for Blob {
         }
         deserializer.deserialize_byte_buf(Bytes)
     }
-}
-
-#[derive(Debug, Serialize)]
-struct ImageMessage {
-    header: Header,
-    height: u32,
-    width: u32,
-    encoding: &'static str,
-    is_bigendian: u8,
-    step: u32,
-    data: Blob,
 }
 
 #[derive(Debug, Serialize)]
@@ -216,22 +201,20 @@ fn context(context: Option<&Value>) -> String {
     context.map_or_else(String::new, Value::to_string)
 }
 
-/// An event, with its channel and its time.
+/// Every message that a recording, or a viewer such as Foxglove, has of an event: a frame has three.
+/// `pitch_mm` is that of the sensor.
+pub(crate) fn encode_all(event: &Event, pitch_mm: f64) -> Vec<(Topic, Timestamp, Vec<u8>)> {
+    let mut messages = vec![encode(event)];
+    if let Event::Frame(frame) = event {
+        messages.extend([frame::contact(frame), frame::grid(frame, pitch_mm)]);
+    }
+    messages
+}
+
+/// An event as its main message, with the message's channel and time.
 pub(crate) fn encode(event: &Event) -> (Topic, Timestamp, Vec<u8>) {
     match event {
-        Event::Frame(frame) => {
-            let bytes = frame.newtons.iter().flat_map(|n| n.to_le_bytes()).collect();
-            let message = ImageMessage {
-                header: Header::new(frame.time, &frame.sensor),
-                height: ROWS as u32,
-                width: COLS as u32,
-                encoding: "32FC1",
-                is_bigendian: 0,
-                step: (COLS * size_of::<f32>()) as u32,
-                data: Blob(bytes),
-            };
-            (FRAME, frame.time, to_cdr(&message))
-        }
+        Event::Frame(frame) => frame::image(frame),
         Event::Hardness(verdict) => {
             let shore = verdict.shore;
             let message = HardnessMessage {

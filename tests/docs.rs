@@ -200,7 +200,8 @@ fn check_keys(
 #[test]
 fn the_page_on_configuration_has_every_key_of_the_daemon_and_no_other() {
     // Tables that are off unless they are there have defaults too.
-    let tables = "[http]\n[record]\n[publish.tcp]\n[publish.zenoh]\n[publish.ros2]";
+    let tables =
+        "[http]\n[record]\n[publish.tcp]\n[publish.foxglove]\n[publish.zenoh]\n[publish.ros2]";
     let config: Config = toml::from_str(&format!("[[sensor]]\nport = \"p\"\n{tables}")).unwrap();
     let mut defaults = BTreeMap::new();
     leaves(&as_file(&config), "", &mut defaults);

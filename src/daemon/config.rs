@@ -20,7 +20,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 pub use self::error::Error;
 pub use self::publish::{
-    Endpoint, EndpointError, Mode, ModeError, Publish, Ros2, Tcp, Unix, Zenoh,
+    Endpoint, EndpointError, Foxglove, Mode, ModeError, Publish, Ros2, Tcp, Unix, Zenoh,
 };
 use super::log;
 use crate::sensor::{Description, Sensor};
@@ -308,6 +308,7 @@ impl Config {
                 unix.max_clients != their_unix.max_clients,
             ),
             ("publish.tcp.listen", ours.tcp != theirs.tcp),
+            ("publish.foxglove.listen", ours.foxglove != theirs.foxglove),
             ("publish.zenoh", ours.zenoh != theirs.zenoh),
             ("publish.ros2", ours.ros2 != theirs.ros2),
             ("http.listen", self.http != other.http),

@@ -133,9 +133,9 @@ impl Log {
 
 /// The filter of `directives`. Without any, it passes the daemon's own lines from `level` on.
 fn filter(directives: &str, level: &str) -> Result<Targets, Error> {
-    // Of libraries only warnings. The DDS libraries warn several times a second of what is harmless;
-    // what matters they return as an error.
-    let unasked = format!("warn,rustdds=off,ros2_client=off,hardnessd={level}");
+    // Of libraries only warnings. The DDS libraries and Foxglove's warn of what is harmless, several
+    // times a second or whenever a peer wants it; what matters they return as an error.
+    let unasked = format!("warn,rustdds=off,ros2_client=off,foxglove=off,hardnessd={level}");
     let parts = |directives: &str| -> Vec<String> {
         let parts = directives.split(',').map(str::trim);
         parts

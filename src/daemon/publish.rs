@@ -10,11 +10,13 @@ use tracing::info;
 use super::accept::{Stop, accept};
 use super::client::{Access, Service};
 use super::config::{Config, Unix};
+#[cfg(feature = "foxglove")]
+use super::foxglove;
 use super::http::Http;
 use super::hub;
-#[cfg(feature = "ros2")]
+#[cfg(any(feature = "foxglove", feature = "ros2"))]
 use super::hub::Line;
-#[cfg(any(feature = "ros2", feature = "zenoh"))]
+#[cfg(any(feature = "foxglove", feature = "ros2", feature = "zenoh"))]
 use super::relay::Worker;
 #[cfg(feature = "ros2")]
 use super::ros2;
@@ -50,6 +52,10 @@ pub enum Error {
     /// A TCP listener.
     #[error(transparent)]
     Tcp(#[from] tcp::Error),
+    /// The server for Foxglove.
+    #[cfg(feature = "foxglove")]
+    #[error(transparent)]
+    Foxglove(#[from] foxglove::Error),
     /// A ROS 2 node.
     #[cfg(feature = "ros2")]
     #[error(transparent)]
@@ -78,6 +84,8 @@ pub(crate) struct Publishers {
     control: Option<Socket>,
     tcp: Option<Tcp>,
     http: Option<Tcp>,
+    #[cfg(feature = "foxglove")]
+    foxglove: Option<Worker<Vec<Line>>>,
     #[cfg(feature = "ros2")]
     ros2: Option<Worker<Vec<Line>>>,
     #[cfg(feature = "zenoh")]
@@ -119,6 +127,12 @@ impl Publishers {
                 .http
                 .as_ref()
                 .map(|http| Tcp::bind("http.listen", http.listen))
+                .transpose()?,
+            #[cfg(feature = "foxglove")]
+            foxglove: publish
+                .foxglove
+                .as_ref()
+                .map(|settings| foxglove::open(settings, &config.robot, arrays(config)))
                 .transpose()?,
             #[cfg(feature = "ros2")]
             ros2: publish
@@ -162,6 +176,8 @@ impl Publishers {
             control,
             tcp,
             http,
+            #[cfg(feature = "foxglove")]
+            foxglove,
             #[cfg(feature = "ros2")]
             ros2,
             #[cfg(feature = "zenoh")]
@@ -197,6 +213,10 @@ impl Publishers {
             );
             tasks.spawn(accept(listener, Http::MOST_CONNECTIONS, http, stop.clone()));
         }
+        #[cfg(feature = "foxglove")]
+        if let Some(foxglove) = foxglove {
+            tasks.spawn(foxglove.serve(hub.clone(), sensors.clone()));
+        }
         #[cfg(feature = "ros2")]
         if let Some(ros2) = ros2 {
             tasks.spawn(ros2.serve(hub.clone(), sensors.clone()));
@@ -207,6 +227,18 @@ impl Publishers {
         }
         tasks
     }
+}
+
+/// The sensors as a viewer needs them.
+#[cfg(feature = "foxglove")]
+fn arrays(config: &Config) -> Vec<foxglove::Sensor> {
+    let sensors = config.sensors.iter();
+    sensors
+        .map(|sensor| foxglove::Sensor {
+            name: sensor.name.clone(),
+            pitch_mm: sensor.calibration.pitch_mm,
+        })
+        .collect()
 }
 
 #[cfg(any(feature = "ros2", feature = "zenoh"))]

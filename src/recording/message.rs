@@ -11,8 +11,15 @@ use crate::motion::Point;
 use crate::ros::{self, Blob, Header, Topic};
 
 /// The channels of a sensor, in the order of their numbers. It never changes: `recover` numbers the
-/// channels of a damaged file by it. Later channels have numbers of their own ([`MOTION`]).
+/// channels of a damaged file by it. Later channels have numbers of their own ([`LATER`]).
 pub(super) const TOPICS: [Topic; 5] = [INPUT, ros::FRAME, ros::HARDNESS, ros::PRESS, ros::STATUS];
+
+/// The channels that came later, each with the number of the first sensor's. It never changes either.
+pub(super) const LATER: [(Topic, u16); 3] = [
+    (MOTION, 50_000),
+    (ros::CONTACT, 55_000),
+    (ros::GRID, 60_000),
+];
 
 pub(super) const INPUT: Topic = Topic {
     name: "input",

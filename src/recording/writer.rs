@@ -7,7 +7,7 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::write::NoSeek;
 use mcap::{Compression, WriteOptions};
 
-use super::message::{self, INPUT, MOTION, TOPICS};
+use super::message::{self, INPUT, LATER, TOPICS};
 use super::{Entry, Error, Labels, RecordedSensor};
 use crate::event::Event;
 use crate::frame::Stamp;
@@ -66,7 +66,7 @@ pub struct About {
 /// ```
 pub struct Writer<W: Write> {
     out: mcap::Writer<NoSeek<W>>,
-    sensors: Vec<String>,
+    sensors: Vec<RecordedSensor>,
     sequence: u32,
 }
 
@@ -81,35 +81,37 @@ pub(super) fn options() -> WriteOptions {
         .disable_seeking(true)
 }
 
+/// Every topic of a sensor.
+fn topics() -> impl Iterator<Item = Topic> + Clone {
+    TOPICS.into_iter().chain(LATER.map(|(topic, _)| topic))
+}
+
 /// The number of a channel. It follows from the sensor's place and the topic, so `recover` knows it
 /// even if the record of the channel is lost.
 pub(super) fn channel_id(sensor: usize, topic: Topic) -> u16 {
-    if topic == MOTION {
-        return FIRST_MOTION + u16::try_from(sensor).expect("a daemon has few sensors");
-    }
-    let place = TOPICS.iter().position(|known| *known == topic);
-    let place = place.expect("every topic stands in TOPICS");
-    u16::try_from(sensor * TOPICS.len() + place + 1).expect("a daemon has few sensors")
+    let id = match LATER.iter().find(|(later, _)| *later == topic) {
+        Some((_, first)) => usize::from(*first) + sensor,
+        None => {
+            let place = TOPICS.iter().position(|known| *known == topic);
+            sensor * TOPICS.len() + place.expect("every other topic stands in TOPICS") + 1
+        }
+    };
+    u16::try_from(id).expect("a daemon has few sensors")
 }
-
-/// The number of the first sensor's [`MOTION`], after those of ten thousand sensors.
-const FIRST_MOTION: u16 = 50_000;
 
 /// The topic of a channel with this number.
 pub(super) fn topic_of(channel_id: u16) -> Topic {
-    match channel_id {
-        FIRST_MOTION.. => MOTION,
-        id => TOPICS[usize::from(id.wrapping_sub(1)) % TOPICS.len()],
-    }
+    let later = LATER.iter().rfind(|(_, first)| channel_id >= *first);
+    later.map_or_else(
+        || TOPICS[usize::from(channel_id.wrapping_sub(1)) % TOPICS.len()],
+        |(topic, _)| *topic,
+    )
 }
 
 /// The number of a topic's schema.
 pub(super) fn schema_id(topic: Topic) -> u16 {
-    if topic == MOTION {
-        return TOPICS.len() as u16 + 1;
-    }
-    let place = TOPICS.iter().position(|known| *known == topic);
-    place.expect("every topic stands in TOPICS") as u16 + 1
+    let place = topics().position(|known| known == topic);
+    place.expect("every topic stands in one of the lists") as u16 + 1
 }
 
 /// A channel's name.
@@ -122,8 +124,7 @@ pub(super) fn is_topic_of_ours(name: &str) -> bool {
     let parts = name
         .strip_prefix("/tactile/")
         .and_then(|rest| rest.split_once('/'));
-    let mut topics = TOPICS.iter().chain([&MOTION]);
-    parts.is_some_and(|(_, name)| topics.any(|topic| topic.name == name))
+    parts.is_some_and(|(_, name)| topics().any(|topic| topic.name == name))
 }
 
 /// Whether a channel of this name holds what happened to a sensor.
@@ -165,7 +166,6 @@ impl<W: Write> Writer<W> {
             let name = name.to_owned();
             out.write_metadata(&Metadata { name, metadata })?;
         }
-        let topics = || TOPICS.into_iter().chain([MOTION]);
         for topic in topics() {
             let text = topic.text();
             out.add_schema_with_id(schema_id(topic), topic.schema, "ros2msg", text.as_bytes())?;
@@ -180,7 +180,7 @@ impl<W: Write> Writer<W> {
         out.flush()?;
         Ok(Self {
             out,
-            sensors: about.sensors.iter().map(|s| s.name().to_owned()).collect(),
+            sensors: about.sensors.clone(),
             sequence: 0,
         })
     }
@@ -191,7 +191,7 @@ impl<W: Write> Writer<W> {
     ///
     /// If it cannot be written. The writer must not be used after that.
     pub fn entry(&mut self, sensor: usize, at: Stamp, entry: &Entry) -> Result<(), Error> {
-        let bytes = message::encode_entry(&self.sensors[sensor], at, entry);
+        let bytes = message::encode_entry(self.sensors[sensor].name(), at, entry);
         let topic = message::topic_of(entry);
         self.write(channel_id(sensor, topic), at.wall, &bytes)
     }
@@ -203,11 +203,14 @@ impl<W: Write> Writer<W> {
     /// If it cannot be written. The writer must not be used after that.
     pub fn event(&mut self, event: &Event) -> Result<(), Error> {
         let mut sensors = self.sensors.iter();
-        let Some(sensor) = sensors.position(|sensor| sensor == event.sensor()) else {
+        let Some(sensor) = sensors.position(|sensor| sensor.name() == event.sensor()) else {
             return Ok(());
         };
-        let (topic, time, bytes) = ros::encode(event);
-        self.write(channel_id(sensor, topic), time, &bytes)
+        let pitch_mm = self.sensors[sensor].description.calibration.pitch_mm;
+        for (topic, time, bytes) in ros::encode_all(event, pitch_mm) {
+            self.write(channel_id(sensor, topic), time, &bytes)?;
+        }
+        Ok(())
     }
 
     fn write(&mut self, channel_id: u16, time: jiff::Timestamp, data: &[u8]) -> Result<(), Error> {

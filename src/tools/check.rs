@@ -113,8 +113,11 @@ pub fn run(args: &Args) -> Result<(), Error> {
     }
     let tcp = setup.config.publish.tcp.as_ref().map(|tcp| tcp.listen);
     let http = setup.config.http.as_ref().map(|http| http.listen);
+    let foxglove = setup.config.publish.foxglove.as_ref();
+    let foxglove = foxglove.map(|foxglove| foxglove.listen);
     for (key, way, listen) in [
         ("publish.tcp.listen", "tcp ", tcp),
+        ("publish.foxglove.listen", "foxglove ws://", foxglove),
         ("http.listen", "page http://", http),
     ] {
         if let Some(listen) = listen {

@@ -4,8 +4,10 @@ import json
 import math
 import os
 import signal
+import socket
 import subprocess
 import tempfile
+import threading
 import time
 
 PATIENCE_S = 60
@@ -47,6 +49,57 @@ def same(found, expected, key):
         # JSON has forces and areas rounded to 0.001, confidence as f32.
         return abs(found - expected) <= 0.0005 + 1e-6
     return found == expected
+
+
+class Arm:
+    """A stand-in for a control socket, at `path`: `simulate --motion PATH` tells it where the simulated arm is, and
+    `tell` is called with each list of [MONO_NS, MM]. What was told is in `told`."""
+
+    def __init__(self, path, tell):
+        self.told, self.tell = [], tell
+        self.listener = socket.socket(socket.AF_UNIX)
+        self.listener.bind(path)
+        self.listener.listen()
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def _serve(self):
+        connection, _ = self.listener.accept()
+        connection.sendall(b'{"type":"hello","sensors":[{"name":"forearm"}]}\n')
+        for line in connection.makefile():
+            request = json.loads(line)
+            if "motion" in request:
+                points = request["motion"]["at"]
+                self.told += points
+                self.tell(points)
+
+
+def arm_reached_the_press(bench, daemon, arm, read_ros2_messages):
+    """A press whose positions `arm` told is judged on them, and the recording has the positions."""
+    sensor = bench.sensor("forearm", "--presses", "2", "--force", "15", "--seed", "3", "--motion", bench.path("arm.sock"))
+    lines = bench.tail("--types", "hardness", "--timeout", "60")
+    finals = []
+    for line in lines.stdout:
+        event = json.loads(line)
+        finals += [event] if event.get("phase") == "final" else []
+        if len(finals) == 2:
+            break
+    lines.kill()
+    sensor.wait(timeout=60)
+    assert [event["course"] for event in finals] == ["positions"] * 2, finals
+    daemon.terminate()
+    assert daemon.wait(timeout=10) == 0
+    (recording,) = [name for name in os.listdir(bench.path("rec")) if name.startswith("hardnessd-")]
+    recorded = {}
+    for found in read_ros2_messages(os.path.join(bench.path("rec"), recording)):
+        if found.channel.topic == "/tactile/forearm/motion":
+            recorded |= zip(found.ros_msg.at_ns, found.ros_msg.approach_mm, strict=True)
+    arrived, late_ns = 0, 0
+    for at_ns, mm in arm.told:
+        near = min(recorded, key=lambda other: abs(other - at_ns))
+        if abs(near - at_ns) < 1_000_000 and math.isclose(recorded[near], mm, abs_tol=1e-6):
+            arrived, late_ns = arrived + 1, max(late_ns, abs(near - at_ns))
+    assert arrived > 0.98 * len(arm.told) > 100, (arrived, len(arm.told), len(recorded))
+    return arrived, len(arm.told), late_ns
 
 
 class Bench:
@@ -124,6 +177,14 @@ class Bench:
         """Reads the Unix socket, JSON a line, on stdout."""
         arguments = [self.binary, "tail", "--json", "--socket", self.path("events.sock")]
         return subprocess.Popen([*arguments, *more], stdout=subprocess.PIPE, text=True)
+
+    def events(self, *more):
+        """Reads the Unix socket into the list `events` until it is killed, because a pipe is soon full of frames."""
+        tail = self.tail("--count", "1000000", *more)
+        tail.events = []
+        tail.thread = threading.Thread(target=lambda: tail.events.extend(map(json.loads, tail.stdout)))
+        tail.thread.start()
+        return tail
 
     def freeze(self, peer, daemon):
         """Stops a peer that reads another way, for 1,500 events of a sensor at 100 frames/s: a

@@ -19,6 +19,11 @@ pub(super) fn check(config: &Config, path: &Path) -> Result<Vec<Sensor>, Error> 
     };
     let publish = &config.publish;
     for (feature, built, given) in [
+        (
+            "foxglove",
+            cfg!(feature = "foxglove"),
+            publish.foxglove.is_some(),
+        ),
         ("zenoh", cfg!(feature = "zenoh"), publish.zenoh.is_some()),
         ("ros2", cfg!(feature = "ros2"), publish.ros2.is_some()),
     ] {
@@ -82,17 +87,26 @@ pub(super) fn check(config: &Config, path: &Path) -> Result<Vec<Sensor>, Error> 
     if let Some(ros2) = &publish.ros2 {
         check_ros2(ros2, &config.sensors, &value)?;
     }
-    let tcp = config.publish.tcp.as_ref().map(|tcp| tcp.listen);
-    let http = config.http.as_ref().map(|http| http.listen);
-    if let (Some(tcp), Some(http)) = (tcp, http)
-        && meet(tcp, http)
-    {
-        let found = format!("{http} beside publish.tcp.listen = {tcp}");
-        return Err(value(
-            "http.listen".to_owned(),
-            found,
-            "another address or port",
-        ));
+    let listeners = [
+        (
+            "publish.tcp.listen",
+            publish.tcp.as_ref().map(|tcp| tcp.listen),
+        ),
+        (
+            "publish.foxglove.listen",
+            publish.foxglove.as_ref().map(|foxglove| foxglove.listen),
+        ),
+        ("http.listen", config.http.as_ref().map(|http| http.listen)),
+    ];
+    for (index, &(key, listen)) in listeners.iter().enumerate() {
+        for &(other_key, other) in &listeners[..index] {
+            if let (Some(listen), Some(other)) = (listen, other)
+                && meet(listen, other)
+            {
+                let found = format!("{listen} beside {other_key} = {other}");
+                return Err(value(key.to_owned(), found, "another address or port"));
+            }
+        }
     }
     Ok(sensors)
 }

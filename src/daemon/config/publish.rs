@@ -16,6 +16,10 @@ pub struct Publish {
     /// The same protocol over TCP; off unless the table is there.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tcp: Option<Tcp>,
+    /// A server for Foxglove and Lichtblick; off unless the table is there. Needs the feature
+    /// `foxglove`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub foxglove: Option<Foxglove>,
     /// Keys of a zenoh session; off unless the table is there. Needs the feature `zenoh`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub zenoh: Option<Zenoh>,
@@ -50,6 +54,23 @@ impl Default for Tcp {
     fn default() -> Self {
         Self {
             listen: SocketAddr::from(([127, 0, 0, 1], 8255)),
+        }
+    }
+}
+
+/// The `[publish.foxglove]` table.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Foxglove {
+    /// Address and port.
+    pub listen: SocketAddr,
+}
+
+impl Default for Foxglove {
+    fn default() -> Self {
+        // The port that the applications propose.
+        Self {
+            listen: SocketAddr::from(([127, 0, 0, 1], 8765)),
         }
     }
 }

@@ -513,6 +513,7 @@ fn zenoh_and_ros2_take_what_their_networks_do() {
 #[test]
 fn a_table_of_a_part_that_was_not_built_in_is_refused_by_name() {
     for (feature, built) in [
+        ("foxglove", cfg!(feature = "foxglove")),
         ("zenoh", cfg!(feature = "zenoh")),
         ("ros2", cfg!(feature = "ros2")),
     ] {

@@ -1,0 +1,262 @@
+//! Foxglove and Lichtblick, live: the topics of a recording, over the websocket protocol
+//! `foxglove.sdk.v1`.
+//!
+//! In: lines of the hub. Out: the messages that a recording has of them, under the same names and
+//! with the same definitions, so a layout fits both. A viewer that comes later gets the last final
+//! verdict and the status of each sensor. The server has no capability that takes anything from a
+//! viewer, so nothing that comes in changes anything. One thread does all this.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+use std::time::Duration;
+
+use foxglove::websocket::{ChannelView, Client, ServerListener};
+use foxglove::{
+    ChannelBuilder, Context, FoxgloveError, PartialMetadata, RawChannel, Schema, SinkId,
+    WebSocketServer, WebSocketServerHandle,
+};
+use tokio::runtime::{Builder, Runtime};
+use tokio::sync::mpsc;
+use tracing::{info, warn};
+
+use super::config;
+use super::hub::Line;
+use super::relay::Worker;
+use crate::event::{Event, Phase};
+use crate::ros::{self, Topic};
+
+/// Why there is no server.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The daemon cannot listen on the address.
+    #[error("publish.foxglove.listen: cannot listen on {address}: {source}")]
+    Listen {
+        /// As configured.
+        address: SocketAddr,
+        /// Why not.
+        source: io::Error,
+    },
+    /// The library refused. The text is its own.
+    #[error("publish.foxglove: {0}")]
+    Server(#[from] FoxgloveError),
+    /// The system gave no thread.
+    #[error("no thread for publish.foxglove: {0}")]
+    Thread(#[from] io::Error),
+}
+
+/// Messages that wait for a viewer, about 1 MB. When there are more, the oldest are dropped.
+const BACKLOG: usize = 512;
+
+/// New subscriptions that wait for their first message. One too many begins with the next event.
+const NEWCOMERS: usize = 64;
+
+/// The library does not say when a viewer has everything, so the last messages get this time.
+const LAST_MESSAGES: Duration = Duration::from_millis(50);
+
+/// A viewer that does not read cannot be told that the server ends. It is given up after this time.
+const FAREWELL: Duration = Duration::from_millis(200);
+
+/// A sensor as its topics need it.
+pub(super) struct Sensor {
+    pub(super) name: String,
+    pub(super) pitch_mm: f64,
+}
+
+/// Listens as `settings` say and announces the topics of `sensors`.
+///
+/// # Errors
+///
+/// If the daemon cannot listen on the address.
+pub(super) fn open(
+    settings: &config::Foxglove,
+    robot: &str,
+    sensors: Vec<Sensor>,
+) -> Result<Worker<Vec<Line>>, Error> {
+    let (address, robot) = (settings.listen, robot.to_owned());
+    Worker::start(
+        "foxglove",
+        move |_| Foxglove::open(address, robot, &sensors),
+        Foxglove::work,
+    )
+}
+
+/// A message of a topic, with its moment in nanoseconds since 1970.
+struct Message {
+    at_ns: u64,
+    bytes: Vec<u8>,
+}
+
+/// The topics and what each sensor's were last.
+struct Topics {
+    /// By the topic's full name.
+    channels: BTreeMap<String, Arc<RawChannel>>,
+    /// The last message of the topics that a late viewer gets at once.
+    last: BTreeMap<String, Message>,
+    /// Taxels of each sensor are this far apart.
+    pitches_mm: BTreeMap<String, f64>,
+}
+
+/// A listening server.
+struct Foxglove {
+    topics: Topics,
+    newcomers: mpsc::Receiver<(String, SinkId)>,
+    server: WebSocketServerHandle,
+    // A channel ends with its context, and the server with its runtime.
+    _context: Arc<Context>,
+    runtime: Runtime,
+}
+
+impl Foxglove {
+    fn open(address: SocketAddr, robot: String, sensors: &[Sensor]) -> Result<Self, Error> {
+        let context = Context::new();
+        let topics = Topics::new(&context, sensors)?;
+        let (door, newcomers) = mpsc::channel(NEWCOMERS);
+        let host = match address.ip() {
+            IpAddr::V4(ip) => ip.to_string(),
+            IpAddr::V6(ip) => format!("[{ip}]"),
+        };
+        let runtime = Builder::new_current_thread().enable_all().build()?;
+        let server = WebSocketServer::new()
+            .name(format!("hardnessd of {robot}"))
+            .bind(host, address.port())
+            .context(&context)
+            .message_backlog_size(BACKLOG)
+            .listener(Arc::new(Door(door)));
+        let server = runtime
+            .block_on(server.start())
+            .map_err(|error| match error {
+                FoxgloveError::Bind(source) => Error::Listen { address, source },
+                other => other.into(),
+            })?;
+        let address = SocketAddr::new(address.ip(), server.port());
+        info!(way = "foxglove", %address, "listening");
+        Ok(Self {
+            topics,
+            newcomers,
+            server,
+            _context: context,
+            runtime,
+        })
+    }
+
+    fn work(self, mut lines: mpsc::Receiver<Vec<Line>>) {
+        let Self {
+            mut topics,
+            mut newcomers,
+            server,
+            runtime,
+            ..
+        } = self;
+        runtime.block_on(async {
+            loop {
+                tokio::select! {
+                    lines = lines.recv() => match lines {
+                        Some(lines) => lines.iter().for_each(|line| topics.publish(line)),
+                        None => break,
+                    },
+                    Some((topic, viewer)) = newcomers.recv() => topics.greet(&topic, viewer),
+                }
+            }
+            tokio::time::sleep(LAST_MESSAGES).await;
+            // It is given up, not failed: the runtime drops what is left.
+            let _ = tokio::time::timeout(FAREWELL, server.stop().wait()).await;
+        });
+    }
+}
+
+impl Topics {
+    fn new(context: &Arc<Context>, sensors: &[Sensor]) -> Result<Self, FoxgloveError> {
+        let mut channels = BTreeMap::new();
+        for sensor in sensors {
+            for topic in [
+                ros::FRAME,
+                ros::GRID,
+                ros::CONTACT,
+                ros::HARDNESS,
+                ros::PRESS,
+                ros::STATUS,
+            ] {
+                let name = full_name(&sensor.name, topic);
+                let schema = Schema::new(topic.schema, "ros2msg", topic.text().into_bytes());
+                let channel = ChannelBuilder::new(name.clone())
+                    .message_encoding("cdr")
+                    .schema(schema)
+                    .context(context)
+                    .build_raw()?;
+                channels.insert(name, channel);
+            }
+        }
+        let pitches = sensors.iter().map(|s| (s.name.clone(), s.pitch_mm));
+        Ok(Self {
+            channels,
+            last: BTreeMap::new(),
+            pitches_mm: pitches.collect(),
+        })
+    }
+
+    fn publish(&mut self, line: &Line) {
+        let Some(event) = &line.event else {
+            warn!(gap = line.json.trim_end(), "foxglove is too slow");
+            return;
+        };
+        let Some(&pitch_mm) = self.pitches_mm.get(event.sensor()) else {
+            return;
+        };
+        for (topic, time, bytes) in ros::encode_all(event, pitch_mm) {
+            let name = full_name(event.sensor(), topic);
+            let at_ns = u64::try_from(time.as_nanosecond()).unwrap_or(0);
+            let message = Message { at_ns, bytes };
+            if let Some(channel) = self.channels.get(&name) {
+                message.send(channel, None);
+            }
+            if greets(event) {
+                self.last.insert(name, message);
+            }
+        }
+    }
+
+    /// Sends a viewer that has just come what it missed.
+    fn greet(&self, topic: &str, viewer: SinkId) {
+        if let (Some(channel), Some(message)) = (self.channels.get(topic), self.last.get(topic)) {
+            message.send(channel, Some(viewer));
+        }
+    }
+}
+
+impl Message {
+    /// Queues it for one viewer, or for all. This never waits.
+    fn send(&self, channel: &RawChannel, viewer: Option<SinkId>) {
+        let meta = PartialMetadata {
+            log_time: Some(self.at_ns),
+        };
+        channel.log_with_meta_to_sink(&self.bytes, meta, viewer);
+    }
+}
+
+/// Whether a viewer that comes later gets this event.
+fn greets(event: &Event) -> bool {
+    match event {
+        Event::Hardness(verdict) => verdict.phase == Phase::Final,
+        Event::Status(_) => true,
+        Event::Press(_) | Event::Frame(_) => false,
+    }
+}
+
+/// As in a recording.
+fn full_name(sensor: &str, topic: Topic) -> String {
+    format!("/tactile/{sensor}/{}", topic.name)
+}
+
+/// Where viewers say which topics they want.
+struct Door(mpsc::Sender<(String, SinkId)>);
+
+impl ServerListener for Door {
+    fn on_subscribe(&self, client: Client, channel: ChannelView<'_>) {
+        if let Some(viewer) = client.sink_id() {
+            // When too many wait, the viewer begins with the next event.
+            let _ = self.0.try_send((channel.topic().to_owned(), viewer));
+        }
+    }
+}

@@ -1,0 +1,313 @@
+#!/usr/bin/env python3
+"""Events as Foxglove and Lichtblick read them, by a websocket client that is not Foxglove's.
+
+    python -m venv venv && venv/bin/pip install websockets mcap mcap-ros2-support
+    cargo build --features foxglove && venv/bin/python tests/peers/foxglove_peer.py target/debug/hardnessd
+
+Claims: every field of every event, decoded by the definitions that the server announces, is what the Unix socket
+says; a late viewer gets the last verdict and status; a recording has the same topics with the same
+definitions, and the layout in clients/foxglove fits both; a viewer that never reads, one that sends nonsense
+and many that say nothing cost no other subscriber an event; and an address in use is one line and 74.
+"""
+
+import json
+import math
+import os
+import pathlib
+import queue
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+
+from bench import Bench, same
+from mcap.reader import make_reader
+from mcap_ros2._dynamic import generate_dynamic
+from websockets.sync.client import connect
+
+LAYOUT = pathlib.Path(__file__).resolve().parents[2] / "clients/foxglove/hardnessd.json"
+TABLE = '[publish.foxglove]\nlisten = "127.0.0.1:0"\n'
+TOPICS = ["contact", "frame", "grid", "hardness", "press", "status"]
+PROTOCOL = "foxglove.sdk.v1"
+
+
+def opened(address, **more):
+    """A connection that stays open until the process ends, or it is closed."""
+    return connect(f"ws://{address}", subprotocols=[PROTOCOL], **more).__enter__()
+
+
+class Viewer:
+    """Subscribes to every topic, and decodes what comes by what was announced."""
+
+    def __init__(self, address):
+        self.socket = opened(address, max_size=None)
+        assert self.socket.subprotocol == PROTOCOL
+        self.info = json.loads(self.socket.recv(timeout=10))
+        assert self.info["op"] == "serverInfo", self.info
+        self.channels = {}
+        while len(self.channels) < len(TOPICS):
+            said = json.loads(self.socket.recv(timeout=10))
+            assert said["op"] == "advertise", said
+            for channel in said["channels"]:
+                assert (channel["encoding"], channel["schemaEncoding"]) == ("cdr", "ros2msg"), channel
+                self.channels[channel["id"]] = channel
+        self.topics = {channel["topic"]: channel for channel in self.channels.values()}
+        self.decoders = {number: decoder(channel) for number, channel in self.channels.items()}
+        self.messages = queue.Queue()
+        # The number of a subscription is not that of its channel.
+        wanted = [{"id": 1000 + number, "channelId": number} for number in self.channels]
+        self.socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+        self.reader = threading.Thread(target=self._read, daemon=True)
+        self.reader.start()
+
+    def _read(self):
+        for data in self.socket:
+            if isinstance(data, str):
+                self.messages.put((json.loads(data)["op"], None, data))
+                continue
+            operation, subscription, time_ns = struct.unpack_from("<BIQ", data)
+            assert operation == 1, operation
+            channel = self.channels[subscription - 1000]
+            message = self.decoders[channel["id"]](data[13:])
+            self.messages.put((channel["topic"].rsplit("/", 1)[1], time_ns, message))
+
+    def until(self, there):
+        """All that came, with the first for which `there(topic, message)` last."""
+        got = []
+        while not got or not there(got[-1][0], got[-1][2]):
+            got.append(self.messages.get(timeout=60))
+        return got
+
+
+def decoder(channel):
+    """How a viewer reads the messages of a channel."""
+    made = generate_dynamic(channel["schemaName"], channel["schema"])
+    return made[channel["schemaName"]]
+
+
+def same_as_the_socket(binary):
+    more = TABLE + '[record]\ndir = "rec"\nkeep_free_mb = 0\n'
+    with Bench(binary, more=more) as bench:
+        daemon = bench.daemon()
+        address = bench.address("foxglove")
+        lines = bench.events("--types", "frame,hardness,press,status")
+        viewer = Viewer(address)
+        # Both subscriptions are made before the first frame.
+        time.sleep(2)
+        assert viewer.info["name"] == "hardnessd of arm-7" and viewer.info["capabilities"] == [], viewer.info
+        assert sorted(viewer.topics) == [f"/tactile/forearm/{topic}" for topic in TOPICS], viewer.topics
+        sensor = bench.sensor("forearm", "--presses", "2", "--force", "15", "--seed", "3", "--motion", bench.path("control.sock"))
+        sensor.wait(timeout=60)
+        got = viewer.until(lambda topic, message: topic == "status" and message.state == "lost")
+        late = Viewer(address)
+        greeted = {}
+        while set(greeted) < {"hardness", "status"}:
+            topic, _, message = late.messages.get(timeout=10)
+            greeted[topic] = message
+        assert (greeted["hardness"].phase, greeted["hardness"].press) == ("final", 2), greeted
+        assert greeted["status"].state == "lost", greeted
+        daemon.terminate()
+        assert daemon.wait(timeout=10) == 0
+        lines.kill()
+        lines.thread.join()
+        events = lines.events
+        compared = compare(got, events)
+        (recording,) = pathlib.Path(bench.path("rec")).glob("hardnessd-*.mcap")
+        check_recording(recording, viewer, got)
+        check_layout(viewer, got)
+        return compared
+
+
+def compare(got, events):
+    """How many messages of each topic are as the socket has them, field by field."""
+    compared = dict.fromkeys(TOPICS, 0)
+    for kind in ("hardness", "press", "status"):
+        told = {event["seq"]: event for event in events if event["type"] == kind and "seq" in event}
+        found = {message.seq: message for topic, _, message in got if topic == kind}
+        assert set(told) - {0} <= set(found), (kind, sorted(told), sorted(found))
+        for seq, event in told.items():
+            for key, value in event.items():
+                if key != "type":
+                    assert same(getattr(found[seq], key), value, key), (kind, key, found[seq], value)
+            assert found[seq].header.frame_id == "forearm"
+            compared[kind] += 1
+    frames = {event["frame"]: event for event in events if event["type"] == "frame"}
+    by_time = {event["time"]: event for event in frames.values()}
+    for topic, time_ns, message in got:
+        if topic == "contact":
+            event = frames[message.frame]
+            assert math.isclose(message.force_n, sum(event["newtons"]), abs_tol=784 * 0.0005), message
+            for key in ("contact_area_taxels", "tared"):
+                assert getattr(message, key) == event[key], (key, message)
+            assert same(message.approach_mm, event["approach_mm"], "approach_mm"), (message, event["approach_mm"])
+        elif topic in ("frame", "grid"):
+            event = by_time[rfc3339(time_ns)]
+            newtons = struct.unpack("<784f", bytes(message.data))
+            if topic == "grid":
+                # Its rows go up from the last.
+                newtons = [n for row in range(27, -1, -1) for n in newtons[28 * row : 28 * row + 28]]
+                assert (message.column_count, message.row_stride, message.cell_stride) == (28, 112, 4)
+                assert math.isclose(message.cell_size.x, 0.0035) and math.isclose(message.pose.position.x, -14 * 0.0035)
+                (field,) = message.fields
+                assert (message.frame_id, field.name, field.type) == ("forearm", "newtons", 7), message
+            else:
+                assert (message.height, message.width, message.encoding, message.step) == (28, 28, "32FC1", 112)
+            assert all(abs(a - b) <= 0.0005 + 1e-6 for a, b in zip(newtons, event["newtons"], strict=True))
+        else:
+            continue
+        compared[topic] += 1
+    assert compared["frame"] == compared["grid"] == compared["contact"] >= 0.9 * len(frames) > 50, (compared, len(frames))
+    assert min(compared.values()) >= 2, compared
+    assert any(not math.isnan(message.approach_mm) for topic, _, message in got if topic == "contact")
+    return compared
+
+
+def rfc3339(time_ns):
+    seconds, rest = divmod(time_ns, 1_000_000_000)
+    return time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(seconds)) + f".{rest // 1000:06}Z"
+
+
+def check_recording(path, viewer, got):
+    """A recording has the same topics, definitions and bytes."""
+    with open(path, "rb") as file:
+        summary = make_reader(file).get_summary()
+        recorded = {}
+        for channel in summary.channels.values():
+            schema = summary.schemas[channel.schema_id]
+            recorded[channel.topic] = (schema.name, schema.data.decode(), channel.message_encoding)
+        for topic, channel in viewer.topics.items():
+            assert recorded[topic] == (channel["schemaName"], channel["schema"], "cdr"), topic
+        contacts = [
+            decoder(viewer.topics[channel.topic])(message.data)
+            for _, channel, message in make_reader(file).iter_messages(topics=["/tactile/forearm/contact"])
+        ]
+    recorded = {message.frame: message.force_n for message in contacts}
+    live = {message.frame: message.force_n for topic, _, message in got if topic == "contact"}
+    assert live.items() <= recorded.items() and len(live) > 50
+
+
+def check_layout(viewer, got):
+    """Every path of the layout leads to a topic, and to a field of its messages."""
+    examples = {topic: message for topic, _, message in got}
+
+    def paths(value):
+        if isinstance(value, dict):
+            for key, below in value.items():
+                yield from paths(key)
+                yield from paths(below)
+        elif isinstance(value, list):
+            for below in value:
+                yield from paths(below)
+        elif isinstance(value, str) and value.startswith("/"):
+            yield value
+
+    found = set(paths(json.loads(LAYOUT.read_text())))
+    assert len(found) >= 10, found
+    for path in found:
+        topic, _, field = path.partition(".")
+        assert topic in viewer.topics, path
+        assert not field or hasattr(examples[topic.rsplit("/", 1)[1]], field), path
+
+
+FROZEN = """
+import sys, time
+sys.path.insert(0, sys.argv[2])
+from foxglove_peer import Viewer
+viewer = Viewer(sys.argv[1])
+viewer.until(lambda topic, message: topic == "frame")
+print("there", flush=True)
+time.sleep(600)
+"""
+
+
+def a_frozen_viewer(binary):
+    with Bench(binary, frame_rate_hz=100, more=TABLE) as bench:
+        daemon = bench.daemon()
+        bench.sensor("forearm", "--force", "15", "--baud", "921600")
+        here = os.path.dirname(os.path.abspath(__file__))
+        arguments = [sys.executable, "-c", FROZEN, bench.address("foxglove"), here]
+        peer = subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True)
+        bench.processes.append(peer)
+        assert peer.stdout.readline() == "there\n"
+        return bench.freeze(peer, daemon)
+
+
+def resident_kb(pid):
+    with open(f"/proc/{pid}/status") as file:
+        return int(next(line for line in file if line.startswith("VmRSS")).split()[1])
+
+
+def strangers(binary):
+    """Memory and frames beside viewers that never read, send nonsense or say nothing."""
+    with Bench(binary, frame_rate_hz=100, more=TABLE) as bench:
+        daemon = bench.daemon()
+        host, port = bench.address("foxglove").split(":")
+        bench.sensor("forearm", "--force", "15", "--baud", "921600")
+        bench.tail("--types", "frame", "--count", "100", "--timeout", "60").communicate()
+        alone_kb = resident_kb(daemon.pid)
+        lines = bench.tail("--types", "frame", "--count", "2000", "--timeout", "60")
+        silent = [socket.create_connection((host, int(port))) for _ in range(200)]
+        for data in (b"\0" * 100_000, b"GET / HTTP/1.1\r\n\r\n", b"GET /" + b"a" * 1_000_000, os.urandom(1_000_000)):
+            with socket.create_connection((host, int(port))) as stranger:
+                try:
+                    stranger.sendall(data)
+                except OSError:
+                    pass
+        stuck = []
+        for _ in range(20):
+            viewer = opened(f"{host}:{port}", max_queue=1)
+            viewer.recv(timeout=10)
+            channels = json.loads(viewer.recv(timeout=10))["channels"]
+            wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in channels]
+            viewer.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+            stuck.append(viewer)
+        for data in (
+            "no JSON",
+            '{"op":"subscribe","subscriptions":[{"id":1,"channelId":4294967295}]}',
+            '{"op":"advertise","channels":[{"id":1,"topic":"/t","encoding":"json","schemaName":""}]}',
+            '{"op":"setParameters","parameters":[{"name":"tare","value":true}]}',
+            b"\x01" + bytes(16),
+            b"\xff" * 1000,
+            "[" * 100_000,
+            json.dumps({"op": "unsubscribe", "subscriptionIds": list(range(100_000))}),
+        ):
+            rude = opened(f"{host}:{port}")
+            for _ in range(50):
+                try:
+                    rude.send(data)
+                except Exception:  # it may close the connection
+                    break
+            rude.socket.close()
+        read = [json.loads(line)["frame"] for line in lines.communicate()[0].splitlines()]
+        assert len(read) == 2000 and read == list(range(read[0], read[0] + 2000)), "a frame was missed"
+        crowded_kb = resident_kb(daemon.pid)
+        # A viewer that behaves is served as before.
+        viewer = Viewer(f"{host}:{port}")
+        viewer.until(lambda topic, message: topic == "hardness")
+        for stranger in silent:
+            stranger.close()
+        assert crowded_kb - alone_kb < 96 * 1024, (alone_kb, crowded_kb)
+        return alone_kb, crowded_kb
+
+
+def an_address_in_use(binary):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        with Bench(binary, more=f'[publish.foxglove]\nlisten = "{address}"\n') as bench:
+            config = bench.path("hardnessd.toml")
+            run = subprocess.run([binary, "run", "--config", config], capture_output=True, text=True, timeout=30)
+    assert run.returncode == 74 and "publish.foxglove" in run.stderr, run
+    assert len(run.stderr.splitlines()) == 1, run.stderr
+    return run.stderr.strip()
+
+
+if __name__ == "__main__":
+    binary = os.path.abspath(sys.argv[1])
+    print("messages as on the socket:", same_as_the_socket(binary))
+    print("a frozen viewer: %d frames, none missed; verdicts after %d us at most; stop in %.2f s" % a_frozen_viewer(binary))
+    print("strangers: 2000 frames, none missed; resident %d kB before, %d kB after" % strangers(binary))
+    print("an address in use:", an_address_in_use(binary))
