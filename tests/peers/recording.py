@@ -5,7 +5,7 @@
     venv/bin/python tests/peers/recording.py target/debug/hardnessd
 
 Claims: a recording of the daemon, and what `recover` saves of one that was killed, open in all three;
-they count the same messages; and every field of the daemon's hardness events is in them, with its
+they count the same messages; a bag that `clients/ros2/bag.py` makes of it opens in rosbags by its metadata.yaml; and every field of the daemon's hardness events is in them, with its
 value.
 """
 
@@ -22,9 +22,11 @@ from bench import Bench, same, wait_for
 from mcap.reader import make_reader
 from mcap_ros2.reader import read_ros2_messages
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-TOPICS = ["input", "frame", "hardness", "press", "status", "motion"]
+TOPICS = ["input", "frame", "hardness", "press", "status", "motion", "contact", "grid"]
+BAG = pathlib.Path(__file__).resolve().parents[2] / "clients/ros2/bag.py"
 
 
 def by_mcap(path):
@@ -90,6 +92,26 @@ def check(path, live):
     return counts, metadata
 
 
+def bag(directory, recordings, counts):
+    """A bag of these recordings says what is in them, and opens by its metadata."""
+    out = directory / "take"
+    subprocess.run([sys.executable, str(BAG), "--out", str(out), *map(str, recordings)], check=True)
+    with Reader(out) as reader:
+        assert "storage_identifier: mcap" in (out / "metadata.yaml").read_text()
+        assert reader.message_count == sum(counts.values())
+        told = {topic.rsplit("/", 1)[1]: info.msgcount for topic, info in reader.topics.items()}
+        assert told == counts, (told, counts)
+        types = {connection.topic.rsplit("/", 1)[1]: connection.msgtype for connection in reader.connections}
+        assert (types["frame"], types["contact"]) == ("sensor_msgs/msg/Image", "tactile_interfaces/msg/Contact"), types
+        read = dict.fromkeys(TOPICS, 0)
+        for connection, time_ns, _ in reader.messages():
+            assert reader.start_time <= time_ns <= reader.end_time
+            read[connection.topic.rsplit("/", 1)[1]] += 1
+        assert read == counts, (read, counts)
+    again = subprocess.run([sys.executable, str(BAG), "--out", str(out), *map(str, recordings)], capture_output=True)
+    assert again.returncode == 1 and b"bag.py: " in again.stderr, again
+
+
 def daemon(binary):
     """The daemon's own recording beside what a subscriber read."""
     more = '[record]\ndir = "rec"\nkeep_free_mb = 0\n'
@@ -106,6 +128,7 @@ def daemon(binary):
         live = [json.loads(line) for line in tail.communicate(timeout=10)[0].splitlines()]
         (recording,) = pathlib.Path(bench.path("rec")).glob("hardnessd-*.mcap")
         counts, metadata = check(recording, live)
+        bag(pathlib.Path(bench.path(".")), [recording], counts)
         assert metadata["hardnessd.recording"]["robot"] == "arm-7"
         assert json.loads(metadata["hardnessd.sensor"]["settings"])["name"] == "forearm"
         finals = [event for event in live if event.get("phase") == "final"]
