@@ -5,6 +5,8 @@
 //! null of an event is 0, NaN or an empty string here.
 
 mod frame;
+#[cfg(feature = "ros2")]
+pub(crate) mod tools;
 
 use byteorder::LittleEndian;
 use jiff::Timestamp;

@@ -22,6 +22,7 @@ use super::accept::Serve;
 use super::hub::{self, Closed, Line};
 use super::lines::{Heard, Lines};
 use super::record::NoBlackbox;
+use super::request::motion::{Positions, Told};
 use super::request::{self, Change, Request, motion};
 use super::sensor::{Command, Sensors};
 use crate::event::{Reply, Tared};
@@ -138,13 +139,8 @@ impl Service {
                 held.await.map_err(stopping)?;
                 Ok(Done::default())
             }
-            Change::Motion { sensor, points } => {
-                // By the clocks of this moment: the sensor's task may have other things to do first.
-                let points = motion::placed(&points, crate::daemon::now())?;
-                let (reply, taken) = oneshot::channel();
-                let command = Command::Motion(points, reply);
-                tell(sensors, "motion.sensor", &sensor, command).await?;
-                taken.await.map_err(stopping)??;
+            Change::Motion(Positions { sensor, points }) => {
+                move_arm(sensors, &sensor, &points).await?;
                 Ok(Done::default())
             }
             Change::Blackbox { sensor } => {
@@ -182,7 +178,7 @@ impl<S: Stream> Serve<S> for Service {
 
 /// Why a request is answered with an `error`.
 #[derive(Debug, thiserror::Error)]
-enum Refused {
+pub(super) enum Refused {
     #[error(transparent)]
     Unusable(#[from] request::Unusable),
     #[error(transparent)]
@@ -399,6 +395,22 @@ async fn tell(
     };
     let stopping = |_| Refused::Stopping(key);
     sensor.commands.send(command).await.map_err(stopping)
+}
+
+/// Tells `sensor` where its arm is. Every way in for positions ends here, and the recording of the
+/// sensor has them.
+pub(super) async fn move_arm(
+    sensors: &Sensors,
+    sensor: &str,
+    points: &[Told],
+) -> Result<(), Refused> {
+    // By the clocks of this moment: the sensor's task may have other things to do first.
+    let points = motion::placed(points, crate::daemon::now())?;
+    let (reply, taken) = oneshot::channel();
+    let command = Command::Motion(points, reply);
+    tell(sensors, "motion.sensor", sensor, command).await?;
+    taken.await.map_err(|_| Refused::Stopping("motion"))??;
+    Ok(())
 }
 
 /// Every sensor's current status.

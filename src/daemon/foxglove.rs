@@ -77,7 +77,7 @@ pub(super) fn open(
     let (address, robot) = (settings.listen, robot.to_owned());
     Worker::start(
         "foxglove",
-        move |_| Foxglove::open(address, robot, &sensors),
+        move |_, _| Foxglove::open(address, robot, &sensors),
         Foxglove::work,
     )
 }

@@ -14,7 +14,7 @@ use super::config::{Config, Unix};
 use super::foxglove;
 use super::http::Http;
 use super::hub;
-#[cfg(any(feature = "foxglove", feature = "ros2"))]
+#[cfg(feature = "foxglove")]
 use super::hub::Line;
 #[cfg(any(feature = "foxglove", feature = "ros2", feature = "zenoh"))]
 use super::relay::Worker;
@@ -87,7 +87,7 @@ pub(crate) struct Publishers {
     #[cfg(feature = "foxglove")]
     foxglove: Option<Worker<Vec<Line>>>,
     #[cfg(feature = "ros2")]
-    ros2: Option<Worker<Vec<Line>>>,
+    ros2: Option<Worker<ros2::Job>>,
     #[cfg(feature = "zenoh")]
     zenoh: Option<Worker<zenoh::Job>>,
 }
@@ -138,7 +138,7 @@ impl Publishers {
             ros2: publish
                 .ros2
                 .as_ref()
-                .map(|settings| ros2::open(settings, sensors(config)))
+                .map(|settings| ros2::open(settings, &config.robot, sensors(config)))
                 .transpose()?,
             #[cfg(feature = "zenoh")]
             zenoh: publish

@@ -3,24 +3,62 @@
 //! In: every kind of event, frames with policy `latest`. Out: the same lines, in order, through a
 //! short channel. While the thread is busy, lines wait in the hub as for any subscriber. When the
 //! hub has no more room for them, there is a `gap`.
+//!
+//! In the other direction, a thread may pass on where the robot says its arm is. This goes the way
+//! of a command of the control socket, and nothing else can be passed on.
 
 use std::thread;
+use std::time::Duration;
 
 use tokio::sync::{mpsc, oneshot};
+use tokio::time::{Interval, MissedTickBehavior};
+use tracing::warn;
 
 use super::client;
 use super::hub::{self, Line};
+use super::request::motion::Positions;
 use super::request::{Policy, Subscription};
 use super::sensor::Sensors;
-use crate::event::Kind;
+use crate::event::{Kind, Status};
 
 /// The most jobs that wait for the thread: batches of lines, and queries between them.
 const JOBS: usize = 8;
+
+/// The most messages with positions that wait for the sensors' tasks.
+const POSITIONS: usize = 256;
+
+/// How often a thread that asked for them gets the statuses.
+const VITALS: Duration = Duration::from_secs(1);
+
+/// Where a thread puts what the robot says of its arm.
+#[derive(Clone)]
+#[cfg_attr(
+    not(any(feature = "ros2", feature = "zenoh")),
+    expect(dead_code, reason = "Foxglove says nothing of an arm")
+)]
+pub(super) struct Door {
+    way: &'static str,
+    positions: mpsc::Sender<Positions>,
+}
+
+impl Door {
+    /// Passes positions on, without waiting.
+    #[cfg(any(feature = "ros2", feature = "zenoh"))]
+    pub(super) fn put(&self, positions: Positions) {
+        if self.positions.try_send(positions).is_err() {
+            warn!(way = self.way, "positions come too fast and are dropped");
+        }
+    }
+}
 
 /// A thread that takes jobs until there are no more.
 pub(super) struct Worker<J> {
     jobs: mpsc::Sender<J>,
     ended: oneshot::Receiver<()>,
+    way: &'static str,
+    positions: mpsc::Receiver<Positions>,
+    /// Makes a job of the statuses, if the thread wants them.
+    vitals: Option<fn(Vec<Status>) -> J>,
 }
 
 impl<J: From<Vec<Line>> + Send + 'static> Worker<J> {
@@ -28,8 +66,8 @@ impl<J: From<Vec<Line>> + Send + 'static> Worker<J> {
     /// is open. The library is never called on the daemon's own thread, because it may have a
     /// runtime of its own.
     pub(super) fn start<O, E>(
-        name: &'static str,
-        open: impl FnOnce(&mpsc::Sender<J>) -> Result<O, E> + Send + 'static,
+        way: &'static str,
+        open: impl FnOnce(&mpsc::Sender<J>, Door) -> Result<O, E> + Send + 'static,
         work: impl FnOnce(O, mpsc::Receiver<J>) + Send + 'static,
     ) -> Result<Self, E>
     where
@@ -39,37 +77,74 @@ impl<J: From<Vec<Line>> + Send + 'static> Worker<J> {
         let (end, ended) = oneshot::channel();
         let (opened, outcome) = std::sync::mpsc::channel();
         let sender = jobs.clone();
-        thread::Builder::new()
-            .name(name.to_owned())
-            .spawn(move || {
-                let open = open(&sender);
-                drop(sender);
-                match open {
-                    Ok(open) => {
-                        let _ = opened.send(Ok(()));
-                        work(open, inbox);
-                    }
-                    Err(error) => {
-                        let _ = opened.send(Err(error));
-                    }
+        let (door, positions) = mpsc::channel(POSITIONS);
+        let door = Door {
+            way,
+            positions: door,
+        };
+        thread::Builder::new().name(way.to_owned()).spawn(move || {
+            let open = open(&sender, door);
+            drop(sender);
+            match open {
+                Ok(open) => {
+                    let _ = opened.send(Ok(()));
+                    work(open, inbox);
                 }
-                drop(end);
-            })?;
+                Err(error) => {
+                    let _ = opened.send(Err(error));
+                }
+            }
+            drop(end);
+        })?;
         outcome
             .recv()
             .expect("a thread that panics ends the process")?;
-        Ok(Self { jobs, ended })
+        Ok(Self {
+            jobs,
+            ended,
+            way,
+            positions,
+            vitals: None,
+        })
+    }
+
+    /// Also gives the thread the status of every sensor, once a second, as the job that `make` makes.
+    #[cfg(feature = "ros2")]
+    pub(super) fn with_vitals(self, make: fn(Vec<Status>) -> J) -> Self {
+        Self {
+            vitals: Some(make),
+            ..self
+        }
     }
 
     /// Passes on what the hub publishes, until the hub closes and the thread has ended.
     pub(super) async fn serve(self, hub: hub::Handle, sensors: Sensors) {
-        if let Ok((id, _hello)) = hub.join().await {
-            // Unlike a subscriber on a socket, it may end only with the daemon.
-            let _ = relay(id, &hub, &sensors, self.jobs).await;
-            hub.leave(id).await;
-        }
+        let Self {
+            jobs,
+            ended,
+            way,
+            positions,
+            vitals,
+        } = self;
+        let relayed = async {
+            if let Ok((id, _hello)) = hub.join().await {
+                // Unlike a subscriber on a socket, it may end only with the daemon.
+                let _ = relay(id, &hub, &sensors, jobs, vitals).await;
+                hub.leave(id).await;
+            }
+        };
+        tokio::join!(relayed, pass_on(way, positions, &sensors));
         // Nothing is ever sent.
-        let _ = self.ended.await;
+        let _ = ended.await;
+    }
+}
+
+/// Gives positions to the sensors' tasks, until the thread has ended.
+async fn pass_on(way: &'static str, mut positions: mpsc::Receiver<Positions>, sensors: &Sensors) {
+    while let Some(Positions { sensor, points }) = positions.recv().await {
+        if let Err(refused) = client::move_arm(sensors, &sensor, &points).await {
+            warn!(way, sensor, %refused, "positions refused");
+        }
     }
 }
 
@@ -78,6 +153,7 @@ async fn relay<J: From<Vec<Line>>>(
     hub: &hub::Handle,
     sensors: &Sensors,
     jobs: mpsc::Sender<J>,
+    vitals: Option<fn(Vec<Status>) -> J>,
 ) -> Result<(), hub::Closed> {
     let wanted = Subscription {
         kinds: Kind::ALL.into_iter().collect(),
@@ -86,12 +162,34 @@ async fn relay<J: From<Vec<Line>>>(
     };
     // Only a `since` can be refused.
     let _ = hub.subscribe(id, wanted).await?;
-    let mut lines = client::statuses(sensors).await;
-    while jobs.send(J::from(lines)).await.is_ok() {
-        let Ok(next) = hub.take(id).await?.await else {
-            break;
+    let mut job = J::from(client::statuses(sensors).await);
+    let mut next = hub.take(id).await?;
+    let mut tick = tokio::time::interval(VITALS);
+    tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    while jobs.send(job).await.is_ok() {
+        job = tokio::select! {
+            // Not biased: a stream of frames must not keep the statuses back.
+            lines = &mut next => match lines {
+                Ok(lines) => {
+                    next = hub.take(id).await?;
+                    J::from(lines)
+                }
+                Err(_) => break,
+            },
+            make = each_second(&mut tick, vitals) => make(sensors.statuses().await),
         };
-        lines = next;
     }
     Ok(())
+}
+
+/// The next second, for a thread that wants statuses; never for another.
+async fn each_second<J>(
+    tick: &mut Interval,
+    vitals: Option<fn(Vec<Status>) -> J>,
+) -> fn(Vec<Status>) -> J {
+    let Some(make) = vitals else {
+        return std::future::pending().await;
+    };
+    tick.tick().await;
+    make
 }

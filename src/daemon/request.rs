@@ -9,7 +9,7 @@ pub(crate) mod motion;
 use serde::Serialize;
 use serde_json::{Map, Value};
 
-use self::motion::Told;
+use self::motion::Positions;
 use crate::event::{CONTEXT_BYTES, Kind};
 
 /// A usable line.
@@ -36,7 +36,7 @@ pub(crate) enum Change {
         context: Option<Value>,
     },
     /// Where the robot says its arm is.
-    Motion { sensor: String, points: Vec<Told> },
+    Motion(Positions),
     /// Write the last minute of this sensor to a file.
     Blackbox { sensor: String },
 }
@@ -47,7 +47,7 @@ impl Change {
         match self {
             Change::Tare { .. } => "tare",
             Change::Context { .. } => "context",
-            Change::Motion { .. } => "motion",
+            Change::Motion(_) => "motion",
             Change::Blackbox { .. } => "blackbox",
         }
     }
@@ -271,7 +271,7 @@ fn motion(value: &Value) -> Result<Change, Unusable> {
         return Err(Unusable::Extra(short(&format!("motion.{other}"))));
     }
     let points = motion::points(fields.get("at").unwrap_or(&Value::Null))?;
-    Ok(Change::Motion { sensor, points })
+    Ok(Change::Motion(Positions { sensor, points }))
 }
 
 fn context(value: Value) -> Result<Change, Unusable> {

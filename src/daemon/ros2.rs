@@ -2,7 +2,9 @@
 //!
 //! In: lines of the hub. Out: samples of the node `hardnessd`. ROS need not be installed. Verdicts and
 //! statuses are reliable, and a subscriber that comes later gets the last of each. Frames are best
-//! effort. The node has no service and no parameter, so nothing comes in.
+//! effort. Besides, there are topics that the tools of ROS users know: pictures, arrays of taxels and
+//! diagnostics. If the configuration names topics for them, positions of the arm come in. The node has
+//! no service and no parameter, so nothing else comes in.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -11,16 +13,20 @@ use ros2_client::dds::rustdds::DomainParticipantBuilder;
 use ros2_client::qos::{Durability, History, QosProfile, WhenFull};
 use ros2_client::{
     Context, CreateError, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher,
+    Subscription,
 };
 use serde::ser::SerializeTuple;
 use serde::{Serialize, Serializer};
+use tokio::runtime::{Builder, Runtime};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
 
 use super::config;
 use super::hub::Line;
-use super::relay::Worker;
-use crate::ros;
+use super::relay::{Door, Worker};
+use super::request::motion::{Positions, Told};
+use crate::event::{Event, FrameEvent, Status};
+use crate::ros::{self, Topic, tools};
 
 /// Why there is no node.
 #[derive(Debug, thiserror::Error)]
@@ -42,6 +48,28 @@ pub enum Error {
 /// Press events that are kept for a subscriber that missed some.
 const PRESSES_KEPT: usize = 16;
 
+/// Pictures and arrays that are kept for a subscriber that missed some. One that needs more misses
+/// them, because nobody waits for it.
+const PICTURES_KEPT: usize = 5;
+
+/// Positions that are kept until the thread reads them.
+const POSITIONS_KEPT: usize = 256;
+
+/// The brightest colour of a picture means at least this force on a taxel, so that noise stays dark.
+const LEAST_SCALE_N: f32 = 0.2;
+
+/// What the thread does next.
+pub(super) enum Job {
+    Lines(Vec<Line>),
+    Vitals(Vec<Status>),
+}
+
+impl From<Vec<Line>> for Job {
+    fn from(lines: Vec<Line>) -> Self {
+        Self::Lines(lines)
+    }
+}
+
 /// Joins the domain as `settings` say and makes the topics of `sensors`.
 ///
 /// # Errors
@@ -49,24 +77,43 @@ const PRESSES_KEPT: usize = 16;
 /// If the domain cannot be joined, for example because no port is free.
 pub(super) fn open(
     settings: &config::Ros2,
+    robot: &str,
     sensors: Vec<String>,
-) -> Result<Worker<Vec<Line>>, Error> {
+) -> Result<Worker<Job>, Error> {
     let (domain, namespace) = (settings.domain_id(), &settings.namespace);
     info!(way = "ros2", domain, namespace, "publishing");
-    let settings = settings.clone();
-    Worker::start("ros2", move |_| Ros2::open(&settings, &sensors), Ros2::work)
+    let (settings, robot) = (settings.clone(), robot.to_owned());
+    let worker = Worker::start(
+        "ros2",
+        move |_, door| Ros2::open(&settings, robot, &sensors, &door),
+        |(runtime, mut ros2), jobs| {
+            runtime.block_on(ros2.work(jobs));
+            // What reads positions ends before its node.
+            drop(runtime);
+        },
+    );
+    Ok(worker?.with_vitals(Job::Vitals))
 }
 
 /// A node and its topics.
 struct Ros2 {
+    robot: String,
     /// By sensor and name.
     topics: BTreeMap<(String, &'static str), Publisher<Message>>,
+    diagnostics: Publisher<Message>,
+    /// The highest taxel of each sensor so far, in newtons.
+    highest_n: BTreeMap<String, f32>,
     // Must be dropped last: its topics end with it.
     _node: Node,
 }
 
 impl Ros2 {
-    fn open(settings: &config::Ros2, sensors: &[String]) -> Result<Self, Error> {
+    fn open(
+        settings: &config::Ros2,
+        robot: String,
+        sensors: &[String],
+        door: &Door,
+    ) -> Result<(Runtime, Self), Error> {
         let mut domain = DomainParticipantBuilder::new(settings.domain_id());
         if !settings.networks.is_empty() {
             domain = domain.with_only_networks(settings.networks.iter().copied());
@@ -84,58 +131,158 @@ impl Ros2 {
                 (ros::STATUS, latched()),
                 (ros::PRESS, kept(PRESSES_KEPT)),
                 (ros::FRAME, QosProfile::subscription_default()),
+                (ros::CONTACT, shown()),
+                (tools::IMAGE, shown()),
+                (tools::TACTILE_STATE, shown()),
             ] {
-                let publisher = publisher(&mut node, settings, sensor, topic, &qos)?;
+                let space = format!(
+                    "{}/tactile/{sensor}",
+                    settings.namespace.trim_end_matches('/')
+                );
+                let publisher = publisher(&mut node, &space, topic, &qos)?;
                 topics.insert((sensor.clone(), topic.name), publisher);
             }
         }
-        Ok(Self {
+        // By convention its name is the same everywhere.
+        let diagnostics = publisher(&mut node, "/", tools::DIAGNOSTICS, &kept(PRESSES_KEPT))?;
+        let runtime = Builder::new_current_thread().build()?;
+        for (sensor, topic) in &settings.motion {
+            let positions = subscription(&mut node, topic)?;
+            runtime.spawn(hear(sensor.clone(), positions, door.clone()));
+        }
+        let ros2 = Self {
+            robot,
             topics,
+            diagnostics,
+            highest_n: BTreeMap::new(),
             _node: node,
-        })
+        };
+        Ok((runtime, ros2))
     }
 
-    fn work(self, mut lines: mpsc::Receiver<Vec<Line>>) {
-        while let Some(lines) = lines.blocking_recv() {
-            for line in lines {
-                self.publish(&line);
+    /// Between two jobs, the runtime reads positions.
+    async fn work(&mut self, mut jobs: mpsc::Receiver<Job>) {
+        while let Some(job) = jobs.recv().await {
+            match job {
+                Job::Lines(lines) => lines.iter().for_each(|line| self.publish(line)),
+                Job::Vitals(statuses) => self.diagnose(&statuses),
             }
         }
     }
 
-    fn publish(&self, line: &Line) {
+    fn diagnose(&self, statuses: &[Status]) {
+        let now = jiff::Timestamp::now();
+        let bytes = tools::diagnostics(now, &self.robot, statuses.iter());
+        if let Err(error) = self.diagnostics.publish(Message(bytes)) {
+            warn!(%error, "no diagnostics published on ros2");
+        }
+    }
+
+    fn publish(&mut self, line: &Line) {
         let Some(event) = &line.event else {
             warn!(gap = line.json.trim_end(), "ros2 is too slow");
             return;
         };
         let (topic, _, bytes) = ros::encode(event);
-        let key = (event.sensor().to_owned(), topic.name);
-        if let Some(publisher) = self.topics.get(&key)
-            && let Err(error) = publisher.publish(Message(bytes))
-        {
-            warn!(sensor = key.0, topic = key.1, %error, "not published on ros2");
+        if let Err(error) = self.send(event.sensor(), topic, bytes) {
+            let (sensor, topic) = (event.sensor(), topic.name);
+            warn!(sensor, topic, error, "not published on ros2");
+        }
+        match &**event {
+            Event::Frame(frame) => self.show(frame),
+            Event::Status(status) => self.diagnose(std::slice::from_ref(status)),
+            Event::Hardness(_) | Event::Press(_) => {}
+        }
+    }
+
+    /// Publishes what viewers know.
+    fn show(&mut self, frame: &FrameEvent) {
+        let highest = self.highest_n.entry(frame.sensor.clone());
+        let highest = highest.or_insert(LEAST_SCALE_N);
+        *highest = frame.newtons.iter().copied().fold(*highest, f32::max);
+        let picture = tools::picture(frame, *highest);
+        let (contact, _, numbers) = ros::contact(frame);
+        for (topic, bytes) in [
+            (contact, numbers),
+            (tools::IMAGE, picture),
+            (tools::TACTILE_STATE, tools::tactile_state(frame)),
+        ] {
+            // A subscriber that is too slow misses it.
+            let _ = self.send(&frame.sensor, topic, bytes);
+        }
+    }
+
+    fn send(&self, sensor: &str, topic: Topic, bytes: Vec<u8>) -> Result<(), String> {
+        match self.topics.get(&(sensor.to_owned(), topic.name)) {
+            Some(publisher) => publisher
+                .publish(Message(bytes))
+                .map_err(|error| error.to_string()),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Reads positions of the arm of `sensor`, for ever.
+async fn hear(sensor: String, positions: Subscription<tools::PointStamped>, door: Door) {
+    loop {
+        let told = match positions.async_take().await {
+            Ok((position, _)) => position.position(),
+            Err(error) => {
+                warn!(sensor, %error, "found no position on ros2");
+                continue;
+            }
+        };
+        match told.and_then(|(at, mm)| Told::at_time(at, mm)) {
+            Some(told) => door.put(Positions {
+                sensor: sensor.clone(),
+                points: vec![told],
+            }),
+            None => warn!(
+                sensor,
+                "found a position on ros2 that is no number or no time"
+            ),
         }
     }
 }
 
 fn publisher(
     node: &mut Node,
-    settings: &config::Ros2,
-    sensor: &str,
-    topic: ros::Topic,
+    space: &str,
+    topic: Topic,
     qos: &QosProfile,
 ) -> Result<Publisher<Message>, Error> {
-    let space = format!(
-        "{}/tactile/{sensor}",
-        settings.namespace.trim_end_matches('/')
-    );
     let (package, name) = topic.package_and_name();
     let made = node.create_topic(
-        &Name::new(&space, topic.name)?,
+        &Name::new(space, topic.name)?,
         MessageTypeName::new(package, name),
         qos,
     )?;
     Ok(node.create_publisher(&made, Some(qos.clone()))?)
+}
+
+/// Subscribes to where an arm is. It takes what reliable and other publishers send.
+fn subscription(node: &mut Node, topic: &str) -> Result<Subscription<tools::PointStamped>, Error> {
+    let (space, base) = topic.rsplit_once('/').unwrap_or_default();
+    let space = if space.is_empty() { "/" } else { space };
+    let (package, name) = tools::POSITION.package_and_name();
+    let qos = QosProfile::subscription_default().history(History::KeepLast {
+        depth: POSITIONS_KEPT,
+    });
+    let made = node.create_topic(
+        &Name::new(space, base)?,
+        MessageTypeName::new(package, name),
+        &qos,
+    )?;
+    Ok(node.create_subscription(&made, Some(qos))?)
+}
+
+/// RViz2 of Humble asks for reliable images only. Nobody waits for a viewer that is too slow.
+fn shown() -> QosProfile {
+    QosProfile::publisher_default()
+        .reliability_reliable(WhenFull::Fail)
+        .history(History::KeepLast {
+            depth: PICTURES_KEPT,
+        })
 }
 
 /// A subscriber that comes later gets the last sample.

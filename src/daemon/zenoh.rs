@@ -2,7 +2,8 @@
 //!
 //! In: lines of the hub. Out: puts, the last final verdict and status of each sensor as answers to
 //! queries, and the liveliness token `tactile/SITE`, which ends with the daemon. The session talks only
-//! to addresses that the configuration names. Nothing that comes in changes anything.
+//! to addresses that the configuration names. If the configuration names a key for them, positions of
+//! the arm come in; nothing else that comes in changes anything.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -12,14 +13,16 @@ use tokio::sync::mpsc::{self, WeakSender};
 use tracing::{info, warn};
 use zenoh::bytes::Encoding;
 use zenoh::liveliness::LivelinessToken;
-use zenoh::pubsub::Publisher;
+use zenoh::pubsub::{Publisher, Subscriber};
 use zenoh::qos::CongestionControl;
 use zenoh::query::{Query, Queryable};
+use zenoh::sample::Sample;
 use zenoh::{Session, Wait};
 
 use super::config;
 use super::hub::Line;
-use super::relay::Worker;
+use super::relay::{Door, Worker};
+use super::request::{self, Change, Request};
 use crate::event::{Event, Kind, Phase};
 
 /// Why there is no session.
@@ -77,7 +80,7 @@ pub(super) fn open(
     let settings = settings.clone();
     Worker::start(
         "zenoh",
-        move |jobs| Zenoh::open(&settings, site, &sensors, jobs.downgrade()),
+        move |jobs, door| Zenoh::open(&settings, site, &sensors, jobs.downgrade(), door),
         Zenoh::work,
     )
 }
@@ -90,6 +93,7 @@ struct Zenoh {
     last: BTreeMap<String, Line>,
     // Dropping these ends them. The session must be the last.
     _queries: Queryable<()>,
+    _motion: Option<Subscriber<()>>,
     _alive: LivelinessToken,
     _session: Session,
 }
@@ -100,6 +104,7 @@ impl Zenoh {
         site: String,
         sensors: &[String],
         jobs: WeakSender<Job>,
+        door: Door,
     ) -> Result<Self, Error> {
         let session = zenoh::open(configuration(settings)?).wait()?;
         let mut publishers = BTreeMap::new();
@@ -129,6 +134,12 @@ impl Zenoh {
                 }
             })
             .wait()?;
+        let motion = settings.motion.as_ref().map(|key| {
+            let subscriber = session.declare_subscriber(key.clone());
+            subscriber
+                .callback(move |sample| hear(&sample, &door))
+                .wait()
+        });
         let alive = session
             .liveliness()
             .declare_token(format!("tactile/{site}"))
@@ -138,6 +149,7 @@ impl Zenoh {
             site,
             last: BTreeMap::new(),
             _queries: queries,
+            _motion: motion.transpose()?,
             _alive: alive,
             _session: session,
         })
@@ -187,6 +199,24 @@ impl Zenoh {
                 }
             }
         }
+    }
+}
+
+/// The longest value with positions, as for a line of the control socket.
+const LONGEST_VALUE_BYTES: usize = 64 * 1024;
+
+/// Takes positions of the arm: the line that the control socket takes, and no other.
+fn hear(sample: &Sample, door: &Door) {
+    let key = sample.key_expr();
+    let bytes = sample.payload().to_bytes();
+    if bytes.len() > LONGEST_VALUE_BYTES {
+        warn!(%key, "found {} bytes on zenoh, expected {LONGEST_VALUE_BYTES} at most", bytes.len());
+        return;
+    }
+    match request::parse(&bytes).request {
+        Ok(Request::Change(Change::Motion(positions))) => door.put(positions),
+        Ok(_) => warn!(%key, "found another request on zenoh, expected motion"),
+        Err(unusable) => warn!(%key, %unusable, "positions refused"),
     }
 }
 

@@ -168,6 +168,9 @@ fn networks(setup: &Setup, path: &Path) -> String {
             zenoh.listen,
             zenoh.connect
         );
+        if let Some(motion) = &zenoh.motion {
+            lines += &format!("zenoh positions of arms at {motion}\n");
+        }
         let open = |endpoint: &&Endpoint| {
             let parsed = endpoint.address().parse::<SocketAddr>();
             parsed.map_or(true, |address| !address.ip().is_loopback())
@@ -187,6 +190,9 @@ fn networks(setup: &Setup, path: &Path) -> String {
             ros2.domain_id(),
             ros2.networks
         );
+        for (sensor, topic) in &ros2.motion {
+            lines += &format!("ros2 positions of the arm of {sensor} at {topic}\n");
+        }
     }
     lines
 }

@@ -1,18 +1,21 @@
 #!/usr/bin/env python3
 """Events as ROS 2 topics, read by Cyclone DDS, the middleware under a ROS 2 installation.
 
-    python -m venv venv && venv/bin/pip install cyclonedds
+    python -m venv venv && venv/bin/pip install cyclonedds mcap mcap-ros2-support
     cargo build --features ros2 && venv/bin/python tests/peers/ros2_peer.py target/debug/hardnessd
 
 Claims: every field of every event, as the message files of clients/ros2 have it, is what the Unix socket
-says; whoever comes late gets the last verdict and status; frames come best effort; the node and its
-topics are in ROS's own discovery; a frozen reader costs no other subscriber an event, nor the stop its
-second.
+says; pictures, taxels, numbers of frames and diagnostics are what frames and statuses say, for reliable readers too;
+whoever comes late gets the last verdict and status; frames come best effort; positions of an arm reach the press
+and the recording; the node and its topics are in ROS's own discovery; a frozen reader costs no other subscriber an
+event, nor the stop its second.
 """
 
 import json
+import math
 import os
 import pathlib
+import re
 import struct
 import subprocess
 import sys
@@ -24,14 +27,16 @@ os.environ["CYCLONEDDS_URI"] = """<CycloneDDS><Domain><General>
 </General><Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>20</MaxAutoParticipantIndex>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 
-from bench import Bench, same, wait_for  # noqa: E402
+from bench import Arm, Bench, arm_reached_the_press, same, wait_for  # noqa: E402
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication  # noqa: E402
 from cyclonedds.core import Policy, Qos  # noqa: E402
 from cyclonedds.domain import DomainParticipant  # noqa: E402
 from cyclonedds.idl import make_idl_struct, types  # noqa: E402
+from cyclonedds.pub import DataWriter  # noqa: E402
 from cyclonedds.sub import DataReader  # noqa: E402
 from cyclonedds.topic import Topic  # noqa: E402
 from cyclonedds.util import duration  # noqa: E402
+from mcap_ros2.reader import read_ros2_messages  # noqa: E402
 
 DOMAIN = 87
 MESSAGES = pathlib.Path(__file__).resolve().parents[2] / "clients/ros2/tactile_interfaces/msg"
@@ -43,6 +48,7 @@ TYPES = {
     "float32": types.float32,
     "float64": types.float64,
     "string": str,
+    "bool": bool,
 }
 
 
@@ -50,6 +56,8 @@ def message(package, name, text):
     """A message of ROS, from its definition, as a type of DDS."""
     fields = {}
     for line in text.splitlines():
+        if line.startswith("#"):
+            continue
         kind, field = line.split()
         base = TYPES[kind.removesuffix("[]")]
         fields[field] = types.sequence[base] if kind.endswith("[]") else base
@@ -69,6 +77,24 @@ OURS = {
     kind: message("tactile_interfaces", kind.title(), (MESSAGES / f"{kind.title()}.msg").read_text())
     for kind in ("hardness", "press", "status")
 }
+CONTACT = message("tactile_interfaces", "Contact", (MESSAGES / "Contact.msg").read_text())
+message("sensor_msgs", "ChannelFloat32", "string name\nfloat32[] values")
+TACTILE = message("tactile_msgs", "TactileState", "std_msgs/Header header\nsensor_msgs/ChannelFloat32[] sensors")
+message("diagnostic_msgs", "KeyValue", "string key\nstring value")
+message(
+    "diagnostic_msgs",
+    "DiagnosticStatus",
+    "uint8 level\nstring name\nstring message\nstring hardware_id\ndiagnostic_msgs/KeyValue[] values",
+)
+DIAGNOSTICS = message(
+    "diagnostic_msgs", "DiagnosticArray", "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status"
+)
+message("geometry_msgs", "Point", "float64 x\nfloat64 y\nfloat64 z")
+POSITION = message("geometry_msgs", "PointStamped", "std_msgs/Header header\ngeometry_msgs/Point point")
+# For viewers, all by reliable readers as RViz2 of Humble has them.
+SHOWN = {"contact": CONTACT, "image": IMAGE, "tactile_state": TACTILE}
+COLOURS = pathlib.Path(__file__).resolve().parents[2] / "src/colour.rs"
+COURSE = pathlib.Path(__file__).resolve().parents[2] / "models/course.onnx"
 
 RELIABLE = Policy.Reliability.Reliable(duration(seconds=1))
 LATCHED = Qos(RELIABLE, Policy.Durability.TransientLocal, Policy.History.KeepLast(100))
@@ -96,6 +122,7 @@ class Reader:
 def readers(participant, space):
     qos = {"hardness": LATCHED, "press": VOLATILE, "status": LATCHED}
     made = {kind: Reader(participant, f"{space}/{kind}", OURS[kind], qos[kind]) for kind in OURS}
+    made |= {kind: Reader(participant, f"{space}/{kind}", SHOWN[kind], VOLATILE) for kind in SHOWN}
     return made | {"frame": Reader(participant, f"{space}/frame", IMAGE, BEST_EFFORT)}
 
 
@@ -106,24 +133,32 @@ def table(namespace="/"):
 def same_as_the_socket(binary):
     with Bench(binary, more=table("/arm_7")) as bench:
         bench.daemon()
-        lines = bench.tail("--timeout", "90", "--count", "1000")
+        lines = bench.events("--types", "frame,hardness,press,status")
         participant = DomainParticipant(DOMAIN)
         topics = readers(participant, "/arm_7/tactile/forearm")
+        diagnostics = Reader(participant, "/diagnostics", DIAGNOSTICS, VOLATILE)
+        begin = time.monotonic()
         topics["status"].until(lambda status: status.state == "connecting")
         time.sleep(1)
         sensor = bench.sensor("forearm", "--presses", "2", "--force", "15", "--seed", "3")
-        sensor.wait(timeout=60)
+        # A reader keeps 100 samples.
+        while sensor.poll() is None:
+            for reader in (*topics.values(), diagnostics):
+                reader.take()
+            time.sleep(0.2)
         topics["hardness"].until(lambda verdict: verdict.phase == "final" and verdict.press == 2)
         topics["press"].until(lambda press: press.press == 2 and press.state == "end")
         topics["status"].until(lambda status: status.state == "lost")
         image = topics["frame"].take()[-1]
+        check_diagnostics(diagnostics, time.monotonic() - begin)
         late = readers(DomainParticipant(DOMAIN), "/arm_7/tactile/forearm")
         (verdict,) = late["hardness"].until(lambda verdict: verdict.phase == "final")[-1:]
         (status,) = late["status"].until(lambda status: status.state == "lost")[-1:]
         assert (verdict.press, status.state) == (2, "lost"), (verdict, status)
         found = discovered(participant)
         lines.kill()
-        events = [json.loads(line) for line in lines.communicate()[0].splitlines()]
+        lines.thread.join()
+        events = lines.events
         compared = 0
         for kind in OURS:
             told = {event["seq"]: event for event in events if event["type"] == kind and "seq" in event}
@@ -143,7 +178,97 @@ def same_as_the_socket(binary):
         assert (image.height, image.width, image.encoding, image.step) == (28, 28, "32FC1", 112)
         newtons = struct.unpack("<784f", bytes(image.data))
         assert 0 <= min(newtons) and max(newtons) < 100
-        return compared, found
+        frames = [event for event in events if event["type"] == "frame"]
+        return compared, check_shown(topics, frames), found
+
+
+def at(header):
+    """As a frame event writes its time."""
+    stamp = header.stamp
+    return time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(stamp.sec)) + f".{stamp.nanosec // 1000:06}Z"
+
+
+def check_diagnostics(diagnostics, seconds):
+    arrays = diagnostics.until(lambda array: array.status[0].level == 2)
+    levels = [status.level for array in arrays for status in array.status]
+    # Connecting, live, lost; and once a second at least.
+    assert [level for level, last in zip(levels, [None, *levels]) if level != last] == [1, 0, 2], levels
+    assert len(arrays) > 0.8 * seconds, (len(arrays), seconds)
+    status = arrays[-1].status[0]
+    values = {pair.key: pair.value for pair in status.values}
+    assert (status.name, status.hardware_id, values["state"]) == ("hardnessd: forearm", "arm-7", "lost"), status
+    assert int(values["frames"]) > 50 and values["frame_rate_hz"] == "", values
+    rates = [pair.value for array in arrays for pair in array.status[0].values if pair.key == "frame_rate_hz"]
+    assert any(rate and float(rate) > 15 for rate in rates), rates
+
+
+def check_shown(topics, frames):
+    """Pictures, taxels and numbers are what the frame events say."""
+    table = re.search(r"VIRIDIS.*?= \[(.*?)\];", COLOURS.read_text(), re.DOTALL)[1]
+    colours = [[int(n) for n in colour.split(",")] for colour in re.findall(r"\[([0-9, ]+)\]", table)]
+    assert len(colours) == 10
+    by_time, most_n = {}, 0.2
+    for frame in frames:
+        most_n = max(most_n, *frame["newtons"])
+        by_time[frame["time"]] = (frame, most_n)
+
+    def colour(share):
+        k = min(int(9 * share), 8)
+        return [a + (9 * share - k) * (b - a) for a, b in zip(colours[k], colours[k + 1], strict=True)]
+
+    seen = {}
+    for kind in SHOWN:
+        for sample in topics[kind].samples:
+            frame, most_n = by_time[at(sample.header)]
+            assert sample.header.frame_id == "forearm"
+            if kind == "contact":
+                assert math.isclose(sample.force_n, sum(frame["newtons"]), abs_tol=784 * 0.0005), sample
+                for key in ("frame", "contact_area_taxels", "tared"):
+                    assert getattr(sample, key) == frame[key], (key, sample)
+            elif kind == "image":
+                assert (sample.height, sample.width, sample.encoding, sample.step) == (28, 28, "rgb8", 84)
+                expected = [channel for n in frame["newtons"] for channel in colour(n / most_n)]
+                # A newton of the event is rounded to 0.001.
+                assert all(abs(a - b) < 3 for a, b in zip(sample.data, expected, strict=True)), frame["frame"]
+            else:
+                (channel,) = sample.sensors
+                assert channel.name == "forearm"
+                assert all(abs(a - b) < 0.00051 for a, b in zip(channel.values, frame["newtons"], strict=True))
+        seen[kind] = len(topics[kind].samples)
+        assert seen[kind] > 0.9 * len(frames) > 50, (seen, len(frames))
+    assert max(by_time.values(), key=lambda pair: pair[1])[1] > 0.2
+    return seen
+
+
+def an_arm(binary):
+    """Positions as a robot's controller publishes them."""
+    more = table() + f'motion = {{ forearm = "/arm_7/approach" }}\n[model]\npath = "{COURSE}"\n'
+    with Bench(binary, more=more + '[record]\ndir = "rec"\nkeep_free_mb = 0\n') as bench:
+        daemon = bench.daemon()
+        participant = DomainParticipant(DOMAIN)
+        topic = Topic(participant, "rt/arm_7/approach", POSITION)
+        writer = DataWriter(participant, topic, qos=VOLATILE)
+        wait_for("the daemon's subscription", lambda: writer.get_matched_subscriptions())
+
+        def point(mm, at_ns):
+            stamp = TYPES["builtin_interfaces/Time"](*divmod(at_ns, 1_000_000_000))
+            header = TYPES["std_msgs/Header"](stamp, "tool0")
+            return POSITION(header, TYPES["geometry_msgs/Point"](7.0, -3.0, mm / 1e3))
+
+        # Neither a number, nor of this minute, nor near.
+        for mm, at_ns in ((math.nan, time.time_ns()), (1.0, 0), (1e9, time.time_ns())):
+            writer.write(point(mm, at_ns))
+
+        def tell(points):
+            ahead = time.time_ns() - time.monotonic_ns()
+            for mono_ns, mm in points:
+                writer.write(point(mm, mono_ns + ahead))
+
+        reached = arm_reached_the_press(bench, daemon, Arm(bench.path("arm.sock"), tell), read_ros2_messages)
+        with open(bench.path("log")) as log:
+            said = log.read()
+        assert said.count("no number or no time") == 2 and "found a moment" in said, said
+        return reached
 
 
 def discovered(participant):
@@ -171,6 +296,7 @@ from ros2_peer import DOMAIN, readers
 from cyclonedds.domain import DomainParticipant
 topics = readers(DomainParticipant(DOMAIN), "/tactile/forearm")
 topics["hardness"].until(lambda verdict: True)
+topics["image"].until(lambda image: True)
 print("there", flush=True)
 time.sleep(600)
 """
@@ -189,6 +315,7 @@ def a_frozen_reader(binary):
 
 if __name__ == "__main__":
     binary = os.path.abspath(sys.argv[1])
-    compared, found = same_as_the_socket(binary)
-    print(f"{compared} messages, as on the socket; discovered: {' '.join(found)}")
+    compared, seen, found = same_as_the_socket(binary)
+    print(f"{compared} messages, as on the socket; of frames {seen}; discovered: {' '.join(found)}")
+    print("an arm: %d of %d positions recorded, at most %d ns off" % an_arm(binary))
     print("a frozen reader: %d frames, none missed; verdicts after %d us at most; stop in %.2f s" % a_frozen_reader(binary))

@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
 """Events on zenoh, read by Eclipse's own implementation.
 
-    python -m venv venv && venv/bin/pip install eclipse-zenoh
+    python -m venv venv && venv/bin/pip install eclipse-zenoh mcap mcap-ros2-support
     cargo build --features zenoh && venv/bin/python tests/peers/zenoh_peer.py target/debug/hardnessd
 
-Claims: a peer gets, under the keys of docs/protocol.md, the very lines of the Unix socket; a late peer
+Claims: positions of an arm that a peer puts at the configured key reach the press and the recording; a peer gets,
+under the keys of docs/protocol.md, the very lines of the Unix socket; a late peer
 asks for the last verdict and status, beside 100 frames/s too; the liveliness token goes when the daemon is killed; a router
 that comes later is found; a frozen peer costs no other subscriber an event, nor the stop its second;
 nothing listens that was not named; and an address in use is one line and 74.
@@ -19,7 +20,8 @@ import sys
 import time
 
 import zenoh
-from bench import Bench
+from bench import Arm, Bench, arm_reached_the_press, wait_for
+from mcap_ros2.reader import read_ros2_messages
 
 
 def free():
@@ -136,6 +138,37 @@ def a_router_that_comes_later(binary):
         assert "tactile/hall/3/forearm/hardness" in keys, keys
 
 
+COURSE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "../../models/course.onnx")
+
+
+def an_arm(binary):
+    endpoint = free()
+    more = f'[publish.zenoh]\nlisten = ["{endpoint}"]\nmotion = "robot/motion"\n'
+    more += f'[model]\npath = "{COURSE}"\n[record]\ndir = "rec"\nkeep_free_mb = 0\n'
+    with Bench(binary, more=more) as bench:
+        daemon = bench.daemon()
+        with session(connect=[endpoint]) as peer:
+            motion = peer.declare_publisher("robot/motion")
+            wait_for("the daemon's subscription", lambda: motion.matching_status.matching)
+            # Nothing else is taken, and nothing that is no position.
+            for bad in (
+                '{"tare":"forearm"}',
+                "no JSON",
+                json.dumps({"motion": {"sensor": "foot", "at": [[time.monotonic_ns(), 2]]}}),
+                '{"motion":{"sensor":"forearm","at":[[1,2]]}}',
+                "[" * 100_000,
+            ):
+                motion.put(bad)
+            tell = lambda points: motion.put(json.dumps({"motion": {"sensor": "forearm", "at": points}}))  # noqa: E731
+            reached = arm_reached_the_press(bench, daemon, Arm(bench.path("arm.sock"), tell), read_ros2_messages)
+        with open(bench.path("log")) as log:
+            said = log.read()
+        for expected in ("another request", "refused", 'found "foot"', "found a moment", "bytes on zenoh"):
+            assert expected in said, (expected, said)
+        assert "tare" not in said.replace("tare: contact", ""), said
+        return reached
+
+
 FROZEN = """
 import sys, time
 sys.path.insert(0, sys.argv[2])
@@ -185,6 +218,7 @@ def an_address_in_use(binary):
 if __name__ == "__main__":
     binary = os.path.abspath(sys.argv[1])
     print("numbered events, as on the socket:", same_as_the_socket(binary))
+    print("an arm: %d of %d positions recorded, at most %d ns off" % an_arm(binary))
     a_router_that_comes_later(binary)
     print("a router that comes later is found")
     print("a frozen peer: %d frames, none missed; verdicts after %d us at most; stop in %.2f s" % a_frozen_peer(binary))

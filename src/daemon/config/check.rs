@@ -117,12 +117,21 @@ fn check_zenoh(
     value: &impl Fn(String, String, &'static str) -> Error,
 ) -> Result<(), Error> {
     // These characters have a meaning in zenoh's key expressions.
+    let is_key =
+        |key: &str| !key.split('/').any(str::is_empty) && !key.contains(['*', '$', '?', '#']);
     let site = zenoh.site(robot);
-    if site.split('/').any(str::is_empty) || site.contains(['*', '$', '?', '#']) {
+    if !is_key(site) {
         return Err(value(
             "publish.zenoh.site".to_owned(),
             format!("{site:?} (by default the robot's name)"),
             "parts of a key, without * $ ? #",
+        ));
+    }
+    if let Some(motion) = zenoh.motion.as_ref().filter(|motion| !is_key(motion)) {
+        return Err(value(
+            "publish.zenoh.motion".to_owned(),
+            format!("{motion:?}"),
+            "a key such as \"arm-7/motion\", without * $ ? #",
         ));
     }
     Ok(())
@@ -158,6 +167,23 @@ fn check_ros2(
             format!("{namespace:?}"),
             "a namespace of ROS such as \"/arm_7\"",
         ));
+    }
+    for (sensor, topic) in &ros2.motion {
+        if !sensors.iter().any(|known| known.name == *sensor) {
+            return Err(value(
+                "publish.ros2.motion".to_owned(),
+                format!("{sensor:?}"),
+                "the name of a [[sensor]] before each topic",
+            ));
+        }
+        let tokens = topic.strip_prefix('/');
+        if !tokens.is_some_and(|tokens| tokens.split('/').all(token)) {
+            return Err(value(
+                format!("publish.ros2.motion.{sensor}"),
+                format!("{topic:?}"),
+                "a topic of ROS such as \"/arm_7/approach\"",
+            ));
+        }
     }
     match sensors.iter().find(|sensor| !token(&sensor.name)) {
         Some(sensor) => Err(value(

@@ -1,5 +1,6 @@
 //! The `[publish]` tables: where events go, except by HTTP.
 
+use std::collections::BTreeMap;
 use std::env;
 use std::fmt;
 use std::net::{IpAddr, SocketAddr};
@@ -87,6 +88,9 @@ pub struct Zenoh {
     /// The part after `tactile/` in every key; by default the robot's name.
     #[serde(skip_serializing_if = "Option::is_none")]
     site: Option<String>,
+    /// The key at which the robot says where its arms are; none: it does not.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub motion: Option<String>,
 }
 
 impl Default for Zenoh {
@@ -95,6 +99,7 @@ impl Default for Zenoh {
             listen: vec![Endpoint("tcp/127.0.0.1:7447".to_owned())],
             connect: Vec::new(),
             site: None,
+            motion: None,
         }
     }
 }
@@ -165,6 +170,9 @@ pub struct Ros2 {
     pub namespace: String,
     /// Addresses of the interfaces to use. An empty list means every interface, as in ROS 2.
     pub networks: Vec<IpAddr>,
+    /// By sensor: the topic on which the robot says where its arm is.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub motion: BTreeMap<String, String>,
 }
 
 impl Default for Ros2 {
@@ -173,6 +181,7 @@ impl Default for Ros2 {
             domain_id: None,
             namespace: "/".to_owned(),
             networks: Vec::new(),
+            motion: BTreeMap::new(),
         }
     }
 }

@@ -468,7 +468,7 @@ fn only_what_a_sensor_can_change_while_it_runs_may_differ_in_a_reload() {
 #[cfg(all(feature = "ros2", feature = "zenoh"))]
 #[test]
 fn zenoh_and_ros2_take_what_their_networks_do() {
-    let bad: [(&str, &[&str]); 7] = [
+    let bad: [(&str, &[&str]); 10] = [
         (
             "zenoh]\nlisten = [\"udp/127.0.0.1:7447\"]",
             &["4:10", "listen", "udp/"],
@@ -479,6 +479,18 @@ fn zenoh_and_ros2_take_what_their_networks_do() {
         ),
         ("zenoh]\nsite = \"hall//3\"", &["zenoh.site", "hall//3"]),
         ("zenoh]\nsite = \"**\"", &["zenoh.site", "**"]),
+        (
+            "zenoh]\nmotion = \"*/motion\"",
+            &["zenoh.motion", "*/motion"],
+        ),
+        (
+            "ros2]\nmotion = { foot = \"/approach\" }",
+            &["ros2.motion", "foot", "the name of a [[sensor]]"],
+        ),
+        (
+            "ros2]\nmotion = { forearm = \"approach\" }",
+            &["ros2.motion.forearm", "\"approach\"", "/arm_7/approach"],
+        ),
         (
             "ros2]\ndomain_id = 233",
             &["ros2.domain_id", "233", "0 to 232"],

@@ -13,11 +13,27 @@ const MOST_POINTS: usize = 256;
 /// A point may be this far ahead of this machine's clock: clocks of two machines differ a little.
 const AHEAD_NS: i128 = 1_000_000_000;
 
+/// Where the arm of a sensor was, as it was told.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Positions {
+    pub(crate) sensor: String,
+    pub(crate) points: Vec<Told>,
+}
+
 /// A point as it was told.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Told {
     at: Moment,
     mm: f64,
+}
+
+impl Told {
+    /// A point at a time of the calendar; `None`, if it is too far from its zero.
+    #[cfg(feature = "ros2")]
+    pub(crate) fn at_time(at: Timestamp, mm: f64) -> Option<Self> {
+        let at = Moment::Wall(at);
+        (mm.abs() <= FURTHEST_MM).then_some(Self { at, mm })
+    }
 }
 
 /// When a point was, by one of two clocks.
