@@ -1,0 +1,96 @@
+//! What can be wrong with a command, and the exit code of each.
+
+use std::path::PathBuf;
+
+use hardnessd::daemon::config::Error as ConfigError;
+use hardnessd::tools::exit;
+use hardnessd::train::data::collect::CollectError;
+use hardnessd::train::data::dataset::DatasetError;
+use hardnessd::train::methods::LabelsError;
+use hardnessd::train::methods::frame::NoStart;
+use hardnessd::train::model::adopt::Foreign;
+use hardnessd::train::settings::SettingsError;
+use hardnessd::verdict::ModelError;
+
+/// A file named on the command line that cannot be read.
+#[derive(Debug, thiserror::Error)]
+#[error("{}: {source}", path.display())]
+pub(super) struct Unreadable {
+    pub(super) path: PathBuf,
+    pub(super) source: std::io::Error,
+}
+
+/// A directory named on the command line that has no model to take.
+#[derive(Debug, thiserror::Error)]
+#[error("{}: no finished run: {}", .0.display(), .1)]
+pub(super) struct NoRun(pub(super) PathBuf, pub(super) &'static str);
+
+/// A CUDA device was asked for.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "--device cuda: no CUDA device found, expected a build with --features cuda, a device and its \
+     driver"
+)]
+pub(super) struct NoCuda;
+
+/// Options that do not go together.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum WrongUsage {
+    #[error("--methods: found course, which judges presses, expected methods that judge a frame")]
+    NotOfFrames,
+    #[error("--data: found {0} files, expected 1 without --course")]
+    ManyFiles(usize),
+    #[error(
+        "--start: found none, expected a model of whole presses, such as models/course.onnx, for such data"
+    )]
+    NoStart,
+    #[error("--one-robot: found another method, expected course")]
+    NotOneRobot,
+}
+
+/// No objects at all were asked for.
+#[derive(Debug, thiserror::Error)]
+#[error("--objects and --test-objects: found 0 and 0, expected one or more of either")]
+pub(super) struct NoObjects;
+
+/// An option that has no meaning for these materials.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}: works with `--materials {1}` only")]
+pub(super) struct OtherMaterials(pub(super) &'static str, pub(super) &'static str);
+
+/// The exit code: 2 wrong usage, 66 unreadable input, 69 no such device, 78 bad configuration or model, 74
+/// other I/O error, else 1.
+pub(super) fn exit_code(error: &anyhow::Error) -> u8 {
+    let has = |test: fn(&(dyn std::error::Error + 'static)) -> bool| error.chain().any(test);
+    if has(|e| {
+        e.is::<NoObjects>()
+            || e.is::<OtherMaterials>()
+            || e.is::<WrongUsage>()
+            || matches!(e.downcast_ref(), Some(LabelsError::Range { .. }))
+            || matches!(e.downcast_ref(), Some(CollectError::NoLevel { .. }))
+    }) {
+        exit::USAGE
+    } else if has(|e| {
+        e.is::<Unreadable>()
+            || e.is::<NoRun>()
+            || matches!(e.downcast_ref(), Some(DatasetError::Unreadable { .. }))
+            || matches!(e.downcast_ref(), Some(CollectError::Unreadable { .. }))
+            || matches!(e.downcast_ref(), Some(ConfigError::Unreadable { .. }))
+    }) {
+        exit::NO_INPUT
+    } else if has(<dyn std::error::Error>::is::<NoCuda>) {
+        exit::UNAVAILABLE
+    } else if has(|e| {
+        e.is::<ModelError>()
+            || e.is::<NoStart>()
+            || e.is::<Foreign>()
+            || e.is::<SettingsError>()
+            || e.is::<ConfigError>()
+    }) {
+        exit::CONFIG
+    } else if has(<dyn std::error::Error>::is::<std::io::Error>) {
+        exit::IO
+    } else {
+        exit::FAILED
+    }
+}

@@ -1,0 +1,159 @@
+//! The commands on a model file: `evaluate`, `export`, `inspect`, `check-model` and `adopt`.
+
+use std::path::Path;
+use std::process::ExitCode;
+
+use anyhow::Context as _;
+use hardnessd::tools::{self, exit};
+use hardnessd::train::data::courses::Courses;
+use hardnessd::train::data::dataset::Dataset;
+use hardnessd::train::model::adopt::{self, Told};
+use hardnessd::train::model::course::{self, CourseEvaluation};
+use hardnessd::train::model::{export, review};
+use hardnessd::trial;
+use hardnessd::verdict::Hrn;
+
+use super::account;
+use super::arguments::{Adopt, Evaluate};
+use super::failure::{NoRun, exit_code};
+use super::files::{load, read, write};
+
+pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
+    let hrn = load(&arguments.model)?;
+    if Courses::is_at(&arguments.data)? {
+        return evaluate_courses(arguments, &hrn);
+    }
+    let dataset = Dataset::read(&arguments.data)?;
+    let (of_model, of_data) = (hrn.card().pitch_mm, dataset.pitch_mm() as f32);
+    if of_model != of_data {
+        eprintln!(
+            "warning: {}: taxel pitch: found {of_data} mm, expected {of_model} mm, that of the model",
+            arguments.data.display()
+        );
+    }
+    dataset.warn_of_object_in_both_splits();
+    let indices = dataset.labelled(arguments.split.into())?;
+    let evaluation = export::evaluate(&hrn, &dataset, &indices)?;
+    if let Some(path) = &arguments.verdicts {
+        let samples = indices.iter().map(|&index| &dataset.samples[index]);
+        let verdicts = samples.map(|sample| Ok((sample, hrn.judge(&sample.frame)?)));
+        let verdicts: Vec<_> = verdicts.collect::<anyhow::Result<_>>()?;
+        let rows = verdicts
+            .iter()
+            .map(|(sample, verdict)| (sample.object, sample.level, verdict));
+        write(path, account::csv(rows).as_bytes())?;
+    }
+    Ok(if arguments.json {
+        serde_json::to_string(&evaluation)? + "\n"
+    } else {
+        account::of_evaluation(&evaluation)
+    })
+}
+
+fn evaluate_courses(arguments: &Evaluate, hrn: &Hrn) -> anyhow::Result<String> {
+    let courses = Courses::read(&arguments.data)?;
+    let verdicts = course::verdicts(hrn, &courses, arguments.split.into(), |course| course)?;
+    anyhow::ensure!(
+        !verdicts.is_empty(),
+        "{}: no labelled presses in this split: found 0, expected 1 or more",
+        arguments.data.display()
+    );
+    if let Some(path) = &arguments.verdicts {
+        let rows = verdicts.iter();
+        let rows = rows.map(|(press, verdict)| (Some(press.object), press.level, verdict));
+        write(path, account::csv(rows).as_bytes())?;
+    }
+    let evaluation = CourseEvaluation::of(&verdicts, hrn.card().levels.len());
+    Ok(if arguments.json {
+        serde_json::to_string(&evaluation)? + "\n"
+    } else {
+        account::of_courses(&evaluation)
+    })
+}
+
+pub(super) fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {
+    let model = run.join("hrn.onnx");
+    if run.is_dir() && !model.exists() {
+        let hint = if run.join("settings.toml").exists() {
+            "it was stopped: `hrn-train train --resume` with its options finishes it"
+        } else {
+            "it has no hrn.onnx"
+        };
+        return Err(NoRun(run.to_owned(), hint).into());
+    }
+    let hrn = load(&model)?;
+    write(out, &read(&model)?)?;
+    Ok(format!("{}: sha256 {}\n", out.display(), hrn.sha256()))
+}
+
+pub(super) fn inspect(path: &Path) -> anyhow::Result<String> {
+    Ok(account::of_model(path, &load(path)?))
+}
+
+/// The time that a sensor of 5 frames/s leaves for a verdict.
+const SLOWEST_HZ: f64 = 5.0;
+
+/// Its lines are what was asked for, so they go to stdout even if the model does not pass.
+pub(super) fn check_model(path: &Path) -> ExitCode {
+    let checked = read(path).map_err(anyhow::Error::from).and_then(|bytes| {
+        let findings = review::review(&bytes);
+        let mut lines = format!("{}: {}\n", path.display(), review::wanted());
+        for finding in &findings {
+            lines += &format!("{finding}\n");
+        }
+        let mut passes = findings.iter().all(|finding| finding.problem.is_none());
+        if passes {
+            // Memory and time, as the daemon tries them.
+            let most = trial::verdict_most(SLOWEST_HZ);
+            match trial::load(&bytes, Some(most)) {
+                Ok(_) => lines += "ok       memory and time of a verdict\n",
+                Err(error) => {
+                    passes = false;
+                    lines += &format!("missing  memory and time of a verdict: {error}\n");
+                }
+            }
+        } else if findings.iter().all(|f| f.problem.is_none() || f.is_mended) {
+            lines += &format!(
+                "`hrn-train adopt {} --data D.npz --out H.onnx` adds what is missing\n",
+                path.display()
+            );
+        }
+        tools::print(lines.as_bytes())?;
+        Ok(passes)
+    });
+    match checked {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(exit::CONFIG),
+        Err(error) => {
+            eprintln!("hrn-train: {}", tools::line(error.as_ref()));
+            ExitCode::from(exit_code(&error))
+        }
+    }
+}
+
+pub(super) fn adopt_model(arguments: &Adopt) -> anyhow::Result<String> {
+    let bytes = read(&arguments.model)?;
+    let dataset = Dataset::read(&arguments.data)?;
+    let name = arguments.model.file_name().unwrap_or_default();
+    let told = Told {
+        method: arguments
+            .method
+            .clone()
+            .unwrap_or_else(|| format!("adopted from {}", name.display())),
+        validation: arguments.validation.clone(),
+    };
+    let adopted = adopt::adopt(&bytes, &dataset, &told);
+    let (model, done, evaluation) =
+        adopted.with_context(|| arguments.model.display().to_string())?;
+    write(&arguments.out, &model)?;
+    let hrn = load(&arguments.out)?;
+    let mut account = String::new();
+    for change in done {
+        account += &format!("changed  {change}\n");
+    }
+    account += &format!("{}: sha256 {}\n", arguments.out.display(), hrn.sha256());
+    if let Some(evaluation) = evaluation {
+        account += &account::of_evaluation(&evaluation);
+    }
+    Ok(account)
+}

@@ -1,0 +1,210 @@
+//! `hrn-train train` and `hrn-train adapt`.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::Context as _;
+use burn::tensor::Device;
+use hardnessd::train::data::courses::Courses;
+use hardnessd::train::data::dataset::{Dataset, DatasetError, LabelChoice};
+use hardnessd::train::methods::{self, Method, Request};
+use hardnessd::train::run::Run;
+use hardnessd::train::settings::{Profile, Settings, Told};
+use hardnessd::verdict::{BUILT_IN, Hrn};
+
+use super::account;
+use super::arguments::{Adapt, DeviceName, Train};
+use super::failure::{NoCuda, Unreadable, WrongUsage};
+use super::files::{load, read};
+
+pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
+    if let Some(parent) = arguments.parent {
+        end_with(parent)?;
+    }
+    if arguments.method == Method::Course {
+        return train_course(arguments);
+    }
+    if arguments.one_robot {
+        return Err(WrongUsage::NotOneRobot.into());
+    }
+    let settings = settings(
+        arguments.method,
+        arguments.profile,
+        arguments.config.as_deref(),
+    )?;
+    let dataset = dataset_of(&arguments.data)?;
+    for other in &arguments.from {
+        let unreadable = |source| Unreadable {
+            path: other.clone(),
+            source,
+        };
+        std::fs::read_dir(other).map_err(unreadable)?;
+    }
+    let request = Request {
+        method: arguments.method,
+        profile: arguments.profile,
+        seed: arguments.seed,
+        labels: arguments.labels,
+        label_choice: arguments.label_choice,
+        settings,
+    };
+    let description = request.description(&dataset)?;
+    methods::check(arguments.method, &dataset, &description)?;
+    let device = device(arguments.device)?;
+    let run = Run::open(&arguments.out, &description, arguments.resume)?
+        .taking_from(arguments.from.clone());
+    eprint!("{}", account::of_data(&dataset));
+    if arguments.profile == Profile::Smoke {
+        eprintln!("--profile smoke: tries the commands in seconds; too short to learn anything");
+    }
+    let begun = Instant::now();
+    let evaluation = methods::train(arguments.method, &dataset, &description, &run, &device)?;
+    Ok(account_of_run(
+        begun,
+        &run,
+        evaluation.as_ref().map(account::of_evaluation),
+    ))
+}
+
+fn train_course(arguments: &Train) -> anyhow::Result<String> {
+    let mut settings = settings(
+        arguments.method,
+        arguments.profile,
+        arguments.config.as_deref(),
+    )?;
+    if arguments.one_robot {
+        settings.told = Told::ONE_ROBOT;
+    }
+    let (courses, sources) = Courses::read_all(&arguments.data)?;
+    let told = (arguments.profile, arguments.seed, settings);
+    let description = methods::course::description(Method::Course, &courses, sources, told)?;
+    let device = device(arguments.device)?;
+    let run = Run::open(&arguments.out, &description, arguments.resume)?;
+    let begun = Instant::now();
+    let evaluation = methods::course::train(&courses, None, &description, &run, &device)?;
+    Ok(account_of_run(
+        begun,
+        &run,
+        evaluation.as_ref().map(account::of_courses),
+    ))
+}
+
+pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
+    if Courses::is_at(&arguments.data[0])? {
+        return adapt_course(arguments);
+    }
+    let (method, profile) = (Method::Adapt, Profile::Paper);
+    let settings = settings(method, profile, arguments.config.as_deref())?;
+    let device = device(arguments.device)?;
+    let start = match &arguments.start {
+        Some(path) => {
+            let bytes = read(path)?;
+            methods::frame::start(&load(path)?, &bytes, &device)
+                .with_context(|| path.display().to_string())?
+        }
+        None => methods::frame::start(&Hrn::load(BUILT_IN)?, BUILT_IN, &device)
+            .context("the built-in model")?,
+    };
+    let dataset = dataset_of(&arguments.data)?;
+    let request = Request {
+        method,
+        profile,
+        seed: arguments.seed,
+        labels: None,
+        label_choice: LabelChoice::Object,
+        settings,
+    };
+    let description = request.description(&dataset)?;
+    methods::check(method, &dataset, &description)?;
+    let run = Run::open(&arguments.out, &description, arguments.resume)?;
+    eprint!("{}", account::of_data(&dataset));
+    let begun = Instant::now();
+    let evaluation = methods::frame::adapt(&dataset, start, &description, &run, &device)?;
+    Ok(account_of_run(
+        begun,
+        &run,
+        evaluation.as_ref().map(account::of_evaluation),
+    ))
+}
+
+/// Goes on from a model of whole presses.
+fn adapt_course(arguments: &Adapt) -> anyhow::Result<String> {
+    let path = arguments.start.as_ref().ok_or(WrongUsage::NoStart)?;
+    let (method, profile) = (Method::Adapt, Profile::Paper);
+    let settings = settings(method, profile, arguments.config.as_deref())?;
+    let device = device(arguments.device)?;
+    let bytes = read(path)?;
+    let start = methods::course::start(&load(path)?, &bytes, &device)
+        .with_context(|| path.display().to_string())?;
+    let (courses, sources) = Courses::read_all(&arguments.data)?;
+    let told = (profile, arguments.seed, settings);
+    let description = methods::course::description(method, &courses, sources, told)?;
+    let run = Run::open(&arguments.out, &description, arguments.resume)?;
+    let begun = Instant::now();
+    let evaluation = methods::course::train(&courses, Some(start), &description, &run, &device)?;
+    Ok(account_of_run(
+        begun,
+        &run,
+        evaluation.as_ref().map(account::of_courses),
+    ))
+}
+
+/// The data of several files, joined.
+fn dataset_of(paths: &[PathBuf]) -> anyhow::Result<Dataset> {
+    let parts: Result<Vec<Dataset>, DatasetError> =
+        paths.iter().map(|path| Dataset::read(path)).collect();
+    let parts = parts?;
+    for part in &parts {
+        part.warn_of_object_in_both_splits();
+    }
+    Ok(Dataset::joined(parts)?)
+}
+
+/// How long it took, where the model is and what it is worth on the data's test presses, if it has any.
+fn account_of_run(begun: Instant, run: &Run, figures: Option<String>) -> String {
+    format!(
+        "trained in {:.1} s: {}\n{}",
+        begun.elapsed().as_secs_f64(),
+        run.path("hrn.onnx").display(),
+        figures.unwrap_or_else(|| {
+            "not evaluated: the data has no labelled test presses\n".to_owned()
+        })
+    )
+}
+
+/// Those of the method, and what a file overrides.
+fn settings(method: Method, profile: Profile, file: Option<&Path>) -> anyhow::Result<Settings> {
+    let settings = method.settings(profile);
+    let Some(path) = file else {
+        return Ok(settings);
+    };
+    let text = String::from_utf8_lossy(&read(path)?).into_owned();
+    let overridden = settings.overridden(&text);
+    overridden.with_context(|| path.display().to_string())
+}
+
+fn device(name: DeviceName) -> Result<Device, NoCuda> {
+    match name {
+        DeviceName::Cpu => Ok(Device::flex()),
+        #[cfg(feature = "cuda")]
+        DeviceName::Cuda => Device::enumerate(burn::tensor::DeviceType::Cuda)
+            .into_iter()
+            .next()
+            .ok_or(NoCuda),
+        #[cfg(not(feature = "cuda"))]
+        DeviceName::Cuda => Err(NoCuda),
+    }
+}
+
+/// Asks the system to end this process when its parent ends, for whatever reason.
+fn end_with(parent: i32) -> anyhow::Result<()> {
+    rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::TERM))
+        .map_err(std::io::Error::from)
+        .context("end with the parent process")?;
+    let actual = rustix::process::getppid().map(rustix::process::Pid::as_raw_nonzero);
+    anyhow::ensure!(
+        actual.is_some_and(|actual| actual.get() == parent),
+        "the process that started this one, {parent}, has ended"
+    );
+    Ok(())
+}
