@@ -329,7 +329,7 @@ fn tables(rows: &[CourseRow]) -> Vec<Table> {
     let sets: Vec<&str> = rows[0].sets.iter().map(|on| on.set.as_str()).collect();
     let of = |title: &str, note: &str, cell: &dyn Fn(&OnSet) -> String| Table {
         title: title.to_owned(),
-        note: format!("{note}\n\n"),
+        note: note.to_owned(),
         head: std::iter::once("judged by")
             .chain(sets.iter().copied())
             .map(str::to_owned)

@@ -138,7 +138,7 @@ pub(super) fn table(model: &str, set: &str, so_far: &SoFar) -> Table {
     };
     Table {
         title: format!("{model} on {set}, before the end"),
-        note: format!("{early}\n\n"),
+        note: early,
         head: [
             "after",
             "still pressed, %",
