@@ -77,7 +77,7 @@ pub(super) fn open(
     let (address, robot) = (settings.listen, robot.to_owned());
     Worker::start(
         "foxglove",
-        move |_, _| Foxglove::open(address, robot, &sensors),
+        move |_, _| Foxglove::open(address, &robot, &sensors),
         Foxglove::work,
     )
 }
@@ -109,7 +109,7 @@ struct Foxglove {
 }
 
 impl Foxglove {
-    fn open(address: SocketAddr, robot: String, sensors: &[Sensor]) -> Result<Self, Error> {
+    fn open(address: SocketAddr, robot: &str, sensors: &[Sensor]) -> Result<Self, Error> {
         let context = Context::new();
         let topics = Topics::new(&context, sensors)?;
         let (door, newcomers) = mpsc::channel(NEWCOMERS);
