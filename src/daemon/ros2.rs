@@ -13,7 +13,7 @@ use ros2_client::dds::rustdds::DomainParticipantBuilder;
 use ros2_client::qos::{Durability, History, QosProfile, WhenFull};
 use ros2_client::{
     Context, CreateError, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher,
-    Subscription,
+    Subscription, WriteResult,
 };
 use serde::ser::SerializeTuple;
 use serde::{Serialize, Serializer};
@@ -186,7 +186,7 @@ impl Ros2 {
         let (topic, _, bytes) = ros::encode(event);
         if let Err(error) = self.send(event.sensor(), topic, bytes) {
             let (sensor, topic) = (event.sensor(), topic.name);
-            warn!(sensor, topic, error, "not published on ros2");
+            warn!(sensor, topic, %error, "not published on ros2");
         }
         match &**event {
             Event::Frame(frame) => self.show(frame),
@@ -212,11 +212,9 @@ impl Ros2 {
         }
     }
 
-    fn send(&self, sensor: &str, topic: Topic, bytes: Vec<u8>) -> Result<(), String> {
+    fn send(&self, sensor: &str, topic: Topic, bytes: Vec<u8>) -> WriteResult<(), Message> {
         match self.topics.get(&(sensor.to_owned(), topic.name)) {
-            Some(publisher) => publisher
-                .publish(Message(bytes))
-                .map_err(|error| error.to_string()),
+            Some(publisher) => publisher.publish(Message(bytes)),
             None => Ok(()),
         }
     }
