@@ -258,7 +258,7 @@ pub struct Hardness {
     pub seq: Option<u64>,
     /// Sensor's name.
     pub sensor: String,
-    /// Of the chosen frame.
+    /// Time of the chosen frame.
     #[serde(serialize_with = "rfc3339")]
     pub time: Timestamp,
     /// Number of the press.

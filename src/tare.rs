@@ -136,7 +136,7 @@ pub struct Tare {
 struct Scale {
     newtons_per_count: f32,
     exponent: f32,
-    /// Of each taxel.
+    /// Gain of each taxel.
     gains: Box<[f32; TAXELS]>,
 }
 

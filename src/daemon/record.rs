@@ -70,7 +70,7 @@ pub enum Error {
     /// The file cannot be written.
     #[error("{path}: {source}")]
     Write {
-        /// Of the recording.
+        /// File of the recording.
         path: PathBuf,
         /// Why not.
         source: crate::recording::Error,
@@ -88,7 +88,7 @@ pub enum Error {
     Lost {
         /// The last one.
         sensor: String,
-        /// Why.
+        /// What went wrong.
         reason: String,
     },
     /// The directory of the configuration cannot be written to.

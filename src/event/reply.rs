@@ -95,7 +95,7 @@ pub struct SensorCard {
 /// The model as announced in `hello`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ModelCard {
-    /// Of the file.
+    /// SHA-256 of the model's file.
     pub sha256: String,
     /// What it was validated on, such as "simulated data only".
     pub validation: String,

@@ -93,7 +93,7 @@ pub enum Error {
     /// There is no place for the recording.
     #[error("{path}: {source}")]
     Temporary {
-        /// Of the recording.
+        /// File of the recording.
         path: PathBuf,
         /// Why not.
         source: io::Error,

@@ -83,7 +83,7 @@ pub enum Error {
     /// The directory of a session, or its list, cannot be used.
     #[error("--session: {}: {source}", path.display())]
     Session {
-        /// Of the directory or the list.
+        /// The directory, or the list.
         path: PathBuf,
         /// The reason.
         source: io::Error,

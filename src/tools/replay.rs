@@ -56,7 +56,7 @@ pub enum Error {
     /// The arm's positions cannot be used.
     #[error("--motion {path}:{source}")]
     Motion {
-        /// Of the positions.
+        /// File of the positions.
         path: PathBuf,
         /// Why not.
         source: motion::Error,
@@ -64,7 +64,7 @@ pub enum Error {
     /// A recording has its own positions.
     #[error("--motion: found {path}, a recording with times of its own, expected raw bytes")]
     OwnMotion {
-        /// Of the recording.
+        /// File of the recording.
         path: PathBuf,
     },
     /// The recording is damaged, or another program's.

@@ -38,7 +38,7 @@ pub struct Description {
     pub labels: usize,
     /// How they are chosen.
     pub label_choice: LabelChoice,
-    /// Of the method.
+    /// Settings of the method.
     pub settings: Settings,
     /// The files it learns from.
     pub data: Vec<Source>,

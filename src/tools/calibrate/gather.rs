@@ -17,7 +17,7 @@ use crate::verdict::Hrn;
 /// One press.
 #[derive(Debug, Default)]
 pub(super) struct Press {
-    /// Of its frames in contact.
+    /// Moments of its frames in contact.
     pub(super) moments: Vec<Duration>,
     /// Newtons on each taxel in them.
     pub(super) frames: Vec<Vec<f32>>,

@@ -42,7 +42,7 @@ pub(super) struct Proposal {
     pub(super) frames_damaged: u64,
     /// In whole frames.
     pub(super) bytes_explained: u64,
-    /// Of all bytes.
+    /// Share of all bytes that the proposal explains.
     pub(super) share: f64,
     /// Mean difference of neighbouring taxels, in counts.
     roughness: f64,

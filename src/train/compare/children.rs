@@ -50,7 +50,7 @@ impl Job {
 /// A run that ended without its product.
 #[derive(Debug)]
 pub(super) struct Failure {
-    /// Of the run.
+    /// Name of the run.
     pub(super) name: String,
     /// Its last words.
     pub(super) reason: String,

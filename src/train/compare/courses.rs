@@ -51,7 +51,7 @@ pub struct CourseRow {
 pub struct OnSet {
     /// The set's file, without folder and suffix.
     pub set: String,
-    /// Of the levels.
+    /// How well the levels were judged.
     pub levels: Evaluation,
     /// Share of presses whose level is off by more than one.
     pub beyond_neighbour: f64,

@@ -142,7 +142,7 @@ impl Worth {
 }
 
 impl Entry {
-    /// Of a finished run.
+    /// Reads the entry of a finished run.
     pub(super) fn of(run: &Path, told: &Description, sets: &[TestSet]) -> anyhow::Result<Self> {
         let worth = Worth::measure(run, sets)?;
         let history = History::read(run)?;

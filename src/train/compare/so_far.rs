@@ -116,7 +116,7 @@ pub(super) fn of(
     })
 }
 
-/// Of a model on a set.
+/// The table of what a model says of the presses of a set before their end.
 pub(super) fn table(model: &str, set: &str, so_far: &SoFar) -> Table {
     let percent = |share: f64| format!("{:.1}", 100.0 * share);
     let or_dash = |share: Option<f64>| share.map_or("-".to_owned(), percent);

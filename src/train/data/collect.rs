@@ -79,14 +79,14 @@ pub enum CollectError {
     Label {
         /// The capture.
         path: PathBuf,
-        /// Of the label.
+        /// Key of the label.
         key: &'static str,
         /// As it is.
         found: String,
         /// As it should be.
         expected: &'static str,
     },
-    /// Of another sensor than the others.
+    /// The capture is of another sensor than the others.
     #[error("{path}: taxel pitch: found {found} mm, expected {expected} mm, that of {first}")]
     Pitch {
         /// The capture.

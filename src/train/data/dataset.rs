@@ -199,7 +199,7 @@ pub enum DatasetError {
         /// `train` or `test`.
         split: &'static str,
     },
-    /// Of another sensor than the files before it.
+    /// The file is of another sensor than the files before it.
     #[error("{}: taxel pitch: found {found} mm, expected {expected} mm, that of {}", path.display(), first.display())]
     Pitch {
         /// The file.

@@ -15,7 +15,7 @@ pub(super) const TILE: usize = COLS * ZOOM;
 pub(super) const GAP: usize = 8;
 /// Height of a line of text.
 pub(super) const TEXT: usize = 16;
-/// Of the letters.
+/// Height of the letters.
 const FONT_PIXELS: f32 = 14.0;
 /// Width of the names to the left.
 pub(super) const MARGIN: usize = 112;

@@ -123,20 +123,20 @@ pub struct Task<'a> {
     pub levels: usize,
     /// What the arm may tell wrongly, or not at all.
     pub told: Told,
-    /// How.
+    /// Settings of the training.
     pub settings: &'a Training,
     /// Everything random follows from it.
     pub seed: u64,
-    /// Where.
+    /// The device that computes.
     pub device: &'a Device,
 }
 
 /// A trained network.
 #[derive(Debug)]
 pub struct Trained {
-    /// Of all layers.
+    /// Weights of all layers.
     pub weights: Weights,
-    /// Of the columns.
+    /// Mean and deviation of the columns.
     pub standard: Standard,
     /// What its verdicts promise.
     pub calibration: Calibration,
@@ -193,7 +193,7 @@ impl Task<'_> {
         Stream::new(self.seed, &format!("{} {name}", self.stage))
     }
 
-    /// Of the presses learnt from.
+    /// Mean and deviation of the columns of the presses learnt from.
     fn standard(&self) -> Standard {
         let presses = self.train.iter().map(|&place| &self.presses[place]);
         let rows: Vec<Vec<f32>> = presses.map(Press::columns).collect();

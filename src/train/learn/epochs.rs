@@ -28,9 +28,9 @@ pub struct Stage<'a> {
     pub origin: String,
     /// Samples to learn from.
     pub train: &'a [usize],
-    /// How.
+    /// Settings of the training.
     pub settings: &'a Training,
-    /// Of the order of the samples.
+    /// Seed of the order of the samples.
     pub seed: u64,
 }
 

@@ -47,18 +47,18 @@ pub struct Task<'a> {
     pub unlabelled: Option<(&'a [usize], ConsistencySettings)>,
     /// From newtons to images.
     pub scale: Scale,
-    /// How.
+    /// Settings of the training.
     pub settings: &'a Training,
-    /// Of the order of the samples and their augmentation.
+    /// Seed of the order of the samples and of their augmentation.
     pub seed: u64,
-    /// Where.
+    /// The device that computes.
     pub device: &'a Device,
 }
 
 /// A trained recogniser.
 #[derive(Debug)]
 pub struct Trained {
-    /// Of trunk and head.
+    /// Weights of trunk and head.
     pub weights: Weights,
     /// Mean and variance of each normalised layer over the training samples.
     pub statistics: Statistics,

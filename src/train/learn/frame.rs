@@ -47,20 +47,20 @@ pub struct Task<'a> {
     pub unlabelled: (&'a [usize], ConsistencySettings),
     /// How many levels there are.
     pub levels: usize,
-    /// How.
+    /// Settings of the training.
     pub settings: &'a Training,
     /// Everything random follows from it.
     pub seed: u64,
-    /// Where.
+    /// The device that computes.
     pub device: &'a Device,
 }
 
 /// A trained network.
 #[derive(Debug)]
 pub struct Trained {
-    /// Of all layers.
+    /// Weights of all layers.
     pub weights: Weights,
-    /// Of the features.
+    /// Mean and deviation of the features.
     pub standard: Standard,
     /// What its verdicts promise.
     pub calibration: Calibration,

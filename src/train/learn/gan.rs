@@ -36,9 +36,9 @@ pub use step::{Batch, Rules, step};
 /// Both sides.
 #[derive(Debug, Clone)]
 pub struct Gan {
-    /// Of the generator and its mixture.
+    /// Weights of the generator and its mixture.
     pub generator: Weights,
-    /// Of trunk and head.
+    /// Weights of trunk and head.
     pub discriminator: Weights,
 }
 
@@ -70,11 +70,11 @@ pub struct Task<'a> {
     pub labelled: &'a [usize],
     /// From newtons to images.
     pub scale: Scale,
-    /// How.
+    /// Settings of the training.
     pub settings: &'a GanSettings,
-    /// Of noise and orders.
+    /// Seed of noise and orders.
     pub seed: u64,
-    /// Where.
+    /// The device that computes.
     pub device: &'a Device,
 }
 

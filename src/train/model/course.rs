@@ -27,7 +27,7 @@ const CHECKS_A_LEVEL: usize = 2;
 /// How good a model is on whole presses: what `evaluate --json` prints of such a file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CourseEvaluation {
-    /// Of the levels.
+    /// How well the levels were judged.
     #[serde(flatten)]
     pub levels: Evaluation,
     /// Share of presses whose level is off by more than one.

@@ -72,7 +72,7 @@ pub struct Batch {
 }
 
 impl Batch {
-    /// Of frames.
+    /// Prepares frames.
     ///
     /// # Errors
     ///

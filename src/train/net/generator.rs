@@ -229,9 +229,9 @@ pub fn statistics(
 /// What generated frames are made with.
 #[derive(Debug)]
 pub struct Making<'a> {
-    /// Of the generator.
+    /// The generator's weights.
     pub weights: &'a Weights,
-    /// Of its normalised layers.
+    /// Statistics of its normalised layers.
     pub statistics: &'a Statistics,
     /// From images to newtons.
     pub scale: Scale,

@@ -27,7 +27,7 @@ pub struct Sensor {
 }
 
 impl Sensor {
-    /// Of the sensor whose frames these are.
+    /// Reads step and threshold off the frames of a sensor.
     pub fn of<'a>(frames: impl Iterator<Item = &'a Frame>) -> Self {
         let values: BTreeSet<u32> = frames
             .take(FRAMES)

@@ -11,7 +11,7 @@ const CLIP: f32 = 4.0;
 pub struct Standard {
     /// A number a column.
     pub mean: Vec<f32>,
-    /// Likewise.
+    /// Standard deviation of each column.
     pub deviation: Vec<f32>,
 }
 

@@ -12,9 +12,9 @@ pub type Constant = (Vec<usize>, Vec<f32>);
 /// What an exported file tells of its network.
 #[derive(Debug, Clone)]
 pub struct Start {
-    /// Of all layers.
+    /// Weights of all layers.
     pub weights: Weights,
-    /// Of the columns.
+    /// Mean and deviation of the columns.
     pub standard: Standard,
     /// What the logits are divided by.
     pub temperature: f32,

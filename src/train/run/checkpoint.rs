@@ -46,7 +46,7 @@ pub struct Progress {
 pub struct Origin(Sha256);
 
 impl Origin {
-    /// Of a stage with these settings and seed.
+    /// Begins the origin of a stage with these settings and this seed.
     pub fn new(stage: &str, settings: &impl Serialize, seed: u64) -> Self {
         let settings = serde_json::to_vec(settings).expect("settings are plain numbers");
         let mut hash = Sha256::new();

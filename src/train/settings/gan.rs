@@ -26,7 +26,7 @@ pub struct GanSettings {
     /// A picture is drawn, and generated samples are measured, after every so many epochs and
     /// after the last.
     pub picture_every_epochs: u32,
-    /// Of both sides.
+    /// The optimiser of generator and discriminator.
     pub optimiser: OptimiserSettings,
 }
 

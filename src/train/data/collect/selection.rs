@@ -57,7 +57,7 @@ pub(super) struct Selection {
     pub(super) presses: Vec<Judged>,
 }
 
-/// Of one sensor.
+/// What is selected of one sensor.
 #[derive(Debug, Default)]
 struct Held {
     /// Those of a press under way, or the newest.

@@ -346,7 +346,7 @@ enum ArrayError {
     Zip(#[from] ZipError),
     #[error(transparent)]
     Npy(#[from] NpyError),
-    /// Of the right type and another shape.
+    /// The array has the right type and another shape.
     #[error("{name} {shape:?}")]
     Shape {
         name: &'static str,
