@@ -184,6 +184,10 @@ fn compare(at: &Path, told: &Value) {
     );
     assert!(so_far.is_sorted_by(|a, b| going_on(a) >= going_on(b)));
 
+    for (model, code) in [("missing.onnx", 66), ("d.npz", 78)] {
+        let command = format!("compare --course --data d.npz --test d.npz --model {model} --out c");
+        assert_eq!(hrn_train(at, &command).status.code(), Some(code), "{model}");
+    }
     let output = hrn_train(at, "compare --course --data d.npz --out c");
     assert_eq!(output.status.code(), Some(2));
     let output = hrn_train(at, "compare --data d.npz d.npz --out c");

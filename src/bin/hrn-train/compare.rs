@@ -9,14 +9,16 @@ use hardnessd::train::methods::Method;
 
 use super::arguments::Compare;
 use super::failure::{Unreadable, WrongUsage};
-use super::files::write;
+use super::files::{load, write};
 
 pub(super) fn compare(arguments: Compare) -> anyhow::Result<String> {
     if arguments.course {
+        let models = arguments.model.iter();
+        let models = models.map(|path| Ok((path.display().to_string(), load(path)?)));
         let table = compare_courses(&CoursePlan {
             data: arguments.data,
             tests: arguments.test,
-            models: arguments.model,
+            models: models.collect::<anyhow::Result<_>>()?,
             out: arguments.out.clone(),
         })?;
         let page = arguments.out.join("course.md");

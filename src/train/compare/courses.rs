@@ -31,8 +31,8 @@ pub struct CoursePlan {
     pub data: Vec<PathBuf>,
     /// Sets to judge.
     pub tests: Vec<PathBuf>,
-    /// Model files, the first of which the others are compared with.
-    pub models: Vec<PathBuf>,
+    /// Models with their names; the others are compared with the first. There is one at least.
+    pub models: Vec<(String, Hrn)>,
     /// Where tables go.
     pub out: PathBuf,
 }
@@ -124,11 +124,8 @@ struct TestSet {
 impl TestSet {
     fn read(path: &Path) -> anyhow::Result<Self> {
         let courses = read(std::slice::from_ref(&path.to_owned()))?;
-        let is_there = |press: &crate::train::data::courses::Press| {
-            press.split == Split::Test && press.level > 0
-        };
         ensure!(
-            courses.presses.iter().any(is_there),
+            courses.labelled(Split::Test).next().is_some(),
             "{}: no labelled test presses: found 0, expected 1 or more",
             path.display()
         );
@@ -138,14 +135,6 @@ impl TestSet {
             presses: course::presses(&courses)?,
             courses,
         })
-    }
-
-    /// Places of its labelled test presses.
-    fn judged(&self) -> impl Iterator<Item = usize> {
-        let presses = self.courses.presses.iter().enumerate();
-        presses
-            .filter(|(_, press)| press.split == Split::Test && press.level > 0)
-            .map(|(place, _)| place)
     }
 }
 
@@ -166,15 +155,6 @@ fn read(paths: &[PathBuf]) -> anyhow::Result<Courses> {
 ///
 /// If a file cannot be read or judged, or the directory cannot be written.
 pub fn compare_courses(plan: &CoursePlan) -> anyhow::Result<String> {
-    let models: Vec<(String, Hrn)> = plan
-        .models
-        .iter()
-        .map(|path| {
-            let name = path.display().to_string();
-            let bytes = std::fs::read(path).with_context(|| name.clone())?;
-            Ok((name.clone(), Hrn::load(&bytes).context(name)?))
-        })
-        .collect::<anyhow::Result<_>>()?;
     let sets: Vec<TestSet> = plan
         .tests
         .iter()
@@ -183,10 +163,10 @@ pub fn compare_courses(plan: &CoursePlan) -> anyhow::Result<String> {
     std::fs::create_dir_all(&plan.out).with_context(|| plan.out.display().to_string())?;
 
     let mut rows = controls(&plan.data, &sets)?;
-    for (name, hrn) in &models {
+    for (name, hrn) in &plan.models {
         rows.extend(of_model(name, hrn, &sets)?);
     }
-    compare_with_first(&mut rows, &models[0].0);
+    compare_with_first(&mut rows, &plan.models[0].0);
     let json = serde_json::to_vec_pretty(&rows)?;
     write_whole(&plan.out.join("course.json"), &json)?;
     let tables = tables(&rows);
@@ -199,13 +179,9 @@ pub fn compare_courses(plan: &CoursePlan) -> anyhow::Result<String> {
 fn controls(data: &[PathBuf], sets: &[TestSet]) -> anyhow::Result<Vec<CourseRow>> {
     let courses = read(data)?;
     let presses = course::presses(&courses)?;
-    let is_learnt =
-        |press: &crate::train::data::courses::Press| press.split == Split::Train && press.level > 0;
-    let learnt: Vec<&Press> = presses
-        .iter()
-        .zip(&courses.presses)
-        .filter(|(_, press)| is_learnt(press))
-        .map(|(press, _)| press)
+    let learnt: Vec<&Press> = courses
+        .labelled(Split::Train)
+        .map(|place| &presses[place])
         .collect();
     ensure!(
         !learnt.is_empty(),
@@ -219,14 +195,15 @@ fn controls(data: &[PathBuf], sets: &[TestSet]) -> anyhow::Result<Vec<CourseRow>
     // Levels with few presses are lifted halfway, as the method `course` lifts them.
     let lifts: Vec<f32> = (0..levels)
         .map(|level| level_of.iter().filter(|&&of| of == level).count())
-        .map(|count| (count.max(1) as f32).powf(-0.5))
+        .map(|count| (count.max(1) as f32).powf(-course::BALANCE))
         .collect();
     let row_of = |control: Control| {
         let rows: Vec<Vec<f32>> = learnt.iter().map(|press| control.row(press)).collect();
         let fitted = Baseline::fit(&rows, &level_of, levels);
         let on = |set: &TestSet| {
             let judged: Vec<Judged> = set
-                .judged()
+                .courses
+                .labelled(Split::Test)
                 .map(|place| Judged {
                     level: set.presses[place].level,
                     probabilities: lifted(
@@ -263,11 +240,15 @@ fn of_model(name: &str, hrn: &Hrn, sets: &[TestSet]) -> anyhow::Result<Vec<Cours
         let on = |set: &TestSet| {
             let verdicts = model::verdicts(hrn, &set.courses, Split::Test, told)?;
             let levels = hrn.card().levels.len();
-            let rmse = model::CourseEvaluation::of(&verdicts, levels).shore;
-            let rmse = rmse.map(|shore| shore.rmse);
+            let rmse = model::shore(&verdicts, levels).map(|shore| shore.rmse);
             let mut on = on_set(&set.name, &model::judged(&verdicts), levels, rmse);
             if is_whole {
-                on.so_far = Some(so_far::of(hrn, &set.courses, set.judged(), &verdicts)?);
+                on.so_far = Some(so_far::of(
+                    hrn,
+                    &set.courses,
+                    set.courses.labelled(Split::Test),
+                    &verdicts,
+                )?);
             }
             Ok(on)
         };

@@ -113,6 +113,13 @@ impl Courses {
         });
     }
 
+    /// Places of a split's presses whose level is known.
+    pub fn labelled(&self, split: Split) -> impl Iterator<Item = usize> {
+        let presses = self.presses.iter().enumerate();
+        let wanted = presses.filter(move |(_, press)| press.split == split && press.level > 0);
+        wanted.map(|(place, _)| place)
+    }
+
     /// The rows of press number `press`.
     pub fn rows(&self, press: usize) -> Range<usize> {
         let first = |press: usize| self.press.partition_point(|&of| (of as usize) < press);

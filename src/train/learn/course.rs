@@ -29,7 +29,7 @@ mod varied;
 /// How far levels with few samples are lifted: halfway. Even Shore hardness gives few samples of the narrow
 /// levels. The course tells them well enough that half of the way costs nothing where samples count alike, and
 /// most of what is to be won where levels do (`models/course.md`).
-const BALANCE: f32 = 0.5;
+pub const BALANCE: f32 = 0.5;
 /// Presses a pass without gradients.
 const JUDGED_AT_ONCE: usize = 250;
 

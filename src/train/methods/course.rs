@@ -20,13 +20,6 @@ use crate::train::run::{Description, Run};
 use crate::train::settings::{Profile, Settings};
 use crate::verdict::Hrn;
 
-/// Labelled training presses of a file.
-fn labelled(courses: &Courses) -> Vec<usize> {
-    let presses = courses.presses.iter().enumerate();
-    let wanted = presses.filter(|(_, press)| press.split == Split::Train && press.level > 0);
-    wanted.map(|(place, _)| place).collect()
-}
-
 /// What a run of a method is told: all labels are used.
 ///
 /// # Errors
@@ -38,7 +31,7 @@ pub fn description(
     sources: Vec<Source>,
     (profile, seed, settings): (Profile, u64, Settings),
 ) -> anyhow::Result<Description> {
-    let labels = labelled(courses).len();
+    let labels = courses.labelled(Split::Train).count();
     ensure!(
         labels > 0,
         "{}: no labelled training presses: found 0, expected 1 or more",
@@ -69,7 +62,7 @@ pub fn train(
     device: &Device,
 ) -> anyhow::Result<Option<CourseEvaluation>> {
     let presses = course::presses(courses)?;
-    let all = labelled(courses);
+    let all: Vec<usize> = courses.labelled(Split::Train).collect();
     let Description { settings, seed, .. } = description;
     let (train, held_out) = hold_out(&presses, &all, settings.validation.share, *seed);
     let task = Task {

@@ -150,10 +150,9 @@ pub fn verdicts(
     split: Split,
     told: impl Fn(Course) -> Course,
 ) -> anyhow::Result<Vec<(courses::Press, Verdict)>> {
-    let of_split = |(_, press): &(usize, &courses::Press)| press.split == split && press.level > 0;
-    let all = courses.presses.iter().enumerate().filter(of_split);
     let mut verdicts = Vec::new();
-    for (place, press) in all {
+    for place in courses.labelled(split) {
+        let press = courses.presses[place];
         ensure!(
             usize::from(press.level) <= hrn.card().levels.len(),
             "the model has {} levels, and the data has a press of level {}",
@@ -164,7 +163,7 @@ pub fn verdicts(
             Format::Frame => hrn.judge(&courses.frame(press.best as usize))?,
             Format::Course { .. } => hrn.judge_course(&told(course_of(courses, place)))?,
         };
-        verdicts.push((*press, verdict));
+        verdicts.push((press, verdict));
     }
     Ok(verdicts)
 }
@@ -195,7 +194,8 @@ impl CourseEvaluation {
     }
 }
 
-fn shore(verdicts: &[(courses::Press, Verdict)], levels: usize) -> Option<ShoreEvaluation> {
+/// How good the Shore hardness of verdicts is; `None` for a model or presses without it.
+pub fn shore(verdicts: &[(courses::Press, Verdict)], levels: usize) -> Option<ShoreEvaluation> {
     let both = |(press, verdict): &(courses::Press, Verdict)| {
         let shore = verdict.shore?;
         press
