@@ -71,3 +71,26 @@ fn collect(value: &toml::Value, keys: &mut Vec<String>) {
         _ => {}
     }
 }
+
+#[test]
+fn every_file_that_names_the_version_names_this_one() {
+    let version = env!("CARGO_PKG_VERSION");
+    for (file, expected) in [
+        (
+            "clients/python/pyproject.toml",
+            format!("\nversion = \"{version}\"\n"),
+        ),
+        (
+            "clients/ros2/tactile_interfaces/package.xml",
+            format!("<version>{version}</version>"),
+        ),
+        ("CHANGELOG.md", format!("# Changelog\n\n## {version}")),
+        (
+            "docs/operator.md",
+            format!("hardnessd_{version}-1_amd64.deb"),
+        ),
+    ] {
+        let text = fs::read_to_string(shipped(file)).unwrap();
+        assert!(text.contains(&expected), "{file}: expected {expected:?}");
+    }
+}
