@@ -1,7 +1,7 @@
-//! What one press costs, bytes to verdict, and where it goes: `cargo bench --bench pipeline`.
+//! The cost of one press from bytes to verdict, and of its parts: `cargo bench --bench pipeline`.
 //!
-//! The bytes are a recording of two presses on foam at 5 frames/s, 41 frames. Compare lines of one run
-//! with each other, not with another day's.
+//! The bytes are a recording of two presses on foam at 5 frames/s, 41 frames. Only compare lines of
+//! one run with each other, not with those of another day.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -15,7 +15,7 @@ use hardnessd::sensor::{Description, Sensor};
 use hardnessd::verdict::{BUILT_IN, Hrn};
 use hardnessd::wire::{self, Decoder, Layout};
 
-/// What a read of a serial port at 115,200 baud gives at a time, about.
+/// The approximate size of one read of a serial port at 115,200 baud.
 const CHUNK_BYTES: usize = 64;
 
 fn main() {
@@ -40,7 +40,7 @@ fn pipeline(hrn: &Arc<Hrn>) -> Pipeline {
     Pipeline::new(sensor, Arc::clone(hrn), Clock::FrameRate)
 }
 
-/// Bytes to frames.
+/// Measures bytes to frames.
 #[divan::bench(args = [1, CHUNK_BYTES, 4096])]
 fn decode(bencher: Bencher, chunk_bytes: usize) {
     let bytes = recording();
@@ -59,7 +59,7 @@ fn decode(bencher: Bencher, chunk_bytes: usize) {
         });
 }
 
-/// Bytes to events, with an early and a final verdict a press; an item is a press.
+/// Measures bytes to events, with an early and a final verdict for each press. An item is a press.
 #[divan::bench]
 fn bytes_to_events(bencher: Bencher) {
     let (bytes, hrn) = (recording(), hrn());
@@ -93,14 +93,14 @@ fn bytes_to_events(bencher: Bencher) {
         });
 }
 
-/// A frame to a verdict.
+/// Measures a frame to a verdict.
 #[divan::bench]
 fn judge(bencher: Bencher) {
     let hrn = hrn();
     bencher.bench_local(|| hrn.judge_check(2));
 }
 
-/// A model file to something that judges, its check frames reproduced: start and reload.
+/// Measures loading a model file, including its check frames. Start and reload do this.
 #[divan::bench]
 fn load_model() -> Arc<Hrn> {
     hrn()

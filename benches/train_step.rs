@@ -1,9 +1,9 @@
 //! Seconds of a training step: `cargo bench --features train --bench train_step`.
 //!
-//! On its own it prints the median step of each network. With `--serve` it obeys a peer line by
-//! line, so that `benches/pytorch_step.py` can run its own steps in turn with these on the same
-//! machine in the same minute, from the same weights and images: only their ratio says anything.
-//! Seconds are those of the processor, so that a busy machine does not count.
+//! Alone, it prints the median step of each network. With `--serve` it obeys a peer line by line.
+//! So `benches/pytorch_step.py` can run its own steps in turn with these, on the same machine in
+//! the same minute, from the same weights and images. Only their ratio has a meaning. The seconds
+//! are processor time, so that a busy machine makes no difference.
 
 use std::io::{BufRead as _, Write as _};
 use std::path::Path;
@@ -21,19 +21,19 @@ use ndarray::{ArrayD, IxDyn};
 use ndarray_npy::NpzWriter;
 use rustix::time::{ClockId, clock_gettime};
 
-/// As in `hrn-train`.
+/// The same allocator as in `hrn-train`.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
-/// Of the paper: a batch of 100, four levels, a learning rate of 1e-3.
+/// The paper's values: a batch of 100, four levels, a learning rate of 1e-3.
 const BATCH: usize = 100;
 const LEVELS: usize = 4;
 const RATE: f64 = 1e-3;
-/// USTGAN's.
+/// The game of USTGAN.
 const GAME: Game = Game::RealOrFake;
 
 fn main() {
-    // As hrn-train does: steps are taken on a thread of the pool.
+    // Like hrn-train, take the steps on a thread of the pool.
     rayon::scope(|_| run());
 }
 
@@ -68,13 +68,13 @@ fn serve(file: &Path) {
     }
 }
 
-/// What takes steps: the supervised HRN, and both sides of USTGAN; always on the same inputs.
+/// The networks: the supervised HRN, and both sides of USTGAN. Their inputs are always the same.
 struct Networks {
     hrn: Learner,
-    /// Generator and discriminator.
+    /// The generator and the discriminator.
     gan: [Learner; 2],
-    /// The same with plain SGD. Adam makes a step of the full rate of a gradient that is nothing
-    /// but rounding, so with it two exact computations part after three steps.
+    /// The same two with plain SGD. If a gradient is nothing but rounding, Adam still makes a step
+    /// of the full rate. So with Adam, two exact computations differ after three steps.
     gan_sgd: [Learner; 2],
     images: Tensor<4>,
     targets: Tensor<2>,
@@ -85,7 +85,7 @@ impl Networks {
     fn new() -> Self {
         let device = Device::flex();
         let mut stream = Stream::new(1, "bench images");
-        // Like pressed frames: most of it background.
+        // Like pressed frames, the images are mostly background.
         let pixel = |_| (stream.normal().max(0.0) * 0.5 - 1.0).min(1.0) as f32;
         let images: Vec<f32> = (0..BATCH * 28 * 28).map(pixel).collect();
         let images = Tensor::from_data(TensorData::new(images, [BATCH, 1, 28, 28]), &device);
@@ -107,7 +107,7 @@ impl Networks {
         }
     }
 
-    /// Seconds of so many steps, and their losses; those of a GAN are the sum of both sides'.
+    /// The seconds and the losses of `steps` steps. The losses of a GAN are the sum of both sides'.
     fn run(&mut self, name: &str, steps: usize) -> (f64, Vec<f64>) {
         let begun = processor_seconds();
         let step = |_| match name {
@@ -149,7 +149,7 @@ impl Networks {
     }
 }
 
-/// Of all threads of this process.
+/// The processor time of all threads of this process.
 fn processor_seconds() -> f64 {
     let time = clock_gettime(ClockId::ProcessCPUTime);
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9

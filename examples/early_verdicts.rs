@@ -1,11 +1,11 @@
-//! Measures early verdicts on simulated presses: how often one comes, how often it names the level of
-//! the final one, and how much sooner it comes.
+//! Measures early verdicts on simulated presses: how many presses have one, how often its level is
+//! that of the final verdict, and how much sooner it comes.
 //!
 //!     cargo run --release --example early_verdicts -- [PRESSES]
 //!
-//! It plays PRESSES (default 200, some minutes) of each material at 5, 20 and 100 frames/s, with the
-//! built-in settings and model. It prints the table of `docs/results.md`, and how many early verdicts came
-//! before the press had reached 95 % of its greatest force: none should.
+//! It plays PRESSES (default 200, some minutes) of each material at 5, 20 and 100 frames/s, with
+//! the built-in settings and model. It prints the table of `docs/results.md`, and the number of
+//! early verdicts before the press had reached 95 % of its greatest force. That number should be 0.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -18,7 +18,7 @@ use hardnessd::simulator::{Material, Sequence, SequenceSettings};
 use hardnessd::verdict::{BUILT_IN, Hrn};
 
 const SEED: u64 = 1;
-/// Of a press's greatest force: from here on it no longer rises.
+/// The share of a press's greatest force from which on the force no longer counts as rising.
 const RISEN: f32 = 0.95;
 
 fn main() {
@@ -50,19 +50,19 @@ fn main() {
     println!("\nwhile the load was rising: {rising}");
 }
 
-/// A press with what came of it.
+/// A press and its verdicts.
 #[derive(Default)]
 struct Press {
-    /// Total force of each of its frames, newtons.
+    /// The total force of each of its frames, in newtons.
     forces_n: Vec<f32>,
-    /// Its early verdict, when that came, and after how many of the frames.
+    /// Its early verdict, the time of that verdict, and the number of frames until then.
     early: Option<(Hardness, Duration, usize)>,
-    /// Its final verdict, and when that came.
+    /// Its final verdict, and the time of that verdict.
     last: Option<(Hardness, Duration)>,
 }
 
 impl Press {
-    /// Whether its early verdict came before the load had risen.
+    /// Whether the early verdict came while the load was still rising.
     fn is_judged_rising(&self) -> bool {
         let greatest_n = |forces_n: &[f32]| forces_n.iter().copied().fold(0.0, f32::max);
         self.early.as_ref().is_some_and(|(_, _, frames)| {
@@ -108,8 +108,8 @@ fn measure(sequence: Sequence, frame_rate_hz: f64, hrn: &Arc<Hrn>) -> Vec<Press>
     presses
 }
 
-/// Share of presses with an early verdict, share of these with the level of the final one, and by
-/// how much they came sooner (median).
+/// The share of presses with an early verdict, the share of these with the level of the final
+/// verdict, and how much sooner they came (median).
 fn cell(presses: &[Press]) -> String {
     let mut sooner_s = Vec::new();
     let mut same = 0;

@@ -4,7 +4,7 @@
 //! cargo run --example generate -- DIR
 //! ```
 //!
-//! Both are generated from the definition of the command line, so that there is only one definition.
+//! Both are generated from the definition of the command line, so there is only one definition.
 
 use std::fs;
 use std::io;

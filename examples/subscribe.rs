@@ -9,7 +9,7 @@
 //! - The subscriber keeps its place in the daemon's run (`RUN:SEQ`) and sends it when it connects
 //!   again, so that it misses nothing. An event that came before the daemon took the subscription
 //!   may come a second time.
-//! - While there is no connection, nothing is known of the sensor.
+//! - While there is no connection, nothing is known about the sensor.
 
 use std::convert::Infallible;
 use std::io::{self, BufRead, BufReader, Read, Write};
@@ -18,7 +18,8 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 
-/// No line of the daemon comes near this. What is longer does not come from hardnessd.
+/// The longest line that is read. Lines of the daemon are far shorter, so a longer one does not
+/// come from hardnessd.
 const LONGEST_LINE_BYTES: u64 = 1 << 20;
 
 fn main() {

@@ -1,8 +1,8 @@
-//! The one colour map: what a share of the largest force is drawn in, on a terminal, on the live page
-//! (`page.html` repeats the table, and a test compares the two) and in pictures.
+//! The one colour map: the colour of each share of the largest force. The terminal, the live page
+//! and pictures use it. `page.html` repeats the table, and a test compares the two.
 
-/// Ten colours of matplotlib's viridis (CC0) at even distances. Lightness rises evenly, so the order
-/// shows without colour too.
+/// Ten colours of matplotlib's viridis (CC0) at even distances. Lightness rises evenly, so the
+/// order is visible even without colour.
 pub const VIRIDIS: [[u8; 3]; 10] = [
     [68, 1, 84],
     [72, 40, 120],
@@ -16,7 +16,8 @@ pub const VIRIDIS: [[u8; 3]; 10] = [
     [253, 231, 37],
 ];
 
-/// The colour of `share`, as red, green and blue; below 0 and above 1 it is that of the end.
+/// The colour of `share`, as red, green and blue. A share below 0 or above 1 has the colour of that
+/// end.
 pub fn viridis(share: f32) -> [u8; 3] {
     let at = share.clamp(0.0, 1.0) * (VIRIDIS.len() - 1) as f32;
     let k = (at as usize).min(VIRIDIS.len() - 2);

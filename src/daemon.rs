@@ -1,4 +1,4 @@
-//! The daemon: sensors at one end, subscribers at the other, the core between.
+//! The daemon, which connects sensors to subscribers and runs the core between them.
 //!
 //! In: a checked [`Setup`], a future that ends when the daemon must end, and requests to read the
 //! configuration again. Out: events on the sockets. One thread runs everything: one task for each
@@ -57,22 +57,22 @@ use crate::frame::Stamp;
 use crate::pipeline::{Clock, Pipeline};
 use crate::recording::{About, Labels, RecordedSensor};
 
-/// Questions that wait for a sensor. When there are more, the tasks that ask wait.
+/// The most commands that wait for a sensor. When the queue is full, the tasks that send wait.
 const QUESTIONS: usize = 16;
 
-/// Why the daemon cannot start, or has stopped by itself.
+/// The reason the daemon cannot start, or has stopped by itself.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// A publisher could not be opened.
     #[error(transparent)]
     Publish(#[from] publish::Error),
-    /// There are no random numbers, and without them runs cannot be told apart.
+    /// The system gives no random numbers. Without them, two runs cannot be distinguished.
     #[error("/dev/urandom: {0}")]
     Random(#[source] std::io::Error),
-    /// There is nothing to record, or the recording cannot be written.
+    /// A sensor to record is missing or lost, or the recording cannot be written.
     #[error(transparent)]
     Record(#[from] record::Error),
-    /// There is nothing to write the log to.
+    /// The log cannot be written as configured.
     #[error(transparent)]
     Log(#[from] log::Error),
     /// A task ended by itself, which is a fault of this program.
@@ -83,22 +83,22 @@ pub enum Error {
 /// The sockets of a daemon that records into one file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Sockets {
-    /// None: it is a tool for one person.
+    /// No sockets, because one person uses the daemon as a tool.
     None,
-    /// Those of `[publish.unix]`: a robot tells where its arm is.
+    /// The sockets of `[publish.unix]`, on which a robot reports the positions of its arm.
     Configured,
 }
 
-/// A daemon whose sockets are bound. Connections wait until it runs.
+/// A daemon whose sockets are bound. Connections wait until the daemon runs.
 pub struct Daemon {
     setup: Setup,
     hello: Hello,
     publishers: Publishers,
-    /// Where the recording goes, if there is one.
+    /// The target of the recording, if there is one.
     target: Option<Target>,
 }
 
-/// The time now, by both clocks.
+/// The current time of CLOCK_MONOTONIC and of the wall clock.
 pub(crate) fn now() -> Stamp {
     let mono = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
     Stamp {
@@ -107,12 +107,12 @@ pub(crate) fn now() -> Stamp {
     }
 }
 
-/// Checks that a daemon can write where `config` says. It only looks, so it cannot see what another
-/// process holds or what the network refuses.
+/// Checks that a daemon can write where `config` says. The check binds nothing, so it cannot detect
+/// a path that another process uses or an address that the network refuses.
 ///
 /// # Errors
 ///
-/// If a socket, the log or a recording cannot be where `config` says.
+/// Fails if a socket, the log or a recording cannot be written where `config` says.
 pub fn check(config: &Config) -> Result<(), Error> {
     log::check(config.log)?;
     publish::check(&config.publish.unix)?;
@@ -127,8 +127,8 @@ impl Daemon {
     ///
     /// # Errors
     ///
-    /// If a socket cannot be bound: its path or address is in use, the path holds another file, or
-    /// the system refuses.
+    /// Fails if the system gives no random numbers, or if a socket cannot be bound: its path or
+    /// address is in use, the path holds another file, or the system refuses.
     pub fn bind(setup: Setup) -> Result<Self, Error> {
         let hello = hello(&setup, run_token().map_err(Error::Random)?);
         let publishers = Publishers::bind(&setup.config)?;
@@ -140,13 +140,13 @@ impl Daemon {
         })
     }
 
-    /// A daemon with `sockets` that records into `file`, which is empty and at `path`, and says in
-    /// `progress` what the file holds. It ends by itself if a sensor is missing at the start, or when
-    /// all sensors are gone.
+    /// A daemon with `sockets` that records into `file`, an empty file at `path`, and reports in
+    /// `progress` what the file holds. The daemon ends by itself if a sensor is missing at the
+    /// start, or when all sensors are lost.
     ///
     /// # Errors
     ///
-    /// If there are no random numbers, or a socket cannot be bound.
+    /// Fails if the system gives no random numbers, or a socket cannot be bound.
     pub fn recording(
         mut setup: Setup,
         path: PathBuf,
@@ -185,20 +185,21 @@ impl Daemon {
     ///
     /// # Errors
     ///
-    /// If a task ends by itself, which is a fault of this program, or the recording fails.
+    /// Fails if a task ends by itself, which is a fault of this program, or if the recording fails.
     pub async fn run(
         self,
         shutdown: impl Future<Output = ()>,
         mut reload: Option<Reload>,
     ) -> Result<(), Error> {
         let mut running = self.start()?;
-        // The log must outlive the last line.
+        // `serve` only borrows `reload`, because `reload` owns the log, which `finish` still uses.
         let ended = running.serve(shutdown, &mut reload).await;
         let recorded = running.finish().await;
         ended.and(recorded)
     }
 
-    /// Starts a task for each sensor and each listener, and says that the daemon is ready.
+    /// Starts a task for each sensor and each listener, and notifies systemd that the daemon is
+    /// ready.
     fn start(self) -> Result<Running, Error> {
         let Self {
             setup,
@@ -261,7 +262,8 @@ fn start_sensors(
     (Sensors(sensors), tasks)
 }
 
-/// The status of every sensor, if every sensor's task and the hub answer. This feeds the watchdog.
+/// The status of every sensor, if every sensor's task and the hub answer. The answer feeds the
+/// watchdog.
 async fn alive(hub: &hub::Handle, sensors: &Sensors) -> Option<Vec<Status>> {
     let statuses = sensors.statuses().await;
     let all = statuses.len() == sensors.0.len();
@@ -304,7 +306,7 @@ fn about(setup: &Setup, hello: &Hello) -> About {
 }
 
 fn hello(setup: &Setup, run: String) -> Hello {
-    // Where /proc is hidden there is no boot id. The run token still tells starts apart.
+    // Where /proc is hidden, there is no boot ID. The run token still distinguishes starts.
     let boot_id = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
     let card = setup.hrn.card();
     Hello {
@@ -333,7 +335,8 @@ fn hello(setup: &Setup, run: String) -> Hello {
     }
 }
 
-/// 64 random bits in hex, so that no two starts of any robots are likely to share a token.
+/// 64 random bits in hex, so that two starts, even of different robots, are unlikely to share a
+/// token.
 fn run_token() -> std::io::Result<String> {
     let mut bytes = [0; 8];
     File::open("/dev/urandom")?.read_exact(&mut bytes)?;

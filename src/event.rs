@@ -1,8 +1,8 @@
-//! What subscribers read: one JSON object a line, protocol 1.
+//! The published format, protocol 1: one JSON object a line.
 //!
-//! The published format is defined here alone. Within a protocol version, fields may be added but
-//! never change their meaning. The order of fields is part of the golden bytes. Nothing here decides
-//! anything: the pipeline fills events in, the hub numbers and publishes them.
+//! The format is defined here alone. Within a protocol version, fields may be added, but no field
+//! ever changes its meaning. The order of fields is part of the golden bytes. Nothing here decides
+//! anything: the pipeline fills events in, and the hub numbers and publishes them.
 
 mod reply;
 
@@ -15,10 +15,10 @@ pub use self::reply::{Hello, ModelCard, Reply, SensorCard, Tared};
 use crate::frame::{COLS, ROWS};
 use crate::verdict::Shore;
 
-/// Version of the format, announced in `hello`.
+/// The version of the format, as announced in `hello`.
 pub const PROTOCOL: u32 = 1;
 
-/// A context is shorter than this, written as JSON without spaces.
+/// A context, written as JSON without spaces, is shorter than this.
 pub const CONTEXT_BYTES: usize = 1024;
 
 /// A numbered or live event of one sensor.
@@ -29,17 +29,17 @@ pub const CONTEXT_BYTES: usize = 1024;
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "type", rename_all = "lowercase")]
 pub enum Event {
-    /// The link changed, or was asked for.
+    /// The link changed, or a client asked for its status.
     Status(Status),
     /// A press began, ended or was aborted.
     Press(Press),
     /// A press was judged.
     Hardness(Hardness),
-    /// One frame; never numbered.
+    /// One frame. Frames are never numbered.
     Frame(FrameEvent),
 }
 
-/// The kinds of [`Event`] a subscriber may ask for.
+/// The kinds of [`Event`] that a subscriber may ask for.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, serde::Deserialize, Serialize,
 )]
@@ -59,7 +59,7 @@ impl Kind {
     /// Every kind.
     pub const ALL: [Kind; 4] = [Kind::Status, Kind::Press, Kind::Hardness, Kind::Frame];
 
-    /// The `type` of its events.
+    /// The `type` of this kind's events.
     pub fn name(self) -> &'static str {
         match self {
             Kind::Status => "status",
@@ -76,7 +76,7 @@ impl Kind {
 }
 
 impl Event {
-    /// Which kind this is.
+    /// The kind of this event.
     pub fn kind(&self) -> Kind {
         match self {
             Event::Status(_) => Kind::Status,
@@ -86,7 +86,7 @@ impl Event {
         }
     }
 
-    /// The sensor it speaks of.
+    /// The name of the event's sensor.
     pub fn sensor(&self) -> &str {
         match self {
             Event::Status(event) => &event.sensor,
@@ -96,7 +96,7 @@ impl Event {
         }
     }
 
-    /// Gives the event its number in the run. A `frame` has none and stays as it is.
+    /// Gives the event its number in the run. A `frame` has no number and stays unchanged.
     pub fn number(&mut self, seq: u64) {
         match self {
             Event::Status(event) => event.seq = Some(seq),
@@ -106,7 +106,7 @@ impl Event {
         }
     }
 
-    /// Its number in the run, once it has one.
+    /// The event's number in the run, once it has one.
     pub fn seq(&self) -> Option<u64> {
         match self {
             Event::Status(event) => event.seq,
@@ -122,123 +122,123 @@ impl Event {
     }
 }
 
-/// State of a sensor's link.
+/// The state of a sensor's link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LinkState {
-    /// Never opened, or open without a frame for under 2.5 periods.
+    /// The port was never opened, or has been open without a frame for less than 2.5 periods.
     Connecting,
     /// Frames arrive.
     Live,
-    /// Open, and silent for too long.
+    /// The port is open, and the sensor has been silent for too long.
     Stale,
-    /// Was open and is gone.
+    /// The port was open and is gone.
     Lost,
 }
 
 impl LinkState {
-    /// All of them.
+    /// Every state.
     pub const ALL: [Self; 4] = [Self::Connecting, Self::Live, Self::Stale, Self::Lost];
 }
 
 /// A sensor's link and its counters.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Status {
-    /// Place in the run; absent in a status sent on request or after `hello`.
+    /// The event's number in the run. Absent in a status sent on request or after `hello`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub seq: Option<u64>,
-    /// Sensor's name.
+    /// The sensor's name.
     pub sensor: String,
-    /// Of the frame concerned, else of now.
+    /// The time of the frame that caused the status, or else the current time.
     #[serde(serialize_with = "rfc3339")]
     pub time: Timestamp,
-    /// State of the link.
+    /// The state of the link.
     pub state: LinkState,
-    /// Why the link is in this state, if that says more.
+    /// The reason for the state, if there is one.
     pub reason: Option<String>,
-    /// Whole frames since start.
+    /// The number of whole frames since the start.
     pub frames: u64,
-    /// Damaged frames since start.
+    /// The number of damaged frames since the start.
     pub frames_damaged: u64,
-    /// Bytes since start that belonged to no whole frame.
+    /// The number of bytes since the start that belonged to no whole frame.
     pub bytes_skipped: u64,
-    /// Measured over the last frames; null before two.
+    /// The frame rate over the last frames. Null before there are two.
     #[serde(serialize_with = "rounded_or_null")]
     pub frame_rate_hz: Option<f64>,
 }
 
-/// What happened to a press.
+/// The state of a press.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum PressState {
-    /// First frame at or above the begin area.
+    /// The first frame at or above the begin area came.
     Begin,
-    /// Released, or timed out.
+    /// The press was released, or timed out.
     End,
-    /// Over without a verdict.
+    /// The press ended without a verdict.
     Aborted,
 }
 
 /// A change of a press.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Press {
-    /// Place in the run.
+    /// The event's number in the run.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub seq: Option<u64>,
-    /// Sensor's name.
+    /// The sensor's name.
     pub sensor: String,
-    /// Of `frame`.
+    /// The time of `frame`.
     #[serde(serialize_with = "rfc3339")]
     pub time: Timestamp,
-    /// Number of the press, from 1, per sensor.
+    /// The number of the press, from 1, per sensor.
     pub press: u64,
-    /// What happened.
+    /// The state of the press.
     pub state: PressState,
-    /// The frame it began with, or its last frame in contact.
+    /// The number of the frame that began the press, or of its last frame in contact.
     pub frame: u64,
     /// `timeout`, `short`, `lost`, `shutdown`, `end of recording`, or null.
     pub reason: Option<&'static str>,
-    /// Frames in contact so far.
+    /// The number of frames in contact so far.
     pub frames: u64,
-    /// What the controller last said it is doing.
+    /// The controller's last context.
     pub context: Option<serde_json::Value>,
 }
 
-/// When in the press it was judged.
+/// The phase of the press at a verdict.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Phase {
-    /// The contact has settled; the press goes on.
+    /// The contact has settled, and the press continues.
     Early,
-    /// The press is over.
+    /// The press has ended.
     Final,
 }
 
-/// Why a verdict was withheld.
+/// The reason why a verdict has no level.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Rejection {
-    /// Confidence below `model.min_confidence`.
+    /// The confidence is below `model.min_confidence`.
     LowConfidence,
-    /// Force below `model.min_force_n`.
+    /// The force is below `model.min_force_n`.
     LowForce,
     /// The conformal set holds more than one level.
     Ambiguous,
 }
 
-/// What was known of the arm's approach.
+/// The source of the arm's approach.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Course {
-    /// Where the arm was, frame by frame.
+    /// The robot sent positions.
     Positions,
-    /// A constant speed while the contact was loaded.
+    /// A constant speed was assumed while the contact was loaded.
     Speed,
-    /// Nothing.
+    /// The approach is unknown.
     None,
 }
 
-/// What a user should know of the chosen frame.
+/// A note on the chosen frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Note {
@@ -246,85 +246,85 @@ pub enum Note {
     AtEdge,
     /// A taxel reads full scale.
     Saturated,
-    /// Force or area lies outside what the model was trained on.
+    /// The force or the area is outside the range of the model's training.
     OutsideTraining,
 }
 
 /// A verdict.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Hardness {
-    /// Place in the run.
+    /// The event's number in the run.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub seq: Option<u64>,
-    /// Sensor's name.
+    /// The sensor's name.
     pub sensor: String,
-    /// Time of the chosen frame.
+    /// The time of the chosen frame.
     #[serde(serialize_with = "rfc3339")]
     pub time: Timestamp,
-    /// Number of the press.
+    /// The number of the press.
     pub press: u64,
-    /// Early or final.
+    /// Whether the verdict is early or final.
     pub phase: Phase,
-    /// 1..L, or null when rejected.
+    /// The level, 1..L, or null when rejected.
     pub level: Option<u8>,
     /// The model's label of the level, or null when rejected.
     pub label: Option<String>,
-    /// Why there is no level.
+    /// The reason why there is no level.
     pub rejected: Option<Rejection>,
-    /// What to know of the chosen frame.
+    /// The notes on the chosen frame.
     pub notes: Vec<Note>,
-    /// One a level; they sum to 1. Published with six digits after the point.
+    /// One probability for each level; their sum is 1. Published with six digits after the point.
     #[serde(serialize_with = "millionths")]
     pub probabilities: Vec<f32>,
     /// The largest probability. Published with six digits after the point.
     #[serde(serialize_with = "rounded_6")]
     pub confidence: f32,
-    /// The chosen frame: maximal contact area.
+    /// The number of the chosen frame, which has the maximal contact area.
     pub frame: u64,
-    /// Contact area of the chosen frame in taxels.
+    /// The contact area of the chosen frame in taxels.
     pub contact_area_taxels: u32,
-    /// The same in mm2.
+    /// The contact area of the chosen frame in mm2.
     #[serde(serialize_with = "rounded_3")]
     pub contact_area_mm2: f64,
-    /// Total force of the chosen frame in newtons.
+    /// The total force of the chosen frame in newtons.
     #[serde(serialize_with = "rounded_3")]
     pub force_n: f64,
-    /// First 12 hex digits of the model file's SHA-256.
+    /// The first 12 hex digits of the model file's SHA-256.
     pub model: String,
-    /// State of the link.
+    /// The state of the link.
     pub state: LinkState,
-    /// What the controller last said it is doing.
+    /// The controller's last context.
     pub context: Option<serde_json::Value>,
-    /// CLOCK_MONOTONIC at the chosen frame's last byte; null in a replay.
+    /// CLOCK_MONOTONIC at the arrival of the chosen frame's last byte; null in a replay.
     pub mono_ns: Option<u64>,
-    /// Age of the chosen frame at publication; null in a replay.
+    /// The age of the chosen frame at publication; null in a replay.
     pub age_at_publish_ms: Option<f64>,
-    /// From the arrival of the byte that made the decision possible; null in a replay.
+    /// The time since the arrival of the byte that made the verdict possible; null in a replay.
     pub latency_us: Option<u64>,
-    /// Shore hardness with its 90 % interval; null unless the model judges courses.
+    /// The Shore hardness with its 90 % interval; null unless the model judges courses.
     #[serde(serialize_with = "shore")]
     pub shore: Option<Shore>,
     /// The levels that the model cannot tell apart; null without a conformal threshold.
     pub levels: Option<Vec<u8>>,
-    /// What was known of the approach; null unless the model judges courses.
+    /// The source of the approach; null unless the model judges courses.
     pub course: Option<Course>,
-    /// Slope of force against indentation at the end of loading; null where unknown.
+    /// The slope of force against indentation at the end of loading; null if unknown.
     #[serde(serialize_with = "rounded_or_null")]
     pub stiffness_n_per_mm: Option<f64>,
-    /// When that byte came, on CLOCK_MONOTONIC; not published.
+    /// The arrival of the byte that made the verdict possible, on CLOCK_MONOTONIC. Not published.
     #[serde(skip)]
     pub arrival: Duration,
 }
 
-/// One frame, tared as far as the sensor is.
+/// One frame in newtons, tared if the first tare has been taken.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FrameEvent {
-    /// Sensor's name.
+    /// The sensor's name.
     pub sensor: String,
-    /// Of the frame's last byte.
+    /// The arrival of the frame's last byte.
     #[serde(serialize_with = "rfc3339")]
     pub time: Timestamp,
-    /// Number of the frame, from 0, per sensor.
+    /// The number of the frame, from 0, per sensor.
     pub frame: u64,
     /// Always 28.
     pub rows: usize,
@@ -333,12 +333,13 @@ pub struct FrameEvent {
     /// `[rows, cols]` flattened, row-major, rounded to 0.001 N.
     #[serde(serialize_with = "millinewtons")]
     pub newtons: Vec<f32>,
-    /// Taxels at or above the contact threshold then in force.
+    /// The number of taxels at or above the contact threshold.
     pub contact_area_taxels: u32,
-    /// False until the first tare is taken: newtons then still contain the unloaded sensor's.
+    /// False until the first tare is taken: until then, `newtons` contain those of the unloaded
+    /// sensor.
     pub tared: bool,
-    /// During a press: how far the arm went since its begin, by what was told up to now. For views; the
-    /// verdict knows more exactly.
+    /// During a press: how far the arm went since the press began, by the positions up to now. This
+    /// is for views; the verdict has a more exact value.
     #[serde(serialize_with = "rounded")]
     pub approach_mm: Option<f64>,
 }
@@ -374,8 +375,8 @@ fn line<T: Serialize>(value: &T) -> String {
     text
 }
 
-/// The name under which a state, phase or note is published. The log, the metrics and recordings use
-/// it too.
+/// The name under which a state, phase or note is published. The log, the metrics and recordings
+/// use it too.
 pub(crate) fn name(state: &impl Serialize) -> String {
     match serde_json::to_value(state) {
         Ok(serde_json::Value::String(name)) => name,
@@ -383,12 +384,12 @@ pub(crate) fn name(state: &impl Serialize) -> String {
     }
 }
 
-/// RFC 3339 in UTC with microseconds, so that every time has one width.
+/// The time by RFC 3339 in UTC with microseconds, so that every time has the same width.
 pub(crate) fn time_text(time: Timestamp) -> String {
     format!("{time:.6}")
 }
 
-/// To a micrometre.
+/// Rounds to a micrometre.
 fn rounded<S: Serializer>(mm: &Option<f64>, serializer: S) -> Result<S::Ok, S::Error> {
     mm.map(|mm| (mm * 1e3).round() / 1e3).serialize(serializer)
 }
@@ -435,7 +436,8 @@ fn round_3(value: f64) -> f64 {
     (value * 1e3).round() / 1e3
 }
 
-/// More digits mean nothing: an f32 has seven, and a calibrated probability is good for two or three.
+/// Rounds to six digits. More would mean nothing: an f32 has seven, and a calibrated probability is
+/// good for two or three.
 fn round_6(value: f32) -> f64 {
     (f64::from(value) * 1e6).round() / 1e6
 }

@@ -1,7 +1,8 @@
 //! One instant of the sensor: 28x28 taxels, row-major.
 //!
-//! A [`RawFrame`] is in counts, as it came off the wire. A [`Frame`] is in newtons, after tare and
-//! with dead taxels replaced. Only `tare` makes the second from the first, so raw counts cannot
+//! A [`RawFrame`] is in counts, as the sensor sent them. A [`Frame`] is in newtons, after tare and
+//! with dead taxels replaced. Only `tare` makes a [`Frame`] from a [`RawFrame`], so raw counts
+//! cannot
 //! reach the press tracker.
 
 pub mod sparse;
@@ -10,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 /// Rows of a frame, and of the network's input (paper, "Tactile sensor").
 pub const ROWS: usize = 28;
-/// Columns of a frame.
+/// Columns of a frame, and of the network's input.
 pub const COLS: usize = 28;
 /// Taxels in a frame.
 pub const TAXELS: usize = ROWS * COLS;
@@ -30,7 +31,7 @@ impl Default for RawFrame {
     }
 }
 
-/// Prints the sum and the peak: 784 numbers in a log or a failed assertion help nobody.
+/// Prints the sum and the peak, because 784 numbers are unreadable in a log or a failed assertion.
 impl std::fmt::Debug for RawFrame {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let sum: u32 = self.counts.iter().map(|&count| u32::from(count)).sum();
@@ -89,13 +90,13 @@ impl From<Frame> for Vec<f32> {
     }
 }
 
-/// Numbers that are no frame.
+/// The reason why numbers are not a frame.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum FrameError {
-    /// A force that no taxel bears.
+    /// The force is negative or not finite.
     #[error("found {0} N at a taxel, expected 0 or more")]
     Newtons(f32),
-    /// Too many taxels, or too few.
+    /// There are too many or too few taxels.
     #[error("found {0} taxels, expected {TAXELS}")]
     Length(usize),
 }
@@ -114,7 +115,8 @@ impl TryFrom<Vec<f32>> for Frame {
     }
 }
 
-/// One value a taxel, as a list, for `#[serde(with)]`: serde itself knows no arrays of this length.
+/// Writes one value for each taxel as a list, for `#[serde(with)]`. Serde itself supports no arrays
+/// of this length.
 pub(crate) mod taxels {
     use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error};
 
@@ -139,7 +141,7 @@ pub(crate) mod taxels {
 }
 
 impl Frame {
-    /// Contact area in taxels: those at or above `threshold_n`.
+    /// The contact area: the number of taxels at or above `threshold_n`.
     pub fn contact_area_taxels(&self, threshold_n: f32) -> u32 {
         self.newtons
             .iter()
@@ -147,13 +149,14 @@ impl Frame {
             .sum()
     }
 
-    /// Total force in newtons, summed in f64 so that the order of taxels does not show.
+    /// The total force in newtons. It is summed in f64, so the order of taxels makes no difference.
     pub fn force_n(&self) -> f64 {
         self.newtons.iter().map(|&n| f64::from(n)).sum()
     }
 }
 
-/// The sensor's own array. In a frame it is centred: at offset floor((28 - n) / 2).
+/// The size of the sensor's own array. The array is centred in a frame: at offset floor((28 - n) /
+/// 2).
 ///
 /// # Example
 ///
@@ -181,12 +184,12 @@ impl Array {
         cols: COLS,
     };
 
-    /// Place in the frame of the array's own `row` and `col`.
+    /// The place in the frame of the array's own `row` and `col`.
     pub fn place(self, row: usize, col: usize) -> usize {
         (row + (ROWS - self.rows) / 2) * COLS + col + (COLS - self.cols) / 2
     }
 
-    /// The array's own row and column of a place in the frame; `None` outside the array.
+    /// The array's own row and column of a place in the frame, or `None` outside the array.
     pub fn position(self, place: usize) -> Option<(usize, usize)> {
         let row = (place / COLS).checked_sub((ROWS - self.rows) / 2)?;
         let col = (place % COLS).checked_sub((COLS - self.cols) / 2)?;
@@ -200,12 +203,12 @@ impl Array {
     }
 }
 
-/// When something came, on two clocks: one that never jumps, for durations, and the calendar, for
+/// The arrival time on two clocks: one that never jumps, for durations, and the calendar, for
 /// people.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Stamp {
-    /// CLOCK_MONOTONIC.
+    /// The time by CLOCK_MONOTONIC.
     pub mono: std::time::Duration,
-    /// UTC.
+    /// The time in UTC.
     pub wall: jiff::Timestamp,
 }

@@ -2,9 +2,9 @@
 //! subscribers, and only the two ends touch the world.
 //!
 //! The modules are in reading order. Each module from [`frame`] to [`random`] uses only the modules
-//! above it. These modules do no I/O, wait for nothing and ask no clock: callers pass in the bytes and
-//! the time at which they arrived. [`recording`] is also given a reader or a writer. `daemon`, `tools`
-//! and `train` are the two ends that touch the world.
+//! above it. These modules do no I/O, wait for nothing and ask no clock: callers pass in the bytes
+//! and the time at which they arrived. [`recording`] is also given a reader or a writer. `daemon`,
+//! `tools` and `train` are the two ends that touch the world.
 
 pub mod frame;
 pub mod colour;

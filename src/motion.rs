@@ -1,8 +1,8 @@
-//! Where the arm is: the positions that a robot tells, and what they say of a press.
+//! The positions of a robot's arm, and how far the arm went during a press.
 //!
 //! In: [`Point`]s, and the moments of a press's frames. Out: how far the arm went since the press
-//! began, or nothing where that is not certain. It never guesses: it interpolates between two
-//! points, but goes beyond none. It reads no clock.
+//! began, or nothing if that is uncertain. This module never guesses: it interpolates between two
+//! points, but never extrapolates. It reads no clock.
 
 mod settings;
 
@@ -13,14 +13,15 @@ use serde::{Deserialize, Serialize};
 
 pub use self::settings::{SPEEDS_MM_S, Settings, SettingsError};
 
-/// Where the arm was at a moment.
+/// The position of the arm at one moment.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(into = "(i64, f64)", from = "(i64, f64)")]
 pub struct Point {
-    /// CLOCK_MONOTONIC, in nanoseconds. In a recording without times it counts from the first frame
-    /// and may be negative.
+    /// The time by CLOCK_MONOTONIC, in nanoseconds. In a recording without times it counts from the
+    /// first frame and may be negative.
     pub at_ns: i64,
-    /// Along the press's direction, growing towards the object. Any zero.
+    /// The position along the press's direction, which grows towards the object. Its zero is
+    /// arbitrary.
     pub mm: f64,
 }
 
@@ -36,33 +37,33 @@ impl From<(i64, f64)> for Point {
     }
 }
 
-/// Points are held for this long after they were told.
+/// How long points are held after they arrive.
 pub const HELD: Duration = Duration::from_secs(60);
-/// Between two points that are further apart in time, nobody knows where the arm was.
+/// The longest time between two points. In a longer gap, the position of the arm is unknown.
 pub const LONGEST_GAP: Duration = Duration::from_millis(250);
-/// Between two points that are further apart in space, one of them is wrong.
+/// The longest way between two points. If two points are further apart, one of them is wrong.
 pub const LONGEST_JUMP_MM: f64 = 20.0;
-/// No position is further from its zero.
+/// The largest distance of a position from its zero.
 pub const FURTHEST_MM: f64 = 1e6;
-/// The most points that are held: a little over a minute at 1000 a second.
+/// The most points that are held: a little over a minute at 1000 points a second.
 const MOST_POINTS: usize = 1 << 16;
-/// The most stretches that are remembered as unusable. When there are more, the oldest two become
-/// one.
+/// The most unusable stretches that are remembered. When there are more, the two oldest stretches
+/// become one.
 const MOST_DOUBTS: usize = 16;
 
 const HELD_NS: i64 = HELD.as_nanos() as i64;
 const LONGEST_GAP_NS: i64 = LONGEST_GAP.as_nanos() as i64;
 
-/// A point whose moment is not after that of the point before it.
+/// The error of a point that is not later than the point before it.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[error(
     "found a step of {back_ms} ms back in time, expected points in order: the approach is unknown \
      for the press it falls in"
 )]
 pub struct StepBack {
-    /// Which of the points.
+    /// The index of the point.
     pub index: usize,
-    /// How far back.
+    /// How far the point goes back in time.
     pub back_ms: f64,
 }
 
@@ -70,7 +71,7 @@ pub struct StepBack {
 ///
 /// # Example
 ///
-/// The arm goes 5 mm a second, and a press begins at 2 s.
+/// The arm moves at 5 mm/s, and a press begins at 2 s.
 ///
 /// ```
 /// use std::time::Duration;
@@ -93,25 +94,25 @@ pub struct StepBack {
 /// ```
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Track {
-    /// Forward in time.
+    /// The points, ascending in time.
     points: VecDeque<Point>,
-    /// First and last moment of stretches in which a step back was told.
+    /// The first and the last moment of each stretch in which time stepped back.
     doubts: VecDeque<(i64, i64)>,
-    /// Points told since the start.
+    /// The number of points since the start.
     told: u64,
-    /// Those among them that came after the verdict that they belong to.
+    /// The number of points that came after the verdict that they belong to.
     late: u64,
-    /// The last moment that a final verdict rests on.
+    /// The last moment of the last press that has a final verdict.
     judged_ns: Option<i64>,
 }
 
 impl Track {
-    /// Takes in what the robot tells. `points` are finite.
+    /// Takes in points from the robot. `points` are finite.
     ///
     /// # Errors
     ///
-    /// [`StepBack`], for the first point that is not after the one before it. All points are taken
-    /// in nevertheless: a clock that was set back goes on from there.
+    /// Returns a [`StepBack`] for the first point that is not later than the point before it. All
+    /// points are taken in nevertheless: after a clock was set back, points continue from there.
     pub fn push(&mut self, points: &[Point]) -> Result<(), StepBack> {
         let mut first_back = None;
         for (index, &point) in points.iter().enumerate() {
@@ -147,7 +148,7 @@ impl Track {
         }
     }
 
-    /// Drops what is older than [`HELD`] at `latest`.
+    /// Drops everything that is older than [`HELD`] at `latest`.
     fn forget(&mut self, latest: i64) {
         let oldest = latest.saturating_sub(HELD_NS);
         while self.points.front().is_some_and(|p| p.at_ns < oldest) {
@@ -156,29 +157,29 @@ impl Track {
         self.doubts.retain(|&(_, to)| to >= oldest);
     }
 
-    /// Points told since the start, and those among them that came too late.
+    /// The number of points since the start, and the number of points that came too late.
     pub fn counts(&self) -> (u64, u64) {
         (self.told, self.late)
     }
 
-    /// Whether the robot tells positions: whether there are any of the last minute before `now`.
+    /// Whether the robot sends positions: whether there are any from the last minute before `now`.
     pub fn is_told(&self, now: Duration, delay_ms: f64) -> bool {
         let oldest = of_arm(now, delay_ms).saturating_sub(HELD_NS);
         self.points.back().is_some_and(|p| p.at_ns >= oldest)
     }
 
-    /// A final verdict was given on a press whose last frame is of `last`: a position up to then
-    /// comes too late from now on.
+    /// Remembers that a press whose last frame came at `last` has its final verdict. From now on, a
+    /// position up to that moment counts as late.
     pub fn judged(&mut self, last: Duration, delay_ms: f64) {
         self.judged_ns = Some(of_arm(last, delay_ms));
     }
 
-    /// How far the arm went from `begin` to each of `moments`, in mm. The moments ascend and are
-    /// those of frames; the arm's stamps are `delay_ms` earlier. A moment after the latest position
-    /// has `None`.
+    /// How far the arm went from `begin` to each of `moments`, in mm. The moments are those of
+    /// frames, and ascend. The arm's stamps are `delay_ms` earlier. A moment after the latest
+    /// position has `None`.
     ///
-    /// `None` for all of them, if from `begin` to the last moment there is a gap, a jump or a step
-    /// back in time, or if `begin` is not within what was told.
+    /// Returns `None` if there is a gap, a jump or a step back in time between `begin` and the last
+    /// moment, or if the points do not cover `begin`.
     pub fn approach(
         &self,
         begin: Duration,
@@ -208,14 +209,14 @@ impl Track {
         Some(moments.map(|at| Some(self.at(at)? - zero)).collect())
     }
 
-    /// How far the arm had gone since `begin` by what was told up to `now`. It is behind `now` by as much
-    /// as positions are late, 250 ms at most. `None`, where [`Self::approach`] knows nothing.
+    /// How far the arm went since `begin`, by the points up to `now`. The answer lags behind `now`
+    /// as positions do, by 250 ms at most. `None` if [`Self::approach`] has no answer.
     pub fn latest(&self, begin: Duration, now: Duration, delay_ms: f64) -> Option<f64> {
         let known = self.approach(begin, &[now], delay_ms)?;
         known[0].or_else(|| Some(self.points.back()?.mm - self.at(of_arm(begin, delay_ms))?))
     }
 
-    /// Where the arm was, between two points or at one.
+    /// The position of the arm at a point or between two points.
     fn at(&self, at_ns: i64) -> Option<f64> {
         let next = self.points.partition_point(|p| p.at_ns < at_ns);
         let next = self.points.get(next).map(|point| (next, point))?;
@@ -227,12 +228,12 @@ impl Track {
         Some(before.mm + part * (next.1.mm - before.mm))
     }
 
-    /// What is needed for presses that begin at `since` or later: a recording holds no more.
+    /// The points that presses from `since` on need. A recording holds no more.
     #[must_use]
     pub fn since(&self, since: Duration) -> Self {
         let since = of_arm(since, settings::DELAYS_MS.1);
         let first = self.points.partition_point(|p| p.at_ns <= since);
-        // The newest point says that the robot tells positions, however old it is.
+        // Keep the newest point, however old it is: it shows that the robot sends positions.
         let first = first
             .saturating_sub(1)
             .min(self.points.len().saturating_sub(1));
@@ -248,7 +249,7 @@ impl Track {
         }
     }
 
-    /// Whether points can have made this track.
+    /// Whether points can have made this track. A damaged recording may hold an impossible one.
     pub(crate) fn is_possible(&self) -> bool {
         let ascends = |(one, next): (&Point, &Point)| one.at_ns < next.at_ns;
         let span = self.points.front().zip(self.points.back());
@@ -264,17 +265,17 @@ impl Track {
     }
 }
 
-/// No moment is further from zero: differences of two fit an i64.
+/// The furthest moment from zero. With it, the difference of two moments fits an i64.
 const FURTHEST_NS: i64 = i64::MAX / 4;
 
 impl Point {
-    /// Whether moment and position are within their bounds.
+    /// Whether the moment and the position are within their bounds.
     pub fn is_usable(&self) -> bool {
         (-FURTHEST_NS..=FURTHEST_NS).contains(&self.at_ns) && self.mm.abs() <= FURTHEST_MM
     }
 }
 
-/// The moment of a frame by the arm's stamps.
+/// The moment of a frame on the clock of the arm's stamps.
 fn of_arm(frame: Duration, delay_ms: f64) -> i64 {
     let frame = i64::try_from(frame.as_nanos()).unwrap_or(FURTHEST_NS);
     frame.min(FURTHEST_NS) - (delay_ms * 1e6).round() as i64

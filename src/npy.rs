@@ -1,91 +1,92 @@
-//! One numpy array: what its header says, then its numbers.
+//! Reader and writer of one numpy array: a header, then numbers.
 //!
-//! In: the bytes of an `.npy` file, alone or within an `.npz` file. Out: a [`Header`] and elements; and
-//! back. A parser goes over the header once and reads only three keys; the header's length is bounded.
-//! Nothing is unpacked that the header does not ask for.
+//! In: the bytes of an `.npy` file, alone or within an `.npz` file. Out: a [`Header`] and elements.
+//! [`to_bytes`] is the way back. The parser goes over the header once and reads only three keys;
+//! the header's length is bounded. It unpacks no more bytes than the header asks for.
 
 use std::io::{self, Read};
 
-/// Longest header that is read, in bytes: numpy's own have about a hundred, and it reads ten thousand.
+/// The longest header that is read, in bytes. Numpy writes about a hundred bytes and reads ten
+/// thousand.
 const LONGEST_HEADER: usize = 10_000;
-/// Most dimensions of an array.
+/// The largest number of dimensions.
 const MOST_DIMENSIONS: usize = 8;
-/// Bytes unpacked at once.
+/// The number of bytes that are unpacked at once.
 const BLOCK_BYTES: usize = 1 << 16;
 
-/// What an array's header says.
+/// The header of an array.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Header {
-    /// Type of its elements, as numpy writes it: `<f4`.
+    /// The type of the elements, as numpy writes it: `<f4`.
     pub descr: String,
     /// Whether the first axis changes fastest.
     pub fortran_order: bool,
-    /// Length of each axis.
+    /// The length of each axis.
     pub shape: Vec<usize>,
 }
 
-/// What was found in place of an array. Each message continues "found".
+/// The reason why bytes are not a usable array. Each message follows the word "found".
 #[derive(Debug, thiserror::Error)]
 pub enum NpyError {
-    /// Other bytes.
+    /// The magic bytes are missing.
     #[error("no .npy array")]
     Magic,
-    /// A format that is newer than this reader.
+    /// The format is newer than this reader.
     #[error("an .npy array of version {0}")]
     Version(u8),
-    /// A header that no array needs.
+    /// The header is too long.
     #[error("a header of {0} bytes, of which at most {LONGEST_HEADER} are read")]
     LongHeader(usize),
-    /// A header that is not UTF-8.
+    /// The header is not UTF-8.
     #[error("a header that is no text")]
     NoText,
-    /// A key that no header has, or one that comes twice.
+    /// A key is unknown, or occurs twice.
     #[error("a header with {0:?}")]
     Key(String),
-    /// Another character than the one that has to follow.
+    /// A character is not the expected one.
     #[error("a header with {found:?} where `{expected}` should be")]
     Character {
-        /// The text from there on.
+        /// The text from that character on.
         found: String,
-        /// The character.
+        /// The expected character.
         expected: char,
     },
-    /// A quote without its other end.
+    /// A quoted text has no closing quote.
     #[error("a header with a text that does not end")]
     OpenText,
-    /// Neither `True` nor `False`.
+    /// A value is neither `True` nor `False`.
     #[error("a header with {0:?} as truth")]
     Truth(String),
-    /// An axis whose length is no number.
+    /// The length of an axis is not a number.
     #[error("a length {0:?}")]
     Length(String),
-    /// More axes than are read.
+    /// The array has too many axes.
     #[error("more than {MOST_DIMENSIONS} dimensions")]
     Dimensions,
-    /// More text after the header.
+    /// There is more text after the header.
     #[error("a header that ends with {0:?}")]
     Trailing(String),
-    /// A key that every header has.
+    /// The header lacks a key.
     #[error("a header without `{0}`")]
     Missing(&'static str),
-    /// Fewer elements than the header says.
+    /// There are fewer elements than the header says.
     #[error("{found} elements of {expected}")]
     Few {
-        /// Those that are there.
+        /// The number of elements in the file.
         found: usize,
-        /// Those that should be.
+        /// The number of elements by the header.
         expected: usize,
     },
-    /// More elements than the header says.
+    /// There are more elements than the header says.
     #[error("more than {0} elements")]
     Many(usize),
-    /// Elements of another type.
+    /// The elements have the wrong type.
     #[error("dtype '{0}'")]
     Type(String),
-    /// Another shape than that of a table.
+    /// The shape is not that of a table.
     #[error("an array of shape {0:?}")]
     Shape(Vec<usize>),
-    /// The end of the file.
+    /// The file ends too early.
     #[error("an array that is cut off")]
     CutOff,
     /// The bytes cannot be read or unpacked.
@@ -106,7 +107,7 @@ impl From<io::Error> for NpyError {
 ///
 /// # Errors
 ///
-/// [`NpyError`], if there is no header that can be read.
+/// Returns an [`NpyError`] if there is no header or an unreadable one.
 pub fn header(reader: &mut impl Read) -> Result<Header, NpyError> {
     let mut start = [0; 8];
     reader.read_exact(&mut start)?;
@@ -136,11 +137,12 @@ pub fn header(reader: &mut impl Read) -> Result<Header, NpyError> {
     Text(text.as_str()).header()
 }
 
-/// Reads `count` elements of `SIZE` bytes, and no more. Room is made for those that are there.
+/// Reads `count` elements of `SIZE` bytes, and no more. It allocates memory only for elements that
+/// are there.
 ///
 /// # Errors
 ///
-/// [`NpyError`], if there are fewer or more, or they cannot be unpacked.
+/// Returns an [`NpyError`] if there are fewer or more elements, or they cannot be unpacked.
 pub fn elements<const SIZE: usize, T>(
     reader: &mut impl Read,
     count: usize,
@@ -167,7 +169,7 @@ pub fn elements<const SIZE: usize, T>(
     match reader.read(&mut [0]) {
         Ok(0) => Ok(values),
         Ok(_) => Err(NpyError::Many(count)),
-        // The checksum is compared at the end.
+        // The unpacker compares the checksum at the end, and reports a difference here.
         Err(error) => Err(error.into()),
     }
 }
@@ -176,7 +178,7 @@ pub fn elements<const SIZE: usize, T>(
 ///
 /// # Errors
 ///
-/// [`NpyError`], if it is another array, or none.
+/// Returns an [`NpyError`] if the bytes are not an array, or not a table of f32.
 pub fn table(reader: &mut impl Read) -> Result<Vec<Vec<f32>>, NpyError> {
     let Header {
         descr,
@@ -200,7 +202,7 @@ pub fn table(reader: &mut impl Read) -> Result<Vec<Vec<f32>>, NpyError> {
     Ok((0..rows).map(row).collect())
 }
 
-/// The rest of a header's text.
+/// The part of a header's text that is not parsed yet.
 struct Text<'a>(&'a str);
 
 impl<'a> Text<'a> {
@@ -231,7 +233,7 @@ impl<'a> Text<'a> {
         })
     }
 
-    /// Whether `char` comes next; then it is taken.
+    /// Takes `char` if it comes next, and says whether it did.
     fn take(&mut self, char: char) -> bool {
         self.0 = self.0.trim_start();
         match self.0.strip_prefix(char) {
@@ -297,21 +299,22 @@ impl<'a> Text<'a> {
     }
 }
 
-/// The beginning of a text of which little is said.
+/// The beginning of `text`, for a message.
 fn short(text: &str) -> String {
     text.chars().take(20).collect()
 }
 
-/// The bytes of an array of f32 with this many rows and columns, row by row, as numpy reads it.
+/// The bytes of an array of f32 with `rows` rows and `cols` columns, row by row, in numpy's format.
 ///
 /// # Panics
 ///
-/// If there is another number of `values`.
+/// Panics if there are not `rows * cols` values.
 pub fn to_bytes(values: &[f32], rows: usize, cols: usize) -> Vec<u8> {
     assert_eq!(values.len(), rows * cols, "a value for each row and column");
     let mut text =
         format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({rows}, {cols}), }}");
-    // Magic, version, length and text together have a multiple of 64 bytes; the text ends with a newline.
+    // Magic, version, length and text together are a multiple of 64 bytes, and the text ends with a
+    // newline.
     const BEFORE_TEXT: usize = 10;
     let length = (BEFORE_TEXT + text.len() + 1).next_multiple_of(64) - BEFORE_TEXT;
     text = format!("{text:<width$}\n", width = length - 1);
@@ -392,7 +395,7 @@ mod tests {
         }
     }
 
-    /// Bytes without an end, and how many were asked for.
+    /// A reader of endless bytes. It counts the bytes that were asked for.
     struct Endless(usize);
 
     impl Read for Endless {

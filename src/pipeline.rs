@@ -1,8 +1,8 @@
-//! The whole core, for one sensor: bytes and the moment they came go in, events come out.
+//! The whole core for one sensor: bytes and their arrival times go in, events come out.
 //!
-//! It owns the sensor's numbers (frames, presses, damage) and its link state, which go on over
-//! reconnects. It never waits, never logs and never asks the time: [`Pipeline::deadline`] says
-//! when it must be told that time has passed.
+//! A pipeline owns the sensor's counts (frames, presses, damage) and its link state, which continue
+//! over reconnects. It never waits, never logs and never asks the time: [`Pipeline::deadline`] says
+//! when the caller must call [`Pipeline::tick`].
 
 mod course;
 mod events;
@@ -27,16 +27,16 @@ use crate::tare::{self, Aim, Contact, RetareError, Tare};
 use crate::verdict::{Hrn, ModelError};
 use crate::wire::{Decoded, Decoder};
 
-/// Where the times of frames come from.
+/// The source of the frames' times.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Clock {
-    /// The moment the frame's last byte came.
+    /// The time of a frame is when its last byte came.
     Arrival,
-    /// Frame n comes n periods after 1970-01-01T00:00:00Z: bytes without times.
+    /// Frame n comes n periods after 1970-01-01T00:00:00Z. This is for bytes without times.
     FrameRate,
 }
 
-/// A changed description that a running pipeline cannot take over.
+/// The error of a changed description that a running pipeline cannot take over.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("{key} cannot change while the sensor runs")]
 pub struct FixedError {
@@ -44,20 +44,20 @@ pub struct FixedError {
     pub key: &'static str,
 }
 
-/// A verdict that was due, but the model failed.
+/// A verdict that is missing because the model failed.
 #[derive(Debug)]
 pub struct Unjudged {
-    /// Name of the sensor.
+    /// The sensor's name.
     pub sensor: String,
-    /// Number of the press.
+    /// The press's number.
     pub press: u64,
-    /// When in the press it was to be judged.
+    /// The phase of the verdict.
     pub phase: Phase,
-    /// How the model failed.
+    /// The model's error.
     pub error: ModelError,
 }
 
-/// The rate is measured over this many frames.
+/// The number of frames over which the frame rate is measured.
 const RATE_FRAMES: usize = 32;
 
 /// The state of one sensor.
@@ -71,38 +71,38 @@ pub struct Pipeline {
     tracker: PressTracker,
     track: Track,
     seen: Seen,
-    /// When the last of the bytes came that are being decoded.
+    /// When the last of the bytes came that are now decoded.
     arrival: Duration,
-    /// Verdicts that did not come, until they are fetched.
+    /// The missing verdicts that are not fetched yet.
     unjudged: Vec<Unjudged>,
 }
 
-/// What the pipeline itself knows of the past.
+/// The pipeline's own state.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Seen {
     link: Link,
     context: Option<serde_json::Value>,
-    /// Speed of the approach when the press under way, or the last one, began.
+    /// The speed of the approach when the press under way, or the last one, began.
     #[serde(default)]
     speed_mm_s: Option<f64>,
-    /// A model of the course judges the press under way when it has this many frames in contact;
-    /// the greatest number once its early verdict has come.
+    /// The number of frames in contact at which a model of the course next judges the press under
+    /// way. It is the greatest number once the early verdict has come.
     #[serde(default)]
     next_look: u64,
     frames: u64,
     frames_damaged: u64,
-    /// Ends of recent chunks in the stream, and when they came.
+    /// The ends of recent chunks in the stream, and when they came.
     chunks: VecDeque<(u64, Stamp)>,
-    /// When the latest frames came.
+    /// The arrival times of the latest frames.
     recent: VecDeque<Duration>,
     last_bytes: Option<Duration>,
     last_frame: Option<Stamp>,
-    /// State and reason of the last status published.
+    /// State and reason of the last published status.
     told: (LinkState, Option<String>),
 }
 
 impl Pipeline {
-    /// A pipeline of a sensor whose port has not been opened; `hrn` judges.
+    /// A pipeline of a sensor whose port has not been opened. The model is `hrn`.
     ///
     /// # Example
     ///
@@ -165,17 +165,18 @@ impl Pipeline {
         }
     }
 
-    /// Counts whole frames and damaged ones since the start.
+    /// The number of whole frames and the number of damaged frames since the start.
     pub fn frame_counts(&self) -> (u64, u64) {
         (self.seen.frames, self.seen.frames_damaged)
     }
 
-    /// Takes over a changed description of the sensor, and the model that judges from now on. The
+    /// Takes over a changed description of the sensor, and the model for verdicts from now on. The
     /// baseline and a press under way stay.
     ///
     /// # Errors
     ///
-    /// If the description differs in what cannot change while it runs. Nothing has changed then.
+    /// Returns an error if the description differs in a key that cannot change while the sensor
+    /// runs. Nothing has changed then.
     pub fn reload(&mut self, sensor: Sensor, hrn: Arc<Hrn>) -> Result<(), FixedError> {
         let described = sensor.description();
         if let Some(key) = self.sensor.description().fixed_difference(described) {
@@ -189,13 +190,13 @@ impl Pipeline {
         Ok(())
     }
 
-    /// Takes another tare from the next frames on; [`Self::retared`] says what became of it. It is
-    /// taken too when a press has timed out and is not released: that mends a drift which looks
-    /// like a press.
+    /// Takes another tare from the next frames on. [`Self::retared`] returns its outcome. A tare is
+    /// also allowed when a press has timed out and is not released, because this removes a drift
+    /// that looks like a press.
     ///
     /// # Errors
     ///
-    /// If one cannot be taken now: see [`RetareError`]. Nothing has changed then.
+    /// Returns a [`RetareError`] if no tare can be taken now. Nothing has changed then.
     pub fn retare(&mut self) -> Result<(), RetareError> {
         if self.tracker.is_pressed() {
             return Err(RetareError::Pressed);
@@ -206,7 +207,7 @@ impl Pipeline {
         self.tare.retake()
     }
 
-    /// What became of a tare that was asked for, once.
+    /// The outcome of the requested tare. The next call returns `None`.
     pub fn retared(&mut self) -> Option<Result<Tared, RetareError>> {
         let sensor = self.sensor.name();
         let tared = |tare::Retaken { old, new }| Tared {
@@ -217,46 +218,47 @@ impl Pipeline {
         self.tare.ended().map(|outcome| outcome.map(tared))
     }
 
-    /// Takes what the controller says it is doing. Presses and verdicts echo it until it changes.
+    /// Takes the controller's context. Presses and verdicts repeat it until it changes.
     pub fn set_context(&mut self, context: Option<serde_json::Value>) {
         self.seen.context = context;
     }
 
-    /// Takes what the robot tells of where its arm is. `points` are finite.
+    /// Takes positions of the arm from the robot. `points` are finite.
     ///
     /// # Errors
     ///
-    /// As [`Track::push`]: the points are taken nevertheless.
+    /// Returns the errors of [`Track::push`]. The points are taken nevertheless.
     pub fn tell(&mut self, points: &[Point]) -> Result<(), StepBack> {
         self.track.push(points)
     }
 
-    /// Positions told since the start, and those among them that came too late for their verdict.
+    /// The number of positions since the start, and the number of them that came too late for their
+    /// verdict.
     pub fn motion_counts(&self) -> (u64, u64) {
         self.track.counts()
     }
 
-    /// Gives the verdicts that did not come, each once.
+    /// Takes out the missing verdicts. Each is returned once.
     pub fn unjudged(&mut self) -> Vec<Unjudged> {
         std::mem::take(&mut self.unjudged)
     }
 
-    /// The sensor, as it is now.
+    /// The current sensor.
     pub fn sensor(&self) -> &Sensor {
         &self.sensor
     }
 
-    /// The model that judges now.
+    /// The current model.
     pub fn hrn(&self) -> &Arc<Hrn> {
         &self.hrn
     }
 
-    /// When the last whole frame came.
+    /// The arrival time of the last whole frame.
     pub fn last_frame(&self) -> Option<Stamp> {
         self.seen.last_frame
     }
 
-    /// The port is open. The next bytes do not continue those that came before.
+    /// Call this when the port is open. The next bytes do not continue the earlier bytes.
     pub fn opened(&mut self, at: Stamp) -> Vec<Event> {
         self.decoder.restart();
         self.seen.chunks.clear();
@@ -267,7 +269,8 @@ impl Pipeline {
         self.status_if_changed(at)
     }
 
-    /// The port could not be opened. If it has been open before, the loss already says so.
+    /// Call this when the port could not be opened. If the port was open before, the sensor is
+    /// already lost, and its reason stays.
     pub fn unavailable(&mut self, reason: String, at: Stamp) -> Vec<Event> {
         if let Link::Closed { reason: known } = &mut self.seen.link {
             *known = Some(reason);
@@ -275,7 +278,7 @@ impl Pipeline {
         self.status_if_changed(at)
     }
 
-    /// Bytes came.
+    /// Takes bytes in.
     pub fn push(&mut self, bytes: &[u8], at: Stamp) -> Vec<Event> {
         let mut events = self.tick(at);
         self.decoder.push(bytes);
@@ -287,7 +290,8 @@ impl Pipeline {
         events
     }
 
-    /// Time has passed. A silence settles a pending frame; after a longer one the sensor is stale.
+    /// Call this when time has passed. A silence settles a pending frame. After a longer silence
+    /// the sensor is stale.
     pub fn tick(&mut self, at: Stamp) -> Vec<Event> {
         let mut events = Vec::new();
         if self.clock == Clock::FrameRate {
@@ -307,7 +311,7 @@ impl Pipeline {
                 _ => Link::Stale,
             };
             self.tare.give_up(RetareError::NotLive);
-            // Counted from the last frame, so that its time and this one come from one clock reading.
+            // Count from the last frame, so that both times come from one clock reading.
             let since = self.seen.last_frame.unwrap_or(at);
             let wait = deadline.saturating_sub(since.mono);
             let wall = since.wall.checked_add(wait).unwrap_or(at.wall);
@@ -319,7 +323,7 @@ impl Pipeline {
         events
     }
 
-    /// The device is gone: a press under way is aborted.
+    /// Call this when the device is gone. A press under way is aborted.
     pub fn lost(&mut self, reason: String, at: Stamp) -> Vec<Event> {
         let mut events = Vec::new();
         self.settle(at, &mut events);
@@ -332,15 +336,15 @@ impl Pipeline {
         events
     }
 
-    /// The daemon stops: a press under way is aborted.
+    /// Call this when the daemon stops. A press under way is aborted.
     pub fn shutdown(&mut self) -> Vec<Event> {
         let mut events = Vec::new();
         self.abort(Abort::Shutdown, &mut events);
         events
     }
 
-    /// The recording ended. What is pending is settled, and the last status carries the totals. `at`
-    /// is the recording's last moment; without one, the last frame's is taken.
+    /// Call this when the recording ended. Pending bytes are settled, and the last status has the
+    /// totals. `at` is the recording's last moment. Without it, the last frame's moment is used.
     pub fn end_of_recording(&mut self, at: Option<Stamp>) -> Vec<Event> {
         let mut events = Vec::new();
         self.settle(at.unwrap_or(EPOCH), &mut events);
@@ -349,20 +353,21 @@ impl Pipeline {
             reason: Abort::EndOfRecording.reason().to_owned(),
         };
         let at = at.or(self.seen.last_frame).unwrap_or(EPOCH);
-        // The bytes that are left never became a frame.
+        // The rest of the bytes never became a frame, so count them as skipped.
         self.decoder.restart();
         events.push(Event::Status(self.status(at)));
         events
     }
 
-    /// No byte follows for now. A frame that is whole then was whole when the last byte came.
+    /// Takes the pending frame, because no byte follows for now. A frame that is whole without more
+    /// bytes was whole when the last byte came.
     fn settle(&mut self, at: Stamp, events: &mut Vec<Event>) {
         self.decoder.settle();
         let arrival = self.seen.last_bytes.take().unwrap_or(at.mono);
         self.drain(arrival, events);
     }
 
-    /// Takes the frames that are whole now. The last byte came at `arrival`.
+    /// Takes all frames that are whole now. The last byte came at `arrival`.
     fn drain(&mut self, arrival: Duration, events: &mut Vec<Event>) {
         self.arrival = arrival;
         while let Some(found) = self.decoder.next_frame() {
@@ -385,7 +390,7 @@ impl Pipeline {
         }
     }
 
-    /// When the byte before `end` came.
+    /// The arrival time of the byte before `end`.
     fn stamp_of(&self, end: u64) -> Stamp {
         match self.clock {
             Clock::Arrival => self
@@ -405,7 +410,7 @@ impl Pipeline {
         }
     }
 
-    /// A whole frame.
+    /// Takes in a whole frame.
     fn take(&mut self, raw: &RawFrame, stamp: Stamp, events: &mut Vec<Event>) {
         let at = Moment {
             frame: self.seen.frames,
@@ -413,7 +418,7 @@ impl Pipeline {
         };
         self.seen.frames += 1;
         let before = self.seen.last_frame.replace(stamp);
-        // A rate over a silence would be none.
+        // A rate measured across a silence would be meaningless.
         if matches!(self.seen.link, Link::Silent | Link::Stale) {
             self.seen.recent.clear();
         }
@@ -424,7 +429,7 @@ impl Pipeline {
         self.seen.link = Link::Live { since: stamp.mono };
 
         let frame = self.tare.apply(raw);
-        // While another baseline is taken on request, presses are tracked with the one in force.
+        // During a tare on request, presses are tracked with the old baseline.
         let tared = !matches!(self.tare.aim(), Some(Aim::First { .. }));
         let changes = if tared {
             let marks = self.marks(raw, &frame);
@@ -435,7 +440,7 @@ impl Pipeline {
         if self.tracker.is_pressed() {
             self.tare.give_up(RetareError::Pressed);
         }
-        // With the seconds of the clock: a pipeline that is recalled keeps the same pace.
+        // Use the seconds of the clock, so that a recalled pipeline keeps the same pace.
         let is_due = before.is_some_and(|b| b.mono.as_secs() != stamp.mono.as_secs());
         if is_due && tared && self.tracker.is_idle() {
             self.tare.follow(raw);

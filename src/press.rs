@@ -1,7 +1,7 @@
 //! Presses: one contact each, from touch to release.
 //!
-//! In: tared [`Frame`]s with their numbers and the moments they came. Out: [`Change`]s. The tracker
-//! reads no clock: a press lasts as long as its frames say.
+//! In: tared [`Frame`]s with their numbers and arrival times. Out: [`Change`]s. The tracker reads
+//! no clock: the times of the frames decide how long a press lasts.
 
 mod course;
 mod packed;
@@ -20,55 +20,55 @@ use self::settling::{Load, Settling};
 pub use self::thin::thinned;
 use crate::frame::{Frame, Stamp, TAXELS};
 
-/// A frame of a press: its number and when its last byte came.
+/// The number of a frame in a press, and when its last byte came.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Moment {
-    /// Number of the frame, per sensor.
+    /// The number of the frame, per sensor.
     pub frame: u64,
-    /// When it came.
+    /// When the frame's last byte came.
     pub stamp: Stamp,
 }
 
-/// What else is known of a frame. The settings under which it came decide it, because others may
-/// hold when its press is judged.
+/// Marks of a frame. They are decided by the settings at the frame's arrival, because the settings
+/// may have changed when the press is judged.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Marks {
-    /// The contact touches the border of the array.
+    /// Whether the contact touches the border of the array.
     pub at_edge: bool,
-    /// A live taxel reads full scale.
+    /// Whether a live taxel reads full scale.
     pub saturated: bool,
 }
 
-/// A frame of a press, in contact. The best one has the maximal contact area; ties go to the greater
-/// force, then the earlier one.
+/// A frame of a press, in contact. The best frame has the maximal contact area. Of equal areas the
+/// greater force wins, then the earlier frame.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Peak {
-    /// Which frame.
+    /// The frame's number and arrival.
     pub moment: Moment,
-    /// Its taxels.
+    /// The frame itself.
     pub frame: Frame,
-    /// What else is known of it.
+    /// The frame's marks.
     #[serde(default)]
     pub marks: Marks,
-    /// Its contact area.
+    /// The contact area of the frame.
     pub contact_area_taxels: u32,
-    /// Its total force.
+    /// The total force of the frame.
     pub force_n: f64,
 }
 
-/// How a press ended that gets a verdict.
+/// The end of a press that gets a verdict.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum End {
-    /// Released.
+    /// The press was released.
     Release,
-    /// Held for `max_seconds`.
+    /// The press was held for `max_seconds`.
     Timeout,
 }
 
-/// Why a press gets no verdict.
+/// The reason why a press gets no verdict.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Abort {
-    /// Fewer than `min_frames` in contact.
+    /// The press had fewer than `min_frames` frames in contact.
     Short,
     /// The device was lost.
     Lost,
@@ -79,7 +79,7 @@ pub enum Abort {
 }
 
 impl Abort {
-    /// As published.
+    /// The reason as it is published.
     pub fn reason(self) -> &'static str {
         match self {
             Abort::Short => "short",
@@ -90,52 +90,52 @@ impl Abort {
     }
 }
 
-/// What became of a press.
+/// A change of a press.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Change {
-    /// It began with this frame.
+    /// A press began with this frame.
     Begin {
-        /// Its number.
+        /// The press's number.
         press: u64,
         /// The frame.
         at: Moment,
     },
     /// The contact has settled.
     Settled {
-        /// Its number.
+        /// The press's number.
         press: u64,
-        /// Best frame so far.
+        /// The best frame so far.
         peak: Box<Peak>,
     },
-    /// It ended and is to be judged.
+    /// The press ended and is to be judged.
     End {
-        /// Its number.
+        /// The press's number.
         press: u64,
-        /// Its last frame in contact.
+        /// The last frame in contact.
         last: Moment,
-        /// Frames in contact.
+        /// The number of frames in contact.
         frames: u64,
-        /// Released, or timed out.
+        /// Whether the press was released or timed out.
         end: End,
-        /// Its best frame.
+        /// The best frame.
         peak: Box<Peak>,
-        /// All its frames in contact.
+        /// The frames in contact.
         course: Box<SoFar>,
     },
-    /// It is over and gets no verdict.
+    /// The press ended without a verdict.
     Aborted {
-        /// Its number.
+        /// The press's number.
         press: u64,
-        /// Its last frame in contact.
+        /// The last frame in contact.
         last: Moment,
-        /// Frames in contact.
+        /// The number of frames in contact.
         frames: u64,
-        /// Why it gets no verdict.
+        /// The reason why there is no verdict.
         reason: Abort,
     },
 }
 
-/// The frames in contact of a press, as far as it has come.
+/// The frames in contact of a press up to now.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SoFar {
     press: u64,
@@ -149,8 +149,8 @@ impl SoFar {
         self.press
     }
 
-    /// Its frames up to `until`, and the place of the best one among them. There are some hundred at
-    /// most, evenly over the press; of a short press all.
+    /// The frames up to `until`, and the place of the best frame among them. They are evenly spread
+    /// over the press, some hundred at most. A short press has all its frames.
     pub fn until(&self, until: Duration) -> (Vec<&Peak>, usize) {
         self.course.until(until, &self.peak)
     }
@@ -192,7 +192,7 @@ pub struct PressTracker {
     presses: u64,
 }
 
-/// What a [`PressTracker`] has seen, without its settings.
+/// The state of a [`PressTracker`], without its settings.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Memory {
     state: State,
@@ -200,7 +200,7 @@ pub struct Memory {
 }
 
 impl Memory {
-    /// Whether a tracker can have come to this in this many frames.
+    /// Whether a tracker can have this state after this many frames.
     pub(crate) fn is_possible(&self, frames: u64) -> bool {
         let is_press = |pressed: &Pressed| {
             let peak = &pressed.peak;
@@ -224,7 +224,7 @@ impl Memory {
 enum State {
     Idle,
     Pressed(Box<Pressed>),
-    /// It timed out. Counts the frames without contact since.
+    /// The press timed out. The count is that of frames without contact since then.
     AwaitingRelease {
         released_frames: u32,
     },
@@ -238,7 +238,7 @@ struct Pressed {
     frames: u64,
     released_frames: u32,
     peak: Peak,
-    /// Recordings have it since models judge the course of a press.
+    /// The course of the press. Recordings from before models of courses do not have it.
     #[serde(default)]
     course: Course,
     /// `None` once the early verdict has come.
@@ -246,7 +246,7 @@ struct Pressed {
 }
 
 impl PressTracker {
-    /// A tracker that has seen nothing. `settings` have passed [`Settings::check`].
+    /// A tracker without a press. `settings` have passed [`Settings::check`].
     pub fn new(settings: Settings) -> Self {
         Self {
             settings,
@@ -255,12 +255,12 @@ impl PressTracker {
         }
     }
 
-    /// Takes over changed settings; a press under way goes on under them.
+    /// Takes over changed settings. They also apply to a press under way.
     pub fn reload(&mut self, settings: Settings) {
         self.settings = settings;
     }
 
-    /// What it has seen.
+    /// The tracker's state.
     pub fn memory(&self) -> Memory {
         Memory {
             state: self.state.clone(),
@@ -268,7 +268,7 @@ impl PressTracker {
         }
     }
 
-    /// Goes on where the tracker stood whose memory this is.
+    /// Continues from the state of another tracker.
     pub fn recall(&mut self, memory: Memory) {
         Memory {
             state: self.state,
@@ -281,22 +281,22 @@ impl PressTracker {
         self.pressed().is_some()
     }
 
-    /// Whether no press is under way, and none that timed out waits for its release.
+    /// Whether there is no press under way, and no press that timed out and is not yet released.
     pub fn is_idle(&self) -> bool {
         matches!(self.state, State::Idle)
     }
 
-    /// Counts the frames in contact of the press under way.
+    /// The number of frames in contact of the press under way.
     pub fn frames(&self) -> Option<u64> {
         self.pressed().map(|pressed| pressed.frames)
     }
 
-    /// When the press under way began.
+    /// The start time of the press under way.
     pub fn began(&self) -> Option<Duration> {
         self.pressed().map(|pressed| pressed.began)
     }
 
-    /// The press under way.
+    /// The frames of the press under way.
     pub fn so_far(&self) -> Option<SoFar> {
         self.pressed().map(Pressed::so_far)
     }
@@ -308,7 +308,7 @@ impl PressTracker {
         }
     }
 
-    /// Takes the next frame in. Gives what it changed, in order.
+    /// Takes the next frame in. Returns its changes, in order.
     pub fn push(&mut self, frame: &Frame, marks: Marks, at: Moment) -> Vec<Change> {
         let area = frame.contact_area_taxels(self.settings.contact_threshold_n);
         let touched = area >= self.settings.end_area_taxels;
@@ -371,7 +371,7 @@ impl PressTracker {
         }
     }
 
-    /// Adds what this frame makes of the press: settled, released or timed out.
+    /// Adds the changes of this frame to the press: settled, released or timed out.
     fn conclude(&mut self, frame: &Frame, at: Moment, area: u32, changes: &mut Vec<Change>) {
         let State::Pressed(pressed) = &mut self.state else {
             return;
@@ -410,7 +410,8 @@ impl PressTracker {
     }
 }
 
-/// The largest share by which two equal forces differ. Each taxel is an f32 and is rounded twice:
+/// The largest share by which two equal forces may differ. Each taxel is an f32 and is rounded
+/// twice:
 /// when the baseline is subtracted, and when counts become newtons.
 const ROUNDING: f64 = 2.0 * f32::EPSILON as f64;
 

@@ -30,7 +30,7 @@ impl Stream {
         Self { key, position: 0 }
     }
 
-    /// The independent sub-stream number `index`: one an object, a press, an epoch.
+    /// The independent sub-stream with the number `index`: one for each object, press or epoch.
     #[must_use]
     pub fn child(&self, index: u64) -> Self {
         Self {
@@ -47,34 +47,34 @@ impl Stream {
             .wrapping_add(self.position.wrapping_mul(GOLDEN_GAMMA)))
     }
 
-    /// Uniform in `[0, 1)`, 53 bits.
+    /// A uniform number in `[0, 1)`, 53 bits.
     pub fn uniform(&mut self) -> f64 {
         (self.next_u64() >> 11) as f64 / (1_u64 << 53) as f64
     }
 
-    /// Uniform in `[low, high)`.
+    /// A uniform number in `[low, high)`.
     pub fn range(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.uniform()
     }
 
-    /// Uniform in `0..n`; its bias is below 2^-53 for the sizes used here.
+    /// A uniform number in `0..n`. Its bias is below 2^-53 for the sizes used here.
     ///
     /// # Panics
     ///
-    /// If `n` is 0.
+    /// Panics if `n` is 0.
     pub fn below(&mut self, n: usize) -> usize {
         assert!(n > 0, "an empty range has no element to draw");
         (((u128::from(self.next_u64())) * n as u128) >> 64) as usize
     }
 
-    /// Standard normal, by Box and Muller; two words a value, so that the position stays a
+    /// A standard normal number, by Box and Muller. Each takes two words, so the position stays a
     /// plain count.
     pub fn normal(&mut self) -> f64 {
         let radius = (-2.0 * (1.0 - self.uniform()).ln()).sqrt();
         radius * (std::f64::consts::TAU * self.uniform()).cos()
     }
 
-    /// A random order of `items` (Fisher-Yates).
+    /// Shuffles `items` (Fisher-Yates).
     pub fn shuffle<T>(&mut self, items: &mut [T]) {
         for last in (1..items.len()).rev() {
             items.swap(last, self.below(last + 1));

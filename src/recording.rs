@@ -1,10 +1,10 @@
-//! Recordings: what sensors sent and when, as MCAP files that ROS tools open.
+//! Recordings: the bytes of sensors and when they came, as MCAP files that ROS tools open.
 //!
-//! In: what happens to a sensor's pipeline ([`Input`]), and the events that follow. Out: the bytes of
-//! a file. A [`Reader`] gives the inputs back, and a [`Playback`] turns them into the same events. A
-//! file can be played from the first [`State`] of a sensor on. It has one every few seconds, so
-//! damage costs the damaged stretch and no more. Nothing here opens a file or asks the time. No other
-//! module names MCAP.
+//! In: what happens to a sensor's pipeline ([`Input`]), and the events that follow. Out: the bytes
+//! of a file. A [`Reader`] returns the inputs, and a [`Playback`] turns them into the same events.
+//! A file can be played from the first [`State`] of a sensor on. It has one every few seconds, so
+//! damage costs only the damaged stretch. Nothing here opens a file or asks the time. No other
+//! module uses the MCAP library.
 
 mod labels;
 mod message;
@@ -33,33 +33,33 @@ use crate::pipeline::{self, Pipeline};
 use crate::sensor::{Description, Sensor, SensorError};
 use crate::verdict::Hrn;
 
-/// One thing that happens to a pipeline. The only other thing is that its sensor's description
-/// changes ([`Entry::Settings`]).
+/// One thing that happens to a pipeline. Only a change of the sensor's description is an entry of
+/// its own ([`Entry::Settings`]).
 #[derive(Debug, Clone, PartialEq)]
 pub enum Input<'a> {
     /// The port is open.
     Opened,
-    /// The port could not be opened, and why.
+    /// The port could not be opened, for this reason.
     Unavailable(Cow<'a, str>),
     /// Bytes came.
     Bytes(Cow<'a, [u8]>),
     /// Time has passed.
     Tick,
-    /// The device is gone, and why.
+    /// The device is gone, for this reason.
     Lost(Cow<'a, str>),
-    /// A tare was asked for.
+    /// A tare was requested.
     Tare,
-    /// What the controller says it is doing.
+    /// The controller's context.
     Context(Option<Value>),
-    /// Where the robot says its arm is.
+    /// Positions of the arm from the robot.
     Motion(Cow<'a, [Point]>),
     /// The daemon stops.
     Shutdown,
 }
 
 impl Input<'_> {
-    /// Passes the input to `pipeline`. Only [`Pipeline::retare`] itself says whether a tare could be
-    /// taken, and only [`Pipeline::tell`] whether positions were in order.
+    /// Passes the input to `pipeline`. A refused tare and a step back in time are not reported: see
+    /// [`Pipeline::retare`] and [`Pipeline::tell`].
     pub fn feed(self, pipeline: &mut Pipeline, at: Stamp) -> Vec<Event> {
         match self {
             Input::Opened => pipeline.opened(at),
@@ -68,7 +68,7 @@ impl Input<'_> {
             Input::Tick => pipeline.tick(at),
             Input::Lost(reason) => pipeline.lost(reason.into_owned(), at),
             Input::Tare => {
-                // A refusal changes nothing and publishes nothing.
+                // A refused tare changes nothing and publishes nothing.
                 let _ = pipeline.retare();
                 Vec::new()
             }
@@ -77,7 +77,7 @@ impl Input<'_> {
                 Vec::new()
             }
             Input::Motion(points) => {
-                // A step back is taken in like the rest.
+                // Points after a step back are taken in too.
                 let _ = pipeline.tell(&points);
                 Vec::new()
             }
@@ -102,19 +102,19 @@ impl Input<'_> {
     }
 }
 
-/// What a recording holds of one sensor, in order.
+/// An entry of a recording for one sensor. Entries are in order of time.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Entry {
-    /// Something happened to it.
+    /// Something happened to the sensor.
     Input(Input<'static>),
-    /// The configuration was read again, and the sensor was judged by this from then on.
+    /// The configuration was read again. This sensor and model hold from then on.
     Settings(Box<RecordedSensor>),
-    /// Everything that its pipeline had seen by then.
+    /// The whole state of the pipeline.
     State(Box<State>),
 }
 
 impl Entry {
-    /// About how many bytes of memory it takes, its moment included.
+    /// The approximate memory of the entry in bytes, including its time.
     pub(crate) fn weight(&self) -> usize {
         let beside = match self {
             Entry::Input(Input::Bytes(bytes)) => bytes.len(),
@@ -129,7 +129,7 @@ impl Entry {
     }
 }
 
-/// The length as JSON. For lists of numbers, which are most of a state, it is near what they take in
+/// The length as JSON. A state is mostly lists of numbers, and their JSON is about as long as their
 /// memory.
 fn text_bytes(value: &impl Serialize) -> usize {
     serde_json::to_vec(value).map_or(0, |text| text.len())
@@ -154,18 +154,18 @@ fn heap_bytes(value: &Value) -> usize {
     }
 }
 
-/// A sensor as a recording describes it.
+/// The description of a sensor in a recording.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RecordedSensor {
-    /// What is said of it.
+    /// The description of the sensor.
     #[serde(flatten)]
     pub description: Description,
-    /// SHA-256 of the model that judged.
+    /// The SHA-256 of the model.
     pub model: String,
 }
 
 impl RecordedSensor {
-    /// What is to be recorded of `sensor` while `hrn` judges.
+    /// The recorded description of `sensor` with the model `hrn`.
     pub fn new(sensor: &Sensor, hrn: &Hrn) -> Self {
         Self {
             description: sensor.description().for_recording(sensor.stale_after()),
@@ -173,34 +173,34 @@ impl RecordedSensor {
         }
     }
 
-    /// Its name.
+    /// The sensor's name.
     pub fn name(&self) -> &str {
         &self.description.name
     }
 
-    /// The sensor that is described.
+    /// Checks the description and returns the sensor.
     ///
     /// # Errors
     ///
-    /// As [`Sensor::new`]: a recording may say anything.
+    /// Returns the errors of [`Sensor::new`], because a recording may hold anything.
     pub fn check(&self) -> Result<Sensor, SensorError> {
         Sensor::new(self.description.of_recording())
     }
 }
 
-/// A sensor, and everything that its pipeline had seen: enough to go on from there.
+/// A sensor and the whole state of its pipeline. Another pipeline can continue from it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct State {
     /// The sensor.
     pub sensor: RecordedSensor,
-    /// What its pipeline had seen.
+    /// The state of the pipeline.
     pub memory: pipeline::Memory,
-    /// The recording's labels, repeated here because a checksum covers them here.
+    /// The recording's labels. They are repeated here because a checksum covers them here.
     pub labels: Labels,
 }
 
 impl State {
-    /// The state of `pipeline` now.
+    /// The current state of `pipeline`.
     pub fn of(pipeline: &Pipeline, labels: Labels) -> Self {
         Self {
             sensor: RecordedSensor::new(pipeline.sensor(), pipeline.hrn()),
@@ -213,18 +213,19 @@ impl State {
 /// The first bytes of every recording.
 pub const MAGIC: &[u8] = mcap::MAGIC;
 
-/// What a file with a sensor's bytes is. Its first bytes decide, not its name.
+/// The kind of a file with a sensor's bytes. Its first bytes decide, not its name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FileKind {
-    /// A recording: MCAP.
+    /// A recording, which is MCAP.
     Recording,
-    /// What a sensor sent, back to back.
+    /// The bytes of a sensor, without anything else.
     Raw,
 }
 
 impl FileKind {
-    /// Of a file that begins with `start`: at least as many bytes as [`MAGIC`] has, or all of a
-    /// shorter file. A file that breaks off within the magic, or is empty, is a damaged recording.
+    /// The kind of a file that begins with `start`. `start` has at least as many bytes as
+    /// [`MAGIC`], or all of a shorter file. A file that is empty or ends within the magic is a
+    /// damaged recording.
     ///
     /// # Example
     ///
@@ -244,12 +245,12 @@ impl FileKind {
         }
     }
 
-    /// Reads the kind of `source`. The reader that you get back begins where `source` began, because
-    /// a pipe cannot be read twice.
+    /// Reads the kind of `source`. The returned reader begins where `source` began, because a pipe
+    /// cannot be read twice.
     ///
     /// # Errors
     ///
-    /// Those of reading.
+    /// Returns the errors of reading.
     pub fn read<R: Read>(mut source: R) -> io::Result<(Self, impl Read)> {
         let mut start = Vec::with_capacity(MAGIC.len());
         let most = MAGIC.len() as u64;
@@ -258,21 +259,21 @@ impl FileKind {
     }
 }
 
-/// Why a recording cannot be written or read.
+/// The reason why a recording cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Reading or writing broke off.
+    /// Reading or writing failed.
     #[error(transparent)]
     Io(#[from] io::Error),
-    /// It is damaged or cut off.
+    /// The recording is damaged or cut off.
     #[error("{0}: `hardnessd recover` saves what is whole")]
     Damaged(String),
-    /// MCAP of another program, or of a later version.
+    /// The file is MCAP of another program or of a later version, or not MCAP.
     #[error("found {found}, expected {expected}")]
     Foreign {
-        /// What there is.
+        /// The content found.
         found: String,
-        /// What there should be.
+        /// The expected content.
         expected: &'static str,
     },
 }

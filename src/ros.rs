@@ -1,8 +1,8 @@
-//! Events as ROS 2 messages: definitions, and bytes by them (CDR, little-endian).
+//! Events as ROS 2 messages: their definitions, and their bytes (CDR, little-endian).
 //!
-//! In: events. Out: the messages that recordings hold and ROS 2 subscribers get. Every message begins
-//! with a `std_msgs/Header`: the moment in UTC and the sensor's name. A ROS message has no null. So a
-//! null of an event is 0, NaN or an empty string here.
+//! In: events. Out: the messages that recordings hold and ROS 2 subscribers get. Every message
+//! begins with a `std_msgs/Header`: the moment in UTC and the sensor's name. A ROS message has no
+//! null, so a null of an event becomes 0, NaN or an empty string.
 
 mod frame;
 #[cfg(feature = "ros2")]
@@ -49,7 +49,7 @@ pub(crate) const STATUS: Topic = Topic {
 };
 
 impl Topic {
-    /// Package and name of its schema, as a middleware names them.
+    /// The package and the name of the topic's schema, as a middleware names them.
     #[cfg(feature = "ros2")]
     pub(crate) fn package_and_name(&self) -> (&'static str, &'static str) {
         let named = self.schema.split_once("/msg/");
@@ -81,7 +81,8 @@ struct Time {
 
 impl Time {
     fn new(time: Timestamp) -> Self {
-        // In ROS, nanoseconds always count up from the second; jiff's do not before 1970.
+        // In ROS, nanoseconds always count up from the second. Before 1970, jiff's nanoseconds do
+        // not.
         let ns = time.as_nanosecond();
         Self {
             sec: ns.div_euclid(1_000_000_000) as i32,
@@ -104,7 +105,7 @@ impl Header {
     }
 }
 
-/// Bytes that are written in one piece: one element at a time is slow.
+/// Bytes that are written in one piece, because writing one element at a time is slow.
 #[derive(Debug)]
 pub(crate) struct Blob(pub(crate) Vec<u8>);
 
@@ -203,8 +204,8 @@ fn context(context: Option<&Value>) -> String {
     context.map_or_else(String::new, Value::to_string)
 }
 
-/// Every message that a recording, or a viewer such as Foxglove, has of an event: a frame has three.
-/// `pitch_mm` is that of the sensor.
+/// Every message that a recording or a viewer such as Foxglove holds of an event. A frame has three
+/// messages. `pitch_mm` is the distance between the sensor's taxels.
 pub(crate) fn encode_all(event: &Event, pitch_mm: f64) -> Vec<(Topic, Timestamp, Vec<u8>)> {
     let mut messages = vec![encode(event)];
     if let Event::Frame(frame) = event {
@@ -213,7 +214,7 @@ pub(crate) fn encode_all(event: &Event, pitch_mm: f64) -> Vec<(Topic, Timestamp,
     messages
 }
 
-/// An event as its main message, with the message's channel and time.
+/// The main message of an event, with its channel and its time.
 pub(crate) fn encode(event: &Event) -> (Topic, Timestamp, Vec<u8>) {
     match event {
         Event::Frame(frame) => frame::image(frame),

@@ -1,8 +1,8 @@
-//! A sensor as its owner describes it: how it writes frames, how counts become newtons, what a
-//! press is, and when a verdict is rejected.
+//! The description of a sensor: how it writes frames, how counts become newtons, when a press
+//! begins and ends, and when a verdict is rejected.
 //!
-//! In: a [`Description`], which a configuration or a recording holds. Out: a [`Sensor`]: every
-//! value is in its range, and the values fit each other. Nothing behind this door checks them again.
+//! In: a [`Description`] from a configuration or a recording. Out: a [`Sensor`]. Every value of a
+//! [`Sensor`] is in its range, and the values fit each other, so no other module checks them again.
 
 use std::time::Duration;
 
@@ -11,31 +11,31 @@ use serde::{Deserialize, Serialize};
 use crate::wire::{self, Layout};
 use crate::{motion, press, tare};
 
-/// What is said of a sensor. None of it has been checked.
+/// The description of a sensor. Its values are unchecked.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Description {
-    /// Its name: `[a-z][a-z0-9_]*`.
+    /// The sensor's name: `[a-z][a-z0-9_]*`.
     pub name: String,
-    /// Frames a second that it is expected to send.
+    /// The number of frames that the sensor is expected to send in a second.
     pub frame_rate_hz: f64,
-    /// A live sensor is stale after a silence of this length. `None`: the larger of 2.5 periods
-    /// and 50 ms.
+    /// The silence after which a live sensor is stale. `None` means the larger of 2.5 periods and
+    /// 50 ms.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stale_after_ms: Option<f64>,
-    /// How it writes a frame.
+    /// How the sensor writes a frame.
     pub frame: wire::Settings,
-    /// Counts to newtons.
+    /// How counts become newtons.
     pub calibration: tare::Settings,
-    /// What a press is.
+    /// The thresholds that begin and end a press.
     pub press: press::Settings,
-    /// The arm that presses with it.
+    /// The arm that presses with this sensor.
     #[serde(default)]
     pub arm: motion::Settings,
     /// A verdict below this confidence is rejected.
     pub min_confidence: f32,
-    /// A verdict on less force is rejected.
+    /// A verdict on a frame with less total force is rejected.
     pub min_force_n: f64,
-    /// A model of the course gives an early verdict with this confidence.
+    /// A model of the course gives an early verdict when its confidence reaches this value.
     #[serde(default = "early_confidence")]
     pub early_confidence: f32,
 }
@@ -63,7 +63,7 @@ impl Default for Description {
 }
 
 impl Description {
-    /// The first key by which the two differ that a running pipeline cannot take over.
+    /// The first key that differs and that a running pipeline cannot change.
     pub fn fixed_difference(&self, other: &Self) -> Option<&'static str> {
         let differs = [
             ("name", self.name != other.name),
@@ -74,8 +74,8 @@ impl Description {
         first.map(|(key, _)| *key)
     }
 
-    /// The description as a recording holds it: with the silence that makes it stale, whatever the
-    /// default is when the recording is played.
+    /// The description as a recording holds it. The stale time is always written, so a later
+    /// default does not change what a recording says.
     pub(crate) fn for_recording(&self, stale_after: Duration) -> Self {
         Self {
             stale_after_ms: Some(stale_after.as_nanos() as f64 / 1e6),
@@ -83,8 +83,8 @@ impl Description {
         }
     }
 
-    /// The description as a recording means it: before recordings held the silence that makes a
-    /// sensor stale, that was 2.5 periods.
+    /// The description that a recording means. Old recordings do not hold the stale time. It was
+    /// 2.5 periods then.
     pub(crate) fn of_recording(&self) -> Self {
         let late = || {
             (FRAME_RATES_HZ.0..=FRAME_RATES_HZ.1)
@@ -98,70 +98,72 @@ impl Description {
     }
 }
 
-/// A value of a [`Description`] that cannot be used. The message begins with its key.
+/// An unusable value of a [`Description`]. The message begins with the value's key.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SensorError {
-    /// A name that is no part of a topic, a file's name or a log line.
+    /// The name cannot be part of a topic, a file name or a log line.
     #[error("name: found {0:?}, expected [a-z][a-z0-9_]*")]
     Name(String),
-    /// A longer name than any of those takes.
+    /// The name is too long for a topic, a file name or a log line.
     #[error("name: found {found} characters, expected at most {MOST_NAME_CHARS}")]
     LongName {
-        /// Characters.
+        /// The length of the name in characters.
         found: usize,
     },
-    /// A rate that no sensor has.
+    /// The frame rate is outside [`FRAME_RATES_HZ`].
     #[error(
         "frame_rate_hz: found {0:?}, expected {least} to {most} frames a second",
         least = FRAME_RATES_HZ.0,
         most = FRAME_RATES_HZ.1
     )]
     FrameRate(f64),
-    /// A silence that is too short for any sensor, or too long for any user.
+    /// The stale time is too short for any sensor, or too long for any user.
     #[error(
         "stale_after_ms: found {0:?}, expected {least} to {most} milliseconds",
         least = STALE_AFTER_MS.0,
         most = STALE_AFTER_MS.1
     )]
     StaleAfter(f64),
-    /// Its layout.
+    /// The layout of a frame is unusable.
     #[error("frame.{0}")]
     Frame(#[from] wire::LayoutError),
-    /// Its calibration.
+    /// The calibration is unusable.
     #[error("calibration.{0}")]
     Calibration(#[from] tare::SettingsError),
-    /// Its presses.
+    /// The settings of presses are unusable.
     #[error("press.{0}")]
     Press(#[from] press::SettingsError),
-    /// Its arm.
+    /// The settings of the arm are unusable.
     #[error("arm.{0}")]
     Arm(#[from] motion::SettingsError),
-    /// A confidence that no verdict has.
+    /// The least confidence is not within 0 to 1.
     #[error("min_confidence: found {0:?}, expected 0 to 1")]
     MinConfidence(f32),
-    /// A force that no press has.
+    /// The least force is negative or not finite.
     #[error("min_force_n: found {0:?}, expected newtons, 0 or more")]
     MinForce(f64),
-    /// A confidence that no verdict has.
+    /// The confidence of early verdicts is not within 0 to 1.
     #[error("early_confidence: found {0:?}, expected 0 to 1")]
     EarlyConfidence(f32),
 }
 
-/// Wider than any sensor, and narrow enough that a period is a sane time to wait.
+/// The accepted frame rates: a wider range than that of any sensor, but every period is still a
+/// sane time to wait.
 pub const FRAME_RATES_HZ: (f64, f64) = (0.01, 10_000.0);
 
-/// From a period of the highest rate to an hour, which is longer than anyone waits for a frame.
+/// The accepted stale times: from a period of the highest rate to an hour. Nobody waits longer for
+/// a frame.
 const STALE_AFTER_MS: (f64, f64) = (0.1, 3_600_000.0);
 
-/// A name is part of topics, of file names and of each line of the log.
+/// The longest name. A name is part of topics, of file names and of each line of the log.
 const MOST_NAME_CHARS: usize = 64;
 
 /// A frame is late after this many periods.
 pub const LATE_PERIODS: f64 = 2.5;
 
-/// By default no shorter silence makes a sensor stale. USB adapters deliver every 16 ms, and a busy
-/// host reads some milliseconds later: with 2.5 periods, a sensor at 100 frames/s would be stale and
-/// live again all the time.
+/// The least stale time by default. USB adapters deliver every 16 ms, and a busy host reads some
+/// milliseconds later. With 2.5 periods, a sensor at 100 frames/s would often become stale and live
+/// again.
 const LEAST_STALE_AFTER: Duration = Duration::from_millis(50);
 
 /// A sensor whose description has been checked.
@@ -177,7 +179,8 @@ impl Sensor {
     ///
     /// # Errors
     ///
-    /// [`SensorError`], for the first value that is out of its range or does not fit the layout.
+    /// Returns a [`SensorError`] for the first value that is out of its range or does not fit the
+    /// layout.
     ///
     /// # Example
     ///
@@ -246,27 +249,27 @@ impl Sensor {
         })
     }
 
-    /// What is said of it, every value in its range.
+    /// The checked description of the sensor.
     pub fn description(&self) -> &Description {
         &self.description
     }
 
-    /// Its name.
+    /// The sensor's name.
     pub fn name(&self) -> &str {
         &self.description.name
     }
 
-    /// How it writes a frame.
+    /// How the sensor writes a frame.
     pub fn layout(&self) -> &Layout {
         &self.layout
     }
 
-    /// The time from frame to frame, as expected.
+    /// The expected time from frame to frame.
     pub fn period(&self) -> Duration {
         period(self.description.frame_rate_hz)
     }
 
-    /// How long a frame may take to come before it is late: 2.5 periods.
+    /// The time after which a missing frame is late: 2.5 periods.
     pub fn late_after(&self) -> Duration {
         late(self.description.frame_rate_hz)
     }

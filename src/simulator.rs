@@ -1,13 +1,14 @@
-//! A film array pressed on objects, simulated: labelled samples and whole press sequences.
+//! Simulates a film array that is pressed on objects: labelled samples and whole press sequences.
 //!
 //! In: settings and a seed. Out: [`dataset`], the labelled samples of the paper's Table 1 (force
-//! prescribed), and [`Sequence`], raw frames as a sensor would send them (motion prescribed).
-//! Everything follows from the seed; nothing here reads a clock, does I/O or keeps global state.
-//! What is modelled and what is not stands at the head of each part.
+//! prescribed), `courses`, whole presses with the arm's motion, and [`Sequence`], raw frames as a
+//! sensor would send them (motion prescribed). Everything follows from the seed. Nothing here reads
+//! a clock, does I/O or keeps global state. The head of each part says what it models and what it
+//! does not.
 //!
-//! Two figures are not those it was meant to have. The durometer gives the three foams mean moduli
-//! 10 to 18 % lower: sponge 0.278 MPa (meant: 0.34), foam 0.763 (0.85), yoga mat 0.318 (0.38). And
-//! a rough face touches on 1.21 to 1.26 times the area of Persson's theory (meant: 1.0 to 1.15).
+//! Two results differ from the intended values. The durometer gives the three foams mean moduli 10
+//! to 18 % lower: sponge 0.278 MPa (intended: 0.34), foam 0.763 (0.85), yoga mat 0.318 (0.38). And
+//! a rough face touches on 1.21 to 1.26 times the area of Persson's theory (intended: 1.0 to 1.15).
 
 mod body;
 mod broad;
@@ -44,8 +45,8 @@ pub use settings::{DatasetSettings, Materials, UnknownMaterials};
 
 pub use crate::tare::NEWTONS_PER_COUNT;
 
-/// Names of what a sample's `material` is an index of: the eight named materials, then, where there
-/// are broad ones, the laws that they are drawn of.
+/// The names that a sample's `material` indexes: the eight named materials, then, for broad
+/// materials, their laws.
 pub fn material_names(materials: Materials) -> Vec<&'static str> {
     let mut names = Material::ALL.map(Material::name).to_vec();
     if materials == Materials::Broad {
@@ -54,7 +55,7 @@ pub fn material_names(materials: Materials) -> Vec<&'static str> {
     names
 }
 
-/// Of what [`dataset`] makes of the same settings and seed: to be raised with every change of its
-/// samples. A comparison names the files that it keeps by it, so that none of an older simulator is
-/// taken for one of this.
+/// The version of the samples that [`dataset`] makes. Raise it with every change of the samples for
+/// the same settings and seed. A comparison puts the version into the names of its files, so that
+/// it never takes an older simulator's file for a current one.
 pub const VERSION: u32 = 3;

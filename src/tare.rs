@@ -1,8 +1,8 @@
-//! Tare: the unloaded baseline, and subtracting it.
+//! Tare: the unloaded baseline, and its subtraction.
 //!
-//! In: [`RawFrame`]s in counts. Out: [`Frame`]s in newtons, with dead taxels replaced, and what
-//! became of the tare. A tare under load would zero a press away. So while the sensor is touched, no
-//! baseline is taken: the first tare is tried again, and one on request is given up.
+//! In: [`RawFrame`]s in counts. Out: [`Frame`]s in newtons, with dead taxels replaced, and the
+//! outcome of a tare. A tare under load would zero a press away, so no baseline is taken while
+//! something touches the sensor. The first tare is tried again. A tare on request is given up.
 
 mod settings;
 
@@ -14,46 +14,46 @@ pub use self::settings::{
 };
 use crate::frame::{Array, COLS, Frame, ROWS, RawFrame, TAXELS, taxels};
 
-/// When a frame counts as touched while a tare is taken.
+/// The thresholds at which frames of a tare count as touched.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Contact {
-    /// A taxel that varies by this much is being touched.
+    /// A taxel is touched if it varies by this much.
     pub threshold_n: f32,
-    /// This many touched taxels are a contact.
+    /// The sensor is touched if this many taxels are.
     pub area_taxels: u32,
 }
 
-/// Force by which [`Tare::follow`] moves a taxel's baseline at most: once a second, 1 N in an hour.
-/// Film arrays drift by half as much. A touch that is too light for a press, below 0.07 N on a taxel, takes
-/// four minutes to disappear.
+/// The largest force by which [`Tare::follow`] moves a taxel's baseline in one step. One step a
+/// second is 1 N in an hour. Film arrays drift by half as much. A touch that is too light for a
+/// press, below 0.07 N on a taxel, takes four minutes to disappear.
 pub const MOST_STEP_N: f32 = 1.0 / 3600.0;
 
-/// What a frame did to the tare.
+/// The effect of a frame on the tare.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Progress {
     /// No tare is under way.
     Ready,
-    /// This frame is one of those averaged.
+    /// The frame is averaged into the tare under way.
     Taking,
-    /// It was the last of them: the new baseline holds from the next frame on.
+    /// The frame was the last of the tare. The new baseline holds from the next frame on.
     Taken,
-    /// The sensor is touched, and the frames were thrown away. A first tare begins anew; one on request
-    /// has ended.
+    /// Something touches the sensor, and the frames of the tare were discarded. A first tare begins
+    /// again. A tare on request has ended.
     Contact,
 }
 
-/// A baseline, summed up over the array's live taxels.
+/// A summary of a baseline over the array's live taxels.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Offsets {
-    /// Mean over the taxels.
+    /// The mean over the taxels.
     pub mean_counts: f32,
-    /// Smallest of a taxel.
+    /// The smallest value of a taxel.
     pub least_counts: f32,
-    /// Largest of a taxel.
+    /// The largest value of a taxel.
     pub most_counts: f32,
 }
 
-/// Why a tare that was asked for is not taken. The offsets stay as they were.
+/// The reason why a requested tare is not taken. The offsets stay unchanged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum RetareError {
     /// A press is under way, and the tare would zero it away.
@@ -73,25 +73,25 @@ pub enum RetareError {
     NoFrames,
 }
 
-/// The offsets before and after a tare that was asked for.
+/// The offsets before and after a requested tare.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Retaken {
-    /// Those until now.
+    /// The offsets up to now.
     pub old: Offsets,
-    /// Those from the next frame on.
+    /// The offsets from the next frame on.
     pub new: Offsets,
 }
 
-/// What a tare under way is for.
+/// The purpose of a tare under way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Aim {
     /// The first baseline. It is tried again until nothing touches the sensor.
     First {
-        /// Something touched it at an earlier try.
+        /// Whether something touched the sensor during an earlier try.
         met_contact: bool,
     },
-    /// Another baseline, on request. The one in force stays until this one is taken. It is given
-    /// up when something touches the sensor.
+    /// Another baseline, on request. The old baseline stays in force until the new one is taken.
+    /// The tare is given up when something touches the sensor.
     Request,
 }
 
@@ -117,9 +117,9 @@ pub enum Aim {
 #[derive(Debug, Clone)]
 pub struct Tare {
     scale: Scale,
-    /// Frames of a tare.
+    /// The number of frames of a tare.
     frames: u32,
-    /// `[ROWS, COLS]` in counts; zeros until a tare is taken.
+    /// `[ROWS, COLS]` in counts. All zeros until a tare is taken.
     baseline: Box<[f32; TAXELS]>,
     stage: Stage,
     contact: Contact,
@@ -127,16 +127,16 @@ pub struct Tare {
     /// Whether the baseline follows drift.
     follows: bool,
     array: Array,
-    /// Each dead taxel's place and those of its live neighbours.
+    /// The place of each dead taxel, and the places of its live neighbours.
     dead: Vec<(usize, Vec<usize>)>,
 }
 
-/// From counts to newtons.
+/// The conversion from counts to newtons.
 #[derive(Debug, Clone)]
 struct Scale {
     newtons_per_count: f32,
     exponent: f32,
-    /// Gain of each taxel.
+    /// The gain of each taxel.
     gains: Box<[f32; TAXELS]>,
 }
 
@@ -155,10 +155,11 @@ impl Scale {
         }
     }
 
-    /// Of this many counts above the baseline, at a taxel.
+    /// The newtons of this many counts above the baseline, at a taxel.
     fn newtons(&self, counts: f32, place: usize) -> f32 {
         let counts = counts.max(0.0);
-        // A line gives the very same bits as before there was an exponent.
+        // An exponent of 1 skips `powf`, so the result has the same bits as before exponents
+        // existed.
         let raised = if self.exponent == 1.0 {
             counts
         } else {
@@ -167,27 +168,27 @@ impl Scale {
         raised * self.newtons_per_count * self.gains[place]
     }
 
-    /// The counts above the baseline that are `newtons`, where an exponent bends nothing.
+    /// The counts above the baseline that give `newtons`, without the exponent.
     fn counts(&self, newtons: f32, place: usize) -> f32 {
         newtons / (self.newtons_per_count * self.gains[place])
     }
 }
 
-/// How far a tare is.
+/// The stage of a tare.
 #[derive(Debug, Clone)]
 enum Stage {
-    /// None is under way.
+    /// No tare is under way.
     Idle,
     Taking {
         aim: Aim,
         sums: Sums,
     },
-    /// A tare on request has ended, and its outcome has not been fetched.
+    /// A requested tare has ended, and its outcome has not been fetched.
     Ended(Result<Retaken, RetareError>),
 }
 
 impl Stage {
-    /// The beginning of a tare over `frames` frames; none is taken over 0.
+    /// Begins a tare over `frames` frames. With 0 frames, no tare begins.
     fn begin(aim: Aim, frames: u32) -> Self {
         if frames == 0 {
             return Self::Idle;
@@ -197,7 +198,7 @@ impl Stage {
     }
 }
 
-/// What a [`Tare`] has seen, without its settings and without what the tare under way is for.
+/// The state of a [`Tare`], without its settings and without the purpose of the tare under way.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Memory {
     #[serde(with = "taxels")]
@@ -206,9 +207,9 @@ pub struct Memory {
 }
 
 impl Memory {
-    /// Whether a tare can have come to this: a recording may say anything.
+    /// Whether a tare can have this state. A recording may hold anything.
     pub(crate) fn is_possible(&self) -> bool {
-        // A mean of counts, with room for its rounding.
+        // The mean of counts, with room for rounding.
         let is_count = |mean: &f32| (0.0..=65_536.0).contains(mean);
         let are_sums = |sums: &Sums| {
             let most = u64::from(sums.seen) * u64::from(u16::MAX);
@@ -220,7 +221,7 @@ impl Memory {
     }
 }
 
-/// Sums over the frames of a tare.
+/// The sums over the frames of a tare.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Sums {
     wanted: u32,
@@ -255,7 +256,7 @@ impl Sums {
 }
 
 impl Tare {
-    /// A tare about to be taken, or a zero baseline for good where `tare_frames` is 0.
+    /// A tare that is about to be taken. With `tare_frames` 0, the baseline stays zero.
     ///
     /// `settings` have passed [`Settings::check`] for `array`.
     pub fn new(settings: &Settings, array: Array, contact: Contact) -> Self {
@@ -273,8 +274,8 @@ impl Tare {
         }
     }
 
-    /// Takes over changed settings; the baseline in force stays. If a tare takes another number of
-    /// frames now, one under way begins anew; if it takes none, the one under way ends.
+    /// Takes over changed settings. The baseline in force stays. If the number of frames of a tare
+    /// changes, a tare under way begins again. If the number becomes 0, a tare under way ends.
     pub fn reload(&mut self, settings: &Settings, contact: Contact) {
         let frames = settings.tare_frames;
         self.stage = match std::mem::replace(&mut self.stage, Stage::Idle) {
@@ -292,7 +293,7 @@ impl Tare {
         self.dead = dead(settings, self.array);
     }
 
-    /// What it has seen.
+    /// The state of the tare.
     pub fn memory(&self) -> Memory {
         Memory {
             baseline: self.baseline.clone(),
@@ -303,14 +304,14 @@ impl Tare {
         }
     }
 
-    /// Goes on where the tare stood whose memory this is. If it was under way, it was for `aim`.
+    /// Continues from the state of another tare. If a tare was under way, its purpose is `aim`.
     pub fn recall(&mut self, memory: Memory, aim: Aim) {
         self.baseline = memory.baseline;
         let taking = memory.taking.map(|sums| Stage::Taking { aim, sums });
         self.stage = taking.unwrap_or(Stage::Idle);
     }
 
-    /// What the tare under way is for, if there is one.
+    /// The purpose of the tare under way, if there is one.
     pub fn aim(&self) -> Option<Aim> {
         match &self.stage {
             Stage::Taking { aim, .. } => Some(*aim),
@@ -318,11 +319,12 @@ impl Tare {
         }
     }
 
-    /// Begins another tare; the baseline in force stays until it is taken.
+    /// Begins another tare. The baseline in force stays until the new one is taken.
     ///
     /// # Errors
     ///
-    /// If one is under way, or the settings say that none is to be taken. Nothing has changed then.
+    /// Returns an error if a tare is under way, or if the settings allow none. Nothing has changed
+    /// then.
     pub fn retake(&mut self) -> Result<(), RetareError> {
         if self.aim().is_some() {
             return Err(RetareError::UnderWay);
@@ -334,14 +336,14 @@ impl Tare {
         Ok(())
     }
 
-    /// Ends a tare that was asked for; the baseline in force stays. A first tare goes on.
+    /// Ends a requested tare. The baseline in force stays. A first tare continues.
     pub fn give_up(&mut self, reason: RetareError) {
         if self.aim() == Some(Aim::Request) {
             self.stage = Stage::Ended(Err(reason));
         }
     }
 
-    /// What became of a tare that was asked for, once.
+    /// The outcome of the requested tare. The next call returns `None`.
     pub fn ended(&mut self) -> Option<Result<Retaken, RetareError>> {
         match self.stage {
             Stage::Ended(outcome) => {
@@ -363,8 +365,8 @@ impl Tare {
         }
     }
 
-    /// Counts to newtons: `newtons_per_count x max(0, counts - baseline)^exponent x gain`, dead taxels
-    /// replaced by the mean of their live neighbours.
+    /// Converts counts to newtons: `newtons_per_count x max(0, counts - baseline)^exponent x gain`.
+    /// A dead taxel is replaced by the mean of its live neighbours.
     pub fn apply(&self, raw: &RawFrame) -> Frame {
         let mut frame = Frame::default();
         for (place, newtons) in frame.newtons.iter_mut().enumerate() {
@@ -381,10 +383,10 @@ impl Tare {
         frame
     }
 
-    /// Lets the baseline follow drift, where the settings say so: by [`MOST_STEP_N`] at most towards
-    /// `raw`. A taxel that reads the contact threshold or more stays as it is.
+    /// Moves the baseline towards `raw`, by [`MOST_STEP_N`] at most, if the settings allow it. A
+    /// taxel that reads the contact threshold or more keeps its baseline.
     ///
-    /// Call it once a second at most, and never during a press.
+    /// Call this function once a second at most, and never during a press.
     pub fn follow(&mut self, raw: &RawFrame) {
         if !self.follows {
             return;
@@ -405,7 +407,7 @@ impl Tare {
         })
     }
 
-    /// Shows the tare a frame.
+    /// Takes in a frame for the tare under way.
     pub fn observe(&mut self, raw: &RawFrame) -> Progress {
         let Stage::Taking { aim, sums } = &mut self.stage else {
             return Progress::Ready;
@@ -453,7 +455,7 @@ impl Tare {
         varying.count() >= limit || high.count() >= limit
     }
 
-    /// Places of the array's live taxels.
+    /// The places of the array's live taxels.
     fn live(&self) -> Vec<usize> {
         self.array
             .places()

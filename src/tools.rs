@@ -1,4 +1,5 @@
-//! What stands around the daemon: a sensor to try it on, recordings played again, eyes on a terminal.
+//! The tools around the daemon: a simulated sensor, recording and replay, views of a running
+//! daemon, calibration and diagnosis.
 
 pub mod args;
 pub mod calibrate;
@@ -31,7 +32,7 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 
 use crate::wording;
 
-/// What is printed of an error: one line, with the causes that it does not tell itself.
+/// The text of an error on one line, with every cause that the text does not contain already.
 pub fn line(error: &(dyn Error + 'static)) -> String {
     let mut line = error.to_string();
     let mut cause = error.source();
@@ -45,7 +46,8 @@ pub fn line(error: &(dyn Error + 'static)) -> String {
     shown(&without_numbers(&line))
 }
 
-/// Without the numbers that the system has for its errors: its words are there beside them.
+/// Removes the numbers of the system's errors, such as ` (os error 2)`: the system's words are
+/// there already.
 fn without_numbers(text: &str) -> String {
     let mut parts = text.split(" (os error ");
     let mut told = parts.next().unwrap_or_default().to_owned();
@@ -60,8 +62,8 @@ fn without_numbers(text: &str) -> String {
     told
 }
 
-/// One line of text. Whatever a file or a process in it is called, it cannot break the line or speak to
-/// the terminal.
+/// Escapes hidden characters. Without this, the name of a file or a process could break the line or
+/// control the terminal.
 fn shown(text: &str) -> String {
     let shown = |c: char| {
         let escaped = wording::is_hidden(c).then(|| c.escape_default());
@@ -71,8 +73,8 @@ fn shown(text: &str) -> String {
     text.chars().flat_map(shown).collect()
 }
 
-/// What clap says of arguments that it refuses, on one line, with exit code 2; or the help or version
-/// that was asked for.
+/// Prints clap's error on one line, and returns exit code 2. Prints the help or the version instead
+/// if the command line asks for it.
 pub fn usage(program: &str, error: &clap::Error) -> ExitCode {
     if matches!(
         error.kind(),
@@ -126,7 +128,8 @@ fn where_to_look(error: &clap::Error, text: &str) -> Option<String> {
     Some(command.join(" "))
 }
 
-/// `hardnessd run hardnessd.toml`: a configuration without the option that it belongs to.
+/// The configuration in a command line such as `hardnessd run hardnessd.toml`, which lacks the
+/// option `--config`.
 fn configuration_in_place_of_an_option(error: &clap::Error) -> Option<&str> {
     match (error.kind(), error.get(ContextKind::InvalidArg)) {
         (ErrorKind::UnknownArgument, Some(ContextValue::String(argument))) => {
@@ -136,8 +139,8 @@ fn configuration_in_place_of_an_option(error: &clap::Error) -> Option<&str> {
     }
 }
 
-/// Opens a file to read from. A directory is refused here: the system would do so at the first read
-/// only, when what was asked for has begun.
+/// Opens a file to read from. Refuses a directory at once, because the system would refuse it only
+/// at the first read, after the work has begun.
 fn open(path: &Path) -> io::Result<File> {
     let file = File::open(path)?;
     if file.metadata()?.is_dir() {
@@ -146,12 +149,13 @@ fn open(path: &Path) -> io::Result<File> {
     Ok(file)
 }
 
-/// Writes lines to stdout at once, and waits until there is room for them: not for a thread that has
-/// anything else to do. `Ok(false)`: nobody reads any more, which ends a tool quietly.
+/// Writes lines to stdout at once, and blocks until there is room for them. Do not call it on a
+/// thread that has other work. Returns `Ok(false)` if nobody reads any more, which ends a tool
+/// quietly.
 ///
 /// # Errors
 ///
-/// If stdout cannot be written to for another reason.
+/// Fails if stdout cannot be written to for another reason.
 pub fn print(lines: &[u8]) -> io::Result<bool> {
     let mut out = io::stdout().lock();
     match out.write_all(lines).and_then(|()| out.flush()) {
@@ -160,7 +164,7 @@ pub fn print(lines: &[u8]) -> io::Result<bool> {
     }
 }
 
-/// As [`print`], from a thread of its own: whoever reads may take as long as they like.
+/// Like [`print`], but on a thread of its own, because the reader of stdout may be slow.
 async fn print_apart(lines: Vec<u8>) -> io::Result<bool> {
     tokio::task::spawn_blocking(move || print(&lines)).await?
 }

@@ -1,16 +1,17 @@
 //! The method of the paper, storey by storey: data, networks, losses, loop, file.
 //!
 //! In: labelled and unlabelled frames. Out: a run's directory with the model that the daemon loads
-//! and what it is worth. The modules below stand in the order of the storeys. Each uses only those
-//! above it: [`settings`] says what a run can be told, [`data`] makes data sets and batches,
+//! and its evaluation. The modules below are in the order of the storeys, and each uses only those
+//! above it: [`settings`] holds the settings of a run, [`data`] makes data sets and batches,
 //! [`net`] holds the networks and their losses, [`judge`] measures, [`run`] keeps a run's files,
-//! [`learn`] takes the steps, [`model`] writes the ONNX file, [`stages`] and [`methods`] are the
-//! paper's method over these parts, and [`compare`] runs all methods for tables and reports.
+//! [`learn`] takes the steps, [`model`] writes the ONNX file, [`stages`] and [`methods`] build the
+//! paper's method from these parts, and [`compare`] runs all methods for tables and reports.
 //! Nothing here draws from a global random state.
 //!
-//! What to expect: `--method frame --profile quick` on 58,000 simulated presses is right on 78 % of presses of
-//! random other materials with `matched` shapes and on 65 % with `wide` ones; 3 minutes of one thread.
-//! `--method course` on 60,000 presses is right on 90 and 89 %; 20 minutes of one thread (`models/`).
+//! What to expect: `--method frame --profile quick`, trained on 58,000 simulated presses, judges
+//! 78 % of the presses of other random materials correctly with `matched` shapes and 65 % with
+//! `wide` ones, and takes 3 minutes of one thread. `--method course`, trained on 60,000 presses,
+//! judges 90 and 89 % correctly and takes 20 minutes of one thread (`models/`).
 
 pub mod settings;
 pub mod data;

@@ -1,10 +1,10 @@
-//! A model file is tried in a child process before this one loads it.
+//! The trial of a model file in a child process, before this process loads the file.
 //!
-//! In: the bytes of a model file, and how long a verdict may take. Out: the [`Hrn`], or why the file
-//! is refused. [`verdict`] refuses what is known to hurt before the inference library sees it; a
-//! trial catches what is not known: the child may panic, fill its memory or never end, and this
-//! process says so in one line and goes on. The child is the same program, which calls [`entry`]
-//! first thing; where nobody has called it, as in a test of the library, there is no trial.
+//! In: the bytes of a model file, and how long a verdict may take. Out: the [`Hrn`], or the reason
+//! why the file is refused. [`verdict`] refuses all known dangers before the inference library sees
+//! them. A trial catches the unknown ones: the child may panic, fill its memory or never end. This
+//! process then reports it in one line and continues. The child is the same program, which calls
+//! [`entry`] first. If nobody has called [`entry`], as in a test of the library, there is no trial.
 
 use std::io::{Read, Write};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
@@ -21,33 +21,33 @@ use serde::{Deserialize, Serialize};
 
 use crate::verdict::{self, Hrn, ModelError};
 
-/// By this name (argv 0) a process of the program knows that it is a trial.
+/// The name (argv 0) by which a process of the program knows that it is a trial.
 const NAME: &str = "hardnessd-trial";
-/// Share of a frame's period that a verdict may take.
+/// The share of a frame's period that a verdict may take.
 const SHARE: f64 = 0.1;
-/// A verdict may take this long whatever the sensor's rate, and never longer than the second: the
-/// daemon does nothing else meanwhile.
+/// A verdict may take the first time whatever the sensor's rate is, and never more than the second,
+/// because the daemon does nothing else during a verdict.
 const VERDICT_MOST: [Duration; 2] = [Duration::from_millis(1), Duration::from_millis(20)];
-/// Address space of a trial, in bytes.
+/// The address space of a trial, in bytes.
 const MEMORY_BYTES: u64 = 1 << 30;
-/// Processor time of a trial.
+/// The processor time of a trial.
 const PROCESSOR: Duration = Duration::from_secs(10);
-/// How long a trial may take by the clock: other processes may be busy.
+/// The wall-clock time of a trial. It is longer, because other processes may be busy.
 const DEADLINE: Duration = Duration::from_secs(30);
-/// Verdicts that are timed.
+/// The number of verdicts that are timed.
 const VERDICTS: usize = 15;
-/// No verdict is timed after this much processor time.
+/// After this much processor time, no further verdict is timed.
 const TIMED: Duration = Duration::from_secs(1);
-/// Longest answer of a trial.
+/// The longest answer of a trial.
 const ANSWER_BYTES: u64 = 64 << 10;
 
-/// Whether this program can be a trial.
+/// Set if this program can run as a trial.
 static IS_TRIER: OnceLock<()> = OnceLock::new();
 
-/// What a trial says, as a line of JSON.
+/// The answer of a trial, as a line of JSON.
 #[derive(Debug, Serialize, Deserialize)]
 enum Answer {
-    /// The file is good; the median of the processor time of its verdicts.
+    /// The file is good. The number is the median of the processor time of its verdicts.
     Good {
         verdict_us: f64,
     },
@@ -55,14 +55,15 @@ enum Answer {
     Panicked(String),
 }
 
-/// How long a verdict may take where the fastest sensor sends `frame_rate_hz` frames a second.
+/// The longest time for a verdict if the fastest sensor sends `frame_rate_hz` frames a second.
 pub fn verdict_most(frame_rate_hz: f64) -> Duration {
     let [least, most] = VERDICT_MOST;
     let share = Duration::try_from_secs_f64(SHARE / frame_rate_hz).unwrap_or(most);
     share.clamp(least, most)
 }
 
-/// Lets this process try models, or is the trial of one: then its exit code.
+/// Allows this process to try models. If this process is itself a trial, runs the trial and returns
+/// its exit code.
 pub fn entry() -> Option<ExitCode> {
     if std::env::args_os().next().is_some_and(|name| name == NAME) {
         return Some(trial());
@@ -71,12 +72,12 @@ pub fn entry() -> Option<ExitCode> {
     None
 }
 
-/// Loads a model file after a trial. A verdict may take `most`, if that is given.
+/// Loads a model file after a trial. If `most` is given, a verdict may take no longer.
 ///
 /// # Errors
 ///
-/// As [`Hrn::load`]; [`ModelError::Trial`] if the trial refuses the file or does not come to an end,
-/// [`ModelError::Slow`] if a verdict takes too long.
+/// Returns the errors of [`Hrn::load`]. Also returns [`ModelError::Trial`] if the trial refuses the
+/// file or does not complete, and [`ModelError::Slow`] if a verdict takes too long.
 pub fn load(bytes: &[u8], most: Option<Duration>) -> Result<Hrn, ModelError> {
     if bytes.len() > verdict::MAX_FILE_BYTES {
         return Err(ModelError::TooLarge { found: bytes.len() });
@@ -92,17 +93,17 @@ pub fn load(bytes: &[u8], most: Option<Duration>) -> Result<Hrn, ModelError> {
     Hrn::load(bytes)
 }
 
-/// The same program, even if another one is installed in its place meanwhile.
+/// The command that starts this program again, even if another one has been installed in its place.
 fn child() -> Command {
     let mut command = Command::new("/proc/self/exe");
     command.arg0(NAME);
-    // The trainer's allocator takes a GiB of address space at its start, which is all that a trial may
-    // have: a good model failed now and then.
+    // At its start, the trainer's allocator takes a GiB of address space. That is all that a trial
+    // may have, so good models sometimes failed.
     command.env("MIMALLOC_ARENA_RESERVE", "64MiB");
     command
 }
 
-/// Has a child try the file: how long a verdict takes.
+/// Runs a trial of the file in a child. Returns how long a verdict takes.
 fn tried(mut command: Command, bytes: &[u8], deadline: Duration) -> Result<Duration, ModelError> {
     let trial = |problem: String| ModelError::Trial(format!("model: {problem}"));
     let mut child = command
@@ -112,7 +113,7 @@ fn tried(mut command: Command, bytes: &[u8], deadline: Duration) -> Result<Durat
         .spawn()
         .map_err(|error| trial(format!("no process to try it in: {error}")))?;
     let answer = ask(&mut child, bytes, deadline);
-    // It may have answered and still hang.
+    // The child may have answered and still hang.
     let _ = child.kill();
     let ended = child.wait();
     match answer {
@@ -130,11 +131,11 @@ fn tried(mut command: Command, bytes: &[u8], deadline: Duration) -> Result<Durat
     }
 }
 
-/// Gives the child the file and waits for its answer; `None`: there came none.
+/// Gives the child the file and waits for its answer. `None` if there is no answer.
 fn ask(child: &mut Child, bytes: &[u8], deadline: Duration) -> Option<Answer> {
     let (mut stdin, stdout) = (child.stdin.take()?, child.stdout.take()?);
     thread::scope(|scope| {
-        // A child that ends early does not read all; a child that is killed ends both threads.
+        // A child that ends early does not read everything. Killing the child ends both threads.
         scope.spawn(move || {
             let _ = stdin.write_all(bytes);
         });
@@ -148,14 +149,14 @@ fn ask(child: &mut Child, bytes: &[u8], deadline: Duration) -> Option<Answer> {
         if line.is_none() {
             let _ = child.kill();
         }
-        // A panic comes first; what follows it does not count.
+        // After a panic, a second answer may follow. Only the first answer counts.
         let line = line?;
         let mut answers = serde_json::Deserializer::from_slice(&line).into_iter();
         answers.next()?.ok()
     })
 }
 
-/// Why a child that has ended said nothing.
+/// The reason why a child that has ended gave no answer.
 fn why_silent(status: ExitStatus) -> String {
     let signal = status.signal().and_then(Signal::from_named_raw);
     match signal {
@@ -175,7 +176,7 @@ fn why_silent(status: ExitStatus) -> String {
     }
 }
 
-/// Is the child: tries the file on stdin and answers on stdout.
+/// Runs in the child: tries the file on stdin and answers on stdout.
 fn trial() -> ExitCode {
     limit();
     panic::set_hook(Box::new(|info| {
@@ -196,7 +197,8 @@ fn trial() -> ExitCode {
     ExitCode::SUCCESS
 }
 
-/// Bounds what this process can take. Where the system forbids it, the deadline is left.
+/// Limits the resources of this process. Where the system forbids a limit, the deadline still
+/// holds.
 fn limit() {
     let bound = |most: u64| Rlimit {
         current: Some(most),
@@ -211,12 +213,12 @@ fn limit() {
             maximum: Some(PROCESSOR.as_secs() + 1),
         },
     );
-    // Where memory is short, this process goes before the daemon.
+    // When memory is short, the system kills this process before the daemon.
     let _ = std::fs::write("/proc/self/oom_score_adj", "1000");
     let _ = rustix::process::set_parent_process_death_signal(Some(Signal::KILL));
 }
 
-/// The median of the processor time of verdicts: other processes do not count in it.
+/// The median of the processor time of verdicts. Processor time excludes that of other processes.
 fn median_us(hrn: &Hrn) -> Result<f64, ModelError> {
     let now = || {
         let time = rustix::time::clock_gettime(ClockId::ThreadCPUTime);
@@ -245,7 +247,7 @@ fn one_line(info: &PanicHookInfo<'_>) -> String {
 }
 
 fn say(answer: &Answer) {
-    // Nobody is left to hear a failure.
+    // If writing fails, nobody is left to tell.
     let _ = serde_json::to_writer(std::io::stdout(), answer);
 }
 
@@ -275,7 +277,8 @@ mod tests {
         let check = |script: &str, expected: &str| {
             let mut command = Command::new("sh");
             command.args(["-c", script]);
-            // More than a pipe holds: a child that does not read it is no reason to wait.
+            // A pipe holds less than this: the parent must not wait for a child that does not read
+            // it.
             let bytes = vec![0; 1 << 20];
             let error = tried(command, &bytes, Duration::from_millis(500)).unwrap_err();
             let line = error.to_string();

@@ -1,9 +1,10 @@
 //! A press becomes a verdict: loads an HRN from ONNX bytes and judges presses with it.
 //!
-//! In: the bytes of a model file as `hrn-train export` writes them, then frames in newtons (format 1)
-//! or the course of a press (format 2). Out: [`Verdict`]s. A file is refused unless all of it is as agreed and it
-//! reproduces the probabilities that its trainer wrote into it, so a loaded [`Hrn`] is known to
-//! compute what was evaluated. Never reads a file itself, never prints, never trains.
+//! In: the bytes of a model file as `hrn-train export` writes them, then frames in newtons (format
+//! 1) or the course of a press (format 2). Out: [`Verdict`]s. This module refuses a file unless all
+//! of it follows the format and it reproduces the probabilities that its trainer wrote into it. So
+//! a loaded [`Hrn`] computes what was evaluated. This module never reads a file itself, never
+//! prints and never trains.
 
 mod course;
 mod file;
@@ -24,62 +25,63 @@ use crate::frame::{COLS, Frame, ROWS};
 /// The default model, built into the binary; `models/README.md` is its card.
 pub const BUILT_IN: &[u8] = include_bytes!("../models/hrn.onnx");
 
-/// Largest model file accepted, in bytes: 64 MB.
+/// The largest accepted model file, in bytes: 64 MB.
 pub const MAX_FILE_BYTES: usize = 64_000_000;
-/// Oldest ONNX operator set accepted.
+/// The oldest accepted ONNX operator set.
 pub const MIN_OPSET: i64 = 17;
-/// The check frames' probabilities must be reproduced within this.
+/// The largest accepted difference from the check frames' probabilities.
 pub const CHECK_TOLERANCE: f32 = 1e-4;
-/// The check presses' Shore hardness must be reproduced within this.
+/// The largest accepted difference from the check presses' Shore hardness.
 pub const SHORE_TOLERANCE: f32 = 1e-2;
 
-/// One hardness level as `hello` tells it.
+/// One hardness level, as `hello` publishes it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Level {
-    /// 1-based; 1 is the hardest.
+    /// The level's number, from 1; 1 is the hardest.
     pub level: u8,
     /// A short name without control characters, such as `very-soft`.
     pub label: String,
-    /// The Shore hardness it covers, such as `51-60`.
+    /// The Shore hardness that the level covers, such as `51-60`.
     pub shore: String,
 }
 
-/// What a model saw in training; outside it a verdict carries the note `outside_training`.
+/// The range of forces and areas in training. A verdict on a frame outside it has the note
+/// `outside_training`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Range {
-    /// Least and greatest total force of a training frame, in newtons.
+    /// The least and the greatest total force of a training frame, in newtons.
     pub force_n: [f32; 2],
-    /// Least and greatest contact area of a training frame, in taxels.
+    /// The least and the greatest contact area of a training frame, in taxels.
     pub contact_area_taxels: [u32; 2],
 }
 
-/// What a model file says of itself: its `hrn.*` metadata.
+/// The description of a model in its file: the `hrn.*` metadata.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Card {
     /// `hrn.format`: "1" or "2".
     pub format: String,
-    /// `hrn.levels`: 1 to L in order.
+    /// `hrn.levels`: levels 1 to L in order.
     pub levels: Vec<Level>,
-    /// `hrn.pitch_mm`: the distance between taxels that it was trained on.
+    /// `hrn.pitch_mm`: the distance between taxels in the training data.
     pub pitch_mm: f32,
-    /// `hrn.method`: how it was trained, such as `hrn100`.
+    /// `hrn.method`: the method of training, such as `hrn100`.
     pub method: String,
-    /// `hrn.data`: name, seed and hash of the data, as written.
+    /// `hrn.data`: name, seed and hash of the training data, as the file has it.
     pub data: String,
-    /// `hrn.metrics`: what its trainer measured.
+    /// `hrn.metrics`: the trainer's measurements.
     pub metrics: serde_json::Value,
-    /// `hrn.validation`: what it was validated on, such as `simulated data only`.
+    /// `hrn.validation`: the data of the validation, such as `simulated data only`.
     pub validation: String,
-    /// `hrn.range`.
+    /// `hrn.range`: the forces and areas in training.
     pub range: Range,
-    /// `hrn.conformal`, of format 2 alone.
+    /// `hrn.conformal`: only a file of format 2 may have it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub conformal: Option<Conformal>,
 }
 
-/// `hrn.conformal`: which levels a verdict cannot tell apart.
+/// `hrn.conformal`: the threshold for the set of levels that a verdict cannot tell apart.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Conformal {
@@ -101,17 +103,17 @@ impl Conformal {
     }
 }
 
-/// What a file carries to be checked by.
+/// The checks in a model file: inputs, and the trainer's outputs for them.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Checks {
-    /// Of format 1.
+    /// The check frames of format 1.
     Frames(Check),
-    /// Of format 2.
+    /// The check presses of format 2.
     Courses(CourseCheck),
 }
 
 impl Checks {
-    /// Counts the frames or presses.
+    /// The number of check frames or check presses.
     pub fn count(&self) -> usize {
         match self {
             Self::Frames(check) => check.frames.len(),
@@ -119,7 +121,7 @@ impl Checks {
         }
     }
 
-    /// The probabilities that the trainer computed for one of them.
+    /// The probabilities that the trainer computed for check `index`.
     fn probabilities(&self, index: usize) -> &[f32] {
         match self {
             Self::Frames(check) => &check.probabilities[index],
@@ -127,7 +129,7 @@ impl Checks {
         }
     }
 
-    /// Likewise the Shore hardness.
+    /// The Shore hardness that the trainer computed for check `index`.
     fn shore(&self, index: usize) -> Option<Shore> {
         match self {
             Self::Frames(_) => None,
@@ -140,47 +142,47 @@ impl Checks {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Check {
-    /// Newtons, row-major, 784 a frame; two frames a level.
+    /// The frames: 784 newtons each, row-major. There are 8 frames, or two frames of each level.
     pub frames: Vec<Vec<f32>>,
-    /// One row of L a frame.
+    /// One row of L probabilities for each frame.
     pub probabilities: Vec<Vec<f32>>,
 }
 
-/// Why a model file is refused, or a judgement failed.
+/// The reason why a model file is refused, or why a judgement failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
-    /// More than [`MAX_FILE_BYTES`].
+    /// The file has more than [`MAX_FILE_BYTES`].
     #[error("model file of {found} bytes: at most {MAX_FILE_BYTES} are accepted")]
     TooLarge {
-        /// Size of the file.
+        /// The size of the file.
         found: usize,
     },
     /// The bytes are no ONNX model.
     #[error("not an ONNX model: {0}")]
     NotOnnx(String),
-    /// Operator set too old, or none named.
+    /// The operator set is too old or missing.
     #[error("ONNX opset {}: expected {MIN_OPSET} or newer", .found.map_or("missing".into(), |v| v.to_string()))]
     Opset {
-        /// The default domain's version, if the file names one.
+        /// The default domain's version, if the file has one.
         found: Option<i64>,
     },
-    /// Weights outside the file.
+    /// A tensor's data lies outside the file.
     #[error("tensor `{tensor}` lies in an external file: expected all data inside the model file")]
     ExternalData {
-        /// Name of the tensor.
+        /// The name of the tensor.
         tensor: String,
     },
-    /// Inputs or outputs of other names, types or shapes.
+    /// The inputs or outputs have wrong names, types or shapes.
     #[error("model {what} {found}: expected {expected}")]
     Signature {
-        /// `input` or `outputs`.
+        /// `input`, `inputs` or `outputs`.
         what: &'static str,
-        /// As the file has them.
+        /// The names, types and shapes in the file.
         found: String,
-        /// As agreed.
+        /// The names, types and shapes of the format.
         expected: String,
     },
-    /// A metadata key is not there.
+    /// A metadata key is missing.
     #[error("model metadata `{key}` is missing")]
     KeyMissing {
         /// The key.
@@ -191,42 +193,42 @@ pub enum ModelError {
     KeyInvalid {
         /// The key.
         key: &'static str,
-        /// The value, or what is wrong with it.
+        /// The value, or the problem with it.
         found: String,
-        /// What would be right.
+        /// The expected value.
         expected: String,
     },
-    /// An operator, an attribute, a tensor or a size that no model may have.
+    /// The file has an operator, an attribute, a tensor or a size that no model may have.
     #[error("model {place}: {problem}")]
     Guard {
-        /// Which node, tensor, input or output.
+        /// The node, tensor, input or output.
         place: String,
-        /// What is wrong with it.
+        /// The problem with it.
         problem: String,
     },
     /// The graph cannot be run.
     #[error("model graph cannot be run: {0}")]
     Graph(String),
-    /// Other probabilities than the trainer's.
+    /// The probabilities differ from the trainer's.
     #[error(
         "check frame {frame}: probabilities differ from the trainer's by up to {difference:.6}: \
          expected at most {CHECK_TOLERANCE}"
     )]
     CheckDiffers {
-        /// Index in `hrn.check`.
+        /// The check's index in `hrn.check`.
         frame: usize,
-        /// The largest difference in that frame.
+        /// The largest difference in that check.
         difference: f32,
     },
-    /// Another Shore hardness than the trainer's.
+    /// The Shore hardness differs from the trainer's.
     #[error(
         "check press {press}: `shore` differs from the trainer's by up to {difference:.4}: expected \
          at most {SHORE_TOLERANCE}"
     )]
     ShoreDiffers {
-        /// Index in `hrn.check`.
+        /// The press's index in `hrn.check`.
         press: usize,
-        /// The largest difference of its three numbers.
+        /// The largest difference of the three numbers.
         difference: f32,
     },
     /// `probabilities` is not the softmax of `logits`.
@@ -235,24 +237,24 @@ pub enum ModelError {
          {difference:.6}: expected at most {CHECK_TOLERANCE}"
     )]
     NotSoftmax {
-        /// Index in `hrn.check`.
+        /// The check's index in `hrn.check`.
         frame: usize,
-        /// The largest difference in that frame.
+        /// The largest difference in that check.
         difference: f32,
     },
-    /// A judgement gave NaN or infinity.
+    /// A judgement returned NaN or infinity.
     #[error("model gave a number that is not finite in `{output}`")]
     NotFinite {
-        /// The output.
+        /// The name of the output.
         output: &'static str,
     },
     /// A judgement failed inside the inference library.
     #[error("model could not judge a frame: {0}")]
     Inference(String),
-    /// Refused by the process that tried it, or that process did not come to an end.
+    /// The trial process refused the file, or did not complete.
     #[error("{0}")]
     Trial(String),
-    /// A verdict takes so long that frames would wait.
+    /// A verdict takes so long that frames would have to wait.
     #[error(
         "model takes {:.1} ms for a verdict: expected at most {:.1} ms, a tenth of the fastest \
          sensor's frame period (but 1 to 20 ms)",
@@ -260,38 +262,39 @@ pub enum ModelError {
         .expected.as_secs_f64() * 1e3
     )]
     Slow {
-        /// Median of the processor time.
+        /// The median processor time of a verdict.
         found: Duration,
-        /// What the sensors leave.
+        /// The time that the sensors allow for a verdict.
         expected: Duration,
     },
 }
 
-/// What an HRN says of a press.
+/// The verdict of an HRN on a press.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Verdict {
-    /// 1-based argmax of the probabilities (Eq. 10); equal ones go to the lower level.
+    /// The 1-based argmax of the probabilities (Eq. 10). Of equal probabilities, the lower level
+    /// wins.
     pub level: u8,
-    /// `[L]`, after temperature.
+    /// `[L]`: the logits, after temperature.
     pub logits: Vec<f32>,
-    /// `[L]`, softmax of the logits.
+    /// `[L]`: the softmax of the logits.
     pub probabilities: Vec<f32>,
     /// The largest probability.
     pub confidence: f32,
-    /// A model of format 2 has it, and one of format 1 may.
+    /// The Shore hardness. A model of format 2 always has it; a model of format 1 may.
     pub shore: Option<Shore>,
-    /// The conformal set, where the file has a threshold.
+    /// The conformal set, if the file has a threshold.
     pub levels: Option<Vec<u8>>,
 }
 
-/// What a model judges.
+/// The input that a model judges.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
     /// Format 1: the frame of the largest contact area.
     Frame,
     /// Format 2: the course of a press.
     Course {
-        /// Frames at most.
+        /// The largest number of frames in a course.
         most_frames: usize,
     },
 }
@@ -315,11 +318,11 @@ pub enum Format {
 pub struct Hrn {
     plan: Arc<TypedRunnableModel>,
     format: Format,
-    /// Of format 2, in the order of the file.
+    /// The inputs of format 2, in the order of the file.
     inputs: Vec<Input>,
     logits_output: usize,
     probabilities_output: usize,
-    /// A model of format 2 has it, and one of format 1 may.
+    /// A model of format 2 always has this output; a model of format 1 may.
     shore_output: Option<usize>,
     card: Card,
     checks: Checks,
@@ -331,24 +334,25 @@ impl Hrn {
     ///
     /// # Errors
     ///
-    /// If anything in the file is not as agreed, which the [`ModelError`] names, or if one of its check
-    /// frames cannot be judged: as [`Hrn::judge`].
+    /// Returns the [`ModelError`] for the first part of the file that breaks the format, or an
+    /// error as [`Hrn::judge`] if a check frame cannot be judged.
     pub fn load(bytes: &[u8]) -> Result<Self, ModelError> {
         let hrn = Self::read(bytes)?;
         hrn.reproduce_check()?;
         Ok(hrn)
     }
 
-    /// Loads a model file whose check frames nobody has computed yet: for who is about to write them.
+    /// Loads a model file without reproducing its check frames. The trainer uses it to compute
+    /// them.
     ///
     /// # Errors
     ///
-    /// As [`Hrn::load`], but for the check frames.
+    /// Returns the errors of [`Hrn::load`], except those of the check frames.
     pub fn read(bytes: &[u8]) -> Result<Self, ModelError> {
         if bytes.len() > MAX_FILE_BYTES {
             return Err(ModelError::TooLarge { found: bytes.len() });
         }
-        // What a file says of values inside the graph is not needed, and was not checked.
+        // The file's types and shapes of values inside the graph are not needed, and are unchecked.
         let onnx = tract_onnx::onnx().with_ignore_value_info(true);
         let mut reader = bytes;
         let mut proto = onnx
@@ -372,10 +376,10 @@ impl Hrn {
         };
 
         let graph_error = |error: TractError| ModelError::Graph(root_cause(&error));
-        // The inference library would keep a copy.
+        // The inference library would keep a copy of the metadata.
         proto.metadata_props.clear();
         let inference = onnx.model_for_proto_model(&proto).map_err(graph_error)?;
-        // From here on only the plan is kept: the protobuf is as large again as the weights.
+        // The protobuf is as large as the weights. Only the plan is needed from here on.
         drop(proto);
         let shapes = match format {
             Format::Frame => vec![vec![1, 1, ROWS, COLS]],
@@ -393,7 +397,7 @@ impl Hrn {
         let optimized = inference
             .and_then(InferenceModelExt::into_optimized)
             .map_err(graph_error)?;
-        // The inference library does not hold a graph to the shapes it declares.
+        // The inference library does not compare a graph with the shapes that it declares.
         let of_levels = |output| (output, f32::fact([1, card.levels.len()]));
         let agreed = [of_levels(logits_output), of_levels(probabilities_output)];
         let of_shore = shore_output.map(|output| (output, f32::fact([1, 3])));
@@ -427,27 +431,28 @@ impl Hrn {
         &self.sha256
     }
 
-    /// What the file says of itself.
+    /// The description of the model in its file.
     pub fn card(&self) -> &Card {
         &self.card
     }
 
-    /// What it judges.
+    /// The input that the model judges.
     pub fn format(&self) -> Format {
         self.format
     }
 
-    /// What the file carries to be checked by.
+    /// The checks in the file.
     pub fn checks(&self) -> &Checks {
         &self.checks
     }
 
-    /// Judges one frame. A model of format 2 judges it as a press of which nothing else is known.
+    /// Judges one frame. A model of format 2 judges it as a press with one frame and an unknown
+    /// approach.
     ///
     /// # Errors
     ///
-    /// [`ModelError::NotFinite`] if an output is NaN or infinite, [`ModelError::Inference`] if
-    /// the inference library fails.
+    /// Returns [`ModelError::NotFinite`] if an output is NaN or infinite, and
+    /// [`ModelError::Inference`] if the inference library fails.
     pub fn judge(&self, frame: &Frame) -> Result<Verdict, ModelError> {
         match self.format {
             Format::Frame => {
@@ -469,11 +474,11 @@ impl Hrn {
     ///
     /// # Errors
     ///
-    /// As [`Self::judge`].
+    /// Returns the errors of [`Self::judge`].
     ///
     /// # Panics
     ///
-    /// If the course has no frame, or more than the model takes.
+    /// Panics if the course has no frame, or has more frames than a model of format 2 takes.
     pub fn judge_course(&self, course: &Course) -> Result<Verdict, ModelError> {
         let last = course.moments.last().expect("a press has a frame");
         let Format::Course { most_frames } = self.format else {
@@ -490,7 +495,7 @@ impl Hrn {
     ///
     /// # Errors
     ///
-    /// As [`Self::judge`].
+    /// Returns the errors of [`Self::judge`].
     pub fn judge_check(&self, index: usize) -> Result<Verdict, ModelError> {
         match &self.checks {
             Checks::Frames(check) => {
@@ -519,7 +524,7 @@ impl Hrn {
         let level = self.card.levels[best].level;
         let shore = match self.shore_output {
             Some(output) => match read(output, "shore")?[..] {
-                // An interval that does not hold the value is none.
+                // An interval has to contain its value, so widen it if it does not.
                 [value, low, high] => Some(Shore {
                     value,
                     low: low.min(value),
@@ -539,7 +544,7 @@ impl Hrn {
         })
     }
 
-    /// Judges every check frame or press; the first judgement is also the plan's warm-up.
+    /// Judges every check frame or press. The first judgement also warms up the plan.
     fn reproduce_check(&self) -> Result<(), ModelError> {
         for index in 0..self.checks.count() {
             let verdict = self.judge_check(index)?;
@@ -578,7 +583,7 @@ fn inference_error(error: TractError) -> ModelError {
     ModelError::Inference(root_cause(&error))
 }
 
-/// Index and value of the largest; the first of equal ones.
+/// The index and the value of the largest element. Of equal elements, the first wins.
 pub(crate) fn argmax(values: &[f32]) -> (usize, f32) {
     let mut best = (0, f32::NEG_INFINITY);
     for (index, &value) in values.iter().enumerate() {
@@ -603,12 +608,12 @@ fn largest_difference(left: &[f32], right: &[f32]) -> f32 {
         .fold(0.0, f32::max)
 }
 
-/// SHA-256 of `bytes` as 64 hexadecimal digits.
+/// The SHA-256 of `bytes` as 64 hexadecimal digits.
 pub fn sha256_hex(bytes: &[u8]) -> String {
     hex::encode(Sha256::digest(bytes))
 }
 
-/// The innermost message: tract's outer ones name its own stages.
+/// The innermost message. The outer messages name only tract's own stages.
 fn root_cause(error: &TractError) -> String {
     error.root_cause().to_string()
 }

@@ -1,38 +1,40 @@
-//! Words for people: what a parser says of a settings file, and which text can be shown as it is.
+//! Words for people: plain messages for a parser's errors, and a check for text that is safe to
+//! show.
 
-/// Why `text` is not the TOML it should be: the line and what was found and expected.
+/// The error of a TOML text in plain words: the line, and what was found and expected.
 pub fn of_toml(text: &str, error: &toml::de::Error) -> String {
     let before = &text[..error.span().map_or(0, |span| span.start).min(text.len())];
     let line = before.matches('\n').count() + 1;
     format!("line {line}: {}", plain(error.message()))
 }
 
-/// Whether `text` looks the same wherever it is shown: it has no control characters, and none that
-/// end a line or change the direction in which what follows is read.
+/// Whether `text` looks the same wherever it is shown. It then has no control characters, and no
+/// characters that end a line or change the direction of the following text.
 pub fn is_plain(text: &str) -> bool {
     !text.chars().any(is_hidden)
 }
 
-/// Whether a character is not shown, but changes how others are.
+/// Whether a character is invisible, but changes how other characters look.
 pub(crate) fn is_hidden(c: char) -> bool {
     // Unicode's Bidi_Control (PropList.txt), its line separator and its paragraph separator.
     let bidi = matches!(c, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
     c.is_control() || bidi || matches!(c, '\u{2028}' | '\u{2029}')
 }
 
-/// The number that was written, not the one nearest to it among the shorter ones.
+/// The number as it was written, for example 0.1, and not the f64 that equals the f32.
 pub(crate) fn as_written(value: f32) -> f64 {
     let text = format!("{value:?}");
     text.parse()
         .expect("a number's own text is a number's text")
 }
 
-/// What is wrong with the value of an option: the command line's parser says it for programmers.
+/// The error of an option's value in plain words. The command line's parser words it for
+/// programmers.
 pub(crate) fn of_argument(message: &str) -> String {
     if message == "invalid digit found in string" {
         return "expected a whole number".to_owned();
     }
-    // The value itself stands before this.
+    // The caller's message already has the value before this text.
     if let Some((_, expected)) = message
         .strip_prefix("unknown variant ")
         .and_then(|rest| rest.split_once(", "))
@@ -51,7 +53,7 @@ pub(crate) fn of_argument(message: &str) -> String {
     }
 }
 
-/// `message` on one line, and without the names that Rust has for types.
+/// `message` on one line, without Rust's names of types.
 pub fn plain(message: &str) -> String {
     let message = message.trim().replace('\n', ": ");
     match message.as_str() {
@@ -62,13 +64,14 @@ pub fn plain(message: &str) -> String {
         "invalid IP address syntax" => {
             return "found no address, expected such as 192.0.2.7".to_owned();
         }
-        // A name that is one of several.
+        // This comes from a name that has to be one of several.
         "wanted string or table" => {
             return "found a value that is no text, expected a name in quotes".to_owned();
         }
         _ => {}
     }
-    // A key, to the author of a settings file. Where a name is one of several, it is a variant.
+    // The author of a settings file knows an unknown field as a key, and an unknown variant as a
+    // value.
     let message = message.replace("unknown field ", "unknown key ");
     let message = message.replace("unknown variant ", "found ");
     let Some((found, expected)) = message.rsplit_once(", expected ") else {

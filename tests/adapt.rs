@@ -1,5 +1,5 @@
-//! `train --method frame` and `adapt` on tiny data: what the model says, that a killed run goes on bit for
-//! bit, and what is refused.
+//! `train --method frame` and `adapt` on tiny data: the model's outputs, a killed run that
+//! continues bit for bit, and refused inputs.
 #![cfg(feature = "train")]
 #![allow(
     clippy::unwrap_used,
@@ -35,8 +35,8 @@ fn succeed(arguments: &[&str]) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// A directory with `own.npz`, half of whose training presses are unlabelled, `start.onnx` of the method
-/// `frame`, and settings.
+/// A directory with settings, `start.onnx` of the method `frame`, and `own.npz`, half of whose
+/// training presses are unlabelled.
 fn bench() -> &'static Path {
     static BENCH: OnceLock<tempfile::TempDir> = OnceLock::new();
     let directory = BENCH.get_or_init(|| {

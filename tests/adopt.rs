@@ -1,4 +1,4 @@
-//! A model of someone else's making: what `hrn-train check-model` says of it, and what `adopt` makes of it.
+//! A model from elsewhere: the report of `hrn-train check-model`, and the result of `adopt`.
 #![cfg(feature = "train")]
 #![allow(
     clippy::unwrap_used,
@@ -49,7 +49,7 @@ fn data() -> (tempfile::TempDir, PathBuf) {
     (directory, path)
 }
 
-/// A linear model: the weight of taxel `t` for level `l`.
+/// The linear model's weight of `taxel` for `level`.
 fn weight(taxel: usize, level: usize) -> f32 {
     ((taxel * 7 + level * 13) % 29) as f32 / 290.0 - 0.05
 }
@@ -87,7 +87,8 @@ fn node(operator: &str, inputs: &[&str], output: &str) -> pb::NodeProto {
     }
 }
 
-/// The linear model as a framework may write it: an input `x` with any batch, and `output` of `levels`.
+/// The linear model as a framework may write it: an input `x` with any batch, and `output` of
+/// `levels`.
 fn model(output: &str, levels: usize, opset: i64) -> pb::ModelProto {
     let weights: Vec<f32> = (0..784)
         .flat_map(|taxel| (0..levels).map(move |level| weight(taxel, level)))
@@ -187,7 +188,7 @@ fn a_foreign_model_is_told_all_that_it_lacks_and_adopted() {
             16,
             "{lines}"
         );
-        // What `adopt` measured is what `evaluate` measures of the file.
+        // `adopt` measured the same as `evaluate` measures on the file.
         let evaluated = hrn_train(&["evaluate", "--model", out, "--data", data]);
         assert!(
             stdout(&adopted).ends_with(&stdout(&evaluated)),

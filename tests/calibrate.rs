@@ -43,20 +43,20 @@ fn presses_on_wood_say_the_arms_stiffness_and_delay() {
     let bench = Bench::new();
     let control = bench.path("control.sock");
     let control = control.to_str().unwrap();
-    // The first press of the bench's sensor is of hard plastic.
+    // The default sensor of the bench presses hard plastic first.
     let more = ["--material", "wood", "--motion", control];
     let _sensor = bench.sensor(&more);
     let output = calibrate(&bench, &["--presses", "4"]).output().unwrap();
     assert!(output.status.success(), "{output:?}");
     let text = String::from_utf8(output.stdout).unwrap();
-    // The simulated arm has 10 N/mm; the cover in series, and the sensor's own scale, make it less or
+    // The simulated arm has 10 N/mm. The cover in series and the sensor's own scale make it less or
     // a little more.
     let n_per_mm = value(&text, "stiffness_n_per_mm");
     assert!((8.0..11.0).contains(&n_per_mm), "{text}");
-    // A frame takes 34.3 ms at 230,400 baud. A busy machine adds some.
+    // A frame takes 34.3 ms at 230,400 baud. A busy machine adds to it.
     let delay_ms = value(&text, "delay_ms");
     assert!((15.0..90.0).contains(&delay_ms), "{text}");
-    // What it prints is a configuration.
+    // The output is a configuration.
     let lines = text
         .split_once("\n\n")
         .unwrap()
@@ -103,14 +103,14 @@ fn a_signal_ends_it_and_its_sockets() {
 #[test]
 fn known_weights_say_the_newtons_of_a_count() {
     let bench = Bench::new();
-    // Slowly, so that the first press comes when a busy machine has taken the tare.
+    // The arm is slow, so that even on a busy machine the tare is taken before the first press.
     let _sensor = bench.sensor(&["--force", "5", "--force", "20", "--speed", "0.5"]);
     let output = calibrate(&bench, &["--newtons", "15", "5", "20"])
         .output()
         .unwrap();
     assert!(output.status.success(), "{output:?}");
     let text = String::from_utf8(output.stdout).unwrap();
-    // The simulated film has 0.04 N a count, and each sensor a scale of its own.
+    // The simulated film has 0.04 N a count, times a scale of each sensor's own.
     let newtons_per_count = value(&text, "newtons_per_count");
     assert!((0.034..0.046).contains(&newtons_per_count), "{text}");
     assert_eq!(value(&text, "exponent"), 1.0, "{text}");
@@ -161,7 +161,7 @@ fn presses_of_a_recording_say_the_gains_and_a_recording_holds_them() {
     assert!(text.contains("gains = \"gains.npy\"\n"), "{text}");
     assert!(text.contains(" of 784 measured, each in "), "{text}");
 
-    // What it prints is a configuration, and a daemon with it records the gains themselves.
+    // The output is a configuration, and a daemon with it records the gains themselves.
     let (_, lines) = text.split_once("\n[sensor.calibration]\n").unwrap();
     let calibrated = path("calibrated.toml");
     let table = "[[sensor]]\nname = \"forearm\"\nport = \"port\"\nframe_rate_hz = 20.0\n";
@@ -197,7 +197,7 @@ fn presses_of_a_recording_say_the_gains_and_a_recording_holds_them() {
         "{why}"
     );
 
-    // No presses: no file, and the exit code of what was asked.
+    // Without presses, no file is written, and the exit code is 1.
     fs::write(path("none.bin"), [0; 2000]).unwrap();
     let output = taxels(&path("none.bin"));
     assert_eq!(output.status.code(), Some(1), "{output:?}");

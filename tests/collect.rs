@@ -1,4 +1,4 @@
-//! Recordings to a data set: the frames that the daemon would judge, labelled.
+//! Recordings become a data set: the frames that the daemon would judge, with labels.
 #![cfg(feature = "train")]
 #![allow(
     clippy::unwrap_used,
@@ -33,7 +33,7 @@ fn collected(out: &Path, arguments: &[&str]) -> Vec<Sample> {
     Dataset::read(out).unwrap().samples
 }
 
-/// Area and force of each final verdict of a replay.
+/// The area and the force of each final verdict in a replay.
 fn judged(capture: &Path) -> Vec<(u64, f64)> {
     let replay = hardnessd(&["replay", capture.to_str().unwrap()]);
     let text = String::from_utf8(replay.stdout).unwrap();
@@ -75,7 +75,7 @@ fn samples_are_the_frames_that_the_daemon_judges() {
     assert!(samples.iter().all(|s| s.level == 2 && s.object == Some(9)));
     assert_are_those(&samples, &judged(&fixture));
 
-    // The same of a recording, which says itself what was pressed.
+    // The same holds for a recording, whose own labels tell the pressed object.
     let config = bench.configure("record.toml", "events.sock", "");
     let capture = bench.path("a.mcap");
     let _sensor = bench.sensor(&[]);
@@ -86,14 +86,14 @@ fn samples_are_the_frames_that_the_daemon_judges() {
     assert!(samples.iter().all(|s| s.level == 1 && s.object == Some(7)));
     assert!(samples.iter().all(|s| s.split == Split::Train));
     assert_are_those(&samples, &judged(&capture));
-    // What it is made of stands beside it, by its place among the names.
+    // The material is stored too, as its index among the names.
     assert!(samples.iter().all(|s| s.material == Some(0)));
     assert_eq!(meta(&out).unwrap()["materials"], serde_json::json!(["oak"]));
     assert!(samples.iter().all(|s| s.shore == Some(95.0)));
     let collector = concat!("hrn-train collect ", env!("CARGO_PKG_VERSION"));
     assert_eq!(meta(&out).unwrap()["generator"], collector);
 
-    // What is added says the same of what was there; what is given goes before labels.
+    // Appending keeps the earlier samples, and options override labels.
     let more = [
         "--append",
         "--split",
@@ -113,11 +113,11 @@ fn samples_are_the_frames_that_the_daemon_judges() {
     );
     assert_eq!(meta(&out).unwrap()["captures"].as_array().unwrap().len(), 2);
     assert_eq!(meta(&out).unwrap()["generator"], collector);
-    // Without a number an object is a new one.
+    // An object without a number gets a new number.
     let bytes = bench.path("bytes.npz");
     let new = collected(&bytes, &["--append", "--level", "4", text(&fixture)]);
     assert_eq!(new.last().unwrap().object, Some(10));
-    // That capture is of no known material, and the array is for all or for none.
+    // That capture has no known material. A data set has materials for all samples or for none.
     let lost = ["--append", "--level", "4", text(&fixture)];
     let expected = format!(
         "{}: material: found none, expected one, as in {}: --label material=... when recording",
@@ -132,7 +132,8 @@ fn samples_are_the_frames_that_the_daemon_judges() {
         "foam.5hz.bin: material: found none",
     );
 
-    // After simulated samples a material keeps its place, and a new one is put behind.
+    // Appended to simulated samples, a material keeps its index, and a new material gets the next
+    // one.
     let settings = DatasetSettings {
         objects: 1,
         test_objects: 1,
@@ -148,7 +149,7 @@ fn samples_are_the_frames_that_the_daemon_judges() {
     assert_eq!(meta(&out).unwrap()["materials"][8], "oak");
     assert_eq!(both.last().unwrap().shore, Some(95.0));
     assert!(both[0].shore.is_some_and(|shore| shore != 95.0));
-    // Both had a part in it, and a model of it says so.
+    // The data set has both sources, and a model trained on it says so.
     let both = Dataset::read(&out).unwrap();
     assert_eq!(both.sources[0].kinds(), [Kind::Simulated, Kind::Recorded]);
     let card = trained(&bench, &[&out]);
@@ -201,14 +202,14 @@ fn whole_presses_with_the_arms_approach_are_evaluated() {
         let rows = courses.rows(number);
         assert!(rows.len() >= 3 && courses.time_s[rows.start] == 0.0);
         assert!(courses.known[rows.clone()].iter().all(|&known| known == 1));
-        // The simulated arm comes at 5 mm/s, and on hard plastic it goes a millimetre or two.
+        // The simulated arm moves at 5 mm/s. On hard plastic it goes a millimetre or two.
         let way = &courses.approach_mm[rows.clone()];
         let most = way.iter().copied().fold(0.0, f32::max);
         assert!(way[0] == 0.0 && (0.5..8.0).contains(&most), "{way:?}");
         let (time_s, mm) = (courses.time_s[rows.start + 2], way[2]);
         assert!((mm / time_s - 5.0).abs() < 1.5, "{mm} mm in {time_s} s");
     }
-    // A press more of another object, of which nobody told the arm.
+    // Append a press on another object, without positions of the arm.
     let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/foam.5hz.bin");
     let more = [
         "--sequences",
@@ -251,14 +252,15 @@ fn whole_presses_with_the_arms_approach_are_evaluated() {
     let figures: Value = serde_json::from_slice(&evaluated.stdout).unwrap();
     assert_eq!(figures["n"], both.presses.len());
 
-    // Single frames and presses over time are no one file.
+    // One file cannot hold both single frames and presses over time.
     let bytes = std::fs::read(&out).unwrap();
     let output = collect(&out, &["--append", "--level", "1", text(&capture)]);
     assert_eq!(output.status.code(), Some(1), "{output:?}");
     assert!(std::fs::read(&out).unwrap() == bytes);
 }
 
-/// Refused with 1 and one line that has this in it, and nothing is written.
+/// Asserts that the command is refused with exit code 1 and one line that contains `part`, and that
+/// nothing is written.
 #[track_caller]
 fn assert_refused(out: &Path, arguments: &[&str], part: &str) {
     let before = std::fs::read(out).ok();
@@ -279,7 +281,7 @@ fn train(bench: &Bench, data: &[&Path]) -> Output {
         .unwrap()
 }
 
-/// The card of a model of the data.
+/// The card of a model trained on the data.
 fn trained(bench: &Bench, data: &[&Path]) -> Card {
     let output = train(bench, data);
     assert!(output.status.success(), "{output:?}");
@@ -302,7 +304,7 @@ fn a_model_is_of_the_pitch_of_its_recordings_and_pitches_do_not_mix() {
     let out = bench.path("narrow.npz");
     collected(&out, &["--level", "1", text(&capture)]);
     assert_eq!(meta(&out).unwrap()["pitch_mm"], 2.0);
-    // A .bin is of the configuration's sensor.
+    // A .bin file belongs to the configuration's sensor.
     for level in ["1", "2", "3", "4"] {
         let arguments = [
             "--append",
@@ -332,7 +334,7 @@ fn a_model_is_of_the_pitch_of_its_recordings_and_pitches_do_not_mix() {
         &["--level", "1", text(&capture), fixture],
         "foam.5hz.bin: taxel pitch: found 3.5 mm, expected 2 mm, that of",
     );
-    // A model is evaluated on data of another pitch, but not without a word.
+    // A model can be evaluated on data of another pitch, with a warning.
     let model = bench.path("run/hrn.onnx");
     for (data, said) in [
         (&out, ""),
@@ -397,7 +399,7 @@ fn nothing_of_a_data_set_is_lost_when_it_is_added_to() {
     assert_refused(&out, &object, "own.npz: force: found none");
     write(|sample| sample.shore = Some(70.0));
     assert_refused(&out, &object, "foam.5hz.bin: shore: found none");
-    // Nor does a test object become one to learn from, or the other way round.
+    // A test object cannot become a training object either, or the other way round.
     write(|sample| sample.split = Split::Test);
     let expected = format!(
         "{fixture}: object 4294967295: found it for train, expected it for test, as in {}",
@@ -405,7 +407,7 @@ fn nothing_of_a_data_set_is_lost_when_it_is_added_to() {
     );
     assert_refused(&out, &[&append[..], &most[..2]].concat(), &expected);
     collected(&out, &object);
-    // Nothing told who made it, and that is not forgotten either.
+    // The file does not say who made it, and that is kept too.
     write(|_| ());
     collected(&out, &object);
     let kinds = Dataset::read(&out).unwrap().sources[0].kinds();

@@ -1,4 +1,4 @@
-//! What the commands around the daemon say to whoever types them.
+//! The messages of the commands around the daemon.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -20,7 +20,7 @@ fn text(bytes: &[u8]) -> String {
 #[test]
 fn a_recording_without_a_press_is_warned_of() {
     let bench = Bench::new();
-    // Its first press comes after 2 s.
+    // The sensor's first press comes after 2 s.
     let _sensor = bench.sensor(&["--speed", "0.1"]);
     let config = bench.configure("record.toml", "x.sock", "");
     let out = bench.path("rest.mcap");
@@ -123,7 +123,7 @@ fn sniff_writes_a_configuration_that_check_takes() {
         text(&stdout).contains("28x28 taxels in 790 bytes"),
         "{written}"
     );
-    // It is somebody's now.
+    // The file now exists, and must not be overwritten.
     let Output { status, stderr, .. } = sniff();
     assert_eq!(status.code(), Some(74), "{}", text(&stderr));
     assert_eq!(fs::read_to_string(&config).unwrap(), written);

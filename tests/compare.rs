@@ -1,4 +1,5 @@
-//! `hrn-train compare` and `report` on tiny data: what they write, and what they do not do again.
+//! `hrn-train compare` and `report` on tiny data: the files that they write, and the runs that they
+//! do not repeat.
 #![cfg(feature = "train")]
 #![allow(
     clippy::unwrap_used,
@@ -27,7 +28,7 @@ fn succeed(arguments: &[&str]) -> Output {
     output
 }
 
-/// A directory for the whole process, and a small data set in it.
+/// A directory for the whole process, with a small data set.
 fn data() -> &'static (tempfile::TempDir, PathBuf) {
     static DATA: OnceLock<(tempfile::TempDir, PathBuf)> = OnceLock::new();
     DATA.get_or_init(|| {
@@ -41,7 +42,7 @@ fn data() -> &'static (tempfile::TempDir, PathBuf) {
     })
 }
 
-/// A comparison in a directory of its own.
+/// A comparison in its own directory.
 struct Comparison {
     out: PathBuf,
     methods: &'static str,
@@ -69,12 +70,12 @@ impl Comparison {
         command
     }
 
-    /// Runs to the end and gives what it said.
+    /// Runs the comparison to its end and returns its stderr.
     fn run(&self) -> String {
         let output = self.command().output().unwrap();
         let errors = String::from_utf8_lossy(&output.stderr).into_owned();
         assert!(output.status.success(), "{errors}");
-        // The main table, and where the page is.
+        // Stdout has the main table and the path of the page.
         let printed = String::from_utf8_lossy(&output.stdout).into_owned();
         assert!(printed.starts_with("method "), "{printed}");
         assert!(printed.ends_with("report.html\n"), "{printed}");
@@ -89,7 +90,7 @@ impl Comparison {
         std::fs::read_to_string(self.out.join(name)).unwrap()
     }
 
-    /// When each run's model was written, by name.
+    /// When each run's model was written, by the run's name.
     fn models(&self) -> Vec<(String, SystemTime)> {
         let mut models = Vec::new();
         for entry in std::fs::read_dir(self.out.join("runs"))
@@ -107,7 +108,7 @@ impl Comparison {
     }
 }
 
-/// One that several tests look at.
+/// A comparison that several tests share.
 fn whole() -> &'static Comparison {
     static WHOLE: OnceLock<Comparison> = OnceLock::new();
     WHOLE.get_or_init(|| {
@@ -144,10 +145,10 @@ fn results_have_the_documented_fields_and_agree_with_evaluate() {
         assert_eq!(result["profile"], "smoke");
         assert!(result["steps"].as_u64().unwrap() > 0, "{result}");
         assert!(result["seconds"].as_f64().is_some(), "{result}");
-        // 20 fresh objects a material; one press each in this profile.
+        // There are 20 fresh objects a material, with one press each in this profile.
         for (set, samples) in [("paper_split", 40), ("fresh", 80), ("matched", 80)] {
             assert_eq!(result[set]["n"], samples, "{set}");
-            // The test split has one object a level, which gives no interval.
+            // The test split has one object a level, too few for an interval.
             let ends = (set != "paper_split").then_some(2);
             let interval = result[set]["accuracy_interval_by_object"].as_array();
             assert_eq!(interval.map(Vec::len), ends, "{set}");
@@ -200,8 +201,8 @@ fn a_finished_comparison_does_nothing_again() {
     assert!(first.contains("features-1: done"), "{first}");
     assert!(first.contains("features-24-swapped-13: done"), "{first}");
     let (models, results) = (comparison.models(), comparison.text("results.json"));
-    // Two seeds and, in this profile, 4 assignments of the materials' roles, with many labels and
-    // with few.
+    // There are two seeds. In this profile, there are also 4 assignments of the materials' roles,
+    // with many labels and with few.
     assert_eq!(models.len(), 2 * (2 + 4));
     // A method that is named twice counts once.
     assert_eq!(comparison.json("results.json").len(), 2 * 2);
@@ -213,7 +214,7 @@ fn a_finished_comparison_does_nothing_again() {
     assert!(comparison.models() == models, "a run was done again");
     assert_eq!(comparison.text("results.json"), results);
 
-    // Another method's runs, as good as finished.
+    // Add runs of another method that are as good as finished.
     for run in ["1", "swapped-13"] {
         let from = comparison.out.join(format!("runs/features-24-{run}"));
         let to = comparison.out.join(format!("runs/ours-{run}"));
@@ -225,7 +226,7 @@ fn a_finished_comparison_does_nothing_again() {
         let told = told.replacen("features", "ours", 1);
         std::fs::write(to.join("settings.toml"), told).unwrap();
     }
-    // Asked for less, a comparison forgets nothing of what stands there.
+    // A comparison with fewer rows keeps the earlier results.
     let less = comparison.command_of("1").output().unwrap();
     assert!(less.status.success(), "{less:?}");
     let all = comparison.json("results.json");
@@ -237,7 +238,7 @@ fn a_finished_comparison_does_nothing_again() {
     let all = comparison.json("swaps.json");
     assert_eq!((all.len(), &all[8]["method"]), (9, &Value::from("ours")));
 
-    // What was told otherwise is none of its runs.
+    // A run with other settings does not belong to the comparison.
     let told = comparison.text("runs/features-1/settings.toml");
     for (from, to, expected) in [
         ("seed = 1\n", "seed = 2\n", "`seed`: found 2, expected 1"),
@@ -268,7 +269,7 @@ fn a_finished_comparison_does_nothing_again() {
     }
     std::fs::write(comparison.out.join("runs/features-1/settings.toml"), told).unwrap();
 
-    // Nor does it stand beside them where it is not asked for.
+    // Even if that row is not asked for, such a run is left out.
     let settings = comparison.out.join("runs/features-2/settings.toml");
     let told = comparison.text("runs/features-2/settings.toml");
     std::fs::write(&settings, told.replacen("10.2", "9.0", 1)).unwrap();
@@ -292,7 +293,8 @@ fn a_plan_runs_in_any_shell_and_the_comparison_finds_what_it_made() {
     assert!(planned.status.success(), "{planned:?}");
     let lines = String::from_utf8(planned.stdout).unwrap();
     assert!(!comparison.out.join("results.json").exists());
-    // `nihrn` takes stages of `ours`, so it stands behind it; `features` and `hrn15` have three rows each.
+    // `nihrn` takes stages of `ours`, so it comes after it. `features` and `hrn15` have three rows
+    // each.
     let first = lines.lines().next().unwrap();
     assert!(
         first.contains("--method ours") && first.contains("&& "),
@@ -304,7 +306,7 @@ fn a_plan_runs_in_any_shell_and_the_comparison_finds_what_it_made() {
     );
     assert_eq!(lines.matches("-8-1 --seed").count(), 4, "{lines}");
 
-    // The cheap ones, two at a time, by another program.
+    // Let another program run the cheap lines, two at a time.
     let cheap: Vec<&str> = lines
         .lines()
         .filter(|line| line.contains("--method features"))
@@ -334,7 +336,7 @@ fn a_plan_runs_in_any_shell_and_the_comparison_finds_what_it_made() {
         .map(|run| run["labels"].clone())
         .collect();
     assert_eq!(labels, [160, 24, 8]);
-    // Not asked for, a row of extra labels stays.
+    // A row of extra labels that is not asked for stays.
     let less = Comparison::new("planned", "features", &[])
         .command_of("1")
         .output()
@@ -352,7 +354,7 @@ fn data_that_will_not_do_is_refused_before_anything_is_made() {
         dataset::write(file, &samples, &meta).unwrap();
     };
     write("unsaid.npz", serde_json::json!({}));
-    // A seed that the fresh test objects have.
+    // This is a seed of the fresh test objects.
     write("fresh.npz", serde_json::json!({"seed": 2_019_002}));
     std::fs::write(path("text.npz"), "neither").unwrap();
     for (name, more, code, expected) in [
@@ -390,7 +392,7 @@ fn data_that_a_comparison_is_no_measure_of_is_warned_of() {
     }
     let file = std::fs::File::create(&path).unwrap();
     dataset::write(file, &samples, &serde_json::json!({"pitch_mm": 2.0})).unwrap();
-    // Told before anything is made, which fails here.
+    // The warning comes before anything is made. Making the directory fails here.
     let mut command = hrn_train(&["compare", "--profile", "smoke", "--out", "/dev/null/no"]);
     let output = command.arg("--data").arg(&path).output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
@@ -403,7 +405,7 @@ fn data_that_a_comparison_is_no_measure_of_is_warned_of() {
         assert_eq!(said.matches(&expected).count(), 1, "{said}");
     }
     assert_eq!(said.lines().count(), 3, "{said}");
-    // As is one that is evaluated.
+    // Evaluating a model gives the same warning.
     let model = concat!(env!("CARGO_MANIFEST_DIR"), "/models/hrn.onnx");
     let data = path.to_str().unwrap();
     let output = succeed(&["evaluate", "--model", model, "--data", data]);
@@ -417,7 +419,7 @@ fn a_stopped_or_killed_comparison_takes_its_runs_with_it_and_goes_on() {
     let mut finished = Vec::new();
     for (signal, code) in [("-TERM", Some(143)), ("-KILL", None)] {
         let mut process: Child = comparison.command().stderr(Stdio::null()).spawn().unwrap();
-        // As soon as one run more is done.
+        // Wait until one more run is done.
         while comparison.models().len() == finished.len() {
             assert!(process.try_wait().unwrap().is_none(), "ended by itself");
             std::thread::sleep(Duration::from_millis(10));
@@ -444,7 +446,7 @@ fn a_stopped_or_killed_comparison_takes_its_runs_with_it_and_goes_on() {
         "{errors}"
     );
     assert_eq!(comparison.json("results.json").len(), 6);
-    // Seconds apart, runs are the same.
+    // Apart from their seconds, the runs are the same.
     let without_price = |results: Vec<Value>| -> Vec<Value> {
         let without = |mut result: Value| {
             result.as_object_mut().unwrap().remove("seconds");
@@ -472,7 +474,7 @@ fn at_work_in(directory: &Path) -> bool {
 fn a_failing_run_is_named_and_the_others_go_on() {
     let more = ["--jobs", "1", "--swaps"].as_slice();
     let comparison = Comparison::new("failing", "hrn100,features", more);
-    // What ends the swaps before they begin; then a file where a run wants a directory.
+    // One file stops the swaps before they begin. Another is where a run needs a directory.
     let swapped = comparison.out.join("runs/features-swapped-none");
     std::fs::create_dir_all(&swapped).unwrap();
     std::fs::write(swapped.join("settings.toml"), "neither").unwrap();
@@ -533,7 +535,7 @@ fn a_report_needs_no_network_and_has_all_its_sections() {
     assert_eq!({ output }.output().unwrap().status.code(), Some(66));
 }
 
-/// A page loads nothing, and links only to its own sections, which are these.
+/// Checks that a page loads nothing, and links only to its own sections, which are `sections`.
 fn check_page(page: &str, sections: &[&str]) {
     for foreign in [
         "http:", "https:", "//", "@import", "<script", "<link", "url(",

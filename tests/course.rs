@@ -1,5 +1,5 @@
-//! The method `course` on a few presses: it learns, resumes exactly, and the daemon's own code judges
-//! whole presses with its file.
+//! The method `course` on a few presses: it learns and resumes exactly, and the daemon's own code
+//! judges whole presses with its file.
 #![cfg(feature = "train")]
 #![allow(
     clippy::unwrap_used,
@@ -49,7 +49,7 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
     let said = succeed(at, &format!("{train} --out whole"));
     assert!(said.contains("Shore OO"), "{said}");
 
-    // A run that lost its end and its last checkpoint goes on to the same file.
+    // A run without its end and its last checkpoint continues to the same file.
     succeed(at, &format!("{train} --out cut"));
     let checkpoints = at.join("cut/checkpoints");
     let mut names: Vec<_> = std::fs::read_dir(&checkpoints)
@@ -64,7 +64,7 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
         ["whole", "cut"].map(|run| std::fs::read(at.join(run).join("hrn.onnx")).unwrap());
     assert!(whole == cut, "the resumed run has another model");
 
-    // The daemon's own code takes the file, and the approach matters to it.
+    // The daemon's own code loads the file, and the approach changes its verdicts.
     let hrn = Hrn::load(&whole).unwrap();
     assert_eq!(hrn.format(), Format::Course { most_frames: 48 });
     let courses = Courses::read(&at.join("d.npz")).unwrap();
@@ -101,7 +101,8 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
     adapt(at, &whole);
 }
 
-/// Going on from a model: with no step taken it stays the same, and it goes on from its own.
+/// Adapts a model. Without a real step the model stays the same. An adapted model can be adapted
+/// again.
 fn adapt(at: &Path, start: &[u8]) {
     let simulate = "simulate --sequences --one-sensor 5 --cover 1 --objects 2 --test-objects 1 --presses 3 \
                     --fps 20 --seed 6 --out own.npz";
@@ -117,7 +118,7 @@ fn adapt(at: &Path, start: &[u8]) {
         "adapt --data own.npz --config settings.toml --start own/hrn.onnx --out again",
     );
 
-    // A step so small that no weight moves.
+    // The step is so small that no weight changes.
     std::fs::write(
         at.join("still.toml"),
         "[training]\nepochs = 1\n[training.optimiser]\nlearning_rate = 1e-30\nweight_decay = 0.0\n",
@@ -132,7 +133,7 @@ fn adapt(at: &Path, start: &[u8]) {
     for press in 0..courses.presses.len() {
         let course = course_of(&courses, press);
         let [before, after] = [&before, &still].map(|hrn| hrn.judge_course(&course).unwrap());
-        // The running average of weights that stand still rounds.
+        // The running average of unchanged weights has rounding errors.
         let pairs = before.probabilities.iter().zip(&after.probabilities);
         assert!(pairs.into_iter().all(|(a, b)| (a - b).abs() < 1e-5));
         let [before, after] = [before, after].map(|verdict| verdict.shore.unwrap());
@@ -150,7 +151,8 @@ fn adapt(at: &Path, start: &[u8]) {
     assert_eq!(output.status.code(), Some(78), "{output:?}");
 }
 
-/// The tables of a model of whole presses, one of a frame, and the controls, on the same presses.
+/// Compares a model of whole presses, one of a frame, and the controls on the same presses, and
+/// checks the tables.
 fn compare(at: &Path, told: &Value) {
     let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/hrn.onnx");
     let command = format!(
@@ -175,7 +177,7 @@ fn compare(at: &Path, told: &Value) {
     let difference = less["levels"]["accuracy"].as_f64().unwrap()
         - model["levels"]["accuracy"].as_f64().unwrap();
     assert!((less["less_first"]["mean"].as_f64().unwrap() - difference).abs() < 1e-12);
-    // Most presses have ended after 6.4 s: what is said then is what is said at last.
+    // Most presses have ended after 6.4 s, so most verdicts of that time are final.
     let so_far = model["so_far"]["after"].as_array().unwrap();
     let going_on = |after: &Value| after["going_on"].as_f64().unwrap();
     assert!(

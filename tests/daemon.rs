@@ -1,8 +1,8 @@
 //! The real binary on a real pty: readiness, verdicts, unplug and replug, signals, bad input.
 //!
-//! Bounds are those of `docs/protocol.md`, measured with the daemon's own stamps where it has them. A
-//! busy machine may delay a process by more than a bound, so a bounded action is tried three times and
-//! must keep its bound once.
+//! The limits of time are those of `docs/protocol.md`, measured with the daemon's own stamps where
+//! it has them. A busy machine may delay a process beyond a limit. So an action with a limit is
+//! tried three times, and must keep the limit once.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -27,7 +27,7 @@ fn time(event: &Value) -> jiff::Timestamp {
     event["time"].as_str().unwrap().parse().unwrap()
 }
 
-/// The binary must fail so: this code, one line that has all these parts.
+/// The binary must fail with this exit code and one line that has all these parts.
 fn fails(arguments: &[&str], code: i32, parts: &[&str]) {
     let output = hardnessd(arguments);
     let stderr = String::from_utf8(output.stderr).unwrap();
@@ -69,7 +69,7 @@ fn a_press_on_the_port_becomes_a_verdict_on_the_socket() {
     assert_eq!(verdict["state"], "live");
     assert!(verdict["mono_ns"].as_u64().unwrap() > 0);
     assert!(verdict["latency_us"].as_u64().unwrap() < 1_000_000);
-    // The chosen frame is older than the release that decided.
+    // The chosen frame is older than the release that ended the press.
     assert!(verdict["age_at_publish_ms"].as_f64().unwrap() > 50.0);
     let line = daemon.logged("phase=\"final\"");
     for field in [
@@ -124,8 +124,8 @@ fn an_unplugged_sensor_is_lost_at_once_and_goes_on_counting_when_it_is_back() {
     );
 }
 
-/// Silences the sensor, and gives the shortest time that passed before it was called stale. A busy
-/// machine only makes it longer.
+/// Silences the sensor, and returns the shortest time until the sensor was stale. A busy machine
+/// only makes the time longer.
 fn stale_after(key: &str) -> Duration {
     let bench = Bench::new();
     let script = bench.path("faults.toml");
@@ -175,7 +175,7 @@ fn sigterm_aborts_the_press_in_hand_and_ends_within_a_second() {
     for signal in [Signal::TERM, Signal::INT, Signal::TERM] {
         let mut daemon = bench.daemon();
         let mut subscriber = bench.subscriber();
-        // One that never reads must not keep the daemon.
+        // A subscriber that never reads must not delay the end of the daemon.
         let _deaf = bench.subscriber();
         subscriber.until(&json!({"type": "press", "state": "begin"}));
         let start = Instant::now();
@@ -212,7 +212,7 @@ fn sighup_changes_all_or_nothing() {
     reload(&mut daemon, low, "reloaded");
     subscriber.until(&json!({"state": "begin"}));
     assert_eq!(rejected(&mut subscriber), "low_force");
-    // Neither of these may take effect, not even in part.
+    // Neither of these files may take effect, not even in part.
     let line = reload(&mut daemon, "[model]\nmin_force = 0.0\n", "refused");
     assert!(
         line.contains("min_force") && line.contains("ERROR"),
@@ -253,7 +253,7 @@ fn a_reload_from_what_does_not_end_is_given_up_and_the_next_one_works() {
     bench.configure("hardnessd.toml", "events.sock", "");
     daemon.process.signal(Signal::HUP);
     daemon.logged("reloaded");
-    // The thread that still waits for the pipe does not keep the daemon.
+    // The thread that still waits for the pipe does not delay the end of the daemon.
     let start = Instant::now();
     daemon.process.signal(Signal::TERM);
     assert_eq!(daemon.process.exit_code(), Some(0));
@@ -290,7 +290,7 @@ fn a_socket_whose_file_was_deleted_is_there_again() {
         let made = fs::metadata(&path).unwrap().permissions().mode();
         assert_eq!(made & 0o777, mode, "{name}");
     }
-    // A connection from before lives on.
+    // An earlier connection stays open.
     assert_eq!(before.ask(r#"{"get":"last"}"#), json!({"type": "ok"}));
     daemon.process.signal(Signal::TERM);
     assert_eq!(daemon.process.exit_code(), Some(0));
@@ -304,7 +304,7 @@ fn a_line_that_repeats_without_end_is_left_out_and_counted() {
     let mut daemon = bench.daemon();
     let mut control = Subscriber::connect(&bench.path("control.sock"));
     for _ in 0..TARES {
-        // There is no sensor.
+        // The sensor is absent, so the tare is refused.
         assert_eq!(control.ask(r#"{"tare":"forearm"}"#)["type"], "error");
     }
     daemon.process.signal(Signal::TERM);
@@ -316,7 +316,7 @@ fn a_line_that_repeats_without_end_is_left_out_and_counted() {
         .filter_map(|line| line.split_once("left_out=")?.1.split(' ').next())
         .map(|count| count.parse::<u64>().unwrap())
         .sum();
-    // A line that says how many were left out names the line, too.
+    // A line with `left_out` also contains the text of the line that it counts.
     let written = said("tare refused") - said("left_out=");
     assert_eq!(written + left_out, TARES, "{written} written");
     assert!(written < TARES / 10, "{written} written");
@@ -366,7 +366,7 @@ fn a_port_held_by_another_process_is_named_as_such_and_logged_once() {
     let mut subscriber = Subscriber::connect(&bench.path("second.sock"));
     let held = json!({"state": "connecting", "reason": "port held by another process"});
     subscriber.until(&held);
-    // Some tries later nothing has been added.
+    // The daemon has tried several times by then, and must have logged nothing more.
     std::thread::sleep(Duration::from_millis(700));
     second.process.signal(Signal::TERM);
     second.logged("stopping");
@@ -405,9 +405,9 @@ fn a_subscriber_is_told_what_is_wrong_and_harms_nobody() {
     let mut long = bench.subscriber();
     long.until(&json!({"type": "status"}));
     long.say(&"x".repeat(70_000));
-    // Another status may come first: why the port cannot be opened.
+    // A status about the unopened port may come first.
     long.until(&json!({"type": "error"}));
-    // Closed, perhaps with a reset: what it sent last was never read.
+    // The connection is closed, perhaps with a reset, because the daemon never read the last bytes.
     assert!(long.lines.read_line(&mut String::new()).unwrap_or(0) == 0);
 
     let mut half = bench.subscriber();
@@ -480,7 +480,8 @@ fn a_log_that_nobody_reads_delays_nobody() {
             .unwrap(),
     );
     wait_for("the socket", || bench.path("events.sock").exists());
-    // Each leaves a line of 80 bytes: far more than a pipe holds and the daemon keeps.
+    // Each connection logs a line of 80 bytes: far more in all than a pipe holds and the daemon
+    // keeps.
     for _ in 0..4_000 {
         assert_eq!(bench.subscriber().next().unwrap()["type"], "hello");
     }
@@ -525,7 +526,7 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
     fs::write(bench.path("junk.onnx"), "no model").unwrap();
     let config = written("[model]\npath = \"junk.onnx\"\n");
     fails(&["run", "--config", &config], 78, &["junk.onnx"]);
-    // Refused by a build without it, and for its value by one with it.
+    // A build without ROS 2 refuses the table; a build with it refuses the value.
     let config = written("[publish.ros2]\ndomain_id = 300\n");
     let expected = if cfg!(feature = "ros2") {
         "expected 0 to 232"
@@ -545,7 +546,8 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         74,
         &["http.listen", &address.to_string(), "in use"],
     );
-    // 20 frames/s of 790 bytes are more than 115,200 baud, and nothing is known of this port.
+    // 20 frames/s of 790 bytes need more than 115,200 baud, and the real rate of this port is
+    // unknown.
     let config = written("");
     fails(
         &["check", "--config", &config],
@@ -616,7 +618,7 @@ fn check_refuses_a_rate_that_no_frame_would_allow_and_warns_of_one_that_some_do_
         let stderr = String::from_utf8(output.stderr).unwrap();
         (output.status.code(), stderr)
     };
-    // 115,200 baud; texts of 784 values are 1,569 to 5,546 bytes, packed zeros 9 to 1,569.
+    // At 115,200 baud: texts of 784 values have 1,569 to 5,546 bytes, packed zeros 9 to 1,569.
     for (rate, preset, code, warning) in [
         ("2.0", "ascii", 0, ""),
         ("5.0", "ascii", 0, "5 frames/s of 5546 bytes"),
@@ -681,7 +683,7 @@ fn check_refuses_what_run_would_refuse() {
             fails(&arguments, 78, &["log.format", "journald", "expected"]);
         }
     }
-    // The daemon runs without its disk, and says so; whoever checks wants to know before.
+    // The daemon runs without its disk and logs it. `check` tells the user beforehand.
     for dir in ["file", "file/rec"] {
         let record = format!("[record]\ndir = \"{dir}\"\n");
         let config = bench.configure("bad.toml", "events.sock", &record);
@@ -707,7 +709,7 @@ fn check_looks_and_changes_nothing() {
     assert!(output.status.success(), "{output:?}");
     let left = fs::read_dir(bench.path("")).unwrap().count();
     assert_eq!(left, 1, "nothing but the configuration");
-    // Beside a running daemon, too.
+    // `check` also works beside a running daemon.
     let _daemon = Daemon::start(&config);
     let output = hardnessd(&["check", "--config", config.to_str().unwrap()]);
     assert!(output.status.success(), "{output:?}");
@@ -731,7 +733,7 @@ fn a_signal_ends_recover_while_it_waits_for_a_writer() {
         .arg("--out")
         .arg(bench.path("new.mcap"));
     let mut process = Process(command.stderr(Stdio::piped()).spawn().unwrap());
-    // Without a writer it cannot get further than to open the pipe. Signals must be caught by then.
+    // Without a writer, the process waits while it opens the pipe. Signals must be caught by then.
     let status = format!("/proc/{}/status", process.0.id());
     let are_caught = || {
         let text = fs::read_to_string(&status).unwrap();
@@ -776,7 +778,7 @@ fn a_signal_ends_every_command_that_waits_for_a_file() {
         let mut command = Command::new(BINARY);
         command.args(arguments).stderr(Stdio::piped());
         let mut process = Process(command.spawn().unwrap());
-        // A writer gets through once somebody reads.
+        // Opening the pipe for writing succeeds once a process reads.
         let _writer = fs::File::options().write(true).open(fifo).unwrap();
         process.signal(Signal::TERM);
         assert_eq!(process.exit_code(), Some(code), "{arguments:?}");
@@ -812,7 +814,7 @@ fn a_configuration_may_be_a_pipe_but_has_an_end() {
 fn a_replay_of_any_length_ends_at_a_signal() {
     for (signal, code) in [(Signal::INT, 130), (Signal::TERM, 143)] {
         let mut command = Command::new(BINARY);
-        // There is no end to it.
+        // This file never ends.
         command.args(["replay", "/dev/zero"]).stdout(Stdio::null());
         let mut replay = Process(command.spawn().unwrap());
         std::thread::sleep(Duration::from_millis(300));

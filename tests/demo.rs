@@ -1,5 +1,5 @@
-//! The first minute: `demo` on a terminal, and commands that find a daemon and a configuration by
-//! themselves.
+//! The first minute of a user: `demo` on a terminal, and commands that find a daemon and a
+//! configuration by themselves.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -34,12 +34,12 @@ fn text(bytes: &[u8]) -> String {
     String::from_utf8(bytes.to_vec()).unwrap()
 }
 
-/// What a program writes to a terminal until it ends, and with which code.
+/// The output of a program on a terminal until the program ends, and its exit code.
 fn on_a_terminal(mut command: Command, stop_after: Option<&str>) -> (String, Option<i32>) {
     let Pair { master, device, .. } = Pair::open().unwrap();
     command.stdout(Stdio::from(device)).stderr(Stdio::null());
     let mut process = Process(command.spawn().unwrap());
-    // It holds the device's last descriptor.
+    // `command` holds the last descriptor of the device.
     drop(command);
     let mut written = Vec::new();
     let mut master = File::from(master);
@@ -113,7 +113,7 @@ fn json_on_a_terminal_is_what_a_subscriber_reads() {
     assert_eq!(events.last().unwrap()["phase"], "final");
 }
 
-/// One status by `tail`, and what it said on stderr.
+/// One status from `tail`, with its exit code and its stderr.
 fn tail(runtime: &Path, arguments: &[&str]) -> (Option<i32>, Value, String) {
     let mut command = program(runtime);
     command.args(["tail", "--json", "--types", "status", "--count", "1"]);
@@ -172,7 +172,7 @@ fn a_running_demo_is_found_and_a_daemon_goes_before_it() {
         "{said}"
     );
     assert_eq!(said, format!("hardnessd: events of {}\n", own.display()));
-    // What is named is taken, and nothing is to be said of it.
+    // A socket that is named is used without a message.
     let (_, event, said) = tail(&runtime, &["--socket", socket]);
     assert_eq!((&event["sensor"], said.as_str()), (&"demo".into(), ""));
     let address = daemon.address("tcp").to_string();

@@ -1,5 +1,5 @@
-//! The reference pages agree with the programs: every key, option, field and metric is in them, with its
-//! default, and nothing else is. Every link between pages leads to a page or a heading.
+//! The reference pages agree with the programs: they have every key, option, field and metric with
+//! its default, and nothing else. Every link between pages leads to a page or a heading.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -25,7 +25,7 @@ fn page(name: &str) -> String {
     fs::read_to_string(root().join(name)).unwrap()
 }
 
-/// A row of a table: its cells by the names of their columns, and the headings that it is under.
+/// A row of a table: its cells by the names of their columns, and the headings above it.
 #[derive(Debug)]
 struct Row {
     chapter: String,
@@ -41,7 +41,7 @@ fn cells(line: &str) -> Vec<String> {
         .collect()
 }
 
-/// All rows of all tables of a page.
+/// All rows of all tables in a page.
 fn rows(text: &str) -> Vec<Row> {
     let (mut chapter, mut section) = (String::new(), String::new());
     let mut columns: Vec<String> = Vec::new();
@@ -68,7 +68,7 @@ fn rows(text: &str) -> Vec<Row> {
     rows
 }
 
-/// The text between backticks, if it is the whole cell.
+/// The text between backticks, if the whole cell is that text.
 fn code(cell: &str) -> Option<&str> {
     let inner = cell.strip_prefix('`')?.strip_suffix('`')?;
     (!inner.contains('`')).then_some(inner)
@@ -90,7 +90,7 @@ fn documented(chapter: &str) -> BTreeMap<String, (String, String)> {
         let Some(key) = row.cells.get("Key").and_then(|cell| code(cell)) else {
             continue;
         };
-        // A table of something else than keys has no unit.
+        // Only a table of keys has a unit.
         let Some(unit) = row.cells.get("Unit") else {
             continue;
         };
@@ -117,7 +117,7 @@ fn documented(chapter: &str) -> BTreeMap<String, (String, String)> {
     keys
 }
 
-/// The keys of all values that are no tables, with the values as TOML writes them.
+/// The keys of all values that are not tables, with the values as TOML writes them.
 fn leaves(value: &toml::Value, path: &str, found: &mut BTreeMap<String, String>) {
     let below = |key: &str| {
         if path.is_empty() {
@@ -141,12 +141,12 @@ fn leaves(value: &toml::Value, path: &str, found: &mut BTreeMap<String, String>)
     }
 }
 
-/// Settings written and read again, so that an f32 keeps its own digits.
+/// Writes and reads settings, so that an f32 keeps its own digits.
 fn as_file(settings: &impl serde::Serialize) -> toml::Value {
     toml::from_str(&toml::to_string(settings).unwrap()).unwrap()
 }
 
-/// The unit that the end of a key's name gives.
+/// The unit at the end of a key's name.
 fn unit_of(key: &str) -> Option<&'static str> {
     [
         ("newtons_per_count", "N/count"),
@@ -199,14 +199,14 @@ fn check_keys(
 
 #[test]
 fn the_page_on_configuration_has_every_key_of_the_daemon_and_no_other() {
-    // Tables that are off unless they are there have defaults too.
+    // Tables that are off by default have default values too.
     let tables =
         "[http]\n[record]\n[publish.tcp]\n[publish.foxglove]\n[publish.zenoh]\n[publish.ros2]";
     let config: Config = toml::from_str(&format!("[[sensor]]\nport = \"p\"\n{tables}")).unwrap();
     let mut defaults = BTreeMap::new();
     leaves(&as_file(&config), "", &mut defaults);
-    // Keys whose default follows from the machine or the preset. The shipped file, which another test
-    // checks, shows that they are keys.
+    // The default of these keys depends on the machine or the preset. The shipped file, which
+    // another test checks, shows that they are keys.
     let mut without: BTreeSet<String> = ["robot".to_owned(), "sensor.port".to_owned()].into();
     let mut table = String::new();
     let mut shipped = BTreeSet::new();
@@ -238,7 +238,7 @@ fn the_page_on_configuration_has_every_key_of_the_trainer_and_no_other() {
     check_keys(&documented("The trainer"), &defaults, &BTreeSet::new());
 }
 
-/// The long options that `--help` of a command lists, with the text of each on one line.
+/// The long options in a command's `--help`, with the text of each on one line.
 fn options(program: &Path, command: &str) -> BTreeMap<String, String> {
     let help = Command::new(program)
         .args([command, "--help"])
@@ -274,7 +274,7 @@ fn default_of(text: &str) -> Option<&str> {
     (!value.contains(' ') && value != "never").then_some(value)
 }
 
-/// The commands that `--help` of a program lists.
+/// The commands in a program's `--help`.
 fn commands(program: &Path) -> Vec<String> {
     let help = Command::new(program).arg("--help").output().unwrap();
     let help = String::from_utf8(help.stdout).unwrap();
@@ -354,7 +354,8 @@ fn the_page_on_the_protocol_has_every_field_of_the_schema_and_no_other() {
     for (kind, fields) in &written {
         let known = schema["$defs"][kind]["properties"].as_object().unwrap();
         let mut known: BTreeSet<String> = known.keys().cloned().collect();
-        // The fields of all events are in a table of their own. The `seq` of `hello` has another meaning.
+        // The fields of all events are in a table of their own. The `seq` of `hello` has another
+        // meaning.
         for shared in ["type", "sensor", "time"] {
             known.remove(shared);
         }
@@ -376,7 +377,7 @@ fn the_page_on_metrics_has_every_metric_and_no_other() {
     let _sensor = bench.sensor(&[]);
     daemon.logged("\"live\"");
     let mut found: BTreeMap<String, (String, BTreeSet<String>)> = BTreeMap::new();
-    // The measured rate is there from the second frame on.
+    // The measured rate exists from the second frame on.
     bench::wait_for("two frames", || {
         found = scrape(&get(&address.to_string(), "/metrics"));
         found.contains_key("hardnessd_frame_rate_hertz")
@@ -403,7 +404,7 @@ fn get(address: &str, path: &str) -> String {
     answer
 }
 
-/// Name of every series -> its type and the names of its labels.
+/// The name of every series -> its type and the names of its labels.
 fn scrape(text: &str) -> BTreeMap<String, (String, BTreeSet<String>)> {
     let mut found: BTreeMap<String, (String, BTreeSet<String>)> = BTreeMap::new();
     let mut kind = String::new();
@@ -446,7 +447,7 @@ fn pages(directory: &Path, found: &mut Vec<PathBuf>) {
     }
 }
 
-/// The page without its blocks of code.
+/// The page without its code blocks.
 fn prose(text: &str) -> String {
     let mut is_code = false;
     let mut kept = String::new();
@@ -471,7 +472,7 @@ fn links(text: &str) -> Vec<String> {
         .collect()
 }
 
-/// The anchor that a heading gets: lower case, no punctuation, dashes for spaces.
+/// The anchor of a heading: lower case, no punctuation, dashes for spaces.
 fn anchor(heading: &str) -> String {
     let lower = heading.to_lowercase();
     let kept = lower

@@ -1,6 +1,7 @@
-//! What strangers send, at every door that bytes come in by: whatever the bytes, a door answers, never
-//! panics, and takes no more than a bounded time. `doors/properties.rs` says what holds; `fuzz/` looks for
-//! bytes that break it, guided by coverage. Model files are also tried in `src/verdict/guard`.
+//! Bytes from strangers, at every input of the programs. Whatever the bytes are, the program
+//! answers, never panics, and takes a bounded time. `doors/properties.rs` has the properties.
+//! `fuzz/` searches for bytes that break them, guided by coverage. `src/verdict/guard` also tries
+//! model files.
 
 #![allow(clippy::unwrap_used, reason = "a test")]
 
@@ -16,10 +17,10 @@ use hardnessd::wire::{Cell, Checksum, Decoder, HexBytes, Layout, LengthField, Or
 use proptest::prelude::*;
 use proptest::test_runner::TestRunner;
 
-/// A recording of a daemon.
+/// A recording from a daemon.
 const RECORDING: &[u8] = include_bytes!("../fixtures/earlier.mcap");
 
-/// Changes to bytes: where, and what comes there instead of how many.
+/// Changes to bytes: the place, the new bytes, and the number of bytes that they replace.
 type Damage = Vec<(prop::sample::Index, Vec<u8>, usize)>;
 
 fn damage() -> impl Strategy<Value = Damage> {
@@ -85,8 +86,8 @@ fn layout() -> impl Strategy<Value = Layout> {
     })
 }
 
-/// What a decoder makes of bytes that come in chunks: frames and damaged candidates in order, and how many
-/// bytes it has skipped.
+/// The output of a decoder for bytes in chunks: frames and damaged candidates in order, and the
+/// number of skipped bytes.
 fn decoded<'a>(layout: &Layout, chunks: impl Iterator<Item = &'a [u8]>) -> (Vec<String>, u64) {
     let mut decoder = Decoder::new(layout.clone());
     let mut found = Vec::new();
@@ -131,19 +132,21 @@ proptest! {
         let (one, one_skipped) = decoded(&layout, [bytes.as_slice()].into_iter());
         let (many, many_skipped) = decoded(&layout, chunks.into_iter());
         prop_assert_eq!(one, many);
-        // What is skipped and what is still pending may differ by less than a frame.
+        // The numbers of skipped bytes may differ by less than a frame, because some bytes are
+        // still pending.
         let differ = one_skipped.abs_diff(many_skipped);
         prop_assert!(differ < layout.max_frame_bytes() as u64, "{}", differ);
     }
 }
 
-/// Seconds for changes to what is kept: `HARDNESSD_DOORS_SECONDS` is for CI and for who wants to know more.
+/// The seconds for changes to the kept bytes. `HARDNESSD_DOORS_SECONDS` sets another number, for CI
+/// and for longer searches.
 fn seconds() -> u64 {
     let told = std::env::var("HARDNESSD_DOORS_SECONDS").ok();
     told.map_or(3, |told| told.parse().expect("seconds"))
 }
 
-/// What the fuzzer kept for a door, and a whole recording.
+/// The bytes that the fuzzer kept for a door, and a whole recording.
 fn kept(door: &str) -> Vec<Vec<u8>> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("fuzz/corpus")
@@ -164,7 +167,7 @@ proptest! {
     #[test]
     fn of_a_damaged_recording_what_could_be_read_is_saved(damage in damage()) {
         let bytes = damaged(RECORDING, damage);
-        // It ends with the first error.
+        // The reader ends with the first error.
         let read = Reader::new(bytes.as_slice()).filter(Result::is_ok).count();
         let (_, good) = recover(Cursor::new(&bytes), Vec::new()).unwrap();
         prop_assert!(Reader::new(good.as_slice()).count() >= read.min(1));
@@ -189,7 +192,7 @@ fn every_property_holds_of_changes_to_what_the_fuzzer_kept() {
             let kept = kept(door);
             let config = ProptestConfig {
                 cases: 8,
-                // What is found is kept by hand, in the corpus.
+                // Bytes that break a property are added to the corpus by hand.
                 failure_persistence: None,
                 ..ProptestConfig::default()
             };

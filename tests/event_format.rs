@@ -1,6 +1,6 @@
-//! The published bytes of protocol 1, frozen. If one of these fails, the change is wrong, not the
-//! test: fields may be added with a new expectation, never renamed, reordered or given another
-//! meaning.
+//! The published bytes of protocol 1, frozen. If one of these tests fails, the change is wrong, not
+//! the test. Fields may be added with a new expectation, but never renamed, reordered or given
+//! another meaning.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"

@@ -1,5 +1,5 @@
-//! Faults of a sensor and its cable, at the real binary on a real pty: what subscribers see, and when.
-//! `docs/reliability.md` has the same as a table.
+//! Faults of a sensor and its cable, with the real binary on a real pty: what subscribers see, and
+//! when. `docs/reliability.md` has the same as a table.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -26,14 +26,14 @@ use rustix::process::Signal;
 use rustix::termios::OptionalActions;
 use serde_json::{Value, json};
 
-/// Time between two frames.
+/// The time between two frames.
 const PERIOD: Duration = Duration::from_millis(10);
 
 fn rest() -> RawFrame {
     RawFrame::default()
 }
 
-/// 36 taxels in the middle of the array.
+/// A frame with 36 loaded taxels in the middle of the array.
 fn pressed() -> RawFrame {
     let mut raw = rest();
     for row in 11..17 {
@@ -42,7 +42,7 @@ fn pressed() -> RawFrame {
     raw
 }
 
-/// The sensor's end of a cable: the test says every byte on it.
+/// The sensor's end of a cable. The test writes every byte on it.
 struct Cable {
     pair: Option<Pair>,
     link: PathBuf,
@@ -61,10 +61,10 @@ impl Cable {
         cable
     }
 
-    /// A new port behind the link. One that is still there goes after that.
+    /// Puts a new port behind the link. The old port, if there is one, is closed after that.
     fn replug(&mut self) {
         let pair = Pair::open().unwrap();
-        // A new tty echoes and edits lines.
+        // A new tty echoes and edits lines, so make it raw.
         let mut settings = rustix::termios::tcgetattr(&pair.device).unwrap();
         settings.make_raw();
         rustix::termios::tcsetattr(&pair.device, OptionalActions::Now, &settings).unwrap();
@@ -74,7 +74,7 @@ impl Cable {
         self.pair = Some(pair);
     }
 
-    /// Says when.
+    /// Pulls the cable and returns the time.
     fn unplug(&mut self) -> SystemTime {
         self.drain();
         let now = SystemTime::now();
@@ -96,7 +96,7 @@ impl Cable {
         }
     }
 
-    /// Frames at their pace.
+    /// Writes frames at their pace.
     fn play(&self, raw: &RawFrame, frames: usize) {
         for _ in 0..frames {
             self.write(&self.bytes(raw));
@@ -104,10 +104,10 @@ impl Cable {
         }
     }
 
-    /// Waits until all is read.
+    /// Waits until everything is read.
     fn drain(&self) {
         let device = &self.pair.as_ref().unwrap().device;
-        // What is written reaches the device a moment later.
+        // Written bytes reach the device a moment later.
         let mut empty = 0;
         wait_for("a reader", || {
             std::thread::sleep(Duration::from_millis(2));
@@ -117,8 +117,8 @@ impl Cable {
         });
     }
 
-    /// Rests until the port is read. The first frame may be thrown away, because it is from before the
-    /// port was opened.
+    /// Sends frames without load until the port is read. The daemon may drop the first frame,
+    /// because it is from before the port was opened.
     fn wake(&self) {
         for _ in 0..2 {
             self.write(&self.bytes(&rest()));
@@ -127,7 +127,7 @@ impl Cable {
     }
 }
 
-/// A daemon with a sensor on a cable, live and tared.
+/// A daemon with a sensor on a cable, which is live and tared.
 struct Rig {
     bench: Bench,
     daemon: Daemon,
@@ -136,7 +136,7 @@ struct Rig {
 }
 
 impl Rig {
-    /// `sensor` and `tables`: more keys of the sensor, and more tables.
+    /// Starts a rig whose sensor is live and tared. `tables` are added to the configuration.
     fn start(tables: &str) -> Self {
         let mut rig = Self::connect(tables);
         rig.cable.wake();
@@ -145,7 +145,7 @@ impl Rig {
         rig
     }
 
-    /// The port is open and no byte has come.
+    /// Starts a rig whose port is open, before any byte has come.
     fn connect(tables: &str) -> Self {
         let bench = Bench::new();
         let cable = Cable::plug(bench.path("port"));
@@ -164,15 +164,15 @@ impl Rig {
         self.subscriber.until(fields)
     }
 
-    /// What became of all bytes so far.
+    /// The status after all bytes so far.
     fn status(&mut self) -> Value {
         self.cable.drain();
         self.subscriber.say(r#"{"get":"status"}"#);
-        // Of an event it has a number.
+        // Only the status of an event has a number, and this one is an answer.
         self.sees(&json!({"type": "status", "seq": null}))
     }
 
-    /// Ends the press in hand: it is number `press`, and has a verdict.
+    /// Ends the press under way, and checks that it is number `press` and has a verdict.
     fn release(&mut self, press: u64) -> Value {
         self.cable.play(&rest(), 4);
         let end = self.sees(&json!({"type": "press", "state": "end"}));
@@ -185,7 +185,7 @@ impl Rig {
         end
     }
 
-    /// The next press is number `press`.
+    /// Makes a press, and checks that it is number `press`.
     fn press(&mut self, press: u64) -> Value {
         self.cable.play(&pressed(), 10);
         let begin = self.sees(&json!({"type": "press", "state": "begin"}));
@@ -265,9 +265,9 @@ fn plugged_in_elsewhere_behind_its_link_a_sensor_is_read_on_within_its_pause() {
         shortest = shortest.min(since(replugged, &live));
         rig.press(press);
     }
-    // The first pause is 50 ms.
+    // The first pause between two tries to open the port is 50 ms.
     assert!(shortest < Duration::from_millis(500), "{shortest:?}");
-    // After a long time away it is 2 s.
+    // After a long time without the port, the pause is 2 s.
     rig.cable.unplug();
     std::thread::sleep(Duration::from_secs(4));
     let replugged = SystemTime::now();
@@ -302,7 +302,7 @@ fn flipped_dropped_and_doubled_bytes_cost_their_frame_and_no_press() {
     let after = rig.status();
     let more = |key: &str| after[key].as_u64().unwrap() - before[key].as_u64().unwrap();
     assert_eq!((more("frames"), more("frames_damaged")), (good, 9));
-    // Three of them have a byte less, three a byte more.
+    // Three of the damaged frames have a byte less, three a byte more.
     assert_eq!(more("bytes_skipped"), 9 * 790);
     assert_eq!(after["state"], "live");
     assert_eq!(rig.release(1)["frames"], good);
@@ -340,7 +340,7 @@ fn half_a_frame_and_silence_are_stale_and_its_other_half_makes_it_whole() {
     rig.cable.write(tail);
     rig.sees(&json!({"type": "status", "state": "live"}));
 
-    // Without its other half it is skipped.
+    // Without its other half, the half frame is skipped.
     let before = rig.status();
     rig.cable.write(head);
     rig.sees(&json!({"type": "status", "state": "stale"}));
@@ -349,7 +349,7 @@ fn half_a_frame_and_silence_are_stale_and_its_other_half_makes_it_whole() {
     let after = rig.status();
     let more = |key: &str| after[key].as_u64().unwrap() - before[key].as_u64().unwrap();
     assert_eq!((more("frames"), more("bytes_skipped")), (1, 400));
-    // 5, one in two halves, one more.
+    // There are 5 frames, one in two halves, and one more.
     assert_eq!(rig.release(1)["frames"], 7);
 }
 
@@ -368,8 +368,8 @@ fn a_burst_after_a_stall_loses_no_frame_and_no_press() {
     assert_eq!(status["bytes_skipped"], 0);
 }
 
-/// What a UART reads at `ratio` times the rate that `bytes` are sent at: it waits for a start bit, and
-/// samples the line in the middle of each of its own bits.
+/// The bytes that a UART reads at `ratio` times the rate of the sender of `bytes`. It waits for a
+/// start bit, and samples the line in the middle of each of its own bits.
 fn misread(bytes: &[u8], ratio: f64) -> Vec<u8> {
     let bits = bytes.iter().flat_map(|byte| {
         let data = (0..8).map(move |bit| byte >> bit & 1 == 1);
@@ -415,7 +415,7 @@ fn at_a_wrong_baud_rate_there_is_no_frame_no_press_and_a_stale_sensor() {
         status["bytes_skipped"].as_u64().unwrap() > 10_000,
         "{status}"
     );
-    // At the right one it is live and has pressed nothing yet.
+    // At the right rate, the sensor is live and has no press yet.
     rig.cable.play(&rest(), 8);
     let live = rig.sees(&json!({"type": "status", "state": "live"}));
     assert_eq!(live["seq"], 2, "one event before: it was stale");
@@ -471,7 +471,7 @@ fn a_dead_row_is_missing_in_the_contact_until_it_is_named() {
         areas.push(verdict["contact_area_taxels"].as_u64().unwrap());
         rig.reload(&format!("[sensor.calibration]\ndead_taxels = {row:?}\n"));
     }
-    // The neighbours of a dead taxel beside the contact are partly in it.
+    // Some neighbours of a dead taxel beside the contact are in the contact.
     assert_eq!(areas, [30, 38]);
 }
 
@@ -483,7 +483,7 @@ fn drift_is_no_press_below_the_threshold_and_above_it_one_that_ends_by_the_clock
         raw.counts.fill(counts);
         raw
     };
-    // A count is 0.04 N, the threshold 0.07 N.
+    // A count is 0.04 N, and the threshold is 0.07 N.
     rig.cable.play(&drifted(1), 60);
     rig.cable.play(&drifted(2), 60);
     let begin = rig.sees(&json!({"type": "press"}));
@@ -503,7 +503,7 @@ fn drift_is_no_press_below_the_threshold_and_above_it_one_that_ends_by_the_clock
             .unwrap()
             .contains(&json!("at_edge"))
     );
-    // It is said once, however long it lasts, and a tare takes the drift away.
+    // A long drift is only one press, and a tare removes the drift.
     rig.cable.play(&drifted(2), 60);
     let control = rig.bench.path("control.sock");
     let taring =
@@ -574,7 +574,7 @@ fn a_wall_clock_that_jumps_changes_the_times_of_events_and_nothing_else() {
             let raw = if is_pressed { pressed() } else { rest() };
             layout.encode(&raw, &mut bytes);
             events.extend(pipeline.push(&bytes, at));
-            // The next thing that time alone would bring is as far away as ever.
+            // The next deadline is as far away as after any other frame.
             assert_eq!(
                 pipeline.deadline(),
                 Some(mono + Duration::from_millis(50)),
@@ -592,14 +592,14 @@ fn a_wall_clock_that_jumps_changes_the_times_of_events_and_nothing_else() {
     let verdicts = steady.iter().filter(|event| event["phase"] == "final");
     assert_eq!(verdicts.count(), 2);
     let year_s = 365 * 86_400;
-    // In a press, at its last frame, between presses.
+    // The calendar jumps during a press, at its last frame, and between presses.
     assert_eq!(
         play(&[(30, year_s), (59, -2 * year_s), (70, -1), (90, 3600)]),
         steady
     );
 }
 
-/// It takes minutes: `.ci/peers` runs it.
+/// This test takes minutes: `.ci/peers` runs it.
 #[test]
 #[ignore = "heavy"]
 fn a_daemon_killed_a_hundred_times_starts_each_time_and_its_recordings_can_be_saved() {
@@ -622,7 +622,7 @@ fn a_daemon_killed_a_hundred_times_starts_each_time_and_its_recordings_can_be_sa
     }
     let files = fs::read_dir(bench.path("rec")).unwrap();
     let mut files: Vec<PathBuf> = files.map(|file| file.unwrap().path()).collect();
-    // Their names are the times of their beginnings.
+    // The names are the times at which the files begin.
     files.sort();
     assert_eq!(files.len(), lives.len());
     let mut saved = 0;
@@ -632,7 +632,8 @@ fn a_daemon_killed_a_hundred_times_starts_each_time_and_its_recordings_can_be_sa
         let output = hardnessd(&["recover", from, "--out", to]);
         let said = String::from_utf8(output.stderr).unwrap();
         if !output.status.success() {
-            // Less than a second may be lost, and so all of a shorter life.
+            // Less than a second may be lost, so a recording of less than a second may be lost
+            // completely.
             assert!(lived < Duration::from_secs(1), "{lived:?}: {said}");
             assert!(
                 said.contains("no chunk of messages in it is whole"),

@@ -1,9 +1,8 @@
 //! The guides in `docs/` are true: this test runs every command in them, unchanged, on a simulated
 //! sensor, and expects every line that they show.
-//!
-//! A `console` block has commands after `$ ` and their output; `...` matches anything. A `toml` or
-//! `python` block that begins with `# NAME` is a file of that name. Commands that need a machine of
-//! their own (`sudo`, `systemctl`) are in `sh` blocks. This test does not run those.
+//! A `console` block has commands after `$ ` and their output, in which `...` matches anything. A
+//! `toml` or `python` block that begins with `# NAME` is a file of that name. Commands that need a
+//! machine of their own (`sudo`, `systemctl`) are in `sh` blocks. This test does not run those.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -24,7 +23,7 @@ fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// The fenced blocks of a page: kind and content.
+/// The fenced blocks of a page, with kind and content.
 fn blocks(text: &str) -> Vec<(String, String)> {
     let mut blocks = Vec::new();
     let mut lines = text.lines();
@@ -110,7 +109,7 @@ fn follow(guide: &str) {
     }
 }
 
-/// Runs a script to its end, then ends every process that it left.
+/// Runs a script to its end, then ends every process that the script left running.
 fn run(script: &str, place: &Path) -> String {
     let binaries = Path::new(BINARY).parent().unwrap();
     let path = std::env::var("PATH").unwrap();
@@ -134,7 +133,7 @@ fn run(script: &str, place: &Path) -> String {
     let mut child = child.unwrap();
     child.wait().unwrap();
     let group = Pid::from_raw(i32::try_from(child.id()).unwrap()).unwrap();
-    // The group may be empty by now.
+    // The group may already be empty.
     let _ = kill_process_group(group, Signal::KILL);
     fs::read_to_string(place.join(".output")).unwrap()
 }

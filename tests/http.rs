@@ -1,4 +1,4 @@
-//! The real binary over HTTP: events that resume, metrics, health, and a door that is shut.
+//! The real binary over HTTP: events that resume, metrics, health, and refused requests.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -16,7 +16,7 @@ use serde_json::{Value, json};
 
 const HTTP: &str = "[http]\nlisten = \"127.0.0.1:0\"\n";
 
-/// A daemon with a page, and where it is.
+/// A daemon with a page, and the page's address.
 fn serving(bench: &Bench) -> (Daemon, SocketAddr) {
     let config = bench.configure("hardnessd.toml", "events.sock", HTTP);
     let mut daemon = Daemon::start(&config);
@@ -30,7 +30,7 @@ struct Answer {
     body: String,
 }
 
-/// Sends a request as it stands; without a `Host` among `headers` the right one is added.
+/// Sends a request unchanged. Without a `Host` among `headers`, the right one is added.
 fn ask(address: SocketAddr, request: &str, headers: &[&str]) -> Answer {
     let mut stream = open(address, request, headers);
     let mut text = String::new();
@@ -64,7 +64,7 @@ fn get(address: SocketAddr, path: &str) -> Answer {
 /// Server-sent events, as a browser reads them.
 struct Events {
     lines: BufReader<TcpStream>,
-    /// What a browser would name in `Last-Event-ID`.
+    /// The value that a browser would send in `Last-Event-ID`.
     last_id: String,
 }
 
@@ -96,7 +96,7 @@ impl Events {
         }
     }
 
-    /// The next numbered event's number.
+    /// The number of the next numbered event.
     fn next_seq(&mut self) -> u64 {
         loop {
             let event = self.next();
@@ -119,7 +119,7 @@ fn events_broken_off_and_resumed_come_once_each() {
     let hello = events.next();
     assert_eq!(hello["type"], "hello");
     let run = hello["run"].as_str().unwrap().to_owned();
-    // Who breaks off before the first event misses none either.
+    // A client that disconnects before the first event misses no event either.
     let mut next = hello["seq"].as_u64().unwrap() + 1;
     assert_eq!(events.last_id, format!("{run}:{}", next - 1));
     let _sensor = bench.sensor(&[]);
@@ -128,7 +128,7 @@ fn events_broken_off_and_resumed_come_once_each() {
             assert_eq!(events.next_seq(), next);
             next += 1;
         }
-        // Some more happens while nobody reads.
+        // More events come while nobody reads.
         witness.until(&json!({"type": "press", "state": "end"}));
         let last_id = events.last_id.clone();
         assert_eq!(last_id, format!("{run}:{}", next - 1));
@@ -139,7 +139,7 @@ fn events_broken_off_and_resumed_come_once_each() {
         next += 1;
     }
 
-    // Another run's place: all that is held, and it says that something is missing.
+    // With a place in another run, all held events come, and a gap says that some are missing.
     let mut other = Events::open(address, "/events?types=press", Some("0ther:7"));
     assert_eq!(other.next()["type"], "hello");
     assert_eq!(other.last_id, format!("{run}:0"));
@@ -155,7 +155,7 @@ fn requests_given_up_at_once_leave_no_subscriber() {
     for _ in 0..6 {
         for wait_us in 0..50 {
             let stream = open(address, "GET /events", &[]);
-            // Wherever the daemon is with it by then.
+            // The connection closes wherever the daemon is in the request by then.
             std::thread::sleep(Duration::from_micros(2 * wait_us));
             drop(stream);
         }
@@ -221,7 +221,7 @@ fn only_this_machine_by_its_address_is_served() {
         let host = format!("Host: {host}:{}", address.port());
         assert_eq!(ask(address, "GET /livez", &[&host]).code, 200, "{host}");
     }
-    // A page from elsewhere may not read an answer: no CORS header lets it.
+    // A page from another origin may not read an answer: no CORS header allows it.
     let answer = ask(address, "GET /api/status", &["Origin: null"]);
     assert!(!answer.head.contains("access-control-"), "{}", answer.head);
 }
@@ -280,7 +280,7 @@ fn the_page_is_one_file_that_may_load_nothing() {
     assert!(!page.head.contains("unsafe"), "{}", page.head);
 }
 
-/// The series of a scrape: name and labels, and value. Every line must be one, or a comment.
+/// The series of a scrape: name with labels, and value. Every line must be a series or a comment.
 fn series(text: &str) -> Vec<(String, f64)> {
     assert_eq!(text.lines().last(), Some("# EOF"));
     text.lines()
@@ -388,7 +388,7 @@ fn connections_are_bounded_and_those_that_leave_make_room() {
         .map(|_| TcpStream::connect(address).unwrap())
         .collect();
     wait_for("a refusal", || get_or_reset(address) == Some(503));
-    // What stands on sockets is not concerned.
+    // Subscribers on sockets are not affected.
     assert_eq!(bench.subscriber().next().unwrap()["type"], "hello");
     drop(idle);
     wait_for("room", || get_or_reset(address) == Some(200));
@@ -396,7 +396,7 @@ fn connections_are_bounded_and_those_that_leave_make_room() {
     assert_eq!(daemon.process.exit_code(), Some(0));
 }
 
-/// The code of an answer; `None` where the connection was reset before it came.
+/// The status code of an answer. `None` if the connection was reset before the answer.
 fn get_or_reset(address: SocketAddr) -> Option<u16> {
     let mut stream = TcpStream::connect(address).ok()?;
     let request = format!("GET /livez HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");

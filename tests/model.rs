@@ -1,5 +1,5 @@
-//! Model files that are no good, against the real binary: `check` refuses each with one line, and a
-//! running daemon keeps the model that it has.
+//! Bad model files, with the real binary: `check` refuses each with one line, and a running daemon
+//! keeps its model.
 
 #![allow(clippy::unwrap_used, reason = "a test")]
 
@@ -60,8 +60,8 @@ fn floats(name: &str, dims: &[i64], value: f32) -> pb::TensorProto {
     tensor(name, dims, DataType::Float, raw)
 }
 
-/// Adds `count` convolutions of `channels` channels whose result, 0 everywhere, is added to the image:
-/// the verdicts stay what they are.
+/// Adds `count` convolutions of `channels` channels. Their result, which is 0 everywhere, is added
+/// to the image, so the verdicts stay the same.
 fn convolutions(graph: &mut pb::GraphProto, count: usize, channels: i64) {
     let mut first = graph.node.remove(0);
     let mut last = "plain image".to_owned();
@@ -97,7 +97,7 @@ fn convolutions(graph: &mut pb::GraphProto, count: usize, channels: i64) {
     graph.node = nodes;
 }
 
-/// Files that killed the daemon, stopped it or made it slow, and a part of what is said of each.
+/// Files that killed the daemon, stopped it or made it slow, and a part of the message for each.
 fn bad_files() -> Vec<(&'static str, Vec<u8>, &'static str)> {
     vec![
         (
@@ -147,7 +147,7 @@ fn bad_files() -> Vec<(&'static str, Vec<u8>, &'static str)> {
         (
             "bytes that become a hundred times as many",
             {
-                // A graph of nothing but empty nodes.
+                // The graph has only empty nodes.
                 let nodes = [0x0a, 0x00].repeat(25_000_000);
                 let mut model = vec![0x08, 8, 0x3a];
                 prost::encode_length_delimiter(nodes.len(), &mut model).unwrap();
@@ -159,7 +159,7 @@ fn bad_files() -> Vec<(&'static str, Vec<u8>, &'static str)> {
     ]
 }
 
-/// A configuration with a line that carries its frames, and the model beside it.
+/// A configuration whose line is fast enough for its frames, with a model beside it.
 fn configure(bench: &Bench) -> PathBuf {
     let table = "[model]\npath = \"hrn.onnx\"\n";
     let path = bench.configure("hardnessd.toml", "events.sock", table);
@@ -183,7 +183,7 @@ fn a_bad_file_is_refused_by_check_in_one_line() {
         assert!(line.contains(expected), "{what}: {line}");
         assert_eq!(line.lines().count(), 1, "{what}: {line}");
     }
-    // The same changes within bounds are no reason to refuse a file.
+    // The same changes within bounds do not make a file bad.
     let few = changed(|graph| convolutions(graph, 3, 4));
     for bytes in [BUILT_IN, &few] {
         fs::write(bench.path("hrn.onnx"), bytes).unwrap();
@@ -203,7 +203,7 @@ fn a_running_daemon_survives_every_bad_file() {
         fs::write(bench.path("hrn.onnx"), bytes).unwrap();
         daemon.process.signal(Signal::HUP);
         let line = daemon.logged("refused");
-        // A busy machine may need more time for it than a reload has.
+        // On a busy machine, the trial may take longer than a reload allows.
         let refused = line.contains(expected) || line.contains("given up");
         assert!(refused, "{what}: {line}");
         let hello = bench.subscriber().next().unwrap();

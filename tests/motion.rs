@@ -1,4 +1,4 @@
-//! Where the arm is: told to the real daemon on the control socket, recorded and replayed.
+//! Positions of the arm: sent to the real daemon on the control socket, recorded and replayed.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -26,7 +26,7 @@ fn mono_ns() -> u64 {
     u64::try_from(Duration::try_from(now).unwrap().as_nanos()).unwrap()
 }
 
-/// The points that a recording holds, line by line.
+/// The points in a recording, line by line.
 fn recorded(path: &Path) -> Vec<Vec<(i64, f64)>> {
     let file = fs::File::open(path).unwrap();
     let found = Reader::new(std::io::BufReader::new(file)).map(Result::unwrap);
@@ -77,7 +77,7 @@ fn positions_are_checked_counted_and_recorded() {
     refused(tell("forearm", json!([])), "motion.at: found 0 points");
     let old = json!([[now, 1], [now - 61_000_000_000, 1]]);
     refused(tell("forearm", old), "motion.at[1]: found a moment 61");
-    // It is taken in nevertheless: the clock of the robot may have been set back.
+    // The points are taken nevertheless, because the robot may have set its clock back.
     let back = json!([[mono_ns(), 4.5], [now, 5]]);
     refused(tell("forearm", back), "motion.at[1]: found a step of");
     let mut events = bench.subscriber();
@@ -110,7 +110,7 @@ fn positions_are_checked_counted_and_recorded() {
     let at = i64::try_from(now).unwrap();
     assert_eq!(lines[0], [(at - 2_000_000, 3.5), (at, 3.75)]);
     assert_eq!(lines.iter().map(Vec::len).collect::<Vec<_>>(), [2, 1, 2]);
-    // The calendar and the monotonic clock are read at the same moment.
+    // This point was sent with a calendar time. The daemon reads both clocks at the same moment.
     assert!((lines[1][0].0 - at).abs() < 60_000_000_000 && lines[1][0].1 == 4.0);
     let replayed = hardnessd(&["replay", tape.to_str().unwrap()]);
     assert!(replayed.status.success(), "{replayed:?}");
@@ -148,7 +148,7 @@ fn positions_of_raw_bytes_come_from_a_table() {
     assert_eq!(check(&["--speed", "1e6"], 0, ""), events);
 }
 
-/// An event without what only a live one has.
+/// An event without the fields that only a live event has.
 fn timeless(mut event: Value) -> Value {
     for key in ["mono_ns", "age_at_publish_ms", "latency_us"] {
         event[key] = Value::Null;
@@ -181,7 +181,8 @@ fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_rep
             earlies += 1;
             continue;
         }
-        // Of hard plastic, nearly all of the way is the arm's own. The second press is of a yoga mat.
+        // On hard plastic, nearly all of the way is the arm's own. The second press is on a yoga
+        // mat.
         let stiffness = verdict["stiffness_n_per_mm"].as_f64();
         let is_told = stiffness.is_some_and(|n_per_mm| (0.5..60.0).contains(&n_per_mm));
         assert!(finals.is_empty() || is_told, "{verdict}");
@@ -190,7 +191,7 @@ fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_rep
             (shore("high") - shore("value") - 10.0).abs() < 0.01,
             "{verdict}"
         );
-        // 15 N are 1.5 mm of the arm, and what is pressed gives way too.
+        // 15 N bend the arm by 1.5 mm, and the pressed object gives way too.
         let frames = shore("value") - shore("low");
         let mean_mm = shore("value") / frames;
         assert!((0.8..8.0).contains(&mean_mm), "{verdict}");
@@ -229,7 +230,7 @@ fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_rep
         .collect();
     assert_eq!(found.len(), 2);
     for (mut found, mut live) in found.into_iter().zip(finals) {
-        // Statuses before the first state of the recording are counted live alone.
+        // Only the live numbers count the statuses before the first state of the recording.
         for event in [&mut found, &mut live] {
             event.as_object_mut().unwrap().remove("seq");
         }

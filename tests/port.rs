@@ -1,4 +1,4 @@
-//! `sniff` and `doctor` as they are used: the real binary, recordings and ptys of the simulator.
+//! `sniff` and `doctor` in use: the real binary, with recordings and ptys of the simulator.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -16,7 +16,7 @@ use bench::{BINARY, Bench, Daemon, Process, by_terminal, hardnessd, wait_for};
 use rustix::process::Signal;
 use serde_json::json;
 
-/// Exit code, stdout, stderr.
+/// Runs the binary. Returns exit code, stdout and stderr.
 fn run(arguments: &[&str]) -> (i32, String, String) {
     let output = hardnessd(arguments);
     (
@@ -38,7 +38,7 @@ fn recorded(bench: &Bench, preset: &str) -> String {
     path
 }
 
-/// The proposal in a configuration, as `check` takes it.
+/// Runs `check` on a configuration with the proposal.
 fn checked(bench: &Bench, proposal: &str) -> String {
     let text = format!("[[sensor]]\nname = \"forearm\"\nport = \"/dev/ttyACM0\"\n{proposal}");
     let path = bench.path("proposed.toml");
@@ -63,11 +63,11 @@ fn a_recording_of_an_unknown_layout_is_named_and_the_proposal_runs() {
         let (code, toml, stderr) = run(&["sniff", &recorded(&bench, preset)]);
         assert_eq!(code, 0, "{preset}: {stderr}");
         assert!(toml.contains("[sensor.frame]"), "{toml}");
-        // Without a checksum, a header and a tail look alike in the middle of a stream.
+        // Without a checksum, a header and a tail look the same in the middle of a stream.
         let named = format!("preset = \"{preset}\"");
         let is_named = toml.contains(&named) || preset.starts_with("jq");
         assert!(is_named, "{preset} is not named in\n{toml}");
-        // A capture decodes with what was proposed.
+        // A capture decodes with the proposed layout.
         let config = bench.path("proposed.toml");
         checked(&bench, &toml);
         let (code, events, stderr) = run(&[
@@ -114,11 +114,11 @@ fn sniff_says_why_it_has_no_proposal() {
     fs::write(&noise, (0..40_000).map(|_| random()).collect::<Vec<u8>>()).unwrap();
     check(&[noise.to_str().unwrap()], 1, "no layout");
     check(&["/no/such.bin"], 66, "/no/such.bin");
-    // A cause is told once.
+    // The message gives the cause once.
     let (_, _, stderr) = run(&["sniff", "/no/such.bin"]);
     assert_eq!(stderr.matches("No such file").count(), 1, "{stderr}");
     assert!(!stderr.contains("os error"), "{stderr}");
-    // Its lines are of many lengths: 60 % of it fit a layout, with 18 of 39 frames damaged.
+    // This text has lines of many lengths: 60 % of it fit a layout, with 18 of 39 frames damaged.
     check(&["/etc/passwd"], 1, "no layout");
     check(
         &["--port", "/dev/no-such"],
@@ -139,12 +139,12 @@ fn doctor_names_what_is_missing_and_who_holds_a_port() {
         "{stdout}"
     );
 
-    // Its name cannot make two of the line, nor speak to the terminal.
+    // The port's name cannot split the line, nor send codes to the terminal.
     let (_, stdout, _) = run(&["doctor", "--port", "/dev/no\nsuch\u{1b}[2J"]);
     assert!(stdout.starts_with("/dev/no\\nsuch\\u{1b}[2J: "), "{stdout}");
     assert_eq!(stdout.lines().count(), 1, "{stdout}");
 
-    // One line says that it is none, whatever else may be said of it.
+    // One line says that this is not a port, whatever else is reported.
     for port in ["/dev/null", "/tmp", "Cargo.toml"] {
         let (code, stdout, _) = run(&["doctor", "--port", port]);
         assert_eq!(code, 1, "{stdout}");
@@ -177,7 +177,8 @@ fn doctor_names_the_group_that_may_use_a_port() {
     let port = bench.path("port");
     let device = fs::canonicalize(&port).unwrap();
     let is_root = rustix::process::geteuid().is_root();
-    // Root may do everything: it asks as somebody else, from where that one may go.
+    // Root is allowed everything, so run as another user, from a directory which that user may
+    // read.
     let mut command = if is_root {
         let copy = bench.path("hardnessd");
         fs::copy(BINARY, &copy).unwrap();
@@ -233,7 +234,7 @@ fn a_simulated_sensor_ends_at_a_signal_and_takes_its_link_along() {
             fs::symlink_metadata(bench.path("port")).is_err(),
             "{signal:?}"
         );
-        // Whole frames, as many as there was time for.
+        // The file has as many whole frames as there was time for.
         assert_eq!(fs::metadata(&long).unwrap().len() % 790, 0);
         fs::remove_file(&long).unwrap();
     }
@@ -243,7 +244,7 @@ fn a_simulated_sensor_ends_at_a_signal_and_takes_its_link_along() {
 fn a_recording_that_does_not_fit_the_disk_leaves_nothing_behind() {
     let bench = Bench::new();
     let path = bench.path("long.bin").to_str().unwrap().to_owned();
-    // A file ends at this limit as on a full disk.
+    // With this limit, the file ends as on a full disk.
     let script = "ulimit -f 8; exec \"$@\"";
     let mut simulate = Command::new("sh");
     simulate.args(["-c", script, "sh", BINARY]);
@@ -259,7 +260,7 @@ fn a_recording_that_does_not_fit_the_disk_leaves_nothing_behind() {
     );
     assert_eq!(error.lines().count(), 1, "{error}");
     assert!(!Path::new(&path).exists());
-    // A device stays.
+    // A device is not removed.
     let (code, _, error) = run(&["simulate", "--presses", "1", "--to", "/dev/full"]);
     assert_eq!(code, 74, "{error}");
     assert!(Path::new("/dev/full").exists());
@@ -272,7 +273,7 @@ fn a_reader_gets_the_last_frame_of_a_simulated_sensor_whole() {
     let mut port = fs::File::open(bench.path("port")).unwrap();
     let mut bytes = Vec::new();
     let mut chunk = [0; 4096];
-    // The end of a pty is an error.
+    // Reading a pty at its end is an error.
     while let Ok(read) = port.read(&mut chunk) {
         bytes.extend_from_slice(&chunk[..read]);
     }
@@ -293,7 +294,7 @@ fn a_link_that_became_anothers_is_left() {
     assert_eq!(fs::read_link(&link).unwrap(), Path::new("/dev/null"));
 }
 
-/// It takes half a second; ten on a busy machine are no reason to wait longer.
+/// Sniffing takes half a second. The test fails after ten, which are enough for a busy machine.
 #[test]
 fn ten_megabytes_are_sniffed_in_time() {
     let bench = Bench::new();

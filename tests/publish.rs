@@ -1,5 +1,5 @@
-//! The ways out of the real binary: TCP, the control socket, bad and many subscribers, many
-//! sensors. The heavy ones are ignored here and run by `.ci/peers`.
+//! The outputs of the real binary: TCP, the control socket, bad and many subscribers, many sensors.
+//! The heavy tests are ignored here; `.ci/peers` runs them.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -32,7 +32,7 @@ fn tcp_speaks_the_same_protocol_and_changes_nothing() {
     let mut over_unix = bench.subscriber();
     let [hello, also] = [&mut over_tcp, &mut over_unix].map(|subscriber| {
         let mut hello = subscriber.next().unwrap();
-        // Another status may have come between the two.
+        // Another status may have come between the two connections.
         hello["seq"].take();
         hello
     });
@@ -82,7 +82,7 @@ fn the_control_socket_tares_and_gives_presses_their_context() {
     let mut subscriber = bench.subscriber();
     let begin = subscriber.until(&json!({"type": "press", "state": "begin"}));
     assert_eq!(begin["context"], context);
-    // At 20 frames/s it is not over before this comes.
+    // At 20 frames/s, the press does not end before this command arrives.
     refused(
         &control.ask(r#"{"tare":"forearm"}"#),
         "a press is under way",
@@ -90,7 +90,7 @@ fn the_control_socket_tares_and_gives_presses_their_context() {
     let verdict = subscriber.until(&json!({"phase": "final"}));
     assert_eq!(verdict["context"], context);
 
-    // Between presses there is time for five frames, if not always at once.
+    // Between presses there is usually time for the five frames of a tare.
     let tared = loop {
         subscriber.until(&json!({"phase": "final"}));
         let answer = control.ask(r#"{"tare":"forearm","id":2}"#);
@@ -119,7 +119,7 @@ fn the_control_socket_tares_and_gives_presses_their_context() {
     assert_eq!(begin["context"], Value::Null);
 }
 
-/// `tail` of this bench's daemon, found by where sockets are by default.
+/// `tail` of this bench's daemon, which it finds at the default place of sockets.
 fn tail(bench: &Bench, arguments: &[&str]) -> Command {
     let mut command = Command::new(BINARY);
     command.arg("tail").args(arguments);
@@ -169,7 +169,7 @@ fn tail_gives_a_script_the_events_it_counts_or_an_exit_code() {
     let mut stderr = String::new();
     let mut unread = unread.0.stderr.take().unwrap();
     unread.read_to_string(&mut stderr).unwrap();
-    // Where it found the daemon, and no more.
+    // The message only names the daemon that was found.
     assert!(stderr.starts_with("hardnessd: events of ") && stderr.lines().count() == 1);
 
     let mut left = Process(tail(&bench, &[]).spawn().unwrap());
@@ -194,7 +194,7 @@ fn tail_does_not_wait_for_a_hello_that_does_not_come_nor_take_another_protocol()
         let listening = std::thread::spawn(move || {
             let (mut stream, _) = listener.accept().unwrap();
             stream.write_all(line.as_bytes()).unwrap();
-            // Until it goes.
+            // Wait until the client disconnects.
             let _ = stream.read_to_end(&mut Vec::new());
         });
         let output = tail(&bench, &[]).output().unwrap();
@@ -228,7 +228,7 @@ fn ok_comes_before_all_that_since_asks_for() {
     let run = first.next().unwrap()["run"].as_str().unwrap().to_owned();
     let mut sensor = bench.sensor(&["--presses", "1"]);
     assert_eq!(sensor.exit_code(), Some(0));
-    // From then on nothing happens.
+    // From then on, no event comes.
     let last = first.until(&json!({"state": "lost", "type": "status"}))["seq"].clone();
     for subscription in [
         json!({"subscribe": ["hardness", "press", "status"], "since": format!("{run}:0")}),
@@ -243,7 +243,7 @@ fn ok_comes_before_all_that_since_asks_for() {
         let expected = if held["type"] == "gap" { "lost" } else { "seq" };
         assert!(held.get(expected).is_some(), "{held}");
         subscriber.until(&json!({"type": "press", "state": "end"}));
-        // Those that come later come too.
+        // The subscriber also gets later lines.
         assert_eq!(subscriber.ask(r#"{"get":"status"}"#)["type"], "ok");
     }
     let mut again = bench.subscriber();
@@ -254,7 +254,7 @@ fn ok_comes_before_all_that_since_asks_for() {
     again.until(&json!({"state": "live"}));
 }
 
-/// Reads everything on a thread of its own until told to stop, and claims that nothing was missed.
+/// Reads everything on a thread of its own until it is stopped, and checks that nothing was missed.
 struct Witness {
     stop: Arc<AtomicBool>,
     reading: JoinHandle<u64>,
@@ -293,14 +293,14 @@ impl Witness {
         Self { stop, reading }
     }
 
-    /// How many frames it got.
+    /// Ends the witness and returns its number of frames.
     fn end(self) -> u64 {
         self.stop.store(true, Ordering::Relaxed);
         self.reading.join().expect("nothing was missed")
     }
 }
 
-/// Lets this process have as many files open as it may.
+/// Raises this process's limit of open files as far as it may.
 fn many_files() {
     let limit = getrlimit(Resource::Nofile);
     let current = limit.maximum;
@@ -344,7 +344,7 @@ fn bad_subscribers_get_an_error_or_a_refusal_and_cost_nobody_anything() {
         assert_eq!(unknown.ask(r#"{"subscribe":[]}"#), json!({"type": "ok"}));
 
         let mut long = connect();
-        // It is closed before all is written.
+        // The daemon closes the connection before everything is written.
         let _ = long.lines.get_mut().write_all(&[b'x'; 1 << 20]);
         let mut line = String::new();
         let ended = loop {
@@ -357,13 +357,13 @@ fn bad_subscribers_get_an_error_or_a_refusal_and_cost_nobody_anything() {
         };
         assert!(ended);
 
-        // Half a line, then silence.
+        // This subscriber sends half a line, then nothing.
         let mut half = connect();
         half.lines
             .get_mut()
             .write_all(br#"{"subscribe":["#)
             .unwrap();
-        // Questions without end, and never an answer read.
+        // This subscriber asks many questions and never reads an answer.
         let mut deaf = connect();
         for _ in 0..200 {
             deaf.say(r#"{"get":"status"}"#);
@@ -371,7 +371,7 @@ fn bad_subscribers_get_an_error_or_a_refusal_and_cost_nobody_anything() {
         kept.extend([half, deaf]);
     }
 
-    // A thousand at once: each is served or refused, and says which.
+    // A thousand connect at once. Each is served or refused, and its first line says which.
     let crowd: Vec<UnixStream> = (0..1000)
         .map(|_| UnixStream::connect(bench.path("events.sock")).unwrap())
         .collect();
@@ -392,7 +392,8 @@ fn bad_subscribers_get_an_error_or_a_refusal_and_cost_nobody_anything() {
             refused += 1;
         }
     }
-    // The witness, and two of each way in that are kept; those that left make room as it goes.
+    // Places are taken by the witness and by the two kept connections of each way. Closed
+    // connections free theirs during the loop.
     assert!((240..=255).contains(&served), "{served} served");
     assert_eq!(served + refused, 1000);
     drop(crowd);
@@ -427,7 +428,7 @@ fn a_lost_sensor_disturbs_no_other_and_every_word_names_its_sensor() {
     while finals < 2 {
         let event = subscriber.next().unwrap();
         if event["sensor"] == "forearm" {
-            // What was left of its press.
+            // This is the rest of the sensor's press.
             assert_eq!(
                 (&event["type"], &event["reason"]),
                 (&json!("press"), &json!("lost"))
@@ -472,7 +473,7 @@ fn a_lost_sensor_disturbs_no_other_and_every_word_names_its_sensor() {
     assert!(lines > 6, "{log}");
 }
 
-/// An event as it is told apart from others: `s` and its number, or `f` and the frame's.
+/// The mark of an event: `s` and its number, or `f` and the frame's number.
 type Mark = (char, u64);
 
 fn mark(line: &str) -> Option<Mark> {
@@ -487,7 +488,7 @@ fn mark(line: &str) -> Option<Mark> {
     }
 }
 
-/// Reads until `end`; the marks of all events, and where a gap stood, how many it told of.
+/// Reads until `end`. Returns the marks of all events, and for each gap its place and its count.
 fn read_marks(mut subscriber: Subscriber, end: Instant) -> (Vec<Mark>, Vec<(usize, u64)>) {
     let (mut marks, mut gaps) = (Vec::new(), Vec::new());
     let mut line = String::new();
@@ -504,7 +505,7 @@ fn read_marks(mut subscriber: Subscriber, end: Instant) -> (Vec<Mark>, Vec<(usiz
     (marks, gaps)
 }
 
-/// 40 s, and both cores of a small machine: run by `.ci/peers`.
+/// This test takes 40 s and both cores of a small machine: `.ci/peers` runs it.
 #[test]
 #[ignore = "takes 40 s and much of the machine"]
 fn fifty_subscribers_miss_nothing_beside_one_that_never_reads() {
@@ -529,7 +530,7 @@ fn fifty_subscribers_miss_nothing_beside_one_that_never_reads() {
         subscribe(bench.subscriber()),
         subscribe(Subscriber::over_tcp(address)),
     ];
-    // A page that is asleep: of frames it is owed the newest, of all else everything.
+    // This page never reads. It must get the newest frame, and every other event.
     let http = daemon.address("http");
     let page =
         format!("GET /events?types=status,press,hardness,frame HTTP/1.1\r\nHost: {http}\r\n\r\n");
@@ -563,7 +564,7 @@ fn fifty_subscribers_miss_nothing_beside_one_that_never_reads() {
     for line in std::io::BufReader::new(asleep_page).lines() {
         let line = line.unwrap();
         page_gaps += usize::from(line.contains("\"type\":\"gap\""));
-        // `hello` has the number before the first.
+        // `hello` has the number before that of the first event.
         if let Some(id) = line.strip_prefix("id: ") {
             seqs.push(id.rsplit_once(':').unwrap().1.parse::<u64>().unwrap());
         }

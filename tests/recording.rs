@@ -1,4 +1,4 @@
-//! Recordings of the real binary on a real pty: replayed, cut off, damaged, on a bad disk.
+//! Recordings of the real binary on a real pty: replayed, cut off, damaged, and on a bad disk.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -19,7 +19,7 @@ use hardnessd::recording::{Entry, Found, Input, Reader};
 use rustix::process::Signal;
 use serde_json::{Value, json};
 
-/// A configuration without sockets' paths: for `record`.
+/// A configuration without paths of sockets, for `record`.
 fn configure(bench: &Bench, fps: u32) -> PathBuf {
     let path = bench.path("record.toml");
     let text =
@@ -28,7 +28,7 @@ fn configure(bench: &Bench, fps: u32) -> PathBuf {
     path
 }
 
-/// A configuration whose sensor counts as stale only after 1.25 s: a busy machine is no fault.
+/// A configuration whose sensor is stale only after 1.25 s, so that a busy machine causes no fault.
 fn configure_patient(bench: &Bench, record: &str) -> PathBuf {
     let config = bench.configure("hardnessd.toml", "events.sock", record);
     let text = fs::read_to_string(&config).unwrap();
@@ -62,7 +62,7 @@ fn replay(recording: &Path) -> Vec<Value> {
         .collect()
 }
 
-/// An event without what only a live one has.
+/// An event without the fields that only a live event has.
 fn timeless(mut event: Value) -> Value {
     for key in ["mono_ns", "age_at_publish_ms", "latency_us"] {
         if let Some(value) = event.get_mut(key) {
@@ -148,14 +148,14 @@ fn a_replay_repeats_what_subscribers_read_live() {
     let mut replayed = replay(recording);
     let end = replayed.pop().unwrap();
     assert_eq!(end["reason"], "end of recording");
-    // The subscriber came a moment after the start.
+    // The subscriber connected a moment after the start.
     let first = live[0]["seq"].as_u64().unwrap();
     replayed.retain(|event| event["seq"].as_u64().unwrap() >= first);
     let live: Vec<Value> = live.into_iter().map(timeless).collect();
     assert_eq!(replayed, live);
 }
 
-/// What two sensors were judged to be, each by itself: numbers run over both.
+/// The verdicts on one of two sensors, without their numbers, which run over both sensors.
 fn verdicts_of(events: &[Value], sensor: &str) -> Vec<Value> {
     let verdicts = events
         .iter()
@@ -195,10 +195,10 @@ fn two_sensors_in_one_recording_are_judged_as_they_were_live() {
         assert_eq!(verdicts_of(&replayed, sensor), verdicts);
     }
 
-    // `record` takes both into one file, too.
+    // `record` also records both sensors in one file.
     let out = bench.path("both.mcap");
     let mut recording = record(&config, &out, &[]);
-    // Without a sensor at a port there would be nothing to record.
+    // Without a sensor at a port, there is nothing to record.
     assert_eq!(recording.exit_code(), Some(69));
     let mut forearm = bench.sensor(&["--presses", "1"]);
     let mut wrist = bench.sensor_at("port-2", 20, &["--presses", "1", "--seed", "2"]);
@@ -254,7 +254,7 @@ fn record_writes_a_new_file_for_as_long_as_there_is_a_sensor() {
     let config = configure(&bench, 20);
     let out = bench.path("a.mcap");
     let labels = ["--label", "level=2", "--label", "object=7"];
-    // A level that no model has is no label of one.
+    // A label with a level that the model does not have is refused.
     for level in ["level=9", "level=hard", "level=-1"] {
         let config = config.to_str().unwrap();
         let out = out.to_str().unwrap();
@@ -271,7 +271,7 @@ fn record_writes_a_new_file_for_as_long_as_there_is_a_sensor() {
     let twice = [&["record", "--config", at, "--out", to], &twice[..]].concat();
     let said = String::from_utf8(hardnessd(&twice).stderr).unwrap();
     assert!(said.contains("--label object: given twice"), "{said}");
-    // Nothing to record: said, and no file left behind.
+    // Without anything to record, `record` says so and leaves no file.
     let none = hardnessd(&["record", "--config", at, "--out", to]);
     let said = String::from_utf8(none.stderr).unwrap();
     assert_eq!(none.status.code(), Some(69), "{said}");
@@ -295,7 +295,7 @@ fn record_writes_a_new_file_for_as_long_as_there_is_a_sensor() {
     assert_eq!(again.exit_code(), Some(74));
     assert_eq!(fs::read(&out).unwrap(), before);
 
-    // A signal ends it as well, and so does the loss of its sensor, with another code.
+    // A signal also ends it. So does the loss of its sensor, with another exit code.
     let second = bench.path("b.mcap");
     let mut recording = record(&config, &second, &[]);
     wait_for("a frame", || {
@@ -329,7 +329,7 @@ fn killed_at_any_moment_less_than_a_second_is_lost() {
     kill_recordings(10);
 }
 
-/// It takes minutes: run it by hand.
+/// This test takes minutes: run it by hand.
 #[test]
 #[ignore = "heavy"]
 fn killed_a_hundred_times_less_than_a_second_is_lost_each_time() {
@@ -337,7 +337,7 @@ fn killed_a_hundred_times_less_than_a_second_is_lost_each_time() {
     println!("100 recordings killed, at most {worst:?} lost");
 }
 
-/// Kills `record` at chance moments, and gives the most that one lost.
+/// Kills `record` at random moments, and returns the most that one recording lost.
 fn kill_recordings(rounds: u32) -> Duration {
     let mut worst = Duration::ZERO;
     let bench = Bench::new();
@@ -370,7 +370,7 @@ fn kill_recordings(rounds: u32) -> Duration {
             "{lost:?} lost in round {round}"
         );
         worst = worst.max(lost);
-        // Nothing is missing between: bytes came every 4 ms or so.
+        // Nothing is missing in between: bytes came every 4 ms or so.
         let moments: Vec<Duration> = found.iter().map(|found| found.at.mono).collect();
         let gap = moments.windows(2).map(|two| two[1] - two[0]).max().unwrap();
         assert!(gap < Duration::from_millis(500), "{gap:?} in round {round}");
@@ -393,7 +393,7 @@ fn recover_says_what_it_saved_and_leaves_files_alone() {
     };
     let (code, said) = recover("none.mcap", "good.mcap");
     assert_eq!(code, 66, "{said}");
-    // What is no recording yet, of somebody who gives files such names too.
+    // This file, with a name like that of an unfinished recording, belongs to somebody else.
     fs::write(path("good.mcap.part"), "theirs").unwrap();
     fs::write(path("noise.mcap"), vec![7; 100_000]).unwrap();
     let (code, said) = recover("noise.mcap", "good.mcap");
@@ -422,7 +422,8 @@ fn recover_says_what_it_saved_and_leaves_files_alone() {
     assert_eq!(code, 74, "{said}");
     assert_eq!(replay(&bench.path("whole.mcap")), replay(&out));
 
-    // Cut off anywhere it is played to its end, with the last words that bytes would have.
+    // A recording that is cut off anywhere is played to its end, and ends with the same last events
+    // as raw bytes.
     let whole = fs::read(&out).unwrap();
     let mut aborted = 0;
     for cut in [
@@ -456,7 +457,7 @@ fn recover_says_what_it_saved_and_leaves_files_alone() {
     let middle = bytes.len() / 2;
     bytes[middle] ^= 4;
     fs::write(&out, bytes).unwrap();
-    // What a try that was killed has left is no hindrance, and does not stay.
+    // The remains of a killed try do not hinder the next one, and are removed.
     fs::write(path("good.mcap.part.part"), &whole[..1000]).unwrap();
     let (code, said) = recover("a.mcap", "good.mcap");
     assert_eq!(code, 0, "{said}");
@@ -547,7 +548,7 @@ fn the_last_minute_is_written_on_request_and_at_a_fault() {
     assert_eq!(boxes.len(), 2, "{boxes:?}");
     let events = replay(boxes.iter().find(|path| **path != written).unwrap());
     assert!(events.iter().any(|event| event["state"] == "lost"));
-    // A second fault within the minute writes nothing.
+    // A second fault within the minute writes no black box.
     let _sensor = bench.sensor(&["--presses", "1"]);
     subscriber.until(&json!({"state": "live"}));
     subscriber.until(&json!({"state": "lost"}));
@@ -562,7 +563,7 @@ fn much_damage_is_a_fault() {
     let record = "[record]\ndir = \"rec\"\ncontinuous = false\nkeep_free_mb = 0\n";
     let config = configure_patient(&bench, record);
     let script = bench.path("faults.toml");
-    // Half of the frames, never so many in a row that the sensor is stale.
+    // Half of the frames are damaged, but never so many in a row that the sensor becomes stale.
     let faults: String = (1..9)
         .map(|at_s| format!("[[fault]]\nat_s = {at_s}.0\nkind = \"flip\"\nframes = 10\n"))
         .collect();
@@ -642,12 +643,12 @@ fn a_recording_that_is_deleted_begins_anew() {
 
 #[test]
 fn a_disk_that_is_full_or_fails_does_not_stop_the_sensor() {
-    // Below the floor: said once, and nothing is written.
+    // With too little free space, recording stops with one message, and nothing is written.
     let bench = Bench::new();
     let record = "[record]\ndir = \"rec\"\nkeep_free_mb = 1000000000\n";
     let config = bench.configure("hardnessd.toml", "events.sock", record);
     let mut daemon = Daemon::start(&config);
-    // It may have been said before the daemon served, or after.
+    // The message may come before or after the daemon serves.
     if !daemon
         .heard
         .iter()
@@ -671,8 +672,8 @@ fn a_disk_that_is_full_or_fails_does_not_stop_the_sensor() {
 
 #[test]
 fn recording_goes_on_when_writes_succeed_again() {
-    // No file may grow beyond 64 blocks of 1 KiB, which is what a full disk looks like from inside:
-    // some 8 s of this sensor, so that there is a moment when all since its last state fits.
+    // No file may grow beyond 64 blocks of 1 KiB, which acts like a full disk. That is some 8 s of
+    // this sensor, so there is a moment when everything since its last state fits.
     let bench = Bench::new();
     let record = "[record]\ndir = \"rec\"\nkeep_free_mb = 0\n";
     let config = bench.configure("hardnessd.toml", "events.sock", record);
@@ -698,7 +699,7 @@ fn recording_goes_on_when_writes_succeed_again() {
     assert!(verdicts > 0);
     daemon.signal(Signal::TERM);
     assert_eq!(daemon.exit_code(), Some(0));
-    // What broke off is saved, and what could not be begun is not left behind.
+    // An incomplete recording can be saved, and a file that could not be begun is removed.
     for broken in recordings_in(&bench.path("rec"), "hardnessd-") {
         let good = broken.with_extension("good");
         let output = hardnessd(&[

@@ -1,4 +1,4 @@
-//! Recorded bytes give exactly the expected events, whatever the pace and the chunks.
+//! Recorded bytes give exactly the expected events, at any pace and in any chunks.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -20,7 +20,7 @@ fn fixtures() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures")
 }
 
-/// Every recording, with the configuration named by its rate and its golden events.
+/// Every recording, with the configuration for its rate and its golden events.
 fn recordings() -> Vec<(PathBuf, PathBuf, PathBuf)> {
     let mut found: Vec<_> = std::fs::read_dir(fixtures())
         .unwrap()
@@ -48,7 +48,8 @@ fn replay(recording: &Path, more: &[&str]) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// Equal but for probabilities, which another machine may give 1e-4 apart.
+/// Asserts that events are equal, except for probabilities, which may differ by 1e-4 between
+/// machines.
 fn assert_same(found: &str, golden: &str, recording: &Path) {
     let events = |text: &str| -> Vec<Value> {
         text.lines()
@@ -130,7 +131,7 @@ fn bytes_without_a_whole_frame_are_said_to_have_none() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("other.bin");
     let mut frame = std::fs::read(fixtures().join("foam.5hz.bin")).unwrap();
-    // One frame of which a byte is damaged.
+    // One frame has a damaged byte.
     frame.truncate(790);
     frame[400] ^= 1;
     let text = "no frame ".repeat(100).into_bytes();
@@ -151,7 +152,7 @@ fn bytes_without_a_whole_frame_are_said_to_have_none() {
         for part in ["other.bin", found, "hardnessd sniff"] {
             assert!(stderr.contains(part), "{part:?} not in {stderr}");
         }
-        // The totals come all the same.
+        // The last status with the totals comes nevertheless.
         let events = String::from_utf8(output.stdout).unwrap();
         assert!(
             events.contains("\"reason\":\"end of recording\""),
@@ -192,7 +193,7 @@ fn a_frame_comes_no_earlier_than_its_time_however_long_frames_are() {
         let frames = serde_json::from_str::<Value>(last).unwrap()["frames"].clone();
         let frames = frames.as_f64().unwrap();
         assert!(frames > 10.0, "{events}");
-        // At 5 frames/s, ten times as fast.
+        // The replay runs ten times as fast as 5 frames/s.
         let least = Duration::from_secs_f64((frames - 1.0) / 50.0);
         assert!(took >= least, "{preset}: {took:?} for {frames} frames");
     }
@@ -235,7 +236,7 @@ fn bytes_one_at_a_time_or_split_anywhere_give_the_same_events() {
             .any(|event| matches!(event, Event::Hardness(_)))
     );
     assert_eq!(events(bytes.chunks(1)), expected);
-    // One frame and a bit around the damage, cut at every byte.
+    // Split at every byte of the damaged frame and a bit around it.
     for at in 790 * 17..790 * 18 + 20 {
         let (head, tail) = bytes.split_at(at);
         assert_eq!(events([head, tail].into_iter()), expected, "split at {at}");

@@ -1,4 +1,4 @@
-//! What the service manager hands over: the socket that subscribers wait at.
+//! The socket that the service manager passes to the daemon.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -15,8 +15,8 @@ use bench::{BINARY, Bench, Process};
 use rustix::process::Signal;
 use serde_json::json;
 
-/// The daemon as the manager starts it: descriptor 3 is the socket, the variables are those of
-/// sd_listen_fds(3).
+/// The daemon as the service manager starts it: descriptor 3 is the socket, and the variables are
+/// those of sd_listen_fds(3).
 fn activated(config: &Path, socket: &UnixListener) -> Command {
     let mut command = Command::new("sh");
     command
@@ -38,12 +38,12 @@ fn a_socket_of_the_service_manager_is_served_and_stays() {
     let path = bench.path("events.sock");
     let socket = UnixListener::bind(&path).unwrap();
     for _ in 0..2 {
-        // Before there is a daemon: it waits instead of being refused.
+        // A subscriber that connects before the daemon runs waits, and is not refused.
         let mut subscriber = bench.subscriber();
         let mut daemon = Process(activated(&config, &socket).spawn().unwrap());
         subscriber.until(&json!({"type": "hello", "robot": "arm-7"}));
         subscriber.until(&json!({"type": "status", "state": "connecting"}));
-        // What the manager does not listen at the daemon makes itself.
+        // The daemon makes the sockets that the manager does not listen on.
         assert!(bench.path("control.sock").exists());
         daemon.signal(Signal::TERM);
         assert_eq!(daemon.exit_code(), Some(0));

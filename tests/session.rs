@@ -1,4 +1,5 @@
-//! `hardnessd record --session` on a real pty, with a simulated sensor: what it asks, and what it leaves.
+//! `hardnessd record --session` on a real pty, with a simulated sensor: its questions and its
+//! files.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -25,7 +26,7 @@ struct Session {
     process: Process,
     master: OwnedFd,
     bytes: Receiver<Vec<u8>>,
-    /// What it has written and the test has not looked at.
+    /// The output that the test has not looked at yet.
     written: String,
 }
 
@@ -33,7 +34,7 @@ impl Session {
     fn start(config: &Path, directory: &Path) -> Self {
         let Pair { master, device, .. } = Pair::open().unwrap();
         let end = || Stdio::from(device.try_clone().unwrap());
-        // Without a terminal of its own, which a test may be started from.
+        // `setsid` keeps the process from using the terminal that the test was started from.
         let process = Command::new("setsid")
             .args([BINARY, "record", "--config"])
             .arg(config)
@@ -62,7 +63,7 @@ impl Session {
         }
     }
 
-    /// Waits until it has written `part` after what was looked at before.
+    /// Waits for `part` in the output that was not looked at before.
     fn says(&mut self, part: &str) {
         let start = Instant::now();
         loop {
@@ -133,7 +134,7 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
     #[cfg(feature = "train")]
     assert_collects(&bench, &own);
 
-    // The next session goes on, and one without a press leaves nothing.
+    // The next session continues, and a session without a press leaves no file.
     let mut session = Session::start(&config, &own);
     session.says("object 3: its name: ");
     session.answer("q");
@@ -142,7 +143,7 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
     assert_eq!(fs::read_dir(&own).unwrap().count(), 3);
 }
 
-/// `hrn-train` takes the recordings as they are.
+/// `hrn-train` accepts the recordings unchanged.
 #[cfg(feature = "train")]
 fn assert_collects(bench: &Bench, own: &Path) {
     let out = bench.path("own.npz");

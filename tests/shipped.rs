@@ -1,4 +1,4 @@
-//! The files that are shipped: the real binary takes them, and they say what the code does.
+//! The shipped files: the real binary accepts them, and they agree with the code.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -43,7 +43,7 @@ fn the_shipped_configuration_names_every_key() {
     let mut keys = Vec::new();
     let defaults = Config::new(vec![SensorTable::new(PathBuf::from("/dev/ttyUSB0"))]);
     collect(&toml::Value::try_from(defaults).unwrap(), &mut keys);
-    // Those without a default value do not show in the defaults.
+    // Keys without a default value are not in the defaults.
     let silent = "gains stale_after_ms sync tail length cell mask invert checksum rows cols order path sha256 control_path listen connect site domain_id namespace networks dir continuous rotate_mb rotate_s keep_free_mb";
     keys.extend(silent.split(' ').map(str::to_owned));
     for key in keys {
@@ -54,7 +54,7 @@ fn the_shipped_configuration_names_every_key() {
     }
 }
 
-/// The keys of all values that are no tables.
+/// The keys of all values that are not tables.
 fn collect(value: &toml::Value, keys: &mut Vec<String>) {
     match value {
         toml::Value::Table(table) => {

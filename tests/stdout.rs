@@ -1,5 +1,5 @@
-//! Nobody reads stdout, or nothing comes from a file that is a pipe: no command waits for that longer
-//! than it was asked to run.
+//! If nobody reads stdout, or a pipe delivers no input, no command waits longer than it was asked
+//! to run.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -19,7 +19,7 @@ use rustix::io::{ioctl_fionbio, ioctl_fionread};
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// A pipe without room for another byte.
+/// A pipe that has no room for another byte.
 fn full_pipe() -> (PipeReader, PipeWriter) {
     let (reader, mut writer) = io::pipe().unwrap();
     ioctl_fionbio(&writer, true).unwrap();
@@ -33,7 +33,7 @@ fn full_pipe() -> (PipeReader, PipeWriter) {
     (reader, writer)
 }
 
-/// The program, whose stdout is a full pipe that nobody reads while the reader is kept.
+/// The program with a full pipe as stdout. Nobody reads the pipe as long as the reader is kept.
 fn unread(arguments: &[&str]) -> (Command, PipeReader) {
     let (reader, writer) = full_pipe();
     let mut command = Command::new(BINARY);
@@ -48,7 +48,7 @@ fn fifo(bench: &Bench) -> PathBuf {
     fifo
 }
 
-/// It must end by this signal in a moment, with this exit code.
+/// The process must end soon after this signal, with this exit code.
 fn ends_at(signal: Signal, process: &mut Process, code: i32) {
     let start = Instant::now();
     process.signal(signal);
@@ -64,7 +64,7 @@ fn bytes_that_do_not_come_keep_nothing_from_its_end() {
         let fifo = fifo(&bench);
         let child = Command::new(BINARY).arg(command).arg(&fifo).spawn();
         let mut process = Process(child.unwrap());
-        // A writer gets through once somebody reads.
+        // Opening the pipe for writing succeeds once a process reads.
         let _writer = File::options().write(true).open(&fifo).unwrap();
         ends_at(Signal::TERM, &mut process, 143);
     }
@@ -80,7 +80,7 @@ fn a_replay_that_nobody_reads_ends_at_a_signal() {
         let fifo = fifo(&bench);
         let (mut command, _reader) = unread(&["replay", fifo.to_str().unwrap()]);
         let mut replay = Process(command.spawn().unwrap());
-        // With the first frame comes a status.
+        // The first frame causes a status, which blocks the output.
         let mut writer = File::options().write(true).open(&fifo).unwrap();
         writer.write_all(&frame).unwrap();
         wait_for("a reader", || ioctl_fionread(&writer).unwrap() == 0);

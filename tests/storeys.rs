@@ -11,7 +11,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-/// A module's path within the crate, such as `["train", "net", "layers"]`. A binary begins with `bin`.
+/// A module's path within the crate, such as `["train", "net", "layers"]`. The path of a binary
+/// begins with `bin`.
 type Module = Vec<String>;
 
 /// Every module of `src`, with its source.
@@ -47,7 +48,7 @@ fn modules() -> BTreeMap<Module, String> {
     found
 }
 
-/// The words and signs of Rust source outside comments, strings and tests.
+/// The words and signs of Rust source, without comments, strings and tests.
 fn tokens(source: &str) -> Vec<String> {
     let mut tokens: Vec<String> = Vec::new();
     let bytes: Vec<char> = source.chars().collect();
@@ -79,7 +80,7 @@ fn tokens(source: &str) -> Vec<String> {
             }
             at += 1;
         } else if rest[0] == '\'' && (rest[1] == '\\' || rest.get(2) == Some(&'\'')) {
-            // What is escaped may be a quote itself.
+            // The character after a backslash may itself be a quote.
             at += if rest[1] == '\\' { 3 } else { 2 };
             while bytes[at] != '\'' {
                 at += 1;
@@ -105,7 +106,7 @@ fn tokens(source: &str) -> Vec<String> {
     without_tests(&tokens)
 }
 
-/// Leaves out every item behind `#[cfg(test)]`.
+/// Leaves out every item after `#[cfg(test)]`.
 fn without_tests(tokens: &[String]) -> Vec<String> {
     let mut left = Vec::new();
     let mut at = 0;
@@ -133,7 +134,8 @@ fn without_tests(tokens: &[String]) -> Vec<String> {
     left
 }
 
-/// The paths of a `use` tree that begins at `at`, each after `prefix`; gives where the tree ends.
+/// Adds the paths of the `use` tree that begins at `at`, each after `prefix`. Returns the tree's
+/// end.
 fn use_tree(tokens: &[String], mut at: usize, prefix: &[String], into: &mut Vec<Module>) -> usize {
     let mut path = prefix.to_vec();
     loop {
@@ -182,7 +184,7 @@ fn imports(module: &Module, source: &str, all: &BTreeMap<Module, String>) -> BTr
             at += 1 + tokens[at..].iter().position(|token| token == ")").unwrap();
             continue;
         }
-        // A re-export hands a child's names on and uses none of them.
+        // A re-export passes on names of a child, but uses none of them.
         if tokens[at] == "use" && before(1) == "pub" {
             at += tokens[at..].iter().position(|token| token == ";").unwrap();
             continue;
@@ -289,12 +291,13 @@ fn name(module: &Module) -> String {
 #[test]
 fn no_two_files_import_each_other_in_a_loop() {
     let mut arrows = arrows();
-    // A file and those in its own folder are one module: it may call them, and they know its types.
+    // A file and its own folder count as one module: the file may call them, and they know its
+    // types.
     for (module, imports) in &mut arrows {
         imports.retain(|imported| !imported.starts_with(module));
     }
     assert!(arrows.len() > 100, "found {} files", arrows.len());
-    // What imports nothing that is left is in no loop.
+    // A file whose imports are all gone is in no loop.
     loop {
         let left: BTreeSet<Module> = arrows.keys().cloned().collect();
         let free = |imports: &BTreeSet<Module>| imports.is_disjoint(&left);
@@ -304,7 +307,7 @@ fn no_two_files_import_each_other_in_a_loop() {
             break;
         }
     }
-    // What nothing imports that is left is in none either.
+    // A file that no remaining file imports is in no loop either.
     loop {
         let imported: BTreeSet<Module> = arrows.values().flatten().cloned().collect();
         let before = arrows.len();

@@ -1,4 +1,4 @@
-//! The example in Rust, beside a daemon that goes and comes back.
+//! The example in Rust, with a daemon that stops and starts again.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -66,7 +66,7 @@ fn it_tells_verdicts_that_it_knows_nothing_without_a_daemon_and_goes_on_with_the
     says(&lines, &["nothing is known until it is back"]);
     drop(daemon);
     let _daemon = bench.daemon();
-    // Another run: what it holds is new, and a gap of unknown length is said.
+    // A new run begins: its held events are new, and a gap of unknown length is printed.
     says(&lines, &["missed null events"]);
     says(&lines, &["\"forearm\" is \"live\""]);
     says(&lines, &["\"forearm\" press 1 (\"final\"): "]);

@@ -32,7 +32,7 @@ fn succeed(arguments: &[&str]) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// A directory for the whole process, and a small data set of rigid and soft objects in it.
+/// A directory for the whole process, with a small data set of rigid and soft objects.
 fn data() -> &'static (tempfile::TempDir, PathBuf) {
     static DATA: OnceLock<(tempfile::TempDir, PathBuf)> = OnceLock::new();
     DATA.get_or_init(|| {
@@ -60,7 +60,7 @@ fn data() -> &'static (tempfile::TempDir, PathBuf) {
     })
 }
 
-/// Adam on small batches: enough steps in two epochs to learn something.
+/// Settings with Adam on small batches: enough steps in few epochs to learn something.
 const SETTINGS: &str = "
     [training]
     epochs = 6
@@ -80,7 +80,8 @@ const SETTINGS: &str = "
     keep = \"best\"
 ";
 
-/// All stages of the method in seconds: pictures and measures of generated samples take longest.
+/// Settings for all stages of the method in seconds. Pictures and measures of generated samples
+/// take longest.
 const GAN_SETTINGS: &str = "
     [ustgan]
     epochs = 4
@@ -106,7 +107,7 @@ impl Trial {
 
     fn of(method: &'static str, name: &str, settings: &str) -> Self {
         let directory = data().0.path();
-        // Tests run side by side: a file of its own, so that none is read half written.
+        // Tests run in parallel, so each has its own file, and none reads a half-written one.
         let config = directory.join(format!("{name}.toml"));
         std::fs::write(&config, settings).unwrap();
         Self {
@@ -156,7 +157,7 @@ impl Trial {
         std::fs::read(self.out.join(name)).unwrap()
     }
 
-    /// Names of the checkpoints, sorted.
+    /// The names of the checkpoints, sorted.
     fn checkpoints(&self) -> Vec<String> {
         let Ok(directory) = std::fs::read_dir(self.out.join("checkpoints")) else {
             return Vec::new();
@@ -169,7 +170,7 @@ impl Trial {
         names
     }
 
-    /// Whether both left the same checkpoints and model, byte for byte.
+    /// Asserts that both runs have the same checkpoints and model, byte for byte.
     #[track_caller]
     fn assert_same(&self, other: &Self) {
         assert_eq!(self.checkpoints(), other.checkpoints());
@@ -213,10 +214,10 @@ fn a_run_learns_and_leaves_what_it_promises() {
         assert!(!trial.read(name).is_empty(), "{name}");
     }
 
-    // What `evaluate` measures on an exported copy is what the run wrote down.
+    // `evaluate` measures the same on an exported copy as the run recorded.
     let (copy, data) = (trial.out.join("copy.onnx"), data().1.to_str().unwrap());
     let copy = copy.to_str().unwrap();
-    // Like every file that the trainer writes, it takes the place of what stood there, and says so.
+    // Like every output of the trainer, the copy replaces an existing file, and a message says so.
     for said in ["", "replaced"] {
         let output = hrn_train(&["export", trial.out.to_str().unwrap(), "--out", copy]);
         let stderr = String::from_utf8(output.stderr).unwrap();
@@ -237,8 +238,9 @@ fn a_run_learns_and_leaves_what_it_promises() {
     assert!(inspected.contains(&line), "{inspected}");
 }
 
-/// Starts or resumes a run and sends `signal` as soon as `count` checkpoints of `stage` stand,
-/// wherever the run then is; gives its exit code, if it had one, and the last line it said.
+/// Starts or resumes a run, and sends `signal` once there are `count` checkpoints of `stage`,
+/// wherever the run is by then. Returns the exit code, if there is one, and the last line of
+/// stderr.
 fn interrupted(
     trial: &Trial,
     seed: &'static str,
@@ -307,7 +309,8 @@ fn the_whole_method_killed_in_any_stage_resumes_bit_for_bit_and_shares_its_stage
     killed.train("6", &["--resume"]);
     killed.assert_same(&whole);
 
-    // A generator's and a discriminator's loss, sigma, and at the end the likeness of each stage.
+    // A row has the losses of generator and discriminator and sigma. The last one has the likeness
+    // of each stage.
     let metrics = String::from_utf8(whole.read("metrics.csv")).unwrap();
     let last = |stage: &str| -> Vec<String> {
         let row = metrics.lines().rfind(|row| row.starts_with(stage)).unwrap();
@@ -340,7 +343,7 @@ fn the_whole_method_killed_in_any_stage_resumes_bit_for_bit_and_shares_its_stage
         assert!(!whole.read(name).is_empty(), "{name}");
     }
 
-    // NAHRN has the same USTGAN, and takes it: nothing of it is trained again.
+    // NAHRN has the same USTGAN and takes it over, so none of it is trained again.
     let sharing = Trial::of("nahrn", "sharing", GAN_SETTINGS);
     sharing.train("6", &["--from", whole.out.to_str().unwrap()]);
     let of_ustgan = |trial: &Trial| -> Vec<String> {
@@ -351,14 +354,14 @@ fn the_whole_method_killed_in_any_stage_resumes_bit_for_bit_and_shares_its_stage
     assert_eq!(of_ustgan(&sharing), of_ustgan(&whole));
     assert_eq!(of_ustgan(&sharing).len(), 4);
     assert!(!sharing.out.join("samples/ustgan-000004.png").exists());
-    // Another seed has another USTGAN, and what is taken is what it would have trained itself.
+    // Training USTGAN alone gives the same model. With another seed, USTGAN is trained anew.
     let alone = Trial::of("nahrn", "alone", GAN_SETTINGS);
     alone.train("6", &[]);
     assert!(alone.read("hrn.onnx") == sharing.read("hrn.onnx"));
     let other = Trial::of("nahrn", "other seed", GAN_SETTINGS);
     other.train("7", &["--from", whole.out.to_str().unwrap()]);
     assert!(other.out.join("samples/ustgan-000004.png").exists());
-    // One whose metrics are another version's is no failure: the stage is trained here.
+    // Metrics of another version are not an error: the stage is trained here.
     std::fs::write(whole.out.join("metrics.csv"), "stage,other\n").unwrap();
     let foreign = Trial::of("nahrn", "foreign metrics", GAN_SETTINGS);
     foreign.train("6", &["--from", whole.out.to_str().unwrap()]);
@@ -372,7 +375,7 @@ fn a_discriminators_statistics_are_over_what_it_learnt_from() {
         trial.train("1", &[]);
         trial
     });
-    // What only recognisers are told changes nothing of it.
+    // Settings of recognisers alone do not change it.
     plain.assert_same(&augmented);
 }
 
@@ -399,7 +402,7 @@ fn held_out_objects_are_used_or_it_is_said() {
             78,
             "`validation.share`: found 0.25, expected 0: sgan and igan",
         ),
-        // Four objects a level.
+        // There are four objects a level.
         (
             "hrn100",
             "share = 0.1\nkeep = \"best\"",
@@ -442,7 +445,7 @@ fn a_training_that_diverges_ends_where_it_does() {
             1e30,
             "sgan: epoch 1: loss: found NaN",
         ),
-        // By the very last step.
+        // The weights become NaN in the very last step.
         (
             "weight",
             "hrn100",
@@ -523,10 +526,11 @@ fn every_method_leaves_a_model() {
         let card = Hrn::load(&trial.read("hrn.onnx")).unwrap().card().clone();
         assert_eq!(card.method, method);
         let settings = String::from_utf8(trial.read("settings.toml")).unwrap();
-        // 15 or 50 % of 160.
+        // These are 15 or 50 % of 160.
         let labels = if method == "hrn50" { 80 } else { 24 };
         if method == "hrn15-long" {
-            // Ours: 400 generated samples twice, in 4 steps each; 24 labelled ones twice, in one.
+            // In this setting: 400 generated samples twice, in 4 steps each; 24 labelled ones
+            // twice, in one step.
             let metrics = String::from_utf8(trial.read("metrics.csv")).unwrap();
             let last = metrics.lines().last().unwrap();
             assert!(last.starts_with("hrn,10,10,"), "{last}");
@@ -541,7 +545,7 @@ fn every_method_leaves_a_model() {
 #[test]
 fn a_discriminator_learns_from_unlabelled_samples_too() {
     let mut samples = Dataset::read(&data().1).unwrap().samples;
-    // Of each object two presses; the first samples of all are then unlabelled.
+    // Two presses of each object become unlabelled, so the first samples of all are.
     for (number, sample) in samples.iter_mut().enumerate() {
         sample.level *= u8::from(number % 10 > 1);
     }
@@ -579,8 +583,8 @@ fn a_full_disk_is_an_error_and_leaves_the_last_checkpoint_intact() {
     let trial = Trial::new("full disk");
     interrupted(&trial, "8", ("hrn", 1), Signal::KILL);
     let before = trial.checkpoints();
-    // No file may grow beyond 64 blocks of 512 bytes, and a process that tries is not killed but
-    // told so, as on a full disk. A checkpoint is greater.
+    // No file may grow beyond 64 blocks of 512 bytes. A process that tries gets an error and is not
+    // killed, as on a full disk. A checkpoint is larger.
     let output = Command::new("sh")
         .args(["-c", "trap '' XFSZ; ulimit -f 64; exec \"$@\"", "sh"])
         .arg(env!("CARGO_BIN_EXE_hrn-train"))
@@ -613,7 +617,7 @@ fn another_seed_gives_other_weights_and_a_run_is_not_overwritten() {
     };
     refused("3", &[], "continue it with --resume");
     refused("5", &["--resume"], "`seed`: found 5, expected 3");
-    // Nor is it gone on with by two at once.
+    // Two processes cannot continue the same run.
     let other_process = std::fs::File::open(&first.out).unwrap();
     let lock = rustix::fs::FlockOperation::LockExclusive;
     rustix::fs::flock(&other_process, lock).unwrap();
@@ -623,7 +627,7 @@ fn another_seed_gives_other_weights_and_a_run_is_not_overwritten() {
         "seed 3: another process is at work here",
     );
     drop(other_process);
-    // Nor does it go on from a checkpoint of another run.
+    // A run does not continue from a checkpoint of another run.
     for name in first.checkpoints() {
         let place = |trial: &Trial| trial.out.join("checkpoints").join(&name);
         std::fs::copy(place(&other), place(&first)).unwrap();
@@ -761,7 +765,7 @@ fn presses_over_time_are_data_too() {
             "{times:?}"
         );
     }
-    // It is no set of single frames.
+    // This data set cannot be read as single frames.
     let error = Dataset::read(&path).unwrap_err().to_string();
     assert!(error.contains("array `frames`: found none"), "{error}");
 }
@@ -948,13 +952,13 @@ fn bad_input_has_its_exit_code_and_one_line() {
         assert!(error.contains(expected), "{error}");
         assert!(code != 2 || error.lines().count() == 1, "{error}");
     }
-    // Nothing is trained, nor a run begun, of which a stage could not be done.
+    // If a stage cannot be done, nothing is trained, and no run is begun.
     assert!(!Path::new(&no_gan).exists());
-    // A picture that cannot be written does not cost the data set.
+    // If a picture cannot be written, the data set is written nevertheless.
     assert!(Dataset::read(Path::new(&beside)).is_ok());
 }
 
-/// It takes minutes: run it by hand.
+/// This test takes minutes: run it by hand.
 #[test]
 #[ignore = "heavy"]
 fn a_training_killed_a_hundred_times_ends_with_the_same_bits() {

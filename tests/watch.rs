@@ -1,5 +1,5 @@
-//! `hardnessd watch` on a real pty, beside a real daemon: what a terminal shows, and that it is given
-//! back.
+//! `hardnessd watch` on a real pty, with a real daemon: what the terminal shows, and that it is
+//! restored.
 #![cfg(feature = "watch")]
 #![allow(
     clippy::unwrap_used,
@@ -26,7 +26,7 @@ use pair::Pair;
 use rustix::process::Signal;
 use rustix::termios::{LocalModes, Winsize};
 
-/// A terminal, and a `watch` on it.
+/// A terminal with a `watch` on it.
 struct Terminal {
     watch: Process,
     master: OwnedFd,
@@ -41,7 +41,7 @@ impl Terminal {
         let Pair { master, device, .. } = Pair::open().unwrap();
         let end = || Stdio::from(device.try_clone().unwrap());
         resize(&master, size);
-        // Without a terminal of its own, which a test may be started from.
+        // `setsid` keeps the process from using the terminal that the test was started from.
         let watch = Command::new("setsid")
             .args([BINARY, "watch", "--socket"])
             .arg(socket)
@@ -85,7 +85,7 @@ impl Terminal {
         rustix::io::write(&self.master, keys).unwrap();
     }
 
-    /// Waits until the screen shows what is looked for.
+    /// Waits until `there` is true for the screen.
     fn until(&mut self, what: &str, there: impl Fn(&str) -> bool) -> String {
         let start = Instant::now();
         loop {
@@ -112,7 +112,7 @@ impl Terminal {
         }
     }
 
-    /// It must end by itself, and leave the terminal as it was.
+    /// Asserts that `watch` ends by itself and restores the terminal.
     fn ends(mut self) {
         assert_eq!(self.watch.exit_code(), Some(0));
         while !self.written.ends_with(b"\x1b[?1049l") {
@@ -167,7 +167,7 @@ fn it_shows_presses_loss_and_a_daemon_that_goes_and_comes_back() {
     let _sensor = bench.sensor(&[]);
     let _daemon = bench.daemon();
     terminal.shows("LIVE");
-    // A daemon that is there and says nothing is not taken for one that is well.
+    // A daemon that runs but does not answer must not look healthy.
     _daemon.process.signal(Signal::STOP);
     terminal.shows("DAEMON SILENT");
     _daemon.process.signal(Signal::CONT);
@@ -180,7 +180,7 @@ fn it_shows_presses_loss_and_a_daemon_that_goes_and_comes_back() {
 fn what_takes_the_connection_and_says_nothing_is_silent() {
     let bench = Bench::new();
     let path = bench.path("events.sock");
-    // The system takes connections for whoever listens.
+    // The system accepts connections for any listener.
     let listener = UnixListener::bind(&path).unwrap();
     let mut terminal = Terminal::new(&path, (80, 24), &[]);
     terminal.shows("NO DAEMON");
@@ -221,7 +221,7 @@ fn it_fits_whatever_size_the_terminal_takes() {
     terminal.shows("contact area");
     for size in [(40, 24), (80, 24), (20, 5), (100, 40)] {
         terminal.resize(size);
-        // What stood there is gone: the keys are in the last row, and there alone.
+        // The old screen is gone: the keys are in the last row and nowhere else.
         terminal.until("the new size", |text| {
             let lines: Vec<&str> = text.lines().collect();
             let keys = |line: &&str| line.starts_with("q quit");
@@ -295,7 +295,8 @@ fn a_terminal_that_goes_away_ends_it() {
     drop((command, device));
     let mut shown = [0; 4096];
     assert!(File::from(master).read(&mut shown).unwrap() > 0);
-    // Its other end is closed now, and no signal says so: the terminal is not its own.
+    // The other end of the terminal is closed. No signal tells `watch`, because this is not its
+    // controlling terminal.
     assert_eq!(watch.exit_code(), Some(0));
 }
 

@@ -1,4 +1,4 @@
-//! Any chunking gives the same frames; noise never panics; damage costs the damaged frame.
+//! Any chunking gives the same frames, noise never panics, and damage loses only the damaged frame.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -57,7 +57,7 @@ fn encode(layout: &Layout, frames: &[RawFrame]) -> Vec<u8> {
     bytes
 }
 
-/// Everything in one decoder: frames, damaged candidates, and the books balanced.
+/// The output of one decoder: frames and the number of damaged candidates. Its counts must add up.
 fn decode<'a>(layout: &Layout, chunks: impl IntoIterator<Item = &'a [u8]>) -> (Vec<RawFrame>, u64) {
     let mut decoder = Decoder::new(layout.clone());
     let (mut whole, mut damaged, mut total) = (Vec::new(), 0, 0);
@@ -121,7 +121,7 @@ fn jx255n_is_790_bytes_and_its_bytes_are_frozen() {
     let bytes = encode(&layout, &[raw]);
     assert_eq!(bytes.len(), 790);
     assert_eq!(bytes[..5], [0xBB, 0xAA, 0x10, 0x03, 0x01]);
-    // CRC-16/MODBUS over the 788 bytes before it, by crcmod's "modbus".
+    // This is CRC-16/MODBUS over the 788 bytes before it, by crcmod's "modbus".
     let crc = hardnessd::wire::Checksum::Crc16Modbus.of(&bytes[..788]);
     assert_eq!(bytes[788..], crc.to_le_bytes());
     let u16_layout = Layout::new(&Settings {
@@ -174,15 +174,15 @@ fn ten_megabytes_of_noise_around_100_frames_lose_none() {
 
 #[test]
 fn a_damaged_frame_costs_itself_alone() {
-    // Presets whose damage shows; one byte lost in the middle frame, at every place.
+    // One byte is lost in the middle frame, at every place.
     for preset in PRESETS {
         let layout = layout(preset);
         let sent = frames(5, 3);
         let whole = encode(&layout, &sent);
         let first = encode(&layout, &sent[..1]).len();
         let middle = encode(&layout, &sent[1..2]).len();
-        // By its definition a jq frame is whole when a header follows: a broken header costs the
-        // frame before it too.
+        // By definition, a jq frame is whole when a header follows. So a broken header also loses
+        // the frame before it.
         let header = if preset == Preset::Jq { 4 } else { 0 };
         for lost in (header..middle).step_by(7) {
             let mut bytes = whole.clone();
@@ -211,7 +211,7 @@ fn flipped_bits_are_caught_and_counted_where_there_is_a_checksum() {
         bytes[790 + bit / 8] ^= 1 << (bit % 8);
         let (found, damaged) = decode(&layout, [bytes.as_slice()]);
         assert_eq!(found, [sent[0], sent[2]], "bit {bit}");
-        // A broken sync is no candidate.
+        // A frame with a broken sync is not a candidate.
         assert_eq!(damaged, u64::from(bit >= 16), "bit {bit}");
     }
 }
@@ -252,7 +252,8 @@ fn jq_is_not_misled_by_its_header_in_the_data() {
 fn after_a_restart_nothing_is_made_of_the_bytes_before() {
     for preset in PRESETS {
         let layout = layout(preset);
-        // A header of jq in the data: which one is a frame's, the place in the stream decides.
+        // The data contains a header of jq. The place in the stream decides which header begins a
+        // frame.
         let mut held = frames(12, 1)[0];
         for (place, byte) in (300..).zip([0xAA, 0x55, 0x03, 0x99]) {
             held.counts[place] = byte;
@@ -292,7 +293,7 @@ fn jq_waits_for_no_header_that_is_farther_from_its_phase() {
         held.counts[place] = byte;
     }
     let mut bytes = encode(&layout, &vec![held; 4]);
-    // Behind the header in the second frame's data: that one is followed by nothing.
+    // The lost byte is after the header in the second frame's data, so no header follows that one.
     bytes.remove(788 + 600);
     let mut decoder = Decoder::new(layout);
     let mut whole = Vec::new();
@@ -309,7 +310,7 @@ fn jq_waits_for_no_header_that_is_farther_from_its_phase() {
             decoder.pending()
         );
     }
-    // The first and the third, as soon as the header after them is there.
+    // The first and the third frame are found as soon as the header after each is complete.
     assert_eq!(whole, [788 + 4, 3 * 788 - 1 + 4]);
 }
 
@@ -322,8 +323,9 @@ fn of_two_headers_as_near_to_its_phase_jq_takes_the_earlier() {
     }
     let sent = vec![held; 5];
     let mut bytes = encode(&layout, &sent);
-    // Half as many as stand before the header in the data: without them the next frame begins as far
-    // before the phase as the header in its data stands behind it, and either is followed.
+    // Remove half as many bytes as are before the header in the data. The next frame then begins as
+    // far before the phase as the header in its data is after it. Another header follows either of
+    // them.
     bytes.drain(788 + 400..788 + 400 + (4 + 300) / 2);
     assert_eq!(decode(&layout, [bytes.as_slice()]).0, sent[1..]);
 }
@@ -351,8 +353,8 @@ fn long_noise_counts_alike_in_any_chunks() {
     for (preset, noise) in [(Preset::Ascii, digits), (Preset::ZeroRun, pairs)] {
         let layout = layout(preset);
         let sent = frames(10, 3);
-        // Before any frame nothing tells noise from a frame whose beginning was missed; after one it
-        // is damage.
+        // Before any frame, noise cannot be told from a frame whose beginning was missed. After a
+        // frame, noise is damage.
         let first = encode(&layout, &sent[..1]);
         let others = encode(&layout, &sent[1..]);
         let bytes = [&noise, first.as_slice(), &noise, &others].concat();
@@ -373,14 +375,15 @@ fn long_noise_counts_alike_in_any_chunks() {
 fn lines_of_noise_before_the_first_ascii_frame_are_no_damage_in_any_chunks() {
     let text = "preset = 'ascii'\nrows = 2\ncols = 1";
     let layout = Layout::new(&toml::from_str(text).unwrap()).unwrap();
-    // Longer than a frame, so that its first lines are let go of somewhere in their middle.
+    // The bytes are longer than a frame, so the decoder drops the first lines in the middle of a
+    // line.
     let bytes = [b"x 1\n".repeat(9), b"\n7\n8\n\n".to_vec()].concat();
     let expected = decode(&layout, [bytes.as_slice()]);
     assert_eq!((expected.0.len(), expected.1), (1, 0));
     for size in 1..bytes.len() {
         assert_eq!(decode(&layout, bytes.chunks(size)), expected, "by {size}");
     }
-    // Nor is what is left of a number a number.
+    // The rest of a cut number is not a number.
     let bytes = [b"7".as_slice(), &[b'0'; 30], b"1\n8\n\n"].concat();
     for size in 1..=bytes.len() {
         assert_eq!(decode(&layout, bytes.chunks(size)).0, [], "by {size}");
@@ -503,7 +506,7 @@ fn cells_masks_orders_and_small_arrays_land_in_place() {
 
 #[test]
 fn every_length_cell_checksum_and_order_stands_where_it_should() {
-    // Two rows of three cells; the sensor's first row is 1 2 3, its second 4 5 6.
+    // Two rows of three cells: the sensor's first row is 1 2 3, and its second is 4 5 6.
     let mut frame = RawFrame::default();
     for (index, count) in (1..=6).enumerate() {
         frame.counts[(13 + index / 3) * 28 + 12 + index % 3] = count;
@@ -517,7 +520,7 @@ fn every_length_cell_checksum_and_order_stands_where_it_should() {
         ("length = 'u16be'", &[0, 6, 1, 2, 3, 4, 5, 6]),
         ("cell = 'u16le'", &[1, 0, 2, 0, 3, 0, 4, 0, 5, 0, 6, 0]),
         ("cell = 'u16be'", &[0, 1, 0, 2, 0, 3, 0, 4, 0, 5, 0, 6]),
-        // Over the sync too: A5 + 21, and A5 ^ 7.
+        // The checksum includes the sync: A5 + 21, and A5 ^ 7.
         ("checksum = 'sum8'", &[1, 2, 3, 4, 5, 6, 0xBA]),
         ("checksum = 'xor8'", &[1, 2, 3, 4, 5, 6, 0xA2]),
     ] {
@@ -535,13 +538,13 @@ fn every_length_cell_checksum_and_order_stands_where_it_should() {
 
 #[test]
 fn a_cell_that_cannot_be_sent_is_neither_sent_nor_full_scale() {
-    // 255 is the mark of both: cells go up to 254, be it that the mask is written out.
+    // 255 is the mark of both presets. So cells go up to 254, even if the mask is written out.
     for preset in ["ff-tail", "zero-run"] {
         for (rest, full_scale, sent, read) in [
             ("", 254, 255, 254),
             ("mask = 255", 254, 255, 254),
             ("mask = 0x7F", 127, 255, 127),
-            // A cell counts down from 255 here, and 0 has to be 1.
+            // A cell counts down from 255 here, and 0 has to be sent as 1.
             ("invert = true", 255, 0, 1),
             ("invert = true", 255, 255, 255),
         ] {

@@ -1,4 +1,4 @@
-//! Clients: what they hear, and how long after it was sent.
+//! Clients: the events that they read, and how long after sending they read them.
 
 use std::fmt;
 use std::io;
@@ -17,22 +17,22 @@ use crate::{Args, Failure, Kind, What};
 
 /// How long the server may take to start, and to answer a client.
 const PATIENCE: Duration = Duration::from_secs(30);
-/// What comes before the forces of a frame.
+/// The text before the forces of a frame.
 pub(crate) const FORCES: &str = "\"newtons\":[";
 
-/// What all clients heard.
+/// The record of all clients.
 #[derive(Default)]
 pub(crate) struct Heard {
-    /// Clients that are connected and have been answered.
+    /// The number of clients that are connected and have an answer.
     ready: AtomicUsize,
-    /// What is sent from this moment on is measured; 0: nothing yet.
+    /// Events sent from this moment on are measured. 0: nothing is measured yet.
     since_ns: AtomicU64,
-    /// Microseconds of each event.
+    /// The delay of each event in microseconds.
     late: Mutex<Vec<f32>>,
 }
 
 impl Heard {
-    /// Measures what is sent from now on.
+    /// Measures the events that are sent from now on.
     pub(crate) fn begin(&self) {
         self.since_ns.store(now_ns(), Relaxed);
     }
@@ -61,7 +61,7 @@ impl Heard {
     }
 }
 
-/// What is said of a run.
+/// The figures of a run.
 pub(crate) struct Figures {
     events: usize,
     lost: i64,
@@ -79,7 +79,7 @@ impl fmt::Display for Figures {
     }
 }
 
-/// Waits until all clients are there.
+/// Waits until all clients are connected.
 pub(crate) fn wait(heard: &Heard, clients: usize) -> Result<(), Failure> {
     let start = Instant::now();
     while heard.ready.load(Relaxed) < clients {
@@ -91,7 +91,7 @@ pub(crate) fn wait(heard: &Heard, clients: usize) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Reads until the server ends: what went wrong.
+/// Reads until the server ends. Returns the problem, if there was one.
 pub(crate) fn listen(
     args: &Args,
     place: &Place,
@@ -186,9 +186,9 @@ async fn client<S: AsyncRead + AsyncWrite + Unpin>(
     }
 }
 
-/// When the frame was sent that `line` is of.
+/// When the frame of the event in `line` was sent.
 fn sent_at(what: What, line: &[u8], sent: &Sent) -> Option<u64> {
-    // What is looked for comes first.
+    // The fields needed are at the beginning of the line.
     let head = std::str::from_utf8(&line[..line.len().min(400)]).ok()?;
     let sensor = value(head, "\"sensor\":\"s")?;
     match what {
@@ -212,7 +212,7 @@ fn value(text: &str, key: &str) -> Option<usize> {
     rest[..end].parse().ok()
 }
 
-/// The cycle that a line of gpsd is of, by its time.
+/// The cycle of a line from gpsd, by the line's time.
 fn fix(line: &[u8]) -> Option<usize> {
     let line = std::str::from_utf8(line).ok()?;
     line.starts_with("{\"class\":\"TPV\"").then_some(())?;

@@ -1,11 +1,13 @@
-//! Measures byte in to event out: from the write of a frame's last byte on a pty to its event at a client.
+//! Measures byte in to event out: from the write of a frame's last byte on a pty to its event at a
+//! client.
 //!
 //!     cargo build --release && cargo run --release --example latency -- --seconds 60
 //!
-//! It plays sensors to a daemon of its own, reads as many clients as you say, and prints percentiles, what
-//! was lost, and the daemon's processor time and memory. `--server gpsd` does the same with gpsd and NMEA
-//! sentences, `--server bare` with a process that only copies bytes: the floor. Start it with
-//! `chrt --rr 20`, so that a busy machine delays the daemon and not the measurement.
+//! It plays sensors to a daemon of its own and reads with as many clients as you ask for. It prints
+//! percentiles, the number of lost events, and the daemon's processor time and memory. `--server
+//! gpsd` does the same with gpsd and NMEA sentences. `--server bare` uses a process that only
+//! copies bytes, as the lower bound. Start the example with `chrt --rr 20`, so that a busy machine
+//! delays the daemon and not the measurement.
 
 mod clients;
 #[path = "../../src/tools/pty/pair.rs"]
@@ -26,7 +28,7 @@ use server::Server;
 
 type Failure = Box<dyn std::error::Error + Send + Sync>;
 
-/// Nothing is measured before everything has run for this long.
+/// The time for which everything runs before the measurement begins.
 const WARM: Duration = Duration::from_secs(2);
 
 #[derive(Parser, Clone)]
@@ -104,7 +106,8 @@ fn main() -> ExitCode {
     }
 }
 
-/// Two for each sensor and one for each client are more than most systems begin with.
+/// Raises the limit of descriptors: each sensor needs two and each client one, more than most
+/// systems allow at first.
 fn raise_descriptors() {
     let limit = rustix::process::getrlimit(Resource::Nofile);
     let raised = Rlimit {
@@ -131,11 +134,11 @@ fn measure(args: &Args) -> Result<(), Failure> {
     thread::sleep(WARM);
     heard.begin();
     let (before, start) = (server.processor_time()?, Instant::now());
-    // The sensors stay plugged in until all was heard.
+    // The sensors stay plugged in until all events are read.
     let (_sensors, late) = player.join().map_err(|_| "the sensors stopped")??;
     let taken = start.elapsed();
     let busy = server.processor_time()?.saturating_sub(before);
-    // The last events are on their way.
+    // Wait for the last events, which are on their way.
     thread::sleep(Duration::from_millis(300));
     let memory = server.anonymous_kb()?;
     drop(server);

@@ -1,4 +1,4 @@
-//! Sensors on ptys: what they send, and when they sent it.
+//! Sensors on ptys: the frames that they send, and when they sent them.
 
 use std::fmt::Write as _;
 use std::io;
@@ -14,25 +14,26 @@ use rustix::termios::OptionalActions;
 use crate::pair::Pair;
 use crate::{Args, Failure, Kind, What};
 
-/// A press every so many frames: half of them loaded. The second frame without load ends it.
+/// The number of frames in a cycle with one press. The press ends with the second frame without
+/// load.
 const CYCLE: usize = 40;
 const LOADED: usize = 20;
-/// As configured by default.
+/// The default of the daemon's configuration.
 const NEWTONS_PER_COUNT: f64 = 0.04;
-/// Bytes of an NMEA cycle: about those of a frame.
+/// The number of bytes of an NMEA cycle: about as many as of a frame.
 const SENTENCES: usize = 791;
 
-/// When a frame was sent, in ns of the clock of [`now_ns`]: for each sensor a list.
+/// When each frame was sent, in ns of the clock of [`now_ns`]: a list for each sensor.
 pub(crate) struct Sent(Vec<Vec<AtomicU64>>);
 
 impl Sent {
-    /// When frame `number` of `sensor` was sent; the first has number 0.
+    /// When frame `number` of `sensor` was sent. The first frame has the number 0.
     pub(crate) fn frame(&self, sensor: usize, number: usize) -> Option<u64> {
         let at = self.0.get(sensor)?.get(number)?;
         Some(at.load(Relaxed)).filter(|&at| at > 0)
     }
 
-    /// How many events are to come of what was sent at `since_ns` or later.
+    /// The number of expected events of frames that were sent at `since_ns` or later.
     pub(crate) fn count(&self, what: What, since_ns: u64) -> usize {
         let of = |(sensor, frames): (usize, &Vec<AtomicU64>)| {
             let sent = frames.iter().enumerate();
@@ -43,20 +44,21 @@ impl Sent {
         self.0.iter().enumerate().map(of).sum()
     }
 
-    /// When the frame was sent that ended press `number` of `sensor`.
+    /// When the frame that ended press `number` of `sensor` was sent.
     pub(crate) fn end(&self, sensor: usize, number: usize) -> Option<u64> {
         let frame = number * CYCLE + LOADED + 1;
         self.frame(sensor, frame.checked_sub(phase(sensor))?)
     }
 }
 
-/// Whether a sensor's frame ends a press.
+/// Whether this frame of the sensor ends a press.
 fn ends(sensor: usize, frame: usize) -> bool {
     let cycle = frame + phase(sensor);
     cycle >= CYCLE && cycle % CYCLE == LOADED + 1
 }
 
-/// How far into its cycle a sensor begins, so that not all end a press at once.
+/// How far into its cycle a sensor begins. The phases differ, so that not all sensors end a press
+/// at once.
 fn phase(sensor: usize) -> usize {
     sensor * 7 % CYCLE
 }
@@ -96,7 +98,7 @@ impl Sensors {
         Arc::clone(&self.sent)
     }
 
-    /// Sends for `length`; how late the latest was.
+    /// Sends for `length`. Returns the largest delay of a frame.
     pub(crate) fn play(self, length: Duration) -> Result<(Self, Duration), Failure> {
         let layout = Layout::new(&Settings::default())?;
         let start = Instant::now();
@@ -108,7 +110,7 @@ impl Sensors {
             if due >= start + length {
                 break;
             }
-            // All sensors send the same.
+            // All sensors send the same frames.
             let encode = |is_loaded| {
                 let mut bytes = Vec::new();
                 match self.kind {
@@ -119,14 +121,16 @@ impl Sensors {
             };
             let (rest, loaded) = (encode(false), encode(true));
             for (sensor, pair) in self.pairs.iter().enumerate() {
-                // The sensors of one machine do not send at the same moment.
+                // The sensors of one machine do not send at the same moment, so spread them over
+                // the period.
                 let due = due + period.mul_f64(sensor as f64 / count as f64);
                 std::thread::sleep(due.saturating_duration_since(Instant::now()));
                 latest = latest.max(due.elapsed());
                 let cycle = number as usize + phase(sensor);
                 let is_loaded = cycle >= CYCLE && cycle % CYCLE < LOADED;
                 let at = &self.sent.0[sensor][number as usize];
-                // It may be heard of before the write returns.
+                // Store the time first, because a client may read the event before the write
+                // returns.
                 at.store(now_ns(), Relaxed);
                 let mut left = if is_loaded { &loaded } else { &rest }.as_slice();
                 while !left.is_empty() {
@@ -147,7 +151,7 @@ fn plug() -> io::Result<Pair> {
     Ok(pair)
 }
 
-/// Frame `number`, which it carries in its first taxels: fewer than make a contact.
+/// Frame `number`. Its first taxels carry the number. They are too few for a contact.
 fn frame(number: i32, is_loaded: bool) -> RawFrame {
     let mut frame = RawFrame::default();
     for (count, byte) in frame.counts.iter_mut().zip(number.to_le_bytes()) {
@@ -163,7 +167,7 @@ fn frame(number: i32, is_loaded: bool) -> RawFrame {
     frame
 }
 
-/// The number that the first forces of a frame carry, in newtons.
+/// The number in the first forces of a frame, which are in newtons.
 pub(crate) fn number(forces: &[f64; 3]) -> usize {
     let byte = |force: f64| (force / NEWTONS_PER_COUNT).round() as usize;
     forces
@@ -172,7 +176,7 @@ pub(crate) fn number(forces: &[f64; 3]) -> usize {
         .fold(0, |number, &force| number << 8 | byte(force))
 }
 
-/// One cycle of a GPS receiver, a hundredth of a second after the one before.
+/// One cycle of a GPS receiver, a hundredth of a second after the previous one.
 fn sentences(number: i32) -> String {
     let (seconds, hundredths) = (number / 100, number % 100);
     let time = format!(
@@ -186,7 +190,7 @@ fn sentences(number: i32) -> String {
         let sum = body.bytes().fold(0, |sum, byte| sum ^ byte);
         let _ = write!(cycle, "${body}*{sum:02X}\r\n");
     };
-    // Without a time of their own, so that gpsd sends one message a cycle.
+    // These have no time of their own, so that gpsd sends one message a cycle.
     for _ in 0..16 {
         add("GPVTG,054.7,T,034.4,M,000.5,N,001.0,K,A");
     }

@@ -1,4 +1,4 @@
-//! The process that is measured.
+//! The process whose latency is measured.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -17,10 +17,10 @@ use crate::{Args, Failure, Kind, Scheduling};
 
 /// How long a process may take to start.
 const PATIENCE: Duration = Duration::from_secs(30);
-/// Bytes of a frame.
+/// The number of bytes of a frame.
 const FRAME_BYTES: usize = 790;
 
-/// Where clients connect.
+/// The address for clients.
 #[derive(Debug, Clone)]
 pub(crate) enum Place {
     Unix(PathBuf),
@@ -36,7 +36,7 @@ pub(crate) struct Server {
 impl Server {
     pub(crate) fn start(args: &Args, devices: &[PathBuf]) -> Result<Self, Failure> {
         let directory = tempfile::tempdir()?;
-        // Free now, and nobody here takes it meanwhile.
+        // The port is free now, and nothing else here takes it before the server does.
         let port = TcpListener::bind(("127.0.0.1", 0))?.local_addr()?.port();
         let place = if args.tcp || args.server == Kind::Gpsd {
             Place::Tcp(port)
@@ -92,13 +92,13 @@ impl Server {
             .join(name)
     }
 
-    /// Waits until it has opened as many terminals, and for a moment after that.
+    /// Waits until the server has opened `count` terminals, and for a moment after that.
     pub(crate) fn opens(&self, count: usize) -> Result<(), Failure> {
         let start = Instant::now();
         let is_terminal = |file: &fs::DirEntry| {
             fs::read_link(file.path()).is_ok_and(|target| target.starts_with("/dev/pts"))
         };
-        // Its own stderr may be one, too.
+        // The server's own stdin, stdout or stderr may be a terminal too.
         let own = (0..3).filter(|fd| {
             fs::read_link(self.proc("fd").join(fd.to_string()))
                 .is_ok_and(|target| target.starts_with("/dev/pts"))
@@ -119,7 +119,7 @@ impl Server {
         Ok(())
     }
 
-    /// Of all its threads.
+    /// The processor time of all its threads.
     pub(crate) fn processor_time(&self) -> Result<Duration, Failure> {
         let mut taken = 0;
         for thread in fs::read_dir(self.proc("task"))?.flatten() {
@@ -170,13 +170,13 @@ fn configuration(args: &Args, devices: &[PathBuf], port: u16) -> String {
     if args.tcp {
         let _ = write!(text, "[publish.tcp]\nlisten = \"127.0.0.1:{port}\"\n");
     }
-    // The first taxels carry a number and are no contact.
+    // The first taxels carry a number, and must not count as a contact.
     text += "[press]\nbegin_area_taxels = 6\nend_area_taxels = 5\n";
     text + &args.configuration + "\n"
 }
 
-/// Reads frames and writes a line of a frame's length for each, and nothing else: what reading and
-/// writing cost alone.
+/// Reads frames and writes a line of a frame's length for each. It does nothing else, so its cost
+/// is that of reading and writing alone.
 pub(crate) fn copy(device: &Path, args: &Args) -> Result<(), Failure> {
     let mut clients: Vec<Box<dyn Write>> = Vec::new();
     let device = fs::File::open(device)?;
@@ -196,14 +196,15 @@ pub(crate) fn copy(device: &Path, args: &Args) -> Result<(), Failure> {
     for client in &mut clients {
         client.write_all(b"{\"type\":\"hello\"}\n")?;
     }
-    // As many bytes as a frame without load.
+    // These forces are as many bytes as a frame without load.
     let forces = vec!["0.0"; 781].join(",");
     let (mut read, mut bytes) = (0, [0; 4096]);
     for number in 1.. {
         while read < number * FRAME_BYTES {
             read += rustix::io::read(&device, &mut bytes)?;
         }
-        // The number is where sensors put it, in newtons. Here it is the count of frames: none is lost.
+        // The number is at the same place as from a sensor, in newtons. Here it is the count of
+        // frames, because none is lost.
         let force = |byte: u8| 0.04 * f64::from(byte);
         let [a, b, c, ..] = (number as u32 - 1).to_le_bytes().map(force);
         let line = format!(

@@ -1,4 +1,4 @@
-//! What must hold at the end: of every press, and of what the daemon uses.
+//! The checks at the end: of every press, and of the daemon's resources.
 
 use std::fs;
 use std::path::PathBuf;
@@ -8,11 +8,12 @@ use std::time::Duration;
 use crate::Failure;
 use crate::player::Player;
 
-/// The black boxes hold a minute, and up to a stretch of ten seconds more. They are full after this. The
-/// events that are held for `since` fill in minutes more: a longer run leaves out its first quarter.
+/// The time until the black boxes are full: they hold a minute, and up to a stretch of ten seconds
+/// more. The events that are held for `since` take minutes more to fill, so a longer run leaves out
+/// its first quarter.
 const WARM: Duration = Duration::from_secs(75);
 
-/// Memory in kB, descriptors, threads.
+/// The daemon's memory in kB, descriptors and threads.
 pub(crate) fn usage(daemon: &Child) -> Result<[u64; 3], Failure> {
     let directory = PathBuf::from(format!("/proc/{}", daemon.id()));
     let status = fs::read_to_string(directory.join("status"))?;
@@ -25,7 +26,7 @@ pub(crate) fn usage(daemon: &Child) -> Result<[u64; 3], Failure> {
     Ok([of("VmRSS:")?, descriptors, of("Threads:")?])
 }
 
-/// Compares what was sent with what a subscriber heard, press by press.
+/// Compares the presses sent with those that a subscriber read, press by press.
 pub(crate) fn account(sent: &[Player], ends: &[Vec<String>], is_told: bool) -> Vec<String> {
     let mut problems = Vec::new();
     let (mut judged, mut lost) = (0, 0);
@@ -57,7 +58,7 @@ pub(crate) fn account(sent: &[Player], ends: &[Vec<String>], is_told: bool) -> V
     problems
 }
 
-/// Compares the medians of the two halves after the start.
+/// Compares the medians of the two halves of the time after the start.
 pub(crate) fn growth(samples: &[(Duration, [u64; 3])]) -> Vec<String> {
     let length = samples.last().map_or(Duration::ZERO, |(at, _)| *at);
     let warm: Vec<[u64; 3]> = samples
@@ -67,7 +68,8 @@ pub(crate) fn growth(samples: &[(Duration, [u64; 3])]) -> Vec<String> {
         .collect();
     let (first, second) = warm.split_at(warm.len() / 2);
     let mut problems = Vec::new();
-    // Memory may vary by a twentieth and a MB. Guests, files and the threads that open ports come and go.
+    // Memory may vary by a twentieth and a MB. Guests, files and the threads that open ports come
+    // and go.
     let kinds = [
         ("kB of memory", 0.05, 1024),
         ("descriptors", 0.0, 2),

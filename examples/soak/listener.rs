@@ -13,23 +13,23 @@ use serde_json::Value;
 
 use crate::Failure;
 
-/// How often a subscriber has heard of a sensor that it is live, and lost.
+/// How often a subscriber has read that a sensor is live, and that it is lost.
 #[derive(Default)]
 pub(crate) struct Link {
     pub(crate) lives: AtomicU64,
     pub(crate) losses: AtomicU64,
 }
 
-/// What a subscriber heard.
+/// The record of a subscriber.
 #[derive(Default)]
 pub(crate) struct Heard {
     pub(crate) events: u64,
-    /// For each sensor and press, how it ended; empty: not.
+    /// For each sensor and press, how the press ended. Empty if it has not ended.
     pub(crate) ends: Vec<Vec<String>>,
     pub(crate) problems: Vec<String>,
 }
 
-/// Reads to the end. Events must be consecutive, and presses too.
+/// Reads to the end. The numbers of events and of presses must be consecutive.
 pub(crate) fn hear(connection: UnixStream, links: &[Arc<Link>]) -> Result<Heard, Failure> {
     let mut heard = Heard::default();
     heard.ends.resize(links.len(), Vec::new());
@@ -49,7 +49,7 @@ pub(crate) fn hear(connection: UnixStream, links: &[Arc<Link>]) -> Result<Heard,
             (Some(sensor), Some("lost")) => drop(links[sensor].losses.fetch_add(1, Relaxed)),
             _ => {}
         }
-        // A hello has the number of the last event before.
+        // The number in a hello is that of the last event before it.
         let Some(seq) = event["seq"].as_u64() else {
             continue;
         };
@@ -88,7 +88,7 @@ pub(crate) fn hear(connection: UnixStream, links: &[Arc<Link>]) -> Result<Heard,
     Ok(heard)
 }
 
-/// Connects, listens for a moment, goes, again and again.
+/// Again and again, connects, listens for a moment and disconnects.
 pub(crate) fn come_and_go(socket: &Path, seed: u64, over: &AtomicBool) -> Result<(), Failure> {
     let mut stream = Stream::new(seed, "guest");
     while !over.load(Relaxed) {

@@ -2,10 +2,11 @@
 //!
 //!     cargo run --release --example soak -- --minutes 120
 //!
-//! The daemon is a child process with the code of `hardnessd run`. Each sensor sends simulated presses over
-//! a pty of its own, with a fault in every second press. There are subscribers of all kinds, recordings, and a
-//! reload every ten seconds. At the end every press that was sent must have its verdict, or was lost with
-//! the link, by its number. Memory, descriptors and threads must not have grown. It ends with 1 otherwise.
+//! The daemon is a child process with the code of `hardnessd run`. Each sensor sends simulated
+//! presses over a pty of its own, with a fault in every second press. There are subscribers of all
+//! kinds, recordings, and a reload every ten seconds. At the end, every press must have its
+//! verdict, or must be lost with the link, by its number. Memory, descriptors and threads must not
+//! have grown. Otherwise the exit code is 1.
 
 mod account;
 mod listener;
@@ -41,9 +42,9 @@ type Failure = Box<dyn std::error::Error + Send + Sync>;
 
 const FRAMES_PER_S: f64 = 100.0;
 const PERIOD: Duration = Duration::from_millis(10);
-/// How long the daemon may take for anything.
+/// How long any action of the daemon may take.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Recordings that are kept.
+/// The number of recordings that are kept.
 const KEPT: usize = 16;
 
 #[derive(Parser)]
@@ -78,7 +79,7 @@ fn main() -> ExitCode {
     ExitCode::from(u8::from(!problems.is_empty()))
 }
 
-/// The daemon, as `hardnessd run` is one.
+/// Runs the daemon as `hardnessd run` does.
 fn serve(config: &Path) -> Result<(), Failure> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -127,7 +128,7 @@ fn configure(path: &Path, sensors: usize, min_confidence: f64) -> io::Result<()>
     fs::rename(born, path)
 }
 
-/// All recordings, oldest first.
+/// All recordings, the oldest first.
 fn recordings(directory: &Path) -> io::Result<Vec<PathBuf>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(directory)? {
@@ -172,12 +173,12 @@ fn soak(args: &Args) -> Result<Vec<String>, Failure> {
         .stdin(Stdio::null())
         .spawn()?;
     let played = attend(args, &mut daemon, players, &links, &socket, &config);
-    // It has ended, unless something failed.
+    // The daemon has already ended, unless something failed.
     let _ = daemon.kill();
     let _ = daemon.wait();
     let log = fs::read_to_string(at("log"))?;
     let mut problems = played.inspect_err(|_| eprintln!("{log}"))?;
-    // Of a reload that was refused, above all.
+    // Errors are above all those of refused reloads.
     let errors = log.lines().filter(|line| line.contains("ERROR"));
     problems.extend(errors.map(str::to_owned));
     let mut records = 0;
@@ -212,7 +213,7 @@ fn attend(
     let over = Arc::new(AtomicBool::new(false));
     let mut listening = Vec::new();
     for number in 0..17 {
-        // The first tells the players what it hears.
+        // The first subscriber's links tell the players about their sensors.
         let links: Vec<_> = links
             .iter()
             .map(|link| {
@@ -267,7 +268,7 @@ fn attend(
     for guest in guests {
         guest.join().map_err(|_| "a guest panicked")??;
     }
-    // Subscribers have what was said before.
+    // Let the subscribers read the events so far.
     sleep(Duration::from_secs(1));
     kill_process(pid, Signal::TERM)?;
     let ended = daemon.wait()?;
@@ -290,7 +291,7 @@ fn attend(
             );
         }
         for problem in account(&sent, &heard.ends, number == 0) {
-            // All subscribers hear the same.
+            // All subscribers report the same problem, so keep it once.
             if !problems.contains(&problem) {
                 problems.push(problem);
             }

@@ -17,10 +17,10 @@ use crate::listener::Link;
 use crate::pair::Pair;
 use crate::{FRAMES_PER_S, Failure, PATIENCE, PERIOD};
 
-/// One simulated press, in frames as they are sent, with the rest after it.
+/// One simulated press as frames on the wire, with the rest after it.
 pub(crate) struct Press {
     frames: Vec<Vec<u8>>,
-    /// A frame in the middle of the contact.
+    /// The index of a frame in the middle of the contact.
     middle: usize,
 }
 
@@ -62,7 +62,7 @@ pub(crate) const FAULTS: [&str; 7] = [
     "unplug", "silence", "stall", "flip", "drop", "noise", "double",
 ];
 
-/// A sensor, its cable, and what must become of each press it has sent: whether it has a verdict.
+/// A sensor, its cable, and the expected end of each press sent: whether it has a verdict.
 pub(crate) struct Player {
     pub(crate) port: PathBuf,
     pub(crate) pair: Pair,
@@ -85,7 +85,7 @@ pub(crate) fn plug(port: &Path) -> io::Result<Pair> {
 }
 
 impl Player {
-    /// Plays until `end`, and to the end of the press in hand.
+    /// Plays until `end`, and then to the end of the press under way.
     pub(crate) fn play(mut self, end: Instant) -> Result<Self, Failure> {
         self.wake(0)?;
         while Instant::now() < end {
@@ -113,7 +113,7 @@ impl Player {
                     return self.unplug(&bytes);
                 }
                 "silence" if index == middle => self.due += Duration::from_millis(400),
-                // Nothing is sent for 30 frames, then all of it.
+                // Send nothing for 30 frames, then send all of them.
                 "stall" if (middle..middle + 30).contains(&index) => {
                     held.append(&mut bytes);
                 }
@@ -131,20 +131,20 @@ impl Player {
             }
             self.write(&bytes)?;
         }
-        // The press was shorter.
+        // If the press ended before the held frames were sent, send them now.
         self.write(&held)?;
         self.sent.push(true);
         Ok(())
     }
 
-    /// Pulls the cable within a frame, and plugs it in again.
+    /// Pulls the cable in the middle of a frame, and plugs it in again.
     fn unplug(&mut self, frame: &[u8]) -> Result<(), Failure> {
         let part = self.stream.below(frame.len());
         self.write(&frame[..part])?;
         self.drain()?;
         let losses = self.link.losses.load(Relaxed);
         fs::remove_file(&self.port)?;
-        // Two are open for a moment, so that it is another one.
+        // Open the new pty before the old one is closed, so that its name is a different one.
         let next = self.port.with_extension("next");
         self.pair = plug(&next)?;
         self.wait("lost", || Ok(self.link.losses.load(Relaxed) > losses))?;
@@ -169,7 +169,8 @@ impl Player {
         Ok(())
     }
 
-    /// Sends frames without load until it is heard to be live once more, and enough for a tare.
+    /// Sends frames without load until the sensor is live once more, and then enough frames for a
+    /// tare.
     fn wake(&mut self, lives: u64) -> Result<(), Failure> {
         let (start, rest) = (Instant::now(), Arc::clone(&self.rest));
         self.due = start;
@@ -182,22 +183,22 @@ impl Player {
         (0..30).try_for_each(|_| self.write(&rest))
     }
 
-    /// Writes when it is time.
+    /// Writes when the next frame is due.
     fn write(&mut self, mut bytes: &[u8]) -> Result<(), Failure> {
         sleep(self.due.saturating_duration_since(Instant::now()));
         self.due += PERIOD;
         while !bytes.is_empty() {
-            // Until the other end is opened there is room for 4 kB.
+            // Until the other end is opened, there is room for 4 kB.
             bytes = &bytes[rustix::io::write(&self.pair.master, bytes)?..];
         }
         Ok(())
     }
 
-    /// Waits until all is read.
+    /// Waits until everything is read.
     fn drain(&self) -> Result<(), Failure> {
         let mut empty = 0;
         self.wait("read", || {
-            // What is written reaches the device a moment later.
+            // Written bytes reach the device a moment later.
             let is_empty = rustix::io::ioctl_fionread(&self.pair.device)? == 0;
             empty = if is_empty { empty + 1 } else { 0 };
             Ok(empty > 3)

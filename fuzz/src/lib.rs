@@ -1,4 +1,4 @@
-//! The properties of `tests/doors`, for the targets beside this file.
+//! The properties of `tests/doors`, for the fuzz targets.
 
 #[path = "../../tests/doors/properties.rs"]
 mod properties;

@@ -39,7 +39,8 @@ fn main() -> ExitCode {
             return ExitCode::from(exit::IO);
         }
     };
-    // First of all, even before the arguments: an early signal must not kill the process.
+    // Signals come before everything else, even the arguments: an early signal must not kill the
+    // process.
     let signals = {
         let _inside = runtime.enter();
         Signals::catch()
@@ -99,7 +100,7 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
     }
 }
 
-/// Calibrates. The daemon in it ends in order at a signal, which is then a failure.
+/// Calibrates. At a signal, the daemon inside ends in order, and the command fails.
 async fn calibrate(args: calibrate::Args, signals: Signals) -> Result<(), Failure> {
     let path = args.config.path()?;
     let mut end = pin!(signals.end());
@@ -128,7 +129,7 @@ async fn finish<E: Into<Failure>>(
     }
 }
 
-/// As [`finish`], for work that blocks. It runs on another thread.
+/// Like [`finish`], for work that blocks. The work runs on another thread.
 async fn finish_blocking<E: Into<Failure> + Send + 'static>(
     signals: Signals,
     work: impl FnOnce() -> Result<(), E> + Send + 'static,
@@ -140,8 +141,8 @@ async fn finish_blocking<E: Into<Failure> + Send + 'static>(
     .await
 }
 
-/// The configuration and its model; `None`: `end` came first. On a thread of its own, because a
-/// file may be a pipe that says nothing.
+/// Loads the configuration and its model. Returns `None` if `end` comes first. This runs on a
+/// thread of its own, because a file may be a pipe that sends nothing.
 async fn load(path: PathBuf, end: impl Future<Output = ()>) -> Result<Option<Setup>, ConfigError> {
     tokio::select! {
         loaded = tokio::task::spawn_blocking(move || Setup::load(&path)) => {
@@ -190,11 +191,12 @@ struct Signals {
 }
 
 impl Signals {
-    /// Catches them: from now on none of them kills the process.
+    /// Catches the signals. From now on, none of them kills the process.
     fn catch() -> io::Result<Self> {
         // This can be seen only before the signal is caught.
         let outlives_terminal = ignores_hangup();
-        // At the limit of a file's size the write fails, as on a full disk. The process goes on.
+        // At the limit of a file's size, the write fails as on a full disk, and SIGXFSZ does not
+        // end the process.
         drop(signal(SignalKind::from_raw(
             rustix::process::Signal::XFSZ.as_raw(),
         ))?);
@@ -216,12 +218,12 @@ impl Signals {
         }
     }
 
-    /// As [`Signals::end`], for a command that runs until a signal ends it.
+    /// Like [`Signals::end`], for a command that runs until a signal ends it.
     async fn told(self) {
         self.end().await;
     }
 
-    /// A future for SIGINT and SIGTERM, and SIGHUP by itself.
+    /// A future that waits for SIGINT or SIGTERM, and the signal SIGHUP by itself.
     fn apart(self) -> (impl Future<Output = Stop>, Signal) {
         let Self {
             mut interrupt,
@@ -239,8 +241,8 @@ impl Signals {
     }
 }
 
-/// Whether SIGHUP is ignored, by proc_pid_status(5): `SigIgn` is a mask in hex, signal 1 its lowest
-/// bit. Where /proc is hidden it is taken not to be.
+/// Whether SIGHUP is ignored. By proc_pid_status(5), `SigIgn` is a mask in hex, and signal 1 is its
+/// lowest bit. If /proc is hidden, SIGHUP counts as not ignored.
 fn ignores_hangup() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));

@@ -1,7 +1,7 @@
-//! Accepting connections: as many at a time as there is room for, until the order to stop.
+//! Accepts connections, up to a maximum at a time, until the order to stop.
 //!
-//! Every listener uses this one loop. The caller says what is done with a connection, and what one
-//! too many is told.
+//! Every listener uses this loop. The caller decides how a connection is served, and how a
+//! connection beyond the maximum is refused.
 
 use std::future::Future;
 use std::io;
@@ -11,11 +11,11 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tracing::warn;
 
-/// Pause after the system had no room for a connection.
+/// The pause after the system had no room for a connection.
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// Orders to listeners. When the sender is dropped they stop; a value that is sent before asks them
-/// to look whether they can still be reached.
+/// Orders to listeners. Each value orders the listeners to check that they can still be reached.
+/// When the sender is dropped, the listeners stop.
 pub(crate) type Stop = watch::Receiver<()>;
 
 /// Waits for the order to stop.
@@ -23,26 +23,26 @@ pub(crate) async fn stopped(stop: &mut Stop) {
     while stop.changed().await.is_ok() {}
 }
 
-/// Where connections come from.
+/// A source of connections.
 pub(crate) trait Listener {
     /// A connection.
     type Stream: Send;
 
-    /// The next connection. Nothing is lost if the wait is given up.
+    /// Waits for the next connection. Cancelling the wait loses no connection.
     fn accept(&mut self) -> impl Future<Output = io::Result<Self::Stream>> + Send;
 }
 
-/// What is done with connections.
+/// A service for connections.
 pub(crate) trait Serve<S> {
-    /// Serves one to its end.
+    /// Serves a connection until it ends.
     fn serve(&self, stream: S) -> impl Future<Output = ()> + Send + 'static;
 
-    /// Tells one too many so, without waiting.
+    /// Refuses a connection beyond the maximum, without waiting.
     fn refuse(&self, stream: S);
 }
 
-/// Serves connections, at most `most` at a time. Once `stop` comes there are no new ones and the
-/// listener is gone; it ends when those there have come to their end.
+/// Serves connections, at most `most` at a time. On the order to stop, this closes the listener,
+/// and returns when the open connections have ended.
 pub(crate) async fn accept<L: Listener>(
     mut listener: L,
     most: usize,
@@ -53,7 +53,7 @@ pub(crate) async fn accept<L: Listener>(
     let mut refusing = false;
     loop {
         let accepted = tokio::select! {
-            // Those that have gone make room before the next is looked at.
+            // Connections that have ended make room before the next one is accepted.
             biased;
             () = stopped(&mut stop) => break,
             Some(_) = clients.join_next() => continue,
@@ -65,7 +65,7 @@ pub(crate) async fn accept<L: Listener>(
                 refusing = false;
                 clients.spawn(service.serve(stream));
             }
-            // Out of descriptors or memory: later, perhaps. Said once.
+            // The system is out of descriptors or memory. Try again later, and log this only once.
             Err(error) => {
                 if !refusing {
                     warn!(%error, "connections cannot be accepted");

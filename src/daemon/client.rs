@@ -1,9 +1,9 @@
 //! One subscriber's connection: events out, requests in.
 //!
-//! This is the protocol of lines, over Unix sockets and TCP alike. A task fetches lines from the hub
+//! This is the protocol of lines, over both Unix sockets and TCP. A task fetches lines from the hub
 //! and writes them, and reads requests in between. Only a connection with [`Access::Control`] can
-//! change anything. While the daemon carries out its command, events go on and the next request
-//! waits.
+//! change anything. While the daemon carries out a command, events are still sent and the next
+//! request waits.
 
 mod pace;
 
@@ -33,26 +33,27 @@ use crate::tare::RetareError;
 const LONGEST_LINE_BYTES: usize = 64 * 1024;
 
 /// The first and the longest pause between checks of a connection whose other end has stopped
-/// sending. If that end is closed altogether, the runtime learns of it a moment after the last read.
+/// sending. If that end is closed altogether, the runtime learns of it a moment after the last
+/// read.
 const HALF_CLOSED_CHECKS: (Duration, Duration) = (Duration::from_millis(1), Duration::from_secs(1));
 
-/// What a connection may ask for.
+/// The requests that a connection may send.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Access {
-    /// Events and questions.
+    /// Only subscriptions and queries.
     ReadOnly,
-    /// Commands that change something as well.
+    /// Also commands that change something.
     Control,
 }
 
-/// A connection for lines.
+/// A connection that carries lines.
 pub(crate) trait Stream: Send + 'static {
     /// The reading direction.
     type Input: AsyncRead + Unpin + Send + Sync;
     /// The writing direction.
     type Output: Output;
 
-    /// Splits it into its two directions.
+    /// Splits the connection into its two directions.
     fn split(self) -> (Self::Input, Self::Output);
 
     /// Sends a line if there is room for it, without waiting.
@@ -74,7 +75,7 @@ impl Stream for UnixStream {
     }
 
     fn say(self, line: &[u8]) -> io::Result<()> {
-        // Written directly: the runtime does not know yet that the stream is writable.
+        // Write directly, because the runtime does not know yet that the stream is writable.
         io::Write::write_all(&mut self.into_std()?, line)
     }
 }
@@ -104,7 +105,7 @@ impl Output for tcp::OwnedWriteHalf {
     }
 }
 
-/// What the connections of one listener are served with.
+/// Everything that serves the connections of one listener.
 #[derive(Debug, Clone)]
 pub(crate) struct Service {
     pub(crate) access: Access,
@@ -114,7 +115,7 @@ pub(crate) struct Service {
 }
 
 impl Service {
-    /// Carries a command out.
+    /// Carries out a command.
     async fn change(&self, change: Change) -> Result<Done, Refused> {
         let key = change.key();
         if self.access == Access::ReadOnly {
@@ -171,12 +172,12 @@ impl<S: Stream> Serve<S> for Service {
         let message = format!(
             "too many subscribers ({found}): try later, or raise max_clients in the configuration"
         );
-        // A client that does not read it sees the connection end.
+        // If the line cannot be sent, the client still sees the connection end.
         let _ = stream.say(Reply::Error { message, id: None }.to_line().as_bytes());
     }
 }
 
-/// Why a request is answered with an `error`.
+/// The reason a request is answered with an `error`.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum Refused {
     #[error(transparent)]
@@ -208,7 +209,7 @@ pub(super) enum Refused {
     Stopping(&'static str),
 }
 
-/// Why a connection ended.
+/// The reason a connection ended.
 #[derive(Debug, thiserror::Error)]
 enum End {
     #[error(transparent)]
@@ -225,12 +226,12 @@ enum End {
 struct Client<S: Stream> {
     input: Lines<S::Input>,
     output: S::Output,
-    /// Bytes that are being written: a batch goes out in one call.
+    /// The bytes being written. One call writes a whole batch.
     outgoing: Vec<u8>,
     service: Service,
 }
 
-/// What the answer to a command says.
+/// The content of the answer to a command.
 #[derive(Default)]
 struct Done {
     tare: Option<Tared>,
@@ -273,7 +274,7 @@ impl<S: Stream> Client<S> {
                 biased;
                 lines = &mut next => {
                     let Ok(lines) = lines else {
-                        // Closed: only the answer to a command is still to be sent.
+                        // The hub has closed. Only the answer to a command still has to be sent.
                         if let Some(doing) = doing {
                             self.send(&[doing.await]).await?;
                         }
@@ -298,7 +299,7 @@ impl<S: Stream> Client<S> {
                         self.send(&[error(message, None)]).await?;
                         return Err(End::TooLong);
                     }
-                    // It may still read.
+                    // The other end sends no more, but it may still read.
                     Heard::End => {
                         hearing = false;
                         self.stay().await?;
@@ -321,7 +322,8 @@ impl<S: Stream> Client<S> {
         }
     }
 
-    /// Answers a request, or begins to carry out a command. `next` is the take that is under way.
+    /// Answers a request, or begins to carry out a command. `next` is the pending `take` of the
+    /// hub.
     async fn heed(
         &mut self,
         id: u64,
@@ -338,7 +340,8 @@ impl<S: Stream> Client<S> {
             Ok(Request::Status) => Ok(statuses(&sensors).await),
             Ok(Request::Last) => Ok(hub.finals().await?),
             Ok(Request::Change(change)) => {
-                // This may take long: frames must come, or a file must be written.
+                // A command may take long, because it may wait for frames or for a file to be
+                // written.
                 let service = self.service.clone();
                 return Ok(Some(Box::pin(async move {
                     answer(service.change(change).await, line.id)
@@ -357,7 +360,7 @@ impl<S: Stream> Client<S> {
         };
         lines.push(answer(answered, line.id));
         self.send(&lines).await?;
-        // Another subscription ended the take that was under way.
+        // Either the pending `take` gave its lines, or another subscription ended it.
         if given != Err(TryRecvError::Empty) {
             *next = hub.take(id).await?;
         }
@@ -373,13 +376,13 @@ impl<S: Stream> Client<S> {
     }
 }
 
-/// The next line, when another may be read.
+/// Waits until another line may be read, and reads it.
 async fn hear<I: AsyncRead + Unpin>(lines: &mut Lines<I>, pace: &Pace) -> io::Result<Heard> {
     pace.wait().await;
     lines.next().await
 }
 
-/// Passes a command on to the sensor called `name`. `key` is the request's key for it.
+/// Passes a command on to the sensor called `name`. `key` is the request's key for that name.
 async fn tell(
     sensors: &Sensors,
     key: &'static str,
@@ -397,14 +400,14 @@ async fn tell(
     sensor.commands.send(command).await.map_err(stopping)
 }
 
-/// Tells `sensor` where its arm is. Every way in for positions ends here, and the recording of the
-/// sensor has them.
+/// Passes positions of the arm on to the task of `sensor`, which also records them. Positions from
+/// every source pass through this function.
 pub(super) async fn move_arm(
     sensors: &Sensors,
     sensor: &str,
     points: &[Told],
 ) -> Result<(), Refused> {
-    // By the clocks of this moment: the sensor's task may have other things to do first.
+    // Read the clocks now, because the sensor's task may have other work to do first.
     let points = motion::placed(points, crate::daemon::now())?;
     let (reply, taken) = oneshot::channel();
     let command = Command::Motion(points, reply);
@@ -419,7 +422,7 @@ pub(super) async fn statuses(sensors: &Sensors) -> Vec<Line> {
     statuses.into_iter().map(Line::from).collect()
 }
 
-/// Waits for the answer to a command; never ready if none is being carried out.
+/// Waits for the answer to a command. If no command is being carried out, this waits forever.
 async fn done(doing: &mut Option<Doing>) -> Line {
     match doing {
         Some(doing) => doing.await,

@@ -1,9 +1,9 @@
-//! The configuration file: every table composed, every value checked once, at the door.
+//! The configuration file: its tables, and the check of every value, once, at the start.
 //!
-//! In: a TOML file. Out: a [`Setup`]: the [`Config`], the sensors it describes and its model, all
-//! checked. A key that is unknown, or of a part that this version does not have, is an error that
-//! names the file and the key, what was found and what was expected. Paths in the file are
-//! relative to its directory.
+//! In: a TOML file. Out: a [`Setup`], which has the checked [`Config`], the sensors that it
+//! describes, and its model. An unknown key is an error, and so is a table of a feature that this
+//! program was built without. Each error names the file and the key, and what was found and
+//! expected. Paths in the file are relative to the file's directory.
 
 mod error;
 mod publish;
@@ -27,32 +27,32 @@ use crate::sensor::{Description, Sensor};
 use crate::verdict::Hrn;
 use crate::{motion, press, tare, trial, wire};
 
-/// The whole file.
+/// The whole configuration file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
-    /// Name of the robot; by default the host's.
+    /// The name of the robot. The default is the name of the host.
     #[serde(default = "host")]
     pub robot: String,
-    /// The sensors served.
+    /// The sensors that the daemon serves.
     #[serde(default, rename = "sensor")]
     pub sensors: Vec<SensorTable>,
-    /// What a press is.
+    /// The thresholds that begin and end a press.
     #[serde(default)]
     pub press: press::Settings,
-    /// The model that judges.
+    /// The model that gives verdicts.
     #[serde(default)]
     pub model: Model,
-    /// Where events go.
+    /// All ways to publish events, except HTTP.
     #[serde(default)]
     pub publish: Publish,
-    /// The live page and the other HTTP routes; off unless the table is there.
+    /// The live page and the other HTTP routes. Without the table, they are off.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub http: Option<Http>,
-    /// The daemon's own recording; off unless the table is there.
+    /// The daemon's own recording. Without the table, it is off.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub record: Option<Record>,
-    /// How the log is written.
+    /// The format of the log.
     #[serde(default)]
     pub log: log::Settings,
 }
@@ -61,28 +61,28 @@ pub struct Config {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SensorTable {
-    /// Its name, unique, `[a-z][a-z0-9_]*`.
+    /// The sensor's name: unique, and `[a-z][a-z0-9_]*`.
     #[serde(default = "default_name")]
     pub name: String,
-    /// Its device file.
+    /// The sensor's device file.
     pub port: PathBuf,
-    /// Bits a second on the line; a pty and USB CDC ignore it.
+    /// The baud rate of the serial line, in bits per second. A pty and USB CDC ignore it.
     #[serde(default = "default_baud", deserialize_with = "above_zero")]
     pub baud: u32,
-    /// Expected rate.
+    /// The number of frames that the sensor is expected to send in a second.
     #[serde(default = "default_frame_rate_hz")]
     pub frame_rate_hz: f64,
-    /// A live sensor is stale after a silence of this length; by default the larger of 2.5 periods
-    /// and 50 ms.
+    /// The silence after which a live sensor is stale, in milliseconds. The default is the larger
+    /// of 2.5 periods and 50 ms.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stale_after_ms: Option<f64>,
-    /// How a frame is written.
+    /// The layout of a frame in bytes.
     #[serde(default)]
     pub frame: wire::Settings,
-    /// Counts to newtons.
+    /// The calibration, which converts counts to newtons.
     #[serde(default)]
     pub calibration: tare::Settings,
-    /// The arm that presses with it.
+    /// The arm that presses with the sensor.
     #[serde(default)]
     pub arm: motion::Settings,
 }
@@ -104,7 +104,7 @@ fn default_frame_rate_hz() -> f64 {
 }
 
 impl SensorTable {
-    /// A sensor at `port`, all else by default.
+    /// A sensor at `port`, with the defaults of all other keys.
     pub fn new(port: PathBuf) -> Self {
         Self {
             name: default_name(),
@@ -123,17 +123,17 @@ impl SensorTable {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Model {
-    /// ONNX file; by default the one built in.
+    /// The path of the ONNX file. The default is the built-in model.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub path: Option<PathBuf>,
-    /// Hash that the file must have.
+    /// The SHA-256 hash that the model must have, in hex.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sha256: Option<String>,
     /// A verdict below this confidence is rejected.
     pub min_confidence: f32,
-    /// A verdict on less force is rejected.
+    /// A verdict on a frame with less total force, in newtons, is rejected.
     pub min_force_n: f64,
-    /// A model of the course gives an early verdict with this confidence.
+    /// A model of the course gives an early verdict when its confidence reaches this value.
     pub early_confidence: f32,
 }
 
@@ -159,7 +159,7 @@ impl Default for Model {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Http {
-    /// Address and port.
+    /// The address and port to listen on.
     pub listen: SocketAddr,
 }
 
@@ -175,16 +175,16 @@ impl Default for Http {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Record {
-    /// The directory; [`Record::dir`] has the default.
+    /// The directory of the recordings. [`Record::dir`] has the default.
     #[serde(skip_serializing_if = "Option::is_none")]
     dir: Option<PathBuf>,
-    /// True: everything is recorded. False: only the last minute before a fault.
+    /// Whether everything is recorded. If `false`, only the last minute before a fault is recorded.
     pub continuous: bool,
-    /// A file of this many million bytes is ended, and the next one begins.
+    /// When a file has this many million bytes, the next one begins.
     pub rotate_mb: u64,
-    /// A file that is this old is ended, and the next one begins.
+    /// When a file is this many seconds old, the next one begins.
     pub rotate_s: u64,
-    /// This many million bytes stay free on the disk. With less, nothing is written.
+    /// This many million bytes stay free on the disk. If fewer are free, nothing is written.
     pub keep_free_mb: u64,
 }
 
@@ -201,14 +201,14 @@ impl Default for Record {
 }
 
 impl Record {
-    /// The directory: the configured one, else the service's state directory, else
-    /// `/var/lib/hardnessd`.
+    /// The directory of the recordings: the configured one, else the service's state directory,
+    /// else `/var/lib/hardnessd`.
     pub fn dir(&self) -> PathBuf {
         if let Some(dir) = &self.dir {
             return dir.clone();
         }
         let directories = env::var("STATE_DIRECTORY").unwrap_or_default();
-        // systemd separates several by colons.
+        // systemd separates several directories by colons.
         match directories.split(':').next() {
             Some(first) if !first.is_empty() => PathBuf::from(first),
             _ => PathBuf::from("/var/lib/hardnessd"),
@@ -224,7 +224,7 @@ fn host() -> String {
 }
 
 impl Config {
-    /// The defaults, for these sensors.
+    /// The default configuration with `sensors`.
     pub fn new(sensors: Vec<SensorTable>) -> Self {
         Self {
             robot: host(),
@@ -238,27 +238,27 @@ impl Config {
         }
     }
 
-    /// Reads a file. Whether its values can be used, [`Self::check`] says.
+    /// Reads a file, but does not check its values. [`Self::check`] does.
     ///
     /// # Errors
     ///
-    /// [`Error`], if the file cannot be read, is no TOML, or has an unknown key, a value of another
-    /// type or a path that none can be.
+    /// Returns an [`Error`] if the file cannot be read or is not TOML, if it has an unknown key, a
+    /// value of another type or a path that cannot be used, or if a file of gains cannot be used.
     pub fn load(path: &Path) -> Result<Self, Error> {
         parse::load(path)
     }
 
-    /// Checks every value, and all of them together. Gives the sensors, in their order; `path` is
-    /// for messages.
+    /// Checks every value, and whether the values fit together. Returns the sensors in their order.
+    /// `path` is only for messages.
     ///
     /// # Errors
     ///
-    /// [`Error`], for the first value that cannot be used.
+    /// Returns an [`Error`] for the first value that cannot be used.
     pub fn check(&self, path: &Path) -> Result<Vec<Sensor>, Error> {
         check::check(self, path)
     }
 
-    /// What the file says of one of its sensors, in all its tables.
+    /// The description of `sensor`, composed from all tables of the file.
     pub(crate) fn describe(&self, sensor: &SensorTable) -> Description {
         Description {
             name: sensor.name.clone(),
@@ -274,7 +274,7 @@ impl Config {
         }
     }
 
-    /// The first key by which `self` and `other` differ that only a restart can change.
+    /// The first key that differs between `self` and `other` and that only a restart can change.
     pub fn fixed_difference(&self, other: &Self) -> Option<String> {
         if self.robot != other.robot {
             return Some("robot".to_owned());
@@ -321,14 +321,14 @@ impl Config {
     }
 }
 
-/// A configuration whose values have all been checked, and its model: ready to run.
+/// A configuration whose values have all been checked, with its sensors and its model.
 #[derive(Debug, Clone)]
 pub struct Setup {
-    /// As read.
+    /// The configuration as it was read.
     pub config: Config,
     /// The sensors of the configuration, in its order.
     pub sensors: Vec<Sensor>,
-    /// The model that it names.
+    /// The model that the configuration names.
     pub hrn: Arc<Hrn>,
 }
 
@@ -337,17 +337,18 @@ impl Setup {
     ///
     /// # Errors
     ///
-    /// As [`Config::load`] and [`Self::of`].
+    /// Returns the errors of [`Config::load`] and [`Self::of`].
     pub fn load(path: &Path) -> Result<Self, Error> {
         let config = Config::load(path)?;
         Self::of(config, path)
     }
 
-    /// Checks `config` and loads its model; `path` is for messages.
+    /// Checks `config` and loads its model. `path` is only for messages.
     ///
     /// # Errors
     ///
-    /// As [`Config::check`], and if the model cannot be read or is refused.
+    /// Returns the errors of [`Config::check`], and an error if the model cannot be read or is
+    /// refused.
     pub fn of(config: Config, path: &Path) -> Result<Self, Error> {
         let sensors = config.check(path)?;
         let rates = config.sensors.iter().map(|sensor| sensor.frame_rate_hz);

@@ -1,7 +1,7 @@
 //! File descriptors: how many this process may have open, and how many it may need.
 //!
-//! Every subscriber takes one, and so does a sensor's port. If subscribers had taken all, a sensor that is
-//! plugged in again could not be opened.
+//! Every subscriber takes one, and so does a sensor's port. If subscribers took all of them, a
+//! sensor that is plugged in again could not be opened.
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tracing::debug;
@@ -9,10 +9,11 @@ use tracing::debug;
 use super::config::Config;
 use super::http::Http;
 
-/// For the log, the runtime, listeners, recordings, and files that are read on a reload.
+/// The descriptors for the log, the runtime, listeners, recordings, and files that are read on a
+/// reload.
 const OTHERS: u64 = 64;
 
-/// More descriptors may be needed than this process may have.
+/// This process may need more descriptors than it may have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error(
     "{needed} file descriptors may be needed, {limit} are allowed: if subscribers take all, a sensor that \
@@ -20,13 +21,14 @@ const OTHERS: u64 = 64;
      (`ulimit -Hn` of a shell)"
 )]
 pub struct Shortage {
-    /// With the most subscribers that the configuration allows.
+    /// The descriptors needed with the most subscribers that the configuration allows.
     pub needed: u64,
-    /// The hard limit.
+    /// The hard limit of descriptors.
     pub limit: u64,
 }
 
-/// Raises the soft limit to the hard one. Nothing in this process minds numbers above 1,023.
+/// Raises the soft limit to the hard limit. Nothing in this process fails on descriptors above
+/// 1,023.
 pub(super) fn raise() {
     let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
     if current == maximum {
@@ -41,7 +43,7 @@ pub(super) fn raise() {
     }
 }
 
-/// Whether this process may have fewer descriptors than `config` may need.
+/// The shortage, if `config` may need more descriptors than this process may have.
 pub fn shortage(config: &Config) -> Option<Shortage> {
     let limit = getrlimit(Resource::Nofile).maximum?;
     let needed = needed(config);
@@ -50,7 +52,7 @@ pub fn shortage(config: &Config) -> Option<Shortage> {
 
 fn needed(config: &Config) -> u64 {
     let unix = &config.publish.unix;
-    // Events and control.
+    // One socket is for events, the other for control.
     let sockets = if unix.enabled { 2 } else { 0 };
     let ways = sockets + usize::from(config.publish.tcp.is_some());
     let pages = config.http.as_ref().map_or(0, |_| Http::MOST_CONNECTIONS);

@@ -1,10 +1,10 @@
-//! Foxglove and Lichtblick, live: the topics of a recording, over the websocket protocol
-//! `foxglove.sdk.v1`.
+//! A live server for Foxglove and Lichtblick: the topics of a recording, over the websocket
+//! protocol `foxglove.sdk.v1`.
 //!
-//! In: lines of the hub. Out: the messages that a recording has of them, under the same names and
-//! with the same definitions, so a layout fits both. A viewer that comes later gets the last final
-//! verdict and the status of each sensor. The server has no capability that takes anything from a
-//! viewer, so nothing that comes in changes anything. One thread does all this.
+//! In: lines of the hub. Out: the messages that a recording has of these lines, under the same
+//! names and with the same definitions, so one layout fits both. A viewer that connects later gets
+//! the last final verdict and the last status of each sensor. The server has no capability that
+//! accepts data from a viewer, so a viewer cannot change anything. One thread does all this.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -27,38 +27,42 @@ use super::relay::Worker;
 use crate::event::{Event, Phase};
 use crate::ros::{self, Topic};
 
-/// Why there is no server.
+/// The reason the server could not start.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The daemon cannot listen on the address.
     #[error("publish.foxglove.listen: cannot listen on {address}: {source}")]
     Listen {
-        /// As configured.
+        /// The configured address.
         address: SocketAddr,
-        /// Why not.
+        /// The system's error.
         source: io::Error,
     },
-    /// The library refused. The text is its own.
+    /// The library failed. The message is the library's own.
     #[error("publish.foxglove: {0}")]
     Server(#[from] FoxgloveError),
-    /// The system gave no thread.
+    /// The system could not start the thread or its runtime.
     #[error("no thread for publish.foxglove: {0}")]
     Thread(#[from] io::Error),
 }
 
-/// Messages that wait for a viewer, about 1 MB. When there are more, the oldest are dropped.
+/// The most messages that wait for a viewer, about 1 MB. When there are more, the oldest are
+/// dropped.
 const BACKLOG: usize = 512;
 
-/// New subscriptions that wait for their first message. One too many begins with the next event.
+/// The most new subscriptions that wait for their first message. A further subscription begins with
+/// the next event.
 const NEWCOMERS: usize = 64;
 
-/// The library does not say when a viewer has everything, so the last messages get this time.
+/// The time for the last messages to reach the viewers, because the library does not report when a
+/// viewer has everything.
 const LAST_MESSAGES: Duration = Duration::from_millis(50);
 
-/// A viewer that does not read cannot be told that the server ends. It is given up after this time.
+/// How long the server waits at its end until its viewers have closed. A viewer that does not read
+/// cannot be notified, and would keep the server waiting.
 const FAREWELL: Duration = Duration::from_millis(200);
 
-/// A sensor as its topics need it.
+/// The name and the taxel distance of a sensor, which its topics need.
 pub(super) struct Sensor {
     pub(super) name: String,
     pub(super) pitch_mm: f64,
@@ -68,7 +72,7 @@ pub(super) struct Sensor {
 ///
 /// # Errors
 ///
-/// If the daemon cannot listen on the address.
+/// Fails if the daemon cannot listen on the address, or the library fails.
 pub(super) fn open(
     settings: &config::Foxglove,
     robot: &str,
@@ -82,19 +86,19 @@ pub(super) fn open(
     )
 }
 
-/// A message of a topic, with its moment in nanoseconds since 1970.
+/// A message of a topic, with its time in nanoseconds since 1970.
 struct Message {
     at_ns: u64,
     bytes: Vec<u8>,
 }
 
-/// The topics and what each sensor's were last.
+/// The topics and their last messages.
 struct Topics {
-    /// By the topic's full name.
+    /// The channel of each topic, by the topic's full name.
     channels: BTreeMap<String, Arc<RawChannel>>,
-    /// The last message of the topics that a late viewer gets at once.
+    /// The last message of each topic that a late viewer gets at once.
     last: BTreeMap<String, Message>,
-    /// Taxels of each sensor are this far apart.
+    /// The distance between taxels of each sensor, by the sensor's name.
     pitches_mm: BTreeMap<String, f64>,
 }
 
@@ -160,7 +164,7 @@ impl Foxglove {
                 }
             }
             tokio::time::sleep(LAST_MESSAGES).await;
-            // It is given up, not failed: the runtime drops what is left.
+            // A timeout is not a failure: the runtime drops the remaining connections.
             let _ = tokio::time::timeout(FAREWELL, server.stop().wait()).await;
         });
     }
@@ -217,7 +221,7 @@ impl Topics {
         }
     }
 
-    /// Sends a viewer that has just come what it missed.
+    /// Sends the last message of `topic` to a viewer that has just subscribed.
     fn greet(&self, topic: &str, viewer: SinkId) {
         if let (Some(channel), Some(message)) = (self.channels.get(topic), self.last.get(topic)) {
             message.send(channel, Some(viewer));
@@ -226,7 +230,7 @@ impl Topics {
 }
 
 impl Message {
-    /// Queues it for one viewer, or for all. This never waits.
+    /// Queues the message for one viewer, or for all. This never waits.
     fn send(&self, channel: &RawChannel, viewer: Option<SinkId>) {
         let meta = PartialMetadata {
             log_time: Some(self.at_ns),
@@ -244,12 +248,12 @@ fn greets(event: &Event) -> bool {
     }
 }
 
-/// As in a recording.
+/// The full name of a topic, as in a recording.
 fn full_name(sensor: &str, topic: Topic) -> String {
     format!("/tactile/{sensor}/{}", topic.name)
 }
 
-/// Where viewers say which topics they want.
+/// The listener that passes new subscriptions of viewers on to the thread.
 struct Door(mpsc::Sender<(String, SinkId)>);
 
 impl ServerListener for Door {

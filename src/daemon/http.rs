@@ -1,8 +1,9 @@
-//! HTTP: the live page, events as server-sent events, status, metrics, health. Read-only.
+//! The read-only HTTP server: the live page, server-sent events, status, metrics and health.
 //!
-//! Every request passes the same door: its Host header names this machine by an address, its target is
-//! short, and its method reads. No route changes anything, none waits for a slow reader, and the
-//! number of connections is bounded. `/events` subscribes to the hub as any subscriber does.
+//! Every request passes the same checks: its Host header names this machine by an address, its
+//! target is short, and its method only reads. No route changes anything or waits for a slow
+//! reader, and the number of connections is bounded. `/events` subscribes to the hub as any
+//! subscriber does.
 
 mod events;
 mod host;
@@ -40,19 +41,22 @@ use crate::event::LinkState;
 /// The live page: one file, which loads nothing from elsewhere.
 const PAGE: &str = include_str!("page.html");
 
-/// How long the head of a request may take, and how long a connection may idle between two requests.
+/// How long the head of a request may take, and how long a connection may idle between two
+/// requests.
 const HEAD_PATIENCE: Duration = Duration::from_secs(15);
 
-/// Bytes that wait in a connection, in each direction.
+/// The most bytes that wait in a connection, in each direction.
 const BUFFER_BYTES: usize = 64 * 1024;
 
-/// Longest target of a request, in bytes: as much as every server should take (RFC 9112, section 3).
+/// The longest target of a request in bytes: as many as every server should accept (RFC 9112,
+/// section 3).
 const LONGEST_TARGET: usize = 8_000;
 
 /// How long the pipelines may take to answer.
 const PATIENCE: Duration = Duration::from_secs(1);
 
-/// On every answer: a browser must not guess its type, keep it, or let a page from elsewhere use it.
+/// The headers of every answer. A browser must not guess the answer's type, store the answer, or
+/// let a page from elsewhere use it.
 const HEADERS: [(HeaderName, &str); 5] = [
     (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
     (header::REFERRER_POLICY, "no-referrer"),
@@ -64,19 +68,19 @@ const HEADERS: [(HeaderName, &str); 5] = [
     ),
 ];
 
-/// On every answer but the page.
+/// The Content-Security-Policy of every answer except the page.
 const POLICY: &str = "default-src 'none'; frame-ancestors 'none'";
 
 /// Answers requests.
 #[derive(Debug, Clone)]
 pub(crate) struct Http {
-    /// The address of the configuration.
+    /// The address that the server listens on.
     listen: SocketAddr,
     routes: TowerToHyperService<Router>,
     stop: Stop,
 }
 
-/// What answers are made from.
+/// The sources of the answers.
 #[derive(Debug, Clone)]
 struct Sources {
     hub: hub::Handle,
@@ -84,7 +88,7 @@ struct Sources {
 }
 
 impl Http {
-    /// Connections at a time; a page has two or three.
+    /// The most connections at a time. A page has two or three.
     pub(crate) const MOST_CONNECTIONS: usize = 128;
 
     pub(crate) fn new(listen: SocketAddr, hub: hub::Handle, sensors: Sensors, stop: Stop) -> Self {
@@ -111,7 +115,7 @@ impl Http {
         }
     }
 
-    /// `local`: the address that the connection came in at.
+    /// Answers a request. `local` is this machine's address of the connection.
     async fn respond(&self, request: Request<Incoming>, local: SocketAddr) -> Response {
         let mut response = if !host::is_ours(&request, self.listen, local) {
             let message = "the Host header is not an address of this machine: use localhost or \
@@ -143,7 +147,7 @@ fn target_bytes(target: &Uri) -> usize {
     target.path().len() + target.query().map_or(0, str::len)
 }
 
-/// An answer that says in one line why there is no other.
+/// An answer with an error code and one line with the reason.
 fn refusal(code: StatusCode, why: impl Display) -> Response {
     (code, format!("{why}\n")).into_response()
 }
@@ -164,7 +168,7 @@ async fn metrics(State(of): State<Sources>) -> Result<impl IntoResponse, Closed>
     Ok(([(header::CONTENT_TYPE, metrics::CONTENT_TYPE)], text))
 }
 
-/// Asks the same question as the watchdog.
+/// Makes the same check as the watchdog.
 async fn live(State(of): State<Sources>) -> Response {
     match tokio::time::timeout(PATIENCE, super::alive(&of.hub, &of.sensors)).await {
         Ok(Some(_)) => "ok: every pipeline answers\n".into_response(),
@@ -225,15 +229,15 @@ impl Serve<TcpStream> for Http {
     fn refuse(&self, stream: TcpStream) {
         let answer = b"HTTP/1.1 503 Service Unavailable\r\ncontent-length: 0\r\n\
                        retry-after: 1\r\nconnection: close\r\n\r\n";
-        // A client that does not read it learns of it by the end of the connection.
+        // If the answer cannot be sent, the client still sees the connection end.
         let _ = stream
             .into_std()
             .and_then(|mut stream| stream.write_all(answer));
     }
 }
 
-/// The Content-Security-Policy of the page: its own script and style, by their hashes, and
-/// connections to where it came from. Nothing else, from nowhere.
+/// The Content-Security-Policy of the page. It allows the page's own script and style, by their
+/// hashes, images in `data:` URLs, and connections to the page's origin. It allows nothing else.
 fn page_policy(page: &str) -> String {
     let hash = |tag: &str| {
         let (open, close) = (format!("<{tag}>"), format!("</{tag}>"));

@@ -1,9 +1,10 @@
-//! Where events are numbered, kept and handed to subscribers.
+//! The hub, which numbers events, holds them and hands them to subscribers.
 //!
-//! In: events of the sensors, in the order in which they happen. Out: lines; each is serialised
-//! once and shared by all subscribers that want it. Subscribers fetch their lines, so a slow one
-//! costs a bounded queue and delays nobody. When the queue is full its oldest event is dropped and counted,
-//! and a `gap` says so before the next event. This file has no clock and no channel; [`task`] owns it all.
+//! In: events of the sensors, in the order in which they happen. Out: lines. Each line is
+//! serialised once and shared by all subscribers that want it. Subscribers fetch their lines, so a
+//! slow subscriber costs a bounded queue and does not delay the others. When its queue is full, the
+//! oldest event is dropped and counted, and a `gap` reports the number before the next event. This
+//! file has no clock and no channel: [`task`] has both.
 
 mod subscriber;
 mod tally;
@@ -24,11 +25,12 @@ use crate::event::{Event, Hello, Kind, Reply, Status};
 /// A line to send.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Line {
-    /// The number of the event, if it has one. In a `hello`, the latest number given.
+    /// The number of the event, if it has one. In a `hello`, the number of the latest event.
     pub(crate) seq: Option<u64>,
-    /// Its JSON, with the newline.
+    /// The JSON of the line, with its newline.
     pub(crate) json: Arc<str>,
-    /// The event that it was made from. A reply has none, and a line that is held has none left.
+    /// The event that the line was made from. A reply has none, and neither has a line that is
+    /// held.
     pub(crate) event: Option<Arc<Event>>,
 }
 
@@ -59,13 +61,13 @@ impl From<Status> for Line {
 }
 
 impl Line {
-    /// The kind and the sensor of its event.
+    /// The kind and the sensor of the line's event.
     fn about(&self) -> Option<(Kind, &str)> {
         let event = self.event.as_deref()?;
         Some((event.kind(), event.sensor()))
     }
 
-    /// The same line to hold for a long time: with its text, without its event.
+    /// The same line to hold for a long time, with its text but without its event.
     fn to_hold(&self) -> Self {
         Self {
             event: None,
@@ -74,7 +76,7 @@ impl Line {
     }
 }
 
-/// The numbered events that are held for `since` (`docs/controller.md`).
+/// The number of events that are held for `since` (`docs/controller.md`).
 const HELD: usize = 4096;
 
 /// A numbered event as it was sent.
@@ -84,12 +86,12 @@ struct Held {
     line: Line,
 }
 
-/// The whole state. It has no clock.
+/// The whole state of the hub. It has no clock.
 struct Hub {
     hello: Hello,
     /// The last [`HELD`] events. The newest has the number `hello.seq`.
     held: VecDeque<Held>,
-    /// How many events are no longer held, by kind.
+    /// The number of events that are no longer held, by kind.
     forgotten: [u64; Kinds::NUMBERED.len()],
     /// The last final verdict of each sensor.
     finals: BTreeMap<String, Line>,
@@ -113,12 +115,12 @@ impl Hub {
         }
     }
 
-    /// Numbers `event` and offers it to every subscriber that wants it. `now` is of
+    /// Numbers `event` and offers it to every subscriber that wants it. `now` is a time of
     /// CLOCK_MONOTONIC.
     fn publish(&mut self, mut event: Event, now: Duration) {
         let kind = event.kind();
         if let Event::Hardness(verdict) = &mut event {
-            // Rounded to microseconds: further digits are noise of the clock.
+            // Round to microseconds, because further digits are noise of the clock.
             verdict.age_at_publish_ms = verdict.mono_ns.map(|at| {
                 let age = now.saturating_sub(Duration::from_nanos(at));
                 (age.as_secs_f64() * 1e6).round() / 1e3
@@ -203,18 +205,19 @@ impl Hub {
         let first = if known { since.seq + 1 } else { oldest };
         let missing = match first.max(oldest) - first {
             0 if known => Some(0),
-            // Every numbered event is wanted, so each number that is gone is an event missed.
+            // Every numbered event is wanted, so each number that is no longer held is a missed
+            // event.
             gone if known && Kinds::NUMBERED.iter().all(|&k| wanted.kinds.contains(k)) => {
                 Some(gone)
             }
-            // From the start of the run: all that is no longer held was missed.
+            // From the start of the run, every event that is no longer held was missed.
             _ if known && since.seq == 0 => {
                 let wanted = Kinds::NUMBERED
                     .into_iter()
                     .filter(|&k| wanted.kinds.contains(k));
                 Some(wanted.map(|kind| self.forgotten[kind as usize]).sum())
             }
-            // The kinds of the events between are no longer known.
+            // The kinds of the missed events are no longer known.
             _ => None,
         };
         let held = (first.max(oldest)..=latest).zip(
@@ -238,10 +241,10 @@ impl Hub {
     }
 }
 
-/// The state of the hub now.
+/// The current state of the hub.
 #[derive(Debug)]
 pub(crate) struct Survey {
-    /// With the latest number given.
+    /// The `hello` with the number of the latest event.
     pub(crate) hello: Hello,
     /// The last final verdict of each sensor.
     pub(crate) finals: BTreeMap<String, Line>,
@@ -249,7 +252,7 @@ pub(crate) struct Survey {
     pub(crate) subscribers: usize,
 }
 
-/// A place that this run has not reached.
+/// The error of a `since` that this run has not reached.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error("since: found {found}, expected at most {latest}")]
 pub(crate) struct Ahead {

@@ -1,5 +1,5 @@
-//! Lines of a connection, none longer than a bound: the other end does not decide how much memory is
-//! used for it.
+//! The lines of a connection. Their length has a bound, so that the other end does not decide how
+//! much memory the daemon uses.
 
 use std::io;
 
@@ -11,20 +11,20 @@ use tokio::io::{AsyncRead, AsyncReadExt};
 pub(crate) struct Lines<R> {
     input: R,
     longest_bytes: usize,
-    /// What came after the last whole line.
+    /// The bytes after the last whole line.
     unread: BytesMut,
-    /// The first bytes of `unread` in which no line ends.
+    /// The number of first bytes of `unread` that have no newline.
     searched: usize,
 }
 
-/// What the other end did.
+/// The outcome of reading a line.
 #[derive(Debug)]
 pub(crate) enum Heard {
-    /// It sent this line, given here without its newline.
+    /// A line, without its newline.
     Line(BytesMut),
-    /// It sent more than the bound without a newline. Nothing after it can be read.
+    /// The line is longer than the bound. Nothing after it can be read.
     TooLong,
-    /// It sends no more. A last line without a newline is dropped.
+    /// The other end sends no more. A last line without a newline is dropped.
     End,
 }
 
@@ -38,7 +38,7 @@ impl<R: AsyncRead + Unpin> Lines<R> {
         }
     }
 
-    /// Waits for a whole line. Nothing is lost if the wait is given up.
+    /// Waits for a whole line. Cancelling the wait loses nothing.
     pub(crate) async fn next(&mut self) -> io::Result<Heard> {
         loop {
             let rest = &self.unread[self.searched..];
@@ -67,12 +67,12 @@ impl<R: AsyncRead + Unpin> Lines<R> {
 mod tests {
     use super::*;
 
-    /// Lines of `text`, whose bytes come in pieces; what stopped them.
+    /// The lines read from `text`, whose bytes come in pieces, and the outcome that ended them.
     async fn read(text: &[u8], piece: usize, longest: usize) -> (Vec<String>, Heard) {
         let (mut here, there) = tokio::io::duplex(piece);
         let text = text.to_vec();
         tokio::spawn(async move {
-            // A reader that has had enough is gone.
+            // A write fails if the reader stopped at a line that is too long.
             let _ = tokio::io::AsyncWriteExt::write_all(&mut here, &text).await;
         });
         let mut lines = Lines::new(there, longest);

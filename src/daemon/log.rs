@@ -1,7 +1,7 @@
-//! What the operator reads: one line for each event, on stderr or in the journal.
+//! The log for the operator: one line for each event, on stderr or in the journal.
 //!
 //! Field names are stable: they are those of the published events. `RUST_LOG` sets the level, as
-//! levels and `TARGET=LEVEL` separated by commas; without it the level is `info` for the daemon.
+//! levels and `TARGET=LEVEL` separated by commas. Without it, the level is `info` for the daemon.
 //! Nothing here is written to stdout, which is for events.
 
 mod journal;
@@ -29,36 +29,36 @@ use crate::tare::RetareError;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// How a line is written.
+    /// The format of a line.
     pub format: Format,
 }
 
-/// How a line is written.
+/// The format of a line.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Format {
-    /// For people, on stderr.
+    /// Text for people, on stderr.
     #[default]
     Text,
-    /// One JSON object a line, on stderr.
+    /// One JSON object per line, on stderr.
     Json,
-    /// Fields of the journal, prefixed `HARDNESSD_`.
+    /// Entries of the journal, whose fields have the prefix `HARDNESSD_`.
     Journald,
 }
 
-/// How long the process waits for its last lines at the end.
+/// How long the process waits at its end until its last lines are written.
 const LAST_LINES: Duration = Duration::from_millis(200);
 
 type Output = Box<dyn Layer<Registry> + Send + Sync>;
 
-/// The log of this process. Its format may change while it runs.
+/// The log of this process. Its format may change while the process runs.
 pub struct Log {
     output: reload::Handle<Output, Registry>,
     lines: Lines,
     limit: Limit,
 }
 
-/// The last lines are written before the process ends.
+/// Writes the last lines before the process ends.
 impl Drop for Log {
     fn drop(&mut self) {
         self.limit.report_all();
@@ -66,7 +66,7 @@ impl Drop for Log {
     }
 }
 
-/// Why there is no log in the format that was asked for.
+/// The reason there is no log in the configured format.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// There is no journal.
@@ -81,28 +81,28 @@ pub enum Error {
          as in \"warn,hardnessd=debug\""
     )]
     Filter {
-        /// The part of it that is wrong.
+        /// The part of `RUST_LOG` that is wrong.
         found: String,
     },
     /// The thread that writes could not be started.
     #[error("log: cannot start a thread: {0}")]
     Thread(#[source] std::io::Error),
-    /// There is a log already.
+    /// A log was started before.
     #[error("the log was started twice")]
     Twice,
 }
 
 impl Log {
-    /// Starts the log of the process, once. `level` is used where `RUST_LOG` is not set.
+    /// Starts the log of the process, once. `level` is used if `RUST_LOG` is not set.
     ///
     /// # Errors
     ///
-    /// If `RUST_LOG` is malformed, the journal is asked for and cannot be reached, or a log has
-    /// been started before.
+    /// Fails if `RUST_LOG` is malformed, the journal is configured and cannot be reached, the
+    /// thread of the log cannot be started, or a log has been started before.
     pub fn start(settings: Settings, level: &str) -> Result<Self, Error> {
         let filter = filter(&std::env::var("RUST_LOG").unwrap_or_default(), level)?;
-        // The filter is a layer beside the output: a filter inside the output would be lost when the
-        // output is exchanged.
+        // The filter is a layer beside the output: a filter inside the output would be lost when
+        // the output is exchanged.
         let limit = Limit::default();
         let lines = Lines::start(limit.clone()).map_err(Error::Thread)?;
         let (layer, output) = reload::Layer::new(output(settings, &lines)?);
@@ -123,7 +123,7 @@ impl Log {
     ///
     /// # Errors
     ///
-    /// As for [`Log::start`]. The log then stays as it is.
+    /// Fails if the journal is configured and cannot be reached. The log then stays as it is.
     pub fn change(&self, settings: Settings) -> Result<(), Error> {
         self.output
             .reload(output(settings, &self.lines)?)
@@ -131,10 +131,12 @@ impl Log {
     }
 }
 
-/// The filter of `directives`. Without any, it passes the daemon's own lines from `level` on.
+/// The filter of `directives`. Without directives, it passes the daemon's own lines of `level` and
+/// above, and warnings of most libraries.
 fn filter(directives: &str, level: &str) -> Result<Targets, Error> {
-    // Of libraries only warnings. The DDS libraries and Foxglove's warn of what is harmless, several
-    // times a second or whenever a peer wants it; what matters they return as an error.
+    // Libraries log only warnings. The libraries of DDS and of Foxglove log none: they warn of
+    // harmless things, several times a second or whenever a peer causes it, and they return what
+    // matters as an error.
     let unasked = format!("warn,rustdds=off,ros2_client=off,foxglove=off,hardnessd={level}");
     let parts = |directives: &str| -> Vec<String> {
         let parts = directives.split(',').map(str::trim);
@@ -147,7 +149,7 @@ fn filter(directives: &str, level: &str) -> Result<Targets, Error> {
     if asked.is_empty() {
         asked = parts(&unasked);
     }
-    // A bracket begins the name of a span. There are no spans here, so it must be a mistake.
+    // A bracket begins the name of a span. There are no spans here, so a bracket must be a mistake.
     let is_sound = |part: &String| !part.contains('[') && part.parse::<Targets>().is_ok();
     if let Some(found) = asked.iter().find(|part| !is_sound(part)).cloned() {
         return Err(Error::Filter { found });
@@ -156,7 +158,7 @@ fn filter(directives: &str, level: &str) -> Result<Targets, Error> {
     Ok(parsed.expect("a list of sound parts is sound"))
 }
 
-/// Checks that there is something to write to.
+/// Checks that the log can be written: that the journal is there if it is configured.
 pub(crate) fn check(settings: Settings) -> Result<(), Error> {
     match settings.format {
         Format::Text | Format::Json => Ok(()),
@@ -170,7 +172,8 @@ fn output(settings: Settings, lines: &Lines) -> Result<Output, Error> {
         .with_target(false);
     Ok(match settings.format {
         Format::Text => text.with_ansi(std::io::stderr().is_terminal()).boxed(),
-        // Fields are in an object of their own, because a verdict has a `level` and so has the line.
+        // Fields are in an object of their own, because a verdict has a `level` and so has the
+        // line.
         Format::Json => text.json().boxed(),
         Format::Journald => {
             journal::find().map_err(Error::Journal)?;
@@ -229,7 +232,7 @@ pub(crate) fn event(event: &Event) {
                 );
             }
         }
-        // Rounded for the reader. The event itself has every digit.
+        // The numbers are rounded for the reader. The event itself has every digit.
         Event::Hardness(verdict) => info!(
             seq = verdict.seq,
             sensor = verdict.sensor.as_str(),
@@ -249,7 +252,7 @@ pub(crate) fn event(event: &Event) {
     }
 }
 
-/// Says what became of a tare that a client asked for.
+/// Logs the outcome of a tare that a client requested.
 pub(crate) fn tare(sensor: &str, outcome: &Result<Tared, RetareError>) {
     match outcome {
         Ok(Tared { old, new, .. }) => info!(
@@ -266,7 +269,7 @@ pub(crate) fn tare(sensor: &str, outcome: &Result<Tared, RetareError>) {
     }
 }
 
-/// Says that the model failed on a press.
+/// Logs that the model failed on a press.
 pub(crate) fn unjudged(unjudged: &Unjudged) {
     error!(
         sensor = unjudged.sensor.as_str(),
@@ -277,7 +280,7 @@ pub(crate) fn unjudged(unjudged: &Unjudged) {
     );
 }
 
-/// Says what a controller reports about its work.
+/// Logs the context that a controller reports of its work.
 pub(crate) fn context(sensor: &str, context: Option<&serde_json::Value>) {
     info!(
         sensor,

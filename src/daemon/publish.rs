@@ -1,4 +1,4 @@
-//! Every publisher of the daemon: all are opened together and served together.
+//! All publishers of the daemon, which are opened together and served together.
 
 use std::io;
 use std::net::SocketAddr;
@@ -30,7 +30,7 @@ use super::zenoh;
 /// The mode of the control socket's file: only the daemon's own user may connect.
 const CONTROL_MODE: u32 = 0o600;
 
-/// The keys of the sockets' paths.
+/// The keys of the sockets' paths in the configuration.
 const EVENTS_KEY: &str = "publish.unix.path";
 const CONTROL_KEY: &str = "publish.unix.control_path";
 
@@ -43,24 +43,24 @@ pub(crate) fn check(unix: &Unix) -> Result<(), Error> {
     Ok(())
 }
 
-/// Why a publisher could not be opened.
+/// The reason a publisher could not be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A Unix socket.
+    /// The error of a Unix socket.
     #[error(transparent)]
     Socket(#[from] socket::Error),
-    /// A TCP listener.
+    /// The error of a TCP listener.
     #[error(transparent)]
     Tcp(#[from] tcp::Error),
-    /// The server for Foxglove.
+    /// The error of the server for Foxglove.
     #[cfg(feature = "foxglove")]
     #[error(transparent)]
     Foxglove(#[from] foxglove::Error),
-    /// A ROS 2 node.
+    /// The error of the ROS 2 node.
     #[cfg(feature = "ros2")]
     #[error(transparent)]
     Ros2(#[from] ros2::Error),
-    /// A zenoh session.
+    /// The error of the zenoh session.
     #[cfg(feature = "zenoh")]
     #[error(transparent)]
     Zenoh(#[from] zenoh::Error),
@@ -69,15 +69,15 @@ pub enum Error {
         "socket activation: found a socket at {found}, expected publish.unix.path or control_path"
     )]
     Unasked {
-        /// The path that it listens at.
+        /// The path that the service manager listens at.
         found: PathBuf,
     },
-    /// The service manager handed over something else than Unix sockets.
+    /// The service manager passed something other than Unix sockets.
     #[error("socket activation: {0}")]
     Passed(#[source] io::Error),
 }
 
-/// The publishers. Connections wait until [`Publishers::serve`].
+/// The publishers. Connections wait until [`Publishers::serve`] is called.
 pub(crate) struct Publishers {
     max_clients: usize,
     socket: Option<Socket>,
@@ -168,7 +168,8 @@ impl Publishers {
         }
     }
 
-    /// Serves each publisher in a task, until `stop` comes and its subscribers have their last lines.
+    /// Serves each publisher in a task, until the order to stop and until the publisher's
+    /// subscribers have their last lines.
     pub(crate) fn serve(self, hub: &hub::Handle, sensors: &Sensors, stop: &Stop) -> JoinSet<()> {
         let Self {
             max_clients,
@@ -229,7 +230,7 @@ impl Publishers {
     }
 }
 
-/// The sensors as a viewer needs them.
+/// The names and the taxel distances of the sensors.
 #[cfg(feature = "foxglove")]
 fn arrays(config: &Config) -> Vec<foxglove::Sensor> {
     let sensors = config.sensors.iter();

@@ -3,8 +3,8 @@
 //! The daemon does not ask for real-time scheduling. systemd sets it before it starts the daemon
 //! (`CPUSchedulingPolicy=` of the unit), and the sandbox then refuses any change. Threads that the
 //! daemon starts are scheduled as ordinary ones (`CPUSchedulingResetOnFork=`): they log, record and
-//! load models. The daemon locks its memory itself, because systemd cannot. It does so where the unit
-//! has taken the limit away (`LimitMEMLOCK=`), or where it may ignore the limit.
+//! load models. The daemon locks its memory itself, because systemd cannot. It does so where the
+//! unit has removed the limit (`LimitMEMLOCK=`), or where the daemon may ignore the limit.
 
 use std::path::Path;
 use std::{fmt, fs};
@@ -14,9 +14,9 @@ use rustix::process::{Resource, getrlimit};
 use serde::Serialize;
 use tracing::warn;
 
-/// Keeps the pages of this process in memory, each from its first use on. It takes no more memory than
-/// before. Where the process may lock only so much, it locks nothing: at the limit, memory that it needs
-/// later would be refused.
+/// Keeps the pages of this process in memory, each from its first use on. This takes no more memory
+/// than before. If the memory that the process may lock is limited, this locks nothing: at the
+/// limit, the system would refuse memory that the process needs later.
 pub(super) fn lock_memory() {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     if getrlimit(Resource::Memlock).current.is_some() && !may_lock(&status) {
@@ -28,7 +28,7 @@ pub(super) fn lock_memory() {
     }
 }
 
-/// Whether no limit holds for a process, by its proc_pid_status(5): it has CAP_IPC_LOCK.
+/// Whether a process may ignore the limit, because it has CAP_IPC_LOCK in its proc_pid_status(5).
 fn may_lock(status: &str) -> bool {
     const IPC_LOCK: u32 = 14;
     let mut lines = status.lines();
@@ -37,7 +37,7 @@ fn may_lock(status: &str) -> bool {
     bits.is_some_and(|bits| bits >> IPC_LOCK & 1 == 1)
 }
 
-/// How a process runs.
+/// The scheduling of a process, and whether its memory is locked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct Standing {
     /// The scheduling of its main thread.
@@ -52,22 +52,23 @@ pub struct Standing {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Scheduling {
-    /// The ordinary one.
+    /// Ordinary scheduling: SCHED_OTHER.
     Other,
-    /// Real time, until it waits.
+    /// Real time, until the thread waits: SCHED_FIFO.
     Fifo,
-    /// Real time, in turns.
+    /// Real time, in turns with threads of the same priority: SCHED_RR.
     Rr,
-    /// For work that does not interact.
+    /// Ordinary scheduling for work that does not interact: SCHED_BATCH.
     Batch,
-    /// When nothing else runs.
+    /// Only when nothing else runs: SCHED_IDLE.
     Idle,
-    /// By deadlines.
+    /// Real time, by deadlines: SCHED_DEADLINE.
     Deadline,
 }
 
 impl Standing {
-    /// Reads it from the directory of a process in /proc; `None` if that does not say.
+    /// Reads the scheduling of a process from its directory in /proc. Returns `None` if the
+    /// directory does not have it.
     pub fn of(process: &Path) -> Option<Self> {
         let stat = fs::read_to_string(process.join("stat")).ok()?;
         let status = fs::read_to_string(process.join("status")).ok()?;
@@ -76,7 +77,8 @@ impl Standing {
 
     /// Reads proc_pid_stat(5) and proc_pid_status(5).
     fn read(stat: &str, status: &str) -> Option<Self> {
-        // The name before the parenthesis may hold spaces. After it comes field 3.
+        // The name of the process may have spaces and parentheses. Field 3 follows the last
+        // parenthesis.
         let (_, fields) = stat.rsplit_once(") ")?;
         let mut fields = fields.split_whitespace().skip(40 - 3);
         let priority = fields.next()?.parse().ok()?;
@@ -162,7 +164,7 @@ mod tests {
             Some(expected)
         );
         assert_eq!(Standing::read("7 (cut) S 1", &status("0")), None);
-        // /proc is where tests run, too.
+        // /proc also exists where tests run.
         assert!(Standing::of(Path::new("/proc/self")).is_some());
         assert_eq!(expected.to_string(), "ordinary");
         let locked = Standing {

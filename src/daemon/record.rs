@@ -1,9 +1,9 @@
-//! Recording: a thread of its own writes what the sensors' tasks and the hub send to it.
+//! Recording: a separate thread writes what the sensors' tasks and the hub send to it.
 //!
 //! In: the sensors' inputs, and events, through a bounded queue. Out: files. Nothing waits for the
-//! thread. When the queue is full, entries are dropped and counted; the sensor's next entry is then
-//! a state, from which a replay goes on. A disk that fails or is full stops the recording, not the
-//! daemon. The recording goes on when there is room again.
+//! thread. When the queue is full, entries are dropped and counted. The sensor's next entry is then
+//! a state, from which a replay can continue. A disk that fails or is full stops the recording, not
+//! the daemon. The recording continues when there is room again.
 
 mod file;
 mod worker;
@@ -28,22 +28,23 @@ use crate::recording::{About, Entry, Input, Labels, RecordedSensor, State};
 use crate::sensor::Sensor;
 use crate::verdict::Hrn;
 
-/// The most entries and events that wait: some 4 s of a sensor at 100 frames/s.
+/// The most entries and events that wait: about 4 s of a sensor at 100 frames/s.
 const QUEUED: usize = 8192;
-/// How often a sensor's state is noted. A new file begins with the last state and the entries since,
-/// and a damaged chunk costs a replay no more than this.
+/// How often a sensor's state is noted. A new file begins with the last state and the entries
+/// since, and a damaged chunk costs a replay no more than this time.
 const STATE_EVERY: Duration = Duration::from_secs(10);
-/// A state is also noted after this many bytes of entries, so that a flood of entries cannot make the
-/// black box much larger than its bound.
+/// A state is also noted after this many bytes of entries, so that a flood of entries cannot make
+/// the black box much larger than its bound.
 const STATE_EVERY_BYTES: usize = 4 << 20;
-/// It is a fault if this many frames and this share of them were damaged between two states.
+/// A sensor has a fault if at least [`DAMAGED_FRAMES`] frames, and more than [`DAMAGED_SHARE`] of
+/// all its frames, were damaged between two states.
 const DAMAGED_FRAMES: u64 = 5;
 const DAMAGED_SHARE: f64 = 0.1;
 
-/// Where a recording goes.
+/// The target of a recording.
 #[derive(Debug)]
 pub(crate) enum Target {
-    /// Into this one file, which the caller has made. It ends when the file cannot be written or
+    /// One file, which the caller has made. The recording ends when the file cannot be written or
     /// when there is no sensor left.
     File {
         path: PathBuf,
@@ -51,52 +52,52 @@ pub(crate) enum Target {
         labels: Labels,
         progress: watch::Sender<Progress>,
     },
-    /// Into files in the directory of the configuration.
+    /// Files in the directory of the configuration.
     Directory(config::Record),
 }
 
-/// What one file holds so far.
+/// The content of one file so far.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Progress {
-    /// Whole frames of all sensors.
+    /// The number of whole frames of all sensors.
     pub frames: u64,
-    /// Presses that have ended by themselves, so that they have a verdict.
+    /// The number of presses that were not aborted, so that they have a verdict.
     pub presses: u64,
 }
 
-/// Why a recording failed.
+/// The reason a recording failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The file cannot be written.
     #[error("{path}: {source}")]
     Write {
-        /// File of the recording.
+        /// The path of the recording.
         path: PathBuf,
-        /// Why not.
+        /// The error of the write.
         source: crate::recording::Error,
     },
-    /// A sensor is not there.
+    /// A sensor is missing at the start.
     #[error("sensor {sensor:?}: cannot record: {reason}")]
     Unavailable {
-        /// Its name.
+        /// The sensor's name.
         sensor: String,
-        /// Why not.
+        /// The reason its port cannot be opened.
         reason: String,
     },
-    /// All sensors are gone; what they sent is recorded.
+    /// All sensors are lost. What they sent is recorded.
     #[error("sensor {sensor:?} lost: {reason}; the recording ends there")]
     Lost {
-        /// The last one.
+        /// The name of the sensor that was lost last.
         sensor: String,
-        /// What went wrong.
+        /// The reason its port was lost.
         reason: String,
     },
     /// The directory of the configuration cannot be written to.
     #[error("record.dir: found {path}: {source}, expected a directory that can be written to")]
     Directory {
-        /// What there is of it.
+        /// The directory, or the nearest path above it that exists.
         path: PathBuf,
-        /// Why not.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The thread could not be started.
@@ -104,7 +105,7 @@ pub enum Error {
     Thread(#[source] std::io::Error),
 }
 
-/// Why there is no black box.
+/// The reason a black box was not written.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum NoBlackbox {
     #[error("nothing is kept: the configuration has no [record]")]
@@ -117,10 +118,10 @@ pub(crate) enum NoBlackbox {
     Write(#[from] crate::recording::Error),
 }
 
-/// Checks that this process may write to the directory, or make it.
+/// Checks that this process may write to the directory of the recordings, or make it.
 pub(crate) fn check(settings: &config::Record) -> Result<(), Error> {
     let directory = settings.dir();
-    // Directories that are missing will be made.
+    // Missing directories will be made, so check the nearest path that exists.
     let there = directory.ancestors().find(|place| place.exists());
     let there = there.unwrap_or(Path::new("."));
     let found = if there.is_dir() {
@@ -135,7 +136,7 @@ pub(crate) fn check(settings: &config::Record) -> Result<(), Error> {
     })
 }
 
-/// What is sent to the thread.
+/// A job for the thread.
 #[derive(Debug)]
 enum Job {
     Entry {
@@ -148,7 +149,7 @@ enum Job {
     Damage {
         sensor: usize,
     },
-    /// Asks for the last minute of a sensor as a file.
+    /// A client requests the last minute of a sensor as a file.
     Blackbox {
         sensor: usize,
         reply: oneshot::Sender<Result<PathBuf, NoBlackbox>>,
@@ -163,7 +164,7 @@ struct Jobs {
 }
 
 impl Jobs {
-    /// Sends a job if there is room; `false`: there was none.
+    /// Sends a job. Returns `false` if there was no room for it.
     fn tell(&self, job: Job) -> bool {
         match self.sender.try_send(job) {
             Ok(()) => true,
@@ -177,7 +178,7 @@ impl Jobs {
     }
 }
 
-/// The thread, as the daemon holds it.
+/// The daemon's handle to the thread.
 #[derive(Debug)]
 pub(crate) struct Recorder {
     jobs: Jobs,
@@ -189,7 +190,7 @@ pub(crate) struct Recorder {
 }
 
 impl Recorder {
-    /// Starts it.
+    /// Starts the thread.
     pub(crate) fn start(target: Target, mut about: About) -> Result<Self, Error> {
         let (labels, frames) = match &target {
             Target::File { labels, .. } => (labels.clone(), true),
@@ -204,7 +205,7 @@ impl Recorder {
         std::thread::Builder::new()
             .name("recorder".to_owned())
             .spawn(move || {
-                // The daemon may be gone already.
+                // The daemon may no longer wait for the result.
                 let _ = end.send(worker.run(&inbox));
             })
             .map_err(Error::Thread)?;
@@ -217,7 +218,7 @@ impl Recorder {
         })
     }
 
-    /// For the task of the `index`-th sensor.
+    /// The recorder for the task of the sensor with this `index`.
     pub(crate) fn of_sensor(&self, index: usize) -> SensorRecorder {
         SensorRecorder(Some(Box::new(Active {
             jobs: self.jobs.clone(),
@@ -229,7 +230,7 @@ impl Recorder {
         })))
     }
 
-    /// For the hub.
+    /// The recorder for the hub.
     pub(crate) fn of_hub(&self) -> EventRecorder {
         EventRecorder(Some((self.jobs.clone(), self.frames)))
     }
@@ -240,16 +241,16 @@ impl Recorder {
         let _ = (&mut self.stop).await;
     }
 
-    /// Waits until the file is whole. The caller must have dropped every [`SensorRecorder`] and
+    /// Waits until the file is complete. The caller must have dropped every [`SensorRecorder`] and
     /// [`EventRecorder`], because the thread ends when its queue has no sender left.
     pub(crate) async fn finish(self) -> Result<(), Error> {
         drop(self.jobs);
-        // If the thread panicked, it has said so.
+        // If the thread panicked, the panic has been reported.
         self.ended.await.unwrap_or(Ok(()))
     }
 }
 
-/// Records one sensor's inputs; does nothing without a recorder.
+/// Records the inputs of one sensor. Without a recorder, it does nothing.
 #[derive(Debug, Default)]
 pub(crate) struct SensorRecorder(Option<Box<Active>>);
 
@@ -258,11 +259,12 @@ struct Active {
     jobs: Jobs,
     index: usize,
     labels: Labels,
-    /// When a state was last noted. `None`: entries after it were dropped.
+    /// The time of the last noted state. `None`: there is none yet, or entries after it were
+    /// dropped.
     noted: Option<Duration>,
-    /// Bytes of memory that the entries since then take.
+    /// The bytes of memory that the entries since that state take.
     bytes: usize,
-    /// The whole and the damaged frames up to then.
+    /// The numbers of whole and of damaged frames up to that state.
     counted: (u64, u64),
 }
 
@@ -285,7 +287,7 @@ impl SensorRecorder {
         }
     }
 
-    /// Records that `pipeline` will follow `sensor` and `hrn` from now on.
+    /// Records that `pipeline` will use `sensor` and `hrn` from now on.
     pub(crate) fn reload(&mut self, pipeline: &Pipeline, sensor: &Sensor, hrn: &Hrn, at: Stamp) {
         if let Some(active) = &mut self.0 {
             let described = RecordedSensor::new(sensor, hrn);
@@ -293,9 +295,9 @@ impl SensorRecorder {
         }
     }
 
-    /// Asks for the last minute as a file. The answer comes when it is written.
+    /// Requests the last minute as a file. The answer comes when the file is written.
     pub(crate) fn blackbox(&self, reply: oneshot::Sender<Result<PathBuf, NoBlackbox>>) {
-        // If there is no room for the job, `reply` is dropped with it, which the caller sees.
+        // If there is no room for the job, `reply` is dropped with the job, which the caller sees.
         match &self.0 {
             Some(active) => {
                 let sensor = active.index;
@@ -348,7 +350,7 @@ impl Active {
     }
 }
 
-/// Records events; does nothing without a recorder.
+/// Records events. Without a recorder, it does nothing.
 #[derive(Debug, Default)]
 pub(crate) struct EventRecorder(Option<(Jobs, bool)>);
 

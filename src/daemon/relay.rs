@@ -1,11 +1,11 @@
 //! A subscriber of the hub that passes lines to a thread, for publishers whose library may block.
 //!
-//! In: every kind of event, frames with policy `latest`. Out: the same lines, in order, through a
-//! short channel. While the thread is busy, lines wait in the hub as for any subscriber. When the
-//! hub has no more room for them, there is a `gap`.
+//! In: every kind of event, but only the newest frame of each sensor. Out: the same lines, in
+//! order, through a short channel. While the thread is busy, lines wait in the hub as for any
+//! subscriber. When the hub has no more room for them, a `gap` gives the number of lost events.
 //!
-//! In the other direction, a thread may pass on where the robot says its arm is. This goes the way
-//! of a command of the control socket, and nothing else can be passed on.
+//! In the other direction, a thread may pass on positions of the arm that the robot reports. They
+//! take the same path as a command of the control socket. Nothing else can be passed on.
 
 use std::thread;
 use std::time::Duration;
@@ -27,10 +27,10 @@ const JOBS: usize = 8;
 /// The most messages with positions that wait for the sensors' tasks.
 const POSITIONS: usize = 256;
 
-/// How often a thread that asked for them gets the statuses.
+/// How often a thread that wants statuses gets them.
 const VITALS: Duration = Duration::from_secs(1);
 
-/// Where a thread puts what the robot says of its arm.
+/// The queue for the positions of the arm that a thread receives from the robot.
 #[derive(Clone)]
 #[cfg_attr(
     not(any(feature = "ros2", feature = "zenoh")),
@@ -51,7 +51,7 @@ impl Door {
     }
 }
 
-/// A thread that takes jobs until there are no more.
+/// A handle to a thread that takes jobs until there are no more.
 pub(super) struct Worker<J> {
     jobs: mpsc::Sender<J>,
     ended: oneshot::Receiver<()>,
@@ -62,9 +62,9 @@ pub(super) struct Worker<J> {
 }
 
 impl<J: From<Vec<Line>> + Send + 'static> Worker<J> {
-    /// Starts a thread that opens a session and then does jobs with it, and waits until the session
-    /// is open. The library is never called on the daemon's own thread, because it may have a
-    /// runtime of its own.
+    /// Starts a thread that opens a session and then does jobs with it. Returns when the session is
+    /// open. The library is never called on the daemon's own thread, because the library may have
+    /// its own runtime.
     pub(super) fn start<O, E>(
         way: &'static str,
         open: impl FnOnce(&mpsc::Sender<J>, Door) -> Result<O, E> + Send + 'static,
@@ -108,7 +108,8 @@ impl<J: From<Vec<Line>> + Send + 'static> Worker<J> {
         })
     }
 
-    /// Also gives the thread the status of every sensor, once a second, as the job that `make` makes.
+    /// Also sends the thread the status of every sensor, once a second, as the job that `make`
+    /// returns.
     #[cfg(feature = "ros2")]
     pub(super) fn with_vitals(self, make: fn(Vec<Status>) -> J) -> Self {
         Self {
@@ -128,13 +129,14 @@ impl<J: From<Vec<Line>> + Send + 'static> Worker<J> {
         } = self;
         let relayed = async {
             if let Ok((id, _hello)) = hub.join().await {
-                // Unlike a subscriber on a socket, it may end only with the daemon.
+                // Unlike a subscriber on a socket, this subscriber ends only with the daemon.
                 let _ = relay(id, &hub, &sensors, jobs, vitals).await;
                 hub.leave(id).await;
             }
         };
         tokio::join!(relayed, pass_on(way, positions, &sensors));
-        // Nothing is ever sent.
+        // The wait always ends with an error, because the thread sends nothing and only drops its
+        // end.
         let _ = ended.await;
     }
 }
@@ -160,7 +162,7 @@ async fn relay<J: From<Vec<Line>>>(
         policy: Policy::LatestFrames,
         since: None,
     };
-    // Only a `since` can be refused.
+    // Only a subscription with `since` can be refused.
     let _ = hub.subscribe(id, wanted).await?;
     let mut job = J::from(client::statuses(sensors).await);
     let mut next = hub.take(id).await?;
@@ -168,7 +170,7 @@ async fn relay<J: From<Vec<Line>>>(
     tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
     while jobs.send(job).await.is_ok() {
         job = tokio::select! {
-            // Not biased: a stream of frames must not keep the statuses back.
+            // The selection is not biased, because a stream of frames must not delay the statuses.
             lines = &mut next => match lines {
                 Ok(lines) => {
                     next = hub.take(id).await?;
@@ -182,7 +184,8 @@ async fn relay<J: From<Vec<Line>>>(
     Ok(())
 }
 
-/// The next second, for a thread that wants statuses; never for another.
+/// Waits for the next second, for a thread that wants statuses. For any other thread, this waits
+/// forever.
 async fn each_second<J>(
     tick: &mut Interval,
     vitals: Option<fn(Vec<Status>) -> J>,

@@ -1,9 +1,9 @@
-//! Reading the configuration again while the daemon runs (SIGHUP).
+//! Reads the configuration again while the daemon runs (SIGHUP).
 //!
-//! In: the path of the file, and the setup in force. Out: the new setup, or the reason why all
-//! stays as it was. A thread of its own reads file and model, within [`PATIENCE`]. A thread that
-//! takes longer is given up: its file may be a pipe that no program writes to, and such a thread
-//! cannot be ended. So at most [`MOST_READERS`] may be left behind.
+//! In: the path of the file, and the current setup. Out: the new setup, or the reason why nothing
+//! changes. A separate thread reads the file and the model within [`PATIENCE`]. A thread that takes
+//! longer is abandoned: its file may be a pipe that no program writes to, and such a thread cannot
+//! be ended. So at most [`MOST_READERS`] threads may be left behind.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -18,10 +18,10 @@ use super::log::{self, Log};
 /// a second.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// Threads that may read at a time: one, and those that were given up.
+/// The most threads that read at a time: the current one, and those that were abandoned.
 const MOST_READERS: usize = 4;
 
-/// How a running daemon is asked to read its configuration again.
+/// The requests to a running daemon to read its configuration again.
 pub struct Reload {
     /// One item for each request.
     pub requests: mpsc::Receiver<()>,
@@ -31,7 +31,7 @@ pub struct Reload {
     pub log: Log,
 }
 
-/// Why a reload was refused.
+/// The reason a reload was refused.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum Refusal {
     #[error(transparent)]
@@ -73,7 +73,7 @@ impl Readers {
     }
 }
 
-/// What `read` makes of the file at `path`, unless it takes longer than `patience`.
+/// Calls `read` with `path` in a thread, and waits for its result, but not longer than `patience`.
 async fn load<T: Send + 'static>(
     readers: Arc<Semaphore>,
     path: PathBuf,
@@ -88,13 +88,13 @@ async fn load<T: Send + 'static>(
     };
     let (done, result) = oneshot::channel();
     let thread_path = path.clone();
-    // Not one of the runtime's threads: the runtime would wait for them at its end.
+    // Do not use one of the runtime's threads, because the runtime would wait for it at its end.
     let started = std::thread::Builder::new()
         .name("reload".to_owned())
         .spawn(move || {
             let loaded = read(&thread_path);
             drop(reader);
-            // After the time limit there is no receiver any more.
+            // After the timeout there is no receiver any more.
             let _ = done.send(loaded);
         });
     if let Err(source) = started {
@@ -107,7 +107,8 @@ async fn load<T: Send + 'static>(
     }
 }
 
-/// The next request to reload, as the path to read; never ready if no request can come.
+/// Waits for the next request to reload, and returns the path to read. If no request can come, this
+/// waits forever.
 pub(super) async fn requested(reload: &mut Option<Reload>) -> PathBuf {
     if let Some(reload) = reload
         && reload.requests.recv().await.is_some()
@@ -117,7 +118,7 @@ pub(super) async fn requested(reload: &mut Option<Reload>) -> PathBuf {
     std::future::pending().await
 }
 
-/// All or nothing: `changed`, if all of it can change while the daemon runs.
+/// Returns `changed` if all of it can change while the daemon runs. Otherwise nothing changes.
 pub(super) fn change(setup: &Setup, changed: Setup, log: Option<&Log>) -> Result<Setup, Refusal> {
     if let Some(key) = setup.config.fixed_difference(&changed.config) {
         return Err(Refusal::Fixed { key });
@@ -165,7 +166,7 @@ mod tests {
         }
         let (loaded, _) = load(PATIENCE, |_| Ok(())).await;
         assert!(matches!(loaded, Err(Refusal::Stuck { .. })), "{loaded:?}");
-        // A thread that was given up makes room when it ends.
+        // A thread that was abandoned makes room when it ends.
         stuck.clear();
         while readers.available_permits() < MOST_READERS {
             std::thread::yield_now();

@@ -1,8 +1,8 @@
-//! What a subscriber may say: one JSON object a line.
+//! The requests of a subscriber: one JSON object per line.
 //!
-//! In: a line as it came. Out: a [`Request`], or what was found and what was expected instead; in
-//! both cases with the `id` to echo. Whether the connection may ask for a [`Change`] is not decided
-//! here.
+//! In: a line as it came. Out: a [`Request`], or an error with what was found and expected, in both
+//! cases with the `id` to echo. This module does not decide whether the connection may send a
+//! [`Change`].
 
 pub(crate) mod motion;
 
@@ -12,16 +12,16 @@ use serde_json::{Map, Value};
 use self::motion::Positions;
 use crate::event::{CONTEXT_BYTES, Kind};
 
-/// A usable line.
+/// A request that can be used.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Request {
-    /// What to be sent from now on.
+    /// Set the subscription of the connection.
     Subscribe(Subscription),
-    /// Every sensor's status now.
+    /// Get every sensor's current status.
     Status,
-    /// Every sensor's last final verdict.
+    /// Get every sensor's last final verdict.
     Last,
-    /// To change something: for the control socket alone.
+    /// Change something. Of all sockets, only the control socket may do this.
     Change(Change),
 }
 
@@ -30,19 +30,19 @@ pub(crate) enum Request {
 pub(crate) enum Change {
     /// Take another tare.
     Tare { sensor: String },
-    /// What the controller says it is doing; `None`: nothing any more.
+    /// Set the context that the controller reports of its work. `None` clears it.
     Context {
         sensor: String,
         context: Option<Value>,
     },
-    /// Where the robot says its arm is.
+    /// Take positions of the arm that the robot reports.
     Motion(Positions),
     /// Write the last minute of this sensor to a file.
     Blackbox { sensor: String },
 }
 
 impl Change {
-    /// As in the request.
+    /// The key of the command in its request.
     pub(crate) fn key(&self) -> &'static str {
         match self {
             Change::Tare { .. } => "tare",
@@ -53,12 +53,12 @@ impl Change {
     }
 }
 
-/// What a subscriber wants, and what is to happen when it is slow.
+/// The events that a subscriber wants, and the policy if it is slow.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Subscription {
     pub(crate) kinds: Kinds,
     pub(crate) policy: Policy,
-    /// Where in an earlier connection it stopped.
+    /// The last event that the subscriber had in an earlier connection.
     pub(crate) since: Option<Since>,
 }
 
@@ -75,14 +75,15 @@ impl Default for Subscription {
     }
 }
 
-/// What is kept for a subscriber that does not keep up.
+/// The events that are kept for a subscriber that is slow.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Policy {
-    /// Every event, the oldest dropped when the queue is full.
+    /// Every event. When the queue is full, the oldest is dropped.
     Queue,
-    /// The newest event a kind and sensor.
+    /// The newest event of each kind and sensor.
     Latest,
-    /// The newest frame a sensor, every other event: for those who look on (`/events`).
+    /// The newest frame of each sensor, and every other event. This is for viewers, as on
+    /// `/events`.
     LatestFrames,
 }
 
@@ -132,7 +133,7 @@ impl FromIterator<Kind> for Kinds {
     }
 }
 
-/// Why a line cannot be used.
+/// The reason a line cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum Unusable {
     #[error("found no JSON ({0}), expected an object")]
@@ -159,7 +160,7 @@ pub(crate) enum Unusable {
 }
 
 impl Unusable {
-    /// Of a value in JSON.
+    /// The error of a value in JSON.
     fn value(key: &'static str, found: &Value, expected: &'static str) -> Self {
         let found = short(found);
         Self::Value {
@@ -173,9 +174,9 @@ impl Unusable {
 /// A line that was read.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Line {
-    /// To be echoed in the answer.
+    /// The `id` to echo in the answer.
     pub(crate) id: Option<Value>,
-    /// What it asks for, or why it cannot be used.
+    /// The request, or the reason the line cannot be used.
     pub(crate) request: Result<Request, Unusable>,
 }
 
@@ -242,10 +243,10 @@ fn name(key: &'static str, value: &Value) -> Result<String, Unusable> {
     name.ok_or_else(|| Unusable::value(key, value, NAME))
 }
 
-/// What is expected where a sensor is meant.
+/// The expected value of a key that names a sensor.
 const NAME: &str = "a sensor's name";
 
-/// The sensor that a command with an object is for.
+/// The sensor in the object of a command.
 fn sensor(key: &'static str, fields: &Map<String, Value>) -> Result<String, Unusable> {
     fields.get("sensor").map_or_else(
         || {
@@ -290,7 +291,7 @@ fn context(value: Value) -> Result<Change, Unusable> {
     })
 }
 
-/// What was found, as JSON, short enough for a message.
+/// The value found as JSON, cut to a length that fits in a message.
 pub(crate) fn short(found: &(impl Serialize + ?Sized)) -> String {
     const CHARS: usize = 60;
     let text = serde_json::to_string(found).expect("what was read as JSON can be written as JSON");

@@ -1,10 +1,10 @@
 //! ROS 2 over DDS: the messages of a recording as topics, `NAMESPACE/tactile/SENSOR/KIND`.
 //!
-//! In: lines of the hub. Out: samples of the node `hardnessd`. ROS need not be installed. Verdicts and
-//! statuses are reliable, and a subscriber that comes later gets the last of each. Frames are best
-//! effort. Besides, there are topics that the tools of ROS users know: pictures, arrays of taxels and
-//! diagnostics. If the configuration names topics for them, positions of the arm come in. The node has
-//! no service and no parameter, so nothing else comes in.
+//! In: lines of the hub. Out: messages of the node `hardnessd`. ROS need not be installed. Verdicts
+//! and statuses are reliable, and a subscriber that comes later gets the last of each. Frames are
+//! best effort. Further topics are for the usual tools of ROS: pictures, arrays of taxels and
+//! diagnostics. If the configuration names topics with positions of the arm, the node subscribes to
+//! them. The node has no service and no parameter, so nothing else comes in.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -28,7 +28,7 @@ use super::request::motion::{Positions, Told};
 use crate::event::{Event, FrameEvent, Status};
 use crate::ros::{self, Topic, tools};
 
-/// Why there is no node.
+/// The reason the node could not start.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The domain or a topic could not be made.
@@ -37,28 +37,29 @@ pub enum Error {
     /// The node could not be made.
     #[error("publish.ros2: {0}")]
     Node(#[from] ros2_client::NodeCreateError),
-    /// ROS does not allow this name.
+    /// ROS does not allow a name.
     #[error("publish.ros2.namespace: {0}")]
     Name(#[from] ros2_client::names::NameError),
-    /// The system gave no thread.
+    /// The system could not start the thread or its runtime.
     #[error("no thread for publish.ros2: {0}")]
     Thread(#[from] io::Error),
 }
 
-/// Press events that are kept for a subscriber that missed some.
+/// The number of press events that are kept for a subscriber that missed some.
 const PRESSES_KEPT: usize = 16;
 
-/// Pictures and arrays that are kept for a subscriber that missed some. One that needs more misses
-/// them, because nobody waits for it.
+/// The number of pictures and arrays that are kept for a subscriber that missed some. A subscriber
+/// that needs more misses them, because publishing does not wait for it.
 const PICTURES_KEPT: usize = 5;
 
-/// Positions that are kept until the thread reads them.
+/// The number of positions that are kept until the thread reads them.
 const POSITIONS_KEPT: usize = 256;
 
-/// The brightest colour of a picture means at least this force on a taxel, so that noise stays dark.
+/// The brightest colour of a picture means at least this force on a taxel, so that noise stays
+/// dark.
 const LEAST_SCALE_N: f32 = 0.2;
 
-/// What the thread does next.
+/// A job for the thread.
 pub(super) enum Job {
     Lines(Vec<Line>),
     Vitals(Vec<Status>),
@@ -74,7 +75,7 @@ impl From<Vec<Line>> for Job {
 ///
 /// # Errors
 ///
-/// If the domain cannot be joined, for example because no port is free.
+/// Fails if the domain cannot be joined, for example because no port is free.
 pub(super) fn open(
     settings: &config::Ros2,
     robot: &str,
@@ -88,7 +89,7 @@ pub(super) fn open(
         move |_, door| Ros2::open(&settings, robot, &sensors, &door),
         |(runtime, mut ros2), jobs| {
             runtime.block_on(ros2.work(jobs));
-            // What reads positions ends before its node.
+            // The tasks that read positions must end before their node.
             drop(runtime);
         },
     );
@@ -98,12 +99,12 @@ pub(super) fn open(
 /// A node and its topics.
 struct Ros2 {
     robot: String,
-    /// By sensor and name.
+    /// The publisher of each topic, by the sensor and by the topic's name.
     topics: BTreeMap<(String, &'static str), Publisher<Message>>,
     diagnostics: Publisher<Message>,
-    /// The highest taxel of each sensor so far, in newtons.
+    /// The highest force on a taxel of each sensor so far, in newtons.
     highest_n: BTreeMap<String, f32>,
-    // Must be dropped last: its topics end with it.
+    // The node must be dropped last, because its topics end with it.
     _node: Node,
 }
 
@@ -143,7 +144,7 @@ impl Ros2 {
                 topics.insert((sensor.clone(), topic.name), publisher);
             }
         }
-        // By convention its name is the same everywhere.
+        // By convention, the name of this topic is the same everywhere.
         let diagnostics = publisher(&mut node, "/", tools::DIAGNOSTICS, &kept(PRESSES_KEPT))?;
         let runtime = Builder::new_current_thread().build()?;
         for (sensor, topic) in &settings.motion {
@@ -160,7 +161,7 @@ impl Ros2 {
         Ok((runtime, ros2))
     }
 
-    /// Between two jobs, the runtime reads positions.
+    /// Does the jobs. Between two jobs, the runtime reads positions.
     async fn work(&mut self, mut jobs: mpsc::Receiver<Job>) {
         while let Some(job) = jobs.recv().await {
             match job {
@@ -195,7 +196,7 @@ impl Ros2 {
         }
     }
 
-    /// Publishes what viewers know.
+    /// Publishes a frame in the messages that viewers know.
     fn show(&mut self, frame: &FrameEvent) {
         let highest = self.highest_n.entry(frame.sensor.clone());
         let highest = highest.or_insert(LEAST_SCALE_N);
@@ -207,7 +208,7 @@ impl Ros2 {
             (tools::IMAGE, picture),
             (tools::TACTILE_STATE, tools::tactile_state(frame)),
         ] {
-            // A subscriber that is too slow misses it.
+            // A subscriber that is too slow misses the message.
             let _ = self.send(&frame.sensor, topic, bytes);
         }
     }
@@ -220,7 +221,7 @@ impl Ros2 {
     }
 }
 
-/// Reads positions of the arm of `sensor`, for ever.
+/// Reads positions of the arm of `sensor`, forever.
 async fn hear(sensor: String, positions: Subscription<tools::PointStamped>, door: Door) {
     loop {
         let told = match positions.async_take().await {
@@ -258,7 +259,8 @@ fn publisher(
     Ok(node.create_publisher(&made, Some(qos.clone()))?)
 }
 
-/// Subscribes to where an arm is. It takes what reliable and other publishers send.
+/// Subscribes to the positions of an arm. The subscription accepts reliable and best-effort
+/// publishers.
 fn subscription(node: &mut Node, topic: &str) -> Result<Subscription<tools::PointStamped>, Error> {
     let (space, base) = topic.rsplit_once('/').unwrap_or_default();
     let space = if space.is_empty() { "/" } else { space };
@@ -274,7 +276,8 @@ fn subscription(node: &mut Node, topic: &str) -> Result<Subscription<tools::Poin
     Ok(node.create_subscription(&made, Some(qos))?)
 }
 
-/// RViz2 of Humble asks for reliable images only. Nobody waits for a viewer that is too slow.
+/// The quality of service for viewers. RViz2 of Humble accepts only reliable images. Publishing
+/// does not wait for a viewer that is too slow.
 fn shown() -> QosProfile {
     QosProfile::publisher_default()
         .reliability_reliable(WhenFull::Fail)
@@ -283,20 +286,20 @@ fn shown() -> QosProfile {
         })
 }
 
-/// A subscriber that comes later gets the last sample.
+/// The quality of service by which a subscriber that comes later gets the last message.
 fn latched() -> QosProfile {
     kept(1).durability(Durability::TransientLocal)
 }
 
-/// A subscriber that missed samples gets them again.
+/// The quality of service by which a subscriber gets up to `depth` missed messages again.
 fn kept(depth: usize) -> QosProfile {
     QosProfile::publisher_default()
         .reliability_reliable(WhenFull::DEFAULT)
         .history(History::KeepLast { depth })
 }
 
-/// A message as [`ros::encode`] makes it. The library writes the encapsulation header; the bytes after it
-/// are sent unchanged.
+/// A message as [`ros::encode`] makes it. The library writes the encapsulation header; the bytes
+/// after it are sent unchanged.
 struct Message(Vec<u8>);
 
 impl Serialize for Message {

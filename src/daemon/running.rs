@@ -1,4 +1,4 @@
-//! A daemon that serves: its main loop, reloads, and its end.
+//! The running daemon: its main loop, reloads, and its end.
 
 use std::pin::{Pin, pin};
 use std::time::Duration;
@@ -14,22 +14,23 @@ use super::reload::{self, Readers, Refusal, Reload};
 use super::sensor::{Command, Sensors};
 use super::{Error, alive, hello, hub, short, systemd};
 
-/// How long subscribers may take to fetch their last lines: the daemon must end within 1 s.
+/// How long subscribers may take to fetch their last lines. This is short, because the daemon must
+/// end within 1 s.
 const FAREWELL: Duration = Duration::from_millis(300);
 
-/// A daemon that serves.
+/// A running daemon.
 pub(super) struct Running {
     pub(super) setup: Setup,
     /// The token of this run.
     pub(super) run: String,
     pub(super) hub: hub::Handle,
     pub(super) sensors: Sensors,
-    /// One for each sensor.
+    /// The tasks of the sensors.
     pub(super) tasks: JoinSet<()>,
-    /// One for each listener.
+    /// The tasks of the publishers.
     pub(super) publishers: JoinSet<()>,
     pub(super) recorder: Option<Recorder>,
-    /// To the listeners.
+    /// Sends orders to the listeners.
     pub(super) orders: watch::Sender<()>,
 }
 
@@ -61,7 +62,7 @@ impl Running {
                 }
                 path = reload::requested(reload), if loading.is_none() => {
                     systemd::reloading();
-                    // Listeners look whether they can still be reached.
+                    // Order the listeners to check that they can still be reached.
                     let _ = self.orders.send(());
                     loading = Some(Box::pin(readers.read(path)));
                 }
@@ -78,7 +79,7 @@ impl Running {
         }
     }
 
-    /// Serves by `changed` from now on.
+    /// Uses `changed` from now on.
     async fn adopt(&mut self, changed: Setup) {
         self.setup = changed;
         self.hub
@@ -93,8 +94,8 @@ impl Running {
         info!(model = short(&self.setup), "reloaded");
     }
 
-    /// Finishes the event in hand: presses are aborted, and subscribers and the recording get
-    /// their last lines.
+    /// Ends the daemon. Presses are aborted, and subscribers and the recording get their last
+    /// lines.
     pub(super) async fn finish(mut self) -> Result<(), Error> {
         systemd::stopping();
         info!("stopping");
@@ -110,7 +111,7 @@ impl Running {
             warn!("a subscriber did not fetch its last lines");
         }
         let recorded = match self.recorder {
-            // A recording that somebody asked for by itself is worth waiting for.
+            // Wait as long as necessary for a recording into one file, because a user asked for it.
             Some(recorder) if self.setup.config.record.is_none() => recorder.finish().await,
             Some(recorder) => tokio::time::timeout(FAREWELL, recorder.finish())
                 .await
@@ -124,7 +125,7 @@ impl Running {
     }
 }
 
-/// Waits until there is no more to record; never ready without a recorder.
+/// Waits until there is no more to record. Without a recorder, this waits forever.
 async fn record_ended(recorder: &mut Option<Recorder>) {
     match recorder {
         Some(recorder) => recorder.stopped().await,
@@ -132,7 +133,7 @@ async fn record_ended(recorder: &mut Option<Recorder>) {
     }
 }
 
-/// Waits for the configuration that is being read; never ready if none is.
+/// Waits for the configuration that is being read. If none is being read, this waits forever.
 async fn finished(loading: &mut Option<Loading>) -> Result<Setup, Refusal> {
     match loading {
         Some(loading) => loading.await,

@@ -1,8 +1,8 @@
-//! One sensor: its port at one end, the hub at the other, its pipeline between.
+//! The task of one sensor, which connects the sensor's port, its pipeline and the hub.
 //!
-//! The task waits for the port, the pipeline's deadline or a command. Then it makes one call into the
-//! pipeline and sends the events to the hub. It shares nothing, so a sensor that is lost disturbs no
-//! other.
+//! The task waits for the port, the pipeline's deadline or a command. Then it makes one call into
+//! the pipeline and sends the events to the hub. It shares nothing, so a sensor that is lost does
+//! not disturb the others.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -24,35 +24,38 @@ use crate::sensor::Sensor;
 use crate::tare::RetareError;
 use crate::verdict::Hrn;
 
-/// What a sensor's task can be asked to do.
+/// A command to a sensor's task.
 #[derive(Debug)]
 pub(crate) enum Command {
-    /// To say how the sensor is now.
+    /// Report the current state of the sensor.
     Status(oneshot::Sender<Vitals>),
-    /// To take another tare. The answer comes when it is taken or given up.
+    /// Take another tare. The answer comes when the tare is taken, refused or abandoned.
     Tare(oneshot::Sender<Result<Tared, RetareError>>),
-    /// To echo what the controller says it is doing. The answer comes when it is in force.
+    /// Repeat the controller's context in events. The answer comes when the pipeline has the
+    /// context.
     Context(Option<Value>, oneshot::Sender<()>),
-    /// To take where the robot says its arm is. The answer comes when it is taken.
+    /// Take positions of the arm that the robot reports. The answer comes when they are taken.
     Motion(Vec<Point>, oneshot::Sender<Result<(), StepBack>>),
-    /// To write the last minute. The answer is the path of the file.
+    /// Write the last minute to a file. The answer is the path of the file.
     Blackbox(oneshot::Sender<Result<PathBuf, NoBlackbox>>),
-    /// To judge by another description and model from now on. Nothing that is fixed may differ.
+    /// Use another description and model from now on. Values that only a restart can change must
+    /// not differ.
     Reload(Box<Sensor>, Arc<Hrn>),
-    /// To end. A press under way is aborted, and no event follows.
+    /// End the task. A press under way is aborted, and no further event follows.
     Finish,
 }
 
-/// A sensor as it is now.
+/// The current state of a sensor.
 #[derive(Debug, Clone)]
 pub(crate) struct Vitals {
     pub(crate) status: Status,
-    /// Age of its last whole frame.
+    /// The age of the sensor's last whole frame.
     pub(crate) last_frame_age: Option<Duration>,
     pub(crate) contact_threshold_n: f32,
-    /// Verdicts since the start that did not come because the model failed.
+    /// The number of verdicts since the start that are missing because the model failed.
     pub(crate) unjudged: u64,
-    /// Positions of the arm since the start, and those among them that came too late.
+    /// The number of positions of the arm since the start, and the number of them that came too
+    /// late.
     pub(crate) motion: (u64, u64),
 }
 
@@ -68,7 +71,7 @@ pub(crate) struct SensorHandle {
 pub(crate) struct Sensors(pub(crate) Vec<SensorHandle>);
 
 impl Sensors {
-    /// Every sensor now; those that have ended are left out.
+    /// The current state of every sensor. A sensor whose task has ended is left out.
     pub(crate) async fn vitals(&self) -> Vec<Vitals> {
         let mut all = Vec::with_capacity(self.0.len());
         for sensor in &self.0 {
@@ -82,7 +85,7 @@ impl Sensors {
         all
     }
 
-    /// Every sensor's status now.
+    /// Every sensor's current status.
     pub(crate) async fn statuses(&self) -> Vec<Status> {
         let vitals = self.vitals().await;
         vitals.into_iter().map(|vitals| vitals.status).collect()
@@ -97,17 +100,17 @@ pub(crate) async fn serve(
     hub: hub::Handle,
     mut commands: mpsc::Receiver<Command>,
 ) {
-    // The asker who waits for a tare.
+    // The client that waits for the outcome of a tare.
     let mut taring = None;
     let mut unjudged = 0;
     loop {
         let deadline = pipeline.deadline();
         let events = tokio::select! {
-            // Not biased: a sensor that never pauses must still obey `Finish`, and commands that
-            // never pause must not keep the task from its port.
+            // The selection is not biased: the task must still obey `Finish` if the sensor never
+            // pauses, and still read its port if commands never pause.
             command = commands.recv() => match command {
                 Some(Command::Status(reply)) => {
-                    // The asker may have gone.
+                    // The client may have gone.
                     let _ = reply.send(vitals(&pipeline, unjudged));
                     continue;
                 }
@@ -131,7 +134,7 @@ pub(crate) async fn serve(
                 Some(Command::Motion(points, reply)) => {
                     let input = Input::Motion(points.as_slice().into());
                     recorder.note(&pipeline, &input, super::now());
-                    // The asker may have gone.
+                    // The client may have gone.
                     let _ = reply.send(pipeline.tell(&points));
                     continue;
                 }
@@ -179,7 +182,7 @@ pub(crate) async fn serve(
     }
 }
 
-/// Answers the asker of a tare when its outcome is known.
+/// Answers the client that requested a tare, when the outcome is known.
 fn answer(
     pipeline: &mut Pipeline,
     taring: &mut Option<oneshot::Sender<Result<Tared, RetareError>>>,
@@ -187,7 +190,7 @@ fn answer(
     if let Some(outcome) = pipeline.retared() {
         log::tare(pipeline.sensor().name(), &outcome);
         if let Some(reply) = taring.take() {
-            // The asker may have gone.
+            // The client may have gone.
             let _ = reply.send(outcome);
         }
     }
@@ -206,8 +209,8 @@ fn vitals(pipeline: &Pipeline, unjudged: u64) -> Vitals {
     }
 }
 
-/// Waits for a moment of CLOCK_MONOTONIC, which is the runtime's clock too. Without a moment it waits
-/// for ever.
+/// Waits for a time of CLOCK_MONOTONIC, which is also the runtime's clock. Without a deadline, this
+/// waits forever.
 async fn until(deadline: Option<Duration>) {
     match deadline {
         Some(deadline) => {

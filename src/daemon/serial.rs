@@ -1,9 +1,10 @@
-//! One serial port: opened, read, lost, opened again.
+//! One serial port, which is opened, read, and opened again when it is lost.
 //!
-//! In: the configured path and baud rate. Out: one [`Turn`] at a time: bytes, or what happened to the
-//! port. It never gives up and never interprets the bytes. The port is opened exclusively (by
-//! TIOCEXCL and flock; only flock keeps root out), and stale input is flushed. A read of no bytes
-//! means that the port is lost, because a tty that was unplugged gives no bytes for ever.
+//! In: the configured path and baud rate. Out: one [`Turn`] at a time: bytes, or what happened to
+//! the port. This module tries to open the port for as long as it runs, and never interprets the
+//! bytes. The port is opened exclusively (by TIOCEXCL and flock; only flock keeps root out), and
+//! stale input is flushed. A read of no bytes means that the port is lost, because every read of an
+//! unplugged tty gives no bytes.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -14,24 +15,24 @@ use tokio::task::JoinHandle;
 use tokio::time::Instant;
 use tokio_serial::SerialStream;
 
-/// Pause before the first try to reopen; it doubles with each that fails.
+/// The pause before the first try to reopen. It doubles with each try that fails.
 const FIRST_PAUSE: Duration = Duration::from_millis(50);
-/// Longest pause: a sensor plugged in again is read within this.
+/// The longest pause. A sensor that is plugged in again is read within this time.
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 
-/// Bytes read at once: 20 frames of the JX255N.
+/// The most bytes read at once: 20 frames of the JX255N.
 const BUFFER_BYTES: usize = 16 * 1024;
 
-/// What happened to the port.
+/// A change of the port, or bytes from it.
 #[derive(Debug)]
 pub(crate) enum Turn<'a> {
-    /// It is open.
+    /// The port was opened.
     Opened,
-    /// It cannot be opened now.
+    /// The port cannot be opened now, for this reason.
     Unavailable(String),
-    /// Bytes came.
+    /// Bytes arrived.
     Bytes(&'a [u8]),
-    /// It was open and is gone.
+    /// The port was open and is lost, for this reason.
     Lost(String),
 }
 
@@ -47,9 +48,9 @@ pub(crate) struct Link {
 
 #[derive(Debug)]
 enum State {
-    /// Will be opened at this time.
+    /// The port will be opened at this time.
     Waiting(Instant),
-    /// Being opened, on a thread of its own: a driver may take its time over it.
+    /// A separate thread is opening the port, because a driver may be slow.
     Opening(JoinHandle<Result<TTYPort, serialport::Error>>),
     Open(SerialStream),
 }
@@ -66,7 +67,7 @@ impl Link {
         }
     }
 
-    /// Waits for the next thing to happen. It may be cancelled: nothing is lost.
+    /// Waits for the next turn of the port. Cancelling the wait loses nothing.
     pub(crate) async fn turn(&mut self) -> Turn<'_> {
         loop {
             match &mut self.state {
@@ -93,8 +94,8 @@ impl Link {
                     }
                 }
                 State::Open(port) => {
-                    // A read that is cancelled has read nothing: it is one system call, made when
-                    // bytes are there.
+                    // A read that is cancelled has read nothing, because a read is one system call,
+                    // made when bytes are there.
                     let lost = match AsyncReadExt::read(port, &mut self.buffer).await {
                         Ok(0) => "end of file".to_owned(),
                         Ok(read) => return Turn::Bytes(&self.buffer[..read]),
@@ -107,8 +108,8 @@ impl Link {
         }
     }
 
-    /// Says that the port works, so that it is opened again quickly after the next loss. A port that
-    /// opens and fails at once never gets so far.
+    /// Records that the port works, so that it is opened again quickly after the next loss. A port
+    /// that fails as soon as it is opened never gets so far.
     pub(crate) fn proven(&mut self) {
         self.pause = FIRST_PAUSE;
     }
@@ -120,7 +121,7 @@ impl Link {
 }
 
 fn open(path: &Path, baud: u32) -> Result<TTYPort, serialport::Error> {
-    // 8N1 without flow control, exclusive: the builder's defaults.
+    // The builder's defaults are 8N1 without flow control, and exclusive access.
     let port = TTYPort::open(&serialport::new(path.to_string_lossy(), baud))?;
     // Bytes from before the port had its settings are of unknown age, and may be garbled.
     port.clear(ClearBuffer::Input)?;
@@ -152,7 +153,7 @@ fn lower_latency(path: &Path) {
 
 fn reason(error: &serialport::Error) -> String {
     match error.kind() {
-        // EBUSY, or the lock is taken: serialport has one kind for both.
+        // This is EBUSY or a lock that is taken: serialport has one kind for both.
         ErrorKind::NoDevice => "port held by another process".to_owned(),
         ErrorKind::Io(std::io::ErrorKind::NotFound) => "no such device".to_owned(),
         ErrorKind::Io(std::io::ErrorKind::PermissionDenied) => "permission denied".to_owned(),
@@ -160,10 +161,10 @@ fn reason(error: &serialport::Error) -> String {
     }
 }
 
-/// What the system says of a port, in plain words where its own are not.
+/// The system's error of a port, in plain words where the system's own are not plain.
 fn of_system(text: &str) -> String {
     match text {
-        // ENOTTY.
+        // These are the texts of ENOTTY.
         "Not a typewriter" | "Inappropriate ioctl for device" => "not a serial port".to_owned(),
         text => text.to_owned(),
     }

@@ -1,7 +1,8 @@
-//! Unix sockets: their files, from the first moment to the last.
+//! Unix sockets and their files.
 //!
-//! A socket's file appears with its mode, and answers from then on. A file that a dead daemon left
-//! behind is replaced; one that answers is not. A file that is deleted is made again.
+//! A socket's file has its mode and accepts connections from its first moment on. A file that a
+//! dead daemon left behind is replaced. A file whose socket answers is not. A file that is deleted
+//! is made again.
 
 mod place;
 
@@ -22,13 +23,13 @@ use super::accept::{Listener, Stop};
 /// How long another daemon may take to put its socket in its place.
 const BIND_PATIENCE: Duration = Duration::from_secs(1);
 
-/// How often a socket looks whether its file is still there.
+/// How often a socket checks that its file is still there.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
 
-/// Why there is no socket.
+/// The reason a socket could not be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A process listens there.
+    /// A process already listens at the path.
     #[error("{key}: found {path}, in use by another process, expected a free path")]
     InUse {
         /// The key of the configuration.
@@ -36,7 +37,7 @@ pub enum Error {
         /// The path of the socket.
         path: PathBuf,
     },
-    /// Another kind of file is there.
+    /// The path has another kind of file.
     #[error("{key}: found {path}, which is no socket, expected a socket or nothing there")]
     NoSocket {
         /// The key of the configuration.
@@ -44,7 +45,7 @@ pub enum Error {
         /// The path of the file.
         path: PathBuf,
     },
-    /// Neither its directory nor the directory above exists.
+    /// Neither the directory of the socket nor the directory above it exists.
     #[error("{key}: found {path} in no directory, expected one, or one to make it in")]
     NoDirectory {
         /// The key of the configuration.
@@ -52,16 +53,16 @@ pub enum Error {
         /// The path of the socket.
         path: PathBuf,
     },
-    /// The system's limit.
+    /// The path is longer than the system allows.
     #[error("{key}: found {path}, {found} bytes, expected a path of at most {max}")]
     TooLong {
         /// The key of the configuration.
         key: &'static str,
-        /// The path as given.
+        /// The path, as configured.
         path: PathBuf,
-        /// Its length.
+        /// The length of the path in bytes.
         found: usize,
-        /// Largest.
+        /// The largest length in bytes.
         max: usize,
     },
     /// The system refused.
@@ -71,14 +72,14 @@ pub enum Error {
         key: &'static str,
         /// The path of the socket.
         path: PathBuf,
-        /// What was tried.
+        /// The step that failed.
         what: &'static str,
-        /// Why not.
+        /// The system's error.
         source: io::Error,
     },
 }
 
-/// A listening socket. Its file is removed with it.
+/// A listening socket. When it is dropped, its file is removed.
 ///
 /// A file that was deleted is made again: the socket looks for it every [`LOOK_EVERY`], and when an
 /// order comes.
@@ -86,18 +87,18 @@ pub enum Error {
 pub(crate) struct Socket {
     listener: UnixListener,
     place: Place,
-    /// Of the file. A file that another process put in its place is not ours to remove. `None`:
-    /// the file belongs to the service manager.
+    /// The identity of the file. A file that another process put in its place is not ours to
+    /// remove. `None`: the file belongs to the service manager.
     identity: Option<Identity>,
     orders: Option<Stop>,
     next_look: Instant,
-    /// Whether the file is gone or another's, and that was logged.
+    /// Whether the file is missing or belongs to another process, and this was logged.
     missed: bool,
 }
 
 impl Socket {
-    /// Listens at `path`. The file has `mode` from its first moment. `key` is the key of the path in
-    /// the configuration. The directory is made if it alone is missing.
+    /// Listens at `path`. The file has `mode` from its first moment. `key` is the key of the path
+    /// in the configuration. If the directory is missing, it is made, but no directory above it.
     pub(crate) fn bind(key: &'static str, path: &Path, mode: u32) -> Result<Self, Error> {
         let path = path.to_owned();
         let place = Place { key, path, mode };
@@ -105,14 +106,14 @@ impl Socket {
         Ok(Self::new(listener, place, Some(identity)))
     }
 
-    /// Takes the listener at `path` out of `passed`, if it is there. Its file, and the mode of that
-    /// file, belong to the service manager.
+    /// Takes the listener at `path` out of `passed`, if it is there. The listener's file, and the
+    /// mode of that file, belong to the service manager.
     pub(crate) fn adopt(
         key: &'static str,
         path: &Path,
         passed: &mut Vec<StdListener>,
     ) -> Option<Result<Self, Error>> {
-        // The same file may have several names: /run and /var/run.
+        // The same file may have several names, as in /run and /var/run.
         let there = path.canonicalize().ok()?;
         let is_there = |socket: &StdListener| {
             let address = socket.local_addr().ok();
@@ -142,18 +143,18 @@ impl Socket {
         }
     }
 
-    /// Makes it look for its file at every order.
+    /// Makes the socket check its file at every order.
     pub(crate) fn obey(mut self, orders: Stop) -> Self {
         self.orders = Some(orders);
         self
     }
 
-    /// The path of its file.
+    /// The path of the socket's file.
     pub(crate) fn path(&self) -> &Path {
         &self.place.path
     }
 
-    /// Makes the file again if it is gone. If that fails, the reason is logged once.
+    /// Makes the file again if it is missing. If that fails, the reason is logged once.
     fn look(&mut self) {
         self.next_look = Instant::now() + LOOK_EVERY;
         let path = self.place.path.display();
@@ -163,7 +164,7 @@ impl Socket {
             (Ok(_), None) => None,
             (Ok(_), Some(_)) => Some("another file is in its place".to_owned()),
             (Err(error), Some(_)) if error.kind() == ErrorKind::NotFound => {
-                // Without patience, because the sensors wait meanwhile.
+                // Do not wait for another daemon, because the sensors wait meanwhile.
                 match self.place.listen(Duration::ZERO) {
                     Ok((listener, identity)) => {
                         self.listener = listener;
@@ -193,7 +194,7 @@ impl Listener for Socket {
         loop {
             tokio::select! {
                 biased;
-                // Connections that wait come first: a new listener would not have them.
+                // Connections that wait come first, because a new listener would not have them.
                 accepted = self.listener.accept() => return Ok(accepted?.0),
                 () = ordered(&mut self.orders) => self.look(),
                 () = tokio::time::sleep_until(self.next_look) => self.look(),
@@ -202,7 +203,7 @@ impl Listener for Socket {
     }
 }
 
-/// Waits for the next order to look for the file; never ready after the last one.
+/// Waits for the next order to check the file. After the last order, this waits forever.
 async fn ordered(orders: &mut Option<Stop>) {
     if let Some(receiver) = orders
         && receiver.changed().await.is_ok()

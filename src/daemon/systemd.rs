@@ -1,5 +1,5 @@
-//! What the daemon tells systemd, and the sockets that systemd passes to it. Without systemd nothing
-//! here does anything.
+//! Notifications to systemd, and the sockets that systemd passes to the daemon. Without systemd,
+//! nothing here does anything.
 
 use std::io;
 use std::os::unix::net::UnixListener;
@@ -14,19 +14,19 @@ use crate::event::{LinkState, Status};
 ///
 /// # Errors
 ///
-/// If it passes anything else.
+/// Fails if systemd passes anything else.
 pub(crate) fn sockets() -> io::Result<Vec<UnixListener>> {
     let mut passed = ListenFd::from_env();
     let sockets = (0..passed.len()).map(|index| passed.take_unix_listener(index));
     sockets.filter_map(Result::transpose).collect()
 }
 
-/// Says that the daemon serves: sockets answer, and ports are being opened.
+/// Notifies systemd that the daemon serves: sockets answer, and ports are being opened.
 pub(crate) fn ready() {
     tell(&[NotifyState::Ready]);
 }
 
-/// Says that the configuration is being read again, until [`ready`].
+/// Notifies systemd that the configuration is being read again, until [`ready`] is called.
 pub(crate) fn reloading() {
     match NotifyState::monotonic_usec_now() {
         Ok(now) => tell(&[NotifyState::Reloading, now]),
@@ -34,12 +34,13 @@ pub(crate) fn reloading() {
     }
 }
 
-/// Says that the daemon is about to end.
+/// Notifies systemd that the daemon is about to end.
 pub(crate) fn stopping() {
     tell(&[NotifyState::Stopping]);
 }
 
-/// Feeds the watchdog: every sensor's task has answered, whatever the hardware does.
+/// Feeds the watchdog, because every sensor's task has answered. The state of the hardware does not
+/// matter.
 pub(crate) fn alive(statuses: &[Status]) {
     let live = statuses
         .iter()
@@ -49,7 +50,8 @@ pub(crate) fn alive(statuses: &[Status]) {
     tell(&[NotifyState::Watchdog, NotifyState::Status(&line)]);
 }
 
-/// How often [`alive`] is due: twice as often as the watchdog demands, or every 10 s without one.
+/// How often [`alive`] is due: twice as often as the watchdog demands, or every 10 s without a
+/// watchdog.
 pub(crate) fn heartbeat() -> Duration {
     const AT_LEISURE: Duration = Duration::from_secs(10);
     sd_notify::watchdog_enabled().map_or(AT_LEISURE, |timeout| timeout / 2)

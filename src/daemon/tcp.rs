@@ -9,18 +9,19 @@ use tokio::net::{TcpListener, TcpStream};
 
 use super::accept::Listener;
 
-/// Bytes that the system may hold for a subscriber that does not read, as for a Unix socket. The
-/// system doubles the number for its own use. Its default would grow to megabytes.
+/// The bytes that the system may hold for a subscriber that does not read, as many as for a Unix
+/// socket. The system doubles the number for its own use. The system's default would grow to
+/// megabytes.
 const SEND_BUFFER_BYTES: usize = 104 * 1024;
 
-/// A connection without traffic is probed after this time,
+/// The time after which a connection without traffic is probed.
 const KEEPALIVE: Duration = Duration::from_secs(30);
-/// then at this interval,
+/// The time between two probes.
 const KEEPALIVE_PAUSE: Duration = Duration::from_secs(10);
-/// and closed after this many probes without an answer.
+/// The number of probes without an answer after which the connection is closed.
 const KEEPALIVE_TRIES: u32 = 3;
 
-/// Why there is no listener.
+/// The reason a listener could not be opened.
 #[derive(Debug, thiserror::Error)]
 #[error("{key}: cannot listen on {address}: {source}")]
 pub struct Error {
@@ -55,7 +56,8 @@ impl Tcp {
         })
     }
 
-    /// Its address. If the configured port was 0, this has the port that the system chose.
+    /// The listener's address. If the configured port was 0, the address has the port that the
+    /// system chose.
     pub(crate) fn address(&self) -> SocketAddr {
         self.address
     }
@@ -66,7 +68,7 @@ impl Listener for Tcp {
 
     async fn accept(&mut self) -> io::Result<TcpStream> {
         let (stream, _) = self.listener.accept().await?;
-        // If the connection is gone already, the next read says so.
+        // If the connection has ended already, the next read returns the error.
         let _ = behave(&stream);
         Ok(stream)
     }

@@ -1,9 +1,10 @@
-//! Zenoh: each event is put under the key `tactile/SITE/SENSOR/KIND`, as the JSON of a socket.
+//! Zenoh: each event is put under the key `tactile/SITE/SENSOR/KIND`, as the same JSON as on a
+//! socket.
 //!
 //! In: lines of the hub. Out: puts, the last final verdict and status of each sensor as answers to
-//! queries, and the liveliness token `tactile/SITE`, which ends with the daemon. The session talks only
-//! to addresses that the configuration names. If the configuration names a key for them, positions of
-//! the arm come in; nothing else that comes in changes anything.
+//! queries, and the liveliness token `tactile/SITE`, which ends with the daemon. The session talks
+//! only to addresses that the configuration names. If the configuration names a key with positions
+//! of the arm, the session subscribes to it. Nothing else that comes in changes anything.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -25,26 +26,26 @@ use super::relay::{Door, Worker};
 use super::request::{self, Change, Request};
 use crate::event::{Event, Kind, Phase};
 
-/// Why there is no session.
+/// The reason the session could not be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The daemon cannot listen on an address.
     #[error("publish.zenoh.listen: cannot listen on {endpoint:?}: {source}")]
     Listen {
-        /// As configured.
+        /// The configured endpoint.
         endpoint: config::Endpoint,
-        /// Why not.
+        /// The system's error.
         source: io::Error,
     },
-    /// The library refused. The text is its own.
+    /// The library failed. The message is the library's own.
     #[error("publish.zenoh: {0}")]
     Session(#[from] zenoh::Error),
-    /// The system gave no thread.
+    /// The system could not start the thread.
     #[error("no thread for publish.zenoh: {0}")]
     Thread(#[from] io::Error),
 }
 
-/// What the thread does next.
+/// A job for the thread.
 pub(super) enum Job {
     Lines(Vec<Line>),
     Query(Query),
@@ -60,14 +61,15 @@ impl From<Vec<Line>> for Job {
 ///
 /// # Errors
 ///
-/// If the daemon cannot listen on an address, or the library refuses. A peer that cannot be reached is
-/// no error: the library tries again.
+/// Fails if the daemon cannot listen on an address, or the library fails. A peer that cannot be
+/// reached is not an error, because the library tries again.
 pub(super) fn open(
     settings: &config::Zenoh,
     robot: &str,
     sensors: Vec<String>,
 ) -> Result<Worker<Job>, Error> {
-    // Tried here first, because the library's error is a page long and names paths of its sources.
+    // Try the addresses here first, because the library's error is a page long and names paths of
+    // its sources.
     for endpoint in &settings.listen {
         TcpListener::bind(endpoint.address()).map_err(|source| Error::Listen {
             endpoint: endpoint.clone(),
@@ -91,7 +93,7 @@ struct Zenoh {
     site: String,
     /// The answers to queries, by key.
     last: BTreeMap<String, Line>,
-    // Dropping these ends them. The session must be the last.
+    // Dropping one of these ends it. The session must be dropped last.
     _queries: Queryable<()>,
     _motion: Option<Subscriber<()>>,
     _alive: LivelinessToken,
@@ -202,10 +204,11 @@ impl Zenoh {
     }
 }
 
-/// The longest value with positions, as for a line of the control socket.
+/// The longest value with positions, as long as the longest line of the control socket.
 const LONGEST_VALUE_BYTES: usize = 64 * 1024;
 
-/// Takes positions of the arm: the line that the control socket takes, and no other.
+/// Takes positions of the arm, in the same line as on the control socket. No other request is
+/// accepted.
 fn hear(sample: &Sample, door: &Door) {
     let key = sample.key_expr();
     let bytes = sample.payload().to_bytes();
@@ -224,7 +227,7 @@ fn key(site: &str, sensor: &str, kind: Kind) -> String {
     format!("tactile/{site}/{sensor}/{}", kind.name())
 }
 
-/// The JSON without its newline: each message is one event.
+/// The JSON without its newline, because each message is one event.
 fn text(line: &Line) -> &str {
     line.json.trim_end()
 }
@@ -240,12 +243,12 @@ fn configuration(settings: &config::Zenoh) -> Result<zenoh::Config, Error> {
         ("mode", "\"peer\"".to_owned()),
         ("listen/endpoints", json(&settings.listen)),
         ("connect/endpoints", json(&settings.connect)),
-        // An address in use is an error. A router that is not there yet is none.
+        // An address in use is an error. A router that is not there yet is not an error.
         ("listen/exit_on_failure", "true".to_owned()),
         ("connect/exit_on_failure", "false".to_owned()),
         ("scouting/multicast/enabled", "false".to_owned()),
-        // Without gossip, a peer behind a router gets events twice. Autoconnect would connect to peers
-        // that the configuration does not name.
+        // Without gossip, a peer behind a router gets events twice. Autoconnect would connect to
+        // peers that the configuration does not name.
         ("scouting/gossip/autoconnect", "[]".to_owned()),
     ] {
         config.insert_json5(key, &value)?;

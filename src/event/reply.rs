@@ -1,38 +1,38 @@
-//! What subscribers read beside events: who is speaking, answers to commands, and what they miss.
+//! The published lines beside events: the greeting, answers to commands, and gaps.
 
 use serde::Serialize;
 
 use super::line;
 use crate::tare::Offsets;
 
-/// What is not an event of a sensor: `hello`, `gap`, `error` and `ok`.
+/// A line that is not an event of a sensor: `hello`, `gap`, `error` or `ok`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "type", rename_all = "lowercase")]
 pub enum Reply {
-    /// First line of every connection.
+    /// The first line of every connection.
     Hello(Hello),
-    /// Events this subscriber will not get.
+    /// Events that this subscriber will not get.
     Gap {
-        /// How many of its subscribed kinds; null: unknown.
+        /// The number of lost events of the subscribed kinds. Null if it is unknown.
         lost: Option<u64>,
     },
-    /// A line could not be used, or there is no room.
+    /// A line could not be used, or the server has no room.
     Error {
         /// What was found and what was expected.
         message: String,
-        /// The `id` of the line, echoed.
+        /// The `id` of the line.
         #[serde(skip_serializing_if = "Option::is_none")]
         id: Option<serde_json::Value>,
     },
     /// A command was carried out.
     Ok {
-        /// The `id` of the line, echoed.
+        /// The `id` of the line.
         #[serde(skip_serializing_if = "Option::is_none")]
         id: Option<serde_json::Value>,
-        /// What a `tare` did.
+        /// The result of a `tare`.
         #[serde(skip_serializing_if = "Option::is_none")]
         tare: Option<Tared>,
-        /// Where a `blackbox` was written.
+        /// The path where a `blackbox` was written.
         #[serde(skip_serializing_if = "Option::is_none")]
         blackbox: Option<String>,
     },
@@ -41,9 +41,9 @@ pub enum Reply {
 /// A tare taken on request.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Tared {
-    /// Sensor's name.
+    /// The sensor's name.
     pub sensor: String,
-    /// The offsets before.
+    /// The offsets before the tare.
     pub old: Offsets,
     /// The offsets from the next frame on.
     pub new: Offsets,
@@ -56,49 +56,49 @@ impl Reply {
     }
 }
 
-/// Who is speaking, and of what.
+/// The greeting: the server, its sensors and its model.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Hello {
     /// [`PROTOCOL`](super::PROTOCOL).
     pub protocol: u32,
-    /// `hardnessd`.
+    /// The name of the server: `hardnessd`.
     pub server: &'static str,
-    /// Version of the daemon.
+    /// The version of the daemon.
     pub version: &'static str,
-    /// Name of the robot.
+    /// The name of the robot.
     pub robot: String,
-    /// Random, of this start of the daemon.
+    /// A random token of this start of the daemon.
     pub run: String,
     /// The kernel's boot id.
     pub boot_id: String,
-    /// Latest number given.
+    /// The number of the latest event.
     pub seq: u64,
-    /// The sensors served.
+    /// The sensors of the daemon.
     pub sensors: Vec<SensorCard>,
     /// The model in use.
     pub model: ModelCard,
 }
 
-/// A sensor as announced in `hello`.
+/// A sensor, as announced in `hello`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SensorCard {
-    /// Its name.
+    /// The sensor's name.
     pub name: String,
-    /// Rows of the array itself.
+    /// The number of rows of the sensor's own array.
     pub rows: usize,
-    /// Columns of the array itself.
+    /// The number of columns of the sensor's own array.
     pub cols: usize,
-    /// Distance of taxel centres.
+    /// The distance between taxel centres.
     pub pitch_mm: f64,
 }
 
-/// The model as announced in `hello`.
+/// The model, as announced in `hello`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ModelCard {
-    /// SHA-256 of the model's file.
+    /// The SHA-256 of the model's file.
     pub sha256: String,
-    /// What it was validated on, such as "simulated data only".
+    /// The data of the model's validation, such as "simulated data only".
     pub validation: String,
-    /// Its levels.
+    /// The model's levels.
     pub levels: Vec<crate::verdict::Level>,
 }

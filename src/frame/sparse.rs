@@ -1,7 +1,7 @@
-//! A frame as short text: the taxels that bear something, in base64.
+//! A frame as short text: its taxels that are not 0, in base64.
 //!
 //! Each such taxel has six bytes: its place in the frame (u16) and its newtons (f32), both
-//! little-endian, the places ascending. `docs/formats.md` shows how numpy reads and writes it.
+//! little-endian. The places ascend. `docs/formats.md` shows how numpy reads and writes the text.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
@@ -9,14 +9,14 @@ use serde::{Deserialize, Deserializer, Serializer, de::Error};
 
 use super::{Frame, TAXELS};
 
-/// Bytes of a taxel.
+/// The bytes of one taxel.
 const BYTES: usize = 6;
 
 /// The frame as text.
 pub fn write(frame: &Frame) -> String {
     let mut bytes = Vec::new();
     for (place, newtons) in (0_u16..).zip(frame.newtons) {
-        // A negative zero is one of its own.
+        // A negative zero is kept, so that a frame is read back bit for bit.
         if newtons.to_bits() != 0 {
             bytes.extend(place.to_le_bytes());
             bytes.extend(newtons.to_le_bytes());
@@ -25,28 +25,28 @@ pub fn write(frame: &Frame) -> String {
     STANDARD.encode(bytes)
 }
 
-/// Text that is no frame.
+/// The reason why a text is not a frame.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SparseError {
-    /// It is no base64.
+    /// The text is not base64.
     #[error("found no base64 ({0})")]
     Text(#[from] base64::DecodeError),
-    /// Not so many bytes for each taxel.
+    /// The number of bytes is not a multiple of a taxel's bytes.
     #[error("found {0} bytes, expected {BYTES} a taxel")]
     Length(usize),
-    /// A place outside the frame, or not after the one before it.
+    /// The place is outside the frame, or does not follow the place before it.
     #[error("found place {0}, expected ascending places below {TAXELS}")]
     Place(u16),
-    /// A force that no taxel bears.
+    /// The force is negative or not finite.
     #[error("found {0} N at a taxel, expected 0 or more")]
     Newtons(f32),
 }
 
-/// The frame that a text says.
+/// Reads the frame that a text holds.
 ///
 /// # Errors
 ///
-/// [`SparseError`], if the text says none.
+/// Returns a [`SparseError`] if the text holds no frame.
 pub fn read(text: &str) -> Result<Frame, SparseError> {
     let bytes = STANDARD.decode(text)?;
     let (taxels, rest) = bytes.as_chunks::<BYTES>();
@@ -70,12 +70,12 @@ pub fn read(text: &str) -> Result<Frame, SparseError> {
     Ok(frame)
 }
 
-/// For `#[serde(with)]`.
+/// Used by `#[serde(with)]`.
 pub(crate) fn serialize<S: Serializer>(frame: &Frame, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_str(&write(frame))
 }
 
-/// For `#[serde(with)]`.
+/// Used by `#[serde(with)]`.
 pub(crate) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Frame, D::Error> {
     let text = String::deserialize(deserializer)?;
     read(&text).map_err(D::Error::custom)

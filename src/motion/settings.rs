@@ -1,4 +1,4 @@
-//! What is known of the arm that presses.
+//! The settings of the arm that presses.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,24 +6,25 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// Stiffness of all behind the sensor's face; `None`: unknown.
+    /// The stiffness of everything behind the sensor's face. `None` if it is unknown.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stiffness_n_per_mm: Option<f64>,
-    /// Speed of a steady approach, where the robot tells no positions; `None`: unknown.
+    /// The speed of a steady approach, if the robot sends no positions. `None` if it is unknown.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub speed_mm_s: Option<f64>,
-    /// The arm's stamps are this much earlier than the frames'.
+    /// How much earlier the arm's stamps are than the frames'.
     pub delay_ms: f64,
 }
 
-/// Slowest and fastest steady approach.
+/// The slowest and the fastest steady approach.
 pub const SPEEDS_MM_S: (f64, f64) = (0.001, 1000.0);
-/// Softest and hardest arm.
+/// The softest and the stiffest arm.
 const STIFFNESSES_N_PER_MM: (f64, f64) = (0.001, 100_000.0);
-/// Least and greatest delay: a frame takes less than a second from the sensor to its last byte.
+/// The least and the greatest delay: a frame takes less than a second from the sensor to its last
+/// byte.
 pub(super) const DELAYS_MS: (f64, f64) = (-1000.0, 1000.0);
 
-/// A value of [`Settings`] that cannot be used.
+/// An unusable value of [`Settings`].
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("{key}: found {found:?}, expected {least} to {most} {unit}")]
 pub struct SettingsError {
@@ -39,7 +40,7 @@ impl Settings {
     ///
     /// # Errors
     ///
-    /// If a stiffness, speed or delay is out of its range.
+    /// Returns an error if a stiffness, speed or delay is out of its range.
     pub fn check(&self) -> Result<(), SettingsError> {
         for (key, found, (least, most), unit) in [
             (

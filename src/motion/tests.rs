@@ -4,7 +4,7 @@ use super::*;
 
 const MS: i64 = 1_000_000;
 
-/// Points of an arm at a steady 10 mm/s, a position every `step_ms`.
+/// The points of an arm at a steady 10 mm/s, one every `step_ms`.
 fn steady(from_ms: i64, to_ms: i64, step_ms: usize) -> Vec<Point> {
     (from_ms..=to_ms)
         .step_by(step_ms)
@@ -48,7 +48,7 @@ fn positions_are_interpolated_and_count_from_the_begin() {
 fn a_delay_looks_that_much_earlier() {
     let mut track = Track::default();
     let mut points = steady(0, 2000, 50);
-    // It stops at 1 s.
+    // The arm stops at 1 s.
     for point in &mut points {
         point.mm = point.mm.min(10.0);
     }
@@ -73,10 +73,10 @@ fn what_is_missing_jumps_or_steps_back_is_unknown_for_its_press_alone() {
             .map(|(begin, end)| approach(points, begin, &[begin, begin + 500, end]).is_some())
     };
     assert_eq!(presses(&hole(0, 0)), [true, true, true]);
-    // 250 ms are no gap, 300 are.
+    // 250 ms are not a gap, 300 ms are.
     assert_eq!(presses(&hole(4300, 4500)), [true, true, true]);
     assert_eq!(presses(&hole(4300, 4550)), [true, false, true]);
-    // It counts from the last position before the press's begin to the first after its end.
+    // The positions used reach from the last one before the press to the first one after it.
     assert_eq!(presses(&hole(3750, 4050)), [true, false, true]);
     assert_eq!(presses(&hole(4950, 5300)), [true, false, true]);
     assert_eq!(presses(&hole(3000, 3950)), [true, true, true]);
@@ -103,7 +103,7 @@ fn a_step_back_is_told_and_time_goes_on_from_there() {
     let again = steady(2000, 9000, 50);
     let back = track.push(&again).unwrap_err();
     assert_eq!((back.index, back.back_ms), (0, 3000.0));
-    // What was told twice is not believed, what came later is.
+    // The track does not trust moments that came twice. It trusts later ones.
     assert_eq!(track.approach(at(4000), &[at(4500)], 0.0), None);
     let expected = [Some(5.0)];
     close(track.approach(at(6000), &[at(6500)], 0.0), &expected);
@@ -158,7 +158,7 @@ fn a_point_after_its_final_verdict_is_late() {
     assert_eq!(track.counts(), (27, 2));
 }
 
-/// What a robot may tell: mostly in order, with gaps, jumps and steps back.
+/// Positions as a robot may send them: mostly in order, with gaps, jumps and steps back.
 fn told() -> impl Strategy<Value = Vec<Point>> {
     let step = prop_oneof![
         8 => 1..100_i64,
@@ -193,7 +193,7 @@ proptest! {
         let mut whole = Track::default();
         let _ = whole.push(&points);
         prop_assert!(whole.is_possible());
-        // Lines of any length say the same.
+        // The division into lines makes no difference.
         let mut cut = Track::default();
         let mut ends: Vec<usize> = cuts.into_iter().map(|end| end.min(points.len())).collect();
         ends.extend([0, points.len()]);
@@ -204,13 +204,13 @@ proptest! {
         prop_assert_eq!(&whole, &cut);
 
         let told = whole.approach(at(begin), &moments, 0.0);
-        // A recording that holds less says the same.
+        // A recording, which holds fewer points, gives the same answer.
         prop_assert_eq!(&whole.since(at(begin)).approach(at(begin), &moments, 0.0), &told);
         let Some(told) = told else { return Ok(()) };
         let last = moments[moments.len() - 1].as_nanos() as i64;
         let near = |ns: i64| points.iter().any(|p| (p.at_ns - ns).abs() <= LONGEST_GAP_NS);
         prop_assert!(near(begin as i64 * MS) && near(last));
-        // No step back that was told falls into the press.
+        // No step back falls into the press.
         let mut latest = i64::MIN;
         for point in &points {
             let falls_in = point.at_ns <= last && latest >= begin as i64 * MS;

@@ -1,4 +1,4 @@
-//! What is known of a press's course: its frames, and how far the arm went at each.
+//! The course of a press: its frames, and how far the arm went at each.
 
 use std::time::Duration;
 
@@ -8,25 +8,26 @@ use crate::motion::SPEEDS_MM_S;
 use crate::press::{Peak, SoFar, thinned};
 use crate::verdict;
 
-/// The contact is loaded up to the first frame that has this share of the greatest force. A steady
-/// approach may end there.
+/// Loading ends at the first frame that has this share of the greatest force. A steady approach may
+/// end there.
 const LOADED_SHARE: f64 = 0.95;
-/// The end of loading begins with this share of its last force, so that the slope is that of the
+/// The slope is fitted from this share of loading's last force on, so that it is the slope of the
 /// deepest part.
 const END_SHARE: f64 = 0.5;
-/// The end of loading has this many frames, if there are so many.
+/// The slope is fitted to at least this many frames, if there are that many.
 const END_FRAMES: usize = 3;
-/// A slope over a smaller spread of indentations (their standard deviation, mm) would be noise.
+/// If indentations have a smaller spread (their standard deviation, mm), their slope would be
+/// noise.
 const LEAST_SPREAD_MM: f64 = 0.005;
 
 /// A press, with the approach at each of its frames.
 pub(super) struct Known<'a> {
     pub(super) frames: Vec<&'a Peak>,
-    /// Place of the best frame.
+    /// The place of the best frame.
     pub(super) best: usize,
-    /// Where it is known.
+    /// The approach at each frame where it is known.
     approach_mm: Vec<Option<f64>>,
-    /// What it rests on.
+    /// The source of the approach.
     pub(super) rests_on: event::Course,
 }
 
@@ -60,7 +61,7 @@ impl<'a> Known<'a> {
         }
     }
 
-    /// As a model of `most` frames gets it.
+    /// The course for a model of `most` frames.
     pub(super) fn course(&self, arm_n_per_mm: Option<f64>, most: usize) -> verdict::Course {
         let begin = self.frames[0].moment.stamp.mono;
         let moment = |place: usize| {
@@ -99,8 +100,8 @@ impl<'a> Known<'a> {
     }
 }
 
-/// Of the line through points that has the least squares; `None`, if they hardly differ in x or it
-/// falls.
+/// The slope of the least-squares line through the points. `None` if they hardly differ in x, or if
+/// the line does not rise.
 fn slope(points: &[(f64, f64)]) -> Option<f64> {
     let count = points.len() as f64;
     let mean = |of: fn(&(f64, f64)) -> f64| points.iter().map(of).sum::<f64>() / count;
@@ -113,7 +114,7 @@ fn slope(points: &[(f64, f64)]) -> Option<f64> {
 }
 
 impl Pipeline {
-    /// What is known of a press up to now.
+    /// The course of a press up to now.
     pub(super) fn known<'a>(&self, so_far: &'a SoFar, phase: Phase) -> Known<'a> {
         let (frames, best) = so_far.until(Duration::MAX);
         let mut known = Known {
@@ -130,7 +131,8 @@ impl Pipeline {
                 known.approach_mm = approach_mm;
                 known.rests_on = event::Course::Positions;
             }
-            // The latest positions may still be on their way. The final verdict waits for none.
+            // The latest positions may still be on their way. The final verdict does not wait for
+            // them.
             return match phase {
                 Phase::Early => known.cut(so_far),
                 Phase::Final => known,
@@ -146,7 +148,7 @@ impl Pipeline {
         known
     }
 
-    /// The speed of a steady approach: what the context says, else the configuration.
+    /// The speed of a steady approach: from the context, or else from the configuration.
     pub(super) fn speed_mm_s(&self) -> Option<f64> {
         let context = self.seen.context.as_ref();
         let said = context.and_then(|context| context.get("speed_mm_s")?.as_f64());

@@ -7,15 +7,15 @@ use crate::press::{Change, End, Marks, Moment, Peak, SoFar};
 use crate::sensor::Description;
 use crate::verdict::{Format, ModelError, Verdict};
 
-/// An early verdict on the course needs this many frames in contact.
+/// The number of frames in contact that an early verdict on the course needs.
 const FIRST_LOOK: u64 = 3;
-/// The course is judged again when the press has this share more frames, at least one: a verdict at
-/// each of a thousand frames would cost more than it brings.
+/// The course is judged again when the press has grown by its frames divided by this number, at
+/// least by one frame. A verdict at each of a thousand frames would cost more than it is worth.
 const LOOK_SHARE: u64 = 8;
-/// The early verdict has come.
+/// The value of `next_look` once the early verdict has come.
 const NO_LOOK: u64 = u64::MAX;
 
-/// What a verdict on the course says besides.
+/// The data that only a verdict on the course has.
 struct Told {
     rests_on: event::Course,
     stiffness_n_per_mm: Option<f64>,
@@ -87,8 +87,8 @@ impl Pipeline {
         })
     }
 
-    /// Judges the press under way, if a model of the course is due to look at it, and gives the early
-    /// verdict once that is sure.
+    /// Judges the press under way if a model of the course is due to judge it. Publishes the early
+    /// verdict once its confidence is high enough.
     pub(super) fn look(&mut self, events: &mut Vec<Event>) {
         let is_due = |frames: &u64| *frames >= self.seen.next_look;
         let Some(frames) = self.tracker.frames().filter(is_due) else {
@@ -115,7 +115,7 @@ impl Pipeline {
         }
     }
 
-    /// The verdict on a press as far as it has come; `peak` is its best frame.
+    /// The verdict on a press up to now. `peak` is its best frame.
     fn judge(&mut self, phase: Phase, so_far: &SoFar, peak: &Peak) -> Option<Event> {
         let press = so_far.press();
         let Format::Course { most_frames } = self.hrn.format() else {
@@ -133,9 +133,9 @@ impl Pipeline {
         self.judged(press, phase, peak, verdict, Some(told))
     }
 
-    /// The event of a verdict. A model that fails on its own check frames was refused when it was
-    /// loaded. If it fails on another frame, the press gets no verdict, and [`Self::unjudged`] gives
-    /// the failure.
+    /// The event of a verdict. A model that fails on its own check frames was already refused at
+    /// loading. If it fails on another frame, the press gets no verdict, and [`Self::unjudged`]
+    /// returns the failure.
     fn judged(
         &mut self,
         press: u64,
@@ -229,7 +229,7 @@ impl Pipeline {
         .collect()
     }
 
-    /// What is known of a frame by the settings that are in force now.
+    /// The marks of a frame by the current settings.
     pub(super) fn marks(&self, raw: &RawFrame, frame: &Frame) -> Marks {
         let full_scale = self.sensor.layout().full_scale();
         Marks {

@@ -1,4 +1,4 @@
-//! The link of a sensor: its state, its measured rate, and when silence changes it.
+//! The link of a sensor: its state, its measured rate, and the silences that change it.
 
 use std::time::Duration;
 
@@ -9,24 +9,24 @@ use crate::event::{Event, LinkState, Status};
 use crate::frame::Stamp;
 use crate::tare::Aim;
 
-/// After a silence of this many periods the pending bytes are settled: later bytes do not belong to
-/// them.
+/// After a silence of this many periods, the pending bytes are settled: later bytes do not belong
+/// to them.
 const PAUSE_PERIODS: f64 = 0.5;
 
-/// What is known of the port.
+/// The state of the port.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) enum Link {
-    /// Never opened, and why the last try failed.
+    /// The port was never opened. The reason is that of the last try.
     Closed { reason: Option<String> },
-    /// Open since then, and no frame yet.
+    /// The port has been open since then, and no frame has come yet.
     Opened { since: Duration },
-    /// The last frame came then.
+    /// The last frame came at this time.
     Live { since: Duration },
-    /// Open, and no frame came in time.
+    /// The port is open, and no first frame came in time.
     Silent,
-    /// Open, and silent after its last frame.
+    /// The port is open, and silent after its last frame.
     Stale,
-    /// It was open and is gone, or it is open again and no frame has come.
+    /// The port was open and is gone, or it is open again and no frame has come.
     Lost { reason: String },
 }
 
@@ -39,7 +39,7 @@ impl Pipeline {
         }
     }
 
-    /// The link and its counters, now.
+    /// The current state of the link and its counters.
     pub fn status(&self, at: Stamp) -> Status {
         let (state, reason) = self.state();
         Status {
@@ -55,7 +55,7 @@ impl Pipeline {
         }
     }
 
-    /// State and reason.
+    /// The state and its reason.
     pub(super) fn state(&self) -> (LinkState, Option<String>) {
         let tare = || {
             let met_contact = self.tare.aim() == Some(Aim::First { met_contact: true });
@@ -75,7 +75,7 @@ impl Pipeline {
         }
     }
 
-    /// A status, if state or reason have changed since the last one.
+    /// A status, if the state or its reason have changed since the last one.
     pub(super) fn status_if_changed(&mut self, at: Stamp) -> Vec<Event> {
         let state = self.state();
         if self.seen.told == state {
@@ -99,7 +99,7 @@ impl Pipeline {
         }
     }
 
-    /// When a silence settles what is pending.
+    /// When a silence settles the pending bytes.
     pub(super) fn pause_deadline(&self) -> Option<Duration> {
         let last_bytes = self
             .seen

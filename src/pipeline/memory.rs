@@ -1,4 +1,4 @@
-//! What a pipeline remembers: enough for another to go on in its place.
+//! The memory of a pipeline, from which another pipeline can continue.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,7 +7,7 @@ use crate::motion::Track;
 use crate::tare::{self, Aim, Offsets};
 use crate::{event, press, wire};
 
-/// Everything that a pipeline has seen. A pipeline of the same sensor that recalls it gives the same
+/// The whole state of a pipeline. A pipeline of the same sensor that recalls it returns the same
 /// events from there on. Recordings begin with it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Memory {
@@ -20,20 +20,21 @@ pub struct Memory {
     pipeline: Noted,
 }
 
-/// What the pipeline itself knows of the past, as recordings hold it. They also hold here, and have
-/// always held here, what the tare under way is for.
+/// The pipeline's own state, as recordings hold it. For compatibility, it also has the purpose of
+/// the tare under way.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Noted {
-    /// It is the first, and something touched the sensor at an earlier try.
+    /// Whether the tare under way is the first, and something touched the sensor during an earlier
+    /// try.
     tare_met_contact: bool,
-    /// It was asked for, when these offsets were in force.
+    /// If the tare under way was requested: the offsets in force at the request.
     retaring: Option<Offsets>,
     #[serde(flatten)]
     seen: Seen,
 }
 
 impl Memory {
-    /// Whether a pipeline can have come to this: a recording may say anything.
+    /// Whether a pipeline can have this state. A recording may hold anything.
     pub(crate) fn is_possible(&self) -> bool {
         let Seen {
             frames,
@@ -54,14 +55,14 @@ impl Memory {
             && context.as_ref().is_none_or(is_context)
     }
 
-    /// What the controller had said it was doing.
+    /// The controller's context.
     pub(crate) fn context(&self) -> Option<&serde_json::Value> {
         self.pipeline.seen.context.as_ref()
     }
 }
 
 impl Pipeline {
-    /// All it has seen.
+    /// The pipeline's state.
     pub fn memory(&self) -> Memory {
         let aim = self.tare.aim();
         let last_frame = self.seen.last_frame.map(|frame| frame.mono);
@@ -79,7 +80,7 @@ impl Pipeline {
         }
     }
 
-    /// Goes on where the pipeline stood whose memory this is. It is one of the same sensor.
+    /// Continues from the state of another pipeline of the same sensor.
     pub fn recall(&mut self, memory: Memory) {
         let Noted {
             tare_met_contact: met_contact,

@@ -17,7 +17,7 @@ fn pipeline(preset: Preset) -> Pipeline {
     pipeline_of(|described| described.frame.preset = preset)
 }
 
-/// Of a JX255N at 5 frames/s, but for what `change` does to it.
+/// A pipeline of a JX255N at 5 frames/s, changed by `change`.
 fn pipeline_of(change: impl FnOnce(&mut Description)) -> Pipeline {
     let mut described = Description {
         name: "forearm".to_owned(),
@@ -43,7 +43,7 @@ fn at(millis: u64) -> Stamp {
     }
 }
 
-/// `taxels` taxels at `counts` in the middle of the array.
+/// A frame with `taxels` taxels at `counts` in the middle of the array.
 fn raw(taxels: usize, counts: u16) -> RawFrame {
     let mut raw = RawFrame::default();
     raw.counts[400..400 + taxels].fill(counts);
@@ -56,7 +56,7 @@ fn bytes(pipeline: &Pipeline, raw: &RawFrame) -> Vec<u8> {
     bytes
 }
 
-/// Events without their `frame`s, one word each.
+/// The events except `frame`s, one word each.
 fn words(events: &[Event]) -> Vec<String> {
     let word = |event: &Event| match event {
         Event::Frame(_) => None,
@@ -73,7 +73,7 @@ fn words(events: &[Event]) -> Vec<String> {
     events.iter().filter_map(word).collect()
 }
 
-/// Pushes one frame a period, from `first` on.
+/// Pushes one frame a period, with numbers from `first` on.
 fn play(pipeline: &mut Pipeline, first: u64, frames: &[RawFrame]) -> Vec<String> {
     let mut events = Vec::new();
     for (number, raw) in (first..).zip(frames) {
@@ -205,7 +205,7 @@ fn a_tare_on_request_zeroes_drift_and_is_refused_or_given_up_under_load() {
     assert_eq!((tared.old.most_counts, tared.new.most_counts), (0.0, 1.0));
     assert_eq!(pipeline.retared(), None, "told once");
 
-    // A press that begins meanwhile is followed, and the offsets stay.
+    // A press that begins during a tare is followed, and the offsets stay.
     assert_eq!(pipeline.retare(), Ok(()));
     let begun = play(&mut pipeline, 10, &[raw(9, 50)]);
     assert_eq!(begun, ["Begin 1"]);
@@ -217,7 +217,7 @@ fn a_tare_on_request_zeroes_drift_and_is_refused_or_given_up_under_load() {
         ["End 1", "Final of 10"]
     );
 
-    // So it is with a touch too small to be a press, and with a loss.
+    // The offsets also stay after a touch too small to be a press, and after a loss.
     assert_eq!(pipeline.retare(), Ok(()));
     let touch = [raw(0, 0), raw(4, 2), raw(0, 0), raw(0, 0), raw(0, 0)];
     assert!(play(&mut pipeline, 14, &touch).is_empty());
@@ -295,7 +295,7 @@ fn how_long_a_live_sensor_may_be_silent_can_be_told() {
             described.stale_after_ms = stale_after_ms;
         });
         pipeline.opened(at(0));
-        // Before the first frame it is 2.5 periods, whatever is told.
+        // Before the first frame, it is 2.5 periods whatever the setting is.
         let first = Duration::from_secs_f64(2.5 / hz);
         assert_eq!(pipeline.deadline(), Some(at(0).mono + first));
         let silent = pipeline.tick(at(60_000));
@@ -374,12 +374,12 @@ fn half_a_period_of_silence_makes_a_jq_frame_whole_at_its_own_time() {
         panic!("{events:?}")
     };
     assert_eq!(status.time, at(0).wall, "the frame's last byte came then");
-    // Live, it would be stale later than that.
+    // With a frame, the sensor becomes stale later.
     pipeline.push(&bytes, at(200));
     assert_eq!(pipeline.deadline(), Some(at(300).mono));
     assert_eq!(words(&pipeline.tick(at(300))), [""; 0]);
     assert_eq!(pipeline.deadline(), Some(at(700).mono));
-    // What is pending after a pause is not waited for again and again.
+    // The pipeline waits only once for the rest of the pending bytes.
     pipeline.push(&bytes[..400], at(350));
     assert_eq!(pipeline.deadline(), Some(at(450).mono));
     assert_eq!(words(&pipeline.tick(at(450))), [""; 0]);
@@ -476,7 +476,7 @@ fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
         pipeline.hrn = Arc::new(Hrn::load(&file.encode_to_vec()).unwrap());
         play(&mut pipeline, 0, &[raw(0, 0); 5]);
         let mut held = RawFrame::default();
-        // Three by three in the middle.
+        // Three by three taxels in the middle.
         for taxel in [348, 376, 404].into_iter().flat_map(|row| row..row + 3) {
             held.counts[taxel] = 50;
         }
@@ -495,7 +495,7 @@ fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
     check(None, wide, 348, 50, &[]);
     for (row, col) in [(0, 9), (27, 9), (9, 0), (9, 27)] {
         check(None, wide, full.place(row, col), 10, &[Note::AtEdge]);
-        // Below the contact threshold.
+        // The count is below the contact threshold.
         check(None, wide, full.place(row, col), 1, &[]);
     }
     for (row, col) in [(0, 5), (9, 5), (5, 0), (5, 11)] {
@@ -505,7 +505,7 @@ fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
     }
     check(None, wide, 348, 255, &[Note::Saturated]);
     check(None, wide, 348, 254, &[]);
-    // 9 x 50 x 0.04 N.
+    // The force is 9 x 50 x 0.04 N.
     check(None, [0.0, 17.9], 348, 50, &[Note::OutsideTraining]);
     check(None, [18.1, 100.0], 348, 50, &[Note::OutsideTraining]);
     check(None, wide, 348, 1, &[Note::OutsideTraining]);
@@ -549,7 +549,7 @@ fn the_end_of_the_input_makes_a_jq_frame_whole() {
     assert_eq!(frames(&pipeline.push(&bytes, at(0))), 0);
     assert_eq!(frames(&pipeline.lost("end of file".to_owned(), at(10))), 1);
     pipeline.opened(at(20));
-    // Half a frame, a loss: what comes then is not its other half.
+    // After half a frame and a loss, the next bytes are not its other half.
     pipeline.push(&bytes[..400], at(30));
     pipeline.lost("end of file".to_owned(), at(40));
     pipeline.opened(at(50));
@@ -562,7 +562,8 @@ fn the_end_of_the_input_makes_a_jq_frame_whole() {
 
 #[test]
 fn a_verdict_became_possible_with_the_last_byte_it_rests_on() {
-    // The last frame of the press is the ninth. A header ends it, a pause does, its last byte does.
+    // The ninth frame ends the press. It is whole with the next header, after a pause, or with its
+    // own last byte.
     for (preset, every_ms, came) in [
         (Preset::Jq, 90, 9 * 90),
         (Preset::Jq, 200, 8 * 200),
@@ -584,8 +585,8 @@ fn a_verdict_became_possible_with_the_last_byte_it_rests_on() {
     }
 }
 
-/// The built-in model, but its logits are NaN where a taxel bears more than 1,000 N: they are
-/// multiplied with the root of what is left to that, over itself.
+/// The built-in model, changed so that its logits are NaN if a taxel bears more than 1,000 N. They
+/// are multiplied by x / x, where x is the square root of 1,000 N minus the largest force.
 fn failing_model() -> Hrn {
     let mut file = pb::ModelProto::decode(BUILT_IN).unwrap();
     let graph = file.graph.as_mut().unwrap();
@@ -650,13 +651,13 @@ fn the_rate_is_measured_over_the_last_frames() {
         rates.push(pipeline.status(at(0)).frame_rate_hz);
     }
     assert_eq!(rates, [None, None, Some(5.0)]);
-    // From one rate to twice that: after 32 frames nothing of the first is left.
+    // The rate doubles. After 32 frames, the first rate has no more effect.
     let bytes = bytes(&pipeline, &raw(0, 0));
     for number in 0..RATE_FRAMES as u64 {
         pipeline.push(&bytes, at(300 + 100 * number));
     }
     assert_eq!(pipeline.status(at(0)).frame_rate_hz, Some(10.0));
-    // A silence that was stale is not in the rate of what comes after it.
+    // A stale silence does not count in the rate after it.
     pipeline.tick(at(8000));
     for (moment, rate) in [(8000, None), (8200, Some(5.0))] {
         pipeline.push(&bytes, at(moment));

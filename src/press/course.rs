@@ -6,18 +6,18 @@ use serde::{Deserialize, Serialize};
 
 use super::{Peak, is_greater, packed};
 
-/// So many frames are held. When there are more, every second one is dropped, and from then on every
-/// second, fourth, ... frame is held.
+/// The largest number of frames that are held. When there are more, every second one is dropped,
+/// and from then on only every second, fourth, ... frame is held.
 const MOST_HELD: usize = 512;
 
 /// The frames in contact so far.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct Course {
-    /// Frame 0, `stride`, 2 `stride`, ... of those in contact.
+    /// Frames 0, `stride`, 2 `stride`, ... of the frames in contact.
     #[serde(with = "packed")]
     held: Vec<Peak>,
     stride: u64,
-    /// The last one in contact.
+    /// The last frame in contact.
     #[serde(with = "packed")]
     newest: Vec<Peak>,
     count: u64,
@@ -43,8 +43,8 @@ impl Course {
         self.count += 1;
     }
 
-    /// The frames up to `until`, by their times, and the place of the best one among them. `peak` is the
-    /// best of all.
+    /// The frames up to `until`, by their times, and the place of the best frame among them. `peak`
+    /// is the best frame of the whole press.
     pub(super) fn until<'a>(&'a self, until: Duration, peak: &'a Peak) -> (Vec<&'a Peak>, usize) {
         let all = self.held.iter().chain(&self.newest).chain([peak]);
         let mut frames: Vec<&Peak> = all.filter(|f| f.moment.stamp.mono <= until).collect();
@@ -138,7 +138,7 @@ mod tests {
         let mut course = Course::default();
         (0..700).for_each(|number| course.push(frame(number, 3)));
         let text = serde_json::to_string(&course).unwrap();
-        // 4 times as long without packing.
+        // Without packing, the text is 4 times as long.
         assert!(text.len() < 200 * 352, "{}", text.len());
         assert_eq!(serde_json::from_str::<Course>(&text).unwrap(), course);
     }

@@ -1,11 +1,11 @@
-//! Frames of a press in a recording: most taxels of them bear nothing.
+//! The form of a press's frames in a recording. It is packed, because most taxels of them are 0.
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use super::{Marks, Moment, Peak};
 use crate::frame::{Frame, sparse};
 
-/// A [`Peak`] as it is written.
+/// The form of a [`Peak`] in a recording.
 #[derive(Serialize, Deserialize)]
 struct Packed {
     moment: Moment,

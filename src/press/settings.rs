@@ -1,4 +1,4 @@
-//! The settings that say what a press is.
+//! The thresholds that begin and end a press.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,21 +9,21 @@ use crate::wording::as_written;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// A taxel is in contact at or above this.
+    /// A taxel is in contact at or above this force.
     pub contact_threshold_n: f32,
     /// A press begins with the first frame of at least this contact area.
     pub begin_area_taxels: u32,
     /// Frames below this contact area release the press.
     pub end_area_taxels: u32,
-    /// How many of them in a row release it.
+    /// The number of such frames in a row that releases it.
     pub end_frames: u32,
     /// A press with fewer frames in contact gets no verdict.
     pub min_frames: u64,
-    /// A press that is held for this long is over.
+    /// A press that is held for this long ends.
     pub max_seconds: f64,
     /// How long the contact must have settled for an early verdict.
     pub early_settle_s: f64,
-    /// Least total force of an early verdict.
+    /// The least total force for an early verdict.
     pub early_min_force_n: f64,
 }
 
@@ -42,44 +42,44 @@ impl Default for Settings {
     }
 }
 
-/// A value of [`Settings`] that cannot be used.
+/// An unusable value of [`Settings`].
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SettingsError {
-    /// A quantity that must be positive and finite.
+    /// The value is not positive, or too large.
     #[error("{key}: found {found:?}, expected a number above 0 and at most {max}")]
     NotPositive {
         /// The key of the value.
         key: &'static str,
-        /// The value that was given.
+        /// The configured value.
         found: f64,
-        /// Largest allowed.
+        /// The largest allowed value.
         max: f64,
     },
-    /// A quantity that must be finite and not negative.
+    /// The value is negative or too large.
     #[error("{key}: found {found:?}, expected 0 or more and at most {max}")]
     Negative {
         /// The key of the value.
         key: &'static str,
-        /// The value that was given.
+        /// The configured value.
         found: f64,
-        /// Largest allowed.
+        /// The largest allowed value.
         max: f64,
     },
-    /// A count outside its range.
+    /// The count is out of its range.
     #[error("{key}: found {found}, expected {least} to {most}")]
     Count {
         /// The key of the value.
         key: &'static str,
-        /// The value that was given.
+        /// The configured value.
         found: u64,
-        /// Smallest allowed.
+        /// The smallest allowed value.
         least: u64,
-        /// Largest allowed.
+        /// The largest allowed value.
         most: u64,
     },
 }
 
-/// Longest duration and largest force that settings may name.
+/// The longest duration and the largest force that settings may have.
 const LARGEST: f64 = 1e6;
 
 impl Settings {
@@ -87,8 +87,8 @@ impl Settings {
     ///
     /// # Errors
     ///
-    /// If a force or duration is not finite or out of range, an area is 0 or above 784, the end
-    /// area is above the begin area, or a count of frames is 0.
+    /// Returns an error if a force or duration is not finite or out of range, an area is 0 or above
+    /// 784, the end area is above the begin area, or a count of frames is 0.
     pub fn check(&self) -> Result<(), SettingsError> {
         for (key, found) in [
             ("contact_threshold_n", as_written(self.contact_threshold_n)),

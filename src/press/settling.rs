@@ -1,4 +1,4 @@
-//! Whether a contact has settled, so that an early verdict may come.
+//! The check whether a contact has settled, so that an early verdict may come.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::Settings;
 
-/// The latest frames that are all near the largest area and force so far.
+/// The latest frames whose area and force are all near the largest ones so far.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct Settling {
     near: VecDeque<Load>,
@@ -24,14 +24,15 @@ pub(super) struct Load {
 }
 
 impl Settling {
-    /// Whether frames can have come to this.
+    /// Whether frames can have made this state.
     pub(super) fn is_possible(&self) -> bool {
         let is_less = |load: &Load| load.contact_area_taxels <= self.most_area;
         self.near.iter().all(is_less)
     }
 
-    /// Adds a frame. True if area and force have stayed near their largest so far, over at least
-    /// `early_settle_s` and [`SETTLED_FRAMES`] frames, and the force is enough for a verdict.
+    /// Adds a frame. Returns true if area and force have stayed near their largest values so far,
+    /// over at least `early_settle_s` and [`SETTLED_FRAMES`] frames, and the force is enough for a
+    /// verdict.
     pub(super) fn push(&mut self, load: Load, settings: &Settings) -> bool {
         self.most_area = self.most_area.max(load.contact_area_taxels);
         self.most_force_n = self.most_force_n.max(load.force_n);
@@ -42,7 +43,7 @@ impl Settling {
             area_gap <= (SETTLED_SHARE * f64::from(most_area)).max(1.0)
                 && most_force_n - load.force_n <= SETTLED_SHARE * most_force_n
         };
-        // The largest values only grow: a frame once too far below them stays so.
+        // The largest values only grow, so a frame that is too far below them stays too far.
         if let Some(last_far) = self.near.iter().rposition(|load| !is_near(load)) {
             self.near.drain(..=last_far);
         }
@@ -59,5 +60,5 @@ impl Settling {
 
 /// An early verdict needs this many settled frames.
 const SETTLED_FRAMES: usize = 3;
-/// A settled frame's area and force are this close to their largest so far.
+/// The share by which a settled frame's area and force may be below the largest ones so far.
 const SETTLED_SHARE: f64 = 0.05;

@@ -18,7 +18,8 @@ fn moment(frame: u64, rate_hz: u64) -> Moment {
     }
 }
 
-/// One letter a change with its frame: b begin, s settled, e end, t timeout, x aborted.
+/// Tracks `loads` and writes each change as a letter with its frame: b begin, s settled, e end, t
+/// timeout, x aborted.
 fn track(settings: &Settings, loads: &[(usize, f32)], rate_hz: u64) -> String {
     let mut tracker = PressTracker::new(settings.clone());
     let mut text = Vec::new();
@@ -109,7 +110,7 @@ fn ties_of_area_go_to_force_then_to_the_earlier_frame() {
 fn equal_counts_are_a_tie_however_their_newtons_are_rounded() {
     let mut tracker = PressTracker::new(Settings::default());
     let mut changes = Vec::new();
-    // In f32 the second is greater by 7e-9 N.
+    // In f32, the second force is greater by 7e-9 N.
     let counts = [[2_u8, 5, 6], [3, 4, 6], [0; 3], [0; 3]];
     for (number, counts) in (0..).zip(counts) {
         let mut frame = Frame::default();
@@ -180,7 +181,7 @@ fn frames_below_the_end_area_release_though_something_is_touched() {
         (5, 2.),
     ];
     assert_eq!(track(&settings, &loads, 5), "b1@1 e@4:last2 n2 peak1 b2@6");
-    // So it is after a timeout.
+    // The same holds after a timeout.
     let settings = Settings {
         max_seconds: 0.2,
         ..settings
@@ -215,11 +216,11 @@ fn a_contact_settles_within_a_taxel_or_5_percent_of_its_largest_area_and_force()
         (&[(5, 8.), (3, 8.), (3, 8.)], false),
         (&[(100, 8.), (100, 7.625), (100, 7.625)], true),
         (&[(100, 8.), (100, 7.5), (100, 7.5)], false),
-        // One far frame among them is enough.
+        // One far frame among them prevents settling.
         (&[(100, 8.), (94, 8.), (100, 8.)], false),
-        // So are several, once a greater one comes.
+        // Several far frames do too, once a greater force comes.
         (&[(5, 0.5), (5, 0.5), (5, 0.5), (5, 8.)], false),
-        // The least force, and a little less.
+        // The force is the least for a verdict, and a little less.
         (&[(4, 1.), (4, 1.), (4, 1.)], true),
         (&[(4, 0.9375), (4, 0.9375), (4, 0.9375)], false),
     ] {
@@ -229,15 +230,15 @@ fn a_contact_settles_within_a_taxel_or_5_percent_of_its_largest_area_and_force()
 
 #[test]
 fn settled_contact_is_reported_once_and_never_while_the_load_rises() {
-    // At 5 frames/s three frames within 5 % span 0.4 s.
+    // At 5 frames/s, three frames within 5 % span 0.4 s.
     check(
         &[(5, 2.), (9, 6.), (12, 10.), (12, 9.9), (12, 9.8), (12, 9.8)],
         "b1@0 s@4:2",
     );
-    // 6 % a frame: every new frame leaves the one two before it behind.
+    // At 6 % a frame, every new frame makes the frame two before it too far away.
     let rising: Vec<(usize, f32)> = (0..20).map(|i| (30, 4.0 * 1.06_f32.powi(i))).collect();
     check(&rising, "b1@0");
-    // Too light.
+    // The force is too small for an early verdict.
     check(&[(5, 0.9); 5], "b1@0");
 }
 

@@ -1,11 +1,11 @@
-//! Which frames of a long press a model of its course gets.
+//! The choice of a long press's frames for a model of its course.
 
-/// Places of at most `most` of a press's `frames`: evenly from the first to the last, the best
-/// among them. Where no more are there, all.
+/// The places of at most `most` of a press's `frames`: evenly from the first to the last, with the
+/// best among them. If there are no more than `most` frames, all places.
 ///
 /// # Panics
 ///
-/// If `best` is no place, or `most` is under 3.
+/// Panics if `best` is not below `frames`, or `most` is under 3.
 pub fn thinned(frames: usize, best: usize, most: usize) -> Vec<usize> {
     assert!(best < frames && most >= 3, "{best} of {frames}, {most}");
     if frames <= most {

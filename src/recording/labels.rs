@@ -1,49 +1,49 @@
-//! Labels: what a recording says was pressed, in its user's words.
+//! Labels: notes on what was pressed in a recording.
 
 use std::collections::BTreeMap;
 
 use crate::wording;
 
-/// What was pressed and whatever else its user wrote down, by key.
+/// Notes of the user by key, for example on the pressed object.
 pub type Labels = BTreeMap<String, String>;
 
-/// Why a label cannot be written down.
+/// The reason why a label is refused.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum LabelError {
-    /// It has no key.
+    /// The label has no key.
     #[error("found no key, expected KEY=VALUE")]
     NoKey,
-    /// Its key or its value is not what its reader would see.
+    /// The key or the value has hidden characters, so a reader would see something else.
     #[error("found {0:?}, expected text without control or bidirectional characters")]
     Hidden(String),
-    /// More than anyone writes down.
+    /// The label is too long.
     #[error("found {found} characters, expected at most {MOST_CHARS}")]
     Long {
-        /// Characters of its key and its value.
+        /// The number of characters of the key and the value.
         found: usize,
     },
-    /// A number is expected under this key.
+    /// The value under this key must be a number.
     #[error("{key}: found {found:?}, expected {expected}")]
     Number {
         /// The key.
         key: &'static str,
-        /// The value that was given.
+        /// The value of the label.
         found: String,
-        /// What `hrn-train collect` reads there.
+        /// The kind of number that `hrn-train collect` reads.
         expected: &'static str,
     },
 }
 
-/// A label is a note, not a document.
+/// The longest label: a label is a note, not a document.
 const MOST_CHARS: usize = 1000;
 
-/// Checks a label before it is written: what `hrn-train collect` reads under its key, it must be able
-/// to read. Whether a `level` is one of the model's, only the model can say.
+/// Checks a label before it is written. `hrn-train collect` must be able to read the value under
+/// its key. Only the model can say whether a `level` is one of its levels.
 ///
 /// # Errors
 ///
-/// [`LabelError`], if the key is empty, a character is hidden, the label is too long, or the value
-/// of `object` or `shore` is no such number.
+/// Returns a [`LabelError`] if the key is empty, a character is hidden, the label is too long, or
+/// the value of `object` or `shore` is not the right kind of number.
 ///
 /// # Example
 ///

@@ -1,4 +1,4 @@
-//! The messages of a recording that say what happened to a sensor. Its events are ROS 2 messages.
+//! The messages of a recording that hold a sensor's entries. Its events are ROS 2 messages.
 
 use byteorder::LittleEndian;
 use serde::de::DeserializeOwned;
@@ -10,11 +10,13 @@ use crate::frame::Stamp;
 use crate::motion::Point;
 use crate::ros::{self, Blob, Header, Topic};
 
-/// The channels of a sensor, in the order of their numbers. It never changes: `recover` numbers the
-/// channels of a damaged file by it. Later channels have numbers of their own ([`LATER`]).
+/// The channels of a sensor, in the order of their numbers. The order never changes, because
+/// `recover` numbers the channels of a damaged file by it. Later channels have numbers of their own
+/// ([`LATER`]).
 pub(super) const TOPICS: [Topic; 5] = [INPUT, ros::FRAME, ros::HARDNESS, ros::PRESS, ros::STATUS];
 
-/// The channels that came later, each with the number of the first sensor's. It never changes either.
+/// The later channels, each with the number of the first sensor's channel. These never change
+/// either.
 pub(super) const LATER: [(Topic, u16); 3] = [
     (MOTION, 50_000),
     (ros::CONTACT, 55_000),
@@ -27,14 +29,14 @@ pub(super) const INPUT: Topic = Topic {
     definition: include_str!("../../clients/ros2/tactile_interfaces/msg/Input.msg"),
 };
 
-/// Where the robot said its arm was.
+/// The positions of the arm, from the robot.
 pub(super) const MOTION: Topic = Topic {
     name: "motion",
     schema: "tactile_interfaces/msg/Motion",
     definition: include_str!("../../clients/ros2/tactile_interfaces/msg/Motion.msg"),
 };
 
-/// The topic on which an entry is written.
+/// The topic for an entry.
 pub(super) fn topic_of(entry: &Entry) -> Topic {
     match entry {
         Entry::Input(Input::Motion(_)) => MOTION,
@@ -75,7 +77,7 @@ fn json(value: &impl Serialize) -> Vec<u8> {
     serde_json::to_vec(value).expect("plain structs of numbers and strings always serialise")
 }
 
-/// What happened to `sensor` at `at`.
+/// The message of an entry of `sensor` at `at`.
 pub(super) fn encode_entry(sensor: &str, at: Stamp, entry: &Entry) -> Vec<u8> {
     let header = Header::new(at.wall, sensor);
     let mono_ns = u64::try_from(at.mono.as_nanos()).unwrap_or(u64::MAX);
@@ -123,7 +125,7 @@ fn stamp(header: &Header, mono_ns: u64) -> Result<Stamp, Error> {
     })
 }
 
-/// Reads the sensor, the moment and where the arm was from a message on [`MOTION`].
+/// Reads the sensor, the moment and the positions of the arm from a message on [`MOTION`].
 pub(super) fn decode_motion(bytes: &[u8]) -> Result<(String, Stamp, Entry), Error> {
     let message: MotionMessage = from_cdr(bytes)?;
     let at = stamp(&message.header, message.mono_ns)?;
@@ -138,7 +140,7 @@ pub(super) fn decode_motion(bytes: &[u8]) -> Result<(String, Stamp, Entry), Erro
     Ok((message.header.frame_id, at, Entry::Input(motion)))
 }
 
-/// Reads the sensor, the moment and what happened from a message.
+/// Reads the sensor, the moment and the entry from a message on [`INPUT`].
 pub(super) fn decode_entry(bytes: &[u8]) -> Result<(String, Stamp, Entry), Error> {
     let message: InputMessage = from_cdr(bytes)?;
     let at = stamp(&message.header, message.mono_ns)?;
@@ -170,7 +172,7 @@ pub(super) fn decode_entry(bytes: &[u8]) -> Result<(String, Stamp, Entry), Error
     Ok((message.header.frame_id, at, entry))
 }
 
-/// The sensor of any message that this program writes.
+/// The sensor's name in any message that this program writes.
 pub(super) fn sensor_of(bytes: &[u8]) -> Option<String> {
     from_cdr::<Header>(bytes).ok().map(|header| header.frame_id)
 }

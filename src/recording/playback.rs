@@ -1,4 +1,4 @@
-//! Turns the entries of a recording into events again.
+//! Turns the entries of a recording back into events.
 
 use std::sync::Arc;
 
@@ -9,7 +9,7 @@ use crate::pipeline::{Clock, FixedError, Pipeline, Unjudged};
 use crate::sensor::SensorError;
 use crate::verdict::Hrn;
 
-/// The pipelines of a recording's sensors. They get what the recorded ones got.
+/// The pipelines of a recording's sensors. They get the same inputs as the recorded ones.
 #[derive(Debug)]
 pub struct Playback {
     hrn: Arc<Hrn>,
@@ -21,11 +21,11 @@ struct Player {
     pipeline: Pipeline,
     last: Stamp,
     labels: Labels,
-    /// Model that judged when it was recorded.
+    /// The SHA-256 of the model during recording.
     model: String,
 }
 
-/// An entry that cannot be played.
+/// The error of an entry that cannot be played.
 #[derive(Debug, thiserror::Error)]
 #[error("sensor {sensor:?}: {problem}")]
 pub struct PlaybackError {
@@ -33,22 +33,22 @@ pub struct PlaybackError {
     problem: PlaybackProblem,
 }
 
-/// Why an entry cannot be played.
+/// The reason why an entry cannot be played.
 #[derive(Debug, thiserror::Error)]
 pub enum PlaybackProblem {
-    /// It describes a sensor that cannot be.
+    /// The description of the sensor is not valid.
     #[error(transparent)]
     Sensor(#[from] SensorError),
-    /// What its pipeline is said to have seen.
+    /// No pipeline can have this state.
     #[error("memory: found what no pipeline can have come to, expected the memory of one")]
     Memory,
-    /// It describes another sensor under the same name.
+    /// The entry describes another sensor under the same name.
     #[error(transparent)]
     Fixed(#[from] FixedError),
 }
 
 impl Playback {
-    /// Plays no sensor yet; `hrn` judges.
+    /// A playback without any sensor yet. The model is `hrn`.
     pub fn new(hrn: Arc<Hrn>) -> Self {
         Self {
             hrn,
@@ -56,12 +56,12 @@ impl Playback {
         }
     }
 
-    /// The events of one entry. An entry before its sensor's first state cannot be played and gives
-    /// none. `mono_ns` is null, because the moment belongs to another boot.
+    /// The events of one entry. An entry before its sensor's first state cannot be played and has
+    /// no events. `mono_ns` is null, because the moment belongs to another boot.
     ///
     /// # Errors
     ///
-    /// If the recording describes a sensor or a state that cannot be.
+    /// Returns an error if the sensor's description or state is not valid.
     pub fn feed(&mut self, found: Found) -> Result<Vec<Event>, PlaybackError> {
         let Found { sensor, at, entry } = found;
         let played = self.play(&sensor, at, entry);
@@ -83,7 +83,7 @@ impl Playback {
                 if !state.memory.is_possible() {
                     return Err(PlaybackProblem::Memory);
                 }
-                // If nothing is missing, the pipeline is in this state already.
+                // If no entry is missing, the pipeline already has this state.
                 let described = state.sensor.check()?;
                 let mut pipeline = Pipeline::new(described, self.hrn.clone(), Clock::Arrival);
                 pipeline.recall(state.memory);
@@ -114,7 +114,7 @@ impl Playback {
         Ok(events)
     }
 
-    /// The recording has ended: the last events of every sensor.
+    /// The last events of every sensor, at the end of the recording.
     pub fn end(&mut self) -> Vec<Event> {
         let players = self.players.iter_mut();
         let mut events: Vec<Event> = players
@@ -124,7 +124,7 @@ impl Playback {
         events
     }
 
-    /// Gives the verdicts that did not come, each once.
+    /// Takes out the missing verdicts. Each is returned once.
     pub fn unjudged(&mut self) -> Vec<Unjudged> {
         let players = self.players.iter_mut();
         players
@@ -132,18 +132,18 @@ impl Playback {
             .collect()
     }
 
-    /// How many sensors have been met so far.
+    /// The number of sensors so far.
     pub fn sensors(&self) -> usize {
         self.players.len()
     }
 
-    /// The labels of the recording, as far as it has been played.
+    /// The labels of the recording, from the part played so far.
     pub fn labels(&self) -> Labels {
         let players = self.players.first();
         players.map_or_else(Labels::new, |player| player.labels.clone())
     }
 
-    /// The SHA-256 of a model that judged then, if it is not the one that judges now.
+    /// The SHA-256 of a model during recording, if it differs from the current model.
     pub fn other_model(&self) -> Option<&str> {
         let models = self.players.iter().map(|player| player.model.as_str());
         models.into_iter().find(|model| *model != self.hrn.sha256())

@@ -1,4 +1,4 @@
-//! Bytes of an MCAP file back into entries.
+//! Reads the bytes of an MCAP file back as entries.
 
 use std::collections::BTreeMap;
 use std::io::{ErrorKind, Read};
@@ -11,30 +11,32 @@ use super::message::{self, INPUT, MOTION};
 use super::{Entry, Error};
 use crate::frame::Stamp;
 
-/// What happened to a sensor, and when.
+/// An entry of a sensor, and its moment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Found {
     /// The sensor's name.
     pub sensor: String,
-    /// The moment it happened.
+    /// The moment of the entry.
     pub at: Stamp,
-    /// What happened.
+    /// The entry.
     pub entry: Entry,
 }
 
-/// Longest record that is read, and longest chunk once it is unpacked. A chunk of ours ends with the
-/// first message after 1 MiB, and a message, of which a state is the longest, has less than 6 MiB: a
-/// state in the middle of a long press that loads every taxel.
+/// The longest record that is read, and the longest chunk once it is unpacked. A chunk of ours ends
+/// with the first message after 1 MiB. The longest message is a state in the middle of a long press
+/// that loads every taxel. It has less than 6 MiB.
 pub(super) const LONGEST_RECORD_BYTES: usize = 8 << 20;
 
-/// Reads a message.
+/// A function that reads a message.
 type Decode = fn(&[u8]) -> Result<(String, Stamp, Entry), Error>;
 
-/// Reads a recording from its beginning: what happened, in order. It ends after the first error.
+/// Reads a recording from its beginning. It yields the entries in order, and ends after the first
+/// error.
 ///
 /// # Example
 ///
-/// [`Writer`](super::Writer) has an example with a recording. This is none:
+/// [`Writer`](super::Writer) has an example with a recording. This example reads bytes that are not
+/// a recording:
 ///
 /// ```
 /// use hardnessd::recording::Reader;
@@ -47,16 +49,17 @@ type Decode = fn(&[u8]) -> Result<(String, Stamp, Entry), Error>;
 pub struct Reader<R> {
     source: R,
     linear: LinearReader,
-    /// Those of messages that are read, by their numbers.
+    /// The decoders of the messages that are read, by schema number. `channels` has them by channel
+    /// number.
     schemas: BTreeMap<u16, Decode>,
     channels: BTreeMap<u16, Decode>,
     bytes: u64,
-    /// No more entries: the summary, an error or the end was reached.
+    /// Whether the summary, an error or the end was reached.
     done: bool,
 }
 
 impl<R: Read> Reader<R> {
-    /// Reads from `source`.
+    /// A reader of `source`.
     pub fn new(source: R) -> Self {
         let options = LinearReaderOptions::default()
             .with_prevalidate_chunk_crcs(true)
@@ -86,7 +89,7 @@ impl<R: Read> Reader<R> {
                     };
                     self.bytes += read as u64;
                     if read == 0 && self.bytes < MAGIC.len() as u64 {
-                        // Nothing of it could be saved.
+                        // Such a short file holds nothing that could be saved.
                         return Err(Error::Foreign {
                             found: format!("{} bytes", self.bytes),
                             expected: "a recording",
@@ -96,7 +99,7 @@ impl<R: Read> Reader<R> {
                     continue;
                 }
                 LinearReadEvent::Record { opcode, .. } if opcode == op::DATA_END => {
-                    // What follows repeats what was read.
+                    // The summary only repeats what was read.
                     return Ok(None);
                 }
                 LinearReadEvent::Record { opcode, data } => mcap::parse_record(opcode, data)?,

@@ -1,9 +1,9 @@
-//! What is whole in a damaged recording, into a new one.
+//! Copies the whole parts of a damaged recording into a new one.
 //!
-//! One scan from front to back that trusts no index: each chunk is taken if its checksum fits. Where
-//! a record does not fill its length, nobody knows where the next begins: it is looked for by what
-//! every compressed chunk has at the same place. Whatever the file is, the scan reads no more than a
-//! few times its length and holds one chunk of bounded size.
+//! One scan goes from front to back and trusts no index. It takes each chunk whose checksum fits.
+//! If a record does not fill its length, the next record's place is unknown. The scan then searches
+//! for the bytes that every compressed chunk has at the same place. Whatever the file holds, the
+//! scan reads no more than a few times its length, and holds one chunk of bounded size.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Read, Seek, SeekFrom, Write};
@@ -17,57 +17,58 @@ use super::message;
 use super::reader::LONGEST_RECORD_BYTES;
 use super::{Entry, Error, writer};
 
-/// What became of a damaged recording.
+/// The result of recovering a damaged recording.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Recovered {
-    /// Messages saved.
+    /// The number of saved messages.
     pub messages: u64,
-    /// Those among them that other programs wrote.
+    /// The number of saved messages that other programs wrote.
     pub messages_foreign: u64,
-    /// Those that are states of a sensor: a recording can be played from the first of them on.
+    /// The number of saved messages that are states of a sensor. A recording can be played from the
+    /// first state on.
     pub states: u64,
-    /// Whole chunks.
+    /// The number of whole chunks.
     pub chunks: u64,
-    /// First and last moment saved, in nanoseconds since 1970.
+    /// The first and the last saved moment, in nanoseconds since 1970.
     pub span_ns: Option<(u64, u64)>,
-    /// Where damaged stretches begin and how long they are, in bytes of the file.
+    /// The beginning and the length of each damaged stretch, in bytes of the file.
     pub lost: Vec<(u64, u64)>,
-    /// Whole chunks' messages of a channel that nothing tells of.
+    /// The number of messages in whole chunks whose channel is unknown.
     pub messages_unknown: u64,
     /// Whether the file had its end.
     pub complete: bool,
 }
 
-/// Which of the two files failed.
+/// The file that could not be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum RecoverError {
-    /// The damaged one.
+    /// The damaged file cannot be read.
     #[error(transparent)]
     Read(io::Error),
-    /// The new one.
+    /// The new file cannot be written.
     #[error(transparent)]
     Write(#[from] Error),
 }
 
-/// Opcode and length.
+/// The bytes of a record's opcode and length.
 const RECORD_HEAD_BYTES: u64 = 9;
-/// Where a chunk says how long it is once it is unpacked, from the record's beginning on: after
-/// opcode, length and two times.
+/// The place in a chunk's record of the chunk's unpacked length: after opcode, length and two
+/// times.
 const UNPACKED_AT: usize = RECORD_HEAD_BYTES as usize + 16;
-/// Where a chunk names its compression: after that length and the checksum.
+/// The place of the name of a chunk's compression: after the unpacked length and the checksum.
 const COMPRESSION_AT: usize = UNPACKED_AT + 12;
-/// The name, with its length.
+/// The name of the compression, with its length.
 const COMPRESSION: [u8; 8] = *b"\x04\0\0\0zstd";
-/// Where the data of a compressed chunk begins: after the name and the data's length.
+/// The place of a compressed chunk's data: after the name and the data's length.
 const DATA_AT: usize = COMPRESSION_AT + COMPRESSION.len() + 8;
-/// Bytes searched at once.
+/// The number of bytes that are searched at once.
 const BLOCK_BYTES: usize = 1 << 20;
 
-/// Copies what is whole in `broken` to `good`, and says what that was.
+/// Copies the whole parts of `broken` to `good`, and returns an account of them.
 ///
 /// # Errors
 ///
-/// If reading or writing fails; damage is none.
+/// Returns an error if reading or writing fails. Damage is not an error.
 pub fn recover<R: Read + Seek, W: Write>(
     broken: R,
     good: W,
@@ -87,16 +88,16 @@ pub fn recover<R: Read + Seek, W: Write>(
 struct Scan<R> {
     file: R,
     length: u64,
-    /// Where it goes on.
+    /// The place where the scan continues.
     place: u64,
     chunks: u64,
     lost: Vec<(u64, u64)>,
     complete: bool,
-    /// Bytes read as records that were none.
+    /// The number of bytes read as records that turned out not to be records.
     wasted: u64,
-    /// What was searched last, and where it begins.
+    /// The block that was searched last, and its place in the file.
     block: (u64, Vec<u8>),
-    /// All bytes read.
+    /// The number of all bytes read.
     #[cfg(test)]
     read: u64,
 }
@@ -107,7 +108,7 @@ impl<R: Read + Seek> Scan<R> {
         Ok(Self {
             file,
             length,
-            // A damaged magic costs nothing.
+            // The magic is skipped unread, so damage to it loses nothing.
             place: MAGIC.len() as u64,
             chunks: 0,
             lost: Vec::new(),
@@ -119,7 +120,7 @@ impl<R: Read + Seek> Scan<R> {
         })
     }
 
-    /// The next records that are whole; `None`: there are no more.
+    /// The next whole records. `None` if there are no more.
     fn next(&mut self) -> io::Result<Option<Vec<Record<'static>>>> {
         while self.place < self.length {
             let place = self.place;
@@ -129,8 +130,9 @@ impl<R: Read + Seek> Scan<R> {
             };
             let body = self.bytes(place + RECORD_HEAD_BYTES, end)?;
             match (opcode, body.len()) {
-                // What follows says nothing new. Their lengths are fixed: another one is another
-                // record, damaged in its first byte.
+                // The rest of the file only repeats what was read. These records have fixed
+                // lengths. With another length, the record is another one whose first byte is
+                // damaged.
                 (op::DATA_END, 4) | (op::FOOTER, 20) => {
                     self.complete = true;
                     return Ok(None);
@@ -157,7 +159,7 @@ impl<R: Read + Seek> Scan<R> {
         Ok(None)
     }
 
-    /// The record at `place`, if one can stand there: its opcode, and where it ends.
+    /// The opcode and the end of the record at `place`, if there can be a record.
     fn record_at(&mut self, place: u64) -> io::Result<Option<(u8, u64)>> {
         let head = self.bytes(place, place + RECORD_HEAD_BYTES)?;
         let Ok(head) = <[u8; RECORD_HEAD_BYTES as usize]>::try_from(head) else {
@@ -168,19 +170,19 @@ impl<R: Read + Seek> Scan<R> {
         let end = place + RECORD_HEAD_BYTES + length.min(self.length);
         let known = (op::HEADER..=op::DATA_END).contains(&opcode);
         let fits = length <= LONGEST_RECORD_BYTES as u64 && end <= self.length;
-        // Where that much was no record, only chunks are believed.
+        // After that many wasted bytes, only chunks are tried as records.
         let hopeless = opcode != op::CHUNK && self.wasted > self.length;
         Ok((known && fits && !hopeless).then_some((opcode, end)))
     }
 
-    /// Gives up what stands at `place`; where the next chunk is, or the end.
+    /// Gives up the bytes at `place`. Returns the place of the next chunk, or the end of the file.
     fn skip(&mut self, place: u64) -> io::Result<u64> {
         let next = self.next_chunk(place + 1)?.unwrap_or(self.length);
         self.lost.push((place, next - place));
         Ok(next)
     }
 
-    /// Where the next chunk begins, whole or not, from `place` on.
+    /// The place of the next chunk from `place` on, whether the chunk is whole or not.
     fn next_chunk(&mut self, place: u64) -> io::Result<Option<u64>> {
         let mut from = place;
         while from + DATA_AT as u64 <= self.length {
@@ -189,10 +191,10 @@ impl<R: Read + Seek> Scan<R> {
                 .checked_sub(*start)
                 .and_then(|at| block.get(at as usize..));
             let Some(block) = inside.filter(|block| block.len() >= DATA_AT) else {
-                // The next search goes on in the same block.
+                // The next search continues in the same block.
                 self.block = (from, self.bytes(from, from + BLOCK_BYTES as u64)?);
                 if self.block.1.len() < DATA_AT {
-                    // The file has become shorter meanwhile.
+                    // The file has become shorter during the scan.
                     return Ok(None);
                 }
                 continue;
@@ -202,13 +204,13 @@ impl<R: Read + Seek> Scan<R> {
             if let Some((at, _)) = heads.find(|(at, head)| is_chunk_head(head, left - *at as u64)) {
                 return Ok(Some(from + at as u64));
             }
-            // A head may stand across the border.
+            // A chunk's head may lie across the border of two blocks.
             from += (block.len() - DATA_AT + 1) as u64;
         }
         Ok(None)
     }
 
-    /// The bytes from `start` to `end`, fewer where the file ends before.
+    /// The bytes from `start` to `end`, or fewer if the file ends before.
     fn bytes(&mut self, start: u64, end: u64) -> io::Result<Vec<u8>> {
         self.file.seek(SeekFrom::Start(start))?;
         let mut bytes = Vec::new();
@@ -224,8 +226,8 @@ impl<R: Read + Seek> Scan<R> {
     }
 }
 
-/// Whether these [`DATA_AT`] bytes begin a chunk as we write it that ends within `left` bytes. Its
-/// lengths agree with each other, so that nothing of it has to be read.
+/// Whether these [`DATA_AT`] bytes begin a chunk of ours that ends within `left` bytes. The check
+/// compares its lengths with each other, so the rest of the chunk need not be read.
 fn is_chunk_head(head: &[u8], left: u64) -> bool {
     let length = |at: usize| {
         let bytes = head.get(at..at + 8).and_then(|bytes| bytes.try_into().ok());
@@ -238,8 +240,8 @@ fn is_chunk_head(head: &[u8], left: u64) -> bool {
         && length(UNPACKED_AT) <= LONGEST_RECORD_BYTES as u64
 }
 
-/// A record that fills its bytes to the last one: one whose length was damaged does not, and where
-/// it ends nobody knows then.
+/// Parses a record if it fills its bytes to the last one. If it does not, its length is damaged,
+/// and its end is unknown.
 fn exact(opcode: u8, body: &[u8]) -> Option<Record<'_>> {
     let record = mcap::parse_record(opcode, body).ok()?;
     let text = |text: &str| 4 + text.len();
@@ -257,16 +259,16 @@ fn exact(opcode: u8, body: &[u8]) -> Option<Record<'_>> {
         Record::Chunk { header, data } => 36 + text(&header.compression) + data.len(),
         Record::MessageIndex(index) => 6 + 16 * index.records.len(),
         Record::Metadata(metadata) => text(&metadata.name) + map(&metadata.metadata),
-        // It has a checksum.
+        // An attachment has a checksum of its own.
         Record::Attachment { .. } => body.len(),
-        // Messages stand in chunks, the others after the end of the data.
+        // Messages are inside chunks, and the other records come after the end of the data.
         _ => return None,
     };
     (bytes == body.len()).then_some(record)
 }
 
-/// The records of a chunk that are copied, if it is whole. Its checksum is asked before anything in it
-/// is believed, and its unpacked length before it is unpacked.
+/// The records of a chunk that are copied, if the chunk is whole. Its unpacked length is checked
+/// before it is unpacked, and its checksum before any record is used.
 fn records(header: &ChunkHeader, body: &[u8]) -> Option<Vec<Record<'static>>> {
     if header.uncompressed_size > LONGEST_RECORD_BYTES as u64 {
         return None;
@@ -288,7 +290,7 @@ fn records(header: &ChunkHeader, body: &[u8]) -> Option<Vec<Record<'static>>> {
             }
             LinearReadEvent::Record { opcode, data } => {
                 let record = mcap::parse_record(opcode, data).ok()?;
-                // What is not copied takes no memory.
+                // Records that are not copied take no memory.
                 if let Record::Schema { .. } | Record::Channel(_) | Record::Message { .. } = record
                 {
                     records.push(record.into_owned());
@@ -304,7 +306,7 @@ struct Copy<W: Write> {
     out: mcap::Writer<NoSeek<W>>,
     schemas: BTreeMap<u16, (String, String, Vec<u8>)>,
     channels: BTreeMap<u16, Channel>,
-    /// Those that the new file has.
+    /// The channels that the new file already has.
     begun: BTreeSet<u16>,
     done: Recovered,
 }
@@ -357,14 +359,15 @@ impl<W: Write> Copy<W> {
                     let (first, last) = self.done.span_ns.unwrap_or((time, time));
                     self.done.span_ns = Some((first.min(time), last.max(time)));
                 }
-                // Indexes are made anew.
+                // The writer makes new indexes.
                 _ => {}
             }
         }
         Ok(())
     }
 
-    /// Sees to it that the new file has this channel; `false`: nothing tells which it is.
+    /// Adds this channel to the new file if it is missing. Returns `false` if the channel is
+    /// unknown.
     fn begin(&mut self, id: u16, message: &[u8]) -> Result<bool, Error> {
         if self.begun.contains(&id) {
             return Ok(true);
@@ -392,8 +395,8 @@ impl<W: Write> Copy<W> {
         Ok(true)
     }
 
-    /// Tells a channel of ours whose record is lost: its number says which of its sensor's it is,
-    /// and every message names the sensor.
+    /// Restores a channel of ours whose record is lost. Its number tells the topic, and every
+    /// message has the sensor's name.
     fn restore(&mut self, id: u16, message: &[u8]) -> bool {
         let named = |name: &String| {
             let ours = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
@@ -422,13 +425,13 @@ impl<W: Write> Copy<W> {
 }
 
 impl Recovered {
-    /// Whether nothing was missing.
+    /// Whether the file was whole.
     pub fn is_whole(&self) -> bool {
         self.complete && self.lost.is_empty() && self.messages_unknown == 0
     }
 }
 
-/// How many messages a file has, and how many bytes were read to find them.
+/// The number of messages in a file, and the number of bytes read to find them.
 #[cfg(test)]
 pub(super) fn read_of(file: &[u8]) -> (u64, u64) {
     let mut scan = Scan::new(io::Cursor::new(file)).expect("memory can be read");

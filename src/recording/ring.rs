@@ -1,4 +1,4 @@
-//! The last minute of one sensor, so that a fault can be looked at after it happened.
+//! The last minute of one sensor, to look at a fault after it happened.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -6,11 +6,11 @@ use std::time::Duration;
 use super::Entry;
 use crate::frame::Stamp;
 
-/// The time that is kept.
+/// The time for which entries are kept.
 const KEPT: Duration = Duration::from_secs(60);
-/// No more than this is kept, however short the time is: neither a device that floods its line nor a
-/// controller that floods the control socket may fill the memory. The JX255N sends 5 MB a minute at
-/// 100 frames/s.
+/// The most bytes that are kept, even if they cover less time. So neither a device that floods its
+/// line nor a controller that floods the control socket can fill the memory. The JX255N sends 5 MB
+/// a minute at 100 frames/s.
 const KEPT_BYTES: usize = 32 << 20;
 
 /// Entries of one sensor, in stretches that each begin with a state.
@@ -26,8 +26,8 @@ struct Stretch {
 }
 
 impl Ring {
-    /// Adds an entry, and drops the stretches that are older than a minute needs. Nothing is kept
-    /// before the first state.
+    /// Adds an entry, and drops the stretches that a minute does not need. Nothing is kept before
+    /// the first state.
     pub fn push(&mut self, at: Stamp, entry: Entry) {
         if matches!(entry, Entry::State(_)) {
             self.stretches.push_back(Stretch {
@@ -54,7 +54,7 @@ impl Ring {
         })
     }
 
-    /// Everything that is kept: a minute, and up to a stretch more. It begins with a state.
+    /// Everything that is kept: a minute, and up to one more stretch. It begins with a state.
     pub fn all(&self) -> impl Iterator<Item = &(Stamp, Entry)> {
         self.stretches.iter().flat_map(|stretch| &stretch.entries)
     }

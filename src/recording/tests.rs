@@ -39,7 +39,7 @@ fn described() -> Description {
 
 fn at(ms: u64) -> Stamp {
     let mono = Duration::from_millis(1_000_000 + ms) + Duration::from_nanos(7);
-    // The calendar is set back in the middle: nobody's durations may know.
+    // The calendar is set back in the middle, which must not change any duration.
     let step_s = if ms > 8_000 { -3_600 } else { 0 };
     let wall = jiff::Timestamp::new(1_790_000_000 + step_s, 123_456_789).unwrap();
     Stamp {
@@ -48,14 +48,14 @@ fn at(ms: u64) -> Stamp {
     }
 }
 
-/// Two presses of a second and a half, a context, a stutter, a tare, a loss and a return: what
-/// happened, and when.
+/// The inputs of a story and their times: two presses of a second and a half, a context, damage, a
+/// tare, a loss and a return.
 fn story() -> Vec<(Stamp, Input<'static>)> {
     let layout = wire::Layout::new(&wire::Settings::default()).unwrap();
     let mut story = vec![(at(0), Input::Opened)];
     for frame in 0..80_u64 {
         let mut raw = RawFrame::default();
-        // It drifts by a count.
+        // The baseline drifts by a count.
         raw.counts.fill(3 + frame as u16 / 40);
         if [20..28, 50..58].iter().any(|press| press.contains(&frame)) {
             for place in 300..300 + 4 * (frame % 10) as usize {
@@ -78,7 +78,8 @@ fn story() -> Vec<(Stamp, Input<'static>)> {
             }
             _ => {}
         }
-        // Where the arm is, 50 ms before and 50 ms after a frame; once it jumps.
+        // The robot sends the arm's position 50 ms before and 50 ms after a frame. Once the
+        // position jumps.
         let point = |ms: u64, mm| Point {
             at_ns: i64::try_from(at(ms).mono.as_nanos()).unwrap(),
             mm,
@@ -90,7 +91,7 @@ fn story() -> Vec<(Stamp, Input<'static>)> {
         };
         let told = [point(ms.saturating_sub(50), mm), point(ms + 50, mm + 0.05)];
         story.push((at(ms), Input::Motion(told.to_vec().into())));
-        // In three pieces, as a line brings them.
+        // The frame arrives in three pieces, as on a serial line.
         for (piece, bytes) in bytes.chunks(300).enumerate() {
             let came = at(ms + 20 * piece as u64 + 3);
             story.push((came, Input::Bytes(bytes.to_vec().into())));
@@ -101,8 +102,9 @@ fn story() -> Vec<(Stamp, Input<'static>)> {
     story
 }
 
-/// The file, and the events as they were when it was written. A state stands every `states`
-/// inputs, a chunk ends after every `chunk`; between the presses the configuration is read again.
+/// A recording of the story, and its events during recording. It has a state every `states` inputs,
+/// and a chunk ends after every `chunk` inputs. Between the presses, the configuration is read
+/// again.
 fn recorded(states: usize, chunk: usize) -> (Vec<u8>, Vec<Event>) {
     let hrn = hrn();
     let about = About {
@@ -192,7 +194,7 @@ fn a_recording_ends_when_the_last_thing_in_it_happened() {
 
 #[test]
 fn a_pipeline_that_recalls_another_goes_on_as_that_one() {
-    // A state before each input: each time the pipeline is made anew from what was written.
+    // With a state before each input, each input goes to a new pipeline made from the recording.
     let (file, events) = recorded(1, 7);
     assert_eq!(play(&file), events);
 }
@@ -212,7 +214,7 @@ fn a_sensor_that_cannot_be_is_refused_wherever_it_is_described() {
     let [mut bad, mut nameless, mut other] = [(); 3].map(|()| good.clone());
     bad.description.press.early_settle_s = -1.0;
     nameless.description.name = "\u{1b}[2J\n".to_owned();
-    // A dead taxel of the smaller array would be no place of the larger one, nor the other way.
+    // A dead taxel of the smaller array has no place in the larger one, nor the other way round.
     other.description.frame.rows = Some(2);
     other.description.calibration.gains = None;
     let of_name = "name: found \"\\u{1b}[2J\\n\", expected [a-z]";
@@ -245,7 +247,7 @@ fn a_sensor_that_cannot_be_is_refused_wherever_it_is_described() {
 fn a_memory_that_no_pipeline_came_to_is_refused() {
     let hrn = hrn();
     let mut pipeline = Pipeline::new(sensor(), hrn.clone(), Clock::Arrival);
-    // Some are in the first tare, some in a press.
+    // Take one state during the first tare, and one during a press.
     let (mut taring, mut pressed) = (None, None);
     for (moment, input) in story() {
         input.feed(&mut pipeline, moment);
@@ -339,9 +341,9 @@ fn one_flipped_bit_costs_its_chunk_and_no_more() {
     let (file, _) = recorded(10, 7);
     let messages = |file: &[u8]| recover(Cursor::new(file), Vec::new()).unwrap();
     let (whole, _) = messages(&file);
-    // A chunk has seven inputs, what came of them, perhaps a state and other settings.
+    // A chunk has seven inputs, their events, and perhaps a state and changed settings.
     let largest = 7 * 4 + 2;
-    // All of a chunk with what stands around it, and samples of the rest.
+    // Flip every byte of one chunk and around it, and samples of the rest.
     let middle = file.len() / 2..file.len() / 2 + 800;
     for place in (0..file.len()).filter(|p| p % 31 == 0 || middle.contains(p)) {
         let mut file = file.clone();
@@ -353,7 +355,7 @@ fn one_flipped_bit_costs_its_chunk_and_no_more() {
             "{lost} messages lost by byte {place}: {found:?}"
         );
         assert!(found.lost.len() <= 1, "{found:?} by byte {place}");
-        // What is saved can be read and played.
+        // The saved part can be read and played.
         if place % 50 == 0 {
             play(&good);
         }
@@ -398,7 +400,7 @@ fn what_is_no_recording_is_refused_in_words() {
     assert_eq!(nothing.messages, 0);
 }
 
-/// A chunk as we write it, with `unpacked` bytes said of it.
+/// A chunk of ours whose header says `unpacked` bytes.
 fn chunk(unpacked: u64, packed: &[u8]) -> Vec<u8> {
     let mut body = vec![0; 16];
     body.extend(unpacked.to_le_bytes());
@@ -414,7 +416,7 @@ fn chunk(unpacked: u64, packed: &[u8]) -> Vec<u8> {
 
 #[test]
 fn every_chunk_that_a_daemon_writes_is_within_bounds() {
-    // Never flushed: each chunk ends where the writer ends one by itself.
+    // Without a flush, the writer itself ends each chunk.
     let hrn = hrn();
     let about = About {
         robot: "arm-7".to_owned(),
@@ -449,7 +451,7 @@ fn every_chunk_that_a_daemon_writes_is_within_bounds() {
 fn a_chunk_that_would_fill_the_memory_is_lost_and_no_other() {
     let (file, _) = recorded(10, 7);
     let (whole, _) = recover(Cursor::new(&file), Vec::new()).unwrap();
-    // 250 MB of zeros in some kilobytes.
+    // 250 MB of zeros pack into some kilobytes.
     let zeros = mcap_zeros(250 << 20);
     assert!(zeros.len() < 32 << 10, "{}", zeros.len());
     let middle = chunk_starts(&file)[3];
@@ -460,10 +462,10 @@ fn a_chunk_that_would_fill_the_memory_is_lost_and_no_other() {
     assert_eq!(found.messages, whole.messages);
     assert_eq!(found.lost.len(), 1, "{found:?}");
     assert_eq!(play(&good), play(&file));
-    // Who plays it is told, and unpacks nothing.
+    // Playing it fails with an error, and unpacks nothing.
     let error = Reader::new(&bomb[..]).find_map(Result::err).unwrap();
     assert!(error.to_string().contains("hardnessd recover"), "{error}");
-    // One that says less than it holds is not believed either.
+    // A chunk whose header says too few bytes is refused too.
     let mut lie = file[..middle].to_vec();
     lie.extend(chunk(1 << 20, &zeros));
     lie.extend(&file[middle..]);
@@ -471,10 +473,10 @@ fn a_chunk_that_would_fill_the_memory_is_lost_and_no_other() {
     assert_eq!(found.messages, whole.messages);
 }
 
-/// So many zeros as zstd packs them: frames of a raw header and blocks of one repeated byte.
+/// `length` zeros, packed as zstd does: frames of a raw header and blocks of one repeated byte.
 fn mcap_zeros(length: usize) -> Vec<u8> {
     const BLOCK: usize = 128 << 10;
-    // Magic; a window of 128 KiB, no checksum, no length.
+    // The header: magic, a window of 128 KiB, no checksum, no length.
     let mut packed = vec![0x28, 0xb5, 0x2f, 0xfd, 0x00, 0x38];
     let blocks = length / BLOCK;
     for block in 0..blocks {
@@ -486,7 +488,7 @@ fn mcap_zeros(length: usize) -> Vec<u8> {
     packed
 }
 
-/// Where the chunks of a whole file begin.
+/// The places where the chunks of a whole file begin.
 fn chunk_starts(file: &[u8]) -> Vec<usize> {
     let mut place = MAGIC.len();
     let mut starts = Vec::new();
@@ -509,8 +511,8 @@ fn the_worst_file_is_read_a_few_times_and_no_more() {
         head.extend(length.to_le_bytes());
         head
     };
-    // The beginnings of chunks, whose lengths do not agree; records that claim all that is left of
-    // the file; and both in turn, so that each search ends soon.
+    // These patterns are: heads of chunks whose lengths do not agree; records that claim the rest
+    // of the file; and both in turn, so that each search ends soon.
     let mut heads = chunk(1 << 10, b"");
     heads[1] = 200;
     let claim = head(mcap::records::op::METADATA, 1 << 20);

@@ -13,18 +13,18 @@ use crate::event::Event;
 use crate::frame::Stamp;
 use crate::ros::{self, Topic};
 
-/// What a recording says of itself to people. A replay reads only the [`super::State`]s.
+/// The description of a recording, for people. A replay reads only the [`super::State`]s.
 #[derive(Debug, Clone, PartialEq)]
 pub struct About {
-    /// Name of the robot.
+    /// The name of the robot.
     pub robot: String,
     /// The token of this start of the daemon, as in `hello`.
     pub run: String,
-    /// The kernel's boot id. Moments of CLOCK_MONOTONIC can be compared within one boot.
+    /// The kernel's boot id. Moments of CLOCK_MONOTONIC can only be compared within one boot.
     pub boot_id: String,
-    /// The fault or request for which a black box was written; none in an ordinary recording.
+    /// The fault or request for which a black box was written. `None` for an ordinary recording.
     pub reason: Option<String>,
-    /// What was pressed, and the like.
+    /// The notes of the user, for example on the pressed object.
     pub labels: Labels,
     /// The sensors, in the order of their channels.
     pub sensors: Vec<RecordedSensor>,
@@ -70,8 +70,8 @@ pub struct Writer<W: Write> {
     sequence: u32,
 }
 
-/// How every recording is written: in whole chunks, so that a file that was cut off ends with a
-/// whole one.
+/// The options of every recording. It is written in whole chunks, so a file that is cut off has
+/// whole chunks up to the cut.
 pub(super) fn options() -> WriteOptions {
     WriteOptions::new()
         .profile("ros2")
@@ -81,12 +81,12 @@ pub(super) fn options() -> WriteOptions {
         .disable_seeking(true)
 }
 
-/// Every topic of a sensor.
+/// The topics of a sensor.
 fn topics() -> impl Iterator<Item = Topic> + Clone {
     TOPICS.into_iter().chain(LATER.map(|(topic, _)| topic))
 }
 
-/// The number of a channel. It follows from the sensor's place and the topic, so `recover` knows it
+/// The number of a channel. It follows from the sensor's index and the topic, so `recover` knows it
 /// even if the record of the channel is lost.
 pub(super) fn channel_id(sensor: usize, topic: Topic) -> u16 {
     let id = match LATER.iter().find(|(later, _)| *later == topic) {
@@ -99,7 +99,7 @@ pub(super) fn channel_id(sensor: usize, topic: Topic) -> u16 {
     u16::try_from(id).expect("a daemon has few sensors")
 }
 
-/// The topic of a channel with this number.
+/// The topic of the channel with this number.
 pub(super) fn topic_of(channel_id: u16) -> Topic {
     let later = LATER.iter().rfind(|(_, first)| channel_id >= *first);
     later.map_or_else(
@@ -114,12 +114,12 @@ pub(super) fn schema_id(topic: Topic) -> u16 {
     place.expect("every topic stands in one of the lists") as u16 + 1
 }
 
-/// A channel's name.
+/// The name of a channel.
 pub(super) fn topic_name(sensor: &str, topic: Topic) -> String {
     format!("/tactile/{sensor}/{}", topic.name)
 }
 
-/// Whether this program may have named a channel so.
+/// Whether this program may have written a channel of this name.
 pub(super) fn is_topic_of_ours(name: &str) -> bool {
     let parts = name
         .strip_prefix("/tactile/")
@@ -127,7 +127,7 @@ pub(super) fn is_topic_of_ours(name: &str) -> bool {
     parts.is_some_and(|(_, name)| topics().any(|topic| topic.name == name))
 }
 
-/// Whether a channel of this name holds what happened to a sensor.
+/// Whether a channel of this name holds a sensor's entries.
 pub(super) fn is_input(name: &str) -> bool {
     is_topic_of_ours(name) && name.rsplit('/').next() == Some(INPUT.name)
 }
@@ -137,7 +137,7 @@ impl<W: Write> Writer<W> {
     ///
     /// # Errors
     ///
-    /// If `out` cannot be written.
+    /// Returns an error if `out` cannot be written.
     pub fn new(out: W, about: &About) -> Result<Self, Error> {
         let mut out = options().create(NoSeek::new(out))?;
         let text = |key: &str, value: &str| (key.to_owned(), value.to_owned());
@@ -185,22 +185,22 @@ impl<W: Write> Writer<W> {
         })
     }
 
-    /// Adds what happened to the `sensor`-th sensor.
+    /// Adds an entry of the `sensor`-th sensor.
     ///
     /// # Errors
     ///
-    /// If it cannot be written. The writer must not be used after that.
+    /// Returns an error if the entry cannot be written. The writer must not be used after that.
     pub fn entry(&mut self, sensor: usize, at: Stamp, entry: &Entry) -> Result<(), Error> {
         let bytes = message::encode_entry(self.sensors[sensor].name(), at, entry);
         let topic = message::topic_of(entry);
         self.write(channel_id(sensor, topic), at.wall, &bytes)
     }
 
-    /// Adds an event. An event of a sensor that the recording does not have is left out.
+    /// Adds an event. An event of a sensor that is not in the recording is left out.
     ///
     /// # Errors
     ///
-    /// If it cannot be written. The writer must not be used after that.
+    /// Returns an error if the event cannot be written. The writer must not be used after that.
     pub fn event(&mut self, event: &Event) -> Result<(), Error> {
         let mut sensors = self.sensors.iter();
         let Some(sensor) = sensors.position(|sensor| sensor.name() == event.sensor()) else {
@@ -225,20 +225,20 @@ impl<W: Write> Writer<W> {
         Ok(self.out.write_to_known_channel(&header, data)?)
     }
 
-    /// Ends the current chunk and writes it. If the process dies, only what came later is lost.
+    /// Ends the current chunk and writes it. If the process dies, only later entries are lost.
     ///
     /// # Errors
     ///
-    /// If it cannot be written. The writer must not be used after that.
+    /// Returns an error if the chunk cannot be written. The writer must not be used after that.
     pub fn flush(&mut self) -> Result<(), Error> {
         Ok(self.out.flush()?)
     }
 
-    /// Ends the recording and gives back what it was written to.
+    /// Ends the recording and returns the `out` of [`Self::new`].
     ///
     /// # Errors
     ///
-    /// If it cannot be written.
+    /// Returns an error if the end cannot be written.
     pub fn finish(mut self) -> Result<W, Error> {
         self.out.finish()?;
         let mut inner = self.out.into_inner().into_inner();

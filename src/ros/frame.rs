@@ -1,4 +1,4 @@
-//! The messages that are made of one frame.
+//! The messages made from one frame.
 //!
 //! In: a frame event. Out: the frame as an image, as a grid that has a size in space, and as two
 //! numbers for plots.
@@ -149,7 +149,7 @@ pub(super) fn image(frame: &FrameEvent) -> (Topic, Timestamp, Vec<u8>) {
     (FRAME, frame.time, to_cdr(&message))
 }
 
-/// Total force and contact area of the frame.
+/// The total force and the contact area of the frame.
 pub(crate) fn contact(frame: &FrameEvent) -> (Topic, Timestamp, Vec<u8>) {
     let message = ContactMessage {
         header: Header::new(frame.time, &frame.sensor),

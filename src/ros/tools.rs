@@ -1,8 +1,8 @@
-//! The messages that the tools of ROS users know: diagnostics, pictures, arrays of taxels, and where
-//! an arm is.
+//! Messages for the usual tools of ROS: diagnostics, pictures, arrays of taxels, and the position
+//! of an arm.
 //!
-//! In: statuses, frames, and the bytes of a position. Out: messages for topics, and the position. Their
-//! definitions are those of ROS; DDS needs only their names.
+//! In: statuses, frames, and the bytes of a position. Out: messages for topics, and the position.
+//! ROS defines these messages; DDS needs only their names.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -13,20 +13,20 @@ use crate::colour::viridis;
 use crate::event::{FrameEvent, LinkState, Status, name};
 use crate::frame::{COLS, ROWS};
 
-/// The state of every sensor, for `rqt_robot_monitor` and the like.
+/// The state of every sensor, for tools such as `rqt_robot_monitor`.
 pub(crate) const DIAGNOSTICS: Topic =
     on_a_wire("diagnostics", "diagnostic_msgs/msg/DiagnosticArray");
 
-/// A picture in colours, which every viewer shows without settings.
+/// A colour picture, which every viewer shows without settings.
 pub(crate) const IMAGE: Topic = on_a_wire("image", "sensor_msgs/msg/Image");
 
 /// The taxels, for the tools of `tactile_toolbox`.
 pub(crate) const TACTILE_STATE: Topic = on_a_wire("tactile_state", "tactile_msgs/msg/TactileState");
 
-/// Where the arm is, from the robot. Its name is configured.
+/// The position of the arm, from the robot. The configuration names the topic.
 pub(crate) const POSITION: Topic = on_a_wire("", "geometry_msgs/msg/PointStamped");
 
-/// A topic that no recording has, so nobody asks for its definition.
+/// A topic that is never recorded, so its definition is not needed.
 const fn on_a_wire(name: &'static str, schema: &'static str) -> Topic {
     Topic {
         name,
@@ -88,7 +88,7 @@ const OK: u8 = 0;
 const WARN: u8 = 1;
 const ERROR: u8 = 2;
 
-/// The states of sensors of `robot` at `time`.
+/// The states of the sensors of `robot` at `time`.
 pub(crate) fn diagnostics<'a>(
     time: Timestamp,
     robot: &str,
@@ -127,7 +127,7 @@ fn diagnostic(robot: &str, status: &Status) -> DiagnosticStatus {
     }
 }
 
-/// The frame in colours: `most_n` newtons on a taxel are the brightest.
+/// The frame as a colour picture. A taxel with `most_n` newtons is the brightest.
 pub(crate) fn picture(frame: &FrameEvent, most_n: f32) -> Vec<u8> {
     let pixels = frame.newtons.iter().flat_map(|n| viridis(n / most_n));
     to_cdr(&ImageMessage {
@@ -153,7 +153,8 @@ pub(crate) fn tactile_state(frame: &FrameEvent) -> Vec<u8> {
 }
 
 impl PointStamped {
-    /// The moment of the position, and millimetres along z. `None`, if its stamp is no time.
+    /// The moment of the position, and its millimetres along z. `None` if the stamp is not a valid
+    /// time.
     pub(crate) fn position(&self) -> Option<(Timestamp, f64)> {
         Some((self.header.time()?, self.point.z * 1e3))
     }

@@ -1,4 +1,4 @@
-//! What one object is made of, with the hardness and the level it is labelled with.
+//! The material of one object, with its hardness and level, which are its labels.
 
 use super::material::Material;
 use super::substance::{Substance, Texture};
@@ -14,12 +14,12 @@ pub(super) struct Body {
     pub(super) shore: f64,
     /// Hardness level, 1 to 4.
     pub(super) level: u8,
-    /// Place among [`super::material_names`].
+    /// Index in [`super::material_names`].
     pub(super) material: u8,
 }
 
 impl Body {
-    /// An object of a named material; its hardness is drawn as the material's varies.
+    /// An object of a named material, with a hardness drawn from the material's distribution.
     pub(super) fn named(material: Material, stream: &mut Stream) -> Self {
         let properties = material.properties();
         let shore = properties.shore.draw(stream);
@@ -33,7 +33,7 @@ impl Body {
     }
 }
 
-/// Roughness of one posture's face.
+/// Draws the roughness of one posture's face.
 pub(super) fn draw_patch(texture: &Texture, roughness: f64, stream: &mut Stream) -> Patch {
     let factor = roughness * (0.35 * stream.normal()).exp();
     Patch::new(texture, factor, super::sensor::CELL_MM, stream)

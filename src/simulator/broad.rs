@@ -1,8 +1,8 @@
-//! A world of materials: each object is of one that is drawn for it.
+//! Broad materials: each object gets a material that is drawn for it.
 //!
-//! In: a stream. Out: a [`Body`] whose modulus follows from the Shore hardness
-//! by the durometer, so that the label is what a durometer reads. The ranges contain the eight
-//! named materials and are not centred on them.
+//! In: a stream. Out: a [`Body`] whose modulus follows from the Shore hardness by the durometer, so
+//! that the label is the durometer's reading. The ranges contain the eight named materials and are
+//! not centred on them.
 
 use serde::{Deserialize, Serialize};
 
@@ -12,22 +12,22 @@ use super::level::{self, Borders, LEVELS, level_of};
 use super::substance::{Creep, Law, Substance, Texture};
 use crate::random::Stream;
 
-/// The laws of which materials are drawn.
+/// A law that materials are drawn from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LawName {
-    /// Elastic.
+    /// An elastic solid.
     Solid,
-    /// Elastic, and flows.
+    /// An elastic solid that flows.
     Plastic,
-    /// With a plateau, where its cells buckle.
+    /// A foam, with a plateau of stress where its cells buckle.
     Foam,
     /// A thin soft layer on a stiff core.
     Layered,
 }
 
 impl LawName {
-    /// All four.
+    /// All four laws.
     pub const ALL: [LawName; 4] = [
         LawName::Solid,
         LawName::Plastic,
@@ -45,7 +45,7 @@ impl LawName {
         }
     }
 
-    /// What its materials are called in a data set, where `foam` is one of the named materials.
+    /// The name of the law's materials in a data set, where `foam` alone is a named material.
     pub fn material_name(self) -> &'static str {
         match self {
             LawName::Solid => "broad-solid",
@@ -65,18 +65,18 @@ impl std::str::FromStr for LawName {
     }
 }
 
-/// A name that is no law's.
+/// A name that is not a law's.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("no law \"{0}\"; there are solid, plastic, foam, layered")]
 pub struct UnknownLaw(pub String);
 
-/// Which laws materials are drawn of, by their place in [`LawName::ALL`]; at least one.
+/// The laws that materials are drawn from, by their index in [`LawName::ALL`]; at least one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "Vec<LawName>", into = "Vec<LawName>")]
 pub struct Laws([bool; 4]);
 
 impl Default for Laws {
-    /// All of them.
+    /// All four laws.
     fn default() -> Self {
         Self([true; 4])
     }
@@ -101,7 +101,7 @@ impl TryFrom<Vec<LawName>> for Laws {
     }
 }
 
-/// No law to draw materials of.
+/// The error of an empty list of laws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("found no law, expected one or more of solid, plastic, foam, layered")]
 pub struct NoLaw;
@@ -112,48 +112,48 @@ impl Laws {
         all.filter_map(|(law, is_in)| is_in.then_some(law))
     }
 
-    /// One of them, evenly, of those that `fits`.
+    /// Draws one of the laws that `fits` accepts, with equal probabilities.
     fn draw(self, stream: &mut Stream, fits: impl Fn(LawName) -> bool) -> Option<LawName> {
         let laws: Vec<LawName> = self.iter().filter(|&law| fits(law)).collect();
         (!laws.is_empty()).then(|| laws[stream.below(laws.len())])
     }
 }
 
-/// Part of level 1's objects that is drawn by the modulus.
+/// Share of level 1's objects that is drawn by the modulus.
 const STIFF_SHARE: f64 = 0.5;
-/// Moduli of these, MPa, log-even.
+/// Range of the moduli of objects drawn by the modulus, MPa, log-uniform.
 const STIFF_MPA: (f64, f64) = (5.0, 3000.0);
-/// Poisson's ratio of solids, plastics, foams and layers.
+/// Ranges of Poisson's ratio of solids, plastics, foams and layers, uniform.
 const NU: [(f64, f64); 4] = [(0.33, 0.49), (0.38, 0.49), (0.05, 0.30), (0.10, 0.49)];
-/// p_H of plastics relative to E, log-even.
+/// p_H of plastics relative to E, log-uniform.
 const HARDNESS: (f64, f64) = (1.0 / 20.0, 1.0 / 4.0);
-/// m, s_p relative to E (log-even) and e_D of foams.
+/// m, s_p relative to E (log-uniform) and e_D of foams.
 const EXPONENT: (f64, f64) = (2.0, 3.0);
 const PLATEAU: (f64, f64) = (0.08, 0.50);
 const STRAIN: (f64, f64) = (0.30, 0.60);
-/// Thickness of a layer in mm, and the core's modulus relative to the layer's, both log-even.
+/// Thickness of a layer in mm, and the core's modulus relative to the layer's, both log-uniform.
 const THICKNESS_MM: (f64, f64) = (1.5, 10.0);
 const CORE: (f64, f64) = (20.0, 2000.0);
-/// A layer is so much thicker than the durometer sinks in, at least: beyond that, it would have to
-/// say what the core feels through a layer squeezed to nothing.
+/// The least ratio of a layer's thickness to the durometer's depth. A thinner layer would be
+/// squeezed to nothing, and the reading would depend on the core beneath it.
 const LAYER_PER_DEPTH: f64 = 1.25;
-/// The two terms of creep: j even, tau log-even.
+/// The two terms of creep: j uniform, tau log-uniform.
 const CREEP: [((f64, f64), (f64, f64)); 2] =
     [((0.03, 0.35), (0.15, 0.6)), ((0.02, 0.35), (1.0, 4.0))];
-/// Texture: rms in um and wavelengths in mm log-even; Hurst's exponent and anisotropy even.
+/// Texture: rms in um and wavelengths in mm log-uniform; Hurst exponent and anisotropy uniform.
 const RMS_UM: (f64, f64) = (30.0, 170.0);
 const SHORTEST_MM: (f64, f64) = (2.0, 5.0);
 const LONGEST_MM: (f64, f64) = (8.0, 40.0);
 const HURST: (f64, f64) = (0.4, 0.9);
 const ANISOTROPY: (f64, f64) = (1.0, 2.0);
 
-/// Draws what an object is made of.
+/// Draws an object's material.
 ///
-/// Its Shore hardness is even from 15 to 95, but for the gaps that `borders` leaves. Half of what
-/// falls into level 1 is stiffer than the durometer can tell well: there the modulus is log-even and
-/// the Shore hardness what the durometer reads; a soft law whose reading falls into another level is
-/// drawn again. A layer is never of the stiff half, unless there is no other law: it would not be the
-/// softer part.
+/// The Shore hardness is uniform from 15 to 95, except for the gaps that `borders` leaves. Half of
+/// level 1 is stiffer than the durometer can distinguish well. There the modulus is log-uniform and
+/// the Shore hardness is the durometer's reading. A soft law whose reading falls into another level
+/// is drawn again. The stiff half has no layered objects, because a layer is the soft part of its
+/// object. If there is no other law, no object is drawn by the modulus.
 pub(super) fn draw(laws: Laws, borders: Borders, stream: &mut Stream) -> Body {
     let shore = level::draw_shore(borders, stream);
     let level = level_of(shore);
@@ -193,7 +193,7 @@ fn stiff(laws: Laws, borders: Borders, stream: &mut Stream) -> Option<Body> {
     }
 }
 
-/// Place of a law among the materials' names: after the eight named materials.
+/// Index of a law among the materials' names, after the eight named materials.
 fn material_index(law: LawName) -> u8 {
     super::material::Material::ALL.len() as u8 + law as u8
 }
@@ -316,7 +316,8 @@ mod tests {
                 is_stiff
             })
             .count();
-        // 53 % of the half of 25 of 80: log(3000 / 100) / log(3000 / 5).
+        // Level 1 is 25 of 80, and half of it is stiff. Of that half,
+        // log(3000 / 100) / log(3000 / 5), or 53 %, has a modulus above 100 MPa.
         assert!((4..19).contains(&stiff), "{stiff} of 130");
     }
 
@@ -351,7 +352,7 @@ mod tests {
                 Law::Layered { .. } => panic!("no named material has a layer"),
             };
             assert!(within(NU[name as usize], nu), "{material}: nu");
-            // Wood, hard plastic and plasticine have one term.
+            // Wood, hard plastic and plasticine have one term of creep.
             for term in creep.into_iter().filter(|term| term.j > 0.0) {
                 let is_in = |(j, tau)| within(j, term.j) && within(tau, term.tau_s);
                 assert!(CREEP.into_iter().any(is_in), "{material}: {term:?}");

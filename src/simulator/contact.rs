@@ -1,13 +1,13 @@
 //! Frictionless normal contact under a prescribed force.
 //!
-//! In: the undeformed gap, the spectrum of the elastic influence, the force, a local law. Out: the
-//! pressure and the rigid approach `d` such that
+//! In: the undeformed gap h, the spectrum of the elastic influence K, the force F, a local law w.
+//! Out: the pressure p and the rigid approach `d` such that
 //! `gap = h + K p + w(p) - d >= 0`, `p >= 0`, `p gap = 0`, `sum(p) dA = F`.
-//! Never knows what is being pressed, nor the time.
+//! The solver knows neither the pressed object nor the time.
 //!
 //! The method is the constrained conjugate gradients of Polonsky and Keer (1999), with the local
-//! law's slope as preconditioner and in the step length. `w` grows with `p`, so that the problem
-//! stays convex and the nonlinear gradient replaces a Newton loop around linear solves.
+//! law's slope as preconditioner and in the step length. `w` grows with `p`, so the problem stays
+//! convex and the nonlinear gradient replaces a Newton loop around linear solves.
 
 use super::fourier::Convolver;
 
@@ -19,33 +19,33 @@ pub(super) enum Local<'a> {
     /// Foam plateau: `w = L e_D z / (1 + z)`, `z = (e / s_p)^m`, with the effective pressure
     /// `e = factor p + history` (creep) and `L = min(height, 0.9 a)`.
     Foam {
-        /// s_p, MPa.
+        /// s_p, the plateau stress, MPa.
         plateau_mpa: f64,
-        /// m.
+        /// m, the exponent.
         exponent: f64,
         /// e_D, the strain at which the cells have closed.
         strain: f64,
         /// Height of the object, mm.
         height_mm: f64,
-        /// Effective pressure per pressure, from creep.
+        /// Ratio of effective pressure to pressure, from creep.
         factor: f64,
-        /// The part of the effective pressure that earlier steps left; empty: none.
+        /// The part of the effective pressure that earlier steps left; empty if there is none.
         history_mpa: &'a [f32],
     },
     /// One implicit step of Norton flow: `w = 0.5 a time (p / p_H)^4`.
     Flow {
-        /// p_H, MPa.
+        /// p_H, the hardness, MPa.
         hardness_mpa: f64,
         /// Length of the step, s.
         time_s: f64,
     },
 }
 
-/// What is to be solved, on one square window.
+/// A contact problem on one square window.
 pub(super) struct Problem<'a> {
-    /// h, mm, `[width, width]`; whatever earlier steps left is added to it.
+    /// h, mm, `[width, width]`, with the displacement that earlier steps left.
     pub(super) gap_mm: &'a [f32],
-    /// Influence of object and cover together, mm per MPa.
+    /// Spectrum of the influence of object and cover together, mm per MPa.
     pub(super) spectrum: &'a [f32],
     pub(super) local: Local<'a>,
     pub(super) force_n: f64,
@@ -54,12 +54,12 @@ pub(super) struct Problem<'a> {
     pub(super) tolerance: f64,
 }
 
-/// What the solver reports beside the pressure.
+/// The solver's results besides the pressure.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Contact {
-    /// d, mm.
+    /// d, the rigid approach, mm.
     pub(super) approach_mm: f64,
-    /// a = sqrt(A / pi), mm.
+    /// a = sqrt(A / pi) of the contact area A, mm.
     pub(super) radius_mm: f64,
     /// Iterations used.
     pub(super) iterations: u32,
@@ -67,12 +67,13 @@ pub(super) struct Contact {
     pub(super) converged: bool,
 }
 
-/// Stops when the pressure-weighted mean of |gap| is below this part of the pressure-weighted
-/// mean compression. At 1e-3 areas and forces have settled far below a taxel's noise (1.5 %).
+/// The solver stops when the pressure-weighted mean of |gap| is below this part of the
+/// pressure-weighted mean compression. At 1e-3, areas and forces have settled far below a taxel's
+/// noise (1.5 %).
 pub(super) const TOLERANCE: f64 = 1e-3;
 const MAX_ITERATIONS: u32 = 250;
 
-/// Fields the solver works in, kept between calls so that a solve allocates nothing.
+/// The solver's work fields, kept between calls so that a solve allocates nothing.
 #[derive(Debug, Default)]
 pub(super) struct Fields {
     displacement: Vec<f32>,
@@ -101,8 +102,8 @@ impl Fields {
     }
 }
 
-/// Solves `problem` from the pressure given (a guess; any non-negative field) and leaves the
-/// solution there.
+/// Solves `problem` from the guess in `pressure_mpa`, which may be any non-negative field, and
+/// leaves the solution there.
 pub(super) fn solve(
     convolver: &mut Convolver,
     fields: &mut Fields,
@@ -113,7 +114,7 @@ pub(super) fn solve(
     let total = problem.force_n / area;
     fields.resize(pressure_mpa.len());
     start(problem, total, pressure_mpa);
-    // The kernel's value at a wavelength of 16 cells stands for it in the preconditioner.
+    // The preconditioner uses the kernel's value at a wavelength of 16 cells.
     let elastic = {
         let padded = 2 * convolver.width;
         problem.spectrum[padded / 16] * (padded * padded) as f32
@@ -133,7 +134,8 @@ pub(super) fn solve(
         if !is_displacement_known {
             convolver.convolve(problem.spectrum, pressure_mpa, &mut fields.displacement);
         }
-        // Late in the solve single cells flicker at the rim; the radius must not follow them.
+        // Late in the solve, single cells at the rim switch on and off. The radius must not follow
+        // them.
         if contact.iterations < 30 {
             radius_mm = contact_radius(pressure_mpa, area);
         }
@@ -148,7 +150,7 @@ pub(super) fn solve(
             contact.converged = true;
             break;
         }
-        // Polak and Ribiere, never negative.
+        // The factor of Polak and Ribiere, never negative.
         let beta = if restart {
             0.0
         } else {
@@ -178,7 +180,7 @@ pub(super) fn solve(
     contact
 }
 
-/// The approach at which the loaded cells balance, and the sum of their inverse slopes.
+/// The approach at which the loaded cells balance, and the sum of the cells' inverse slopes.
 struct Balance {
     approach_mm: f64,
     sum_inverse: f64,
@@ -188,20 +190,20 @@ struct Balance {
 struct Misfit {
     /// Sum over the loaded cells of pressure times |gap|.
     error: f64,
-    /// The same of pressure times compression.
+    /// Sum over the loaded cells of pressure times compression.
     work: f64,
-    /// Residual times preconditioned residual; `cross` with the residual of the step before.
+    /// Sum of residual times preconditioned residual. `cross` uses the residual of the step before.
     rz: f64,
     cross: f64,
-    /// Of the deepest unloaded cell, mm.
+    /// Penetration of the deepest unloaded cell, mm.
     penetration: f32,
 }
 
-/// What a step did.
+/// The changes of a step.
 struct Change {
-    /// A cell would have been in tension.
+    /// Whether a cell would have been in tension.
     clipped: bool,
-    /// A cell without load would have penetrated.
+    /// Whether a cell without load would have penetrated.
     loaded: bool,
     sum_mpa: f64,
 }
@@ -211,8 +213,8 @@ struct Change {
     reason = "one cell of several fields at a time"
 )]
 impl Fields {
-    /// Residual, slope and preconditioner of every cell. The approach is the multiplier of the
-    /// force constraint.
+    /// Computes residual, slope and preconditioner of every cell. The approach is the multiplier of
+    /// the force constraint.
     fn balance(
         &mut self,
         problem: &Problem,
@@ -239,7 +241,7 @@ impl Fields {
         }
     }
 
-    /// Takes the approach off the residuals, and measures them.
+    /// Subtracts the approach from the residuals, and measures them.
     fn misfit(&mut self, problem: &Problem, pressure_mpa: &[f32], approach_mm: f32) -> Misfit {
         let (mut error, mut work, mut rz, mut cross) = (0.0_f64, 0.0_f64, 0.0_f64, 0.0_f64);
         let mut penetration = 0.0_f32;
@@ -268,7 +270,7 @@ impl Fields {
         }
     }
 
-    /// The next conjugate direction, kept free of net force.
+    /// Computes the next conjugate direction, without net force.
     fn turn(&mut self, pressure_mpa: &[f32], beta: f32, sum_inverse: f64) {
         let mut sum_direction = 0.0_f64;
         for i in 0..pressure_mpa.len() {
@@ -288,7 +290,7 @@ impl Fields {
         }
     }
 
-    /// How far to go along the direction whose displacement is `response`.
+    /// The step length along the direction whose displacement is `response`.
     fn step_length(&self) -> f32 {
         let (mut numerator, mut denominator) = (0.0_f64, 0.0_f64);
         for i in 0..self.direction.len() {
@@ -303,7 +305,8 @@ impl Fields {
         }
     }
 
-    /// Steps; clips tension away; loads cells that would penetrate by more than `slack`.
+    /// Takes the step, sets tension to 0, and loads cells that would penetrate by more than
+    /// `slack`.
     fn advance(&self, pressure_mpa: &mut [f32], step: f32, slack: f32) -> Change {
         let mut change = Change {
             clipped: false,
@@ -326,7 +329,7 @@ impl Fields {
     }
 }
 
-/// Makes the guess carry the force; without one, loads the lowest cell.
+/// Scales the guess to carry the force. Without a guess, loads the cell with the least gap.
 fn start(problem: &Problem, total: f64, pressure_mpa: &mut [f32]) {
     let sum: f64 = pressure_mpa.iter().map(|&p| f64::from(p)).sum();
     if sum > 0.0 {
@@ -351,7 +354,7 @@ impl Local<'_> {
         self.at(usize::MAX, pressure_mpa, radius_mm).0
     }
 
-    /// Displacement (mm) and a slope (mm/MPa) that is safe to step with, at cell `i`.
+    /// Displacement (mm) at cell `i`, and a slope (mm/MPa) that is safe for a step.
     fn at(&self, i: usize, pressure_mpa: f32, radius_mm: f64) -> (f32, f32) {
         match *self {
             Local::None => (0.0, 0.0),
@@ -371,8 +374,8 @@ impl Local<'_> {
                 let reach = (height_mm.min(0.9 * radius_mm) * strain) as f32;
                 let z = (effective / plateau_mpa as f32).powf(exponent as f32);
                 let w = reach * z / (1.0 + z);
-                // dw/de = m w / (e (1 + z)). Where the law bends over, its slope falls below the
-                // secant, and a step taken with it overshoots for ever.
+                // dw/de = m w / (e (1 + z)). Where the law flattens, its slope falls below the
+                // secant, and steps taken with the slope would overshoot without end.
                 let secant = w / effective;
                 let slope = secant * (exponent as f32 / (1.0 + z)).max(1.1);
                 (w, slope * factor as f32)

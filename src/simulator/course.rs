@@ -1,8 +1,8 @@
-//! One press in time: motion prescribed, `z(t) = d + F / k_arm`.
+//! One press over time with a prescribed motion, `z(t) = d + F / k_arm`.
 //!
-//! Loading and unloading are solved at chosen forces, and the moment each is reached follows from
-//! the motion; in the hold the force is sought that keeps z. Creep is carried from step to step as
-//! the state of each Kelvin element; pressure is taken as linear in time within a step, for which
+//! Loading and unloading are solved at chosen forces, and the time of each force follows from the
+//! motion. In the hold, the solver seeks the force that keeps z. The state of each Kelvin element
+//! carries creep from step to step. Pressure is taken as linear in time within a step, for which
 //! the element's update is exact.
 
 use super::motion::{Arm, Motion};
@@ -13,9 +13,9 @@ use crate::frame::TAXELS;
 
 /// A press from touch to separation.
 pub(super) struct Course {
-    /// Seconds from the touch, ascending; forces are linear in between.
+    /// The solved moments, ascending in time from the touch. Forces are linear between them.
     moments: Vec<Moment>,
-    /// Where the arm is meanwhile.
+    /// The arm's motion during the press.
     pub(super) motion: Motion,
 }
 
@@ -26,13 +26,14 @@ struct Moment {
     taxels_n: [f32; TAXELS],
 }
 
-/// Forces solved at while loading, and while unloading.
+/// The number of forces solved while loading, and while unloading.
 const LEVELS: u32 = 14;
-/// Exponent that spaces them: contact grows fastest at the touch.
+/// Exponent of the spacing of the forces. They are denser at the touch, where the contact grows
+/// fastest.
 const SPACING: f64 = 1.7;
-/// Moments of the hold solved at, s: creep is fastest at first.
+/// Times of the hold that are solved, s. They are denser at first, where creep is fastest.
 const HOLD_S: [f64; 9] = [0.03, 0.07, 0.14, 0.25, 0.4, 0.6, 0.85, 1.15, 1.5];
-/// Part of the force to which the hold keeps its position.
+/// Tolerance of the position in the hold, as a part of the force.
 const HOLD_TOLERANCE: f64 = 1e-3;
 
 impl Course {
@@ -79,12 +80,12 @@ impl Course {
         }
     }
 
-    /// From touch to separation, s.
+    /// Time from touch to separation, s.
     pub(super) fn duration_s(&self) -> f64 {
         self.moments.last().map_or(0.0, |moment| moment.time_s)
     }
 
-    /// Forces under the taxels `time_s` after the touch; zero before and after the press.
+    /// The taxel forces in newtons `time_s` after the touch; zero before and after the press.
     pub(super) fn taxels_n(&self, time_s: f64) -> [f32; TAXELS] {
         let after = self
             .moments
@@ -98,7 +99,7 @@ impl Course {
     }
 }
 
-/// A press in the making.
+/// The state of a press while it is computed.
 struct Run<'a> {
     bench: &'a mut Bench,
     specimen: &'a Specimen,
@@ -107,18 +108,18 @@ struct Run<'a> {
     gap_mm: Vec<f32>,
     /// State of each Kelvin element, MPa.
     crept: Vec<Vec<f32>>,
-    /// Displacement that flow has left, mm; empty while there is none.
+    /// The displacement left by flow, mm; empty if there is none.
     flowed_mm: Vec<f32>,
     pressure: Vec<f32>,
     force_n: f64,
-    /// Where the sensor's carrier is, z in mm.
+    /// Position z of the sensor's carrier, mm.
     travel_mm: f64,
     time_s: f64,
     moments: Vec<Moment>,
     fits: bool,
 }
 
-/// A step that has been solved but not taken.
+/// A step that is solved but not yet taken.
 struct Trial {
     force_n: f64,
     time_s: f64,
@@ -157,7 +158,8 @@ impl<'a> Run<'a> {
     }
 
     fn load(&mut self, force_n: f64, levels: u32) {
-        // Of the first step only that it is short; afterwards the speed so far tells.
+        // Of the first step we only know that it is short. The later guesses are the length of the
+        // step before.
         let mut guess_s = 0.05;
         for level in 1..=levels {
             let goal = force_n * (f64::from(level) / f64::from(levels)).powf(SPACING);
@@ -176,7 +178,8 @@ impl<'a> Run<'a> {
             self.step_to_force(goal, guess_s, -1.0);
             guess_s = self.time_s - before_s;
         }
-        // The last touch: the surface as it is then, creep and dents included.
+        // The press ends where the sensor leaves the surface, with its creep and dents at that
+        // time.
         let (gap, _) = self.effective_gap(0.0);
         let end_mm = f64::from(gap.iter().copied().fold(f32::INFINITY, f32::min));
         let last_s = ((self.travel_mm - end_mm) / self.arm.speed_mm_s).max(LEAST_STEP_S);
@@ -187,8 +190,8 @@ impl<'a> Run<'a> {
         });
     }
 
-    /// Moves in `direction` until the force is `goal_n`. How long that takes depends on the travel
-    /// and the travel, through creep, on how long it takes: two or three rounds settle it.
+    /// Moves in `direction` until the force is `goal_n`. The time of the step depends on the
+    /// travel, and the travel, through creep, on the time. Two or three rounds settle both.
     fn step_to_force(&mut self, goal_n: f64, guess_s: f64, direction: f64) {
         let mut time_s = guess_s.max(LEAST_STEP_S);
         for round in 1.. {
@@ -205,7 +208,7 @@ impl<'a> Run<'a> {
         }
     }
 
-    /// Keeps z for `hold_s`; the force follows by secants on `z(F)`.
+    /// Keeps z for `hold_s`, with forces from the secant method on `z(F)`.
     fn hold(&mut self, hold_s: f64) {
         let keep_mm = self.travel_mm;
         let start_s = self.time_s;
@@ -265,8 +268,8 @@ impl<'a> Run<'a> {
         }
     }
 
-    /// The gap with what earlier steps have left of creep and flow after another `time_s`, and the
-    /// left part of the effective pressure, which the foam's law needs on its own.
+    /// The gap with the creep and flow that earlier steps leave after another `time_s`, and the
+    /// remaining part of the effective pressure, which the foam's law needs separately.
     fn effective_gap(&mut self, time_s: f64) -> (Vec<f32>, Vec<f32>) {
         let mut gap = self.gap_mm.clone();
         for (gap, &flowed) in gap.iter_mut().zip(&self.flowed_mm) {
@@ -324,10 +327,10 @@ impl<'a> Run<'a> {
     }
 }
 
-/// No step is shorter, so that creep that runs ahead of the motion cannot stop time.
+/// The least length of a step, so that time advances even where creep runs ahead of the motion.
 const LEAST_STEP_S: f64 = 1e-3;
 
-/// Of a Kelvin element of time constant tau, `s' = (p - s) / tau`, under a pressure linear in time
+/// For a Kelvin element of time constant tau, `s' = (p - s) / tau`, under a pressure linear in time
 /// over `t`: the share of the new pressure in the new state, `1 - (tau / t) (1 - exp(-t / tau))`.
 fn share(time_s: f64, tau_s: f64) -> f64 {
     if time_s <= 0.0 {
@@ -337,7 +340,7 @@ fn share(time_s: f64, tau_s: f64) -> f64 {
     1.0 + (-x).exp_m1() / x
 }
 
-/// The same element: the shares of its old state and of the old pressure.
+/// For the same element: the shares of the old state and of the old pressure in the new state.
 fn left(time_s: f64, tau_s: f64) -> (f64, f64) {
     let kept = (-time_s / tau_s).exp();
     (kept, 1.0 - kept - share(time_s, tau_s))
@@ -396,7 +399,7 @@ mod tests {
 
     #[test]
     fn force_relaxes_in_the_hold_as_creep_and_arm_say() {
-        // Soft candy's compliance grows by up to 60 %; arm and growing contact share that out.
+        // Soft candy's compliance grows by up to 60 %, which the arm and the growing contact share.
         let specimen = specimen(Material::SoftCandy, &Face::ball(27.0));
         let course = Course::new(&mut Bench::default(), &specimen, Arm::default(), 12.0, 1.5);
         let top = course
@@ -435,7 +438,7 @@ mod tests {
                     moment.force_n
                 );
             }
-            // Loading ends when z = d + F / k: the arm alone takes 15 N / 10 N/mm / 5 mm/s.
+            // Loading ends when z = d + F / k. The arm alone takes 15 N / 10 N/mm / 5 mm/s.
             let top = course
                 .moments
                 .iter()
@@ -473,7 +476,7 @@ mod tests {
                     .sum::<f64>();
                 sum += total(&b);
             }
-            // Against 1.5 % of noise and 0.04 N of rounding a taxel.
+            // A taxel has 1.5 % of noise and 0.04 N of rounding.
             assert!(
                 off < 0.015 * sum,
                 "{material}: {} of the force is elsewhere",

@@ -1,8 +1,8 @@
-//! A data set of whole presses: frames over time, with what the robot tells of its arm.
+//! A data set of whole presses: frames over time, with the arm's motion as the robot reports it.
 //!
 //! Objects, materials and sensors are those of [`super::dataset`]. Speed, stiffness of the arm,
-//! frame rate, hold and what the robot errs by are drawn anew for each press. Test presses of one
-//! number are pressed alike in every material, as single frames are.
+//! frame rate, hold and the robot's errors are drawn anew for each press. Test presses of the same
+//! number are made alike in every material, as for single frames.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -24,33 +24,34 @@ use crate::press::thinned;
 use crate::random::Stream;
 use crate::tare::NEWTONS_PER_COUNT;
 
-/// What to simulate.
+/// The settings of a simulated data set of presses.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct CourseSettings {
-    /// Objects, materials, shapes, sensors; `lowest_force_n` is the least force of an arm that stops
-    /// by force.
+    /// Objects, materials, shapes, sensors. `lowest_force_n` is the least force of an arm that
+    /// stops by force.
     pub objects: DatasetSettings,
-    /// Least and greatest frame rate, log-even.
+    /// Least and greatest frame rate, drawn log-uniformly.
     pub frame_rate_hz: [f64; 2],
-    /// Least and greatest speed of the arm, log-even.
+    /// Least and greatest speed of the arm, drawn log-uniformly.
     pub speed_mm_s: [f64; 2],
-    /// Least and greatest stiffness of the arm, log-even.
+    /// Least and greatest stiffness of the arm, drawn log-uniformly.
     pub arm_n_per_mm: [f64; 2],
-    /// Least and greatest time that the arm holds its position, even.
+    /// Least and greatest time that the arm holds its position, drawn uniformly.
     pub hold_s: [f64; 2],
-    /// Positions and speeds that the robot tells are off by up to this part, the same in a press.
+    /// Greatest relative error of the reported positions and speeds, constant over a press.
     pub position_error: f64,
-    /// The stiffness that the robot tells is off by up to this part.
+    /// Greatest relative error of the reported stiffness.
     pub arm_error: f64,
-    /// The moments that the robot tells are off by up to so many frames, the same in a press.
+    /// Greatest error of the reported times, in frames, constant over a press.
     pub clock_error_frames: f64,
-    /// Share of the presses of which the robot tells nothing.
+    /// Share of the presses for which the robot reports nothing.
     pub unknown_share: f64,
 }
 
 impl Default for CourseSettings {
-    /// 200 + 20 broad objects of wide shapes, 6 presses each, a robot that tells the truth.
+    /// 200 + 20 objects of the named materials in matched shapes, 6 presses each, and a robot
+    /// without errors.
     fn default() -> Self {
         Self {
             objects: DatasetSettings {
@@ -69,19 +70,19 @@ impl Default for CourseSettings {
     }
 }
 
-/// Frames of a press at most, without those before its begin: as many as a model gets.
+/// The most frames of a press, not counting those before its begin: as many as a model takes.
 pub const MOST_FRAMES: usize = 48;
-/// Frames kept before the one that begins the press.
+/// The number of frames kept before the frame that begins the press.
 const BEFORE: usize = 2;
 
-/// One press over time and what is known of it.
+/// One press over time, with its labels.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabelledCourse {
-    /// The frames that were kept, ascending in time.
+    /// The kept frames, ascending in time.
     pub moments: Vec<CourseMoment>,
-    /// Place of the frame that a verdict of one frame is on.
+    /// Index of the frame that a model of one frame judges.
     pub best: usize,
-    /// The arm's stiffness as told; 0: not told.
+    /// The arm's stiffness as reported; 0 if it is not reported.
     pub arm_n_per_mm: f32,
     /// Hardness level, 1 to 4.
     pub level: u8,
@@ -89,51 +90,51 @@ pub struct LabelledCourse {
     pub object: u32,
     /// Index of the material among [`super::material_names`].
     pub material: u8,
-    /// Greatest force the sensor was pressed with.
+    /// Greatest force on the sensor.
     pub force_n: f32,
-    /// What the object is for.
+    /// The split of the object.
     pub split: Split,
     /// The object's Shore hardness.
     pub shore: f32,
     /// The object's Young's modulus, MPa.
     pub young_mpa: f32,
-    /// Frames a second.
+    /// Frames per second.
     pub frame_rate_hz: f32,
-    /// The arm's speed, as it is.
+    /// The arm's true speed.
     pub speed_mm_s: f32,
 }
 
 /// One frame of a press.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CourseMoment {
-    /// After an ideal tare: counts, at [`NEWTONS_PER_COUNT`] each.
+    /// Counts after an ideal tare, at [`NEWTONS_PER_COUNT`] each.
     pub counts: Box<[u16; TAXELS]>,
-    /// Since the frame that began the press; before it: negative.
+    /// Time since the frame that began the press; negative before it.
     pub time_s: f32,
-    /// How far the arm went since then, as told; 0 where nothing is.
+    /// How far the arm went since the begin, as reported; 0 if it is not reported.
     pub approach_mm: f32,
-    /// Whether that was told.
+    /// Whether the approach is reported.
     pub known: bool,
 }
 
-/// What stops the arm.
+/// The condition that stops the arm.
 #[derive(Clone, Copy)]
 enum Stop {
     Force(f64),
-    /// So far beyond the touch, or at 25 N.
+    /// The arm stops at this distance in mm beyond the touch, or at 25 N.
     Position(f64),
 }
 
-/// How far an arm that stops by position goes beyond the touch, log-even.
+/// How far an arm that stops by position goes beyond the touch, log-uniform.
 const TRAVEL_MM: [f64; 2] = [1.0, 10.0];
-/// No press is lighter to begin with.
+/// The least force of an arm that stops by position.
 const LEAST_FORCE_N: f64 = 0.3;
-/// Longest press: a tracker ends it then.
+/// The longest press. A tracker ends a press after this time.
 const LONGEST_S: f64 = 30.0;
-/// A press is held for so many frames at least, so that a slow sensor sees it.
+/// The least number of frames that a press is held, so that a slow sensor sees it.
 const HOLD_FRAMES: f64 = 3.0;
 
-/// How one press is made: the same in every material.
+/// The plan of one press, the same in every material.
 struct Plan {
     posture: usize,
     pose: Stream,
@@ -141,12 +142,12 @@ struct Plan {
     arm: Arm,
     hold_s: f64,
     period_s: f64,
-    /// Part of a period from the first frame to the touch.
+    /// Offset between the frames and the touch, as a part of a period.
     phase: f64,
     told: Told,
 }
 
-/// What the robot tells, against what is.
+/// The errors of the robot's reports.
 #[derive(Clone, Copy)]
 struct Told {
     is_known: bool,
@@ -196,9 +197,9 @@ fn log_even([low, high]: [f64; 2], stream: &mut Stream) -> f64 {
     stream.range(low.ln(), high.ln()).exp()
 }
 
-/// Simulates the presses on `threads` threads, with `progress` told the number done. They stand in
-/// the order of [`super::dataset`]; the result is the same for any number of threads. A press that
-/// never begins, however hard it is made, is left out.
+/// Simulates the presses on `threads` threads, and calls `progress` with the number done. The
+/// presses are in the order of [`super::dataset`], and the result is the same for any number of
+/// threads. A press that never begins, however hard it is made, is left out.
 pub fn courses(
     settings: &CourseSettings,
     threads: usize,
@@ -221,7 +222,7 @@ pub fn courses(
 }
 
 impl Subject {
-    /// Press number `press`; `None` if it never begins.
+    /// Press number `press`; `None` if it never begins or lasts too long.
     fn course(
         &self,
         bench: &mut Bench,
@@ -246,10 +247,11 @@ impl Subject {
         };
         for attempt in 0..TRIES as u64 {
             let mut noise = noise.child(attempt);
-            // One solve tells whether it is worth the forty of a course.
+            // One solve shows whether the press is worth the forty solves of a course.
             if self.is_felt(bench, &specimen, plan, force_n, &mut noise) {
                 let course = Course::new(bench, &specimen, plan.arm, force_n, plan.hold_s);
-                // What flows faster than the arm follows never bears the force: the press lasts minutes.
+                // A material that flows faster than the arm follows never bears the force, and its
+                // press would last minutes.
                 if course.duration_s() > LONGEST_S {
                     return None;
                 }
@@ -326,7 +328,7 @@ impl Subject {
     }
 }
 
-/// The frames to keep, and the place of the best among them.
+/// The frames to keep, and the index of the best frame among them.
 fn kept(
     frames: &[(f64, RawFrame)],
     seen: &Seen,
@@ -367,14 +369,15 @@ fn kept(
 }
 
 impl Bench {
-    /// The force at which an arm has gone `travel_mm` beyond the touch; 25 N where it stops there.
+    /// The force at which an arm has gone `travel_mm` beyond the touch, at most 25 N.
     fn force_at(&mut self, specimen: &Specimen, arm: Arm, travel_mm: f64) -> f64 {
         let ramp_s = travel_mm / arm.speed_mm_s;
         let mut travel = |force_n: f64| {
             let approach_mm = self.press(specimen, force_n, ramp_s, 0.0).2.approach_mm;
             approach_mm + force_n / arm.n_per_mm
         };
-        // Secant on ln F against ln z, where the contact is nearly a power law; from above.
+        // Use the secant method on ln F against ln z, where the contact is nearly a power law.
+        // Start from above.
         let mut forces = [HIGHEST_FORCE_N, 0.3 * HIGHEST_FORCE_N];
         let first = (travel(forces[0]) / travel_mm).ln();
         if first <= 0.0 {
@@ -395,7 +398,7 @@ impl Bench {
 }
 
 impl LabelledCourse {
-    /// Newtons on all taxels of a frame.
+    /// The total force that frame `place` reads, in newtons.
     pub fn force_read_n(&self, place: usize) -> f64 {
         let counts = self.moments[place].counts.iter();
         counts.map(|&counts| f64::from(counts)).sum::<f64>() * f64::from(NEWTONS_PER_COUNT)
@@ -440,7 +443,7 @@ mod tests {
             };
             assert!(area(begin) >= 3 && (0..begin).all(|place| area(place) < 3));
             assert!((0..times.len()).all(|place| area(place) <= area(course.best)));
-            // The arm is where it is at the begin, goes in, and comes back.
+            // The approach is 0 at the begin, and stays within bounds.
             let approach: Vec<f32> = course.moments.iter().map(|m| m.approach_mm).collect();
             assert_eq!(approach[begin], 0.0);
             assert!(course.moments.iter().all(|moment| moment.known));
@@ -454,7 +457,8 @@ mod tests {
             let ratio = course.force_read_n(course.best) / f64::from(course.force_n);
             assert!((0.1..1.6).contains(&ratio), "reads {ratio} of the force");
         }
-        // Test presses of one number are paired over the objects, but for those that never begin.
+        // Test presses of the same number are paired over the objects, except those that never
+        // begin.
         let motion = |object: u32| {
             let own = made.iter().filter(move |course| course.object == object);
             own.map(|course| (course.speed_mm_s, course.frame_rate_hz))
@@ -465,8 +469,8 @@ mod tests {
 
     #[test]
     fn an_arm_goes_as_deep_as_force_and_stiffness_say() {
-        // In the hold z = d + F / k. Slow presses at many frames a second begin near the touch, so
-        // that nearly all of z is told, and a stiff object leaves all of it to the arm.
+        // In the hold, z = d + F / k. Slow presses at high frame rates begin near the touch, so
+        // nearly all of z is reported. On a stiff object the arm takes nearly all of z.
         let settings = CourseSettings {
             frame_rate_hz: [50.0, 100.0],
             speed_mm_s: [2.0, 4.0],

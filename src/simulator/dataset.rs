@@ -1,7 +1,7 @@
 //! The whole simulated data set: objects, postures, forces, labels.
 //!
-//! Threads share the objects out; every number depends on the seed and on what is pressed, never
-//! on who pressed it.
+//! The objects are distributed over threads. Every number depends on the seed and on the object,
+//! never on the thread.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -18,13 +18,13 @@ use crate::frame::Frame;
 use crate::random::Stream;
 
 impl DatasetSettings {
-    /// How many samples they make.
+    /// The number of samples that the settings make.
     pub fn samples(&self) -> u64 {
         units(self).len() as u64 * u64::from(self.presses)
     }
 }
 
-/// One press and what is known of it.
+/// The sample of one press, with its labels.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabelledSample {
     /// The frame after an ideal tare, in newtons.
@@ -35,9 +35,9 @@ pub struct LabelledSample {
     pub object: u32,
     /// Index of the material among [`super::material_names`].
     pub material: u8,
-    /// Force the sensor was pressed with.
+    /// Force on the sensor.
     pub force_n: f32,
-    /// What the material is for, hence the object.
+    /// The split of the material, and so of the object.
     pub split: Split,
     /// The object's Shore hardness.
     pub shore: f32,
@@ -45,17 +45,17 @@ pub struct LabelledSample {
 
 pub(super) const HIGHEST_FORCE_N: f64 = 25.0;
 const FORCES: usize = 8;
-/// Presses of an object in each posture under each nominal force.
+/// The number of presses of an object in each posture under each nominal force.
 const ROUND: usize = POSTURES * FORCES;
 const FORCE_JITTER: f64 = 0.08;
-/// How much harder a press is made anew that was too light to be one.
+/// Factor on the force when a press was too light to begin.
 pub(super) const HARDER: f64 = 1.5;
-/// Times a press is made harder before it is taken as it is.
+/// The number of attempts at a press before it is taken as it is.
 pub(super) const TRIES: usize = 8;
 
-/// Simulates the data set on `threads` threads, with `progress` told the number of samples done.
-/// Samples stand by material (as in [`super::Material::ALL`]) or by split and level, then by object, posture
-/// and press. The result is the same for any number of threads.
+/// Simulates the data set on `threads` threads, and calls `progress` with the number of samples
+/// done. Samples are in the order of materials (as in [`super::Material::ALL`]) or of split and
+/// group, then of object, posture and press. The result is the same for any number of threads.
 pub fn dataset(
     settings: &DatasetSettings,
     threads: usize,
@@ -74,8 +74,8 @@ pub fn dataset(
 }
 
 impl Subject {
-    /// Every press of the object, in order; postures in the outer loop, so that a face's texture
-    /// and kernels serve all its presses.
+    /// Makes every press of the object. Postures are the outer loop, so that a face's texture and
+    /// kernels serve all its presses.
     fn press_all(
         &self,
         settings: &DatasetSettings,
@@ -111,7 +111,8 @@ impl Subject {
         }
     }
 
-    /// One press, made harder until it reaches the begin area: the force and the frame.
+    /// Makes one press, harder each time until it reaches the begin area. Returns the force and the
+    /// frame.
     fn press(
         &self,
         bench: &mut Bench,
@@ -138,16 +139,16 @@ impl Subject {
     }
 }
 
-/// The numbers of an object's presses: press n is of posture n mod 6, under force n / 6 mod 8. Fewer
-/// than all postures under all forces are some of those 48, no posture or force of them more than
-/// once oftener than another.
+/// The numbers of an object's presses. Press n has posture n mod 6 and force n / 6 mod 8. Fewer
+/// than 48 presses are some of these 48, and the counts of any two postures, or of any two forces,
+/// differ by at most one.
 fn press_numbers(count: usize) -> Vec<usize> {
     if count >= ROUND {
         return (0..count).collect();
     }
-    // In steps of five eight forces come once each, and neighbours are far apart. After half a round
-    // they go on by one: each posture has met four by then, and would meet the same ones again. The
-    // first is in the middle.
+    // In steps of five, each of the eight forces comes once, and neighbours are far apart. After
+    // half a round the forces shift by one, because each posture has met four forces by then and
+    // would meet the same ones again. The first force is in the middle.
     let force = |place: usize| (FORCES / 2 + 5 * place + place / (ROUND / 2)) % FORCES;
     let number = |place: usize| place % POSTURES + POSTURES * force(place);
     let mut numbers: Vec<usize> = (0..count).map(number).collect();
@@ -155,10 +156,10 @@ fn press_numbers(count: usize) -> Vec<usize> {
     numbers
 }
 
-/// Indentation that a sample's ramp is reckoned with; sequences compute theirs.
+/// Assumed indentation in the ramp of a sample. Sequences compute theirs.
 const TYPICAL_DEPTH_MM: f64 = 2.0;
 
-/// Number `step` (0 to 7) of eight forces, evenly from `lowest_n` to 25 N.
+/// Force number `step` (0 to 7) of eight forces, evenly spaced from `lowest_n` to 25 N.
 fn nominal_force_n(lowest_n: f32, step: usize) -> f64 {
     let lowest = f64::from(lowest_n);
     lowest + (HIGHEST_FORCE_N - lowest) * step as f64 / (FORCES - 1) as f64
@@ -198,7 +199,7 @@ mod tests {
 
     #[test]
     fn few_presses_are_of_all_postures_and_forces() {
-        // Of a whole round or more, all in order.
+        // A whole round or more has all numbers in order.
         for count in [48, 49, 50, 100] {
             assert!(press_numbers(count).into_iter().eq(0..count), "{count}");
         }
@@ -240,14 +241,14 @@ mod tests {
         let mean_n = |samples: &[LabelledSample]| {
             samples.iter().map(|s| s.force_n).sum::<f32>() / samples.len() as f32
         };
-        // Nominal forces are 13 N in the mean.
+        // The mean nominal force is 13 N.
         assert!((10.0..14.0).contains(&mean_n(&five)), "{}", mean_n(&five));
     }
 
     #[test]
     fn other_samples_are_another_version() {
-        // Newtons of all frames of each material. Where they are others on purpose, raise VERSION
-        // with them; a count here and there may be a machine's own.
+        // The sums are the newtons of all frames of each material. If they change on purpose,
+        // change them and raise VERSION. Differences of a few counts may come from another machine.
         let samples = dataset(&small(Shapes::Matched), 2, |_| ());
         let newtons = Material::ALL.map(|material| {
             let own = samples.iter().filter(|s| s.material == material.index());
@@ -277,7 +278,7 @@ mod tests {
             let shore = material.properties().shore;
             assert!((shore.low..=shore.high).contains(&f64::from(sample.shore)));
             assert!(begins_press(&sample.frame));
-            // Gains, crosstalk and film creep add, thresholds take away.
+            // Gains, crosstalk and film creep add force, and thresholds remove it.
             let ratio = sample.frame.force_n() / f64::from(sample.force_n);
             assert!(
                 (0.2..1.5).contains(&ratio),
@@ -305,7 +306,7 @@ mod tests {
             swapped([false, true, true, false]),
             swapped([true; 4]),
         );
-        // Rubber and foam, level 2: one object trains, two test.
+        // Rubber and foam are level 2. One object is for training, two are for test.
         for (material, split, count) in [
             (Material::Rubber, Split::Test, 2 * 9),
             (Material::Foam, Split::Train, 9),
@@ -340,7 +341,7 @@ mod tests {
         }
         let pairs = before.iter().zip(&other_gains);
         assert!(pairs.into_iter().all(|(a, b)| a.frame != b.frame));
-        // Under a softer cover a rigid object touches more; a soft one yields itself.
+        // Under a softer cover, a rigid object touches a larger area. A soft object yields itself.
         let area = |samples: &[LabelledSample], level| -> f64 {
             let of_level = samples.iter().filter(|sample| sample.level == level);
             of_level
@@ -380,8 +381,8 @@ mod tests {
                 assert_eq!(labels.len(), 1, "object {object}");
                 assert_eq!(labels.first().unwrap().0, split as u8);
             }
-            // Test objects of one number are pressed alike, whatever they are made of, but for presses
-            // that had to be harder to begin.
+            // Test objects of the same number are pressed alike, whatever their material, except
+            // for presses that had to be harder to begin.
             let forces = |object| {
                 let own = samples.iter().filter(move |sample| sample.object == object);
                 own.map(|sample| sample.force_n).collect::<Vec<_>>()
@@ -404,7 +405,7 @@ mod tests {
         assert_eq!(samples.len(), 8 * 2);
         assert!(samples.iter().all(|sample| sample.split == Split::Test));
         let forces: Vec<f32> = samples.iter().map(|sample| sample.force_n).collect();
-        // Levels 2 to 4, pressed alike.
+        // Rubber and foam are pressed alike.
         assert_eq!(forces[2..4], forces[10..12]);
     }
 

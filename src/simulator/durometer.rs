@@ -1,7 +1,7 @@
-//! A Shore OO durometer, simulated: what ties a material's hardness to its modulus.
+//! Simulates a Shore OO durometer, which relates a material's hardness to its modulus.
 //!
-//! At its depths (up to 1.8 radii) small-strain theory is only a convention for labelling; it is
-//! the same convention for every material.
+//! At the durometer's depths (up to 1.8 radii), small-strain theory is only a convention for
+//! labelling. The convention is the same for every material.
 
 use super::contact::{self, Fields, Local, Problem};
 use super::fourier::Convolver;
@@ -10,13 +10,13 @@ use super::substance::{Law, Substance};
 
 /// Radius of the OO indenter's hemisphere, mm (ASTM D2240).
 const RADIUS_MM: f64 = 1.19;
-/// The reading is taken after this, s.
+/// Time after which the reading is taken, s.
 const READ_S: f64 = 0.15;
-/// Height of what is tested, mm: an object like those the sensor is pressed on.
+/// Height of the tested piece, mm, like the objects that the sensor is pressed on.
 const PIECE_MM: f64 = 40.0;
 const CELL_MM: f64 = 0.04;
 const WIDTH: usize = 64;
-/// Relative error of a force found, and absolute error of a reading.
+/// Relative error of a computed force, and absolute error of a reading.
 const FORCE_TOLERANCE: f64 = 2e-4;
 const SHORE_TOLERANCE: f64 = 0.01;
 
@@ -55,7 +55,7 @@ impl Durometer {
                 None => kernel::half_space(x, y),
             }
         });
-        // Hemisphere; beyond its radius the indenter goes on as a cylinder.
+        // The tip is a hemisphere. Beyond its radius the indenter continues as a cylinder.
         let gap_mm: Vec<f32> = (0..WIDTH * WIDTH)
             .map(|k| {
                 let at = |i: usize| (i as f64 + 0.5 - 0.5 * WIDTH as f64) * CELL_MM;
@@ -100,14 +100,16 @@ impl Durometer {
     /// Young's modulus in MPa with which the durometer reads `shore`.
     ///
     /// All stresses and moduli of the laws are relative to E, so the force at a given depth is
-    /// proportional to E and one indentation with E = 1 MPa suffices.
+    /// proportional to E, and one indentation with E = 1 MPa is enough.
     pub(super) fn young_mpa(&mut self, shore: f64) -> f64 {
         spring_force_n(shore) / self.force_n(depth_mm(shore))
     }
 
-    /// What the durometer reads of this Young's modulus: 0 where it sinks in to the end.
+    /// The durometer's reading for Young's modulus `young_mpa`; 0 if the indenter sinks in to the
+    /// end.
     pub(super) fn reading(&mut self, young_mpa: f64) -> f64 {
-        // How much deeper than the reading says the indenter is: falls from 100 to 0. Illinois.
+        // `excess` is how much deeper the indenter is than at reading `shore`. The Illinois method
+        // finds its root between 0 and 100.
         let mut excess =
             |shore: f64| self.approach_mm(spring_force_n(shore) / young_mpa) - depth_mm(shore);
         let (mut low, mut high) = (0.0, 100.0);
@@ -141,7 +143,7 @@ impl Durometer {
 
     /// Force in N on the indenter at `depth_mm`, for E = 1 MPa.
     fn force_n(&mut self, depth_mm: f64) -> f64 {
-        // Secant on ln F against ln d, where the contact is nearly a power law.
+        // Use the secant method on ln F against ln d, where the contact is nearly a power law.
         let mut force = [0.5, 0.6];
         let mut error = force.map(|f| (self.approach_mm(f) / depth_mm).ln());
         for _ in 0..40 {
@@ -156,7 +158,7 @@ impl Durometer {
         force[1]
     }
 
-    /// Depth in mm at which a force of `force_n` holds the indenter, for E = 1 MPa.
+    /// Depth in mm of the indenter under a force of `force_n`, for E = 1 MPa.
     fn approach_mm(&mut self, force_n: f64) -> f64 {
         let problem = Problem {
             gap_mm: &self.gap_mm,
@@ -189,7 +191,7 @@ mod tests {
         {
             let properties = material.properties();
             let s = properties.shore;
-            // The table's three points, and two between them for the parabola.
+            // Check the table's three points, and two between them for the parabola.
             for (shore, tolerance) in [
                 (s.low, 5e-3),
                 (s.mean, 5e-3),
@@ -207,7 +209,7 @@ mod tests {
         }
     }
 
-    /// One substance of each law, at the ends of what is drawn and between.
+    /// Substances of each law, at the ends of the drawn ranges and between.
     fn substances() -> Vec<Substance> {
         let rubber = Material::Rubber.properties().substance;
         let of = |law, nu| Substance { law, nu, ..rubber };
@@ -267,7 +269,7 @@ mod tests {
             ..solid
         };
         let force_n = |substance: Substance| Durometer::new(&substance).force_n(depth_mm(60.0));
-        // From a layer thicker than any indenter is deep to half a cell.
+        // The thicknesses range from far beyond the indenter's depth to half a cell.
         let forces = [400.0, 10.0, 3.0, 1.0, 0.3, 0.02].map(|mm| force_n(layered(mm)));
         let (thin, others) = forces.split_last().unwrap();
         assert!(
@@ -282,8 +284,8 @@ mod tests {
 
     #[test]
     fn a_shallow_reading_is_hertzs() {
-        // d = (9 F^2 / (16 R E*^2))^(1/3), F and d by the reading: 94.5 and softer sinks in by
-        // a tenth of the radius and more.
+        // Hertz: d = (9 F^2 / (16 R E*^2))^(1/3), with F and d from the reading. At readings of
+        // 94.5 and below, the indenter sinks in by a tenth of its radius or more.
         let wood = Material::Wood.properties().substance;
         let elastic = Substance {
             creep: [super::super::substance::Creep::NONE; 2],

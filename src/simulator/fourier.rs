@@ -1,7 +1,7 @@
 //! Free-space convolution with an even kernel on a square window, by real 2-D FFTs.
 //!
-//! The window is zero-padded to twice its width, so nothing wraps around. Fields are f32: the
-//! contact solver stops at 1e-3, four orders above what f32 FFTs lose.
+//! The window is zero-padded to twice its width, so nothing wraps around. Fields are f32, because
+//! the contact solver stops at 1e-3, four orders above the error of f32 FFTs.
 
 use std::sync::Arc;
 
@@ -20,7 +20,7 @@ pub(super) struct Convolver {
     real: Vec<f32>,
     /// `[2 * width, width + 1]`: the rows' half spectra.
     rows: Vec<Complex32>,
-    /// `[width + 1, 2 * width]`: the same, transposed, so that columns are contiguous.
+    /// `[width + 1, 2 * width]`: the half spectra transposed, so that columns are contiguous.
     columns: Vec<Complex32>,
     scratch: Vec<Complex32>,
 }
@@ -55,9 +55,9 @@ impl Convolver {
         }
     }
 
-    /// The spectrum `[width + 1, 2 * width]` of a kernel that is even in both offsets, given at
-    /// offsets of 0 to `width` cells; real, because the kernel is even. Carries the inverse
-    /// transform's 1/N.
+    /// The spectrum `[width + 1, 2 * width]` of a kernel that is even in both offsets. `kernel`
+    /// gives it at offsets of 0 to `width` cells. The spectrum is real, because the kernel is even,
+    /// and includes the inverse transform's factor 1/N.
     pub(super) fn spectrum(&mut self, kernel: impl Fn(usize, usize) -> f64) -> Vec<f32> {
         let (width, padded, bins) = (self.width, 2 * self.width, self.width + 1);
         for i in 0..=width {
@@ -129,8 +129,8 @@ impl Convolver {
     }
 }
 
-/// `to[j, i] = from[i, j]` over the part both hold; shapes are (rows, columns). In tiles, so that
-/// both sides stay in the cache.
+/// `to[j, i] = from[i, j]` over the part that both hold. Shapes are (rows, columns). The copy goes
+/// in tiles, so that both sides stay in the cache.
 fn transpose(
     from: &[Complex32],
     to: &mut [Complex32],

@@ -1,7 +1,7 @@
 //! Surface displacement under a loaded square cell: half-space, and a layer bonded to a base.
 //!
-//! Everything is dimensionless: lengths in cells, plane-strain modulus E* = 1. Displacement in mm
-//! is the value here times cell_mm / E* times the cell's pressure.
+//! All values are dimensionless: lengths are in cells, and the plane-strain modulus E* is 1. The
+//! displacement in mm is the value here times cell_mm / E* times the cell's pressure.
 
 use std::f64::consts::PI;
 
@@ -9,37 +9,39 @@ use std::f64::consts::PI;
 /// elastic half-space (Love 1929; Johnson, Contact Mechanics, eq. 3.25).
 pub(super) fn half_space(x: f64, y: f64) -> f64 {
     let (xp, xm, yp, ym) = (x + 0.5, x - 0.5, y + 0.5, y - 0.5);
-    // x ln((y1 + sqrt(y1^2 + x^2)) / (y2 + sqrt(y2^2 + x^2))), as asinh, which stays exact where
-    // y2 is negative.
+    // x ln((y1 + sqrt(y1^2 + x^2)) / (y2 + sqrt(y2^2 + x^2))), written with asinh, which stays
+    // exact for negative y2.
     let term = |x: f64, y1: f64, y2: f64| x * ((y1 / x.abs()).asinh() - (y2 / x.abs()).asinh());
     (term(xp, yp, ym) - term(xm, yp, ym) + term(yp, xp, xm) - term(ym, xp, xm)) / PI
 }
 
-/// What a layer is bonded to.
+/// The base that a layer is bonded to.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Base {
-    /// It does not yield.
+    /// A rigid base.
     Rigid,
-    /// An elastic half-space: its Poisson's ratio, and the layer's shear modulus per its own.
+    /// An elastic half-space: the base's Poisson's ratio, and the ratio of the shear moduli, layer
+    /// to base.
     Elastic { nu: f64, shear_ratio: f64 },
 }
 
 /// Influence of a layer bonded to a base, in free space.
 ///
-/// With `K(q) = 2 / (E* q) S(q h)` for the layer and `2 / (E* q)` for the half-space, the layer is
-/// the half-space less a smooth part, which depends on r / h alone:
+/// With `K(q) = 2 / (E* q) S(q h)` for the layer and `2 / (E* q)` for the half-space, the layer's
+/// influence is the half-space's minus a smooth part, which depends only on r / h:
 /// `(1 / (pi E* h)) phi(r / h)`, `phi(s) = integral of (1 - S(x)) J0(x s) dx`.
 /// Taking the difference in real space keeps the kernel free of periodic images.
 pub(super) struct Layer {
     phi: Vec<f64>,
-    /// S(0): what is left far away is the base, as compliant as this part of the layer.
+    /// S(0), the compliance of the base as a share of the layer's. Far away, only the base acts.
     base: f64,
 }
 
 impl Layer {
     /// The layer of Poisson's ratio `nu` on `base`.
     pub(super) fn new(nu: f64, base: Base) -> Self {
-        // Composite Gauss-Legendre, 5 points a panel; 1 - S has fallen below 1e-9 at the end.
+        // Composite Gauss-Legendre quadrature with 5 points per panel. At the end, 1 - S is below
+        // 1e-9.
         const POINTS: [(f64, f64); 5] = [
             (0.0, 0.568_888_888_888_889),
             (0.538_469_310_105_683, 0.478_628_670_499_366),
@@ -82,7 +84,8 @@ impl Layer {
                 self.base * half_space(x, y)
             };
         }
-        // The smooth part varies over one layer height: a thin one needs its mean over the cell.
+        // The smooth part varies over one layer height, so a thin layer needs its mean over the
+        // cell.
         let parts = if height < 8.0 { 4 } else { 1 };
         let mut sum = 0.0;
         for i in 0..parts {
@@ -102,12 +105,14 @@ impl Layer {
     }
 }
 
-/// Beyond this many layer heights the layer is still: its Green's function has decayed.
+/// Distance in layer heights beyond which the layer does not move, because its Green's function has
+/// decayed.
 const REACH: f64 = 12.0;
-/// Spacing of the table of phi, in layer heights; linear interpolation errs by under 1e-4 of phi.
+/// Spacing of the table of phi, in layer heights. Linear interpolation errs by less than 1e-4 of
+/// phi.
 const STEP: f64 = 0.01;
 
-/// S(x) of the bonded layer, x = q h, k = 3 - 4 nu. On a rigid base
+/// S(x) of the bonded layer, with x = q h and k = 3 - 4 nu. On a rigid base
 /// `S = [k sinh 2x - 2x] / [k cosh 2x + (k^2 + 1) / 2 + 2 x^2]`. On an elastic one, with the
 /// ratio m of the shear moduli, layer to base, and k' of the base (O'Sullivan and King 1988):
 /// `S = [1 + 4 c x e - l c e^2] / [1 - (l + c + 4 c x^2) e + l c e^2]`, `e = exp(-2x)`,
@@ -138,7 +143,7 @@ pub(super) fn confined_compliance(nu: f64) -> f64 {
     (1.0 - 2.0 * nu) / ((1.0 - nu) * (1.0 - nu))
 }
 
-/// Bessel's J0 by Abramowitz and Stegun 9.4.1 and 9.4.3 (error below 1e-7).
+/// Bessel function J0 by Abramowitz and Stegun 9.4.1 and 9.4.3 (error below 1e-7).
 fn bessel_j0(x: f64) -> f64 {
     let x = x.abs();
     if x < 3.0 {
@@ -198,7 +203,7 @@ mod tests {
             let point = 1.0 / (PI * f64::hypot(x, y));
             assert!((half_space(x, y) / point - 1.0).abs() < 2e-3);
         }
-        // Centre of a uniformly loaded square of side 1: 4 ln(1 + sqrt 2) / pi.
+        // The value at the centre of a uniformly loaded square of side 1 is 4 ln(1 + sqrt 2) / pi.
         let centre = 4.0 * (1.0 + 2_f64.sqrt()).ln() / PI;
         assert!((half_space(0.0, 0.0) - centre).abs() < 1e-12);
     }
@@ -230,7 +235,8 @@ mod tests {
         assert!((ratio(x) * 2.0 / x / confined_compliance(0.3) - 1.0).abs() < 1e-3);
     }
 
-    /// A core of Poisson's ratio 0.3 whose E is `core` times that of a layer of `nu`.
+    /// A core of Poisson's ratio 0.3, whose E is `core` times the E of a layer of Poisson's ratio
+    /// `nu`.
     fn core(nu: f64, core: f64) -> Base {
         Base::Elastic {
             nu: 0.3,
@@ -242,7 +248,7 @@ mod tests {
     fn a_layer_is_its_core_when_thin_and_itself_when_thick() {
         for (nu, ratio) in [(0.45, 20.0), (0.2, 500.0), (0.3, 0.1)] {
             let layer = Layer::new(nu, core(nu, ratio));
-            // E* of the layer per that of the core.
+            // E* of the layer over E* of the core.
             let compliance = (1.0 - 0.3_f64.powi(2)) / (1.0 - nu * nu) / ratio;
             assert!((layer.base / compliance - 1.0).abs() < 1e-12);
             for (x, y) in [(3.0, 0.0), (5.0, 9.0)] {

@@ -2,30 +2,30 @@
 
 use crate::random::Stream;
 
-/// A hardness level, and what its objects read on a Shore OO durometer.
+/// A hardness level and its range of Shore OO readings.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LevelRange {
-    /// 1 (hardest) to 4.
+    /// The level, 1 (hardest) to 4.
     pub level: u8,
-    /// Its name.
+    /// The name of the level.
     pub label: &'static str,
     /// The interval as the paper's Table 1 writes it, in whole degrees.
     pub table: &'static str,
     /// The interval that leaves no gap to its neighbours.
     pub touching: &'static str,
-    /// Lower border. With `--gaps` it is `gap` higher.
+    /// Lower border, in Shore OO. With `--gaps` it is `gap` higher.
     low: f64,
-    /// Upper border, which belongs to the level.
+    /// Upper border, in Shore OO. It belongs to the level.
     high: f64,
-    /// What the paper's table leaves to the level below.
+    /// The gap in the paper's table between this level and the next softer one.
     gap: f64,
 }
 
-/// The softest and the hardest reading of which objects are drawn by their Shore hardness.
+/// The softest and the hardest reading for objects drawn by their Shore hardness.
 const LEAST_SHORE: f64 = 15.0;
 const MOST_SHORE: f64 = 95.0;
 
-/// The one table of the levels. A reading on a border belongs to the softer level.
+/// The table of the levels. A reading on a border belongs to the softer level.
 pub const LEVELS: [LevelRange; 4] = [
     LevelRange {
         level: 1,
@@ -65,18 +65,18 @@ pub const LEVELS: [LevelRange; 4] = [
     },
 ];
 
-/// Whether the levels touch, or leave the gaps that the paper's Table 1 has.
+/// Whether the levels touch, or have the gaps of the paper's Table 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Borders {
-    /// A real object does not avoid a border.
+    /// The levels touch, because real objects do not avoid a border.
     Touching,
-    /// 50 to 51, 60 to 61 and 70 to 71 are left out.
+    /// The intervals 50 to 51, 60 to 61 and 70 to 71 are left out.
     Gaps,
 }
 
 impl LevelRange {
-    /// What its objects read, from and to; harder ones of level 1 are drawn by their modulus.
+    /// The range of the level's readings. Harder objects of level 1 are drawn by their modulus.
     pub(super) fn shore(&self, borders: Borders) -> (f64, f64) {
         match borders {
             Borders::Touching => (self.low, self.high),
@@ -85,13 +85,13 @@ impl LevelRange {
     }
 }
 
-/// A Shore hardness, even over all levels' intervals together.
+/// Draws a Shore hardness, uniform over the intervals of all levels together.
 pub(super) fn draw_shore(borders: Borders, stream: &mut Stream) -> f64 {
     let widths = LEVELS.map(|range| {
         let (low, high) = range.shore(borders);
         high - low
     });
-    // From the hardest down; the upper border belongs to the level.
+    // Count from the hardest down, because the upper border belongs to the level.
     let mut left = widths.iter().sum::<f64>() * stream.uniform();
     for (range, width) in LEVELS.iter().zip(widths) {
         if left < width {
@@ -102,7 +102,7 @@ pub(super) fn draw_shore(borders: Borders, stream: &mut Stream) -> f64 {
     LEAST_SHORE
 }
 
-/// The level of what reads `shore`.
+/// The level of an object that reads `shore`.
 pub fn level_of(shore: f64) -> u8 {
     LEVELS
         .iter()

@@ -1,7 +1,8 @@
 //! The eight materials of the paper's Table 1: stiffness, laws, creep, texture.
 //!
-//! E of levels 2 to 4 follows from the Shore OO hardness by simulating the durometer with the same
-//! laws ([`super::durometer`]); the moduli it gave are held here, and a test repeats it.
+//! Young's modulus E of levels 2 to 4 follows from the Shore OO hardness by simulating the
+//! durometer with the same laws ([`super::durometer`]). This file holds the resulting moduli, and a
+//! test repeats the simulation.
 
 use std::str::FromStr;
 
@@ -29,13 +30,13 @@ pub enum Material {
     YogaMat,
 }
 
-/// Which part of a data set a sample belongs to.
+/// The part of a data set that a sample belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u8)]
 pub enum Split {
-    /// 0 in the data set's file.
+    /// Training; 0 in the data set's file.
     Train = 0,
-    /// 1 in the data set's file.
+    /// Test; 1 in the data set's file.
     Test = 1,
 }
 
@@ -49,7 +50,7 @@ impl Split {
     }
 }
 
-/// A name that is no material's.
+/// A name that is not a material's.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "no material \"{0}\"; there are wood, rubber, plasticine, sponge, hard-plastic, foam, soft-candy, yoga-mat"
@@ -57,7 +58,7 @@ impl Split {
 pub struct UnknownMaterial(pub String);
 
 impl Material {
-    /// All eight; a material's index is its place here.
+    /// All eight materials, in the order of their indices.
     pub const ALL: [Material; 8] = [
         Material::Wood,
         Material::Rubber,
@@ -74,7 +75,7 @@ impl Material {
         self.index() % 4 + 1
     }
 
-    /// Training or test material: the paper keeps them apart.
+    /// The material's split in the paper: training and test use different materials.
     pub fn split(self) -> Split {
         if self.index() < 4 {
             Split::Train
@@ -97,7 +98,7 @@ impl Material {
         }
     }
 
-    /// Place in [`Material::ALL`].
+    /// Index in [`Material::ALL`].
     pub fn index(self) -> u8 {
         self as u8
     }
@@ -124,7 +125,7 @@ impl std::fmt::Display for Material {
     }
 }
 
-/// A row of the table.
+/// The properties of a material: a row of the table.
 #[derive(Debug)]
 pub(super) struct Properties {
     pub(super) shore: Shore,
@@ -132,7 +133,7 @@ pub(super) struct Properties {
     pub(super) substance: Substance,
 }
 
-/// Shore hardness over a material's objects.
+/// Distribution of the Shore OO hardness over a material's objects.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Shore {
     pub(super) mean: f64,
@@ -142,7 +143,7 @@ pub(super) struct Shore {
 }
 
 impl Shore {
-    /// Normal, drawn again until it lies in the range.
+    /// Draws from a normal distribution until the value is within the range.
     pub(super) fn draw(&self, stream: &mut Stream) -> f64 {
         loop {
             let drawn = self.mean + self.sd * stream.normal();
@@ -156,9 +157,9 @@ impl Shore {
 /// Young's modulus in MPa.
 #[derive(Debug, Clone, Copy)]
 enum Modulus {
-    /// Too hard for the Shore OO scale to tell.
+    /// A fixed modulus, for materials too hard for the Shore OO scale to distinguish.
     Fixed(f64),
-    /// By the durometer, at the lowest, the mean and the highest hardness.
+    /// The moduli from the durometer at the lowest, the mean and the highest hardness.
     Durometer([f64; 3]),
 }
 
@@ -169,7 +170,7 @@ impl Properties {
             Modulus::Fixed(young) => return young,
             Modulus::Durometer(at) => at.map(f64::ln),
         };
-        // ln E is nearly straight in the hardness: a parabola through three points.
+        // ln E is nearly linear in the hardness, so a parabola through three points is enough.
         let Shore {
             mean, low, high, ..
         } = self.shore;

@@ -1,18 +1,18 @@
-//! How the arm moves, and where it is at any moment of a press.
+//! The arm's motion, and its position at any time of a press.
 
 /// The arm that presses.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Arm {
-    /// Stiffness of all behind the sensor.
+    /// Stiffness of everything behind the sensor.
     pub(super) n_per_mm: f64,
     pub(super) speed_mm_s: f64,
 }
 
-/// Stiffness of the arm of a sequence.
+/// Stiffness of the arm in a sequence.
 pub const ARM_N_PER_MM: f64 = 10.0;
 
 impl Default for Arm {
-    /// Stiffness assumed, speed of the paper.
+    /// The stiffness is an assumption, the speed is the paper's.
     fn default() -> Self {
         Self {
             n_per_mm: ARM_N_PER_MM,
@@ -25,22 +25,22 @@ impl Default for Arm {
 /// withdraws.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Motion {
-    /// How far it goes beyond the touch.
+    /// How far the arm goes beyond the touch.
     pub(super) top_mm: f64,
-    /// When it is there, from the touch on.
+    /// The time from the touch to the end of the approach.
     pub(super) load_s: f64,
     pub(super) hold_s: f64,
     pub(super) speed_mm_s: f64,
 }
 
-/// How far the arm starts from what it presses, and withdraws: at 5 mm/s there and back takes less
-/// than the rest between two presses.
+/// The arm's distance from the object before and after a press. At 5 mm/s, this distance there and
+/// back takes less time than the rest between two presses.
 const CLEARANCE_MM: f64 = 2.0;
 
 impl Motion {
-    /// Where the arm is `time_s` after the touch (before it: negative), in mm along the press's
-    /// direction, 0 at the touch: what a robot knows of its hand. Its finger tip is less deep by the
-    /// force over the arm's stiffness.
+    /// The arm's position `time_s` after the touch (negative before it), in mm along the press's
+    /// direction, 0 at the touch. This is what a robot knows of its hand. The finger tip is less
+    /// deep, by the force over the arm's stiffness.
     pub fn approach_mm(&self, time_s: f64) -> f64 {
         let loading = self.top_mm + self.speed_mm_s * (time_s - self.load_s);
         let withdrawing = self.top_mm - self.speed_mm_s * (time_s - self.load_s - self.hold_s);
@@ -48,19 +48,19 @@ impl Motion {
     }
 }
 
-/// Where the arm is in a sequence of presses, between the last one and the next.
+/// The arm's motion in a sequence of presses, around the last press and the next.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Approach {
-    /// When the last press touched, and how the arm moved.
+    /// The time of the last press's touch, and the arm's motion in that press.
     pub(super) last: Option<(f64, Motion)>,
-    /// When the next one will, and how fast the arm comes.
+    /// The time of the next press's touch, and the arm's speed.
     pub(super) next: Option<(f64, f64)>,
 }
 
 impl Approach {
-    /// Where the arm is `time_s` after the sequence's first frame, in mm as
-    /// [`Motion::approach_mm`]. Any moment near the frame that this came with may be asked for: a
-    /// robot sends its positions when it likes.
+    /// The arm's position `time_s` after the sequence's first frame, in mm as in
+    /// [`Motion::approach_mm`]. Any time near this value's frame is valid, because a robot sends
+    /// its positions at times of its own.
     pub fn mm(&self, time_s: f64) -> f64 {
         let last = self.last.map_or(-CLEARANCE_MM, |(touch_s, motion)| {
             motion.approach_mm(time_s - touch_s)

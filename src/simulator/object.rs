@@ -1,25 +1,25 @@
-//! Objects and how they lie under the sensor: families, sizes, faces, postures.
+//! Objects and their positions under the sensor: families, sizes, faces, postures.
 //!
-//! Lengths in mm; x and y in the sensor's plane from its centre, heights measured downwards from
-//! the highest point of the face.
+//! Lengths are in mm. x and y are in the sensor's plane, from its centre. Heights are measured
+//! downwards from the highest point of the face.
 
 use serde::{Deserialize, Serialize};
 
 use super::texture::Patch;
 use crate::random::Stream;
 
-/// Which distribution of shapes the objects are drawn from.
+/// The distribution that the objects' shapes are drawn from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Shapes {
-    /// One distribution for all materials, and test objects of the same geometry, posture and
-    /// force in every test material: shape cannot carry the label.
+    /// One distribution for all materials. The test objects have the same geometry, posture and
+    /// force in every test material, so shape cannot reveal the label.
     Matched,
-    /// As `matched`, but of radii from 8 to 60 mm, edges and points among them: one frame then
-    /// says little of the hardness, because it fixes R / E* alone.
+    /// Like `matched`, but with radii from 8 to 60 mm, and with edges and points. One frame then
+    /// says little of the hardness, because it fixes only R / E*.
     Wide,
-    /// As the paper's pictures suggest: rigid objects mostly flat boxes, soft ones round. Part
-    /// of any accuracy on these is shape.
+    /// As the paper's pictures suggest: rigid objects are mostly flat boxes, soft ones round. Part
+    /// of any accuracy on these shapes comes from the shape.
     Paper,
 }
 
@@ -36,14 +36,14 @@ impl std::str::FromStr for Shapes {
     }
 }
 
-/// A name that is no set of shapes.
+/// A name that is not a set of shapes.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("no shapes \"{0}\"; there are matched, wide, paper")]
 pub struct UnknownShapes(pub String);
 
-/// Postures an object is pressed in (paper: "at least six").
+/// The number of postures that an object is pressed in (paper: "at least six").
 pub(super) const POSTURES: usize = 6;
-/// Where the object is not: no press reaches this depth.
+/// The depth beside the object, which no press reaches.
 const NOTHING_MM: f64 = 1e3;
 
 /// An object's outline, the same in every material.
@@ -51,7 +51,7 @@ const NOTHING_MM: f64 = 1e3;
 pub(super) struct Object {
     solid: Solid,
     edge_mm: f64,
-    /// Radius of curvature of the three pairs of faces; negative: hollow.
+    /// Radius of curvature of the three pairs of faces; negative for hollow faces.
     crown_mm: [f64; 3],
 }
 
@@ -82,13 +82,14 @@ enum Solid {
     },
 }
 
-/// What the sensor meets in one posture.
+/// The face that the sensor meets in one posture.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Face {
     outline: Outline,
-    /// From the table to the highest point.
+    /// The height from the table to the highest point.
     pub(super) height_mm: f64,
-    /// Standard deviation of the tilt, degrees: round objects roll, flat ones lie.
+    /// Standard deviation of the tilt in degrees: large for round objects, which roll, and small
+    /// for flat ones.
     pub(super) tilt_sd_deg: f64,
     /// Factor on the texture's rms.
     pub(super) roughness: f64,
@@ -124,7 +125,7 @@ enum Outline {
     },
 }
 
-/// How the face lies under the sensor in one press.
+/// The face's position under the sensor in one press.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Pose {
     turn_rad: f64,
@@ -134,7 +135,7 @@ pub(super) struct Pose {
 }
 
 impl Pose {
-    /// Turn uniform, shift uniform within 6 mm, tilt normal.
+    /// Draws a pose: the turn is uniform, the shift uniform within 6 mm, the tilt normal.
     pub(super) fn draw(face: &Face, stream: &mut Stream) -> Self {
         let turn_rad = stream.range(0.0, std::f64::consts::TAU);
         let shift_mm = [stream.range(-6.0, 6.0), stream.range(-6.0, 6.0)];
@@ -147,26 +148,26 @@ impl Pose {
     }
 }
 
-/// Weights of ball, cylinder, box, wedge, pebble, point: the paper's rigid objects.
+/// Weights of ball, cylinder, box, wedge, pebble and point for the paper's rigid objects.
 const RIGID: [f64; 6] = [0.05, 0.15, 0.62, 0.08, 0.10, 0.0];
-/// The paper's soft objects.
+/// The weights for the paper's soft objects.
 const SOFT: [f64; 6] = [0.42, 0.18, 0.12, 0.03, 0.25, 0.0];
-/// Every object of the matched shapes: the mean of the two.
+/// The weights for all objects of the matched shapes: the mean of the paper's two.
 const MATCHED: [f64; 6] = [0.235, 0.165, 0.37, 0.055, 0.175, 0.0];
-/// Every object of the wide shapes.
+/// The weights for all objects of the wide shapes.
 const WIDE: [f64; 6] = [0.20, 0.18, 0.26, 0.12, 0.14, 0.10];
-/// Radii of balls, cylinders and crowns of the wide shapes, mm, log-even; pebbles' axes lie within
-/// a tenth of one.
+/// Radii of balls, cylinders and crowns of the wide shapes in mm, log-uniform. Pebbles' axes are
+/// within a tenth of such a radius.
 const WIDE_RADIUS_MM: (f64, f64) = (8.0, 60.0);
-/// Radii of their edges and points, mm: sharper ones would lie between the taxels.
+/// Radii of edges and points of the wide shapes in mm. Sharper ones would fit between the taxels.
 const WIDE_TIP_MM: (f64, f64) = (2.0, 10.0);
 
 impl Object {
-    /// Draws an object; `level` matters for the paper's shapes only.
+    /// Draws an object. `level` only matters for the paper's shapes.
     ///
-    /// Faces are crowned but for the paper's rigid objects, whose faces are flat. A single frame
-    /// fixes R / E* and no more, so that only a narrow range of radii leaves hardness in it; a flat
-    /// soft face touches whole, whatever its hardness.
+    /// Faces are crowned, except those of the paper's rigid objects, which are flat. A single frame
+    /// fixes R / E* and no more, so it carries the hardness only if the range of radii is narrow. A
+    /// flat soft face touches as a whole, whatever its hardness.
     pub(super) fn draw(shapes: Shapes, level: u8, stream: &mut Stream) -> Self {
         let (weights, flat) = match shapes {
             Shapes::Wide => return Self::wide(stream),
@@ -246,7 +247,7 @@ impl Object {
         }
     }
 
-    /// The face that posture `posture` (0 to 5) turns up.
+    /// The upper face in posture `posture` (0 to 5).
     pub(super) fn face(&self, posture: usize) -> Face {
         let edge = self.edge_mm;
         let flat = |outline, height_mm| Face {
@@ -276,7 +277,7 @@ impl Object {
                     roughness: 2.0,
                 }
             }
-            // Four times on its side, once on each end.
+            // A cylinder has four postures on its side and one on each end.
             Solid::Cylinder { radius, length } if posture < 4 => flat(
                 Outline::Ridge {
                     radius,
@@ -329,14 +330,14 @@ impl Object {
     }
 }
 
-/// Place among weights, by these.
+/// Draws an index with the probabilities `weights`.
 fn family(weights: &[f64], stream: &mut Stream) -> usize {
     let mut rest = stream.uniform();
     let place = weights.iter().position(|&weight| {
         rest -= weight;
         rest < 0.0
     });
-    // Rounding leaves a little at the end: to the last one that there is.
+    // Rounding can leave a small rest, which goes to the last weight above 0.
     let last = weights.iter().rposition(|&weight| weight > 0.0);
     place.or(last).unwrap_or_default()
 }
@@ -352,11 +353,11 @@ fn log_even((low, high): (f64, f64), stream: &mut Stream) -> f64 {
     stream.range(low.ln(), high.ln()).exp()
 }
 
-/// Wedges and points stand on their base, tip up.
+/// Height of wedges and points, which rest on their base with the tip up.
 const WEDGE_HEIGHT_MM: f64 = 30.0;
 
 impl Face {
-    /// A ball's top.
+    /// The top of a ball.
     #[cfg(test)]
     pub(super) fn ball(radius: f64) -> Self {
         let outline = Outline::Ellipsoid {
@@ -372,7 +373,8 @@ impl Face {
         }
     }
 
-    /// Gap h in mm under a level sensor at `width` x `width` cells around the centre, least 0.
+    /// Gap h in mm under a level sensor at `width` x `width` cells around the centre. The least gap
+    /// is 0.
     pub(super) fn gap_mm(
         &self,
         pose: &Pose,
@@ -403,12 +405,12 @@ impl Face {
 }
 
 impl Outline {
-    /// Depth below the face's level at (`u`, `v`); [`NOTHING_MM`] beside the object.
+    /// Depth in mm below the face's level at (`u`, `v`); [`NOTHING_MM`] beside the object.
     fn drop_mm(&self, u: f64, v: f64) -> f64 {
         match *self {
             Outline::Ellipsoid { x, y, z } => {
                 let rest = 1.0 - (u / x).powi(2) - (v / y).powi(2);
-                // Near the equator the slope is endless; no contact gets there.
+                // The slope goes to infinity at the equator, which no contact reaches.
                 if rest > 0.01 {
                     z * (1.0 - rest.sqrt())
                 } else {
@@ -447,7 +449,8 @@ impl Outline {
     }
 }
 
-/// Drop of a rounded tip that goes on as a flank, `v` from its middle; a flank of 90 degrees ends.
+/// Drop of a rounded tip that continues as a flank, at `v` from its middle. A flank of 90 degrees
+/// ends the object.
 fn flanked(radius: f64, flank_deg: f64, v: f64) -> f64 {
     let turn = flank_deg.to_radians();
     let at = 0.99 * radius * turn.sin();
@@ -460,7 +463,7 @@ fn flanked(radius: f64, flank_deg: f64, v: f64) -> f64 {
     }
 }
 
-/// Drop of an edge rounded with radius `edge`, at these distances past where the rounding starts.
+/// Drop of an edge rounded with radius `edge`, at these distances past the start of the rounding.
 fn rounded(past_u: f64, past_v: f64, edge: f64) -> f64 {
     let past = past_u.max(0.0).hypot(past_v.max(0.0));
     if past < 0.99 * edge {
@@ -470,7 +473,7 @@ fn rounded(past_u: f64, past_v: f64, edge: f64) -> f64 {
     }
 }
 
-/// Drop of a sphere of this radius; hollow if negative.
+/// Drop of a sphere of radius `crown`; a negative radius is hollow.
 fn crowned(crown: f64, r: f64) -> f64 {
     if r >= 0.99 * crown.abs() {
         NOTHING_MM

@@ -1,6 +1,6 @@
 //! One specimen under the sensor: from gap and force to pressure and taxel forces.
 //!
-//! A [`Bench`] holds what is costly to make and shared by presses: FFT plans, kernels, work
+//! A [`Bench`] holds values that are costly to make and shared by presses: FFT plans, kernels, work
 //! fields. It never changes a result: a fresh bench gives the same bytes.
 
 use std::collections::BTreeMap;
@@ -14,7 +14,7 @@ use super::sensor::{CELL_MM, CELLS};
 use super::substance::{Law, Substance};
 use super::texture::Patch;
 
-/// Windows in cells: their doubles are sizes that FFTs like.
+/// Window widths in cells. FFTs of twice these sizes are fast.
 const WIDTHS: [usize; 6] = [24, 32, 48, 64, 96, CELLS];
 
 /// The sensor's cover: E in MPa, Poisson's ratio, thickness in mm (assumed: soft silicone).
@@ -22,7 +22,7 @@ pub(super) const COVER_YOUNG_MPA: f64 = 3.0;
 const COVER_NU: f64 = 0.45;
 const COVER_MM: f64 = 1.0;
 
-/// A face of an object in its pose.
+/// An object's face in its pose.
 pub(super) struct Specimen {
     pub(super) substance: Substance,
     pub(super) young_mpa: f64,
@@ -31,7 +31,7 @@ pub(super) struct Specimen {
     gap_mm: Vec<f32>,
 }
 
-/// The part of the sensor that a press is solved on.
+/// The part of the sensor on which a press is solved.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Window {
     /// First row and column, in cells of the sensor.
@@ -52,22 +52,22 @@ struct Width {
     convolver: Convolver,
     half_space: Rc<Vec<f32>>,
     cover: Vec<f32>,
-    /// The last few layers' spectra: one posture's presses follow each other.
+    /// The spectra of the last few layers, because the presses of one posture follow each other.
     recent: Vec<(LayerKey, Rc<Vec<f32>>)>,
 }
 
-/// What a layer's spectrum depends on.
+/// The quantities that determine a layer's spectrum.
 #[derive(Clone, Copy, PartialEq)]
 struct LayerKey {
     nu: f64,
     base: Base,
-    /// In cells.
+    /// The layer's height in cells.
     height: f64,
 }
 
-/// Layer spectra held a width; an object has up to three heights.
+/// The number of layer spectra held per width. An object has up to three heights.
 const RECENT: usize = 4;
-/// Kinds of layers held, the cover among them.
+/// The number of kinds of layers held, including the cover.
 const LAYERS: usize = 8;
 
 impl Specimen {
@@ -87,12 +87,12 @@ impl Specimen {
         }
     }
 
-    /// E / (1 - nu^2), MPa.
+    /// The plane-strain modulus E / (1 - nu^2), MPa.
     fn plane_strain_mpa(&self) -> f64 {
         self.substance.plane_strain(self.young_mpa)
     }
 
-    /// The local law at one step: `factor` and `history` from creep, `time_s` for flow.
+    /// The local law at one step. Creep gives `factor` and `history_mpa`, and flow uses `time_s`.
     fn local<'a>(&self, factor: f64, history_mpa: &'a [f32], time_s: f64) -> Local<'a> {
         match self.substance.law {
             Law::Solid | Law::Layered { .. } => Local::None,
@@ -115,7 +115,7 @@ impl Specimen {
         }
     }
 
-    /// Flow over a step of `time_s`, for a plastic specimen; else nothing.
+    /// The flow over a step of `time_s` for a plastic specimen, and no local law for any other.
     pub(super) fn flow(&self, time_s: f64) -> Local<'static> {
         match self.substance.law {
             Law::Plastic { .. } => self.local(1.0, &[], time_s),
@@ -133,10 +133,10 @@ impl Specimen {
         gap
     }
 
-    /// A guess at the contact under `force_n`: the depth below which the gap closes.
+    /// A guess at the contact under `force_n`: cells with a gap below this depth close.
     ///
-    /// With overlap volume V at depth d and radius a of half the overlap's area, a sphere and a
-    /// flat punch both obey `F = 0.42 E* V / a` within 7 %; the cover adds its own compliance.
+    /// With overlap volume V at depth d, and radius a of half the overlap's area, a sphere and a
+    /// flat punch both obey `F = 0.42 E* V / a` within 7 %. The cover adds its own compliance.
     fn closing_depth_mm(&self, force_n: f64) -> f64 {
         let soft = match self.substance.law {
             Law::Foam { .. } => 0.4,
@@ -163,8 +163,8 @@ impl Specimen {
                 high = depth;
             }
         }
-        // A sphere touches where the undeformed gap is under half the depth; a stiff rough face
-        // touches nearly as a mattress, where it is under all of it.
+        // A sphere touches where the undeformed gap is less than half the depth. A stiff rough face
+        // behaves nearly as a mattress and touches where the gap is less than the whole depth.
         let share = if self.young_mpa > 20.0 { 1.0 } else { 0.6 };
         share * f64::from(high)
     }
@@ -199,7 +199,7 @@ impl Specimen {
 }
 
 impl Window {
-    /// Whether it is the whole sensor.
+    /// Whether the window is the whole sensor.
     pub(super) fn is_whole(self) -> bool {
         self.width == CELLS
     }
@@ -211,33 +211,33 @@ impl Window {
     }
 }
 
-/// H / M of the usual cover, mm per MPa: what is made of it is a guess, under any cover.
+/// H / M of the default cover, mm per MPa. It serves for any cover, because it only enters a guess.
 fn cover_compliance() -> f64 {
     let plane_strain = COVER_YOUNG_MPA / (1.0 - COVER_NU * COVER_NU);
     COVER_MM * kernel::confined_compliance(COVER_NU) / plane_strain
 }
 
-/// Creep and flow of one solve.
+/// The force, creep and flow of one solve.
 #[derive(Clone, Copy)]
 pub(super) struct Step<'a> {
     pub(super) force_n: f64,
-    /// Object's compliance per its instantaneous compliance.
+    /// The object's compliance over its instantaneous compliance.
     pub(super) factor: f64,
-    /// What earlier steps left of the effective pressure; empty: nothing.
+    /// The part of the effective pressure that earlier steps left; empty if there is none.
     pub(super) history_mpa: &'a [f32],
     /// Time over which flow acts.
     pub(super) time_s: f64,
 }
 
 impl Default for Bench {
-    /// Under the usual cover.
+    /// A bench for the default cover.
     fn default() -> Self {
         Self::under(COVER_YOUNG_MPA)
     }
 }
 
 impl Bench {
-    /// For a sensor under a cover of this Young's modulus.
+    /// A bench for a sensor whose cover has this Young's modulus.
     pub(super) fn under(cover_young_mpa: f64) -> Self {
         Self {
             cover_young_mpa,
@@ -248,8 +248,8 @@ impl Bench {
         }
     }
 
-    /// Presses with a force held for `hold_s` after a ramp of `ramp_s`; returns the window and the
-    /// pressure (MPa) on it. The window grows until the contact fits.
+    /// Presses with a force held for `hold_s` after a ramp of `ramp_s`. Returns the window, the
+    /// pressure (MPa) on it and the contact. The window grows until the contact fits.
     pub(super) fn press(
         &mut self,
         specimen: &Specimen,
@@ -267,8 +267,8 @@ impl Bench {
                 .collect();
             let step = Step {
                 force_n,
-                // Under a linear ramp the load is, on average, half the ramp old; flow at the
-                // fourth power of the pressure counts a fifth of it.
+                // Under a linear ramp, the mean age of the load is half the ramp. Flow with the
+                // fourth power of the pressure counts a fifth of the ramp.
                 factor: specimen.substance.compliance_ratio(hold_s + 0.5 * ramp_s),
                 history_mpa: &[],
                 time_s: hold_s + 0.2 * ramp_s,
@@ -370,7 +370,7 @@ impl Bench {
         spectrum
     }
 
-    /// Where among `layers` the one of this kind is; made, if it is not there.
+    /// The index in `layers` of the layer of this kind, which is made if it is missing.
     fn layer(&mut self, nu: f64, base: Base) -> usize {
         let kind = (nu, base);
         let held = self.layers.iter().position(|(held, _)| *held == kind);
@@ -381,7 +381,7 @@ impl Bench {
     }
 }
 
-/// Adds to a list of the last few.
+/// Adds to a list of the last `most` items.
 fn keep<T>(list: &mut Vec<T>, item: T, most: usize) {
     if list.len() == most {
         list.remove(0);
@@ -422,7 +422,7 @@ mod tests {
     use super::*;
     use crate::random::Stream;
 
-    /// A ball of radius 27 mm of this material, its roughness times `roughness`.
+    /// A ball of radius 27 mm of this material, with `roughness` times its roughness.
     fn ball(material: Material, roughness: f64) -> Specimen {
         let properties = material.properties();
         let substance = properties.substance;
@@ -441,9 +441,9 @@ mod tests {
 
     #[test]
     fn radius_follows_from_force_and_r_over_e_as_hertz_says() {
-        // Under a cover that hardly yields, a smooth ball of a solid: a^3 = 3 F R / (4 E*), with
-        // the compliance after creep. A sphere is steeper than Hertz's paraboloid, by 1 % of a
-        // where a is a quarter of R.
+        // A smooth solid ball under a cover that hardly yields obeys a^3 = 3 F R / (4 E*), with the
+        // compliance after creep. A sphere is steeper than Hertz's paraboloid, which changes a by
+        // 1 % where a is a quarter of R.
         let mut bench = Bench::under(1e4);
         let rubber = Material::Rubber.properties().substance;
         for (radius, young_mpa, force_n) in [
@@ -487,7 +487,8 @@ mod tests {
                 );
                 let taxels = taxel_forces(&pressure, window.width, window.corner);
                 let sum: f64 = taxels.iter().map(|&force| f64::from(force)).sum();
-                // A taxel senses 3.0 of 3.5 mm: sharp contacts fall between or upon them.
+                // A taxel senses 3.0 of 3.5 mm, so sharp contacts can fall between taxels or upon
+                // them.
                 let slack = if material.level() == 1 { 0.25 } else { 0.02 };
                 assert!(
                     (sum / force_n - 1.0).abs() < slack,
@@ -499,8 +500,8 @@ mod tests {
 
     #[test]
     fn softer_levels_spread_the_force_wider() {
-        // The paper's figure 2, on one smooth shape: radius of contact rises with the level, in
-        // the training materials and in the test materials.
+        // As in the paper's figure 2, on one smooth shape: the contact radius rises with the level,
+        // in the training materials and in the test materials.
         let mut bench = Bench::default();
         for materials in [&Material::ALL[..4], &Material::ALL[4..]] {
             for force_n in [4.0, 12.0, 25.0] {

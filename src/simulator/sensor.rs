@@ -1,8 +1,9 @@
-//! The film array: pressure under the cover becomes taxel forces, and those become counts.
+//! The film array, which turns the pressure under its cover into taxel forces, and those into
+//! counts.
 //!
-//! A [`Sensor`] is one instance: its gains, activation thresholds and dead taxels are drawn once.
-//! No noise without load: below its activation threshold a taxel's layers do not touch, and it
-//! reads exactly 0, as film arrays do.
+//! A [`Sensor`] is one instance, whose gains, activation thresholds and dead taxels are drawn once.
+//! There is no noise without load: below its activation threshold a taxel's layers do not touch,
+//! and the taxel reads exactly 0, as film arrays do.
 
 use std::sync::OnceLock;
 
@@ -19,11 +20,11 @@ pub(super) const CELL_MM: f64 = PITCH_MM / CELLS_PER_TAXEL as f64;
 /// Width of the sensor in cells.
 pub(super) const CELLS: usize = ROWS * CELLS_PER_TAXEL;
 
-/// The part of the pitch that senses.
+/// Width of a taxel's sensitive area, mm.
 const ACTIVE_MM: f64 = 3.0;
-/// Depth of the film under the cover's surface.
+/// Depth of the film under the cover's surface, mm.
 const DEPTH_MM: f64 = 1.0;
-/// Film creep: 3 % at 0.4 s and 4 % at 8 s.
+/// Film creep, as share and time constant in s: 3 % with 0.4 s, and 4 % with 8 s.
 const FILM_CREEP: [(f32, f32); 2] = [(0.03, 0.4), (0.04, 8.0)];
 const CROSSTALK_NEIGHBOUR: f32 = 0.015;
 const CROSSTALK_LINE: f32 = 0.004;
@@ -31,16 +32,16 @@ const NOISE_RATIO: f64 = 0.015;
 const NOISE_N: f64 = 0.012;
 const DEAD_SHARE: f64 = 0.003;
 const FULL_SCALE_COUNTS: f32 = 255.0;
-/// Activation thresholds: lognormal, this median; +3 sigma is the paper's "minimum
-/// discrimination" of 0.2 N, read as a bound that every taxel keeps.
+/// Median of the lognormal activation thresholds. Their +3 sigma is the paper's "minimum
+/// discrimination" of 0.2 N, read as a bound that holds for every taxel.
 const THRESHOLD_MEDIAN_N: f64 = 0.05;
 const THRESHOLD_BOUND_N: f64 = 0.2;
 
-/// How alike the taxels of a sensor are.
+/// The spread between the taxels of a sensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum SensorProfile {
-    /// As after a taxel-wise calibration.
+    /// The spread after a taxel-wise calibration.
     Clean,
     /// The spread measured on a public film array.
     Raw,
@@ -58,12 +59,12 @@ impl std::str::FromStr for SensorProfile {
     }
 }
 
-/// A name that is no sensor profile.
+/// A name that is not a sensor profile.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("no sensor profile \"{0}\"; there are clean, raw")]
 pub struct UnknownProfile(pub String);
 
-/// Relative spreads of a profile: a taxel, a row, a column, a press.
+/// Relative spreads of a profile, per taxel, row, column and press.
 struct Spread {
     taxel: f64,
     row: f64,
@@ -90,7 +91,7 @@ impl SensorProfile {
     }
 }
 
-/// One sensor.
+/// One instance of a sensor.
 #[derive(Debug, Clone)]
 pub(super) struct Sensor {
     gain: Vec<f32>,
@@ -99,7 +100,7 @@ pub(super) struct Sensor {
 }
 
 impl Sensor {
-    /// Draws an instance.
+    /// Draws a sensor.
     pub(super) fn new(profile: SensorProfile, stream: &Stream) -> Self {
         let spread = profile.spread();
         let lines = |sd: f64, name: u64, count: usize| -> Vec<f64> {
@@ -132,17 +133,17 @@ impl Sensor {
         }
     }
 
-    /// Of each taxel; 0 where it is dead.
+    /// The gain of each taxel; 0 for a dead one.
     pub(super) fn gains(&self) -> &[f32] {
         &self.gain
     }
 
-    /// The factor common to all taxels in one press.
+    /// Draws the factor common to all taxels in one press.
     pub(super) fn press_gain(&self, stream: &mut Stream) -> f32 {
         (1.0 + self.press_spread * stream.normal()).max(0.3) as f32
     }
 
-    /// Reads taxel forces in newtons (with film creep) into counts.
+    /// Converts taxel forces in newtons, with film creep, into counts.
     pub(super) fn read(
         &self,
         forces_n: &[f32; TAXELS],
@@ -172,8 +173,8 @@ impl Sensor {
             if column + 1 < COLS {
                 near += forces_n[k + 1];
             }
-            // What comes through the cover can close a taxel; what comes along the lines cannot,
-            // and an open taxel reads nothing. Else 25 N on one point would draw a cross.
+            // Force through the cover can close a taxel. Crosstalk along the lines cannot, and an
+            // open taxel reads nothing. Otherwise 25 N on one point would draw a cross.
             let pressed = own + CROSSTALK_NEIGHBOUR * near;
             if pressed <= self.threshold_n[k] {
                 continue;
@@ -190,14 +191,14 @@ impl Sensor {
             let rounded = (read / NEWTONS_PER_COUNT)
                 .round()
                 .clamp(0.0, FULL_SCALE_COUNTS);
-            // Single counts are suppressed.
+            // A reading of one count becomes 0.
             *counts = if rounded < 2.0 { 0 } else { rounded as u16 };
         }
         raw
     }
 }
 
-/// How far the film has crept under each taxel.
+/// The state of the film's creep under each taxel.
 #[derive(Debug, Clone)]
 pub(super) struct Film {
     crept: Vec<[f32; 2]>,
@@ -211,8 +212,8 @@ impl Film {
         }
     }
 
-    /// Moves on by `time_s` under `forces_n` and returns what the film makes of them. Creep
-    /// multiplies the load, so that an unloaded taxel reads nothing, however long it was loaded.
+    /// Advances by `time_s` under `forces_n` and returns the forces with the film's creep. Creep
+    /// multiplies the load, so an unloaded taxel reads nothing, however long it was loaded.
     pub(super) fn advance(&mut self, forces_n: &[f32; TAXELS], time_s: f64) -> [f32; TAXELS] {
         let step = FILM_CREEP.map(|(_, tau)| -(-(time_s as f32) / tau).exp_m1());
         let mut read = [0.0; TAXELS];
@@ -229,13 +230,13 @@ impl Film {
     }
 }
 
-/// Taxels on each side that feel a load.
+/// The number of taxels on each side that feel a load.
 const REACH: usize = 2;
 const SPAN: usize = 2 * REACH + 1;
 
-/// Adds the forces (N) that the pressure (MPa) on a window of cells makes on the taxels. `corner`
-/// is the window's first row and column in cells of the sensor. What spreads beyond the sensor's
-/// border is lost, as on a real one.
+/// The taxel forces (N) from the pressure (MPa) on a window of cells. `corner` is the window's
+/// first row and column in cells of the sensor. Force beyond the sensor's border is lost, as on a
+/// real sensor.
 pub(super) fn taxel_forces(
     pressure_mpa: &[f32],
     width: usize,
@@ -261,7 +262,7 @@ pub(super) fn taxel_forces(
     forces
 }
 
-/// Share of a load on each of a taxel's cells that it and its neighbours feel.
+/// The shares of a load on each cell of a taxel that the taxel and its neighbours feel.
 ///
 /// Normal stress at depth z under a point load is `3 F z^3 / (2 pi (r^2 + z^2)^(5/2))`, whose
 /// transform is `(1 + q z) exp(-q z)`. A taxel integrates its active square and is calibrated
@@ -270,7 +271,7 @@ fn spreading() -> &'static [[f32; SPAN * SPAN]; CELLS_PER_TAXEL * CELLS_PER_TAXE
     static TABLE: OnceLock<[[f32; SPAN * SPAN]; CELLS_PER_TAXEL * CELLS_PER_TAXEL]> =
         OnceLock::new();
     TABLE.get_or_init(|| {
-        // Points along the active width of a taxel and along a cell (midpoint rule).
+        // The number of points along a taxel's active width and along a cell (midpoint rule).
         const FINE: usize = 12;
         const PARTS: usize = 3;
         let mut table = [[0.0_f32; SPAN * SPAN]; CELLS_PER_TAXEL * CELLS_PER_TAXEL];
@@ -324,7 +325,7 @@ mod tests {
         (pressure, force)
     }
 
-    /// A raw sensor whose taxels feel any load.
+    /// A raw sensor without activation thresholds.
     fn without_thresholds(seed: u64) -> Sensor {
         let mut sensor = Sensor::new(SensorProfile::Raw, &Stream::new(seed, "sensor"));
         sensor.threshold_n.fill(0.0);
@@ -350,7 +351,7 @@ mod tests {
             .iter()
             .map(|&c| f64::from(c) * f64::from(NEWTONS_PER_COUNT))
             .sum();
-        // Crosstalk adds 4 x 1.5 % + 54 x 0.4 % where it exceeds the thresholds.
+        // Where a taxel is above its threshold, crosstalk adds up to 4 x 1.5 % + 54 x 0.4 %.
         assert!(
             (0.97..1.25).contains(&(read / (0.1 * force))),
             "{read} N of {} N",

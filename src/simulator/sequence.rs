@@ -1,7 +1,7 @@
-//! Press after press as a sensor would send them: raw frames at a steady rate.
+//! A sequence of presses as a sensor would send it: raw frames at a steady rate.
 //!
-//! Frames come out one at a time, but a press is computed whole when its first frame is due (0.05
-//! to 0.5 s of work): who plays a sequence in real time runs it some frames ahead.
+//! Frames come out one at a time, but a press is computed as a whole when its first frame is due
+//! (0.05 to 0.5 s of work). To play a sequence in real time, run it some frames ahead.
 
 use std::collections::VecDeque;
 
@@ -17,18 +17,18 @@ use super::tracked::one_press;
 use crate::frame::{RawFrame, TAXELS};
 use crate::random::Stream;
 
-/// What to press, how often and how hard.
+/// The settings of a sequence: what to press, how often and how hard.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SequenceSettings {
-    /// Everything random follows from it.
+    /// The seed of everything random.
     pub seed: u64,
-    /// Frames a second.
+    /// Frames per second.
     pub frame_rate_hz: f64,
-    /// Press k is of `materials[(k - 1) % n]`, each time another object.
+    /// Press k is of `materials[(k - 1) % n]`, each time on another object.
     pub materials: Vec<Material>,
-    /// Greatest forces of the presses, in turn; where there are none, they are drawn from 5 to 25 N.
+    /// Greatest forces of the presses, used in turn. If empty, they are drawn from 5 to 25 N.
     pub forces_n: Vec<f32>,
-    /// Presses to make; `None`: without end.
+    /// The number of presses; `None` for an endless sequence.
     pub presses: Option<u32>,
     /// Distribution of shapes.
     pub shapes: Shapes,
@@ -37,7 +37,7 @@ pub struct SequenceSettings {
 }
 
 impl Default for SequenceSettings {
-    /// The four test materials without end, at the paper's 5 frames/s.
+    /// The four test materials in an endless sequence, at the paper's 5 frames/s.
     fn default() -> Self {
         Self {
             seed: 0,
@@ -51,27 +51,27 @@ impl Default for SequenceSettings {
     }
 }
 
-/// One frame and what is going on in it.
+/// One frame, with the state of the press.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SequenceFrame {
-    /// What the sensor sends.
+    /// The frame that the sensor sends.
     pub raw: RawFrame,
-    /// Number of the press, from 1; the rest after it is counted to it. 0 before the first.
+    /// Number of the press, from 1, which includes the rest after it. 0 before the first press.
     pub press: u32,
-    /// What is or was pressed; `None` before the first press.
+    /// Material of the current or last press; `None` before the first press.
     pub material: Option<Material>,
     /// Whether the object is being touched.
     pub loaded: bool,
-    /// Where the arm is, around this frame.
+    /// The arm's motion around this frame.
     pub approach: Approach,
 }
 
 /// An iterator over the frames of a sequence; see [`SequenceSettings`].
 ///
-/// It begins with at least 2 s and ten frames without load, so that tare has its frames at any rate,
-/// and rests at least 1 s and five frames after each press, which is held for at least three. A press
-/// too light to begin one (3 taxels) is made anew with more force, so that `presses` is the
-/// number that a press tracker sees.
+/// The sequence begins with at least 2 s and ten frames without load, so that tare has its frames
+/// at any rate. It rests at least 1 s and five frames after each press, which is held for at least
+/// three. A press too light to begin one (3 taxels) is made anew with more force, so that a press
+/// tracker sees `presses` presses.
 pub struct Sequence {
     settings: SequenceSettings,
     root: Stream,
@@ -79,23 +79,24 @@ pub struct Sequence {
     bench: Bench,
     film: Film,
     ready: VecDeque<SequenceFrame>,
-    /// Presses made so far.
+    /// The number of presses made so far.
     made: u32,
-    /// Frames made so far; frame n is taken at n / frame rate.
+    /// The number of frames made so far. Frame n is taken at n / frame rate.
     frames: u64,
-    /// When the rest after the last press ends, s.
+    /// Time at which the rest after the last press ends, s.
     free_s: f64,
-    /// The last press: when it touched, and how the arm moved.
+    /// The time of the last press's touch, and the arm's motion in that press.
     last: Option<(f64, Motion)>,
 }
 
-/// Rest before the first press, s and frames.
+/// Least rest before the first press, in s and in frames.
 const FIRST_REST: (f64, f64) = (2.0, 10.0);
-/// Rest after a press, s and frames.
+/// Least rest after a press, in s and in frames.
 const REST: (f64, f64) = (1.0, 5.0);
-/// A press is held for so many frames at least.
+/// The least number of frames that a press is held.
 const HOLD_FRAMES: f64 = 3.0;
-/// Presses do not keep step with the frames: each is up to this much late, s.
+/// Greatest delay of a press, s. Each press gets a random delay, so that presses are not in step
+/// with the frames.
 const DELAY_S: f64 = 0.25;
 
 impl Sequence {
@@ -103,7 +104,7 @@ impl Sequence {
     ///
     /// # Panics
     ///
-    /// If there are no materials, or the frame rate is not a positive finite number.
+    /// Panics if there are no materials, or the frame rate is not a positive finite number.
     pub fn new(settings: SequenceSettings) -> Self {
         assert!(
             !settings.materials.is_empty(),
@@ -114,7 +115,8 @@ impl Sequence {
             rate.is_finite() && rate > 0.0,
             "frame rate {rate} is not a positive number"
         );
-        // A name of its own: a sequence meets no object and no sensor of any data set.
+        // The stream has a name of its own, so that a sequence shares no object and no sensor with
+        // a data set.
         let root = Stream::new(settings.seed, "sequence");
         let sensor = Sensor::new(settings.profile, &root.child(0));
         let mut sequence = Self {
@@ -133,12 +135,13 @@ impl Sequence {
         sequence
     }
 
-    /// The true gain of each taxel, which a calibration is to find; 0 where it is dead.
+    /// The true gain of each taxel, which a calibration should find; 0 for a dead taxel.
     pub fn gains(&self) -> &[f32] {
         self.sensor.gains()
     }
 
-    /// What the next press is drawn from; its first draw is how late it is.
+    /// The touch time of the next press, and the stream that the press is drawn from, after its
+    /// first draw, the delay.
     fn next_draws(&self) -> (f64, Stream) {
         let mut draws = self.root.child(1).child(u64::from(self.made));
         let delay_s = draws.range(0.0, DELAY_S);
@@ -150,7 +153,7 @@ impl Sequence {
         presses.is_some_and(|presses| self.made >= presses)
     }
 
-    /// Frames without load until `free_s`.
+    /// Makes frames without load until `free_s`.
     fn rest(&mut self, material: Option<Material>) {
         let next_s = (!self.is_done()).then(|| self.next_draws().0);
         let approach = Approach {
@@ -218,7 +221,7 @@ impl Sequence {
         }
     }
 
-    /// The frames from now until the end of `course`, and the number of the one after.
+    /// The frames from now until the end of `course`, and the number of the frame after them.
     fn play(
         &self,
         course: &Course,
@@ -262,7 +265,8 @@ mod tests {
     use crate::press::{self, Change, End, Marks, Moment, PressTracker};
     use crate::tare::{self, Tare};
 
-    /// Presses that the daemon sees by its default settings, with their frames in contact.
+    /// The presses that the daemon sees with its default settings, each with its number of frames
+    /// in contact.
     fn tracked(frames: &[SequenceFrame], rate_hz: f64) -> Vec<(u32, u64)> {
         let calibration = tare::Settings {
             tare_frames: 0,
@@ -308,7 +312,7 @@ mod tests {
         let seen = tracked(&frames, rate);
         let numbers: Vec<u32> = seen.iter().map(|&(press, _)| press).collect();
         assert_eq!(numbers, expected, "{settings:?}");
-        // Far from the 30 s after which the daemon gives a press up.
+        // The presses are far shorter than 30 s, after which the daemon aborts a press.
         assert!(seen.iter().all(|&(_, held)| (held as f64) < 15.0 * rate));
         let first = frames.iter().position(|frame| frame.loaded).unwrap();
         assert!(
@@ -381,7 +385,7 @@ mod tests {
         let frames: Vec<SequenceFrame> = Sequence::new(settings).collect();
         let mut before = None;
         for (number, frame) in (0_u32..).zip(&frames) {
-            // Four positions a frame.
+            // Check four positions per frame.
             for part in 0..4 {
                 let time_s = (f64::from(number) + 0.25 * f64::from(part)) / rate;
                 let now = frame.approach.mm(time_s);

@@ -1,4 +1,4 @@
-//! What a simulated data set can be told.
+//! The settings of a simulated data set.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,13 +9,13 @@ use super::object::Shapes;
 use super::press::COVER_YOUNG_MPA;
 use super::sensor::SensorProfile;
 
-/// Which materials the objects are of.
+/// The materials of the objects.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Materials {
-    /// The eight of the paper's Table 1.
+    /// The eight materials of the paper's Table 1.
     Named,
-    /// Each object of a material of its own.
+    /// Each object has a material of its own.
     Broad,
 }
 
@@ -31,45 +31,48 @@ impl std::str::FromStr for Materials {
     }
 }
 
-/// A name that is no set of materials.
+/// A name that is not a set of materials.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("no materials \"{0}\"; there are named, broad")]
 pub struct UnknownMaterials(pub String);
 
-/// What to simulate.
+/// The settings of a simulated data set.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DatasetSettings {
-    /// Everything random follows from it.
+    /// The seed of everything random.
     pub seed: u64,
-    /// Which materials the objects are of.
+    /// The materials of the objects.
     pub materials: Materials,
-    /// Laws of which broad materials are drawn.
+    /// The laws that broad materials are drawn from.
     pub laws: Laws,
     /// Whether broad materials avoid the levels' borders.
     pub borders: Borders,
-    /// Objects of each training material; of broad materials four times as many, each of its own.
+    /// The number of objects of each training material. Broad materials have four times as many
+    /// objects, each of a material of its own.
     pub objects: u32,
-    /// Objects of each test material; of broad materials four times as many.
+    /// The number of objects of each test material. Broad materials have four times as many
+    /// objects.
     pub test_objects: u32,
-    /// Whether all eight named materials are for test.
+    /// Whether all eight named materials are test materials.
     pub all_test: bool,
-    /// Presses of each object. Of all postures each under all nominal forces are 48; fewer are some
-    /// of those, of different postures and forces.
+    /// The number of presses of each object. All postures under all nominal forces are 48 presses.
+    /// Fewer presses are a part of those, spread over postures and forces.
     pub presses: u32,
-    /// The least of the eight nominal forces; the greatest is 25 N (paper).
+    /// The least of the eight nominal forces. The greatest is 25 N (paper).
     pub lowest_force_n: f32,
     /// Distribution of shapes.
     pub shapes: Shapes,
     /// Spread of the sensors.
     pub profile: SensorProfile,
-    /// Of the sensors' gains, thresholds and dead taxels; `None`: `seed`.
+    /// The seed of the sensors' gains, thresholds and dead taxels. `None` takes `seed`.
     pub sensor_seed: Option<u64>,
-    /// Whether all presses, of both splits, are on one sensor.
+    /// Whether all presses of both splits are on one sensor.
     pub one_sensor: bool,
     /// Young's modulus of the sensors' cover, MPa.
     pub cover_young_mpa: f64,
-    /// Levels, from 1, whose two materials change roles: the paper's test material trains.
+    /// Whether the two materials of each level swap roles, from level 1. The paper's test material
+    /// then trains.
     pub swapped_levels: [bool; 4],
 }
 
@@ -97,9 +100,9 @@ impl Default for DatasetSettings {
 }
 
 impl DatasetSettings {
-    /// What a material is for: the paper's split, or the other one where its level is swapped. An
-    /// object's draws follow from the seed, its split, material and number, so that the same
-    /// objects stand in every data set of a seed in which their material has the same role.
+    /// The split of a material: the paper's, or the other one if the material's level is swapped.
+    /// An object's draws follow from the seed and the object's split, material and number. So all
+    /// data sets of a seed contain the same objects of a material if it has the same role.
     pub fn split(&self, material: Material) -> Split {
         if self.all_test {
             return Split::Test;

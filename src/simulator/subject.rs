@@ -1,8 +1,8 @@
-//! Who is pressed: objects with their bodies, the sensors they are pressed on, and the streams
-//! that all of it is drawn from.
+//! The subjects of presses: objects with their bodies, the sensors they are pressed on, and the
+//! streams that all of these are drawn from.
 //!
-//! An object's draws follow from the seed, what it is and its number, so that the same objects
-//! stand in every data set of a seed, however many there are.
+//! An object's draws follow from the seed, its kind and its number. So all data sets of a seed
+//! contain the same objects, whatever the number of objects.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -17,17 +17,17 @@ use super::sensor::Sensor;
 use super::settings::{DatasetSettings, Materials};
 use crate::random::Stream;
 
-/// Groups of broad objects: as many as the levels, so that named and broad materials make equally
-/// many samples.
+/// The number of groups of broad objects. It equals the number of levels, so that named and broad
+/// materials make equally many samples.
 const GROUPS: u8 = LEVELS.len() as u8;
-/// Sensors that each split's objects are shared over.
+/// The number of sensors that each split's objects are distributed over.
 const SENSORS: u32 = 8;
 
-/// What an object is of.
+/// The kind of an object's material.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Origin {
     Named(Material),
-    /// Any material; objects of one number share their geometry over these groups.
+    /// A broad material. Test objects of the same number share their geometry over these groups.
     Broad(u8),
 }
 
@@ -39,7 +39,8 @@ pub(super) struct Unit {
     number: u32,
 }
 
-/// The objects of a data set: by material (as in [`Material::ALL`]) or by split and group.
+/// The objects of a data set, in the order of materials (as in [`Material::ALL`]) or of split and
+/// group.
 pub(super) fn units(settings: &DatasetSettings) -> Vec<Unit> {
     let count = |split| match split {
         Split::Train => settings.objects,
@@ -65,8 +66,8 @@ pub(super) fn units(settings: &DatasetSettings) -> Vec<Unit> {
     }
 }
 
-/// What `work` makes of each unit and its index, in their order, on `threads` threads: whichever
-/// thread does it.
+/// Runs `work` on each unit and its index, on `threads` threads. The results are in the order of
+/// the units, whichever thread makes them.
 pub(super) fn shared_out<T: Send>(
     units: &[Unit],
     threads: usize,
@@ -98,15 +99,15 @@ pub(super) fn shared_out<T: Send>(
     parts.into_iter().flatten().collect()
 }
 
-/// The streams of one object: its geometry, poses and forces, and what its material adds.
+/// The streams of one object: one for its geometry, poses and forces, and one for its material.
 pub(super) struct Draws {
     pub(super) geometry: Stream,
     pub(super) body: Stream,
 }
 
 impl Draws {
-    /// Geometry, poses and forces of test objects of the same number do not depend on the
-    /// material, but for the paper's shapes: that is what pairs them.
+    /// The streams of a unit. Geometry, poses and forces of test objects of the same number do not
+    /// depend on the material, except for the paper's shapes. This pairs the test objects.
     fn new(settings: &DatasetSettings, unit: Unit) -> Self {
         let (own, [train, test]) = match unit.origin {
             Origin::Named(material) => (material.index(), ["train", "test"]),
@@ -130,7 +131,7 @@ impl Draws {
     }
 }
 
-/// An object, what it is made of and the sensor it is pressed on.
+/// An object with its material and the sensor it is pressed on.
 pub(super) struct Subject {
     pub(super) split: Split,
     pub(super) body: Body,
@@ -147,7 +148,8 @@ impl Subject {
             Origin::Named(material) => Body::named(material, &mut hardness),
             Origin::Broad(_) => broad::draw(settings.laws, settings.borders, &mut hardness),
         };
-        // The splits share no sensor, unless there is one alone: the streams have different names.
+        // Different stream names keep the splits' sensors apart, unless the setting asks for one
+        // sensor.
         let (sensors, number) = match (settings.one_sensor, unit.split) {
             (true, _) => ("one sensor", 0),
             (false, Split::Train) => ("train sensor", unit.number % SENSORS),

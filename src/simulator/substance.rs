@@ -1,21 +1,23 @@
-//! What an object is made of: law, creep and texture, whatever its hardness.
+//! An object's substance, apart from its hardness: law, creep and texture.
 
 use super::kernel::Base;
 
-/// How the bulk answers beyond linear elasticity. Stresses and moduli are relative to E.
+/// The law of the bulk. Stresses and moduli are relative to Young's modulus E.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Law {
     /// Elastic half-space.
     Solid,
-    /// Elastic half-space that flows: p_H.
+    /// Elastic half-space that flows: p_H, the hardness.
     Plastic { hardness: f64 },
-    /// Bonded layer of the object's height, with a plateau: m, s_p, e_D.
+    /// Bonded layer of the object's height, with a plateau: m (exponent), s_p (plateau stress) and
+    /// e_D (strain at which the cells have closed).
     Foam {
         exponent: f64,
         plateau: f64,
         strain: f64,
     },
-    /// A layer of E bonded to an elastic half-space: its thickness, and the core's modulus.
+    /// A layer of modulus E bonded to an elastic half-space: the layer's thickness, and the core's
+    /// modulus.
     Layered { thickness_mm: f64, core: f64 },
 }
 
@@ -30,7 +32,7 @@ pub(super) struct Creep {
 }
 
 impl Creep {
-    /// No term.
+    /// A term without effect.
     pub(super) const NONE: Self = Self { j: 0.0, tau_s: 1.0 };
 }
 
@@ -44,7 +46,7 @@ pub(super) struct Texture {
     pub(super) anisotropy: f64,
 }
 
-/// What an object is made of, but for its modulus.
+/// The properties of a material except its modulus.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Substance {
     /// Poisson's ratio.
@@ -55,12 +57,13 @@ pub(super) struct Substance {
 }
 
 impl Substance {
-    /// The terms of its creep compliance.
+    /// The terms of the creep compliance that have an effect.
     pub(super) fn creep(&self) -> impl Iterator<Item = &Creep> {
         self.creep.iter().filter(|creep| creep.j > 0.0)
     }
 
-    /// J(t) / J0 = 1 + sum j (1 - exp(-t / tau)).
+    /// The creep compliance over its instantaneous value: J(t) / J0 = 1 + sum j
+    /// (1 - exp(-t / tau)).
     pub(super) fn compliance_ratio(&self, time_s: f64) -> f64 {
         1.0 + self
             .creep()
@@ -68,8 +71,8 @@ impl Substance {
             .sum::<f64>()
     }
 
-    /// The layer that answers a load, by its base and height in mm, of an object `height_mm` high;
-    /// `None`: a half-space.
+    /// The base and the height in mm of the layer that bears a load, for an object `height_mm`
+    /// high. `None` for a half-space.
     pub(super) fn layer(&self, height_mm: f64) -> Option<(Base, f64)> {
         match self.law {
             Law::Solid | Law::Plastic { .. } => None,
@@ -84,7 +87,7 @@ impl Substance {
         }
     }
 
-    /// E / (1 - nu^2).
+    /// The plane-strain modulus E / (1 - nu^2).
     pub(super) fn plane_strain(&self, young_mpa: f64) -> f64 {
         young_mpa / (1.0 - self.nu * self.nu)
     }

@@ -1,4 +1,4 @@
-//! Roughness of a face: a Gaussian self-affine surface.
+//! The roughness of a face, as a Gaussian self-affine surface.
 
 use realfft::num_complex::Complex32;
 use rustfft::FftPlanner;
@@ -6,8 +6,8 @@ use rustfft::FftPlanner;
 use super::substance::Texture;
 use crate::random::Stream;
 
-/// Width of a patch in cells; periodic, and wider than the sensor (98 mm), so that a press does
-/// not meet the same bump twice.
+/// Width of a patch in cells. A patch is periodic, and wider than the sensor (98 mm), so that a
+/// press does not meet the same bump twice.
 const WIDTH: usize = 128;
 
 /// A periodic patch of roughness.
@@ -18,10 +18,10 @@ pub(super) struct Patch {
 }
 
 impl Patch {
-    /// A patch with the roughness of `texture`, its rms times `rms_factor`.
+    /// A patch with the roughness of `texture` and `rms_factor` times its rms.
     ///
-    /// The power spectrum falls as `q^-2(1+H)` between the longest and the shortest wavelength,
-    /// is level above the longest and nothing below the shortest.
+    /// The power spectrum falls as `q^-2(1+H)` between the longest and the shortest wavelength. It
+    /// is constant above the longest wavelength and 0 below the shortest.
     pub(super) fn new(
         texture: &Texture,
         rms_factor: f64,
@@ -43,15 +43,15 @@ impl Patch {
                         k as f64 - WIDTH as f64
                     }
                 };
-                // Longer along x: the same wave number is "later" there.
+                // Waves are longer along x, so a wave number along x counts as a higher one.
                 let q = (signed(j) * unit * stretch).hypot(signed(i) * unit / stretch);
                 if q == 0.0 || q > high {
                     continue;
                 }
                 let amplitude = (q.max(low) / low).powf(-(1.0 + texture.hurst));
                 power += amplitude * amplitude;
-                // The real part of the transform of independent complex amplitudes is the
-                // surface: half the power is lost with the imaginary part.
+                // The surface is the real part of the transform of independent complex amplitudes.
+                // Half the power is lost with the imaginary part.
                 let mut draw = || (amplitude * stream.normal()) as f32;
                 spectrum[i * WIDTH + j] = Complex32::new(draw(), draw());
             }
@@ -63,7 +63,7 @@ impl Patch {
             .collect();
         plan.process(&mut turned);
         let scale = (1e-3 * texture.rms_um * rms_factor / power.sqrt()) as f32;
-        // `turned` is transposed: row is x. Put y first again.
+        // `turned` is transposed, with x as its row. Put y first again.
         let heights_mm = (0..WIDTH * WIDTH)
             .map(|k| scale * turned[k % WIDTH * WIDTH + k / WIDTH].re)
             .collect();
@@ -73,8 +73,8 @@ impl Patch {
         }
     }
 
-    /// Height in mm at (`x`, `y`) mm, by Catmull-Rom splines: linear interpolation would take a
-    /// third off the shortest waves.
+    /// Height in mm at (`x`, `y`) mm, by Catmull-Rom splines. Linear interpolation would remove a
+    /// third of the shortest waves.
     pub(super) fn height_mm(&self, x_mm: f64, y_mm: f64) -> f32 {
         let locate = |at: f64| {
             let cell = at / self.cell_mm;

@@ -1,7 +1,7 @@
-//! Simulated frames as the daemon sees them: tared, and followed by its press tracker.
+//! Simulated frames as the daemon sees them: after tare, and through its press tracker.
 //!
-//! In: raw frames at a steady rate, the sensor unloaded before the first. Out: their newtons, and
-//! the frames of the one press in them.
+//! In: raw frames at a steady rate, with the sensor unloaded before the first. Out: the frames in
+//! newtons, and the frames of the single press among them.
 
 use std::time::Duration;
 
@@ -9,7 +9,7 @@ use crate::frame::{Frame, RawFrame, Stamp};
 use crate::press::{Change, End, Marks, Moment, PressTracker, Settings};
 use crate::tare::NEWTONS_PER_COUNT;
 
-/// What tare makes of counts whose baseline is 0.
+/// The frame after a tare with baseline 0.
 pub(super) fn ideal_tare(raw: &RawFrame) -> Frame {
     Frame {
         newtons: raw
@@ -18,7 +18,7 @@ pub(super) fn ideal_tare(raw: &RawFrame) -> Frame {
     }
 }
 
-/// Whether a press tracker without a configuration begins a press with this frame.
+/// Whether a press tracker with default settings begins a press with this frame.
 pub(super) fn begins_press(frame: &Frame) -> bool {
     let Settings {
         contact_threshold_n,
@@ -28,16 +28,16 @@ pub(super) fn begins_press(frame: &Frame) -> bool {
     frame.contact_area_taxels(contact_threshold_n) >= begin_area_taxels
 }
 
-/// The one press in some frames, by their places.
+/// The single press among some frames, by the frames' indices.
 pub(super) struct Seen {
     /// Frames in contact, from the one that began the press to its last.
     pub(super) contact: Vec<usize>,
-    /// The frame that a verdict is on.
+    /// The frame that is judged.
     pub(super) best: usize,
 }
 
-/// What a press tracker without a configuration sees in these frames, if that is exactly one press
-/// and its release, when frames without load follow.
+/// The press that a press tracker with default settings sees in these frames, when frames without
+/// load follow. `None` unless there is exactly one press and it ends with a release.
 pub(super) fn one_press<'a>(
     frames: impl IntoIterator<Item = &'a RawFrame>,
     period_s: f64,

@@ -10,41 +10,41 @@ use serde::{Deserialize, Deserializer, Serialize};
 use crate::frame::Array;
 use crate::wording::as_written;
 
-/// Force of one count of the JX255N: 8 bits are 10.2 N.
+/// The force of one count of the JX255N: 8 bits are 10.2 N.
 pub const NEWTONS_PER_COUNT: f32 = 0.04;
-/// Distance of its taxel centres (paper, "Tactile sensor").
+/// The distance between taxel centres of the JX255N (paper, "Tactile sensor").
 pub const PITCH_MM: f64 = 3.5;
 
 /// The `[sensor.calibration]` table.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// Force of one count.
+    /// The force of one count, in newtons.
     pub newtons_per_count: f32,
-    /// Force grows with this power of the counts.
+    /// The power of the counts with which force grows.
     pub exponent: f32,
-    /// By what each taxel's newtons are multiplied; `None`: 1.
+    /// The factor of each taxel's newtons. `None` means 1 for all.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gains: Option<Gains>,
-    /// Distance of taxel centres.
+    /// The distance between taxel centres.
     pub pitch_mm: f64,
-    /// Frames averaged at start; 0: no tare.
+    /// The number of frames that are averaged at start. With 0 there is no tare.
     pub tare_frames: u32,
-    /// How far above the array's median a taxel may rest.
+    /// How far above the array's median an unloaded taxel may read.
     pub tare_max_n: f32,
-    /// The baseline follows slow drift while nothing touches the sensor.
+    /// Whether the baseline follows slow drift while nothing touches the sensor.
     pub auto_tare: bool,
-    /// `[[row, col], ...]` in the sensor's own rows and columns.
+    /// The dead taxels: `[[row, col], ...]` in the sensor's own rows and columns.
     #[serde(deserialize_with = "pairs")]
     pub dead_taxels: Vec<[usize; 2]>,
 }
 
-/// By what each taxel's newtons are multiplied.
+/// The factor of each taxel's newtons.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(untagged)]
 pub enum Gains {
-    /// In a numpy file that a configuration names. Whoever reads the configuration reads it too, and a
-    /// sensor never has it.
+    /// The path of a numpy file, as a configuration gives it. The reader of the configuration
+    /// replaces the path by the numbers, so a sensor never holds a path.
     File(PathBuf),
     /// `[rows][cols]`, in the sensor's own rows and columns. Recordings hold these.
     Taxels(Vec<Vec<f32>>),
@@ -74,7 +74,8 @@ impl<'de> Deserialize<'de> for Gains {
     }
 }
 
-/// Reads lists of exactly two. The TOML parser would silently drop the rest of a longer list.
+/// Reads lists of exactly two numbers. The TOML parser would silently drop the rest of a longer
+/// list.
 fn pairs<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<[usize; 2]>, D::Error> {
     let pair = |list: Vec<usize>| {
         let length = list.len();
@@ -100,87 +101,88 @@ impl Default for Settings {
     }
 }
 
-/// A value of [`Settings`] that cannot be used.
+/// An unusable value of [`Settings`].
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SettingsError {
-    /// A quantity that must be positive, and not so large that no film has it.
+    /// The value is not positive, or is larger than for any film.
     #[error("{key}: found {found:?}, expected a number above 0 and at most {max}")]
     NotPositive {
         /// The key of the value.
         key: &'static str,
-        /// The value that was given.
+        /// The configured value.
         found: f64,
-        /// Largest allowed.
+        /// The largest allowed value.
         max: f64,
     },
-    /// A power that no film has.
+    /// The exponent is outside [`EXPONENTS`].
     #[error("exponent: found {found:?}, expected {least} to {most}", least = EXPONENTS.0, most = EXPONENTS.1)]
     Exponent {
-        /// The value that was given.
+        /// The configured value.
         found: f64,
     },
-    /// Gains that nobody has read.
+    /// The file of the gains has not been read.
     #[error("gains: found the path of a file, expected its numbers")]
     GainsUnread,
-    /// Gains of another array.
+    /// The gains have the shape of another array.
     #[error("gains: found {rows} rows of {found_cols}, expected {} of {}", array.rows, array.cols)]
     GainsShape {
-        /// Rows that were given.
+        /// The number of rows of the gains.
         rows: usize,
-        /// Columns of the first row that does not fit, or of the first.
+        /// The number of columns in the first row that does not fit, or in the first row.
         found_cols: usize,
         /// The array.
         array: Array,
     },
-    /// A gain that no taxel has.
+    /// The gain of a taxel is outside [`GAINS`].
     #[error(
         "gains: found {found:?} at [{row}, {col}], expected {least} to {most}",
         least = GAINS.0,
         most = GAINS.1
     )]
     Gain {
-        /// The value that was given.
+        /// The configured value.
         found: f32,
-        /// Its row.
+        /// The row of the taxel.
         row: usize,
-        /// Its column.
+        /// The column of the taxel.
         col: usize,
     },
-    /// More frames than a sum of counts can hold.
+    /// The sum of counts cannot hold this many frames.
     #[error("tare_frames: found {found}, expected 0 to {max}")]
     TareFrames {
-        /// The value that was given.
+        /// The configured value.
         found: u32,
-        /// Largest.
+        /// The largest allowed value.
         max: u32,
     },
-    /// A dead taxel outside the array.
+    /// A dead taxel is outside the array.
     #[error(
         "dead_taxels: found [{row}, {col}], expected a row below {} and a column below {}",
         array.rows,
         array.cols
     )]
     DeadTaxel {
-        /// The value that was given.
+        /// The configured row.
         row: usize,
-        /// The value that was given.
+        /// The configured column.
         col: usize,
         /// The array.
         array: Array,
     },
 }
 
-/// What every sum and product of a frame stays finite with, and far beyond any film: a count of the
-/// JX255N is 0.04 N, its taxels are 3.5 mm apart, and 1 MN rests on no taxel.
+/// With these limits, every sum and product of a frame stays finite. The limits are far beyond any
+/// film: a count of the JX255N is 0.04 N, its taxels are 3.5 mm apart, and no taxel bears 1 MN.
 const MOST_NEWTONS_PER_COUNT: f64 = 1e3;
 const MOST_PITCH_MM: f64 = 1e3;
-/// Least and greatest power. 65535 counts to the power of 4 are 1.8e19, which a frame's sum still holds.
+/// The least and the greatest exponent. 65535 counts to the power of 4 are 1.8e19, which the sum
+/// over a frame can still hold.
 pub const EXPONENTS: (f64, f64) = (0.25, 4.0);
-/// Least and greatest gain. A taxel that reads a thousandth of the others is dead.
+/// The least and the greatest gain. A taxel that reads a thousandth of the others is dead.
 pub const GAINS: (f32, f32) = (0.001, 1000.0);
 const MOST_TARE_N: f64 = 1e6;
 
-/// 65535 counts x 65536 frames stay below 2^32.
+/// The most frames of a tare: 65535 counts x 65536 frames stay below 2^32.
 pub(super) const MOST_TARE_FRAMES: u32 = 65_536;
 
 impl Settings {
@@ -188,8 +190,9 @@ impl Settings {
     ///
     /// # Errors
     ///
-    /// If `newtons_per_count`, `pitch_mm` or `tare_max_n` is not above 0 or is beyond any film,
-    /// `exponent` is out of its range, `gains` are of another array or out of theirs, `tare_frames` is above 65,536, or a dead taxel lies outside `array`.
+    /// Returns an error if `newtons_per_count`, `pitch_mm` or `tare_max_n` is not above 0 or is
+    /// beyond any film, if `exponent` is out of its range, if `gains` have another shape or are out
+    /// of their range, if `tare_frames` is above 65,536, or if a dead taxel lies outside `array`.
     pub fn check(&self, array: Array) -> Result<(), SettingsError> {
         for (key, found, max) in [
             (

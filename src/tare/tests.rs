@@ -127,7 +127,7 @@ fn a_baseline_follows_by_its_bound_where_nothing_is_in_contact() {
         gains: gains(ROWS, COLS, |_, col| if col == 1 { 2.0 } else { 1.0 }),
         ..Settings::default()
     };
-    // One count above: 0.04 N, and 0.08 N at column 1, which is a contact.
+    // The taxels read one count more: 0.04 N, and 0.08 N at column 1, which is a contact.
     let drifted = RawFrame {
         counts: [3; TAXELS],
     };
@@ -204,8 +204,8 @@ fn what_a_tare_compares_is_the_array_and_its_live_taxels() {
         let found = check(&settings(dead), Array::FULL, CONTACT, flicker);
         assert_eq!(found, expected, "{dead:?}");
     }
-    // What lies high is what lies above the most: some taxels may rest low, and what is outside
-    // a small array reads 0.
+    // Only values above the median count as high: some taxels may rest low, and places outside a
+    // small array read 0.
     let low = raw(&[(0, 0), (1, 0), (2, 0), (3, 0)]);
     let high = RawFrame {
         counts: low.counts.map(|count| 15 * count),
@@ -221,7 +221,7 @@ fn what_a_tare_compares_is_the_array_and_its_live_taxels() {
         check(&settings(&[]), array, CONTACT, [small; 2]),
         Progress::Taken
     );
-    // At the threshold a taxel varies: two counts are 0.08 N.
+    // A variation equal to the threshold counts: two counts are 0.08 N.
     let two = [[(0, 2), (1, 2), (2, 2)], [(0, 4), (1, 4), (2, 4)]].map(|c| raw(&c));
     for (threshold_n, expected) in [(0.08, Progress::Contact), (0.081, Progress::Taken)] {
         let contact = Contact {
@@ -268,7 +268,7 @@ fn another_tare_leaves_the_baseline_until_it_is_taken_or_given_up() {
     assert_eq!(tare.ended(), Some(Ok(Retaken { old, new })));
     assert_eq!((new.least_counts, new.most_counts), (2.0, 9.0));
     assert!((new.mean_counts - (2.0 * 782.0 + 9.0) / 783.0).abs() < 1e-4);
-    // A reload that leaves their number leaves those taken.
+    // A reload with the same number of frames keeps the frames already taken.
     assert_eq!(tare.retake(), Ok(()));
     assert_eq!(tare.observe(&raw(&[])), Progress::Taking);
     tare.reload(&settings, CONTACT);

@@ -1,8 +1,9 @@
-//! `hardnessd calibrate`: what a configuration should say of the sensor and the arm that presses with it.
+//! `hardnessd calibrate`: measures values of a configuration for the sensor and for the arm that
+//! presses with it.
 //!
-//! A daemon with sockets serves the sensor and records in the meantime, so the robot's controller runs
-//! as it always does. Afterwards the recording is read, and stdout gets the values, their spread and the
-//! lines for the configuration. Recordings made earlier serve as well.
+//! A daemon with sockets serves the sensor and records meanwhile, so the robot's controller runs as
+//! it always does. Afterwards, `calibrate` reads the recording and prints the values, their spread
+//! and the lines for the configuration. It can also read recordings made earlier.
 
 mod arm;
 mod force;
@@ -70,89 +71,89 @@ pub enum What {
     Taxels,
 }
 
-/// Why there are no values.
+/// The reason why there are no values.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// There is no such sensor.
+    /// The configuration has no sensor of this name.
     #[error("--sensor: found {found:?}, expected one of {}", names.join(", "))]
     NoSensor {
-        /// As given.
+        /// The name on the command line.
         found: String,
-        /// Those of the configuration.
+        /// The names of the configured sensors.
         names: Vec<String>,
     },
-    /// Weights for something else.
+    /// Weights were given, but not for `calibrate force`.
     #[error("--newtons: found weights, expected none: they are for `calibrate force`")]
     Unasked,
-    /// A file for something else.
+    /// A file was given, but not for `calibrate taxels`.
     #[error("--out: found a file, expected none: it is for `calibrate taxels`")]
     NoFile,
     /// The daemon cannot serve, or has stopped.
     #[error(transparent)]
     Daemon(#[from] daemon::Error),
-    /// There is no place for the recording.
+    /// The temporary file for the recording cannot be used.
     #[error("{path}: {source}")]
     Temporary {
-        /// File of the recording.
+        /// The path of the recording.
         path: PathBuf,
-        /// Why not.
+        /// The system's error.
         source: io::Error,
     },
-    /// A recording that was named is not there.
+    /// A recording that the command line names cannot be opened.
     #[error("{path}: {source}")]
     Missing {
-        /// As given.
+        /// The path on the command line.
         path: PathBuf,
-        /// Why not.
+        /// The system's error.
         source: io::Error,
     },
     /// A recording cannot be read.
     #[error("{path}: {source}")]
     Recording {
-        /// As given, or that it is what was recorded just now.
+        /// The path of the recording, or words for the recording that was made just now.
         path: String,
-        /// Why not.
+        /// The error of the recording.
         source: Unreadable,
     },
-    /// The presses do not say it.
+    /// The presses do not determine the values of the arm.
     #[error(transparent)]
     Arm(#[from] arm::Unfit),
-    /// The weights do not say it.
+    /// The weights do not determine the newtons per count.
     #[error(transparent)]
     Force(#[from] force::Unfit),
-    /// The presses do not say it.
+    /// The presses do not determine the gains.
     #[error(transparent)]
     Taxels(#[from] taxels::Unfit),
-    /// Presses were made that are no presses of a weight.
+    /// The number of presses is not the number of weights.
     #[error("found {found} presses, expected {expected}: put each weight on once")]
     Count {
-        /// As recorded.
+        /// The number of recorded presses.
         found: usize,
-        /// Weights.
+        /// The number of weights.
         expected: usize,
     },
     /// The gains cannot be written.
     #[error("{path}: {source}")]
     Out {
-        /// As given.
+        /// The path on the command line.
         path: PathBuf,
-        /// Why not.
+        /// The system's error.
         source: io::Error,
     },
-    /// Stdout fails.
+    /// Stdout cannot be written to.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
 }
 
-/// Positions are awaited for this long after the last press.
+/// How long to wait for positions after the last press.
 const LAST_POSITIONS: Duration = Duration::from_secs(1);
 
-/// Presses where `--presses` does not say it.
+/// The number of presses if `--presses` does not give it.
 const ARM_PRESSES: u64 = 5;
 const TAXEL_PRESSES: u64 = 200;
 
 impl Args {
-    /// How many presses are to be made.
+    /// The number of presses to make.
     fn wanted(&self) -> u64 {
         match self.what {
             What::Arm => self.presses.unwrap_or(ARM_PRESSES),
@@ -162,13 +163,13 @@ impl Args {
     }
 }
 
-/// Serves the sensor until there are enough presses, or reads recordings, and prints what they say. It
-/// ends early, without values, when `shutdown` comes. `config` is the path of the configuration.
+/// Serves the sensor until there are enough presses, or reads recordings, and prints the values.
+/// Ends early, without values, when `shutdown` comes. `config` is the path of the configuration.
 ///
 /// # Errors
 ///
-/// [`Error`], if the daemon cannot serve, a recording cannot be read, or the presses do not say what is
-/// asked.
+/// Returns [`Error`] if the daemon cannot serve, a recording cannot be read, or the presses do not
+/// determine the values.
 pub async fn run(
     args: Args,
     setup: Setup,
@@ -182,7 +183,7 @@ pub async fn run(
         return Err(Error::NoFile);
     }
     let sensor = chosen(&args, &setup)?;
-    // Before anybody presses two hundred times.
+    // Test the output file now, before anybody presses two hundred times.
     let out = args.out.clone().map(Out::begin).transpose()?;
     let presses = if args.from.is_empty() {
         match live(&args, setup, &sensor, shutdown).await? {
@@ -246,7 +247,7 @@ async fn live(
         .create_new(true)
         .open(&path);
     let file = open.map_err(temporary)?;
-    // Nobody else needs it, and it goes with this process.
+    // Nobody else needs the file. Without its name, it vanishes when this process ends.
     fs::remove_file(&path).map_err(temporary)?;
     let mut recorded = file.try_clone().map_err(temporary)?;
 
@@ -304,7 +305,7 @@ fn recorded(files: &[PathBuf], sensor: &Sensor, hrn: &Arc<Hrn>) -> Result<Vec<Pr
     Ok(presses)
 }
 
-/// A press with the gains taken off that were in force.
+/// A press without the gains that were in force when it was recorded.
 fn plain(press: &Press) -> taxels::Plain {
     let mut frames = press.frames.clone();
     if let Some(described) = &press.described
@@ -323,14 +324,14 @@ fn plain(press: &Press) -> taxels::Plain {
     taxels::Plain { frames }
 }
 
-/// A file being made, at a path of its own until it is whole.
+/// A file that is being made, at a temporary path until it is whole.
 struct Out {
     path: PathBuf,
     part: PathBuf,
 }
 
 impl Out {
-    /// Shows that the file can be made.
+    /// Makes the temporary file, which shows that the file can be made.
     fn begin(path: PathBuf) -> Result<Self, Error> {
         let mut part = path.clone().into_os_string();
         part.push(format!(".{}.part", std::process::id()));
@@ -357,7 +358,7 @@ impl Out {
 
 impl Drop for Out {
     fn drop(&mut self) {
-        // It is gone where all went well.
+        // After a success, the temporary file is gone already.
         let _ = fs::remove_file(&self.part);
     }
 }
@@ -384,7 +385,7 @@ fn chosen(args: &Args, setup: &Setup) -> Result<Sensor, Error> {
     })
 }
 
-/// Says on stderr what to do next, after so many presses.
+/// Says on stderr what to do next, after `seen` presses.
 fn say_next(args: &Args, seen: u64) {
     match args.what {
         What::Arm if seen == 0 => eprintln!(

@@ -1,4 +1,4 @@
-//! `hardnessd check`: what would run, without opening a device.
+//! `hardnessd check`: prints what the daemon would run, without opening a device.
 
 use std::io;
 use std::net::SocketAddr;
@@ -21,7 +21,7 @@ pub struct Args {
     config: Configuration,
 }
 
-/// What is wrong with a configuration.
+/// An error of a configuration.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The configuration cannot be used.
@@ -30,12 +30,12 @@ pub enum Error {
     /// There is no configuration.
     #[error(transparent)]
     Missing(#[from] configuration::Missing),
-    /// A path that it names cannot be written to.
+    /// A path that the configuration names cannot be written to.
     #[error("{path}: {source}")]
     Daemon {
         /// Path of the configuration.
         path: PathBuf,
-        /// Which path, and the reason.
+        /// The daemon's error, which names the path and the reason.
         source: daemon::Error,
     },
     /// The line cannot carry that many frames.
@@ -49,13 +49,13 @@ pub enum Error {
         path: PathBuf,
         /// The sensor's name.
         sensor: String,
-        /// The value as given.
+        /// The configured frame rate in frames/s.
         frame_rate_hz: f64,
-        /// Bytes of a frame of its layout.
+        /// The number of bytes in a frame of the sensor's layout.
         frame_bytes: usize,
-        /// The highest rate that the line carries.
+        /// The highest frame rate that the line can carry.
         most: f64,
-        /// The value as given.
+        /// The configured baud rate.
         baud: u32,
     },
     /// Stdout cannot be written to.
@@ -63,12 +63,12 @@ pub enum Error {
     Print(#[source] io::Error),
 }
 
-/// Prints what would run, warnings on stderr.
+/// Prints what the daemon would run. Warnings go to stderr.
 ///
 /// # Errors
 ///
-/// [`Error`], if the configuration or its model cannot be used, a line cannot carry its frames, or
-/// what is named for sockets, log or recordings cannot be written to.
+/// Returns [`Error`] if the configuration or its model cannot be used, a line cannot carry its
+/// frames, or a path for sockets, the log or recordings cannot be written to.
 pub fn run(args: &Args) -> Result<(), Error> {
     let path = &args.config.path()?;
     let setup = Setup::load(path)?;
@@ -140,7 +140,8 @@ pub fn run(args: &Args) -> Result<(), Error> {
         .map_err(Error::Print)
 }
 
-/// Says where the taxels of a small array are in the model's frame.
+/// Warns if the array is smaller than the model's frame, and says where its taxels are in that
+/// frame.
 fn warn_of_array(sensor: &SensorTable, array: Array, path: &Path) {
     let Array { rows, cols } = array;
     if (rows, cols) == (ROWS, COLS) {
@@ -256,8 +257,8 @@ fn gains(calibration: &tare::Settings) -> String {
     format!(", gains {least:.2} to {most:.2}")
 }
 
-/// Whether the baud rate limits what the port carries: not on a pty, nor on USB CDC, where it is a
-/// word without consequence. A port that is not there is taken at its name.
+/// Whether the baud rate limits what the port carries. On a pty and on USB CDC, the baud rate has
+/// no effect. If the port does not exist, its name decides.
 fn is_paced(port: &Path) -> bool {
     let device = port.canonicalize().unwrap_or_else(|_| port.to_owned());
     let name = device.file_name().unwrap_or_default().to_string_lossy();

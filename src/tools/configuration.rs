@@ -1,4 +1,4 @@
-//! Which configuration a command uses when the command line names none.
+//! The configuration that a command uses when the command line names none.
 
 use std::path::{Path, PathBuf};
 
@@ -21,20 +21,21 @@ pub struct Configuration {
 )]
 pub struct Missing;
 
-/// Where to look for a configuration, in this order.
+/// The paths at which a configuration is looked for, in this order.
 const PLACES: [&str; 2] = ["./hardnessd.toml", "/etc/hardnessd.toml"];
 
 impl Configuration {
-    /// The named file, else the first that exists. In the second case stderr says which.
+    /// The named file, or else the first default path that exists. In the second case, stderr names
+    /// it.
     ///
     /// # Errors
     ///
-    /// [`Missing`], if none was named and there is none.
+    /// Returns [`Missing`] if the command line names no configuration and no default path exists.
     pub fn path(&self) -> Result<PathBuf, Missing> {
         if let Some(config) = &self.config {
             return Ok(config.clone());
         }
-        // A file that exists but cannot be read is an error, not a reason to try the next.
+        // If a file exists but cannot be read, that is an error, not a reason to try the next path.
         let there = |path: &&str| Path::new(path).symlink_metadata().is_ok();
         let found = PLACES.into_iter().find(there).ok_or(Missing)?;
         eprintln!("hardnessd: configuration {found}");

@@ -1,8 +1,8 @@
-//! The way to a running daemon, for `tail` and `watch`.
+//! The connection to a running daemon, for `tail` and `watch`.
 //!
-//! In: the socket or address that was asked for. Without one, the places where a daemon's socket is
-//! by default are tried, then the sockets of running demonstrations. Out: a connection whose lines
-//! have a bound.
+//! In: the socket or address from the command line. Without one, the default paths of a daemon's
+//! socket are tried, then the sockets of running demonstrations. Out: a connection whose lines have
+//! a limited length.
 
 use std::fmt;
 use std::fs;
@@ -58,15 +58,15 @@ impl fmt::Display for Address {
     }
 }
 
-/// Why there is no connection to a daemon.
+/// An error of a connection to a daemon.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// No daemon listens at the address.
     #[error("{address}: no daemon answers: {source}")]
     NoAnswer {
-        /// The value as given.
+        /// The address.
         address: Address,
-        /// The reason.
+        /// The system's error.
         source: io::Error,
     },
     /// No daemon listens at any of the usual places.
@@ -75,7 +75,7 @@ pub enum Error {
          `hardnessd demo`, or name its socket with --socket"
     )]
     Nowhere {
-        /// What the program tried.
+        /// The paths that were tried.
         places: String,
     },
     /// This user may not connect to the socket.
@@ -94,7 +94,7 @@ pub enum Error {
     Broken {
         /// The address.
         address: Address,
-        /// The system's reason.
+        /// The system's error.
         source: io::Error,
     },
     /// The daemon has ended.
@@ -103,7 +103,7 @@ pub enum Error {
         /// The address.
         address: Address,
     },
-    /// The other end does not speak like a daemon.
+    /// The other end sent a line that is too long for a daemon.
     #[error(
         "{address}: closed the connection: a line is longer than {LONGEST_LINE_BYTES} bytes, which no \
          daemon sends"
@@ -114,8 +114,8 @@ pub enum Error {
     },
 }
 
-/// Longest line that a daemon may send: a `hello` that describes thousands of sensors. A frame takes
-/// some 6 kB.
+/// The longest line that a daemon may send: a `hello` that describes thousands of sensors. A frame
+/// takes about 6 kB.
 const LONGEST_LINE_BYTES: usize = 1 << 20;
 
 /// A connection to a daemon.
@@ -131,12 +131,12 @@ enum Output {
 }
 
 impl Source {
-    /// Connects to the daemon that is meant. If it was looked for, [`Connection::address`] says
-    /// where it was found.
+    /// Connects to the daemon that the command line names, or else to the first daemon found.
+    /// [`Connection::address`] gives its address.
     ///
     /// # Errors
     ///
-    /// [`Error`], if no daemon answers.
+    /// Returns [`Error`] if no daemon answers.
     pub(super) async fn connect(&self) -> Result<Connection, Error> {
         match self.given() {
             Some(address) => Connection::open(address).await,
@@ -144,7 +144,7 @@ impl Source {
         }
     }
 
-    /// The address that was asked for.
+    /// The address that the command line names.
     pub(super) fn given(&self) -> Option<Address> {
         let tcp = self.connect.clone().map(Address::Tcp);
         tcp.or_else(|| self.socket.clone().map(Address::Unix))
@@ -199,11 +199,11 @@ impl Connection {
         &self.address
     }
 
-    /// The next line, without its newline. If you stop waiting, nothing is lost.
+    /// The next line, without its newline. Cancelling the call loses nothing.
     ///
     /// # Errors
     ///
-    /// [`Error`], if the connection has ended, or the line is longer than any of a daemon.
+    /// Returns [`Error`] if the connection has ended, or the line is longer than a daemon may send.
     pub(super) async fn next(&mut self) -> Result<String, Error> {
         let address = || self.address.clone();
         match self.lines.next().await {
@@ -221,7 +221,7 @@ impl Connection {
     ///
     /// # Errors
     ///
-    /// [`Error::Broken`], if it cannot be sent.
+    /// Returns [`Error::Broken`] if the request cannot be sent.
     pub(super) async fn send(&mut self, request: &str) -> Result<(), Error> {
         let line = format!("{request}\n");
         let sent = match &mut self.output {
@@ -238,7 +238,7 @@ impl Connection {
     #[cfg(feature = "watch")]
     pub(super) fn try_send(&self, request: &str) {
         let line = format!("{request}\n");
-        // If the daemon does not take the question, its silence shows it later.
+        // If the daemon does not receive the request, its missing answer shows that later.
         let _ = match &self.output {
             Output::Unix(output) => output.try_write(line.as_bytes()),
             Output::Tcp(output) => output.try_write(line.as_bytes()),
@@ -246,7 +246,7 @@ impl Connection {
     }
 }
 
-/// Why the connection was not accepted.
+/// The error for a connection that was not accepted.
 fn refusal(address: Address, source: io::Error) -> Error {
     match address {
         Address::Unix(path) if source.kind() == ErrorKind::PermissionDenied => Error::Denied {
@@ -308,7 +308,7 @@ mod tests {
         let error = connection.next().await.unwrap_err();
         assert!(matches!(error, Error::TooLong { .. }), "{error}");
         drop(connection);
-        // The system's buffers hold more.
+        // The sender wrote more than the reader took, because the system's buffers hold the rest.
         assert!(sender.await.unwrap() < 4 * LONGEST_LINE_BYTES);
     }
 }

@@ -1,9 +1,10 @@
 //! `hardnessd demo`: a simulated JX255N on a pty, the whole daemon on it, and a subscriber that
-//! prints what it gets.
+//! prints what it receives.
 //!
-//! Nothing is short-circuited: bytes go through the tty, events through the socket. On a terminal
-//! stdout shows a line a press, with what was pressed beside the verdict, and a count at the end;
-//! elsewhere what a subscriber reads, `hello` first. Stderr names the live page and the socket.
+//! Nothing is short-circuited: bytes go through the tty, events through the socket. On a terminal,
+//! stdout shows one line for each press, with the pressed material beside the verdict, and a count
+//! at the end. Elsewhere, stdout gets the lines that a subscriber reads, `hello` first. Stderr
+//! names the live page and the socket.
 
 mod account;
 mod place;
@@ -53,32 +54,32 @@ pub struct Args {
     json: bool,
 }
 
-/// Why the demonstration failed.
+/// The reason why the demonstration failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The daemon's configuration or model.
+    /// The daemon's configuration or model cannot be used.
     #[error(transparent)]
     Config(#[from] daemon::config::Error),
-    /// The daemon.
+    /// The daemon failed.
     #[error(transparent)]
     Daemon(#[from] daemon::Error),
-    /// The sensor's layout.
+    /// The sensor's layout cannot be used.
     #[error(transparent)]
     Layout(#[from] LayoutError),
-    /// The pty, the socket or stdout.
+    /// The pty, the socket or stdout failed.
     #[error("{what}: {source}")]
     Io {
-        /// What the program tried.
+        /// The part that failed, such as the pty.
         what: &'static str,
-        /// The reason.
+        /// The system's error.
         source: io::Error,
     },
-    /// Presses went by without a verdict.
+    /// Some presses got no verdict.
     #[error("only {found} of {presses} presses got a verdict")]
     Missed {
-        /// Verdicts that came.
+        /// The number of verdicts.
         found: u32,
-        /// Presses that were made.
+        /// The number of presses.
         presses: u32,
     },
     /// The daemon closed the connection.
@@ -86,14 +87,15 @@ pub enum Error {
     Closed,
 }
 
-/// How long the last verdict may come after the last byte.
+/// The longest time from the last byte to the last verdict.
 const PATIENCE: Duration = Duration::from_secs(3);
 
 /// Runs until the presses have their verdicts, `shutdown` comes or nobody reads stdout.
 ///
 /// # Errors
 ///
-/// [`Error`], if a part cannot be had or a press gets no verdict.
+/// Returns [`Error`] if the daemon, the pty, the socket or stdout fails, or a press gets no
+/// verdict.
 pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
     let io = |what| move |source| Error::Io { what, source };
     let place = Place::new().map_err(io("directory for socket and port"))?;
@@ -106,7 +108,8 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let line_s = layout.max_frame_bytes() as f64 * BITS_A_BYTE / f64::from(sensor.baud);
     sensor.arm = motion::Settings {
         stiffness_n_per_mm: Some(ARM_N_PER_MM),
-        // A frame is stamped when its last byte has come, and the arm when it moves.
+        // A frame's stamp is the time of its last byte. The arm's stamp is the time of its
+        // movement.
         delay_ms: (1e3 * line_s / args.speed).min(1e3),
         ..motion::Settings::default()
     };
@@ -156,12 +159,14 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     printed.and(served.map_err(Error::Daemon))
 }
 
-/// Beyond 100 the 2 ms between frames are more than a busy machine's timers can keep.
+/// Parses `--speed`. Above 100, less than 2 ms would remain between frames, which a busy machine's
+/// timers cannot keep.
 fn speed(text: &str) -> Result<f64, OutOfRange> {
     within(text, 0.01, 100.0)
 }
 
-/// The defaults, with every time of a press shortened as the sensor is hastened.
+/// The default configuration for a sensor that plays `speed` times as fast: the times of a press
+/// are divided by `speed`.
 fn hastened(sensor: SensorTable, socket: &Path, speed: f64) -> Config {
     let frame_rate_hz = sensor.frame_rate_hz * speed;
     let mut config = Config::new(vec![SensorTable {
@@ -174,7 +179,7 @@ fn hastened(sensor: SensorTable, socket: &Path, speed: f64) -> Config {
     config
 }
 
-/// What stdout gets.
+/// The output on stdout.
 enum Shown {
     /// Every event as it comes.
     Json,
@@ -197,7 +202,7 @@ impl Shown {
 /// How long a terminal may take for the last line.
 const LAST_LINE: Duration = Duration::from_millis(500);
 
-/// Prints what the subscriber gets while the sensor plays, and the count at the end.
+/// Prints what the subscriber receives while the sensor plays, and the count at the end.
 async fn print(
     subscriber: UnixStream,
     presses: Option<u32>,
@@ -232,12 +237,13 @@ async fn print_events(
     let mut played = std::pin::pin!(player.play(sequence));
     let mut shutdown = std::pin::pin!(shutdown);
     let mut last_byte: Option<Instant> = None;
-    // The line that is being written: the sensor and the daemon do not wait for the reader of stdout.
+    // The line that is being written. The sensor and the daemon do not wait for the reader of
+    // stdout.
     let mut printing = std::pin::pin!(None);
     loop {
         let patience = last_byte.map(|at| at + PATIENCE);
         tokio::select! {
-            // Read what is there before looking at the time.
+            // Read the lines that have arrived before checking for a timeout.
             biased;
             () = &mut shutdown => return Ok(()),
             printed = wait(printing.as_mut().as_pin_mut()) => {
@@ -273,7 +279,7 @@ async fn print_events(
     }
 }
 
-/// The output of what there is to wait for.
+/// The output of the future. Without a future, this never completes.
 async fn wait<T: Future>(one: Option<T>) -> T::Output {
     match one {
         Some(one) => one.await,

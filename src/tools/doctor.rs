@@ -1,4 +1,5 @@
-//! `hardnessd doctor`: why a port does not work. One line per finding, each with the remedy.
+//! `hardnessd doctor`: finds why a port does not work. It prints each fault on one line, with the
+//! remedy.
 //!
 //! It opens no device, because opening one resets boards like an Arduino.
 
@@ -22,13 +23,13 @@ pub struct Args {
     port: Option<PathBuf>,
 }
 
-/// Why it ended with an error.
+/// An error of `doctor`.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// Faults were found, and stdout names them.
     #[error("{found} fault{} found", if *.found == 1 { "" } else { "s" })]
     Faults {
-        /// Lines printed.
+        /// The number of faults.
         found: usize,
     },
     /// Stdout cannot be written to.
@@ -36,8 +37,8 @@ pub enum Error {
     Print(#[source] io::Error),
 }
 
-/// What keeps this process from opening `port`, and what to do; `None` where nothing is seen, such as
-/// a process of another user that holds it.
+/// The fault that keeps this process from opening `port`, with the remedy. `None` if no fault is
+/// visible. For example, only root can see that a process of another user holds the port.
 pub(super) fn obstacle(port: &Path) -> Option<String> {
     let root = Path::new("/");
     let port = std::path::absolute(port).unwrap_or_else(|_| port.to_owned());
@@ -46,11 +47,12 @@ pub(super) fn obstacle(port: &Path) -> Option<String> {
     fault.map(|fault| fault.to_string())
 }
 
-/// Prints what is wrong, and the remedy.
+/// Prints the faults, each with its remedy.
 ///
 /// # Errors
 ///
-/// [`Error::Faults`], if anything is; [`Error::Print`], if it cannot be said.
+/// Returns [`Error::Faults`] if there is a fault, and [`Error::Print`] if stdout cannot be written
+/// to.
 pub fn run(args: &Args) -> Result<(), Error> {
     let root = Path::new("/");
     let user = User::of_this_process(root);

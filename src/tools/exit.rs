@@ -1,4 +1,4 @@
-//! How a command fails, and the exit code that an operator's script may rely on for it.
+//! The failures of commands and their exit codes, which an operator's scripts may rely on.
 
 #[cfg(feature = "watch")]
 use super::watch;
@@ -11,13 +11,13 @@ use crate::daemon::publish::Error as PublishError;
 use crate::daemon::record::Error as RecordError;
 use crate::daemon::socket::Error as SocketError;
 
-/// Failed, or bad data.
+/// The command failed, or its data is bad.
 pub const FAILED: u8 = 1;
 /// Wrong usage.
 pub const USAGE: u8 = 2;
 /// A file named on the command line is missing or unreadable.
 pub const NO_INPUT: u8 = 66;
-/// A device or the daemon is not there.
+/// A device or the daemon is unavailable.
 pub const UNAVAILABLE: u8 = 69;
 /// I/O error.
 pub const IO: u8 = 74;
@@ -27,7 +27,7 @@ pub const CONFIG: u8 = 78;
 /// A signal that ends a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stop {
-    /// SIGHUP, of a terminal that has gone.
+    /// SIGHUP, which the system sends when the terminal has gone.
     Hangup = 1,
     /// SIGINT.
     Interrupt = 2,
@@ -36,13 +36,14 @@ pub enum Stop {
 }
 
 impl Stop {
-    /// The exit code of a command that had not finished, as a shell has it.
+    /// The exit code of a command that the signal ended early: 128 and the signal's number, as in a
+    /// shell.
     fn code(self) -> u8 {
         128 + self as u8
     }
 }
 
-/// How a command of `hardnessd` failed.
+/// An error of a command of `hardnessd`.
 #[derive(Debug, thiserror::Error)]
 #[expect(
     missing_docs,
@@ -193,7 +194,7 @@ fn of_config(error: &ConfigError) -> u8 {
 
 fn of_daemon(error: &daemon::Error) -> u8 {
     match error {
-        // The configuration names a file that the daemon cannot use there.
+        // The configuration names a path that the daemon cannot use.
         daemon::Error::Publish(PublishError::Socket(
             SocketError::NoSocket { .. }
             | SocketError::NoDirectory { .. }
@@ -201,7 +202,7 @@ fn of_daemon(error: &daemon::Error) -> u8 {
         )) => CONFIG,
         daemon::Error::Record(RecordError::Directory { .. }) | daemon::Error::Log(_) => CONFIG,
         daemon::Error::Publish(PublishError::Unasked { .. } | PublishError::Passed(_)) => CONFIG,
-        // In use or refused. It may work later.
+        // The address is in use, or the system refused. A later try may succeed.
         daemon::Error::Publish(_) | daemon::Error::Random(_) => IO,
         daemon::Error::Record(RecordError::Unavailable { .. } | RecordError::Lost { .. }) => {
             UNAVAILABLE

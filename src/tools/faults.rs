@@ -1,7 +1,8 @@
 //! Faults of a simulated line, from a script. The same script and seed give the same faults.
 //!
-//! In: a TOML file of `[[fault]]` tables. Out: what becomes of each frame. Times are in seconds of
-//! the sensor since it started; which bytes and bits are hit follows from the seed.
+//! In: a TOML file of `[[fault]]` tables, and frames. Out: frames with damage, and whether to send
+//! each. Times are in seconds of the sensor since its start. The seed decides which bytes and bits
+//! are hit.
 
 mod script;
 
@@ -11,14 +12,14 @@ use self::script::Fault;
 pub(crate) use self::script::{Error, FORMAT};
 use crate::random::Stream;
 
-/// What to do with a frame.
+/// The state of the line at a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Line {
-    /// Send it as it is now.
+    /// Send the frame, with its damage.
     Up,
-    /// Do not send it.
+    /// Do not send the frame.
     Silent,
-    /// Do not send it: the port is gone.
+    /// Do not send the frame, and remove the port.
     Unplugged,
 }
 
@@ -39,7 +40,7 @@ impl Faults {
     ///
     /// # Errors
     ///
-    /// If it cannot be read, or has a key or value that cannot be used.
+    /// Fails if the script cannot be read, or has a key or value that cannot be used.
     pub(crate) fn load(path: &Path, seed: u64) -> Result<Self, Error> {
         Ok(Self::of(script::load(path)?, seed))
     }
@@ -51,8 +52,8 @@ impl Faults {
         }
     }
 
-    /// Damages the frame due at `time_s` as the script says, and says whether it is to be sent.
-    /// Frames are asked for in order.
+    /// Damages the frame due at `time_s` as the script says, and returns whether to send it. Call
+    /// it for the frames in order.
     pub(crate) fn strike(&mut self, time_s: f64, frame: &mut Vec<u8>) -> Line {
         let mut line = Line::Up;
         let stream = &mut self.stream;
@@ -92,7 +93,7 @@ impl Faults {
                     frames,
                 } if time_s >= *from_s && *frames > 0 => {
                     *frames -= 1;
-                    // If all bytes were dropped, there is none to invert.
+                    // If all bytes were dropped, there is no bit to invert.
                     let bits = if frame.is_empty() { 0 } else { *bits };
                     for _ in 0..bits {
                         let bit = stream.below(frame.len() * 8);

@@ -1,7 +1,8 @@
 //! A simulated sensor on a pty: presses in real time, bytes at the speed of the line.
 //!
-//! Frames are computed on a thread of their own, a little ahead, so that the physics never delays
-//! a byte. Nobody reading is no reason to wait: the sensor does not know.
+//! Frames are computed on a thread of their own, a little ahead, so that the physics never delays a
+//! byte. The player does not wait for a reader, because a sensor does not know whether anybody
+//! reads.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -19,13 +20,14 @@ use crate::wire::Layout;
 /// Bits on the line for a byte: a start bit, eight data bits, a stop bit.
 pub(crate) const BITS_A_BYTE: f64 = 10.0;
 
-/// How often bytes are passed on: finer than a UART's FIFO is emptied, coarse enough to be cheap.
+/// The time between two writes: shorter than the time in which a UART's FIFO is emptied, yet long
+/// enough to be cheap.
 const SLICE: Duration = Duration::from_millis(4);
 
-/// Frames computed ahead.
+/// The number of frames that are computed ahead.
 const AHEAD: usize = 32;
 
-/// How a sensor plays.
+/// The speed of a simulated sensor and of its line.
 #[derive(Debug, Clone)]
 pub(crate) struct Pace {
     /// Time between frames.
@@ -37,7 +39,7 @@ pub(crate) struct Pace {
 }
 
 impl Pace {
-    /// Frames at `frame_rate_hz` over a line of `baud`, all of it `speed` times as fast.
+    /// The pace of frames at `frame_rate_hz` over a line of `baud`, both multiplied by `speed`.
     pub(crate) fn new(frame_rate_hz: f64, baud: u32, speed: f64) -> Self {
         Self {
             period: Duration::from_secs_f64(1.0 / (frame_rate_hz * speed)),
@@ -47,7 +49,7 @@ impl Pace {
     }
 }
 
-/// A sensor at a pty.
+/// A simulated sensor on a pty.
 #[derive(Debug)]
 pub(crate) struct Player {
     pty: Option<Pty>,
@@ -55,16 +57,16 @@ pub(crate) struct Player {
     layout: Layout,
     pace: Pace,
     faults: Faults,
-    /// To the robot whose arm presses.
+    /// Sends the motion of the arm to the robot.
     moving: watch::Sender<Option<Moving>>,
 }
 
 impl Player {
-    /// Makes the pty.
+    /// Makes the player and its pty.
     ///
     /// # Errors
     ///
-    /// As [`Pty::open`].
+    /// Fails as [`Pty::open`] does.
     pub(crate) fn new(
         link: Option<&Path>,
         layout: Layout,
@@ -90,7 +92,7 @@ impl Player {
             .path()
     }
 
-    /// The robot whose arm presses, to tell the daemon at `socket` of its motion.
+    /// The robot whose arm presses. It sends its motion to the daemon at `socket`.
     pub(crate) fn robot(&self, socket: PathBuf, sensor: Option<String>) -> Robot {
         Robot {
             socket,
@@ -103,13 +105,13 @@ impl Player {
     ///
     /// # Errors
     ///
-    /// If the pty fails, or cannot be had again after an unplug.
+    /// Fails if the pty fails, or cannot be made again after an unplug.
     pub(crate) async fn play(mut self, settings: SequenceSettings) -> io::Result<()> {
         let mut frames = compute(settings);
         let start = Instant::now();
         let mut bytes = Vec::with_capacity(self.layout.max_frame_bytes());
         let mut index = 0_u32;
-        // When the line is free again: a long frame delays the next one.
+        // The time at which the line is free again. A long frame delays the next one.
         let mut free = start;
         while let Some((frame, approach)) = frames.recv().await {
             let due = start + self.pace.period * index;
@@ -141,7 +143,7 @@ impl Player {
         }
     }
 
-    /// Sends from this moment on. Returns when the last byte has arrived.
+    /// Sends `bytes` from the time `from` on. Returns the time at which the last byte has arrived.
     async fn send(&mut self, bytes: &[u8], from: Instant) -> io::Result<Instant> {
         let mut at = from;
         let Some(pty) = &mut self.pty else {
@@ -162,7 +164,7 @@ impl Player {
     }
 }
 
-/// The frames, each with how the arm moves until the next one.
+/// The frames, each with the motion of the arm until the next frame.
 fn compute(settings: SequenceSettings) -> mpsc::Receiver<(SequenceFrame, Approach)> {
     let (frames, played) = mpsc::channel(AHEAD);
     std::thread::spawn(move || {

@@ -1,8 +1,8 @@
-//! A pseudo-terminal that behaves like a sensor's port: it never blocks, and what nobody reads is
-//! gone.
+//! A pseudo-terminal that behaves like a sensor's port: it never blocks, and unread bytes are
+//! dropped.
 //!
-//! It keeps its own descriptor of the device side, so that the pair lives while readers come and
-//! go. Dropped, it plays an unplug: both sides are closed and the link is removed.
+//! It keeps its own descriptor of the device side, so that the pair stays open while readers come
+//! and go. Dropping the pair imitates an unplug: both sides are closed and the link is removed.
 
 pub(crate) mod pair;
 
@@ -18,14 +18,14 @@ use tokio::time::Instant;
 
 use self::pair::Pair;
 
-/// Bytes unread for so long have no reader: what waits is thrown away, and a lock that a killed
-/// reader left (TIOCEXCL outlives it here) is opened.
+/// If bytes stay unread for this long, there is no reader. The bytes are dropped, and a lock that a
+/// killed reader left is released: TIOCEXCL outlives the reader, because the pair stays open here.
 const ABSENT: Duration = Duration::from_millis(500);
 
 /// How long the last bytes may wait for a reader.
 const LINGER: Duration = Duration::from_millis(500);
 
-/// The pair.
+/// A pseudo-terminal, and the link to its device.
 #[derive(Debug)]
 pub(crate) struct Pty {
     master: OwnedFd,
@@ -33,17 +33,17 @@ pub(crate) struct Pty {
     path: PathBuf,
     link: Option<PathBuf>,
     written: u64,
-    /// Bytes that had been read when it was last seen to be more, and when that was.
+    /// The number of bytes that had been read when a reader last made progress, and the time of
+    /// that.
     read: (u64, Instant),
 }
 
 impl Pty {
-    /// Makes a pair, and `link` to its device; a link that stands there is replaced, nothing else
-    /// is.
+    /// Makes a pair, and `link` to its device. An existing link is replaced, any other file is not.
     ///
     /// # Errors
     ///
-    /// If the system has no pair to give, or something that is no link stands at `link`.
+    /// Fails if the system has no pair to give, or a file that is no link exists at `link`.
     pub(crate) fn open(link: Option<&Path>) -> io::Result<Self> {
         let Pair {
             master,
@@ -78,7 +78,7 @@ impl Pty {
     ///
     /// # Errors
     ///
-    /// If the system fails otherwise.
+    /// Fails if the system reports an error other than a full buffer.
     pub(crate) fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
         self.forget_unread()?;
         match rustix::io::write(&self.master, bytes) {
@@ -105,7 +105,8 @@ impl Pty {
     /// Waits until the last bytes are read, up to a limit.
     pub(crate) async fn linger(&self) -> io::Result<()> {
         let end = Instant::now() + LINGER;
-        // Written bytes reach the device a moment later, so one look at an empty device is not enough.
+        // Written bytes reach the device a moment later, so one look at an empty device is not
+        // enough.
         let mut empty = 0;
         while empty < 3 && Instant::now() < end {
             tokio::time::sleep(Duration::from_millis(5)).await;

@@ -1,7 +1,8 @@
-//! `hardnessd record`: a daemon that writes what comes to a file, without sockets unless asked for.
+//! `hardnessd record`: a daemon that records its sensors to a file. It opens sockets only if asked
+//! to.
 //!
-//! On a terminal a line on stderr says how many presses the file holds so far. At the end a warning
-//! says if there were none. A session records one file after another.
+//! On a terminal, a line on stderr says how many presses the file holds so far. At the end, a
+//! warning says if there were none. A session records one file after another.
 
 mod session;
 
@@ -50,60 +51,60 @@ pub struct Args {
     seconds: Option<f64>,
 }
 
-/// Why there is no recording, or why it ended before its time.
+/// The reason why there is no recording, or why it ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A label that says what was pressed, by a level that there is not.
+    /// The label `level` is not a level of the model.
     #[error(
         "--label level: found {found:?}, expected 0 (unlabelled) or one of the model's: {levels}"
     )]
     Level {
-        /// The value as given.
+        /// The value of the label.
         found: String,
-        /// Those of the model.
+        /// The levels of the model.
         levels: String,
     },
-    /// Two labels of one key.
+    /// Two labels have the same key.
     #[error("--label {key}: given twice: give it once")]
     Twice {
         /// The key.
         key: String,
     },
-    /// A label that a session gives each object itself.
+    /// A label was given that a session asks for.
     #[error("--label {key}: --session asks for it: leave it out")]
     Asked {
         /// The key.
         key: String,
     },
-    /// A session has nobody to ask.
+    /// A session needs a terminal to ask on.
     #[error(
         "`record --session` needs a terminal on stdin and stderr: use --out and --label instead"
     )]
     NoTerminal,
-    /// The directory of a session, or its list, cannot be used.
+    /// The directory of a session, or the list in it, cannot be used.
     #[error("--session: {}: {source}", path.display())]
     Session {
-        /// The directory, or the list.
+        /// The path of the directory or of the list.
         path: PathBuf,
-        /// The reason.
+        /// The system's error.
         source: io::Error,
     },
     /// The file cannot be made.
     #[error("{path}: {source}: name a new file")]
     Create {
-        /// The value as given.
+        /// The path of the file.
         path: PathBuf,
-        /// The reason.
+        /// The system's error.
         source: io::Error,
     },
-    /// A sensor is not there to begin with.
+    /// A sensor is missing at the start.
     #[error("sensor {sensor:?}: {}: {obstacle}", port.display())]
     Unavailable {
         /// The sensor's name.
         sensor: String,
-        /// As in the configuration.
+        /// The sensor's port, as the configuration gives it.
         port: PathBuf,
-        /// What is in the way, and what to do.
+        /// The fault, and the remedy.
         obstacle: String,
     },
     /// Recording failed, or all sensors were lost.
@@ -111,12 +112,12 @@ pub enum Error {
     Daemon(#[from] daemon::Error),
 }
 
-/// Records until `shutdown` comes, the time is over or no sensor is left.
+/// Records until `shutdown` comes, the time has passed or no sensor is left.
 ///
 /// # Errors
 ///
-/// [`Error`], if a label says a level that the model has not or one is given twice, the file cannot be
-/// made or written, a sensor is not there to begin with, or the last one is lost.
+/// Returns [`Error`] if a label names a level that the model does not have or is given twice, the
+/// file cannot be made or written, a sensor is missing at the start, or the last sensor is lost.
 pub async fn run(
     args: Args,
     setup: Setup,
@@ -148,7 +149,7 @@ pub async fn run(
     let (progress, counted) = watch::channel(Progress::default());
     let over = async {
         match args.seconds {
-            // A time beyond counting is none.
+            // A duration that is too long to count is no limit.
             Some(seconds) => {
                 let time = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
                 tokio::time::sleep(time).await;
@@ -189,8 +190,8 @@ pub async fn run(
     recorded
 }
 
-/// Records into a new file until `end` comes or no sensor is left. The file is not there afterwards if a sensor
-/// was not there to begin with.
+/// Records into a new file until `end` comes or no sensor is left. Removes the file if a sensor is
+/// missing at the start.
 async fn record(
     setup: Setup,
     sockets: Sockets,
@@ -207,7 +208,7 @@ async fn record(
     let daemon = Daemon::recording(setup, path.to_owned(), file, labels, progress, sockets)?;
     match daemon.run(end, None).await {
         Err(daemon::Error::Record(RecordError::Unavailable { sensor, reason })) => {
-            // It holds nothing, and the next try shall find its place free.
+            // The file holds nothing, and its path must be free for the next try.
             let _ = fs::remove_file(path);
             let port = ports.get(&sensor).cloned().unwrap_or_default();
             let obstacle = doctor::obstacle(&port).unwrap_or(reason);
@@ -229,10 +230,10 @@ fn said(path: &Path) -> String {
     super::shown(&path.display().to_string())
 }
 
-/// Between two lines of progress.
+/// The time between two lines of progress.
 const PROGRESS: Duration = Duration::from_millis(500);
 
-/// Says on a terminal what is recorded, over and over in one line.
+/// Shows the progress on a terminal, always in the same line.
 async fn show(path: &Path, counted: &watch::Receiver<Progress>) {
     let mut stderr = io::stderr();
     if !stderr.is_terminal() {
@@ -243,7 +244,7 @@ async fn show(path: &Path, counted: &watch::Receiver<Progress>) {
         let Progress { frames, presses } = *counted.borrow();
         let seconds = start.elapsed().as_secs();
         let path = said(path);
-        // A terminal that has gone ends the recording by its signal.
+        // If the terminal has gone, its signal ends the recording.
         let _ = write!(
             stderr,
             "\r\x1b[Krecording {path}: {seconds} s, {frames} frames, {presses} presses (Ctrl-C ends it)"
@@ -253,8 +254,8 @@ async fn show(path: &Path, counted: &watch::Receiver<Progress>) {
     }
 }
 
-/// What is labelled `level` becomes a data set: a level that is none is found out before anything
-/// is pressed.
+/// Checks the label `level`, which a data set is made from. A wrong level must be found before
+/// anything is pressed.
 fn check_level(labels: &[(String, String)], levels: &[Level]) -> Result<(), Error> {
     let is_level = |found: &str| {
         found
@@ -271,13 +272,13 @@ fn check_level(labels: &[(String, String)], levels: &[Level]) -> Result<(), Erro
     }
 }
 
-/// Such as `1 (hard), 2 (firm)`.
+/// The levels as text, such as `1 (hard), 2 (firm)`.
 fn levels(levels: &[Level]) -> String {
     let one = |level: &Level| format!("{} ({})", level.level, level.label);
     levels.iter().map(one).collect::<Vec<_>>().join(", ")
 }
 
-/// `KEY=VALUE`.
+/// Parses a label, `KEY=VALUE`.
 fn label(text: &str) -> Result<(String, String), LabelError> {
     let (key, value) = text.split_once('=').ok_or(LabelError::NoKey)?;
     check_label(key, value)?;

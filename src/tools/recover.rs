@@ -22,57 +22,57 @@ pub struct Args {
     out: PathBuf,
 }
 
-/// Why nothing was saved.
+/// The reason why nothing was saved.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The damaged file cannot be read.
     #[error("{path}: cannot read: {source}")]
     Unreadable {
-        /// The value as given.
+        /// The path of the damaged file.
         path: PathBuf,
-        /// The reason.
+        /// The system's error.
         source: io::Error,
     },
     /// Reading the damaged file failed halfway.
     #[error("{path}: {source}")]
     Broken {
-        /// The value as given.
+        /// The path of the damaged file.
         path: PathBuf,
-        /// The reason.
+        /// The system's error.
         source: io::Error,
     },
     /// There is nothing to save.
     #[error("{path}: not a recording, or no chunk of messages in it is whole ({bytes} bytes read)")]
     Nothing {
-        /// The value as given.
+        /// The path of the damaged file.
         path: PathBuf,
-        /// Size of the file.
+        /// The size of the file in bytes.
         bytes: u64,
     },
     /// The file is MCAP, but all its messages are of other programs.
     #[error("{path}: nothing to save: all {messages} messages are of other programs")]
     Foreign {
-        /// The value as given.
+        /// The path of the damaged file.
         path: PathBuf,
-        /// Whole messages.
+        /// The number of whole messages.
         messages: u64,
     },
     /// The new file cannot be written.
     #[error("--out {path}: {source}")]
     Write {
-        /// The value as given.
+        /// The path of the new file.
         path: PathBuf,
-        /// The reason.
+        /// The error of the new recording.
         source: recording::Error,
     },
 }
 
-/// Saves what is whole. Stderr says what was saved and what was lost.
+/// Saves the whole parts. Stderr says what was saved and what was lost.
 ///
 /// # Errors
 ///
-/// [`Error`], if there is nothing to be saved or a file cannot be read or written. The new file is
-/// then not there.
+/// Returns [`Error`] if there is nothing to save, or a file cannot be read or written. The new file
+/// does not exist then.
 pub fn run(args: &Args) -> Result<(), Error> {
     let unreadable = |source| Error::Unreadable {
         path: args.broken.clone(),
@@ -84,7 +84,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
         path: args.out.clone(),
         source,
     };
-    // `file` is held, and its lock with it, until all is done.
+    // `file` stays open until all is done, because it holds the lock.
     let (part, file) = is_new(&args.out)
         .and_then(|()| part(&args.out))
         .map_err(|error| unwritten(error.into()))?;
@@ -135,9 +135,9 @@ fn is_new(out: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// A new file beside the place of `out`, so that one of that name is always a whole one. What stands
-/// there already is somebody's, unless it is what an earlier try that was ended has left. It is
-/// locked: what two wrote there at once would be whole for neither.
+/// Makes and locks a file beside `out`, so that a file at `out` is always whole. An existing file
+/// belongs to somebody and is kept, unless an interrupted `recover` left it. The lock keeps two
+/// processes from writing the same file.
 fn part(out: &Path) -> io::Result<(PathBuf, File)> {
     let mut end = OsString::from(".part");
     loop {
@@ -154,7 +154,7 @@ fn part(out: &Path) -> io::Result<(PathBuf, File)> {
             },
             made => made?,
         };
-        // On a file system without locks, nobody holds one.
+        // On a file system without locks, nobody holds one, so other errors do not matter.
         if let Err(TryLockError::WouldBlock) = file.try_lock() {
             let held = "another `hardnessd recover` is writing it: wait for it";
             return Err(io::Error::new(ErrorKind::ResourceBusy, held));
@@ -169,8 +169,8 @@ fn part(out: &Path) -> io::Result<(PathBuf, File)> {
     }
 }
 
-/// What stands at `part`, if that is the beginning of a recording or nothing yet. A link may lead to
-/// somebody's file, and is not followed.
+/// The file at `part`, if it is empty or begins like a recording. A link is not followed, because
+/// it may lead to somebody's file.
 fn left_over(part: &Path) -> Option<File> {
     let no_link = OFlags::NOFOLLOW.bits().cast_signed();
     let mut options = File::options();
@@ -193,7 +193,7 @@ fn save(broken: File, part: &File) -> Result<Recovered, RecoverError> {
     Ok(recovered)
 }
 
-/// Flushes the directory: only then is the file's name on the disk.
+/// Flushes the directory, because only then is the file's name on the disk.
 fn sync_directory(file: &Path) -> io::Result<()> {
     let directory = file.parent().filter(|path| !path.as_os_str().is_empty());
     File::open(directory.unwrap_or(Path::new(".")))?.sync_all()
@@ -256,7 +256,7 @@ mod tests {
         );
         symlink(&theirs, &out).unwrap();
         assert_eq!(is_new(&out).unwrap_err().kind(), ErrorKind::AlreadyExists);
-        // Where the part would be.
+        // A link at the path of the part is not followed either.
         fs::write(&theirs, recording::MAGIC).unwrap();
         symlink(&theirs, directory.path().join("other.mcap.part")).unwrap();
         let (part, _file) = part(&directory.path().join("other.mcap")).unwrap();
@@ -273,7 +273,7 @@ mod tests {
         let refused = part(&out).unwrap_err();
         assert_eq!(refused.kind(), ErrorKind::ResourceBusy);
         assert_eq!(fs::read(&first).unwrap(), recording::MAGIC);
-        // Ended before its time.
+        // The first process ends before it has finished.
         drop(held);
         let (second, file) = part(&out).unwrap();
         assert_eq!(second, first);

@@ -1,7 +1,8 @@
-//! `hardnessd replay`: a recording through the same pipeline, events on stdout.
+//! `hardnessd replay`: sends a recording through the daemon's pipeline, and prints the events on
+//! stdout.
 //!
-//! Times come from the recording, so the output depends on nothing else: neither on the speed nor
-//! on how the bytes are cut.
+//! All times come from the recording, so the output depends neither on the speed nor on how the
+//! bytes are cut.
 
 pub mod motion;
 
@@ -39,10 +40,10 @@ pub struct Args {
     motion: Option<PathBuf>,
 }
 
-/// Why a recording cannot be played.
+/// The reason why a recording cannot be played.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The configuration or its model.
+    /// The configuration or its model cannot be used.
     #[error(transparent)]
     Config(#[from] config::Error),
     /// The recording cannot be read.
@@ -50,40 +51,40 @@ pub enum Error {
     Unreadable {
         /// Path of the recording.
         path: PathBuf,
-        /// The reason.
+        /// The system's error.
         source: io::Error,
     },
     /// The arm's positions cannot be used.
     #[error("--motion {path}:{source}")]
     Motion {
-        /// File of the positions.
+        /// The path of the file of positions.
         path: PathBuf,
-        /// Why not.
+        /// The error of that file.
         source: motion::Error,
     },
-    /// A recording has its own positions.
+    /// Positions were given for a recording, which has its own.
     #[error("--motion: found {path}, a recording with times of its own, expected raw bytes")]
     OwnMotion {
-        /// File of the recording.
+        /// The path of the recording.
         path: PathBuf,
     },
-    /// The recording is damaged, or another program's.
+    /// The recording is damaged, or of another program.
     #[error("{path}: {source}")]
     Recording {
         /// Path of the recording.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The error of the recording.
         source: recording::Error,
     },
-    /// It describes a sensor that cannot be.
+    /// The recording describes an impossible sensor.
     #[error("{path}: {source}")]
     Sensor {
         /// Path of the recording.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The error of the description.
         source: recording::PlaybackError,
     },
-    /// Bytes of another layout, or none.
+    /// The file has no whole frame of the configured layout.
     #[error(
         "{path}: no whole frame in {bytes_skipped} bytes ({frames_damaged} damaged): the layout is not \
          that of [sensor.frame]: `hardnessd sniff {path}` looks for another"
@@ -91,17 +92,17 @@ pub enum Error {
     NoFrame {
         /// Path of the recording.
         path: PathBuf,
-        /// All bytes of the file.
+        /// The number of bytes in the file.
         bytes_skipped: u64,
-        /// Candidates that were damaged.
+        /// The number of damaged candidates for a frame.
         frames_damaged: u64,
     },
-    /// Reading broke off.
+    /// Reading failed.
     #[error("{path}: {source}")]
     Broken {
         /// Path of the recording.
         path: PathBuf,
-        /// The reason.
+        /// The system's error.
         source: io::Error,
     },
     /// Stdout cannot be written to.
@@ -109,19 +110,19 @@ pub enum Error {
     Print(#[source] io::Error),
 }
 
-/// Bytes read at once when nothing paces them.
+/// The number of bytes that are read at once if neither a speed nor positions pace them.
 const CHUNK_BYTES: usize = 64 * 1024;
 
-/// Plays to the end, or until nobody reads stdout. It stops if the wait is given up.
+/// Plays to the end, or until nobody reads stdout. Dropping the future stops the replay.
 ///
 /// # Errors
 ///
-/// [`Error`], if the recording or the configuration cannot be used.
+/// Returns [`Error`] if the recording or the configuration cannot be used.
 pub async fn run(args: Args) -> Result<(), Error> {
-    // Dropped with the wait.
+    // Dropping this future drops `_stop`, which stops the thread.
     let (_stop, stopped) = mpsc::channel();
-    // On a thread of its own: a signal waits neither for a recording that is a pipe nor for whoever
-    // reads stdout.
+    // The replay runs on a thread of its own, so that a signal waits neither for a recording that
+    // is a pipe nor for the reader of stdout.
     let played = tokio::task::spawn_blocking(move || play(&args, &stopped));
     played.await.expect("a replay does not panic")
 }
@@ -165,21 +166,22 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Error> {
     }
 }
 
-/// When what is played comes.
+/// The timing of a replay.
 struct Pace<'a> {
     speed: Option<f64>,
-    /// When the first was played.
+    /// When the first entry was played.
     start: Option<Instant>,
     stopped: &'a Receiver<()>,
 }
 
 impl Pace<'_> {
-    /// Waits for what came so long after the first; `false`: nothing more is to be played.
+    /// Waits until the entry is due that came `since` after the first one. Returns `false` if the
+    /// replay was stopped.
     fn wait(&mut self, since: Duration) -> bool {
         let start = *self.start.get_or_insert_with(Instant::now);
         let left = self.speed.map_or(Duration::ZERO, |speed| {
             let due = Duration::try_from_secs_f64(since.as_secs_f64() / speed);
-            // A moment beyond counting does not come.
+            // A moment that is too far away to count never comes.
             let due = due.unwrap_or(Duration::MAX);
             due.saturating_sub(start.elapsed())
         });
@@ -187,8 +189,8 @@ impl Pace<'_> {
     }
 }
 
-/// A recording of ours. One that is cut off or damaged ends as bytes do that end there, and says
-/// afterwards what is wrong with it.
+/// Plays a recording. If it is cut off or damaged, its events end like those of bytes that end
+/// there, and the error follows them.
 fn play_recording(path: &Path, file: impl Read, setup: Setup, pace: Pace) -> Result<(), Error> {
     let mut playback = Playback::new(setup.hrn);
     let mut seq = 0;
@@ -209,7 +211,8 @@ fn play_recording(path: &Path, file: impl Read, setup: Setup, pace: Pace) -> Res
     played.map(drop)
 }
 
-/// What its sensors learnt, at the moments they learnt it. `false`: nobody reads, or it was stopped.
+/// Plays the entries of a recording at their moments. Returns `false` if nobody reads stdout or the
+/// replay was stopped.
 fn play_entries(
     path: &Path,
     file: impl Read,
@@ -227,7 +230,7 @@ fn play_entries(
             source,
         },
     };
-    // The first moment played.
+    // The moment of the first entry.
     let mut first: Option<Duration> = None;
     for found in Reader::new(file) {
         let found = found.map_err(failed)?;
@@ -256,7 +259,7 @@ fn play_entries(
 /// Positions are given to the pipeline this long before the frame of their moment.
 const AHEAD: Duration = Duration::from_secs(2);
 
-/// Bytes back to back, with the arm's positions.
+/// Plays raw bytes, with the arm's positions.
 fn play_bytes(
     path: &Path,
     mut file: impl Read,
@@ -267,7 +270,8 @@ fn play_bytes(
     let sensor = setup.sensors.first();
     let sensor = sensor.expect("a configuration has at least one sensor");
     let frame_rate_hz = sensor.description().frame_rate_hz;
-    // No two frames end in so many: each comes at its own moment, between its positions.
+    // No two frames end within this many bytes, so each frame comes at its own moment, between its
+    // positions.
     let chunk_bytes = if pace.speed.is_some() || motion.is_some() {
         sensor.layout().min_frame_bytes()
     } else {
@@ -308,9 +312,10 @@ fn play_bytes(
             .iter()
             .position(|point| i128::from(point.at_ns) > told_until as i128);
         let told: Vec<Point> = motion.drain(..told.unwrap_or(motion.len())).collect();
-        // A step back makes the approach unknown for its press.
+        // An error means that the time of a point went back. The approach of its press is then
+        // unknown.
         let _ = pipeline.tell(&told);
-        // The clock is the recording's: the moment given here is not looked at.
+        // The pipeline takes its times from the recording and does not use this one.
         let events = pipeline.push(&chunk[..read], now());
         warn(pipeline.unjudged());
         let (frames, _) = pipeline.frame_counts();
@@ -321,7 +326,7 @@ fn play_bytes(
     }
 }
 
-/// When whole frame `number` of bytes without times came, after the first.
+/// The time of whole frame `number` after the first one, in bytes without times.
 fn time_of(number: u64, frame_rate_hz: f64) -> Duration {
     Duration::try_from_secs_f64(number as f64 / frame_rate_hz).unwrap_or(Duration::MAX)
 }
@@ -340,7 +345,8 @@ fn warn(unjudged: Vec<Unjudged>) {
     }
 }
 
-/// Prints what a subscriber would get; `false`: nobody reads.
+/// Prints the events that a subscriber would receive, without frames. Returns `false` if nobody
+/// reads stdout.
 fn print(events: Vec<Event>, seq: &mut u64) -> Result<bool, Error> {
     let mut lines = String::new();
     for mut event in events {

@@ -1,7 +1,8 @@
-//! A robot that tells a daemon where its arm is, as the controller of a real one would.
+//! A simulated robot that sends the positions of its arm to a daemon, as a real controller would.
 //!
-//! In: how the simulated arm moves. Out: lines on a daemon's control socket, 50 a second. The daemon
-//! may come later, go, and come again; the robot waits for it and never delays the sensor.
+//! In: the motion of the simulated arm. Out: lines on a daemon's control socket, 50 a second. The
+//! daemon may start later, end, and start again: the robot waits for it and never delays the
+//! sensor.
 
 use std::io;
 use std::path::PathBuf;
@@ -16,21 +17,21 @@ use tokio::time::{Instant, MissedTickBehavior};
 use crate::daemon::now;
 use crate::simulator::Approach;
 
-/// Between two positions.
+/// The time between two positions.
 const STEP: Duration = Duration::from_millis(10);
-/// Positions in a line.
+/// The number of positions in a line.
 const POINTS: usize = 2;
 /// How long the robot waits before it looks for the daemon again.
 const RETRY: Duration = Duration::from_millis(200);
 
-/// How the arm moves now.
+/// The present motion of the arm.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Moving {
-    /// When the sensor's first frame was taken.
+    /// The time of the sensor's first frame.
     pub(crate) start: Instant,
-    /// Sensor seconds a second.
+    /// Seconds of the sensor per second.
     pub(crate) speed: f64,
-    /// Where the arm is, around this moment.
+    /// The path of the arm around this moment.
     pub(crate) approach: Approach,
 }
 
@@ -46,14 +47,14 @@ impl Moving {
 pub(crate) struct Robot {
     /// The daemon's control socket.
     pub(crate) socket: PathBuf,
-    /// The sensor on the arm; none: the daemon's first.
+    /// The sensor on the arm. `None` means the daemon's first sensor.
     pub(crate) sensor: Option<String>,
-    /// How the arm moves; none before the first frame.
+    /// The motion of the arm. `None` before the first frame.
     pub(crate) moving: watch::Receiver<Option<Moving>>,
 }
 
 impl Robot {
-    /// Tells for ever. What the daemon refuses is said on stderr, once.
+    /// Sends positions for ever. Prints the first refusal of a daemon on stderr.
     pub(crate) async fn run(self) {
         let mut complained = false;
         loop {
@@ -67,7 +68,7 @@ impl Robot {
         }
     }
 
-    /// Tells one daemon until it goes.
+    /// Sends positions to one daemon until the daemon ends or refuses them.
     async fn tell(&self) -> Result<(), Ended> {
         let (input, mut output) = UnixStream::connect(&self.socket).await?.into_split();
         let mut lines = BufReader::new(input).lines();
@@ -75,7 +76,7 @@ impl Robot {
         let hello: Value = serde_json::from_str(&hello).unwrap_or_default();
         let first = hello["sensors"][0]["name"].as_str().map(str::to_owned);
         let sensor = self.sensor.clone().or(first).ok_or(Ended::Gone)?;
-        // Events are for others.
+        // The robot needs no events.
         output.write_all(b"{\"subscribe\":[]}\n").await?;
         let mut tick = tokio::time::interval(STEP);
         tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -108,11 +109,11 @@ impl Robot {
     }
 }
 
-/// Why a daemon is told no more.
+/// The reason why no more positions are sent to a daemon.
 enum Ended {
-    /// It is not there, or has gone.
+    /// The daemon is not running, or has ended.
     Gone,
-    /// It does not take what it is told.
+    /// The daemon refused the positions with this message.
     Refused(String),
 }
 

@@ -1,4 +1,4 @@
-//! `hardnessd simulate`: only the sensor, at a pty or into a recording.
+//! `hardnessd simulate`: simulates only the sensor, on a pty or into a file of raw bytes.
 
 use std::fs::File;
 use std::future::Future;
@@ -67,10 +67,10 @@ pub struct Args {
     faults: Option<PathBuf>,
 }
 
-/// Why the sensor cannot be simulated.
+/// The reason why the sensor cannot be simulated.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The script of faults.
+    /// The script of faults cannot be used.
     #[error(transparent)]
     Faults(#[from] faults::Error),
     /// The layout needs more than a preset.
@@ -81,13 +81,13 @@ pub enum Error {
         "--baud: found {baud}, expected at least {needed} to carry {fps} frames/s of {bytes} bytes"
     )]
     Baud {
-        /// The value as given.
+        /// The baud rate of the line.
         baud: u32,
-        /// The lowest rate that carries the frames.
+        /// The lowest baud rate that carries the frames.
         needed: u32,
-        /// The value as given.
+        /// The frame rate in frames/s.
         fps: f64,
-        /// Bytes of a frame.
+        /// The number of bytes in a frame.
         bytes: usize,
     },
     /// The recording cannot be written.
@@ -95,15 +95,15 @@ pub enum Error {
     Recording {
         /// Path of the recording.
         path: PathBuf,
-        /// The reason.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// The pty, or its link.
+    /// The pty or its link failed.
     #[error("{what}: {source}")]
     Pty {
-        /// Path of the link, or that it is the pty.
+        /// The path of the link, or `pty` if there is no link.
         what: String,
-        /// The reason.
+        /// The system's error.
         source: std::io::Error,
     },
 }
@@ -112,7 +112,7 @@ pub enum Error {
 ///
 /// # Errors
 ///
-/// [`Error`], if the arguments do not fit together or the pty fails.
+/// Returns [`Error`] if the arguments do not fit together, or the pty or a file fails.
 pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
     let layout = Layout::new(&Frame {
         preset: args.preset,
@@ -133,7 +133,8 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     };
     if let Some(path) = args.to.clone() {
         let settings = sequence(&args);
-        // On another thread, so that a signal need not wait for the physics or a slow disk.
+        // This runs on another thread, so that a signal need not wait for the physics or a slow
+        // disk.
         let to = path.clone();
         let (stop, stopped) = mpsc::channel();
         let mut recorded =
@@ -176,7 +177,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         }
     };
     let play = async {
-        // It is no error if nobody reads the path: the link shows it too.
+        // It is no error if nobody reads the path, because the link shows it too.
         let told = super::print_apart(line.into_bytes());
         tokio::try_join!(told, player.play(settings)).map(|_| ())
     };
@@ -206,8 +207,8 @@ fn sequence(args: &Args) -> SequenceSettings {
 /// How long a signal waits for the frame that is being written.
 const LAST_FRAME: Duration = Duration::from_millis(500);
 
-/// Writes the bytes that a sensor sends, back to back, until the presses are over or the other end of
-/// `stopped` is dropped. A file that cannot be written to its end is removed; a device is not.
+/// Writes the bytes that a sensor sends, back to back, until the presses are over or the other end
+/// of `stopped` is dropped. If a write fails, the file is removed, unless it is a device.
 fn record(
     path: &Path,
     layout: &Layout,
@@ -224,8 +225,8 @@ fn record(
     written
 }
 
-/// Writes frame by frame, so that the file holds what was played whenever the simulation is stopped.
-/// While the sensor is silent or unplugged it sends nothing.
+/// Writes frame by frame, so that the file holds what was played whenever the simulation is
+/// stopped. While the sensor is silent or unplugged it sends nothing.
 fn write(
     mut file: &File,
     layout: &Layout,
@@ -249,9 +250,9 @@ fn write(
     file.sync_all()
 }
 
-/// The rate of the line: as given, if it carries the shortest frames; else the first usual one that
-/// does, from 115,200 on. With it what there is to be said: another rate than that, or longer frames
-/// that may come late.
+/// The baud rate of the line. A given rate must carry the shortest frames. Without one, it is the
+/// first usual rate from 115,200 on that carries them. The text says that this rate is not 115,200,
+/// or warns that longer frames may come late.
 fn baud(args: &Args, layout: &Layout) -> Result<(u32, Option<String>), Error> {
     const USUAL: [u32; 7] = [
         115_200, 230_400, 460_800, 921_600, 1_000_000, 2_000_000, 4_000_000,
@@ -291,14 +292,14 @@ fn preset(name: &str) -> Result<Preset, NameError> {
     Preset::deserialize(name.into_deserializer())
 }
 
-/// A press is computed whole, and takes as long as it takes to reach its force: what no sensor
-/// does would fill the memory.
+/// Parses `--fps`. A press is computed as a whole, with as many frames as it takes to reach its
+/// force. At a rate beyond any sensor's, they would fill the memory.
 fn frame_rate_hz(text: &str) -> Result<f64, OutOfRange> {
     within(text, 0.1, 1000.0)
 }
 
-/// As [`frame_rate_hz`]: the softest material takes minutes to bear 1,000 N, and the sensor shows no
-/// more than 10 N a taxel.
+/// Parses `--force`, which is limited for the same reason as [`frame_rate_hz`]: the softest
+/// material takes minutes to bear 1,000 N, and the sensor shows no more than 10 N a taxel.
 fn force_n(text: &str) -> Result<f64, OutOfRange> {
     within(text, 0.01, 200.0)
 }
@@ -318,7 +319,7 @@ pub(super) fn within(text: &str, least: f64, most: f64) -> Result<f64, OutOfRang
     }
 }
 
-/// A number above 0, and not so far from 1 that seconds made of it fit no clock.
+/// Parses a number above 0 that is so near to 1 that a clock can count seconds made of it.
 pub(super) fn positive(text: &str) -> Result<f64, OutOfRange> {
     within(text, 1e-6, 1e9)
 }

@@ -1,7 +1,8 @@
 //! `hardnessd sniff`: raw bytes in, a proposed `[sensor.frame]` out.
 //!
-//! On stdout: TOML, to be appended below a `[[sensor]]`. Its comments say how sure it is and why it
-//! was preferred. With `--out` a whole configuration is written to a file instead.
+//! It prints TOML on stdout, to be appended below a `[[sensor]]`. The comments in the TOML say how
+//! sure the proposal is and why it was preferred. With `--out`, it writes a whole configuration to
+//! a file instead.
 
 mod candidates;
 mod proposal;
@@ -45,7 +46,7 @@ pub struct Args {
     out: Option<PathBuf>,
 }
 
-/// Why `sniff` proposes nothing.
+/// The reason why `sniff` proposes nothing.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The recording cannot be read.
@@ -53,15 +54,15 @@ pub enum Error {
     Unreadable {
         /// Path of the recording.
         path: PathBuf,
-        /// The reason.
+        /// The system's error.
         source: io::Error,
     },
-    /// The recording is damaged, or another program's.
+    /// The recording is damaged, or of another program.
     #[error("{path}: {source}")]
     Recording {
         /// Path of the recording.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The error of the recording.
         source: recording::Error,
     },
     /// The port does not open, or it was lost before the first byte.
@@ -69,7 +70,7 @@ pub enum Error {
     Unavailable {
         /// Path of the port.
         path: PathBuf,
-        /// The reason.
+        /// The fault that was found, or the system's reason.
         reason: String,
     },
     /// No layout explains the bytes.
@@ -80,15 +81,15 @@ pub enum Error {
     Unexplained {
         /// Path of the recording or the port.
         path: PathBuf,
-        /// How many bytes there are.
+        /// The number of bytes.
         bytes: usize,
     },
     /// The configuration cannot be written.
     #[error("--out {path}: {source}")]
     Write {
-        /// The value as given.
+        /// The path of the configuration.
         path: PathBuf,
-        /// The reason.
+        /// The system's error.
         source: io::Error,
     },
     /// Stdout cannot be written to.
@@ -96,20 +97,20 @@ pub enum Error {
     Print(#[source] io::Error),
 }
 
-/// Bytes looked at, from the beginning: 20,000 frames of the JX255N.
+/// The most bytes that are examined, from the beginning: 20,000 frames of the JX255N.
 const MOST_BYTES: usize = 16 << 20;
 
-/// Prints a proposal.
+/// Prints a proposal, or writes it to a file.
 ///
 /// # Errors
 ///
-/// [`Error`], if there are no bytes, or nothing explains them.
+/// Returns [`Error`] if the bytes cannot be read, no layout explains them, or the output fails.
 pub async fn run(args: Args) -> Result<(), Error> {
     let listened = match &args.port {
         Some(port) => Some(listen(port, args.baud, args.seconds).await?),
         None => None,
     };
-    // On another thread: the file may be a pipe, and many bytes take long.
+    // This runs on another thread, because the file may be a pipe and many bytes take long.
     let told = tokio::task::spawn_blocking(move || match listened {
         Some(bytes) => tell(&args, &bytes),
         None => read(args.source()).and_then(|bytes| tell(&args, &bytes)),
@@ -125,7 +126,7 @@ impl Args {
     }
 }
 
-/// Prints the layout that explains `bytes`.
+/// Prints or writes the layout that explains `bytes`.
 fn tell(args: &Args, bytes: &[u8]) -> Result<(), Error> {
     let path = args.source();
     let proposals = propose(bytes);
@@ -221,7 +222,8 @@ async fn listen(path: &Path, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> 
     let mut link = Link::new(path, baud);
     let mut bytes = Vec::new();
     let mut lost = None;
-    // A duration that is too long to count ends when the port is lost or the bytes are many.
+    // If the duration is too long to count, listening ends when the port is lost or enough bytes
+    // have come.
     let listened = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
     let _ = tokio::time::timeout(listened, async {
         while bytes.len() < MOST_BYTES {

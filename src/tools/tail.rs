@@ -1,8 +1,8 @@
-//! `hardnessd tail`: events of a running daemon on stdout, for eyes and for scripts.
+//! `hardnessd tail`: prints events of a running daemon on stdout, for people and for scripts.
 //!
-//! What is printed, and counted by `--count`, are events of the types asked for, the current
-//! statuses that a connection begins with among them. A `gap` is printed where it happened and not
-//! counted. `hello` is not printed.
+//! It prints the events of the requested types, and `--count` counts them. They include the current
+//! statuses that a connection begins with. A `gap` is printed where it happened, but not counted.
+//! `hello` is not printed.
 
 mod readable;
 
@@ -42,17 +42,17 @@ pub struct Args {
     types: Vec<Kind>,
 }
 
-/// Why it ended early.
+/// The reason why `tail` ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The time limit has passed.
     #[error("timed out after {seconds} s ({})", events(*.found, *.count))]
     Timeout {
-        /// Events that were printed.
+        /// The number of printed events.
         found: u64,
-        /// The value as given.
+        /// The time limit in seconds.
         seconds: f64,
-        /// The value as given.
+        /// The number of events after which to end, if it was given.
         count: Option<u64>,
     },
     /// No daemon answers, or it has ended.
@@ -72,15 +72,15 @@ pub enum Error {
     Foreign {
         /// The address.
         address: Address,
-        /// Its first line.
+        /// A description of the line that came instead.
         found: String,
     },
-    /// The daemon has too many subscribers.
+    /// The daemon refused the connection: it has too many subscribers.
     #[error("{address}: the daemon says: {message}")]
     Refused {
-        /// Where it is.
+        /// The address.
         address: Address,
-        /// As it came.
+        /// The daemon's message.
         message: String,
     },
     /// Stdout cannot be written to.
@@ -88,8 +88,8 @@ pub enum Error {
     Print(#[source] io::Error),
 }
 
-/// How long a daemon may take to say hello: a hundred times the 50 ms that one takes at most,
-/// for one that a service manager has to start first.
+/// How long a daemon may take to send `hello`: a hundred times the 50 ms that a running one takes
+/// at most, because a service manager may have to start it first.
 const HELLO: Duration = Duration::from_secs(5);
 
 fn events(found: u64, count: Option<u64>) -> String {
@@ -106,7 +106,7 @@ fn kind(name: &str) -> Result<Kind, &'static str> {
 ///
 /// # Errors
 ///
-/// [`Error`], if no daemon answers, it ends, or the time is over.
+/// Returns [`Error`] if no daemon answers, the daemon ends, or the time limit has passed.
 pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
     let mut found = 0;
     tokio::select! {
@@ -138,7 +138,8 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
         Ok(hello) => meet(&hello?.1, address.clone())?,
         Err(_) => return Err(Error::Mute { address }),
     }
-    // Only after the connection is made: if no daemon answers, the error must be the only line.
+    // This comes after the connection is made: if no daemon answers, the error must be the only
+    // line.
     if args.source.given().is_none() {
         eprintln!(
             "hardnessd: events of {}",

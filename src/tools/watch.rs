@@ -1,8 +1,8 @@
 //! `hardnessd watch`: the sensors of a running daemon, on a terminal.
 //!
-//! A subscriber like any other, which asks for the totals once a second, and connects again when the
-//! daemon goes away. What is known is kept in `view`, what it looks like in `draw`; here they
-//! are brought together with the socket, the keys and the clock.
+//! It is a subscriber like any other. It asks for the totals once a second, and connects again when
+//! the daemon goes away. `view` keeps what is known, and `draw` draws it. This file connects both
+//! with the socket, the keys and the clock.
 
 mod draw;
 mod look;
@@ -37,7 +37,7 @@ pub struct Args {
     source: Source,
 }
 
-/// Why `watch` ended with an error.
+/// An error of `watch`.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// Stdin or stdout is not a terminal.
@@ -58,7 +58,7 @@ const PAUSE: Duration = Duration::from_millis(500);
 ///
 /// # Errors
 ///
-/// [`Error`], if there is no terminal or it fails.
+/// Returns [`Error`] if there is no terminal or the terminal fails.
 pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
     if !(io::stdin().is_terminal() && io::stdout().is_terminal()) {
         return Err(Error::NoTerminal);
@@ -138,9 +138,9 @@ enum State {
 
 type Connecting = Pin<Box<dyn Future<Output = Result<Connection, connect::Error>> + Send>>;
 
-/// What comes from the daemon.
+/// A connection to the daemon, or a line from it.
 enum Heard {
-    /// It accepted the connection at this address.
+    /// The daemon accepted the connection at this address.
     Connection(Address),
     Line(String),
 }
@@ -153,7 +153,8 @@ impl Daemon {
         }
     }
 
-    /// The next line, or why there is no daemon. If you stop waiting, nothing is lost.
+    /// The next connection or line, or the reason why there is no daemon. Cancelling the call loses
+    /// nothing.
     async fn next(&mut self) -> Result<Heard, Loss> {
         loop {
             match &mut self.state {
@@ -201,7 +202,7 @@ impl Daemon {
 }
 
 impl Clock {
-    /// Whether a daemon at this address has this machine's clock.
+    /// The clock of a daemon at this address.
     fn of(address: &Address) -> Self {
         match address {
             Address::Unix(_) => Self::Ours,

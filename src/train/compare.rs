@@ -1,10 +1,10 @@
-//! Every method under every seed, and the tables that follow: the paper's Tables 2 and 3.
+//! Trains every method under every seed, and writes the tables, such as the paper's Tables 2 and 3.
 //!
-//! In: a data set. Out, in a directory: `data/`, what every model is judged on; `runs/`, a run's
-//! directory a method and seed; `logs/`; and `results.json`, `tables.md` and `report.html`, written
-//! anew whenever a run ends, of all finished runs that stand there, asked for this time or before.
-//! Nothing is trained in this process: each run is one of its own, so that it can be stopped,
-//! resumed and spread as it likes, and what is finished is not done again.
+//! In: a data set. Out, in a directory: `data/` with the test sets, `runs/` with one run's
+//! directory per method and seed, `logs/`, and `results.json`, `tables.md` and `report.html`. These
+//! three are written anew whenever a run ends, and cover all finished runs in the directory, from
+//! this call or an earlier one. This process trains nothing. Each run is a process of its own, so
+//! that runs can be stopped, resumed and distributed. Finished runs are not repeated.
 
 mod children;
 pub mod courses;
@@ -34,12 +34,12 @@ use crate::train::methods::{self, Method};
 use crate::train::run::Run;
 use crate::train::run::disk::{lock, write_whole};
 
-/// The command lines of the runs that are not finished, the longest first: what [`compare`] would run. What
-/// they leave in the directory, [`compare`] finds.
+/// The command lines of the unfinished runs that [`compare`] would run, the longest first.
+/// [`compare`] finds the results that these commands leave in the directory.
 ///
 /// # Errors
 ///
-/// Those of [`compare`] before its first run.
+/// Fails as [`compare`] does before its first run.
 pub fn plan(plan: &Plan) -> anyhow::Result<String> {
     let dataset = checked(plan)?;
     let recipes = recipes(plan, &dataset)?;
@@ -49,7 +49,7 @@ pub fn plan(plan: &Plan) -> anyhow::Result<String> {
     plan::command_lines(&jobs)
 }
 
-/// The plan's data. Nothing is made before it is known that it will do.
+/// Reads and checks the plan's data, before anything is written.
 fn checked(plan: &Plan) -> anyhow::Result<Dataset> {
     let dataset = Dataset::read(&plan.data)?;
     sets::check_seed(&dataset)?;
@@ -69,7 +69,7 @@ fn make_directories(plan: &Plan) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The longest first, but every method once before any method twice.
+/// Sorts the runs: the longest first, but each method's first seed before any method's second.
 fn in_order(mut open: Vec<(&PlannedRun, Job)>) -> Vec<Job> {
     open.sort_by(|(a, first), (b, second)| {
         (a.told.seed)
@@ -79,12 +79,12 @@ fn in_order(mut open: Vec<(&PlannedRun, Job)>) -> Vec<Job> {
     open.into_iter().map(|(_, job)| job).collect()
 }
 
-/// Runs what is not finished, and writes results and tables of all that is.
+/// Runs the unfinished runs, and writes results and tables of all finished ones.
 ///
 /// # Errors
 ///
-/// If the data cannot be read, the directory cannot be written, holds runs that were told otherwise
-/// or is being worked on by another process, or at the end if a run failed.
+/// Fails if the data cannot be read, if the directory cannot be written, holds runs with other
+/// settings or is in use by another process, or at the end if a run failed.
 pub fn compare(plan: &Plan) -> anyhow::Result<()> {
     let dataset = checked(plan)?;
     let recipes = recipes(plan, &dataset)?;
@@ -104,7 +104,7 @@ pub fn compare(plan: &Plan) -> anyhow::Result<()> {
     });
     let failed = report_failures(&failures, &plan.out);
     match (failed, swapped) {
-        // Both in one line: the runs that failed before are not forgotten.
+        // Report both in one line, so that the swaps' error does not hide the failed runs.
         (Err(failed), Err(error)) => bail!("{failed}; then {error:#}"),
         (failed, swapped) => failed.and(swapped),
     }
@@ -126,7 +126,7 @@ fn report_failures(failures: &[Failure], out: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Writes `results.json` of the finished runs, and the tables.
+/// Writes `results.json` with the finished runs, and the tables.
 fn write_results(plan: &Plan, runs: &[PlannedRun], sets: &[TestSet]) -> anyhow::Result<()> {
     let mut entries = Vec::new();
     for run in runs.iter().filter(|run| run.is_finished()) {
@@ -139,7 +139,7 @@ fn write_results(plan: &Plan, runs: &[PlannedRun], sets: &[TestSet]) -> anyhow::
     write_tables(&plan.out)
 }
 
-/// Writes `tables.md` and `report.html` from what stands in a comparison's directory.
+/// Writes `tables.md` and `report.html` from the files in a comparison's directory.
 fn write_tables(out: &Path) -> anyhow::Result<()> {
     let comparison = Comparison::read(out)?.context("results.json was written just now")?;
     let markdown = tables::markdown(&comparison);

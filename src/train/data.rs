@@ -1,4 +1,4 @@
-//! Where frames come from: data set files, the simulator, recordings; and how a frame is varied.
+//! Sources of frames (data set files, the simulator, recordings), and the variation of a frame.
 
 pub mod dataset;
 pub mod courses;

@@ -1,4 +1,4 @@
-//! How good a recogniser or a generated frame is, beside what trivial methods reach; and pictures.
+//! The quality of recognisers and generated frames, compared with trivial methods; and pictures.
 
 pub mod features;
 pub mod baseline;

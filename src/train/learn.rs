@@ -1,4 +1,4 @@
-//! Steps down a gradient: the optimiser, and the loops of recognisers and GANs.
+//! Training: the optimiser, and the training loops of recognisers and GANs.
 
 pub mod optimiser;
 pub mod learner;

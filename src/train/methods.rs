@@ -1,4 +1,4 @@
-//! The methods of the table, as recipes over the same parts.
+//! The methods of the table, each a sequence of the same stages.
 
 pub mod course;
 pub mod features;
@@ -70,8 +70,8 @@ pub enum Method {
     Course,
 }
 
-/// Steps of the methods without a GAN that are fit to be compared, whatever their labels: about those of
-/// the default model.
+/// Training steps of the strong methods without a GAN, whatever their number of labels: about as
+/// many as the default model takes.
 fn strong_steps(profile: Profile) -> u64 {
     match profile {
         Profile::Paper => 4_800,
@@ -80,7 +80,8 @@ fn strong_steps(profile: Profile) -> u64 {
     }
 }
 
-/// Adam from `learning_rate` down to 0 by a cosine, with weight decay: for the networks that are not the paper's.
+/// Adam with weight decay, whose rate falls from `learning_rate` to 0 along a cosine. For the
+/// networks that are not the paper's.
 fn adam(others: OptimiserSettings, learning_rate: f64) -> OptimiserSettings {
     OptimiserSettings {
         rule: Rule::Adam,
@@ -92,13 +93,13 @@ fn adam(others: OptimiserSettings, learning_rate: f64) -> OptimiserSettings {
 }
 
 impl Method {
-    /// Those that judge a frame, in the order of the tables.
+    /// The methods that judge a frame, in the order of the tables.
     pub fn of_frames() -> impl Iterator<Item = Self> {
         let all = <Self as clap::ValueEnum>::value_variants().iter().copied();
         all.filter(|&method| method != Self::Course)
     }
 
-    /// Its name in commands, files and tables.
+    /// The method's name in commands, files and tables.
     pub fn name(self) -> &'static str {
         match self {
             Self::Ours => "ours",
@@ -121,7 +122,7 @@ impl Method {
         }
     }
 
-    /// Whether it takes [`strong_steps`] and the recipe that goes with them.
+    /// Whether the method takes [`strong_steps`] and the settings that go with them.
     fn is_strong(self) -> bool {
         matches!(
             self,
@@ -129,11 +130,11 @@ impl Method {
         )
     }
 
-    /// Its settings, before anything overrides them.
+    /// The method's settings, before a settings file or an option overrides them.
     pub fn settings(self, profile: Profile) -> Settings {
         let mut settings = Settings::of(profile);
         match self {
-            // As Salimans trains it; the average reaches over about a tenth of the steps.
+            // The rate is Salimans's. The average covers about a tenth of the steps.
             Self::Igan => {
                 settings.ustgan.optimiser.learning_rate = 3e-3;
                 settings.ustgan.averaging = match profile {
@@ -151,7 +152,7 @@ impl Method {
                     },
                     ..settings.training
                 };
-                // Two of a level's eight objects.
+                // This holds out two of a level's eight objects.
                 settings.validation = Validation {
                     share: 0.25,
                     every_epochs: 1,
@@ -239,7 +240,7 @@ impl Method {
         settings
     }
 
-    /// Labels it may use of `labelled` samples, unless told otherwise.
+    /// The number of labels that the method uses of `labelled` samples by default.
     fn labels(self, labelled: usize) -> usize {
         let percent = match self {
             Self::Hrn100 | Self::Features | Self::Frame | Self::Adapt | Self::Course => 100,
@@ -250,33 +251,33 @@ impl Method {
     }
 }
 
-/// Why so many labels cannot be used.
+/// An error of a requested number of labels.
 #[derive(Debug, thiserror::Error)]
 pub enum LabelsError {
     /// The data has no labelled training samples.
     #[error(transparent)]
     None(#[from] DatasetError),
-    /// More were asked for than there are, or too few for one of each level.
+    /// More labels were requested than the data has, or too few for one of each level.
     #[error(
         "--labels: found {asked}, expected at least {least} (one of each level and file) and at \
          most the data's {labelled}"
     )]
     Range {
-        /// As given.
+        /// The requested number of labels.
         asked: usize,
-        /// Levels times files.
+        /// The number of levels times the number of files.
         least: usize,
-        /// Labelled training samples.
+        /// The number of labelled training samples.
         labelled: usize,
     },
 }
 
-/// How many labels `method` uses of `dataset`, if it may use `asked` or its own share.
+/// The number of labels that `method` uses of `dataset`: `asked`, or else the method's own share.
 ///
 /// # Errors
 ///
-/// If the data has no labelled training samples, fewer than asked for, or too few of them for one
-/// of each level.
+/// Fails if the data has no labelled training samples, or if `asked` is more than these or too few
+/// for one of each level.
 pub fn labels(
     method: Method,
     dataset: &Dataset,
@@ -311,30 +312,31 @@ fn chosen(dataset: &Dataset, description: &Description) -> Result<Vec<usize>, Da
     })
 }
 
-/// What is asked of a run, before its data says what that comes to.
+/// A request for a run, before its data determines the labels and epochs.
 #[derive(Debug, Clone, Copy)]
 pub struct Request {
-    /// What to train.
+    /// The method to train.
     pub method: Method,
-    /// How long it may take.
+    /// The profile, which sets how long the run takes.
     pub profile: Profile,
-    /// Everything random follows from it.
+    /// The seed of everything random.
     pub seed: u64,
-    /// Labels to use instead of the method's share.
+    /// The number of labels to use instead of the method's share.
     pub labels: Option<usize>,
-    /// How they are chosen.
+    /// How the labels are chosen.
     pub label_choice: LabelChoice,
-    /// Of the method, with what overrides them.
+    /// The method's settings with all overrides applied.
     pub settings: Settings,
 }
 
 impl Request {
-    /// What the run is told of `dataset`: `hrn15-long` gets as many epochs as make the steps that
-    /// ours would take on the same labels under the same settings.
+    /// The description of the run on `dataset`. `hrn15-long` gets the number of epochs that makes
+    /// as many steps as `ours` would take on the same labels under the same settings. A strong
+    /// method gets enough epochs for its steps.
     ///
     /// # Errors
     ///
-    /// Those of [`labels`].
+    /// Fails as [`labels`] does.
     pub fn description(&self, dataset: &Dataset) -> Result<Description, LabelsError> {
         let mut description = Description {
             method: self.method.name().to_owned(),
@@ -364,12 +366,13 @@ impl Request {
     }
 }
 
-/// Makes sure, before anything is made, that the data has what all stages of a method need.
+/// Checks, before anything is written, that the data has what all stages of a method need.
 ///
 /// # Errors
 ///
-/// If it has no labelled training samples, a GAN is left without unlabelled ones, an STGAN without
-/// any of its level, or objects are to be held out in vain.
+/// Fails if the data has no labelled training samples, if no unlabelled ones remain for a method
+/// that needs them, if an STGAN has none of its level, or if objects are to be held out without
+/// effect.
 pub fn check(method: Method, dataset: &Dataset, description: &Description) -> anyhow::Result<()> {
     let labelled = chosen(dataset, description)?;
     let needs_unlabelled = matches!(
@@ -401,7 +404,8 @@ pub fn check(method: Method, dataset: &Dataset, description: &Description) -> an
     check_validation(method, dataset, description, &labelled)
 }
 
-/// Makes sure that objects held out are used, and says so where a share is none of them.
+/// Checks that the method uses held-out objects. Prints a warning where the share rounds to no
+/// object.
 fn check_validation(
     method: Method,
     dataset: &Dataset,
@@ -435,8 +439,8 @@ fn check_validation(
     Ok(())
 }
 
-/// Epochs over `samples` whose steps are, to the nearest epoch, those of ours in pretraining and
-/// fine-tuning.
+/// The number of epochs over `samples` that makes, to the nearest epoch, as many steps as `ours`
+/// takes in pretraining and fine-tuning.
 fn epochs_as_long_as_ours(settings: &Settings, samples: usize) -> u32 {
     let steps = |samples: u64, training: &Training| samples.div_ceil(training.batch as u64).max(1);
     let levels = crate::train::data::dataset::levels().len() as u64;
@@ -449,13 +453,14 @@ fn epochs_as_long_as_ours(settings: &Settings, samples: usize) -> u32 {
     u32::try_from(epochs).unwrap_or(u32::MAX)
 }
 
-/// Runs a method to its model and evaluation in the run's directory, on data that passed [`check`];
-/// takes up whatever is there. Gives the evaluation on the test split, if the data has one.
+/// Trains a method on data that passed [`check`] and writes its model and evaluation to the run's
+/// directory. A resumed run continues from the files there. Returns the evaluation on the test
+/// split, if the data has one.
 ///
 /// # Errors
 ///
-/// If the data has no labelled training samples, the training diverges, or the directory cannot be
-/// read or written.
+/// Fails if the data has no labelled training samples, the training diverges, or the directory
+/// cannot be read or written.
 pub fn train(
     method: Method,
     dataset: &Dataset,
@@ -515,7 +520,7 @@ pub fn train(
     stages.finish(&trained)
 }
 
-/// Training samples whose level is not used: all but `labelled`.
+/// The training samples whose level is not used: all except `labelled`.
 fn unlabelled(dataset: &Dataset, labelled: &[usize]) -> Vec<usize> {
     let labelled: BTreeSet<usize> = labelled.iter().copied().collect();
     let wanted =
@@ -551,7 +556,8 @@ mod tests {
 
     #[test]
     fn hrn15_long_takes_the_steps_of_ours() {
-        // Ours: 45,000 generated samples 200 times, 90,000 steps; then the labelled ones 200 times.
+        // `ours` takes 90,000 steps over 45,000 generated samples (200 epochs of batches of 100),
+        // then 200 epochs over the labelled samples.
         for (profile, samples, epochs) in [
             (Profile::Paper, 1_500, 6_200),
             (Profile::Quick, 1_500, 620),

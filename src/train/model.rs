@@ -1,4 +1,5 @@
-//! From a trained recogniser to the ONNX file that the daemon loads.
+//! Exports trained recognisers to the ONNX file that the daemon loads, and adapts other ONNX files
+//! to the format.
 
 pub mod file;
 pub mod export;

@@ -1,6 +1,7 @@
 //! A run's directory: settings, revision, metrics, checkpoints, the model and its evaluation.
 //!
-//! Every file is whole whenever it stands there ([`disk`]), also after SIGKILL or a full disk.
+//! Every file is complete at all times ([`disk`]), also after SIGKILL or a full disk. Only the last
+//! row of `metrics.csv` may be broken; a resumed run drops it.
 
 pub mod checkpoint;
 pub mod disk;
@@ -21,32 +22,32 @@ use checkpoint::Checkpoint;
 use disk::{lock, write_whole};
 use history::Metrics;
 
-/// Checkpoints kept of a stage: the newest, and one before it.
+/// The number of checkpoints kept for a stage: the newest, and one before it.
 const CHECKPOINTS_KEPT: usize = 2;
 
-/// What a run was told: `settings.toml`.
+/// The description of a run, in `settings.toml`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Description {
-    /// Such as `hrn100`.
+    /// The name of the method, such as `hrn100`.
     pub method: String,
-    /// How long it may take.
+    /// The profile, which says how long the run may take.
     pub profile: Profile,
-    /// Everything random follows from it.
+    /// The seed of everything random.
     pub seed: u64,
-    /// Labelled samples it may use.
+    /// The number of labelled samples that the run may use.
     pub labels: usize,
-    /// How they are chosen.
+    /// How the labelled samples are chosen.
     pub label_choice: LabelChoice,
     /// Settings of the method.
     pub settings: Settings,
-    /// The files it learns from.
+    /// The files from which the run learns.
     pub data: Vec<Source>,
 }
 
 impl Description {
-    /// Reads `settings.toml`, also one of an earlier version, as long as the run used none of the
-    /// options that are gone.
+    /// Reads `settings.toml`, also of an earlier version, as long as the run used none of the
+    /// retired options.
     fn read(text: &str) -> Result<Self, SettingsError> {
         let syntax = |error| SettingsError::Syntax(wording::of_toml(text, &error));
         let mut table: toml::Table = toml::from_str(text).map_err(syntax)?;
@@ -57,12 +58,12 @@ impl Description {
         if had_retired {
             return table.try_into().map_err(syntax);
         }
-        // From the text itself, so that an error can name the line.
+        // Parse the text itself, so that an error can name the line.
         toml::from_str(text).map_err(syntax)
     }
 
-    /// The first key that is not as `expected`, with what both have there; `None` if they are the
-    /// same. Data are the same if their bytes are: a file may have been renamed.
+    /// The first key whose value differs from `expected`, with both values. `None` if there is
+    /// none. Data are the same if their bytes are, because a file may have been renamed.
     pub fn difference(&self, expected: &Self) -> Option<String> {
         let hashes = |sources: &[Source]| -> Vec<String> {
             sources.iter().map(|source| source.sha256.clone()).collect()
@@ -82,7 +83,7 @@ impl Description {
         if self == expected {
             return None;
         }
-        // A seed may be beyond the numbers of a table, be it written in a file all the same.
+        // A `toml::Table` cannot hold a seed above i64::MAX, although a file can.
         let tables = (toml::Table::try_from(self), toml::Table::try_from(expected));
         let named = match tables {
             (Ok(found), Ok(expected)) => difference("", &found, &expected),
@@ -103,21 +104,21 @@ fn difference(table: &str, found: &toml::Table, expected: &toml::Table) -> Optio
     })
 }
 
-/// A run's directory, in which no other process runs while it is open.
+/// A run's directory, locked against other processes while it is open.
 #[derive(Debug)]
 pub struct Run {
     directory: PathBuf,
     _lock: File,
-    /// Directories of other runs, whose finished stages may be taken.
+    /// Directories of other runs, from which finished stages may be taken.
     others: Vec<PathBuf>,
 }
 
 impl Run {
-    /// What the run in a directory was told; `None` if there is no run.
+    /// The description of the run in a directory. `None` if there is no run.
     ///
     /// # Errors
     ///
-    /// If `settings.toml` is there and cannot be read.
+    /// Returns an error if `settings.toml` exists but cannot be read.
     pub fn told(directory: &Path) -> anyhow::Result<Option<Description>> {
         let path = directory.join("settings.toml");
         match fs::read(&path) {
@@ -130,12 +131,14 @@ impl Run {
         }
     }
 
-    /// Makes the directory, or with `resume` takes up a run that was told the same.
+    /// Starts a run in the directory. With `resume`, continues the run that the directory has, if
+    /// its description is the same.
     ///
     /// # Errors
     ///
-    /// If a run stands there and `resume` is not asked for, if it was told otherwise or another
-    /// process is at it, or if the directory cannot be written.
+    /// Returns an error if there is a run and `resume` is not set, if that run has another
+    /// description, if another process works in the directory, or if the directory cannot be
+    /// written.
     pub fn open(directory: &Path, description: &Description, resume: bool) -> anyhow::Result<Self> {
         fs::create_dir_all(directory).with_context(|| directory.display().to_string())?;
         let run = Self {
@@ -169,8 +172,8 @@ impl Run {
         Ok(run)
     }
 
-    /// The same run, which takes a stage that it has not begun from one of `others` where that
-    /// finished the very same stage.
+    /// The same run, which takes a stage that it has not begun from one of `others`, if that run
+    /// has finished a stage of the same origin.
     #[must_use]
     pub fn taking_from(self, others: Vec<PathBuf>) -> Self {
         Self { others, ..self }
@@ -185,7 +188,7 @@ impl Run {
     ///
     /// # Errors
     ///
-    /// Those of writing; what stood there before then still stands.
+    /// Returns the errors of writing. A file that existed before is then unchanged.
     pub fn write(&self, name: &str, bytes: &[u8]) -> anyhow::Result<()> {
         write_whole(&self.path(name), bytes)
     }
@@ -194,7 +197,7 @@ impl Run {
     ///
     /// # Errors
     ///
-    /// Those of writing.
+    /// Returns the errors of writing.
     pub fn save(&self, stage: &str, checkpoint: &Checkpoint) -> anyhow::Result<()> {
         let name = format!("checkpoints/{stage}-{:010}.npz", checkpoint.progress.step);
         self.write(&name, &checkpoint.to_bytes()?)?;
@@ -205,12 +208,13 @@ impl Run {
         Ok(())
     }
 
-    /// A stage's newest checkpoint that can be read, if there is one; else that of another run
-    /// that did all `epochs` of a stage of the same `origin`, which then is this run's too.
+    /// A stage's newest checkpoint that can be read. Without any checkpoint, that of another run
+    /// which did all `epochs` of a stage of the same `origin`; it then becomes this run's too.
     ///
     /// # Errors
     ///
-    /// If there are some and none can be read, or what was taken cannot be written.
+    /// Returns an error if there are checkpoints but none can be read, or if a stage that was taken
+    /// from another run cannot be written.
     pub fn latest(
         &self,
         stage: &str,
@@ -229,7 +233,8 @@ impl Run {
             return Err(failure);
         }
         for other in &self.others {
-            // What cannot be read there is no failure of this run, which can do the stage itself.
+            // A file of another run that cannot be read is no error, because this run can do the
+            // stage itself.
             let Some(path) = checkpoints(other, stage).unwrap_or_default().pop() else {
                 continue;
             };
@@ -252,11 +257,11 @@ impl Run {
         Ok(None)
     }
 
-    /// Makes sure that a stage's checkpoint follows from what the stage has now.
+    /// Checks that a stage's checkpoint was made from the stage's present settings and inputs.
     ///
     /// # Errors
     ///
-    /// If its origin is another.
+    /// Returns an error if the checkpoint's origin is not `origin`.
     pub fn check_origin(
         &self,
         stage: &str,
@@ -274,8 +279,8 @@ impl Run {
         Ok(())
     }
 
-    /// Adds those lines of `revisions` to the run's that are not among them: other programs had a
-    /// part in it.
+    /// Adds the lines of `revisions` that the run's file lacks, because other programs had a part
+    /// in the run.
     fn add_revisions(&self, revisions: &str) -> anyhow::Result<()> {
         let path = self.path("revision");
         let before = match fs::read_to_string(&path) {
@@ -294,8 +299,8 @@ impl Run {
         self.write("revision", all.as_bytes())
     }
 
-    /// Adds the rows of `stage` of another run's metrics to `metrics.csv`: they are part of what
-    /// this run's model cost.
+    /// Adds the rows of `stage` of another run's metrics to `metrics.csv`, because they are part of
+    /// the cost of this run's model.
     fn take_metrics(&self, stage: &str, text: &str) -> anyhow::Result<()> {
         let mut own = self.metrics_before()?;
         if own.is_empty() {
@@ -313,12 +318,13 @@ impl Run {
         self.write("metrics.csv", own.as_bytes())
     }
 
-    /// Opens `metrics.csv` and cuts off the rows of `stage` after `step`: a resumed run writes
-    /// them again.
+    /// Opens `metrics.csv` and cuts off the rows of `stage` after `step`, because a resumed run
+    /// writes them again.
     ///
     /// # Errors
     ///
-    /// Those of reading and writing, or if another version began the file with other columns.
+    /// Returns the errors of reading and writing, and an error if another version began the file
+    /// with other columns.
     pub fn metrics(&self, stage: &'static str, step: u64) -> anyhow::Result<Metrics> {
         let before = self.metrics_before()?;
         let columns = history::columns();
@@ -328,7 +334,7 @@ impl Run {
             let cells: Vec<&str> = row.split(',').collect();
             let row_step = cells.get(1).and_then(|cell| cell.parse::<u64>().ok());
             let is_done = cells[0] != stage || row_step.is_some_and(|row_step| row_step <= step);
-            // A full disk may have broken one off.
+            // A full disk may have broken a row off.
             if !is_done || cells.len() != columns.split(',').count() {
                 continue;
             }
@@ -346,7 +352,7 @@ impl Run {
         Ok(Metrics::new(file, stage, seconds_before))
     }
 
-    /// What `metrics.csv` has so far; nothing, if it is not there yet.
+    /// The text of `metrics.csv` so far. Empty if the file does not exist yet.
     fn metrics_before(&self) -> anyhow::Result<String> {
         let path = self.path("metrics.csv");
         match fs::read_to_string(&path) {

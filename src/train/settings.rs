@@ -1,7 +1,7 @@
-//! Everything that a training run can be told, as one TOML file.
+//! All settings of a training run, as one TOML file.
 //!
-//! `config/hrn-train.toml` shows every key with its default and unit. A run's own settings are
-//! kept as `settings.toml` in its directory.
+//! `config/hrn-train.toml` shows every key with its default and unit. A run keeps the settings that
+//! it used as `settings.toml` in its directory.
 
 use serde::{Deserialize, Serialize};
 
@@ -38,25 +38,26 @@ pub enum Profile {
     Smoke,
 }
 
-/// Which weights a run keeps.
+/// The choice of the weights that a run keeps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Keep {
-    /// Those of the last step, as the paper.
+    /// The weights of the last step, as in the paper.
     Last,
-    /// Those of the least loss on the validation objects.
+    /// The weights with the least loss on the validation objects.
     Best,
 }
 
-/// Objects taken out of the training objects, to choose weights and temperature by.
+/// The validation objects: training objects held out to choose weights and temperature.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Validation {
-    /// Share of the training objects of each level, 0 to 0.5; 0: none, as the paper.
+    /// Share of the training objects of each level, from 0 to 0.5. With 0, as in the paper, there
+    /// are no validation objects.
     pub share: f64,
-    /// Judged after every so many epochs.
+    /// The number of epochs between two validations.
     pub every_epochs: u32,
-    /// `last` or `best`.
+    /// The weights to keep: `last` or `best`.
     pub keep: Keep,
 }
 
@@ -70,22 +71,23 @@ impl Default for Validation {
     }
 }
 
-/// How a recogniser learns from labelled frames; the defaults are the paper's ("Training of HRN").
+/// Settings for the training of a recogniser on labelled frames. The defaults are the paper's
+/// ("Training of HRN").
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Training {
-    /// Samples a step. The last batch of an epoch may be smaller.
+    /// Samples per step. The last batch of an epoch may be smaller.
     pub batch: usize,
     /// Passes over the training samples: what the paper calls iterations.
     pub epochs: u32,
-    /// Decay a step of the running average of the weights that is evaluated and exported;
-    /// 0: the weights themselves.
+    /// Decay per step of the running average of the weights. The average is evaluated and exported.
+    /// With 0, the weights themselves are.
     pub averaging: f64,
-    /// A checkpoint is written after every so many epochs, and after the last.
+    /// The number of epochs between two checkpoints. The last epoch always ends with one.
     pub checkpoint_every_epochs: u32,
-    /// The rule of the steps.
+    /// Settings of the optimiser.
     pub optimiser: OptimiserSettings,
-    /// What is done to a frame before each use.
+    /// The changes made to a frame before each use.
     pub augmentation: AugmentationSettings,
 }
 
@@ -102,12 +104,12 @@ impl Default for Training {
     }
 }
 
-/// What the STGANs' generators are asked for.
+/// Settings for the samples that the STGANs generate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Generation {
-    /// Samples of each component of each level's mixture: 225 x 50 = 11,250 a level, thirty for
-    /// each of the paper's 375 labelled ones.
+    /// Samples of each component of each level's mixture: 225 x 50 = 11,250 per level, which is
+    /// thirty for each of the paper's 375 labelled samples.
     pub samples_a_component: u32,
 }
 
@@ -119,31 +121,32 @@ impl Default for Generation {
     }
 }
 
-/// Settings of a run; the defaults are the paper's. A stage that a method does not have leaves
-/// its table unused.
+/// Settings of a run. The defaults are the paper's. A method ignores the tables of stages that it
+/// does not have.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Settings {
-    /// Newtons a taxel that become 1 in the network's image; 0 N becomes -1. 10.2 N is what
-    /// 8 bits of 0.04 N hold.
+    /// The force on a taxel, in newtons, that becomes 1 in the network's image. 0 N becomes -1.
+    /// 10.2 N is the full scale of 8 bits of 0.04 N.
     pub full_scale_n: f64,
-    /// How the networks see a frame.
+    /// Settings of the networks' image and pooling.
     pub network: NetworkSettings,
-    /// The GAN over unlabelled samples: USTGAN, or that of SGAN and IGAN.
+    /// The GAN on unlabelled samples: USTGAN, or the GAN of SGAN and IGAN.
     pub ustgan: GanSettings,
-    /// Each of the STGANs.
+    /// Settings of each STGAN.
     pub stgan: GanSettings,
-    /// What the STGANs' generators are asked for.
+    /// Settings for the samples that the STGANs generate.
     pub generation: Generation,
-    /// HRN on the generated samples.
+    /// The training of HRN on the generated samples.
     pub pretraining: Training,
-    /// HRN on the labelled samples: from random weights, or the fine-tuning of others.
+    /// The training of HRN on the labelled samples, from random weights or as the fine-tuning of
+    /// other weights.
     pub training: Training,
-    /// Unlabelled samples beside the labelled ones, without a GAN.
+    /// Learning from unlabelled samples beside the labelled ones, without a GAN.
     pub consistency: ConsistencySettings,
-    /// What a robot may tell of its arm, for networks of whole presses.
+    /// Errors in a robot's reports about its arm, for networks of whole presses.
     pub told: Told,
-    /// Held-out objects of the labelled ones.
+    /// The labelled objects that are held out.
     pub validation: Validation,
 }
 
@@ -154,7 +157,7 @@ impl Default for Settings {
             network: NetworkSettings::default(),
             ustgan: GanSettings::default(),
             stgan: GanSettings {
-                // An epoch has 4 steps there and 85 here.
+                // An epoch of an STGAN has 4 steps, and one of USTGAN has 85.
                 checkpoint_every_epochs: 50,
                 picture_every_epochs: 100,
                 ..GanSettings::default()
@@ -170,13 +173,14 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// The defaults of a profile. A method may have others: [`crate::train::methods::Method::settings`].
+    /// The default settings of a profile. A method may have others:
+    /// [`crate::train::methods::Method::settings`].
     pub fn of(profile: Profile) -> Self {
         let paper = Self::default();
         match profile {
             Profile::Paper => paper,
-            // A tenth of the paper's steps everywhere: all methods take 34 minutes of one core a
-            // seed (`results/quick`).
+            // A tenth of the paper's steps in every stage. All methods take 34 minutes of one core
+            // per seed (`results/quick`).
             Profile::Quick => paper.with_epochs(50, 20),
             Profile::Smoke => Self {
                 generation: Generation {
@@ -207,13 +211,14 @@ impl Settings {
         }
     }
 
-    /// These settings with what `text` says instead.
+    /// Gives these settings, with the values in `text` in place of their own.
     ///
     /// # Errors
     ///
-    /// If `text` is no TOML of our keys, or a value lies outside its range.
+    /// Returns an error if `text` is not TOML with known keys, or a value lies outside its range.
     pub fn overridden(&self, text: &str) -> Result<Self, SettingsError> {
-        // Once as a whole, for errors that show the line; once over these settings.
+        // Parse the text twice: alone, so that an error can show the line, and merged over these
+        // settings.
         let syntax = |error| SettingsError::Syntax(wording::of_toml(text, &error));
         let _: Self = toml::from_str(text).map_err(syntax)?;
         let own = toml::Table::try_from(self).expect("settings are plain tables of numbers");
@@ -222,11 +227,11 @@ impl Settings {
         merged.checked()
     }
 
-    /// The same settings, if every value is within its range.
+    /// Gives the same settings if every value is within its range.
     ///
     /// # Errors
     ///
-    /// If one is not.
+    /// Returns an error if a value lies outside its range.
     pub fn checked(self) -> Result<Self, SettingsError> {
         let scale = self.full_scale_n;
         check("", "full_scale_n", scale, scale > 0.0, "above 0")?;

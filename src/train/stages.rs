@@ -1,9 +1,9 @@
-//! The parts that methods are made of: USTGAN, the STGANs and what they generate, pretraining,
-//! training.
+//! The stages that methods consist of: USTGAN, the STGANs and the samples they generate,
+//! pretraining, training.
 //!
 //! In: labelled and unlabelled samples, settings, a seed. Out: weights, and in the run's directory
-//! each part's checkpoints, metrics and pictures. What a stage has done is taken up, never done
-//! again.
+//! the checkpoints, metrics and pictures of each stage. A resumed run continues each stage from its
+//! last checkpoint.
 
 use burn::tensor::Device;
 
@@ -25,29 +25,29 @@ use crate::train::run::{Description, Run};
 use crate::train::settings::{AugmentationSettings, GanSettings, Settings, Training, Validation};
 use crate::verdict::argmax;
 
-/// Stages of the four STGANs.
+/// Stage names of the four STGANs, one for each hardness level.
 const STGANS: [&str; 4] = ["stgan1", "stgan2", "stgan3", "stgan4"];
 
 fn levels() -> usize {
     crate::train::data::dataset::levels().len()
 }
 
-/// What all stages of a run share.
+/// The inputs that all stages of a run share.
 #[derive(Debug)]
 pub struct Stages<'a> {
-    /// Where the samples are.
+    /// The data set that the indices below refer to.
     pub dataset: &'a Dataset,
-    /// Labelled samples to learn from; for STGANs, of every level.
+    /// Labelled samples to learn from. STGANs need samples of every level.
     pub train: &'a [usize],
     /// Labelled samples of held-out objects; may be empty.
     pub validation: &'a [usize],
-    /// Training samples whose levels are not used; for a GAN, one or more.
+    /// Training samples whose levels are not used. A GAN needs at least one.
     pub unlabelled: &'a [usize],
-    /// Settings and seed.
+    /// The run's settings and seed.
     pub description: &'a Description,
-    /// Where stages leave what they made.
+    /// The run's directory, to which the stages write.
     pub run: &'a Run,
-    /// Where to compute.
+    /// The device that computes.
     pub device: &'a Device,
 }
 
@@ -83,23 +83,23 @@ impl Stages<'_> {
         }
     }
 
-    /// HRN's random start.
+    /// HRN's random initial weights.
     pub fn random(&self) -> Weights {
         let pooling = self.settings().network.pooling;
         hrn::initial(levels(), pooling, self.description.seed, self.device)
     }
 
-    /// HRN's start from USTGAN's discriminator.
+    /// HRN's initial weights, taken from USTGAN's discriminator.
     pub fn inherited(&self, ustgan: &Gan) -> Weights {
         let (pooling, seed) = (self.settings().network.pooling, self.description.seed);
         hrn::inherited(&ustgan.discriminator, levels(), pooling, seed, self.device)
     }
 
-    /// The GAN trained without labels.
+    /// Trains USTGAN, the GAN without labels.
     ///
     /// # Errors
     ///
-    /// If the run's directory cannot be read or written, or the training diverges.
+    /// Fails if the run's directory cannot be read or written, or the training diverges.
     pub fn ustgan(&self) -> anyhow::Result<Gan> {
         let game = Game::RealOrFake;
         let task = self.gan_task("ustgan", game, &self.settings().ustgan);
@@ -107,13 +107,13 @@ impl Stages<'_> {
         gan::fit(&task, initial, self.run)
     }
 
-    /// A GAN a level, started from USTGAN's weights and with fresh optimisers, and equally many
-    /// samples of each component of each. They are not stored: they follow from the STGANs' last
-    /// checkpoints.
+    /// Trains one STGAN per level and generates equally many samples from each component of each.
+    /// The STGANs start from USTGAN's weights with fresh optimisers. The samples are not stored,
+    /// because the STGANs' last checkpoints determine them.
     ///
     /// # Errors
     ///
-    /// If the run's directory cannot be read or written, or a training diverges.
+    /// Fails if the run's directory cannot be read or written, or a training diverges.
     pub fn generated(&self, ustgan: &Gan) -> anyhow::Result<Dataset> {
         let mut samples = Vec::new();
         for (stage, level) in STGANS.into_iter().zip(1..) {
@@ -138,13 +138,13 @@ impl Stages<'_> {
         })
     }
 
-    /// Samples of `level` to learn from.
+    /// The training samples of `level`.
     fn of_level(&self, level: u8) -> Vec<usize> {
         let wanted = |index: &usize| self.dataset.samples[*index].level == level;
         self.train.iter().copied().filter(wanted).collect()
     }
 
-    /// Draws real samples of each level over generated ones.
+    /// Draws real samples of each level above generated ones.
     fn draw_generated(&self, generated: &[Sample]) -> anyhow::Result<()> {
         let mut rows = Vec::new();
         for level in 1..=levels() as u8 {
@@ -165,7 +165,7 @@ impl Stages<'_> {
         self.run.write("samples/generated.png", &picture)
     }
 
-    /// What the STGAN of the samples `real` generates.
+    /// Trains an STGAN on the samples `real` and returns the frames it generates.
     fn generated_of(
         &self,
         stage: &'static str,
@@ -195,11 +195,11 @@ impl Stages<'_> {
         ))
     }
 
-    /// HRN on generated samples.
+    /// Trains HRN on generated samples.
     ///
     /// # Errors
     ///
-    /// If the run's directory cannot be read or written, or the training diverges.
+    /// Fails if the run's directory cannot be read or written, or the training diverges.
     pub fn pretrained(&self, generated: &Dataset, initial: Weights) -> anyhow::Result<Weights> {
         let train: Vec<usize> = (0..generated.samples.len()).collect();
         let task = fit::Task {
@@ -226,20 +226,20 @@ impl Stages<'_> {
         }
     }
 
-    /// HRN on the labelled samples.
+    /// Trains HRN on the labelled samples.
     ///
     /// # Errors
     ///
-    /// If the run's directory cannot be read or written, or the training diverges.
+    /// Fails if the run's directory cannot be read or written, or the training diverges.
     pub fn trained(&self, stage: &'static str, initial: Weights) -> anyhow::Result<Trained> {
         fit::fit(&self.fit_task(stage), initial, self.run)
     }
 
-    /// HRN on the labelled samples and, by consistency, on the unlabelled ones.
+    /// Trains HRN on the labelled samples and, by consistency, on the unlabelled ones.
     ///
     /// # Errors
     ///
-    /// If the run's directory cannot be read or written, or the training diverges.
+    /// Fails if the run's directory cannot be read or written, or the training diverges.
     pub fn consistent(&self, stage: &'static str, initial: Weights) -> anyhow::Result<Trained> {
         let task = fit::Task {
             unlabelled: Some((self.unlabelled, self.settings().consistency)),
@@ -248,12 +248,12 @@ impl Stages<'_> {
         fit::fit(&task, initial, self.run)
     }
 
-    /// HRN on the labelled samples and on those unlabelled ones that `teacher` is sure of, each with the
-    /// level that the teacher sees in it.
+    /// Trains HRN on the labelled samples and on the unlabelled ones that `teacher` judges with
+    /// enough confidence, each with the level that the teacher assigns to it.
     ///
     /// # Errors
     ///
-    /// If the run's directory cannot be read or written, or the training diverges.
+    /// Fails if the run's directory cannot be read or written, or the training diverges.
     pub fn self_trained(
         &self,
         stage: &'static str,
@@ -273,7 +273,7 @@ impl Stages<'_> {
                 train.push(index);
             }
         }
-        // As many steps as the teacher took.
+        // The student takes as many steps as the teacher took.
         let own = &self.settings().training;
         let steps = u64::from(own.epochs) * self.train.len().div_ceil(own.batch) as u64;
         let epochs = steps.div_ceil(train.len().div_ceil(own.batch) as u64);
@@ -290,11 +290,11 @@ impl Stages<'_> {
         fit::fit(&task, initial, self.run)
     }
 
-    /// A GAN whose discriminator learns the levels too, and then is the recogniser.
+    /// Trains a GAN whose discriminator also learns the levels and becomes the recogniser.
     ///
     /// # Errors
     ///
-    /// If the run's directory cannot be read or written, or the training diverges.
+    /// Fails if the run's directory cannot be read or written, or the training diverges.
     pub fn semi_supervised(&self, stage: &'static str, game: Game) -> anyhow::Result<Trained> {
         let task = gan::Task {
             labelled: self.train,
@@ -303,8 +303,8 @@ impl Stages<'_> {
         let initial = gan::initial(game, levels(), self.description.seed, self.device);
         let gan = gan::fit(&task, initial, self.run)?;
         let weights = hrn::of_levels(&gan.discriminator, levels(), self.device);
-        // The layers' statistics over all real frames that the discriminator has seen, as it has
-        // seen them.
+        // Compute the layers' statistics over all real frames that the discriminator has seen, in
+        // batches of the same size and without augmentation, as in its training.
         let mut real = self.unlabelled.to_vec();
         real.extend(self.train);
         let settings = Training {
@@ -320,11 +320,11 @@ impl Stages<'_> {
         task.finished(weights, self.settings().ustgan.epochs)
     }
 
-    /// Writes the model, what it is worth and what it still gets wrong.
+    /// Writes the model, its evaluation and a picture of its mistakes.
     ///
     /// # Errors
     ///
-    /// If the daemon's loader refuses the model, or the run's directory cannot be written.
+    /// Fails if the daemon's loader refuses the model, or the run's directory cannot be written.
     pub fn finish(&self, trained: &Trained) -> anyhow::Result<Option<Evaluation>> {
         let scale = self.scale();
         self.draw_mistakes(trained)?;
@@ -353,7 +353,7 @@ impl Stages<'_> {
         )
     }
 
-    /// Draws mistakes on held-out objects where there are some, else on those learnt from.
+    /// Draws mistakes on held-out objects, or on training samples if no objects are held out.
     fn draw_mistakes(&self, trained: &Trained) -> anyhow::Result<()> {
         let (kind, indices) = if self.validation.is_empty() {
             ("training", self.train)
@@ -369,12 +369,12 @@ impl Stages<'_> {
     }
 }
 
-/// Draws those of labelled samples of a kind that are judged wrongly, from each one's
-/// probabilities.
+/// Draws the labelled samples that are judged wrongly. `probabilities` has one row for each of the
+/// indices; the kind (`training` or `held-out`) appears in the title.
 ///
 /// # Errors
 ///
-/// If the run's directory cannot be written.
+/// Fails if the run's directory cannot be written.
 pub(super) fn draw_mistakes(
     run: &Run,
     dataset: &Dataset,

@@ -1,7 +1,7 @@
-//! The course of a press, as a model of format 2 is given it.
+//! The course of a press, as input of a model of format 2.
 //!
-//! In: a press's frames with their times, and what is known of the arm. Out: the model's inputs, as
-//! tensors; and presses as text, for `hrn.check`.
+//! In: a press's frames with their times, the approach and the arm's stiffness. Out: the model's
+//! inputs as tensors, and presses as text for `hrn.check`.
 
 use serde::{Deserialize, Serialize};
 use tract_onnx::prelude::*;
@@ -9,26 +9,26 @@ use tract_onnx::prelude::*;
 use crate::frame::sparse::{self, SparseError};
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 
-/// Fewest and most frames that a model of format 2 may take.
+/// The fewest and the most frames that a model of format 2 may take.
 pub const COURSE_FRAMES: (usize, usize) = (3, 48);
 
 /// One frame of a press.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CourseMoment {
-    /// Since the frame that began the press.
+    /// The seconds since the frame that began the press.
     pub time_s: f32,
-    /// How far the arm went since then; `None`: unknown.
+    /// How far the arm went since the frame that began the press. `None` if it is unknown.
     pub approach_mm: Option<f32>,
-    /// The taxels.
+    /// The taxels of the frame.
     pub frame: Frame,
 }
 
 /// A press over time.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Course {
-    /// Its frames in contact, from the one that began it, ascending in time.
+    /// The frames in contact, from the one that began the press, ascending in time.
     pub moments: Vec<CourseMoment>,
-    /// Stiffness of the arm; 0: unknown.
+    /// The stiffness of the arm. 0 if it is unknown.
     pub arm_n_per_mm: f32,
 }
 
@@ -64,7 +64,7 @@ impl Input {
         }
     }
 
-    /// Its shape in a model of `most` frames.
+    /// The shape of the input in a model of `most` frames.
     pub(super) fn shape(self, most: usize) -> Vec<usize> {
         match self {
             Self::Frames => vec![1, most, ROWS, COLS],
@@ -73,7 +73,7 @@ impl Input {
         }
     }
 
-    /// What it is of `course`. Frames that are not there are 0.
+    /// The tensor of this input for `course`. Places after the last frame are 0.
     pub(super) fn tensor(self, course: &Course, most: usize) -> TractResult<Tensor> {
         let each = |value: fn(&CourseMoment) -> f32| {
             let mut values: Vec<f32> = course.moments.iter().map(value).collect();
@@ -99,20 +99,20 @@ impl Input {
     }
 }
 
-/// Names and shapes of the inputs of a model of format 2 that takes so many frames.
+/// The names and shapes of the inputs of a model of format 2 that takes `most` frames.
 pub fn course_inputs(most: usize) -> [(&'static str, Vec<usize>); 6] {
     Input::ALL.map(|input| (input.name(), input.shape(most)))
 }
 
-/// The Shore hardness that a model of format 2 gives.
+/// The Shore hardness from a model of format 2.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(into = "[f32; 3]", from = "[f32; 3]")]
 pub struct Shore {
-    /// The most likely one.
+    /// The most likely Shore hardness.
     pub value: f32,
-    /// Where its 90 % interval begins.
+    /// The beginning of the 90 % interval.
     pub low: f32,
-    /// Where it ends.
+    /// The end of the 90 % interval.
     pub high: f32,
 }
 
@@ -128,11 +128,11 @@ impl From<Shore> for [f32; 3] {
     }
 }
 
-/// `hrn.check` of format 2: presses, and what the trainer's own software says of them.
+/// `hrn.check` of format 2: presses, and the outputs of the trainer's own software for them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CourseCheck {
-    /// Two a level.
+    /// The presses: 8, or two of each level.
     pub presses: Vec<CheckedCourse>,
 }
 
@@ -140,20 +140,20 @@ pub struct CourseCheck {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(into = "Written", try_from = "Written")]
 pub struct CheckedCourse {
-    /// The press.
+    /// The course of the press.
     pub course: Course,
-    /// `[L]`.
+    /// `[L]`: the trainer's probabilities.
     pub probabilities: Vec<f32>,
-    /// Value, low and high.
+    /// The trainer's Shore hardness: value, low and high.
     pub shore: Shore,
 }
 
-/// A press as it is written: a list for each input, and each frame as [`sparse`] text.
+/// A press in the file: a list for each input, and each frame as [`sparse`] text.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Written {
     time_s: Vec<f32>,
-    /// Null: unknown.
+    /// The approach at each frame. Null if it is unknown.
     approach_mm: Vec<Option<f32>>,
     arm_n_per_mm: f32,
     frames: Vec<String>,
@@ -178,7 +178,7 @@ impl From<CheckedCourse> for Written {
     }
 }
 
-/// Lists that are no press.
+/// The reason why lists are not a press.
 #[derive(Debug, thiserror::Error)]
 enum Unwritten {
     #[error(

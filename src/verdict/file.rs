@@ -1,7 +1,7 @@
-//! What a model file must be before its graph is built (`docs/formats.md`).
+//! The checks of a model file before its graph is built (`docs/formats.md`).
 //!
-//! In: the file as ONNX's own messages. Out: what it says of itself, or what in it is not as
-//! agreed. Nothing here runs the model.
+//! In: the file as ONNX's own messages. Out: the model's description, or the first part that breaks
+//! the format. Nothing here runs the model.
 
 use serde::Deserialize;
 use tract_onnx::pb;
@@ -25,7 +25,7 @@ pub(super) fn check_opset(proto: &pb::ModelProto) -> Result<(), ModelError> {
     }
 }
 
-/// Refuses data that lies outside the file, in subgraphs and attributes too.
+/// Refuses tensors whose data lies outside the file, including those in subgraphs and attributes.
 pub(super) fn check_tensors_inside(graph: &pb::GraphProto) -> Result<(), ModelError> {
     let inside = |tensor: &pb::TensorProto| {
         let external = pb::tensor_proto::DataLocation::External as i32;
@@ -68,7 +68,7 @@ pub(super) fn check_tensors_inside(graph: &pb::GraphProto) -> Result<(), ModelEr
     Ok(())
 }
 
-/// Refuses other inputs and outputs than the agreed ones. Gives the format, and of format 2 the
+/// Refuses inputs and outputs that break the format. Returns the format, and for format 2 the
 /// inputs in their order.
 pub(super) fn check_signature(
     graph: &pb::GraphProto,
@@ -83,7 +83,7 @@ pub(super) fn check_signature(
             .collect::<Vec<_>>()
             .join(", ")
     };
-    // Before ONNX IR 4 every initialiser is listed among the inputs too.
+    // Before ONNX IR 4, every initialiser is also listed among the inputs.
     let inputs: Vec<&pb::ValueInfoProto> = graph
         .input
         .iter()
@@ -129,7 +129,7 @@ pub(super) fn check_signature(
             expected,
         });
     }
-    // The inference library takes it for granted that somebody computes the outputs.
+    // The inference library assumes that a node computes each output.
     for output in outputs {
         if !graph
             .node
@@ -145,7 +145,7 @@ pub(super) fn check_signature(
     Ok((format, inputs))
 }
 
-/// The inputs of a model of format 2, in their order, and how many frames it takes.
+/// The largest number of frames that a model of format 2 takes, and its inputs in their order.
 fn check_course_inputs(inputs: &[&pb::ValueInfoProto]) -> Result<(usize, Vec<Input>), ModelError> {
     let (least, most) = COURSE_FRAMES;
     let agreed = |input: Input, frames: &dyn std::fmt::Display| {
@@ -179,7 +179,7 @@ fn check_course_inputs(inputs: &[&pb::ValueInfoProto]) -> Result<(usize, Vec<Inp
     })
 }
 
-/// Refuses check presses that are longer than the model takes.
+/// Refuses check presses that have more frames than the model takes.
 fn check_lengths(check: &CourseCheck, most: usize) -> Result<(), ModelError> {
     let mut lengths = check.presses.iter().map(|press| press.course.moments.len());
     match lengths.find(|&found| found > most) {
@@ -407,7 +407,7 @@ fn check_check(check: &Check, levels: usize) -> Result<(), ModelError> {
     let usable = |newtons: &Vec<f32>| {
         newtons.len() == TAXELS && newtons.iter().all(|n| n.is_finite() && *n >= 0.0)
     };
-    // Eight, two a level; a model of other than four levels cannot have both.
+    // There are 8 check frames, or two a level. Only a model of four levels has both.
     if [8, 2 * levels].contains(&check.frames.len())
         && check.frames.len() == check.probabilities.len()
         && check.frames.iter().all(usable)

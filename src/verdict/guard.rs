@@ -1,10 +1,10 @@
-//! What the graph of a model may be: checked before the inference library sees it.
+//! The check of a model's graph before the inference library sees it.
 //!
-//! In: the graph as ONNX's own messages. Out: what it costs, or the first thing in it that is not
-//! allowed. The inference library believes a graph: some make it panic, fill the memory, never end,
-//! or write outside an array. So only the operators of [`table`] may occur, each with the attributes
-//! and sizes that it can have, and the shape of every value is computed here. Nothing here runs the
-//! model, and no value is computed but lists of integers that say a shape.
+//! In: the graph as ONNX's own messages. Out: the graph's cost, or the first thing in it that is
+//! not allowed. The inference library trusts a graph: some graphs make it panic, fill the memory,
+//! never end, or write outside an array. So only the operators of [`table`] may occur, each with
+//! the attributes and sizes that it can have, and the shape of every value is computed here.
+//! Nothing here runs the model. The only values computed are lists of integers that decide a shape.
 
 mod arithmetic;
 mod layers;
@@ -25,32 +25,32 @@ use self::problem::{AttributeProblem, Form, Problem};
 use self::table::{Allowed, Operator};
 use super::ModelError;
 
-/// Most nodes of a graph, those of its subgraphs included.
+/// The most nodes of a graph, including those of its subgraphs.
 const MOST_NODES: u64 = 2_000;
-/// Most tensors that a graph brings along.
+/// The most tensors inside a graph.
 const MOST_TENSORS: usize = 10_000;
-/// Most dimensions of a value.
+/// The most dimensions of a value.
 const MOST_RANK: usize = 8;
-/// Most numbers in one value: as many as a file of the largest size holds.
+/// The most numbers in one value: as many as a file of the largest size holds.
 const MOST_NUMBERS: u64 = 16_000_000;
-/// Most numbers in all values that are computed.
+/// The most numbers in all computed values.
 const MOST_NUMBERS_IN_ALL: u64 = 64_000_000;
-/// Most multiplications and additions of a verdict. What a verdict really takes is measured; this
-/// bounds how long the measurement can take.
+/// The most multiplications and additions of a verdict. The time of a verdict is measured later;
+/// this number limits how long the measurement can take.
 const MOST_WORK: u64 = 500_000_000;
-/// Longest name of a node or a value, in bytes.
+/// The longest name of a node or a value, in bytes.
 const MOST_NAME_BYTES: usize = 1_024;
-/// Longest list of integers whose values are known here.
+/// The longest list of integers whose values are tracked here.
 const MOST_KNOWN: usize = 65_536;
 
-/// What a graph costs.
+/// The cost of a graph.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Cost {
-    /// Nodes, those of subgraphs included.
+    /// The number of nodes, including those of subgraphs.
     pub(super) nodes: u64,
-    /// Numbers in all computed values.
+    /// The number of numbers in all computed values.
     pub(super) numbers: u64,
-    /// Multiplications and additions, about.
+    /// The approximate number of multiplications and additions.
     pub(super) work: u64,
 }
 
@@ -58,7 +58,7 @@ pub(super) struct Cost {
 ///
 /// # Errors
 ///
-/// [`ModelError::Guard`], which names the node or tensor and says what is wrong with it.
+/// Returns a [`ModelError::Guard`] that names the node or tensor and the problem with it.
 pub(super) fn check(proto: &pb::ModelProto, graph: &pb::GraphProto) -> Result<Cost, ModelError> {
     let unsupported = |what| guard("graph", &Problem::Unsupported(what));
     if !proto.functions.is_empty() {
@@ -75,7 +75,7 @@ pub(super) fn check(proto: &pb::ModelProto, graph: &pb::GraphProto) -> Result<Co
     let mut walk = Walk::new(opset);
     walk.tensors(graph)?;
     for input in &graph.input {
-        // Before ONNX IR 4, tensors that the file brings along are listed among the inputs too.
+        // Before ONNX IR 4, tensors inside the file are also listed among the inputs.
         if !graph.initializer.iter().any(|t| t.name == input.name) {
             tensor::declared(input)
                 .and_then(|value| walk.bind(&input.name, value))
@@ -105,7 +105,7 @@ fn guard(place: impl Into<String>, problem: &Problem) -> ModelError {
     }
 }
 
-/// A name out of a file, on one line and of a readable length.
+/// A name from a file, on one line and of a readable length.
 fn quoted(name: &str) -> String {
     if name.chars().count() <= 60 {
         return format!("{name:?}");
@@ -114,7 +114,7 @@ fn quoted(name: &str) -> String {
     format!("{start:?}...")
 }
 
-/// Types of numbers that a graph may use.
+/// The types of numbers that a graph may use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Datum {
     F32,
@@ -142,14 +142,14 @@ impl Datum {
     }
 }
 
-/// What is known of a value before anything runs.
+/// The properties of a value that are known before anything runs.
 #[derive(Debug, Clone)]
 struct Value {
     datum: Datum,
     shape: Vec<usize>,
-    /// Its integers, where they are known: shapes, axes and indices.
+    /// The value's integers if they are known: shapes, axes and indices.
     ints: Option<Rc<[i64]>>,
-    /// Whether it depends on no input.
+    /// Whether the value depends on no input.
     constant: bool,
 }
 
@@ -174,7 +174,7 @@ impl Value {
         self.shape.len()
     }
 
-    /// How many numbers, if they can be counted.
+    /// The number of numbers, or `None` if it overflows.
     fn numbers(&self) -> Option<u64> {
         count(&self.shape)
     }
@@ -190,7 +190,7 @@ fn count(shape: &[usize]) -> Option<u64> {
         .try_fold(1_u64, |product, &length| product.checked_mul(length as u64))
 }
 
-/// What a rule says of a node: its outputs, and the work beside reading and writing them.
+/// The result of a rule for a node: its outputs, and the work beside reading and writing them.
 struct Computed {
     values: Vec<Value>,
     work: u64,
@@ -205,7 +205,7 @@ impl From<Value> for Computed {
     }
 }
 
-/// A node with what is known of its inputs. Its attributes were checked against the table.
+/// A node with the known properties of its inputs. Its attributes were checked against the table.
 struct Node<'a> {
     proto: &'a pb::NodeProto,
     inputs: Vec<Option<Value>>,
@@ -221,12 +221,12 @@ impl Node<'_> {
         self.inputs.get(index).and_then(Option::as_ref)
     }
 
-    /// All inputs, where none may be left out.
+    /// All inputs of a node without optional inputs.
     fn all(&self) -> impl Iterator<Item = &Value> {
         self.inputs.iter().flatten()
     }
 
-    /// An input of this type.
+    /// An input that has to be of this type.
     fn of(&self, index: usize, datum: Datum) -> Result<&Value, Problem> {
         let value = self.input(index)?;
         if value.datum == datum {
@@ -239,7 +239,7 @@ impl Node<'_> {
         })
     }
 
-    /// The integers of an input, which must be known before the model runs.
+    /// The integers of an input that must be known before the model runs.
     fn known(&self, index: usize) -> Result<&[i64], Problem> {
         let value = self.input(index)?;
         let ints = value.ints.as_deref();
@@ -264,7 +264,7 @@ impl Node<'_> {
         std::str::from_utf8(&found.s).ok()
     }
 
-    /// The axis that an attribute names, counted from the front.
+    /// The axis in an attribute, counted from the front.
     fn axis(&self, name: &str, default: i64, rank: usize) -> Result<usize, Problem> {
         axis(self.int(name, default), rank)
     }
@@ -279,7 +279,7 @@ fn axis(axis: i64, rank: usize) -> Result<usize, Problem> {
     Err(Problem::Axis { axis, rank })
 }
 
-/// Different axes counted from the front.
+/// Distinct axes counted from the front.
 fn axes(given: &[i64], rank: usize) -> Result<Vec<usize>, Problem> {
     let mut found = Vec::with_capacity(given.len());
     for &one in given.iter().take(MOST_RANK + 1) {
@@ -292,14 +292,14 @@ fn axes(given: &[i64], rank: usize) -> Result<Vec<usize>, Problem> {
     Ok(found)
 }
 
-/// The values of a graph so far, node by node.
+/// The values of a graph up to now, node by node.
 struct Walk<'a> {
     opset: i64,
     values: HashMap<&'a str, Value>,
     cost: Cost,
-    /// How often each node runs: more than once in the body of a loop.
+    /// How often each node runs. It is more than once in the body of a loop.
     times: u64,
-    /// Whether a node may have a graph of its own.
+    /// Whether a node may have a subgraph.
     may_nest: bool,
 }
 
@@ -314,7 +314,7 @@ impl<'a> Walk<'a> {
         }
     }
 
-    /// Takes the tensors that a graph brings along.
+    /// Adds the tensors inside a graph.
     fn tensors(&mut self, graph: &'a pb::GraphProto) -> Result<(), ModelError> {
         if !graph.sparse_initializer.is_empty() {
             return Err(guard("graph", &Problem::Unsupported("sparse tensors are")));
@@ -330,7 +330,7 @@ impl<'a> Walk<'a> {
         Ok(())
     }
 
-    /// Gives a value its name.
+    /// Adds a value under its name.
     fn bind(&mut self, name: &'a str, value: Value) -> Result<(), Problem> {
         if name.is_empty() || name.len() > MOST_NAME_BYTES {
             return Err(Problem::Name(name.len()));
@@ -341,7 +341,7 @@ impl<'a> Walk<'a> {
         Ok(())
     }
 
-    /// Computes what every node gives.
+    /// Computes the outputs of every node.
     fn nodes(&mut self, graph: &'a pb::GraphProto) -> Result<(), ModelError> {
         for proto in &graph.node {
             self.node(proto).map_err(|problem| {
@@ -432,7 +432,7 @@ impl<'a> Walk<'a> {
         proto.input.iter().enumerate().map(value).collect()
     }
 
-    /// How many numbers a value has, if it may be that large.
+    /// The number of numbers in a value, if the value is not too large.
     fn may_hold(&self, value: &Value) -> Result<u64, Problem> {
         if value.rank() > MOST_RANK {
             return Err(Problem::OutputRank(value.rank()));
@@ -448,7 +448,7 @@ impl<'a> Walk<'a> {
     }
 }
 
-/// Checks each attribute against what the table allows.
+/// Checks each attribute against the table.
 fn attributes(proto: &pb::NodeProto, operator: &Operator) -> Result<(), Problem> {
     for (index, attribute) in proto.attribute.iter().enumerate() {
         let name = attribute.name.as_str();

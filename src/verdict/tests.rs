@@ -22,7 +22,7 @@ fn value<'a>(proto: &'a mut pb::ModelProto, key: &str) -> &'a mut String {
     &mut entry.unwrap().value
 }
 
-/// Dimensions of a graph input or output.
+/// The dimensions of a graph input or output.
 fn dims(value: &mut pb::ValueInfoProto) -> &mut Vec<pb::tensor_shape_proto::Dimension> {
     let pb::type_proto::Value::TensorType(tensor) =
         value.r#type.as_mut().unwrap().value.as_mut().unwrap();
@@ -240,7 +240,7 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
             *value(p, "hrn.check") = serde_json::to_string(&check).unwrap();
         },
     );
-    // Other weights than those checked: the trainer's probabilities do not come out.
+    // With other weights than those of the checks, the trainer's probabilities are not reproduced.
     check(
         "check frame 0: probabilities differ from the trainer's",
         |p| {
@@ -260,7 +260,7 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
             .unwrap();
         bias.raw_data[..4].copy_from_slice(&f32::NAN.to_le_bytes());
     });
-    // Probabilities of the right values, but logits of another temperature.
+    // The probabilities are right, but the logits have another temperature.
     check("differs from softmax(`logits`)", |p| {
         let nodes = &mut graph(p).node;
         let mut sharp = nodes
@@ -349,8 +349,8 @@ fn equal_probabilities_go_to_the_lower_level() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
-    /// A damaged file is refused or judges finite numbers; the daemon, which ends on any
-    /// panic, must not end on a reload.
+    /// A damaged file is refused, or the model judges with finite numbers. A reload must not panic,
+    /// because the daemon ends on any panic.
     #[test]
     fn a_damaged_file_never_panics(
         place in 0..BUILT_IN.len(),
@@ -358,7 +358,7 @@ proptest! {
         near_end in any::<bool>(),
     ) {
         let mut bytes = BUILT_IN.to_vec();
-        // Structure lies at both ends of the file, weights in between.
+        // The file's structure lies at both ends, and the weights lie in between.
         let place = if near_end { bytes.len() - 1 - place % 4096 } else { place };
         bytes[place] = byte;
         let _ = Hrn::load(&bytes);

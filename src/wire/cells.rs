@@ -1,4 +1,4 @@
-//! The cells of a frame: how a number on the wire becomes a taxel's count, and where the taxel is.
+//! The cells of a frame: how a number on the wire becomes a taxel's count, and where its taxel is.
 
 use super::settings::Order;
 use crate::frame::{Array, RawFrame};
@@ -10,7 +10,7 @@ pub(super) struct Cells {
     pub(super) invert: bool,
     /// The largest number that a cell can hold.
     pub(super) largest: u16,
-    /// Wire position of a taxel -> its place in the frame.
+    /// The place in the frame for each position on the wire.
     places: Vec<u16>,
 }
 
@@ -25,12 +25,12 @@ impl Cells {
         }
     }
 
-    /// How many there are.
+    /// The number of cells.
     pub(super) fn count(&self) -> usize {
         self.places.len()
     }
 
-    /// Puts the `index`-th cell on the wire where its taxel is.
+    /// Writes the `index`-th cell on the wire to the place of its taxel.
     pub(super) fn place(&self, frame: &mut RawFrame, index: usize, cell: u16) {
         let masked = cell & self.mask;
         frame.counts[usize::from(self.places[index])] = if self.invert {

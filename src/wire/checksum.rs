@@ -7,11 +7,11 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Checksum {
-    /// None.
+    /// No checksum.
     None,
-    /// Sum of the bytes, modulo 256.
+    /// The sum of the bytes, modulo 256.
     Sum8,
-    /// Exclusive or of the bytes.
+    /// The exclusive or of the bytes.
     Xor8,
     /// CRC-16/MODBUS: polynomial 0x8005 reflected, start 0xFFFF.
     Crc16Modbus,
@@ -20,7 +20,7 @@ pub enum Checksum {
 }
 
 impl Checksum {
-    /// Bytes it takes on the wire.
+    /// The number of bytes that the checksum takes on the wire.
     pub fn bytes(self) -> usize {
         match self {
             Checksum::None => 0,

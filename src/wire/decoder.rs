@@ -6,25 +6,25 @@ use super::layout::Layout;
 use super::scan::{Context, Scan};
 use crate::frame::RawFrame;
 
-/// A candidate frame was dropped: it had a valid sync, but its length, its tail, its checksum or
-/// what must follow it was wrong.
+/// The mark of a dropped candidate frame. The candidate had a valid sync, but its length, its tail,
+/// its checksum or the header after it was wrong.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Damage;
 
-/// A whole frame and where in the stream it ended.
+/// A whole frame, and the place in the stream where it ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Decoded {
-    /// The counts.
+    /// The frame.
     pub frame: RawFrame,
-    /// Bytes of the stream up to and including the frame's last one.
+    /// The number of bytes of the stream up to and including the frame's last byte.
     pub end: u64,
 }
 
 /// Finds frames in a stream of bytes.
 ///
-/// It holds at most the bytes of one pending frame and the header that must follow it. A layout that
-/// has a sync and neither a checksum nor a tail may hold two frames: after damage, a header in the
-/// data may look like the beginning of the next one.
+/// It holds at most the bytes of one pending frame and the header that must follow it. If a layout
+/// has a sync but neither a checksum nor a tail, the decoder may hold two frames: after damage, a
+/// header in the data may look like the beginning of the next frame.
 ///
 /// # Example
 ///
@@ -59,7 +59,7 @@ pub struct Decoder {
     anchor: u64,
 }
 
-/// What a [`Decoder`] has seen and still holds, without its layout.
+/// The state of a [`Decoder`], without its layout.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Memory {
     pending: Vec<u8>,
@@ -71,7 +71,7 @@ pub struct Memory {
 }
 
 impl Memory {
-    /// Whether a decoder that gave this many frames, damaged ones included, can have come to this.
+    /// Whether a decoder that returned `frames` frames, damaged ones included, can have this state.
     pub(crate) fn is_possible(&self, frames: u64) -> bool {
         let passed = self.received.checked_sub(self.pending.len() as u64);
         self.received < MOST_BYTES
@@ -81,7 +81,7 @@ impl Memory {
     }
 }
 
-/// More than any line brings.
+/// More bytes than any line ever delivers.
 const MOST_BYTES: u64 = 1 << 62;
 
 impl Decoder {
@@ -101,7 +101,7 @@ impl Decoder {
         }
     }
 
-    /// What it has seen and still holds.
+    /// The decoder's state.
     pub fn memory(&self) -> Memory {
         Memory {
             pending: self.buffer[self.start..].to_vec(),
@@ -113,7 +113,7 @@ impl Decoder {
         }
     }
 
-    /// Goes on where the decoder stood whose memory this is.
+    /// Continues from the state of another decoder.
     pub fn recall(&mut self, memory: Memory) {
         Memory {
             pending: self.buffer,
@@ -126,13 +126,13 @@ impl Decoder {
         self.start = 0;
     }
 
-    /// The layout it decodes.
+    /// The decoder's layout.
     pub fn layout(&self) -> &Layout {
         &self.layout
     }
 
-    /// Takes bytes in. It never blocks and never fails. Call [`Self::next_frame`] until it is `None`
-    /// before the next push, or the buffer grows.
+    /// Takes bytes in. It never blocks and never fails. Call [`Self::next_frame`] until it is
+    /// `None` before the next push, or the buffer grows.
     pub fn push(&mut self, bytes: &[u8]) {
         if bytes.is_empty() {
             return;
@@ -146,13 +146,13 @@ impl Decoder {
         self.received += bytes.len() as u64;
     }
 
-    /// Says that the input ended or paused for half a period. A complete frame that only waited for
-    /// the next header is whole then.
+    /// Tells the decoder that the input ended or paused for half a period. A complete frame that
+    /// only waited for the next header is then whole.
     pub fn settle(&mut self) {
         self.settled = true;
     }
 
-    /// Drops what is pending, as after a reconnect: what comes next does not continue it.
+    /// Drops the pending bytes, for example after a reconnect: the next bytes do not continue them.
     pub fn restart(&mut self) {
         let pending = self.pending();
         self.skipped += pending as u64;
@@ -198,17 +198,17 @@ impl Decoder {
         }
     }
 
-    /// Bytes taken in since the start.
+    /// The number of bytes taken in since the start.
     pub fn received(&self) -> u64 {
         self.received
     }
 
-    /// Bytes that belonged to no whole frame.
+    /// The number of bytes that belonged to no whole frame.
     pub fn skipped(&self) -> u64 {
         self.skipped
     }
 
-    /// Bytes held that may yet become a frame.
+    /// The number of held bytes that may yet become a frame.
     pub fn pending(&self) -> usize {
         self.buffer.len() - self.start
     }

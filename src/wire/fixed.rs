@@ -1,9 +1,10 @@
 //! Frames of one length: `sync, length, cells, checksum, tail`.
 //!
-//! What makes a candidate whole depends on the layout. A length, a checksum or a tail is checked at
-//! its place. After a failure the search goes on one byte further, *inside* the rejected candidate. A
-//! frame with nothing but its header (`jq`) is whole when another header follows, because the header
-//! can also occur in the data. A frame with nothing but a tail is whole when the tail is at its place.
+//! The layout decides when a candidate is whole. A length, a checksum or a tail is checked at its
+//! place. After a failure the search continues one byte further, *inside* the rejected candidate.
+//! If a frame has only a header (`jq`), it is whole when another header follows, because the header
+//! can also occur in the data. If a frame has only a tail, it is whole when the tail is at its
+//! place.
 
 use super::cells::Cells;
 use super::checksum::Checksum;
@@ -11,7 +12,7 @@ use super::scan::{Context, Scan};
 use super::settings::{Cell, LayoutError, LengthField};
 use crate::frame::RawFrame;
 
-/// What a layout is made of.
+/// The parts of a layout.
 #[derive(Debug)]
 pub(super) struct Parts {
     pub(super) sync: Vec<u8>,
@@ -19,14 +20,14 @@ pub(super) struct Parts {
     pub(super) length: LengthField,
     pub(super) cell: Cell,
     pub(super) checksum: Checksum,
-    /// Whether a cell never holds the (one-byte) tail.
+    /// Whether a cell never holds the tail, which has one byte.
     pub(super) tail_not_in_cells: bool,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Fixed {
     sync: Vec<u8>,
-    /// `sync` and the length field, both constant.
+    /// `sync` and the length field, which are both constant.
     header: Vec<u8>,
     tail: Vec<u8>,
     cell: Cell,
@@ -138,7 +139,7 @@ impl Fixed {
         }
     }
 
-    /// Whether checksum and tail of a candidate of full length are right.
+    /// Whether a candidate of full length has the right checksum and tail.
     fn ends_well(&self, bytes: &[u8]) -> bool {
         let at = self.header.len() + self.payload_bytes;
         let expected = self.checksum.of(&bytes[..at]).to_le_bytes();
@@ -170,7 +171,7 @@ impl Fixed {
         Scan::Frame(self.total(), frame)
     }
 
-    /// A header and nothing else: a frame is whole when another header follows.
+    /// Searches a layout that has only a header. A frame is whole when another header follows.
     fn scan_for_follower(&self, cells: &Cells, bytes: &[u8], context: Context) -> Scan {
         match self.is_followed(bytes, context.settled) {
             None => Scan::Wait,
@@ -185,7 +186,7 @@ impl Fixed {
     }
 
     /// Whether a header, or the settled end of the input, follows the candidate at the front of
-    /// `bytes`. `None`: not known yet.
+    /// `bytes`. `None` if more bytes are needed to know.
     fn is_followed(&self, bytes: &[u8], settled: bool) -> Option<bool> {
         let Some(rest) = bytes.get(self.total()..) else {
             return if settled { Some(false) } else { None };
@@ -197,17 +198,22 @@ impl Fixed {
         (shared == self.header.len() || settled).then_some(true)
     }
 
-    /// After damage, several candidates may be followed by what looks like a header, as in a
-    /// press held still, where a header in the data repeats in every frame. Damage mostly loses
-    /// or adds few bytes, so the one nearest to the phase before it is taken: its place in
-    /// `bytes`, the earlier of two as near. `None`: more bytes are needed.
+    /// The place in `bytes` of the candidate to take after damage, or `None` if more bytes are
+    /// needed.
     ///
-    /// A followed candidate is held, up to two frames of bytes, while a header within it that is
-    /// nearer has yet to be followed. Less is not enough. Let `HuHv` be as long as a frame, `H` its
-    /// header. Two streams begin with `HuHvHu`: `Hu HvHu HvHu`, what is left of a damaged frame and
-    /// two whole ones with a header in their data, and `HuHv Huvw`, two whole ones of which the first
-    /// has it. They differ first where the frame at the second `H` would end. Decided before, the one
-    /// would give a frame that was never sent, or the other lose one that is whole.
+    /// After damage, several candidates may have something that looks like a header after them. An
+    /// example is a press held still, where a header in the data repeats in every frame. Damage
+    /// mostly loses or adds few bytes, so the candidate nearest to the phase before the damage is
+    /// taken. Of two candidates that are as near, the earlier one is taken.
+    ///
+    /// A candidate that has a header after it is held, up to two frames of bytes, as long as a
+    /// nearer header within it still waits for its own next header. Holding fewer bytes is not
+    /// enough. Let `HuHv` be as long as a frame, and `H` its header. Two streams begin with
+    /// `HuHvHu`. `Hu HvHu HvHu` is the rest of a damaged frame, then two whole frames with a header
+    /// in their data. `HuHv Huvw` is two whole frames, of which the first has a header in its data.
+    /// The streams first differ where the frame at the second `H` would end. A decision before that
+    /// place would give a frame that was never sent in one stream, or lose a whole frame in the
+    /// other.
     fn nearest_in_phase(&self, bytes: &[u8], context: Context) -> Option<usize> {
         let period = self.total() as u64;
         let distance = |at: usize| {
@@ -229,7 +235,8 @@ impl Fixed {
         Some(best)
     }
 
-    /// A tail and no sync: a frame is whole when the tail is at its place.
+    /// Searches a layout that has a tail but no sync. A frame is whole when the tail is at its
+    /// place.
     fn scan_for_tail(&self, cells: &Cells, bytes: &[u8], context: Context) -> Scan {
         let total = self.total();
         let tail_at = total - self.tail.len();
@@ -247,12 +254,12 @@ impl Fixed {
         if self.ends_well(bytes) {
             return self.whole(cells, bytes);
         }
-        // The next place at which a tail may be.
+        // Continue at the next place where a tail may be.
         lost(1 + find(&bytes[tail_at + 1..], &self.tail), context)
     }
 }
 
-/// Only the first candidate after a whole frame counts as damaged; the rest is a search.
+/// Only the first candidate after a whole frame counts as damaged. After that the decoder searches.
 fn lost(skip: usize, context: Context) -> Scan {
     if context.locked {
         Scan::Damaged(skip)
@@ -261,8 +268,8 @@ fn lost(skip: usize, context: Context) -> Scan {
     }
 }
 
-/// Where `mark` first occurs in `bytes`, or where it may begin once more bytes come; `bytes.len()`
-/// if nowhere.
+/// The place where `mark` first occurs in `bytes`, or where it may begin once more bytes come.
+/// `bytes.len()` if there is no such place.
 fn find(bytes: &[u8], mark: &[u8]) -> usize {
     (0..bytes.len())
         .find(|&at| {

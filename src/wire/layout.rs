@@ -1,4 +1,4 @@
-//! A layout: where the parts of a frame are, checked.
+//! A checked layout: where the parts of a frame are.
 
 use super::cells::Cells;
 use super::checksum::Checksum;
@@ -7,7 +7,7 @@ use super::settings::{Cell, HexBytes, LayoutError, LengthField, Order, Preset, S
 use super::{fixed, text, zero_run};
 use crate::frame::{Array, COLS, ROWS, RawFrame};
 
-/// How counts are found in bytes.
+/// The way to find counts in bytes.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Framing {
     Fixed(fixed::Fixed),
@@ -28,9 +28,9 @@ impl Layout {
     ///
     /// # Errors
     ///
-    /// [`LayoutError`] naming the key: a side outside 1..=28, no mark to find frames by, a length
-    /// field that cannot hold the payload, a mask wider than the cell, or a key that a preset
-    /// fixes.
+    /// Returns a [`LayoutError`] that names the key: a side outside 1..=28, no mark to find frames
+    /// by, a length field that cannot hold the payload, a mask wider than the cell, or a key that a
+    /// preset fixes.
     pub fn new(settings: &Settings) -> Result<Self, LayoutError> {
         let rows = settings.rows.unwrap_or(ROWS);
         let cols = settings.cols.unwrap_or(COLS);
@@ -59,17 +59,17 @@ impl Layout {
         })
     }
 
-    /// The array this layout carries.
+    /// The array that this layout carries.
     pub fn array(&self) -> Array {
         self.cells.array
     }
 
-    /// The count at which a taxel reads full scale, where the layout has one.
+    /// The count at which a taxel reads full scale, if the layout has one.
     pub fn full_scale(&self) -> Option<u16> {
         self.full_scale
     }
 
-    /// Bytes of a frame; of the longest one where frames vary.
+    /// The number of bytes in a frame. If frames vary, of the longest one.
     pub fn max_frame_bytes(&self) -> usize {
         let cells = self.cells.count();
         match &self.framing {
@@ -79,7 +79,7 @@ impl Layout {
         }
     }
 
-    /// Bytes of a frame; of the shortest one where frames vary.
+    /// The number of bytes in a frame. If frames vary, of the shortest one.
     pub fn min_frame_bytes(&self) -> usize {
         let cells = self.cells.count();
         match &self.framing {
@@ -89,8 +89,8 @@ impl Layout {
         }
     }
 
-    /// Appends `frame` as the sensor would send it. Counts beyond what a cell can hold are
-    /// clipped to its largest value; taxels outside the array are left out.
+    /// Appends `frame` as the sensor would send it. Counts beyond a cell's largest value are
+    /// clipped to it. Taxels outside the array are left out.
     pub fn encode(&self, frame: &RawFrame, out: &mut Vec<u8>) {
         let cells = self.cells.of(frame);
         match &self.framing {
@@ -109,19 +109,21 @@ impl Layout {
         }
     }
 
-    /// Whether a frame may begin with the first byte of a stream: only a sync shows that one does.
+    /// Whether the first byte of a stream counts as the beginning of a frame. Only with a sync can
+    /// the decoder see whether it is one.
     pub(super) fn begins_locked(&self) -> bool {
         matches!(&self.framing, Framing::Fixed(fixed) if fixed.has_sync())
     }
 
-    /// Whether the next frame begins where a dropped candidate ended, as one of text or of runs
-    /// does: it ended with the mark of its end.
+    /// Whether the next frame begins where a dropped candidate ended. This holds for text and for
+    /// runs, whose candidates end with the mark of a frame's end.
     pub(super) fn ends_with_dropped(&self) -> bool {
         matches!(&self.framing, Framing::Text | Framing::ZeroRun)
     }
 }
 
-/// The framing of a preset with its overrides, the largest cell and the full scale.
+/// The framing of a preset with its overrides, the value of a cell with all ones, and the largest
+/// cell value if it is known.
 fn framing(settings: &Settings, cells: usize) -> Result<(Framing, u16, Option<u16>), LayoutError> {
     let hex = |bytes: &[u8]| bytes.to_vec();
     let (sync, tail, length, cell, checksum) = match settings.preset {
@@ -197,10 +199,10 @@ fn framing(settings: &Settings, cells: usize) -> Result<(Framing, u16, Option<u1
     Ok((Framing::Fixed(fixed), all_ones, Some(full_scale)))
 }
 
-/// Header and tail of the JQ arrays.
+/// The header or tail of the JQ arrays.
 const JQ_MARK: [u8; 4] = [0xAA, 0x55, 0x03, 0x99];
 
-/// `ff-tail`, `ascii` and `zero-run` exist as presets only: their marks and cells go together.
+/// Refuses overrides of `ff-tail`, `ascii` and `zero-run`, whose marks and cells belong together.
 fn only_preset(settings: &Settings) -> Result<(), LayoutError> {
     let given = [
         ("sync", settings.sync.is_some()),

@@ -1,8 +1,8 @@
-//! What the decoder passes to the search for a frame, and what the search answers.
+//! The input and the answer of the search for a frame.
 
 use crate::frame::RawFrame;
 
-/// What the bytes at hand amount to.
+/// The answer of a search.
 #[expect(
     clippy::large_enum_variant,
     reason = "a frame is handed on by value: boxing it would allocate each one"
@@ -12,24 +12,24 @@ pub(super) enum Scan {
     Wait,
     /// This many bytes belong to no frame.
     Skip(usize),
-    /// A candidate is damaged. This many of its bytes are skipped, and the search goes on inside
-    /// the rest.
+    /// A candidate is damaged. The decoder skips this many of its bytes and continues the search
+    /// inside the rest.
     Damaged(usize),
-    /// The first bytes, this many, are a frame.
+    /// The first bytes are a frame. The number is the frame's length in bytes.
     Frame(usize, RawFrame),
-    /// This many bytes belong to no frame. Whether a frame ended with them is not known.
+    /// This many bytes belong to no frame. It is unknown whether a frame ended with them.
     Excess(usize),
 }
 
-/// What a search knows beside the bytes.
+/// The input of a search beside the bytes.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Context {
-    /// The input ended or paused after these bytes.
+    /// Whether the input ended or paused after these bytes.
     pub settled: bool,
-    /// The bytes begin where a frame ended.
+    /// Whether the bytes begin where a frame ended.
     pub locked: bool,
-    /// Place of the first byte in the stream.
+    /// The place of the first byte in the stream.
     pub offset: u64,
-    /// Place in the stream where the last whole frame ended, or the stream began.
+    /// The place in the stream where the last whole frame ended, or where the stream began.
     pub anchor: u64,
 }

@@ -1,4 +1,4 @@
-//! The `[sensor.frame]` table, and the ways in which it can be wrong.
+//! The `[sensor.frame]` table and its errors.
 
 use std::fmt;
 
@@ -13,7 +13,7 @@ pub enum Preset {
     /// `BB AA`, payload length u16 LE, cells u8, CRC-16/Modbus.
     #[default]
     Jx255n,
-    /// The same with u16 LE cells.
+    /// Like `Jx255n`, with u16 LE cells.
     Jx255nU16,
     /// `AA 55 03 99`, cells u8.
     Jq,
@@ -25,51 +25,51 @@ pub enum Preset {
     FfTail,
     /// Rows of decimals; a blank line ends the frame.
     Ascii,
-    /// 1..254 a value, `00 n` a run of zeros, `FF` ends.
+    /// 1..254 is a value, `00 n` is a run of n zeros, `FF` ends the frame.
     ZeroRun,
 }
 
 impl fmt::Display for Preset {
-    /// Its name in a configuration.
+    /// Writes the preset's name in a configuration.
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         self.serialize(f)
     }
 }
 
-/// The `[sensor.frame]` table: a preset, and what overrides it.
+/// The `[sensor.frame]` table: a preset and its overrides.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// What the other keys override.
+    /// The preset that the other keys override.
     pub preset: Preset,
-    /// First bytes of a frame, in hex.
+    /// The first bytes of a frame, in hex.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sync: Option<HexBytes>,
-    /// Last bytes of a frame, in hex.
+    /// The last bytes of a frame, in hex.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tail: Option<HexBytes>,
-    /// Field after `sync` holding the bytes of the cells.
+    /// The field after `sync` that holds the number of bytes of the cells.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub length: Option<LengthField>,
     /// How a taxel is written.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cell: Option<Cell>,
-    /// Bits of a cell that carry the count; applied first.
+    /// The bits of a cell that carry the count. The mask is applied first.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub mask: Option<u16>,
     /// Whether the count is `mask` minus the cell.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub invert: Option<bool>,
-    /// Over all bytes before it, little-endian.
+    /// The checksum over all bytes before it, little-endian.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub checksum: Option<Checksum>,
-    /// Rows of the array, 1 to 28.
+    /// The number of rows of the array, 1 to 28.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rows: Option<usize>,
-    /// Columns of the array, 1 to 28.
+    /// The number of columns of the array, 1 to 28.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cols: Option<usize>,
-    /// In which order the taxels are sent.
+    /// The order in which the taxels are sent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub order: Option<Order>,
 }
@@ -79,7 +79,7 @@ pub struct Settings {
 #[serde(try_from = "String", into = "String")]
 pub struct HexBytes(pub Vec<u8>);
 
-/// Text that is no [`HexBytes`].
+/// The error of a text that is not pairs of hex digits.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("found {0:?}, expected pairs of hex digits such as \"BB AA\"")]
 pub struct HexError(String);
@@ -105,7 +105,7 @@ impl From<HexBytes> for String {
     }
 }
 
-/// The length field, in bytes of the cells.
+/// The length field. It holds the number of bytes of the cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LengthField {
@@ -131,7 +131,7 @@ pub enum Cell {
     U16be,
 }
 
-/// In which order taxels are sent.
+/// The order in which taxels are sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Order {
@@ -139,46 +139,46 @@ pub enum Order {
     RowMajor,
     /// Column by column.
     ColumnMajor,
-    /// Row by row, every second row from its end.
+    /// Row by row, with every second row from its end.
     Serpentine,
 }
 
-/// Why a `[sensor.frame]` cannot be used. Each names its key.
+/// The reason why a `[sensor.frame]` table is unusable. Each message names its key.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum LayoutError {
-    /// Array larger than a frame, or empty.
+    /// The array is larger than a frame, or empty.
     #[error("{key}: found {found}, expected 1 to {max}")]
     Size {
         /// `rows` or `cols`.
         key: &'static str,
-        /// The value that was given.
+        /// The configured value.
         found: usize,
-        /// Side of a frame.
+        /// The side of a frame.
         max: usize,
     },
-    /// Neither `sync` nor `tail`.
+    /// The layout has neither `sync` nor `tail`.
     #[error("sync: found neither sync nor tail, expected at least one to find frames by")]
     Unmarked,
-    /// A length field with nothing to find it by.
+    /// The layout has a length field, but no sync to find it by.
     #[error("length: found a length field without sync, expected sync before it")]
     LengthWithoutSync,
     /// The cells are too many for the length field.
     #[error("length: found {found} payload bytes, expected at most {max} for this field")]
     LengthField {
-        /// Bytes of the cells.
+        /// The number of bytes of the cells.
         found: usize,
-        /// Largest value of the field.
+        /// The largest value of the field.
         max: usize,
     },
-    /// The mask has bits that the cell has not.
+    /// The mask has bits that the cell lacks.
     #[error("mask: found {found}, expected 1 to {max} for this cell")]
     Mask {
-        /// The value that was given.
+        /// The configured value.
         found: u16,
-        /// All ones of the cell.
+        /// The value of a cell with all ones.
         max: u16,
     },
-    /// A key that this preset fixes.
+    /// The preset fixes this key.
     #[error("{key}: found a value, expected none: preset {preset} fixes it")]
     Fixed {
         /// The key.

@@ -1,19 +1,20 @@
-//! Frames as text: a row a line, decimals separated by spaces, tabs or commas, LF or CRLF; a
-//! blank line ends the frame.
+//! Frames as text: a row on each line, with decimals separated by spaces, tabs or commas, and LF or
+//! CRLF. A blank line ends the frame.
 
 use super::cells::Cells;
 use super::scan::{Context, Scan};
 use crate::frame::{Array, RawFrame};
 
-/// Bytes of the longest frame looked for: every value at its widest with two separators, CRLF
-/// after each row and the blank line.
+/// The number of bytes of the longest frame that is found: every value at its widest with two
+/// separators, CRLF after each row, and the blank line.
 pub(super) fn max_frame_bytes(cells: &Cells) -> usize {
     let array = cells.array;
     let digits = cells.mask.to_string().len();
     array.rows * (array.cols * (digits + 2) + 2) + 2
 }
 
-/// Bytes of the shortest frame: one digit a value, one separator or LF after it and the blank line.
+/// The number of bytes of the shortest frame: one digit for each value, one separator or LF after
+/// each, and the blank line.
 pub(super) fn min_frame_bytes(array: Array) -> usize {
     array.rows * array.cols * 2 + 1
 }
@@ -33,7 +34,7 @@ pub(super) fn encode(cells: impl Iterator<Item = u16>, cols: usize, out: &mut Ve
 pub(super) fn scan(cells: &Cells, bytes: &[u8], context: Context) -> Scan {
     let Array { rows, cols } = cells.array;
     let mut lines = Lines { bytes, at: 0 };
-    // Where the last `rows` lines began, newest last.
+    // The places where the last `rows` lines began.
     let mut starts = [0; crate::frame::ROWS];
     let mut count = 0;
     loop {
@@ -44,12 +45,14 @@ pub(super) fn scan(cells: &Cells, bytes: &[u8], context: Context) -> Scan {
             count += 1;
             continue;
         }
-        // What comes a byte at a time is cut to this before its end is there. So what comes at once is, too.
+        // Bytes that arrive one at a time are cut to this length before their end arrives. Cut
+        // bytes that arrive at once in the same way.
         if let Some(excess @ 1..) = lines.at.checked_sub(max_frame_bytes(cells) + 1) {
             return Scan::Excess(excess);
         }
         if count == 0 {
-            // It may be the rest of a line whose beginning was too long to keep. No frame ends here.
+            // This may be the rest of a line whose beginning was too long to keep. No frame ends
+            // here.
             return Scan::Excess(lines.at);
         }
         let row = if count >= rows {
@@ -58,7 +61,7 @@ pub(super) fn scan(cells: &Cells, bytes: &[u8], context: Context) -> Scan {
             0
         };
         let first = row + row_start(&bytes[row..start], cols);
-        // Whether a longer frame were found would depend on how many bytes came at once.
+        // Refuse a longer frame: whether it is found would depend on how many bytes arrive at once.
         let is_short = lines.at - first <= max_frame_bytes(cells);
         let frame = parse(cells, &bytes[first..start], rows, cols);
         return match frame.filter(|_| is_short) {
@@ -78,13 +81,13 @@ fn is_separator(byte: u8) -> bool {
     matches!(byte, b' ' | b'\t' | b',' | b'\r')
 }
 
-/// Where the row begins that ends the first line of `text`. Noise, or the rest of a damaged frame,
-/// may be right before it.
+/// The place where the row begins that ends the first line of `text`. Noise, or the rest of a
+/// damaged frame, may be right before the row.
 ///
-/// No cell has a byte that is not a digit. So the row begins after the last such byte of its first
-/// token, and the bytes before that are noise. It might also be damage: `5x12` may be noise `5x` before
-/// a cell of 12, or a cell of 5012 with a wrong byte. These bytes hold a whole frame either way, and
-/// a frame that is whole in the bytes is never lost.
+/// A cell has only digits. So the row begins after the last other byte of its first token, and the
+/// bytes before that are noise. They might also be damage: `5x12` may be noise `5x` before a cell
+/// of 12, or a cell of 5012 with a wrong byte. The bytes hold a whole frame either way, and a frame
+/// that is whole in the bytes is never lost.
 fn row_start(text: &[u8], cols: usize) -> usize {
     let end = text.iter().position(|&byte| byte == b'\n');
     let line = &text[..end.unwrap_or(text.len())];
@@ -100,7 +103,7 @@ fn row_start(text: &[u8], cols: usize) -> usize {
     let token = &line[start..token.map_or(line.len(), |length| start + length)];
     match token.iter().rposition(|byte| !byte.is_ascii_digit()) {
         Some(strange) => start + strange + 1,
-        // Separators before the first cell are the frame's own.
+        // Separators before the first cell belong to the frame.
         None if line[..start].iter().all(|&byte| is_separator(byte)) => 0,
         None => start,
     }

@@ -1,5 +1,5 @@
-//! Frames with their zeros packed: 1..254 is a value, `00 n` a run of n = 1..254 zeros, `FF`
-//! ends the frame.
+//! Frames with packed zeros: 1..254 is a value, `00 n` is a run of n = 1..254 zeros, and `FF` ends
+//! the frame.
 
 use super::cells::Cells;
 use super::scan::{Context, Scan};
@@ -7,16 +7,16 @@ use crate::frame::RawFrame;
 
 const END: u8 = 0xFF;
 
-/// Zeros of the longest run.
+/// The number of zeros in the longest run.
 const MAX_RUN: u8 = 254;
 
-/// Bytes of the longest frame: single zeros, two bytes each, and the end.
+/// The number of bytes of the longest frame: single zeros, two bytes each, and the end.
 pub(super) fn max_frame_bytes(cells: usize) -> usize {
     2 * cells + 1
 }
 
-/// Bytes of the shortest frame: the longest runs of zeros that there are, and the end. The rest may
-/// be one value.
+/// The number of bytes of the shortest frame: the longest possible runs of zeros, and the end. The
+/// rest may be one value.
 pub(super) fn min_frame_bytes(cells: usize) -> usize {
     let full_runs = cells / usize::from(MAX_RUN);
     let rest = (cells % usize::from(MAX_RUN)).min(2);
@@ -54,8 +54,8 @@ pub(super) fn scan(cells: &Cells, bytes: &[u8], context: Context) -> Scan {
             _ => Scan::Wait,
         };
     };
-    // Noise may be right before a whole frame: the frame is the longest run of bytes before
-    // the end that unpacks to exactly its cells.
+    // Noise may be right before a whole frame. The frame is the longest run of bytes before the end
+    // that unpacks to exactly its cells.
     let first = (end + 1).saturating_sub(longest);
     for start in first..end {
         if let Some(frame) = unpack(cells, &bytes[start..end]) {

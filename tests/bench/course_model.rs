@@ -1,8 +1,8 @@
-//! A model of format 2 whose outputs say what its inputs were.
+//! A model of format 2 whose outputs tell its inputs.
 //!
-//! `shore` is the sum of the approach where it is known, that less the number of frames, and that
-//! plus the arm's stiffness. The logits of levels 1 to 3 are 0, a tenth of the greatest force of a
-//! frame, and the last time in seconds; level 4 is out of the question.
+//! The value of `shore` is the sum of the known approach. Its low is that sum less the number of
+//! frames, and its high is the sum plus the arm's stiffness. The logits of levels 1 to 3 are 0, a
+//! tenth of the greatest force of a frame, and the last time in seconds. Level 4 is never likely.
 #![allow(
     dead_code,
     unreachable_pub,
@@ -15,12 +15,12 @@ use tract_onnx::pb;
 
 use super::{CheckedCourse, Course, CourseCheck, CourseMoment, Frame};
 
-/// The file, for presses of `most` frames, with `more` metadata.
+/// The file for presses of `most` frames, with `more` metadata.
 pub fn course_model(most: usize, more: &[(&str, Value)]) -> Vec<u8> {
     encoded(most, more, |_| {})
 }
 
-/// The same, changed.
+/// The same file, changed by a closure.
 pub fn encoded(
     most: usize,
     more: &[(&str, Value)],
@@ -76,7 +76,7 @@ fn graph(most: usize) -> pb::GraphProto {
     let mut graph = pb::GraphProto {
         name: "sums".to_owned(),
         input: vec![
-            // Not in the order of the page.
+            // The order differs from that in the documentation.
             value("arm_n_per_mm", &[1, 1]),
             value("frames", &[1, most, 28, 28]),
             value("mask", all),
@@ -208,7 +208,7 @@ fn floats(name: &str, values: &[f32]) -> pb::TensorProto {
     }
 }
 
-/// Eight presses, of 1 to `most` frames, with and without a known approach.
+/// Eight presses of 1 to `most` frames, with and without a known approach.
 fn check(most: usize) -> CourseCheck {
     let press = |number: usize| {
         let length = 1 + number * (most - 1) / 7;
@@ -237,7 +237,7 @@ fn check(most: usize) -> CourseCheck {
     }
 }
 
-/// What the model says, computed without it.
+/// The outputs of the model, computed without it.
 pub fn judged(course: &Course) -> (Vec<f32>, [f32; 3]) {
     let moments = &course.moments;
     let way: f32 = moments.iter().filter_map(|moment| moment.approach_mm).sum();

@@ -1,4 +1,5 @@
-//! The real binary on a real pty, and what stands around it: shared by the tests of the daemon.
+//! The real binary on a real pty, with sockets and configurations: shared by the tests of the
+//! daemon.
 #![allow(
     dead_code,
     unreachable_pub,
@@ -20,7 +21,7 @@ use serde_json::Value;
 
 pub const BINARY: &str = env!("CARGO_BIN_EXE_hardnessd");
 
-/// How long anything may take before a test has failed: long, for a busy machine.
+/// How long anything may take before a test fails. It is long, for a busy machine.
 pub const PATIENCE: Duration = Duration::from_secs(60);
 
 /// How long a process may take to end by itself.
@@ -61,15 +62,15 @@ impl Bench {
         Subscriber::connect(&self.path("events.sock"))
     }
 
-    /// A sensor at the port, hard enough to press that every press is one.
+    /// A sensor at the port, with enough force that every contact counts as a press.
     pub fn sensor(&self, more: &[&str]) -> Process {
         self.sensor_at("port", 20, more)
     }
 
-    /// The same, at another port and rate.
+    /// A sensor at another port and rate.
     pub fn sensor_at(&self, port: &str, fps: u32, more: &[&str]) -> Process {
         let link = self.path(port);
-        // One that was killed has left its link, which tells nothing of the new one.
+        // A killed sensor leaves its link, which must not be taken for that of the new sensor.
         let _ = fs::remove_file(&link);
         let mut command = by_terminal();
         command.args(["simulate", "--force", "15", "--material", "hard-plastic"]);
@@ -88,7 +89,8 @@ impl Bench {
     }
 }
 
-/// The program with SIGHUP as a terminal starts it: tests may run under `nohup`, which is inherited.
+/// The program with SIGHUP as a terminal starts it. Tests may run under `nohup`, whose setting is
+/// inherited.
 pub fn by_terminal() -> Command {
     let mut command = Command::new("env");
     command.args(["--default-signal=HUP", BINARY]);
@@ -118,8 +120,8 @@ impl Process {
 
 impl Drop for Process {
     fn drop(&mut self) {
-        // A simulator takes its link with it, if it can. The pty of a link that stays may become another
-        // test's.
+        // Let a simulator remove its link if it can. The pty of a remaining link may become that of
+        // another test.
         if matches!(self.0.try_wait(), Ok(None)) {
             self.signal(Signal::TERM);
             let start = Instant::now();
@@ -136,12 +138,12 @@ impl Drop for Process {
 pub struct Daemon {
     pub process: Process,
     log: mpsc::Receiver<String>,
-    /// Lines waited for so far.
+    /// The log lines read so far.
     pub heard: Vec<String>,
 }
 
 impl Daemon {
-    /// Starts one and waits until it serves.
+    /// Starts a daemon and waits until it serves.
     pub fn start(config: &Path) -> Self {
         let mut process = Process(
             Command::new(BINARY)
@@ -170,17 +172,17 @@ impl Daemon {
         daemon
     }
 
-    /// The address that `way` listens on, port and all.
+    /// The address of `way`, including the port.
     pub fn address(&mut self, way: &str) -> SocketAddr {
         let part = format!("way=\"{way}\"");
-        // All are said before "started".
+        // All addresses are logged before "started".
         let line = self.heard.iter().find(|line| line.contains(&part));
         let line = line.unwrap();
         let (_, address) = line.split_once("address=").unwrap();
         address.trim().parse().unwrap()
     }
 
-    /// Kilobytes of memory it has in use.
+    /// The daemon's memory in kilobytes.
     pub fn resident_kb(&self) -> u64 {
         let status = format!("/proc/{}/status", self.process.0.id());
         let status = fs::read_to_string(status).unwrap();
@@ -191,7 +193,7 @@ impl Daemon {
         line.split_whitespace().nth(1).unwrap().parse().unwrap()
     }
 
-    /// All it has logged, once it has ended.
+    /// The whole log, once the daemon has ended.
     pub fn whole_log(&mut self) -> String {
         self.heard.extend(self.log.iter());
         self.heard.join("\n")
@@ -211,7 +213,7 @@ impl Daemon {
     }
 }
 
-/// What a connection runs over.
+/// The stream of a connection.
 pub trait Stream: Read + Write + Send {}
 impl<S: Read + Write + Send> Stream for S {}
 
@@ -237,7 +239,7 @@ impl Subscriber {
         }
     }
 
-    /// Asks, and waits for the answer.
+    /// Sends a line and waits for the answer.
     pub fn ask(&mut self, line: &str) -> Value {
         self.say(line);
         loop {
@@ -255,7 +257,7 @@ impl Subscriber {
             .unwrap();
     }
 
-    /// The next line; `None`: closed.
+    /// The next line. `None` if the connection is closed.
     pub fn next(&mut self) -> Option<Value> {
         let mut line = String::new();
         (self.lines.read_line(&mut line).unwrap() > 0).then(|| serde_json::from_str(&line).unwrap())

@@ -1,7 +1,7 @@
-//! What holds for any bytes, door by door. `fuzz/` looks for bytes that break it, guided by coverage, and
-//! `tests/doors.rs` tries the bytes that were kept, and changes to them.
+//! Properties that hold for any bytes, for every input of the programs. `fuzz/` searches for bytes
+//! that break them, guided by coverage. `tests/doors.rs` tries the kept bytes, and changes to them.
 //!
-//! A property panics if it does not hold. Each takes bytes as a stranger may choose them.
+//! A property panics if it does not hold. Each takes bytes that a stranger may choose.
 
 #![allow(unreachable_pub, reason = "the package fuzz/ uses it, too")]
 
@@ -24,11 +24,11 @@ use hardnessd::wire::{
     Cell, Checksum, Decoder, HexBytes, Layout, LengthField, Order, Preset, Settings,
 };
 
-/// How long an answer of the daemon may take before it counts as none.
+/// How long the daemon may take to answer.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// How long an answer is read that may have no end.
+/// How long an answer that may have no end is read.
 const HTTP_PATIENCE: Duration = Duration::from_millis(200);
-/// Longest line of a subscriber.
+/// The longest line of a subscriber.
 const LONGEST_LINE_BYTES: usize = 64 * 1024;
 
 /// A property of one door.
@@ -48,7 +48,7 @@ pub const ALL: &[(&str, Property)] = &[
     ("wire", wire),
 ];
 
-/// Takes bytes from the front; zeros where there are no more.
+/// Takes bytes from the front, and zeros when there are no more bytes.
 struct Choices<'a>(&'a [u8]);
 
 impl Choices<'_> {
@@ -72,8 +72,8 @@ impl Choices<'_> {
     }
 }
 
-/// A preset, or any layout that the keys of `[sensor.frame]` can describe. Half of the arrays are small, so
-/// that whole frames are short.
+/// A preset, or any layout that the keys of `[sensor.frame]` can describe. Half of the arrays are
+/// small, so that whole frames are short.
 fn layout(choices: &mut Choices) -> Option<Layout> {
     let presets = [
         Preset::Jx255n,
@@ -120,8 +120,8 @@ fn layout(choices: &mut Choices) -> Option<Layout> {
     Layout::new(&settings).ok()
 }
 
-/// What a decoder makes of bytes that come in chunks of `sizes`: frames and damage in order, and how many
-/// bytes it has skipped.
+/// The output of a decoder for bytes in chunks of `sizes`: frames and damage in order, and the
+/// number of skipped bytes.
 fn decoded(layout: &Layout, mut bytes: &[u8], sizes: &[usize]) -> (Vec<String>, u64) {
     let mut decoder = Decoder::new(layout.clone());
     let mut found = Vec::new();
@@ -139,7 +139,7 @@ fn decoded(layout: &Layout, mut bytes: &[u8], sizes: &[usize]) -> (Vec<String>, 
     (found, decoder.skipped())
 }
 
-/// Any chunking of any bytes gives what one chunk gives.
+/// Any chunking of any bytes gives the same result as one chunk.
 pub fn wire(bytes: &[u8]) {
     let mut choices = Choices(bytes);
     let sizes: Vec<usize> = (0..3).map(|_| 1 + usize::from(choices.byte())).collect();
@@ -150,12 +150,13 @@ pub fn wire(bytes: &[u8]) {
     let (one, one_skipped) = decoded(&layout, stream, &[stream.len().max(1)]);
     let (many, many_skipped) = decoded(&layout, stream, &sizes);
     assert_eq!(one, many, "chunks of {sizes:?}");
-    // What is skipped and what is still pending may differ by less than a frame.
+    // The numbers of skipped bytes may differ by less than a frame, because some bytes are still
+    // pending.
     let differ = one_skipped.abs_diff(many_skipped);
     assert!(differ < layout.max_frame_bytes() as u64, "{differ}");
 }
 
-/// A daemon in this process, without a sensor at its port, and where it listens.
+/// A daemon in this process without a sensor at its port, and its addresses.
 struct Served {
     directory: PathBuf,
     http: SocketAddr,
@@ -164,7 +165,7 @@ struct Served {
 fn served() -> &'static Served {
     static SERVED: OnceLock<Served> = OnceLock::new();
     SERVED.get_or_init(|| {
-        // It outlives the process: there is no end at which to remove it.
+        // The directory stays after the process, because there is no point at which to remove it.
         let directory = tempfile::tempdir().expect("a directory").keep();
         let path = directory.join("hardnessd.toml");
         let text = "robot = \"r\"\n[[sensor]]\nname = \"a\"\nport = \"absent\"\n\
@@ -189,8 +190,9 @@ fn served() -> &'static Served {
     })
 }
 
-/// Whatever lines a subscriber or a controller sends, each is answered by one line of JSON, and the next
-/// question after them too. Only a line that is too long ends the connection.
+/// Each line of a subscriber or a controller is answered by one line of JSON, whatever the line is.
+/// The next question after the lines is answered too. Only a line that is too long ends the
+/// connection.
 pub fn lines(bytes: &[u8]) {
     let (socket, said) = match bytes.split_first() {
         Some((first, said)) if first % 2 == 1 => ("control.sock", said),
@@ -223,7 +225,7 @@ pub fn lines(bytes: &[u8]) {
     }
 }
 
-/// Whatever the head of a request, the answer is HTTP or the end of the connection, and the next
+/// Whatever the head of a request is, the answer is HTTP or the end of the connection, and the next
 /// connection is served.
 pub fn http(bytes: &[u8]) {
     let answer = ask(bytes, Some(Shutdown::Write), HTTP_PATIENCE);
@@ -232,33 +234,34 @@ pub fn http(bytes: &[u8]) {
         "{:?}",
         String::from_utf8_lossy(&answer)
     );
-    // The server takes an end of the requests for the end of the connection, so this leaves it open.
+    // For the server, the end of the requests is the end of the connection, so leave it open here.
     let whole = b"GET /livez HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n";
     let alive = ask(whole, None, PATIENCE);
     assert!(alive.starts_with(b"HTTP/1.1 200"), "{alive:?}");
 }
 
-/// What comes in answer, until the end of the connection or for as long as `patience`.
+/// The answer until the end of the connection, or until `patience` has passed.
 fn ask(request: &[u8], end: Option<Shutdown>, patience: Duration) -> Vec<u8> {
-    // Each connection has another address of this machine, because a port rests for a while.
+    // Each connection uses another address of this machine, because a closed port cannot be reused
+    // for a while.
     static NEXT: AtomicU32 = AtomicU32::new(1);
     let next = NEXT.fetch_add(1, Ordering::Relaxed) % 0x00ff_fff0 + 1;
     let address = Ipv4Addr::from_bits((127 << 24) | next);
     let port = served().http.port();
     let mut stream = TcpStream::connect((address, port)).expect("a daemon");
     stream.set_read_timeout(Some(patience)).expect("a timeout");
-    // The other end may have had enough before all was sent.
+    // The other end may close before everything is sent.
     let _ = stream.write_all(request);
     if let Some(end) = end {
         let _ = stream.shutdown(end);
     }
     let mut answer = Vec::new();
-    // It may be reset, or be one of events, which has no end.
+    // The connection may be reset, or be one of events, which has no end.
     let _ = stream.take(4 << 20).read_to_end(&mut answer);
     answer
 }
 
-/// A file of this process with `bytes`.
+/// Writes `bytes` to a file of this process.
 fn file(name: &str, bytes: &[u8]) -> PathBuf {
     static DIRECTORY: OnceLock<PathBuf> = OnceLock::new();
     let directory = DIRECTORY.get_or_init(|| {
@@ -275,7 +278,7 @@ fn file(name: &str, bytes: &[u8]) -> PathBuf {
     path
 }
 
-/// A configuration is used, or refused in a line that begins with its name.
+/// A configuration is used, or refused in a line that begins with the file's name.
 pub fn configuration(bytes: &[u8]) {
     let path = file("fuzzed.toml", bytes);
     let refused = match Config::load(&path) {
@@ -307,7 +310,7 @@ pub fn recording(bytes: &[u8]) {
     playback.end();
 }
 
-/// What is saved of a damaged recording can be read to its end, and is not much larger.
+/// The saved part of a damaged recording can be read to its end, and is not much larger.
 pub fn recovered(bytes: &[u8]) {
     let (_, good) = recover(Cursor::new(bytes), Vec::new()).expect("memory takes all");
     let whole: Result<Vec<_>, _> = Reader::new(good.as_slice()).collect();
@@ -331,7 +334,7 @@ pub fn npz(bytes: &[u8]) {
     }
 }
 
-/// Positions of an arm, as a table or as points: what is known of a press is finite.
+/// Whatever the positions of an arm are, as a table or as points, the known approach is finite.
 pub fn motion(bytes: &[u8]) {
     let mut choices = Choices(bytes);
     let points = if choices.byte() % 2 == 0 {
@@ -347,7 +350,7 @@ pub fn motion(bytes: &[u8]) {
         let mut points = Vec::new();
         let mut at_ns = choices.i64();
         while !choices.0.is_empty() && points.len() < 4096 {
-            // Most steps are as of an arm, some are not.
+            // Most steps are those of an arm, and some are not.
             let step = match choices.byte() {
                 0 => choices.i64(),
                 step => i64::from(step) * 1_000_000,

@@ -56,8 +56,7 @@ pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
     )
 }
 
-/// The figures of an evaluation, and its confusion matrix with a row for each true level.
-/// The same of whole presses.
+/// The figures of an evaluation on whole presses.
 pub(super) fn of_courses(evaluation: &CourseEvaluation) -> String {
     let percent = |share: f64| share * 100.0;
     let mut text = of_evaluation(&evaluation.levels);
@@ -93,6 +92,7 @@ pub(super) fn of_courses(evaluation: &CourseEvaluation) -> String {
     text
 }
 
+/// The figures of an evaluation, and its confusion matrix with a row for each true level.
 pub(super) fn of_evaluation(evaluation: &Evaluation) -> String {
     let percent = |share: f64| share * 100.0;
     let interval = evaluation.accuracy_interval_by_object.map_or_else(
@@ -135,8 +135,8 @@ pub(super) fn of_evaluation(evaluation: &Evaluation) -> String {
     )
 }
 
-/// How many presses of each level a data set has in each split, and a warning where the levels were
-/// probably counted from 0.
+/// The number of presses of each level in each split of a data set, and a warning if the levels
+/// were probably counted from 0.
 pub(super) fn of_data(dataset: &Dataset) -> String {
     let mut text = String::new();
     let levels = dataset::levels();
@@ -175,8 +175,8 @@ pub(super) fn of_data(dataset: &Dataset) -> String {
     text
 }
 
-/// Verdicts as CSV, a line each after the head: object, true level, verdict's level, probabilities, and Shore OO
-/// with its interval. What is not known is left empty.
+/// Verdicts as CSV, one line each after the header: object, true level, verdict's level,
+/// probabilities, and Shore OO with its interval. Unknown values are empty.
 pub(super) fn csv<'a>(verdicts: impl Iterator<Item = (Option<u32>, u8, &'a Verdict)>) -> String {
     let mut text = String::new();
     for (object, level, verdict) in verdicts {

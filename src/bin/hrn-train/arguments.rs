@@ -64,8 +64,8 @@ pub(super) enum Command {
     },
 }
 
-/// Objects of a material and presses of an object: more than fit in any memory, and few enough to
-/// be counted.
+/// The most objects of a material and presses of an object: more than fit in any memory, but few
+/// enough that all presses can be counted.
 const MOST: i64 = 10_000;
 
 #[derive(Debug, clap::Args)]
@@ -306,7 +306,8 @@ pub(super) struct Compare {
     pub(super) model: Vec<PathBuf>,
 }
 
-/// From the least of `hardnessd simulate --force` to the greatest nominal force.
+/// Parses a force in newtons, from the least of `hardnessd simulate --force` to the greatest
+/// nominal force.
 fn lowest_force_n(text: &str) -> Result<f32, String> {
     match text.parse() {
         Ok(force_n) if (0.01..=25.0).contains(&force_n) => Ok(force_n),
@@ -314,7 +315,7 @@ fn lowest_force_n(text: &str) -> Result<f32, String> {
     }
 }
 
-/// From a gel to a hard plastic.
+/// Parses a Young's modulus in MPa, from that of a gel to that of a hard plastic.
 fn cover_mpa(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(mpa) if (0.05..=100.0).contains(&mpa) => Ok(mpa),
@@ -322,7 +323,7 @@ fn cover_mpa(text: &str) -> Result<f64, String> {
     }
 }
 
-/// `LOW..HIGH`, or one number for both, within bounds.
+/// Parses `LOW..HIGH`, or one number for both, within bounds.
 fn range<const LEAST: u32, const MOST: u32>(text: &str) -> Result<[f64; 2], String> {
     let (low, high) = text.split_once("..").unwrap_or((text, text));
     let bounds = f64::from(LEAST)..=f64::from(MOST);
@@ -336,7 +337,7 @@ fn range<const LEAST: u32, const MOST: u32>(text: &str) -> Result<[f64; 2], Stri
     }
 }
 
-/// A number from 0 to `HUNDREDTHS` / 100.
+/// Parses a number from 0 to `HUNDREDTHS` / 100.
 fn part<const HUNDREDTHS: u32>(text: &str) -> Result<f64, String> {
     let most = f64::from(HUNDREDTHS) / 100.0;
     match text.parse() {
@@ -345,7 +346,7 @@ fn part<const HUNDREDTHS: u32>(text: &str) -> Result<f64, String> {
     }
 }
 
-/// The digits of the levels, in any order.
+/// Parses the digits of levels, in any order.
 fn swapped_levels(text: &str) -> Result<[bool; 4], String> {
     let mut swapped = [false; 4];
     for digit in text.chars() {

@@ -1,4 +1,4 @@
-//! What can be wrong with a command, and the exit code of each.
+//! The errors of commands, and the exit code of each.
 
 use std::path::PathBuf;
 
@@ -25,7 +25,7 @@ pub(super) struct Unreadable {
 #[error("{}: no finished run: {}", .0.display(), .1)]
 pub(super) struct NoRun(pub(super) PathBuf, pub(super) &'static str);
 
-/// A CUDA device was asked for.
+/// The command line asks for a CUDA device, and there is none.
 #[derive(Debug, thiserror::Error)]
 #[error(
     "--device cuda: no CUDA device found, expected a build with --features cuda, a device and its \
@@ -48,7 +48,7 @@ pub(super) enum WrongUsage {
     NotOneRobot,
 }
 
-/// No objects at all were asked for.
+/// The command line asks for no objects at all.
 #[derive(Debug, thiserror::Error)]
 #[error("--objects and --test-objects: found 0 and 0, expected one or more of either")]
 pub(super) struct NoObjects;
@@ -58,8 +58,8 @@ pub(super) struct NoObjects;
 #[error("{0}: works with `--materials {1}` only")]
 pub(super) struct OtherMaterials(pub(super) &'static str, pub(super) &'static str);
 
-/// The exit code: 2 wrong usage, 66 unreadable input, 69 no such device, 78 bad configuration or model, 74
-/// other I/O error, else 1.
+/// The exit code: 2 wrong usage, 66 unreadable input, 69 no such device, 78 bad configuration or
+/// model, 74 other I/O error, 1 any other error.
 pub(super) fn exit_code(error: &anyhow::Error) -> u8 {
     let has = |test: fn(&(dyn std::error::Error + 'static)) -> bool| error.chain().any(test);
     if has(|e| {

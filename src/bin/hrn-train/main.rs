@@ -45,8 +45,8 @@ fn main() -> ExitCode {
     let done = match arguments.command {
         Command::Simulate(arguments) => simulate::simulate(&arguments),
         Command::Collect(arguments) => collect::collect(&arguments),
-        // On a thread of the pool: from outside, every operation on several threads would first
-        // wake one of them.
+        // Training runs on a thread of the pool. From outside, every operation on several threads
+        // would first have to wake one of them.
         Command::Train(arguments) => rayon::scope(|_| train::train(&arguments)),
         Command::Adapt(arguments) => rayon::scope(|_| train::adapt(&arguments)),
         Command::Compare(arguments) => compare::compare(arguments),

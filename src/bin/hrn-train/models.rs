@@ -90,10 +90,11 @@ pub(super) fn inspect(path: &Path) -> anyhow::Result<String> {
     Ok(account::of_model(path, &load(path)?))
 }
 
-/// The time that a sensor of 5 frames/s leaves for a verdict.
+/// The frame rate, in frames/s, from which the time limit for a verdict follows.
 const SLOWEST_HZ: f64 = 5.0;
 
-/// Its lines are what was asked for, so they go to stdout even if the model does not pass.
+/// Checks a model file. The lines of the check are the output of the command, so they go to stdout
+/// even if the model does not pass.
 pub(super) fn check_model(path: &Path) -> ExitCode {
     let checked = read(path).map_err(anyhow::Error::from).and_then(|bytes| {
         let findings = review::review(&bytes);
@@ -103,7 +104,7 @@ pub(super) fn check_model(path: &Path) -> ExitCode {
         }
         let mut passes = findings.iter().all(|finding| finding.problem.is_none());
         if passes {
-            // Memory and time, as the daemon tries them.
+            // Try the memory and time of a verdict, as the daemon does.
             let most = trial::verdict_most(SLOWEST_HZ);
             match trial::load(&bytes, Some(most)) {
                 Ok(_) => lines += "ok       memory and time of a verdict\n",

@@ -1,4 +1,4 @@
-//! What a signal does to the trainer.
+//! Ends the trainer at a signal, and says how to continue.
 
 use std::sync::Arc;
 
@@ -7,14 +7,15 @@ use signal_hook::iterator::Signals;
 
 /// Ends the process at SIGINT and SIGTERM, with 130 and 143, and prints the command that continues.
 ///
-/// Every file on the disk is whole at any moment, and a run goes on from its last checkpoint, so there
-/// is nothing to wait for.
+/// Every file on the disk is whole at any moment, and a run continues from its last checkpoint. So
+/// there is nothing to wait for.
 ///
 /// # Errors
 ///
-/// If the system refuses a handler.
+/// Fails if the system refuses a handler.
 pub(super) fn end_at_signals(how_to_go_on: Option<String>) -> std::io::Result<()> {
-    // At the limit of a file's size the write fails, as on a full disk. It does not end the process.
+    // At the limit of a file's size, the write fails as on a full disk, and SIGXFSZ does not end
+    // the process.
     signal_hook::flag::register(SIGXFSZ, Arc::default())?;
     let mut signals = Signals::new([SIGINT, SIGTERM])?;
     std::thread::spawn(move || {
@@ -43,7 +44,7 @@ pub(super) fn again(arguments: impl Iterator<Item = String>) -> String {
     words.join(" ")
 }
 
-/// A word as a shell takes it.
+/// A word, quoted so that a shell takes it as one.
 fn quoted(word: &str) -> String {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./=,:+@%".contains(c);
     if !word.is_empty() && word.chars().all(is_plain) {

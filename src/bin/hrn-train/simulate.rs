@@ -13,7 +13,7 @@ use super::arguments::Simulate;
 use super::failure::{NoObjects, OtherMaterials};
 use super::files::write;
 
-/// What to simulate.
+/// The settings of the simulation.
 fn simulated_settings(arguments: &Simulate) -> Result<DatasetSettings, OtherMaterials> {
     let is_broad = arguments.materials == Materials::Broad;
     let of_named = [
@@ -132,7 +132,7 @@ fn simulate_courses(arguments: &Simulate, objects: DatasetSettings) -> anyhow::R
     ))
 }
 
-/// The training materials' presses as the sensor sees them over time.
+/// One press of each training material, as the frames that the sensor sends over time.
 fn one_press_a_level(settings: &DatasetSettings) -> Vec<(Material, Vec<RawFrame>)> {
     let press_of = |material| {
         let sequence = Sequence::new(SequenceSettings {

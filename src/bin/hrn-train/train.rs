@@ -127,7 +127,7 @@ pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
     ))
 }
 
-/// Goes on from a model of whole presses.
+/// Continues to train a model of whole presses.
 fn adapt_course(arguments: &Adapt) -> anyhow::Result<String> {
     let path = arguments.start.as_ref().ok_or(WrongUsage::NoStart)?;
     let (method, profile) = (Method::Adapt, Profile::Paper);
@@ -160,7 +160,8 @@ fn dataset_of(paths: &[PathBuf]) -> anyhow::Result<Dataset> {
     Ok(Dataset::joined(parts)?)
 }
 
-/// How long it took, where the model is and what it is worth on the data's test presses, if it has any.
+/// The duration of the training, the path of the model, and its figures on the data's test presses,
+/// if there are any.
 fn account_of_run(begun: Instant, run: &Run, figures: Option<String>) -> String {
     format!(
         "trained in {:.1} s: {}\n{}",
@@ -172,7 +173,7 @@ fn account_of_run(begun: Instant, run: &Run, figures: Option<String>) -> String 
     )
 }
 
-/// Those of the method, and what a file overrides.
+/// The settings of the method, with the values that a file overrides.
 fn settings(method: Method, profile: Profile, file: Option<&Path>) -> anyhow::Result<Settings> {
     let settings = method.settings(profile);
     let Some(path) = file else {

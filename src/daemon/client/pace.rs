@@ -1,18 +1,19 @@
-//! How fast the requests of one connection are read.
+//! Limits how fast the requests of one connection are read.
 
 use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// A connection may send this many requests at once, and one in every [`REQUEST_EVERY`] after that. The
-/// rest waits in the system's buffers, so that one who asks without end does not delay the sensors, which
-/// share the daemon's thread.
+/// A connection may send this many requests at once, and after that one in every [`REQUEST_EVERY`].
+/// Further requests wait in the system's buffers, so that a client that never stops asking does not
+/// delay the sensors, which share the daemon's thread.
 const REQUESTS_AT_ONCE: u32 = 64;
 const REQUEST_EVERY: Duration = Duration::from_micros(500);
 
-/// When the next request of a connection is read.
+/// The limit on the rate of one connection's requests.
 pub(super) struct Pace {
-    /// When all requests so far would have been answered at an even pace.
+    /// The time at which all requests so far would have been read at one in every
+    /// [`REQUEST_EVERY`].
     due: Instant,
 }
 
@@ -23,7 +24,7 @@ impl Pace {
         }
     }
 
-    /// Waits until another request may be read. Nothing is lost if the wait is given up.
+    /// Waits until another request may be read. Cancelling the wait loses nothing.
     pub(super) async fn wait(&self) {
         let ahead = REQUESTS_AT_ONCE * REQUEST_EVERY;
         if self.due > Instant::now() + ahead {
@@ -56,7 +57,7 @@ mod tests {
         }
         let wanted = 2000 * REQUEST_EVERY;
         let taken = start.elapsed();
-        // The runtime's timer has milliseconds.
+        // The runtime's timer has a resolution of 1 ms.
         assert!(
             (wanted..wanted + Duration::from_millis(3))
                 .contains(&(taken + Duration::from_millis(1))),

@@ -7,7 +7,7 @@ use crate::daemon::hub::tests::{hello, press};
 use crate::daemon::record::EventRecorder;
 use crate::daemon::sensor::SensorHandle;
 
-/// Far longer than anything here takes.
+/// Far longer than any step of the test takes.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 #[tokio::test]
@@ -30,7 +30,7 @@ async fn events_go_on_and_requests_wait_while_a_command_is_carried_out() {
         serde_json::from_str(&line.unwrap().unwrap().unwrap()).unwrap()
     };
 
-    // The status for its beginning, which this sensor does not tell.
+    // A connection begins with the sensors' statuses. This sensor does not answer.
     let Some(Command::Status(_)) = inbox.recv().await else {
         panic!("another command");
     };

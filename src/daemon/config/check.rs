@@ -8,8 +8,8 @@ use super::{Config, Model, Ros2, SensorTable, Zenoh};
 use crate::sensor::Sensor;
 use crate::wording;
 
-/// Checks a configuration whose paths are not relative to its file any more, and gives its sensors;
-/// `path` is for messages.
+/// Checks a configuration whose paths are already resolved, and returns its sensors. `path` is only
+/// for messages.
 pub(super) fn check(config: &Config, path: &Path) -> Result<Vec<Sensor>, Error> {
     let value = |key: String, found: String, expected| Error::Value {
         path: path.to_owned(),
@@ -195,14 +195,14 @@ fn check_ros2(
     }
 }
 
-/// As long as the longest name of a host.
+/// The most characters of a robot's name, as many as in the longest host name.
 const MOST_ROBOT_CHARS: usize = 255;
 
-/// The ports of a higher domain are no port numbers (DDSI-RTPS 2.5, 9.6.2.3).
+/// The highest domain ID. The ports of a higher domain would exceed 65535 (DDSI-RTPS 2.5, 9.6.2.3).
 const LAST_DOMAIN_ID: u16 = 232;
 
-/// Whether two listeners cannot have these addresses at the same time. For port 0 the system chooses
-/// a free port.
+/// Whether two listeners cannot use these addresses at the same time. For port 0, the system
+/// chooses a free port.
 fn meet(one: SocketAddr, other: SocketAddr) -> bool {
     // `[::]` also covers all IPv4 addresses, by the kernel's default (bindv6only of ipv6(7)).
     let covers = |all: IpAddr, ip: IpAddr| all.is_unspecified() && (all.is_ipv6() || ip.is_ipv4());
@@ -210,10 +210,11 @@ fn meet(one: SocketAddr, other: SocketAddr) -> bool {
     one.port() == other.port() && one.port() != 0 && (a == b || covers(a, b) || covers(b, a))
 }
 
-/// More megabytes than any disk has, but their bytes can be counted. As seconds: 31 years.
+/// The largest number in `[record]`. As megabytes it is more than any disk has, and the number of
+/// bytes still fits in a `u64`. As seconds it is 31 years.
 const MOST: u64 = 1_000_000_000;
 
-/// Whether a sensor has a name and a port of its own.
+/// Checks that a sensor has a name and a port of its own.
 fn check_port(sensor: &SensorTable, earlier: &[SensorTable], path: &Path) -> Result<(), Error> {
     let name = &sensor.name;
     let value = |key: &str, found: String, expected| {
@@ -232,7 +233,7 @@ fn check_port(sensor: &SensorTable, earlier: &[SensorTable], path: &Path) -> Res
             "a name of its own for each sensor",
         );
     }
-    // A device that is there may have several names.
+    // A device that exists may have several names.
     let device = |sensor: &SensorTable| {
         let port = &sensor.port;
         port.canonicalize().unwrap_or_else(|_| port.clone())

@@ -1,4 +1,4 @@
-//! Every way in which a configuration can fail. Each error names the file, and the line or the key.
+//! The errors of a configuration. Each error names the file, and the line or the key.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -7,118 +7,120 @@ use crate::npy::NpyError;
 use crate::sensor::SensorError;
 use crate::verdict::ModelError;
 
-/// Room for a hundred sensors with every taxel dead.
+/// The most bytes of a configuration file. They are enough for a hundred sensors with every taxel
+/// dead.
 pub(super) const MAX_BYTES: usize = 1 << 20;
 
-/// Why there is no configuration. Each message names the file and the key, what was found and what
-/// was expected.
+/// The reason a configuration cannot be used. Each message names the file and the key, what was
+/// found and what was expected.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The file itself cannot be read.
+    /// The configuration file cannot be read.
     #[error("{path}: cannot read: {source}")]
     Unreadable {
-        /// The configuration.
+        /// The path of the configuration.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// It is longer than any configuration: another file, or a device without an end.
+    /// The file is longer than any configuration. It may be another file, or an endless device.
     #[error("{path}: found more than {MAX_BYTES} bytes, expected a configuration")]
     TooLong {
-        /// The configuration.
+        /// The path of the configuration.
         path: PathBuf,
     },
-    /// No TOML, an unknown key, or a value of the wrong type.
+    /// The file is not TOML, or has an unknown key or a value of the wrong type.
     #[error("{path}:{place}: {problem}")]
     Syntax {
-        /// The configuration.
+        /// The path of the configuration.
         path: PathBuf,
         /// The line and the column.
         place: Place,
-        /// What was found and what was expected.
+        /// The problem: what was found and what was expected.
         problem: String,
     },
-    /// A value out of its range.
+    /// A value cannot be used.
     #[error("{path}: {key}: found {found}, expected {expected}")]
     Value {
-        /// The configuration.
+        /// The path of the configuration.
         path: PathBuf,
-        /// The key, as in the file.
+        /// The key, as it is written in the file.
         key: String,
-        /// The value that was given.
+        /// The value found.
         found: String,
-        /// Which values can be used.
+        /// The values that can be used.
         expected: &'static str,
     },
-    /// A value of a sensor's description.
+    /// A value of a sensor's description cannot be used.
     #[error("{path}: {}{problem}", table_of(sensor, problem))]
     Sensor {
-        /// The configuration.
+        /// The path of the configuration.
         path: PathBuf,
-        /// Its name.
+        /// The sensor's name.
         sensor: String,
-        /// The value, and what it should be.
+        /// The value found, and the values that can be used.
         problem: SensorError,
     },
-    /// A table of a part that this program was built without. It is never ignored.
+    /// A table belongs to a feature that this program was built without. Such a table is never
+    /// ignored.
     #[error(
         "{path}: publish.{feature}: found a table, expected none: built without the feature \
          {feature:?}"
     )]
     NotBuilt {
-        /// The configuration.
+        /// The path of the configuration.
         path: PathBuf,
         /// The feature of the package, which is also the table's name.
         feature: &'static str,
     },
-    /// A file of gains cannot be read, or holds something else.
+    /// A file of gains cannot be read, or does not hold gains.
     #[error(
         "{path}: sensor.calibration.gains of {sensor:?}: {}",
         of_gains(file, source)
     )]
     Gains {
-        /// The configuration.
+        /// The path of the configuration.
         path: PathBuf,
-        /// Name of the sensor.
+        /// The sensor's name.
         sensor: String,
-        /// The file.
+        /// The path of the file of gains.
         file: PathBuf,
-        /// What is wrong with it.
+        /// The reason the file cannot be used.
         source: NpyError,
     },
     /// The model file cannot be read.
     #[error("{path}: model.path: cannot read {model}: {source}")]
     ModelUnreadable {
-        /// The configuration.
+        /// The path of the configuration.
         path: PathBuf,
-        /// The model file.
+        /// The path of the model file.
         model: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// The model file has another hash.
+    /// The model has another hash than `model.sha256`.
     #[error("{path}: model.sha256: found a model of {found}, expected {expected}")]
     ModelHash {
-        /// The configuration.
+        /// The path of the configuration.
         path: PathBuf,
-        /// The hash of the file.
+        /// The hash of the model.
         found: String,
-        /// The hash that was given.
+        /// The hash in `model.sha256`.
         expected: String,
     },
     /// The model is refused.
     #[error("{path}: model.path: {model}: {source}")]
     Model {
-        /// The configuration.
+        /// The path of the configuration.
         path: PathBuf,
-        /// The model file, or "the model built in".
+        /// The path of the model file, or "the model built in".
         model: String,
-        /// The reason.
+        /// The reason the model is refused.
         source: Box<ModelError>,
     },
 }
 
-/// What is wrong with a file of gains.
+/// The message about an unusable file of gains.
 fn of_gains(file: &Path, source: &NpyError) -> String {
     let file = file.display();
     match source {
@@ -127,20 +129,20 @@ fn of_gains(file: &Path, source: &NpyError) -> String {
     }
 }
 
-/// The table before the key with which `problem` begins.
+/// The table to name before the key with which `problem` begins.
 fn table_of(sensor: &str, problem: &SensorError) -> String {
     match problem {
         SensorError::Press(_) => String::new(),
         SensorError::MinConfidence(_)
         | SensorError::MinForce(_)
         | SensorError::EarlyConfidence(_) => "model.".to_owned(),
-        // The name itself cannot be used.
+        // The name cannot be used, so it cannot identify the table.
         SensorError::Name(_) | SensorError::LongName { .. } => "sensor.".to_owned(),
         _ => format!("sensor[{sensor:?}]."),
     }
 }
 
-/// Line and column, from 1.
+/// A line and a column, both counted from 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Place {
     line: usize,

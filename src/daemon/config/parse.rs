@@ -1,4 +1,4 @@
-//! Reads the file into a [`Config`], and the model that it names.
+//! Reads the file into a [`Config`], and loads the model that the file names.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -58,7 +58,7 @@ pub(super) fn load(path: &Path) -> Result<Config, Error> {
     Ok(config)
 }
 
-/// The gains in the file that a configuration names.
+/// Reads the gains from the file that the configuration names.
 fn gains(given: &Gains, directory: &Path, sensor: &str, path: &Path) -> Result<Gains, Error> {
     let key = format!("sensor.calibration.gains of {sensor:?}");
     let Gains::File(file) = given else {
@@ -82,9 +82,9 @@ fn gains(given: &Gains, directory: &Path, sensor: &str, path: &Path) -> Result<G
     Ok(Gains::Taxels(rows))
 }
 
-/// Makes a path of the file relative to its directory. An empty path is refused, because it would be
-/// the directory itself, and so is one with a control character, because it would break a line of the
-/// log.
+/// Resolves a path of the configuration against its directory. An empty path is refused, because it
+/// would be the directory itself. A path with a control character is refused, because it would
+/// break a line of the log.
 fn resolve(
     given: &mut PathBuf,
     directory: &Path,
@@ -105,8 +105,9 @@ fn resolve(
     Ok(())
 }
 
-/// Reads a file, but no more than one byte beyond `most`, which is enough to refuse it. The file may be
-/// a pipe, such as `<(...)` of a shell. Then this waits for the program that writes to it.
+/// Reads at most one byte more than `most` from a file. That byte shows that the file is too long.
+/// The file may be a pipe, such as `<(...)` of a shell. Then this waits for the program that writes
+/// to the pipe.
 fn read(path: &Path, most: usize) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     let file = File::open(path)?;
@@ -147,7 +148,7 @@ fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Error {
         };
     }
     let start = error.span().map_or(0, |span| span.start);
-    // The parser says what was found and expected. The key is on the same line before it.
+    // The parser reports what was found and expected. The key is earlier on the same line.
     let line_start = text[..start].rfind('\n').map_or(0, |newline| newline + 1);
     let line = text[line_start..].lines().next().unwrap_or_default();
     let key = line
@@ -165,7 +166,8 @@ fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Error {
     }
 }
 
-/// Where `[sensor]` is written for `[[sensor]]`, if that is what the parser complains of.
+/// The offset at which the file has `[sensor]` in place of `[[sensor]]`, if that caused the
+/// parser's error.
 fn single_brackets(text: &str, message: &str) -> Option<usize> {
     let start = text
         .lines()
@@ -176,8 +178,8 @@ fn single_brackets(text: &str, message: &str) -> Option<usize> {
         .then(|| before.map(str::len).sum())
 }
 
-/// Where the first `[[sensor]]` without a port begins. A missing key has no place of its own, and only
-/// a port can be missing.
+/// The offset of the first `[[sensor]]` without a port. The parser gives no place for a missing
+/// key, and only a port can be missing.
 fn sensor_without_port(text: &str) -> Option<usize> {
     let file = DeTable::parse(text).ok()?;
     let mut sensors = file.get_ref().get("sensor")?.get_ref().as_array()?.iter();
@@ -188,7 +190,8 @@ fn sensor_without_port(text: &str) -> Option<usize> {
     Some(found.span().start)
 }
 
-/// The model, tried in another process if it is a file; `most` is how long a verdict may take.
+/// Loads the model. If it is a file, another process tries it first. `most` is the longest time
+/// that a verdict may take.
 pub(super) fn model(model: &Model, most: Duration, path: &Path) -> Result<Hrn, Error> {
     let hrn = match &model.path {
         None => Hrn::load(verdict::BUILT_IN),

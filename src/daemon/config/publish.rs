@@ -1,4 +1,4 @@
-//! The `[publish]` tables: where events go, except by HTTP.
+//! The `[publish]` tables: all ways to publish events, except HTTP.
 
 use std::collections::BTreeMap;
 use std::env;
@@ -14,23 +14,23 @@ use serde::{Deserialize, Serialize};
 pub struct Publish {
     /// The Unix socket.
     pub unix: Unix,
-    /// The same protocol over TCP; off unless the table is there.
+    /// The same protocol over TCP. Without the table, it is off.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tcp: Option<Tcp>,
-    /// A server for Foxglove and Lichtblick; off unless the table is there. Needs the feature
+    /// A server for Foxglove and Lichtblick. Without the table, it is off. It needs the feature
     /// `foxglove`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub foxglove: Option<Foxglove>,
-    /// Keys of a zenoh session; off unless the table is there. Needs the feature `zenoh`.
+    /// The keys of a zenoh session. Without the table, it is off. It needs the feature `zenoh`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub zenoh: Option<Zenoh>,
-    /// Topics of a ROS 2 node; off unless the table is there. Needs the feature `ros2`.
+    /// The topics of a ROS 2 node. Without the table, it is off. It needs the feature `ros2`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ros2: Option<Ros2>,
 }
 
 impl Publish {
-    /// Publishes nothing at all.
+    /// Settings that publish nothing.
     pub fn none() -> Self {
         let unix = Unix {
             enabled: false,
@@ -47,7 +47,7 @@ impl Publish {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Tcp {
-    /// Address and port.
+    /// The address and port to listen on.
     pub listen: SocketAddr,
 }
 
@@ -63,21 +63,21 @@ impl Default for Tcp {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Foxglove {
-    /// Address and port.
+    /// The address and port to listen on.
     pub listen: SocketAddr,
 }
 
 impl Default for Foxglove {
     fn default() -> Self {
-        // The port that the applications propose.
+        // The applications propose this port.
         Self {
             listen: SocketAddr::from(([127, 0, 0, 1], 8765)),
         }
     }
 }
 
-/// The `[publish.zenoh]` table. A session listens and connects where the table says, and does not
-/// look for other peers.
+/// The `[publish.zenoh]` table. A session uses only the endpoints of the table, and does not look
+/// for other peers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Zenoh {
@@ -85,10 +85,10 @@ pub struct Zenoh {
     pub listen: Vec<Endpoint>,
     /// Endpoints of routers or peers to connect to. The session retries until they answer.
     pub connect: Vec<Endpoint>,
-    /// The part after `tactile/` in every key; by default the robot's name.
+    /// The part after `tactile/` in every key. The default is the robot's name.
     #[serde(skip_serializing_if = "Option::is_none")]
     site: Option<String>,
-    /// The key at which the robot says where its arms are; none: it does not.
+    /// The key at which the robot reports the positions of its arms. `None`: it reports none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub motion: Option<String>,
 }
@@ -111,13 +111,13 @@ impl Zenoh {
     }
 }
 
-/// Where a zenoh session listens or connects: `tcp/HOST:PORT`.
+/// An endpoint at which a zenoh session listens or connects: `tcp/HOST:PORT`.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Endpoint(String);
 
 impl Endpoint {
-    /// `HOST:PORT`.
+    /// The address of the endpoint: `HOST:PORT`.
     pub fn address(&self) -> &str {
         let address = Self::parse(&self.0);
         address.expect("an endpoint is read from a text that is one")
@@ -130,14 +130,14 @@ impl Endpoint {
     }
 }
 
-/// As it is written in the configuration.
+/// Formats an endpoint as it is written in the configuration.
 impl fmt::Debug for Endpoint {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         self.0.fmt(out)
     }
 }
 
-/// Text that is no [`Endpoint`].
+/// The error of a text that is not an [`Endpoint`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("found {0:?}, expected an endpoint such as \"tcp/127.0.0.1:7447\"")]
 pub struct EndpointError(String);
@@ -163,14 +163,14 @@ impl From<Endpoint> for String {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Ros2 {
-    /// Domain; by default `$ROS_DOMAIN_ID`, else 0.
+    /// The domain ID. The default is `$ROS_DOMAIN_ID`, else 0.
     #[serde(skip_serializing_if = "Option::is_none")]
     domain_id: Option<u16>,
     /// Namespace of the node and its topics.
     pub namespace: String,
     /// Addresses of the interfaces to use. An empty list means every interface, as in ROS 2.
     pub networks: Vec<IpAddr>,
-    /// By sensor: the topic on which the robot says where its arm is.
+    /// The topic on which the robot reports the positions of its arm, by the sensor's name.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub motion: BTreeMap<String, String>,
 }
@@ -187,17 +187,17 @@ impl Default for Ros2 {
 }
 
 impl Ros2 {
-    /// The domain: the configured one, else that of the environment, else 0.
+    /// The domain ID: the configured one, else that of the environment, else 0.
     ///
     /// # Panics
     ///
-    /// If the configuration was not checked.
+    /// Panics if the configuration was not checked and `$ROS_DOMAIN_ID` is not a number.
     pub fn domain_id(&self) -> u16 {
         let chosen = self.chosen_domain_id();
         chosen.expect("the domain was checked when the configuration was read")
     }
 
-    /// The same before it is checked.
+    /// The domain ID before it is checked.
     pub(super) fn chosen_domain_id(&self) -> Result<u16, DomainIdError> {
         match (self.domain_id, env::var("ROS_DOMAIN_ID")) {
             (Some(id), _) => Ok(id),
@@ -207,7 +207,7 @@ impl Ros2 {
     }
 }
 
-/// A `$ROS_DOMAIN_ID` that is no number.
+/// The error of a `$ROS_DOMAIN_ID` that is not a number.
 #[derive(Debug, thiserror::Error)]
 #[error("$ROS_DOMAIN_ID {0:?}")]
 pub(super) struct DomainIdError(String);
@@ -216,17 +216,17 @@ pub(super) struct DomainIdError(String);
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Unix {
-    /// Whether there is one.
+    /// Whether the daemon opens its Unix sockets.
     pub enabled: bool,
-    /// The path of the socket; [`Unix::path`] has the default.
+    /// The path of the socket. [`Unix::path`] has the default.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) path: Option<PathBuf>,
-    /// Permissions of its file.
+    /// The permissions of the socket's file.
     pub mode: Mode,
-    /// The path of the control socket; by default `control.sock` beside the other socket.
+    /// The path of the control socket. The default is `control.sock` beside the other socket.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) control_path: Option<PathBuf>,
-    /// Subscribers at a time, on each socket and on TCP.
+    /// The most subscribers at a time, on each socket and on TCP.
     pub max_clients: usize,
 }
 
@@ -243,17 +243,17 @@ impl Default for Unix {
 }
 
 impl Unix {
-    /// Where the socket is: at the configured path, else at the first of [`Unix::places`].
+    /// The path of the socket: the configured one, else the first of [`Unix::places`].
     pub fn path(&self) -> PathBuf {
         let configured = self.path.clone();
         configured.unwrap_or_else(|| Self::places().swap_remove(0))
     }
 
-    /// Where a socket is by default: in the service's runtime directory, else in the user's, else in
-    /// `/run/hardnessd`. Those that apply here, the first one first.
+    /// The default paths of a socket that apply here, the preferred one first: in the service's
+    /// runtime directory, in the user's runtime directory, and in `/run/hardnessd`.
     pub fn places() -> Vec<PathBuf> {
         let named = |variable| env::var(variable).ok().filter(|value| !value.is_empty());
-        // systemd separates several by colons.
+        // systemd separates several directories by colons.
         let service = named("RUNTIME_DIRECTORY").map(|directories| {
             let first = directories.split(':').next().unwrap_or_default();
             PathBuf::from(first)
@@ -267,13 +267,13 @@ impl Unix {
             .collect()
     }
 
-    /// Where the control socket is.
+    /// The path of the control socket.
     pub fn control_path(&self) -> PathBuf {
         let beside = || self.path().with_file_name("control.sock");
         self.control_path.clone().unwrap_or_else(beside)
     }
 
-    /// The same, at `path`.
+    /// The same settings with the socket at `path`.
     #[must_use]
     pub fn at(self, path: PathBuf) -> Self {
         Self {
@@ -288,7 +288,7 @@ impl Unix {
 #[serde(try_from = "String", into = "String")]
 pub struct Mode(pub u32);
 
-/// Text that is no [`Mode`].
+/// The error of a text that is not a [`Mode`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("found {0:?}, expected octal permissions such as \"0660\"")]
 pub struct ModeError(String);

@@ -259,7 +259,7 @@ fn gains_are_read_from_a_file_beside_the_configuration() {
         read.sensors[0].calibration.gains,
         Some(tare::Gains::Taxels(rows))
     );
-    // It may change while the daemon runs.
+    // The gains may change while the daemon runs.
     write(&npy::to_bytes(&gains.map(|gain| 2.0 * gain), 2, 3));
     let changed = checked(&path).unwrap();
     assert_ne!(read, changed);
@@ -322,7 +322,7 @@ fn no_message_speaks_of_types_of_a_program() {
         ("[record]", "rotate_s", "-1"),
         ("[model]", "path", "4"),
     ] {
-        // Where the table is the sensor's own, a port would stand there twice.
+        // If the key is `port`, a second `port` would be a duplicate key.
         let port = if key == "port" { "" } else { "port = \"p\"\n" };
         let error = load(&format!("[[sensor]]\n{port}{table}\n{key} = {value}")).unwrap_err();
         assert!(error.contains("expected "), "{error}");

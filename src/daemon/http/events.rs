@@ -1,8 +1,8 @@
-//! `/events`: what a subscriber on a socket reads, as server-sent events.
+//! `/events`: the lines of a subscriber on a socket, as server-sent events.
 //!
-//! The id of an event is `RUN:SEQ`. A browser that connects again names in `Last-Event-ID` where it
-//! stopped, which is the hub's `since`. Frames come only when they are asked for, and only the
-//! newest: a page shows the present.
+//! The ID of an event is `RUN:SEQ`. A browser that connects again sends its last ID in
+//! `Last-Event-ID`, which is the hub's `since`. Frames are sent only on request, and only the
+//! newest of each sensor, because a page shows the present.
 
 use std::convert::Infallible;
 use std::time::Duration;
@@ -21,14 +21,15 @@ use crate::event::Kind;
 
 const LAST_EVENT_ID: &str = "Last-Event-ID";
 
-/// A silence this long is broken by a comment: without it a lost connection would not be noticed.
+/// After a silence of this length the server sends a comment. Without it, a lost connection would
+/// not be noticed.
 const HEARTBEAT: Duration = Duration::from_secs(15);
 
 /// How soon a browser that has lost the connection connects again.
 const RETRY: Duration = Duration::from_secs(1);
 
-/// Events that go to the connection together. What it does not take stays in the hub, whose queue
-/// is bounded.
+/// Events that go to the connection together. Events that the connection does not take stay in the
+/// hub, whose queue is bounded.
 type Batch = Vec<Event>;
 
 /// Answers a request.
@@ -51,8 +52,9 @@ pub(super) async fn answer(
     })
 }
 
-/// Reads what a request asks for: `types` and `since` of its query, and `Last-Event-ID`, which is
-/// newer than the query when both are there.
+/// Reads the subscription that a request asks for: `types` and `since` of its query, and
+/// `Last-Event-ID`. If a request has both `since` and `Last-Event-ID`, `Last-Event-ID` is newer and
+/// takes precedence.
 fn wanted<B>(request: &Request<B>) -> Result<Subscription, Unusable> {
     let mut wanted = Subscription {
         policy: Policy::LatestFrames,
@@ -101,10 +103,10 @@ fn since(key: &'static str, token: &str) -> Result<Since, Unusable> {
     })
 }
 
-/// Subscribes; the inner error is for the client.
+/// Subscribes. The inner error is for the client.
 ///
-/// All of it is a task of its own: a request is dropped wherever it waits when its browser goes
-/// away, and a subscriber that has joined the hub must leave it.
+/// This runs in a separate task. When a browser disconnects, its request is dropped wherever it
+/// waits, but a subscriber that has joined the hub must leave it.
 async fn open(
     sources: Sources,
     wanted: Subscription,
@@ -112,7 +114,7 @@ async fn open(
     let (reply, opened) = oneshot::channel();
     tokio::spawn(async move {
         if let Ok((id, hello)) = sources.hub.join().await {
-            // The client, the hub and the connection may each end it.
+            // The client, the hub and the connection may each end the subscription.
             let _ = serve(&sources, id, hello, wanted, reply).await;
             sources.hub.leave(id).await;
         }
@@ -120,8 +122,8 @@ async fn open(
     opened.await.map_err(|_| Closed)
 }
 
-/// Serves a subscriber that has joined, from the answer to its request on, until its connection is
-/// gone or the hub has ended.
+/// Answers the request of a subscriber that has joined, and serves the subscriber until its
+/// connection or the hub has ended.
 async fn serve(
     Sources { hub, sensors }: &Sources,
     id: u64,
@@ -130,7 +132,7 @@ async fn serve(
     opened: oneshot::Sender<Result<mpsc::Receiver<Batch>, Ahead>>,
 ) -> Option<()> {
     let run = hub.survey().await.ok()?.hello.run;
-    // Where a connection that breaks before its first event is to go on.
+    // If the connection breaks before its first event, the browser resumes from here.
     let from = match &wanted.since {
         None => hello.seq,
         Some(since) if since.run == run => None,
@@ -202,7 +204,7 @@ mod tests {
                 "found bytes that are not ASCII",
             ),
             ("/events?types=%ff", None, "types"),
-            // A percent sign before anything but two hex digits stands for itself.
+            // A percent sign that two hex digits do not follow is an ordinary character.
             ("/events?types=%+1", None, "\"% 1\""),
         ] {
             let message = ask(uri, last).unwrap_err().to_string();

@@ -1,10 +1,10 @@
 //! Protection against DNS rebinding: a page from elsewhere must not reach this server under a name
 //! of its own.
 //!
-//! A browser sends in `Host` what its address bar shows. An attacker's name is a name, even if it
-//! resolves to this machine. So this accepts only addresses, and `localhost`, which always means this
-//! machine. It ignores the port: another port comes from a tunnel (`ssh -L`), and does not help an
-//! attacker.
+//! A browser sends in `Host` the host in its address bar. An attacker has to use a name, even if
+//! the name resolves to this machine. So this module accepts only addresses, and `localhost`, which
+//! always means this machine. It ignores the port: another port comes from a tunnel (`ssh -L`), and
+//! does not help an attacker.
 
 use std::net::{IpAddr, SocketAddr};
 
@@ -12,7 +12,8 @@ use hyper::Request;
 use hyper::header::HOST;
 use hyper::http::uri::Authority;
 
-/// Whether `request` was meant for this server, which listens on `listen` and accepted it at `local`.
+/// Whether `request` was meant for this server, which listens on `listen` and accepted it at
+/// `local`.
 pub(super) fn is_ours<B>(request: &Request<B>, listen: SocketAddr, local: SocketAddr) -> bool {
     let mut hosts = request.headers().get_all(HOST).iter();
     let (Some(host), None) = (hosts.next(), hosts.next()) else {

@@ -63,8 +63,8 @@ pub(super) fn encode(survey: &Survey, vitals: &[Vitals]) -> String {
     text
 }
 
-/// A label's value with the escapes of the format, which the library leaves to its callers. Only the
-/// robot's name can hold such characters, and it has no line feed.
+/// A label's value with the escapes of the format, which the library leaves to its callers. Only
+/// the robot's name can hold such characters, and it has no line feed.
 fn escaped(value: &str) -> String {
     value.replace('\\', r"\\").replace('"', r#"\""#)
 }
@@ -141,7 +141,7 @@ fn presses(registry: &mut Registry, survey: &Survey) {
             counter.inc_by(count);
         }
         for (phase, made) in [("early", &counts.early), ("final", &counts.finals)] {
-            // Levels of a model that a reload has replaced stay.
+            // Keep the series for the levels of a model that a reload has replaced.
             let known = survey.hello.model.levels.iter().map(|level| level.level);
             let mut levels: Vec<u8> = known.chain(made.levels.keys().copied()).collect();
             levels.sort_unstable();

@@ -10,9 +10,9 @@ use crate::daemon::sensor::Vitals;
 use crate::event::{Event, Reply};
 
 /// An object of `hello` as on a socket, `subscribers`, `process` (how the kernel runs the daemon,
-/// [`Standing`]), and a list of `sensors`. A sensor has its
-/// `status` and `last` (its last final verdict, or null) as on a socket, `last_frame_age_s` (null
-/// before the first frame) and the `contact_threshold_n` in force.
+/// [`Standing`]), and a list of `sensors`. A sensor has its `status` and `last` (its last final
+/// verdict, or null) as on a socket, `last_frame_age_s` (null before the first frame) and the
+/// current `contact_threshold_n`.
 pub(super) fn json(survey: &Survey, vitals: &[Vitals]) -> String {
     let read = |line: &str| -> Value {
         serde_json::from_str(line).expect("what was written as JSON can be read as JSON")
@@ -24,7 +24,8 @@ pub(super) fn json(survey: &Survey, vitals: &[Vitals]) -> String {
             json!({
                 "status": read(&Event::Status(vitals.status.clone()).to_line()),
                 "last_frame_age_s": vitals.last_frame_age.map(|age| age.as_secs_f64()),
-                // With the digits of the configuration, which are those of an f32.
+                // The threshold is written with the digits of the configuration, which are those of
+                // an f32.
                 "contact_threshold_n": read(&vitals.contact_threshold_n.to_string()),
                 "last": last.map(|line| read(&line.json)),
             })

@@ -1,4 +1,5 @@
-//! One subscriber in the hub: what it wants, what waits for it, and what it has missed.
+//! One subscriber in the hub: its subscription, the events that wait for it, and the events that it
+//! missed.
 
 use std::collections::VecDeque;
 
@@ -21,9 +22,9 @@ pub(super) struct Subscriber {
     missing: Option<Reply>,
     /// The held events that `since` asked for, oldest first, by number and kind.
     replay: VecDeque<(u64, Kind)>,
-    /// The events that wait.
+    /// The events that wait to be fetched.
     queue: VecDeque<Line>,
-    /// How many events of its kinds were dropped since its last line.
+    /// The number of events of its kinds that were dropped since its last line.
     lost: u64,
     /// `gap` lines sent since the hub last counted them.
     pub(super) gaps: u64,
@@ -51,7 +52,8 @@ impl Subscriber {
         self.kinds.contains(kind)
     }
 
-    /// Changes the subscription. Events that wait and are no longer wanted go without a `gap`.
+    /// Changes the subscription. Events that wait and are no longer wanted are removed without a
+    /// `gap`.
     pub(super) fn change(&mut self, kinds: Kinds, policy: Policy) {
         (self.kinds, self.policy) = (kinds, policy);
         self.replay.retain(|&(_, kind)| kinds.contains(kind));
@@ -64,11 +66,11 @@ impl Subscriber {
         }
     }
 
-    /// Sends `held` before anything live, except for events that this subscriber has had. `missing`
-    /// is how many of its events are no longer held; `None`: unknown.
+    /// Sends the `held` events before any live event, except those that this subscriber has had.
+    /// `missing` is the number of its events that are no longer held, or `None` if that is unknown.
     pub(super) fn replay(&mut self, held: impl Iterator<Item = (u64, Kind)>, missing: Option<u64>) {
         self.missing = (missing != Some(0)).then_some(Reply::Gap { lost: missing });
-        // Numbered events that wait are held too, and come again with the others.
+        // Numbered events that wait are also held, and the replay sends them.
         self.queue.retain(|line| line.seq.is_none());
         self.lost = 0;
         self.replay = held
@@ -76,8 +78,8 @@ impl Subscriber {
             .collect();
     }
 
-    /// Queues a new event if it is wanted. Returns how many older ones it displaced that the next
-    /// `gap` will count.
+    /// Queues a new event if it is wanted. Returns the number of older events that it displaced and
+    /// that the next `gap` counts.
     pub(super) fn offer(&mut self, line: &Line) -> u64 {
         if let Some(seq) = line.seq {
             self.handed.remove(seq);
@@ -111,7 +113,7 @@ impl Subscriber {
         lost
     }
 
-    /// Its next batch of lines. `held` looks a numbered event up.
+    /// The subscriber's next batch of lines. `held` looks up a numbered event.
     pub(super) fn take(&mut self, held: impl Fn(u64) -> Option<Line>) -> Vec<Line> {
         let mut lines = Vec::new();
         let mut bytes = 0;
@@ -129,7 +131,7 @@ impl Subscriber {
                     bytes += line.json.len();
                     lines.push(line);
                 }
-                // No longer held, because the subscriber was too slow.
+                // The event is no longer held, because the subscriber was too slow.
                 None => self.lost += 1,
             }
         }
@@ -157,7 +159,7 @@ impl Subscriber {
     }
 }
 
-/// Which of the held events this subscriber has had, one bit each.
+/// The held events that this subscriber has had, one bit for each.
 struct Handed([u64; HELD / 64]);
 
 impl Handed {

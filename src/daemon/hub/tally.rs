@@ -7,11 +7,12 @@ use crate::event::{Event, Phase, PressState, Rejection};
 /// Counts over all sensors of a run.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Tally {
-    /// By the sensor's name. A sensor that has published nothing is missing.
+    /// The counts of each sensor, by the sensor's name. A sensor that has published nothing is
+    /// missing.
     pub(crate) sensors: BTreeMap<String, Counts>,
-    /// `gap` lines sent.
+    /// The number of `gap` lines sent.
     pub(crate) gaps: u64,
-    /// Events dropped because a subscriber's queue was full.
+    /// The number of events dropped because a subscriber's queue was full.
     pub(crate) dropped: u64,
 }
 

@@ -1,7 +1,7 @@
-//! The task that owns the hub, and the way to it.
+//! The task that owns the hub, and the handle to the task.
 //!
-//! In: commands through a bounded channel. Out: replies, each through a channel of its own. The task never
-//! waits for a subscriber.
+//! In: commands through a bounded channel. Out: replies, each through its own channel. The task
+//! never waits for a subscriber.
 
 use std::collections::HashMap;
 
@@ -13,7 +13,7 @@ use crate::daemon::record::EventRecorder;
 use crate::daemon::request::Subscription;
 use crate::event::{Event, Hello};
 
-/// What the hub's task is asked to do.
+/// A command to the hub's task.
 enum Command {
     Publish {
         events: Vec<Event>,
@@ -45,13 +45,13 @@ enum Command {
     Close,
 }
 
-/// The way to the hub.
+/// A handle to the hub's task.
 #[derive(Debug, Clone)]
 pub(crate) struct Handle {
     commands: mpsc::Sender<Command>,
 }
 
-/// The hub has ended: the daemon is stopping.
+/// The error that the hub has ended, because the daemon is stopping.
 #[derive(Debug, thiserror::Error)]
 #[error("the daemon is stopping")]
 pub(crate) struct Closed;
@@ -74,8 +74,8 @@ impl Handle {
             .await;
     }
 
-    /// Adds a subscriber, and gives its number and its `hello`. The caller must call
-    /// [`Handle::leave`] in the end, so it must not be cancelled before: call this in a task of its
+    /// Adds a subscriber, and returns its number and its `hello`. In the end the caller must call
+    /// [`Handle::leave`], so the caller must not be cancelled before: call this in a task of its
     /// own.
     pub(crate) async fn join(&self) -> Result<(u64, Line), Closed> {
         self.ask(|reply| Command::Join { reply }).await
@@ -122,7 +122,8 @@ impl Handle {
         let _ = self.commands.send(Command::Leave { id }).await;
     }
 
-    /// Says that no more events come. Subscribers get the lines that are left, and then their end.
+    /// Closes the hub after its last event. Subscribers get the remaining lines, and then
+    /// [`Handle::take`] gives no more.
     pub(crate) async fn close(&self) {
         let _ = self.commands.send(Command::Close).await;
     }
@@ -140,10 +141,12 @@ impl Handle {
     }
 }
 
-/// Commands that may wait. The hub never waits, so the queue is short unless the machine is busy.
+/// The most commands that wait. The hub never waits, so the queue is short unless the machine is
+/// busy.
 const COMMANDS: usize = 256;
 
-/// Starts the hub. It passes what it publishes on to `recorder`, and ends with the last handle.
+/// Starts the hub. The hub passes every event that it publishes on to `recorder`, and ends when the
+/// last handle is dropped.
 pub(crate) fn start(hello: Hello, recorder: EventRecorder) -> Handle {
     let (commands, inbox) = mpsc::channel(COMMANDS);
     let hub = Hub {
@@ -155,11 +158,11 @@ pub(crate) fn start(hello: Hello, recorder: EventRecorder) -> Handle {
 }
 
 async fn serve(mut hub: Hub, mut inbox: mpsc::Receiver<Command>) {
-    // Subscribers that have fetched everything and wait.
+    // The subscribers that have fetched everything and wait for more.
     let mut waiting: HashMap<u64, oneshot::Sender<Vec<Line>>> = HashMap::new();
     let mut closing = false;
     while let Some(command) = inbox.recv().await {
-        // A reply that cannot be sent is for a subscriber that has just gone.
+        // If a reply cannot be sent, its subscriber has just disconnected.
         match command {
             Command::Publish { events } => {
                 for event in events {
@@ -200,7 +203,8 @@ async fn serve(mut hub: Hub, mut inbox: mpsc::Receiver<Command>) {
                 subscription,
                 reply,
             } => {
-                // Held events may be due at once: the subscriber takes again after its answer.
+                // End the pending `take`, because held events may be due at once. The subscriber
+                // takes again after its answer.
                 waiting.remove(&id);
                 let _ = reply.send(hub.subscribe(id, &subscription));
             }

@@ -75,7 +75,7 @@ impl Hub {
         self.publish(event, Duration::ZERO);
     }
 
-    /// All a subscriber gets now, each line as `TYPE:SEQ`, `gap:LOST` or `frame:NUMBER`.
+    /// All lines that a subscriber gets now, each as `TYPE:SEQ`, `gap:LOST` or `frame:NUMBER`.
     fn drain(&mut self, id: u64) -> Vec<String> {
         let mut told = Vec::new();
         loop {
@@ -204,7 +204,7 @@ fn since_gives_what_is_held_then_what_comes_and_nothing_twice() {
     }
     let (id, _) = hub.join();
     hub.tell(press("a"));
-    // The default subscription has handed number 11 out before the request came.
+    // The default subscription delivered number 11 before the request came.
     assert_eq!(hub.drain(id), ["press:11"]);
     hub.tell(press("a"));
     hub.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(7)))
@@ -247,7 +247,7 @@ fn since_older_than_what_is_held_says_how_much_is_gone() {
         assert_eq!(told[1..], held);
     };
     check(&Kinds::NUMBERED, 40, "60");
-    // Which of the 60 were presses is not known any more.
+    // The kinds of the 60 events are no longer known.
     check(&[Kind::Press], 40, "null");
     check(&[Kind::Press], 0, "100");
 }

@@ -1,10 +1,10 @@
-//! Log lines for the journal: an entry an event, with its fields.
+//! Log lines for the journal: one entry for each event, with the event's fields.
 //!
 //! An entry is a datagram of `FIELD=value` lines in systemd's native protocol
 //! (<https://systemd.io/JOURNAL_NATIVE_PROTOCOL>). Its field names are those of the published
 //! events, in capitals and with `HARDNESSD_` before them. The crate `tracing-journald` would wait
-//! for a journal that reads nothing, so we do not use it: an entry is given to a function that does
-//! not wait.
+//! for a journal that reads nothing, so we do not use it. Here an entry is passed to a function
+//! that does not wait.
 
 use std::fmt::{Debug, Write as _};
 use std::io::{self, ErrorKind};
@@ -14,24 +14,25 @@ use tracing::field::{Field, Visit};
 use tracing::{Event, Level, Subscriber};
 use tracing_subscriber::layer::{Context, Layer};
 
-/// Where the journal listens.
+/// The path of the journal's socket.
 pub(super) const SOCKET: &str = "/run/systemd/journal/socket";
 
-/// What every field name of the daemon begins with.
+/// The prefix of every field name of the daemon.
 const PREFIX: &str = "HARDNESSD_";
 
 /// The layer that makes an entry of each event and gives it to a function.
 pub(super) struct Journal<F>(pub(super) F);
 
-/// Looks for the journal.
+/// Checks that the journal is there.
 ///
 /// # Errors
 ///
-/// If no process listens at [`SOCKET`].
+/// Fails if no process listens at [`SOCKET`].
 pub(super) fn find() -> io::Result<()> {
     let socket = UnixDatagram::unbound()?;
     socket.set_nonblocking(true)?;
-    // The journal ignores an entry without fields. A journal that is full is there, too.
+    // The journal ignores an entry without fields. If its queue is full, the journal is still
+    // there.
     match socket.send_to(&[], SOCKET) {
         Err(error) if error.kind() != ErrorKind::WouldBlock => Err(error),
         _ => Ok(()),
@@ -60,7 +61,7 @@ impl<S: Subscriber, F: Fn(Vec<u8>) + 'static> Layer<S> for Journal<F> {
     }
 }
 
-/// An entry that says how many were lost.
+/// An entry with the number of lost lines.
 pub(super) fn lost(lines: u64) -> Vec<u8> {
     let mut entry = Entry::default();
     entry.put("PRIORITY", "4");

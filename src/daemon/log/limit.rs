@@ -1,11 +1,11 @@
-//! How often the same line may repeat.
+//! Limits how often the same line is repeated.
 //!
-//! A program that commands the daemon can make it log as fast as that program can write. So of the
-//! lines from one place in the source about one sensor, at most [`MOST`] are written within
-//! [`WINDOW`]. The others are counted, and when the window ends one line says how many there were.
+//! A program that sends commands can make the daemon log as fast as that program can write. So of
+//! the lines from one place in the source about one sensor, at most [`MOST`] are written within
+//! [`WINDOW`]. The others are counted, and when the window ends, one line gives their number.
 //!
-//! Two kinds of line are never left out: numbered events (they have a `seq`), which only a sensor
-//! can cause, and lines below `info`, which somebody asked for by `RUST_LOG`.
+//! Two kinds of line are always written: numbered events (they have a `seq`), which only a sensor
+//! can cause, and lines below `info`, which the operator requested with `RUST_LOG`.
 
 use std::collections::HashMap;
 use std::fmt::Debug;
@@ -17,22 +17,22 @@ use tracing::field::{Field, Visit};
 use tracing::{Event, Level, Subscriber, warn};
 use tracing_subscriber::layer::{Context, Layer};
 
-/// Lines of one kind that are written within a window.
+/// The most lines of one kind that are written within a window.
 const MOST: u64 = 50;
 
-/// How long lines of one kind are counted together, from the first of them on.
+/// The length of a window. It begins with the first line of its kind.
 const WINDOW: Duration = Duration::from_secs(10);
 
-/// The field that marks the line which says how many were left out.
+/// The field that marks the line with the number of lines left out.
 const LEFT_OUT: &str = "left_out";
 
-/// The layer that leaves lines out; clones share the counts.
+/// The layer that leaves lines out. Clones share the counts.
 #[derive(Clone, Default)]
 pub(super) struct Limit(Arc<Mutex<Windows>>);
 
 impl Limit {
-    /// Says what was left out in every window that is over by `now`. Returns how long the next one
-    /// still lasts, or `None` if no line is being counted.
+    /// Logs the number of lines left out in every window that has ended by `now`. Returns the time
+    /// until the next window ends, or `None` if no line is being counted.
     pub(super) fn report(&self, now: Instant) -> Option<Duration> {
         let over = self.windows().close(now);
         for LeftOut { what, lines } in over {
@@ -49,13 +49,13 @@ impl Limit {
         self.windows().next_end(now)
     }
 
-    /// Says what was left out so far: no more lines will come.
+    /// Logs the number of lines left out so far, because no more lines follow.
     pub(super) fn report_all(&self) {
         self.report(Instant::now() + WINDOW);
     }
 
     fn windows(&self) -> MutexGuard<'_, Windows> {
-        // Counts stay usable whatever a thread did that panicked between.
+        // The counts stay usable even if a thread panicked while it changed them.
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -75,7 +75,7 @@ impl<S: Subscriber> Layer<S> for Limit {
     }
 }
 
-/// What a line is about.
+/// The message of a line, and the sensor that it is about.
 #[derive(Debug, Clone, Default, PartialEq)]
 struct About {
     message: String,
@@ -98,7 +98,7 @@ impl Visit for About {
     }
 }
 
-/// Lines that were not written.
+/// The number of lines that were not written, and what they were about.
 #[derive(Debug, PartialEq)]
 struct LeftOut {
     what: About,
@@ -116,7 +116,7 @@ struct Window {
 }
 
 impl Windows {
-    /// Counts a line; `true`: it is to be written.
+    /// Counts a line. Returns whether the line is to be written.
     fn admit(&mut self, place: Identifier, about: About, now: Instant) -> bool {
         let window = self.0.entry((place, about.sensor)).or_insert(Window {
             since: now,
@@ -127,7 +127,7 @@ impl Windows {
         window.lines <= MOST
     }
 
-    /// Closes the windows that are over, and gives what they left out.
+    /// Closes the windows that have ended, and returns what they left out.
     fn close(&mut self, now: Instant) -> Vec<LeftOut> {
         let over = |window: &Window| now.saturating_duration_since(window.since) >= WINDOW;
         let closed = self.0.extract_if(|_, window| over(window));
@@ -140,7 +140,7 @@ impl Windows {
             .collect()
     }
 
-    /// How long it is until the next window ends.
+    /// The time until the next window ends.
     fn next_end(&self, now: Instant) -> Option<Duration> {
         let first = self.0.values().map(|window| window.since).min()?;
         Some((first + WINDOW).saturating_duration_since(now))
@@ -181,7 +181,7 @@ mod tests {
         };
         assert_eq!(windows.close(start + WINDOW), [expected]);
         assert_eq!(windows.next_end(start + WINDOW), None);
-        // From then on it is written again.
+        // In a new window the line is written again.
         assert!(windows.admit(id(place), about(Some("forearm")), start + WINDOW));
     }
 }

@@ -1,8 +1,8 @@
-//! Log lines on their way to stderr or the journal, through a thread of their own.
+//! Passes log lines to a thread that writes them to stderr or to the journal.
 //!
 //! The program that reads the log may stop reading, and the sensor must not wait for that program.
-//! So when [`WAITING`] lines wait, further lines are dropped. As soon as one is read again, a line
-//! says how many were dropped.
+//! So when [`WAITING`] lines wait, further lines are dropped. As soon as the next line is written,
+//! another line gives the number of dropped lines.
 
 use std::io::{self, Write};
 use std::os::unix::net::UnixDatagram;
@@ -16,19 +16,19 @@ use tracing_subscriber::fmt::MakeWriter;
 use super::journal;
 use super::limit::Limit;
 
-/// The most lines that wait: some 150 kB.
+/// The most lines that wait, about 150 kB.
 const WAITING: usize = 1024;
 
 enum Message {
-    /// To stderr.
+    /// A line for stderr.
     Line(Vec<u8>),
-    /// To the journal.
+    /// An entry for the journal.
     Entry(Vec<u8>),
-    /// An answer is due once all lines before are written.
+    /// A request for an answer as soon as all earlier lines are written.
     Flush(SyncSender<()>),
 }
 
-/// The queue to the thread; clones share it.
+/// The queue to the thread. Clones share it.
 #[derive(Clone)]
 pub(super) struct Lines {
     thread: SyncSender<Message>,
@@ -36,11 +36,11 @@ pub(super) struct Lines {
 }
 
 impl Lines {
-    /// Starts the thread, which also has `limit` say what it left out.
+    /// Starts the thread, which also makes `limit` log the number of lines left out.
     ///
     /// # Errors
     ///
-    /// If the system has no room for a thread.
+    /// Fails if the system cannot make the thread or its socket.
     pub(super) fn start(limit: Limit) -> io::Result<Self> {
         let (thread, messages) = mpsc::sync_channel(WAITING);
         let journal = UnixDatagram::unbound()?;
@@ -69,14 +69,15 @@ impl Lines {
     /// Waits until all lines are written, but not longer than `patience`.
     pub(super) fn flush(&self, patience: Duration) {
         let (written, answer) = mpsc::sync_channel(1);
-        // When the queue is full no program reads the log, so waiting is of no use.
+        // When the queue is full, no program reads the log, so waiting is of no use.
         if self.thread.try_send(Message::Flush(written)).is_ok() {
             let _ = answer.recv_timeout(patience);
         }
     }
 }
 
-/// The next message. Meanwhile what was left out is said when it is due.
+/// Waits for the next message. Meanwhile, when a window ends, this logs the number of lines left
+/// out.
 fn next(messages: &Receiver<Message>, limit: &Limit) -> Option<Message> {
     loop {
         let Some(wait) = limit.report(Instant::now()) else {

@@ -1,4 +1,4 @@
-//! The file that is being written, and the room on its disk.
+//! The file that is being written, and the free space on its disk.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, ErrorKind};
@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use crate::recording::{self, About, Writer};
 
-/// A megabyte as disks are sold.
+/// The bytes of a megabyte in the decimal sense, as in the sizes of disks.
 pub(super) const MB: u64 = 1_000_000;
 
 /// A file that is being written.
@@ -32,7 +32,7 @@ impl Open {
         })
     }
 
-    /// Whether the file is not at its path any more. What is written to it then is lost.
+    /// Whether the file is no longer at its path. Bytes that are then written to it are lost.
     pub(super) fn is_deleted(&self) -> bool {
         let identity = |file: fs::Metadata| (file.dev(), file.ino());
         match (self.file.metadata(), fs::symlink_metadata(&self.path)) {
@@ -48,7 +48,7 @@ impl Open {
     }
 }
 
-/// Fails if fewer than this many bytes are free on the disk.
+/// Makes `directory` if it is missing. Fails if fewer than `floor` bytes are free on its disk.
 pub(super) fn has_room(directory: &Path, floor: u64) -> io::Result<()> {
     fs::create_dir_all(directory).map_err(|error| named(directory, &error))?;
     let disk = rustix::fs::statvfs(directory).map_err(|error| named(directory, &error.into()))?;
@@ -65,7 +65,7 @@ pub(super) fn has_room(directory: &Path, floor: u64) -> io::Result<()> {
     Ok(())
 }
 
-/// Makes a new file, named by `what` it is and by the time.
+/// Makes a new file, whose name has `what` and the time.
 pub(super) fn create(directory: &Path, what: &str) -> io::Result<(PathBuf, File)> {
     let now = jiff::Timestamp::now().strftime("%Y%m%dT%H%M%S%.3fZ");
     let path = directory.join(format!("{what}-{now}.mcap"));

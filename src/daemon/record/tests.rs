@@ -27,7 +27,8 @@ fn at(ms: u64) -> Stamp {
     }
 }
 
-/// Numbers of the inputs that were told; those that follow a gap without a state between.
+/// The count of the recorded inputs, and the numbers of those that follow a gap without a state
+/// between.
 fn told(inbox: &Receiver<Job>) -> (usize, Vec<u64>) {
     let (mut count, mut bad) = (0, Vec::new());
     let mut next = None;
@@ -56,10 +57,11 @@ fn told(inbox: &Receiver<Job>) -> (usize, Vec<u64>) {
 
 #[test]
 fn after_a_gap_comes_a_state() {
-    // Room for a state and inputs: the first are told whoever runs when.
+    // There is room for a state and inputs, so the first ones are recorded in any order of the
+    // threads.
     let (sender, inbox) = sync_channel(4);
     let (mut recorder, pipeline) = recorder(sender);
-    // Takes what is told as fast as it comes: room appears at any moment.
+    // The reader takes jobs as fast as they come, so room appears at any moment.
     let reader = std::thread::spawn(move || told(&inbox));
     for number in 0..20_000_u64 {
         let bytes = number.to_le_bytes().to_vec();
@@ -73,7 +75,7 @@ fn after_a_gap_comes_a_state() {
 
 #[test]
 fn a_flood_is_bounded_in_the_black_box() {
-    // Less than 1 KiB as text, and in memory 100 objects.
+    // The context takes less than 1 KiB as text, but 100 objects in memory.
     let context = serde_json::json!({ "tags": vec![serde_json::json!({ "": 0 }); 100] });
     assert!(context.to_string().len() < 1024);
     for flood in [

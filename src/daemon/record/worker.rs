@@ -1,4 +1,5 @@
-//! The recorder's thread: which file is open, when it ends, and what to do when the disk fails.
+//! The recorder's thread, which decides which file is open, when it ends, and what to do when the
+//! disk fails.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -17,15 +18,16 @@ use crate::event::{Event, LinkState, PressState};
 use crate::frame::Stamp;
 use crate::recording::{self, About, Entry, Input, Ring};
 
-/// How often written entries are passed to the system: kill -9 loses no more than this.
+/// How often written entries are passed to the system. `kill -9` loses no more than this time.
 const FLUSH_EVERY: Duration = Duration::from_millis(500);
-/// How long the recorder waits after the disk failed or was full.
+/// How long the recorder waits before it tries again after the disk failed or was full.
 const RETRY_AFTER: Duration = Duration::from_secs(5);
 /// The shortest time between black boxes of one sensor's faults.
 const FAULT_EVERY: Duration = Duration::from_secs(60);
-/// The shortest time between black boxes of one sensor that are asked for: each takes the disk a moment.
+/// The shortest time between requested black boxes of one sensor, because each takes the disk a
+/// moment.
 const ASKED_EVERY: Duration = Duration::from_secs(1);
-/// Before a recording goes on, this share more than the floor must be free.
+/// Before a paused recording continues, 1 / [`ROOM_SHARE`] more than the floor must be free.
 const ROOM_SHARE: u64 = 16;
 
 /// The state of the thread.
@@ -36,9 +38,9 @@ pub(super) struct Worker {
     dropped_said: u64,
     sensors: Vec<Watched>,
     open: Option<Open>,
-    /// When to try again, if a file should be open and is not.
+    /// The time of the next try, if a file should be open and is not.
     retry: Option<Instant>,
-    /// Whether the disk is the reason.
+    /// Whether the recording is paused because the disk failed or is full.
     paused: bool,
     /// Sent when there is no more to record.
     stop: Option<oneshot::Sender<()>>,
@@ -46,20 +48,20 @@ pub(super) struct Worker {
     progress: Progress,
 }
 
-/// A sensor, as the thread sees it.
+/// The thread's state of one sensor.
 #[derive(Default)]
 struct Watched {
     ring: Ring,
-    /// Whether its port is open, once that is known.
+    /// Whether the sensor's port is open. `None`: this is not known yet.
     is_open: Option<bool>,
     last_fault: Option<Instant>,
     last_asked: Option<Instant>,
 }
 
-/// Why a job failed.
+/// The reason a job failed.
 enum Failure {
     Write(recording::Error),
-    /// No sensor is left.
+    /// A sensor is missing at the start, or no sensor is left.
     Gone(Error),
 }
 
@@ -91,8 +93,8 @@ impl Worker {
         }
     }
 
-    /// Writes until its queue has no sender left, or there is no more to record. A failure is an
-    /// error only of a recording into one file. In a directory it is a line in the log.
+    /// Writes until the queue has no sender left. A failed write is an error only of a recording
+    /// into one file, which ends there. In a directory, it is a line in the log.
     pub(super) fn run(mut self, jobs: &Receiver<Job>) -> Result<(), Error> {
         self.begin()?;
         let mut flush = Instant::now() + FLUSH_EVERY;
@@ -131,7 +133,8 @@ impl Worker {
         Ok(())
     }
 
-    /// Handles a failure: it ends a recording into one file; in a directory another file may work.
+    /// Handles a failure. A failed write ends a recording into one file. In a directory, another
+    /// file may work.
     fn settle(&mut self, done: Result<(), Failure>) -> Result<(), Error> {
         match (done, &self.target) {
             (Ok(()), _) => {}
@@ -172,7 +175,7 @@ impl Worker {
         let mut finished = open.finish();
         if matches!(self.target, Target::File { .. }) {
             finished = finished.and_then(|()| Ok(file.sync_all()?));
-            // Nothing is kept of a sensor that was never there.
+            // If a sensor was missing at the start, the file is not kept, so do not report it.
             if !matches!(gone, Err(Error::Unavailable { .. })) {
                 info!(
                     path = %path.display(),
@@ -238,7 +241,8 @@ impl Worker {
         if self.directory().is_some() {
             self.sensors[sensor].ring.push(at, entry);
         }
-        // Only after the entry is in the ring, so that the next file can have it.
+        // Return a failed write only now: the entry is in the ring, so that the next file can have
+        // it.
         written?;
         match gone {
             Some(gone) if matches!(self.target, Target::File { .. }) => Err(Failure::Gone(gone)),
@@ -270,7 +274,8 @@ impl Worker {
         Ok(())
     }
 
-    /// Writes what a client asks for, unless it asked a moment ago.
+    /// Writes the black box that a client requests, unless one was written less than
+    /// [`ASKED_EVERY`] ago.
     fn asked(&mut self, sensor: usize) -> Result<PathBuf, NoBlackbox> {
         let now = Instant::now();
         let last = self.sensors[sensor].last_asked;
@@ -285,7 +290,8 @@ impl Worker {
         written
     }
 
-    /// Writes what led to a fault, unless a black box was written a moment ago.
+    /// Writes a black box of a fault, unless the last one of this sensor was less than
+    /// [`FAULT_EVERY`] ago.
     fn fault(&mut self, sensor: usize, fault: &str) {
         let now = Instant::now();
         let recent = |last: Instant| now.duration_since(last) < FAULT_EVERY;
@@ -325,7 +331,7 @@ impl Worker {
             let directory = settings.dir();
             has_room(&directory, settings.keep_free_mb * MB)?;
             let (path, file) = create(&directory, &format!("blackbox-{name}"))?;
-            // The client may run in another directory.
+            // The path must be absolute, because the client may run in another directory.
             let path = std::path::absolute(&path).unwrap_or(path);
             or_removed(&path, || {
                 let mut open = Open::new(path.clone(), file, &about)?;
@@ -341,7 +347,7 @@ impl Worker {
         Ok(path)
     }
 
-    /// Does what is due every half second.
+    /// Does the work that is due every [`FLUSH_EVERY`].
     fn look_after(&mut self) -> Result<(), Failure> {
         let dropped = self.dropped.load(Ordering::Relaxed);
         if dropped > self.dropped_said {
@@ -356,7 +362,7 @@ impl Worker {
         Ok(())
     }
 
-    /// Ends a file that is full or old, or when too little room is left, and begins the next.
+    /// Ends the file if it is full or old, or if too little room is left, and begins the next file.
     fn look_after_directory(&mut self) {
         let Target::Directory(settings) = &self.target else {
             return;
@@ -387,8 +393,8 @@ impl Worker {
         if self.retry.is_none_or(|at| Instant::now() < at) {
             return;
         }
-        // After a pause a little more room is asked for, so that it does not begin and end over
-        // and over.
+        // After a pause, a little more room is required, so that the recording does not begin and
+        // end again and again.
         let floor = if self.paused {
             floor + floor / ROOM_SHARE
         } else {
@@ -424,7 +430,7 @@ impl Worker {
     }
 }
 
-/// Fills the new file at `path`, or removes it again: the disk may be full.
+/// Fills the new file at `path`. If this fails, removes the file, because the disk may be full.
 fn or_removed<T>(
     path: &Path,
     fill: impl FnOnce() -> Result<T, recording::Error>,

@@ -1,5 +1,5 @@
-//! Where a controller says its arm is: from a line of the control socket to points on the clock of
-//! the frames.
+//! Positions of the arm that a controller reports: from a line of the control socket to points on
+//! the clock of the frames.
 
 use jiff::Timestamp;
 use serde_json::Value;
@@ -10,17 +10,18 @@ use crate::motion::{FURTHEST_MM, HELD, Point};
 
 /// The most points in a line.
 const MOST_POINTS: usize = 256;
-/// A point may be this far ahead of this machine's clock: clocks of two machines differ a little.
+/// A point may be this far ahead of this machine's clock, because clocks of two machines differ a
+/// little.
 const AHEAD_NS: i128 = 1_000_000_000;
 
-/// Where the arm of a sensor was, as it was told.
+/// Positions of the arm of a sensor, as they were reported.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Positions {
     pub(crate) sensor: String,
     pub(crate) points: Vec<Told>,
 }
 
-/// A point as it was told.
+/// A point as it was reported.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Told {
     at: Moment,
@@ -28,7 +29,7 @@ pub(crate) struct Told {
 }
 
 impl Told {
-    /// A point at a time of the calendar; `None`, if it is too far from its zero.
+    /// A point at a calendar time. `None` if the position is too far from its zero.
     #[cfg(feature = "ros2")]
     pub(crate) fn at_time(at: Timestamp, mm: f64) -> Option<Self> {
         let at = Moment::Wall(at);
@@ -36,16 +37,16 @@ impl Told {
     }
 }
 
-/// When a point was, by one of two clocks.
+/// The time of a point, by one of two clocks.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Moment {
     /// CLOCK_MONOTONIC of this machine, in nanoseconds.
     Mono(u64),
-    /// The calendar.
+    /// Calendar time.
     Wall(Timestamp),
 }
 
-/// Why points cannot be used.
+/// The reason points cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum Unusable {
     #[error("motion.at: found {0}, expected a list of 1 to {MOST_POINTS} points [MONO_NS, MM]")]
@@ -98,7 +99,7 @@ pub(super) fn points(at: &Value) -> Result<Vec<Told>, Unusable> {
     points.iter().enumerate().map(point).collect()
 }
 
-/// A whole number of nanoseconds. Some languages write large ones as 1.2e15.
+/// A whole number of nanoseconds. Some languages write large numbers as 1.2e15.
 fn nanoseconds(number: &Value) -> Option<u64> {
     let rounded = || {
         let number = number.as_f64()?;
@@ -107,11 +108,11 @@ fn nanoseconds(number: &Value) -> Option<u64> {
     number.as_u64().or_else(rounded)
 }
 
-/// The points on CLOCK_MONOTONIC, at `now`.
+/// The points on CLOCK_MONOTONIC. `now` is the current time of both clocks.
 ///
 /// # Errors
 ///
-/// If one is of the future, or older than a point is held.
+/// Fails if a point is more than [`AHEAD_NS`] ahead of `now`, or older than [`HELD`].
 pub(crate) fn placed(told: &[Told], now: Stamp) -> Result<Vec<Point>, Unusable> {
     let mono_now = now.mono.as_nanos() as i128;
     let point = |(index, told): (usize, &Told)| {

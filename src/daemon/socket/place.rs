@@ -1,4 +1,4 @@
-//! The file of a socket: made with its mode, and only where nobody listens.
+//! The file of a socket, which is made with its mode, and only where no process listens.
 
 use std::fs::{self, DirBuilder, File, OpenOptions, Permissions};
 use std::io::{self, ErrorKind};
@@ -21,7 +21,7 @@ const LONGEST_PATH_BYTES: usize = 107;
 /// The file that a daemon locks while it binds, in the socket's directory.
 const LOCK_FILE: &str = ".hardnessd.lock";
 
-/// The file of a socket, as the configuration says.
+/// The file of a socket, as configured.
 #[derive(Debug, Clone)]
 pub(super) struct Place {
     /// The key of the configuration.
@@ -30,7 +30,7 @@ pub(super) struct Place {
     pub(super) mode: u32,
 }
 
-/// Device and inode of a file.
+/// The device and the inode of a file.
 pub(super) type Identity = (u64, u64);
 
 pub(super) fn identity(path: &Path) -> io::Result<Identity> {
@@ -39,8 +39,8 @@ pub(super) fn identity(path: &Path) -> io::Result<Identity> {
 }
 
 impl Place {
-    /// Listens here. If another daemon binds in the same directory at the moment, this waits for it,
-    /// but not longer than `patience`.
+    /// Listens at the path. If another daemon binds in the same directory at the moment, this waits
+    /// for it, but not longer than `patience`.
     pub(super) fn listen(&self, patience: Duration) -> Result<(UnixListener, Identity), Error> {
         let Self { key, path, mode } = self;
         check(key, path)?;
@@ -77,12 +77,13 @@ impl Place {
     }
 }
 
-/// The right to bind a socket in a directory, which one daemon has at a time. It is a lock on a file
-/// that exists only meanwhile and that no other user can open. Other users may open the directory
-/// itself, so a lock on the directory would let each of them keep the daemon out.
+/// The right to bind a socket in a directory, which only one daemon has at a time. It is a lock on
+/// a file that exists only while the lock is held and that no other user can open. Other users may
+/// open the directory itself, so a lock on the directory would let each of them keep the daemon
+/// out.
 struct Lock {
     path: PathBuf,
-    /// Locked for as long as it is open.
+    /// The file is locked for as long as it is open.
     _file: File,
 }
 
@@ -112,7 +113,8 @@ impl Lock {
             .custom_flags((OFlags::NOFOLLOW | OFlags::NONBLOCK).bits().cast_signed())
             .open(path)?;
         flock(&file, FlockOperation::NonBlockingLockExclusive)?;
-        // The last holder removed this file meanwhile: a lock on it would keep nobody out.
+        // If the last holder removed this file meanwhile, a lock on it would exclude no other
+        // daemon.
         let held = file.metadata()?;
         if identity(path).ok() != Some((held.dev(), held.ino())) {
             return Err(ErrorKind::WouldBlock.into());
@@ -124,7 +126,7 @@ impl Lock {
 
 impl Drop for Lock {
     fn drop(&mut self) {
-        // This comes before the lock is released.
+        // The file is removed before the lock is released.
         let _ = fs::remove_file(&self.path);
     }
 }
@@ -189,8 +191,8 @@ fn vacant(key: &'static str, path: &Path) -> Result<(), Error> {
     if !is_there(key, path)? {
         return Ok(());
     }
-    // A connection to a dead socket is refused. With any other result a process may listen there. The
-    // socket does not block, because a full backlog would keep a blocking connect waiting.
+    // A connection to a dead socket is refused. With any other result a process may listen there.
+    // The socket does not block, because a full backlog would keep a blocking connect waiting.
     let probe = || {
         let socket = rustix::net::socket_with(
             AddressFamily::UNIX,

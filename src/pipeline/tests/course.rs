@@ -1,4 +1,4 @@
-//! A model of format 2 judges the course of a press.
+//! Tests with a model of format 2, which judges the course of a press.
 
 use serde_json::{Value, json};
 
@@ -6,7 +6,7 @@ use super::*;
 use crate::event::{Course as RestsOn, Hardness};
 use crate::verdict::course_model::course_model;
 
-/// An arm of 10 N/mm, tared, and judged by a model that says what it was given.
+/// A tared pipeline with an arm of 10 N/mm. Its model returns its own input.
 fn tared(more: &[(&str, Value)], change: impl FnOnce(&mut Description)) -> Pipeline {
     let mut pipeline = pipeline_of(|described| {
         described.arm.stiffness_n_per_mm = Some(10.0);
@@ -18,14 +18,15 @@ fn tared(more: &[(&str, Value)], change: impl FnOnce(&mut Description)) -> Pipel
     pipeline
 }
 
-/// Nine taxels, loaded in four frames, held for one and released: 7.2 to 28.8 N.
+/// The frames of a press on nine taxels, loaded in four frames, held for one and released: 7.2 to
+/// 28.8 N.
 fn press() -> Vec<RawFrame> {
     let held = [20, 40, 60, 80, 80].map(|counts| raw(9, counts));
     [&held[..], &[raw(0, 0); 2]].concat()
 }
 
-/// Positions of an arm at 5 mm/s that holds from 2.8 s on, when the fourth of the press's frames
-/// comes; one every 50 ms.
+/// Positions of an arm at 5 mm/s, one every 50 ms. The arm stops at 2.8 s, when the press's fourth
+/// frame comes.
 fn positions(from_ms: i64, to_ms: i64) -> Vec<Point> {
     (from_ms..=to_ms)
         .step_by(50)
@@ -44,7 +45,8 @@ fn verdicts(events: Vec<Event>) -> Vec<Hardness> {
     events.into_iter().filter_map(verdict).collect()
 }
 
-/// The verdicts on one press; before each frame comes what `told` says of its moment in ms.
+/// The verdicts on one press. Before each frame, the pipeline gets the positions that `told`
+/// returns for the frame's time in ms.
 fn judged(pipeline: &mut Pipeline, told: impl Fn(i64) -> Vec<Point>) -> Vec<Hardness> {
     let mut events = Vec::new();
     for (number, raw) in (6..).zip(press()) {
@@ -56,7 +58,7 @@ fn judged(pipeline: &mut Pipeline, told: impl Fn(i64) -> Vec<Point>) -> Vec<Hard
     verdicts(events)
 }
 
-/// The sum of the approach, the number of frames and the arm, as the model was given them.
+/// The model's input: the sum of the approach, the number of frames and the arm's stiffness.
 fn given(verdict: &Hardness) -> [f32; 3] {
     let shore = verdict.shore.unwrap();
     [
@@ -75,14 +77,14 @@ fn positions_reach_the_model_and_the_slope_is_the_objects() {
     let [early, last] = &found[..] else {
         panic!("{found:?}");
     };
-    // Of 0, 1, 2, 3 and again 3 mm.
+    // This is the sum of 0, 1, 2, 3 and again 3 mm.
     assert_eq!(given(last), [9.0, 5.0, 10.0]);
     assert_eq!(last.course, Some(RestsOn::Positions));
-    // From 14.4 to 28.8 N the arm goes 2 mm, of which 1.44 are its own.
+    // From 14.4 to 28.8 N the arm goes 2 mm, of which 1.44 mm are its own bending.
     let slope = last.stiffness_n_per_mm.unwrap();
     assert!((slope - 14.4 / 0.56).abs() < 1e-3, "{slope}");
     assert_eq!((last.level, last.frame), (Some(2), 8));
-    // With three frames it is sure to 78 %, with four to 86.
+    // With three frames, the confidence is 78 %. With four, it is 86 %.
     assert_eq!((early.phase, early.frame), (Phase::Early, 8));
     assert_eq!(given(early), [6.0, 4.0, 10.0]);
     assert!(early.confidence > 0.8);
@@ -93,7 +95,7 @@ fn a_delay_shifts_the_approach() {
     let mut pipeline = tared(&[], |described| described.arm.delay_ms = 100.0);
     pipeline.tell(&positions(1000, 9000)).unwrap();
     let found = judged(&mut pipeline, |_| Vec::new());
-    // At the fifth frame the arm is where it stops: half a millimetre further than at the fourth.
+    // At the fifth frame the arm has stopped: half a millimetre further than at the fourth.
     assert_eq!(given(&found[1]), [9.5, 5.0, 10.0]);
 }
 
@@ -105,7 +107,7 @@ fn an_early_verdict_is_on_the_frames_whose_positions_have_come() {
     let [early, last] = &found[..] else {
         panic!("{found:?}");
     };
-    // It comes with the fifth frame, and leaves it out.
+    // The early verdict comes with the fifth frame, and leaves that frame out.
     assert_eq!((early.frame, given(early)), (8, [6.0, 4.0, 10.0]));
     assert_eq!((last.frame, given(last)), (8, [9.0, 5.0, 10.0]));
 }
@@ -121,12 +123,12 @@ fn without_positions_there_is_the_speed_while_the_force_grows() {
         let mut pipeline = tared(&[], |described| described.arm.speed_mm_s = configured);
         pipeline.set_context(context);
         let found = judged(&mut pipeline, |_| Vec::new());
-        // Of 0, 1, 2 and 3 mm; while it holds nobody knows.
+        // This is the sum of 0, 1, 2 and 3 mm. While the arm holds, its position is unknown.
         assert_eq!(given(&found[1]), [value, 5.0, 10.0]);
         assert_eq!(found[1].course, Some(RestsOn::Speed));
         assert!(found[1].stiffness_n_per_mm.is_some());
     }
-    // A context is any JSON.
+    // A context may be any JSON.
     let mut pipeline = tared(&[], |_| {});
     pipeline.set_context(Some(json!({"speed_mm_s": "fast"})));
     let found = judged(&mut pipeline, |_| Vec::new());

@@ -1,12 +1,12 @@
-//! The baseline follows slow drift, and nothing else.
+//! Tests that the baseline follows slow drift, and nothing else.
 
 use super::*;
 use crate::frame::TAXELS;
 
-/// In seconds.
+/// An hour in seconds.
 const HOUR: u64 = 3600;
 
-/// Newtons of a count.
+/// The newtons of one count.
 const COUNT_N: f64 = 0.04;
 
 fn following(auto_tare: bool) -> Pipeline {
@@ -19,8 +19,9 @@ fn following(auto_tare: bool) -> Pipeline {
     pipeline
 }
 
-/// Plays `seconds` of a sensor all of whose taxels rest at `rest_n`, after so many seconds; `touched`
-/// taxels read 1 N more. Gives the words, and the greatest mean of a frame's 12 most loaded taxels.
+/// Plays `seconds` seconds of a sensor from second `from_s` on. All its taxels rest at `rest_n`,
+/// and `touched` taxels read 1 N more. Returns the words, and the greatest mean of a frame's 12
+/// most loaded taxels.
 fn play_at_2_hz(
     pipeline: &mut Pipeline,
     from_s: u64,
@@ -52,7 +53,7 @@ fn play_at_2_hz(
     (told, most_n)
 }
 
-/// 0.5 N an hour.
+/// A drift of 0.5 N an hour.
 fn drift(second: u64) -> f64 {
     0.5 * second as f64 / HOUR as f64
 }
@@ -70,7 +71,7 @@ fn a_baseline_that_follows_keeps_drift_from_being_a_press() {
     let (told, most_n) = play_at_2_hz(&mut pipeline, 10, HOUR, drift, &[]);
     assert_eq!(told, Vec::<String>::new());
     assert!(most_n <= COUNT_N, "{most_n}");
-    // Then a press reads what it would have read an hour ago, to a count.
+    // A press then reads the same as an hour ago, within a count.
     let (told, most_n) = play_at_2_hz(&mut pipeline, HOUR + 10, 3, drift, &TOUCHED);
     assert_eq!(told[0], "Begin 1", "{told:?}");
     assert!((most_n - 1.0).abs() <= COUNT_N, "{most_n}");
@@ -78,15 +79,16 @@ fn a_baseline_that_follows_keeps_drift_from_being_a_press() {
 
 #[test]
 fn a_press_is_never_followed_however_slow_or_long() {
-    // Held for an hour: far beyond the timeout, until when it waits for its release.
+    // The press is held for an hour, far beyond its timeout. After the timeout it waits for its
+    // release.
     let mut pipeline = following(true);
     let (told, _) = play_at_2_hz(&mut pipeline, 10, HOUR, |_| 0.0, &TOUCHED);
     assert!(told.contains(&"End 1 (timeout)".to_owned()), "{told:?}");
     let (_, most_n) = play_at_2_hz(&mut pipeline, HOUR + 10, 1, |_| 0.0, &TOUCHED);
     assert!((most_n - 1.0).abs() < 1e-4, "{most_n}");
 
-    // A load that grows by 2 N an hour on each taxel, twice the bound: after 252 s it is 0.07 N above a
-    // baseline that has followed by 0.07 N. From then on the baseline stays.
+    // The load grows by 2 N an hour on each taxel, twice the bound. After 252 s it is 0.07 N above
+    // the baseline, which has followed by 0.07 N. From then on the baseline stays.
     let mut pipeline = following(true);
     let slow = |second: u64| 2.0 * (second - 10) as f64 / HOUR as f64;
     let (told, most_n) = play_at_2_hz(&mut pipeline, 10, HOUR, slow, &[]);
@@ -109,7 +111,7 @@ fn a_gap_and_a_busy_sensor_do_not_speed_it_up() {
         Some(Event::Frame(frame)) => frame.newtons[0],
         other => panic!("{other:?}"),
     };
-    // An hour without a frame is one step, and a hundred frames within a second are none.
+    // An hour without a frame is one step. A hundred frames within a second are no further step.
     newtons(pipeline.push(&bytes, at(HOUR * 1000)));
     for ms in 0..100 {
         newtons(pipeline.push(&bytes, at(HOUR * 1000 + ms)));

@@ -4,7 +4,7 @@ use super::*;
 use crate::simulator::kernel::{self, Base, Layer};
 use crate::simulator::sensor::CELL_MM;
 
-/// Solves a gap given by radius on a half-space of this E*, or a layer of (nu, E*, height).
+/// Solves gaps that are given by radius, on a half-space of modulus E* or on a layer.
 struct Bed {
     width: usize,
     cell_mm: f64,
@@ -94,14 +94,15 @@ fn near(seen: f64, expected: f64, tolerance: f64, what: &str) {
 
 #[test]
 fn sphere_on_half_space_is_hertz() {
-    // A paraboloid, as Hertz has it.
+    // The gap is Hertz's paraboloid.
     let (radius, modulus) = (27.0, 0.8);
     let mut bed = Bed::half_space(48, CELL_MM, modulus);
     let gap = bed.gap(|r| 0.5 * r * r / radius);
     for force in [10.0, 15.0, 20.0, 25.0] {
         let (pressure, contact) = bed.press(&gap, force, Local::None);
         let a = (0.75 * force * radius / modulus).cbrt();
-        // Counted cells err by the cells on the rim; the second moment, 2 a^2 / 5, does not.
+        // The radius from counted cells errs by the cells on the rim. The second moment, 2 a^2 / 5,
+        // does not.
         near(
             (2.5 * bed.second_moment(&pressure)).sqrt(),
             a,
@@ -141,7 +142,8 @@ fn flat_punch_sinks_by_force_over_diameter_and_modulus() {
 
 #[test]
 fn thin_layer_is_a_mattress() {
-    // Contact radius over thickness above 20: Winkler with the confined modulus.
+    // Above a ratio of 20 of contact radius to thickness, the layer is a Winkler foundation with
+    // the confined modulus.
     let (nu, modulus, height, radius, force) = (0.3, 3.0, 0.5, 4000.0, 40.0);
     let mut bed = Bed::layer(96, nu, modulus, height);
     let gap = bed.gap(|r| 0.5 * r * r / radius);
@@ -188,7 +190,7 @@ fn local_laws_obey_the_force_and_close_the_gap() {
                 deepest = deepest.max(-open);
             }
         }
-        // Against an approach of millimetres.
+        // The approach is of the order of millimetres.
         assert!(
             worst < 0.02 * contact.approach_mm,
             "{local:?}: open by {worst} mm"
@@ -236,11 +238,11 @@ fn a_finer_tolerance_changes_little() {
 
 #[test]
 fn rough_contact_area_is_linear_in_the_load() {
-    // Well resolved roughness on a flat: shortest wave 9 cells. Persson: A / A0 =
-    // sqrt(8 / pi) p / (E* h'), h' the rms slope; the ratio to it is 1.0 to 1.15 once the
-    // cells on the rim are not counted whole: 0.118 of a cell's area less for each of its sides
-    // there (Yastrebov, Anciaux and Molinari 2017). Seen here: 1.21 to 1.26, with a finite window
-    // and a slope from differences, which is some 4 % low.
+    // The roughness on a flat is well resolved: its shortest wave has 9 cells. Persson:
+    // A / A0 = sqrt(8 / pi) p / (E* h'), with h' the rms slope. The ratio to this is 1.0 to 1.15 if
+    // the cells on the rim are not counted whole: 0.118 of a cell's area is subtracted for each of
+    // its sides on the rim (Yastrebov, Anciaux and Molinari 2017). Here it is 1.21 to 1.26, with a
+    // finite window and a slope from differences, which is about 4 % low.
     use crate::random::Stream;
     use crate::simulator::substance::Texture;
     use crate::simulator::texture::Patch;

@@ -1,12 +1,12 @@
-//! From presses on something rigid to the arm's stiffness and the delay of its stamps.
+//! Computes the arm's stiffness and the delay of its stamps from presses on something rigid.
 //!
-//! The way of the arm is a curve over force: mostly a line, whose slope is what gives way behind the
-//! sensor's face; a little bent, because the sensor's cover stiffens. With the right delay the arm
-//! goes back on the curve that it came on. With another delay there is a loop.
+//! The way of the arm is a curve over force. It is mostly a line, whose slope comes from what gives
+//! way behind the sensor's face. It is a little bent, because the sensor's cover stiffens. With the
+//! right delay, the arm returns on the same curve. With another delay, there is a loop.
 
 use super::gather::Press;
 
-/// A value, and the least and greatest of the presses one by one.
+/// A value, and its least and greatest over single presses.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Spread {
     pub(super) value: f64,
@@ -14,12 +14,12 @@ pub(super) struct Spread {
     pub(super) most: f64,
 }
 
-/// What presses say.
+/// The values that presses give.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Fit {
-    /// How many there were.
+    /// The number of presses.
     pub(super) presses: usize,
-    /// Least and greatest of their greatest forces.
+    /// The least and the greatest peak force of the presses, in newtons.
     pub(super) force_n: [f64; 2],
     pub(super) n_per_mm: Spread,
     pub(super) delay_ms: Spread,
@@ -27,7 +27,7 @@ pub(super) struct Fit {
     pub(super) residual_mm: f64,
 }
 
-/// Why presses say nothing.
+/// The reason why presses give no values.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Unfit {
     /// Positions are missing.
@@ -36,20 +36,20 @@ pub enum Unfit {
          after their end: does the robot send them to the control socket of this configuration?"
     )]
     Unknown {
-        /// With positions.
+        /// The number of presses with positions.
         known: usize,
-        /// All.
+        /// The number of all presses.
         presses: usize,
     },
-    /// Too few frames.
+    /// There are too few frames with a fair force.
     #[error(
         "only {found} frames with a fair force in {presses} presses: press more slowly, harder or \
          more often"
     )]
     Few {
-        /// Frames.
+        /// The number of frames with a fair force.
         found: usize,
-        /// Presses.
+        /// The number of presses.
         presses: usize,
     },
     /// The force does not grow with the way.
@@ -63,28 +63,29 @@ pub enum Unfit {
          deeper, and keep the arm moving"
     )]
     NoDelay {
-        /// The way of the arm.
+        /// The way of the arm while the sensor was pressed.
         moved_mm: f64,
     },
 }
 
-/// Delays that are tried.
+/// The least and the greatest delay that are tried.
 const DELAYS_MS: (f64, f64) = (-300.0, 600.0);
-/// First and second step between them.
+/// The step between delays in the first and in the second search.
 const STEPS_MS: [f64; 2] = [10.0, 0.5];
-/// Frames with a smaller share of a press's greatest force tell of the cover alone.
+/// Frames with a smaller share of a press's peak force depend on the cover alone.
 const FAIR_SHARE: f64 = 0.2;
-/// The slope is that of frames with at least this share.
+/// The slope comes from frames with at least this share of a press's peak force.
 const STEEP_SHARE: f64 = 0.5;
-/// Fewer frames than this cannot say four numbers and a spread.
+/// Fewer frames than this cannot determine four numbers and a spread.
 const LEAST_FRAMES: usize = 8;
-/// At a delay this far from the best one, the distance from the curve must have grown by this part.
+/// If a delay is wrong by `WRONG_MS`, the distance from the curve must be more than `GROWN` times
+/// as large as at the best delay. Otherwise, the delay is unknown.
 const WRONG_MS: f64 = 150.0;
 const GROWN: f64 = 1.3;
 
 impl Press {
-    /// Way and force of its frames with at least `share` of its greatest force, if positions are known
-    /// at all of its frames.
+    /// Way and force of the frames with at least `share` of the press's peak force. `None` unless
+    /// the positions at all frames are known.
     fn points(&self, delay_ms: f64, share: f64) -> Option<Vec<(f64, f64)>> {
         let begin = *self.moments.first()?;
         let way = self.track.approach(begin, &self.moments, delay_ms)?;
@@ -106,7 +107,7 @@ impl Press {
 }
 
 impl Fit {
-    /// What `presses` say.
+    /// Computes the values from `presses`.
     pub(super) fn of(presses: &[Press]) -> Result<Self, Unfit> {
         let known: Vec<&Press> = presses.iter().filter(|press| press.is_known()).collect();
         if known.len() < 2 {
@@ -171,7 +172,7 @@ impl Fit {
     }
 }
 
-/// The delay with which the presses are nearest to one curve, and how near.
+/// The delay with which the presses are nearest to one curve, and their distance from it in mm.
 fn best_delay(presses: &[&Press]) -> (f64, f64) {
     let mut best = (0.0, f64::INFINITY);
     let (mut from, mut to) = DELAYS_MS;
@@ -189,7 +190,7 @@ fn best_delay(presses: &[&Press]) -> (f64, f64) {
     best
 }
 
-/// Root mean square distance of the way from a + b force + c force^2, each press with an a of its own.
+/// Root mean square distance of the way from a + b force + c force^2. Each press has its own a.
 fn residual_mm_at(presses: &[&Press], delay_ms: f64) -> Option<f64> {
     // Sums over all frames, of differences from the press's means.
     let [mut ff, mut fq, mut qq, mut fx, mut qx, mut xx] = [0.0; 6];
@@ -211,7 +212,7 @@ fn residual_mm_at(presses: &[&Press], delay_ms: f64) -> Option<f64> {
         count += own;
     }
     let determinant = ff * qq - fq * fq;
-    // All forces alike, or two of them: the line alone.
+    // If there are only one or two different forces, fit a line.
     let explained = if determinant > 1e-9 * ff * qq {
         let (b, c) = (
             (fx * qq - qx * fq) / determinant,
@@ -226,7 +227,7 @@ fn residual_mm_at(presses: &[&Press], delay_ms: f64) -> Option<f64> {
     Some(((xx - explained).max(0.0) / count).sqrt())
 }
 
-/// The slope of force over way, in N/mm; each press has a zero of its own.
+/// The slope of force over way, in N/mm. Each press has its own zero.
 fn slope(presses: &[&Press], delay_ms: f64) -> Option<f64> {
     let (mut ff, mut fx) = (0.0, 0.0);
     for press in presses {
@@ -249,8 +250,8 @@ mod tests {
     use super::*;
     use crate::motion::{Point, Track};
 
-    /// A press of an arm of `n_per_mm` at 5 mm/s, to `depth_mm` and back, held for 0.4 s, whose stamps
-    /// are `delay_ms` early; frames at `hz`, positions at 100 Hz.
+    /// A press of an arm of `n_per_mm` at 5 mm/s, to `depth_mm` and back, held for 0.4 s. Its
+    /// stamps are `delay_ms` early. Frames come at `hz`, positions at 100 Hz.
     fn press(n_per_mm: f64, delay_ms: f64, depth_mm: f64, hz: f64) -> Press {
         let way = |time_s: f64| {
             let load_s = depth_mm / 5.0;
@@ -314,7 +315,7 @@ mod tests {
             let fit = Fit::of(&presses).unwrap();
             assert_eq!(fit.presses, 4);
             assert!((fit.delay_ms.value - delay_ms).abs() < 5.0, "{fit:?}");
-            // What the cover gives way at half of 24 N counts too.
+            // The cover gives way too, even at half of 24 N, which lowers the stiffness found.
             let ratio = fit.n_per_mm.value / n_per_mm;
             assert!((0.75..1.01).contains(&ratio), "{fit:?}");
             assert!(
@@ -343,7 +344,7 @@ mod tests {
             Fit::of(&short),
             Err(Unfit::Few { presses: 2, .. })
         ));
-        // The arm stands while the force comes and goes.
+        // The arm stands still while the force comes and goes.
         let mut still = [good(), good()];
         for press in &mut still {
             press.track = Track::default();

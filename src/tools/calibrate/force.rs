@@ -1,54 +1,56 @@
-//! From known weights on the sensor to newtons.
+//! Computes newtons per count from known weights on the sensor.
 //!
-//! A weight N presses c counts on each taxel, so N = a (c1^e + c2^e + ...). With e = 1 that is a line,
-//! whose a is `newtons_per_count`; film arrays are often nearer to another power.
+//! A weight of N newtons gives c1, c2, ... counts on the taxels, so N = a (c1^e + c2^e + ...). With
+//! e = 1, this is a line whose a is `newtons_per_count`. Film arrays are often nearer to another
+//! power.
 
 use super::gather::Press;
 use crate::tare;
 
-/// What known weights say.
+/// The values that known weights give.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Fit {
-    /// Each weight, and the sensor's reading with the values below.
+    /// Each weight, and the sensor's reading of it with the values below, in newtons.
     pub(super) weights: Vec<(f64, f64)>,
     pub(super) newtons_per_count: f64,
-    /// The same of each weight alone: least and greatest.
+    /// The least and the greatest `newtons_per_count` of single weights.
     pub(super) alone: [f64; 2],
     pub(super) exponent: f64,
     /// Root mean square error of a line, as a part of the weight.
     pub(super) line_error: f64,
-    /// The same with the best exponent, if the weights can say one.
+    /// The best exponent and the error that it leaves, if the weights can determine an exponent.
     pub(super) power: Option<(f64, f64)>,
 }
 
-/// Why weights say nothing.
+/// The reason why weights give no values.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Unfit {
-    /// A press without force.
+    /// A press shows no force.
     #[error("press {press}, of {newtons} N, shows no force: was the weight on the sensor?")]
     Nothing {
-        /// From 1.
+        /// The number of the press, from 1.
         press: usize,
-        /// The weight.
+        /// The weight in newtons.
         newtons: f64,
     },
 }
 
-/// The weight rests while the sum of counts has at least this share of its greatest.
+/// The weight is at rest while the sum of counts has at least this share of its maximum.
 const RESTING_SHARE: f64 = 0.8;
-/// An exponent is proposed from this number of different weights on.
+/// An exponent needs at least this number of different weights.
 const LEAST_WEIGHTS: usize = 3;
-/// The heaviest of them is this many times the lightest, at least.
+/// For an exponent, the heaviest weight must be at least this many times the lightest.
 const LEAST_RATIO: f64 = 2.0;
-/// No exponent is proposed where a line is wrong by less than this part.
+/// No exponent is proposed if the relative error of a line is at most this.
 const LEAST_ERROR: f64 = 0.02;
-/// The exponent leaves this share of the line's error, at most.
+/// The exponent must leave less than this share of the line's error.
 const MOST_LEFT: f64 = 0.5;
 /// The step between the exponents that are tried.
 const STEP: f64 = 0.01;
 
 impl Fit {
-    /// What `weights` in newtons say, each with its press. `settings` are those of the presses.
+    /// Computes the values from `weights` in newtons, each with its press. `settings` are those
+    /// with which the presses were recorded.
     pub(super) fn of(weights: &[(f64, &Press)], settings: &tare::Settings) -> Result<Self, Unfit> {
         let mut resting = Vec::with_capacity(weights.len());
         for (press, (newtons, frames)) in (1..).zip(weights) {
@@ -104,7 +106,8 @@ impl Fit {
     }
 }
 
-/// The counts of the frame that stands for a press while its weight rests: the one in the middle.
+/// The counts of one frame of a press: the median frame, by its sum, of those in which the weight
+/// is at rest.
 fn rest(press: &Press, settings: &tare::Settings) -> Vec<f64> {
     let (a, e) = (
         f64::from(settings.newtons_per_count),
@@ -131,8 +134,8 @@ fn raised(counts: &[f64], exponent: f64) -> f64 {
     counts.iter().map(|count| count.powf(exponent)).sum()
 }
 
-/// The a that fits weights best with this exponent, and the root mean square error that is left, as a
-/// part of the weight.
+/// The a that fits the weights best with this exponent, and the root mean square error that is
+/// left, as a part of the weight.
 fn scale(weights: &[(f64, Vec<f64>)], exponent: f64) -> (f64, f64) {
     let logs = weights
         .iter()
@@ -147,7 +150,8 @@ fn scale(weights: &[(f64, Vec<f64>)], exponent: f64) -> (f64, f64) {
 mod tests {
     use super::*;
 
-    /// A press of `newtons` over 20 taxels of a film where `a` and `e` hold, as `settings` read it.
+    /// A press of `newtons` over 20 taxels of a film with the values `a` and `e`, as a sensor with
+    /// `settings` reads it.
     fn press(newtons: f64, a: f64, e: f64, settings: &tare::Settings) -> Press {
         let shares = (1..=20).map(|n| f64::from(n) / 210.0);
         let read = |count: f64| {
@@ -196,7 +200,7 @@ mod tests {
         for (newtons, read) in &found.weights {
             assert!((read / newtons - 1.0).abs() < 0.01, "{found:?}");
         }
-        // Two weights say no curve.
+        // Two different weights cannot determine an exponent.
         assert_eq!(fit(0.01, 1.4, &[2.0, 20.0, 20.0], &settings).exponent, 1.0);
     }
 

@@ -1,4 +1,4 @@
-//! The presses of a recording, each with where the arm was.
+//! The presses of a recording, each with the positions of the arm.
 
 use std::io::{BufReader, Read};
 use std::sync::Arc;
@@ -17,15 +17,15 @@ use crate::verdict::Hrn;
 /// One press.
 #[derive(Debug, Default)]
 pub(super) struct Press {
-    /// Moments of its frames in contact.
+    /// The moments of the frames in contact.
     pub(super) moments: Vec<Duration>,
-    /// Newtons on each taxel in them.
+    /// The newtons on each taxel, for each of these frames.
     pub(super) frames: Vec<Vec<f32>>,
-    /// Total force in them.
+    /// The total force of each of these frames, in newtons.
     pub(super) forces_n: Vec<f64>,
-    /// Where the arm was.
+    /// The positions of the arm.
     pub(super) track: Track,
-    /// What was said of the sensor then; `None` where nobody said it.
+    /// The description of the sensor at that time. `None` if the file has none.
     pub(super) described: Option<Arc<Description>>,
 }
 
@@ -36,13 +36,13 @@ struct Taken {
     newtons: Vec<f32>,
 }
 
-/// Why a recording cannot be read.
+/// The reason why a recording cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum Unreadable {
-    /// It is damaged, or none of ours.
+    /// The recording is damaged, or of another program.
     #[error(transparent)]
     Recording(#[from] recording::Error),
-    /// It describes what cannot be.
+    /// The recording describes an impossible sensor.
     #[error(transparent)]
     Playback(#[from] PlaybackError),
 }
@@ -53,11 +53,11 @@ impl From<std::io::Error> for Unreadable {
     }
 }
 
-/// So long after a press its positions have come.
+/// This long after a press, all its positions have come.
 const AFTER: Duration = Duration::from_millis(800);
 
-/// The presses that a file holds of a sensor: of the one of this name, or of this one where the file has
-/// bytes alone.
+/// The presses of `sensor` in a file. A recording tells sensors apart by name. In a file of raw
+/// bytes, all bytes are those of `sensor`.
 pub(super) fn presses(
     file: impl Read,
     sensor: &Sensor,
@@ -81,7 +81,8 @@ fn of_recording(file: impl Read, sensor: &str, hrn: Arc<Hrn>) -> Result<Vec<Pres
         let at = found.at;
         match &found.entry {
             Entry::Input(Input::Motion(points)) => {
-                // A step back makes the approach of its press unknown.
+                // An error means that the time of a point went back. The approach of its press is
+                // then unknown.
                 let _ = gathered.track.push(points);
             }
             Entry::Settings(sensor) => gathered.describe(&sensor.description),
@@ -97,7 +98,7 @@ fn of_recording(file: impl Read, sensor: &str, hrn: Arc<Hrn>) -> Result<Vec<Pres
 fn of_bytes(mut file: impl Read, sensor: &Sensor, hrn: Arc<Hrn>) -> std::io::Result<Vec<Press>> {
     let mut bytes = Vec::new();
     file.read_to_end(&mut bytes)?;
-    // Its frames have times of their own, which count from here.
+    // The frames of raw bytes get their times from the frame rate, counted from here.
     let start = Stamp {
         mono: Duration::ZERO,
         wall: Timestamp::UNIX_EPOCH,
@@ -113,20 +114,21 @@ fn of_bytes(mut file: impl Read, sensor: &Sensor, hrn: Arc<Hrn>) -> std::io::Res
     Ok(gathered.end())
 }
 
-/// Bytes whose frames are held at a time.
+/// The number of bytes whose frames are held at a time.
 const CHUNK_BYTES: usize = 1 << 16;
 
-/// What has been read so far.
+/// The presses and the state of reading so far.
 #[derive(Default)]
 struct Gathered {
     presses: Vec<Press>,
     track: Track,
     described: Option<Arc<Description>>,
-    /// Those of a press under way or of one in `ended`, and the newest.
+    /// The frames of the press under way and of those in `ended`, and the newest frame.
     frames: Vec<Taken>,
-    /// First frame of the press under way.
+    /// The number of the first frame of the press under way.
     began: Option<u64>,
-    /// First and last frame of presses that wait for their last positions, and when each ended.
+    /// The first and the last frame of each press that waits for its last positions, and when it
+    /// ended.
     ended: Vec<(u64, u64, Duration)>,
 }
 

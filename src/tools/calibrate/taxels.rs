@@ -1,54 +1,55 @@
-//! From presses at many places, or from an even pressure, to a gain for each taxel.
+//! Computes a gain for each taxel from presses at many places, or from an even pressure.
 //!
-//! Under a smooth pressure the logarithm of a taxel's reading is the mean of its two neighbours' along a
-//! row or a column; what differs is the gains of the three. Each such trio counts once a press, in the
-//! middle of the contact. Under a pressure on the whole array a taxel is also compared with the array's
-//! median. The gains that fit all of it best are found by least squares, and drawn towards 1 where there
-//! are few presses.
+//! Under a smooth pressure, the logarithm of a taxel's reading is the mean of those of its two
+//! neighbours along a row or a column. A difference comes from the gains of the three. Each such
+//! trio counts once a press, in the middle of the contact. Under a pressure on the whole array, a
+//! taxel is also compared with the array's median. The gains that fit all comparisons best are
+//! found by least squares, and drawn towards 1 where there are few presses.
 
 use crate::frame::{Array, TAXELS};
 
-/// A press with the gains taken off.
+/// A press without gains.
 pub(super) struct Plain {
-    /// Newtons on each taxel of each frame, as they would read with gains of 1.
+    /// The newtons on each taxel of each frame, as they would read with gains of 1.
     pub(super) frames: Vec<Vec<f32>>,
 }
 
-/// What is compared with what.
+/// The two sides of a comparison.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Compared {
-    /// A taxel with two on either side of it: places in the frame.
+    /// A taxel and its two neighbours on opposite sides, as places in the frame.
     Trio(usize, [usize; 2]),
-    /// A taxel with the array's median.
+    /// A taxel and the array's median.
     Array(usize),
 }
 
 /// One comparison, over all presses.
 struct Row {
     compared: Compared,
-    /// Median over the presses.
+    /// The median over the presses.
     value: f64,
     presses: usize,
 }
 
-/// What presses say.
+/// The gains that presses give.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Fit {
-    /// By what each taxel's newtons are multiplied, `[rows, cols]` of the array; 1 where nothing is known.
+    /// The factor for each taxel's newtons, `[rows, cols]` of the array. 1 where nothing is known.
     pub(super) gains: Vec<f32>,
-    /// Presses in which each taxel was compared, likewise.
+    /// The number of presses in which each taxel was compared, `[rows, cols]` of the array.
     pub(super) presses: Vec<usize>,
-    /// Presses that loaded the whole array.
+    /// The number of presses that loaded the whole array.
     pub(super) even: usize,
     /// Standard deviation of the logarithm of the gains that were measured.
     pub(super) spread: f64,
-    /// How wrong such a gain is, as a part of it: half of what two halves of the presses differ by.
+    /// The relative error of such a gain: half of the standard deviation of the difference between
+    /// two halves of the presses.
     pub(super) error: f64,
-    /// Taxels that read nothing while all around them did, `[row, col]`.
+    /// Taxels that read nothing while all their neighbours did, `[row, col]`.
     pub(super) dead: Vec<[usize; 2]>,
 }
 
-/// Why presses say nothing.
+/// The reason why presses give no gains.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Unfit {
     /// Too few taxels were loaded well.
@@ -57,40 +58,42 @@ pub enum Unfit {
          more places, or with something wide and soft ({presses} presses found)"
     )]
     Few {
-        /// Taxels.
+        /// The number of taxels that were loaded well in two presses or more.
         found: usize,
-        /// Taxels that are alive.
+        /// The number of live taxels.
         taxels: usize,
-        /// Presses.
+        /// The number of presses.
         presses: usize,
     },
 }
 
-/// A taxel is loaded well with so much: five counts of 0.04 N.
+/// A taxel is loaded well from this force on: five counts of 0.04 N.
 const LEAST_N: f32 = 0.2;
-/// An array of which this share is loaded well is under an even pressure.
+/// The pressure on an array is even if this share of its taxels is loaded well.
 const EVEN_SHARE: f64 = 0.9;
-/// A taxel is dead that reads nothing in this share of the presses around it,
+/// A taxel is dead if it reads nothing in this share of the presses around it.
 const DEAD_SHARE: f64 = 0.5;
-/// if there are so many.
+/// The least number of presses around a taxel that can show that it is dead.
 const DEAD_PRESSES: usize = 3;
-/// Gains are expected to spread by this much (standard deviation of the logarithm). On a public film
-/// array it was 0.16 between taxels, 0.03 between rows and 0.055 between columns.
+/// The expected spread of gains (standard deviation of the logarithm). On a public film array it
+/// was 0.16 between taxels, 0.03 between rows and 0.055 between columns.
 const EXPECTED_SPREAD: f64 = 0.18;
-/// No press says a comparison more exactly than this.
+/// The least noise of one press in a comparison.
 const LEAST_NOISE: f64 = 0.02;
-/// A pressure is never as smooth as supposed, however many presses there are: a comparison with two sides is
-/// wrong by this much, and one with an even array by less. Between 0.05 and 0.2 simulated presses hardly
-/// care; without it, slow waves over the array would be taken for gains.
+/// The errors of a comparison with two sides and of one with an even array. They remain however
+/// many presses there are, because a pressure is never as smooth as supposed. Any `UNEVEN` from
+/// 0.05 to 0.2 changes little for simulated presses. Without it, slow waves over the array would be
+/// taken for gains.
 const UNEVEN: f64 = 0.1;
 const EVEN: f64 = 0.02;
-/// So many taxels must have been reached.
+/// The least number of taxels that must have been measured.
 const LEAST_TAXELS: usize = 16;
-/// Of the method of conjugate gradients. 784 would solve it exactly, were there no rounding.
+/// The most steps of the method of conjugate gradients. Without rounding, 784 steps would be exact.
 const STEPS: usize = 400;
 
 impl Fit {
-    /// What presses on `array` say. `dead` are the taxels whose newtons are no measurement.
+    /// Computes the gains from presses on `array`. `dead` are the taxels whose newtons are no
+    /// measurement.
     pub(super) fn of(presses: &[Plain], array: Array, dead: &[[usize; 2]]) -> Result<Self, Unfit> {
         let mut is_dead = vec![false; TAXELS];
         for &[row, col] in dead {
@@ -135,7 +138,8 @@ impl Fit {
     }
 }
 
-/// The logarithm of each taxel's sensitivity, 0 in the mean, and how many presses tell of it.
+/// The logarithm of each taxel's sensitivity, with a mean of 0, and the number of presses in which
+/// each taxel was compared.
 fn solve(presses: &[&Plain], array: Array, is_dead: &[bool]) -> (Vec<f64>, Vec<usize>) {
     let (rows, noise) = compare(presses, array, is_dead);
     let mut reached = vec![0; TAXELS];
@@ -180,7 +184,7 @@ fn solve(presses: &[&Plain], array: Array, is_dead: &[bool]) -> (Vec<f64>, Vec<u
         back(&mut wanted, row.compared, weight(row) * row.value);
     }
     let mut logs = conjugate_gradients(apply, &wanted);
-    // The scale of all of them is that of newtons_per_count.
+    // The common scale of all taxels belongs to `newtons_per_count`, so remove the mean.
     let measured: Vec<usize> = (0..TAXELS).filter(|&place| reached[place] > 0).collect();
     let mean = measured.iter().map(|&p| logs[p]).sum::<f64>() / measured.len().max(1) as f64;
     measured.iter().for_each(|&place| logs[place] -= mean);
@@ -246,7 +250,8 @@ fn compare(presses: &[&Plain], array: Array, is_dead: &[bool]) -> (Vec<Row>, f64
     for (place, values) in evens.into_iter().enumerate() {
         add(Compared::Array(place), values);
     }
-    // A dome is higher in its middle than around it, wherever it is.
+    // A dome is higher in its middle than around it, wherever it is. So remove the median over all
+    // trios.
     let is_trio = |row: &&mut Row| matches!(row.compared, Compared::Trio(..));
     let mut curved: Vec<f64> = rows
         .iter()
@@ -257,12 +262,12 @@ fn compare(presses: &[&Plain], array: Array, is_dead: &[bool]) -> (Vec<Row>, f64
     rows.iter_mut()
         .filter(is_trio)
         .for_each(|row| row.value -= curved);
-    // Of a normal distribution the median distance from the median is 0.6745 standard deviations.
+    // In a normal distribution, the median distance from the median is 0.6745 standard deviations.
     let noise = median(&mut rests).map_or(LEAST_NOISE, |rest| (rest / 0.6745).max(LEAST_NOISE));
     (rows, noise)
 }
 
-/// The logarithm of each taxel's newtons; NaN where it is not loaded well.
+/// The logarithm of each taxel's newtons. NaN where the taxel is not loaded well.
 fn logs(frame: &[f32]) -> Vec<f64> {
     let log = |&newtons: &f32| match newtons >= LEAST_N {
         true => f64::from(newtons).ln(),
@@ -299,7 +304,8 @@ fn is_even(press: &Plain, array: Array, is_dead: &[bool]) -> bool {
     })
 }
 
-/// Whether a taxel reads nothing while all that touch it along its row and column are loaded well.
+/// Whether a taxel reads nothing while all its live neighbours along its row and column are loaded
+/// well.
 fn looks_dead(presses: &[Plain], array: Array, is_dead: &[bool], place: usize) -> bool {
     let Some((row, col)) = array.position(place) else {
         return false;

@@ -1,4 +1,4 @@
-//! What was pressed beside what it was judged to be: a line a press, and a count at the end.
+//! One line for each press, with the pressed material beside the verdict, and a count at the end.
 //!
 //! In: events of the daemon. Out: lines for people.
 
@@ -6,10 +6,10 @@ use serde_json::Value;
 
 use crate::simulator::Material;
 
-/// The presses so far.
+/// The counts of the presses so far.
 #[derive(Debug, Default)]
 pub(super) struct Account {
-    /// Press k is of material k - 1 of these, over and over.
+    /// The materials in the order of the presses. After the last one, the first one follows again.
     materials: Vec<Material>,
     /// Columns that the longest label of a level takes.
     label_columns: usize,
@@ -81,7 +81,7 @@ impl Account {
                 (said, if is_right { "ok" } else { "wrong" })
             }
         };
-        // A label, a blank and up to 100 per cent.
+        // Room for a label, a blank and `100 %`.
         let columns = self.label_columns + 6;
         format!("press {number:<2} {pressed}  ->  {said:<columns$}  {mark:<5}  {force_n:4.1} N")
     }
@@ -101,7 +101,7 @@ impl Account {
         self.materials.get(index).copied()
     }
 
-    /// The count.
+    /// The line with the counts.
     pub(super) fn close(&self) -> String {
         let Self {
             presses,

@@ -1,4 +1,4 @@
-//! Where a demonstration keeps its port and its socket, and how others find them.
+//! The directory of a demonstration, with its port and its socket, and the search for such sockets.
 
 use std::env;
 use std::fs::{self, DirBuilder};
@@ -6,14 +6,15 @@ use std::io::{self, ErrorKind};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
-/// How the directory of every demonstration begins.
+/// The first part of the name of every demonstration's directory.
 const PREFIX: &str = "hardnessd-demo-";
 
 /// The demonstration's own directory. Dropping this value removes it.
 pub(super) struct Place(PathBuf);
 
 impl Place {
-    /// Makes a directory in the user's runtime directory, else in the directory for temporary files.
+    /// Makes a directory in the user's runtime directory, else in the directory for temporary
+    /// files.
     pub(super) fn new() -> io::Result<Self> {
         let mut outcome = Err(ErrorKind::NotFound.into());
         for directory in directories().filter(|one| one.as_os_str().len() <= LONGEST_BYTES) {
@@ -29,7 +30,8 @@ impl Place {
         let mut path = directory.join(format!("{PREFIX}{}", std::process::id()));
         loop {
             match DirBuilder::new().mode(0o700).create(&path) {
-                // In a container that is started again, one that was killed had the same number.
+                // In a restarted container, a killed demonstration may have had the same process
+                // id.
                 Err(error) if error.kind() == ErrorKind::AlreadyExists => {
                     path.as_mut_os_string().push("-");
                 }
@@ -57,7 +59,8 @@ impl Drop for Place {
 
 const SOCKET: &str = "events.sock";
 
-/// Longest directory to make one in: the path of a socket has a bound of 107 bytes.
+/// The longest path of a directory in which to make the demonstration's own. The path of a socket
+/// has at most 107 bytes.
 const LONGEST_BYTES: usize = 60;
 
 fn directories() -> impl Iterator<Item = PathBuf> {
@@ -68,7 +71,8 @@ fn directories() -> impl Iterator<Item = PathBuf> {
         .chain([env::temp_dir()])
 }
 
-/// Sockets of this user's demonstrations, the newest first. A killed demonstration may have left one.
+/// Sockets of this user's demonstrations, the newest first. A killed demonstration may have left
+/// one.
 pub(in crate::tools) fn sockets() -> Vec<PathBuf> {
     let uid = rustix::process::geteuid().as_raw();
     let mut found = Vec::new();

@@ -32,7 +32,8 @@ pub(super) struct User {
     pub(super) uid: u32,
     /// The groups of the process. `/etc/group` may list others.
     pub(super) gids: Vec<u32>,
-    /// Asks the kernel whether this user may read and write. The kernel also knows access lists and containers.
+    /// Asks the kernel whether this user may read and write. The kernel also knows access lists and
+    /// containers.
     pub(super) access: fn(&Path) -> io::Result<()>,
 }
 
@@ -91,8 +92,8 @@ pub(super) fn refused(root: &Path, port: &Path) -> Option<Fault> {
     })
 }
 
-/// The kernel's name of what the character device `number` is, if that is no tty. Ptys have no
-/// entry there, and where there is no sysfs nothing is known.
+/// The kernel's name for the kind of the character device `number`, if it is no tty. `None` for a
+/// pty, because it has no entry in sysfs, and on a system without sysfs.
 fn device_of_another_kind(root: &Path, number: u64) -> Option<String> {
     let (major, minor) = (rustix::fs::major(number), rustix::fs::minor(number));
     let entry = format!("sys/dev/char/{major}:{minor}/subsystem");
@@ -101,7 +102,7 @@ fn device_of_another_kind(root: &Path, number: u64) -> Option<String> {
     (name != "tty").then(|| format!("a device of the kind {name}"))
 }
 
-/// All that is wrong with `port`, an absolute path under `root`.
+/// All faults of `port`, an absolute path under `root`.
 pub(super) fn examine(root: &Path, port: &Path, user: &User) -> Vec<Fault> {
     let mut faults = in_the_way(root, port, user);
     if let Some(device) = device(root, port) {
@@ -122,7 +123,7 @@ pub(super) fn in_the_way(root: &Path, port: &Path, user: &User) -> Vec<Fault> {
         .collect()
 }
 
-/// What `port` resolves to, without the root.
+/// The path of the device that `port` leads to, without the root.
 fn device(root: &Path, port: &Path) -> Option<PathBuf> {
     let device = under(root, port).canonicalize().ok()?;
     let device = device.strip_prefix(root.canonicalize().ok()?).ok()?;
@@ -191,7 +192,8 @@ fn denied(root: &Path, device: &Path, user: &User) -> Option<Fault> {
     })
 }
 
-/// Processes but `own` that have it open. Of other users' processes only root sees this.
+/// A fault for each process other than `own` that has the device open. Only root can see this of
+/// other users' processes.
 fn held(root: &Path, device: &Path, own: u32) -> Vec<Fault> {
     let mut faults = Vec::new();
     for pid in processes(root).filter(|&pid| pid != own) {
@@ -290,7 +292,8 @@ fn latency(root: &Path, device: &Path) -> Option<Fault> {
     })
 }
 
-/// The shipped udev rule, which mends ModemManager and the latency timer.
+/// The commands that install the shipped udev rule. It keeps ModemManager away and sets the latency
+/// timer.
 const UDEV_RULE: &str = "sudo cp systemd/99-hardnessd.rules /etc/udev/rules.d/ && \
     sudo udevadm control --reload && sudo udevadm trigger";
 

@@ -13,12 +13,12 @@ use crate::tools::pty::Pty;
 
 const PORT: &str = "/dev/serial/by-id/usb-film-if00";
 
-/// What it says to opening a port.
+/// The kernel's answer to a process that opens a port.
 type Kernel = fn(&Path) -> io::Result<()>;
 const GRANTED: Kernel = |_| Ok(());
 const REFUSED: Kernel = |_| Err(io::ErrorKind::PermissionDenied.into());
 
-/// A machine without fault: an FTDI adapter that its user may use.
+/// A machine without a fault. Its user may open its FTDI adapter.
 struct Machine(TempDir);
 
 impl Machine {
@@ -48,14 +48,14 @@ impl Machine {
         fs::write(path, text).unwrap();
     }
 
-    /// As a user in the device's group.
+    /// The faults for a user in the device's group.
     fn faults(&self, port: &str) -> Vec<String> {
         let gid = fs::metadata(self.path("dev/ttyUSB0")).unwrap().gid();
         self.faults_of(port, vec![gid])
     }
 
     fn faults_of(&self, port: &str, gids: Vec<u32>) -> Vec<String> {
-        // A kernel that goes by group and mode alone.
+        // This kernel decides by group and mode alone.
         let gid = fs::metadata(self.path("dev/ttyUSB0")).unwrap().gid();
         let access = if gids.contains(&gid) {
             GRANTED
@@ -103,7 +103,7 @@ fn a_missing_port_is_answered_by_those_that_are_there() {
 fn a_stranger_to_the_group_is_told_how_to_join() {
     let machine = Machine::new();
     let gid = fs::metadata(machine.path("dev/ttyUSB0")).unwrap().gid();
-    // Tests run as root too, whose files are root's: a group that nobody shall join.
+    // If the tests run as root, the files belong to the group root, which nobody should join.
     let denied = machine.faults_of(PORT, vec![gid + 1]);
     if gid == 0 {
         return one(
@@ -142,11 +142,12 @@ fn the_group_of_the_device_is_the_one_to_join() {
 fn what_the_kernel_says_goes_before_mode_and_group() {
     let machine = Machine::new();
     let gid = fs::metadata(machine.path("dev/ttyUSB0")).unwrap().gid();
-    // An access list, as of systemd's uaccess, lets in who is in no group of the port ...
+    // An access list, such as that of systemd's uaccess, can grant access to a user outside the
+    // group.
     let stranger = vec![gid + 1];
     let faults = machine.faults_under(PORT, stranger, GRANTED);
     assert_eq!(faults, Vec::<String>::new());
-    // ... and another, or a container, keeps out who is.
+    // Another access list, or a container, can refuse a user in the group.
     one(
         &machine.faults_under(PORT, vec![gid], REFUSED),
         &["refused to ada, whom its mode would let in", "getfacl"],
@@ -197,10 +198,10 @@ fn the_daemon_that_holds_the_port_is_stopped_as_a_service() {
         &machine.faults(PORT),
         &["process 88, the daemon", "systemctl stop hardnessd"],
     );
-    // A tool of the same name is no service.
+    // Another subcommand of `hardnessd` is not a service.
     machine.put("proc/88/cmdline", "hardnessd\0record\0--config\0x\0");
     one(&machine.faults(PORT), &["(hardnessd): kill 88"]);
-    // One that made the port is in nobody's way.
+    // A simulator made the port and does not keep others from opening it.
     machine.put("proc/88/cmdline", "hardnessd\0simulate\0--link\0port\0");
     assert_eq!(machine.faults(PORT), Vec::<String>::new());
 }
@@ -224,7 +225,7 @@ fn what_is_no_serial_port_is_said_to_be_none() {
     assert_eq!(refusal(Path::new("/dev/no-such")), None);
 }
 
-/// Ends with the test.
+/// A process that ends with the test.
 struct Holder(Child);
 
 impl Drop for Holder {

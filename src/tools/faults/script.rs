@@ -1,4 +1,4 @@
-//! The file of a script: TOML in, faults out, or what is wrong with it.
+//! Reads the file of a script: TOML in, faults or an error out.
 
 use std::path::{Path, PathBuf};
 
@@ -22,11 +22,11 @@ pub(crate) const FORMAT: &str = r#"The faults of --faults FILE, a TOML file; tim
 `for_s` is needed where it applies; `bytes`, `bits` and `frames` are 1 unless given, and `bytes`
 and `bits` at most 1000000."#;
 
-/// Bytes or bits struck at a frame: a minute and a half of a line at 115,200 baud, far beyond what
-/// a frame has.
+/// The most bytes or bits of a frame that a fault may strike. It is far more than a frame has: a
+/// line at 115,200 baud needs a minute and a half for this many bytes.
 const MOST_STRUCK: usize = 1_000_000;
 
-/// Why a script cannot be played.
+/// The reason why a script cannot be played.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The file cannot be read.
@@ -34,23 +34,24 @@ pub enum Error {
     Unreadable {
         /// Path of the script.
         path: PathBuf,
-        /// The reason.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// No TOML, or a key or value that cannot be used.
+    /// The file is not TOML, or has a key or value that cannot be used.
     #[error("{path}: {problem}")]
     Malformed {
         /// Path of the script.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The problem, with its place in the script.
         problem: Problem,
     },
 }
 
-/// What is wrong with a script.
+/// A problem in a script.
 #[derive(Debug, thiserror::Error)]
 pub enum Problem {
-    /// No TOML, or not these tables: in the parser's words.
+    /// The text is not TOML, or its tables are not those of a script. The field is the parser's
+    /// message in plain words.
     #[error("{0}")]
     Syntax(String),
     /// A value that cannot be used.
@@ -58,7 +59,7 @@ pub enum Problem {
     Value {
         /// Number of the fault, from 1.
         number: usize,
-        /// Which value, and why not.
+        /// The value, with the reason.
         value: Unfit,
     },
 }
@@ -77,13 +78,13 @@ pub enum Unfit {
     TooMany {
         /// The key.
         key: &'static str,
-        /// The value as given.
+        /// The value in the script.
         found: usize,
     },
     /// The time is not a number of seconds above 0.
     #[error("for_s: found {0}, expected seconds above 0")]
     Span(f64),
-    /// A fault that needs a time and has none.
+    /// The fault needs a time and has none.
     #[error("for_s: this kind of fault needs it, in seconds")]
     NoSpan,
 }
@@ -123,7 +124,7 @@ enum Kind {
     Flip,
 }
 
-/// What happens to the line for a time, or to frames.
+/// A fault of the line for a time, or a fault of a number of frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Fault {
     Unplug {

@@ -1,5 +1,5 @@
-//! A pseudo-terminal as the system gives it: the port of the simulator. The tests include this file for
-//! their terminals.
+//! A pseudo-terminal as the system gives it, for the simulator's port. The tests include this file
+//! for their terminals.
 
 use std::ffi::OsStr;
 use std::io;
@@ -10,7 +10,7 @@ use std::path::PathBuf;
 use rustix::fs::{Mode, OFlags};
 use rustix::pty::OpenptFlags;
 
-/// Both sides, and where the device is.
+/// Both sides of a pseudo-terminal, and the path of the device.
 #[derive(Debug)]
 pub(crate) struct Pair {
     pub(crate) master: OwnedFd,
@@ -19,11 +19,11 @@ pub(crate) struct Pair {
 }
 
 impl Pair {
-    /// A new one, with the settings of a fresh terminal. No child inherits it.
+    /// Makes a new pair with the settings of a fresh terminal. No child process inherits it.
     ///
     /// # Errors
     ///
-    /// If the system has none to give.
+    /// Fails if the system has no pair to give.
     pub(crate) fn open() -> io::Result<Self> {
         let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
         let master = rustix::pty::openpt(flags)?;

@@ -1,7 +1,7 @@
-//! `hardnessd record --session`: one recording for each object, labelled as its user answers.
+//! `hardnessd record --session`: one recording for each object, labelled with the user's answers.
 //!
-//! It asks on the terminal what the object is and how hard, counts the presses while they come, and goes on
-//! with the next object. `hrn-train collect` takes the files as they are.
+//! It asks on the terminal for the object's name and level, counts the presses as they come, and
+//! continues with the next object. `hrn-train collect` takes the files as they are.
 
 use std::fs::{self, File};
 use std::future::Future;
@@ -20,13 +20,13 @@ use crate::recording::{LabelError, Labels, check_label};
 
 /// The list of what was recorded, in the directory of a session.
 const LIST: &str = "session.csv";
-/// Its first line.
+/// The first line of the list.
 const HEADING: &str = "object,name,level,presses,file\n";
 
-/// Between two looks at what is recorded.
+/// The time between two updates of the progress.
 const SHOWN_EVERY: Duration = Duration::from_millis(200);
 
-/// The one who presses.
+/// The user at the terminal.
 struct User<'a> {
     lines: mpsc::Receiver<String>,
     shutdown: Pin<&'a mut dyn Future<Output = ()>>,
@@ -51,7 +51,7 @@ impl User<'_> {
         }
     }
 
-    /// The next line without the blanks around it; `None`: no more comes.
+    /// The next line, without the blanks around it. `None` if no more lines come.
     async fn line(&mut self) -> Option<String> {
         if self.has_gone {
             return None;
@@ -64,7 +64,8 @@ impl User<'_> {
         line.map(|line| line.trim().to_owned())
     }
 
-    /// Asks until the answer is usable. `None`: `q`, or no answer comes any more.
+    /// Asks until the answer is usable. Returns `None` if the answer is `q` or no more answers
+    /// come.
     async fn ask<T>(
         &mut self,
         question: &str,
@@ -84,7 +85,7 @@ impl User<'_> {
     }
 }
 
-/// Why an answer cannot be used.
+/// The reason why an answer cannot be used.
 #[derive(Debug, thiserror::Error)]
 enum Unusable {
     #[error("the name is empty: write what you will press")]
@@ -95,7 +96,7 @@ enum Unusable {
     Level(String),
 }
 
-/// What is pressed.
+/// An object to press.
 struct Object {
     number: u32,
     name: String,
@@ -113,7 +114,7 @@ enum Next {
 ///
 /// # Errors
 ///
-/// Those of [`super::run`], or if there is no terminal or the list cannot be read or written.
+/// Fails as [`super::run`] does, or if there is no terminal or the list cannot be read or written.
 pub(super) async fn run(
     directory: &Path,
     labels: &Labels,
@@ -171,7 +172,8 @@ async fn ask_for_object(user: &mut User<'_>, number: u32, setup: &Setup) -> Opti
     })
 }
 
-/// Records presses of one object, again as often as the user wants to. `false`: the user has had enough.
+/// Records presses of one object, and again if the user asks for it. Returns `false` if the user
+/// quits.
 async fn record_object(
     user: &mut User<'_>,
     object: &Object,
@@ -206,7 +208,7 @@ async fn record_object(
         };
         let presses = counted.borrow().presses;
         if presses == 0 || matches!(next, Next::Redo) {
-            // One without a press would stop `hrn-train collect`.
+            // A recording without a press would stop `hrn-train collect`.
             let _ = fs::remove_file(&path);
         } else if recorded.is_err() {
             list.add(object, presses, &file)?;
@@ -224,7 +226,7 @@ async fn record_object(
     }
 }
 
-/// Counts presses in one line until the user says what is next.
+/// Counts presses in one line until the user decides what to do next.
 async fn wait_for_user(
     user: &mut User<'_>,
     counted: &mut watch::Receiver<Progress>,
@@ -252,7 +254,8 @@ async fn wait_for_user(
     }
 }
 
-/// Writes to the terminal. One that has gone ends the session by its signal.
+/// Writes to the terminal. Errors are ignored: if the terminal has gone, its signal ends the
+/// session.
 fn say(text: &str) {
     let mut stderr = io::stderr();
     let _ = stderr.write_all(text.as_bytes());
@@ -275,7 +278,7 @@ fn slug(name: &str) -> String {
 /// `session.csv`: a line for each object.
 struct List {
     path: PathBuf,
-    /// The number of the next object: those of an earlier session go on.
+    /// The number of the next object. It continues the numbers of an earlier session.
     next: u32,
     added: u32,
 }

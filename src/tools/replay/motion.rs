@@ -5,12 +5,12 @@ use std::path::Path;
 
 use crate::motion::{FURTHEST_MM, Point};
 
-/// More than a day of positions, 100 a second.
+/// The most bytes of a file: more than a day of positions, 100 a second.
 const MOST_BYTES: u64 = 256 << 20;
-/// No recording is longer: 30 years.
+/// The greatest time in a file: 30 years, longer than any recording.
 const LONGEST_S: f64 = 1e9;
 
-/// Why positions cannot be used.
+/// The reason why positions cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The file cannot be read.
@@ -19,19 +19,19 @@ pub enum Error {
     /// The first line does not name the columns.
     #[error("1: found {0:?}, expected the names of the columns, time_s and approach_mm among them")]
     Columns(String),
-    /// A line without the two numbers.
+    /// A line lacks one of the two numbers.
     #[error("{line}: {key}: found {found:?}, expected {expected}")]
     Value {
-        /// The line, from 1.
+        /// The number of the line, from 1.
         line: usize,
-        /// The column.
+        /// The name of the column.
         key: &'static str,
-        /// What is there.
+        /// The text in the column.
         found: String,
-        /// What should be.
+        /// The expected unit.
         expected: &'static str,
     },
-    /// Another file altogether.
+    /// The file is too large to be one of positions.
     #[error(" found more than {} MB, expected fewer", MOST_BYTES >> 20)]
     TooLong,
 }
@@ -55,15 +55,15 @@ pub(super) fn load(path: &Path) -> Result<Vec<Point>, Error> {
     parse(&text)
 }
 
-/// Reads the text of such a file.
+/// Reads positions from the text of a file.
 ///
 /// # Errors
 ///
-/// If the first line does not name the columns, or another line has no number in one of them.
+/// Fails if the first line does not name the columns, or another line has no number in one of them.
 pub fn parse(text: &str) -> Result<Vec<Point>, Error> {
     let mut lines = (1..).zip(text.lines());
     let (_, names) = lines.next().unwrap_or((1, ""));
-    // A spreadsheet may have written a mark of the byte order.
+    // A spreadsheet may have written a byte order mark.
     let names = names.trim_start_matches('\u{feff}');
     let place = |name: &str| names.split(',').position(|found| found.trim() == name);
     let (Some(time), Some(approach)) = (place("time_s"), place("approach_mm")) else {

@@ -1,30 +1,37 @@
-//! Layouts that bytes may have, from what repeats in them.
+//! Finds layouts that bytes may have, from repetitions in the bytes.
 //!
-//! In: a sample of raw bytes. Out: free layouts worth decoding it with, every key given. What
-//! stands between the cells of two frames is `checksum, tail, sync, length`, of which all but the
-//! checksum is the same in every frame. So: which distances do pairs of bytes recur at; which
-//! square array fits such a distance; which bytes are constant there. Nothing is decoded here.
+//! In: a sample of raw bytes. Out: free layouts that are worth decoding it with, with every key
+//! given. Between the cells of two frames are `checksum, tail, sync, length`. All but the checksum
+//! are the same in every frame. So the search finds the distances at which pairs of bytes recur,
+//! the square arrays that fit such a distance, and the bytes that are constant at it. Nothing is
+//! decoded here.
 //!
-//! What bytes cannot tell: whether a mark stands before its cells or after them, where no checksum
-//! says it (the frames are the same); whether a zero beside a mark belongs to it or is a taxel that
-//! is never pressed; an array that is not square, but for `ascii`, or smaller than 4x4.
+//! The bytes cannot show the following:
+//!
+//! - Whether a mark comes before its cells or after them, if there is no checksum. The frames are
+//!   the same.
+//! - Whether a zero beside a mark belongs to the mark or is a taxel that is never pressed.
+//! - An array that is smaller than 4x4.
+//! - An array that is not square, except in `ascii`.
 
 use std::collections::BTreeMap;
 
 use crate::frame::{Array, COLS, ROWS};
 use crate::wire::{Cell, Checksum, HexBytes, LengthField, Preset, Settings};
 
-/// Smallest side of an array looked for: below it, any short repetition would be one.
+/// The smallest side of an array that is looked for. Any short repetition would fit a smaller
+/// array.
 const SMALLEST_SIDE: usize = 4;
-/// Most bytes of a frame beside its cells: `jq-u16` has 8.
+/// The most bytes of a frame beside its cells: `jq-u16` has 8.
 const MOST_OVERHEAD_BYTES: usize = 12;
-/// Distances looked into. Rows of a press recur too, so the frame's is not always the first.
+/// The number of distances that are examined. Rows of a press recur too, so the distance of frames
+/// is not always the first.
 const PERIODS: usize = 8;
-/// Recurrences at a distance that are no accident.
+/// With fewer recurrences, a distance may be an accident.
 const LEAST_RECURRENCES: usize = 3;
-/// Share of frames in which a constant byte is undamaged.
+/// The least share of frames in which a constant byte has its value: some frames are damaged.
 const CONSTANT_SHARE: f64 = 0.75;
-/// Constant stretches looked into for each distance.
+/// The number of constant stretches that are examined for each array and checksum.
 const BLOCKS: usize = 4;
 
 const CHECKSUMS: [Checksum; 5] = [
@@ -35,14 +42,15 @@ const CHECKSUMS: [Checksum; 5] = [
     Checksum::Crc16Ccitt,
 ];
 
-/// What the constant bytes of a frame of `period` bytes must tell, in bits: as much as one byte that
-/// stands once a frame and hardly anywhere else, but no more than one byte of noise.
+/// The least information of the constant bytes in a frame of `period` bytes, in bits. It is about
+/// that of one byte that occurs once a frame and hardly anywhere else, but at most that of one byte
+/// of noise.
 fn least_bits(period: usize) -> f64 {
     f64::min(8.0, 0.85 * (period as f64).log2())
 }
 
-/// Layouts worth trying, each with the bits that its constant bytes tell. Cells of two bytes are
-/// taken as low byte first: which it is shows only in the frames.
+/// Layouts worth trying, each with the information of its constant bytes in bits. Cells of two
+/// bytes are taken as low byte first, because only the frames show the order.
 pub(super) fn candidates(bytes: &[u8]) -> Vec<(Settings, u32)> {
     let rarity = rarity(bytes);
     let mut found = Vec::new();
@@ -52,7 +60,7 @@ pub(super) fn candidates(bytes: &[u8]) -> Vec<(Settings, u32)> {
             for checksum in CHECKSUMS {
                 let constant = overhead.saturating_sub(checksum.bytes());
                 for (bits, block) in constant_blocks(&columns, constant, &rarity) {
-                    // A header of zeros would be found in every frame at rest, again and again.
+                    // A header of zeros would be found at many places of every frame at rest.
                     let is_header = |header: &[u8]| {
                         header.is_empty() || told(header, &rarity) >= least_bits(period)
                     };
@@ -116,7 +124,7 @@ fn payloads(period: usize) -> Vec<(usize, Cell, usize)> {
     payloads
 }
 
-/// For each byte of a frame, counted from `mark`: its value, if that is constant.
+/// The value of each byte of a frame, counted from `mark`, if that value is constant.
 fn columns(bytes: &[u8], period: usize, mark: u16) -> Vec<Option<u8>> {
     let is_mark = |at: usize| bytes.get(at..at + 2) == Some(&mark.to_be_bytes()[..]);
     let mut counts = vec![[0_u32; 256]; period];
@@ -134,8 +142,8 @@ fn columns(bytes: &[u8], period: usize, mark: u16) -> Vec<Option<u8>> {
         .collect()
 }
 
-/// Stretches of `length` constant bytes and the bits they tell, most first: cells are constant too
-/// where nothing presses, but those are zeros, of which there are many.
+/// Stretches of `length` constant bytes with their information in bits, most first. Cells are
+/// constant too where nothing presses, but those are zeros, which are frequent.
 fn constant_blocks(
     columns: &[Option<u8>],
     length: usize,
@@ -158,13 +166,14 @@ fn constant_blocks(
     blocks
 }
 
-/// Bits that `block` tells.
+/// The information of `block`, in bits.
 fn told(block: &[u8], rarity: &[f64; 256]) -> f64 {
     block.iter().map(|&byte| rarity[usize::from(byte)]).sum()
 }
 
-/// How much each byte tells, in bits: the rarer, the more. What a quarter of all are is a taxel at rest
-/// and tells nothing: some of them beside a mark would make it a better one.
+/// The information of each byte value, in bits. A rare value has more. A value that makes up a
+/// quarter of all bytes is a taxel at rest and counts 0. Otherwise, such bytes beside a mark would
+/// improve the mark.
 fn rarity(bytes: &[u8]) -> [f64; 256] {
     let mut counts = [1_u32; 256];
     for &byte in bytes {
@@ -177,8 +186,8 @@ fn rarity(bytes: &[u8]) -> [f64; 256] {
     })
 }
 
-/// The layout whose constant bytes are `block`: first `tail` bytes of tail, then sync and, if the
-/// bytes say so, length.
+/// The layout whose constant bytes are `block`: first `tail` bytes of tail, then sync, then a
+/// length if the last bytes hold the right one.
 fn free(block: &[u8], tail: usize, side: usize, cell: Cell, checksum: Checksum) -> Settings {
     let (tail, header) = block.split_at(tail);
     let payload_bytes = side * side * if cell == Cell::U8 { 1 } else { 2 };
@@ -212,7 +221,7 @@ fn free(block: &[u8], tail: usize, side: usize, cell: Cell, checksum: Checksum) 
     }
 }
 
-/// The array that most blocks of lines have, if these are rows of a text.
+/// The array that most blocks of lines have, if the bytes are rows of text.
 pub(super) fn text_array(bytes: &[u8]) -> Option<Array> {
     let words = |line: &[u8]| {
         line.split(|byte| matches!(byte, b' ' | b'\t' | b'\r' | b','))
@@ -224,14 +233,14 @@ pub(super) fn text_array(bytes: &[u8]) -> Option<Array> {
     most_frequent(blocks.filter_map(|block| Some((block.len(), *block.last()?))))
 }
 
-/// The square array that most stretches between two FF have cells for.
+/// The square array whose number of cells is most frequent among the stretches between two FF.
 pub(super) fn marked_array(bytes: &[u8]) -> Option<Array> {
     let stretches = bytes.split(|&byte| byte == 0xFF);
     most_frequent(stretches.filter_map(|stretch| square(stretch.len())))
 }
 
-/// The square array that most stretches between two FF unpack to, of those with zeros: without any
-/// they are those of `ff-tail`, too.
+/// The square array that most stretches between two FF unpack to. Only stretches with zeros count,
+/// because those without also fit `ff-tail`.
 pub(super) fn packed_array(bytes: &[u8]) -> Option<Array> {
     let cells = |packed: &[u8]| {
         let mut bytes = packed.iter();
@@ -250,13 +259,14 @@ pub(super) fn packed_array(bytes: &[u8]) -> Option<Array> {
     most_frequent(packed.filter_map(cells).filter_map(square))
 }
 
-/// Rows and columns of the square array of so many cells.
+/// Rows and columns of the square array with this number of cells, if there is one.
 fn square(cells: usize) -> Option<(usize, usize)> {
     let side = cells.isqrt();
     (side * side == cells).then_some((side, side))
 }
 
-/// The most frequent array, the largest of several; of those too small or too large, none.
+/// The most frequent array. Of several, the largest. Arrays that are too small or too large do not
+/// count.
 fn most_frequent(arrays: impl Iterator<Item = (usize, usize)>) -> Option<Array> {
     let mut counts: BTreeMap<(usize, usize), usize> = BTreeMap::new();
     for (rows, cols) in arrays {

@@ -1,7 +1,7 @@
-//! How well layouts explain bytes, and which does best.
+//! Measures how well layouts explain bytes, and ranks them.
 //!
-//! In: raw bytes. Out: [`Proposal`]s, best first, each decoded by the daemon's own decoder over
-//! all the bytes. The same bytes give the same proposals; the time is bounded by their number.
+//! In: raw bytes. Out: [`Proposal`]s, best first. The daemon's own decoder decodes all the bytes
+//! for each of them. The same bytes give the same proposals. The number of bytes bounds the time.
 
 use std::cmp::Reverse;
 
@@ -9,57 +9,60 @@ use super::candidates::{candidates, marked_array, packed_array, text_array};
 use crate::frame::{Array, COLS, ROWS};
 use crate::wire::{Cell, Checksum, Decoder, Layout, LengthField, Preset, Settings};
 
-/// What candidates are first tried on: so many pieces from all over the bytes, so that neither
-/// a bad beginning nor a long rest decides.
+/// The number of pieces that candidates are first tried on. The pieces come from all over the
+/// bytes, so that neither a bad beginning nor a long rest decides.
 const PIECES: usize = 8;
-/// Five of the longest frames, or ten of the JX255N's.
+/// The bytes of a piece: five of the longest frames, or ten of the JX255N's.
 const PIECE_BYTES: usize = 8 * 1024;
-/// Candidates tried on all the bytes.
+/// The number of candidates that are tried on all the bytes.
 const FINALISTS: usize = 4;
-/// Share of the bytes below which nothing is explained: noise ends as `ff-tail` or `zero-run` by
-/// chance in some of them.
+/// The least share of the bytes that a layout must explain. Noise contains some frames of `ff-tail`
+/// or `zero-run` by chance.
 const LEAST_SHARE: f64 = 0.5;
-/// Whole frames below which nothing is.
+/// The least number of whole frames that a layout must find.
 const LEAST_FRAMES: u64 = 3;
-/// Without a checksum, at most one of so many candidates may be damaged: marks repeat in a text, too.
+/// Without a checksum, at most one in this many candidates for a frame may be damaged, because
+/// marks repeat in a text too.
 const CANDIDATES_A_DAMAGED: u64 = 10;
 
-/// What marks tell where every byte of a frame must be in order, as good as a checksum.
+/// The bits of a layout in which every byte of a frame must be in order. That is as good as a
+/// checksum.
 const ALL_IN_ORDER: u32 = u32::MAX;
 
-/// What `ff-tail` tells: more than any one byte, as its cells have no FF, less than any two.
+/// The bits of `ff-tail`: more than any one byte, because its cells have no FF, and less than any
+/// two bytes.
 const FF_TAIL_BITS: u32 = 16;
 
-/// A layout and what it makes of the bytes.
+/// A layout, and the outcome of decoding the bytes with it.
 #[derive(Debug, Clone)]
 pub(super) struct Proposal {
-    /// With the fewest keys.
+    /// The settings of the layout, with the fewest keys.
     pub(super) settings: Settings,
-    /// Whole.
+    /// The number of whole frames.
     pub(super) frames: u64,
-    /// Whole, and not the same as the one before.
+    /// The number of whole frames that differ from the one before.
     pub(super) frames_changed: u64,
     pub(super) frames_damaged: u64,
-    /// In whole frames.
+    /// The number of bytes in whole frames.
     pub(super) bytes_explained: u64,
     /// Share of all bytes that the proposal explains.
     pub(super) share: f64,
     /// Mean difference of neighbouring taxels, in counts.
     roughness: f64,
-    /// Told by the constant bytes.
+    /// The information of the constant bytes, in bits.
     bits: u32,
     is_checked: bool,
     length_bytes: usize,
     is_preset: bool,
     overhead_bytes: usize,
     keys: usize,
-    /// Whether the bytes begin with what the layout calls a tail. Then it is a header.
+    /// Whether the bytes begin with the layout's tail, which is then a header.
     is_headed_by_tail: bool,
-    /// What speaks for it, by the criteria of [`MERITS`] in order: the more, the better.
+    /// The values for the criteria of [`MERITS`], in the same order. More is better.
     merits: [u64; MERITS.len()],
 }
 
-/// What decides between two layouts: the first of these in which they differ.
+/// The criteria for preferring a layout. The first one in which two layouts differ decides.
 const MERITS: [&str; 9] = [
     "its checksum fits frames that change",
     "it explains more of the bytes",
@@ -72,7 +75,7 @@ const MERITS: [&str; 9] = [
     "it explains a few bytes more",
 ];
 
-/// Layouts that explain `bytes`, best first; none if nothing does.
+/// Layouts that explain `bytes`, best first. Empty if there is none.
 pub(super) fn propose(bytes: &[u8]) -> Vec<Proposal> {
     let sample = sample(bytes);
     let presets = [
@@ -102,7 +105,7 @@ pub(super) fn propose(bytes: &[u8]) -> Vec<Proposal> {
     proposals = proposals
         .iter()
         .filter_map(|proposal| smoother(proposal, bytes))
-        // Not of the sample, whose pieces begin and end within frames.
+        // This holds only for all the bytes: the pieces of the sample begin and end within frames.
         .filter(|p| p.is_checked || is_little_damaged(p))
         .collect();
     rank(&mut proposals);
@@ -110,7 +113,7 @@ pub(super) fn propose(bytes: &[u8]) -> Vec<Proposal> {
 }
 
 impl Proposal {
-    /// `None`: it explains too little.
+    /// Decodes `bytes` with the layout of `settings`. `None` if it explains too little.
     fn of(settings: &Settings, bits: u32, bytes: &[u8]) -> Option<Self> {
         let layout = Layout::new(settings).ok()?;
         let mut decoder = Decoder::new(layout);
@@ -150,14 +153,14 @@ impl Proposal {
         })
     }
 
-    /// Why it goes before `other`, which goes after it.
+    /// The reason why this proposal ranks before `other`.
     pub(super) fn reason(&self, other: &Self) -> &'static str {
         let mut merits = self.merits.iter().zip(&other.merits);
         let decisive = merits.position(|(ours, theirs)| ours > theirs);
         decisive.map_or("nothing tells them apart", |merit| MERITS[merit])
     }
 
-    /// In frames that are not the same as the one before.
+    /// The number of bytes in frames that differ from the one before.
     fn bytes_changed(&self) -> u64 {
         self.frames_changed * self.bytes_explained / self.frames
     }
@@ -192,11 +195,15 @@ impl Tally {
     }
 }
 
-/// Best first. A checksum that fits frames which change is no accident, whatever more another
-/// layout makes of damaged ones. Else shares within two frames or a fiftieth of the best are equal
-/// (damage in a mark costs the longer mark more). What the bytes begin with is no tail. Then the more
-/// telling marks go first, a length field before a longer sync, a preset as it is, few bytes beside
-/// the cells (the rest are taxels at rest), and few keys before many.
+/// Sorts the proposals, best first, by the criteria of [`MERITS`]:
+///
+/// - A checksum that fits frames which change is no accident, even if another layout finds more in
+///   damaged frames.
+/// - Shares of explained bytes within two frames or a fiftieth of the best are equal, because
+///   damage in a mark costs the longer mark more.
+/// - The first bytes of all are not a tail.
+/// - Marks with more information come first, then a length field before a longer sync, an unchanged
+///   preset, few bytes beside the cells (the rest are taxels at rest), and few keys.
 fn rank(proposals: &mut [Proposal]) {
     let most = |of: fn(&Proposal) -> u64| proposals.iter().map(of).max().unwrap_or_default();
     let changed = most(Proposal::bytes_changed);
@@ -230,10 +237,10 @@ fn is_little_damaged(proposal: &Proposal) -> bool {
     CANDIDATES_A_DAMAGED * frames_damaged <= frames + frames_damaged
 }
 
-/// The layout with two-byte cells the other way round, where that makes smoother frames.
+/// The layout on all the bytes. Two-byte cells get the byte order that makes smoother frames.
 fn smoother(of_sample: &Proposal, bytes: &[u8]) -> Option<Proposal> {
     let (settings, bits) = (&of_sample.settings, of_sample.bits);
-    // The sample begins as the bytes do.
+    // The sample begins as the bytes do, so it has shown whether the tail is a header.
     let proposed = |settings| {
         let proposal = Proposal::of(settings, bits, bytes)?;
         Some(Proposal {
@@ -247,7 +254,7 @@ fn smoother(of_sample: &Proposal, bytes: &[u8]) -> Option<Proposal> {
         ..settings.clone()
     };
     let as_is = Layout::new(settings);
-    // Only a layout of two-byte cells is the same with these.
+    // Only a layout of two-byte cells stays the same with `U16le` cells.
     if Layout::new(&swapped(Cell::U16le)) != as_is {
         return Some(proposal);
     }
@@ -278,7 +285,7 @@ fn simplest(settings: &Settings, layout: &Layout) -> Settings {
         .unwrap_or_else(|| settings.clone())
 }
 
-/// Without the keys whose absence changes nothing.
+/// The settings without the keys whose absence changes nothing.
 fn shortened(mut settings: Settings, layout: &Layout) -> Settings {
     let forget: [fn(&mut Settings); 7] = [
         |settings| settings.sync = None,
@@ -299,7 +306,7 @@ fn shortened(mut settings: Settings, layout: &Layout) -> Settings {
     settings
 }
 
-/// Whether the layout would be another one after `change`, and could be.
+/// Whether `change` makes another layout, and a valid one.
 fn is_other(settings: &Settings, layout: &Layout, change: impl Fn(&mut Settings)) -> bool {
     let mut changed = settings.clone();
     change(&mut changed);
@@ -333,8 +340,8 @@ fn overhead_bytes(settings: &Settings, layout: &Layout) -> usize {
     layout.max_frame_bytes() - rows * cols * if is_wide { 2 } else { 1 }
 }
 
-/// Whether `bytes` begin with what the layout calls a tail. Candidates say theirs, as sets of keys
-/// that leave nothing out; of the presets `ff-tail` has one.
+/// Whether `bytes` begin with the layout's tail. Candidates give every key, so they give their
+/// tail. Of the presets that are tried, only `ff-tail` has a tail.
 fn is_headed_by_tail(candidate: &Settings, bytes: &[u8]) -> bool {
     let tail = match (&candidate.tail, candidate.preset) {
         (Some(tail), _) => &tail.0[..],
@@ -358,7 +365,7 @@ fn is_preset(settings: &Settings) -> bool {
     *settings == sized
 }
 
-/// Keys beside the preset.
+/// The number of keys beside the preset.
 fn keys(settings: &Settings) -> usize {
     let Settings {
         preset: _,
@@ -390,7 +397,7 @@ fn keys(settings: &Settings) -> usize {
     .count()
 }
 
-/// Pieces from all over `bytes`; all of them if they are few.
+/// Pieces from all over `bytes`, or all of `bytes` if they are few.
 fn sample(bytes: &[u8]) -> Vec<u8> {
     if bytes.len() <= PIECES * PIECE_BYTES {
         return bytes.to_vec();

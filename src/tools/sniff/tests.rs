@@ -1,4 +1,4 @@
-//! Layouts are found again in what they have encoded.
+//! Each layout is found again in the bytes that it has encoded.
 
 use super::proposal::propose;
 use super::toml;
@@ -20,8 +20,8 @@ fn frames(seed: u64) -> Vec<RawFrame> {
     frames
 }
 
-/// As a line would deliver it: begun anywhere in the first frame, ended anywhere in the last, one
-/// frame short of bytes and one with a bit flipped.
+/// The bytes of `frames` as a line would deliver them. They begin anywhere in the first frame and
+/// end anywhere in the last. One frame lacks a byte, and one has a flipped bit.
 fn line(layout: &Layout, frames: &[RawFrame], stream: &mut Stream) -> Vec<u8> {
     let dropped = frames.len() / 3 + stream.below(3);
     let flipped = 2 * frames.len() / 3 + stream.below(3);
@@ -50,8 +50,8 @@ fn decoded(layout: Layout, bytes: &[u8]) -> Vec<RawFrame> {
         .collect()
 }
 
-/// Frames in `of` that `among` has not, in the same order: those outside the longest sequence that
-/// both have.
+/// The number of frames in `of` that are outside the longest sequence of frames that `of` and
+/// `among` have in common.
 fn missing(of: &[RawFrame], among: &[RawFrame]) -> usize {
     let mut common = vec![0; among.len() + 1];
     for frame in of {
@@ -69,8 +69,8 @@ fn missing(of: &[RawFrame], among: &[RawFrame]) -> usize {
     of.len() - common[among.len()]
 }
 
-/// What is proposed must be the layout; without a checksum another may do that finds the same
-/// frames but for three, those at the ends and beside damage.
+/// The proposed layout must be the layout of `settings`. Without a checksum, it may be another one
+/// if at most three frames differ, those at the ends and beside damage.
 fn check(settings: &Settings, seed: u64) -> Result<(), String> {
     let layout = Layout::new(settings).unwrap();
     let mut stream = Stream::new(seed, "line");
@@ -103,7 +103,7 @@ fn check(settings: &Settings, seed: u64) -> Result<(), String> {
     Ok(())
 }
 
-/// All that fail, at once.
+/// Checks all cases, and reports all failures at once.
 fn check_all(cases: impl Iterator<Item = (Settings, u64)>) {
     let failed: Vec<String> = cases
         .filter_map(|(settings, seed)| check(&settings, seed).err())
@@ -171,7 +171,7 @@ fn free_layouts_are_found() {
         let mut stream = Stream::new(seed, "layouts");
         let mark = |stream: &mut Stream, least| {
             let length = least + stream.below(3);
-            // A zero at the edge of a mark is not told from a taxel at rest.
+            // A zero at the edge of a mark would look like a taxel at rest.
             HexBytes((0..length).map(|_| 1 + stream.below(255) as u8).collect())
         };
         let checksums = [
@@ -304,7 +304,7 @@ fn a_header_that_the_bytes_begin_with_is_no_tail() {
         for frame in frames(seed) {
             layout.encode(&frame, &mut bytes);
         }
-        // The end of a stream that was cut off speaks for a tail: its last frame has none.
+        // A stream that was cut off makes a tail more likely, because its last frame has none.
         bytes.truncate(bytes.len() - 400);
         let best = &propose(&bytes)[0];
         assert_eq!(

@@ -30,8 +30,9 @@ pub(super) fn line(event: &Value) -> String {
     line
 }
 
-/// When a verdict was published: so long after the frame that it judges. A final verdict judges a
-/// frame from the middle of the press, so its `time` alone would be before that of the `end`.
+/// The time when a verdict was published: its age after the frame that it judges. A final verdict
+/// judges a frame from the middle of the press, so its `time` alone would be before that of the
+/// `end`.
 fn published(event: &Value) -> Option<String> {
     let age_ms = event["age_at_publish_ms"].as_f64()?;
     let age = Duration::try_from_secs_f64(age_ms / 1000.0).ok()?;
@@ -39,7 +40,8 @@ fn published(event: &Value) -> Option<String> {
     Some(format!("{:.6}", frame.checked_add(age).ok()?))
 }
 
-/// 10:00:00.123 of 2026-11-21T10:00:00.123456Z: the day is known, microseconds are not read by eye.
+/// The time of day in milliseconds, such as 10:00:00.123 of 2026-11-21T10:00:00.123456Z. People
+/// know the day and do not read microseconds.
 fn clock(time: &str) -> String {
     time.get(11..23).unwrap_or_default().to_owned()
 }

@@ -1,8 +1,8 @@
-//! Draws a view into the room that there is.
+//! Draws as much of a view as fits.
 //!
-//! What a sensor's link is and how old its frame is stands above all else. Where the link is not
-//! live, the last frame is shown without its colours and under the word for what it is, the curves
-//! run out, and no number of it is called present.
+//! The state of a sensor's link and the age of its frame come above all else. If the link is not
+//! live, the last frame is shown without its colours and under the state of the link, the curves
+//! end, and no value is shown as present.
 
 mod curve;
 mod map;
@@ -21,7 +21,7 @@ use super::view::{Link, Sensor, Verdict, View, age};
 /// Pictures up to this width have one column.
 const NARROW: u16 = 64;
 
-/// Columns between two columns.
+/// The blank columns between the left and the right part of a picture.
 const GAP: u16 = 2;
 
 /// Draws as much as there is room for.
@@ -241,7 +241,7 @@ impl Page<'_> {
         let missed = view
             .missed
             .map_or("?".to_owned(), |missed| missed.to_string());
-        // Damage is shown only if there is any.
+        // A count of damage stands out if it is not 0.
         let plain = self.look.aside();
         let alarm = |count: u64| match count {
             0 => plain,
@@ -345,7 +345,7 @@ impl Page<'_> {
             "q quit   Ctrl-L draw again"
         };
         let rest = self.text(row, line, self.look.aside());
-        // The daemon's name, if there is room for it.
+        // Show the daemon's address if there is room for it.
         let columns = view.address.chars().count();
         if let Some(indent) = usize::from(rest.width).checked_sub(columns + 3) {
             let address = format!("{:indent$}   {}", "", view.address);
@@ -365,7 +365,8 @@ fn is_unplugged(reason: &str) -> bool {
     gone.iter().any(|gone| reason.contains(gone))
 }
 
-/// Press, phase, verdict, probabilities in per cent and age. Force and notes if there is room.
+/// Press, phase, verdict, probabilities in per cent and age. Force and notes follow if there is
+/// room.
 fn verdict_line(verdict: &Verdict, old: &str, width: usize) -> String {
     let level = match &verdict.level {
         Ok((level, label)) => format!("{level} {label}"),

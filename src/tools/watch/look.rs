@@ -1,26 +1,26 @@
-//! What a terminal can show, and the styles that follow from that.
+//! The abilities of a terminal, and the styles that follow from them.
 
 use ratatui_core::style::{Color, Modifier, Style};
 
 use super::view::Link;
 use crate::colour::viridis;
 
-/// What the terminal can show.
+/// The abilities of the terminal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Look {
-    /// It has 256 colours.
+    /// Whether the terminal has 256 colours.
     pub(super) colours: bool,
-    /// It has 24 bits of colour.
+    /// Whether the terminal has 24 bits of colour.
     pub(super) true_colours: bool,
-    /// It has bold and reversed text.
+    /// Whether the terminal has bold and reversed text.
     pub(super) attributes: bool,
-    /// It shows more than ASCII.
+    /// Whether the terminal shows more than ASCII.
     pub(super) unicode: bool,
 }
 
 impl Look {
-    /// By the variables `TERM`, `COLORTERM`, `NO_COLOR` (<https://no-color.org>), and the first that is set
-    /// of `LC_ALL`, `LC_CTYPE` and `LANG`.
+    /// Derives the abilities from the values of `TERM`, `COLORTERM`, `NO_COLOR`
+    /// (<https://no-color.org>), and the first of `LC_ALL`, `LC_CTYPE` and `LANG` that is set.
     pub(super) fn new(term: &str, color_term: &str, no_color: &str, locale: &str) -> Self {
         let is_plain = ["", "dumb", "unknown"].contains(&term);
         let is_old = term.starts_with("vt") || term.ends_with("-m") || term.ends_with("-mono");
@@ -87,8 +87,8 @@ impl Look {
     }
 }
 
-/// The nearest of xterm's 256 colours. 216 of them are a cube with the levels 0, 95, 135, 175, 215 and 255 of
-/// red, green and blue.
+/// The nearest of xterm's 256 colours. 216 of them are a cube with the levels 0, 95, 135, 175, 215
+/// and 255 of red, green and blue.
 fn indexed(colour: [u8; 3]) -> Color {
     let level = |value: u8| match value {
         0..48 => 0,

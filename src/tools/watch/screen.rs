@@ -1,8 +1,8 @@
-//! The terminal: takes it over, draws, reads keys, and always restores it.
+//! Takes the terminal over, draws on it, reads keys, and always restores it.
 //!
-//! Pictures are made in memory and written by a thread of their own. So a terminal that takes
-//! nothing (Ctrl-S, a slow ssh) delays neither the reading of events nor the end: while a picture
-//! is on its way no other is drawn.
+//! Pictures are made in memory, and a thread of their own writes them. So a terminal that accepts
+//! no bytes (Ctrl-S, a slow ssh) delays neither the reading of events nor the end. While a picture
+//! is being written, no other is drawn.
 
 use std::cell::RefCell;
 use std::fs::File;
@@ -60,7 +60,8 @@ impl Write for Picture {
 impl Screen {
     /// Takes the terminal of stdin and stdout over.
     pub(super) fn open() -> io::Result<Self> {
-        // Without the standard library's lock: a stalled thread could hold it while another one panics.
+        // This handle avoids the standard library's lock, which a stalled thread could hold while
+        // another one panics.
         let stdout = File::from(io::stdout().as_fd().try_clone_to_owned()?);
         let area = area();
         let picture = Picture::default();

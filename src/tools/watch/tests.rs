@@ -1,4 +1,4 @@
-//! What is known, how old it is called, and what of it is drawn in which room.
+//! Tests of the known state, of the ages shown, and of what is drawn at each size.
 
 use std::process::{Command, Stdio};
 use std::time::Duration;
@@ -31,7 +31,7 @@ const PLAIN: Look = Look {
     unicode: false,
 };
 
-/// Milliseconds after a moment at which the machine had been up for an hour.
+/// The stamp `ms` milliseconds after a moment at which the machine had been up for an hour.
 fn at(ms: u64) -> Stamp {
     let since = Duration::from_millis(ms);
     Stamp {
@@ -40,7 +40,7 @@ fn at(ms: u64) -> Stamp {
     }
 }
 
-/// A view, told `events`, each at its `ms`, without delay.
+/// A view that has received `events` without delay, each at its time in ms.
 fn told(events: &[(u64, Value)]) -> View {
     let mut view = View::new();
     for (ms, event) in events {
@@ -86,7 +86,7 @@ fn verdict(press: u64, level: Option<u8>, rejected: Option<&str>) -> Value {
         "force_n": 12.34, "notes": []})
 }
 
-/// One sensor that is live and has been pressed.
+/// A view of one sensor that is live and has been pressed.
 fn pressed_sensor() -> View {
     told(&[
         (0, hello("a", &["forearm"])),
@@ -180,14 +180,14 @@ fn what_is_not_live_is_not_shown_as_present() {
         lost("lost", "LOST"),
         lost("connecting", "CONNECTING"),
         (gone, "NO DAEMON".to_owned()),
-        // Four seconds on, the daemon has answered none of three questions.
+        // After four seconds, the daemon has answered none of three requests.
         (pressed_sensor(), "DAEMON SILENT".to_owned()),
     ];
     for (view, word) in cases {
         for size in [(80, 24), (40, 24), (120, 50)] {
             let buffer = picture(&view, 4_100, size, COLOURS);
             let text = rows(&buffer).join("\n");
-            // Once above all else, once across the map.
+            // The word comes at the top and on the map.
             assert!(
                 text.matches(&word).count() >= 2,
                 "{word:?} not twice in\n{text}"
@@ -219,18 +219,18 @@ fn a_curve_has_holes_where_there_was_no_frame() {
         hear(&mut view, ms, frame("forearm", newtons, 1));
     }
     let sensor = view.sensor().unwrap();
-    // Spans of a second up to 30 s; a frame is current for 2.5 periods of 0.2 s.
+    // The spans are one second long, up to 30 s. A frame is current for 2.5 periods of 0.2 s.
     let curve = sensor.curve(at(30_000).mono, 30, |load| load.force_n);
     let there: Vec<(usize, f32)> = (0..)
         .zip(&curve)
         .filter_map(|(span, value)| value.map(|value| (span, value)))
         .collect();
     assert_eq!(there, [(5, 1.0), (10, 3.0)]);
-    // Finer spans than frames: each stands for its 2.5 periods, and no longer.
+    // The spans are shorter than a period. Each frame holds for its 2.5 periods, and no longer.
     let curve = sensor.curve(at(30_000).mono, 300, |load| load.force_n);
     let there: Vec<usize> = (0..300).filter(|&span| curve[span].is_some()).collect();
     assert_eq!(there, (50..55).chain(100..106).collect::<Vec<_>>());
-    // Twenty seconds later the first is past.
+    // At 36 s, the curve begins at 6 s, after the first frame.
     let curve = sensor.curve(at(36_000).mono, 30, |load| load.force_n);
     assert_eq!(curve.iter().flatten().count(), 1);
 }
@@ -244,7 +244,8 @@ fn a_bar_is_as_high_as_its_share_of_the_highest() {
     for (ms, newtons) in [(10_000, 2.0), (20_000, 1.25), (29_950, 0.5)] {
         hear(&mut view, ms, frame("forearm", newtons, 1));
     }
-    // Bars of the force from left to right: what stands in each of the rows, lower first.
+    // The bars of the force from left to right, each with its symbols from the lowest row to the
+    // highest.
     let bars = |look| {
         let rows = rows(&picture(&view, 30_000, (150, 40), look));
         let heading = rows.iter().position(|row| row.contains("force ")).unwrap();
@@ -267,7 +268,7 @@ fn a_bar_is_as_high_as_its_share_of_the_highest() {
         bars.retain(|bar| !bar.trim().is_empty() && !bar.starts_with('\u{b7}'));
         bars
     };
-    // Nine rows of eight eighths.
+    // There are nine rows of eight eighths each.
     assert_eq!(
         bars(COLOURS),
         [
@@ -283,7 +284,7 @@ fn a_bar_is_as_high_as_its_share_of_the_highest() {
 fn verdicts_stand_with_their_probabilities_newest_first_and_none_twice() {
     let mut view = pressed_sensor();
     hear(&mut view, 9_000, verdict(4, None, Some("low_force")));
-    // As `get last` repeats it after a break.
+    // `get last` repeats the verdict after a break.
     hear(&mut view, 9_100, verdict(4, None, Some("low_force")));
     hear(&mut view, 9_100, status("forearm", "live"));
     let text = shown(&view, 10_200, (80, 24), PLAIN);
@@ -325,7 +326,7 @@ fn every_sensor_has_its_link_in_view_and_its_picture_by_a_key() {
     assert_eq!(view.sensor().unwrap().name, "palm");
     let text = shown(&view, 100, (80, 24), PLAIN);
     assert!(text.contains("force 6.00 N"), "{text}");
-    // Where not all have room, the chosen one has.
+    // If not all sensors fit, the chosen one must be visible.
     assert!(shown(&view, 100, (30, 24), PLAIN).contains(">3 palm LIVE"));
     view.press(Key::Next);
     assert_eq!(view.sensor().unwrap().name, "forearm");
@@ -421,7 +422,7 @@ fn a_small_array_is_drawn_alone() {
     hello["sensors"][0]["rows"] = json!(4);
     hello["sensors"][0]["cols"] = json!(6);
     let mut newtons = vec![0.0; TAXELS];
-    // Its last row and column: 12 + 3 and 11 + 5 in the 28x28.
+    // The last row and column of the array: 12 + 3 and 11 + 5 in the 28x28 frame.
     newtons[15 * COLS + 16] = 1.0;
     let view = told(&[
         (0, hello),
@@ -520,7 +521,7 @@ fn a_panic_gives_the_terminal_back() {
 fn a_soft_touch_is_seen_after_a_hard_one() {
     let mut view = pressed_sensor();
     hear(&mut view, 200, frame("forearm", 4.6, 3));
-    // Little more than the usual contact threshold.
+    // The force is little more than the usual contact threshold.
     hear(&mut view, 300, frame("forearm", 0.08, 12));
     let text = shown(&view, 400, (80, 24), PLAIN);
     assert!(text.contains("::::::::::::"), "{text}");
@@ -544,7 +545,8 @@ fn what_was_before_is_asked_for_and_stands_in_order() {
             .unwrap()
             .contains(&json!("frame"))
     );
-    // The last verdict comes first, then what is too old to be held, then the rest in order.
+    // The last verdict comes first, then a gap for the events that are too old, then the rest in
+    // order.
     let numbered = |mut event: Value, seq: u64| {
         event["seq"] = json!(seq);
         event
@@ -565,7 +567,7 @@ fn what_was_before_is_asked_for_and_stands_in_order() {
     assert_eq!(presses, [9, 8]);
     assert_eq!(sensor.press.as_ref().unwrap().state, "end");
     assert_eq!(view.missed, Some(0), "nobody was there to miss it");
-    // From then on a gap is one, and after a break it goes on where it was.
+    // After that, a gap counts as missed. After a break, the view asks from its last event on.
     hear(&mut view, 200, numbered(press(10, "begin"), 41));
     hear(&mut view, 200, json!({"type": "gap", "lost": 2}));
     assert_eq!(view.missed, Some(2));
@@ -628,7 +630,7 @@ fn a_frame_of_a_machine_with_another_clock_is_new() {
     view.wait("robot:8255".to_owned(), Clock::Theirs, at(0).mono);
     hear(&mut view, 0, hello("a", &["forearm"]));
     hear(&mut view, 0, status("forearm", "live"));
-    // Its clock is an hour behind, and the frames take 10 and 30 ms.
+    // The other clock is an hour behind. The frames take 10 and 30 ms.
     for (ms, delay) in [(200, 10), (400, 30)] {
         let mut event = frame("forearm", 1.0, 5);
         let there = at(ms - delay).wall - jiff::SignedDuration::from_hours(1);
@@ -662,7 +664,7 @@ fn force_stands_against_approach_where_the_robot_tells_it() {
     let expected = "force against approach  to 2.4 mm, to 18 N";
     let text = shown(&view, 900, size, COLOURS);
     assert!(text.contains(expected), "{text}");
-    // Another press begins anew, and the last one stays until then.
+    // The curve of the last press stays until another press begins.
     hear(&mut view, 3000, at_mm(0.5, json!(null)));
     assert!(shown(&view, 3000, size, PLAIN).contains(expected));
     hear(&mut view, 3200, at_mm(0.1, json!(0.0)));

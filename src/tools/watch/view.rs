@@ -1,7 +1,7 @@
-//! What is known of each sensor and how old it is: lines in, answers at a moment.
+//! The state of each sensor and its age. In: lines of the daemon. Out: answers for a moment.
 //!
-//! A moment is a [`Duration`] on CLOCK_MONOTONIC; that of an event is when it happened, not when it
-//! was read, so what lay in a queue is as old as it is. Nothing here has a clock or does I/O.
+//! A moment is a [`Duration`] on CLOCK_MONOTONIC. The moment of an event is when it happened, not
+//! when it was read, so time in a queue counts as age. Nothing here has a clock or does I/O.
 
 mod sensor;
 
@@ -14,7 +14,8 @@ pub(super) use self::sensor::{Frame, Load, Sensor, Verdict, WINDOW};
 use crate::event::PROTOCOL;
 use crate::frame::Stamp;
 
-/// How often the daemon is asked for the totals, which it tells by itself only with a change.
+/// The time between two requests for the totals. Without a request, the daemon sends them only when
+/// the state changes.
 pub(super) const QUESTION: Duration = Duration::from_secs(1);
 
 /// After three questions without an answer, the daemon counts as dead.
@@ -31,16 +32,18 @@ pub(super) struct View {
     /// Address of the last connection.
     pub(super) address: String,
     daemon: Daemon,
-    /// When the daemon last said anything.
+    /// The moment of the daemon's last line, or of the connection.
     heard: Duration,
-    /// Number of events that the daemon dropped. `None`: unknown.
+    /// The number of events that the daemon dropped. `None` if unknown.
     pub(super) missed: Option<u64>,
-    /// The last event of this run that was received.
+    /// The number of the last event of this run that was received.
     seq: u64,
-    /// While what happened up to this event is being told: what is too old for that is not missed.
+    /// The number of the last past event, while the daemon repeats past events. A gap among them
+    /// does not count as missed: it holds events that are too old for the daemon.
     catching_up: Option<u64>,
     clock: Clock,
-    /// How far the daemon's clock is behind ours, as far as frames tell: they come at once.
+    /// How far the daemon's clock is behind this machine's. Frames show it, because they are sent
+    /// at once.
     behind: Option<SignedDuration>,
 }
 
@@ -56,9 +59,10 @@ pub(super) enum Clock {
 /// Whether there is a daemon.
 #[derive(Debug, PartialEq, Eq)]
 enum Daemon {
-    /// There is none, for this reason.
+    /// There is no daemon, for this reason.
     Absent(String),
-    /// Something has taken the connection and not said what it is; why there was none before.
+    /// Something has accepted the connection, but has not sent `hello` yet. The field is the reason
+    /// why there was no daemon before.
     Unknown(String),
     Met,
 }
@@ -69,21 +73,21 @@ pub(super) struct Hello {
     pub(super) robot: String,
     pub(super) version: String,
     run: String,
-    /// First digits of the model's hash.
+    /// The first digits of the model's hash.
     pub(super) model: String,
     pub(super) validation: String,
     /// The labels of the levels, in order.
     pub(super) labels: Vec<String>,
 }
 
-/// Whether what is shown of a sensor is true now.
+/// The state of a link. The values of a sensor are current only if it is `Live`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Link {
     Live,
     Connecting,
     Stale,
     Lost,
-    /// The daemon is connected and sends nothing.
+    /// The daemon is connected but sends nothing.
     Silent,
     NoDaemon,
 }
@@ -101,28 +105,28 @@ impl Link {
     }
 }
 
-/// What a key asks for.
+/// The action of a key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Key {
     Quit,
     Redraw,
     Next,
     Previous,
-    /// A sensor by its index.
+    /// Show the sensor with this index.
     Sensor(usize),
 }
 
-/// How a daemon was lost.
+/// The way in which a daemon was lost.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Loss {
-    /// It closed the connection.
+    /// The daemon closed the connection.
     Closed,
-    /// It cannot be reached, for this reason.
+    /// The daemon cannot be reached, for this reason.
     Unreachable(String),
 }
 
 impl View {
-    /// Nothing is known yet.
+    /// A view that knows nothing yet.
     pub(super) fn new() -> Self {
         Self {
             hello: None,
@@ -139,8 +143,8 @@ impl View {
         }
     }
 
-    /// Takes in a line of the daemon, read at `now`, and ignores a line that it does not know. What
-    /// it returns is to be sent to the daemon.
+    /// Takes in a line of the daemon, read at `now`. Ignores an unknown line. The caller must send
+    /// the returned requests to the daemon.
     pub(super) fn hear(&mut self, line: &str, now: Stamp) -> Option<String> {
         let event = serde_json::from_str::<Value>(line).ok()?;
         self.heard = now.mono;
@@ -170,8 +174,8 @@ impl View {
         None
     }
 
-    /// When an event happened. A daemon on another machine has another clock: by how much it is
-    /// behind is told by the frame that came soonest.
+    /// The moment of an event. A daemon on another machine has another clock. The frame with the
+    /// shortest delay shows how far that clock is behind.
     fn moment(&mut self, event: &Value, kind: &str, now: Stamp) -> Duration {
         let time = text(event, "time").parse::<jiff::Timestamp>();
         let Ok(past) = time.map(|time| now.wall.duration_since(time)) else {
@@ -185,8 +189,8 @@ impl View {
             .saturating_sub(Duration::try_from(past).unwrap_or_default())
     }
 
-    /// Something at `address` has taken the connection at `now`: it is given as long to say what it
-    /// is as a daemon to answer.
+    /// Takes in that something at `address` has accepted the connection at `now`. It has as long to
+    /// send `hello` as a daemon has to answer.
     pub(super) fn wait(&mut self, address: String, clock: Clock, now: Duration) {
         self.heard = now;
         self.address = address;
@@ -194,7 +198,8 @@ impl View {
         self.daemon = Daemon::Unknown(self.absence().to_owned());
     }
 
-    /// Takes in a `hello`. What it returns asks for all that happened since the last event, and on.
+    /// Takes in a `hello`. Returns the requests for all events since the last one that was
+    /// received.
     fn meet(&mut self, event: &Value) -> Option<String> {
         let protocol = &event["protocol"];
         if *protocol != PROTOCOL {
@@ -203,7 +208,7 @@ impl View {
             return None;
         }
         let hello = hello(event);
-        // In another run numbers begin again, and nothing of the old one is known any more.
+        // In another run, the numbers begin again, and nothing of the old run is valid any more.
         if self
             .hello
             .as_ref()
@@ -217,7 +222,7 @@ impl View {
                 .position(|one| Some(&one.name) == name.as_ref());
             self.chosen = again.unwrap_or(0);
             (self.missed, self.seq) = (Some(0), 0);
-            // In a new run nothing has happened yet.
+            // If no event has happened yet in this run, there is nothing to repeat.
             self.catching_up = Some(number(event, "seq")).filter(|&past| past > 0);
         }
         let since = format!("{}:{}", hello.run, self.seq);
@@ -232,17 +237,17 @@ impl View {
         Some(requests.map(|request| request.to_string()).join("\n"))
     }
 
-    /// The daemon has gone, or does not answer.
+    /// Takes in that the daemon has gone or cannot be reached.
     pub(super) fn lose(&mut self, loss: Loss) {
         match loss {
             Loss::Unreachable(reason) => self.daemon = Daemon::Absent(reason),
-            // If there was no `hello`, the reason is known already.
+            // The daemon's `error` or its protocol gave the reason already.
             Loss::Closed if matches!(self.daemon, Daemon::Absent(_)) => {}
             Loss::Closed => self.daemon = Daemon::Absent("it closed the connection".to_owned()),
         }
     }
 
-    /// Does what the key asks for, if it concerns sensors.
+    /// Chooses another sensor, if the key asks for one.
     pub(super) fn press(&mut self, key: Key) {
         let count = self.sensors.len().max(1);
         self.chosen = match key {
@@ -288,7 +293,7 @@ impl View {
         }
     }
 
-    /// Why there is no daemon.
+    /// The reason why there is no daemon.
     fn absence(&self) -> &str {
         match &self.daemon {
             Daemon::Absent(reason) | Daemon::Unknown(reason) => reason,
@@ -335,8 +340,8 @@ fn text(event: &Value, key: &str) -> String {
     event[key].as_str().map(plain).unwrap_or_default()
 }
 
-/// Text without control characters. A reason comes from the system and a label from a model file: neither may
-/// move the cursor.
+/// Text without control characters. A reason comes from the system and a label from a model file:
+/// neither may move the cursor.
 fn plain(text: &str) -> String {
     text.chars().filter(|c| !c.is_control()).collect()
 }

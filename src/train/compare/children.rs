@@ -1,9 +1,9 @@
-//! Training runs as processes of their own, several at a time.
+//! Runs trainings as child processes, several at a time.
 //!
-//! In: what to run. Out: which of it failed. Each process computes on one thread, so that a run
-//! gives the same weights whatever runs beside it, and writes a log. When this process ends, for
-//! whatever reason, the system ends the others; what they have not finished goes on from its last
-//! checkpoint when it is run again.
+//! In: the jobs. Out: the failures. Each process computes on one thread, so that a run gives the
+//! same weights whatever runs beside it, and writes a log. When this process ends for any reason,
+//! the system ends the child processes. Running the same command again resumes unfinished runs from
+//! their last checkpoints.
 
 use std::ffi::OsStr;
 use std::fs::File;
@@ -14,31 +14,32 @@ use std::time::{Duration, Instant};
 use anyhow::Context as _;
 use indicatif::{HumanDuration, MultiProgress, ProgressBar, ProgressStyle};
 
-/// How often the processes are looked after.
+/// How often the processes are polled.
 const LOOKED_AFTER_EVERY: Duration = Duration::from_millis(100);
 
-/// One run.
+/// One run to start.
 #[derive(Debug, Clone)]
 pub(super) struct Job {
-    /// What people call it.
+    /// The run's name in messages.
     pub(super) name: String,
     /// The subcommand and its arguments.
     pub(super) arguments: Vec<String>,
-    /// The directory of a run that it takes finished stages from, if that is there by then.
+    /// The directory of a run to take finished stages from, if it exists when this run starts.
     pub(super) from: Option<PathBuf>,
-    /// Where standard output and standard error go.
+    /// The file that receives standard output and standard error.
     pub(super) log: PathBuf,
-    /// The file that stands when it is done.
+    /// The file that exists when the run is done.
     pub(super) product: PathBuf,
-    /// A run that it waits for, if that is to be run too: it takes finished stages from there.
+    /// The name of a run to wait for if it is among the jobs, because this run takes finished
+    /// stages from it.
     pub(super) after: Option<String>,
-    /// What it costs beside others, in any unit.
+    /// The cost relative to other runs, in any unit.
     pub(super) effort: f64,
 }
 
 impl Job {
-    /// The arguments that name the other run, once that has a directory: its method may not be
-    /// among those compared.
+    /// The arguments that name the run to take stages from, if its directory exists. Its method may
+    /// not be among those compared.
     fn taking(&self) -> Vec<&OsStr> {
         match &self.from {
             Some(run) if run.is_dir() => vec![OsStr::new("--from"), run.as_os_str()],
@@ -50,9 +51,9 @@ impl Job {
 /// A run that ended without its product.
 #[derive(Debug)]
 pub(super) struct Failure {
-    /// Name of the run.
+    /// The name of the run.
     pub(super) name: String,
-    /// Its last words.
+    /// The last line of its log, or its exit status.
     pub(super) reason: String,
 }
 
@@ -63,11 +64,11 @@ struct Running {
     bar: ProgressBar,
 }
 
-/// Runs `jobs` in their order, `at_once` at a time, and tells `ended` of each that succeeded.
+/// Runs `jobs` in their order, `at_once` at a time, and calls `ended` with each that succeeded.
 ///
 /// # Errors
 ///
-/// If a process cannot be started or a log not be written, or those of `ended`.
+/// Fails if a process cannot be started, a log cannot be written, or `ended` fails.
 pub(super) fn run(
     jobs: Vec<Job>,
     at_once: usize,
@@ -121,7 +122,7 @@ pub(super) fn run(
     Ok(failures)
 }
 
-/// The first run that waits for none that is still to end.
+/// The first waiting run that does not wait for an unfinished run.
 fn next(waiting: &[Job], running: &[Running]) -> Option<usize> {
     let to_end = |name: &String| {
         let mut jobs = waiting.iter().chain(running.iter().map(|child| &child.job));
@@ -153,7 +154,7 @@ fn start(job: Job, board: &Board) -> anyhow::Result<Running> {
     })
 }
 
-/// Why a run ended without its product.
+/// The reason a run ended without its product.
 fn last_words(status: ExitStatus, log: &Path) -> String {
     if matches!(status.code(), Some(0 | 130 | 143)) {
         return "it was stopped; the same command goes on with it".to_owned();
@@ -178,7 +179,7 @@ fn last_line(log: &Path) -> String {
         .to_owned()
 }
 
-/// How much has been done in what time.
+/// The cost of the finished runs, and the time they took.
 #[derive(Default)]
 struct Progress {
     effort: f64,
@@ -191,7 +192,7 @@ impl Progress {
         self.seconds += seconds;
     }
 
-    /// What is left at the rate so far; `None` before the first run has ended.
+    /// The seconds left at the rate so far; `None` before the first run has ended.
     fn seconds_left(&self, waiting: &[Job], running: &[Running], at_once: usize) -> Option<f64> {
         let begun = |child: &Running| (child.job.effort, child.since.elapsed().as_secs_f64());
         let begun: Vec<(f64, f64)> = running.iter().map(begun).collect();
@@ -199,15 +200,16 @@ impl Progress {
         self.left(&waiting, &begun, at_once)
     }
 
-    /// The same from efforts, and of what has begun also the seconds so far. `None` also at the end.
+    /// The seconds left, from the efforts of waiting runs, and the efforts and seconds so far of
+    /// those that have begun. `None` before the first run has ended, and when no run is left.
     fn left(&self, waiting: &[f64], begun: &[(f64, f64)], at_once: usize) -> Option<f64> {
         let nothing_is_left = waiting.is_empty() && begun.is_empty();
         if self.effort <= 0.0 || nothing_is_left {
             return None;
         }
         let rate = self.seconds / self.effort;
-        // A run that takes longer than the others let expect is not at its end: it is given a tenth
-        // of its time so far.
+        // For a run that takes longer than expected from the others, assume that a tenth of its
+        // time so far is left.
         let left_of = |(effort, so_far): &(f64, f64)| (rate * effort - so_far).max(0.1 * so_far);
         let of_begun: Vec<f64> = begun.iter().map(left_of).collect();
         let not_begun: f64 = waiting.iter().map(|effort| rate * effort).sum();
@@ -217,7 +219,7 @@ impl Progress {
     }
 }
 
-/// Bars on a terminal, lines elsewhere.
+/// The display of progress: bars on a terminal, lines elsewhere.
 struct Board {
     bars: MultiProgress,
     total: ProgressBar,
@@ -252,12 +254,13 @@ impl Board {
         if self.total.is_hidden() {
             eprintln!("{line}");
         } else {
-            // The only way past bars; a terminal that is gone needs no line.
+            // Only this call prints past the bars. It fails when the terminal is gone, where nobody
+            // reads the line.
             let _ = self.bars.println(line);
         }
     }
 
-    /// Tells how long it still takes: always on a terminal, else where a run has just `ended`.
+    /// Shows the time left: always on a terminal, elsewhere only when a run has just `ended`.
     fn time_left(&self, seconds: Option<f64>, ended: bool) {
         let left = seconds.map_or_else(String::new, |seconds| {
             let left = HumanDuration(Duration::from_secs_f64(seconds));
@@ -281,9 +284,9 @@ mod tests {
         assert_eq!(progress.left(&[1.0], &[], 2), None);
         progress.effort = 2.0;
         progress.seconds = 20.0;
-        // 10 s an effort: 30 s wait, and 10 of 20 are left of the one that runs.
+        // At 10 s per unit of effort, 30 s of work wait, and the running one has 10 of 20 s left.
         assert_eq!(progress.left(&[3.0], &[(2.0, 10.0)], 2), Some(20.0));
-        // Overdue by far.
+        // This run is far overdue.
         assert_eq!(progress.left(&[], &[(2.0, 300.0)], 2), Some(30.0));
         assert_eq!(progress.left(&[], &[(0.01, 0.0)], 2), Some(1.0));
         assert_eq!(progress.left(&[], &[], 2), None);

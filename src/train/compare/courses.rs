@@ -1,9 +1,9 @@
-//! How models of whole presses, models of one frame and simpler controls judge the same presses:
-//! `hrn-train compare --course`.
+//! Compares models of whole presses, models of one frame and simpler controls on the same presses
+//! (`hrn-train compare --course`).
 //!
-//! In: presses to fit the controls on, sets of test presses, model files. Out, in a directory: `course.json`
-//! and `course.md`: accuracy with its interval, the difference to the first model on the same presses,
-//! and what a model of format 2 says of a press so far.
+//! In: presses to fit the controls on, sets of test presses, model files. Out, in a directory:
+//! `course.json` and `course.md`, with the accuracy and its interval, the difference from the first
+//! model on the same presses, and the verdicts of a model of format 2 before the end of a press.
 
 use std::path::{Path, PathBuf};
 
@@ -24,58 +24,58 @@ use crate::train::net::frames::FEATURES;
 use crate::train::run::disk::write_whole;
 use crate::verdict::{Course, Format, Hrn, argmax};
 
-/// What is to be compared.
+/// The request for a comparison.
 #[derive(Debug)]
 pub struct CoursePlan {
     /// Presses that the controls are fitted on.
     pub data: Vec<PathBuf>,
-    /// Sets to judge.
+    /// The sets of test presses.
     pub tests: Vec<PathBuf>,
-    /// Models with their names; the others are compared with the first. There is one at least.
+    /// Models with their names, at least one. The others are compared with the first.
     pub models: Vec<(String, Hrn)>,
-    /// Where tables go.
+    /// The directory of the tables.
     pub out: PathBuf,
 }
 
-/// A row of the tables: who judged, and how well on each set.
+/// A row of the tables: a control or model, and its results on each set.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CourseRow {
     /// A control's name, or the model's file.
     pub name: String,
-    /// On each set, in the order of the plan.
+    /// The results on each set, in the order of the plan.
     pub sets: Vec<OnSet>,
 }
 
-/// How well a set was judged.
+/// The results on one set.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct OnSet {
     /// The set's file, without folder and suffix.
     pub set: String,
-    /// How well the levels were judged.
+    /// The evaluation of the levels.
     pub levels: Evaluation,
     /// Share of presses whose level is off by more than one.
     pub beyond_neighbour: f64,
-    /// Root of the mean squared error of the Shore hardness; null for a control.
+    /// Root mean square error of the Shore hardness, in Shore OO; null without a Shore hardness.
     pub shore_rmse: Option<f64>,
-    /// Presses judged rightly, by object.
+    /// Presses judged correctly, by object.
     pub objects: Vec<ObjectCount>,
-    /// Accuracy less that of the first model on the same presses, with its 95 % interval by object; null for
-    /// that model itself.
+    /// Accuracy minus that of the first model on the same presses, with its 95 % interval by
+    /// object; null for the first model.
     pub less_first: Option<Difference>,
-    /// What is said before a press's end; null but for models of format 2.
+    /// The evaluation of verdicts before the end of presses; null except for models of format 2.
     pub so_far: Option<SoFar>,
 }
 
 /// A difference of two accuracies.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Difference {
-    /// In shares of the presses.
+    /// The difference, as a share of the presses.
     pub mean: f64,
-    /// 95 %, by a bootstrap over objects.
+    /// The 95 % interval, by a bootstrap over objects.
     pub interval: Option<[f64; 2]>,
 }
 
-/// What a control takes of a press.
+/// A control: a logistic regression on one kind of features of a press.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Control {
     Frame,
@@ -149,11 +149,11 @@ fn read(paths: &[PathBuf]) -> anyhow::Result<Courses> {
     Ok(Courses::read_all(paths)?.0)
 }
 
-/// Judges every set by every control and model, writes the tables and gives the first as text.
+/// Judges every set by every control and model, writes the tables and returns the first as text.
 ///
 /// # Errors
 ///
-/// If a file cannot be read or judged, or the directory cannot be written.
+/// Fails if a file cannot be read or judged, or the directory cannot be written.
 pub fn compare_courses(plan: &CoursePlan) -> anyhow::Result<String> {
     let sets: Vec<TestSet> = plan
         .tests
@@ -175,7 +175,7 @@ pub fn compare_courses(plan: &CoursePlan) -> anyhow::Result<String> {
     Ok(tables[0].text())
 }
 
-/// Fits the controls and judges the sets.
+/// Fits the controls and judges the sets with them.
 fn controls(data: &[PathBuf], sets: &[TestSet]) -> anyhow::Result<Vec<CourseRow>> {
     let courses = read(data)?;
     let presses = course::presses(&courses)?;
@@ -192,7 +192,7 @@ fn controls(data: &[PathBuf], sets: &[TestSet]) -> anyhow::Result<Vec<CourseRow>
         .iter()
         .map(|press| usize::from(press.level) - 1)
         .collect();
-    // Levels with few presses are lifted halfway, as the method `course` lifts them.
+    // Raise the weights of levels with few presses halfway, as the method `course` does.
     let lifts: Vec<f32> = (0..levels)
         .map(|level| level_of.iter().filter(|&&of| of == level).count())
         .map(|count| (count.max(1) as f32).powf(-course::BALANCE))
@@ -223,7 +223,7 @@ fn controls(data: &[PathBuf], sets: &[TestSet]) -> anyhow::Result<Vec<CourseRow>
     Ok(Control::ALL.into_iter().map(row_of).collect())
 }
 
-/// Each probability times its level's lift, brought to a sum of 1.
+/// Multiplies each probability by its level's lift, and normalises the sum to 1.
 fn lifted(mut probabilities: Vec<f32>, lifts: &[f32]) -> Vec<f32> {
     probabilities
         .iter_mut()
@@ -234,7 +234,7 @@ fn lifted(mut probabilities: Vec<f32>, lifts: &[f32]) -> Vec<f32> {
     probabilities
 }
 
-/// A model's row; of one of format 2 also the row of what it says where the arm is not told.
+/// A model's row. A model of format 2 also gets a row of its verdicts without the arm's motion.
 fn of_model(name: &str, hrn: &Hrn, sets: &[TestSet]) -> anyhow::Result<Vec<CourseRow>> {
     let row = |name: String, told: &dyn Fn(Course) -> Course, is_whole: bool| {
         let on = |set: &TestSet| {
@@ -266,7 +266,7 @@ fn of_model(name: &str, hrn: &Hrn, sets: &[TestSet]) -> anyhow::Result<Vec<Cours
     }
 }
 
-/// The press, as a robot gives it that says nothing of its arm.
+/// The course of a press without the arm's motion and stiffness, as from a robot that reports none.
 fn untold(mut course: Course) -> Course {
     course.arm_n_per_mm = 0.0;
     for moment in &mut course.moments {

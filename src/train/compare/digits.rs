@@ -1,11 +1,11 @@
-//! Numbers as people read them.
+//! Formats numbers for people.
 
-/// A number without decimals that are all 0.
+/// Formats a number with `decimals` decimals, or none for an integer.
 pub(super) fn number(value: f64, decimals: usize) -> String {
     rounded(value, if value.fract() == 0.0 { 0 } else { decimals })
 }
 
-/// To so many decimals. What rounds to zero has no sign.
+/// Formats a number with `decimals` decimals. A number that rounds to zero has no sign.
 pub fn rounded(value: f64, decimals: usize) -> String {
     let text = format!("{value:.decimals$}");
     match text.strip_prefix('-') {
@@ -14,7 +14,7 @@ pub fn rounded(value: f64, decimals: usize) -> String {
     }
 }
 
-/// An integer with its thousands apart.
+/// Formats an integer with commas between thousands.
 pub fn thousands(value: u64) -> String {
     let digits = value.to_string();
     let mut text = String::new();

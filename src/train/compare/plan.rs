@@ -1,7 +1,7 @@
-//! What a comparison runs: its rows, their runs, and the command line of each.
+//! The plan of a comparison: its rows, their runs, and the command line of each run.
 //!
-//! In: what is asked for, and what stands in the comparison's directory. Out: the runs of every row,
-//! finished or not. Nothing is run here.
+//! In: the user's request, and the comparison's directory. Out: the runs of every row, finished or
+//! not. Nothing is run here.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -14,29 +14,30 @@ use crate::train::methods::{self, LabelsError, Method, Request};
 use crate::train::run::{Description, Run};
 use crate::train::settings::Profile;
 
-/// What to compare.
+/// The request for a comparison.
 #[derive(Debug, Clone)]
 pub struct Plan {
     /// The data set to learn from.
     pub data: PathBuf,
-    /// Directory of the comparison.
+    /// The directory of the comparison.
     pub out: PathBuf,
-    /// Which methods to run.
+    /// The methods to run.
     pub methods: Vec<Method>,
-    /// Numbers of labels to run each of them with, beside its own; those that a method has anyway change nothing.
+    /// Numbers of labels to run each method with, besides its own number. A number that a method
+    /// has anyway adds no run.
     pub labels: Vec<usize>,
-    /// To run under seeds 1 to this one.
+    /// The number of seeds: runs use seeds 1 to this one.
     pub seeds: u64,
-    /// How long each run may take.
+    /// The profile of each run.
     pub profile: Profile,
-    /// Runs at a time.
+    /// The number of runs at a time.
     pub jobs: usize,
-    /// Whether to swap the materials' roles as well.
+    /// Whether to also run with the materials' roles swapped.
     pub swaps: bool,
 }
 
 impl Plan {
-    /// Whether it has a recipe's runs done.
+    /// Whether the plan requests the runs of a recipe.
     pub(super) fn asks(&self, recipe: &Recipe) -> bool {
         self.methods.contains(&recipe.method) && (!recipe.is_extra || self.wants(recipe.labels))
     }
@@ -50,14 +51,14 @@ impl Plan {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Recipe {
     pub(super) method: Method,
-    /// Labels other than the method's own share.
+    /// The number of labels, if it is not the method's own share.
     pub(super) labels: Option<usize>,
     pub(super) choice: LabelChoice,
-    /// Whether the tables have it only where its number of labels was asked for.
+    /// Whether the row appears only where its number of labels was requested.
     pub(super) is_extra: bool,
 }
 
-/// The rows that there can be, those of the plan's methods first.
+/// All possible rows, those of the plan's methods first.
 pub(super) fn recipes(plan: &Plan, dataset: &Dataset) -> anyhow::Result<Vec<Recipe>> {
     let few = methods::labels(Method::Hrn15, dataset, None)?;
     let mut methods = plan.methods.clone();
@@ -75,12 +76,12 @@ pub(super) fn recipes(plan: &Plan, dataset: &Dataset) -> anyhow::Result<Vec<Reci
         };
         recipes.push(own);
         match method {
-            // As few labels as the others have, and all of them.
+            // Run with as few labels as the other methods have, and with all of them.
             Method::Features => recipes.push(Recipe {
                 labels: Some(few),
                 ..own
             }),
-            // Labels by object, and as the paper probably chose them.
+            // Choose labels by object, and at random, as the paper probably chose them.
             Method::Ours | Method::Hrn15 => recipes.push(Recipe {
                 choice: LabelChoice::Random,
                 ..own
@@ -107,7 +108,7 @@ pub(super) fn recipes(plan: &Plan, dataset: &Dataset) -> anyhow::Result<Vec<Reci
     Ok(recipes)
 }
 
-/// Numbers of labels that a method was run with before: of the runs called `METHOD-LABELS-SEED`.
+/// Numbers of labels of a method's earlier runs, from directories called `METHOD-LABELS-SEED`.
 fn budgets_in(runs: &Path, method: Method) -> BTreeSet<usize> {
     let prefix = format!("{}-", method.name());
     let names = std::fs::read_dir(runs).into_iter().flatten().flatten();
@@ -120,7 +121,7 @@ fn budgets_in(runs: &Path, method: Method) -> BTreeSet<usize> {
     names.filter_map(budget).collect()
 }
 
-/// Every run that the plan asks for, and those that another finished before.
+/// Every run that the plan requests, and the finished runs of earlier plans.
 pub(super) fn planned(
     plan: &Plan,
     recipes: &[Recipe],
@@ -138,7 +139,7 @@ pub(super) fn planned(
                 told: recipe.told(seed, plan.profile, dataset)?,
                 data: plan.data.clone(),
                 directory: directory.join(format!("{}-{seed}", recipe.name())),
-                // USTGAN is the same, and what the STGANs generate.
+                // These methods have the same USTGAN as `ours`, and the same generated samples.
                 shares_with: matches!(recipe.method, Method::Nahrn | Method::Nihrn)
                     .then(|| format!("{}-{seed}", recipe.as_ours().name())),
             };
@@ -151,7 +152,7 @@ pub(super) fn planned(
 }
 
 impl Recipe {
-    /// The paper's whole method with the same labels.
+    /// The recipe of `ours` with the same labels.
     fn as_ours(&self) -> Self {
         Self {
             method: Method::Ours,
@@ -159,7 +160,7 @@ impl Recipe {
         }
     }
 
-    /// Of its runs' directories.
+    /// The name of the recipe in its runs' directories.
     pub(super) fn name(&self) -> String {
         let mut name = self.method.name().to_owned();
         if let Some(labels) = self.labels {
@@ -171,7 +172,7 @@ impl Recipe {
         name
     }
 
-    /// Seeds of its runs that stand in a directory.
+    /// The seeds of the recipe's runs in a directory.
     fn seeds_in(&self, runs: &Path) -> anyhow::Result<BTreeSet<u64>> {
         let prefix = self.name() + "-";
         let mut seeds = BTreeSet::new();
@@ -183,7 +184,7 @@ impl Recipe {
         Ok(seeds)
     }
 
-    /// What its run of a seed is told.
+    /// The description of the recipe's run with a seed.
     pub(super) fn told(
         &self,
         seed: u64,
@@ -201,9 +202,9 @@ impl Recipe {
         request.description(dataset)
     }
 
-    /// What a run costs, in thousands of HRN's steps in the `paper` profile, a step of a GAN as six
-    /// (by the seconds in `results/quick`), without the stages that it takes from ours. Other
-    /// profiles keep the proportions.
+    /// The cost of a run, in thousands of HRN's steps in the `paper` profile. A step of a GAN
+    /// counts as six (by the seconds in `results/quick`). Stages taken from `ours` count nothing.
+    /// Other profiles have the same proportions.
     fn effort(&self) -> f64 {
         match self.method {
             Method::Ours => 396.0,
@@ -217,7 +218,7 @@ impl Recipe {
             Method::Hrn15 | Method::Nahrn => 3.0,
             Method::Hrn15Strong => 5.0,
             Method::Features => 0.5,
-            // No row of a comparison.
+            // These methods are not rows of a comparison.
             Method::Course | Method::Adapt => 0.0,
         }
     }
@@ -230,18 +231,18 @@ pub(super) struct PlannedRun {
     pub(super) told: Description,
     pub(super) data: PathBuf,
     pub(super) directory: PathBuf,
-    /// Name of a run that has stages in common with it.
+    /// Name of a run that has stages in common with this run.
     pub(super) shares_with: Option<String>,
 }
 
 impl PlannedRun {
-    /// Whether its model stands.
+    /// Whether the run's model exists.
     pub(super) fn is_finished(&self) -> bool {
         self.directory.join("hrn.onnx").exists()
     }
 
-    /// Whether a run that is not asked for belongs in the tables: it is finished, and was told what
-    /// it would be told now. That it was told otherwise is said.
+    /// Whether a run that was not requested belongs in the tables: it is finished, and its
+    /// description equals the one it would get now. Prints a difference, if any.
     pub(super) fn counts(&self) -> bool {
         if !self.is_finished() {
             return false;
@@ -256,7 +257,7 @@ impl PlannedRun {
         difference.is_none()
     }
 
-    /// Makes sure that what stands in the directory was told what this run is to be.
+    /// Checks that a run in the directory has this run's description.
     fn check(&self) -> anyhow::Result<()> {
         match self.difference()? {
             None => Ok(()),
@@ -268,7 +269,8 @@ impl PlannedRun {
         }
     }
 
-    /// What the run in the directory was told otherwise; `None` if nothing, or if there is no run.
+    /// The difference between the description in the directory and this run's; `None` if there is
+    /// no difference or no run.
     fn difference(&self) -> anyhow::Result<Option<String>> {
         let told = Run::told(&self.directory)?;
         Ok(told.and_then(|told| told.difference(&self.told)))
@@ -319,8 +321,8 @@ impl PlannedRun {
     }
 }
 
-/// A command line for each run that is not finished, for a shell. A run that takes stages of another one
-/// stands behind it on the same line.
+/// A shell command line for each unfinished run. A run that takes stages from another one follows
+/// it on the same line.
 pub(super) fn command_lines(jobs: &[Job]) -> anyhow::Result<String> {
     let line = |job: &Job, from: Option<&Path>| {
         let mut words = vec!["hrn-train".to_owned()];
@@ -348,7 +350,7 @@ pub(super) fn command_lines(jobs: &[Job]) -> anyhow::Result<String> {
     Ok(lines)
 }
 
-/// What is still to be run.
+/// The runs that are not finished, with their jobs.
 pub(super) fn unfinished<'a>(
     runs: impl IntoIterator<Item = &'a PlannedRun>,
     out: &Path,

@@ -1,7 +1,8 @@
-//! One page that shows a run or a comparison, and opens without a network.
+//! One HTML page that shows a run or a comparison, and opens without a network.
 //!
-//! In: what a comparison found, or a run's directory. Out: HTML with its style, its pictures as SVG
-//! and the runs' own as data URIs: nothing is loaded from anywhere. Writes no file.
+//! In: a comparison's results, or a run's directory. Out: HTML with its style, its figures as SVG
+//! and the runs' own pictures as data URIs. The page loads nothing else. This module writes no
+//! file.
 
 mod figures;
 mod plot;
@@ -22,11 +23,11 @@ use crate::train::judge::metrics::{Bin, Evaluation};
 
 const STYLE: &str = include_str!("report/style.css");
 
-/// The page of what stands in `directory`: a comparison or a run.
+/// The page of the comparison or run in `directory`.
 ///
 /// # Errors
 ///
-/// If neither stands there, or a file of it is not as it should be.
+/// Fails if the directory holds neither, or a file in it cannot be read or parsed.
 pub fn of(directory: &Path) -> anyhow::Result<String> {
     if let Some(found) = Comparison::read(directory)? {
         return comparison(&found);
@@ -39,7 +40,7 @@ pub fn of(directory: &Path) -> anyhow::Result<String> {
 ///
 /// # Errors
 ///
-/// If a picture of a run cannot be read.
+/// Fails if a picture of a run cannot be read.
 pub fn comparison(comparison: &Comparison) -> anyhow::Result<String> {
     let rows = comparison.rows();
     let mut page = Page::default();
@@ -125,7 +126,7 @@ pub fn comparison(comparison: &Comparison) -> anyhow::Result<String> {
 ///
 /// # Errors
 ///
-/// If the directory holds no run, or a file of it is not as it should be.
+/// Fails if the directory holds no run, or a file in it cannot be read or parsed.
 pub fn run(details: &Details) -> anyhow::Result<String> {
     let directory = details.directory.display();
     let told = details.told.as_ref();
@@ -212,7 +213,8 @@ fn reliabilities(rows: &[Row]) -> Vec<String> {
     pictures
 }
 
-/// A sheet of the first seed of every method that generates; of ours every stage's.
+/// Adds a picture of generated frames for each method that has any, from the row's first run. The
+/// reference method gets the pictures of all stages.
 fn samples(page: &mut Page, rows: &[Row]) -> anyhow::Result<()> {
     let mut none = true;
     for row in rows {
@@ -240,8 +242,7 @@ fn samples(page: &mut Page, rows: &[Row]) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A run's pictures: real beside generated frames, what is judged wrongly, and of each stage the
-/// last.
+/// A run's pictures: real beside generated frames, mistakes, and the last picture of each stage.
 fn pictures(run: &Path) -> Vec<PathBuf> {
     let Ok(entries) = std::fs::read_dir(run.join("samples")) else {
         return Vec::new();
@@ -251,7 +252,7 @@ fn pictures(run: &Path) -> Vec<PathBuf> {
         .filter(|path| path.extension().is_some_and(|extension| extension == "png"))
         .collect();
     paths.sort();
-    // Of a stage: `ustgan-000500.png`, in the order of epochs.
+    // Pictures of a stage are called like `ustgan-000500.png`, so their names sort by epoch.
     let stage = |path: &Path| {
         let name = path
             .file_stem()
@@ -271,7 +272,7 @@ fn pictures(run: &Path) -> Vec<PathBuf> {
     first
 }
 
-/// A page in the making.
+/// A page under construction.
 #[derive(Debug, Default)]
 struct Page {
     links: String,
@@ -327,7 +328,7 @@ impl Page {
         self.body += "</table></div>\n";
     }
 
-    /// A PNG, inside the page.
+    /// Embeds a PNG in the page.
     fn picture(&mut self, path: &Path) -> anyhow::Result<()> {
         let bytes = std::fs::read(path).with_context(|| path.display().to_string())?;
         let name = escaped(&path.file_stem().unwrap_or_default().to_string_lossy());

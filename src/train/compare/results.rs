@@ -1,4 +1,4 @@
-//! What a comparison found: `results.json`, and what tables and report take besides.
+//! The results of a comparison: `results.json`, and the other files that tables and report read.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::ErrorKind;
@@ -20,31 +20,31 @@ use crate::train::settings::Profile;
 use crate::trial;
 use crate::verdict::sha256_hex;
 
-/// A finished run and what its exported model is worth: an element of `results.json`.
+/// A finished run and the evaluation of its exported model: an element of `results.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Entry {
-    /// Such as `hrn100`.
+    /// The method's name, such as `hrn100`.
     pub method: String,
-    /// Everything random in it followed from it.
+    /// The seed of everything random in the run.
     pub seed: u64,
-    /// How long it was given.
+    /// The profile of the run.
     pub profile: Profile,
-    /// Labelled samples it used.
+    /// The number of labelled samples that the run used.
     pub labels: usize,
-    /// How they were chosen.
+    /// How the labels were chosen.
     pub label_choice: LabelChoice,
-    /// Steps of all its stages.
+    /// The steps of all stages of the run.
     pub steps: u64,
-    /// Seconds of all its stages, over restarts.
+    /// The seconds of all stages of the run, including those before a restart.
     pub seconds: f64,
-    /// On the data set's own test split; null without one.
+    /// The evaluation on the data set's own test split; null without one.
     pub paper_split: Option<Evaluation>,
-    /// On fresh objects of `paper` shapes.
+    /// The evaluation on fresh objects of `paper` shapes.
     pub fresh: Evaluation,
-    /// On fresh objects of `matched` shapes.
+    /// The evaluation on fresh objects of `matched` shapes.
     pub matched: Evaluation,
-    /// On the fresh objects of `paper` shapes under other sensors, and on those of other shapes and
-    /// materials.
+    /// The evaluations on the fresh objects of `paper` shapes under other sensors, and on those of
+    /// other shapes and materials, by the set's name.
     pub shifts: BTreeMap<String, Evaluation>,
     /// The run's directory under `runs/`.
     pub run: String,
@@ -53,50 +53,50 @@ pub struct Entry {
 /// A finished run with some levels' materials swapped: an element of `swaps.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SwapEntry {
-    /// Such as `features`.
+    /// The method's name, such as `features`.
     pub method: String,
-    /// Everything random in it followed from it.
+    /// The seed of everything random in the run.
     pub seed: u64,
-    /// Labelled samples it used.
+    /// The number of labelled samples that the run used.
     pub labels: usize,
-    /// Levels, from 1, whose two materials changed roles.
+    /// Whether the two materials of each level changed roles, from level 1.
     pub swapped_levels: [bool; 4],
-    /// On 20 objects of each material that had the test's role.
+    /// The evaluation on 20 objects of each material in the test's role.
     pub test: Evaluation,
 }
 
-/// A model on one test set.
+/// The results of a model on one test set.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Measured {
-    /// Of the test set's file.
+    /// The SHA-256 of the test set's file.
     data_sha256: String,
-    /// As `evaluate --json`.
+    /// The evaluation, as `evaluate --json` prints it.
     pub evaluation: Evaluation,
     /// The bins of its calibration error.
     pub calibration: Vec<Bin>,
-    /// What the calibration error was before the fitted temperature; null without one.
+    /// The calibration error before the fitted temperature; null without one.
     pub ece_before_temperature: Option<f64>,
-    /// How each object was judged; null without objects.
+    /// The correct verdicts of each object; null without objects.
     pub objects: Option<Vec<ObjectCount>>,
 }
 
-/// A model on every test set, by name: `compared.json` in a run's directory.
+/// The results of a model on every test set: `compared.json` in a run's directory.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Worth {
     model_sha256: String,
-    /// By the set's name.
+    /// The results by the set's name.
     pub sets: BTreeMap<String, Measured>,
 }
 
 impl Worth {
-    /// What a run's directory holds of it. What an older version wrote is as good as nothing: it
-    /// is only measured again.
+    /// Reads a run's `compared.json`. A file that is missing or unreadable, such as one of an older
+    /// version, counts as empty, because the results can be measured again.
     fn read(run: &Path) -> Self {
         let worth = read_json(&run.join("compared.json"));
         worth.ok().flatten().unwrap_or_default()
     }
 
-    /// Judges every set with the run's model, but for what is known already.
+    /// Judges every set with the run's model, unless all results are known already.
     pub(super) fn measure(run: &Path, sets: &[TestSet]) -> anyhow::Result<Self> {
         let model = run.join("hrn.onnx");
         let bytes = std::fs::read(&model).with_context(|| model.display().to_string())?;
@@ -116,7 +116,8 @@ impl Worth {
             return Ok(worth);
         }
         let hrn = trial::load(&bytes, None).with_context(|| model.display().to_string())?;
-        // Every model of ours says its own; of another's that does not, 1 gives no figure before it.
+        // Every model of this trainer states its temperature. For a model without one, 1 means that
+        // there is no error before the temperature to report.
         let temperature = hrn.card().metrics["temperature"].as_f64().unwrap_or(1.0);
         for set in sets {
             let judged = export::judge(&hrn, &set.dataset, &set.indices)?;
@@ -172,38 +173,38 @@ impl Entry {
     }
 }
 
-/// A comparison's directory, read.
+/// The contents of a comparison's directory.
 #[derive(Debug)]
 pub struct Comparison {
     /// Every finished run, by method and then by seed.
     pub entries: Vec<Entry>,
-    /// What is known of each entry's run beyond its entry; empty where `runs/` is missing.
+    /// Further details of each entry's run; empty where `runs/` is missing.
     pub details: Vec<Details>,
     /// Runs with swapped materials; empty without any.
     pub swaps: Vec<SwapEntry>,
 }
 
-/// A run's files.
+/// The contents of a run's directory.
 #[derive(Debug, Default)]
 pub struct Details {
-    /// Its directory.
+    /// The run's directory.
     pub directory: PathBuf,
-    /// What it was told.
+    /// The run's description.
     pub told: Option<Description>,
-    /// What made it, a line each.
+    /// The program revisions that made the run, one per line.
     pub revisions: String,
-    /// On each test set.
+    /// The results on each test set.
     pub worth: Worth,
-    /// How it trained.
+    /// The metrics of its training.
     pub history: History,
 }
 
 impl Details {
-    /// Reads a run's directory; what is missing is left empty.
+    /// Reads a run's directory. Missing files leave their fields empty.
     ///
     /// # Errors
     ///
-    /// If a file is there and is not as it should be.
+    /// Fails if a file exists but cannot be read or parsed.
     pub fn read(directory: &Path) -> anyhow::Result<Self> {
         let revisions = std::fs::read_to_string(directory.join("revision")).unwrap_or_default();
         Ok(Self {
@@ -216,11 +217,12 @@ impl Details {
     }
 }
 
-/// The runs of one method under several seeds, all with as many labels chosen alike: a row of the
-/// tables.
+/// The runs of one method under several seeds, all with the same number of labels and the same way
+/// of choosing them: a row of the tables.
 #[derive(Debug)]
 pub struct Row<'a> {
-    /// Its name in tables: the method, and what tells it from the method's other rows.
+    /// The row's name in tables: the method, and what distinguishes it from the method's other
+    /// rows.
     pub title: String,
     /// Each seed's entry and details.
     pub runs: Vec<(&'a Entry, &'a Details)>,
@@ -231,7 +233,7 @@ impl Comparison {
     ///
     /// # Errors
     ///
-    /// If a file is there and is not as it should be.
+    /// Fails if a file exists but cannot be read or parsed.
     pub fn read(directory: &Path) -> anyhow::Result<Option<Self>> {
         let Some(entries) = read_json::<Vec<Entry>>(&directory.join("results.json"))? else {
             return Ok(None);
@@ -278,7 +280,7 @@ impl Comparison {
     }
 }
 
-/// Reads JSON; `None` if the file is not there.
+/// Reads a JSON file; `None` if the file does not exist.
 pub(super) fn read_json<T: DeserializeOwned>(path: &Path) -> anyhow::Result<Option<T>> {
     match std::fs::read(path) {
         Ok(bytes) => {

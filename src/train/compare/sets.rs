@@ -1,8 +1,8 @@
-//! What every model of a comparison is judged on.
+//! The test sets of a comparison.
 //!
 //! In: the data set that the models learn from. Out: its own test split, 20 fresh objects of each
-//! test material, the same objects under other sensors, and objects of other shapes and materials. The fresh ones are simulated once and
-//! kept; no model may ever learn from their seeds.
+//! test material, the same objects under other sensors, and objects of other shapes and materials.
+//! The fresh objects are simulated once and kept. No model may ever learn from their seeds.
 
 use std::path::{Path, PathBuf};
 
@@ -15,28 +15,28 @@ use crate::train::run::disk::write_whole;
 use crate::train::settings::Profile;
 use crate::verdict::sha256_hex;
 
-/// Seeds of the fresh objects: of `paper` and of `matched` shapes, and of other worlds.
+/// Seeds of the fresh objects of `paper` shapes, of `matched` shapes, and of [`WORLDS`].
 const FRESH_SEEDS: [u64; 3] = [2_019_001, 2_019_002, 2_019_004];
 /// Seed of the other gain map.
 const OTHER_SENSORS_SEED: u64 = 2_019_003;
-/// Fresh objects of each test material.
+/// The number of fresh objects of each test material.
 pub(super) const FRESH_OBJECTS: u32 = 20;
-/// A softer cover has this part of the usual one's modulus.
+/// The softer cover's modulus as a share of the usual cover's.
 const SOFTER: f64 = 0.5;
 
 /// Labelled samples to judge.
 #[derive(Debug)]
 pub(super) struct TestSet {
-    /// Its key in results.
+    /// The key of the set in the results.
     pub(super) name: &'static str,
-    /// Where the samples are.
+    /// The data set that the indices refer to.
     pub(super) dataset: Dataset,
-    /// Which they are.
+    /// The indices of the samples to judge.
     pub(super) indices: Vec<usize>,
 }
 
 impl TestSet {
-    /// SHA-256 of its file.
+    /// The SHA-256 of the set's file.
     pub(super) fn sha256(&self) -> &str {
         &self.dataset.sources[0].sha256
     }
@@ -48,14 +48,14 @@ pub(super) const PAPER_SPLIT: &str = "paper_split";
 pub(super) const FRESH: &str = "fresh";
 /// Key of the fresh objects of `matched` shapes.
 pub(super) const MATCHED: &str = "matched";
-/// Keys of the fresh objects of `paper` shapes under another sensor, and what is other about it.
+/// Keys of the fresh objects of `paper` shapes under another sensor, each with the difference.
 pub(super) const SHIFTS: [(&str, &str); 3] = [
     ("gain_map", "other gains, thresholds and dead taxels"),
     ("soft_cover", "a cover half as stiff"),
     ("raw", "taxels as uneven as on a raw film array"),
 ];
 
-/// Keys of fresh objects of other shapes and materials than the paper's, and what they are.
+/// Keys of fresh objects of other shapes and materials than the paper's, each with a description.
 pub(super) const WORLDS: [(&str, &str); 3] = [
     (
         "wide",
@@ -71,11 +71,11 @@ pub(super) const WORLDS: [(&str, &str); 3] = [
     ),
 ];
 
-/// Makes sure that no model learns from the fresh objects.
+/// Checks that no model learns from the fresh objects.
 ///
 /// # Errors
 ///
-/// If the data has a seed of theirs.
+/// Fails if the data was simulated with a seed of the fresh objects.
 pub(super) fn check_seed(dataset: &Dataset) -> anyhow::Result<()> {
     let seed = dataset.sources[0].seed;
     ensure!(
@@ -87,7 +87,7 @@ pub(super) fn check_seed(dataset: &Dataset) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Says so if the data are of another sensor than what is simulated, whose pitch is fixed: figures on
+/// Warns if the data's taxel pitch differs from the simulated sensor's, which is fixed. Results on
 /// fresh objects then say little.
 pub(super) fn warn_of_pitch(dataset: &Dataset) {
     let pitch_mm = dataset.pitch_mm();
@@ -100,12 +100,12 @@ pub(super) fn warn_of_pitch(dataset: &Dataset) {
     }
 }
 
-/// All sets in order; those that are simulated lie in `directory`. The first is left out where
+/// All sets in order. The simulated ones are kept in `directory`. The first set is left out if
 /// `dataset` has no labelled test samples.
 ///
 /// # Errors
 ///
-/// If a file cannot be read or written.
+/// Fails if a file cannot be read or written.
 pub(super) fn all(
     dataset: Dataset,
     profile: Profile,
@@ -131,7 +131,7 @@ pub(super) fn all(
     Ok(sets)
 }
 
-/// What is simulated for all comparisons of a profile.
+/// The simulated sets of all comparisons of a profile.
 fn simulations(profile: Profile) -> [(&'static str, DatasetSettings); 8] {
     let fresh = |seed, shapes| DatasetSettings {
         seed,
@@ -183,7 +183,8 @@ fn simulations(profile: Profile) -> [(&'static str, DatasetSettings); 8] {
     ]
 }
 
-/// The file of what `settings` make, simulated unless it is there. Its name tells the settings.
+/// The file of the samples of `settings`, which is simulated unless it exists. Its name contains a
+/// hash of the settings.
 fn simulated(directory: &Path, name: &str, settings: &DatasetSettings) -> anyhow::Result<PathBuf> {
     let path = file_of(directory, name, settings)?;
     if !path.exists() {
@@ -194,8 +195,8 @@ fn simulated(directory: &Path, name: &str, settings: &DatasetSettings) -> anyhow
     Ok(path)
 }
 
-/// Where the samples of `settings` are kept: another simulator or other settings, another file.
-/// Whoever changes what the simulator makes raises [`simulator::VERSION`].
+/// The file of the samples of `settings`. Another simulator version or other settings give another
+/// file. Raise [`simulator::VERSION`] with every change of the simulator's output.
 pub(super) fn file_of(
     directory: &Path,
     name: &str,

@@ -1,4 +1,4 @@
-//! What a model of format 2 says of a press before its end.
+//! Evaluates the verdicts of a model of format 2 before the end of a press.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,43 +8,44 @@ use crate::train::judge::metrics::{self, Judged};
 use crate::train::model::course as model;
 use crate::verdict::{Course, Hrn, Verdict};
 
-/// Seconds since the begin of a press at which the press so far is judged.
+/// The times at which the press so far is judged, in seconds since its begin.
 const SECONDS: [f32; 7] = [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4];
-/// An early verdict comes at this confidence: the default of `[model] early_confidence`.
+/// The confidence of an early verdict: the default of `[model] early_confidence`.
 const CONFIDENCE: f32 = 0.95;
-/// Frames that an early verdict needs.
+/// The least number of frames of an early verdict.
 const LEAST_FRAMES: usize = 3;
 
-/// Verdicts before the end of presses.
+/// The evaluation of verdicts before the end of presses.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SoFar {
-    /// After so many seconds.
+    /// The evaluation at several times after the begin.
     pub after: Vec<After>,
     /// Share of presses with an early verdict before their last frame.
     pub early: f64,
-    /// Share of these whose early level is right; null without any.
+    /// Share of the early verdicts whose level is right; null without early verdicts.
     pub early_accuracy: Option<f64>,
-    /// Share of these whose final level is another one; null without any.
+    /// Share of the early verdicts whose final level differs; null without early verdicts.
     pub changed: Option<f64>,
-    /// How long before the last frame it came, the median in seconds; null without any.
+    /// Median time from an early verdict to the last frame, in seconds; null without early
+    /// verdicts.
     pub ahead_s: Option<f64>,
 }
 
-/// Verdicts at one moment of the presses, on the frames that were there; of a press that had ended, the
-/// final one.
+/// The evaluation of verdicts at one time after the begin, on the frames up to then. For a press
+/// that had ended, the final verdict counts.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct After {
-    /// Since the begin of the press.
+    /// Seconds since the begin of the press.
     pub seconds: f32,
-    /// Share of presses that were still going on.
+    /// Share of presses that had not ended.
     pub going_on: f64,
-    /// Share whose level is right.
+    /// Share of presses whose level is right.
     pub accuracy: f64,
     /// Expected calibration error.
     pub ece: f64,
 }
 
-/// The press up to its frame number `frames`.
+/// The first `frames` frames of a press.
 fn until(course: &Course, frames: usize) -> Course {
     Course {
         moments: course.moments[..frames].to_vec(),
@@ -52,11 +53,11 @@ fn until(course: &Course, frames: usize) -> Course {
     }
 }
 
-/// Judges presses so far; `finals` are what was said of the same presses at their end.
+/// Judges presses before their end. `finals` are the final verdicts on the same presses.
 ///
 /// # Errors
 ///
-/// If the model fails to judge a press.
+/// Fails if the model fails to judge a press.
 pub(super) fn of(
     hrn: &Hrn,
     courses: &Courses,
@@ -69,7 +70,7 @@ pub(super) fn of(
         let course = model::course_of(courses, place);
         let frames = course.moments.len();
         let mut is_early = false;
-        // What was said after each number of frames; the end is known.
+        // The probabilities after each number of frames; those at the end are known.
         let mut said = Vec::with_capacity(frames);
         for count in 1..frames {
             let verdict = hrn.judge_course(&until(&course, count))?;
@@ -116,7 +117,7 @@ pub(super) fn of(
     })
 }
 
-/// The table of what a model says of the presses of a set before their end.
+/// The table of a model's verdicts on the presses of a set before their end.
 pub(super) fn table(model: &str, set: &str, so_far: &SoFar) -> Table {
     let percent = |share: f64| format!("{:.1}", 100.0 * share);
     let or_dash = |share: Option<f64>| share.map_or("-".to_owned(), percent);

@@ -1,9 +1,10 @@
-//! The two materials of a level in each other's roles.
+//! Trains and tests with the two materials of a level in swapped roles.
 //!
 //! A level is one material in training and another in the test, so an interval over objects says
-//! nothing of what other materials would have given. Here every assignment of the roles is a data
-//! set of its own, like the comparison's but for that: same seed, same numbers of objects to learn
-//! from, 20 objects a material to judge. What they share is simulated once.
+//! nothing of the results that other materials would have given. Here each assignment of the roles
+//! is a data set of its own. It is like the comparison's in all else: same seed, same numbers of
+//! training objects, 20 objects per material to judge. Parts that data sets share are simulated
+//! once.
 
 use std::path::PathBuf;
 
@@ -31,7 +32,7 @@ const FEW: [[bool; 4]; 4] = [
     [true, true, true, true],
 ];
 
-/// The assignments that a recipe is run under; none for most.
+/// The assignments that a recipe is run under; empty for most recipes.
 fn assignments(recipe: &Recipe, profile: Profile) -> Vec<[bool; 4]> {
     let all = || (0..16).map(|bits| std::array::from_fn(|level| bits >> level & 1 == 1));
     match (recipe.method, recipe.choice, profile) {
@@ -44,7 +45,7 @@ fn assignments(recipe: &Recipe, profile: Profile) -> Vec<[bool; 4]> {
     }
 }
 
-/// The levels that are swapped, such as `24`; `none` if none is.
+/// The name of an assignment: the swapped levels, such as `24`, or `none`.
 pub(super) fn name(swapped_levels: [bool; 4]) -> String {
     let levels = (1..).zip(swapped_levels).filter(|(_, swapped)| *swapped);
     let name: String = levels
@@ -57,20 +58,21 @@ pub(super) fn name(swapped_levels: [bool; 4]) -> String {
     }
 }
 
-/// What is run with materials swapped, and what can have been before.
+/// The possible runs with swapped materials.
 #[derive(Debug)]
 pub(super) struct Swaps {
     every: Vec<(Recipe, [bool; 4])>,
-    /// What the data sets are simulated with, but for the roles.
+    /// The settings of the data sets, without the roles.
     settings: DatasetSettings,
 }
 
 impl Swaps {
-    /// Those of all `recipes`, if the plan asks for any of them.
+    /// The runs with swapped materials of all `recipes`, or `None` if the plan requests none of
+    /// them.
     ///
     /// # Errors
     ///
-    /// If the data does not say what it was simulated with.
+    /// Fails if the data does not carry its simulation settings.
     pub(super) fn of(plan: &Plan, recipes: &[Recipe]) -> anyhow::Result<Option<Self>> {
         let every: Vec<(Recipe, [bool; 4])> = recipes
             .iter()
@@ -90,11 +92,11 @@ impl Swaps {
         Ok(Some(Self { every, settings }))
     }
 
-    /// Runs what is not finished and writes `swaps.json`.
+    /// Runs the unfinished runs and writes `swaps.json`.
     ///
     /// # Errors
     ///
-    /// If a file cannot be read or written, or a directory holds a run that was told otherwise.
+    /// Fails if a file cannot be read or written, or a directory holds a run with other settings.
     pub(super) fn run(&self, plan: &Plan) -> anyhow::Result<Vec<Failure>> {
         let mut parts = None;
         let mut runs = Vec::with_capacity(self.every.len());
@@ -110,7 +112,7 @@ impl Swaps {
                 told: recipe.told(SEED, plan.profile, &Dataset::read(&file)?)?,
                 data: file,
                 directory,
-                // With nobody swapped it is the comparison's own run, judged on more objects.
+                // Without a swap, the training is the comparison's own run, judged on more objects.
                 shares_with: (*swapped == [false; 4]).then(|| format!("{}-{SEED}", recipe.name())),
             };
             if plan.asks(recipe) || run.counts() {
@@ -141,10 +143,10 @@ impl Swaps {
     }
 }
 
-/// Samples without any swap, and with all.
+/// The samples without any swap, and with all levels swapped.
 type Parts = [Vec<LabelledSample>; 2];
 
-/// The file of an assignment, made unless it is there. `parts` are simulated once it is needed.
+/// The file of an assignment, written unless it exists. `parts` are simulated when first needed.
 fn file(
     plan: &Plan,
     settings: DatasetSettings,
@@ -170,8 +172,8 @@ fn file(
     Ok(path)
 }
 
-/// What the simulator gives for an assignment: each material as in the part in which it has its
-/// role, objects numbered through.
+/// Composes the samples that the simulator gives for an assignment. Each material comes from the
+/// part in which it has its role, and objects are numbered consecutively.
 fn composed([none, all]: &Parts, swapped_levels: [bool; 4]) -> Vec<LabelledSample> {
     let mut samples: Vec<LabelledSample> = Vec::new();
     let mut objects = 0;

@@ -1,7 +1,7 @@
-//! The paper's Tables 2 and 3 beside ours, and what they leave out.
+//! The paper's Tables 2 and 3 beside our results, and tables of further results.
 //!
-//! In: a comparison's results. Out: tables as rows of text, which `tables.md` and the report show
-//! alike.
+//! In: a comparison's results. Out: tables as rows of text, which `tables.md` and the report both
+//! show.
 
 mod cells;
 
@@ -25,13 +25,13 @@ pub use cells::{
 /// A table.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Table {
-    /// What it shows.
+    /// The table's title.
     pub title: String,
-    /// How to read it.
+    /// A note on how to read the table.
     pub note: String,
     /// Names of the columns.
     pub head: Vec<String>,
-    /// Its cells.
+    /// The cells, row by row.
     pub rows: Vec<Vec<String>>,
 }
 
@@ -45,7 +45,7 @@ impl Table {
         }
     }
 
-    /// Its head and rows as plain text in columns.
+    /// The head and rows as plain text in columns.
     pub fn text(&self) -> String {
         let lines: Vec<&Vec<String>> = std::iter::once(&self.head).chain(&self.rows).collect();
         let widths: Vec<usize> = (0..self.head.len())
@@ -68,7 +68,7 @@ impl Table {
         text
     }
 
-    /// A section of a page: its title, how to read it, and the table.
+    /// A section of a page: the title, the note and the table, in Markdown.
     pub fn section(&self) -> String {
         format!("## {}\n\n{}", self.title, self.markdown())
     }
@@ -83,7 +83,7 @@ impl Table {
     }
 }
 
-/// `tables.md`.
+/// The content of `tables.md`.
 pub fn markdown(comparison: &Comparison) -> String {
     let mut text = format!("# Comparison\n\n{}\n", provenance(comparison));
     for table in all(comparison) {
@@ -92,7 +92,7 @@ pub fn markdown(comparison: &Comparison) -> String {
     text
 }
 
-/// Where the figures come from, a line of text each.
+/// The origin of the figures, as lines of text.
 pub fn provenance(comparison: &Comparison) -> String {
     let mut lines = Vec::new();
     if let (Some(entry), Some(details)) = (comparison.entries.first(), comparison.details.first()) {
@@ -103,7 +103,7 @@ pub fn provenance(comparison: &Comparison) -> String {
             seeds.unwrap_or_default(),
         );
         let mut revisions: Vec<&str> = Vec::new();
-        // Results can stand without their runs.
+        // The results can exist without their runs, which then add no revision.
         let all = comparison.details.iter();
         for revision in all.flat_map(|details| details.revisions.lines()) {
             if !revisions.contains(&revision) {
@@ -149,7 +149,7 @@ fn all(comparison: &Comparison) -> Vec<Table> {
     tables
 }
 
-/// The table to read first.
+/// The summary table.
 pub fn headline(rows: &[Row]) -> Table {
     let note = "20 fresh objects of each test material, shapes alike for all materials, so that \
                 shape says nothing of hardness. \"less ours\": difference of accuracies on the same \
@@ -181,7 +181,7 @@ pub fn headline(rows: &[Row]) -> Table {
     table
 }
 
-/// What tables of accuracies show of a method.
+/// The columns of a method in tables of accuracies.
 const ACCURACIES: [&str; 7] = [
     "level 1",
     "level 2",
@@ -192,7 +192,7 @@ const ACCURACIES: [&str; 7] = [
     "less ours",
 ];
 
-/// Table 2, the paper's figures in brackets.
+/// Table 2, with the paper's figures in brackets.
 pub fn table_2(rows: &[Row]) -> Table {
     let note = "Category accuracies and overall accuracy in per cent on the data set's own test \
                 split, of the paper's size; in brackets the paper's.";
@@ -215,7 +215,7 @@ pub fn table_2(rows: &[Row]) -> Table {
     table
 }
 
-/// Accuracies on the fresh objects of either shapes.
+/// Accuracies on the fresh objects of `paper` and of `matched` shapes.
 pub fn fresh(rows: &[Row]) -> [Table; 2] {
     [
         (FRESH, "Fresh objects, shapes as the paper's pictures"),
@@ -239,7 +239,7 @@ fn accuracies(rows: &[Row], set: &str, title: &str) -> Table {
     table
 }
 
-/// Table 3's kappas, the paper's in brackets.
+/// Table 3's kappas, with the paper's in brackets.
 pub fn table_3(rows: &[Row]) -> Table {
     let note = "Cohen's kappa on the counts, and the same with quadratic weights, because levels \
                 are ordinal; in brackets what the paper's counts give.";
@@ -270,7 +270,7 @@ pub fn table_3(rows: &[Row]) -> Table {
     table
 }
 
-/// Table 3's confusion matrices as counts, the paper's to the right.
+/// Table 3's confusion matrices as counts, with the paper's to the right.
 fn confusions(rows: &[Row]) -> Table {
     let note = "Samples of the test split, mean over seeds; the paper's are of 250 a level. Rows \
                 are the truth, columns what was said.";
@@ -299,7 +299,7 @@ fn confusions(rows: &[Row]) -> Table {
     table
 }
 
-/// How sure the models are, beside how sure they should be.
+/// Calibration errors and likelihoods of the models' probabilities.
 pub fn calibration(rows: &[Row]) -> Table {
     let note = "Expected calibration error (15 bins of the largest probability) and mean negative \
                 log-likelihood in nats, on materials that no model has seen. \"Raw\": before the \
@@ -330,7 +330,7 @@ pub fn calibration(rows: &[Row]) -> Table {
     table
 }
 
-/// The same objects under other sensors.
+/// Results on the same objects under other sensors.
 pub fn shifts(rows: &[Row]) -> Table {
     let note = format!(
         "The fresh objects of the paper's shapes, pressed again on other sensors: accuracy in per \
@@ -345,7 +345,7 @@ pub fn shifts(rows: &[Row]) -> Table {
     )
 }
 
-/// Objects of other shapes and materials.
+/// Results on objects of other shapes and materials.
 pub fn worlds(rows: &[Row]) -> Table {
     let note = format!(
         "Fresh objects of other shapes and materials: accuracy in per cent and expected calibration \
@@ -357,13 +357,14 @@ pub fn worlds(rows: &[Row]) -> Table {
     elsewhere(rows, (title, &note), (MATCHED, "matched shapes"), &WORLDS)
 }
 
-/// Sets and what they are, in one line.
+/// The sets with their descriptions, in one line.
 fn described(sets: &[(&str, &str)]) -> String {
     let one = |(name, what): &(&str, &str)| format!("{}: {what}", name.replace('_', " "));
     sets.iter().map(one).collect::<Vec<_>>().join("; ")
 }
 
-/// Accuracy and calibration on a set, and on others beside it. Runs of earlier programs lack some.
+/// Accuracy and calibration on a base set and on other sets. Runs of earlier versions lack some
+/// sets.
 fn elsewhere(
     rows: &[Row],
     (title, note): (&str, &str),
@@ -436,7 +437,7 @@ pub fn price(rows: &[Row]) -> Table {
     table
 }
 
-/// The stages of one run.
+/// The table of a run's stages.
 pub fn stages(history: &History) -> Table {
     let mut table = Table::new("Stages", "", &["stage", "steps", "seconds"]);
     for stage in &history.stages {
@@ -449,7 +450,7 @@ pub fn stages(history: &History) -> Table {
     table
 }
 
-/// One evaluation.
+/// The table of one evaluation.
 pub fn evaluation(evaluation: &Evaluation) -> Table {
     let mut table = Table::new("Evaluation", "", &["", "", ""]);
     let interval = evaluation.accuracy_interval_by_object;
@@ -484,7 +485,7 @@ pub fn evaluation(evaluation: &Evaluation) -> Table {
     table
 }
 
-/// The roles of materials swapped.
+/// The table of runs with swapped materials.
 pub fn swaps(swaps: &[SwapEntry]) -> Table {
     let note = "The two materials of some levels in each other's roles, each time learnt anew and \
                 judged on 20 objects a material of the paper's shapes: accuracy in per cent over the \

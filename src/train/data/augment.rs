@@ -1,9 +1,9 @@
 //! Augmentation that keeps the physics: the 8 symmetries of the square and integer shifts.
 //!
-//! And, if it is asked for, another sensor of the kind (`disturb`).
+//! Optionally also the changes of another sensor of the same kind (`disturb`).
 //!
-//! No zoom, no shear, no intensity jitter and no normalisation by a frame's own maximum: contact
-//! width and force are what carries hardness.
+//! There is no zoom, no shear, no intensity jitter and no normalisation by a frame's own maximum,
+//! because hardness shows in the contact's width and force.
 
 use crate::frame::{COLS, Frame, ROWS};
 use crate::random::Stream;

@@ -1,8 +1,8 @@
 //! Recordings of known objects as samples of a data set.
 //!
-//! In: captures, `.mcap` or `.bin`. Out: the chosen frame of every press that was judged, or all its
-//! frames with the arm's approach. The daemon's own pipeline decodes, tares and selects, so what is
-//! learnt from is what will be judged.
+//! In: captures, `.mcap` or `.bin`. Out: the chosen frame of every press that was judged, or all
+//! its frames with the arm's approach. The daemon's own pipeline decodes, tares and selects, so a
+//! model learns from the same frames that it will judge.
 
 mod capture;
 mod selection;
@@ -21,57 +21,57 @@ use crate::train::data::dataset::{self, Dataset, DatasetError, Sample};
 
 use self::selection::Judged;
 
-/// What a data set says of who made it.
+/// The generator that a data set made here names.
 const COLLECTED: &str = concat!("hrn-train collect ", env!("CARGO_PKG_VERSION"));
-/// And of who made it where it says nothing.
+/// The generator of a data set that names none.
 const UNKNOWN: &str = "unknown";
 
-/// What the samples are said to be; what is `None` the capture's labels say.
+/// The labels of the samples. A field that is `None` is taken from the capture's labels.
 #[derive(Debug, Clone, Copy)]
 pub struct Labelling {
-    /// 1..=4, or 0: unlabelled.
+    /// The hardness level 1..=4, or 0 for unlabelled.
     pub level: Option<u8>,
-    /// What was pressed; in another data set the same number is another object. Where neither
-    /// says it, captures of one call are one object, a new one.
+    /// The number of the pressed object. The same number in another data set is another object. If
+    /// neither this field nor a label gives a number, all captures of one call are one new object.
     pub object: Option<u32>,
-    /// For training or for test.
+    /// The split: training or test.
     pub split: Split,
 }
 
-/// Why a capture gives no samples.
+/// The reason that a capture gives no samples.
 #[derive(Debug, thiserror::Error)]
 pub enum CollectError {
-    /// Missing or unreadable.
+    /// The capture is missing or unreadable.
     #[error("{path}: {source}")]
     Unreadable {
         /// The capture.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// Damaged, or none of ours.
+    /// The capture is damaged, or is not a recording of hardnessd.
     #[error("{path}: {source}")]
     Recording {
         /// The capture.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The reader's error.
         source: recording::Error,
     },
-    /// It describes a sensor that cannot be.
+    /// The capture describes an impossible sensor.
     #[error("{path}: {source}")]
     Sensor {
         /// The capture.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The error of the playback.
         source: PlaybackError,
     },
-    /// Neither given nor a label.
+    /// The level is neither given nor a label.
     #[error("{path}: level: found none, expected --level, or a recording with the label level")]
     NoLevel {
         /// The capture.
         path: PathBuf,
     },
-    /// A label that is no number in its range.
+    /// A label is not a number in its range.
     #[error(
         "{path}: label {key}: found {found}, expected {expected}{}",
         said_too(key)
@@ -79,40 +79,41 @@ pub enum CollectError {
     Label {
         /// The capture.
         path: PathBuf,
-        /// Key of the label.
+        /// The label's key.
         key: &'static str,
-        /// As it is.
+        /// The value found.
         found: String,
-        /// As it should be.
+        /// The accepted values.
         expected: &'static str,
     },
-    /// The capture is of another sensor than the others.
+    /// The capture has another taxel pitch than the others.
     #[error("{path}: taxel pitch: found {found} mm, expected {expected} mm, that of {first}")]
     Pitch {
         /// The capture.
         path: PathBuf,
-        /// Its pitch.
+        /// The capture's pitch, in mm.
         found: f64,
-        /// That of the others.
+        /// The pitch of the others, in mm.
         expected: f64,
-        /// One of them, or the data set that they are added to.
+        /// One of the others, or the data set to which the captures are added.
         first: PathBuf,
     },
-    /// An array that the data set would lose: it has a value for every sample, or is not there.
+    /// An array has values for some samples only. The data set would lose it, because an array has
+    /// a value for every sample or is missing.
     #[error(
         "{path}: {array}: found none, expected one, as in {first}: {}it can be a data set of its \
          own, and train takes several --data",
         remedy(array)
     )]
     Lost {
-        /// Where there are no values.
+        /// The file without values.
         path: PathBuf,
-        /// Its name.
+        /// The array's name.
         array: &'static str,
-        /// Where there are.
+        /// The file with values.
         first: PathBuf,
     },
-    /// The same object for training and for test.
+    /// The same object is in the training split and in the test split.
     #[error(
         "{path}: object {object}: found it for {found}, expected it for {expected}, as in {first}: \
          presses of one object are near-copies"
@@ -122,14 +123,14 @@ pub enum CollectError {
         path: PathBuf,
         /// The object's number.
         object: u32,
-        /// What its presses here are for.
+        /// The split of the object's presses in this capture.
         found: &'static str,
-        /// What those before are for.
+        /// The split of the object's earlier presses.
         expected: &'static str,
-        /// The data set that they are added to.
+        /// The data set to which the capture is added.
         first: PathBuf,
     },
-    /// Nothing was pressed, or no press was judged.
+    /// The sensor was not pressed, or no press was judged.
     #[error(
         "{path}: no press found: was the sensor pressed, and is this its layout? (`hardnessd replay {path}`)"
     )]
@@ -153,14 +154,18 @@ fn remedy(array: &str) -> String {
     }
 }
 
-/// The bytes of a data set of `captures`, after the samples of `before` if there are any. It has
-/// the arrays `material` and `shore` if every capture is labelled with one.
+/// Builds the bytes of a data set of `captures`, after the samples of `before` if there are any.
+/// The data set has the array `material`, and the array `shore`, if every capture has that label.
 ///
 /// # Errors
 ///
-/// If a level is neither given nor a label, captures and what was before are of different pitches,
-/// have different arrays or the same object in different splits, there are more objects or materials
-/// than arrays of u32 and u8 can tell apart, or the archive cannot be built.
+/// Returns an error if:
+///
+/// - a level is neither given nor a label,
+/// - captures and `before` have different pitches or arrays, or the same object in different
+///   splits,
+/// - there are more objects or materials than a u32 and a u8 can number, or
+/// - the archive cannot be built.
 pub fn to_bytes(
     captures: &[Capture],
     labelling: Labelling,
@@ -179,11 +184,13 @@ pub fn to_bytes(
     collection.finish()
 }
 
-/// As [`to_bytes`], with all frames of each press. A press whose begin the recording has not is left out.
+/// Like [`to_bytes`], but with all frames of each press. A press that began before its recording is
+/// left out.
 ///
 /// # Errors
 ///
-/// As [`to_bytes`]. A material or a measured hardness may be missing here.
+/// Returns the errors of [`to_bytes`], except that a material or a measured hardness may be
+/// missing.
 pub fn courses_to_bytes(
     captures: &[Capture],
     labelling: Labelling,
@@ -229,7 +236,7 @@ fn sample_of(press: &Press, courses: &Courses) -> Sample {
     }
 }
 
-/// A data set that is added to.
+/// A data set to which captures are added.
 struct Before {
     samples: Vec<Sample>,
     meta: Value,
@@ -237,25 +244,25 @@ struct Before {
     path: PathBuf,
 }
 
-/// The material of presses over time whose recording does not say it.
+/// The material of presses over time whose recording does not name one.
 const NO_MATERIAL: &str = "unknown";
 
-/// A data set in the making.
+/// A data set under construction.
 struct Collection {
     samples: Vec<Sample>,
-    /// The same presses over time, if these are asked for.
+    /// The same presses over time, if the data set is one of whole presses.
     courses: Option<Courses>,
     meta: Value,
-    /// Where the arrays of the first samples come from.
+    /// The file of the first samples.
     first: PathBuf,
     pitch_mm: f64,
-    /// The number of an object that no label names; `None` if all numbers are taken.
+    /// The number for an object that no label names. `None` if all numbers are taken.
     new_object: Option<u32>,
     materials: Vec<String>,
 }
 
 impl Collection {
-    /// Before its first capture, with the samples of a data set that is added to.
+    /// Begins with the samples of `before`, or without samples for the capture `first`.
     fn begun(first: Option<&Capture>, before: Option<Before>) -> Self {
         let (samples, mut meta, others, pitch_mm, first) = match before {
             Some(before) => {
@@ -280,7 +287,8 @@ impl Collection {
             ),
         };
         let last = samples.iter().filter_map(|sample| sample.object).max();
-        // Models are said to be of simulated data, recorded or both by all who had a part in it.
+        // Keep the names of all generators, because they tell whether a model's data is simulated,
+        // recorded or both.
         let others = others
             .split(", ")
             .filter(|one| !["", COLLECTED].contains(one));
@@ -359,7 +367,7 @@ impl Collection {
         Ok(())
     }
 
-    /// The object of a capture: as given, as its label says, or a new one.
+    /// The object of a capture: the given number, its label's number, or a new one.
     fn object(&self, capture: &Capture, labelling: Labelling) -> anyhow::Result<u32> {
         if let Some(object) = labelling.object {
             return Ok(object);
@@ -389,7 +397,7 @@ impl Collection {
     }
 }
 
-/// Adds a press over time; `sample` says what is known of it.
+/// Adds a press over time. Level, object, material and split are those of `sample`.
 fn push_course(courses: &mut Courses, judged: &Judged, sample: &Sample, shore: Option<f32>) {
     let press = Press {
         level: sample.level,
@@ -408,7 +416,7 @@ fn push_course(courses: &mut Courses, judged: &Judged, sample: &Sample, shore: O
     );
 }
 
-/// Refuses samples of which some have a value for an array, and some have none.
+/// Returns an error if one of two samples has a value for an array and the other has none.
 fn check_arrays(
     (before, first): (&Sample, &Path),
     (added, path): (&Sample, &Path),
@@ -437,7 +445,7 @@ fn check_arrays(
     Ok(())
 }
 
-/// Refuses a sample of an object that has others in the other split.
+/// Returns an error if the other split has a sample of the same object.
 fn check_splits(
     (before, first): (&[Sample], &Path),
     (added, path): (&Sample, &Path),
@@ -454,7 +462,7 @@ fn check_splits(
     })
 }
 
-/// The place of a name in `meta.materials`; a new one is added.
+/// The index of a name in `meta.materials`. A new name is added.
 fn index_of(name: &str, materials: &mut Vec<String>) -> anyhow::Result<u8> {
     let known = materials.iter().position(|material| material == name);
     let index = known.unwrap_or(materials.len());
@@ -466,11 +474,11 @@ fn index_of(name: &str, materials: &mut Vec<String>) -> anyhow::Result<u8> {
     })
 }
 
-/// As [`existing`], of presses over time.
+/// Like [`existing`], for presses over time.
 ///
 /// # Errors
 ///
-/// If the file is there and has no presses over time.
+/// Returns an error if the file exists but has no presses over time.
 pub fn existing_courses(path: &Path) -> Result<Option<(Courses, Value, PathBuf)>, DatasetError> {
     if !path.exists() {
         return Ok(None);
@@ -482,11 +490,11 @@ pub fn existing_courses(path: &Path) -> Result<Option<(Courses, Value, PathBuf)>
     Ok(Some((Courses::read(path)?, meta, path.to_owned())))
 }
 
-/// What is in the file to be appended to; nothing, if it is not there yet.
+/// Reads the file to be appended to. `None` if it does not exist yet.
 ///
 /// # Errors
 ///
-/// If it is there and no data set.
+/// Returns an error if the file exists but is not a data set.
 pub fn existing(path: &Path) -> Result<Option<(Dataset, Value)>, DatasetError> {
     if !path.exists() {
         return Ok(None);

@@ -1,7 +1,7 @@
 //! Presses over time as `.npz` files that numpy reads and writes.
 //!
-//! In: files, or the simulator's courses. Out: [`Courses`], one row a kept frame and one a press.
-//! `docs/formats.md` has the arrays.
+//! In: files, or the simulator's courses. Out: [`Courses`], with a row per kept frame and a row per
+//! press. `docs/formats.md` has the arrays.
 
 use std::io::{Seek, Write};
 use std::ops::Range;
@@ -15,44 +15,45 @@ use super::dataset::{DatasetError, Source, levels};
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::simulator::{LabelledCourse, NEWTONS_PER_COUNT, Split};
 
-/// Newtons of a unit of [`Courses::frames_mn`].
+/// Newtons per unit of [`Courses::frames_mn`].
 const NEWTONS: f32 = 1e-3;
 
-/// Presses over time, a column an array of the file.
+/// Presses over time. Each column is an array of the file.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Courses {
     /// Taxels of the kept frames in millinewtons, `[frames, 784]`.
     pub frames_mn: Vec<u16>,
-    /// Which press each frame is of; ascending.
+    /// The number of each frame's press, ascending.
     pub press: Vec<u32>,
-    /// Since the frame that began the press; before it: negative.
+    /// Seconds since the frame that began the press. Negative before that frame.
     pub time_s: Vec<f32>,
-    /// How far the arm went since then; 0 where unknown.
+    /// The approach of the arm since that frame, in mm. 0 where it is unknown.
     pub approach_mm: Vec<f32>,
     /// 1 where the approach is known.
     pub known: Vec<u8>,
-    /// What is known of each press.
+    /// Labels and measurements of each press.
     pub presses: Vec<Press>,
 }
 
-/// What is known of one press.
+/// Labels and measurements of one press.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Press {
-    /// 1..=4, or 0: unlabelled.
+    /// The hardness level 1..=4, or 0 for unlabelled.
     pub level: u8,
-    /// What was pressed; unique in the file.
+    /// The number of the pressed object, unique in the file.
     pub object: u32,
     /// Index into `meta.materials`.
     pub material: u8,
-    /// Train or test.
+    /// The split: train or test.
     pub split: Split,
     /// Shore hardness; NaN where it was not measured.
     pub shore: f32,
-    /// Greatest force of the press.
+    /// Force of the press: the greatest applied force if simulated, the chosen frame's total force
+    /// if recorded.
     pub force_n: f32,
-    /// Stiffness of the arm; 0: unknown.
+    /// Stiffness of the arm. 0 if unknown.
     pub arm_n_per_mm: f32,
-    /// Which frame of the file a verdict of one frame is on.
+    /// The row of the frame that a model of single frames judges.
     pub best: u32,
 }
 
@@ -89,8 +90,8 @@ impl Courses {
         all
     }
 
-    /// Adds a press: `moments` are time since its begin in s, approach in mm where known, and frame.
-    /// `press.best` counts from the first of them.
+    /// Adds a press. Each of `moments` is the time since the press began in s, the approach in mm
+    /// where known, and the frame. `press.best` counts from the first moment.
     pub fn push<'a>(
         &mut self,
         press: Press,
@@ -98,7 +99,7 @@ impl Courses {
     ) {
         let (first, number) = (self.press.len() as u32, self.presses.len() as u32);
         for (time_s, approach_mm, frame) in moments {
-            // What is beyond 65 N on a taxel is beyond any film.
+            // A u16 holds up to 65 N on a taxel, which is beyond the range of any film.
             let millinewtons = |newtons: &f32| (newtons / NEWTONS).round() as u16;
             self.frames_mn
                 .extend(frame.newtons.iter().map(millinewtons));
@@ -113,7 +114,7 @@ impl Courses {
         });
     }
 
-    /// Places of a split's presses whose level is known.
+    /// Indices of a split's presses whose level is known.
     pub fn labelled(&self, split: Split) -> impl Iterator<Item = usize> {
         let presses = self.presses.iter().enumerate();
         let wanted = presses.filter(move |(_, press)| press.split == split && press.level > 0);
@@ -138,17 +139,18 @@ impl Courses {
     ///
     /// # Errors
     ///
-    /// If it cannot be read.
+    /// Returns an error if the file cannot be read.
     pub fn is_at(path: &Path) -> Result<bool, DatasetError> {
         let bytes = file::read(path)?;
         Ok(File::open(&bytes, path)?.has("frames_mn"))
     }
 
-    /// Reads several files as one, and tells where each came from; their objects stay apart.
+    /// Reads several files as one, and gives the source of each. Objects of different files stay
+    /// apart.
     ///
     /// # Errors
     ///
-    /// Those of [`Courses::read`].
+    /// Returns the errors of [`Courses::read`].
     pub fn read_all(paths: &[PathBuf]) -> Result<(Self, Vec<Source>), DatasetError> {
         let (mut all, mut sources) = (Self::default(), Vec::new());
         for path in paths {
@@ -184,7 +186,8 @@ impl Courses {
     ///
     /// # Errors
     ///
-    /// If it cannot be read, or an array is missing or not as agreed.
+    /// Returns an error if the file cannot be read, or an array is missing or has another type,
+    /// shape or content than `docs/formats.md` says.
     pub fn read(path: &Path) -> Result<Self, DatasetError> {
         Self::parse(&file::read(path)?, path)
     }
@@ -269,7 +272,7 @@ impl Courses {
     ///
     /// # Errors
     ///
-    /// Those of writing to `out`.
+    /// Returns the errors of writing to `out`.
     pub fn write<W: Write + Seek>(
         &self,
         out: W,

@@ -1,8 +1,8 @@
 //! Labelled and unlabelled frames, as `.npz` files that numpy reads and writes.
 //!
-//! In: files, or the simulator's samples. Out: a [`Dataset`], and choices of its samples that do
-//! not cut objects in two: presses of one object are near-copies, so a model chosen by some of
-//! an object's frames has as good as seen the others.
+//! In: files, or the simulator's samples. Out: a [`Dataset`], and choices of its samples that keep
+//! objects whole. Presses of one object are near-copies, so a model that was chosen by some of an
+//! object's frames has practically seen the others.
 
 pub(super) mod file;
 
@@ -15,7 +15,7 @@ use crate::random::Stream;
 use crate::simulator::{LEVELS, LabelledSample, LevelRange, Split};
 use crate::verdict::Level;
 
-/// The distance between taxels, unless a file says another one.
+/// The distance between taxels, unless a file names another one.
 pub use crate::tare::PITCH_MM;
 
 /// The four hardness levels of the paper's Table 1.
@@ -57,24 +57,25 @@ pub enum LabelChoice {
     Random,
 }
 
-/// One press's chosen frame and what is known of it.
+/// The chosen frame of one press, with its labels and measurements.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
-    /// Newtons, after tare.
+    /// The frame in newtons, after tare.
     pub frame: Frame,
-    /// 1..=4, or 0: unlabelled.
+    /// The hardness level 1..=4, or 0 for unlabelled.
     pub level: u8,
-    /// What was pressed; unique in the data set.
+    /// The number of the pressed object, unique in the data set.
     pub object: Option<u32>,
     /// Index into the file's `meta.materials`.
     pub material: Option<u8>,
-    /// Force of the press.
+    /// Force of the press: the applied force if simulated, the chosen frame's total force if
+    /// recorded.
     pub force_n: Option<f32>,
-    /// Train or test.
+    /// The split: train or test.
     pub split: Split,
     /// Measured Shore hardness.
     pub shore: Option<f32>,
-    /// Which of [`Dataset::sources`] it came from.
+    /// Index of the sample's file in [`Dataset::sources`].
     pub source: usize,
 }
 
@@ -94,7 +95,8 @@ impl From<LabelledSample> for Sample {
 }
 
 impl Sample {
-    /// Whether both are of one object: of the same number, and not of another material or level.
+    /// Whether both samples are of one object: they have the same number and material, and not two
+    /// different levels. An unlabelled sample agrees with every level.
     pub fn shares_object_with(&self, other: &Self) -> bool {
         let same_level = self.level == other.level || self.level == 0 || other.level == 0;
         let same_number = self.object.is_some() && self.object == other.object;
@@ -102,7 +104,7 @@ impl Sample {
     }
 }
 
-/// By source and level: a list of objects, each a list of samples.
+/// Objects by source and level. Each object is a list of samples.
 type Groups = BTreeMap<(usize, u8), Vec<Vec<usize>>>;
 
 /// A file that samples came from.
@@ -110,34 +112,34 @@ type Groups = BTreeMap<(usize, u8), Vec<Vec<usize>>>;
 pub struct Source {
     /// The file's name without its directory.
     pub name: String,
-    /// The simulator's seed, where the file tells one.
+    /// The simulator's seed, if the file names one.
     pub seed: Option<u64>,
     /// SHA-256 of the file.
     pub sha256: String,
-    /// What made it, where the file tells; several are parted by commas.
+    /// The programs that made the file, separated by commas, if it names any.
     pub generator: Option<String>,
-    /// Distance between the sensor's taxels, where the file tells one.
+    /// Distance between the sensor's taxels, if the file names one.
     pub pitch_mm: Option<f64>,
 }
 
-/// What our simulator calls itself in `meta.generator`.
+/// The name of our simulator in `meta.generator`.
 pub const SIMULATOR: &str = "hardnessd simulator";
-/// What `hrn-train collect` calls itself there.
+/// The name of `hrn-train collect` in `meta.generator`.
 pub const COLLECTOR: &str = "hrn-train collect";
 
-/// What kind of samples a file has.
+/// The kind of samples in a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// Our simulator's.
+    /// Samples of our simulator.
     Simulated,
-    /// `hrn-train collect`'s.
+    /// Samples of `hrn-train collect`.
     Recorded,
-    /// Something else made them, or it is not told what.
+    /// Samples of another program, or of one that the file does not name.
     Unknown,
 }
 
 impl Source {
-    /// Of what kinds its samples are, in the order of those who had a part in it.
+    /// The kinds of the samples, in the order of the programs that made them.
     pub fn kinds(&self) -> Vec<Kind> {
         let kind = |generator: &str| match generator {
             _ if generator.starts_with(SIMULATOR) => Kind::Simulated,
@@ -152,46 +154,46 @@ impl Source {
 /// Samples of one or several files.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Dataset {
-    /// In the files' order.
+    /// The samples, in the order of the files.
     pub samples: Vec<Sample>,
     /// The files.
     pub sources: Vec<Source>,
-    /// Where they were read.
+    /// The paths of the files.
     pub paths: Vec<PathBuf>,
 }
 
-/// Why a file is no data set.
+/// The reason that a file is not a data set.
 #[derive(Debug, thiserror::Error)]
 pub enum DatasetError {
-    /// Missing or unreadable.
+    /// The file is missing or unreadable.
     #[error("{}: {source}", path.display())]
     Unreadable {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// Not a zip archive of arrays.
+    /// The file is not a zip archive of arrays.
     #[error("{}: not an .npz file: {reason}", path.display())]
     NotNpz {
         /// The file.
         path: PathBuf,
-        /// What the reader said.
+        /// The reader's error.
         reason: String,
     },
-    /// An array is missing or not as agreed.
+    /// An array is missing, or has another type, shape or content than expected.
     #[error("{}: array `{array}`: found {found}, expected {expected}", path.display())]
     Array {
         /// The file.
         path: PathBuf,
-        /// Its name.
+        /// The array's name.
         array: &'static str,
-        /// As it is.
+        /// The type, shape or content found.
         found: String,
-        /// As it should be.
+        /// The type, shape or content expected.
         expected: String,
     },
-    /// Nothing to work on.
+    /// The split has no labelled sample.
     #[error("{paths}: {split} split: found no labelled sample, expected one or more")]
     EmptySplit {
         /// The file, or files.
@@ -199,16 +201,16 @@ pub enum DatasetError {
         /// `train` or `test`.
         split: &'static str,
     },
-    /// The file is of another sensor than the files before it.
+    /// The file has another taxel pitch than the files before it.
     #[error("{}: taxel pitch: found {found} mm, expected {expected} mm, that of {}", path.display(), first.display())]
     Pitch {
         /// The file.
         path: PathBuf,
-        /// Its pitch.
+        /// The file's pitch, in mm.
         found: f64,
-        /// That of the others.
+        /// The pitch of the files before it, in mm.
         expected: f64,
-        /// One of them.
+        /// One of the files before it.
         first: PathBuf,
     },
 }
@@ -218,9 +220,9 @@ impl Dataset {
     ///
     /// # Errors
     ///
-    /// If the file cannot be read, or an array is missing or of another type, shape or content
-    /// than agreed. `object`, `material`, `force`, `shore`, `split` (then all 0) and `meta` may
-    /// be missing.
+    /// Returns an error if the file cannot be read, or an array is missing or has another type,
+    /// shape or content than `docs/formats.md` says. `object`, `material`, `force`, `shore`,
+    /// `split` (then all 0) and `meta` may be missing.
     pub fn read(path: &Path) -> Result<Self, DatasetError> {
         let bytes = file::read(path)?;
         let name = path
@@ -231,11 +233,12 @@ impl Dataset {
         file::parse(&bytes, path, name)
     }
 
-    /// Several files as one data set; their objects stay apart.
+    /// Joins several files into one data set. Objects of different files stay apart.
     ///
     /// # Errors
     ///
-    /// If they are of sensors of different pitches, or their objects are more than a u32 counts.
+    /// Returns an error if the sensors of the files have different pitches, or the files have more
+    /// objects than a u32 can number.
     pub fn joined(parts: Vec<Self>) -> Result<Self, DatasetError> {
         let mut all = Self {
             samples: Vec::new(),
@@ -285,7 +288,7 @@ impl Dataset {
         Ok(all)
     }
 
-    /// Distance between taxels of the sensor that was pressed.
+    /// Distance between the taxels of the sensor that was pressed, in mm.
     pub fn pitch_mm(&self) -> f64 {
         let told = self.sources.first().and_then(|source| source.pitch_mm);
         told.unwrap_or(PITCH_MM)
@@ -306,7 +309,7 @@ impl Dataset {
         self.samples.iter().find(is_tested)?.object
     }
 
-    /// Says so if an object has samples in both splits.
+    /// Prints a warning if an object has samples in both splits.
     pub fn warn_of_object_in_both_splits(&self) {
         if let Some(object) = self.object_in_both_splits() {
             eprintln!(
@@ -318,7 +321,7 @@ impl Dataset {
         }
     }
 
-    /// Where the first file was read.
+    /// The path of the first file.
     pub fn path(&self) -> PathBuf {
         self.paths.first().cloned().unwrap_or_default()
     }
@@ -327,7 +330,7 @@ impl Dataset {
     ///
     /// # Errors
     ///
-    /// If there is none.
+    /// Returns an error if the split has no labelled sample.
     pub fn labelled(&self, split: Split) -> Result<Vec<usize>, DatasetError> {
         let wanted = |sample: &Sample| sample.split == split && sample.level > 0;
         let indices: Vec<usize> = (0..self.samples.len())
@@ -343,8 +346,8 @@ impl Dataset {
         Ok(indices)
     }
 
-    /// The objects of `indices` by source and level, in a random order of `stream`'s. A sample of
-    /// no known object stands for itself.
+    /// The objects of `indices` by source and level, in a random order drawn from `stream`. A
+    /// sample without a known object counts as an object of its own.
     fn objects(&self, indices: &[usize], stream: &Stream) -> Groups {
         self.groups(indices, stream, |sample| sample.object)
     }
@@ -370,8 +373,8 @@ impl Dataset {
         groups.into_iter().enumerate().map(shuffled).collect()
     }
 
-    /// Takes `share` of the objects of every source and level out of `indices`: what is kept,
-    /// and what is held out, each in the data set's order.
+    /// Takes `share` of the objects of every source and level out of `indices`. Gives the kept and
+    /// the held-out indices, each in the data set's order.
     pub fn hold_out(&self, indices: &[usize], share: f64, seed: u64) -> (Vec<usize>, Vec<usize>) {
         let (mut kept, mut held) = (Vec::new(), Vec::new());
         for objects in self
@@ -389,9 +392,10 @@ impl Dataset {
         (kept, held)
     }
 
-    /// Chooses `labels` of `indices`, equally many a level (and source); of one with fewer all, and
-    /// the more of the others. By object, whole ones are taken, and of the last of each level only
-    /// as many presses as are still wanted.
+    /// Chooses `labels` of `indices`, with equal numbers for each level and source. A group with
+    /// too few samples gives all of them, and the other groups give more. By object, whole objects
+    /// are chosen, except that the last object of each group gives only as many presses as are
+    /// still wanted.
     pub fn choose_labelled(
         &self,
         indices: &[usize],
@@ -415,8 +419,8 @@ impl Dataset {
     }
 }
 
-/// How many of `labels` each of some groups gives: all alike, but none more than its size. The
-/// first that have more give one more where the number does not divide.
+/// How many of `labels` each group gives. All groups give the same number, but none more than its
+/// size. If `labels` does not divide equally, the first groups that have more give one more.
 fn shares(sizes: &[usize], labels: usize) -> Vec<usize> {
     let given = |each: usize| -> usize { sizes.iter().map(|size| each.min(*size)).sum() };
     let each = (0..=labels).take_while(|&each| given(each) <= labels);

@@ -1,8 +1,9 @@
 //! A frame as another sensor of the same kind would have given it.
 //!
-//! Gains, a light cover's crosstalk, noise, the activation threshold, counts and dead taxels are drawn
-//! anew for each frame, over ranges wider than one sensor's (`docs/method.md`). The press stays: total
-//! force moves by some ten per cent, and the contact keeps its place.
+//! Gains, a light cover's crosstalk, noise, the activation threshold and dead taxels are drawn anew
+//! for each frame, over ranges wider than one sensor's (`docs/method.md`). Forces are rounded to
+//! counts. The press stays: total force changes by about ten per cent, and the contact keeps its
+//! place.
 
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::random::Stream;
@@ -14,7 +15,7 @@ const GAIN_LINE: f64 = 0.05;
 const GAIN_FRAME: f64 = 0.10;
 /// Largest share of its force that a taxel takes from each of its four neighbours.
 const CROSSTALK: f64 = 0.04;
-/// Noise: a share of the force, and newtons.
+/// Standard deviation of the noise: a share of the force, and newtons.
 const NOISE: (f64, f64) = (0.015, 0.012);
 /// Range of the activation threshold, newtons.
 const THRESHOLD_N: (f64, f64) = (0.03, 0.2);
@@ -57,7 +58,7 @@ fn mixed(frame: &Frame, share: f32) -> Frame {
     image
 }
 
-/// The frame with each dead taxel as the mean of its live neighbours, as `tare` fills it.
+/// The frame with each dead taxel replaced by the mean of its live neighbours, as `tare` does.
 fn filled(frame: &Frame, is_dead: &[bool]) -> Frame {
     let mut image = *frame;
     for place in (0..TAXELS).filter(|&place| is_dead[place]) {
@@ -70,7 +71,7 @@ fn filled(frame: &Frame, is_dead: &[bool]) -> Frame {
     image
 }
 
-/// Places of the taxels beside a taxel in its row and column.
+/// Indices of the taxels beside a taxel in its row and column.
 fn neighbours(place: usize) -> impl Iterator<Item = usize> {
     let (row, column) = (place / COLS, place % COLS);
     [

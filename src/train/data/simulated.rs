@@ -1,7 +1,7 @@
 //! Simulated data sets as files.
 //!
-//! In: the simulator's settings. Out: `.npz` files that carry them in `meta.settings`, so that the
-//! same objects can be pressed again under other conditions.
+//! In: the simulator's settings. Out: `.npz` files that carry the settings in `meta.settings`, so
+//! that the same objects can be pressed again under other conditions.
 
 use std::io::Cursor;
 use std::path::Path;
@@ -18,14 +18,14 @@ use crate::train::data::courses::Courses;
 use crate::train::data::dataset::{self, SIMULATOR, Sample};
 use crate::verdict::Level;
 
-/// Simulates on all cores, with a bar on a terminal.
+/// Simulates samples on all cores, with a progress bar on a terminal.
 pub fn simulate(settings: &DatasetSettings) -> Vec<LabelledSample> {
     with_bar(settings.samples(), "samples", |threads, progress| {
         simulator::dataset(settings, threads, progress)
     })
 }
 
-/// As [`simulate`], of whole presses.
+/// Like [`simulate`], for whole presses.
 pub fn simulate_courses(settings: &CourseSettings) -> Vec<LabelledCourse> {
     with_bar(
         settings.objects.samples(),
@@ -61,7 +61,7 @@ fn levels(settings: &DatasetSettings) -> Vec<Level> {
 ///
 /// # Errors
 ///
-/// If the archive cannot be built.
+/// Returns an error if the archive cannot be built.
 pub fn to_bytes(
     settings: &DatasetSettings,
     samples: Vec<LabelledSample>,
@@ -71,11 +71,11 @@ pub fn to_bytes(
     Ok(dataset::write(Cursor::new(Vec::new()), &samples, &meta)?.into_inner())
 }
 
-/// The same of whole presses.
+/// The bytes of a file of whole presses that `settings` made.
 ///
 /// # Errors
 ///
-/// If the archive cannot be built.
+/// Returns an error if the archive cannot be built.
 pub fn courses_to_bytes(
     settings: &CourseSettings,
     courses: &[LabelledCourse],
@@ -95,11 +95,11 @@ fn meta(objects: &DatasetSettings, settings: &serde_json::Value) -> serde_json::
     })
 }
 
-/// What a file was simulated with.
+/// The settings that a file was simulated with.
 ///
 /// # Errors
 ///
-/// If the file cannot be read, or says nothing of it.
+/// Returns an error if the file cannot be read, or has no such settings.
 pub fn settings_of(path: &Path) -> anyhow::Result<DatasetSettings> {
     let meta = dataset::meta(path)?;
     serde_json::from_value(meta["settings"].clone()).with_context(|| {

@@ -1,12 +1,13 @@
-//! The trivial baseline: multinomial logistic regression on hand-made features, of a frame or of a press.
+//! The trivial baseline: multinomial logistic regression on hand-made features of a frame or a
+//! press.
 //!
-//! What it reaches is what area, force and spread alone tell, and every table carries it.
+//! The baseline shows how much area, force and spread alone say. Every table includes it.
 
 use crate::train::judge::features::{FEATURES, feature_graph, moments};
 use crate::train::net::graph::Graph;
 
-/// Weight of the squared coefficients beside the mean loss. It keeps Newton's method solvable
-/// where two features say the same, and is too small to matter otherwise.
+/// Weight of the squared coefficients relative to the mean loss. It keeps Newton's method solvable
+/// where two features carry the same information, and is too small to matter otherwise.
 const RIDGE: f64 = 1e-4;
 
 /// A fitted baseline.
@@ -14,18 +15,18 @@ const RIDGE: f64 = 1e-4;
 pub struct Baseline {
     /// Mean of each feature over the training samples.
     mean: Vec<f64>,
-    /// Standard deviation of each.
+    /// Standard deviation of each feature over the training samples.
     deviation: Vec<f64>,
-    /// `[L][features + 1]`: a coefficient each, and the bias.
+    /// `[L][features + 1]`: for each level a coefficient per feature, and the bias.
     coefficients: Vec<Vec<f64>>,
     /// Newton steps that the fit took.
     pub steps: u32,
-    /// Mean loss on the training samples, and the ridge.
+    /// Mean loss on the training samples plus the ridge.
     pub loss: f64,
 }
 
 impl Baseline {
-    /// Fits by Newton's method: rows of features with their level, from 0.
+    /// Fits rows of features to their levels by Newton's method. Levels count from 0.
     pub fn fit(rows: &[Vec<f32>], level_of: &[usize], levels: usize) -> Self {
         let (mean, deviation) = moments(rows);
         let coefficients = vec![vec![0.0; mean.len() + 1]; levels];
@@ -41,7 +42,8 @@ impl Baseline {
         baseline.loss = baseline.loss_on(&rows, level_of);
         for _ in 0..50 {
             let step = baseline.newton_step(&rows, level_of);
-            // Halve until the loss falls: far from the optimum a whole step may overshoot.
+            // Halve the step until the loss falls, because a whole step far from the optimum may
+            // overshoot.
             let mut share = 1.0;
             let next = loop {
                 let mut next = baseline.moved(&step, share);
@@ -65,7 +67,7 @@ impl Baseline {
         baseline
     }
 
-    /// Features less mean over deviation, and a 1 for the bias.
+    /// Features minus mean, divided by deviation, and a 1 for the bias.
     fn standardised(&self, row: &[f32]) -> Vec<f64> {
         let one = |((x, mean), deviation): ((&f32, &f64), &f64)| (f64::from(*x) - mean) / deviation;
         row.iter()
@@ -94,7 +96,7 @@ impl Baseline {
         probabilities.into_iter().map(|p| p as f32).collect()
     }
 
-    /// Mean cross-entropy and the ridge.
+    /// Mean cross-entropy plus the ridge.
     fn loss_on(&self, rows: &[Vec<f64>], level_of: &[usize]) -> f64 {
         let losses = rows
             .iter()
@@ -145,8 +147,8 @@ impl Baseline {
         moved
     }
 
-    /// The graph from newtons to logits, and the logits' name, of a fit to a frame's features.
-    /// Standardisation is inside.
+    /// The graph from newtons to logits, and the logits' name, for a baseline fitted to features of
+    /// frames. The graph includes the standardisation.
     pub fn graph(&self) -> (Graph, String) {
         let (mut graph, features) = feature_graph();
         let levels = self.coefficients.len();
@@ -179,7 +181,7 @@ impl Baseline {
     }
 }
 
-/// Solves `matrix x = right` by Cholesky's decomposition; only the lower triangle is read, and the
+/// Solves `matrix x = right` by Cholesky's decomposition. It reads only the lower triangle. The
 /// matrix is positive definite because of the ridge.
 fn solve(mut matrix: Vec<Vec<f64>>, mut right: Vec<f64>) -> Vec<f64> {
     let n = right.len();
@@ -222,7 +224,8 @@ mod tests {
 
     #[test]
     fn the_fit_finds_the_optimum() {
-        // Only feature 0 tells the level, wrongly in one case of four: the best logit is ln 3.
+        // Only feature 0 shows the level, and is wrong in one of four cases, so the best logit is
+        // ln 3.
         let row = |x: f32| {
             let mut row = vec![0.0; FEATURES];
             row[0] = x;

@@ -7,7 +7,7 @@ use epaint_default_fonts::UBUNTU_LIGHT;
 use crate::colour::viridis;
 use crate::frame::{COLS, Frame, ROWS};
 
-/// Pixels a taxel.
+/// Pixels per taxel along each axis.
 const ZOOM: usize = 4;
 /// Rows and columns of a drawn frame, in pixels.
 pub(super) const TILE: usize = COLS * ZOOM;
@@ -19,7 +19,7 @@ pub(super) const TEXT: usize = 16;
 const FONT_PIXELS: f32 = 14.0;
 /// Width of the names to the left.
 pub(super) const MARGIN: usize = 112;
-/// Ends of the colour scale, N: below a count, and an 8-bit taxel's full scale.
+/// Ends of the colour scale, N: one count, and an 8-bit taxel's full scale.
 const SCALE_N: (f32, f32) = (0.04, 10.2);
 const BACKGROUND: [u8; 3] = [250, 250, 250];
 const INK: [u8; 3] = [30, 30, 30];
@@ -68,7 +68,7 @@ impl Canvas {
         }
     }
 
-    /// Covers a share of a pixel with ink.
+    /// Blends ink into a pixel; `coverage` is the share of the pixel that the ink covers.
     fn blend(&mut self, x: usize, y: usize, coverage: f32) {
         if x >= self.width || y >= self.height {
             return;

@@ -1,7 +1,7 @@
 //! 18 hand-made features of a frame: area, force, spread and the like.
 //!
-//! They are nodes of the exported graph of the baseline, and training computes them by running that
-//! graph: there is no second definition to disagree with.
+//! The features are nodes of the baseline's exported graph, and training computes them by running
+//! that graph. So there is no second definition that could disagree.
 
 use anyhow::Context as _;
 use tract_onnx::pb;
@@ -10,7 +10,7 @@ use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::press;
 use crate::train::net::graph::{self, Graph};
 
-/// Features of a frame.
+/// The number of features of a frame.
 pub const FEATURES: usize = 18;
 /// Thresholds, beside the contact threshold, above which taxels are counted, in newtons.
 const AREA_THRESHOLDS_N: [f32; 4] = [0.2, 0.5, 1.0, 2.0];
@@ -56,7 +56,7 @@ impl Builder {
         self.node("Div", &[x, &raised], output)
     }
 
-    /// Taxels of at least `threshold` as 1, others 0.
+    /// A mask: 1 for taxels of at least `threshold_n`, 0 for the others.
     fn mask(&mut self, threshold_n: f32) -> String {
         let threshold = self.scalar(threshold_n);
         let name = format!("at least {threshold_n}");
@@ -69,7 +69,7 @@ impl Builder {
         self.graph.node("Cast", &[&at_least], &name, vec![to])
     }
 
-    /// Sum of |differences| of neighbours along rows and columns.
+    /// Sum of the absolute differences of neighbours along rows and columns.
     fn variation(&mut self, x: &str, output: &str) -> String {
         let mut along = |kernel: &str, direction: &str| {
             let name = format!("{output} {direction}");
@@ -81,8 +81,9 @@ impl Builder {
         self.node("Add", &[&down, &right], output)
     }
 
-    /// Second moments of `weights` about their centroid: adds log of their trace, and anisotropy
-    /// 0 (round) to 1 (a line), as features. Gives the trace and squared distances.
+    /// Adds two features of the second moments of `weights` about their centroid: the log of their
+    /// trace, and the anisotropy from 0 (round) to 1 (a line). Returns the trace and the squared
+    /// distances.
     fn spread(&mut self, weights: &str, total: &str) -> (String, String) {
         let mut centred = Vec::new();
         for axis in ["row", "column"] {
@@ -132,7 +133,7 @@ impl Builder {
         (trace, squares)
     }
 
-    /// Axes, coordinates and kernels.
+    /// Adds the constants: axes, coordinates and kernels.
     fn constants(&mut self) {
         let coordinate = |of: fn(usize) -> usize| -> Vec<f32> {
             (0..TAXELS).map(|index| of(index) as f32).collect()
@@ -148,14 +149,15 @@ impl Builder {
         self.graph.constant("right", &[1, 1, 1, 2], &[-1.0, 1.0]);
     }
 
-    /// Five features: the contact area, and the areas above higher thresholds. Gives the contact area.
+    /// Adds five features: the contact area, and the areas above higher thresholds. Returns the
+    /// contact area.
     fn areas(&mut self, contact: &str) -> String {
         let area = self.sum(contact, "area");
         self.log_feature(&area);
         for threshold_n in AREA_THRESHOLDS_N {
             let mask = self.mask(threshold_n);
             let count = self.sum(&mask, &format!("area of {threshold_n}"));
-            // Often 0: log(1 + count), not log(tiny).
+            // The count is often 0, so the feature is log(1 + count) and not log(count + tiny).
             let one = self
                 .graph
                 .constant(&format!("one for {threshold_n}"), &[], &[1.0]);
@@ -166,8 +168,8 @@ impl Builder {
         area
     }
 
-    /// Five features: force, greatest taxel, mean, the greatest taxel's share, and the effective area
-    /// F^2 / sum p^2. Gives the force.
+    /// Adds five features: force, greatest taxel, mean, the greatest taxel's share, and the
+    /// effective area F^2 / sum p^2. Returns the force.
     fn forces(&mut self, pressed: &str, area: &str) -> String {
         let force = self.sum(pressed, "force");
         self.log_feature(&force);
@@ -190,8 +192,9 @@ impl Builder {
         force
     }
 
-    /// Five features: the second moments of force and of contact, and the fourth moment of force over
-    /// the square of its second. Gives a sixth, how far the force reaches beside the contact.
+    /// Adds five features: the second moments of force and of contact, and the fourth moment of
+    /// force over the square of its second. Returns a sixth: the spread of the force over the
+    /// spread of the contact.
     fn shape(&mut self, (pressed, force): (&str, &str), (contact, area): (&str, &str)) -> String {
         let (spread, arm) = self.spread(pressed, force);
         let (contact_spread, _) = self.spread(contact, area);
@@ -205,7 +208,8 @@ impl Builder {
         self.quotient(&spread, &contact_spread, "reach")
     }
 
-    /// Two features: the variation of force and of contact from taxel to taxel, each by its size.
+    /// Adds two features: the variation from taxel to taxel of force, over the force, and of
+    /// contact, over the area.
     fn roughness(&mut self, (pressed, force): (&str, &str), (contact, area): (&str, &str)) {
         let variation = self.variation(pressed, "variation");
         let roughness = self.quotient(&variation, force, "roughness");
@@ -216,7 +220,7 @@ impl Builder {
     }
 }
 
-/// The graph from newtons to features `[1, FEATURES]`, and their name.
+/// The graph from newtons to features `[1, FEATURES]`, and the features' name.
 pub(super) fn feature_graph() -> (Graph, String) {
     let mut b = Builder {
         graph: Graph::default(),
@@ -245,18 +249,18 @@ pub(super) fn feature_graph() -> (Graph, String) {
     (b.graph, features)
 }
 
-/// The features of every frame, a row each.
+/// The features of every frame, a row per frame.
 ///
 /// # Errors
 ///
-/// If the graph cannot be run.
+/// Returns an error if the graph cannot be run.
 pub fn features<'a>(frames: impl Iterator<Item = &'a Frame>) -> anyhow::Result<Vec<Vec<f32>>> {
     let (graph, features) = feature_graph();
     let plan = graph::Plan::new(graph, &features, &[1, FEATURES]).context("features")?;
     frames.map(|frame| plan.run(frame)).collect()
 }
 
-/// Mean and standard deviation of each feature over `rows`, of which there is one at least.
+/// Mean and standard deviation of each feature over `rows`, which must not be empty.
 pub fn moments(rows: &[Vec<f32>]) -> (Vec<f64>, Vec<f64>) {
     let (n, width) = (rows.len() as f64, rows[0].len());
     let column = |index: usize| rows.iter().map(move |row| f64::from(row[index]));
@@ -266,7 +270,7 @@ pub fn moments(rows: &[Vec<f32>]) -> (Vec<f64>, Vec<f64>) {
     let deviation: Vec<f64> = (0..width)
         .map(|index| {
             let squares = column(index).map(|x| (x - mean[index]).powi(2));
-            // A feature that never varies is no divisor.
+            // The lower limit avoids a division by 0 for a feature that never varies.
             (squares.sum::<f64>() / n).sqrt().max(1e-6)
         })
         .collect();

@@ -1,4 +1,4 @@
-//! How like the real frames the generated ones are: what a loss of two players does not tell.
+//! The likeness of generated frames to real ones, which the losses of a GAN do not show.
 //!
 //! In: frames. Out: the spread of their taxels beside that of real ones, which shows a collapse,
 //! and a distance between their hand-made features, which shows whether they are of the right
@@ -8,29 +8,29 @@ use crate::frame::{Frame, TAXELS};
 use crate::train::judge::features;
 use crate::train::net::image::Scale;
 
-/// Generated frames beside real ones.
+/// A comparison of generated frames with real ones.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Likeness {
-    /// Standard deviation over the generated frames, mean over the taxels, in units of the image
-    /// (half the full scale).
+    /// Standard deviation over the generated frames, averaged over the taxels, in units of the
+    /// image (half the full scale).
     pub pixel_std: f64,
-    /// The same of the real frames.
+    /// `pixel_std` of the real frames.
     pub pixel_std_real: f64,
-    /// The same of the generated frames of one component, mean over the components: a mixture
-    /// whose sigma shrinks ends as one frame a component, which the figure over all hides.
+    /// `pixel_std` of the generated frames of one component, averaged over the components. A
+    /// mixture whose sigma shrinks ends with one frame per component, which `pixel_std` hides.
     pub pixel_std_component: f64,
-    /// Between the features of both, each in units of its deviation among the real ones: their
-    /// energy distance `2 E|X-Y| - E|X-X'| - E|Y-Y'|` over `2 E|X-Y|`. About 0 for frames of the
-    /// same kind; 1 would be two different points.
+    /// Distance between the features of generated and real frames, each in units of its deviation
+    /// among the real ones: the energy distance `2 E|X-Y| - E|X-X'| - E|Y-Y'|` over `2 E|X-Y|`.
+    /// About 0 for frames of the same kind, and 1 for two different points.
     pub feature_distance: f64,
 }
 
-/// Real frames to compare with.
+/// The real frames of a comparison.
 #[derive(Debug)]
 pub struct Reference {
     mean: Vec<f64>,
     deviation: Vec<f64>,
-    /// Standardised features, a row each.
+    /// Standardised features, a row per frame.
     rows: Vec<Vec<f64>>,
     pixel_std: f64,
     scale: Scale,
@@ -41,7 +41,7 @@ impl Reference {
     ///
     /// # Errors
     ///
-    /// If their features cannot be computed.
+    /// Returns an error if the features cannot be computed.
     pub fn of(frames: &[&Frame], scale: Scale) -> anyhow::Result<Self> {
         let rows = features::features(frames.iter().copied())?;
         let (mean, deviation) = features::moments(&rows);
@@ -60,7 +60,7 @@ impl Reference {
     ///
     /// # Errors
     ///
-    /// If their features cannot be computed.
+    /// Returns an error if the features cannot be computed.
     pub fn compare(&self, frames: &[Frame], components: usize) -> anyhow::Result<Likeness> {
         let rows = self.standardised(&features::features(frames.iter())?);
         let across = 2.0 * mean_distance(&self.rows, &rows);
@@ -104,7 +104,7 @@ fn mean_distance(left: &[Vec<f64>], right: &[Vec<f64>]) -> f64 {
     left.iter().map(of_one).sum::<f64>() / (left.len() * right.len()) as f64
 }
 
-/// Over pairs of different rows.
+/// Mean distance over pairs of different rows.
 fn mean_distance_within(rows: &[Vec<f64>]) -> f64 {
     let n = rows.len() as f64;
     mean_distance(rows, rows) * n / (n - 1.0).max(1.0)
@@ -171,7 +171,7 @@ mod tests {
         let likeness = reference.compare(&[real[0]; 20], 1).unwrap();
         assert!(likeness.pixel_std < 1e-6, "{likeness:?}");
         assert!(likeness.feature_distance > 0.3, "{likeness:?}");
-        // Five components of one frame each.
+        // The 20 frames are five components, each of which gives one frame only.
         let components: Vec<Frame> = (0..20).map(|n| real[10 * (n % 5) + 9]).collect();
         let likeness = reference.compare(&components, 5).unwrap();
         assert!(likeness.pixel_std > 1e-4, "{likeness:?}");

@@ -1,10 +1,10 @@
-//! How good a recogniser is: the paper's Eqs. 11 to 14, and what they leave out.
+//! The quality of a recogniser: the paper's Eqs. 11 to 14, and measures that the paper leaves out.
 //!
 //! In: the true level, the probabilities and the object of every labelled sample. Out: an
-//! [`Evaluation`], which is what `evaluate --json` prints. All ratios are taken on counts.
+//! [`Evaluation`], which `evaluate --json` prints. All ratios are computed from counts.
 //!
-//! Presses of one object are near-copies, so an interval over frames is too narrow: ours draws
-//! whole objects.
+//! Presses of one object are near-copies, so an interval over frames is too narrow. Our interval
+//! draws whole objects.
 
 mod by_object;
 
@@ -14,17 +14,18 @@ use crate::verdict::argmax;
 
 pub use by_object::{Estimate, ObjectCount, accuracy_by_object, by_object, difference_by_object};
 
-/// Equal-width bins of the largest probability in the expected calibration error.
+/// Number of equal bins of the largest probability in the expected calibration error.
 const CALIBRATION_BINS: usize = 15;
-/// A probability of 0 for what happened would make the NLL infinite.
+/// The least probability in the NLL, because a probability of 0 for the true level would make it
+/// infinite.
 const SMALLEST_PROBABILITY: f64 = 1e-12;
 
-/// One labelled sample and what was said of it.
+/// One labelled sample and its verdict.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Judged {
     /// The true level, 1..=L.
     pub level: u8,
-    /// `[L]`, of levels 1..=L.
+    /// Probabilities `[L]` of the levels 1..=L.
     pub probabilities: Vec<f32>,
     /// The object that was pressed, if known.
     pub object: Option<u32>,
@@ -40,8 +41,8 @@ impl Judged {
         usize::from(self.level) - 1
     }
 
-    /// What was said before the logits were divided by `temperature`: softmax(z) is softmax(z / T)
-    /// to the power of T, brought to a sum of 1.
+    /// The verdict before the logits were divided by `temperature`: softmax(z) is softmax(z / T) to
+    /// the power of T, normalised to a sum of 1.
     #[must_use]
     pub fn before_temperature(&self, temperature: f64) -> Self {
         let powers = self
@@ -59,24 +60,24 @@ impl Judged {
 /// The fields of `evaluate --json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Evaluation {
-    /// Labelled samples.
+    /// The number of labelled samples.
     pub n: usize,
-    /// Eq. 12: right ones among all, 0..1.
+    /// Eq. 12: share of all samples judged rightly, 0..1.
     pub accuracy: f64,
-    /// Eq. 11: right ones among each level's; null for an absent level.
+    /// Eq. 11: share of each level's samples judged rightly. Null for an absent level.
     pub category_accuracy: Vec<Option<f64>>,
     /// Counts; rows are the truth, columns the prediction.
     pub confusion: Vec<Vec<u64>>,
-    /// Cohen's kappa on the counts; null where chance alone would always agree.
+    /// Cohen's kappa on the counts. Null where chance alone would always agree.
     pub kappa: Option<f64>,
-    /// The same with quadratic weights: levels are ordinal.
+    /// Cohen's kappa with quadratic weights, because levels are ordinal.
     pub kappa_quadratic: Option<f64>,
     /// Expected calibration error, 0..1.
     pub ece: f64,
     /// Mean negative log-likelihood, nats.
     pub nll: f64,
-    /// 95 % interval of the accuracy by a bootstrap over objects within each level; null
-    /// without objects, and where no level has two of them.
+    /// 95 % interval of the accuracy by a bootstrap over objects within each level. Null without
+    /// objects, and where no level has two objects.
     pub accuracy_interval_by_object: Option<[f64; 2]>,
 }
 
@@ -85,7 +86,7 @@ impl Evaluation {
     ///
     /// # Panics
     ///
-    /// If `judged` is empty or a level lies outside 1..=`levels`.
+    /// Panics if `judged` is empty or a level lies outside 1..=`levels`.
     pub fn of(judged: &[Judged], levels: usize) -> Self {
         assert!(!judged.is_empty(), "there is nothing to evaluate");
         let mut confusion = vec![vec![0_u64; levels]; levels];
@@ -153,9 +154,9 @@ fn weighted_kappa(confusion: &[Vec<u64>], weight: impl Fn(usize, usize) -> f64) 
     (expected > 0.0).then(|| 1.0 - observed / expected)
 }
 
-/// Eq. (14) on counts. As printed, on the rows' shares, it equals Cohen's kappa only when all
-/// levels have equally many samples. Eq. (13)'s text calls `N_hw` the falsely recognised ones;
-/// the diagonal, which Eq. (14) needs, is of course the rightly recognised.
+/// Eq. (14) on counts. The paper prints it with the rows' shares, which equals Cohen's kappa only
+/// when all levels have the same number of samples. Eq. (13)'s text calls `N_hw` the samples
+/// recognised falsely, but the diagonal, which Eq. (14) needs, counts those recognised rightly.
 fn kappa(confusion: &[Vec<u64>]) -> Option<f64> {
     weighted_kappa(confusion, |h, w| if h == w { 0.0 } else { 1.0 })
 }
@@ -165,18 +166,18 @@ pub fn kappa_quadratic(confusion: &[Vec<u64>]) -> Option<f64> {
     weighted_kappa(confusion, |h, w| (h as f64 - w as f64).powi(2))
 }
 
-/// What one bin of the calibration error holds.
+/// One bin of the calibration error.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Bin {
-    /// Samples whose largest probability falls into it.
+    /// Samples whose largest probability falls into the bin.
     pub samples: u64,
-    /// Right ones among them.
+    /// Samples of the bin that were judged rightly.
     pub right: u64,
-    /// Sum of their largest probabilities.
+    /// Sum of the largest probabilities of the bin's samples.
     pub confidence: f64,
 }
 
-/// The bins of the expected calibration error: as many, equally wide, from 0 to 1.
+/// The bins of the expected calibration error, equally wide from 0 to 1.
 pub fn calibration(judged: &[Judged]) -> Vec<Bin> {
     let mut bins = vec![Bin::default(); CALIBRATION_BINS];
     for one in judged {
@@ -233,7 +234,7 @@ mod tests {
 
     #[test]
     fn quadratic_kappa_forgives_the_neighbouring_level() {
-        // By hand from Table 3's counts; the paper does not print it.
+        // These values are computed by hand from Table 3's counts; the paper does not print them.
         for (method, expected) in [("hrn15", 0.682), ("hrn100", 0.973), ("ours", 0.963)] {
             let kappa = kappa_quadratic(&paper::row(method).unwrap().counts()).unwrap();
             assert!((kappa - expected).abs() < 0.5e-3, "{method}: {kappa}");
@@ -257,7 +258,7 @@ mod tests {
             judged(2, [0.05, 0.95, 0.0, 0.0], 1),
         ];
         let evaluation = Evaluation::of(&samples, 4);
-        // Bin of 0.7: two of three right; bin of 0.95: one of one right.
+        // In the bin of 0.7, two of three are right. In the bin of 0.95, one of one is right.
         let expected_ece = (3.0 * (2.0 / 3.0_f64 - 0.7).abs() + 0.05) / 4.0;
         assert!(
             (evaluation.ece - expected_ece).abs() < 1e-6,
@@ -279,7 +280,7 @@ mod tests {
 
     #[test]
     fn temperature_can_be_taken_back() {
-        // Logits ln 8 and 0 twice, at temperature 3: 2, 1 and 1 of 4.
+        // The logits ln 8, 0 and 0 give 2, 1 and 1 of 4 at temperature 3.
         let said = judged(1, [0.5, 0.25, 0.25, 0.0], 0).before_temperature(3.0);
         for (found, expected) in said.probabilities.iter().zip([0.8, 0.1, 0.1, 0.0]) {
             assert!((found - expected).abs() < 1e-6, "{:?}", said.probabilities);
@@ -293,8 +294,9 @@ mod tests {
 
     #[test]
     fn the_interval_is_wide_when_whole_objects_fail() {
-        // 20 objects of 50 presses, one of the five a level always wrong: frames would give
-        // +-2.5 points, objects give about +-18 (binomial, 20 draws).
+        // There are 20 objects of 50 presses, and one of the five objects of each level is always
+        // judged wrongly. Frames would give +-2.5 points, objects give about +-18 (binomial, 20
+        // draws).
         let samples: Vec<Judged> = (0..20_u32)
             .flat_map(|object| (0..50).map(move |_| object))
             .map(|object| {

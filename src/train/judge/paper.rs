@@ -1,4 +1,4 @@
-//! What the paper reports, for every table and test that stands beside it.
+//! The results that the paper reports, for the tables and tests that compare with them.
 
 /// A method's row in the paper's Tables 2 and 3.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -122,7 +122,7 @@ pub fn row(method: &str) -> Option<&'static Row> {
 }
 
 impl Row {
-    /// The confusion matrix as our metrics take it.
+    /// The confusion matrix in the form that our metrics take.
     pub fn counts(&self) -> Vec<Vec<u64>> {
         self.confusion.iter().map(|row| row.to_vec()).collect()
     }

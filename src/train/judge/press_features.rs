@@ -1,7 +1,8 @@
-//! Hand-made features of a whole press, and Hertz's law fitted to it: what the controls of
-//! `hrn-train compare --course` know.
+//! Hand-made features of a whole press, and Hertz's law fitted to it. They are the input of the
+//! controls of `hrn-train compare --course`.
 //!
-//! In: the features of a press's frames, their times, the arm's way. Out: a row of numbers a press.
+//! In: the features of a press's frames, their times, the arm's approach. Out: a row of numbers per
+//! press.
 
 use crate::tare::PITCH_MM;
 use crate::train::net::course::Moment;
@@ -9,29 +10,30 @@ use crate::train::net::frames::FEATURES;
 
 /// Shares of the greatest force at which area and indentation are read off while the force rises.
 const SHARES: [f32; 3] = [0.25, 0.5, 0.75];
-/// Numbers of [`timed`].
+/// The length of a row of [`timed`].
 const TIMED: usize = 5 + SHARES.len();
-/// Numbers of [`moved`].
+/// The length of a row of [`moved`].
 const MOVED: usize = 4 + SHARES.len();
-/// Columns of [`of_press`].
+/// The length of a row of [`of_press`].
 pub const PRESS_FEATURES: usize = FEATURES + TIMED + MOVED;
-/// Numbers of [`of_hertz`].
+/// The length of a row of [`of_hertz`].
 pub const HERTZ_FEATURES: usize = 3;
-/// Keep logarithms finite: mm, N, MPa.
+/// Added before a logarithm to keep it finite: mm, N, MPa.
 const LITTLE_MM: f32 = 0.1;
 const LITTLE_N: f32 = 0.05;
 const LITTLE_MPA: f32 = 1e-3;
-/// Below this share of the greatest force the law is not fitted: the contact is then a few taxels.
+/// The law is not fitted below this share of the greatest force, because the contact is then only a
+/// few taxels.
 const LEAST_SHARE: f32 = 0.1;
 
-/// A press as its features are computed of it.
+/// The data of a press from which its features are computed.
 #[derive(Debug, Clone, Copy)]
 pub struct PressOf<'a> {
     /// Features of each frame (`net::frames`), `[frames, FEATURES]`.
     pub frames: &'a [f32],
     /// Time, approach and force of each frame.
     pub moments: &'a [Moment],
-    /// Stiffness of the arm; 0: unknown.
+    /// Stiffness of the arm. 0 if unknown.
     pub arm_n_per_mm: f32,
 }
 
@@ -45,7 +47,7 @@ pub struct Hertz {
 }
 
 impl PressOf<'_> {
-    /// Taxels in contact in a frame.
+    /// Number of taxels in contact in a frame.
     fn area(&self, frame: usize) -> f32 {
         self.frames[frame * FEATURES].exp() - 1.0
     }
@@ -58,7 +60,7 @@ impl PressOf<'_> {
             .unwrap_or(0)
     }
 
-    /// The frame of the greatest area; of equal ones that of the greater force.
+    /// The frame of the greatest area. Of equal areas, the one of the greater force.
     fn best(&self) -> usize {
         let key = |&frame: &usize| (self.area(frame), self.moments[frame].force_n);
         let before = |a: &usize, b: &usize| {
@@ -68,7 +70,7 @@ impl PressOf<'_> {
         (0..self.moments.len()).max_by(before).unwrap_or(0)
     }
 
-    /// How far object and cover gave way in a frame: the approach less what the arm gave way.
+    /// The indentation of object and cover in a frame: the approach minus the arm's deflection.
     fn indentation_mm(&self, frame: usize) -> Option<f32> {
         let Moment {
             approach_mm,
@@ -78,8 +80,8 @@ impl PressOf<'_> {
         (self.arm_n_per_mm > 0.0).then_some(approach_mm? - force_n / self.arm_n_per_mm)
     }
 
-    /// What `value` was when the rising force passed `share` of the greatest, between the frames before and
-    /// after.
+    /// `value` when the rising force passed `share` of the greatest force, interpolated between the
+    /// frames before and after.
     fn at_share(&self, share: f32, value: impl Fn(usize) -> Option<f32>) -> Option<f32> {
         let top = self.top();
         let wanted = share * self.moments[top].force_n;
@@ -93,9 +95,9 @@ impl PressOf<'_> {
         Some(low + part * (high - low))
     }
 
-    /// Fits `F^(2/3)`, which is a line in the indentation, by least squares; the radius follows from the
-    /// contact area `pi R d` at the greatest force. `None` where the approach or the arm is not known, or
-    /// the force does not rise with the indentation.
+    /// Fits `F^(2/3)`, which is linear in the indentation, by least squares. The radius follows
+    /// from the contact area `pi R d` at the greatest force. `None` where the approach or the arm's
+    /// stiffness is unknown, or the force does not rise with the indentation.
     pub fn hertz(&self) -> Option<Hertz> {
         let top = self.top();
         let least = LEAST_SHARE * self.moments[top].force_n;
@@ -126,7 +128,7 @@ impl PressOf<'_> {
     }
 }
 
-/// What the forces and areas tell over time; nothing of the arm.
+/// Features of the forces and areas over time, without the arm.
 fn timed(press: &PressOf) -> [f32; TIMED] {
     let top = press.top();
     let force_n = press.moments[top].force_n;
@@ -157,7 +159,7 @@ fn timed(press: &PressOf) -> [f32; TIMED] {
     row
 }
 
-/// What the arm's way adds; zeros where it is not known.
+/// Features from the arm's approach. Zeros where the approach or the stiffness is unknown.
 fn moved(press: &PressOf) -> [f32; MOVED] {
     let mut row = [0.0; MOVED];
     let Some(depth_mm) = press.indentation_mm(press.top()) else {
@@ -178,8 +180,8 @@ fn moved(press: &PressOf) -> [f32; MOVED] {
     row
 }
 
-/// A press's row for logistic regression, [`PRESS_FEATURES`] numbers: its best frame's features, forces and
-/// areas over time, and where the arm's way is known the indentations and Hertz's fit.
+/// A press's row for logistic regression, [`PRESS_FEATURES`] numbers: its best frame's features,
+/// forces and areas over time, and, where the approach is known, the indentations and Hertz's fit.
 pub fn of_press(press: &PressOf) -> Vec<f32> {
     let best = &press.frames[press.best() * FEATURES..][..FEATURES];
     best.iter()
@@ -189,8 +191,8 @@ pub fn of_press(press: &PressOf) -> Vec<f32> {
         .collect()
 }
 
-/// The physical control's row, [`HERTZ_FEATURES`] numbers: whether there is a fit, and the logarithms of
-/// its modulus and radius.
+/// The physical control's row, [`HERTZ_FEATURES`] numbers: whether there is a fit, and the
+/// logarithms of its modulus and radius.
 pub fn of_hertz(press: &PressOf) -> Vec<f32> {
     press.hertz().map_or_else(
         || vec![0.0; HERTZ_FEATURES],

@@ -1,7 +1,7 @@
-//! A picture of simulated presses, to be looked at before the data is believed.
+//! A picture of simulated presses, to check the data by eye before they are used.
 //!
-//! In: labelled samples and one sequence a level. Out: the bytes of a PNG, all taxels on one
-//! logarithmic colour scale in newtons. Writes no file.
+//! In: labelled samples and sequences. Out: the bytes of a PNG, all taxels on one logarithmic
+//! colour scale in newtons. Writes no file.
 
 use std::collections::BTreeMap;
 
@@ -19,13 +19,13 @@ const ROW: usize = TILE + TEXT + GAP;
 const HEAD: usize = 2 * TEXT + GAP;
 const FOOT: usize = 56;
 
-/// Draws up to twelve samples of each material, from the lightest press to the hardest, and up to twelve frames
-/// of each sequence, spread over its first press. Frames of a sequence are taken as of a zero
-/// baseline.
+/// Draws up to twelve samples of each material, from the lightest press to the hardest, and up to
+/// twelve frames of each sequence, spread over its first press. The baseline of a sequence is taken
+/// to be zero.
 ///
 /// # Errors
 ///
-/// If the PNG encoder fails.
+/// Returns an error if the PNG encoder fails.
 pub fn sheet(
     samples: &[LabelledSample],
     sequences: &[(Material, Vec<RawFrame>)],
@@ -84,17 +84,17 @@ pub fn sheet(
     canvas.png()
 }
 
-/// A named row of frames, each with what is said of it.
+/// A named row of frames, each with a caption.
 #[derive(Debug)]
 pub struct Strip<'a> {
-    /// To the left of the frames.
+    /// The row's name, drawn to the left of the frames.
     pub name: String,
-    /// At most twelve are drawn.
+    /// The frames with their captions. At most twelve are drawn.
     pub tiles: Vec<(&'a Frame, String)>,
 }
 
 impl<'a> Strip<'a> {
-    /// Frames with their contact area, force and greatest taxel.
+    /// A row of frames whose captions give contact area, force and greatest taxel.
     pub fn of(name: &str, frames: impl Iterator<Item = &'a Frame>) -> Self {
         let tile = |frame: &'a Frame| {
             let peak = frame.newtons.iter().copied().fold(0.0, f32::max);
@@ -113,7 +113,7 @@ fn contact_threshold_n() -> f32 {
     press::Settings::default().contact_threshold_n
 }
 
-/// What the captions of [`Strip::of`] say, for titles.
+/// The meaning of the captions of [`Strip::of`], for titles.
 pub fn captions() -> String {
     format!(
         "contact area in taxels at {} N, force, greatest taxel",
@@ -125,7 +125,7 @@ pub fn captions() -> String {
 ///
 /// # Errors
 ///
-/// If the PNG encoder fails.
+/// Returns an error if the PNG encoder fails.
 pub fn strips(title: &str, strips: &[Strip]) -> anyhow::Result<Vec<u8>> {
     let width = MARGIN + TILES * (TILE + GAP);
     let mut canvas = Canvas::new(width, HEAD + strips.len() * ROW + FOOT);
@@ -142,7 +142,7 @@ pub fn strips(title: &str, strips: &[Strip]) -> anyhow::Result<Vec<u8>> {
     canvas.png()
 }
 
-/// Names a row after its material; a named one is of one level.
+/// Writes a row's name: its material and level. Only a named material has one level.
 fn name(canvas: &mut Canvas, top: usize, material: usize) {
     let name = material_names(Materials::Broad)[material];
     canvas.text(GAP, top + TILE / 2 - TEXT, name);
@@ -151,12 +151,12 @@ fn name(canvas: &mut Canvas, top: usize, material: usize) {
     canvas.text(GAP, top + TILE / 2, &level);
 }
 
-/// Draws one press of each material and level over time: seconds, the arm's approach in mm, newtons
-/// read.
+/// Draws one press of each material and level over time. The captions give seconds, the arm's
+/// approach in mm and the newtons read.
 ///
 /// # Errors
 ///
-/// If the PNG encoder fails.
+/// Returns an error if the PNG encoder fails.
 pub fn courses(courses: &[LabelledCourse]) -> anyhow::Result<Vec<u8>> {
     let mut shown: BTreeMap<(u8, u8), &LabelledCourse> = BTreeMap::new();
     for course in courses {
@@ -205,7 +205,7 @@ fn first_press(frames: &[RawFrame]) -> Vec<(usize, &RawFrame)> {
     let Some(first) = frames.iter().position(loaded) else {
         return Vec::new();
     };
-    // Two empty frames end it: a single one is a light touch that flickers.
+    // Two empty frames end the press. A single one comes from a light touch that flickers.
     let length = frames[first..]
         .windows(2)
         .position(|pair| !pair.iter().any(loaded))

@@ -1,5 +1,5 @@
-//! What makes a verdict hold what it promises on objects that were held out: a temperature, sets of
-//! levels, and the widths of intervals (split conformal prediction, by object).
+//! Calibrates verdicts on held-out objects: the temperature, the threshold for sets of levels, and
+//! the widths of intervals (split conformal prediction, by object).
 
 use std::collections::BTreeMap;
 
@@ -8,46 +8,47 @@ use burn::tensor::Device;
 use crate::random::Stream;
 use crate::train::learn::fit;
 
-/// Sets of levels and intervals of Shore miss the truth in at most this share.
+/// Sets of levels and intervals of Shore hardness miss the truth in at most this share of cases.
 pub const ALPHA: f32 = 0.1;
-/// Draws of a press from each object that a quantile is averaged over.
+/// A quantile is the mean over this many draws of one press from each object.
 const DRAWS: usize = 50;
 
-/// A press of a held-out object, and what the network made of it.
+/// A press of a held-out object, and the network's outputs for it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Judged {
-    /// What was pressed.
+    /// The number of the pressed object.
     pub object: u32,
-    /// Its level, from 0.
+    /// The object's level, from 0.
     pub level: usize,
-    /// Shore OO, where it was measured.
+    /// The measured Shore OO hardness, if any.
     pub shore: Option<f32>,
-    /// Before temperature.
+    /// Logits, before temperature.
     pub logits: Vec<f32>,
-    /// Shore OO: value, low, high; not widened yet.
+    /// The network's Shore OO: value, low, high, before the interval is widened.
     pub said: [f32; 3],
 }
 
-/// What follows from the held-out presses.
+/// The calibration computed from the held-out presses.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Calibration {
-    /// What the logits are divided by.
+    /// The divisor of the logits.
     pub temperature: f32,
-    /// What is added below and above the interval of Shore, in Shore OO.
+    /// The widths added below and above the interval, in Shore OO.
     pub widths: [f32; 2],
-    /// A set of levels holds those of at least this probability; 0: nothing is known of sets.
+    /// A set of levels holds the levels of at least this probability. 0 means that there are no
+    /// sets.
     pub threshold: f32,
 }
 
 impl Calibration {
-    /// Without held-out presses: nothing is changed, nothing promised.
+    /// The calibration without held-out presses: it changes nothing and promises nothing.
     pub const NONE: Self = Self {
         temperature: 1.0,
         widths: [0.0; 2],
         threshold: 0.0,
     };
 
-    /// Of held-out presses; `stream` draws presses of the objects.
+    /// Calibrates on held-out presses. `stream` draws presses of the objects.
     pub fn of(presses: &[Judged], stream: &mut Stream, device: &Device) -> Self {
         let level_and_logits = |press: &Judged| (press.level, press.logits.clone());
         let judged: Vec<_> = presses.iter().map(level_and_logits).collect();
@@ -75,7 +76,7 @@ impl Calibration {
     }
 }
 
-/// Values of presses, a list an object.
+/// Groups values of presses into one list per object.
 fn by_object(values: impl Iterator<Item = (u32, f32)>) -> Vec<Vec<f32>> {
     let mut objects = BTreeMap::<u32, Vec<f32>>::new();
     for (object, value) in values {
@@ -84,9 +85,9 @@ fn by_object(values: impl Iterator<Item = (u32, f32)>) -> Vec<Vec<f32>> {
     objects.into_values().collect()
 }
 
-/// The split-conformal quantile of 1 - [`ALPHA`] where objects are exchangeable: of a press of each
-/// object, the value of rank ceil((1 - alpha)(n + 1)), averaged over draws of the presses. `None` without
-/// objects.
+/// The split-conformal quantile of 1 - [`ALPHA`] for exchangeable objects: with one press of each
+/// of n objects, the value of rank ceil((1 - alpha)(n + 1)), averaged over draws of the presses.
+/// `None` without objects.
 fn quantile(objects: &[Vec<f32>], stream: &mut Stream) -> Option<f32> {
     if objects.is_empty() {
         return None;
@@ -115,7 +116,7 @@ mod tests {
         let mut objects: Vec<Vec<f32>> = (1..=99_u8).map(|n| vec![f32::from(n)]).collect();
         objects[98] = vec![99.0; 1000];
         assert_eq!(quantile(&objects, &mut stream), Some(90.0));
-        // Too few objects for the promise: the greatest.
+        // With too few objects for the rank, the quantile is the greatest value.
         assert_eq!(quantile(&objects[..3], &mut stream), Some(3.0));
         assert_eq!(quantile(&[], &mut stream), None);
     }

@@ -1,8 +1,8 @@
-//! A step that learns from unlabelled samples too, without a GAN.
+//! A training step that also learns from unlabelled samples, without a GAN.
 //!
-//! In: labelled images, and unlabelled ones in two views: a weak one, which the averaged weights judge,
-//! and a strong one, which is to be judged alike (FixMatch, Sohn et al. 2020; averaged teacher, Tarvainen
-//! and Valpola 2017). Out: the loss; the weights have moved.
+//! In: labelled images, and unlabelled ones in two views. The averaged weights judge the weak view,
+//! and the network learns to judge the strong view alike (FixMatch, Sohn et al. 2020; averaged
+//! teacher, Tarvainen and Valpola 2017). Out: the loss. The step changes the weights.
 
 use burn::tensor::{Tensor, TensorData, activation};
 
@@ -15,21 +15,21 @@ use crate::verdict::argmax;
 /// Labelled images with their targets, and two views of the unlabelled ones.
 #[derive(Debug)]
 pub struct Views {
-    /// `[batch, 1, 28, 28]`.
+    /// Labelled images `[batch, 1, 28, 28]`.
     pub labelled: Tensor<4>,
-    /// `[batch, L]`.
+    /// Targets of the labelled images `[batch, L]`.
     pub targets: Tensor<2>,
-    /// `[unlabelled, 1, 28, 28]`: turned and shifted.
+    /// Unlabelled images `[unlabelled, 1, 28, 28]`, turned and shifted.
     pub weak: Tensor<4>,
-    /// The same samples as another sensor would have given them.
+    /// The same samples as another sensor would have measured them.
     pub strong: Tensor<4>,
 }
 
-/// A step; gives the loss, the labelled images' logits before it, and the share of unlabelled samples
-/// that were learnt from.
+/// Takes a step. Returns the loss, the logits of the labelled images before the step, and the share
+/// of unlabelled samples that the network learnt from.
 ///
-/// Labelled and unlabelled images go through the network one after the other, each normalised by its own
-/// statistics: the strong views are of other sensors.
+/// Labelled and unlabelled images pass through the network separately, and each batch is normalised
+/// by its own statistics, because the strong views are of other sensors.
 pub fn step(
     hrn: &mut Learner,
     views: Views,
@@ -44,7 +44,8 @@ pub fn step(
     let mut loss = hrn::cross_entropy(logits, views.targets);
     if share > 0.0 {
         let strong = hrn::logits(&tracked, views.strong, &mut Normalisation::Batch);
-        // A row of zeros, where the teacher was not sure, adds nothing to the mean.
+        // Where the teacher is not sure, the target is a row of zeros, which adds nothing to the
+        // mean.
         let unlabelled = hrn::cross_entropy(strong, pseudo);
         loss = loss.add(unlabelled.mul_scalar(settings.weight));
     }
@@ -53,8 +54,8 @@ pub fn step(
     (f64::from(numbers(&loss)[0]), judged, share)
 }
 
-/// A 1 at the level that the teacher sees in each image, where it is sure enough; and the share of
-/// images where it is.
+/// The targets `[batch, L]`, and the share of images with a target. A row has a 1 at the teacher's
+/// level where the teacher's probability reaches `confidence`, and only zeros elsewhere.
 fn pseudo_targets(teacher: &Weights, images: Tensor<4>, confidence: f64) -> (Tensor<2>, f64) {
     let device = images.device();
     let logits = hrn::logits(teacher, images, &mut Normalisation::Batch);
@@ -95,7 +96,7 @@ mod tests {
         let (none, share) = pseudo_targets(&teacher, images.clone(), 1.0);
         assert_eq!((numbers(&none).iter().sum::<f32>(), share), (0.0, 0.0));
 
-        // Where the teacher is sure of nothing, the step is the supervised one.
+        // If the teacher is sure of no image, the step is the supervised one.
         let views = |confidence| {
             let mut learner = Learner::fresh(
                 hrn::initial(4, Pooling::Max, 1, &device),

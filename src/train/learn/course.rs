@@ -1,8 +1,8 @@
 //! The training loop of the network that judges the course of a press.
 //!
-//! In: presses over time, with what the arm told. Out: weights, a temperature, and what makes sets of
-//! levels and intervals of Shore hold what they promise on objects held out. Metrics and checkpoints
-//! are written on the way; a killed run goes on bit for bit.
+//! In: presses over time, with the arm's reported motion. Out: weights, a temperature, and the
+//! calibration of sets of levels and intervals of Shore hardness on held-out objects. Metrics and
+//! checkpoints are written on the way. An interrupted run resumes with bit-identical results.
 
 use burn::tensor::{Device, Tensor};
 
@@ -26,35 +26,36 @@ use crate::verdict::argmax;
 
 mod varied;
 
-/// How far levels with few samples are lifted: halfway. Even Shore hardness gives few samples of the narrow
-/// levels. The course tells them well enough that half of the way costs nothing where samples count alike, and
-/// most of what is to be won where levels do (`models/course.md`).
+/// How far the weights of levels with few samples are raised towards equal levels: halfway. Evenly
+/// spread Shore hardness gives few samples of the narrow levels. The course of a press separates
+/// these levels well enough that halfway costs no accuracy over samples, and gains most of what
+/// equal weights would gain over levels (`models/course.md`).
 pub const BALANCE: f32 = 0.5;
-/// Presses a pass without gradients.
+/// Presses per pass without gradients.
 const JUDGED_AT_ONCE: usize = 250;
 
-/// A press, ready to be learnt from.
+/// A press, prepared for training.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Press {
     /// Features of each frame, `[frames, FEATURES]`.
     pub features: Vec<f32>,
     /// Time, approach and force of each frame.
     pub moments: Vec<Moment>,
-    /// Stiffness of the arm; 0: unknown.
+    /// Stiffness of the arm in N/mm; 0 if unknown.
     pub arm_n_per_mm: f32,
-    /// 1..=L, or 0: unlabelled.
+    /// The hardness level, 1..=L, or 0 if unlabelled.
     pub level: u8,
-    /// Shore OO, where it was measured.
+    /// The measured Shore OO hardness, if any.
     pub shore: Option<f32>,
-    /// What was pressed.
+    /// The number of the pressed object.
     pub object: u32,
 }
 
-/// The presses of a file, from the frame that began each.
+/// The presses of the data, each from the frame that began it.
 ///
 /// # Errors
 ///
-/// If features cannot be computed.
+/// Fails if features cannot be computed.
 pub fn presses(courses: &Courses) -> anyhow::Result<Vec<Press>> {
     let plan = Features::new()?;
     let prepare = |(number, press): (usize, &crate::train::data::courses::Press)| {
@@ -86,7 +87,7 @@ pub fn presses(courses: &Courses) -> anyhow::Result<Vec<Press>> {
 }
 
 impl Press {
-    /// Columns of each moment, not standardised.
+    /// The columns of each moment, before standardisation.
     fn columns(&self) -> Vec<f32> {
         let motion = course::motion(&self.moments, self.arm_n_per_mm);
         let rows = self.features.chunks(FEATURES).zip(motion);
@@ -94,7 +95,7 @@ impl Press {
             .collect()
     }
 
-    /// As the network takes it.
+    /// The network's inputs: the standardised columns, and the force of each moment.
     fn inputs(&self, standard: &Standard) -> (Vec<f32>, Vec<f32>) {
         let columns = self.columns();
         let standardised = columns.iter().enumerate();
@@ -108,24 +109,24 @@ impl Press {
     }
 }
 
-/// What is to be learnt, and from what.
+/// The inputs of a training.
 #[derive(Debug)]
 pub struct Task<'a> {
     /// Name of the stage.
     pub stage: &'static str,
-    /// All presses of the training split.
+    /// All presses of the data.
     pub presses: &'a [Press],
-    /// Places of labelled presses to learn from.
+    /// Indices of labelled presses to learn from.
     pub train: &'a [usize],
-    /// Places of presses of held-out objects.
+    /// Indices of labelled presses of held-out objects; may be empty.
     pub held_out: &'a [usize],
-    /// How many levels there are.
+    /// The number of hardness levels.
     pub levels: usize,
-    /// What the arm may tell wrongly, or not at all.
+    /// The errors and gaps in the arm's reports that training presses are given.
     pub told: Told,
     /// Settings of the training.
     pub settings: &'a Training,
-    /// Everything random follows from it.
+    /// The seed of everything random.
     pub seed: u64,
     /// The device that computes.
     pub device: &'a Device,
@@ -138,12 +139,12 @@ pub struct Trained {
     pub weights: Weights,
     /// Mean and deviation of the columns.
     pub standard: Standard,
-    /// What its verdicts promise.
+    /// The calibration of the verdicts.
     pub calibration: Calibration,
 }
 
 impl Trained {
-    /// Logits and Shore OO (value, low, high) of presses, before temperature.
+    /// Logits, before temperature, and Shore OO (value, low, high) of presses.
     pub fn judge(
         &self,
         presses: &[Press],
@@ -163,13 +164,13 @@ impl Trained {
     }
 }
 
-/// Trains from random weights, or from `start` with what its verdicts promise; goes on from the last
-/// checkpoint in `run`.
+/// Trains from random weights or from `start` with its calibration, or continues from the stage's
+/// last checkpoint in `run`.
 ///
 /// # Errors
 ///
-/// If the run's directory cannot be read or written, its checkpoint is of another stage than this,
-/// or the loss or a weight is no number any more.
+/// Fails if the run's directory cannot be read or written, its checkpoint is of another stage than
+/// this, or the loss or a weight is no longer finite.
 pub fn fit(task: &Task, start: Option<(Start, Calibration)>, run: &Run) -> anyhow::Result<Trained> {
     let Some((start, calibration)) = start else {
         let initial = course::initial(task.levels, task.seed, task.device);
@@ -193,14 +194,14 @@ impl Task<'_> {
         Stream::new(self.seed, &format!("{} {name}", self.stage))
     }
 
-    /// Mean and deviation of the columns of the presses learnt from.
+    /// Mean and deviation of the columns of the training presses.
     fn standard(&self) -> Standard {
         let presses = self.train.iter().map(|&place| &self.presses[place]);
         let rows: Vec<Vec<f32>> = presses.map(Press::columns).collect();
         Standard::of(COLUMNS, rows.iter().flat_map(|rows| rows.chunks(COLUMNS)))
     }
 
-    /// The epochs.
+    /// Runs the epochs from `initial`, or from the last checkpoint.
     fn learnt(
         &self,
         initial: Weights,
@@ -245,8 +246,8 @@ impl Task<'_> {
         origin.weights(initial).finish()
     }
 
-    /// One step on a batch of presses; gives the batch's mean loss, and how many of them were judged
-    /// rightly before it.
+    /// Takes a step on a batch of presses. Returns the batch's mean loss, and how many of the
+    /// presses were judged correctly before the step.
     fn step(
         &self,
         learner: &mut Learner,
@@ -288,7 +289,7 @@ impl Task<'_> {
         (f64::from(numbers(&loss)[0]), right)
     }
 
-    /// From the held-out objects' presses, varied as those learnt from.
+    /// Calibrates on the presses of held-out objects, varied like the training presses.
     fn calibrated(&self, weights: Weights, standard: Standard) -> Trained {
         let mut trained = Trained {
             weights,

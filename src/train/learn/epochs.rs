@@ -1,5 +1,6 @@
 //! The epochs of a network that is trained in one stage: the order of the samples, the rate of each
-//! step, checks, metrics and checkpoints. A killed run goes on bit for bit.
+//! step, checks, metrics and checkpoints. An interrupted run resumes from its checkpoint with
+//! bit-identical results.
 
 use std::time::Instant;
 
@@ -14,17 +15,18 @@ use crate::train::run::history::Row;
 use crate::train::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
 use crate::train::settings::Training;
 
-/// Training that goes on from a start ends this far from it, on the line to what was learnt: a few objects
-/// tell what the sensor is like, and little of other materials, which the start knows (Wortsman et al. 2022,
-/// "Robust fine-tuning of zero-shot models").
+/// Training that starts from a model's weights ends at this share of the way from them to the
+/// weights it learnt. A few objects show what the sensor is like, but say little of other
+/// materials, which the start knows (Wortsman et al. 2022, "Robust fine-tuning of zero-shot
+/// models").
 pub const LEARNT_SHARE: f32 = 0.5;
 
-/// What is trained, and how.
+/// The description of a training stage.
 #[derive(Debug)]
 pub struct Stage<'a> {
-    /// Of its checkpoints and of its rows in `metrics.csv`.
+    /// The name of the stage in its checkpoints and in `metrics.csv`.
     pub name: &'static str,
-    /// What the weights follow from; a checkpoint of another origin is refused.
+    /// A hash of everything that determines the weights. A checkpoint of another origin is refused.
     pub origin: String,
     /// Samples to learn from.
     pub train: &'a [usize],
@@ -37,21 +39,22 @@ pub struct Stage<'a> {
 /// One step's batch.
 #[derive(Debug, Clone, Copy)]
 pub struct Batch<'a> {
-    /// Its samples.
+    /// The samples of the batch.
     pub samples: &'a [usize],
-    /// Number of the step, from 0.
+    /// The number of the step, from 0.
     pub step: u64,
     /// Learning rate.
     pub rate: f64,
 }
 
-/// Trains `initial`, or goes on from the stage's last checkpoint in `run`. `step` takes a step and gives
-/// the batch's mean loss, and how many of its samples were judged rightly before it.
+/// Trains `initial`, or continues from the stage's last checkpoint in `run`. `step` takes a step
+/// and returns the batch's mean loss and how many of its samples were judged correctly before the
+/// step.
 ///
 /// # Errors
 ///
-/// If the run's directory cannot be read or written, its checkpoint is of another origin, or the loss or
-/// a weight is no number any more; those of `step`.
+/// Fails if the run's directory cannot be read or written, its checkpoint is of another origin, the
+/// loss or a weight is no longer finite, or `step` fails.
 pub fn run(
     stage: &Stage,
     initial: Weights,

@@ -1,9 +1,9 @@
 //! The supervised training loop: Eq. (9) minimised over labelled frames.
 //!
 //! In: a data set, which of its samples to learn from and which to validate on, and initial
-//! weights. Out: weights, the statistics of their batch normalisation, and a temperature. Written
-//! to the run's directory on the way: metrics and checkpoints, from which a killed run goes on bit
-//! for bit. The test split never enters here.
+//! weights. Out: weights, the statistics of their batch normalisation, and a temperature. The run's
+//! directory receives metrics and checkpoints on the way. An interrupted run resumes from its
+//! checkpoint with bit-identical results. The test split never enters here.
 
 use std::time::Instant;
 
@@ -26,26 +26,27 @@ use crate::train::run::progress::{ensure_finite, ensure_finite_weights, progress
 use crate::train::settings::{ConsistencySettings, Keep, Training, Validation};
 use crate::verdict::argmax;
 
-/// Samples a pass without gradients.
+/// Samples per pass without gradients.
 const JUDGED_AT_ONCE: usize = 250;
 
-/// Set in the number of a step, it gives the sub-streams of the step's unlabelled samples.
+/// A bit of the step number: when set, the number selects the sub-stream of the step's unlabelled
+/// samples.
 const UNLABELLED: u64 = 1 << 62;
 
-/// What is to be learnt, and from what.
+/// The inputs of a training.
 #[derive(Debug)]
 pub struct Task<'a> {
-    /// Name of the stage: of its checkpoints and of its rows in `metrics.csv`.
+    /// The name of the stage in its checkpoints and in `metrics.csv`.
     pub stage: &'static str,
-    /// Where the samples are.
+    /// The data set that the indices below refer to.
     pub dataset: &'a Dataset,
     /// Labelled samples to learn from.
     pub train: &'a [usize],
     /// Samples of held-out training objects, and how they are used; may be empty.
     pub validation: (&'a [usize], Validation),
-    /// Unlabelled samples that are learnt from by consistency, and how; none for most methods.
+    /// Unlabelled samples to learn from by consistency, and its settings; `None` for most methods.
     pub unlabelled: Option<(&'a [usize], ConsistencySettings)>,
-    /// From newtons to images.
+    /// The scale from newtons to images.
     pub scale: Scale,
     /// Settings of the training.
     pub settings: &'a Training,
@@ -62,7 +63,7 @@ pub struct Trained {
     pub weights: Weights,
     /// Mean and variance of each normalised layer over the training samples.
     pub statistics: Statistics,
-    /// What the logits are divided by; 1 without validation objects.
+    /// The divisor of the logits; 1 without validation objects.
     pub temperature: f32,
 }
 
@@ -91,8 +92,8 @@ impl Trained {
 ///
 /// # Errors
 ///
-/// If the run's directory cannot be read or written, its checkpoint is of another stage than this,
-/// or the loss, a weight or what they compute at the end is no number any more.
+/// Fails if the run's directory cannot be read or written, its checkpoint is of another stage than
+/// this, or the loss, a weight or a logit of the trained network is no longer finite.
 pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> {
     let Training { batch, epochs, .. } = *task.settings;
     let (validation_samples, validation_settings) = task.validation;
@@ -101,8 +102,8 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
     let origin = task.origin(&initial);
     let mut state = match run.latest(task.stage, &origin, epochs, task.device)? {
         Some(checkpoint) => {
-            // Frames generated on another device, or on more threads, may differ in their last
-            // bits; the run goes on from its weights all the same.
+            // Generated frames have no source file, and may differ in their last bits on another
+            // device or with more threads. The run then continues from its weights all the same.
             if !task.dataset.sources.is_empty() {
                 run.check_origin(task.stage, &checkpoint, &origin)?;
             }
@@ -171,8 +172,8 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
     Ok(trained)
 }
 
-/// A step of HRN on images `[batch, 1, 28, 28]` and targets `[batch, L]`; gives the mean loss and
-/// the logits that it had before it, row by row.
+/// Takes a step of HRN on images `[batch, 1, 28, 28]` and targets `[batch, L]`. Returns the mean
+/// loss and the logits before the step, row by row.
 pub fn step(
     hrn: &mut Learner,
     images: Tensor<4>,
@@ -192,12 +193,12 @@ fn levels() -> usize {
     dataset::levels().len()
 }
 
-/// All that changes from step to step.
+/// Everything that changes from step to step.
 #[derive(Debug)]
 struct State {
     progress: Progress,
     learner: Learner,
-    /// Of the least validation loss, if those are kept.
+    /// The weights of the least validation loss, if the settings keep them.
     best: Option<Weights>,
 }
 
@@ -243,8 +244,8 @@ impl State {
         }
     }
 
-    /// One step on the samples `indices`; gives the batch's mean loss, and how many of them were
-    /// judged rightly before it.
+    /// Takes a step on the samples `indices`. Returns the batch's mean loss, and how many of the
+    /// samples were judged correctly before the step.
     fn step(&mut self, task: &Task, indices: &[usize], rate: f64) -> (f64, usize) {
         let number = self.progress.step;
         let (images, targets) = (task.images(indices, number), task.targets(indices));
@@ -271,7 +272,8 @@ impl State {
         (loss, right)
     }
 
-    /// Loss and accuracy on the validation samples; keeps the weights if they are the best.
+    /// Computes loss and accuracy on the validation samples, and keeps the weights if they are the
+    /// best.
     fn validate(&mut self, task: &Task) -> (f64, f64) {
         let trained = task.with_statistics(self.learner.evaluated());
         let (samples, settings) = task.validation;
@@ -326,16 +328,16 @@ impl Task<'_> {
         self.scale.images(frames.iter(), self.device)
     }
 
-    /// The weak and the strong view of the unlabelled samples of step `step`, so many for each of
-    /// `labelled` ones. They come in the order of passes of their own.
+    /// The weak and the strong view of the unlabelled samples of step `step`: `ratio` samples for
+    /// each of the `labelled` ones. The unlabelled samples have passes and an order of their own.
     fn unlabelled_views(
         &self,
         labelled: usize,
         step: u64,
     ) -> Option<(Tensor<4>, Tensor<4>, ConsistencySettings)> {
         let (samples, settings) = self.unlabelled?;
-        // A batch that is smaller at an epoch's end takes as many as a whole one: places follow from
-        // the step's number alone.
+        // The last batch of an epoch may be smaller, but it advances by a whole batch too, so that
+        // the places follow from the step's number alone.
         let batch = (self.settings.batch.min(self.train.len()) * settings.ratio).min(samples.len());
         let wanted = (labelled * settings.ratio).clamp(1, batch);
         let batches = (samples.len() / batch) as u64;
@@ -375,14 +377,14 @@ impl Task<'_> {
         }
     }
 
-    /// The same at a stage's end, after so many epochs.
+    /// The recogniser of `weights` at the end of a stage of `epochs` epochs.
     ///
     /// # Errors
     ///
-    /// If it computes what is no number, as weights can that are numbers themselves.
+    /// Fails if a logit is not finite, which finite weights can still cause.
     pub fn finished(&self, weights: Weights, epochs: u32) -> anyhow::Result<Trained> {
         let trained = self.with_statistics(weights);
-        // Of one frame, which need not be a labelled one.
+        // One frame is enough for this check, and it need not be labelled.
         for logit in self.logits(&trained, &self.train[..1]).concat() {
             ensure_finite(self.stage, epochs, "logit", logit.into())?;
         }
@@ -390,7 +392,7 @@ impl Task<'_> {
     }
 
     /// Statistics of the normalised layers over the training samples, augmented as the settings
-    /// say, in whole batches of their size: what is left over for a smaller one is not counted.
+    /// say, in batches of their size. A smaller remainder is left out.
     fn statistics(&self, weights: &Weights) -> Statistics {
         let mut statistics = Statistics::default();
         let mut order = self.train.to_vec();
@@ -399,7 +401,8 @@ impl Task<'_> {
             .chunks_exact(self.settings.batch.min(order.len()))
             .zip(0..)
         {
-            // Steps count from 0, so no step shares a batch's sub-stream counted from the end.
+            // Training steps count from 0 and these batches from the maximum down, so none share a
+            // sub-stream.
             let images = self.images(indices, u64::MAX - number);
             hrn::logits(
                 weights,
@@ -410,7 +413,7 @@ impl Task<'_> {
         statistics
     }
 
-    /// Level, from 0, and logits of each of `indices`.
+    /// The level, from 0, and the logits of each of `indices`.
     fn judge(&self, trained: &Trained, indices: &[usize]) -> Vec<(usize, Vec<f32>)> {
         let levels = indices.iter().map(|&index| self.level(index));
         levels.zip(self.logits(trained, indices)).collect()
@@ -423,7 +426,7 @@ impl Task<'_> {
         trained.logits(frames, self.scale, self.device)
     }
 
-    /// Of a labelled sample, from 0.
+    /// The level of a labelled sample, from 0.
     fn level(&self, index: usize) -> usize {
         usize::from(self.dataset.samples[index].level) - 1
     }
@@ -439,8 +442,8 @@ fn mean_loss(judged: &[(usize, Vec<f32>)], temperature: f64) -> f64 {
     judged.iter().map(loss).sum::<f64>() / judged.len() as f64
 }
 
-/// The temperature of least loss, between 1/8 and 8: the loss is convex in 1/T, so shrinking a
-/// bracket around the least finds it.
+/// The temperature of least loss, between 1/8 and 8. The loss is convex in 1/T, so a shrinking
+/// bracket finds its minimum.
 pub fn temperature(judged: &[(usize, Vec<f32>)]) -> f32 {
     let (mut low, mut high) = (0.125_f64, 8.0_f64);
     for _ in 0..60 {
@@ -454,7 +457,7 @@ pub fn temperature(judged: &[(usize, Vec<f32>)]) -> f32 {
     (2.0 / (low + high)) as f32
 }
 
-/// Probabilities, a row each, of logits over `temperature`.
+/// The softmax of the logits over `temperature`, one row per row of logits.
 pub fn probabilities(logits: &[Vec<f32>], temperature: f32, device: &Device) -> Vec<Vec<f32>> {
     let one = |row: &Vec<f32>| {
         let scaled = Tensor::<1>::from_floats(row.as_slice(), device).div_scalar(temperature);
@@ -469,7 +472,8 @@ mod tests {
 
     #[test]
     fn the_temperature_undoes_overconfidence() {
-        // Logits of two levels that are right in 3 of 4 cases, stated four times too surely.
+        // The larger logit is right in 3 of 4 cases, but the logits are 4 times those of
+        // probability 3/4.
         let honest = 3.0_f64.ln();
         let judged: Vec<(usize, Vec<f32>)> = (0..8)
             .map(|n| (usize::from(n % 4 == 0), vec![(4.0 * honest) as f32, 0.0]))

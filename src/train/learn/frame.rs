@@ -1,8 +1,8 @@
 //! The training loop of the network that judges a frame, with Shore hardness.
 //!
-//! In: labelled frames, those of held-out objects, and unlabelled ones if there are any. Out: weights, and
-//! what makes verdicts hold what they promise. Training begins from random weights, or goes on from those
-//! of an exported file.
+//! In: labelled frames, labelled frames of held-out objects, and unlabelled frames if there are
+//! any. Out: weights, and the calibration of the verdicts. Training begins from random weights or
+//! from those of an exported file.
 
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
@@ -26,30 +26,31 @@ use crate::train::run::checkpoint::Origin;
 use crate::train::settings::{ConsistencySettings, Training};
 use crate::verdict::argmax;
 
-/// How far levels with few samples are lifted: wholly. Even Shore hardness gives few samples of the narrow
-/// levels, and a network that weighs samples alike hardly ever names those.
+/// How far the weights of levels with few samples are raised towards equal levels: 1, wholly.
+/// Evenly spread Shore hardness gives few samples of the narrow levels, and a network that weighs
+/// samples alike hardly ever names those levels.
 const BALANCE: f32 = 1.0;
-/// Frames a pass without gradients.
+/// Frames per pass without gradients.
 const JUDGED_AT_ONCE: usize = 250;
 
-/// What is to be learnt, and from what.
+/// The inputs of a training.
 #[derive(Debug)]
 pub struct Task<'a> {
     /// Name of the stage.
     pub stage: &'static str,
-    /// Where the samples are.
+    /// The data set that the indices below refer to.
     pub dataset: &'a Dataset,
     /// Labelled samples to learn from.
     pub train: &'a [usize],
     /// Labelled samples of held-out objects; may be empty.
     pub held_out: &'a [usize],
-    /// Samples without labels, and how they are learnt from; may be empty.
+    /// Unlabelled samples to learn from by consistency, and its settings; may be empty.
     pub unlabelled: (&'a [usize], ConsistencySettings),
-    /// How many levels there are.
+    /// The number of hardness levels.
     pub levels: usize,
     /// Settings of the training.
     pub settings: &'a Training,
-    /// Everything random follows from it.
+    /// The seed of everything random.
     pub seed: u64,
     /// The device that computes.
     pub device: &'a Device,
@@ -62,7 +63,7 @@ pub struct Trained {
     pub weights: Weights,
     /// Mean and deviation of the features.
     pub standard: Standard,
-    /// What its verdicts promise.
+    /// The calibration of the verdicts.
     pub calibration: Calibration,
 }
 
@@ -71,7 +72,7 @@ impl Trained {
     ///
     /// # Errors
     ///
-    /// If features cannot be computed.
+    /// Fails if features cannot be computed.
     pub fn judge(
         &self,
         frames: &[Frame],
@@ -89,12 +90,13 @@ impl Trained {
     }
 }
 
-/// Trains from random weights, or from `start`; goes on from the last checkpoint in `run`.
+/// Trains from random weights or from `start`, or continues from the stage's last checkpoint in
+/// `run`.
 ///
 /// # Errors
 ///
-/// If the run's directory cannot be read or written, its checkpoint is of another stage than this,
-/// features cannot be computed, or the loss or a weight is no number any more.
+/// Fails if the run's directory cannot be read or written, its checkpoint is of another stage than
+/// this, features cannot be computed, or the loss or a weight is no longer finite.
 pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Trained> {
     let plan = Features::new()?;
     let kept = start.as_ref().map(|start| start.weights.clone());
@@ -168,13 +170,14 @@ impl Task<'_> {
         samples.iter().map(frame).collect()
     }
 
-    /// Samples, each varied as the settings say.
+    /// The frames of `samples`, each augmented as the settings say.
     fn varied(&self, samples: &[usize], stream: &mut Stream) -> Vec<Frame> {
         let vary = |frame| augment::vary(&frame, self.settings.augmentation, stream);
         self.frames(samples).into_iter().map(vary).collect()
     }
 
-    /// One step; gives the batch's mean loss, and how many of its samples were judged rightly before it.
+    /// Takes a step. Returns the batch's mean loss, and how many of its samples were judged
+    /// correctly before the step.
     fn step(
         &self,
         learner: &mut Learner,
@@ -217,7 +220,8 @@ impl Task<'_> {
         Ok((f64::from(numbers(&loss)[0]), right.count()))
     }
 
-    /// The weak and the strong view of as many unlabelled samples as the batch has labelled ones.
+    /// The weak and the strong view of randomly drawn unlabelled samples: `ratio` for each labelled
+    /// sample of the batch. `None` at step 0 or without unlabelled samples.
     fn unlabelled_views(
         &self,
         batch: Batch,
@@ -235,7 +239,8 @@ impl Task<'_> {
         Some((weak, strong.collect()))
     }
 
-    /// A 1 at the level that the averaged weights see in each weak view, where they are sure enough.
+    /// Targets `[batch, L]` from the averaged weights' outputs for the weak views: a 1 at the most
+    /// probable level where its probability reaches the confidence, and only zeros elsewhere.
     fn sure_targets(&self, outputs: &Tensor<2>) -> Tensor<2> {
         let count = outputs.dims()[0];
         let logits = outputs.clone().slice([0..count, 0..self.levels]);
@@ -250,7 +255,7 @@ impl Task<'_> {
         Tensor::from_data(TensorData::new(rows, [count, self.levels]), self.device)
     }
 
-    /// From the held-out objects' frames, varied as those learnt from.
+    /// Calibrates on the frames of held-out objects, augmented like the training frames.
     fn calibration(
         &self,
         weights: &Weights,

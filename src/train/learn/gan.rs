@@ -1,10 +1,9 @@
-//! Generator and discriminator against each other: one loop for USTGAN, the STGANs, SGAN and
-//! IGAN.
+//! The training loop of generator and discriminator, shared by USTGAN, the STGANs, SGAN and IGAN.
 //!
-//! In: real frames, the game that is played (see [`crate::train::net::losses`]) and the weights both start from.
-//! Out: both sides' weights. USTGAN and an STGAN differ in their frames and starting weights
-//! alone; SGAN and IGAN also see labelled frames. Written to the run's directory on the way:
-//! metrics, checkpoints and pictures of what fixed noise becomes.
+//! In: real frames, the game (see [`crate::train::net::losses`]) and the initial weights of both
+//! sides. Out: both sides' trained weights. USTGAN and an STGAN differ only in their frames and
+//! starting weights. SGAN and IGAN also use labelled frames. The run's directory receives metrics,
+//! checkpoints and pictures of frames generated from fixed noise.
 
 use std::time::Instant;
 
@@ -33,7 +32,7 @@ mod tests;
 
 pub use step::{Batch, Rules, step};
 
-/// Both sides.
+/// The weights of generator and discriminator.
 #[derive(Debug, Clone)]
 pub struct Gan {
     /// Weights of the generator and its mixture.
@@ -42,7 +41,7 @@ pub struct Gan {
     pub discriminator: Weights,
 }
 
-/// Both sides before training; the head is that of the game.
+/// Generator and discriminator before training. The game determines the discriminator's head.
 pub fn initial(game: Game, levels: usize, seed: u64, device: &Device) -> Gan {
     let stream = Stream::new(seed, "discriminator weights");
     let mut discriminator = Weights::default();
@@ -55,24 +54,24 @@ pub fn initial(game: Game, levels: usize, seed: u64, device: &Device) -> Gan {
     }
 }
 
-/// What is to be learnt, and from what.
+/// The inputs of a training.
 #[derive(Debug)]
 pub struct Task<'a> {
-    /// Name of the stage: of its checkpoints, pictures and rows in `metrics.csv`.
+    /// The name of the stage in its checkpoints, its pictures and `metrics.csv`.
     pub stage: &'static str,
-    /// What the discriminator tells apart.
+    /// The classes that the discriminator distinguishes, and the losses.
     pub game: Game,
-    /// Where the samples are.
+    /// The data set that the indices below refer to.
     pub dataset: &'a Dataset,
-    /// Samples taken as real, without their levels.
+    /// Real samples, used without their levels.
     pub real: &'a [usize],
     /// Samples whose levels the discriminator learns; empty where the game has no levels.
     pub labelled: &'a [usize],
-    /// From newtons to images.
+    /// The scale from newtons to images.
     pub scale: Scale,
     /// Settings of the training.
     pub settings: &'a GanSettings,
-    /// Seed of noise and orders.
+    /// Seed of the noise and of the order of the samples.
     pub seed: u64,
     /// The device that computes.
     pub device: &'a Device,
@@ -82,8 +81,8 @@ pub struct Task<'a> {
 ///
 /// # Errors
 ///
-/// If the run's directory cannot be read or written, its checkpoint is of another stage than this,
-/// or a loss or a weight is no number any more.
+/// Fails if the run's directory cannot be read or written, its checkpoint is of another stage than
+/// this, or a loss or a weight is no longer finite.
 pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
     let GanSettings { batch, epochs, .. } = *task.settings;
     let steps = u64::from(epochs) * task.real.len().div_ceil(batch) as u64;
@@ -166,7 +165,7 @@ pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
     })
 }
 
-/// All that changes from step to step.
+/// Everything that changes from step to step, and the sensor.
 #[derive(Debug)]
 struct State {
     progress: Progress,
@@ -175,7 +174,7 @@ struct State {
     discriminator: Learner,
 }
 
-/// Prefixes of the two sides' lists in a checkpoint.
+/// Prefixes of the generator's and the discriminator's lists in a checkpoint.
 const SIDES: [&str; 2] = ["generator ", "discriminator "];
 
 impl State {
@@ -220,8 +219,8 @@ impl State {
         }
     }
 
-    /// A step of both sides on the real samples `indices`; gives the losses of discriminator and
-    /// generator.
+    /// Takes a step of both sides on the real samples `indices`. Returns the losses of
+    /// discriminator and generator.
     fn step(&mut self, task: &Task, indices: &[usize], rate: f64) -> (f64, f64) {
         let number = self.progress.step;
         self.progress.step += 1;
@@ -245,7 +244,7 @@ impl State {
     }
 }
 
-/// Least, mean and greatest size of the mixture's deviations; their sign means nothing.
+/// Least, mean and greatest absolute value of the mixture's deviations, whose sign has no effect.
 fn sigma_range(generator: &Weights) -> [f64; 3] {
     let sizes: Vec<f64> = generator
         .numbers("mixture.sigma")
@@ -260,7 +259,7 @@ fn sigma_range(generator: &Weights) -> [f64; 3] {
 }
 
 impl Task<'_> {
-    /// What gave the real frames.
+    /// The sensor that measured the real frames.
     pub fn sensor(&self) -> Sensor {
         Sensor::of(self.frames(self.real).into_iter())
     }
@@ -279,7 +278,7 @@ impl Task<'_> {
         Stream::new(self.seed, &format!("{} {name}", self.stage))
     }
 
-    /// `samples` in the order of pass `pass`.
+    /// `samples` in the random order of pass `pass`.
     fn order(&self, name: &str, samples: &[usize], pass: u64) -> Vec<usize> {
         let mut order = samples.to_vec();
         self.stream(name).child(pass).shuffle(&mut order);
@@ -291,8 +290,8 @@ impl Task<'_> {
         indices.iter().map(frame).collect()
     }
 
-    /// The images of step `step`. The labelled samples are fewer than the real ones and come
-    /// again and again.
+    /// The images of step `step`. The labelled samples are fewer than the real ones, so they repeat
+    /// in passes of their own.
     fn batch(&self, real: &[usize], step: u64) -> Batch {
         let images = |indices: &[usize]| {
             self.scale

@@ -1,5 +1,5 @@
-//! A network while it learns: weights, optimiser, running average. All of it goes into a
-//! checkpoint.
+//! The state of a network in training: weights, optimiser, running average. A checkpoint holds all
+//! of it.
 
 use burn::tensor::{Gradients, Tensor};
 
@@ -9,21 +9,21 @@ use crate::train::run::checkpoint::Checkpoint;
 use crate::train::settings::OptimiserSettings;
 use crate::train::settings::optimiser::Rule;
 
-/// Weights and what goes with them from step to step.
+/// The weights, and the state that changes with them at every step.
 #[derive(Debug)]
 pub struct Learner {
-    /// As of the last step.
+    /// The weights after the last step.
     pub weights: Weights,
     optimiser: Optimiser,
-    /// Decay a step of the average.
+    /// The decay of the average per step.
     averaging: f64,
-    /// Sum of decayed weights, if they are averaged.
+    /// The decayed sum of the weights, if they are averaged.
     average: Option<Weights>,
 }
 
 impl Learner {
-    /// Weights before their first step. They are averaged if `averaging`, the decay a step, is
-    /// above 0.
+    /// A learner before its first step. `averaging` is the decay of the average per step; 0 means
+    /// no average.
     pub fn fresh(weights: Weights, settings: OptimiserSettings, averaging: f64) -> Self {
         let zeros = |weight: &Weight| Weight {
             values: weight.values.zeros_like(),
@@ -40,12 +40,12 @@ impl Learner {
         }
     }
 
-    /// One as [`Learner::lists`] put it under `prefix` into a checkpoint, after so many steps of its
-    /// own.
+    /// The learner that [`Learner::lists`] stored in a checkpoint under `prefix`, after `steps`
+    /// steps.
     ///
     /// # Errors
     ///
-    /// If a part of it is missing there.
+    /// Fails if the checkpoint lacks a part of the learner.
     pub fn resumed(
         checkpoint: &Checkpoint,
         prefix: &str,
@@ -82,7 +82,7 @@ impl Learner {
         })
     }
 
-    /// What a checkpoint keeps of it.
+    /// The lists that a checkpoint stores, each name preceded by `prefix`.
     pub fn lists(&self, prefix: &str) -> Vec<(String, Weights)> {
         let like_weights = |values: Vec<Tensor<1>>| {
             let with = |(weight, values): (&Weight, Tensor<1>)| Weight {
@@ -106,7 +106,7 @@ impl Learner {
         lists.into_iter().map(named).collect()
     }
 
-    /// Takes a step; `gradients` belong to `tracked`, the weights as leaves.
+    /// Takes a step. `gradients` belong to `tracked`, which are the weights as leaves.
     pub fn step(&mut self, tracked: &Weights, gradients: &mut Gradients, rate: f64) {
         self.optimiser
             .step(&mut self.weights, tracked, gradients, rate);
@@ -119,8 +119,8 @@ impl Learner {
         }
     }
 
-    /// The weights to judge with: averaged ones if they are averaged. The average began at 0,
-    /// which is divided out.
+    /// The weights to judge with: the averaged ones if there is an average. The average began at 0,
+    /// so it is divided by the sum of its factors.
     pub fn evaluated(&self) -> Weights {
         let Some(average) = self.average.as_ref().filter(|_| self.optimiser.steps() > 0) else {
             return self.weights.clone();

@@ -1,6 +1,7 @@
 //! Gradient steps: plain SGD, as the paper trains HRN, and Adam, as it trains its GANs.
 //!
-//! Written out on flat weights so that a checkpoint can hold the whole state in full precision.
+//! The optimisers are written here, on flat weights, so that a checkpoint can hold the whole state
+//! in full precision.
 
 use burn::tensor::{Gradients, Tensor};
 
@@ -8,15 +9,15 @@ use crate::train::net::network::Weights;
 use crate::train::settings::OptimiserSettings;
 use crate::train::settings::optimiser::Rule;
 
-/// Adam's epsilon, of its authors. burn's default of 1e-5 is not negligible beside the gradients
-/// here.
+/// Adam's epsilon, as its authors recommend. burn's default of 1e-5 is not negligible beside the
+/// gradients here.
 const ADAM_EPSILON: f32 = 1e-8;
 
 /// An optimiser with its state.
 #[derive(Debug)]
 pub struct Optimiser {
     settings: OptimiserSettings,
-    /// Steps taken.
+    /// The number of steps taken.
     step: u64,
     /// Running mean and mean square of each weight's gradient; empty for SGD.
     moments: Vec<(Tensor<1>, Tensor<1>)>,
@@ -41,8 +42,8 @@ impl Optimiser {
         }
     }
 
-    /// Takes one step at `rate`. `tracked` are the leaves that `gradients` belong to, in the
-    /// order of `weights`; a weight without a gradient stays.
+    /// Takes one step at `rate`. `tracked` are the leaves that `gradients` belong to, in the order
+    /// of `weights`. A weight without a gradient does not change.
     pub fn step(
         &mut self,
         weights: &mut Weights,
@@ -88,7 +89,7 @@ impl Optimiser {
         }
     }
 
-    /// Steps taken so far.
+    /// The number of steps taken so far.
     pub fn steps(&self) -> u64 {
         self.step
     }
@@ -131,7 +132,7 @@ mod tests {
             weights.add(name, dims, vec![2.0], &Device::flex());
         }
         let tracked = weights.tracked();
-        // Every weight has a gradient, of 0.
+        // Every weight has a gradient of 0, so only weight decay changes it.
         let values = tracked.entries.iter().map(|weight| weight.values.clone());
         let loss = Tensor::cat(values.collect(), 0).mul_scalar(0.0).sum();
         let settings = OptimiserSettings {

@@ -1,5 +1,5 @@
-//! The method `course`, and `adapt` on presses: the network that judges whole presses, from random weights or
-//! from those of a model file.
+//! The method `course`, and `adapt` on presses: the network that judges whole presses, from random
+//! weights or from those of a model file.
 
 use anyhow::ensure;
 use burn::tensor::Device;
@@ -20,11 +20,11 @@ use crate::train::run::{Description, Run};
 use crate::train::settings::{Profile, Settings};
 use crate::verdict::Hrn;
 
-/// What a run of a method is told: all labels are used.
+/// The description of a run of a method, which uses all labels.
 ///
 /// # Errors
 ///
-/// If the data has no labelled training presses.
+/// Fails if the data has no labelled training presses.
 pub fn description(
     method: Method,
     courses: &Courses,
@@ -48,12 +48,12 @@ pub fn description(
     })
 }
 
-/// Trains to a model and its evaluation in the run's directory, from random weights or from `start`; takes
-/// up what is there.
+/// Trains from random weights or from `start`, and writes the model and its evaluation to the run's
+/// directory. A resumed run continues from the files there.
 ///
 /// # Errors
 ///
-/// If the training diverges, or the directory cannot be read or written.
+/// Fails if the training diverges, or the directory cannot be read or written.
 pub fn train(
     courses: &Courses,
     start: Option<(Start, Calibration)>,
@@ -90,11 +90,12 @@ pub fn train(
     )
 }
 
-/// What `adapt` goes on from: a model file that the daemon's loader has taken, and what its verdicts promise.
+/// The start of `adapt`: the weights and calibration of a model file that the daemon's loader has
+/// accepted.
 ///
 /// # Errors
 ///
-/// [`NoStart`] if it is of another network.
+/// Returns [`NoStart`] if the file holds another network.
 pub fn start(hrn: &Hrn, bytes: &[u8], device: &Device) -> anyhow::Result<(Start, Calibration)> {
     let constants = file::constants(bytes)?;
     let start = network::start(|name| constants.get(name), dataset::levels().len(), device);
@@ -108,7 +109,8 @@ pub fn start(hrn: &Hrn, bytes: &[u8], device: &Device) -> anyhow::Result<(Start,
     Ok((start, calibration))
 }
 
-/// Parts presses by their objects: those to learn from, and `share` of the objects to calibrate on.
+/// Splits presses by their objects into presses to learn from and presses to calibrate on. `share`
+/// is the share of the objects held out for calibration.
 fn hold_out(presses: &[Press], all: &[usize], share: f64, seed: u64) -> (Vec<usize>, Vec<usize>) {
     let mut objects: Vec<u32> = all.iter().map(|&place| presses[place].object).collect();
     objects.sort_unstable();

@@ -14,11 +14,11 @@ use crate::train::run::history::Row;
 use crate::train::run::{Description, Run};
 use crate::train::stages;
 
-/// Fits it to its model and evaluation in the run's directory.
+/// Fits the regression and writes the model and its evaluation to the run's directory.
 ///
 /// # Errors
 ///
-/// If features cannot be computed, or the directory cannot be written.
+/// Fails if features cannot be computed, or the directory cannot be written.
 pub fn train(
     dataset: &Dataset,
     labelled: &[usize],

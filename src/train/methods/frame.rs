@@ -1,5 +1,5 @@
-//! The methods `frame` and `adapt`: the network of frames with Shore hardness, from random weights or from
-//! those of a model file.
+//! The methods `frame` and `adapt`: the network that judges a frame and gives its Shore hardness,
+//! from random weights or from those of a model file.
 
 use anyhow::Context as _;
 use burn::tensor::Device;
@@ -19,25 +19,25 @@ use crate::train::run::{Description, Run};
 use crate::train::stages;
 use crate::verdict::Hrn;
 
-/// Which samples are used, and how.
+/// The samples of a run, by their use.
 #[derive(Debug)]
 pub struct Samples<'a> {
-    /// Where they are.
+    /// The data set that the indices below refer to.
     pub dataset: &'a Dataset,
-    /// Labelled ones to learn from.
+    /// Labelled samples to learn from.
     pub train: &'a [usize],
-    /// Labelled ones of held-out objects; may be empty.
+    /// Labelled samples of held-out objects; may be empty.
     pub held_out: &'a [usize],
-    /// Those without labels that are learnt from; may be empty.
+    /// Samples to learn from without their labels; may be empty.
     pub unlabelled: &'a [usize],
 }
 
-/// Trains to a model and its evaluation in the run's directory, from random weights or from `start`; takes
-/// up what is there.
+/// Trains from random weights or from `start`, and writes the model and its evaluation to the run's
+/// directory. A resumed run continues from the files there.
 ///
 /// # Errors
 ///
-/// If the training diverges, or the directory cannot be read or written.
+/// Fails if the training diverges, or the directory cannot be read or written.
 pub fn train(
     stage: &'static str,
     samples: &Samples,
@@ -63,7 +63,7 @@ pub fn train(
     finish(samples, &trained, description, run, device)
 }
 
-/// A model file that `adapt` cannot go on from.
+/// A model file that `adapt` cannot start from, because it holds another network.
 #[derive(Debug, thiserror::Error)]
 #[error(
     "with such data adapt goes on from models of {from} with {expected} levels: this one is of {method}, with \
@@ -77,7 +77,7 @@ pub struct NoStart {
 }
 
 impl NoStart {
-    /// Of a file that is of another network than those of `from`.
+    /// The error for a file whose network is not one of `from`.
     pub(super) fn of(hrn: &Hrn, from: &'static str) -> Self {
         Self {
             from,
@@ -88,11 +88,11 @@ impl NoStart {
     }
 }
 
-/// What `adapt` goes on from: a model file that the daemon's loader has taken.
+/// The start of `adapt`: the weights of a model file that the daemon's loader has accepted.
 ///
 /// # Errors
 ///
-/// [`NoStart`] if it is of another network.
+/// Returns [`NoStart`] if the file holds another network.
 pub fn start(hrn: &Hrn, bytes: &[u8], device: &Device) -> anyhow::Result<Start> {
     let levels = dataset::levels().len();
     let constants = file::constants(bytes)?;
@@ -100,12 +100,13 @@ pub fn start(hrn: &Hrn, bytes: &[u8], device: &Device) -> anyhow::Result<Start> 
     Ok(start.ok_or_else(|| NoStart::of(hrn, "frames (frame, adapt)"))?)
 }
 
-/// Goes on from `start` on all labelled training samples and, by consistency, on the others.
+/// Trains from `start` on all labelled training samples and, by consistency, on the unlabelled
+/// ones.
 ///
 /// # Errors
 ///
-/// If the data has no labelled training samples, the training diverges, or the directory cannot be read
-/// or written.
+/// Fails if the data has no labelled training samples, the training diverges, or the directory
+/// cannot be read or written.
 pub fn adapt(
     dataset: &Dataset,
     start: Start,
@@ -125,7 +126,7 @@ pub fn adapt(
     train("adapt", &samples, Some(start), description, run, device)
 }
 
-/// Writes the model, what it is worth and what it still gets wrong.
+/// Writes the model, its evaluation and a picture of its mistakes.
 fn finish(
     samples: &Samples,
     trained: &Trained,
@@ -159,7 +160,8 @@ fn finish(
         levels,
         calibration.widths,
     );
-    // Without measured hardness the second head learnt nothing, or unlearnt what it knew.
+    // Leave the Shore output out if no training sample has a measured hardness: the second head
+    // then learnt nothing, or lost what the start knew.
     let has_shore = |&index: &usize| samples.dataset.samples[index].shore.is_some();
     let recogniser = Recogniser {
         graph,

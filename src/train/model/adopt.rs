@@ -1,8 +1,9 @@
-//! Makes a model that the daemon loads of an ONNX file of someone else's making.
+//! Makes a model that the daemon loads from an ONNX file of another program.
 //!
-//! In: the file, with a graph from newtons to logits or probabilities, and the data set that it learnt
-//! from. Out: the same graph with the metadata, and what it is worth on the test split. Nothing in the
-//! graph is changed but names, a batch of any size, and the last step between logits and probabilities.
+//! In: the file, with a graph from newtons to logits or probabilities, and the data set that it
+//! learnt from. Out: the same graph with the metadata, and its evaluation on the test split. Only
+//! three things in the graph change: names, the batch size, and the last step between logits and
+//! probabilities.
 
 use anyhow::{Context as _, ensure};
 use prost::Message as _;
@@ -18,38 +19,39 @@ use crate::train::judge::metrics::Evaluation;
 use crate::train::net::graph::{INPUT, frame_input, integer, value_info};
 use crate::verdict::{Card, Check, Checks, Hrn};
 
-/// The least probability of which a logarithm is taken: the file's own may round to 0.
+/// The least probability before a logarithm, because the file's probabilities may round to 0.
 const LEAST_PROBABILITY: f32 = 1e-30;
 
-/// Why the graph cannot be adopted.
+/// The reason a graph cannot be adopted.
 #[derive(Debug, thiserror::Error)]
 pub enum Foreign {
-    /// Not an ONNX file.
+    /// The file is not an ONNX model.
     #[error("not an ONNX model: {0}")]
     NotOnnx(String),
-    /// Other inputs than one frame.
+    /// The inputs differ from one frame.
     #[error("inputs: found {found}, expected one, f32 [1,1,{ROWS},{COLS}]")]
     Inputs {
-        /// As the file has them.
+        /// The file's inputs or outputs, with type and shape.
         found: String,
     },
-    /// Neither logits nor probabilities by name.
+    /// No output of the expected shape is called `logits` or `probabilities`, or both differ in
+    /// their number of levels.
     #[error(
         "outputs: found {found}, expected `logits` or `probabilities` or both, f32 [1,L], by these \
          names"
     )]
     Outputs {
-        /// As the file has them.
+        /// The file's inputs or outputs, with type and shape.
         found: String,
     },
 }
 
-/// What is told of a model besides its data.
+/// What the user states about a model besides its data.
 #[derive(Debug, Clone)]
 pub struct Told {
-    /// `hrn.method`.
+    /// The value of `hrn.method`.
     pub method: String,
-    /// `hrn.validation`; else by the origin of the data.
+    /// The value of `hrn.validation`. `None` derives it from the origin of the data.
     pub validation: Option<String>,
 }
 
@@ -57,7 +59,7 @@ pub struct Told {
 ///
 /// # Errors
 ///
-/// [`Foreign::NotOnnx`].
+/// Returns [`Foreign::NotOnnx`] if the bytes are not an ONNX model with a graph.
 pub fn decode(bytes: &[u8]) -> Result<pb::ModelProto, Foreign> {
     let proto = pb::ModelProto::decode(bytes);
     let proto = proto.map_err(|error| Foreign::NotOnnx(error.to_string()))?;
@@ -67,12 +69,12 @@ pub fn decode(bytes: &[u8]) -> Result<pb::ModelProto, Foreign> {
     }
 }
 
-/// Gives the graph the agreed input and outputs: their names, a batch of one, and of logits and
-/// probabilities the one that is missing. Says what it changed, and the number of levels.
+/// Gives the graph the agreed input and outputs: their names, a batch of one, and whichever of
+/// logits and probabilities is missing. Returns a list of the changes and the number of levels.
 ///
 /// # Errors
 ///
-/// [`Foreign::Inputs`] and [`Foreign::Outputs`], if it is not clear what is what.
+/// Returns [`Foreign::Inputs`] or [`Foreign::Outputs`] if the inputs or outputs are not recognised.
 pub fn mend(proto: &mut pb::ModelProto) -> Result<(Vec<String>, usize), Foreign> {
     let mut done = Vec::new();
     mend_input(proto, &mut done)?;
@@ -80,7 +82,7 @@ pub fn mend(proto: &mut pb::ModelProto) -> Result<(Vec<String>, usize), Foreign>
     Ok((done, levels))
 }
 
-/// The input alone.
+/// Mends the input only, and adds the changes to `done`.
 pub(super) fn mend_input(
     proto: &mut pb::ModelProto,
     done: &mut Vec<String>,
@@ -115,7 +117,7 @@ pub(super) fn mend_input(
     Ok(())
 }
 
-/// The outputs alone.
+/// Mends the outputs only, and adds the changes to `done`. Returns the number of levels.
 pub(super) fn mend_outputs(
     proto: &mut pb::ModelProto,
     done: &mut Vec<String>,
@@ -178,7 +180,8 @@ fn node(operator: &str, inputs: &[&str], output: &str) -> pb::NodeProto {
     }
 }
 
-/// The dimensions of an f32 value, `None` where the file does not say one; `None` for another type.
+/// The dimensions of an f32 value, each `None` where the file leaves it open. `None` for a value of
+/// another type.
 fn dims(value: &pb::ValueInfoProto) -> Option<Vec<Option<usize>>> {
     use pb::tensor_shape_proto::dimension::Value;
     let Some(pb::type_proto::Value::TensorType(tensor)) = &value.r#type.as_ref()?.value else {
@@ -215,7 +218,7 @@ fn describe(values: &[&pb::ValueInfoProto]) -> String {
     }
 }
 
-/// Sets the metadata of a file, in place of what it has under `hrn.`.
+/// Sets the metadata of a file, replacing all its `hrn.` keys.
 pub(super) fn set(proto: &mut pb::ModelProto, card: &Card, checks: &Checks) -> anyhow::Result<()> {
     proto
         .metadata_props
@@ -224,14 +227,15 @@ pub(super) fn set(proto: &mut pb::ModelProto, card: &Card, checks: &Checks) -> a
     Ok(())
 }
 
-/// The file with its metadata, what was changed in its graph, and what it is worth on the test split,
-/// if the data set has one. The probabilities of the check frames are those that the daemon's own
-/// inference library computes here.
+/// Adopts a file. Returns the file with its metadata, the changes in its graph, and its evaluation
+/// on the test split if the data set has one. The daemon's own inference library computes the
+/// probabilities of the check frames here.
 ///
 /// # Errors
 ///
-/// If the graph is not clear, the data set has no labelled samples to learn from, or the daemon's
-/// loader refuses the file.
+/// Fails if the inputs or outputs of the graph are not recognised, it has another number of levels
+/// than the data set, the data set has no labelled training samples, or the daemon's loader refuses
+/// the file.
 pub fn adopt(
     bytes: &[u8],
     dataset: &Dataset,

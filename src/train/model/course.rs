@@ -1,4 +1,4 @@
-//! From a trained network of courses to a model file of format 2, and how good the file is.
+//! Exports a trained network of courses to a model file of format 2, and evaluates that file.
 
 use anyhow::ensure;
 use burn::tensor::Device;
@@ -21,53 +21,54 @@ use crate::verdict::{
     Verdict,
 };
 
-/// Check presses a level (`docs/formats.md`).
+/// Check presses per level (`docs/formats.md`).
 const CHECKS_A_LEVEL: usize = 2;
 
-/// How good a model is on whole presses: what `evaluate --json` prints of such a file.
+/// The evaluation of a model on whole presses, which `evaluate --json` prints for data of whole
+/// presses.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CourseEvaluation {
-    /// How well the levels were judged.
+    /// The evaluation of the levels.
     #[serde(flatten)]
     pub levels: Evaluation,
     /// Share of presses whose level is off by more than one.
     pub beyond_neighbour: f64,
-    /// Of the Shore hardness; null for a model or data without it.
+    /// The evaluation of the Shore hardness; null for a model or data without it.
     pub shore: Option<ShoreEvaluation>,
-    /// Of the sets of levels; null for a model without them.
+    /// The evaluation of the sets of levels; null for a model without them.
     pub sets: Option<SetEvaluation>,
 }
 
-/// How good the Shore hardness is.
+/// The evaluation of the Shore hardness.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ShoreEvaluation {
-    /// Root of the mean squared error, Shore OO.
+    /// Root mean square error, in Shore OO.
     pub rmse: f64,
-    /// The same of each level; null for an absent one.
+    /// Root mean square error of each level; null for a level without presses.
     pub rmse_by_level: Vec<Option<f64>>,
-    /// Share of presses whose interval holds the truth: 0.9 is promised.
+    /// Share of presses whose interval contains the true hardness. The model promises 0.9.
     pub coverage: f64,
-    /// Mean width of the intervals, Shore OO.
+    /// Mean width of the intervals, in Shore OO.
     pub width: f64,
 }
 
-/// How good the sets of levels are.
+/// The evaluation of the sets of levels.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SetEvaluation {
-    /// Share of presses whose set holds the true level: 0.9 is promised.
+    /// Share of presses whose set contains the true level. The model promises 0.9.
     pub coverage: f64,
-    /// Share of presses whose set is more than one level: such verdicts are rejected as ambiguous.
+    /// Share of presses whose set has more than one level. Such verdicts are rejected as ambiguous.
     pub ambiguous: f64,
-    /// Accuracy on the others.
+    /// Accuracy on the presses that are not ambiguous; null if there are none.
     pub accuracy_of_others: Option<f64>,
 }
 
-/// Writes the model and its evaluation on the test split into the run's directory. `train` are
-/// the presses learnt from.
+/// Writes the model and its evaluation on the test split to the run's directory. `train` are the
+/// indices of the training presses.
 ///
 /// # Errors
 ///
-/// If the daemon's loader refuses the file, or the directory cannot be written.
+/// Fails if the daemon's loader refuses the file, or the directory cannot be written.
 pub fn finish(
     run: &Run,
     description: &Description,
@@ -138,12 +139,12 @@ pub fn finish(
     Ok(evaluation)
 }
 
-/// What a model says of the labelled presses of a split, after `told` changed what it is told of each; a
-/// model of format 1 judges each press's best frame.
+/// The verdicts of a model on the labelled presses of a split, after `told` has changed each
+/// course. A model of format 1 judges each press's best frame.
 ///
 /// # Errors
 ///
-/// If the model has fewer levels than the data, or fails to judge a press.
+/// Fails if the model has fewer levels than the data, or fails to judge a press.
 pub fn verdicts(
     hrn: &Hrn,
     courses: &Courses,
@@ -168,7 +169,7 @@ pub fn verdicts(
     Ok(verdicts)
 }
 
-/// The verdicts as metrics take them.
+/// The verdicts in the form that the metrics take.
 pub fn judged(verdicts: &[(courses::Press, Verdict)]) -> Vec<Judged> {
     let judged = |(press, verdict): &(courses::Press, Verdict)| Judged {
         level: press.level,
@@ -179,7 +180,7 @@ pub fn judged(verdicts: &[(courses::Press, Verdict)]) -> Vec<Judged> {
 }
 
 impl CourseEvaluation {
-    /// Of verdicts on labelled presses; there must be one at least.
+    /// Evaluates verdicts on labelled presses; there must be at least one.
     pub fn of(verdicts: &[(courses::Press, Verdict)], levels: usize) -> Self {
         let n = verdicts.len() as f64;
         let far = verdicts
@@ -194,7 +195,7 @@ impl CourseEvaluation {
     }
 }
 
-/// How good the Shore hardness of verdicts is; `None` for a model or presses without it.
+/// The evaluation of the Shore hardness of verdicts; `None` for a model or presses without it.
 pub fn shore(verdicts: &[(courses::Press, Verdict)], levels: usize) -> Option<ShoreEvaluation> {
     let both = |(press, verdict): &(courses::Press, Verdict)| {
         let shore = verdict.shore?;
@@ -253,7 +254,7 @@ fn sets(verdicts: &[(courses::Press, Verdict)]) -> Option<SetEvaluation> {
     })
 }
 
-/// A press as the daemon would give it to a model.
+/// The course of a press as the daemon would give it to a model.
 pub fn course_of(courses: &Courses, press: usize) -> Course {
     let rows = courses
         .rows(press)
@@ -269,13 +270,13 @@ pub fn course_of(courses: &Courses, press: usize) -> Course {
     }
 }
 
-/// Two presses of each level, from a third and two thirds of its presses.
+/// Two presses of each level: those one third and two thirds through its presses.
 fn check_presses(courses: &Courses, train: &[usize]) -> Vec<usize> {
     let mut checked = Vec::new();
     for level in dataset::levels() {
         let of_level = |press: &usize| courses.presses[*press].level == level.level;
         let presses: Vec<usize> = train.iter().copied().filter(of_level).collect();
-        // A level without presses is checked by those of the others.
+        // A level without presses is checked on presses of other levels.
         let presses = if presses.is_empty() {
             train.to_vec()
         } else {

@@ -1,8 +1,8 @@
-//! From a trained recogniser to the file the daemon loads, and what that file is worth.
+//! Exports a trained recogniser to the file that the daemon loads, and evaluates that file.
 //!
 //! In: a graph with its temperature, the data it learnt from, and a function that computes its
-//! probabilities as training does. Out: `hrn.onnx`, which carries check frames that the daemon
-//! must reproduce, and `evaluation.json`, which is measured on that very file.
+//! probabilities as training does. Out: `hrn.onnx`, which carries check frames that the daemon must
+//! reproduce, and `evaluation.json`, which is measured on the exported file.
 
 use anyhow::ensure;
 use serde_json::json;
@@ -17,28 +17,28 @@ use crate::train::net::graph::Graph;
 use crate::train::run::{Description, Run};
 use crate::verdict::{Card, Check, Checks, Hrn, Range};
 
-/// Check frames a level (`docs/formats.md`).
+/// Check frames per level (`docs/formats.md`).
 const CHECK_FRAMES_A_LEVEL: usize = 2;
 
 /// A recogniser as a graph.
 #[derive(Debug, Clone)]
 pub struct Recogniser {
-    /// From newtons to logits.
+    /// The graph from newtons to logits.
     pub graph: Graph,
-    /// Name of the logits in it, before temperature.
+    /// Name of the logits in the graph, before temperature.
     pub raw_logits: String,
-    /// Name of the Shore hardness in it, if it gives one.
+    /// Name of the Shore hardness in the graph, if it has one.
     pub shore: Option<String>,
-    /// What the logits are divided by.
+    /// The divisor of the logits.
     pub temperature: f32,
 }
 
-/// Writes the model and its evaluation on the test split into the run's directory. `train` are
-/// the samples learnt from, and `probabilities` computes those of frames without the file.
+/// Writes the model and its evaluation on the test split to the run's directory. `train` are the
+/// training samples, and `probabilities` computes the probabilities of frames without the file.
 ///
 /// # Errors
 ///
-/// If the daemon's loader refuses the file, or the directory cannot be written.
+/// Fails if the daemon's loader refuses the file, or the directory cannot be written.
 pub fn finish(
     run: &Run,
     description: &Description,
@@ -77,7 +77,7 @@ pub fn finish(
         };
         file::write(graph, &outputs, card, &checks)
     };
-    // The metrics are measured on the file and then become part of it; the graph is the same.
+    // The metrics are measured on a file without them and then added; the graph does not change.
     let hrn = Hrn::load(&write(&card)?)?;
     let evaluation = match dataset.labelled(Split::Test) {
         Ok(test) => Some(evaluate(&hrn, dataset, &test)?),
@@ -95,11 +95,11 @@ pub fn finish(
     Ok(evaluation)
 }
 
-/// Judges samples with a model and evaluates what it said.
+/// Judges samples with a model and evaluates its verdicts.
 ///
 /// # Errors
 ///
-/// If the model has fewer levels than the data, or fails to judge a frame.
+/// Fails if the model has fewer levels than the data, or fails to judge a frame.
 pub fn evaluate(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Evaluation> {
     let judged = judge(hrn, dataset, indices)?;
     Ok(Evaluation::of(&judged, hrn.card().levels.len()))
@@ -109,7 +109,7 @@ pub fn evaluate(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Resu
 ///
 /// # Errors
 ///
-/// If the model has fewer levels than the data, or fails to judge a frame.
+/// Fails if the model has fewer levels than the data, or fails to judge a frame.
 pub fn judge(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Vec<Judged>> {
     let levels = hrn.card().levels.len();
     let mut judged = Vec::with_capacity(indices.len());
@@ -144,13 +144,13 @@ fn evaluations_by_source(hrn: &Hrn, dataset: &Dataset) -> anyhow::Result<serde_j
     Ok(by_source.into())
 }
 
-/// Two frames of each level, from a third and two thirds of its samples.
+/// Two frames of each level: those one third and two thirds through its samples.
 pub(super) fn check_frames<'a>(dataset: &'a Dataset, train: &[usize]) -> Vec<&'a Frame> {
     let mut frames = Vec::new();
     for level in dataset::levels() {
         let of_level = |index: &usize| dataset.samples[*index].level == level.level;
         let samples: Vec<usize> = train.iter().copied().filter(of_level).collect();
-        // A level without samples is checked by those of the others.
+        // A level without samples is checked on samples of other levels.
         let samples = if samples.is_empty() {
             train.to_vec()
         } else {
@@ -164,7 +164,7 @@ pub(super) fn check_frames<'a>(dataset: &'a Dataset, train: &[usize]) -> Vec<&'a
     frames
 }
 
-/// `hrn.data`: name, seed and hash; a list where there are several files.
+/// The value of `hrn.data`: name, seed and hash of the file, or a list of them for several files.
 pub(super) fn data(sources: &[Source]) -> serde_json::Result<String> {
     let one = |source: &Source| json!({ "name": source.name, "seed": source.seed, "sha256": source.sha256 });
     match sources {
@@ -173,7 +173,7 @@ pub(super) fn data(sources: &[Source]) -> serde_json::Result<String> {
     }
 }
 
-/// `hrn.validation`.
+/// The value of `hrn.validation`.
 pub(super) fn validation(sources: &[Source]) -> &'static str {
     let kinds: Vec<Kind> = sources.iter().flat_map(Source::kinds).collect();
     let [simulated, recorded, unknown] =
@@ -187,7 +187,7 @@ pub(super) fn validation(sources: &[Source]) -> &'static str {
     }
 }
 
-/// Total force and contact area of the frames learnt from.
+/// The range of total force and contact area of the training frames.
 pub(super) fn range(frames: impl Iterator<Item = Frame>) -> Range {
     let threshold_n = press::Settings::default().contact_threshold_n;
     let mut range = Range {

@@ -1,8 +1,8 @@
-//! Writes a recogniser as an ONNX file and takes it only if the daemon would.
+//! Writes a recogniser as an ONNX file and accepts it only if the daemon would.
 //!
-//! In: a [`Graph`] from newtons to logits, the temperature, the card, and check frames or presses with
-//! the trainer's probabilities. Out: the bytes of the file, already read back through
-//! [`verdict::Hrn`](crate::verdict::Hrn), which reproduces the check frames or refuses.
+//! In: a [`Graph`] from newtons to logits, the temperature, the card, and check frames or presses
+//! with the trainer's probabilities. Out: the bytes of the file, already read back through
+//! [`verdict::Hrn`](crate::verdict::Hrn), which refuses a file that does not reproduce its checks.
 
 use std::collections::BTreeMap;
 
@@ -14,14 +14,15 @@ use tract_onnx::prelude::Framework as _;
 use crate::train::net::graph::{Graph, frame_input, integer, model, value_info};
 use crate::verdict::{COURSE_FRAMES, Card, Checks, Hrn, course_inputs};
 
-/// What a graph computes.
+/// The outputs of a graph.
 #[derive(Debug, Clone)]
 pub struct Outputs {
-    /// Name of the logits `[1, L]` in it, before temperature.
+    /// Name of the logits `[1, L]` in the graph, before temperature.
     pub raw_logits: String,
-    /// What they are divided by.
+    /// The divisor of the logits.
     pub temperature: f32,
-    /// Name of the Shore hardness `[1, 3]` in it; a model of format 2 has one.
+    /// Name of the Shore hardness `[1, 3]` in the graph, if it has one. A model of format 2 always
+    /// has one.
     pub shore: Option<String>,
 }
 
@@ -29,7 +30,7 @@ pub struct Outputs {
 ///
 /// # Errors
 ///
-/// If the daemon's loader refuses the file, or reads another card from it.
+/// Fails if the daemon's loader refuses the file, or reads another card from it.
 pub fn write(
     mut graph: Graph,
     outputs: &Outputs,
@@ -107,14 +108,14 @@ pub(super) fn metadata(
     Ok(entries.into_iter().map(entry).collect())
 }
 
-/// Shape and numbers of constants, by their names.
+/// Constants by name: the shape and the numbers of each.
 pub type Constants = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
-/// The f32 constants of a file that [`write()`] wrote: shape and numbers of each by its name.
+/// The f32 constants of a file that [`write()`] wrote.
 ///
 /// # Errors
 ///
-/// If the bytes are no ONNX model.
+/// Fails if the bytes are not an ONNX model.
 pub fn constants(bytes: &[u8]) -> anyhow::Result<Constants> {
     let mut reader = bytes;
     let proto = tract_onnx::onnx().proto_model_for_read(&mut reader)?;

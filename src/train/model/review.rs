@@ -1,8 +1,10 @@
-//! Says line by line what the model format wants of a file: for who brings a model of their own.
+//! Reports line by line what the model format requires of a file, for users who bring their own
+//! model.
 //!
 //! In: the bytes of an ONNX file. Out: one [`Finding`] for each part of the format. The daemon's
-//! loader names only the first thing that it refuses. This mends a copy of the file there and asks the
-//! loader again, until it has nothing more to say. So the loader alone decides what is right.
+//! loader names only the first problem that it finds. This module mends that part in a copy of the
+//! file and asks the loader again, until the loader finds no further problem. So the loader alone
+//! decides what is right.
 
 use std::fmt;
 
@@ -15,7 +17,7 @@ use crate::frame::TAXELS;
 use crate::train::data::dataset;
 use crate::verdict::{Card, Check, Checks, Hrn, Level, MIN_OPSET, ModelError, Range};
 
-/// The parts of the format, in the order in which a file is read.
+/// The metadata keys of the format.
 const KEYS: [&str; 9] = [
     "hrn.format",
     "hrn.levels",
@@ -28,14 +30,14 @@ const KEYS: [&str; 9] = [
     "hrn.check",
 ];
 
-/// What is found of one part of the format.
+/// The result for one part of the format.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Finding {
-    /// The part.
+    /// The part of the format.
     pub part: &'static str,
-    /// What is wrong with it; `None`: nothing.
+    /// The problem with the part; `None` if there is none.
     pub problem: Option<String>,
-    /// Whether `adopt` mends it.
+    /// Whether `adopt` mends the problem.
     pub is_mended: bool,
 }
 
@@ -54,7 +56,7 @@ impl fmt::Display for Finding {
     }
 }
 
-/// Reviews a file. It passes if no finding has a problem.
+/// Reviews a file. The file passes if no finding has a problem.
 pub fn review(bytes: &[u8]) -> Vec<Finding> {
     let mut problems: Vec<(&'static str, String, bool)> = Vec::new();
     let mut stopped_at = None;
@@ -65,7 +67,7 @@ pub fn review(bytes: &[u8]) -> Vec<Finding> {
         }
         Ok(mut proto) => {
             let mut has_own_check = true;
-            // Each turn mends one part, so there are no more turns than parts.
+            // Each turn mends one part, so there is at most one turn more than there are parts.
             for _ in 0..=PARTS.len() {
                 let error = match Hrn::load(&proto.encode_to_vec()) {
                     Ok(_) => break,
@@ -108,7 +110,7 @@ pub fn review(bytes: &[u8]) -> Vec<Finding> {
     PARTS.map(finding).to_vec()
 }
 
-/// The parts in the order of the lines.
+/// The parts in the order of the findings.
 const PARTS: [&str; 15] = [
     "file",
     "opset",
@@ -146,7 +148,7 @@ const READ: [&str; 15] = [
     "graph",
 ];
 
-/// Which part an error is about.
+/// The part that an error concerns.
 fn part(error: &ModelError) -> &'static str {
     match error {
         ModelError::TooLarge { .. } | ModelError::NotOnnx(_) => "file",
@@ -163,7 +165,8 @@ fn part(error: &ModelError) -> &'static str {
     }
 }
 
-/// Mends a part as `adopt` does, if it does. The values only have to be right in form.
+/// Mends a part if `adopt` would mend it, and returns whether it did. The values only have to be
+/// right in form.
 fn mend_part(proto: &mut pb::ModelProto, part: &str) -> bool {
     match part {
         "input" => mend_input(proto, &mut Vec::new()).is_ok(),
@@ -192,7 +195,7 @@ fn mend_part(proto: &mut pb::ModelProto, part: &str) -> bool {
             if set(&mut mended, &card, &Checks::Frames(check)).is_err() {
                 return false;
             }
-            // Only what was refused.
+            // Replace only the refused key.
             proto.metadata_props.retain(|entry| entry.key != part);
             let mut props = mended.metadata_props.into_iter();
             proto
@@ -204,7 +207,7 @@ fn mend_part(proto: &mut pb::ModelProto, part: &str) -> bool {
     }
 }
 
-/// As many levels as the outputs have.
+/// A list of as many levels as the outputs have.
 fn levels(proto: &pb::ModelProto) -> Vec<Level> {
     let count = mend(&mut proto.clone()).map_or(4, |(_, levels)| levels);
     let agreed = dataset::levels();
@@ -221,7 +224,7 @@ fn levels(proto: &pb::ModelProto) -> Vec<Level> {
         .collect()
 }
 
-/// What the format wants, as one line before the findings.
+/// The requirements of the format, as one line before the findings.
 pub fn wanted() -> String {
     format!(
         "ONNX of opset {MIN_OPSET} or newer, all in one file: `frame` to `logits` and `probabilities`, \

@@ -1,11 +1,11 @@
-//! Nodes of a graph one by one: what the networks of frames and of courses have in common.
+//! A builder of graph nodes, shared by the networks of frames and of courses.
 
 use tract_onnx::pb;
 
 use crate::train::net::graph::Graph;
 use crate::train::net::network::Weights;
 
-/// Nodes one by one, with scalars by value.
+/// Adds nodes one by one. Scalars are given by value.
 pub(super) struct Builder(pub(super) Graph);
 
 impl Builder {
@@ -48,7 +48,7 @@ impl Builder {
         self.node("Div", &[x, &raised], output)
     }
 
-    /// log(x within 0 and `most`, and `added`).
+    /// log(y + `added`), where y is `x` clipped to 0..=`most`.
     pub(super) fn logarithm(&mut self, x: &str, most: f32, added: f32) -> String {
         let clipped = self.clipped(x, 0.0, most);
         self.logarithm_of(&clipped, added)
@@ -60,7 +60,7 @@ impl Builder {
         self.node("Clip", &[x, &low, &high], &format!("{x} clipped"))
     }
 
-    /// `x` `[rows, inputs]` through the layer `name`.
+    /// Passes `x` `[rows, inputs]` through the layer `name`.
     pub(super) fn dense(
         &mut self,
         weights: &Weights,

@@ -1,9 +1,9 @@
 //! The network that judges the course of a press: a temporal convolution over hand-made features of
 //! each frame and the arm's approach.
 //!
-//! In: the features of a press's frames, their times and what the arm told. Out: weights, and the
-//! graph of the exported file of format 2. A frame fixes only the ratio of radius and modulus; force
-//! against approach fixes both (`docs/method.md`).
+//! In: the features of a press's frames, their times and the arm's approach. Out: weights, and the
+//! graph of the exported file of format 2. A frame fixes only the ratio of radius and modulus,
+//! whereas force against approach fixes both (`docs/method.md`).
 
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
@@ -18,11 +18,11 @@ pub use graph::graph;
 
 mod graph;
 
-/// Frames that a model takes.
+/// The number of frames that a model takes.
 pub const FRAMES: usize = COURSE_FRAMES.1;
-/// Columns beside a frame's features.
+/// The number of columns beside a frame's features.
 pub const MOTION: usize = 7;
-/// Columns of a moment.
+/// The number of columns of a moment.
 pub const COLUMNS: usize = FEATURES + MOTION;
 /// Width of the hidden layers, and of the layer before the outputs.
 const HIDDEN: usize = 48;
@@ -30,23 +30,23 @@ const LAST: usize = 64;
 /// Moments under a kernel, and the distance between them in each convolution.
 const KERNEL: usize = 5;
 const DILATIONS: [usize; 3] = [1, 2, 4];
-/// A press's pools: mean, greatest, and mean weighted by force.
+/// The number of pools of a press: mean, greatest, and mean weighted by force.
 const POOLS: usize = 3;
-/// What a press tells at one moment, beside the frame.
+/// The measurements of a press at one moment, beside the frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Moment {
-    /// Since the frame that began the press.
+    /// Seconds since the frame that began the press.
     pub time_s: f32,
-    /// How far the arm went since then; `None`: unknown.
+    /// Approach of the arm since that frame, in mm. `None` if unknown.
     pub approach_mm: Option<f32>,
     /// Total force of the frame's taxels in contact.
     pub force_n: f32,
 }
 
-/// The columns beside the features, a row a moment; `arm_n_per_mm` is 0 where it is unknown.
+/// The columns beside the features, a row per moment. `arm_n_per_mm` is 0 if unknown.
 ///
-/// With d the approach and k the arm's stiffness, d - F/k is how far object and cover gave way; by
-/// Hertz F = 4/3 E* R^(1/2) (d - F/k)^(3/2), so logarithms make a power law a sum.
+/// With d the approach and k the arm's stiffness, d - F/k is the indentation of object and cover.
+/// By Hertz F = 4/3 E* R^(1/2) (d - F/k)^(3/2), so logarithms turn the power law into a sum.
 pub fn motion(moments: &[Moment], arm_n_per_mm: f32) -> Vec<[f32; MOTION]> {
     let is_arm_known = if arm_n_per_mm > 0.0 { 1.0 } else { 0.0 };
     let arm = arm_n_per_mm.max(graph::LEAST_ARM);
@@ -83,12 +83,12 @@ pub struct Batch {
     pub columns: Tensor<3>,
     /// 1 where there is a frame: `[batch, FRAMES, 1]`.
     pub mask: Tensor<3>,
-    /// Each frame's part of the press's force: `[batch, FRAMES, 1]`.
+    /// Each frame's share of the press's force: `[batch, FRAMES, 1]`.
     pub weights: Tensor<3>,
 }
 
 impl Batch {
-    /// Of presses: each one's columns, standardised, and the forces of its frames.
+    /// Makes a batch of presses, each with its standardised columns and the forces of its frames.
     pub fn new(presses: &[(Vec<f32>, Vec<f32>)], device: &Device) -> Self {
         let batch = presses.len();
         let mut columns = vec![0.0; batch * FRAMES * COLUMNS];
@@ -112,8 +112,8 @@ impl Batch {
     }
 }
 
-/// Initial weights for `levels` levels: N(0, 2 / inputs) before a ReLU, less where a residual layer adds and
-/// before the outputs, so that outputs begin near 1.
+/// Initial weights for `levels` levels: N(0, 2 / inputs) before a ReLU. The variance is smaller
+/// where a residual layer adds and before the outputs, so that outputs begin near 1.
 pub fn initial(levels: usize, seed: u64, device: &Device) -> Weights {
     let root = Stream::new(seed, "course weights");
     let mut weights = Weights::default();
@@ -143,7 +143,8 @@ pub fn initial(levels: usize, seed: u64, device: &Device) -> Weights {
     weights
 }
 
-/// What training goes on from, of an exported graph's constants; `None` if they are of another network.
+/// The start of further training, from an exported graph's constants. `None` if they are of another
+/// network.
 pub fn start<'a>(
     constant: impl Fn(&str) -> Option<&'a Constant>,
     levels: usize,
@@ -198,7 +199,7 @@ mod tests {
         assert_eq!(rows[1][2..], [0.0; 5]);
         assert_eq!(rows[1][0], 0.25_f32.ln());
         assert_eq!(rows[1][1], 0.21_f32.ln());
-        // 4 mm less the 0.5 mm that 10 N/mm give under 5 N.
+        // 4 mm minus the 0.5 mm by which an arm of 10 N/mm gives way under 5 N.
         let rows = motion(&[moment(0.0, Some(0.0)), moment(0.2, Some(4.0))], 10.0);
         assert_eq!(rows[1][3], 4.3_f32.ln());
         assert_eq!(rows[1][4], 3.8_f32.ln());

@@ -1,9 +1,9 @@
 //! The network that judges a frame, with Shore hardness: convolutions beside hand-made features.
 //!
-//! In: an image and the features of the same frame. Out: weights, outputs `[batch, L + 3]`, and the graph
-//! of the exported file. Convolutions see the shape of a contact, and the features add up its force and
-//! area. There is no batch normalisation, so that a file's weights are the network's and training can go
-//! on from any file.
+//! In: an image and the features of the same frame. Out: weights, outputs `[batch, L + 3]`, and the
+//! graph of the exported file. Convolutions see the shape of a contact, and the features add up its
+//! force and area. There is no batch normalisation, so a file holds the network's own weights, and
+//! training can continue from any file.
 
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
@@ -22,18 +22,19 @@ use crate::train::net::shore;
 use crate::train::net::standard::Standard;
 use crate::train::net::start::{Constant, Start};
 
-/// From newtons to an image: the light taxels of a contact's edge count as much as the heavy ones.
+/// The scale from newtons to an image. It is logarithmic, so that the light taxels of a contact's
+/// edge count as much as the heavy ones.
 pub const SCALE: Scale = Scale {
     full_scale_n: 10.2,
     log_above_n: 0.1,
 };
-/// Each channel's greatest value and mean.
+/// The number of pooled values: each channel's greatest value and mean.
 const POOLED: usize = 2 * network::FEATURES;
 /// Width of the layer before the outputs.
 const LAST: usize = 64;
 
-/// Initial weights for `levels` levels: N(0, 2 / inputs) before a ReLU, a quarter of that before the
-/// outputs.
+/// Initial weights for `levels` levels: N(0, 2 / inputs) before a ReLU, and a quarter of that
+/// variance before the outputs.
 pub fn initial(levels: usize, seed: u64, device: &Device) -> Weights {
     let root = Stream::new(seed, "frame weights");
     let mut weights = Weights::default();
@@ -65,9 +66,9 @@ pub fn initial(levels: usize, seed: u64, device: &Device) -> Weights {
 /// A batch of frames as the network takes them.
 #[derive(Debug, Clone)]
 pub struct Batch {
-    /// `[batch, 1, 28, 28]`.
+    /// The images `[batch, 1, 28, 28]`.
     pub images: Tensor<4>,
-    /// Standardised, `[batch, FEATURES]`.
+    /// The standardised features `[batch, FEATURES]`.
     pub features: Tensor<2>,
 }
 
@@ -76,7 +77,7 @@ impl Batch {
     ///
     /// # Errors
     ///
-    /// If features cannot be computed.
+    /// Returns an error if the features cannot be computed.
     pub fn new(
         frames: &[Frame],
         plan: &Features,
@@ -99,7 +100,7 @@ impl Batch {
 /// Logits and Shore outputs `[batch, L + 3]`.
 pub fn outputs(weights: &Weights, batch: &Batch) -> Tensor<2> {
     let count = batch.images.dims()[0];
-    // Raised by 1 the background is 0, as what the convolutions pad with.
+    // Raised by 1, the background is 0, like the padding of the convolutions.
     let mut x = batch.images.clone().add_scalar(1.0).permute([1, 2, 3, 0]);
     for layer in &TRUNK {
         x = as_images(leaky_relu(sums(weights, layer, x), LEAKY_SLOPE), count);
@@ -109,7 +110,8 @@ pub fn outputs(weights: &Weights, batch: &Batch) -> Tensor<2> {
     dense(weights, "head", joint)
 }
 
-/// What training goes on from, of an exported graph's constants; `None` if they are of another network.
+/// The start of further training, from an exported graph's constants. `None` if they are of another
+/// network.
 pub fn start<'a>(
     constant: impl Fn(&str) -> Option<&'a Constant>,
     levels: usize,
@@ -119,8 +121,8 @@ pub fn start<'a>(
     Start::of_constants(initial(levels, 0, device), FEATURES, constant, device)
 }
 
-/// The graph from newtons to raw logits `[1, levels]` and Shore OO `[1, 3]`, and their names. `widths` are
-/// added below and above to the ends of the interval.
+/// The graph from newtons to raw logits `[1, levels]` and Shore OO `[1, 3]`, and the names of both.
+/// `widths` widen the interval below and above.
 pub fn graph(
     weights: &Weights,
     standard: &Standard,

@@ -1,8 +1,8 @@
 //! Hand-made features of frames, as nodes of an exported graph: areas, force, peak, moments and
 //! roughness. Training computes them by running those nodes.
 //!
-//! A verdict computes them of up to 48 frames, so sums over taxels are matrix products: one pass over
-//! the taxels gives all moments.
+//! A verdict needs the features of up to 48 frames, so sums over taxels are matrix products: one
+//! pass over the taxels gives all moments.
 
 use tract_onnx::pb;
 
@@ -11,24 +11,25 @@ use crate::press;
 use crate::train::net::builder::Builder;
 use crate::train::net::graph::{Graph, Plan, integer, integers};
 
-/// Frames that are computed in one pass.
+/// The number of frames that are computed in one pass.
 const FRAMES_AT_ONCE: usize = 48;
-/// Features of a frame.
+/// The number of features of a frame.
 pub const FEATURES: usize = 13;
 /// Thresholds, beside the contact threshold, above which taxels are counted, in newtons.
 const AREA_THRESHOLDS_N: [f32; 4] = [0.2, 0.5, 1.0, 2.0];
-/// Keep logarithms and quotients of an empty frame finite: newtons, taxels squared, and a share.
+/// Added to keep logarithms and quotients of an empty frame finite: to newtons, to squared taxels,
+/// to taxels, and to a divisor.
 const LITTLE_N: f32 = 0.05;
 const LITTLE_SPREAD: f32 = 0.05;
 const LITTLE_AREA: f32 = 0.5;
 const TINY: f32 = 1e-4;
-/// Place of the logarithm of the force.
+/// Index of the feature that is the logarithm of the force.
 const FORCE: usize = 5;
-/// Sums over taxels: 1, row, column, and their products.
+/// The number of sums over taxels: of 1, row, column, and their products.
 const SUMS: usize = 6;
 
-/// Adds the nodes from `input`, of `frames` frames, to features, `[frames, 1]` each. Gives their
-/// names, and that of the frames' forces `[frames, 1]`.
+/// Adds the nodes from `input`, which has `frames` frames, to features of `[frames, 1]` each.
+/// Returns the features' names, and the name of the frames' forces `[frames, 1]`.
 pub(super) fn nodes(b: &mut Builder, input: &str, frames: usize) -> (Vec<String>, String) {
     let taxels = b.reshaped(input, &[frames, TAXELS], "taxels");
     let of_taxel = |place: usize| {
@@ -75,7 +76,7 @@ pub(super) fn nodes(b: &mut Builder, input: &str, frames: usize) -> (Vec<String>
     (columns, force)
 }
 
-/// Taxels of at least `threshold_n` as 1, others 0.
+/// A mask: 1 for taxels of at least `threshold_n`, 0 for the others.
 fn above(b: &mut Builder, taxels: &str, threshold_n: f32) -> String {
     let name = format!("at least {threshold_n}");
     let threshold = b.scalar(&name, threshold_n);
@@ -84,8 +85,8 @@ fn above(b: &mut Builder, taxels: &str, threshold_n: f32) -> String {
     b.with("Cast", &[&is], &name, vec![to])
 }
 
-/// The sum of `weights` `[frames, 784]`; the trace of their second central moments, and their anisotropy
-/// 0 (round) to 1 (a line). `[frames, 1]` each.
+/// Returns three values of `[frames, 1]` each: the sum of `weights` `[frames, 784]`, the trace of
+/// their second central moments, and their anisotropy from 0 (round) to 1 (a line).
 fn moments(b: &mut Builder, weights: &str, of: &str) -> (String, (String, String)) {
     let all = b.node("MatMul", &[weights, "sums"], &format!("sums of {of}"));
     let axis = b.0.indices(&format!("sum axis of {of}"), &[1]);
@@ -124,7 +125,7 @@ fn moments(b: &mut Builder, weights: &str, of: &str) -> (String, (String, String
     (total, (trace, anisotropy))
 }
 
-/// Sum of |differences| of neighbours along rows and columns, `[frames, 1]`.
+/// Sum of the absolute differences of neighbours along rows and columns, `[frames, 1]`.
 fn variation(b: &mut Builder, pressed: &str, frames: usize) -> String {
     let image = b.reshaped(pressed, &[frames, ROWS, COLS], "pressed image");
     let pairs = (ROWS - 1) * COLS;
@@ -172,7 +173,7 @@ impl Features {
     ///
     /// # Errors
     ///
-    /// If the inference library cannot run it.
+    /// Returns an error if the inference library cannot run the graph.
     pub fn new() -> anyhow::Result<Self> {
         let mut b = Builder(Graph::default());
         let (columns, _) = nodes(&mut b, "frames", FRAMES_AT_ONCE);
@@ -183,11 +184,11 @@ impl Features {
         Ok(Self(Plan::over(b.0, &input, &output)?))
     }
 
-    /// A row of [`FEATURES`] a frame.
+    /// The features of `frames`, a row of [`FEATURES`] numbers per frame.
     ///
     /// # Errors
     ///
-    /// If the inference library fails.
+    /// Returns an error if the inference library fails.
     pub fn of(&self, frames: &[Frame]) -> anyhow::Result<Vec<f32>> {
         let mut features = Vec::with_capacity(frames.len() * FEATURES);
         for part in frames.chunks(FRAMES_AT_ONCE) {

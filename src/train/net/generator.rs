@@ -16,11 +16,11 @@ use crate::train::net::network::{
 };
 use crate::train::net::sensed::Sensor;
 
-/// n: numbers of noise an image (paper, "Training of STGAN and USTGAN").
+/// n: noise values per image (paper, "Training of STGAN and USTGAN").
 pub const NOISE: usize = 30;
-/// K: components of the mixture, all of weight 1/K (ditto).
+/// K: components of the mixture, all of weight 1/K (same section).
 pub const COMPONENTS: usize = 50;
-/// sigma before training (ditto). DeLiGAN's code has 0.2.
+/// sigma before training (same section). DeLiGAN's code has 0.2.
 const INITIAL_SIGMA: f32 = 0.15;
 /// The first layer starts at U(-0.316, 0.316), of variance 1/30: one over its inputs (DeLiGAN's
 /// code).
@@ -29,26 +29,26 @@ const INITIAL_LIMIT: f64 = 0.316;
 const BATCH_NORM_EPSILON: f32 = 1e-5;
 /// Rows and columns of the first image.
 const FIRST_SIDE: usize = 4;
-/// Batches of generated samples that statistics are taken over.
+/// The number of batches of generated samples over which statistics are taken.
 const STATISTICS_BATCHES: u64 = 20;
-/// Samples of each component a pass without gradients.
+/// Samples of each component per pass without gradients.
 const GENERATED_AT_ONCE: usize = 5;
-/// Rounds in which frames that are no press are drawn again.
+/// The number of rounds in which frames that are not presses are drawn again.
 const DRAWN_AGAIN: usize = 8;
 
 /// A transposed convolution: square kernel, stride 2, cropped as TF's SAME padding is.
 #[derive(Debug, Clone, Copy)]
 struct Layer {
-    /// Prefix of its weights' names.
+    /// Prefix of the names of its weights.
     name: &'static str,
-    /// Channels in.
+    /// Input channels.
     inputs: usize,
-    /// Channels out.
+    /// Output channels.
     outputs: usize,
     /// Rows and columns of the kernel.
     kernel: usize,
-    /// Rows and columns of the image out; of the full one, one is cropped before and the rest
-    /// after.
+    /// Rows and columns of the output image. One row and column of the full output is cropped
+    /// before, and the rest after.
     side: usize,
 }
 
@@ -128,8 +128,9 @@ impl Layer {
         self.side == ROWS
     }
 
-    /// Of the convolution that this one is the adjoint of: from an image of `side` rows back to
-    /// the smaller one, padded with one zero before and as many after as SAME needs.
+    /// The geometry of the convolution whose adjoint this layer is. That convolution goes from an
+    /// image of `side` rows back to the smaller image, padded with one zero before and as many
+    /// after as SAME needs.
     fn geometry(&self) -> Geometry {
         let small = self.side.div_ceil(STRIDE);
         let after = (small - 1) * STRIDE + self.kernel - self.side - 1;
@@ -143,7 +144,7 @@ impl Layer {
 }
 
 /// eta ~ N(0, 1) for `samples` of each component: `[samples x 50, 30]`. Row r is of component
-/// r mod 50, so that every batch has equally many of each (all weights of Eq. 1 are 1/K).
+/// r mod 50, so every batch has the same number of each (all weights of Eq. 1 are 1/K).
 pub fn noise(samples: usize, stream: &mut Stream, device: &Device) -> Tensor<2> {
     let rows = samples * COMPONENTS;
     let values = (0..rows * NOISE).map(|_| stream.normal() as f32).collect();
@@ -208,8 +209,8 @@ pub fn images(weights: &Weights, eta: Tensor<2>, normalisation: &mut Normalisati
     x.tanh().permute([3, 0, 1, 2])
 }
 
-/// Mean and variance of each normalised layer over generated samples, in batches as in training:
-/// taken anew from the weights as they are (see [`crate::train::net::network`]).
+/// Mean and variance of each normalised layer over generated samples, in batches as in training.
+/// They are computed anew from the current weights (see [`crate::train::net::network`]).
 pub fn statistics(
     weights: &Weights,
     samples_a_component: usize,
@@ -226,25 +227,25 @@ pub fn statistics(
     statistics
 }
 
-/// What generated frames are made with.
+/// The weights, statistics and scales with which [`generate`] makes frames.
 #[derive(Debug)]
 pub struct Making<'a> {
     /// The generator's weights.
     pub weights: &'a Weights,
     /// Statistics of its normalised layers.
     pub statistics: &'a Statistics,
-    /// From images to newtons.
+    /// The scale from images to newtons.
     pub scale: Scale,
-    /// What the sensor gives for a force.
+    /// The sensor that turns a force into a reading.
     pub sensor: Sensor,
-    /// Where to compute.
+    /// The device to compute on.
     pub device: &'a Device,
 }
 
 /// Exactly `samples_a_component` frames of every component; frame r is of component r mod 50.
 ///
-/// A frame that is no press is drawn again, as it is when presses are recorded. A component that makes
-/// none in eight rounds keeps what it makes.
+/// A frame that is not a press is drawn again, because recorded samples are all presses. A
+/// component that still has too few after eight rounds keeps whatever it makes.
 pub fn generate(making: &Making, samples_a_component: usize, stream: &mut Stream) -> Vec<Frame> {
     let mut of_component: Vec<Vec<Frame>> = vec![Vec::new(); COMPONENTS];
     for round in 0..=DRAWN_AGAIN {
@@ -321,7 +322,8 @@ mod tests {
 
     #[test]
     fn every_layer_mirrors_one_of_the_trunks() {
-        // So the adjoint's test of `layers`, on the trunk's geometries, covers the generator.
+        // The adjoint test of `layers` uses the trunk's geometries. It covers the generator if the
+        // generator's layers mirror the trunk's.
         let sizes = [28, 14, 7];
         let trunk = TRUNK
             .iter()
@@ -333,7 +335,7 @@ mod tests {
 
     #[test]
     fn generated_frames_are_equally_many_of_each_component() {
-        // Components far apart and without spread: each gives one picture, whatever eta is.
+        // The components are far apart and without spread, so each gives one picture for any eta.
         let mut weights = initial(1, &device());
         let sigma = weights
             .entries
@@ -355,7 +357,7 @@ mod tests {
             device: &device(),
         };
         let frames = generate(&making, samples, &mut stream);
-        // The paper's 375 labelled samples a level, thirty for one.
+        // Thirty for each of the paper's 375 labelled samples per level.
         assert_eq!((samples, frames.len()), (225, 30 * 375));
         for component in 0..COMPONENTS {
             for sample in 1..samples {

@@ -1,7 +1,8 @@
 //! A network as a graph of ONNX nodes, from newtons to logits.
 //!
 //! In: nodes and constants, one by one. Out: the graph as tract's own ONNX types, so that the
-//! exported file and the daemon's reader share one schema, or a plan that computes it here and now.
+//! exported file and the daemon's reader share one schema, or a plan that computes it in this
+//! process.
 
 use tract_onnx::pb;
 use tract_onnx::prelude::*;
@@ -9,12 +10,12 @@ use tract_onnx::prelude::*;
 use crate::frame::{COLS, Frame, ROWS};
 use crate::verdict::MIN_OPSET;
 
-/// The name of the graph's input: newtons a taxel, `[1, 1, 28, 28]`.
+/// The name of the graph's input: newtons per taxel, `[1, 1, 28, 28]`.
 pub const INPUT: &str = "frame";
 /// The IR version that goes with opset 17.
 const IR_VERSION: i64 = 8;
 
-/// The nodes and constants of a graph under construction. A value is known by its name.
+/// The nodes and constants of a graph under construction. A name identifies each value.
 #[derive(Debug, Clone, Default)]
 pub struct Graph {
     nodes: Vec<pb::NodeProto>,
@@ -22,7 +23,7 @@ pub struct Graph {
 }
 
 impl Graph {
-    /// Adds an f32 constant and gives its name back.
+    /// Adds an f32 constant and returns its name.
     pub fn constant(&mut self, name: &str, dims: &[usize], values: &[f32]) -> String {
         debug_assert_eq!(dims.iter().product::<usize>(), values.len(), "{name}");
         self.raw(name, dims, pb::tensor_proto::DataType::Float, |raw| {
@@ -30,7 +31,7 @@ impl Graph {
         })
     }
 
-    /// Adds an i64 vector, as shapes and axes are given, and gives its name back.
+    /// Adds an i64 vector, the form of shapes and axes, and returns its name.
     pub fn indices(&mut self, name: &str, values: &[i64]) -> String {
         self.raw(
             name,
@@ -60,7 +61,7 @@ impl Graph {
         name.to_owned()
     }
 
-    /// Adds a node with one output, which it gives back.
+    /// Adds a node with one output and returns the output's name.
     pub fn node(
         &mut self,
         op: &str,
@@ -100,7 +101,7 @@ pub fn integers(name: &str, values: &[i64]) -> pb::AttributeProto {
     }
 }
 
-/// A number as an attribute.
+/// A floating-point number as an attribute.
 pub fn number(name: &str, value: f32) -> pb::AttributeProto {
     pb::AttributeProto {
         name: name.to_owned(),
@@ -110,7 +111,7 @@ pub fn number(name: &str, value: f32) -> pb::AttributeProto {
     }
 }
 
-/// A graph that runs here and now, for what training itself needs from it.
+/// A graph that runs in this process, for values that training itself needs.
 #[derive(Debug)]
 pub struct Plan {
     plan: Arc<TypedRunnableModel>,
@@ -122,17 +123,17 @@ impl Plan {
     ///
     /// # Errors
     ///
-    /// If the inference library cannot run it.
+    /// Returns an error if the inference library cannot run the graph.
     pub fn new(graph: Graph, output: &str, dims: &[usize]) -> anyhow::Result<Self> {
         let input = (INPUT, vec![1, 1, ROWS, COLS]);
         Self::over(graph, &input, &(output, dims.to_vec()))
     }
 
-    /// The same of another input than a frame; both have a name and a shape.
+    /// Prepares a graph whose input is not a frame. `input` and `output` are a name and a shape.
     ///
     /// # Errors
     ///
-    /// If the inference library cannot run it.
+    /// Returns an error if the inference library cannot run the graph.
     pub fn over(
         graph: Graph,
         input: &(&str, Vec<usize>),
@@ -155,7 +156,7 @@ impl Plan {
     ///
     /// # Errors
     ///
-    /// If the inference library fails.
+    /// Returns an error if the inference library fails.
     pub fn run(&self, frame: &Frame) -> anyhow::Result<Vec<f32>> {
         self.run_on(&frame.newtons)
     }
@@ -164,7 +165,8 @@ impl Plan {
     ///
     /// # Errors
     ///
-    /// If they are not as many as the input's shape says, or the inference library fails.
+    /// Returns an error if the numbers are not as many as the input's shape says, or the inference
+    /// library fails.
     pub fn run_on(&self, numbers: &[f32]) -> anyhow::Result<Vec<f32>> {
         let input = Tensor::from_shape(&self.shape, numbers)?;
         let outputs = self.plan.run(tvec!(input.into()))?;

@@ -14,7 +14,7 @@ use crate::train::net::network::{
 };
 use crate::train::settings::network::Pooling;
 
-/// How many features a pooling makes.
+/// The number of features that a pooling makes.
 fn features(pooling: Pooling) -> usize {
     match pooling {
         Pooling::Max => FEATURES,
@@ -32,7 +32,7 @@ pub fn initial(levels: usize, pooling: Pooling, seed: u64, device: &Device) -> W
 }
 
 /// HRN before pretraining or fine-tuning: a USTGAN's discriminator with a head for `levels` levels
-/// in place of its own, which told real from generated.
+/// in place of its own head, which separated real from generated frames.
 pub fn inherited(
     discriminator: &Weights,
     levels: usize,
@@ -49,7 +49,7 @@ pub fn inherited(
     weights
 }
 
-/// HRN of a discriminator whose first `levels` logits are the levels: further ones are cut off.
+/// HRN from a discriminator whose first `levels` logits are the levels. Further logits are cut off.
 pub fn of_levels(discriminator: &Weights, levels: usize, device: &Device) -> Weights {
     let mut weights = discriminator.clone();
     weights
@@ -88,8 +88,9 @@ pub fn cross_entropy(logits: Tensor<2>, targets: Tensor<2>) -> Tensor<1> {
         .div_scalar(batch)
 }
 
-/// What a sample of each level weighs, `[1, L]`: its number of samples to the power of `-share`, and 1 on
-/// average over the samples. With a share of 1 all levels that are there count the same, with 0 all samples.
+/// The weight of a sample of each level, `[1, L]`: the level's number of samples to the power of
+/// `-share`, scaled to 1 on average over the samples. With a share of 1 all levels with samples
+/// count the same, with 0 all samples do.
 pub fn level_weights(
     levels_of: impl Iterator<Item = u8>,
     levels: usize,
@@ -135,15 +136,15 @@ pub fn graph(weights: &Weights, statistics: &Statistics, scale: Scale) -> (Graph
     (graph, raw_logits)
 }
 
-/// Adds the nodes from newtons to each channel's greatest value, with the means behind them: `[1, 64]` or
-/// `[1, 128]`. Gives their output's name.
+/// Adds the nodes from newtons to each channel's greatest value, `[1, 64]`, or with the means after
+/// them, `[1, 128]`. Returns the name of their output.
 pub(super) fn trunk_nodes(
     graph: &mut Graph,
     folded: &[network::Folded],
     scale: Scale,
     with_means: bool,
 ) -> String {
-    // The trunk's first line raises the image by 1, too.
+    // `network::trunk` raises the image by 1, too.
     let mut x = scale.nodes(graph);
     for (layer, folded) in TRUNK.iter().zip(folded) {
         let name = layer.name;
@@ -217,7 +218,7 @@ mod tests {
                 .iter()
                 .map(|g| g.abs())
                 .fold(0.0, f32::max);
-            // A bias before batch normalisation is taken away again with the mean.
+            // Batch normalisation subtracts such a bias again with the mean.
             let cancelled = matches!(weight.name.as_str(), "conv2.bias" | "conv3.bias");
             assert!(
                 size.is_finite() && (cancelled || size > 1e-9),
@@ -297,7 +298,8 @@ mod tests {
     fn check_folding(pooling: Pooling, scale: Scale) {
         let frames: Vec<Frame> = (0..5).map(|n| blob(9.0 + n as f32, 14.0, 2.0)).collect();
         let mut weights = initial(4, pooling, 9, &device());
-        // Untrained, every gamma is 1 and every beta and bias 0, which hides what is left out.
+        // In an untrained network every gamma is 1 and every beta and bias is 0, which hides an
+        // omission.
         for weight in &mut weights.entries {
             if weight.dims.len() == 1 {
                 let mut stream = Stream::new(9, &weight.name);
@@ -327,8 +329,9 @@ mod tests {
 
     #[test]
     fn the_layers_begin_with_unit_variance() {
-        // Pressed taxels are a small part of the full scale and most taxels are 0, so the sums before
-        // a normalised layer are tiny at the start. Normalised, they must not be.
+        // Pressed taxels are a small part of the full scale and most taxels are 0, so the sums
+        // before a normalised layer are tiny at the start. After normalisation they must not be
+        // tiny.
         let samples = simulator::dataset(
             &DatasetSettings {
                 objects: 1,

@@ -1,4 +1,4 @@
-//! From newtons to the image that a network sees, and back.
+//! The scale from newtons to the image that a network sees, and back.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::Serialize;
@@ -9,15 +9,15 @@ use crate::train::net::graph::{self, Graph};
 /// One scale for all frames, because force carries hardness: 0 N is -1, the full scale is 1.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Scale {
-    /// Newtons a taxel that become 1.
+    /// The force on a taxel, in newtons, that becomes 1.
     pub full_scale_n: f64,
-    /// Above 0: the image goes with log(1 + newtons / this), so that light taxels are told apart as
-    /// well as heavy ones. 0: it goes with newtons.
+    /// Above 0, the image is linear in log(1 + newtons / this value), so that light taxels differ
+    /// as clearly as heavy ones. With 0, it is linear in newtons.
     pub log_above_n: f64,
 }
 
 impl Scale {
-    /// A taxel of the image.
+    /// The image's value for a taxel of `newtons`.
     pub fn pixel(self, newtons: f32) -> f32 {
         let Self {
             full_scale_n,
@@ -30,7 +30,7 @@ impl Scale {
         part * self.log_factor() - 1.0
     }
 
-    /// The newtons of a taxel of the image: the inverse of [`Scale::pixel`].
+    /// The force on a taxel for a value of the image: the inverse of [`Scale::pixel`].
     pub fn newtons(self, pixel: f32) -> f32 {
         let Self {
             full_scale_n,
@@ -42,7 +42,7 @@ impl Scale {
         ((pixel + 1.0) / self.log_factor()).exp_m1() * log_above_n as f32
     }
 
-    /// What makes log(1 + full scale) 2.
+    /// The factor that makes log(1 + full scale / `log_above_n`) equal to 2.
     fn log_factor(self) -> f32 {
         (2.0 / (self.full_scale_n / self.log_above_n).ln_1p()) as f32
     }
@@ -62,7 +62,7 @@ impl Scale {
     }
 
     /// Adds the nodes from the graph's input in newtons to the image raised by 1, so that the
-    /// background is 0; gives that value's name.
+    /// background is 0. Returns that value's name.
     pub fn nodes(self, graph: &mut Graph) -> String {
         if self.log_above_n == 0.0 {
             let scale = graph.constant("scale", &[], &[(2.0 / self.full_scale_n) as f32]);

@@ -2,10 +2,10 @@
 //! pass.
 //!
 //! Images are kept as `[channels, rows, columns, batch]`. With the batch innermost, gathering the
-//! patches under a kernel copies whole runs of `batch` numbers; the product of the kernels
-//! `[outputs, inputs k k]` with these patches `[inputs k k, rows' columns' batch]` is the next
-//! layer's image as it stands, and a channel's statistics are those of a row. An HRN step of 100
-//! takes 9.5 ms of a core (`results/quick`); with burn's own convolution and the system's allocator it
+//! patches under a kernel copies whole runs of `batch` numbers. The product of the kernels
+//! `[outputs, inputs k k]` with these patches `[inputs k k, rows' columns' batch]` is already the
+//! next layer's image, and a channel's statistics are those of a row. An HRN step of 100 takes
+//! 9.5 ms of a core (`results/quick`). With burn's own convolution and the system's allocator it
 //! took more than twice as long as with these (`benches/train_step.rs`, 2026-11-21).
 //!
 //! [`patches`] and [`from_patches`] are each other's adjoint, so the transposed convolution is the
@@ -29,12 +29,12 @@ use cpu::Rows;
 /// Stride of every convolution here.
 pub const STRIDE: usize = 2;
 
-/// How a convolution lies on its images: square images and kernels, stride 2.
+/// The geometry of a convolution: square images and kernels, stride 2.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Geometry {
     /// Channels of the larger image.
     pub channels: usize,
-    /// Its rows and columns.
+    /// Rows and columns of the larger image.
     pub size: usize,
     /// Rows and columns of the kernel.
     pub kernel: usize,
@@ -53,14 +53,15 @@ impl Geometry {
         self.channels * self.kernel * self.kernel
     }
 
-    /// Row or column of the larger image under tap `tap` of patch `place`, if it is one.
+    /// The row or column of the larger image under tap `tap` of patch `place`. `None` in the
+    /// padding.
     fn under(self, place: usize, tap: usize) -> Option<usize> {
         let index = (place * STRIDE + tap).checked_sub(self.padding.0)?;
         (index < self.size).then_some(index)
     }
 
-    /// Where in an image each run of `batch` numbers under one of the `kernel kernel` taps lies,
-    /// place by place; `None`: in the padding.
+    /// The position in an image of each run of `batch` numbers under `tap`, one of `kernel kernel`,
+    /// place by place. `None` in the padding.
     fn runs(self, tap: usize, batch: usize) -> impl Iterator<Item = Option<usize>> {
         let small = self.small();
         (0..small * small).map(move |place| {
@@ -72,7 +73,7 @@ impl Geometry {
 }
 
 /// Whether the operations below are made for `x`. Other devices, and the double precision that
-/// tests compare with, take burn's own.
+/// tests compare with, use burn's own operations.
 fn is_ours<const D: usize>(x: &Tensor<D>) -> bool {
     x.dtype() == DType::F32 && x.device().without_autodiff() == Device::flex()
 }
@@ -101,7 +102,7 @@ pub fn convolution(x: Tensor<4>, kernels: Tensor<2>, geometry: Geometry) -> Tens
 }
 
 /// The adjoint of [`convolution`]: images `[inputs, size, size, batch]` of `x`
-/// `[outputs, small, small, batch]`. "Transposed convolution" to everybody.
+/// `[outputs, small, small, batch]`. Its usual name is transposed convolution.
 pub fn transposed_convolution(x: Tensor<4>, kernels: Tensor<2>, geometry: Geometry) -> Tensor<4> {
     let [outputs, small, _, batch] = x.dims();
     let Geometry {
@@ -117,8 +118,8 @@ pub fn transposed_convolution(x: Tensor<4>, kernels: Tensor<2>, geometry: Geomet
         return from_patches(products, geometry, batch);
     }
     let kernels = kernels.reshape([outputs, channels, kernel, kernel]);
-    // burn crops as much after as before. What is missing then was one past the last patch and
-    // is 0; what is over is cut off.
+    // burn crops as much after as before. A row that is then missing lies past the last patch and
+    // is 0. Rows that are too many are cut off.
     let full = (small - 1) * STRIDE + kernel;
     let missing = (size + before).saturating_sub(full);
     let options =
@@ -128,12 +129,12 @@ pub fn transposed_convolution(x: Tensor<4>, kernels: Tensor<2>, geometry: Geomet
         .permute([1, 2, 3, 0])
 }
 
-/// What lies under the kernel at each of its places: `[inputs k k, small small batch]`.
+/// The numbers under the kernel at each of its places: `[inputs k k, small small batch]`.
 pub fn patches(x: Tensor<4>, geometry: Geometry) -> Tensor<2> {
     Tensor::from_dispatch(<Dispatch as Layers>::patches(x.into_dispatch(), geometry))
 }
 
-/// The adjoint of [`patches`]: adds every number to the place it would have come from.
+/// The adjoint of [`patches`]: adds every number at the place it would have come from.
 pub fn from_patches(patches: Tensor<2>, geometry: Geometry, batch: usize) -> Tensor<4> {
     let patches = patches.into_dispatch();
     Tensor::from_dispatch(<Dispatch as Layers>::from_patches(patches, geometry, batch))
@@ -167,8 +168,8 @@ pub fn normalised(
     activation::leaky_relu(y, f64::from(slope))
 }
 
-/// LeakyReLU, whose gradient at 0 lies in the middle of both slopes. burn's own goes through
-/// `mask_where` for the gradient, which took 17 % of a step; without one there is nothing to gain.
+/// LeakyReLU, whose gradient at 0 is the mean of both slopes. burn's own computes the gradient with
+/// `mask_where`, which took 17 % of a step. Without a gradient there is nothing to gain.
 pub fn leaky_relu<const D: usize>(x: Tensor<D>, slope: f32) -> Tensor<D> {
     if !is_ours(&x) || !x.is_autodiff() {
         return activation::leaky_relu(x, f64::from(slope));
@@ -176,7 +177,7 @@ pub fn leaky_relu<const D: usize>(x: Tensor<D>, slope: f32) -> Tensor<D> {
     Tensor::from_dispatch(<Dispatch as Layers>::leaky_relu(x.into_dispatch(), slope))
 }
 
-/// The operations that burn has not, for its dispatch.
+/// The operations that burn lacks, for its dispatch.
 #[backend_extension(Autodiff, Flex)]
 trait Layers: Backend {
     fn product(kernels: FloatTensor<Self>, patches: FloatTensor<Self>) -> FloatTensor<Self>;
@@ -196,9 +197,10 @@ trait Layers: Backend {
     fn leaky_relu(x: FloatTensor<Self>, slope: f32) -> FloatTensor<Self>;
 }
 
-/// The matrix product, as burn's own but for the kernels' gradient: that of patches by gradient,
-/// transposed. The product of gradient and transposed patches would have the many patches copied
-/// into another order first, by one thread; here it is the gradient, which is smaller.
+/// The matrix product. It differs from burn's own only in the kernels' gradient, which is the
+/// product of patches and transposed gradient, transposed. burn's product of gradient and
+/// transposed patches would first copy the many patches into another order, on one thread. Here
+/// only the gradient is copied, which is smaller.
 #[derive(Debug)]
 struct ProductStep;
 

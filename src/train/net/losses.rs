@@ -1,25 +1,26 @@
-//! What discriminator and generator minimise in each of the three games, from logits.
+//! The losses of discriminator and generator in each of the three games, from logits.
 //!
-//! In: what a discriminator made of batches of real, generated and, where there are levels,
-//! labelled frames. Out: a loss of one number. With `sp` the softplus and `LSE` the logarithm of
-//! the sum of exponentials, nothing here overflows or takes the logarithm of 0.
+//! In: a discriminator's outputs for batches of real, generated and, where there are levels,
+//! labelled frames. Out: a loss of one number. The losses are written with `sp`, the softplus, and
+//! `LSE`, the logarithm of the sum of exponentials, so nothing here overflows or takes the
+//! logarithm of 0.
 
 use burn::tensor::{Tensor, activation};
 
-/// What the discriminator tells apart.
+/// The task of the discriminator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Game {
-    /// Real from generated, by one logit: DeLiGAN, so USTGAN and STGAN.
+    /// Real or generated, by one logit: DeLiGAN, and so USTGAN and STGAN.
     RealOrFake,
-    /// L levels and a further one for generated frames: SGAN (Odena 2016).
+    /// L levels and one more for generated frames: SGAN (Odena 2016).
     FakeLevel,
-    /// L levels; a generated frame's logit is fixed at 0. The generator matches mean features:
-    /// IGAN (Salimans 2016).
+    /// L levels; a generated frame's logit is fixed at 0. The generator matches mean features: IGAN
+    /// (Salimans 2016).
     FeatureMatching,
 }
 
 impl Game {
-    /// Logits of the discriminator.
+    /// The number of the discriminator's logits.
     pub fn outputs(self, levels: usize) -> usize {
         match self {
             Self::RealOrFake => 1,
@@ -29,12 +30,12 @@ impl Game {
     }
 }
 
-/// What a discriminator makes of a batch.
+/// A discriminator's outputs for a batch.
 #[derive(Debug, Clone)]
 pub struct Judged {
-    /// `[batch, 64]`, after the trunk.
+    /// The features `[batch, 64]` after the trunk.
     pub features: Tensor<2>,
-    /// `[batch, outputs]`.
+    /// The logits `[batch, outputs]`.
     pub logits: Tensor<2>,
 }
 
@@ -45,18 +46,18 @@ fn softplus<const D: usize>(x: Tensor<D>) -> Tensor<D> {
 
 /// Logarithm of the sum of exponentials of each row: `[batch, columns]` to `[batch, 1]`.
 fn log_sum_exp(x: Tensor<2>) -> Tensor<2> {
-    // The largest is taken out before and added after, so its gradient cancels.
+    // The largest is subtracted before and added after, so its gradient cancels.
     let top = x.clone().detach().max_dim(1);
     x.sub(top.clone()).exp().sum_dim(1).log().add(top)
 }
 
-/// The levels' logits of a game that has one more for generated frames.
+/// The first `columns` logits, which are those of the levels.
 fn first(logits: Tensor<2>, columns: usize) -> Tensor<2> {
     let [batch, _] = logits.dims();
     logits.slice([0..batch, 0..columns])
 }
 
-/// -log(1 - p(generated)), a row each, where the last logit is that of generated frames.
+/// -log(1 - p(generated)) of each row, where the last logit is that of generated frames.
 fn not_generated(logits: Tensor<2>) -> Tensor<2> {
     let levels = logits.dims()[1] - 1;
     log_sum_exp(logits.clone()).sub(log_sum_exp(first(logits, levels)))
@@ -72,11 +73,11 @@ pub fn discriminator(
 ) -> Tensor<1> {
     let (real, generated) = (real.logits, generated.logits);
     let loss = match game {
-        // Eqs. (3), (5): L_D = -E log D(x) - E log(1 - D(G(z))). The paper prints +log D(G(z))
-        // for the second term, which has no lower bound. Eq. (8) is this loss again, of features;
-        // below it the paper calls beta^G the discriminator's parameters and beta^D the generator's.
+        // Eqs. (3), (5): L_D = -E log D(x) - E log(1 - D(G(z))). The paper prints +log D(G(z)) for
+        // the second term, which has no lower bound. Eq. (8) is this loss again, of features. Below
+        // Eq. (8) the paper calls beta^G the discriminator's parameters and beta^D the generator's.
         Game::RealOrFake => softplus(real.neg()).mean().add(softplus(generated).mean()),
-        // Real: not generated. Generated: the last level.
+        // A real frame is not generated. A generated frame is of the last level.
         Game::FakeLevel => {
             let [batch, outputs] = generated.dims();
             let last = generated
@@ -94,7 +95,7 @@ pub fn discriminator(
     };
     match labelled {
         None => loss,
-        // Eq. (9) over all logits: a labelled frame is none of the generated ones either.
+        // Eq. (9) over all logits, because a labelled frame is not a generated one either.
         Some((logits, targets)) => {
             let of_level = first(logits.clone(), targets.dims()[1])
                 .mul(targets)
@@ -104,8 +105,8 @@ pub fn discriminator(
     }
 }
 
-/// The generator's loss on a batch of generated frames; feature matching alone asks for the
-/// `real` batch. Without [`sigma_penalty`].
+/// The generator's loss on a batch of generated frames, without [`sigma_penalty`]. Only feature
+/// matching needs the `real` batch.
 pub fn generator(game: Game, real: impl FnOnce() -> Judged, generated: Judged) -> Tensor<1> {
     match game {
         // Eqs. (4), (6): max E log D(G(z)), so L_G = -E log D(G(z)).

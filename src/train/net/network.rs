@@ -14,24 +14,25 @@ use crate::random::Stream;
 use crate::train::net::layers::{Geometry, convolution, leaky_relu, normalised};
 
 /// Batch normalisation's epsilon in the discriminator. It must lie far below the variances that it
-/// is added to, or the layer normalises nothing: with weights of N(0, 0.02) they begin at 4e-7 before
-/// the second layer of a network of newtons. `the_layers_begin_with_unit_variance` measures them.
+/// is added to, or the layer normalises nothing. With weights of N(0, 0.02) these variances begin
+/// at 4e-7 before the second layer of a network of newtons. `the_layers_begin_with_unit_variance`
+/// measures them.
 pub(super) const BATCH_NORM_EPSILON: f32 = 1e-8;
-/// LeakyReLU below 0.
+/// Slope of LeakyReLU below 0.
 pub const LEAKY_SLOPE: f32 = 0.2;
-/// Standard deviation of initial weights; normal, cut at two deviations.
+/// Standard deviation of initial weights, which are normal and cut at two deviations.
 const INITIAL_DEVIATION: f64 = 0.02;
-/// Features after a global pool: one of each channel.
+/// The number of features after a global pool: one per channel.
 pub const FEATURES: usize = 64;
 
 /// One of the trunk's convolutions: square kernel, stride 2, TF's SAME padding.
 #[derive(Debug, Clone, Copy)]
 pub struct Convolution {
-    /// Prefix of its weights' names.
+    /// Prefix of the names of its weights.
     pub name: &'static str,
-    /// Channels in.
+    /// Input channels.
     pub inputs: usize,
-    /// Channels out.
+    /// Output channels.
     pub outputs: usize,
     /// Rows and columns of the kernel.
     pub kernel: usize,
@@ -42,7 +43,7 @@ pub struct Convolution {
 }
 
 impl Convolution {
-    /// How it lies on images of `size` rows and columns.
+    /// The geometry of the convolution on images of `size` rows and columns.
     pub fn geometry(&self, size: usize) -> Geometry {
         Geometry {
             channels: self.inputs,
@@ -84,18 +85,18 @@ pub const TRUNK: [Convolution; 3] = [
 /// One named weight.
 #[derive(Debug, Clone)]
 pub struct Weight {
-    /// Such as `conv2.kernel`.
+    /// The name, such as `conv2.kernel`.
     pub name: String,
-    /// Lengths of its axes.
+    /// Lengths of the axes.
     pub dims: Vec<usize>,
-    /// Row-major.
+    /// The numbers, row-major.
     pub values: Tensor<1>,
 }
 
 /// The weights of a network, in a fixed order.
 #[derive(Debug, Clone, Default)]
 pub struct Weights {
-    /// In the order in which they were added.
+    /// The weights, in the order in which they were added.
     pub entries: Vec<Weight>,
 }
 
@@ -115,7 +116,7 @@ impl Weights {
     ///
     /// # Panics
     ///
-    /// If there is none, or it has another number of axes: networks name their weights
+    /// Panics if there is none, or it has another number of axes. Networks name their weights
     /// themselves.
     pub fn tensor<const D: usize>(&self, name: &str) -> Tensor<D> {
         let weight = self.entry(name);
@@ -161,7 +162,7 @@ impl Weights {
         }
     }
 
-    /// The weights that lie `share` of the way from `start` to these; both are of one network.
+    /// The weights that lie `share` of the way from `start` to these. Both are of one network.
     #[must_use]
     pub fn between(&self, start: &Self, share: f32) -> Self {
         let between = |(weight, start): (&Weight, &Weight)| {
@@ -177,7 +178,7 @@ impl Weights {
         }
     }
 
-    /// How many numbers there are.
+    /// The number of parameters in all weights.
     #[cfg(test)]
     pub(super) fn count(&self) -> usize {
         self.entries
@@ -206,7 +207,7 @@ pub fn truncated_normal(count: usize, stream: &mut Stream) -> Vec<f32> {
     (0..count).map(|_| draw(stream)).collect()
 }
 
-/// Adds the trunk's initial weights; each layer draws from its own sub-stream.
+/// Adds the trunk's initial weights. Each layer draws from its own sub-stream.
 pub fn add_trunk(weights: &mut Weights, stream: &Stream, device: &Device) {
     for (layer, index) in TRUNK.iter().zip(0..) {
         let Convolution {
@@ -282,14 +283,15 @@ impl Statistics {
     }
 }
 
-/// Where batch normalisation takes mean and variance from.
+/// The source of mean and variance for batch normalisation.
 #[derive(Debug)]
 pub enum Normalisation<'a> {
-    /// From the batch itself: training.
+    /// From the batch itself, for training.
     Batch,
-    /// From the batch itself, and adds them up: once over the training set before evaluation.
+    /// From the batch itself, and adds them to the statistics. Used once over the training set,
+    /// before evaluation.
     Collect(&'a mut Statistics),
-    /// From those collected: evaluation.
+    /// From the collected statistics, for evaluation.
     Fixed(&'a Statistics),
 }
 
@@ -299,8 +301,8 @@ pub fn takes_means(weights: &Weights) -> bool {
     weights.dims("head.matrix")[0] == 2 * FEATURES
 }
 
-/// The trunk: images `[batch, 1, 28, 28]` in [-1, 1], background -1, to features: `[batch, 64]`, the
-/// greatest value of each channel, or `[batch, 128]`, behind which the means follow.
+/// The trunk: images `[batch, 1, 28, 28]` in [-1, 1], background -1, to features. These are the
+/// greatest value of each channel, `[batch, 64]`, or with the means after them, `[batch, 128]`.
 pub fn trunk(weights: &Weights, images: Tensor<4>, normalisation: &mut Normalisation) -> Tensor<2> {
     let batch = images.dims()[0];
     debug_assert_eq!(images.dims(), [batch, 1, ROWS, COLS]);
@@ -354,8 +356,8 @@ pub(super) fn as_images(rows: Tensor<2>, batch: usize) -> Tensor<4> {
     rows.reshape([outputs, size, size, batch])
 }
 
-/// The last layer's images `[64, 4, 4, batch]` to `[batch, 64]`, each channel's greatest value, or
-/// `[batch, 128]`, behind which the means follow.
+/// Pools the last layer's images `[64, 4, 4, batch]` to each channel's greatest value,
+/// `[batch, 64]`, or with the means after them, `[batch, 128]`.
 pub(super) fn pooled(x: Tensor<4>, with_means: bool) -> Tensor<2> {
     let [_, rows, columns, batch] = x.dims();
     let x = x.reshape([FEATURES, rows * columns, batch]);
@@ -410,7 +412,7 @@ pub fn head(weights: &Weights, features: Tensor<2>) -> Tensor<2> {
     features.matmul(matrix).add(bias.reshape([1, outputs]))
 }
 
-/// `x` `[rows, inputs]` through the layer `name`.
+/// Passes `x` `[rows, inputs]` through the layer `name`.
 pub(super) fn dense(weights: &Weights, name: &str, x: Tensor<2>) -> Tensor<2> {
     let bias = weights.tensor::<1>(&format!("{name}.bias"));
     let (inputs, outputs) = (x.dims()[1], bias.dims()[0]);
@@ -423,9 +425,9 @@ pub(super) fn dense(weights: &Weights, name: &str, x: Tensor<2>) -> Tensor<2> {
 /// A convolution with batch normalisation folded into it, as it is exported.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Folded {
-    /// `[outputs, inputs, kernel, kernel]`.
+    /// The kernel `[outputs, inputs, kernel, kernel]`.
     pub kernel: Vec<f32>,
-    /// `[outputs]`.
+    /// The bias `[outputs]`.
     pub bias: Vec<f32>,
 }
 

@@ -1,8 +1,8 @@
-//! What the sensor makes of a force: generated frames go through it before anything judges them.
+//! The sensor's reading of a force: generated frames pass through it before anything judges them.
 //!
-//! A generator's forces are any numbers. The sensor gives multiples of a count, and nothing below a
-//! threshold. A discriminator that sees the difference tells generated frames from real ones without
-//! a look at the press.
+//! A generator gives any force. The sensor gives multiples of a count, and nothing below a
+//! threshold. A discriminator that sees this difference can recognise generated frames without
+//! looking at the press.
 
 use std::collections::BTreeSet;
 
@@ -12,17 +12,17 @@ use crate::frame::Frame;
 use crate::train::net::image::Scale;
 use crate::train::net::network::numbers;
 
-/// Frames that are looked at to learn what the sensor gives.
+/// The number of frames from which step and threshold are read.
 const FRAMES: usize = 200;
 
-/// What a sensor gives: steps and a threshold, as seen in its own frames.
+/// Step, threshold and greatest force of a sensor, as seen in its own frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sensor {
-    /// Newtons a count; 0 where the frames are no multiples of anything.
+    /// Newtons per count. 0 if the forces are not multiples of one step.
     step_n: f32,
     /// The least force above 0.
     threshold_n: f32,
-    /// The greatest.
+    /// The greatest force.
     most_n: f32,
 }
 
@@ -35,7 +35,7 @@ impl Sensor {
             .filter(|newtons| *newtons > 0.0)
             .map(f32::to_bits)
             .collect();
-        // The bits of positive numbers are in the order of the numbers.
+        // The bits of positive numbers have the same order as the numbers.
         let values: Vec<f32> = values.into_iter().map(f32::from_bits).collect();
         let (Some(&threshold_n), Some(&most_n)) = (values.first(), values.last()) else {
             return Self {
@@ -63,14 +63,14 @@ impl Sensor {
         }
     }
 
-    /// What it gives for a force.
+    /// The sensor's reading of a force.
     pub fn newtons(self, newtons: f32) -> f32 {
         let counted = if self.step_n > 0.0 {
             (newtons / self.step_n).round() * self.step_n
         } else {
             newtons
         };
-        // Half a step of tolerance: multiples are not exact.
+        // Half a step is tolerated, because multiples are not exact.
         if counted < self.threshold_n - 0.5 * self.step_n {
             0.0
         } else {
@@ -78,8 +78,8 @@ impl Sensor {
         }
     }
 
-    /// Generated images as the sensor would give them. Gradients pass as if nothing had happened
-    /// (the straight-through estimate): a step has none of its own.
+    /// Generated images as the sensor would give them. Gradients pass unchanged (the
+    /// straight-through estimate), because a step has no gradient of its own.
     pub fn images(self, images: Tensor<4>, scale: Scale) -> Tensor<4> {
         let dims = images.dims();
         let device = images.device();

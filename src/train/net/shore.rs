@@ -1,7 +1,7 @@
 //! The second head: Shore hardness with the ends of a 90 % interval, beside the levels.
 //!
-//! A network's outputs are `[batch, L + 3]`: logits, then the median and the two ends, on a scale on
-//! which a unit is 25 Shore OO.
+//! A network's outputs are `[batch, L + 3]`: logits, then the median and the two ends. A unit of
+//! the last three is 25 Shore OO.
 
 use burn::tensor::{Tensor, TensorData, activation};
 
@@ -11,19 +11,19 @@ use crate::train::net::network::numbers;
 
 /// Outputs beside the levels: Shore OO, and the low and high end of its interval.
 pub const OUTPUTS: usize = 3;
-/// Their quantiles.
+/// The quantiles of the outputs.
 const QUANTILES: [f32; OUTPUTS] = [0.5, 0.05, 0.95];
 /// Shore OO of an output of 0.
 const MIDDLE: f32 = 55.0;
-/// Shore OO of a unit more.
+/// Shore OO per unit of an output.
 const UNIT: f32 = 25.0;
 
-/// How much the intervals' loss counts beside the levels'.
+/// Weight of the intervals' loss relative to the levels' loss.
 const WEIGHT: f32 = 1.5;
 
-/// Logits and Shore OO (value, low, high) of each press, from the outputs `[batch, levels + 3]`. `widths`
-/// are added below and above to the ends of the interval, which then are moved to the value where they do
-/// not hold it, as the daemon does: a network that has learnt little may put them anywhere.
+/// Logits and Shore OO (value, low, high) of each press, from the outputs `[batch, levels + 3]`.
+/// `below` and `above` widen the interval. An end on the wrong side of the value is moved to the
+/// value, as the daemon does, because a network that has learnt little may put the ends anywhere.
 pub fn of_outputs(
     outputs: &Tensor<2>,
     levels: usize,
@@ -42,8 +42,8 @@ pub fn of_outputs(
         .collect()
 }
 
-/// The loss of both heads: Eq. (9) of the levels, and that of the intervals where the hardness was
-/// `measured`. Also gives the logits, row by row. `targets` is `[batch, L]`.
+/// The loss of both heads: Eq. (9) of the levels, and the loss of the intervals where the hardness
+/// was `measured`. Also returns the logits, row by row. `targets` is `[batch, L]`.
 pub fn loss(
     outputs: Tensor<2>,
     targets: Tensor<2>,
@@ -67,9 +67,9 @@ pub fn loss(
     )
 }
 
-/// Pinball losses of the median and of the ends of a 90 % interval, summed and averaged over presses.
-/// `outputs` are the three of each press; `shore` is `[batch, 1]` on their scale, `known` 1 where it was
-/// measured.
+/// Pinball losses of the median and of the ends of a 90 % interval, summed and averaged over
+/// presses. `outputs` is `[batch, 3]`. `shore` is `[batch, 1]` on the same scale, and `known` is 1
+/// where it was measured.
 fn interval_loss(outputs: Tensor<2>, shore: Tensor<2>, known: Tensor<2>) -> Tensor<1> {
     let batch = outputs.dims()[0] as f32;
     let quantiles = Tensor::<1>::from_floats(QUANTILES, &outputs.device()).reshape([1, OUTPUTS]);
@@ -79,8 +79,8 @@ fn interval_loss(outputs: Tensor<2>, shore: Tensor<2>, known: Tensor<2>) -> Tens
     above.add(below).mul(known).sum().div_scalar(batch)
 }
 
-/// Adds the nodes from a network's outputs `[1, levels + 3]` to raw logits `[1, levels]` and Shore OO
-/// `[1, 3]`, and gives their names.
+/// Adds the nodes from a network's outputs `[1, levels + 3]` to raw logits `[1, levels]` and Shore
+/// OO `[1, 3]`, and returns the names of both.
 pub(super) fn nodes(
     b: &mut Builder,
     outputs: &str,
@@ -124,7 +124,7 @@ mod tests {
         };
         let inside = row([7.0, 0.0, -1.0, 1.0]);
         assert_eq!(inside, (vec![7.0], [55.0, 29.0, 82.0]));
-        // Ends on the wrong sides, and beyond the scale.
+        // The ends are on the wrong sides, and then also beyond the scale.
         assert_eq!(row([7.0, 0.0, 1.0, -1.0]).1, [55.0, 55.0, 55.0]);
         assert_eq!(row([7.0, 9.0, -9.0, 9.0]).1, [100.0, 0.0, 100.0]);
     }
@@ -136,7 +136,7 @@ mod tests {
             let data = TensorData::new(values.to_vec(), [values.len(), 1]);
             Tensor::<2>::from_data(data, &device)
         };
-        // Twenty presses of 0, 0.05, ..., 0.95, and one that was not measured.
+        // Twenty presses have 0, 0.05, ..., 0.95, and one was not measured.
         let mut shore: Vec<f32> = (0..20_u8).map(|n| f32::from(n) / 20.0).collect();
         let mut known = vec![1.0; 20];
         shore.push(50.0);

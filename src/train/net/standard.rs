@@ -2,21 +2,21 @@
 
 use crate::train::net::builder::Builder;
 
-/// Columns are clipped at so many standard deviations from their mean: beyond what was trained on,
-/// a network extrapolates.
+/// The number of standard deviations from the mean at which a column is clipped, because a network
+/// extrapolates beyond its training data.
 const CLIP: f32 = 4.0;
 
-/// Mean and standard deviation of each column over what was learnt from.
+/// Mean and standard deviation of each column over the training data.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Standard {
-    /// A number a column.
+    /// Mean of each column.
     pub mean: Vec<f32>,
     /// Standard deviation of each column.
     pub deviation: Vec<f32>,
 }
 
 impl Standard {
-    /// Of rows of `columns` numbers.
+    /// Computes mean and deviation over rows of `columns` numbers.
     pub fn of<'a>(columns: usize, rows: impl Iterator<Item = &'a [f32]> + Clone) -> Self {
         let count = rows.clone().count().max(1) as f64;
         let mut mean = vec![0.0; columns];
@@ -33,17 +33,18 @@ impl Standard {
         }
         Self {
             mean: mean.iter().map(|&mean| mean as f32).collect(),
-            // A column that never varies is no divisor.
+            // The lower limit avoids a division by 0 for a column that never varies.
             deviation: variance.iter().map(|v| v.sqrt().max(1e-3) as f32).collect(),
         }
     }
 
-    /// A column's number as the network takes it.
+    /// A column's number on the scale that the network takes.
     pub fn apply(&self, column: usize, x: f32) -> f32 {
         ((x - self.mean[column]) / self.deviation[column]).clamp(-CLIP, CLIP)
     }
 
-    /// Adds the nodes that bring `x` `[rows, columns]` to the scale, and gives their output's name.
+    /// Adds the nodes that bring `x` `[rows, columns]` to the scale, and returns their output's
+    /// name.
     pub(super) fn nodes(&self, b: &mut Builder, x: &str) -> String {
         let dims = [self.mean.len()];
         let mean = b.0.constant("column means", &dims, &self.mean);

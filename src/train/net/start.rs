@@ -1,4 +1,4 @@
-//! A network that training goes on from: the weights of an exported file.
+//! The start of further training: the weights of an exported file.
 
 use burn::tensor::{Device, Tensor, TensorData};
 
@@ -9,23 +9,23 @@ use crate::train::net::standard::Standard;
 /// Shape and numbers of a constant of an exported graph.
 pub type Constant = (Vec<usize>, Vec<f32>);
 
-/// What an exported file tells of its network.
+/// The network of an exported file.
 #[derive(Debug, Clone)]
 pub struct Start {
     /// Weights of all layers.
     pub weights: Weights,
     /// Mean and deviation of the columns.
     pub standard: Standard,
-    /// What the logits are divided by.
+    /// The temperature by which the logits are divided.
     pub temperature: f32,
-    /// What is added below and above the interval of Shore, in Shore OO.
+    /// The widths by which the interval of Shore hardness is widened below and above, in Shore OO.
     pub widths: [f32; 2],
 }
 
 impl Start {
-    /// From an exported graph's constants; `None` if they are of another network than `initial`, which has
-    /// the same layers with any weights, and `columns` columns. `constant` gives a constant by its name, laid
-    /// out as the weights are.
+    /// Reads the network from an exported graph's constants. `initial` has the expected layers with
+    /// any weights, and `columns` is the expected number of columns. `None` if the constants are of
+    /// another network. `constant` gives a constant by its name, laid out like the weights.
     pub fn of_constants(
         initial: Weights,
         columns: usize,

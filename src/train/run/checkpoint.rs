@@ -1,7 +1,8 @@
-//! The state of a stage in full precision, so that a killed run goes on bit for bit.
+//! The state of a stage in full precision, so that a killed run continues with the same bits.
 //!
 //! Every random choice follows from the run's seed and the step's number through counter-based
-//! streams, so the number of steps done is the position of all of them. The rest is tensors.
+//! streams, so the number of steps done is the position of every stream. The rest of the state is
+//! tensors.
 
 use std::io::Cursor;
 use std::path::Path;
@@ -16,19 +17,19 @@ use sha2::{Digest as _, Sha256};
 use crate::train::data::dataset::Dataset;
 use crate::train::net::network::{Weight, Weights, numbers};
 
-/// What a stage needs to go on, beside its settings and data.
+/// The state from which a stage continues, beside its settings and data.
 #[derive(Debug, Clone)]
 pub struct Checkpoint {
-    /// What the stage follows from: see [`Origin`].
+    /// The origin of the stage: see [`Origin`].
     pub origin: String,
-    /// The plain part.
+    /// The progress of the stage.
     pub progress: Progress,
-    /// The weights, and the same lists of whatever else goes with them, by name: Adam's moments,
-    /// averaged weights, the best so far.
+    /// The weights, and similar lists by name: Adam's moments, averaged weights, the best weights
+    /// so far.
     pub lists: Vec<(String, Weights)>,
 }
 
-/// How far a stage is.
+/// The progress of a stage.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Progress {
     /// Epochs done.
@@ -39,9 +40,9 @@ pub struct Progress {
     pub best_loss: Option<f64>,
 }
 
-/// All that a stage's result follows from, as one hash: its settings, seed, frames in their order
-/// with their levels, and initial weights. Two runs whose stages have the same one need to run it
-/// once.
+/// One hash of everything that determines a stage's result: its settings, seed, frames in their
+/// order with their levels, and initial weights. If stages of two runs have the same origin, it is
+/// enough to run one of them.
 #[derive(Debug)]
 pub struct Origin(Sha256);
 
@@ -106,7 +107,7 @@ impl Checkpoint {
     ///
     /// # Errors
     ///
-    /// If there is none.
+    /// Returns an error if there is no such list.
     pub fn list(&self, name: &str) -> anyhow::Result<&Weights> {
         let found = self.lists.iter().find(|(list, _)| list == name);
         found
@@ -118,7 +119,7 @@ impl Checkpoint {
     ///
     /// # Errors
     ///
-    /// If the archive cannot be built.
+    /// Returns an error if the archive cannot be built.
     pub fn to_bytes(&self) -> anyhow::Result<Vec<u8>> {
         let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
         let progress = serde_json::to_vec(&self.progress)?;
@@ -137,7 +138,7 @@ impl Checkpoint {
     ///
     /// # Errors
     ///
-    /// If it is damaged.
+    /// Returns an error if the file cannot be read or is damaged.
     pub fn read(path: &Path, device: &Device) -> anyhow::Result<Self> {
         let bytes = std::fs::read(path)?;
         let mut npz = NpzReader::new(Cursor::new(bytes.as_slice()))?;

@@ -1,7 +1,7 @@
-//! Files that are whole, and directories that are one process's.
+//! Files that are complete at all times, and directories locked for one process.
 //!
-//! In: paths and bytes. A file is written beside its place, flushed to the disk and renamed, so that
-//! whatever stands there is whole, also after SIGKILL or a full disk.
+//! In: paths and bytes. A file is written under another name, flushed to the disk and renamed, so
+//! that it is complete at all times, also after SIGKILL or a full disk.
 
 use std::fs::{self, File};
 use std::io::{self, ErrorKind, Write as _};
@@ -10,12 +10,12 @@ use std::path::Path;
 use anyhow::{Context as _, bail};
 use rustix::fs::FlockOperation;
 
-/// Writes a file beside its place, flushes it and renames it; a link stays, and its target is
-/// written. What is no file, such as a pipe or a device, is written to as it stands.
+/// Writes a file under another name, flushes it and renames it. A link stays, and its target is
+/// written. If the path is not a file but, for example, a pipe or a device, it is written directly.
 ///
 /// # Errors
 ///
-/// Those of writing; a file that stood there before then still stands.
+/// Returns the errors of writing. A file that existed before is then unchanged.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let attempt = || -> anyhow::Result<()> {
         if let Some(directory) = path.parent()
@@ -26,7 +26,7 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
             return Err(io::Error::new(ErrorKind::NotFound, text).into());
         }
         if path.is_symlink() && !path.exists() {
-            // A link to what is not there yet: so that there is a path to follow it to.
+            // The link's target does not exist yet. Create it, so that the link can be followed.
             File::create(path)?;
         }
         match fs::metadata(path) {
@@ -47,21 +47,21 @@ fn replace(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
         file.write_all(bytes)?;
         file.sync_all()?;
         fs::rename(&part, path)?;
-        // The rename itself reaches the disk with the directory.
+        // The rename is on the disk only after the directory is flushed.
         let directory = path
             .parent()
             .filter(|parent| !parent.as_os_str().is_empty());
         File::open(directory.unwrap_or(Path::new(".")))?.sync_all()
     };
     attempt().inspect_err(|_| {
-        // A part left behind would fill the disk further; its removal may fail like the rest.
+        // A part left behind would fill the disk further. Its removal may fail for the same reason.
         let _ = fs::remove_file(&part);
     })?;
     Ok(())
 }
 
-/// A new file in the place of what a killed process left, which may not be writable; of a link,
-/// not of what it points to.
+/// Creates a file anew. It first removes what a killed process left, which may not be writable. It
+/// removes a link itself, not its target.
 fn create_anew(path: &Path) -> io::Result<File> {
     match fs::remove_file(path) {
         Err(error) if error.kind() != ErrorKind::NotFound => Err(error),
@@ -69,11 +69,11 @@ fn create_anew(path: &Path) -> io::Result<File> {
     }
 }
 
-/// Nobody else may work in a directory while the file is open.
+/// Locks a directory against other processes while the file is open.
 ///
 /// # Errors
 ///
-/// If somebody does, or the directory cannot be opened.
+/// Returns an error if another process holds the lock, or the directory cannot be opened.
 pub(in crate::train) fn lock(directory: &Path) -> anyhow::Result<File> {
     let context = || directory.display().to_string();
     let file = File::open(directory).with_context(context)?;
@@ -107,7 +107,7 @@ mod tests {
     fn whatever_has_the_name_of_the_part_loses_nothing_but_a_part() {
         let directory = tempfile::tempdir().unwrap();
         let path = |name: &str| directory.path().join(name);
-        // As a killed process leaves it, here even for reading only.
+        // The part is as a killed process leaves it, and here also read-only.
         fs::write(path("file.part"), "longer than what is written now").unwrap();
         let only_reading = std::os::unix::fs::PermissionsExt::from_mode(0o400);
         fs::set_permissions(path("file.part"), only_reading).unwrap();
@@ -155,7 +155,7 @@ mod tests {
             std::thread::spawn(move || fs::read(pipe))
         };
         write_whole(&pipe, b"through").unwrap();
-        // Were it a file by now, the reader would still wait.
+        // If the pipe had become a file, the reader would still wait.
         assert!(!pipe.is_file());
         assert_eq!(reader.join().unwrap().unwrap(), b"through");
     }

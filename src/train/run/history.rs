@@ -1,8 +1,8 @@
-//! A run's `metrics.csv`, written a row an epoch, and what it tells when read again: how each stage
-//! went, and the run's price.
+//! A run's `metrics.csv`, written with a row per epoch, and read again for each stage's course and
+//! the run's cost.
 //!
-//! Columns are found by their names, so that a stage may have others than its neighbours; a cell
-//! that is no number is a column the stage does not have.
+//! Columns are found by their names, so that stages may have different ones. A cell that is not a
+//! number is a column that the stage does not have.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -18,7 +18,7 @@ use crate::train::judge::likeness::Likeness;
 pub struct Metrics {
     file: File,
     stage: &'static str,
-    /// What the stage had taken at the checkpoint it goes on from.
+    /// Seconds that the stage had taken at the checkpoint from which it continues.
     seconds_before: f64,
 }
 
@@ -29,35 +29,35 @@ pub struct Row {
     pub step: u64,
     /// Epochs done.
     pub epoch: u32,
-    /// Mean training loss of the epoch; of a GAN's stage the discriminator's.
+    /// Mean training loss of the epoch; in a GAN's stage, that of the discriminator.
     pub loss: f64,
-    /// Of the epoch's last step.
+    /// Learning rate of the epoch's last step.
     pub learning_rate: f64,
-    /// Share of the epoch's samples judged rightly, each before the step that learnt from it; of a
-    /// recogniser's stage.
+    /// Share of the epoch's samples judged rightly, each before the step that learnt from it. Only
+    /// a recogniser's stage has it.
     pub accuracy: Option<f64>,
-    /// Loss and accuracy on the validation objects, where they were judged.
+    /// Loss and accuracy on the validation objects, in epochs that judged them.
     pub validation: Option<(f64, f64)>,
-    /// Since this process took the stage up. The file has the sum over processes; what was done
-    /// after the last checkpoint of a killed one is not in it, and is done again.
+    /// Seconds since this process took up the stage. The file has the sum over processes. It does
+    /// not include what a killed process did after its last checkpoint, which is done again.
     pub seconds: f64,
-    /// Of a GAN's stage.
+    /// The figures of a GAN's stage.
     pub adversarial: Option<Adversarial>,
 }
 
-/// What a GAN's row has beside.
+/// The further figures in a GAN's row.
 #[derive(Debug, Clone, Copy)]
 pub struct Adversarial {
-    /// Mean of the epoch.
+    /// Mean generator loss of the epoch.
     pub generator_loss: f64,
-    /// Least, mean and greatest deviation of the mixture.
+    /// Least, mean and greatest deviation sigma of the mixture.
     pub sigma: [f64; 3],
-    /// Generated frames beside real ones, where they were compared.
+    /// The comparison of generated frames with real ones, in epochs that made it.
     pub likeness: Option<Likeness>,
 }
 
 impl Metrics {
-    /// Rows of `stage` are added to `file`, which has its columns already.
+    /// Adds rows of `stage` to `file`, which already has its columns.
     pub fn new(file: File, stage: &'static str, seconds_before: f64) -> Self {
         Self {
             file,
@@ -70,14 +70,14 @@ impl Metrics {
     ///
     /// # Errors
     ///
-    /// Those of writing.
+    /// Returns the errors of writing.
     pub fn add(&mut self, row: &Row) -> anyhow::Result<()> {
         let row = Row {
             seconds: self.seconds_before + row.seconds,
             ..*row
         };
         let cells = row.cells(self.stage).map(|(_, cell)| cell);
-        // One write a row: a full disk leaves whole rows.
+        // One write per row, so that a killed process leaves whole rows.
         self.file
             .write_all((cells.join(",") + "\n").as_bytes())
             .context("metrics.csv")
@@ -85,7 +85,7 @@ impl Metrics {
 }
 
 impl Row {
-    /// Its columns and what stands in them; what a stage does not have stays empty.
+    /// The columns and their cells. A cell is empty if the stage does not have the value.
     fn cells(&self, stage: &str) -> [(&'static str, String); 17] {
         let optional = |value: Option<f64>, digits: usize| {
             value.map_or_else(String::new, |value| format!("{value:.digits$}"))
@@ -140,11 +140,11 @@ pub fn columns() -> String {
     Row::default().cells("").map(|(column, _)| column).join(",")
 }
 
-/// Whether a file begun before has the columns of this version.
+/// Checks that an existing file has the columns of this version.
 ///
 /// # Errors
 ///
-/// If it has not: its rows and new ones would not stand under the same names.
+/// Returns an error if it has others, because its rows and new ones would mix different columns.
 pub fn check_columns(text: &str, path: &Path) -> anyhow::Result<()> {
     let (found, expected) = (text.lines().next().unwrap_or_default(), columns());
     ensure!(
@@ -158,25 +158,25 @@ pub fn check_columns(text: &str, path: &Path) -> anyhow::Result<()> {
 /// The stages of a run, in the order they ran.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct History {
-    /// Each once.
+    /// The stages, each once.
     pub stages: Vec<Stage>,
 }
 
 /// A stage of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Stage {
-    /// Such as `ustgan`.
+    /// The stage's name, such as `ustgan`.
     pub name: String,
-    /// Its rows: column to value.
+    /// The stage's rows, each a map from column to value.
     pub rows: Vec<BTreeMap<String, f64>>,
 }
 
 impl History {
-    /// Reads a run's `metrics.csv`; a run without one has no stages.
+    /// Reads a run's `metrics.csv`. A run without the file has no stages.
     ///
     /// # Errors
     ///
-    /// If the file is there and cannot be read.
+    /// Returns an error if the file exists but cannot be read.
     pub fn read(run: &Path) -> anyhow::Result<Self> {
         let path = run.join("metrics.csv");
         match std::fs::read_to_string(&path) {
@@ -216,7 +216,7 @@ impl History {
             .sum()
     }
 
-    /// Seconds of all stages, over restarts.
+    /// Seconds of all stages, summed over restarts.
     pub fn seconds(&self) -> f64 {
         self.stages.iter().map(Stage::seconds).sum()
     }
@@ -228,18 +228,18 @@ impl Stage {
         self.last("step") as u64
     }
 
-    /// Seconds taken, over restarts.
+    /// Seconds taken, summed over restarts.
     pub fn seconds(&self) -> f64 {
         self.last("seconds")
     }
 
-    /// A column's last value; 0 if it has none.
+    /// A column's last value. 0 if it has none.
     fn last(&self, column: &str) -> f64 {
         let values = self.rows.iter().rev().filter_map(|row| row.get(column));
         values.copied().next().unwrap_or(0.0)
     }
 
-    /// A column against the steps, where it has values.
+    /// A column's values over the steps, where it has any.
     pub fn curve(&self, column: &str) -> Vec<(f64, f64)> {
         let point = |row: &BTreeMap<String, f64>| Some((*row.get("step")?, *row.get(column)?));
         self.rows.iter().filter_map(point).collect()

@@ -1,15 +1,15 @@
-//! How a stage is getting on: its bar or lines, and the end of one that has diverged.
+//! The progress of a stage as a bar or lines, and the end of a stage that has diverged.
 
 use anyhow::ensure;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::train::net::network::{Weights, numbers};
 
-/// Ends a stage of which something is no number any more: no further step would make it one.
+/// Ends a stage with a value that is NaN or infinite, because no further step would make it finite.
 ///
 /// # Errors
 ///
-/// If `found`, which is `what` of it, is not finite.
+/// Returns an error if `found`, the value of `what`, is not finite.
 pub(in crate::train) fn ensure_finite(
     stage: &str,
     epoch: u32,
@@ -24,12 +24,12 @@ pub(in crate::train) fn ensure_finite(
     Ok(())
 }
 
-/// Ends a stage whose weights are no numbers any more; a step's loss is that of the weights before
-/// it.
+/// Ends a stage with weights that are NaN or infinite. The loss does not show them yet, because a
+/// step's loss is that of the weights before it.
 ///
 /// # Errors
 ///
-/// If one of `weights` is not finite.
+/// Returns an error if one of `weights` is not finite.
 pub(in crate::train) fn ensure_finite_weights(
     stage: &str,
     epoch: u32,
@@ -47,7 +47,7 @@ pub(in crate::train) fn ensure_finite_weights(
 pub(in crate::train) fn progress_bar(stage: &str, steps: u64, done: u64) -> ProgressBar {
     let template = "{prefix} {bar:30} {pos}/{len} steps, {per_sec}, {eta} left {msg}";
     let style = ProgressStyle::with_template(template).expect("the template is right");
-    // indicatif draws on a terminal only; elsewhere `report` prints lines.
+    // indicatif draws on a terminal only. Elsewhere `report` prints lines.
     let bar = ProgressBar::new(steps)
         .with_style(style)
         .with_prefix(stage.to_owned());
@@ -56,7 +56,7 @@ pub(in crate::train) fn progress_bar(stage: &str, steps: u64, done: u64) -> Prog
     bar
 }
 
-/// The state of a stage after an epoch: beside the bar on a terminal, a line elsewhere.
+/// Shows the state of a stage after an epoch: beside the bar on a terminal, as a line elsewhere.
 pub(in crate::train) fn report(
     bar: &ProgressBar,
     stage: &str,

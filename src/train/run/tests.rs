@@ -1,4 +1,4 @@
-//! What a run's directory keeps.
+//! Tests of what a run's directory keeps.
 
 use burn::tensor::Tensor;
 
@@ -48,7 +48,7 @@ fn every_program_that_had_a_part_in_a_run_is_named() {
     let revisions = |name: &str| fs::read_to_string(path(name).join("revision")).unwrap();
     let own = revision();
 
-    // Begun by others, gone on with by this one, twice.
+    // The run was begun by others and is continued by this program, twice.
     drop(open("other", false));
     made_by("0.1 (aa)\n0.1 (bb)\n", "other");
     for _ in 0..2 {
@@ -56,7 +56,7 @@ fn every_program_that_had_a_part_in_a_run_is_named() {
         assert_eq!(revisions("other"), format!("0.1 (aa)\n0.1 (bb)\n{own}\n"));
     }
 
-    // A stage that is taken from there was made by all of them.
+    // A stage that is taken from the other run was made by all of its programs.
     let device = Device::flex();
     let weight = Weight {
         name: "bias".to_owned(),
@@ -108,7 +108,7 @@ fn seconds_go_on_from_the_row_of_the_checkpoint() {
     metrics.add(&row(20, 4.0)).unwrap();
     metrics.add(&row(30, 9.0)).unwrap();
     run.metrics("second", 0).unwrap().add(&row(5, 1.0)).unwrap();
-    // Killed after step 30, taken up from the checkpoint of step 20.
+    // The run was killed after step 30 and continues from the checkpoint of step 20.
     let mut metrics = run.metrics("first", 20).unwrap();
     metrics.add(&row(30, 3.5)).unwrap();
     let text = fs::read_to_string(run.path("metrics.csv")).unwrap();
@@ -121,7 +121,7 @@ fn seconds_go_on_from_the_row_of_the_checkpoint() {
     assert_eq!(seconds, ["2.0", "4.0", "7.5"], "{text}");
     assert!(text.contains("second,5,"), "{text}");
 
-    // A row that a full disk broke off goes; a file that is something else stays as it is.
+    // A row that a full disk broke off is dropped. A file that is not text stays unchanged.
     fs::write(run.path("metrics.csv"), text.clone() + "sec").unwrap();
     run.metrics("first", 30).unwrap();
     assert_eq!(fs::read_to_string(run.path("metrics.csv")).unwrap(), text);

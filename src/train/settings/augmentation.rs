@@ -1,16 +1,16 @@
-//! What augmentation can be told.
+//! Settings of augmentation.
 
 use serde::{Deserialize, Serialize};
 
-/// What is done to a training frame before each use.
+/// The changes made to a training frame before each use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 #[derive(Default)]
 pub struct AugmentationSettings {
-    /// Turn and mirror.
+    /// Whether frames are turned and mirrored.
     pub symmetries: bool,
-    /// Shift by up to this many taxels along each axis; what comes in is background.
+    /// The largest shift along each axis, in taxels. The taxels that come in are background.
     pub shift_taxels: u8,
-    /// Half of the frames as another sensor of the kind would have given them.
+    /// Whether half of the frames are changed to what another sensor of the same kind would give.
     pub other_sensors: bool,
 }

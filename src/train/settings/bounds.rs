@@ -1,32 +1,32 @@
-//! What a value may be, and what is said of one that may not.
+//! The ranges of values, and the error for a value outside its range.
 
-/// Why settings cannot be used.
+/// The reason that settings cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum SettingsError {
-    /// Not TOML, an unknown key, or a value of another type.
+    /// The text is not TOML, or has an unknown key or a value of another type.
     #[error("{0}")]
     Syntax(String),
-    /// A value outside its range.
+    /// A value is outside its range.
     #[error("`{key}`: found {found}, expected {expected}")]
     Range {
         /// Path of the key.
         key: String,
-        /// Its value.
+        /// The value of the key.
         found: f64,
-        /// What is accepted.
+        /// The accepted range.
         expected: &'static str,
     },
-    /// A run of an earlier version used an option that is gone.
+    /// A run of an earlier version used an option that no longer exists.
     #[error("the run used `{key}`, which is gone: read it with revision {last_revision}")]
     Retired {
         /// Path of the key.
         key: String,
-        /// The last revision that knew it.
+        /// The last revision that knew the option.
         last_revision: &'static str,
     },
 }
 
-/// Checks what every loop has.
+/// Checks the settings that every training loop has.
 pub(in crate::train) fn check_loop(
     table: &str,
     batch: usize,
@@ -43,7 +43,7 @@ pub(in crate::train) fn check_loop(
     check(table, key, every, every > 0, "1 or more")
 }
 
-/// Refuses a value of `table` and `key` unless it `fits`.
+/// Returns an error for a value of `table` and `key` unless it `fits`.
 pub(in crate::train) fn check(
     table: &str,
     key: &str,

@@ -1,19 +1,19 @@
-//! What learning from unlabelled samples by consistency can be told.
+//! Settings for learning from unlabelled samples by consistency.
 
 use serde::{Deserialize, Serialize};
 
 use super::bounds::{SettingsError, check};
 
-/// How unlabelled samples are learnt from without a GAN (FixMatch, Sohn et al. 2020, with the averaged
-/// weights as the teacher).
+/// Settings for learning from unlabelled samples without a GAN (FixMatch, Sohn et al. 2020, with
+/// the averaged weights as the teacher).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ConsistencySettings {
-    /// Unlabelled samples a step for each labelled one.
+    /// Unlabelled samples per labelled sample in each step.
     pub ratio: usize,
-    /// The teacher's confidence from which its verdict on an unlabelled sample is learnt from.
+    /// The least confidence of the teacher at which its verdict on an unlabelled sample is learnt.
     pub confidence: f64,
-    /// Weight of the unlabelled samples' loss beside the labelled ones'.
+    /// Weight of the unlabelled samples' loss relative to the labelled samples' loss.
     pub weight: f64,
 }
 
@@ -28,7 +28,7 @@ impl Default for ConsistencySettings {
 }
 
 impl ConsistencySettings {
-    /// Refuses what lies outside its range.
+    /// Returns an error if a value lies outside its range.
     pub(super) fn check(&self) -> Result<(), SettingsError> {
         let check =
             |key, found: f64, fits, expected| check("consistency.", key, found, fits, expected);

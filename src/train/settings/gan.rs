@@ -1,30 +1,32 @@
-//! What a GAN's training can be told.
+//! Settings of a GAN's training.
 
 use serde::{Deserialize, Serialize};
 
 use super::bounds::{SettingsError, check, check_loop};
 use super::optimiser::{OptimiserSettings, Rule};
 
-/// How both sides learn; the defaults are the paper's ("Training of STGAN and USTGAN").
+/// Settings for the training of generator and discriminator. The defaults are the paper's
+/// ("Training of STGAN and USTGAN").
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct GanSettings {
-    /// Real samples a step. The last batch of an epoch may be smaller.
+    /// Real samples per step. The last batch of an epoch may be smaller.
     pub batch: usize,
-    /// Generated samples of each component a step.
+    /// Generated samples of each component per step.
     pub samples_a_component: usize,
-    /// Passes over the real samples: what the paper calls iterations. Counted in steps, its 500
-    /// would be six passes over the unlabelled samples; DeLiGAN's code calls an epoch so.
+    /// Passes over the real samples: what the paper calls iterations. If its 500 were steps, they
+    /// would be six passes over the unlabelled samples. DeLiGAN's code also calls an epoch an
+    /// iteration.
     pub epochs: u32,
-    /// Lambda of Eq. (7), on a mean.
+    /// Lambda of Eq. (7), which weighs the penalty's mean over all of sigma.
     pub sigma_penalty: f64,
-    /// Decay a step of the running average of the discriminator's weights that is kept at the
-    /// end; 0: the weights themselves.
+    /// Decay per step of the running average of the discriminator's weights. The average is kept at
+    /// the end. With 0, the weights themselves are.
     pub averaging: f64,
-    /// A checkpoint is written after every so many epochs, and after the last.
+    /// The number of epochs between two checkpoints. The last epoch always ends with one.
     pub checkpoint_every_epochs: u32,
-    /// A picture is drawn, and generated samples are measured, after every so many epochs and
-    /// after the last.
+    /// The number of epochs between two pictures, and between two measurements of generated
+    /// samples. The last epoch always ends with both.
     pub picture_every_epochs: u32,
     /// The optimiser of generator and discriminator.
     pub optimiser: OptimiserSettings,
@@ -42,7 +44,7 @@ impl Default for GanSettings {
             picture_every_epochs: 25,
             optimiser: OptimiserSettings {
                 rule: Rule::Adam,
-                // The paper gives no betas; DeLiGAN's code has 0.5.
+                // The paper gives no betas. DeLiGAN's code has 0.5.
                 beta1: 0.5,
                 ..OptimiserSettings::default()
             },
@@ -51,7 +53,7 @@ impl Default for GanSettings {
 }
 
 impl GanSettings {
-    /// Refuses what lies outside its range; `table` is where these settings stand.
+    /// Returns an error if a value lies outside its range. `table` is the prefix of the keys.
     pub(in crate::train) fn check(&self, table: &str) -> Result<(), SettingsError> {
         check_loop(
             table,

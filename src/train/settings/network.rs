@@ -1,27 +1,28 @@
-//! What the networks can be told.
+//! Settings of the networks.
 
 use serde::{Deserialize, Serialize};
 
 use super::bounds::{SettingsError, check};
 
-/// What of each channel's places reaches the recogniser's last layer.
+/// The pooling of each channel for the recogniser's last layer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Pooling {
-    /// The greatest value, as the paper.
+    /// The greatest value, as in the paper.
     Max,
     /// The greatest value and the mean. A mean can add up an area or a force.
     MaxMean,
 }
 
-/// How the networks see a frame; the defaults are the paper's.
+/// Settings of the networks' image and pooling. The defaults are the paper's.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct NetworkSettings {
-    /// `max` or `max-mean`, of a recogniser with a last layer of its own: not of SGAN and IGAN, whose
-    /// discriminator is the recogniser.
+    /// `max` or `max-mean`. It applies to a recogniser with a last layer of its own, so not to SGAN
+    /// and IGAN, whose discriminator is the recogniser.
     pub pooling: Pooling,
-    /// Above 0: the image goes with log(1 + newtons / this); 0: with newtons.
+    /// Above 0, the image is linear in log(1 + newtons / this value). With 0, it is linear in
+    /// newtons.
     pub log_above_n: f64,
 }
 
@@ -35,7 +36,7 @@ impl Default for NetworkSettings {
 }
 
 impl NetworkSettings {
-    /// Refuses what lies outside its range.
+    /// Returns an error if a value lies outside its range.
     pub(super) fn check(&self) -> Result<(), SettingsError> {
         let least = self.log_above_n;
         let fits = least == 0.0 || (1e-3..=1e3).contains(&least);

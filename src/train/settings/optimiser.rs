@@ -1,10 +1,10 @@
-//! What an optimiser can be told.
+//! Settings of an optimiser.
 
 use serde::{Deserialize, Serialize};
 
 use super::bounds::{SettingsError, check};
 
-/// Which rule.
+/// The rule of a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Rule {
@@ -14,13 +14,13 @@ pub enum Rule {
     Adam,
 }
 
-/// How the learning rate goes over the run.
+/// How the learning rate changes over the run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Schedule {
-    /// The same throughout.
+    /// The learning rate stays the same.
     Constant,
-    /// From the full rate to 0 along half a cosine.
+    /// The learning rate falls from its full value to 0 along half a cosine.
     Cosine,
 }
 
@@ -28,18 +28,18 @@ pub enum Schedule {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct OptimiserSettings {
-    /// `sgd` or `adam`.
+    /// The rule of a step: `sgd` or `adam`.
     pub rule: Rule,
-    /// At the first step.
+    /// The learning rate of the first step.
     pub learning_rate: f64,
-    /// `constant` or `cosine`.
+    /// The schedule of the learning rate: `constant` or `cosine`.
     pub schedule: Schedule,
     /// Adam's decay of the gradient's mean.
     pub beta1: f64,
     /// Adam's decay of the gradient's square.
     pub beta2: f64,
-    /// Share of a kernel taken away a step, times the learning rate; not of biases, nor
-    /// of the mixture's mu and sigma.
+    /// The share, times the learning rate, by which each step shrinks a kernel. Biases and the
+    /// mixture's mu and sigma do not decay.
     pub weight_decay: f64,
 }
 
@@ -57,7 +57,7 @@ impl Default for OptimiserSettings {
 }
 
 impl OptimiserSettings {
-    /// Refuses what lies outside its range; `table` is where these settings stand.
+    /// Returns an error if a value lies outside its range. `table` is the prefix of the keys.
     pub(super) fn check(&self, table: &str) -> Result<(), SettingsError> {
         let table = format!("{table}optimiser.");
         let check = |key, found, fits, expected| check(&table, key, found, fits, expected);

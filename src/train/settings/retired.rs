@@ -1,12 +1,12 @@
-//! Options that earlier versions had, in the settings of their runs.
+//! Options that only earlier versions had, in the settings of their runs.
 //!
-//! `docs/method.md` says what they did: none of them helped.
+//! `docs/method.md` says what the options did. None of them helped.
 
 use super::SettingsError;
 
 /// The last revision that knew the options.
 const LAST_REVISION: &str = "637834a";
-/// Where each option was, and its default.
+/// The table, the key and the default of each option.
 const OPTIONS: [(&str, &str, Default); 5] = [
     ("", "minibatch_discrimination", Default::Off),
     ("ustgan", "turns", Default::Alternate),
@@ -32,11 +32,11 @@ impl Default {
     }
 }
 
-/// Takes the retired options out of a run's settings; gives whether there were any.
+/// Removes the retired options from a run's settings, and returns whether there were any.
 ///
 /// # Errors
 ///
-/// If one was in use: this version cannot do what the run did.
+/// Returns an error if the run used an option, because this version cannot do what the run did.
 pub(in crate::train) fn strip(settings: &mut toml::Table) -> Result<bool, SettingsError> {
     let mut had_any = false;
     for (table, key, default) in OPTIONS {

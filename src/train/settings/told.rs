@@ -1,29 +1,29 @@
-//! What a robot may tell of its arm while a network learns whole presses.
+//! Errors in a robot's reports about its arm while a network learns whole presses.
 
 use serde::{Deserialize, Serialize};
 
 use super::bounds::{SettingsError, check};
 
-/// Errors of what the arm tells, drawn for each press: a network that was only ever told the truth believes
-/// everything. And how else a press may differ from that of the data.
+/// Errors in the reports about the arm, and other changes to a press, drawn anew for each press. A
+/// network that has only learnt from correct reports trusts every report.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Told {
-    /// Share of presses of which nothing is known of the arm.
+    /// Share of the presses for which nothing is known about the arm.
     pub unknown: f64,
-    /// Share of the others of which the stiffness is not known.
+    /// Share of the other presses for which the stiffness is unknown.
     pub unknown_arm: f64,
-    /// Share of the others that are told without an error.
+    /// Share of the other presses whose reports have no error.
     pub exact: f64,
-    /// Positions are off by up to this part.
+    /// The largest relative error of the positions.
     pub position: f64,
-    /// The stiffness is off by up to this part.
+    /// The largest relative error of the stiffness.
     pub arm: f64,
-    /// The moments are off by up to so many frames.
+    /// The largest error of the moments, in frames.
     pub clock_frames: f64,
-    /// Share of presses that are judged before their end.
+    /// Share of the presses that are judged before their end.
     pub early: f64,
-    /// Share of presses that a slower sensor sees: every second to eighth frame of them.
+    /// Share of the presses that a slower sensor sees, with only every second to eighth frame.
     pub slower: f64,
 }
 
@@ -43,7 +43,8 @@ impl Default for Told {
 }
 
 impl Told {
-    /// A robot that always moves alike and tells nothing: time then stands for the way.
+    /// A robot that always moves alike and reports nothing. Time then takes the place of the
+    /// approach.
     pub const ONE_ROBOT: Self = Self {
         unknown: 1.0,
         unknown_arm: 0.0,
@@ -55,7 +56,7 @@ impl Told {
         slower: 0.0,
     };
 
-    /// Refuses what lies outside its range.
+    /// Returns an error if a value lies outside its range.
     pub(super) fn check(&self) -> Result<(), SettingsError> {
         let check = |key, found: f64, fits, expected| check("told.", key, found, fits, expected);
         let shares = [

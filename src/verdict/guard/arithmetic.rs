@@ -1,9 +1,9 @@
-//! Operators that work number by number.
+//! Operators that work on each number separately.
 
 use super::problem::Problem;
 use super::{Computed, Datum, Node, Value, tensor};
 
-/// The shape that values of these shapes have together, as numpy broadcasts them.
+/// The common shape of values with these shapes, as numpy broadcasts them.
 pub(super) fn broadcast(left: &[usize], right: &[usize]) -> Result<Vec<usize>, Problem> {
     let rank = left.len().max(right.len());
     let length = |shape: &[usize], axis: usize| {
@@ -68,7 +68,8 @@ pub(super) fn cast(node: &Node<'_>) -> Result<Computed, Problem> {
     let value = node.input(0)?;
     let to = tensor::datum(node.int("to", 0) as i32)?;
     let ints = match to {
-        // What becomes an integer of another size may become another integer.
+        // A cast to an integer of another size may change the value, so only i64 keeps its
+        // integers.
         Datum::I64 => value.ints.clone(),
         _ => None,
     };
@@ -76,7 +77,7 @@ pub(super) fn cast(node: &Node<'_>) -> Result<Computed, Problem> {
     Ok(Value { ints, ..cast }.into())
 }
 
-/// Two values of one type.
+/// The two inputs, which have to be of one type, and their common shape.
 fn pair<'a>(node: &'a Node<'_>) -> Result<(&'a Value, &'a Value, Vec<usize>), Problem> {
     let (left, right) = (node.input(0)?, node.input(1)?);
     if left.datum != right.datum {
@@ -123,7 +124,7 @@ pub(super) fn binary(node: &Node<'_>) -> Result<Computed, Problem> {
     .into())
 }
 
-/// One operation on integers that say a shape: they stay small.
+/// One operation on integers that decide a shape. They have to stay small.
 fn whole(operator: &str, left: i64, right: i64) -> Result<i64, Problem> {
     let result = match operator {
         "Add" => left.checked_add(right),
@@ -154,7 +155,8 @@ pub(super) fn several(node: &Node<'_>) -> Result<Computed, Problem> {
 }
 
 pub(super) fn power(node: &Node<'_>) -> Result<Computed, Problem> {
-    // The inference library panics on an exponent that it takes for a length.
+    // The exponent must have the base's type: the inference library panics on an integer exponent
+    // that it takes for a length.
     let (base, _, shape) = pair(node)?;
     Ok(Value::new(is_float(base)?.datum, shape).into())
 }

@@ -8,7 +8,7 @@ fn f32(shape: Vec<usize>) -> Value {
     Value::new(Datum::F32, shape)
 }
 
-/// What is written, each number of it of `each` products.
+/// A result of this shape, in which each number is a sum of `each` products.
 fn products(shape: Vec<usize>, each: usize) -> Computed {
     let work = count(&shape).map_or(u64::MAX, |numbers| numbers.saturating_mul(each as u64));
     Computed {
@@ -17,7 +17,7 @@ fn products(shape: Vec<usize>, each: usize) -> Computed {
     }
 }
 
-/// A constant input of type f32: weights.
+/// Weights: a constant input of type f32.
 fn weights<'a>(node: &'a Node<'_>, index: usize) -> Result<&'a Value, Problem> {
     let value = node.of(index, Datum::F32)?;
     if value.constant {
@@ -26,7 +26,7 @@ fn weights<'a>(node: &'a Node<'_>, index: usize) -> Result<&'a Value, Problem> {
     Err(Problem::NotConstant(index, value.into()))
 }
 
-/// Weights that are one number a channel.
+/// Checks that an input is weights with one number for each channel.
 fn per_channel(node: &Node<'_>, index: usize, channels: usize) -> Result<(), Problem> {
     let value = weights(node, index)?;
     if value.shape == [channels] {
@@ -88,7 +88,7 @@ pub(super) fn gemm(node: &Node<'_>) -> Result<Computed, Problem> {
     Ok(products(shape, inner))
 }
 
-/// The window of a convolution or a pool over `spatial` lengths, and what it leaves of them.
+/// The lengths that a convolution or a pool leaves of `spatial` lengths.
 fn windows(node: &Node<'_>, spatial: &[usize], kernel: &[usize]) -> Result<Vec<usize>, Problem> {
     let rank = spatial.len();
     let list = |name: &'static str, length: usize, default: i64| {
@@ -120,7 +120,7 @@ fn windows(node: &Node<'_>, spatial: &[usize], kernel: &[usize]) -> Result<Vec<u
         }
         let (before, after) = (pads[axis], pads[axis + rank]);
         let padded = length + before + after;
-        // A window of padding alone has no largest number.
+        // In a pool, a window of padding alone has no largest number.
         let empty = is_pool && (before >= span || after >= span);
         if padded < span || empty || span > length.max(1) + before + after {
             return Err(Problem::Window {
@@ -190,7 +190,7 @@ pub(super) fn global_pool(node: &Node<'_>) -> Result<Computed, Problem> {
     Ok(f32(shape).into())
 }
 
-/// Channels of a value whose second axis they are.
+/// An input whose second axis is its channels, and the number of channels.
 fn channels<'a>(node: &'a Node<'_>, least: usize) -> Result<(&'a Value, usize), Problem> {
     let value = node.of(0, Datum::F32)?;
     match value.shape.get(1) {
@@ -237,7 +237,7 @@ pub(super) fn softmax(node: &Node<'_>) -> Result<Computed, Problem> {
     Ok(f32(value.shape.clone()).into())
 }
 
-/// What is left of a shape when axes are reduced to one number.
+/// The shape after axes are reduced to one number each.
 fn reduced(shape: &[usize], gone: &[usize], keep: bool) -> Vec<usize> {
     let lengths = shape.iter().enumerate();
     lengths
@@ -256,7 +256,8 @@ pub(super) fn reduce(node: &Node<'_>) -> Result<Computed, Problem> {
     if value.datum != Datum::F32 && !(whole && of_whole) {
         return Err(Problem::Of(value.into()));
     }
-    // ONNX moved the axes from an attribute to an input: for sums with opset 13, else with 18.
+    // ONNX moved the axes from an attribute to an input: for sums with opset 13, for others with
+    // 18.
     let by_input = operator == "ReduceSum" || node.opset >= 18;
     let given = match (node.optional(1), node.ints("axes")) {
         (None, None) => None,

@@ -1,14 +1,14 @@
-//! Classic learners, of ONNX's domain `ai.onnx.ml`.
+//! Classic learners, from ONNX's domain `ai.onnx.ml`.
 //!
-//! The inference library goes through trees without looking whether a place exists: every place that
-//! a tree names is checked here.
+//! The inference library follows trees without checking that a place exists. So every place that a
+//! tree names is checked here.
 
 use std::collections::HashMap;
 
 use super::problem::Problem;
 use super::{Computed, Datum, Node, Value, count};
 
-/// Rows of features.
+/// The first input, which has to be rows of features, and its lengths.
 fn rows<'a>(node: &'a Node<'_>) -> Result<(&'a Value, usize, usize), Problem> {
     let value = node.of(0, Datum::F32)?;
     match value.shape.as_slice() {
@@ -21,7 +21,7 @@ fn floats<'a>(node: &'a Node<'_>, name: &str) -> Option<&'a [f32]> {
     node.attribute(name).map(|found| found.floats.as_slice())
 }
 
-/// Scores, one number of which takes `each` steps.
+/// Scores of this shape, and their work. Each score takes `each` steps.
 fn scores(rows: usize, columns: usize, each: u64) -> (Value, u64) {
     let value = Value::new(Datum::F32, vec![rows, columns]);
     let work = count(&value.shape).map_or(u64::MAX, |numbers| numbers.saturating_mul(each));
@@ -60,7 +60,7 @@ pub(super) fn linear_classifier(node: &Node<'_>) -> Result<Computed, Problem> {
     let classes = node.ints("classlabels_ints").unwrap_or_default().len();
     let coefficients = floats(node, "coefficients").unwrap_or_default().len();
     let intercepts = floats(node, "intercepts").map(<[f32]>::len);
-    // Two classes may share one line between them.
+    // Two classes may share one line of coefficients.
     let one_line = classes == 2 && coefficients == features && node.int("multi_class", 0) == 0;
     let lines = if one_line { 1 } else { classes };
     if classes < 2
@@ -82,7 +82,7 @@ pub(super) fn linear_classifier(node: &Node<'_>) -> Result<Computed, Problem> {
     })
 }
 
-/// A forest: nodes and leaves as lists, a tree after another.
+/// A forest: nodes and leaves as lists, tree after tree.
 pub(super) fn trees(node: &Node<'_>) -> Result<Computed, Problem> {
     let (_, rows, features) = rows(node)?;
     let list = |name: &str| node.ints(name).unwrap_or_default();
@@ -111,7 +111,7 @@ pub(super) fn trees(node: &Node<'_>) -> Result<Computed, Problem> {
     if nodes == 0 || lengths.iter().any(|&length| length != nodes) {
         return Err(Problem::TreeLists(nodes, lengths));
     }
-    // Where each tree's nodes are: 0, 1, 2, ... in order, so that its size says which exist.
+    // Each tree's nodes must be 0, 1, 2, ... in order, so that the tree's size tells which exist.
     let mut sizes: Vec<i64> = Vec::new();
     for (&tree, &id) in of_tree.iter().zip(ids) {
         if tree == sizes.len() as i64 {
@@ -131,7 +131,7 @@ pub(super) fn trees(node: &Node<'_>) -> Result<Computed, Problem> {
             continue;
         }
         let size = sizes[tree as usize];
-        // A way through a tree that only goes forward has an end.
+        // A path that only goes forward has an end.
         let forward = |next: i64| id < next && next < size;
         if !forward(yes[place]) || !forward(no[place]) {
             return Err(Problem::TreeEnd { id, tree });

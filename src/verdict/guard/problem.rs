@@ -1,4 +1,4 @@
-//! What can be wrong with a graph, in the words that the author of its file reads.
+//! The problems of a graph, worded for the author of its file.
 
 use tract_onnx::pb::attribute_proto::AttributeType;
 
@@ -7,7 +7,7 @@ use super::{
     MOST_WORK, ModelError, Value,
 };
 
-/// The type and the shape of a value.
+/// The type and the shape of a value, for a message.
 #[derive(Debug)]
 pub(super) struct Form {
     datum: Datum,
@@ -30,10 +30,10 @@ impl std::fmt::Display for Form {
     }
 }
 
-/// The first thing in a graph that is not allowed. Names are quoted already.
+/// The first thing in a graph that is not allowed. Names are already quoted.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum Problem {
-    // What no graph may have.
+    // Limits of every graph: features that no graph may have.
     #[error("{0} not supported")]
     Unsupported(&'static str),
     #[error("attribute {0} is not supported")]
@@ -309,7 +309,7 @@ pub(super) enum Problem {
     Vote { class: i64, id: i64, tree: i64 },
 }
 
-/// What is wrong with an attribute.
+/// The problem with an attribute.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum AttributeProblem {
     #[error(" twice")]

@@ -1,11 +1,11 @@
-//! Operators that go along a sequence.
+//! Operators that work along a sequence.
 
 use tract_onnx::pb;
 
 use super::problem::Problem;
 use super::{Computed, Datum, Node, Value, Walk, quoted, tensor};
 
-/// Most steps of a sequence.
+/// The most steps of a sequence.
 const MOST_STEPS: usize = 1_024;
 
 /// RNN, GRU and LSTM: `X` [steps, batch, inputs], `W` [directions, gates x hidden, inputs],
@@ -59,7 +59,7 @@ pub(super) fn recurrent(node: &Node<'_>) -> Result<Computed, Problem> {
     })
 }
 
-/// The inference library has ONNX's default activations alone.
+/// Checks the activations. The inference library supports only ONNX's default ones.
 fn usual_activations(node: &Node<'_>, gates: usize, directions: usize) -> Result<(), Problem> {
     let Some(given) = node.attribute("activations") else {
         return Ok(());
@@ -78,8 +78,8 @@ fn usual_activations(node: &Node<'_>, gates: usize, directions: usize) -> Result
     ))
 }
 
-/// A loop over a sequence: its body runs once a step, on the states so far and a slice of each
-/// sequence, and gives the new states and a slice of each output.
+/// A loop over a sequence. Its body runs once for each step. It takes the current states and a
+/// slice of each sequence, and returns the new states and a slice of each output.
 pub(super) fn scan<'a>(node: &Node<'a>, walk: &mut Walk<'a>) -> Result<Computed, Problem> {
     if !walk.may_nest {
         return Err(Problem::Unsupported("a loop in a loop is"));

@@ -1,4 +1,4 @@
-//! Operators that rearrange numbers and compute none.
+//! Operators that rearrange numbers without computing any.
 
 use super::arithmetic::broadcast;
 use super::problem::Problem;
@@ -60,7 +60,7 @@ pub(super) fn constant_of_shape(node: &Node<'_>) -> Result<Computed, Problem> {
     Ok(Value::new(datum, shape).into())
 }
 
-/// Integers as a shape, none of them 0 or less.
+/// Integers as a shape. None of them may be 0 or less.
 fn lengths(ints: &[i64]) -> Result<Vec<usize>, Problem> {
     if ints.len() > MOST_RANK {
         return Err(Problem::ShapeRank(ints.len()));
@@ -287,10 +287,11 @@ pub(super) fn slice(node: &Node<'_>) -> Result<Computed, Problem> {
     .into())
 }
 
-/// The places that `start..end` by `step` picks of `length`, at least one.
+/// The places that `start..end` by `step` selects from `length` places. There has to be at least
+/// one.
 fn places(length: usize, start: i64, end: i64, step: i64) -> Result<Vec<usize>, Problem> {
     let long = length as i64;
-    // Exporters write "to the end" as the largest integer there is.
+    // Exporters write "to the end" as the largest or the smallest integer.
     let last = [i64::MAX, i64::MIN, i64::MIN + 1].contains(&end) || end.unsigned_abs() < 1 << 31;
     let first = (-long..=long).contains(&start) || (step < 0 && start == i64::MAX);
     let stride = step != 0 && step.unsigned_abs() <= 1 << 16;

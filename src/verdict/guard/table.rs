@@ -1,46 +1,46 @@
-//! The operators that a graph may use, and what each may be given.
+//! The operators that a graph may use, with their inputs and attributes.
 //!
-//! To allow another one, add a line here, with a rule that computes the shapes of its outputs and
-//! refuses what the inference library cannot take.
+//! To allow another operator, add a line here. Its rule must compute the shapes of the outputs, and
+//! refuse everything that the inference library cannot handle.
 
 use super::problem::Problem;
 use super::{Computed, Node, arithmetic, layers, learners, recurrent, shapes};
 
-/// What an attribute may be.
+/// The values that an attribute may have.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Allowed {
-    /// A whole number from the first to the second.
+    /// A whole number from the first bound to the second.
     Int(i64, i64),
-    /// At most so many whole numbers, from the second to the third.
+    /// At most the first number of whole numbers, each from the second to the third number.
     Ints(usize, i64, i64),
     Float,
-    /// At most so many numbers.
+    /// At most this number of numbers.
     Floats(usize),
     /// One of these texts.
     Text(&'static [&'static str]),
-    /// At most so many of these texts.
+    /// At most this number of these texts.
     Texts(usize, &'static [&'static str]),
     Tensor,
     Graph,
 }
 
-/// How the outputs of a node are computed.
+/// The way to compute the outputs of a node.
 pub(super) enum Rule {
-    /// From the node alone.
+    /// The node alone is enough.
     Of(fn(&Node<'_>) -> Result<Computed, Problem>),
-    /// A loop: from its body too.
+    /// A loop: the body is needed too.
     Scan,
 }
 
-/// An operator, or several that take the same.
+/// An operator, or several that take the same inputs and attributes.
 pub(super) struct Operator {
     pub(super) domain: &'static str,
     pub(super) names: &'static [&'static str],
-    /// Fewest and most inputs.
+    /// The fewest and the most inputs.
     pub(super) inputs: (usize, usize),
-    /// Fewest and most outputs.
+    /// The fewest and the most outputs.
     pub(super) outputs: (usize, usize),
-    /// Whether optional inputs and outputs may be left out by an empty name.
+    /// Whether an empty name may leave out an optional input or output.
     pub(super) gaps: bool,
     pub(super) attributes: &'static [(&'static str, Allowed)],
     pub(super) rule: Rule,
@@ -74,14 +74,14 @@ impl Operator {
         self
     }
 
-    /// One of ONNX's classic learners.
+    /// Makes this one of ONNX's classic learners.
     const fn learner(mut self) -> Self {
         self.domain = "ai.onnx.ml";
         self
     }
 }
 
-/// The operator of this name, if it may be used.
+/// The operator of this name, if it is allowed.
 pub(super) fn find(domain: &str, name: &str) -> Option<&'static Operator> {
     let domain = if domain == "ai.onnx" { "" } else { domain };
     let mut operators = OPERATORS.iter();
@@ -92,14 +92,14 @@ use Allowed::{Float, Floats, Graph, Int, Ints, Tensor, Text, Texts};
 
 const AXIS: Allowed = Int(-8, 7);
 const FLAG: Allowed = Int(0, 1);
-/// As many numbers as a file of the largest size holds.
+/// The longest list: as many numbers as a file of the largest size holds.
 const LONG: usize = 16_000_000;
-/// Nodes of all trees of a forest.
+/// The most nodes in all trees of a forest.
 const TREE_NODES: usize = 1_000_000;
 const TREE_PLACES: Allowed = Ints(TREE_NODES, 0, TREE_NODES as i64);
 const POST_TRANSFORMS: Allowed = Text(&["NONE", "SOFTMAX", "LOGISTIC"]);
 
-/// Window of a convolution or a pool.
+/// The window of a convolution or a pool.
 const KERNEL: Allowed = Ints(2, 1, 64);
 const STRIDES: Allowed = Ints(2, 1, 64);
 const DILATIONS: Allowed = Ints(2, 1, 64);
@@ -127,7 +127,7 @@ const RECURRENT: &[(&str, Allowed)] = &[
 
 #[rustfmt::skip]
 pub(super) const OPERATORS: &[Operator] = &[
-    // Number by number.
+    // These operators work number by number.
     Operator::new(
         &["Relu", "Sigmoid", "Tanh", "Softplus", "Softsign", "HardSwish", "Mish", "Exp", "Log",
           "Sqrt", "Reciprocal", "Floor", "Ceil", "Round", "Erf", "Sin", "Cos"],
@@ -145,7 +145,7 @@ pub(super) const OPERATORS: &[Operator] = &[
         arithmetic::question),
     Operator::new(&["Not"], (1, 1), &[], arithmetic::not),
     Operator::new(&["Cast"], (1, 1), &[("to", Int(1, 13)), ("saturate", FLAG)], arithmetic::cast),
-    // Two or more values, number by number.
+    // These operators work on two or more values, number by number.
     Operator::new(&["Add", "Sub", "Mul", "Div"], (2, 2), &[], arithmetic::binary),
     Operator::new(&["Sum", "Mean", "Min", "Max"], (1, 16), &[], arithmetic::several),
     Operator::new(&["Pow"], (2, 2), &[], arithmetic::power),
@@ -155,7 +155,7 @@ pub(super) const OPERATORS: &[Operator] = &[
     Operator::new(&["And", "Or", "Xor"], (2, 2), &[], arithmetic::logic),
     Operator::new(&["Where"], (3, 3), &[], arithmetic::choose),
     Operator::new(&["Clip"], (1, 3), &[], arithmetic::clip).gaps(),
-    // Shapes.
+    // These operators work on shapes.
     Operator::new(&["Identity"], (1, 1), &[], shapes::identity),
     Operator::new(&["Dropout"], (1, 3), &[("seed", Int(i64::MIN, i64::MAX))], shapes::dropout)
         .outputs(1, 2).gaps(),
@@ -180,7 +180,7 @@ pub(super) const OPERATORS: &[Operator] = &[
         shapes::pad).gaps(),
     Operator::new(&["Expand"], (2, 2), &[], shapes::expand),
     Operator::new(&["Tile"], (2, 2), &[], shapes::tile),
-    // Layers.
+    // These operators are layers.
     Operator::new(&["MatMul"], (2, 2), &[], layers::matmul),
     Operator::new(&["Gemm"], (2, 3),
         &[("alpha", Float), ("beta", Float), ("transA", FLAG), ("transB", FLAG)], layers::gemm),
@@ -212,7 +212,7 @@ pub(super) const OPERATORS: &[Operator] = &[
           "ReduceMin", "ReduceProd", "ReduceSum", "ReduceSumSquare"],
         (1, 2), REDUCE, layers::reduce),
     Operator::new(&["ArgMax", "ArgMin"], (1, 1), ARG, layers::arg),
-    // Sequences.
+    // These operators work on sequences.
     Operator::new(&["RNN", "GRU"], (3, 6), RECURRENT, recurrent::recurrent)
         .outputs(1, 2).gaps(),
     Operator::new(&["LSTM"], (3, 7), RECURRENT, recurrent::recurrent).outputs(1, 3).gaps(),
@@ -227,7 +227,7 @@ pub(super) const OPERATORS: &[Operator] = &[
             ("scan_output_axes", Ints(32, 0, 7)), ("scan_output_directions", Ints(32, 0, 1))],
         rule: Rule::Scan,
     },
-    // Classic learners.
+    // These operators are classic learners.
     Operator::new(&["Normalizer"], (1, 1), &[("norm", Text(&["MAX", "L1", "L2"]))],
         learners::normalizer).learner(),
     Operator::new(&["LinearRegressor"], (1, 1),

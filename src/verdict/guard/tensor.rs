@@ -1,4 +1,4 @@
-//! Tensors that a file brings along, and the types that it declares.
+//! Tensors inside a file, and the types that the file declares.
 
 use tract_onnx::pb;
 use tract_onnx::pb::tensor_proto::DataType;
@@ -6,7 +6,7 @@ use tract_onnx::pb::tensor_proto::DataType;
 use super::problem::Problem;
 use super::{Datum, MOST_NUMBERS, MOST_RANK, Value, count};
 
-/// What a tensor is, if its data is whole.
+/// The properties of a tensor, if its data is whole.
 pub(super) fn value(proto: &pb::TensorProto) -> Result<Value, Problem> {
     let datum = datum(proto.data_type)?;
     let shape = proto
@@ -81,7 +81,7 @@ pub(super) fn value(proto: &pb::TensorProto) -> Result<Value, Problem> {
     })
 }
 
-/// The type that a number stands for, if it is one that a graph may use.
+/// The type with this number, if a graph may use it.
 pub(super) fn datum(data_type: i32) -> Result<Datum, Problem> {
     match DataType::try_from(data_type) {
         Ok(DataType::Float) => Ok(Datum::F32),
@@ -95,7 +95,7 @@ pub(super) fn datum(data_type: i32) -> Result<Datum, Problem> {
     }
 }
 
-/// A graph's input or output as declared; every length must be a number.
+/// A graph's input or output as declared. Every length must be a number.
 pub(super) fn declared(info: &pb::ValueInfoProto) -> Result<Value, Problem> {
     use pb::tensor_shape_proto::dimension::Value as Length;
     use pb::type_proto::Value as Type;

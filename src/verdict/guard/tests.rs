@@ -9,7 +9,7 @@ use super::table::OPERATORS;
 use super::*;
 use crate::verdict::{BUILT_IN, Hrn};
 
-/// Numbers that a seed decides (SplitMix64).
+/// Random numbers from a seed (SplitMix64).
 struct Dice(u64);
 
 impl Dice {
@@ -33,7 +33,7 @@ impl Dice {
     }
 }
 
-/// Whole numbers at which programs fail.
+/// Whole numbers that often make programs fail.
 const WHOLE: [i64; 20] = [
     0,
     1,
@@ -160,7 +160,7 @@ fn accepted(seed: u64) -> GraphProto {
         ints("ones", &[1, 1, 1, 1]),
         ints("none", &[]),
     ];
-    // The proofs of what is known borrow the nodes.
+    // The values of the walk borrow the nodes, so the nodes are leaked.
     let base: &'static GraphProto = Box::leak(Box::new(graph.clone()));
     let mut walk = Walk::new(17 + dice.below(3) as i64);
     walk.tensors(base).unwrap();
@@ -207,7 +207,7 @@ fn accepted(seed: u64) -> GraphProto {
             walk.cost = before;
         }
     }
-    // From whatever it is to four numbers.
+    // Turn the last value, whatever it is, into four numbers.
     graph.initializer.push(floats("four", &[1, 4]));
     graph.initializer.push(ints("one by one", &[1, 1]));
     let mut mean = node("", "ReduceSum", &[&last], &["mean"]);
@@ -225,7 +225,7 @@ fn accepted(seed: u64) -> GraphProto {
     graph
 }
 
-/// Loads a file as a trial does; what a panic says.
+/// Loads a file as a trial does. An error is the message of a panic.
 fn load(bytes: &[u8]) -> Result<String, String> {
     let loaded = catch_unwind(AssertUnwindSafe(|| match Hrn::load(bytes) {
         Ok(_) => "good".to_owned(),
@@ -240,7 +240,7 @@ fn load(bytes: &[u8]) -> Result<String, String> {
     })
 }
 
-/// How many graphs a test tries: more on demand, to look for what the guard misses.
+/// How many graphs a test tries. `HARDNESSD_GRAPHS` sets more, to search for gaps in the guard.
 fn tries(usual: u64) -> u64 {
     let wanted = std::env::var("HARDNESSD_GRAPHS").ok();
     wanted.map_or(usual, |wanted| wanted.parse().unwrap())
@@ -357,7 +357,7 @@ fn damage(graph: &mut GraphProto, dice: &mut Dice) {
     }
 }
 
-/// Names of operators, those of one line of the table.
+/// The names of the operators in a random line of the table.
 fn dice_names(dice: &mut Dice) -> &'static [&'static str] {
     dice.one(OPERATORS).names
 }

@@ -1,4 +1,4 @@
-//! Models of format 2.
+//! Tests of models of format 2.
 
 use serde_json::{Value, json};
 
@@ -49,7 +49,7 @@ fn a_frame_alone_is_a_press_of_which_nothing_else_is_known() {
     let frame = course(1, false).moments[0].frame;
     let verdict = hrn.judge(&frame).unwrap();
     assert_eq!(<[f32; 3]>::from(verdict.shore.unwrap()), [0.0, -1.0, 0.0]);
-    // And a course is its last frame to a model of frames.
+    // A model of frames judges the last frame of a course.
     let hrn = Hrn::load(BUILT_IN).unwrap();
     let course = course(4, true);
     let last = hrn.judge(&course.moments[3].frame).unwrap();
@@ -173,8 +173,8 @@ fn what_is_not_as_agreed_is_refused() {
     }
 }
 
-/// The nodes of a network as they are trained: convolutions over each frame and over time, and a
-/// GRU. Its last layer is 0, so that what it says is known.
+/// A network with the nodes of a trained one: convolutions over each frame and over time, and a
+/// GRU. The weights of its last layer are 0, so its outputs are known.
 fn network(most: usize) -> Vec<u8> {
     encoded(most, &[], |proto| {
         let graph = proto.graph.as_mut().unwrap();

@@ -10,8 +10,8 @@ use crate::simulator::{Material, SensorProfile, Sequence, SequenceSettings};
 use crate::tare::Gains;
 use crate::verdict::{BUILT_IN, Hrn};
 
-/// Presses of 20 N a taxel in the middle on every taxel in turn, round and smooth, as an array of `gains`
-/// reads them; with noise.
+/// Round, smooth presses on every taxel in turn, as an array of `gains` reads them, with noise. The
+/// taxel in the middle of a press has 4 N.
 fn domes(array: Array, gains: impl Fn(usize, usize) -> f32) -> Vec<Plain> {
     let mut noise = Stream::new(4, "noise");
     let mut presses = Vec::new();
@@ -104,7 +104,8 @@ fn too_few_presses_say_nothing() {
     );
 }
 
-/// Bytes of presses on one raw sensor: the first `for_gains`, and those after them, with their levels.
+/// The bytes of presses on one simulated sensor: first `for_gains` presses, then the others, with
+/// the levels of the others and the true gains.
 struct Played {
     first: Vec<u8>,
     then: Vec<u8>,
@@ -114,7 +115,7 @@ struct Played {
 
 fn sensor(gains: Option<Gains>, dead_taxels: Vec<[usize; 2]>) -> Sensor {
     let mut described = Description::default();
-    // The sensor reads 0 at rest, and the bytes may begin with a press.
+    // The sensor needs no tare: it reads 0 at rest, and the bytes may begin with a press.
     described.calibration.tare_frames = 0;
     described.calibration.gains = gains;
     described.calibration.dead_taxels = dead_taxels;
@@ -169,7 +170,7 @@ fn right(played: &Played, sensor: Sensor, hrn: &Arc<Hrn>) -> f64 {
             && verdict.phase == Phase::Final
         {
             let number = verdict.press as usize - 1;
-            // Four materials to train on, four to test on, in turn.
+            // Four materials to train on and four to test on take turns.
             if number % 8 >= 4 {
                 all += 1;
                 right += u32::from(verdict.level == Some(played.levels[number]));
@@ -214,7 +215,7 @@ fn gains_of_a_raw_simulated_sensor_are_found_from_its_presses() {
     assert!(are_dead, "{:?}", fit.dead);
 }
 
-/// Prints what the calibration is worth: docs/new-sensor.md has the figures.
+/// Prints how much the calibration improves the verdicts. docs/new-sensor.md has the figures.
 #[test]
 #[ignore = "minutes: cargo test --features train --lib worth_of_gains -- --ignored --nocapture"]
 fn print_the_worth_of_gains() {

@@ -18,7 +18,7 @@ impl Page<'_> {
         self.curve(area, "contact area", sensor, link, present, area_taxels);
     }
 
-    /// Force over the arm's way in the present or last press, if somebody tells where the arm is.
+    /// Force over the arm's way in the present or last press, if the arm's positions are known.
     pub(super) fn way(&mut self, area: Rect, sensor: &Sensor) {
         let mut rows = Rows(area);
         let Some((forces, far)) = sensor.way(usize::from(area.width)) else {
@@ -61,11 +61,12 @@ impl Page<'_> {
         }
     }
 
-    /// One column of `area`: filled up to `share` of its height. `None`: nothing is known of then.
+    /// Draws one column of `area`, filled up to `share` of its height. `None` if the value is
+    /// unknown.
     fn bar(&mut self, x: u16, area: Rect, share: Option<f32>) {
         let bars = if self.look.unicode { BLOCKS } else { ASCII };
         let blue = Style::new().fg(Color::Indexed(75));
-        // Where nothing was ever pressed the share is no number, and that is none.
+        // If nothing was ever pressed, the share is NaN, and the cast makes it 0.
         let eighths = share.map(|share| (share * 8.0 * f32::from(area.height)) as usize);
         for (below, y) in (area.top()..area.bottom()).rev().enumerate() {
             let (symbol, style) = match eighths {
@@ -81,7 +82,7 @@ impl Page<'_> {
     }
 }
 
-/// A cell that is filled by so many eighths.
+/// The symbols of a cell that is filled by 0 to 8 eighths.
 const BLOCKS: [&str; 9] = [
     " ", "\u{2581}", "\u{2582}", "\u{2583}", "\u{2584}", "\u{2585}", "\u{2586}", "\u{2587}",
     "\u{2588}",

@@ -1,4 +1,4 @@
-//! The pressure map: in colours, in greys where it is no longer true, or in characters.
+//! The pressure map: in colours, in greys if it is no longer current, or in characters.
 
 use ratatui_core::layout::Rect;
 use ratatui_core::style::Color;
@@ -7,8 +7,8 @@ use super::super::view::{Link, Sensor};
 use super::Page;
 
 impl Page<'_> {
-    /// Columns and rows of the pressure map: the largest that fits, with so many columns a taxel and
-    /// half as many rows, because a cell is twice as high as it is wide. `(0, 0)`: none fits.
+    /// Columns and rows of the largest pressure map that fits. A taxel takes half as many rows as
+    /// columns, because a cell is twice as high as it is wide. Returns `(0, 0)` if no map fits.
     pub(super) fn map_size(&self, sensor: &Sensor, width: u16, height: u16) -> (u16, u16) {
         let cols = u16::try_from(sensor.cols).unwrap_or(u16::MAX);
         let rows = u16::try_from(sensor.rows).unwrap_or(u16::MAX);
@@ -33,7 +33,7 @@ impl Page<'_> {
             ..area
         };
         let scale = (usize::from(cols) / sensor.cols).max(1);
-        // By its root, or a soft touch would vanish beside a hard one.
+        // The square root keeps a soft touch visible beside a hard one.
         let shade = |row, col| sensor.newtons(row, col).map(|n| (n / top).min(1.0).sqrt());
         for y in 0..area.height {
             for x in 0..area.width {
@@ -52,13 +52,14 @@ impl Page<'_> {
                         cell.set_char('\u{2580}').set_fg(colour(upper));
                         cell.set_bg(colour(lower));
                     } else {
-                        // The greater of the two: a touch must not vanish.
+                        // The cell has one colour for both halves. It shows the greater one, so
+                        // that no touch vanishes.
                         cell.set_char(' ').set_bg(colour(max(upper, lower)));
                     }
                 } else {
                     let share = max(upper, lower);
                     let step = share.map_or(0, |share| step(share, CHARACTERS.len()));
-                    // Where nothing is pressed, the corners say how far the array goes.
+                    // Where nothing is pressed, the corners show how far the array goes.
                     let is_corner =
                         (x == 0 || x + 1 == area.width) && (y == 0 || y + 1 == area.height);
                     let character = if step == 0 && is_corner {
@@ -90,18 +91,18 @@ fn max(one: Option<f32>, other: Option<f32>) -> Option<f32> {
     one.into_iter().chain(other).reduce(f32::max)
 }
 
-/// Which of so many steps a share of 0 to 1 is.
+/// The index of the step that a share of 0 to 1 falls into, of `steps` equal ones.
 fn step(share: f32, steps: usize) -> usize {
     ((share * steps as f32) as usize).min(steps - 1)
 }
 
-/// The map's scale reaches at least so far, in newtons a taxel: noise must not look like a touch.
+/// The least full scale of the map, in newtons a taxel: noise must not look like a touch.
 const LEAST_SCALE_N: f32 = 1.0;
 
-/// From nothing to the greatest pressure, for what is no longer true.
+/// Greys from no pressure to the greatest, for a map that is no longer current.
 const GREY: [u8; 13] = [
     234, 235, 236, 238, 240, 241, 243, 244, 246, 247, 249, 251, 253,
 ];
 
-/// The same without colours.
+/// Characters from no pressure to the greatest, for a terminal without colours.
 const CHARACTERS: &[u8; 10] = b" .:-=+*#%@";

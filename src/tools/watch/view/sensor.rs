@@ -1,4 +1,4 @@
-//! What is known of one sensor: its link, its last frame, the curves behind it, presses and verdicts.
+//! The state of one sensor: its link, its last frame, its curves, its presses and its verdicts.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -12,10 +12,10 @@ use crate::sensor::LATE_PERIODS;
 /// How far back the curves go.
 pub(in crate::tools::watch) const WINDOW: Duration = Duration::from_secs(30);
 
-/// Frames of a press whose approach is kept: 30 s at 1000 frames/s.
+/// The most frames of a press whose approach is kept: 30 s at 1000 frames/s.
 const MOST_WAY: usize = 30_000;
 
-/// Verdicts kept of a sensor: more than a tall terminal shows.
+/// The number of verdicts kept for a sensor: more than a tall terminal shows.
 const VERDICTS: usize = 100;
 
 /// One sensor.
@@ -25,17 +25,18 @@ pub(in crate::tools::watch) struct Sensor {
     pub(in crate::tools::watch) rows: usize,
     pub(in crate::tools::watch) cols: usize,
     pub(in crate::tools::watch) status: Option<Status>,
-    /// Its last frame.
+    /// The sensor's last frame.
     pub(in crate::tools::watch) frame: Option<Frame>,
     trace: VecDeque<Load>,
-    /// Approach in mm and force of the frames of the present or last press, where the approach is known.
+    /// Approach in mm and force in newtons of the frames of the present or last press, where the
+    /// approach is known.
     way: Vec<(f32, f32)>,
     pub(in crate::tools::watch) press: Option<Press>,
-    /// The newest first.
+    /// The verdicts, the newest press first.
     pub(in crate::tools::watch) verdicts: VecDeque<Verdict>,
 }
 
-/// What the daemon says of a link.
+/// The state of a link, as the daemon reports it.
 #[derive(Debug, Clone, PartialEq)]
 pub(in crate::tools::watch) struct Status {
     pub(super) state: String,
@@ -79,7 +80,7 @@ pub(in crate::tools::watch) struct Verdict {
     pub(in crate::tools::watch) at: Duration,
     pub(in crate::tools::watch) press: u64,
     pub(in crate::tools::watch) phase: String,
-    /// Level and label; or why there are none.
+    /// Level and label, or the reason why there is no level.
     pub(in crate::tools::watch) level: Result<(u64, String), String>,
     pub(in crate::tools::watch) probabilities: Vec<f64>,
     pub(in crate::tools::watch) force_n: f64,
@@ -122,11 +123,11 @@ impl Sensor {
                     reason: event["reason"].as_str().map(plain),
                 };
                 if press.state == "begin" {
-                    // Its first frame has just come.
+                    // The newest frame is the first one of this press.
                     let first = self.way.len().saturating_sub(1);
                     self.way.drain(..first);
                 }
-                // What happened before may be told after what happens now.
+                // The daemon may send past events after present ones.
                 let is_older = |known: &Press| (known.number, known.at) > (press.number, press.at);
                 if !self.press.as_ref().is_some_and(is_older) {
                     self.press = Some(press);
@@ -157,8 +158,8 @@ impl Sensor {
                 .map(|note| plain(note).replace('_', " "))
                 .collect(),
         };
-        // The newest press first, its final verdict before its early one. What is told of the past
-        // may be known.
+        // The newest press comes first, its final verdict before its early one. A repeated verdict
+        // may be known already.
         let order = |one: &Verdict| (one.press, one.phase == "final");
         let place = self
             .verdicts
@@ -205,16 +206,16 @@ impl Sensor {
         });
     }
 
-    /// Newtons of the taxel at a row and column of the sensor's own array in the last frame. A smaller
-    /// array is in the middle of the 28x28 frame (`docs/configuration.md`).
+    /// Newtons of the taxel at a row and column of the sensor's own array in the last frame. A
+    /// smaller array is in the middle of the 28x28 frame (`docs/configuration.md`).
     pub(in crate::tools::watch) fn newtons(&self, row: usize, col: usize) -> Option<f32> {
         let (rows, cols) = (self.rows, self.cols);
         let frame = self.frame.as_ref()?;
         (row < rows && col < cols).then(|| frame.newtons[Array { rows, cols }.place(row, col)])
     }
 
-    /// The course of `value` up to `now` in so many equal spans, the greatest of each; `None` where
-    /// no frame was current.
+    /// The greatest `value` in each of `spans` equal spans up to `now`. `None` where no frame was
+    /// current.
     pub(in crate::tools::watch) fn curve(
         &self,
         now: Duration,
@@ -232,7 +233,7 @@ impl Sensor {
                 let cell: &mut Option<f32> = &mut curve[place as usize];
                 *cell = Some(cell.map_or(value(load), |most| most.max(value(load))));
             }
-            // It stands for the spans after it, for as long as it is current.
+            // The value also holds for the following spans while the frame is current.
             let current = rate_hz.map_or(0.0, |hz| LATE_PERIODS / hz / span);
             let first = place.max(0.0) as usize;
             let last = (place + current).max(0.0) as usize;
@@ -244,8 +245,8 @@ impl Sensor {
         filled.map(|(own, held)| own.or(held)).collect()
     }
 
-    /// The greatest force in each of so many equal parts of the arm's way in the present or last press, and
-    /// how far the arm went; `None` where nobody told it.
+    /// The greatest force in each of `parts` equal parts of the arm's way in the present or last
+    /// press, and how far the arm went in mm. `None` if the approach is unknown.
     pub(in crate::tools::watch) fn way(&self, parts: usize) -> Option<(Vec<Option<f32>>, f32)> {
         let far = self.way.iter().map(|&(mm, _)| mm).fold(0.0, f32::max);
         if self.way.len() < 2 || far <= 0.0 || parts == 0 {
@@ -257,7 +258,8 @@ impl Sensor {
             let known: &mut Option<f32> = &mut forces[part.min(parts - 1)];
             *known = Some(known.map_or(force, |most| most.max(force)));
         }
-        // A slow sensor leaves parts without a frame.
+        // A slow sensor leaves parts without a frame. Such a part repeats the force of the part
+        // before it.
         let mut before = None;
         for force in &mut forces {
             *force = force.or(before);
@@ -266,7 +268,7 @@ impl Sensor {
         Some((forces, far))
     }
 
-    /// The greatest taxel of the last frame.
+    /// The greatest force on a taxel in the last frame, in newtons.
     pub(in crate::tools::watch) fn highest_n(&self) -> f32 {
         let newtons = self.frame.iter().flat_map(|frame| &frame.newtons);
         newtons.copied().fold(0.0, f32::max)

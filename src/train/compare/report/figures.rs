@@ -1,4 +1,4 @@
-//! The report's pictures, each from the rows of a comparison or the files of one run.
+//! The report's figures, each from the rows of a comparison or the files of one run.
 
 use super::plot::{Anchor, Scale, Svg, axes};
 use crate::train::compare::digits;
@@ -8,8 +8,8 @@ use crate::train::compare::tables::{self, mean};
 use crate::train::judge::metrics::Bin;
 use crate::train::run::history::History;
 
-/// Accuracy of every row on a set: its interval, its mean, a tick a seed, and a ring where the
-/// paper has it.
+/// Accuracy of every row on a set: the interval, the mean, a tick per seed, and a ring for the
+/// paper's figure.
 pub(super) fn accuracies(rows: &[Row], set: &str, title: &str) -> String {
     let shown: Vec<(&Row, Vec<f64>)> = rows
         .iter()
@@ -60,7 +60,7 @@ pub(super) fn accuracies(rows: &[Row], set: &str, title: &str) -> String {
     svg.finish(title)
 }
 
-/// Accuracy against steps: what each row reached for its price.
+/// Accuracy against training steps, a dot per row.
 pub(super) fn price(rows: &[Row], set: &str) -> String {
     let mut points: Vec<(String, f64, f64)> = Vec::new();
     for row in rows {
@@ -104,7 +104,7 @@ pub(super) fn price(rows: &[Row], set: &str) -> String {
     svg.finish("accuracy against steps")
 }
 
-/// Where a name stands, in pixels.
+/// The place of a name, in pixels.
 struct Label {
     left: f64,
     width: f64,
@@ -114,7 +114,7 @@ struct Label {
 impl Label {
     const HEIGHT: f64 = 13.0;
 
-    /// The place nearest to `dot` that covers no other dot and no name placed before.
+    /// The place nearest to `dot` that covers no dot and no name placed before.
     fn beside(dot: (f64, f64), name: &str, dots: &[(f64, f64)], placed: &[Self]) -> Self {
         // Letters of the page's 12 px font are 6.5 px wide on average.
         let width = 6.5 * name.chars().count() as f64;
@@ -144,8 +144,8 @@ impl Label {
     }
 }
 
-/// Accuracy in training against the steps of all stages, a line a run; at the end a dot for the
-/// row's mean accuracy on `set`. `None` of a method that keeps no such accuracy.
+/// Accuracy in training against the steps of all stages, a line per run. A dot at the end shows the
+/// row's mean accuracy on `set`. `None` for a method that records no such accuracy.
 pub(super) fn curve(row: &Row, set: &str) -> Option<String> {
     let stages = row
         .runs
@@ -178,7 +178,7 @@ pub(super) fn curve(row: &Row, set: &str) -> Option<String> {
                 svg.path(class, &thinned(&points));
             }
             let end = before + stage.steps() as f64;
-            // The end of a stage, once a panel.
+            // Draw the end of a stage once per panel.
             if number == 0 && end < longest as f64 {
                 svg.line("stage", (x.at(end), 146.0), (x.at(end), 40.0));
             }
@@ -202,15 +202,15 @@ pub(super) fn curve(row: &Row, set: &str) -> Option<String> {
     Some(svg.finish(&format!("accuracy of {} in training", row.title)))
 }
 
-/// At most a few hundred points: no more can be seen.
+/// Thins points to a few hundred, because no more can be distinguished.
 fn thinned(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let every = points.len().div_ceil(300).max(1);
     let last = points.last().filter(|_| points.len() % every != 1);
     points.iter().step_by(every).chain(last).copied().collect()
 }
 
-/// A picture of a stage: what it shows, its axis, by how much its columns are multiplied, and the
-/// columns with their classes.
+/// A figure of a stage: its name, its axis, the factor of its columns, and the columns with their
+/// style classes.
 type Picture = (
     &'static str,
     &'static str,
@@ -218,7 +218,7 @@ type Picture = (
     &'static [(&'static str, &'static str)],
 );
 
-/// What a run's page shows of each stage.
+/// The figures of each stage on a run's page.
 const PICTURES: [Picture; 5] = [
     (
         "losses",
@@ -264,7 +264,7 @@ const PICTURES: [Picture; 5] = [
     ),
 ];
 
-/// What one run's stages kept, against the steps of each.
+/// Figures of the metrics of one run's stages, against the steps of each stage.
 pub(super) fn stages(history: &History) -> Vec<String> {
     let mut pictures = Vec::new();
     for stage in &history.stages {
@@ -304,7 +304,7 @@ pub(super) fn stages(history: &History) -> Vec<String> {
     pictures
 }
 
-/// A confusion matrix: darker is more of the truth's samples.
+/// A confusion matrix. A darker cell holds a larger share of its row's samples.
 pub(super) fn confusion(counts: &[Vec<f64>], title: &str) -> String {
     let (left, top, cell) = (40.0, 48.0, 40.0);
     let levels = counts.len();
@@ -339,8 +339,8 @@ pub(super) fn confusion(counts: &[Vec<f64>], title: &str) -> String {
     svg.finish(&format!("confusion matrix, {title}"))
 }
 
-/// Accuracy against confidence, bin by bin; on the diagonal a model is as sure as it is right.
-/// Larger dots hold more samples.
+/// Accuracy against confidence, bin by bin. On the diagonal, confidence equals accuracy. Larger
+/// dots hold more samples.
 pub(super) fn reliability(bins: &[Bin], title: &str) -> String {
     let x = Scale::linear((0.0, 100.0), (38.0, 190.0));
     let y = Scale::linear((0.0, 100.0), (192.0, 40.0));
@@ -377,7 +377,7 @@ pub(super) fn reliability(bins: &[Bin], title: &str) -> String {
     svg.finish(&format!("calibration of {title}"))
 }
 
-/// The bins of several runs added up.
+/// The sums of the bins of several runs.
 pub(super) fn added(runs: &[&[Bin]]) -> Vec<Bin> {
     let mut sum = vec![Bin::default(); runs.iter().map(|bins| bins.len()).max().unwrap_or(0)];
     for bins in runs {
@@ -390,7 +390,7 @@ pub(super) fn added(runs: &[&[Bin]]) -> Vec<Bin> {
     sum
 }
 
-/// Accuracy under every assignment of roles, a dot each; the ring is the paper's assignment.
+/// Accuracy under every assignment of roles, a dot each. The ring marks the paper's assignment.
 pub(super) fn swaps(groups: &[Vec<&SwapEntry>]) -> String {
     let percent = |swap: &SwapEntry| 100.0 * swap.test.accuracy;
     let least = groups

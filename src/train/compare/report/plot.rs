@@ -1,9 +1,9 @@
-//! Pictures as SVG. Colours are classes of the page's style sheet, so that they follow its dark
-//! and light modes; nothing is loaded from anywhere.
+//! Draws figures as SVG. Colours are classes of the page's style sheet, so that they follow its
+//! dark and light modes. The SVG loads nothing.
 
 use std::fmt::Write as _;
 
-/// An SVG in the making; lengths in its own pixels.
+/// An SVG under construction. Lengths are in its own pixels.
 #[derive(Debug)]
 pub(super) struct Svg {
     width: f64,
@@ -11,7 +11,7 @@ pub(super) struct Svg {
     body: String,
 }
 
-/// Where a text is anchored.
+/// The anchor of a text.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Anchor {
     Start,
@@ -46,7 +46,7 @@ impl Svg {
         ));
     }
 
-    /// A dot that tells `tip` when pointed at.
+    /// A dot that shows `tip` under the pointer.
     pub(super) fn dot(&mut self, class: &str, (x, y): (f64, f64), radius: f64, tip: &str) {
         let tip = escaped(tip);
         self.element(format_args!(
@@ -84,7 +84,7 @@ impl Svg {
         self.body.push('\n');
     }
 
-    /// The element, with `title` for who cannot see it.
+    /// The complete element. `title` is its label for screen readers.
     pub(super) fn finish(self, title: &str) -> String {
         let Self {
             width,
@@ -100,7 +100,7 @@ impl Svg {
     }
 }
 
-/// From values to pixels.
+/// A scale from values to pixels.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Scale {
     values: (f64, f64),
@@ -117,7 +117,7 @@ impl Scale {
         }
     }
 
-    /// For values above 0.
+    /// A logarithmic scale, for values above 0.
     pub(super) fn logarithmic(values: (f64, f64), pixels: (f64, f64)) -> Self {
         Self {
             values,
@@ -163,7 +163,7 @@ impl Scale {
     }
 }
 
-/// A tick's label.
+/// The label of a tick.
 pub(super) fn label(value: f64) -> String {
     if value == 0.0 {
         return "0".to_owned();
@@ -174,12 +174,12 @@ pub(super) fn label(value: f64) -> String {
     } else if size >= 1e3 {
         format!("{}k", value / 1e3)
     } else {
-        // Decimals of a round value, without the noise of binary fractions.
+        // Round to 6 decimals, which removes the noise of binary fractions.
         format!("{}", (value * 1e6).round() / 1e6)
     }
 }
 
-/// Draws two axes, each with its name, about so many ticks, and a grid.
+/// Draws two axes, each with its name and about `ticks` ticks, and a grid.
 pub(super) fn axes(
     svg: &mut Svg,
     (x, x_name): (&Scale, &str),
@@ -204,7 +204,7 @@ pub(super) fn axes(
     svg.text("tick", (left, top - 9.0), Anchor::Start, y_name);
 }
 
-/// Text for HTML and SVG, in elements and in attributes.
+/// Escapes text for elements and attributes of HTML and SVG.
 pub(super) fn escaped(text: &str) -> String {
     let mut safe = String::with_capacity(text.len());
     for letter in text.chars() {

@@ -1,4 +1,4 @@
-//! What stands in the tables' cells: a row's runs summed up, as text.
+//! The text of the tables' cells, which summarises a row's runs.
 
 use crate::train::compare::digits::rounded;
 use crate::train::compare::results::{Details, Entry, Row, SwapEntry};
@@ -6,13 +6,13 @@ use crate::train::compare::sets::{FRESH, MATCHED, PAPER_SPLIT};
 use crate::train::judge::metrics::{self, Estimate, Evaluation, ObjectCount};
 use crate::train::judge::paper;
 
-/// The method that the others are compared with.
+/// The method that the other methods are compared with.
 pub const REFERENCE: &str = "ours";
 
-/// What every network must be better than.
+/// The method that every network must surpass.
 const FEATURES: &str = "features";
 
-/// Mean counts of some evaluations.
+/// The mean confusion matrix of some evaluations.
 pub fn mean_confusion(evaluations: &[&Evaluation]) -> Vec<Vec<f64>> {
     let levels = evaluations.first().map_or(0, |first| first.confusion.len());
     let cell = |truth: usize, said: usize| {
@@ -24,7 +24,7 @@ pub fn mean_confusion(evaluations: &[&Evaluation]) -> Vec<Vec<f64>> {
         .collect()
 }
 
-/// The assignments of each method and number of labels.
+/// The runs with swapped materials, grouped by method and number of labels.
 pub fn swap_groups(swaps: &[SwapEntry]) -> Vec<Vec<&SwapEntry>> {
     let mut groups: Vec<Vec<&SwapEntry>> = Vec::new();
     for swap in swaps {
@@ -39,12 +39,12 @@ pub fn swap_groups(swaps: &[SwapEntry]) -> Vec<Vec<&SwapEntry>> {
     groups
 }
 
-/// The paper's row of a row; ours has others beside, such as another choice of labels.
+/// The paper's figures for the method of a row, if it has any.
 pub fn paper_row(row: &Row) -> Option<&'static paper::Row> {
     paper::row(&row.runs[0].0.method)
 }
 
-/// What a row's runs reached on a set, where it was measured.
+/// The evaluations of a row's runs on a set, where it was measured.
 pub fn evaluations<'a>(row: &Row<'a>, set: &str) -> Vec<&'a Evaluation> {
     let of_entry = |(entry, _): &(&'a Entry, _)| match set {
         PAPER_SPLIT => entry.paper_split.as_ref(),
@@ -55,7 +55,7 @@ pub fn evaluations<'a>(row: &Row<'a>, set: &str) -> Vec<&'a Evaluation> {
     row.runs.iter().filter_map(of_entry).collect()
 }
 
-/// The objects of a row's runs on a set, with the runs' seeds.
+/// The counts by object of a row's runs on a set, with the runs' seeds.
 fn objects<'a>(row: &Row<'a>, set: &str) -> Vec<(u64, &'a [ObjectCount])> {
     let of_run = |&(entry, details): &(&'a Entry, &'a Details)| {
         let objects = details.worth.sets.get(set)?.objects.as_deref()?;
@@ -75,14 +75,14 @@ pub(super) fn interval(row: &Row, set: &str) -> String {
     interval_text(accuracy(row, set).and_then(|estimate| estimate.interval))
 }
 
-/// In per cent; a dash where there is none.
+/// An interval in per cent, or a dash if there is none.
 pub fn interval_text(interval: Option<[f64; 2]>) -> String {
     interval.map_or("-".to_owned(), |[low, high]| {
         format!("{:.1} to {:.1}", 100.0 * low, 100.0 * high)
     })
 }
 
-/// Paired with the reference's runs of the same seeds.
+/// The difference from the reference's accuracy, paired with its runs of the same seeds.
 pub(super) fn less_reference(row: &Row, rows: &[Row], set: &str) -> String {
     let Some(reference) = rows.iter().find(|row| row.title == REFERENCE) else {
         return "-".to_owned();
@@ -99,7 +99,8 @@ pub(super) fn less_reference(row: &Row, rows: &[Row], set: &str) -> String {
     metrics::difference_by_object(&pairs).map_or("-".to_owned(), difference_text)
 }
 
-/// Assignments of a method less those of `features` with the same labels, where both have one.
+/// A method's accuracy minus that of `features` over the assignments, seeds and labels that both
+/// have: mean, least and most, in points.
 pub(super) fn less_features(group: &[&SwapEntry], swaps: &[SwapEntry]) -> String {
     if group[0].method == FEATURES {
         return String::new();
@@ -118,7 +119,7 @@ pub(super) fn less_features(group: &[&SwapEntry], swaps: &[SwapEntry]) -> String
     format!("{:+.1} ({low:+.1} to {high:+.1})", mean(&points))
 }
 
-/// In points.
+/// A difference and its interval, in points.
 pub fn difference_text(difference: Estimate) -> String {
     let points = |share: f64| match rounded(100.0 * share, 1) {
         text if text == "0.0" || text.starts_with('-') => text,
@@ -139,7 +140,7 @@ pub(super) fn of_entries(row: &Row, value: impl Fn(&Entry) -> f64) -> Vec<f64> {
     row.runs.iter().map(|(entry, _)| value(entry)).collect()
 }
 
-/// Mean over the seeds, and their deviation if there are several.
+/// The mean over the seeds, with the standard deviation if there are several.
 pub(super) fn with_spread(
     row: &Row,
     set: &str,
@@ -173,7 +174,7 @@ pub(super) fn mean_over_seeds(
     rounded(mean(&values), decimals)
 }
 
-/// The calibration error before the temperature, where one was fitted.
+/// The mean calibration error before the temperature, where one was fitted.
 pub(super) fn before_temperature(row: &Row, set: &str) -> String {
     let measured =
         |(_, details): &(&Entry, &Details)| details.worth.sets.get(set)?.ece_before_temperature;
@@ -191,22 +192,22 @@ pub(super) fn beside(here: String, there: Option<f64>, decimals: usize) -> Strin
     }
 }
 
-/// Mean; 0 of nothing.
+/// The mean; 0 without values.
 pub fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len().max(1) as f64
 }
 
-/// The least; infinite of nothing.
+/// The least value; infinity without values.
 pub(super) fn least(values: &[f64]) -> f64 {
     values.iter().copied().fold(f64::INFINITY, f64::min)
 }
 
-/// The most; minus infinity of nothing.
+/// The greatest value; minus infinity without values.
 pub(super) fn most(values: &[f64]) -> f64 {
     values.iter().copied().fold(f64::NEG_INFINITY, f64::max)
 }
 
-/// Standard deviation of a sample; `None` of fewer than two.
+/// The standard deviation of a sample; `None` for fewer than two values.
 pub(super) fn deviation(values: &[f64]) -> Option<f64> {
     let mean = mean(values);
     let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();

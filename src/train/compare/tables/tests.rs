@@ -1,4 +1,4 @@
-//! What the tables say of runs that differ.
+//! Tests of the tables with runs that differ.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,8 @@ use crate::train::data::dataset::LabelChoice;
 use crate::train::judge::metrics::Judged;
 use crate::train::settings::Profile;
 
-/// One method's runs of seeds 1, 2, ..., each of so many steps and of a revision.
+/// A comparison of one method with seeds 1, 2, ...; `runs` holds the steps and the revision of each
+/// run.
 fn comparison(runs: &[(u64, &str)]) -> Comparison {
     let judged = Judged {
         level: 1,

@@ -20,17 +20,19 @@ pub struct Capture {
     pub(super) path: PathBuf,
     pub(super) sha256: String,
     pub(super) labels: Labels,
-    /// Of the sensor's taxels.
+    /// Distance between the sensor's taxels.
     pub(super) pitch_mm: f64,
     pub(super) presses: Vec<Judged>,
 }
 
 impl Capture {
-    /// Reads a capture; `sensor` sent one that does not describe its own, and `hrn` judges.
+    /// Reads a capture. `sensor` is the sensor of a capture that does not describe its own, and
+    /// `hrn` judges the presses.
     ///
     /// # Errors
     ///
-    /// If it cannot be read, is damaged, or no press in it was judged.
+    /// Returns an error if the capture cannot be read, is damaged, describes an impossible sensor
+    /// or sensors of different pitches, or has no press that was judged.
     pub fn read(path: &Path, sensor: &Sensor, hrn: &Arc<Hrn>) -> Result<Self, CollectError> {
         let path = path.to_owned();
         let mut bytes = Vec::new();
@@ -60,19 +62,20 @@ impl Capture {
         })
     }
 
-    /// How many presses it has.
+    /// The number of presses.
     pub fn presses(&self) -> usize {
         self.presses.len()
     }
 
-    /// How many of them it has from their begin on, and of how many of those the approach is known.
+    /// The number of presses that are recorded from their begin, and the number of those with a
+    /// known approach.
     pub fn courses(&self) -> (usize, usize) {
         let whole = self.presses.iter().filter(|press| press.is_whole());
         let known = whole.clone().filter(|press| press.is_known());
         (whole.count(), known.count())
     }
 
-    /// The label `key`, if there is one.
+    /// The label `key` as a number, if there is one.
     pub(super) fn number(
         &self,
         key: &'static str,
@@ -125,7 +128,7 @@ impl Capture {
     }
 }
 
-/// A time for a pipeline whose clock is the frame rate.
+/// The time given to a pipeline whose clock is the frame rate.
 const NOT_LOOKED_AT: Stamp = Stamp {
     mono: std::time::Duration::ZERO,
     wall: jiff::Timestamp::UNIX_EPOCH,
@@ -157,13 +160,13 @@ fn play(
         })?;
         selection.take(events, at);
     }
-    // What was under way gets no verdict.
+    // A press that is still under way gets no verdict.
     selection.take(playback.end(), NOT_LOOKED_AT);
-    // Without a sensor there is no press either.
+    // A recording without a sensor has no press either, so this pitch is never used.
     Ok((playback.labels(), pitch_mm.unwrap_or(dataset::PITCH_MM)))
 }
 
-/// What an entry says of its sensor's taxels.
+/// The taxel pitch of the sensor that an entry describes.
 fn pitch_of(found: &Found) -> Option<f64> {
     match &found.entry {
         Entry::State(state) => Some(state.sensor.description.calibration.pitch_mm),

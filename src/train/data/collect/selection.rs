@@ -18,22 +18,22 @@ use crate::simulator::MOST_FRAMES;
 pub(super) struct Judged {
     /// The chosen frame.
     pub(super) frame: Frame,
-    /// Its total force.
+    /// Total force of the chosen frame.
     pub(super) force_n: f32,
-    /// Its frames in contact, thinned; none, if the recording has not all of them.
+    /// The press's frames in contact, thinned. Empty if the recording does not have all of them.
     pub(super) moments: Vec<Moment>,
-    /// Place of the chosen frame among them.
+    /// Index of the chosen frame in `moments`.
     pub(super) best: usize,
-    /// Stiffness of the arm; 0: unknown, or the approach is.
+    /// Stiffness of the arm. 0 if the stiffness or the approach is unknown.
     pub(super) arm_n_per_mm: f32,
 }
 
 /// A frame of a press.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Moment {
-    /// Since the begin.
+    /// Seconds since the press began.
     pub(super) time_s: f32,
-    /// Since the begin, where it is known.
+    /// The approach since the press began, where it is known.
     pub(super) approach_mm: Option<f32>,
     pub(super) frame: Frame,
 }
@@ -50,20 +50,20 @@ impl Judged {
     }
 }
 
-/// What has been read so far.
+/// The presses found so far, and what is held of each sensor to find more.
 #[derive(Debug, Default)]
 pub(super) struct Selection {
     held: BTreeMap<String, Held>,
     pub(super) presses: Vec<Judged>,
 }
 
-/// What is selected of one sensor.
+/// The frames, press and arm of one sensor.
 #[derive(Debug, Default)]
 struct Held {
-    /// Those of a press under way, or the newest.
+    /// The frames of the press under way. Without a press, the newest frame.
     frames: BTreeMap<u64, Shown>,
     is_pressed: bool,
-    /// First and last frame of the press.
+    /// Numbers of the first and the last frame of the press.
     began: Option<u64>,
     last: u64,
     track: Track,
@@ -78,7 +78,7 @@ struct Shown {
 }
 
 impl Selection {
-    /// Takes what a recording says besides the sensor's bytes.
+    /// Takes the arm's positions and the sensor's description from an entry of a recording.
     pub(super) fn note(&mut self, found: &Found) {
         match &found.entry {
             Entry::Input(Input::Motion(points)) => {
@@ -99,7 +99,7 @@ impl Selection {
         }
     }
 
-    /// Takes the events of what came at `at`.
+    /// Takes the events of the input that arrived at `at`.
     pub(super) fn take(&mut self, events: Vec<Event>, at: Stamp) {
         for event in events {
             let held = self.held.entry(event.sensor().to_owned()).or_default();
@@ -115,7 +115,7 @@ impl Selection {
                     };
                     held.frames.insert(frame.frame, shown);
                 }
-                // Its first frame came just before.
+                // The press's first frame came just before this event.
                 Event::Press(press) => {
                     held.is_pressed = press.state == PressState::Begin;
                     match press.state {
@@ -135,7 +135,7 @@ impl Selection {
 impl Held {
     /// The press that has just ended.
     fn judged(&mut self, verdict: &Hardness) -> Option<Judged> {
-        // One that began before the recording did may have its frame there.
+        // The chosen frame of a press that began before the recording may be missing from it.
         let chosen = self.frames.get(&verdict.frame)?;
         let mut judged = Judged {
             frame: Frame::try_from(chosen.newtons.clone()).ok()?,
@@ -167,7 +167,7 @@ impl Held {
         let way = way.flatten().unwrap_or_else(|| vec![None; moments.len()]);
         let mut before_s = -1.0_f32;
         for place in thinned(pressed.len(), best, MOST_FRAMES) {
-            // Two frames may have come at once, and times in a file ascend.
+            // Two frames may have arrived at the same moment, but times in a file must ascend.
             let time_s = moments[place].saturating_sub(begin).as_secs_f32();
             before_s = time_s.max(before_s.next_up());
             if place == best {
@@ -186,7 +186,7 @@ impl Held {
     }
 }
 
-/// The moment of an event by the clock of the positions.
+/// The moment of an event on the clock of the positions.
 fn moment(at: Stamp, time: Timestamp) -> Duration {
     let ago = at.wall.as_nanosecond() - time.as_nanosecond();
     let mono = at.mono.as_nanos() as i128 - ago;

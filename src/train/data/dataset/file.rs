@@ -14,16 +14,16 @@ use crate::npy::{self, Header, NpyError};
 use crate::simulator::Split;
 use crate::verdict::sha256_hex;
 
-/// More on a taxel than any sensor shows, and little enough that sums of squares stay finite.
+/// A force above any sensor's, and low enough that sums of squares stay finite.
 const MOST_NEWTONS: f32 = 1e6;
 
-/// How many times smaller than itself an array may be packed: frames of presses are packed to a tenth,
-/// and arrays of nothing but zeros to a thousandth.
+/// The largest ratio of an array's size to its packed size. Frames of presses are packed to a
+/// tenth, and arrays of zeros to a thousandth.
 const MOST_PACKED: u64 = 256;
-/// An array of this size may be packed at will.
+/// An array up to this size may have any ratio.
 const FREE_BYTES: u64 = 16 << 20;
 
-/// The samples in `bytes`, which are those of the file `path`.
+/// Reads the samples in `bytes`, the content of the file `path`.
 pub(super) fn parse(bytes: &[u8], path: &Path, name: String) -> Result<Dataset, DatasetError> {
     let mut file = File::open(bytes, path)?;
     let frames: Vec<f32> = file.read("frames", &[ROWS, COLS], None)?.ok_or_else(|| {
@@ -101,7 +101,7 @@ pub(in crate::train::data) fn read(path: &Path) -> Result<Vec<u8>, DatasetError>
     })
 }
 
-/// Where the samples or presses of a file came from.
+/// The source of a file's samples or presses.
 pub(in crate::train::data) fn source(
     bytes: &[u8],
     file: &File,
@@ -126,11 +126,11 @@ pub(in crate::train::data) fn source(
     })
 }
 
-/// What an `.npz` file says of itself; null if it says nothing.
+/// The description that an `.npz` file carries as `meta`. Null if it has none.
 ///
 /// # Errors
 ///
-/// If the file cannot be read, or it is no JSON.
+/// Returns an error if the file cannot be read, or `meta` is not JSON.
 pub fn meta(path: &Path) -> Result<serde_json::Value, DatasetError> {
     File::open(&read(path)?, path)?.meta()
 }
@@ -139,7 +139,7 @@ pub fn meta(path: &Path) -> Result<serde_json::Value, DatasetError> {
 ///
 /// # Errors
 ///
-/// Those of writing to `out`.
+/// Returns the errors of writing to `out`.
 pub fn write<W: Write + Seek>(
     out: W,
     samples: &[Sample],
@@ -181,11 +181,11 @@ fn add_optional<W: Write + Seek, T: WritableElement>(
 
 /// An element type that our files may hold.
 pub(in crate::train::data) trait Element: Copy {
-    /// As errors name it.
+    /// The type's name in errors.
     const NAME: &'static str;
-    /// As numpy writes it.
+    /// The type's names in numpy's headers.
     const DESCRIPTIONS: &'static [&'static str];
-    /// Reads so many.
+    /// Reads `count` elements.
     fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, NpyError>;
 }
 impl Element for f32 {
@@ -249,8 +249,8 @@ impl<'a> File<'a> {
         }
     }
 
-    /// Reads an array of `n` (or any number of) elements of shape `inner`, row-major; `None` if
-    /// it is not there. Nothing is unpacked but its header unless that is as expected.
+    /// Reads an array of `n` (or any number of) elements of shape `inner`, row-major. `None` if it
+    /// is missing. If its header is not as expected, the rest is not unpacked.
     fn read<T: Element>(
         &mut self,
         array: &'static str,
@@ -281,14 +281,14 @@ impl<'a> File<'a> {
         }
     }
 
-    /// Whether there is such an array.
+    /// Whether the file has the array.
     pub(in crate::train::data) fn has(&self, array: &str) -> bool {
         self.zip
             .file_names()
             .any(|name| name.strip_suffix(".npy") == Some(array))
     }
 
-    /// As [`File::read`], of an array that must be there.
+    /// Like [`File::read`], for an array that must not be missing.
     pub(in crate::train::data) fn required<T: Element>(
         &mut self,
         array: &'static str,
@@ -299,7 +299,7 @@ impl<'a> File<'a> {
         found.ok_or_else(|| self.error(array, "none".to_owned(), T::NAME.to_owned()))
     }
 
-    /// The array `meta`; null if it is not there.
+    /// The array `meta` as JSON. Null if it is missing.
     pub(in crate::train::data) fn meta(&mut self) -> Result<serde_json::Value, DatasetError> {
         let Some(text) = self.read::<u8>("meta", &[], None)? else {
             return Ok(serde_json::Value::Null);
@@ -339,7 +339,7 @@ impl<'a> File<'a> {
     }
 }
 
-/// What was found in place of an array. Each message continues "found".
+/// The content found in place of an array. Each message continues the word "found".
 #[derive(Debug, thiserror::Error)]
 enum ArrayError {
     #[error(transparent)]
@@ -352,12 +352,13 @@ enum ArrayError {
         name: &'static str,
         shape: Vec<usize>,
     },
-    /// Few bytes that would become very many.
+    /// A few packed bytes would unpack to very many.
     #[error("{bytes} bytes packed into {packed}")]
     Packed { bytes: u64, packed: u64 },
 }
 
-/// An array of `n` (or any number of) elements of shape `inner`, row-major, out of `packed` bytes.
+/// Reads an array of `n` (or any number of) elements of shape `inner`, row-major, from `packed`
+/// bytes.
 fn array_of<T: Element>(
     reader: &mut impl Read,
     packed: u64,
@@ -391,7 +392,7 @@ fn array_of<T: Element>(
     if !fortran_order {
         return Ok(values);
     }
-    // The first axis changes fastest there, the last one here.
+    // In Fortran order the first axis changes fastest; in our order the last one does.
     let place = |mut index: usize| {
         let mut steps = count;
         let (mut place, mut stride) = (0, 1);

@@ -1,4 +1,4 @@
-//! Files read back, and choices of samples.
+//! Tests of reading files back and of choosing samples.
 
 use std::io::Cursor;
 
@@ -98,7 +98,7 @@ fn a_file_that_unpacks_to_far_more_than_it_has_is_an_error() {
     npz.add_array("frames", &Array3::<f32>::zeros((1, ROWS, COLS)))
         .unwrap();
     npz.add_array("level", &Array1::from(vec![1_u8])).unwrap();
-    // 32 MB of spaces, which are JSON around a null.
+    // 32 MB of spaces around a null are JSON too.
     let meta = vec![b' '; 32 << 20];
     npz.add_array("meta", &Array1::from(meta)).unwrap();
     let bytes = npz.finish().unwrap().into_inner();
@@ -263,7 +263,7 @@ fn an_object_in_both_splits_is_found() {
         ([(test, three, None, 1), (test, three, None, 1)], None),
         ([(train, three, None, 1), (test, Some(4), None, 1)], None),
         ([(train, None, None, 1), (test, None, None, 1)], None),
-        // Numbered by level, or by material.
+        // Object numbers begin anew for each level, or for each material.
         ([(train, three, None, 1), (test, three, None, 2)], None),
         (
             [(train, three, Some(5), 1), (test, three, Some(6), 1)],
@@ -316,13 +316,14 @@ fn labels_are_chosen_by_object_and_equally_from_each_level() {
             .count();
         assert_eq!(of_level, 12, "level {level}");
     }
-    // Two whole objects and two presses of a third, of each level.
+    // Each level has two whole objects and two presses of a third.
     assert_eq!(objects_of(&dataset, &chosen).len(), 12);
-    // More labels are those and further ones: methods of one seed share what they can.
+    // A choice of more labels includes the smaller choice, so methods of one seed share labels.
     let more = dataset.choose_labelled(&indices, 100, LabelChoice::Object, 1);
     assert!(chosen.iter().all(|index| more.contains(index)));
 
-    // A level that has fewer gives all, and the others the more: never fewer than are told of.
+    // A level with too few samples gives all, and the others give more, so that the number is
+    // right.
     let few: Vec<usize> = (0..10).chain(50..200).collect();
     for choice in [LabelChoice::Object, LabelChoice::Random] {
         let chosen = dataset.choose_labelled(&few, 101, choice, 1);

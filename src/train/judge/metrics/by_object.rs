@@ -1,4 +1,4 @@
-//! How sure an accuracy is: intervals by a bootstrap over objects, and over seeds.
+//! Intervals of an accuracy, by a bootstrap over objects and over seeds.
 
 use std::collections::BTreeMap;
 
@@ -7,19 +7,19 @@ use serde::{Deserialize, Serialize};
 use super::Judged;
 use crate::random::Stream;
 
-/// Draws of the bootstrap.
+/// The number of draws of the bootstrap.
 const DRAWS: usize = 2_000;
 
-/// How an object was judged.
+/// How often an object was judged rightly.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ObjectCount {
-    /// Its true level, 1..=L.
+    /// The object's true level, 1..=L.
     pub level: u8,
-    /// Its number.
+    /// The object's number.
     pub object: u32,
     /// Samples judged rightly.
     pub right: u64,
-    /// Samples of it.
+    /// All samples of the object.
     pub samples: u64,
 }
 
@@ -41,14 +41,14 @@ pub fn by_object(judged: &[Judged]) -> Option<Vec<ObjectCount>> {
 }
 
 /// A share of samples, or a difference of two, with its 95 % interval by a bootstrap over objects
-/// within each level, and over seeds if there are several. Of one seed, what another seed or another
-/// rounding would have given is not in the interval.
+/// within each level, and over seeds if there are several. The interval of one seed does not cover
+/// what another seed or another rounding would have given.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Estimate {
-    /// Over all samples, and over the seeds if there are several.
+    /// The value over all samples, and over the seeds if there are several.
     pub mean: f64,
-    /// Low and high end; `None` where no level has two objects: every draw is then the same, which
-    /// says nothing of other objects.
+    /// Low and high end. `None` where no level has two objects, because every draw is then the same
+    /// and says nothing about other objects.
     pub interval: Option<[f64; 2]>,
 }
 
@@ -62,9 +62,10 @@ pub fn accuracy_by_object(seeds: &[&[ObjectCount]]) -> Option<Estimate> {
     bootstrap(&seeds)
 }
 
-/// A method's accuracy less another's, over `seeds`: both methods' judgements of the same samples
-/// under one seed, a pair each. An object and a seed are drawn with both, so that what makes them hard
-/// for both cancels out. `None` without pairs, or if two do not count the same samples.
+/// A method's accuracy minus another's. Each pair of `seeds` holds both methods' judgements of the
+/// same samples under one seed. Each draw takes an object and a seed for both methods, so that what
+/// is hard for both cancels out. `None` without pairs, or if the two of a pair do not count the
+/// same samples.
 pub fn difference_by_object(seeds: &[(&[ObjectCount], &[ObjectCount])]) -> Option<Estimate> {
     let samples = |count: &ObjectCount| (count.level, count.object, count.samples);
     let mut differences = Vec::new();
@@ -100,9 +101,10 @@ impl Sum {
     }
 }
 
-/// Estimates a sum over objects by their samples; the counts are given seed by seed. Draws the seeds,
-/// if there are several, and whole objects, as many as each level has, both with replacement: an object
-/// is drawn with its counts under every seed that was. Seed 0.
+/// Estimates a sum of values over objects, divided by their samples; `seeds` has the counts and
+/// values seed by seed. Each draw takes seeds, if there are several, and as many whole objects as
+/// each level has, both with replacement. A drawn object counts under every drawn seed. The draws
+/// themselves use seed 0.
 fn bootstrap(seeds: &[Vec<(ObjectCount, i64)>]) -> Option<Estimate> {
     let mut levels: BTreeMap<u8, BTreeMap<u32, Vec<Sum>>> = BTreeMap::new();
     for (seed, counts) in seeds.iter().enumerate() {
@@ -155,7 +157,7 @@ fn bootstrap(seeds: &[Vec<(ObjectCount, i64)>]) -> Option<Estimate> {
     })
 }
 
-/// Linear between the two nearest, as numpy's default.
+/// The quantile, linear between the two nearest values, as numpy does by default.
 fn quantile(sorted: &[f64], q: f64) -> f64 {
     let place = q * (sorted.len() - 1) as f64;
     let below = place.floor() as usize;
@@ -168,7 +170,7 @@ mod tests {
     use super::super::{Evaluation, tests::judged};
     use super::*;
 
-    /// Objects of 50 samples of one level: how many each method judged rightly.
+    /// Objects of one level with 50 samples each, of which `right` were judged rightly.
     fn counts(right: &[u64]) -> Vec<ObjectCount> {
         (0..)
             .zip(right)
@@ -183,7 +185,7 @@ mod tests {
 
     #[test]
     fn a_difference_that_is_the_same_on_every_object_is_certain() {
-        // The objects differ widely, but the second method is two samples better on each.
+        // The objects differ widely, but the second method is two samples better on each object.
         let (first, second) = (counts(&[0, 10, 48, 30]), counts(&[2, 12, 50, 32]));
         let difference = difference_by_object(&[(&first, &second)]).unwrap();
         assert_eq!(difference.mean, -0.04);
@@ -209,8 +211,9 @@ mod tests {
 
     #[test]
     fn the_interval_of_a_difference_is_the_normal_one_for_many_objects() {
-        // Half of 400 objects 10 samples better, half 10 worse, each seed the same way: the mean's
-        // standard deviation is 0.2 / sqrt(400) = 0.01, whatever the number of seeds.
+        // The first method is 10 samples better on half of 400 objects and 10 worse on the others,
+        // and each seed gives the same. So the mean's standard deviation is 0.2 / sqrt(400) = 0.01
+        // for any number of seeds.
         let first = counts(&[30; 400]);
         let second = counts(&[[20; 200], [40; 200]].concat());
         let pair = (&first[..], &second[..]);
@@ -225,8 +228,9 @@ mod tests {
 
     #[test]
     fn seeds_that_differ_widen_the_interval() {
-        // One seed 10 samples of 50 better on every object, one 10 worse: both drawn alike in a quarter
-        // of the draws each.
+        // One seed is better by 10 of 50 samples on every object, the other is worse by 10. Both
+        // drawn seeds are the better one in a quarter of the draws, and the worse one in another
+        // quarter.
         let (low, middle, high) = (counts(&[20; 40]), counts(&[30; 40]), counts(&[40; 40]));
         let pairs = [(&high[..], &middle[..]), (&low[..], &middle[..])];
         let difference = difference_by_object(&pairs).unwrap();

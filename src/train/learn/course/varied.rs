@@ -1,18 +1,18 @@
-//! What a robot may tell wrongly: presses are learnt from with these errors, because a network that
-//! was only ever told the truth believes everything.
+//! Errors in what a robot reports. Training presses get these errors, because a network that was
+//! trained on exact reports alone would trust every report.
 
 use super::Press;
 use crate::random::Stream;
 use crate::train::net::frames::FEATURES;
 use crate::train::settings::Told;
 
-/// Frames at least of a press that is judged before its end, or that a slower sensor sees.
+/// The least number of frames of a press that is judged before its end or seen by a slower sensor.
 const LEAST_FRAMES: usize = 3;
-/// The slowest sensor sees one frame of so many.
+/// The slowest sensor sees one frame of this many.
 const MOST_FRAMES_A_STEP: usize = 8;
 
 impl Told {
-    /// The press as a robot might tell it.
+    /// The press as a robot might report it.
     pub(super) fn varied(&self, press: &Press, stream: &mut Stream) -> Press {
         let mut press = press.clone();
         if stream.uniform() < self.slower {
@@ -61,8 +61,8 @@ impl Told {
 }
 
 impl Press {
-    /// Keeps every k-th frame from a chance one on. The first one kept is the press's begin: times and the
-    /// approach count from it.
+    /// Keeps every k-th frame, from a randomly chosen first one. The first frame kept becomes the
+    /// press's begin, from which times and the approach count.
     fn slow_down(&mut self, stream: &mut Stream) {
         let most = (self.moments.len() / LEAST_FRAMES).min(MOST_FRAMES_A_STEP);
         if most < 2 {
@@ -86,7 +86,7 @@ impl Press {
         }
     }
 
-    /// The least time between its frames.
+    /// The shortest time between two frames of the press, at most 1 s.
     fn period_s(&self) -> f64 {
         let steps = self
             .moments
@@ -96,8 +96,8 @@ impl Press {
     }
 }
 
-/// The approach at a moment between, before or after those told; before the first and after the last
-/// it goes on as it did.
+/// The approach at `time_s`, interpolated between the moments of `told`. Before the first moment it
+/// is extrapolated; after the last it stays constant.
 fn at(told: &[(f32, f32)], time_s: f32) -> f32 {
     let [_, .., last] = told else {
         return told.first().map_or(0.0, |&(_, mm)| mm);
@@ -105,7 +105,7 @@ fn at(told: &[(f32, f32)], time_s: f32) -> f32 {
     if time_s >= last.0 {
         return last.1;
     }
-    // Before the begin the arm was on its way at the speed of the first two.
+    // Before the begin, the arm moved at the speed between the first two moments.
     let next = told
         .partition_point(|&(moment_s, _)| moment_s <= time_s)
         .clamp(1, told.len() - 1);
@@ -151,7 +151,7 @@ mod tests {
             assert!((7.0..=13.0).contains(&press.arm_n_per_mm));
             assert_eq!(press.moments[0].approach_mm, Some(0.0));
             let top = press.moments[9].approach_mm.unwrap();
-            // 4.5 mm, a tenth and a frame more or less.
+            // The approach is 4.5 mm, plus or minus a tenth and the way of one frame.
             assert!((3.5..=5.5).contains(&top), "{top}");
             moved = moved.max((top - 4.5).abs());
         }
@@ -179,7 +179,7 @@ mod tests {
             for (place, moment) in (0_u8..).zip(&slow.moments) {
                 let time_s = f32::from(place) * step_s;
                 assert!((moment.time_s - time_s).abs() < 1e-5, "{slow:?}");
-                // The arm goes 5 mm/s.
+                // The arm moves at 5 mm/s.
                 assert!((moment.approach_mm.unwrap() - 5.0 * time_s).abs() < 1e-4);
             }
         }
@@ -194,7 +194,7 @@ mod tests {
             .collect();
         let share = |is: fn(&Press) -> bool| drawn.iter().filter(|press| is(press)).count();
         assert!((240..360).contains(&share(|p| p.moments[0].approach_mm.is_none())));
-        // A quarter is early; of the others three in ten are slower.
+        // A quarter of the presses end early. Of the others, three in ten have a slower sensor.
         assert!((410..540).contains(&share(|p| p.moments.len() < 10)));
         assert!(
             drawn

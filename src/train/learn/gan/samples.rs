@@ -1,5 +1,4 @@
-//! What the generator makes of fixed noise as it trains: measured against real frames, and drawn
-//! beside them.
+//! Compares frames that the generator makes from fixed noise with real frames, and draws both.
 
 use anyhow::Context as _;
 
@@ -10,20 +9,21 @@ use crate::train::net::generator;
 use crate::train::net::network::{Normalisation, Weights};
 use crate::train::run::Run;
 
-/// Real frames, at most, that generated ones are measured against; they are measured pair by pair.
+/// The most real frames to compare generated ones with. The comparison is pair by pair, so its cost
+/// grows with the square.
 const COMPARED: usize = 500;
-/// Pairs of strips of generated frames in a picture.
+/// The most pairs of strips of generated frames in a picture.
 const STRIPS: usize = 3;
 
 impl Task<'_> {
-    /// Real samples to measure generated ones by.
+    /// Real samples to compare generated ones with.
     pub(super) fn reference(&self) -> anyhow::Result<Reference> {
         let order = self.order("compared", self.real, 0);
         let frames = self.frames(&order[..order.len().min(COMPARED)]);
         Reference::of(&frames, self.scale).context("real samples")
     }
 
-    /// Compares what fixed noise becomes with them.
+    /// Compares frames generated from fixed noise with the real samples.
     pub(super) fn likeness(
         &self,
         real: &Reference,
@@ -47,8 +47,8 @@ impl Task<'_> {
             .context("generated samples")
     }
 
-    /// Draws what fixed noise becomes beside real frames: of each component one frame, and under
-    /// it another.
+    /// Draws real frames above frames generated from fixed noise: one frame of each component, and
+    /// below it a second frame of the same component.
     pub(super) fn picture(&self, generator: &Weights, epoch: u32, run: &Run) -> anyhow::Result<()> {
         let samples = self.settings.samples_a_component.max(2);
         let eta = generator::noise(samples, &mut self.stream("picture"), self.device);

@@ -1,7 +1,7 @@
-//! One step of both sides against each other, the discriminator first.
+//! One training step of the discriminator, then of the generator.
 //!
-//! In: both sides as they learn, what is real, noise, the rules. Out: both losses; the sides have
-//! moved.
+//! In: both learners, real images, noise, the rules. Out: both losses. The step changes the weights
+//! of both.
 
 use burn::tensor::Tensor;
 
@@ -12,30 +12,30 @@ use crate::train::net::losses::{self, Game, Judged};
 use crate::train::net::network::{self, Normalisation, Weights, numbers};
 use crate::train::net::sensed::Sensor;
 
-/// What a step goes by.
+/// The settings of a step.
 #[derive(Debug, Clone, Copy)]
 pub struct Rules {
-    /// What the discriminator tells apart.
+    /// The classes that the discriminator distinguishes, and the losses.
     pub game: Game,
     /// Lambda of Eq. (7).
     pub sigma_penalty: f64,
     /// Learning rate.
     pub rate: f64,
-    /// What the sensor makes of generated images, before anything judges them; `None`: they are
-    /// judged as they are.
+    /// The sensor applied to generated images before the discriminator judges them. `None` applies
+    /// no sensor.
     pub sensing: Option<(Sensor, Scale)>,
 }
 
-/// What the discriminator is shown in a step beside generated images.
+/// The discriminator's inputs in a step, besides generated images.
 #[derive(Debug)]
 pub struct Batch {
-    /// `[batch, 1, 28, 28]`.
+    /// Real images `[batch, 1, 28, 28]`.
     pub real: Tensor<4>,
-    /// Images and targets `[batch, L]`.
+    /// Labelled images `[batch, 1, 28, 28]` and their targets `[batch, L]`.
     pub labelled: Option<(Tensor<4>, Tensor<2>)>,
 }
 
-/// A step of the discriminator, then one of the generator; gives the losses of both.
+/// Takes a step of the discriminator, then one of the generator. Returns the losses of both.
 pub fn step(
     generator: &mut Learner,
     discriminator: &mut Learner,
@@ -43,7 +43,7 @@ pub fn step(
     eta: Tensor<2>,
     rules: Rules,
 ) -> (f64, f64) {
-    // The generator does not change while the discriminator takes its step, so both use the
+    // The generator does not change while the discriminator takes its step, so both steps use the
     // same images.
     let generated = Generated::of(generator, eta, rules.sensing);
 
@@ -56,7 +56,7 @@ pub fn step(
     (number(&loss), of_generator)
 }
 
-/// Images, and the weights that their gradients lead to.
+/// Generated images, and the tracked weights that receive their gradients.
 struct Generated {
     tracked: Weights,
     images: Tensor<4>,
@@ -74,8 +74,7 @@ impl Generated {
     }
 }
 
-/// The discriminator's loss, to which generated images are constants, and the weights that its
-/// gradients lead to.
+/// The tracked weights of the discriminator and its loss. Generated images are constants here.
 fn told_apart(
     discriminator: &Learner,
     batch: &Batch,
@@ -88,7 +87,7 @@ fn told_apart(
     (tracked, loss)
 }
 
-/// The generator's step on its loss and the penalty on sigma; gives their sum.
+/// Takes the generator's step on its loss plus the penalty on sigma, and returns this sum.
 fn learn(generator: &mut Learner, tracked: &Weights, fooled: Tensor<1>, rules: Rules) -> f64 {
     let loss = fooled.add(penalty(tracked, rules.sigma_penalty));
     let mut gradients = loss.backward();
@@ -100,8 +99,8 @@ fn number(loss: &Tensor<1>) -> f64 {
     f64::from(numbers(loss)[0])
 }
 
-/// Every batch goes through the discriminator by itself and is normalised by its own statistics:
-/// mixed, a batch of real and generated frames would tell the layers what it is made of.
+/// Judges one batch. Each batch passes through the discriminator alone and is normalised by its own
+/// statistics: in a mixed batch, the statistics would reveal the share of real frames.
 fn judge(discriminator: &Weights, images: Tensor<4>) -> Judged {
     let features = network::trunk(discriminator, images, &mut Normalisation::Batch);
     Judged {
@@ -125,7 +124,7 @@ pub(super) fn discriminator_loss(
     losses::discriminator(game, real, generated, labelled)
 }
 
-/// Without [`penalty`].
+/// The generator's loss without [`penalty`].
 pub(super) fn generator_loss(
     game: Game,
     discriminator: &Weights,

@@ -1,4 +1,4 @@
-//! Gradients of a whole step against differences, and how a stage starts.
+//! Compares gradients of a whole step with finite differences, and checks how a stage starts.
 
 use super::step::{discriminator_loss, generator_loss, penalty};
 use super::*;
@@ -13,7 +13,8 @@ fn device() -> Device {
     Device::flex()
 }
 
-/// In double precision, so that differences of the loss over a small step are exact enough.
+/// Converts to double precision, so that differences of the loss over a small step are exact
+/// enough.
 fn double<const D: usize>(tensor: &Tensor<D>) -> Tensor<D> {
     tensor.clone().cast(FloatDType::F64)
 }
@@ -31,8 +32,8 @@ fn doubles<const D: usize>(tensor: &Tensor<D>) -> Vec<f64> {
     tensor.to_data().try_to_vec::<f64>().unwrap()
 }
 
-/// One step's inputs, and weights as after some training: the start's are so small that
-/// hardly anything reaches the logits.
+/// One step's inputs, with weights as after some training, because the initial weights are so small
+/// that hardly anything reaches the logits.
 struct Case {
     gan: Gan,
     batch: Batch,
@@ -107,8 +108,8 @@ impl Case {
     }
 }
 
-/// Compares the gradients of `loss` in single precision with differences of `exact`, the same
-/// in double precision, along the gradient of each weight.
+/// Compares the gradients of `loss` in single precision with finite differences of `exact`, the
+/// same loss in double precision, along the gradient of each weight.
 fn check(
     weights: &Weights,
     loss: impl Fn(&Weights) -> Tensor<1>,
@@ -129,7 +130,7 @@ fn check(
     for (index, weight) in weights.entries.iter().enumerate() {
         let gradient = gradient_of(index);
         let size = size(&gradient);
-        // A bias before batch normalisation is taken away again with the mean.
+        // Batch normalisation subtracts the mean and so cancels the bias before it.
         let cancelled = [
             "conv2.bias",
             "conv3.bias",
@@ -149,7 +150,7 @@ fn check(
             *values = values.clone().add(direction.clone().mul_scalar(step));
             doubles(&exact(&moved))[0]
         };
-        // Small enough to cross no kink of the leaky ReLU or of the pool.
+        // The step is small enough to cross no kink of the leaky ReLU or of the pool.
         let step = 1e-6;
         let numeric = (at(step) - at(-step)) / (2.0 * step);
         assert!(

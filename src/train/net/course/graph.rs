@@ -1,4 +1,4 @@
-//! The same network as ONNX nodes: from the inputs of format 2 to logits and Shore.
+//! The network of courses as ONNX nodes: from the inputs of format 2 to logits and Shore hardness.
 
 use tract_onnx::pb;
 
@@ -11,11 +11,11 @@ use crate::train::net::shore;
 use crate::train::net::standard::Standard;
 use crate::train::net::start::Constant;
 
-/// Keep logarithms finite: added to mm, s and s between frames.
+/// Added before a logarithm to keep it finite: to mm, s, and s between frames.
 pub(super) const MM: f32 = 0.3;
 pub(super) const TIME_S: f32 = 0.05;
 pub(super) const STEP_S: f32 = 0.01;
-/// What lies beyond is taken as this.
+/// The limits to which inputs are clipped.
 pub(super) const MOST_MM: f32 = 30.0;
 pub(super) const MOST_S: f32 = 30.0;
 pub(super) const MOST_STEP_S: f32 = 1.0;
@@ -61,7 +61,7 @@ impl Builder {
         );
         let stiffness = self.node("Log", &[&arm], "log arm");
         let stiffness = self.node("Mul", &[&stiffness, &is_known], "known stiffness");
-        // A row of as many as there are frames.
+        // The product with the mask repeats the stiffness for every frame.
         let stiffness = self.node("Mul", &["mask", &stiffness], "stiffness");
 
         let rows = [
@@ -111,15 +111,15 @@ impl Builder {
     }
 }
 
-/// Where the number at `place` of a matrix `[tap, in, out]` lies in the kernel `[out, in, tap]`.
+/// The place in the kernel `[out, in, tap]` of the number at `place` of a matrix `[tap, in, out]`.
 fn in_kernel(place: usize) -> usize {
     let (tap, rest) = (place / (HIDDEN * HIDDEN), place % (HIDDEN * HIDDEN));
     let (input, output) = (rest / HIDDEN, rest % HIDDEN);
     (output * HIDDEN + input) * KERNEL + tap
 }
 
-/// A weight of [`super::initial`] from the constants of an exported graph, which holds the convolutions as
-/// kernels.
+/// A weight of [`super::initial`] from the constants of an exported graph, which holds the
+/// convolutions as kernels.
 pub(super) fn weight<'a>(
     name: &str,
     constant: impl Fn(&str) -> Option<&'a Constant>,
@@ -140,8 +140,8 @@ pub(super) fn weight<'a>(
     is_kernel.then(|| (vec![KERNEL, HIDDEN, HIDDEN], matrix(kernel)))
 }
 
-/// The graph from the inputs of format 2 to raw logits `[1, levels]` and Shore OO `[1, 3]`, and their
-/// names. `widths` are added below and above to the ends of the interval.
+/// The graph from the inputs of format 2 to raw logits `[1, levels]` and Shore OO `[1, 3]`, and the
+/// names of both. `widths` widen the interval below and above.
 pub fn graph(
     weights: &Weights,
     standard: &Standard,

@@ -91,7 +91,8 @@ impl Layers for Flex {
     }
 }
 
-/// `values`, those where `x` is below 0 times `slope`; where it is 0, times the middle.
+/// `values`, times `slope` where `x` is below 0, and times the mean of 1 and `slope` where `x`
+/// is 0.
 pub(super) fn leaky(values: FlexTensor, x: FlexTensor, slope: f32) -> FlexTensor {
     let shape = values.layout().shape().clone();
     let (values, x) = (Contiguous::of(values), Contiguous::of(x));
@@ -105,10 +106,10 @@ pub(super) fn leaky(values: FlexTensor, x: FlexTensor, slope: f32) -> FlexTensor
     FlexTensor::from_data(TensorData::new(scaled.collect::<Vec<f32>>(), shape))
 }
 
-/// Fewer numbers are not worth another thread.
+/// With fewer numbers, another thread does not pay.
 const NUMBERS: usize = 1 << 14;
 
-/// What batch normalisation works on: a row a channel.
+/// The input of batch normalisation, with a row per channel.
 pub(super) struct Rows {
     x: Contiguous,
     gamma: Contiguous,
@@ -197,7 +198,7 @@ impl Rows {
             .zip(self.rows())
             .map(|((of_x, gradient), (x, row))| {
                 let (scale, slope) = (row.gamma * row.rate, self.slope);
-                // The gradient before the LeakyReLU, until it is that of x.
+                // `of_x` first holds the gradient before the LeakyReLU, and then the gradient of x.
                 for ((before, x), gradient) in of_x.iter_mut().zip(x).zip(gradient) {
                     let z = scale * (x - row.mean) + row.beta;
                     *before = gradient * if z > 0.0 { 1.0 } else { slope };

@@ -25,7 +25,7 @@ fn geometries() -> Vec<(Geometry, usize)> {
         .collect()
 }
 
-/// In double precision, which takes burn's own operations.
+/// The same tensor in double precision, for which burn's own operations run.
 fn double<const D: usize>(tensor: &Tensor<D>) -> Tensor<D> {
     tensor.clone().cast(FloatDType::F64)
 }
