@@ -1,10 +1,10 @@
 //! A press becomes a verdict: loads an HRN from ONNX bytes and judges presses with it.
 //!
-//! In: the bytes of a model file as `hrn-train export` writes them, then frames in newtons (format
-//! 1) or the course of a press (format 2). Out: [`Verdict`]s. This module refuses a file unless all
-//! of it follows the format and it reproduces the probabilities that its trainer wrote into it. So
-//! a loaded [`Hrn`] computes what was evaluated. This module never reads a file itself, never
-//! prints and never trains.
+//! In: the bytes of a model file as `hrn-train export` writes them, then frames in newtons
+//! (format 1) or the course of a press (format 2). Out: [`Verdict`]s. This module refuses a file
+//! unless all of it follows the format and it reproduces the probabilities that its trainer wrote
+//! into it. So a loaded [`Hrn`] computes what was evaluated. This module never reads a file itself,
+//! never prints and never trains.
 
 mod course;
 mod file;
