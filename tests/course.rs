@@ -177,6 +177,14 @@ fn compare(at: &Path, told: &Value) {
     let difference = less["levels"]["accuracy"].as_f64().unwrap()
         - model["levels"]["accuracy"].as_f64().unwrap();
     assert!((less["less_first"]["mean"].as_f64().unwrap() - difference).abs() < 1e-12);
+    let page = std::fs::read_to_string(at.join("c/course.html")).unwrap();
+    for section in ["accuracy", "curves", "time", "calibration"] {
+        assert!(page.contains(&format!("id=\"{section}\"")), "{section}");
+    }
+    let count = |what: &str| page.matches(what).count();
+    assert!(count("force against approach, level ") >= 2, "{page}");
+    assert_eq!(count("accuracy against time, d"), 1);
+    assert_eq!(count("calibration of d"), 1);
     // Most presses have ended after 6.4 s, so most verdicts of that time are final.
     let so_far = model["so_far"]["after"].as_array().unwrap();
     let going_on = |after: &Value| after["going_on"].as_f64().unwrap();

@@ -7,6 +7,7 @@
 //! that runs can be stopped, resumed and distributed. Finished runs are not repeated.
 
 mod children;
+pub mod course_results;
 pub mod courses;
 pub mod digits;
 mod plan;

@@ -2,27 +2,34 @@
 //! (`hrn-train compare --course`).
 //!
 //! In: presses to fit the controls on, sets of test presses, model files. Out, in a directory:
-//! `course.json` and `course.md`, with the accuracy and its interval, the difference from the first
-//! model on the same presses, and the verdicts of a model of format 2 before the end of a press.
+//! `course.json`, `course.md` and `course.html`, with the accuracy and its interval, the difference
+//! from the first model on the same presses, and the verdicts of a model of format 2 before the end
+//! of a press.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, ensure};
-use serde::{Deserialize, Serialize};
 
-use super::so_far::{self, SoFar};
-use super::tables::{self, Table};
+use super::course_results::{self, CourseRow, Difference, OnSet};
+use super::report::{self, Curve};
+use super::so_far;
+use super::tables::Table;
 use crate::simulator::Split;
 use crate::train::data::courses::Courses;
 use crate::train::data::dataset;
 use crate::train::judge::baseline::Baseline;
-use crate::train::judge::metrics::{self, Evaluation, Judged, ObjectCount};
+use crate::train::judge::metrics::{self, Evaluation, Judged};
 use crate::train::judge::press_features::{self, PressOf};
 use crate::train::learn::course::{self, Press};
 use crate::train::model::course as model;
+use crate::train::net::course::Moment;
 use crate::train::net::frames::FEATURES;
 use crate::train::run::disk::write_whole;
 use crate::verdict::{Course, Format, Hrn, argmax};
+
+/// Presses of a level in the picture of force against approach. More would hide each other.
+const CURVES_A_LEVEL: usize = 8;
 
 /// The request for a comparison.
 #[derive(Debug)]
@@ -35,44 +42,6 @@ pub struct CoursePlan {
     pub models: Vec<(String, Hrn)>,
     /// The directory of the tables.
     pub out: PathBuf,
-}
-
-/// A row of the tables: a control or model, and its results on each set.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct CourseRow {
-    /// A control's name, or the model's file.
-    pub name: String,
-    /// The results on each set, in the order of the plan.
-    pub sets: Vec<OnSet>,
-}
-
-/// The results on one set.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct OnSet {
-    /// The set's file, without folder and suffix.
-    pub set: String,
-    /// The evaluation of the levels.
-    pub levels: Evaluation,
-    /// Share of presses whose level is off by more than one.
-    pub beyond_neighbour: f64,
-    /// Root mean square error of the Shore hardness, in Shore OO; null without a Shore hardness.
-    pub shore_rmse: Option<f64>,
-    /// Presses judged correctly, by object.
-    pub objects: Vec<ObjectCount>,
-    /// Accuracy minus that of the first model on the same presses, with its 95 % interval by
-    /// object; null for the first model.
-    pub less_first: Option<Difference>,
-    /// The evaluation of verdicts before the end of presses; null except for models of format 2.
-    pub so_far: Option<SoFar>,
-}
-
-/// A difference of two accuracies.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Difference {
-    /// The difference, as a share of the presses.
-    pub mean: f64,
-    /// The 95 % interval, by a bootstrap over objects.
-    pub interval: Option<[f64; 2]>,
 }
 
 /// A control: a logistic regression on one kind of features of a press.
@@ -91,7 +60,7 @@ impl Control {
         match self {
             Self::Frame => "features of the best frame",
             Self::Hertz => "Hertz's fit",
-            Self::PressAlone => "features of the press, arm not told",
+            Self::PressAlone => "features of the press, arm unknown",
             Self::Press => "features of the press",
         }
     }
@@ -169,10 +138,42 @@ pub fn compare_courses(plan: &CoursePlan) -> anyhow::Result<String> {
     compare_with_first(&mut rows, &plan.models[0].0);
     let json = serde_json::to_vec_pretty(&rows)?;
     write_whole(&plan.out.join("course.json"), &json)?;
-    let tables = tables(&rows);
+    let tables = course_results::tables(&rows);
     let text: Vec<String> = tables.iter().map(Table::section).collect();
     write_whole(&plan.out.join("course.md"), text.join("\n").as_bytes())?;
+    let page = report::courses(&rows, &plan.models[0].0, &curves(&sets));
+    write_whole(&plan.out.join("course.html"), page.as_bytes())?;
     Ok(tables[0].text())
+}
+
+/// Curves of force against approach: of each level the first press of several objects, from the first
+/// set whose presses all have a known approach.
+fn curves(sets: &[TestSet]) -> Option<(&str, Vec<Curve>)> {
+    let is_known = |press: &Press| {
+        press
+            .moments
+            .iter()
+            .all(|moment| moment.approach_mm.is_some())
+    };
+    let set = sets.iter().find(|set| set.presses.iter().all(is_known))?;
+    let mut drawn: BTreeMap<u8, BTreeSet<u32>> = BTreeMap::new();
+    let mut curves = Vec::new();
+    for place in set.courses.labelled(Split::Test) {
+        let press = &set.presses[place];
+        let objects = drawn.entry(press.level).or_default();
+        if objects.len() == CURVES_A_LEVEL || !objects.insert(press.object) {
+            continue;
+        }
+        let point = |moment: &Moment| {
+            let approach_mm = moment.approach_mm.unwrap_or_default();
+            (f64::from(approach_mm), f64::from(moment.force_n))
+        };
+        curves.push(Curve {
+            level: press.level,
+            points: press.moments.iter().map(point).collect(),
+        });
+    }
+    Some((&set.name, curves))
 }
 
 /// Fits the controls and judges the sets with them.
@@ -260,7 +261,7 @@ fn of_model(name: &str, hrn: &Hrn, sets: &[TestSet]) -> anyhow::Result<Vec<Cours
     match hrn.format() {
         Format::Frame => Ok(vec![row(name.to_owned(), &|course| course, false)?]),
         Format::Course { .. } => Ok(vec![
-            row(format!("{name}, arm not told"), &untold, false)?,
+            row(format!("{name}, arm unknown"), &untold, false)?,
             row(name.to_owned(), &|course| course, true)?,
         ]),
     }
@@ -281,6 +282,7 @@ fn on_set(set: &str, judged: &[Judged], levels: usize, shore_rmse: Option<f64>) 
     OnSet {
         set: set.to_owned(),
         levels: Evaluation::of(judged, levels),
+        calibration: metrics::calibration(judged),
         beyond_neighbour: judged.iter().filter(is_far).count() as f64 / judged.len() as f64,
         shore_rmse,
         objects: metrics::by_object(judged).unwrap_or_default(),
@@ -304,67 +306,4 @@ fn compare_with_first(rows: &mut [CourseRow], first: &str) {
             });
         }
     }
-}
-
-fn tables(rows: &[CourseRow]) -> Vec<Table> {
-    let sets: Vec<&str> = rows[0].sets.iter().map(|on| on.set.as_str()).collect();
-    let of = |title: &str, note: &str, cell: &dyn Fn(&OnSet) -> String| Table {
-        title: title.to_owned(),
-        note: note.to_owned(),
-        head: std::iter::once("judged by")
-            .chain(sets.iter().copied())
-            .map(str::to_owned)
-            .collect(),
-        rows: rows
-            .iter()
-            .map(|row| {
-                let cells = row.sets.iter().map(cell);
-                std::iter::once(row.name.clone()).chain(cells).collect()
-            })
-            .collect(),
-    };
-    let percent = |share: f64| format!("{:.1}", 100.0 * share);
-    let mut all = vec![
-        of(
-            "Accuracy",
-            "Per cent of the presses whose level is right, with a 95 % interval by object.",
-            &|on| {
-                let interval = tables::interval_text(on.levels.accuracy_interval_by_object);
-                format!("{} ({interval})", percent(on.levels.accuracy))
-            },
-        ),
-        of(
-            "Beside the first model",
-            "Points of accuracy more than the first model on the same presses, with a 95 % interval by object.",
-            &|on| {
-                on.less_first.map_or("-".to_owned(), |difference| {
-                    tables::difference_text(metrics::Estimate {
-                        mean: difference.mean,
-                        interval: difference.interval,
-                    })
-                })
-            },
-        ),
-        of(
-            "Beyond the neighbour",
-            "Per cent of the presses whose level is off by more than one.",
-            &|on| percent(on.beyond_neighbour),
-        ),
-        of(
-            "Shore hardness",
-            "Root of the mean squared error, Shore OO.",
-            &|on| {
-                on.shore_rmse
-                    .map_or("-".to_owned(), |rmse| format!("{rmse:.1}"))
-            },
-        ),
-    ];
-    for row in rows {
-        for on in &row.sets {
-            if let Some(so_far) = &on.so_far {
-                all.push(so_far::table(&row.name, &on.set, so_far));
-            }
-        }
-    }
-    all
 }

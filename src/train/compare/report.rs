@@ -4,6 +4,7 @@
 //! and the runs' own pictures as data URIs. The page loads nothing else. This module writes no
 //! file.
 
+mod courses;
 mod figures;
 mod plot;
 
@@ -13,6 +14,8 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;
+
+pub use self::courses::{Curve, courses};
 
 use self::plot::escaped;
 use crate::train::compare::digits;

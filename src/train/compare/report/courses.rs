@@ -1,0 +1,123 @@
+//! The page of `hrn-train compare --course`, with its pictures.
+
+use super::Page;
+use super::figures;
+use super::plot::{Anchor, Scale, Svg, axes};
+use crate::train::compare::course_results::{self, CourseRow, OnSet};
+use crate::train::compare::so_far::SoFar;
+
+/// The force of a press against the approach of the arm.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Curve {
+    /// The hardness level of the object.
+    pub level: u8,
+    /// Approach in mm and total force in N, frame by frame.
+    pub points: Vec<(f64, f64)>,
+}
+
+/// The page of the results `rows`. The pictures of calibration and of verdicts before the end are
+/// those of the row called `first`. `curves` are presses of a set, with its name.
+pub fn courses(rows: &[CourseRow], first: &str, curves: &Option<(&str, Vec<Curve>)>) -> String {
+    let mut page = Page::default();
+    let tables = course_results::tables(rows);
+    let (overview, before_end) = tables.split_at(course_results::OVERVIEW.min(tables.len()));
+    page.section("accuracy", "Accuracy and errors");
+    for table in overview {
+        page.subtitle(&table.title);
+        page.table(table);
+    }
+    if let Some((set, curves)) = curves {
+        page.section("curves", "Force against approach");
+        page.note(&format!(
+            "Presses of {set}, one an object. The approach is what the robot says of its arm, so it \
+             holds what object, cover and arm gave way. A harder object rises more steeply, but so \
+             does a blunter one or a stiffer arm."
+        ));
+        page.panels(force_against_approach(curves));
+    }
+    let reference = rows.iter().find(|row| row.name == first);
+    let sets = || reference.into_iter().flat_map(|row| &row.sets);
+    if sets().any(|on| on.so_far.is_some()) {
+        page.section("time", "Before the end of a press");
+        page.note(&format!(
+            "{first}: share of correct levels after each number of seconds (blue), and share of \
+             presses that had not ended (dashed). For a press that had ended, the final verdict counts."
+        ));
+        let picture = |on: &OnSet| Some(against_time(on.so_far.as_ref()?, &on.set));
+        page.panels(sets().filter_map(picture).collect());
+        for table in before_end {
+            page.subtitle(&table.title);
+            page.table(table);
+        }
+    }
+    page.section("calibration", "Calibration");
+    page.note(&format!(
+        "{first}: share of correct levels against stated confidence. Below the diagonal the model is \
+         too sure."
+    ));
+    let picture = |on: &OnSet| figures::reliability(&on.calibration, &on.set);
+    page.panels(sets().map(picture).collect());
+    page.finish("Hardness from the course of a press", "")
+}
+
+/// A panel a level, all with the same axes.
+fn force_against_approach(curves: &[Curve]) -> Vec<String> {
+    let points = || curves.iter().flat_map(|curve| &curve.points);
+    let most_mm = points().fold(0.0_f64, |most, point| most.max(point.0));
+    let most_n = points().fold(0.0_f64, |most, point| most.max(point.1));
+    let x = Scale::linear((0.0, most_mm), (38.0, 244.0));
+    let y = Scale::linear((0.0, most_n), (146.0, 40.0));
+    let mut levels: Vec<u8> = curves.iter().map(|curve| curve.level).collect();
+    levels.sort_unstable();
+    levels.dedup();
+    let panel = |level: u8| {
+        let mut svg = Svg::new(260.0, 181.0);
+        let title = format!("level {level}");
+        svg.text("name", (0.0, 12.0), Anchor::Start, &title);
+        axes(&mut svg, (&x, "approach, mm"), (&y, "force, N"), (4, 4));
+        for curve in curves.iter().filter(|curve| curve.level == level) {
+            let points = curve
+                .points
+                .iter()
+                .map(|point| (x.at(point.0), y.at(point.1)));
+            svg.path("train", &points.collect::<Vec<_>>());
+        }
+        svg.finish(&format!("force against approach, {title}"))
+    };
+    levels.into_iter().map(panel).collect()
+}
+
+/// Accuracy against the time since a press began.
+fn against_time(so_far: &SoFar, set: &str) -> String {
+    let seconds = so_far.after.iter().map(|after| f64::from(after.seconds));
+    let (least, most) = seconds.fold((1.0_f64, 1.0_f64), |(least, most), seconds| {
+        (least.min(seconds), most.max(seconds))
+    });
+    // With a margin, so that the ends of the axis show decades.
+    let x = Scale::logarithmic((0.8 * least, 1.6 * most), (38.0, 244.0));
+    let y = Scale::linear((0.0, 100.0), (146.0, 40.0));
+    let mut svg = Svg::new(260.0, 181.0);
+    svg.text("name", (0.0, 12.0), Anchor::Start, set);
+    axes(&mut svg, (&x, "seconds"), (&y, "%"), (3, 4));
+    let at = |share: f64, seconds: f32| (x.at(f64::from(seconds)), y.at(100.0 * share));
+    let going_on = so_far
+        .after
+        .iter()
+        .map(|after| at(after.going_on, after.seconds));
+    svg.path("diagonal", &going_on.collect::<Vec<_>>());
+    let accuracy = so_far
+        .after
+        .iter()
+        .map(|after| at(after.accuracy, after.seconds));
+    svg.path("train", &accuracy.collect::<Vec<_>>());
+    for after in &so_far.after {
+        let tip = format!(
+            "after {} s: {:.1} % correct, {:.1} % still pressed",
+            after.seconds,
+            100.0 * after.accuracy,
+            100.0 * after.going_on
+        );
+        svg.dot("mark", at(after.accuracy, after.seconds), 3.0, &tip);
+    }
+    svg.finish(&format!("accuracy against time, {set}"))
+}
