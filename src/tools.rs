@@ -10,6 +10,8 @@ pub mod demo;
 pub mod doctor;
 pub mod exit;
 mod faults;
+#[cfg(feature = "zenoh")]
+pub mod fleet;
 mod player;
 mod pty;
 pub mod record;

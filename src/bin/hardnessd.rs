@@ -13,6 +13,8 @@ use hardnessd::daemon::log::{Log, Settings as LogSettings};
 use hardnessd::daemon::{Daemon, Reload};
 use hardnessd::tools::args::{Args, Command};
 use hardnessd::tools::exit::{self, Failure, Stop};
+#[cfg(feature = "zenoh")]
+use hardnessd::tools::fleet;
 #[cfg(feature = "watch")]
 use hardnessd::tools::watch;
 use hardnessd::tools::{
@@ -93,6 +95,8 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
         Command::Tail(args) => Ok(tail::run(args, signals.told()).await?),
         #[cfg(feature = "watch")]
         Command::Watch(args) => Ok(watch::run(args, signals.told()).await?),
+        #[cfg(feature = "zenoh")]
+        Command::Fleet(args) => Ok(fleet::run(args, signals.told()).await?),
         Command::Check(args) => finish_blocking(signals, move || check::run(&args)).await,
         Command::Calibrate(args) => calibrate(args, signals).await,
         Command::Doctor(args) => finish_blocking(signals, move || doctor::run(&args)).await,

@@ -19,7 +19,7 @@ use super::hub::{self, Line};
 use super::request::motion::Positions;
 use super::request::{Policy, Subscription};
 use super::sensor::Sensors;
-use crate::event::{Kind, Status};
+use crate::event::{Hello, Kind, Status};
 
 /// The most jobs that wait for the thread: batches of lines, and queries between them.
 const JOBS: usize = 8;
@@ -27,8 +27,11 @@ const JOBS: usize = 8;
 /// The most messages with positions that wait for the sensors' tasks.
 const POSITIONS: usize = 256;
 
-/// How often a thread that wants statuses gets them.
+/// How often a thread that wants the `hello` and the statuses gets them.
 const VITALS: Duration = Duration::from_secs(1);
+
+/// Makes a job of the `hello` and the status of every sensor.
+type Vitals<J> = fn(Hello, Vec<Status>) -> J;
 
 /// The queue for the positions of the arm that a thread receives from the robot.
 #[derive(Clone)]
@@ -57,8 +60,8 @@ pub(super) struct Worker<J> {
     ended: oneshot::Receiver<()>,
     way: &'static str,
     positions: mpsc::Receiver<Positions>,
-    /// Makes a job of the statuses, if the thread wants them.
-    vitals: Option<fn(Vec<Status>) -> J>,
+    /// Only if the thread wants them.
+    vitals: Option<Vitals<J>>,
 }
 
 impl<J: From<Vec<Line>> + Send + 'static> Worker<J> {
@@ -108,10 +111,10 @@ impl<J: From<Vec<Line>> + Send + 'static> Worker<J> {
         })
     }
 
-    /// Also sends the thread the status of every sensor, once a second, as the job that `make`
-    /// returns.
-    #[cfg(feature = "ros2")]
-    pub(super) fn with_vitals(self, make: fn(Vec<Status>) -> J) -> Self {
+    /// Also sends the thread the `hello` and the status of every sensor, once a second, as the job
+    /// that `make` returns.
+    #[cfg(any(feature = "ros2", feature = "zenoh"))]
+    pub(super) fn with_vitals(self, make: Vitals<J>) -> Self {
         Self {
             vitals: Some(make),
             ..self
@@ -155,7 +158,7 @@ async fn relay<J: From<Vec<Line>>>(
     hub: &hub::Handle,
     sensors: &Sensors,
     jobs: mpsc::Sender<J>,
-    vitals: Option<fn(Vec<Status>) -> J>,
+    vitals: Option<Vitals<J>>,
 ) -> Result<(), hub::Closed> {
     let wanted = Subscription {
         kinds: Kind::ALL.into_iter().collect(),
@@ -178,7 +181,9 @@ async fn relay<J: From<Vec<Line>>>(
                 }
                 Err(_) => break,
             },
-            make = each_second(&mut tick, vitals) => make(sensors.statuses().await),
+            make = each_second(&mut tick, vitals) => {
+                make(hub.survey().await?.hello, sensors.statuses().await)
+            }
         };
     }
     Ok(())
@@ -186,10 +191,7 @@ async fn relay<J: From<Vec<Line>>>(
 
 /// Waits for the next second, for a thread that wants statuses. For any other thread, this waits
 /// forever.
-async fn each_second<J>(
-    tick: &mut Interval,
-    vitals: Option<fn(Vec<Status>) -> J>,
-) -> fn(Vec<Status>) -> J {
+async fn each_second<J>(tick: &mut Interval, vitals: Option<Vitals<J>>) -> Vitals<J> {
     let Some(make) = vitals else {
         return std::future::pending().await;
     };

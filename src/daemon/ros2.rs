@@ -93,7 +93,7 @@ pub(super) fn open(
             drop(runtime);
         },
     );
-    Ok(worker?.with_vitals(Job::Vitals))
+    Ok(worker?.with_vitals(|_, statuses| Job::Vitals(statuses)))
 }
 
 /// A node and its topics.

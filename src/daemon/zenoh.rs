@@ -1,14 +1,16 @@
 //! Zenoh: each event is put under the key `tactile/SITE/SENSOR/KIND`, as the same JSON as on a
 //! socket.
 //!
-//! In: lines of the hub. Out: puts, the last final verdict and status of each sensor as answers to
-//! queries, and the liveliness token `tactile/SITE`, which ends with the daemon. The session talks
-//! only to addresses that the configuration names. If the configuration names a key with positions
-//! of the arm, the session subscribes to it. Nothing else that comes in changes anything.
+//! In: lines of the hub. Out: puts; the `hello`, the last final verdict and the status of each
+//! sensor as answers to queries; and the liveliness token `tactile/SITE`, which ends with the
+//! daemon. The session talks only to addresses that the configuration names. If the configuration
+//! names a key with positions of the arm, the session subscribes to it. Nothing else that comes in
+//! changes anything.
 
 use std::collections::BTreeMap;
 use std::io;
 use std::net::TcpListener;
+use std::time::Duration;
 
 use tokio::sync::mpsc::{self, WeakSender};
 use tracing::{info, warn};
@@ -24,7 +26,7 @@ use super::config;
 use super::hub::Line;
 use super::relay::{Door, Worker};
 use super::request::{self, Change, Request};
-use crate::event::{Event, Kind, Phase};
+use crate::event::{Event, Hello, Kind, Phase, Reply, Status};
 
 /// The reason the session could not be opened.
 #[derive(Debug, thiserror::Error)]
@@ -49,6 +51,7 @@ pub enum Error {
 pub(super) enum Job {
     Lines(Vec<Line>),
     Query(Query),
+    Vitals(Hello, Vec<Status>),
 }
 
 impl From<Vec<Line>> for Job {
@@ -80,11 +83,12 @@ pub(super) fn open(
     let (listen, connect) = (&settings.listen, &settings.connect);
     info!(way = "zenoh", site, ?listen, ?connect, "publishing");
     let settings = settings.clone();
-    Worker::start(
+    let worker = Worker::start(
         "zenoh",
         move |jobs, door| Zenoh::open(&settings, site, &sensors, jobs.downgrade(), door),
         Zenoh::work,
-    )
+    );
+    Ok(worker?.with_vitals(Job::Vitals))
 }
 
 /// An open session.
@@ -162,6 +166,19 @@ impl Zenoh {
             match job {
                 Job::Lines(lines) => lines.into_iter().for_each(|line| self.publish(line)),
                 Job::Query(query) => self.answer(&query),
+                Job::Vitals(hello, statuses) => self.hold(hello, statuses),
+            }
+        }
+    }
+
+    /// Keeps what is true now, for answers: totals and rates change without an event.
+    fn hold(&mut self, hello: Hello, statuses: Vec<Status>) {
+        let hello = Line::from(Reply::Hello(hello));
+        self.last.insert(format!("tactile/{}", self.site), hello);
+        for status in statuses {
+            let key = key(&self.site, &status.sensor, Kind::Status);
+            if self.publishers.contains_key(&key) {
+                self.last.insert(key, status.into());
             }
         }
     }
@@ -232,20 +249,46 @@ fn text(line: &Line) -> &str {
     line.json.trim_end()
 }
 
+/// The daemon's session. An address in use is an error. A router that is not there yet is none: the
+/// library tries again.
+fn configuration(settings: &config::Zenoh) -> Result<zenoh::Config, zenoh::Error> {
+    let mut config = quiet("peer", &settings.listen, &settings.connect)?;
+    config.insert_json5("connect/exit_on_failure", "false")?;
+    Ok(config)
+}
+
+/// The session of a client of the first router or peer in `connect` that answers. It is an error if none answers
+/// within `timeout`. A router brokers between a client and everyone else, but not between two peers.
+///
+/// # Errors
+///
+/// If the library refuses an endpoint.
+pub(crate) fn searching(
+    connect: &[config::Endpoint],
+    timeout: Duration,
+) -> Result<zenoh::Config, zenoh::Error> {
+    let mut config = quiet("client", &[], connect)?;
+    config.insert_json5("connect/exit_on_failure", "true")?;
+    config.insert_json5("connect/timeout_ms", &timeout.as_millis().to_string())?;
+    Ok(config)
+}
+
 /// By default zenoh listens on every interface and looks for peers by multicast. This configuration
 /// does neither.
-fn configuration(settings: &config::Zenoh) -> Result<zenoh::Config, Error> {
+fn quiet(
+    mode: &str,
+    listen: &[config::Endpoint],
+    connect: &[config::Endpoint],
+) -> Result<zenoh::Config, zenoh::Error> {
     let json = |endpoints: &[config::Endpoint]| {
         serde_json::to_string(endpoints).expect("a list of strings is JSON")
     };
     let mut config = zenoh::Config::default();
     for (key, value) in [
-        ("mode", "\"peer\"".to_owned()),
-        ("listen/endpoints", json(&settings.listen)),
-        ("connect/endpoints", json(&settings.connect)),
-        // An address in use is an error. A router that is not there yet is not an error.
+        ("mode", format!("\"{mode}\"")),
+        ("listen/endpoints", json(listen)),
         ("listen/exit_on_failure", "true".to_owned()),
-        ("connect/exit_on_failure", "false".to_owned()),
+        ("connect/endpoints", json(connect)),
         ("scouting/multicast/enabled", "false".to_owned()),
         // Without gossip, a peer behind a router gets events twice. Autoconnect would connect to
         // peers that the configuration does not name.

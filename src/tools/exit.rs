@@ -1,5 +1,7 @@
 //! The failures of commands and their exit codes, which an operator's scripts may rely on.
 
+#[cfg(feature = "zenoh")]
+use super::fleet;
 #[cfg(feature = "watch")]
 use super::watch;
 use super::{
@@ -75,6 +77,9 @@ pub enum Failure {
     #[cfg(feature = "watch")]
     #[error(transparent)]
     Watch(#[from] watch::Error),
+    #[cfg(feature = "zenoh")]
+    #[error(transparent)]
+    Fleet(#[from] fleet::Error),
     #[error(transparent)]
     Check(#[from] check::Error),
     #[error(transparent)]
@@ -177,6 +182,10 @@ impl Failure {
 
             #[cfg(feature = "watch")]
             Self::Watch(watch::Error::Terminal(_)) => IO,
+            #[cfg(feature = "zenoh")]
+            Self::Fleet(fleet::Error::Unavailable { .. }) => UNAVAILABLE,
+            #[cfg(feature = "zenoh")]
+            Self::Fleet(fleet::Error::Thread(_) | fleet::Error::Print(_)) => IO,
 
             Self::Log(_)
             | Self::Demo(demo::Error::Layout(_))

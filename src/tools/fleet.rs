@@ -1,0 +1,154 @@
+//! `hardnessd fleet`: the sensors of every robot behind a zenoh router or peer, on stdout.
+//!
+//! In: what daemons put on zenoh. Out: a table, or JSON lines. A robot is there while its liveliness token is.
+//! Nothing is sent to a robot but the question what is true now.
+
+mod numbers;
+mod robots;
+mod session;
+mod view;
+
+use std::future::Future;
+use std::io::{self, IsTerminal};
+use std::time::Duration;
+
+use clap::Args as ClapArgs;
+use tokio::sync::mpsc;
+use tokio::time::{Instant, MissedTickBehavior};
+
+use self::robots::{ASK, Fleet};
+use self::session::{Session, WAITING};
+use super::simulate::positive;
+use crate::daemon::config::Endpoint;
+
+/// Arguments of `fleet`.
+#[derive(Debug, Clone, ClapArgs)]
+pub struct Args {
+    /// A zenoh router or a daemon, tcp/HOST:PORT; of several, the first that answers
+    #[arg(long, value_name = "ENDPOINT", required = true, value_parser = endpoint)]
+    connect: Vec<Endpoint>,
+    /// Print JSON lines: one for each sensor, once a second if something of it is new
+    #[arg(long)]
+    json: bool,
+    /// End after S seconds. A table is then printed once, at the end [default: no limit]
+    #[arg(long, value_name = "S", value_parser = positive)]
+    seconds: Option<f64>,
+}
+
+/// Why it ended early.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// No router or peer answers.
+    #[error("no zenoh router or peer answers at {}: {reason}", listed(.connect))]
+    Unavailable {
+        /// As given.
+        connect: Vec<Endpoint>,
+        /// What the library says, on one line.
+        reason: String,
+    },
+    /// The system gave no thread.
+    #[error("no thread for zenoh: {0}")]
+    Thread(#[source] io::Error),
+    /// Stdout cannot be written to.
+    #[error("stdout: {0}")]
+    Print(#[source] io::Error),
+}
+
+fn listed(endpoints: &[Endpoint]) -> String {
+    let each: Vec<String> = endpoints.iter().cloned().map(String::from).collect();
+    each.join(", ")
+}
+
+/// How often what is new is printed.
+const TICK: Duration = Duration::from_secs(1);
+
+fn endpoint(text: &str) -> Result<Endpoint, String> {
+    Endpoint::try_from(text.to_owned()).map_err(|error| error.to_string())
+}
+
+/// Prints until `shutdown` comes, the time is over, or nobody reads stdout.
+///
+/// # Errors
+///
+/// [`Error`], if no router or peer answers, or stdout cannot be written to.
+pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
+    let mut shutdown = std::pin::pin!(shutdown);
+    let (sender, mut news) = mpsc::channel(WAITING);
+    let opened = tokio::select! {
+        opened = Session::open(&args.connect, sender) => opened.map_err(Error::Thread)?,
+        () = &mut shutdown => return Ok(()),
+    };
+    let session = opened.map_err(|reason| Error::Unavailable {
+        connect: args.connect.clone(),
+        reason,
+    })?;
+    let mut fleet = Fleet::default();
+    let mut tick = tokio::time::interval_at(Instant::now() + TICK, TICK);
+    tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let end = args
+        .seconds
+        .and_then(|s| Duration::try_from_secs_f64(s).ok());
+    let end = end.and_then(|end| Instant::now().checked_add(end));
+    let mut asked = jiff::Timestamp::now();
+    let mut dropped = 0;
+    // While a slow reader takes what is printed, news are still taken in.
+    let mut printing = std::pin::pin!(None);
+    let mut is_over = false;
+    loop {
+        tokio::select! {
+            () = &mut shutdown => return Ok(()),
+            printed = wait(printing.as_mut().as_pin_mut()) => {
+                printing.set(None);
+                let printed: io::Result<bool> = printed;
+                if !printed.map_err(Error::Print)? || is_over {
+                    return Ok(());
+                }
+                continue;
+            }
+            Some(news) = news.recv() => {
+                fleet.learn(news, jiff::Timestamp::now());
+                continue;
+            }
+            () = until(end), if printing.is_none() => is_over = true,
+            _ = tick.tick() => {}
+        }
+        let now = jiff::Timestamp::now();
+        fleet.settle(now);
+        if now.duration_since(asked) >= ASK {
+            asked = now;
+            let there = fleet.robots().filter(|(_, robot)| robot.is_there);
+            there.for_each(|(site, _)| session.ask(site));
+        }
+        if dropped != session.dropped() {
+            dropped = session.dropped();
+            eprintln!("hardnessd: {dropped} messages came too fast and were dropped");
+        }
+        // The rest is printed when the reader has taken this.
+        if printing.is_some() || !(args.json || is_over || end.is_none()) {
+            continue;
+        }
+        let text = match args.json {
+            true => view::lines(&mut fleet, now),
+            false if end.is_none() && io::stdout().is_terminal() => {
+                view::CLEAR.to_owned() + &view::table(&fleet, now)
+            }
+            false => view::table(&fleet, now),
+        };
+        printing.set(Some(super::print_apart(text.into_bytes())));
+    }
+}
+
+/// The output of what there is to wait for.
+async fn wait<T: Future>(one: Option<T>) -> T::Output {
+    match one {
+        Some(one) => one.await,
+        None => std::future::pending().await,
+    }
+}
+
+async fn until(moment: Option<Instant>) {
+    match moment {
+        Some(moment) => tokio::time::sleep_until(moment).await,
+        None => std::future::pending().await,
+    }
+}

@@ -1,0 +1,307 @@
+//! What is known of every robot.
+//!
+//! In: news, and the time. Out: robots, their sensors and what is new. It reads no clock. Strangers who reach
+//! the router can claim to be robots, so everything that is kept has a bound.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use jiff::{SignedDuration, Timestamp};
+use serde_json::Value;
+
+use super::numbers::Numbers;
+use super::session::{Heard, Hello, News, What};
+use crate::event::Kind;
+
+/// Robots beyond these are kept only in the place of one that is gone.
+const MOST_ROBOTS: usize = 4096;
+/// Sensors beyond these, of all robots together, are left out.
+const MOST_SENSORS: usize = 4096;
+/// Numbers that wait to know which run they are of.
+const MOST_WAITING: usize = 512;
+
+/// An event that was sent before a `hello` comes at most this long after it.
+const ON_ITS_WAY: SignedDuration = SignedDuration::from_secs(2);
+
+/// A robot is asked every [`ASK`]. One that has said nothing for so long does not answer.
+const SILENT: SignedDuration = SignedDuration::from_secs(25);
+
+/// How often each robot is asked what is true now.
+pub(super) const ASK: SignedDuration = SignedDuration::from_secs(10);
+
+/// Every robot that was heard of.
+#[derive(Debug, Default)]
+pub(super) struct Fleet {
+    robots: BTreeMap<String, Robot>,
+    sensors: usize,
+    /// Robots of which something is new: of these sensors, or of the robot itself.
+    new: BTreeMap<String, BTreeSet<String>>,
+    /// Robots and sensors that were left out.
+    left_out: u64,
+}
+
+/// A robot, by what came from it.
+#[derive(Debug, Default)]
+pub(super) struct Robot {
+    /// Whether its token is there.
+    pub(super) is_there: bool,
+    /// When its token went.
+    pub(super) gone: Option<Timestamp>,
+    /// What it last said of itself.
+    pub(super) hello: Option<Hello>,
+    pub(super) sensors: BTreeMap<String, Sensor>,
+    /// How many numbered events came.
+    pub(super) received: u64,
+    /// Events of earlier runs that did not come.
+    missed_before: u64,
+    /// How often its daemon was started anew.
+    pub(super) restarts: u64,
+    numbers: Option<Numbers>,
+    /// While it is not known which run the robot is in: the numbers that came.
+    waiting: Option<Vec<u64>>,
+    /// The number of the newest `hello`, and when it came.
+    claimed: Option<(Timestamp, u64)>,
+}
+
+/// A sensor, by its newest events.
+#[derive(Debug)]
+pub(super) struct Sensor {
+    /// When the last word of it came.
+    pub(super) heard: Timestamp,
+    /// JSON, empty before the first.
+    pub(super) status: String,
+    /// The last final verdict: JSON, empty before the first.
+    pub(super) verdict: String,
+    /// When that came.
+    pub(super) verdict_heard: Option<Timestamp>,
+}
+
+impl Fleet {
+    /// Takes in what is new of a robot.
+    pub(super) fn learn(&mut self, news: News, now: Timestamp) {
+        let News { site, what } = news;
+        if !self.robots.contains_key(&site) {
+            // An answer or an end makes nobody known.
+            if matches!(what, What::Gone | What::Asked) {
+                return;
+            }
+            if self.robots.len() == MOST_ROBOTS && !self.forget_one() {
+                self.left_out += 1;
+                return;
+            }
+        }
+        let robot = self.robots.entry(site.clone()).or_default();
+        let mut about = None;
+        match what {
+            What::Came => robot.come(),
+            What::Gone => (robot.is_there, robot.gone) = (false, Some(now)),
+            What::Hello(hello) => robot.meet(hello, now),
+            What::Asked if robot.waiting.is_some() => robot.settle_run(None),
+            // Whatever came with the answers was new by itself.
+            What::Asked => return,
+            What::Event(heard) => {
+                robot.count(&heard);
+                about = Some(heard.sensor.clone());
+                if !robot.sensors.contains_key(&heard.sensor) {
+                    if self.sensors == MOST_SENSORS {
+                        self.left_out += 1;
+                        return;
+                    }
+                    self.sensors += 1;
+                }
+                robot.hear(heard);
+            }
+        }
+        let new = self.new.entry(site).or_default();
+        match about {
+            Some(sensor) => drop(new.insert(sensor)),
+            None => new.extend(robot.sensors.keys().cloned()),
+        }
+    }
+
+    /// Makes room by the robot that is gone for longest.
+    fn forget_one(&mut self) -> bool {
+        let gone = self.robots.iter().filter(|(_, robot)| !robot.is_there);
+        let first = gone.min_by_key(|(_, robot)| robot.gone);
+        let Some(site) = first.map(|(site, _)| site.clone()) else {
+            return false;
+        };
+        let robot = self.robots.remove(&site);
+        self.sensors -= robot.map_or(0, |robot| robot.sensors.len());
+        self.new.remove(&site);
+        true
+    }
+
+    /// Counts as missed what was sent a while ago and did not come.
+    pub(super) fn settle(&mut self, now: Timestamp) {
+        for (site, robot) in &mut self.robots {
+            if robot.settle(now) {
+                let new = self.new.entry(site.clone()).or_default();
+                new.extend(robot.sensors.keys().cloned());
+            }
+        }
+    }
+
+    /// Every robot by name.
+    pub(super) fn robots(&self) -> impl Iterator<Item = (&String, &Robot)> {
+        self.robots.iter()
+    }
+
+    /// One of them.
+    pub(super) fn robot(&self, site: &str) -> Option<&Robot> {
+        self.robots.get(site)
+    }
+
+    /// The robots of which something is new since the last call, with those of their sensors.
+    pub(super) fn take_new(&mut self) -> BTreeMap<String, BTreeSet<String>> {
+        std::mem::take(&mut self.new)
+    }
+
+    /// Robots and sensors that were left out, because there were too many.
+    pub(super) fn left_out(&self) -> u64 {
+        self.left_out
+    }
+}
+
+impl Robot {
+    fn come(&mut self) {
+        (self.is_there, self.gone) = (true, None);
+        // Until its hello comes, it may be in another run.
+        self.waiting.get_or_insert_default();
+        self.claimed = None;
+    }
+
+    fn meet(&mut self, hello: Hello, now: Timestamp) {
+        let run = hello.run.clone();
+        let is_other = self.hello.as_ref().is_some_and(|known| known.run != run);
+        if is_other || self.waiting.is_some() {
+            self.settle_run(Some(is_other));
+        }
+        // The first one of a robot may be older than this subscription.
+        let is_known = self.hello.is_some();
+        if is_known && self.claimed.is_none() {
+            self.claimed = Some((now, hello.seq));
+        }
+        self.hello = Some(hello);
+    }
+
+    /// Counts the numbers that waited. Without a `hello`, they say by themselves whether they began anew.
+    fn settle_run(&mut self, is_other: Option<bool>) {
+        let waiting = self.waiting.take().unwrap_or_default();
+        let first = waiting.first().copied();
+        if let Some(numbers) = &self.numbers {
+            let began_anew = || first.is_some_and(|first| numbers.is_long_past(first));
+            if is_other.unwrap_or_else(began_anew) {
+                self.missed_before = self.missed();
+                self.restarts += 1;
+                self.numbers = Some(Numbers::after(0));
+                self.claimed = None;
+            }
+        }
+        for number in waiting {
+            self.receive(number);
+        }
+    }
+
+    fn receive(&mut self, number: u64) {
+        // The first number that comes: those before it were sent before anyone listened.
+        let begin = || Numbers::after(number.saturating_sub(1));
+        let numbers = self.numbers.get_or_insert_with(begin);
+        self.received += u64::from(numbers.come(number));
+    }
+
+    fn count(&mut self, heard: &Heard) {
+        let Some(number) = heard.seq else {
+            return;
+        };
+        // An answer repeats an event of any age. It is counted if the event itself did not come.
+        if heard.is_answer && self.numbers.is_none() {
+            return;
+        }
+        let numbers = self.numbers.as_ref();
+        let is_odd = numbers.is_some_and(|numbers| numbers.is_long_past(number));
+        if is_odd && !heard.is_answer {
+            self.waiting.get_or_insert_default();
+        }
+        match &mut self.waiting {
+            Some(waiting) if waiting.len() < MOST_WAITING => waiting.push(number),
+            Some(_) => {
+                self.settle_run(None);
+                self.receive(number);
+            }
+            None => self.receive(number),
+        }
+    }
+
+    fn hear(&mut self, heard: Heard) {
+        let sensor = self.sensors.entry(heard.sensor).or_insert_with(|| Sensor {
+            heard: heard.at,
+            status: String::new(),
+            verdict: String::new(),
+            verdict_heard: None,
+        });
+        sensor.heard = sensor.heard.max(heard.at);
+        match heard.kind {
+            Kind::Status => sensor.status = heard.text,
+            // What came by itself is never older than an answer.
+            Kind::Hardness if heard.is_final => {
+                if !heard.is_answer || is_newer(&heard.text, &sensor.verdict) {
+                    sensor.verdict = heard.text;
+                    sensor.verdict_heard = Some(heard.at);
+                }
+            }
+            Kind::Hardness | Kind::Press | Kind::Frame => {}
+        }
+    }
+
+    fn settle(&mut self, now: Timestamp) -> bool {
+        let Some((at, number)) = self.claimed else {
+            return false;
+        };
+        if now.duration_since(at) < ON_ITS_WAY || self.waiting.is_some() {
+            return false;
+        }
+        self.claimed = None;
+        let before = self.missed();
+        match &mut self.numbers {
+            Some(numbers) => numbers.reach(number),
+            // It sent nothing yet. From here on it counts.
+            None => self.numbers = Some(Numbers::after(number)),
+        }
+        self.missed() != before
+    }
+
+    /// Numbered events that it sent and that did not come.
+    pub(super) fn missed(&self) -> u64 {
+        let now = self.numbers.as_ref().map_or(0, Numbers::missed);
+        self.missed_before.saturating_add(now)
+    }
+
+    /// The state of a sensor. What is out of date is never shown as current.
+    pub(super) fn state(&self, sensor: &Sensor, now: Timestamp) -> String {
+        if self.gone.is_some() {
+            return "gone".to_owned();
+        }
+        if now.duration_since(sensor.heard) > SILENT {
+            return "no answer".to_owned();
+        }
+        let status = read(&sensor.status);
+        status["state"].as_str().unwrap_or("unknown").to_owned()
+    }
+}
+
+/// JSON that was read before; null for what is not there.
+pub(super) fn read(text: &str) -> Value {
+    serde_json::from_str(text).unwrap_or_default()
+}
+
+/// When the frame was, which a verdict is about.
+pub(super) fn time(verdict: &Value) -> Option<Timestamp> {
+    verdict["time"].as_str()?.parse().ok()
+}
+
+fn is_newer(text: &str, than: &str) -> bool {
+    match (time(&read(text)), time(&read(than))) {
+        (Some(new), Some(old)) => new > old,
+        (_, old) => old.is_none(),
+    }
+}
