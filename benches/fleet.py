@@ -180,7 +180,7 @@ def measure(router, fleet, workers, names):
         late_ms.append((heard - put).total_seconds() * 1e3)
     late_ms.sort()
     took_s = lasted_s + 14
-    print(f"{len(names)} robots, {len(names)} there, {lasted_s:.0f} s, load {os.getloadavg()[0]:.1f}")
+    print(f"{len(names)} robots, {lasted_s:.0f} s, load {os.getloadavg()[0]:.1f}")
     print(f"sent {sum(sent.values())}, received {received}, lost {sum(sent.values()) - received}, told as missed {missed}")
     quantile = lambda share: late_ms[min(len(late_ms) - 1, int(share * len(late_ms)))]  # noqa: E731
     print(

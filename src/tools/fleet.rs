@@ -17,7 +17,7 @@ use tokio::sync::mpsc;
 use tokio::time::{Instant, MissedTickBehavior};
 
 use self::robots::{ASK, Fleet};
-use self::session::{Session, WAITING};
+use self::session::{PATIENCE, Session, WAITING};
 use super::simulate::positive;
 use crate::daemon::config::Endpoint;
 
@@ -38,13 +38,15 @@ pub struct Args {
 /// Why it ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// No router or peer answers.
-    #[error("no zenoh router or peer answers at {}: {reason}", listed(.connect))]
+    /// No router or daemon answers.
+    #[error(
+        "{}: no zenoh router or daemon answered within {} s",
+        listed(.connect),
+        PATIENCE.as_secs()
+    )]
     Unavailable {
         /// As given.
         connect: Vec<Endpoint>,
-        /// What the library says, on one line.
-        reason: String,
     },
     /// The system gave no thread.
     #[error("no thread for zenoh: {0}")]
@@ -78,10 +80,10 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         opened = Session::open(&args.connect, sender) => opened.map_err(Error::Thread)?,
         () = &mut shutdown => return Ok(()),
     };
-    let session = opened.map_err(|reason| Error::Unavailable {
-        connect: args.connect.clone(),
-        reason,
-    })?;
+    let Some(session) = opened else {
+        let connect = args.connect;
+        return Err(Error::Unavailable { connect });
+    };
     let mut fleet = Fleet::default();
     let mut tick = tokio::time::interval_at(Instant::now() + TICK, TICK);
     tick.set_missed_tick_behavior(MissedTickBehavior::Delay);

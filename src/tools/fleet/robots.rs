@@ -95,8 +95,10 @@ impl Fleet {
             What::Came => robot.come(),
             What::Gone => (robot.is_there, robot.gone) = (false, Some(now)),
             What::Hello(hello) => robot.meet(hello, now),
-            What::Asked if robot.waiting.is_some() => robot.settle_run(None),
-            // Whatever came with the answers was new by itself.
+            // A robot that never says its run is not waited for. One that did is asked again.
+            What::Asked if robot.waiting.is_some() && robot.hello.is_none() => {
+                robot.settle_run(None);
+            }
             What::Asked => return,
             What::Event(heard) => {
                 robot.count(&heard);
@@ -239,18 +241,22 @@ impl Robot {
             verdict: String::new(),
             verdict_heard: None,
         });
-        sensor.heard = sensor.heard.max(heard.at);
+        // An event is never older than an answer. An answer may come from a storage, and repeat what was
+        // true long ago.
+        let is_older = |known: &str| heard.is_answer && is_older(&heard.text, known);
         match heard.kind {
+            Kind::Status if is_older(&sensor.status) => return,
             Kind::Status => sensor.status = heard.text,
-            // What came by itself is never older than an answer.
-            Kind::Hardness if heard.is_final => {
-                if !heard.is_answer || is_newer(&heard.text, &sensor.verdict) {
-                    sensor.verdict = heard.text;
+            Kind::Hardness if heard.is_final && !is_older(&sensor.verdict) => {
+                // The time at which a verdict first came stays.
+                if !heard.is_answer || heard.text != sensor.verdict {
                     sensor.verdict_heard = Some(heard.at);
                 }
+                sensor.verdict = heard.text;
             }
             Kind::Hardness | Kind::Press | Kind::Frame => {}
         }
+        sensor.heard = sensor.heard.max(heard.at);
     }
 
     fn settle(&mut self, now: Timestamp) -> bool {
@@ -294,14 +300,12 @@ pub(super) fn read(text: &str) -> Value {
     serde_json::from_str(text).unwrap_or_default()
 }
 
-/// When the frame was, which a verdict is about.
-pub(super) fn time(verdict: &Value) -> Option<Timestamp> {
-    verdict["time"].as_str()?.parse().ok()
+/// The time of an event.
+pub(super) fn time(event: &Value) -> Option<Timestamp> {
+    event["time"].as_str()?.parse().ok()
 }
 
-fn is_newer(text: &str, than: &str) -> bool {
-    match (time(&read(text)), time(&read(than))) {
-        (Some(new), Some(old)) => new > old,
-        (_, old) => old.is_none(),
-    }
+fn is_older(text: &str, than: &str) -> bool {
+    let known = time(&read(than));
+    known.is_some_and(|known| time(&read(text)).is_none_or(|time| time < known))
 }

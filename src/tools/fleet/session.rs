@@ -85,7 +85,7 @@ pub(super) const WAITING: usize = 4096;
 const QUESTIONS: usize = 4096;
 
 /// How long the router may take to answer at the beginning.
-const PATIENCE: Duration = Duration::from_secs(5);
+pub(super) const PATIENCE: Duration = Duration::from_secs(5);
 
 /// How long a robot may take to answer.
 const ANSWER: Duration = Duration::from_secs(10);
@@ -111,11 +111,11 @@ pub(super) struct Session {
 }
 
 impl Session {
-    /// Connects, and sends what is new to `news`. The inner error says why nobody answered.
+    /// Connects, and sends what is new to `news`. `None`: nobody answered within [`PATIENCE`].
     pub(super) async fn open(
         connect: &[Endpoint],
         news: mpsc::Sender<News>,
-    ) -> io::Result<Result<Self, String>> {
+    ) -> io::Result<Option<Self>> {
         let (questions, asked) = std_mpsc::sync_channel(QUESTIONS);
         let (opened, outcome) = oneshot::channel();
         let connect = connect.to_vec();
@@ -128,19 +128,18 @@ impl Session {
         let asks = session.questions.clone();
         thread::Builder::new()
             .name("zenoh".to_owned())
-            .spawn(move || match Open::open(&connect, &outlet, &asks) {
-                Ok(open) => {
-                    let _ = opened.send(Ok(()));
-                    open.ask(&outlet, &asked);
+            .spawn(move || match Link::open(&connect, &outlet, &asks) {
+                Ok(link) => {
+                    let _ = opened.send(true);
+                    link.ask(&outlet, &asked);
                 }
-                Err(error) => {
-                    let _ = opened.send(Err(one_line(&error)));
-                }
+                // The library's error is pages long. It says that it could not connect.
+                Err(_) => drop(opened.send(false)),
             })?;
         let outcome = outcome
             .await
             .expect("a thread that panics ends the process");
-        Ok(outcome.map(|()| session))
+        Ok(outcome.then_some(session))
     }
 
     /// Asks a robot for its `hello`, its statuses and its last verdicts.
@@ -171,13 +170,13 @@ impl Outlet {
 }
 
 /// What the library keeps open.
-struct Open {
+struct Link {
     session: zenoh::Session,
     _events: Vec<Subscriber<()>>,
     _tokens: Subscriber<()>,
 }
 
-impl Open {
+impl Link {
     fn open(
         connect: &[Endpoint],
         outlet: &Outlet,
@@ -323,13 +322,6 @@ fn hello<'a>(key: &'a str, bytes: &[u8]) -> Option<(&'a str, Hello)> {
     let words = [&hello.run, &hello.version, &hello.model.sha256];
     let are_short = words.iter().all(|word| word.len() <= LONGEST_WORD_BYTES);
     are_short.then_some((site, hello))
-}
-
-/// The library's errors are pages long and name places in its sources.
-fn one_line(error: &zenoh::Error) -> String {
-    let text = error.to_string();
-    let first = text.split(" at ").next().unwrap_or_default();
-    first.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
 #[cfg(test)]

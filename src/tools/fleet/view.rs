@@ -340,13 +340,32 @@ hall/3  palm    live   2 s    20.0      3        #7 fi\u{1b}r\u{202e}m 93 %  12 
         for seq in [3, 4] {
             learn(&mut fleet, event(&status(Some(seq)), 4), 4);
         }
-        learn(&mut fleet, hello("b", 4), 4);
+        // It did not answer in time. The next question is answered.
         learn(&mut fleet, What::Asked, 4);
+        learn(&mut fleet, hello("b", 4), 4);
         fleet.settle(at(7));
         let line = one_line(&mut fleet, 7);
         let counts = ["missed", "received", "restarts"].map(|key| line[key].as_u64().unwrap());
         assert_eq!(counts, [2, 5, 1]);
         assert!(table(&fleet, at(7)).contains("2, 1 restart"));
+    }
+
+    #[test]
+    fn an_answer_that_is_older_than_what_is_known_changes_nothing() {
+        let mut fleet = fleet();
+        let said = |state: &str, second: i64, seq: Option<u64>| {
+            json!({"type": "status", "sensor": "palm", "state": state, "seq": seq,
+                "time": at(second).to_string()})
+        };
+        learn(&mut fleet, event(&said("stale", 20, Some(9)), 20), 20);
+        learn(&mut fleet, event(&said("live", 10, None), 40), 40);
+        let line = one_line(&mut fleet, 40);
+        assert_eq!(
+            (&line["state"], &line["heard"]),
+            (&json!("stale"), &json!(at(20).to_string()))
+        );
+        learn(&mut fleet, event(&said("stale", 20, None), 41), 41);
+        assert_eq!(one_line(&mut fleet, 41)["heard"], at(41).to_string());
     }
 
     #[test]
