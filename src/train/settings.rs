@@ -11,8 +11,8 @@ pub mod consistency;
 pub mod gan;
 pub mod network;
 pub mod optimiser;
+pub mod reports;
 pub(in crate::train) mod retired;
-pub mod told;
 
 use crate::wording;
 
@@ -22,7 +22,7 @@ pub use consistency::ConsistencySettings;
 pub use gan::GanSettings;
 pub use network::NetworkSettings;
 pub use optimiser::OptimiserSettings;
-pub use told::Told;
+pub use reports::ArmReports;
 
 use bounds::{check, check_loop};
 
@@ -144,8 +144,10 @@ pub struct Settings {
     pub training: Training,
     /// Learning from unlabelled samples beside the labelled ones, without a GAN.
     pub consistency: ConsistencySettings,
-    /// Errors in a robot's reports about its arm, for networks of whole presses.
-    pub told: Told,
+    /// What a robot reports of its arm, and the errors in it, for networks of whole presses.
+    /// Older settings files call the table `told`.
+    #[serde(alias = "told")]
+    pub reports: ArmReports,
     /// The labelled objects that are held out.
     pub validation: Validation,
 }
@@ -166,7 +168,7 @@ impl Default for Settings {
             pretraining: Training::default(),
             training: Training::default(),
             consistency: ConsistencySettings::default(),
-            told: Told::default(),
+            reports: ArmReports::default(),
             validation: Validation::default(),
         }
     }
@@ -222,7 +224,11 @@ impl Settings {
         let syntax = |error| SettingsError::Syntax(wording::of_toml(text, &error));
         let _: Self = toml::from_str(text).map_err(syntax)?;
         let own = toml::Table::try_from(self).expect("settings are plain tables of numbers");
-        let given = toml::from_str(text).map_err(syntax)?;
+        let mut given: toml::Table = toml::from_str(text).map_err(syntax)?;
+        // These settings have the table under its present name.
+        if let Some(reports) = given.remove(reports::OLD_NAME) {
+            given.insert(reports::NAME.to_owned(), reports);
+        }
         let merged: Self = merged(own, given).try_into().map_err(syntax)?;
         merged.checked()
     }
@@ -244,7 +250,7 @@ impl Settings {
         self.pretraining.check("pretraining.")?;
         self.training.check("training.")?;
         self.consistency.check()?;
-        self.told.check()?;
+        self.reports.check()?;
         let Validation {
             share,
             every_epochs,
@@ -318,6 +324,27 @@ mod tests {
         expected.training.batch = 50;
         expected.training.optimiser.rule = optimiser::Rule::Adam;
         assert_eq!(settings, expected);
+    }
+
+    #[test]
+    fn an_older_file_names_the_reports_of_the_arm_told() {
+        let quick = Settings::of(Profile::Quick);
+        let text = "[told]\nunknown = 1.0\nclock_frames = 0.0";
+        let settings = quick.overridden(text).unwrap();
+        assert_eq!(
+            settings,
+            quick.overridden(&text.replace("told", "reports")).unwrap()
+        );
+        assert_eq!(settings.reports.unknown, 1.0);
+
+        let written = toml::to_string(&settings).unwrap();
+        assert!(written.contains("[reports]"), "{written}");
+        let older = written.replace("[reports]", "[told]");
+        assert_eq!(toml::from_str::<Settings>(&older).unwrap(), settings);
+
+        let both = "[told]\nexact = 0.0\n[reports]\nexact = 1.0";
+        let error = quick.overridden(both).unwrap_err().to_string();
+        assert!(error.contains("reports"), "{error}");
     }
 
     #[test]

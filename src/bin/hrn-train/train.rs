@@ -9,7 +9,7 @@ use hardnessd::train::data::courses::Courses;
 use hardnessd::train::data::dataset::{Dataset, DatasetError, LabelChoice};
 use hardnessd::train::methods::{self, Method, Request};
 use hardnessd::train::run::Run;
-use hardnessd::train::settings::{Profile, Settings, Told};
+use hardnessd::train::settings::{ArmReports, Profile, Settings};
 use hardnessd::verdict::{BUILT_IN, Hrn};
 
 use super::account;
@@ -73,7 +73,7 @@ fn train_course(arguments: &Train) -> anyhow::Result<String> {
         arguments.config.as_deref(),
     )?;
     if arguments.one_robot {
-        settings.told = Told::ONE_ROBOT;
+        settings.reports = ArmReports::ONE_ROBOT;
     }
     let (courses, sources) = Courses::read_all(&arguments.data)?;
     let told = (arguments.profile, arguments.seed, settings);

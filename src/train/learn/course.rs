@@ -21,7 +21,7 @@ use crate::train::net::standard::Standard;
 use crate::train::net::start::Start;
 use crate::train::run::Run;
 use crate::train::run::checkpoint::Origin;
-use crate::train::settings::{Told, Training};
+use crate::train::settings::{ArmReports, Training};
 use crate::verdict::argmax;
 
 mod varied;
@@ -123,7 +123,7 @@ pub struct Task<'a> {
     /// The number of hardness levels.
     pub levels: usize,
     /// The errors and gaps in the arm's reports that training presses are given.
-    pub told: Told,
+    pub reports: ArmReports,
     /// Settings of the training.
     pub settings: &'a Training,
     /// The seed of everything random.
@@ -229,7 +229,7 @@ impl Task<'_> {
     }
 
     fn origin(&self, initial: &Weights) -> String {
-        let mut origin = Origin::new(self.stage, &(self.settings, self.told), self.seed);
+        let mut origin = Origin::new(self.stage, &(self.settings, self.reports), self.seed);
         for &place in self.train.iter().chain(self.held_out) {
             let press = &self.presses[place];
             let known = press
@@ -262,7 +262,7 @@ impl Task<'_> {
         let inputs: Vec<_> = places
             .iter()
             .map(|&place| {
-                self.told
+                self.reports
                     .varied(&self.presses[place], &mut stream)
                     .inputs(standard)
             })
@@ -300,7 +300,7 @@ impl Task<'_> {
         let presses: Vec<Press> = self
             .held_out
             .iter()
-            .map(|&place| self.told.varied(&self.presses[place], &mut stream))
+            .map(|&place| self.reports.varied(&self.presses[place], &mut stream))
             .collect();
         let judged = trained.judge(&presses, self.levels, self.device);
         let judged: Vec<Judged> = presses

@@ -74,7 +74,7 @@ pub fn train(
         train: &train,
         held_out: &held_out,
         levels: dataset::levels().len(),
-        told: settings.told,
+        reports: settings.reports,
         settings: &settings.training,
         seed: *seed,
         device,

@@ -4,14 +4,14 @@
 use super::Press;
 use crate::random::Stream;
 use crate::train::net::frames::FEATURES;
-use crate::train::settings::Told;
+use crate::train::settings::ArmReports;
 
 /// The least number of frames of a press that is judged before its end or seen by a slower sensor.
 const LEAST_FRAMES: usize = 3;
 /// The slowest sensor sees one frame of this many.
 const MOST_FRAMES_A_STEP: usize = 8;
 
-impl Told {
+impl ArmReports {
     /// The press as a robot might report it.
     pub(super) fn varied(&self, press: &Press, stream: &mut Stream) -> Press {
         let mut press = press.clone();
@@ -42,17 +42,17 @@ impl Told {
         let late_frames = off(self.clock_frames);
         press.arm_n_per_mm *= arm as f32;
         let late_s = (late_frames * press.period_s()) as f32;
-        let told: Vec<(f32, f32)> = press
+        let reported: Vec<(f32, f32)> = press
             .moments
             .iter()
             .filter_map(|moment| Some((moment.time_s, moment.approach_mm?)))
             .collect();
-        let Some(begin) = told.first().map(|_| at(&told, late_s)) else {
+        let Some(begin) = reported.first().map(|_| at(&reported, late_s)) else {
             return press;
         };
         for moment in &mut press.moments {
             if moment.approach_mm.is_some() {
-                let late = at(&told, moment.time_s + late_s);
+                let late = at(&reported, moment.time_s + late_s);
                 moment.approach_mm = Some((late - begin) * position as f32);
             }
         }
@@ -96,20 +96,20 @@ impl Press {
     }
 }
 
-/// The approach at `time_s`, interpolated between the moments of `told`. Before the first moment it
+/// The approach at `time_s`, interpolated between the moments of `reported`. Before the first moment it
 /// is extrapolated; after the last it stays constant.
-fn at(told: &[(f32, f32)], time_s: f32) -> f32 {
-    let [_, .., last] = told else {
-        return told.first().map_or(0.0, |&(_, mm)| mm);
+fn at(reported: &[(f32, f32)], time_s: f32) -> f32 {
+    let [_, .., last] = reported else {
+        return reported.first().map_or(0.0, |&(_, mm)| mm);
     };
     if time_s >= last.0 {
         return last.1;
     }
     // Before the begin, the arm moved at the speed between the first two moments.
-    let next = told
+    let next = reported
         .partition_point(|&(moment_s, _)| moment_s <= time_s)
-        .clamp(1, told.len() - 1);
-    let (before, after) = (told[next - 1], told[next]);
+        .clamp(1, reported.len() - 1);
+    let (before, after) = (reported[next - 1], reported[next]);
     before.1 + (after.1 - before.1) * (time_s - before.0) / (after.0 - before.0)
 }
 
@@ -136,18 +136,18 @@ mod tests {
 
     #[test]
     fn errors_stay_within_what_was_asked_for() {
-        let told = Told {
+        let reports = ArmReports {
             unknown: 0.0,
             unknown_arm: 0.0,
             exact: 0.0,
             early: 0.0,
             slower: 0.0,
-            ..Told::default()
+            ..ArmReports::default()
         };
-        let mut stream = Stream::new(1, "told");
+        let mut stream = Stream::new(1, "reports");
         let mut moved = 0.0_f32;
         for _ in 0..200 {
-            let press = told.varied(&press(), &mut stream);
+            let press = reports.varied(&press(), &mut stream);
             assert!((7.0..=13.0).contains(&press.arm_n_per_mm));
             assert_eq!(press.moments[0].approach_mm, Some(0.0));
             let top = press.moments[9].approach_mm.unwrap();
@@ -160,18 +160,18 @@ mod tests {
 
     #[test]
     fn a_slower_sensor_sees_the_press_from_its_own_first_frame() {
-        let told = Told {
+        let reports = ArmReports {
             unknown: 0.0,
             unknown_arm: 0.0,
             exact: 1.0,
             early: 0.0,
             slower: 1.0,
-            ..Told::default()
+            ..ArmReports::default()
         };
-        let mut stream = Stream::new(3, "told");
+        let mut stream = Stream::new(3, "reports");
         let mut steps = std::collections::BTreeSet::new();
         for _ in 0..100 {
-            let slow = told.varied(&press(), &mut stream);
+            let slow = reports.varied(&press(), &mut stream);
             let step_s = slow.moments[1].time_s;
             steps.insert((10.0 * step_s).round() as u32);
             assert!((3..=5).contains(&slow.moments.len()), "{slow:?}");
@@ -188,9 +188,9 @@ mod tests {
 
     #[test]
     fn shares_are_kept_and_an_early_press_has_three_frames() {
-        let mut stream = Stream::new(2, "told");
+        let mut stream = Stream::new(2, "reports");
         let drawn: Vec<Press> = (0..1000)
-            .map(|_| Told::default().varied(&press(), &mut stream))
+            .map(|_| ArmReports::default().varied(&press(), &mut stream))
             .collect();
         let share = |is: fn(&Press) -> bool| drawn.iter().filter(|press| is(press)).count();
         assert!((240..360).contains(&share(|p| p.moments[0].approach_mm.is_none())));

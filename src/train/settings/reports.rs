@@ -4,11 +4,16 @@ use serde::{Deserialize, Serialize};
 
 use super::bounds::{SettingsError, check};
 
+/// The name of the table.
+pub(super) const NAME: &str = "reports";
+/// The name of the table in older settings files.
+pub(super) const OLD_NAME: &str = "told";
+
 /// Errors in the reports about the arm, and other changes to a press, drawn anew for each press. A
 /// network that has only learnt from correct reports trusts every report.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Told {
+pub struct ArmReports {
     /// Share of the presses for which nothing is known about the arm.
     pub unknown: f64,
     /// Share of the other presses for which the stiffness is unknown.
@@ -27,7 +32,7 @@ pub struct Told {
     pub slower: f64,
 }
 
-impl Default for Told {
+impl Default for ArmReports {
     fn default() -> Self {
         Self {
             unknown: 0.3,
@@ -42,7 +47,7 @@ impl Default for Told {
     }
 }
 
-impl Told {
+impl ArmReports {
     /// A robot that always moves alike and reports nothing. Time then takes the place of the
     /// approach.
     pub const ONE_ROBOT: Self = Self {
@@ -58,7 +63,7 @@ impl Told {
 
     /// Returns an error if a value lies outside its range.
     pub(super) fn check(&self) -> Result<(), SettingsError> {
-        let check = |key, found: f64, fits, expected| check("told.", key, found, fits, expected);
+        let check = |key, found: f64, fits, expected| check("reports.", key, found, fits, expected);
         let shares = [
             ("unknown", self.unknown),
             ("unknown_arm", self.unknown_arm),
