@@ -189,7 +189,7 @@ fn a_model_of_another_network_is_no_start() {
         (
             "models/course.onnx",
             78,
-            "goes on from models of frames (frame, adapt)",
+            "starts from models of frames (frame, adapt)",
         ),
         ("Cargo.toml", 78, "not an ONNX model"),
         ("missing.onnx", 66, "No such file"),

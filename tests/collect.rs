@@ -120,7 +120,7 @@ fn samples_are_the_frames_that_the_daemon_judges() {
     // That capture has no known material. A data set has materials for all samples or for none.
     let lost = ["--append", "--level", "4", text(&fixture)];
     let expected = format!(
-        "{}: material: found none, expected one, as in {}: --label material=... when recording",
+        "{}: has no material, and {} has: record with --label material=..., or",
         fixture.display(),
         out.display()
     );
@@ -129,7 +129,7 @@ fn samples_are_the_frames_that_the_daemon_judges() {
     assert_refused(
         &bench.path("new.npz"),
         &both_ways,
-        "foam.5hz.bin: material: found none",
+        "foam.5hz.bin: has no material",
     );
 
     // Appended to simulated samples, a material keeps its index, and a new material gets the next
@@ -390,19 +390,15 @@ fn nothing_of_a_data_set_is_lost_when_it_is_added_to() {
     };
     write(|sample| sample.object = None);
     let object = [&append[..], &["--object", "3"]].concat();
-    assert_refused(
-        &out,
-        &object,
-        "own.npz: object: found none, expected one, as in",
-    );
+    assert_refused(&out, &object, "own.npz: has no object, and ");
     write(|sample| sample.force_n = None);
-    assert_refused(&out, &object, "own.npz: force: found none");
+    assert_refused(&out, &object, "own.npz: has no force");
     write(|sample| sample.shore = Some(70.0));
-    assert_refused(&out, &object, "foam.5hz.bin: shore: found none");
+    assert_refused(&out, &object, "foam.5hz.bin: has no shore");
     // A test object cannot become a training object either, or the other way round.
     write(|sample| sample.split = Split::Test);
     let expected = format!(
-        "{fixture}: object 4294967295: found it for train, expected it for test, as in {}",
+        "{fixture}: object 4294967295 is in the train split here, and in the test split in {}",
         out.display()
     );
     assert_refused(&out, &[&append[..], &most[..2]].concat(), &expected);
@@ -426,7 +422,11 @@ fn what_cannot_be_collected_is_said_and_nothing_is_written() {
     let noise: PathBuf = bench.path("noise.mcap");
     std::fs::write(&noise, [7; 1000]).unwrap();
     for (arguments, code, part) in [
-        (&[fixture][..], 2, "level: found none, expected --level"),
+        (
+            &[fixture][..],
+            2,
+            "has no label `level`: give its level with --level",
+        ),
         (&["--level", "5", fixture], 2, "5"),
         (&["--level", "1", text(&none)], 66, "none.mcap"),
         (&["--level", "1", text(&empty)], 1, "no press"),

@@ -398,7 +398,7 @@ fn data_that_a_comparison_is_no_measure_of_is_warned_of() {
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(74), "{said}");
     for expected in [
-        "object 0: found it in both splits, expected it in one",
+        "object 0 is in both splits",
         "taxel pitch: found 2 mm, expected 3.5 mm, that of the simulated test objects",
     ] {
         let expected = format!("warning: {}: {expected}", path.display());
@@ -410,7 +410,7 @@ fn data_that_a_comparison_is_no_measure_of_is_warned_of() {
     let data = path.to_str().unwrap();
     let output = succeed(&["evaluate", "--model", model, "--data", data]);
     let said = String::from_utf8_lossy(&output.stderr);
-    assert!(said.contains("object 0: found it in both splits"), "{said}");
+    assert!(said.contains("object 0 is in both splits"), "{said}");
 }
 
 #[test]

@@ -237,7 +237,7 @@ fn what_does_not_go_together_is_wrong_usage() {
     assert_eq!(output.status.code(), Some(1));
     let errors = String::from_utf8(output.stderr).unwrap();
     assert!(
-        errors.contains("frames_mn") && errors.lines().count() == 1,
+        errors.contains("has single frames, not whole presses") && errors.lines().count() == 1,
         "{errors}"
     );
 }

@@ -767,7 +767,10 @@ fn presses_over_time_are_data_too() {
     }
     // This data set cannot be read as single frames.
     let error = Dataset::read(&path).unwrap_err().to_string();
-    assert!(error.contains("array `frames`: found none"), "{error}");
+    assert!(
+        error.contains("has whole presses, not single frames"),
+        "{error}"
+    );
 }
 
 #[test]
@@ -808,8 +811,7 @@ fn bad_input_has_its_exit_code_and_one_line() {
     let without_level_3 = path("without level 3.npz");
     let file = std::fs::File::create(&without_level_3).unwrap();
     dataset::write(file, &samples, &serde_json::json!({})).unwrap();
-    let empty_split =
-        format!("{untested}: test split: found no labelled sample, expected one or more");
+    let empty_split = format!("{untested}: no sample of the test split has a level: add some");
     let corrupt = path("corrupt");
     std::fs::create_dir(&corrupt).unwrap();
     std::fs::write(
@@ -897,7 +899,7 @@ fn bad_input_has_its_exit_code_and_one_line() {
         (
             train(&["--data", &data, "--device", "cuda"]),
             69,
-            "no CUDA device found, expected a build with --features cuda",
+            "this build has no CUDA: build with --features cuda",
         ),
         (lowest("nan"), 2, "expected newtons from 0.01 to 25"),
         (lowest("inf"), 2, "expected newtons from 0.01 to 25"),

@@ -387,8 +387,8 @@ pub fn check(method: Method, dataset: &Dataset, description: &Description) -> an
     );
     ensure!(
         !needs_unlabelled || !unlabelled(dataset, &labelled).is_empty(),
-        "no unlabelled training samples are left for {}: {} labels are used, found 0, expected 1 or \
-         more",
+        "no unlabelled training samples are left for {} beside its {} labelled ones: use fewer with \
+         --labels",
         method.name(),
         description.labels
     );
@@ -397,7 +397,8 @@ pub fn check(method: Method, dataset: &Dataset, description: &Description) -> an
         let of_level = |&index: &usize| dataset.samples[index].level == level.level;
         ensure!(
             !has_stgans || labelled.iter().any(of_level),
-            "no labelled training samples of level {} for its STGAN: found 0, expected 1 or more",
+            "no labelled training samples of level {} for its STGAN: label some, or choose a method \
+             without STGANs",
             level.level
         );
     }

@@ -89,7 +89,7 @@ impl Description {
             (Ok(found), Ok(expected)) => difference("", &found, &expected),
             _ => None,
         };
-        named.or_else(|| Some("found others, expected the same".to_owned()))
+        named.or_else(|| Some("a setting differs".to_owned()))
     }
 }
 
@@ -150,7 +150,8 @@ impl Run {
             Some(before) if resume => {
                 if let Some(difference) = description.difference(&before) {
                     bail!(
-                        "{}: this run was started with other settings or data; {difference}",
+                        "{}: this run was started with other settings or data; {difference}; give \
+                         --resume the same ones, or choose another --out",
                         run.path("settings.toml").display()
                     );
                 }
@@ -271,8 +272,8 @@ impl Run {
         ensure!(
             checkpoint.origin == origin,
             "{}: {stage}: the checkpoint is of other frames, settings or starting weights, or of \
-             another version of the program; found origin {:.12}, expected {origin:.12}; train \
-             into another directory",
+             another version of the program; found origin {:.12}, expected {origin:.12}; choose \
+             another --out",
             self.path("checkpoints").display(),
             checkpoint.origin
         );

@@ -46,10 +46,16 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
         write(&arguments.out, &bytes)?;
     }
     let out = arguments.out.display();
+    let collected = presses_of(presses);
     Ok(format!(
-        "{out}: {presses} presses collected, {all} in all; an object's further presses must go into \
+        "{out}: {collected} collected, {all} in all; an object's further presses must go into \
          this file, not another\n"
     ))
+}
+
+/// A number of presses as text.
+fn presses_of(count: usize) -> String {
+    format!("{count} press{}", if count == 1 { "" } else { "es" })
 }
 
 fn labelling(arguments: &Collect) -> Labelling {
@@ -77,7 +83,9 @@ fn collect_courses(arguments: &Collect, captures: &[Capture]) -> anyhow::Result<
     }
     let left_out = captures.iter().map(Capture::presses).sum::<usize>() - whole;
     if whole == 0 {
-        anyhow::bail!("found no press from its begin on, expected at least one: record longer");
+        anyhow::bail!(
+            "the recordings lack the begin of every press: start to record before you touch the sensor"
+        );
     }
     let bytes = collect::courses_to_bytes(captures, labelling(arguments), before)?;
     if is_added_to {
@@ -85,8 +93,9 @@ fn collect_courses(arguments: &Collect, captures: &[Capture]) -> anyhow::Result<
     } else {
         write(&arguments.out, &bytes)?;
     }
+    let collected = presses_of(whole);
     Ok(format!(
-        "{}: {whole} presses collected, {known} of them with the arm's approach, {left_out} left out \
+        "{}: {collected} collected, {known} of them with the arm's approach, {left_out} left out \
          because the recording lacks their begin, {} in all; an object's further presses must go into this \
          file, not another\n",
         arguments.out.display(),

@@ -27,24 +27,34 @@ pub(super) struct NoRun(pub(super) PathBuf, pub(super) &'static str);
 
 /// The command line asks for a CUDA device, and there is none.
 #[derive(Debug, thiserror::Error)]
-#[error(
-    "--device cuda: no CUDA device found, expected a build with --features cuda, a device and its \
-     driver"
+#[cfg_attr(
+    feature = "cuda",
+    error(
+        "--device cuda: no CUDA device found: check the device and its driver with nvidia-smi, or use \
+         --device cpu"
+    )
+)]
+#[cfg_attr(
+    not(feature = "cuda"),
+    error(
+        "--device cuda: this build has no CUDA: build with --features cuda, or use --device cpu"
+    )
 )]
 pub(super) struct NoCuda;
 
 /// Options that do not go together.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum WrongUsage {
-    #[error("--methods: found course, which judges presses, expected methods that judge a frame")]
+    #[error("--methods: course judges whole presses: compare its models with --course")]
     NotOfFrames,
     #[error("--data: found {0} files, expected 1 without --course")]
     ManyFiles(usize),
     #[error(
-        "--start: found none, expected a model of whole presses, such as models/course.onnx, for such data"
+        "--start is missing: the data has whole presses, and the built-in model judges single frames: \
+         name a model of whole presses, such as models/course.onnx"
     )]
     NoStart,
-    #[error("--one-robot: found another method, expected course")]
+    #[error("--one-robot: works with `--method course` only")]
     NotOneRobot,
 }
 

@@ -55,7 +55,7 @@ fn evaluate_courses(arguments: &Evaluate, hrn: &Hrn) -> anyhow::Result<String> {
     let verdicts = course::verdicts(hrn, &courses, arguments.split.into(), |course| course)?;
     anyhow::ensure!(
         !verdicts.is_empty(),
-        "{}: no labelled presses in this split: found 0, expected 1 or more",
+        "{}: no press of this split has a level: choose the other --split, or other data",
         arguments.data.display()
     );
     if let Some(path) = &arguments.verdicts {

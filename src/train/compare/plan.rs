@@ -262,8 +262,8 @@ impl PlannedRun {
         match self.difference()? {
             None => Ok(()),
             Some(difference) => bail!(
-                "{}: holds a run that was told otherwise; {difference}; compare into another \
-                 directory, or remove this one to have it run again",
+                "{}: has a run with other settings; {difference}; choose another --out, or remove \
+                 this directory to run it again",
                 self.directory.display()
             ),
         }

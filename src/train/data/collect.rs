@@ -66,7 +66,7 @@ pub enum CollectError {
         source: PlaybackError,
     },
     /// The level is neither given nor a label.
-    #[error("{path}: level: found none, expected --level, or a recording with the label level")]
+    #[error("{path}: the recording has no label `level`: give its level with --level")]
     NoLevel {
         /// The capture.
         path: PathBuf,
@@ -101,8 +101,8 @@ pub enum CollectError {
     /// An array has values for some samples only. The data set would lose it, because an array has
     /// a value for every sample or is missing.
     #[error(
-        "{path}: {array}: found none, expected one, as in {first}: {}it can be a data set of its \
-         own, and train takes several --data",
+        "{path}: has no {array}, and {first} has: {}make it a data set of its own (train takes \
+         several --data)",
         remedy(array)
     )]
     Lost {
@@ -115,8 +115,8 @@ pub enum CollectError {
     },
     /// The same object is in the training split and in the test split.
     #[error(
-        "{path}: object {object}: found it for {found}, expected it for {expected}, as in {first}: \
-         presses of one object are near-copies"
+        "{path}: object {object} is in the {found} split here, and in the {expected} split in \
+         {first}: give it the same --split, because presses of one object are near-copies"
     )]
     Splits {
         /// The capture.
@@ -149,7 +149,7 @@ fn said_too(key: &str) -> String {
 
 fn remedy(array: &str) -> String {
     match array {
-        "material" | "shore" => format!("--label {array}=... when recording says it, or "),
+        "material" | "shore" => format!("record with --label {array}=..., or "),
         _ => String::new(),
     }
 }
@@ -470,7 +470,7 @@ fn index_of(name: &str, materials: &mut Vec<String>) -> anyhow::Result<u8> {
         materials.push(name.to_owned());
     }
     u8::try_from(index).with_context(|| {
-        format!("label material: found {name:?} beside 256 others, expected no more than those")
+        format!("label material: {name:?} is one too many: a data set has at most 256 materials")
     })
 }
 

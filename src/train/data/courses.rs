@@ -142,7 +142,7 @@ impl Courses {
     /// Returns an error if the file cannot be read.
     pub fn is_at(path: &Path) -> Result<bool, DatasetError> {
         let bytes = file::read(path)?;
-        Ok(File::open(&bytes, path)?.has("frames_mn"))
+        Ok(File::open(&bytes, path)?.is_of_courses())
     }
 
     /// Reads several files as one, and gives the source of each. Objects of different files stay
@@ -194,6 +194,11 @@ impl Courses {
 
     fn parse(bytes: &[u8], path: &Path) -> Result<Self, DatasetError> {
         let mut file = File::open(bytes, path)?;
+        if file.is_of_frames() {
+            return Err(DatasetError::SingleFrames {
+                path: path.to_owned(),
+            });
+        }
         let frames_mn: Vec<u16> = file.required("frames_mn", &[ROWS, COLS], None)?;
         let rows = Some(frames_mn.len() / TAXELS);
         let press: Vec<u32> = file.required("press", &[], rows)?;

@@ -174,12 +174,30 @@ pub enum DatasetError {
         source: std::io::Error,
     },
     /// The file is not a zip archive of arrays.
-    #[error("{}: not an .npz file: {reason}", path.display())]
+    #[error("{}: not an .npz file, or a damaged one", path.display())]
     NotNpz {
         /// The file.
         path: PathBuf,
-        /// The reader's error.
-        reason: String,
+    },
+    /// The file has presses over time where single frames are needed.
+    #[error(
+        "{}: has whole presses, not single frames: make it without --sequences (`train --method \
+         course` takes whole presses)",
+        path.display()
+    )]
+    WholePresses {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file has single frames where presses over time are needed.
+    #[error(
+        "{}: has single frames, not whole presses: make it with `simulate --sequences` or \
+         `collect --sequences`",
+        path.display()
+    )]
+    SingleFrames {
+        /// The file.
+        path: PathBuf,
     },
     /// An array is missing, or has another type, shape or content than expected.
     #[error("{}: array `{array}`: found {found}, expected {expected}", path.display())]
@@ -194,7 +212,10 @@ pub enum DatasetError {
         expected: String,
     },
     /// The split has no labelled sample.
-    #[error("{paths}: {split} split: found no labelled sample, expected one or more")]
+    #[error(
+        "{paths}: no sample of the {split} split has a level: add some with `collect --append \
+         --split {split} --level L`"
+    )]
     EmptySplit {
         /// The file, or files.
         paths: String,
@@ -313,9 +334,8 @@ impl Dataset {
     pub fn warn_of_object_in_both_splits(&self) {
         if let Some(object) = self.object_in_both_splits() {
             eprintln!(
-                "warning: {}: object {object}: found it in both splits, expected it in one: its \
-                 presses are near-copies, and a test on them says too much of a model that learnt \
-                 from others",
+                "warning: {}: object {object} is in both splits: its presses are near-copies, so a test \
+                 on some of them overrates a model that learnt from the others",
                 self.path().display()
             );
         }

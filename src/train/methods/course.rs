@@ -34,7 +34,7 @@ pub fn description(
     let labels = courses.labelled(Split::Train).count();
     ensure!(
         labels > 0,
-        "{}: no labelled training presses: found 0, expected 1 or more",
+        "{}: no press of the train split has a level: collect some with `--sequences --level L`",
         sources.first().map_or("", |source| &source.name)
     );
     Ok(Description {

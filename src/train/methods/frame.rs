@@ -66,7 +66,7 @@ pub fn train(
 /// A model file that `adapt` cannot start from, because it holds another network.
 #[derive(Debug, thiserror::Error)]
 #[error(
-    "with such data adapt goes on from models of {from} with {expected} levels: this one is of {method}, with \
+    "with such data adapt starts from models of {from} with {expected} levels: this one is of {method}, with \
      {levels} levels"
 )]
 pub struct NoStart {

@@ -32,8 +32,9 @@ fn a_run_goes_on_with_its_data_under_another_name_and_with_no_other() {
     drop(open("a.npz", "12").unwrap());
     drop(open("b.npz", "12").unwrap());
     let error = open("a.npz", "34").unwrap_err().to_string();
-    let expected = "other settings or data; sha256 of the data: found 34, expected 12";
-    assert!(error.ends_with(expected), "{error}");
+    let expected =
+        "other settings or data; sha256 of the data: found 34, expected 12; give --resume";
+    assert!(error.contains(expected), "{error}");
 }
 
 #[test]

@@ -26,6 +26,11 @@ const FREE_BYTES: u64 = 16 << 20;
 /// Reads the samples in `bytes`, the content of the file `path`.
 pub(super) fn parse(bytes: &[u8], path: &Path, name: String) -> Result<Dataset, DatasetError> {
     let mut file = File::open(bytes, path)?;
+    if file.is_of_courses() {
+        return Err(DatasetError::WholePresses {
+            path: path.to_owned(),
+        });
+    }
     let frames: Vec<f32> = file.read("frames", &[ROWS, COLS], None)?.ok_or_else(|| {
         file.error(
             "frames",
@@ -228,9 +233,8 @@ impl<'a> File<'a> {
         bytes: &'a [u8],
         path: &'a Path,
     ) -> Result<Self, DatasetError> {
-        let zip = ZipArchive::new(Cursor::new(bytes)).map_err(|error| DatasetError::NotNpz {
+        let zip = ZipArchive::new(Cursor::new(bytes)).map_err(|_| DatasetError::NotNpz {
             path: path.to_owned(),
-            reason: error.to_string(),
         })?;
         Ok(Self { zip, path })
     }
@@ -281,11 +285,19 @@ impl<'a> File<'a> {
         }
     }
 
-    /// Whether the file has the array.
-    pub(in crate::train::data) fn has(&self, array: &str) -> bool {
-        self.zip
-            .file_names()
-            .any(|name| name.strip_suffix(".npy") == Some(array))
+    /// Whether the file has presses over time.
+    pub(in crate::train::data) fn is_of_courses(&self) -> bool {
+        self.has("frames_mn")
+    }
+
+    /// Whether the file has single frames.
+    pub(in crate::train::data) fn is_of_frames(&self) -> bool {
+        self.has("frames") && !self.is_of_courses()
+    }
+
+    fn has(&self, array: &str) -> bool {
+        let mut names = self.zip.file_names();
+        names.any(|name| name.strip_suffix(".npy").unwrap_or(name) == array)
     }
 
     /// Like [`File::read`], for an array that must not be missing.

@@ -71,7 +71,8 @@ fn optional_arrays_may_be_missing() {
     let error = read.labelled(Split::Test).unwrap_err().to_string();
     assert_eq!(
         error,
-        "D.npz: test split: found no labelled sample, expected one or more"
+        "D.npz: no sample of the test split has a level: add some with `collect --append --split \
+         test --level L`"
     );
 }
 
