@@ -276,7 +276,7 @@ fn a_finished_comparison_does_nothing_again() {
     let output = comparison.command_of("1").output().unwrap();
     let error = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{error}");
-    let said = "runs/features-2: not asked for, and left out of the tables; \
+    let said = "runs/features-2: not requested, and left out of the tables; \
                 `settings.full_scale_n`: found 9.0, expected 10.2";
     assert!(error.contains(said), "{error}");
     assert_eq!(comparison.json("results.json").len(), 4);

@@ -286,7 +286,7 @@ fn an_interrupted_run_resumes_to_the_same_weights_bit_for_bit() {
         assert_eq!(ended, code, "{name}");
         if code.is_some() {
             assert!(
-                said.starts_with("hrn-train: interrupted; to go on: "),
+                said.starts_with("hrn-train: interrupted; to continue: "),
                 "{said}"
             );
             assert!(said.ends_with(" --resume"), "{said}");

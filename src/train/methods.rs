@@ -51,8 +51,8 @@ pub enum Method {
     /// Control: hrn15 with the default model's recipe: Adam, averaged weights, symmetries and shifts, a
     /// logarithmic image, mean pooling beside max pooling.
     Hrn15Strong,
-    /// hrn15-strong that also learns from unlabelled samples: it must judge them alike whatever sensor
-    /// gave them (FixMatch with an averaged teacher).
+    /// hrn15-strong that also learns from unlabelled samples: it must judge them alike under changes
+    /// of the sensor (FixMatch with an averaged teacher).
     #[value(name = "fixmatch")]
     FixMatch,
     /// hrn15-strong twice: the second time also on the unlabelled samples that the first one was sure of.

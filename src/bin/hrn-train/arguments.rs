@@ -227,7 +227,8 @@ pub(super) struct Train {
     /// Which samples get their labels
     #[arg(long, default_value = "object")]
     pub(super) label_choice: LabelChoice,
-    /// With --method course: the model of a robot that always moves alike and tells nothing of its arm
+    /// With --method course: train for a robot that always moves in the same way and reports nothing of its
+    /// arm
     #[arg(long)]
     pub(super) one_robot: bool,
     /// Where to compute
@@ -275,7 +276,7 @@ pub(super) struct Compare {
     /// Methods to run [default: all]. The tables also contain what was finished in DIR before
     #[arg(long, value_name = "M", value_delimiter = ',', num_args = 1..)]
     pub(super) methods: Vec<Method>,
-    /// Also run every method with so many labels, for a curve of accuracy against labels
+    /// Also run every method with each of these numbers of labels, for a curve of accuracy against labels
     #[arg(long, value_name = "N", value_delimiter = ',', num_args = 1..)]
     pub(super) labels: Vec<usize>,
     /// Train with the seeds 1 to N
@@ -294,7 +295,7 @@ pub(super) struct Compare {
     #[arg(long)]
     pub(super) swaps: bool,
     /// Compare models of whole presses instead, with simpler controls that are fitted on --data. Nothing else is
-    /// trained. All data are of `simulate --sequences`
+    /// trained. All data must have whole presses (`simulate --sequences`)
     #[arg(long, requires = "test", requires = "model",
         conflicts_with_all = ["methods", "labels", "seeds", "profile", "plan", "jobs", "swaps"])]
     pub(super) course: bool,

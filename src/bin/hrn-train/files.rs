@@ -21,7 +21,7 @@ pub(super) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let is_replaced = path.is_file();
     write_whole(path, bytes)?;
     if is_replaced {
-        eprintln!("{}: replaced what stood there", path.display());
+        eprintln!("{}: replaced the earlier file", path.display());
     }
     Ok(())
 }

@@ -33,12 +33,12 @@ fn main() -> ExitCode {
         Ok(arguments) => arguments,
         Err(error) => return tools::usage("hrn-train", &error),
     };
-    let how_to_go_on = match arguments.command {
+    let how_to_continue = match arguments.command {
         Command::Train(_) | Command::Adapt(_) => Some(signals::resuming(std::env::args())),
         Command::Compare(_) => Some(signals::again(std::env::args())),
         _ => None,
     };
-    if let Err(error) = signals::end_at_signals(how_to_go_on) {
+    if let Err(error) = signals::end_at_signals(how_to_continue) {
         eprintln!("hrn-train: signals: {error}");
         return ExitCode::from(exit::IO);
     }

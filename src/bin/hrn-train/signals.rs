@@ -13,15 +13,15 @@ use signal_hook::iterator::Signals;
 /// # Errors
 ///
 /// Fails if the system refuses a handler.
-pub(super) fn end_at_signals(how_to_go_on: Option<String>) -> std::io::Result<()> {
+pub(super) fn end_at_signals(how_to_continue: Option<String>) -> std::io::Result<()> {
     // At the limit of a file's size, the write fails as on a full disk, and SIGXFSZ does not end
     // the process.
     signal_hook::flag::register(SIGXFSZ, Arc::default())?;
     let mut signals = Signals::new([SIGINT, SIGTERM])?;
     std::thread::spawn(move || {
         if let Some(signal) = signals.forever().next() {
-            let hint =
-                how_to_go_on.map_or_else(String::new, |command| format!("; to go on: {command}"));
+            let hint = how_to_continue
+                .map_or_else(String::new, |command| format!("; to continue: {command}"));
             eprintln!("hrn-train: interrupted{hint}");
             std::process::exit(128 + signal);
         }
@@ -58,7 +58,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_command_to_go_on_is_one_that_a_shell_takes() {
+    fn the_command_to_continue_is_one_that_a_shell_takes() {
         let words = |words: &[&str]| {
             let words: Vec<String> = words.iter().map(|&word| word.to_owned()).collect();
             words.into_iter()

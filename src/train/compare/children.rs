@@ -157,7 +157,7 @@ fn start(job: Job, board: &Board) -> anyhow::Result<Running> {
 /// The reason a run ended without its product.
 fn last_words(status: ExitStatus, log: &Path) -> String {
     if matches!(status.code(), Some(0 | 130 | 143)) {
-        return "it was stopped; the same command goes on with it".to_owned();
+        return "it was stopped; the same command continues it".to_owned();
     }
     let line = last_line(log);
     if line.is_empty() {

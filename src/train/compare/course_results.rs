@@ -78,8 +78,8 @@ pub(super) fn tables(rows: &[CourseRow]) -> Vec<Table> {
             },
         ),
         of(
-            "Beside the first model",
-            "Points of accuracy more than the first model on the same presses, with a 95 % interval by object.",
+            "Compared with the first model",
+            "Accuracy minus that of the first model on the same presses, in points, with a 95 % interval by object.",
             &|on| {
                 on.less_first.map_or("-".to_owned(), |difference| {
                     tables::difference_text(metrics::Estimate {

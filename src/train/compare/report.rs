@@ -79,13 +79,13 @@ pub fn comparison(comparison: &Comparison) -> anyhow::Result<String> {
     page.section("steps", "Accuracy against steps");
     page.figure(
         &figures::price(&rows, MATCHED),
-        "What every method reached on fresh objects of matched shapes, for the steps of all its \
+        "Accuracy of every method on fresh objects of matched shapes, against the steps of all its \
          stages.",
     );
     page.note(
-        "In training, each seed a line: the share of the samples learnt from that were judged \
-         rightly (blue), and of held-out objects where there are some (orange). Dashed lines part \
-         the stages. Methods that keep no such share are left out. The dot is what was reached on \
+        "In training, a line for each seed: the share of the training samples that were judged \
+         correctly (blue), and of held-out objects if there are some (orange). Dashed lines separate \
+         the stages. Methods that do not measure this share are left out. The dot is the accuracy on \
          fresh objects of matched shapes.",
     );
     page.panels(
@@ -101,7 +101,7 @@ pub fn comparison(comparison: &Comparison) -> anyhow::Result<String> {
     page.table(&tables::calibration(&rows));
     page.note(
         "Share of right answers against stated confidence, fresh objects of matched shapes, all \
-         seeds. Below the diagonal a model is surer than it should be.",
+         seeds. Below the diagonal a model is too sure.",
     );
     page.panels(reliabilities(&rows));
     page.subtitle("Another sensor");
@@ -148,7 +148,7 @@ pub fn run(details: &Details) -> anyhow::Result<String> {
     page.section("steps", "Training");
     page.table(&tables::stages(&details.history));
     page.note(
-        "Blue: loss and accuracy on what is learnt from (of a GAN, the discriminator's loss). \
+        "Blue: loss and accuracy on the training samples (of a GAN, the discriminator's loss). \
          Orange: on held-out objects, the generator's loss, or within a component. Dashed: real \
          frames.",
     );
@@ -164,7 +164,7 @@ pub fn run(details: &Details) -> anyhow::Result<String> {
     page.section("samples", "Frames");
     let pictures = pictures(&details.directory);
     if pictures.is_empty() {
-        page.note("This run has drawn none.");
+        page.note("This run has no pictures.");
     }
     for picture in pictures {
         page.picture(&picture)?;
@@ -240,7 +240,7 @@ fn samples(page: &mut Page, rows: &[Row]) -> anyhow::Result<()> {
         page.body += "</details>\n";
     }
     if none {
-        page.note("None of these runs has drawn any.");
+        page.note("None of these runs has pictures.");
     }
     Ok(())
 }

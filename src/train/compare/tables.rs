@@ -124,8 +124,8 @@ pub fn provenance(comparison: &Comparison) -> String {
     }
     lines.push(
         "Simulated data, unless you gave your own. Intervals are 95 %, by a bootstrap over objects \
-         within each level and, where there are several, over seeds: those of one seed do not hold \
-         what another seed, or another rounding, gives. ± is the standard deviation over seeds."
+         within each level and, where there are several, over seeds: those of one seed do not cover \
+         how much another seed, or another rounding, changes. ± is the standard deviation over seeds."
             .to_owned(),
     );
     lines.join("\n")
@@ -152,9 +152,9 @@ fn all(comparison: &Comparison) -> Vec<Table> {
 /// The summary table.
 pub fn headline(rows: &[Row]) -> Table {
     let note = "20 fresh objects of each test material, shapes alike for all materials, so that \
-                shape says nothing of hardness. \"less ours\": difference of accuracies on the same \
+                the shape does not show the hardness. \"less ours\": difference of accuracies on the same \
                 frames under the same seeds, in points. Seconds are those of one thread; stages \
-                that a method shares with another are in the price of both.";
+                that a method shares with another are counted for both.";
     let head = [
         "method",
         "labels",
@@ -165,7 +165,7 @@ pub fn headline(rows: &[Row]) -> Table {
         "steps",
         "seconds",
     ];
-    let mut table = Table::new("The whole of it", note, &head);
+    let mut table = Table::new("Summary", note, &head);
     for row in rows {
         table.rows.push(vec![
             row.title.clone(),
@@ -273,7 +273,7 @@ pub fn table_3(rows: &[Row]) -> Table {
 /// Table 3's confusion matrices as counts, with the paper's to the right.
 fn confusions(rows: &[Row]) -> Table {
     let note = "Samples of the test split, mean over seeds; the paper's are of 250 a level. Rows \
-                are the truth, columns what was said.";
+                are the truth, columns are the verdicts.";
     let head = [
         "method", "truth", "1", "2", "3", "4", "paper: 1", "2", "3", "4",
     ];
@@ -349,8 +349,8 @@ pub fn shifts(rows: &[Row]) -> Table {
 pub fn worlds(rows: &[Row]) -> Table {
     let note = format!(
         "Fresh objects of other shapes and materials: accuracy in per cent and expected calibration \
-         error. One frame fixes only the ratio of radius and modulus, so shapes that vary cost every \
-         method much. {}.",
+         error. One frame fixes only the ratio of radius and modulus, so varying shapes lower the accuracy \
+         of every method. {}.",
         described(&WORLDS)
     );
     let title = "Other shapes and materials";
@@ -488,8 +488,8 @@ pub fn evaluation(evaluation: &Evaluation) -> Table {
 /// The table of runs with swapped materials.
 pub fn swaps(swaps: &[SwapEntry]) -> Table {
     let note = "The two materials of some levels in each other's roles, each time learnt anew and \
-                judged on 20 objects a material of the paper's shapes: accuracy in per cent over the \
-                assignments. Its spread is what the choice of materials alone does. \"Less \
+                judged on 20 objects of each material, in the paper's shapes: accuracy in per cent over \
+                the assignments. The choice of materials alone causes its spread. \"Less \
                 features\": over the same assignments and labels, in points, least to most.";
     let head = [
         "method",

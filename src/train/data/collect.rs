@@ -142,7 +142,7 @@ pub enum CollectError {
 
 fn said_too(key: &str) -> String {
     match key {
-        "level" | "object" => format!(": --{key} says it, too"),
+        "level" | "object" => format!(": --{key} gives another one"),
         _ => String::new(),
     }
 }

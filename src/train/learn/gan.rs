@@ -303,7 +303,7 @@ impl Task<'_> {
             let mut parts = order.chunks(self.settings.batch);
             let indices = parts
                 .nth((step % batches) as usize)
-                .expect("so many there are");
+                .expect("the step modulo the batches is one of them");
             let levels_of = indices
                 .iter()
                 .map(|&index| self.dataset.samples[index].level);

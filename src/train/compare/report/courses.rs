@@ -29,8 +29,8 @@ pub fn courses(rows: &[CourseRow], first: &str, curves: &Option<(&str, Vec<Curve
     if let Some((set, curves)) = curves {
         page.section("curves", "Force against approach");
         page.note(&format!(
-            "Presses of {set}, one an object. The approach is what the robot says of its arm, so it \
-             holds what object, cover and arm gave way. A harder object rises more steeply, but so \
+            "Presses of {set}, one an object. The approach is what the robot reports of its arm, so it \
+             includes how far object, cover and arm gave way. A harder object rises more steeply, but so \
              does a blunter one or a stiffer arm."
         ));
         page.panels(force_against_approach(curves));
