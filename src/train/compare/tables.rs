@@ -13,8 +13,8 @@ use crate::train::compare::sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS, WORLDS};
 use crate::train::judge::metrics::{self, Evaluation};
 use crate::train::run::history::{History, Stage};
 use cells::{
-    before_temperature, beside, deviation, interval, least, less_features, less_reference,
-    mean_over_seeds, most, of_entries, percent_of, with_spread,
+    before_temperature, beside, deviation, interval, least, mean_over_seeds, minus_features,
+    minus_reference, most, of_entries, percent_of, with_spread,
 };
 
 pub use cells::{
@@ -152,15 +152,15 @@ fn all(comparison: &Comparison) -> Vec<Table> {
 /// The summary table.
 pub fn headline(rows: &[Row]) -> Table {
     let note = "20 fresh objects of each test material, shapes alike for all materials, so that \
-                the shape does not show the hardness. \"less ours\": difference of accuracies on the same \
-                frames under the same seeds, in points. Seconds are those of one thread; stages \
+                the shape does not show the hardness. \"Minus ours\": difference of accuracies on the \
+                same frames under the same seeds. Seconds are those of one thread; stages \
                 that a method shares with another are counted for both.";
     let head = [
         "method",
         "labels",
         "accuracy, %",
         "95 %",
-        "less ours",
+        "minus ours, points",
         "kappa, quadratic",
         "steps",
         "seconds",
@@ -172,7 +172,7 @@ pub fn headline(rows: &[Row]) -> Table {
             thousands(row.runs[0].0.labels as u64),
             with_spread(row, MATCHED, |e| Some(100.0 * e.accuracy), 1),
             interval(row, MATCHED),
-            less_reference(row, rows, MATCHED),
+            minus_reference(row, rows, MATCHED),
             with_spread(row, MATCHED, |e| e.kappa_quadratic, 3),
             thousands(mean(&of_entries(row, |entry| entry.steps as f64)).round() as u64),
             thousands(mean(&of_entries(row, |entry| entry.seconds)).round() as u64),
@@ -189,7 +189,7 @@ const ACCURACIES: [&str; 7] = [
     "level 4",
     "overall",
     "95 %",
-    "less ours",
+    "minus ours, points",
 ];
 
 /// Table 2, with the paper's figures in brackets.
@@ -209,7 +209,7 @@ pub fn table_2(rows: &[Row]) -> Table {
         let here = with_spread(row, PAPER_SPLIT, |e| Some(100.0 * e.accuracy), 1);
         cells.push(beside(here, paper.map(|paper| paper.accuracy_percent), 1));
         cells.push(interval(row, PAPER_SPLIT));
-        cells.push(less_reference(row, rows, PAPER_SPLIT));
+        cells.push(minus_reference(row, rows, PAPER_SPLIT));
         table.rows.push(cells);
     }
     table
@@ -225,7 +225,7 @@ pub fn fresh(rows: &[Row]) -> [Table; 2] {
 }
 
 fn accuracies(rows: &[Row], set: &str, title: &str) -> Table {
-    let note = "Accuracy in per cent on 20 objects of each test material; \"less ours\" in points.";
+    let note = "Accuracy in per cent on 20 objects of each test material.";
     let head = [&["method"], &ACCURACIES[..]].concat();
     let mut table = Table::new(title, note, &head);
     for row in rows {
@@ -233,7 +233,7 @@ fn accuracies(rows: &[Row], set: &str, title: &str) -> Table {
         cells.extend((0..4).map(|level| mean_over_seeds(row, set, |e| percent_of(e, level), 1)));
         cells.push(with_spread(row, set, |e| Some(100.0 * e.accuracy), 1));
         cells.push(interval(row, set));
-        cells.push(less_reference(row, rows, set));
+        cells.push(minus_reference(row, rows, set));
         table.rows.push(cells);
     }
     table
@@ -489,8 +489,8 @@ pub fn evaluation(evaluation: &Evaluation) -> Table {
 pub fn swaps(swaps: &[SwapEntry]) -> Table {
     let note = "The two materials of some levels in each other's roles, each time learnt anew and \
                 judged on 20 objects of each material, in the paper's shapes: accuracy in per cent over \
-                the assignments. The choice of materials alone causes its spread. \"Less \
-                features\": over the same assignments and labels, in points, least to most.";
+                the assignments. The choice of materials alone causes its spread. \"Minus \
+                features\": over the same assignments and labels, least to most.";
     let head = [
         "method",
         "labels",
@@ -500,7 +500,7 @@ pub fn swaps(swaps: &[SwapEntry]) -> Table {
         "deviation",
         "least",
         "most",
-        "less features",
+        "minus features, points",
     ];
     let mut table = Table::new("Materials swapped", note, &head);
     for group in swap_groups(swaps) {
@@ -518,7 +518,7 @@ pub fn swaps(swaps: &[SwapEntry]) -> Table {
             deviation(&percents).map_or("-".to_owned(), |sd| number(sd, 1)),
             number(least(&percents), 1),
             number(most(&percents), 1),
-            less_features(&group, swaps),
+            minus_features(&group, swaps),
         ]);
     }
     table

@@ -83,7 +83,7 @@ pub fn interval_text(interval: Option<[f64; 2]>) -> String {
 }
 
 /// The difference from the reference's accuracy, paired with its runs of the same seeds.
-pub(super) fn less_reference(row: &Row, rows: &[Row], set: &str) -> String {
+pub(super) fn minus_reference(row: &Row, rows: &[Row], set: &str) -> String {
     let Some(reference) = rows.iter().find(|row| row.title == REFERENCE) else {
         return "-".to_owned();
     };
@@ -101,7 +101,7 @@ pub(super) fn less_reference(row: &Row, rows: &[Row], set: &str) -> String {
 
 /// A method's accuracy minus that of `features` over the assignments, seeds and labels that both
 /// have: mean, least and most, in points.
-pub(super) fn less_features(group: &[&SwapEntry], swaps: &[SwapEntry]) -> String {
+pub(super) fn minus_features(group: &[&SwapEntry], swaps: &[SwapEntry]) -> String {
     if group[0].method == FEATURES {
         return String::new();
     }
