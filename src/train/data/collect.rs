@@ -21,8 +21,6 @@ use crate::train::data::dataset::{self, Dataset, DatasetError, Sample};
 
 use self::selection::Judged;
 
-/// The generator that a data set made here names.
-const COLLECTED: &str = concat!("hrn-train collect ", env!("CARGO_PKG_VERSION"));
 /// The generator of a data set that names none.
 const UNKNOWN: &str = "unknown";
 
@@ -289,10 +287,11 @@ impl Collection {
         let last = samples.iter().filter_map(|sample| sample.object).max();
         // Keep the names of all generators, because they tell whether a model's data is simulated,
         // recorded or both.
+        let collected = format!("{} {}", dataset::COLLECTOR, env!("CARGO_PKG_VERSION"));
         let others = others
             .split(", ")
-            .filter(|one| !["", COLLECTED].contains(one));
-        let generators: Vec<&str> = others.chain([COLLECTED]).collect();
+            .filter(|one| !["", &collected].contains(one));
+        let generators: Vec<&str> = others.chain([&*collected]).collect();
         meta["generator"] = json!(generators.join(", "));
         meta["levels"] = json!(dataset::levels());
         meta["pitch_mm"] = json!(pitch_mm);

@@ -8,12 +8,11 @@ use tract_onnx::pb;
 
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::press;
+use crate::train::net::frames::AREA_THRESHOLDS_N;
 use crate::train::net::graph::{self, Graph};
 
 /// The number of features of a frame.
 pub const FEATURES: usize = 18;
-/// Thresholds, beside the contact threshold, above which taxels are counted, in newtons.
-const AREA_THRESHOLDS_N: [f32; 4] = [0.2, 0.5, 1.0, 2.0];
 /// Keeps logarithms and quotients of an empty frame finite; far below one count of 0.04 N.
 const TINY: f32 = 1e-4;
 

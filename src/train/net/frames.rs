@@ -16,7 +16,7 @@ const FRAMES_AT_ONCE: usize = 48;
 /// The number of features of a frame.
 pub const FEATURES: usize = 13;
 /// Thresholds, beside the contact threshold, above which taxels are counted, in newtons.
-const AREA_THRESHOLDS_N: [f32; 4] = [0.2, 0.5, 1.0, 2.0];
+pub const AREA_THRESHOLDS_N: [f32; 4] = [0.2, 0.5, 1.0, 2.0];
 /// Added to keep logarithms and quotients of an empty frame finite: to newtons, to squared taxels,
 /// to taxels, and to a divisor.
 const LITTLE_N: f32 = 0.05;
