@@ -3,6 +3,7 @@
 pub mod course;
 pub mod features;
 pub mod frame;
+mod settings;
 
 use std::collections::BTreeSet;
 
@@ -15,12 +16,7 @@ use crate::train::judge::metrics::Evaluation;
 use crate::train::net::generator::COMPONENTS;
 use crate::train::net::losses::Game;
 use crate::train::run::{Description, Run};
-use crate::train::settings::network::Pooling;
-use crate::train::settings::optimiser::{Rule, Schedule};
-use crate::train::settings::{
-    AugmentationSettings, Keep, NetworkSettings, OptimiserSettings, Profile, Settings,
-    SettingsError, Training, Validation,
-};
+use crate::train::settings::{Keep, Profile, Settings, SettingsError, Training, Validation};
 use crate::train::stages::Stages;
 
 /// A row of the table.
@@ -62,7 +58,7 @@ pub enum Method {
     /// Judges a frame and gives its Shore hardness: convolutions beside hand-made features, on all labels.
     /// The default model is of this method.
     Frame,
-    /// `hrn-train adapt`: goes on from a model of `frame`.
+    /// `hrn-train adapt`: continues a model of `frame`.
     #[value(skip)]
     Adapt,
     /// Judges the course of a press with the arm's motion, and gives its Shore hardness: a temporal
@@ -77,18 +73,6 @@ fn strong_steps(profile: Profile) -> u64 {
         Profile::Paper => 4_800,
         Profile::Quick => 1_200,
         Profile::Smoke => 6,
-    }
-}
-
-/// Adam with weight decay, whose rate falls from `learning_rate` to 0 along a cosine. For the
-/// networks that are not the paper's.
-fn adam(others: OptimiserSettings, learning_rate: f64) -> OptimiserSettings {
-    OptimiserSettings {
-        rule: Rule::Adam,
-        learning_rate,
-        schedule: Schedule::Cosine,
-        weight_decay: 1e-2,
-        ..others
     }
 }
 
@@ -132,112 +116,15 @@ impl Method {
 
     /// The method's settings, before a settings file or an option overrides them.
     pub fn settings(self, profile: Profile) -> Settings {
-        let mut settings = Settings::of(profile);
         match self {
-            // The rate is Salimans's. The average covers about a tenth of the steps.
-            Self::Igan => {
-                settings.ustgan.optimiser.learning_rate = 3e-3;
-                settings.ustgan.averaging = match profile {
-                    Profile::Paper => 0.9999,
-                    Profile::Quick => 0.999,
-                    Profile::Smoke => 0.9,
-                };
-            }
-            Self::Hrn15Tuned => {
-                settings.training = Training {
-                    epochs: 5 * settings.training.epochs,
-                    optimiser: OptimiserSettings {
-                        rule: Rule::Adam,
-                        ..settings.training.optimiser
-                    },
-                    ..settings.training
-                };
-                // This holds out two of a level's eight objects.
-                settings.validation = Validation {
-                    share: 0.25,
-                    every_epochs: 1,
-                    keep: Keep::Best,
-                };
-            }
-            Self::Frame => {
-                settings.training = Training {
-                    epochs: match profile {
-                        Profile::Paper => 60,
-                        Profile::Quick => 20,
-                        Profile::Smoke => 1,
-                    },
-                    averaging: match profile {
-                        Profile::Smoke => 0.0,
-                        Profile::Paper | Profile::Quick => 0.998,
-                    },
-                    optimiser: adam(settings.training.optimiser, 2e-3),
-                    augmentation: AugmentationSettings {
-                        symmetries: true,
-                        shift_taxels: 3,
-                        other_sensors: false,
-                    },
-                    ..settings.training
-                };
-                settings.validation.share = 0.15;
-            }
-            Self::Adapt => {
-                settings.training = Training {
-                    batch: 50,
-                    epochs: 60,
-                    averaging: 0.99,
-                    checkpoint_every_epochs: 10,
-                    optimiser: adam(settings.training.optimiser, 5e-4),
-                    augmentation: AugmentationSettings {
-                        symmetries: true,
-                        shift_taxels: 3,
-                        other_sensors: false,
-                    },
-                };
-                settings.consistency.ratio = 1;
-            }
-            Self::Course => {
-                settings.training = Training {
-                    batch: 128,
-                    epochs: match profile {
-                        Profile::Paper => 150,
-                        Profile::Quick => 60,
-                        Profile::Smoke => 1,
-                    },
-                    averaging: match profile {
-                        Profile::Smoke => 0.0,
-                        Profile::Paper | Profile::Quick => 0.998,
-                    },
-                    checkpoint_every_epochs: 10,
-                    optimiser: adam(settings.training.optimiser, 2e-3),
-                    ..settings.training
-                };
-                settings.validation.share = 0.15;
-            }
-            _ if self.is_strong() => {
-                settings.network = NetworkSettings {
-                    pooling: Pooling::MaxMean,
-                    log_above_n: 0.1,
-                };
-                settings.training = Training {
-                    averaging: 0.998,
-                    checkpoint_every_epochs: 50,
-                    optimiser: OptimiserSettings {
-                        rule: Rule::Adam,
-                        learning_rate: 2e-3,
-                        schedule: Schedule::Cosine,
-                        ..settings.training.optimiser
-                    },
-                    augmentation: AugmentationSettings {
-                        symmetries: true,
-                        shift_taxels: 3,
-                        other_sensors: false,
-                    },
-                    ..settings.training
-                };
-            }
-            _ => {}
+            Self::Igan => settings::igan(profile),
+            Self::Hrn15Tuned => settings::hrn15_tuned(profile),
+            Self::Frame => settings::frame(profile),
+            Self::Adapt => settings::adapt(profile),
+            Self::Course => settings::course(profile),
+            _ if self.is_strong() => settings::strong(profile),
+            _ => Settings::of(profile),
         }
-        settings
     }
 
     /// The number of labels that the method uses of `labelled` samples by default.
