@@ -122,7 +122,7 @@ pub(super) fn of_evaluation(evaluation: &Evaluation) -> String {
          accuracy           {:.1} % ({interval})\n\
          kappa              {}\n\
          kappa, quadratic   {}\n\
-         calibration error  {:.4}\n\
+         calibration error  {:.1} %\n\
          negative log-likelihood  {} nats a sample\n\
          truth \\ said  {levels}\n\
          {rows}",
@@ -130,7 +130,7 @@ pub(super) fn of_evaluation(evaluation: &Evaluation) -> String {
         percent(evaluation.accuracy),
         number(evaluation.kappa),
         number(evaluation.kappa_quadratic),
-        evaluation.ece,
+        percent(evaluation.ece),
         rounded(evaluation.nll, 4)
     )
 }

@@ -134,7 +134,7 @@ pub(super) fn table(model: &str, set: &str, so_far: &SoFar) -> Table {
             format!("{} s", after.seconds),
             percent(after.going_on),
             percent(after.accuracy),
-            format!("{:.3}", after.ece),
+            percent(after.ece),
         ]
     };
     Table {
@@ -144,7 +144,7 @@ pub(super) fn table(model: &str, set: &str, so_far: &SoFar) -> Table {
             "after",
             "still pressed, %",
             "accuracy, %",
-            "calibration error",
+            "calibration error, %",
         ]
         .map(str::to_owned)
         .to_vec(),

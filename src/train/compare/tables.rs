@@ -301,25 +301,25 @@ fn confusions(rows: &[Row]) -> Table {
 
 /// Calibration errors and likelihoods of the models' probabilities.
 pub fn calibration(rows: &[Row]) -> Table {
-    let note = "Expected calibration error (15 bins of the largest probability) and mean negative \
-                log-likelihood in nats, on materials that no model has seen. \"Raw\": before the \
+    let note = "Expected calibration error (ECE) in per cent (15 bins of the largest probability) and mean \
+                negative log-likelihood in nats, on materials that no model has seen. \"Raw\": before the \
                 temperature that methods with held-out objects fit on them.";
     let head = [
         "method",
-        "test split: ECE",
+        "test split: ECE, %",
         "NLL",
-        "fresh, paper's shapes: ECE",
-        "raw",
+        "fresh, paper's shapes: ECE, %",
+        "raw, %",
         "NLL",
-        "fresh, matched shapes: ECE",
-        "raw",
+        "fresh, matched shapes: ECE, %",
+        "raw, %",
         "NLL",
     ];
     let mut table = Table::new("Calibration", note, &head);
     for row in rows {
         let mut cells = vec![row.title.clone()];
         for set in [PAPER_SPLIT, FRESH, MATCHED] {
-            cells.push(with_spread(row, set, |e| Some(e.ece), 3));
+            cells.push(with_spread(row, set, |e| Some(100.0 * e.ece), 1));
             if set != PAPER_SPLIT {
                 cells.push(before_temperature(row, set));
             }
@@ -333,8 +333,8 @@ pub fn calibration(rows: &[Row]) -> Table {
 /// Results on the same objects under other sensors.
 pub fn shifts(rows: &[Row]) -> Table {
     let note = format!(
-        "The fresh objects of the paper's shapes, pressed again on other sensors: accuracy in per \
-         cent and expected calibration error. {}.",
+        "The fresh objects of the paper's shapes, pressed again on other sensors: accuracy and expected \
+         calibration error (ECE) in per cent. {}.",
         described(&SHIFTS)
     );
     elsewhere(
@@ -348,8 +348,8 @@ pub fn shifts(rows: &[Row]) -> Table {
 /// Results on objects of other shapes and materials.
 pub fn worlds(rows: &[Row]) -> Table {
     let note = format!(
-        "Fresh objects of other shapes and materials: accuracy in per cent and expected calibration \
-         error. One frame fixes only the ratio of radius and modulus, so varying shapes lower the accuracy \
+        "Fresh objects of other shapes and materials: accuracy and expected calibration error (ECE) \
+         in per cent. One frame fixes only the ratio of radius and modulus, so varying shapes lower the accuracy \
          of every method. {}.",
         described(&WORLDS)
     );
@@ -373,13 +373,13 @@ fn elsewhere(
 ) -> Table {
     let mut head = vec![
         "method".to_owned(),
-        format!("{called}: accuracy"),
-        "ECE".to_owned(),
+        format!("{called}: accuracy, %"),
+        "ECE, %".to_owned(),
     ];
     for (name, _) in others {
         head.extend([
-            format!("{}: accuracy", name.replace('_', " ")),
-            "ECE".to_owned(),
+            format!("{}: accuracy, %", name.replace('_', " ")),
+            "ECE, %".to_owned(),
         ]);
     }
     let mut table = Table {
@@ -390,7 +390,7 @@ fn elsewhere(
         let mut cells = vec![row.title.clone()];
         for set in std::iter::once(base).chain(others.iter().map(|(name, _)| *name)) {
             cells.push(with_spread(row, set, |e| Some(100.0 * e.accuracy), 1));
-            cells.push(with_spread(row, set, |e| Some(e.ece), 3));
+            cells.push(with_spread(row, set, |e| Some(100.0 * e.ece), 1));
         }
         table.rows.push(cells);
     }
@@ -469,8 +469,8 @@ pub fn evaluation(evaluation: &Evaluation) -> Table {
             String::new(),
         ),
         (
-            "calibration error",
-            format!("{:.4}", evaluation.ece),
+            "calibration error, %",
+            format!("{:.1}", 100.0 * evaluation.ece),
             String::new(),
         ),
         (

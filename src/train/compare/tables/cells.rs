@@ -174,7 +174,7 @@ pub(super) fn mean_over_seeds(
     rounded(mean(&values), decimals)
 }
 
-/// The mean calibration error before the temperature, where one was fitted.
+/// The mean calibration error in per cent before the temperature, where one was fitted.
 pub(super) fn before_temperature(row: &Row, set: &str) -> String {
     let measured =
         |(_, details): &(&Entry, &Details)| details.worth.sets.get(set)?.ece_before_temperature;
@@ -182,7 +182,7 @@ pub(super) fn before_temperature(row: &Row, set: &str) -> String {
     if before.is_empty() {
         return "-".to_owned();
     }
-    format!("{:.3}", mean(&before))
+    rounded(100.0 * mean(&before), 1)
 }
 
 pub(super) fn beside(here: String, there: Option<f64>, decimals: usize) -> String {
