@@ -34,11 +34,11 @@ pub(super) fn accuracies(rows: &[Row], set: &str, title: &str) -> String {
             accuracies.iter().copied().chain(low).chain(paper_of(row))
         })
         .fold(100.0, f64::min);
-    let (left, top, line) = (200.0, 24.0, 22.0);
+    let (left, top, line) = (240.0, 24.0, 22.0);
     let bottom = top + line * shown.len() as f64 + 6.0;
     let x = Scale::linear(((least / 5.0).floor() * 5.0 - 2.0, 101.0), (left, 700.0));
     let y = Scale::linear((0.0, 1.0), (bottom, top));
-    let mut svg = Svg::new(720.0, bottom + 34.0);
+    let mut svg = Svg::new(720.0, bottom + 34.0).of_class("rows");
     axes(&mut svg, (&x, "accuracy, %"), (&y, ""), (8, 0));
     for (number, (row, accuracies)) in shown.iter().enumerate() {
         let at = top + line * (number as f64 + 0.5);
@@ -79,7 +79,7 @@ pub(super) fn price(rows: &[Row], set: &str) -> String {
     let (right, bottom) = (520.0, 290.0);
     let x = Scale::logarithmic((0.7 * fewest, 1.4 * most), (50.0, right));
     let y = Scale::linear((least - 3.0, best + 3.0), (bottom, 24.0));
-    let mut svg = Svg::new(720.0, 330.0);
+    let mut svg = Svg::new(720.0, 330.0).of_class("points");
     axes(
         &mut svg,
         (&x, "steps, all stages"),
@@ -398,11 +398,11 @@ pub(super) fn swaps(groups: &[Vec<&SwapEntry>]) -> String {
         .flatten()
         .map(|swap| percent(swap))
         .fold(100.0, f64::min);
-    let (left, top, line) = (200.0, 24.0, 30.0);
+    let (left, top, line) = (240.0, 24.0, 30.0);
     let bottom = top + line * groups.len() as f64;
     let x = Scale::linear(((least / 5.0).floor() * 5.0 - 2.0, 101.0), (left, 700.0));
     let y = Scale::linear((0.0, 1.0), (bottom, top));
-    let mut svg = Svg::new(720.0, bottom + 34.0);
+    let mut svg = Svg::new(720.0, bottom + 34.0).of_class("rows");
     axes(&mut svg, (&x, "accuracy, %"), (&y, ""), (8, 0));
     for (number, group) in groups.iter().enumerate() {
         let at = top + line * (number as f64 + 0.5);

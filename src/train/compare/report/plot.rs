@@ -6,6 +6,8 @@ use std::fmt::Write as _;
 /// An SVG under construction. Lengths are in its own pixels.
 #[derive(Debug)]
 pub(super) struct Svg {
+    /// The style class of the whole picture; may be empty.
+    class: &'static str,
     width: f64,
     height: f64,
     body: String,
@@ -22,10 +24,16 @@ pub(super) enum Anchor {
 impl Svg {
     pub(super) fn new(width: f64, height: f64) -> Self {
         Self {
+            class: "",
             width,
             height,
             body: String::new(),
         }
+    }
+
+    /// The same picture with a style class, which says how it fits on a narrow screen.
+    pub(super) fn of_class(self, class: &'static str) -> Self {
+        Self { class, ..self }
     }
 
     pub(super) fn line(&mut self, class: &str, from: (f64, f64), to: (f64, f64)) {
@@ -87,13 +95,19 @@ impl Svg {
     /// The complete element. `title` is its label for screen readers.
     pub(super) fn finish(self, title: &str) -> String {
         let Self {
+            class,
             width,
             height,
             body,
         } = self;
         let title = escaped(title);
+        let class = if class.is_empty() {
+            String::new()
+        } else {
+            format!(r#" class="{class}""#)
+        };
         format!(
-            r#"<svg viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img" aria-label="{title}">
+            r#"<svg{class} viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img" aria-label="{title}">
 {body}</svg>
 "#
         )
