@@ -1,5 +1,5 @@
-//! `hardnessd record --session` on a real pty, with a simulated sensor: its questions and its
-//! files.
+//! `hardnessd record` on a real pty, with a simulated sensor: the questions and files of
+//! `--session`, and the line of progress.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -20,8 +20,9 @@ use std::time::{Duration, Instant};
 
 use bench::{BINARY, Bench, PATIENCE, Process, hardnessd};
 use pair::Pair;
+use rustix::process::Signal;
 
-/// A session, and the terminal that it runs on.
+/// A recording, and the terminal that it runs on.
 struct Session {
     process: Process,
     master: OwnedFd,
@@ -32,14 +33,17 @@ struct Session {
 
 impl Session {
     fn start(config: &Path, directory: &Path) -> Self {
+        Self::record(config, &["--session", directory.to_str().unwrap()])
+    }
+
+    fn record(config: &Path, more: &[&str]) -> Self {
         let Pair { master, device, .. } = Pair::open().unwrap();
         let end = || Stdio::from(device.try_clone().unwrap());
         // `setsid` keeps the process from using the terminal that the test was started from.
         let process = Command::new("setsid")
             .args([BINARY, "record", "--config"])
             .arg(config)
-            .arg("--session")
-            .arg(directory)
+            .args(more)
             .stdin(end())
             .stdout(end())
             .stderr(end())
@@ -77,6 +81,15 @@ impl Session {
                 self.written += &String::from_utf8_lossy(&bytes);
             }
         }
+    }
+
+    /// Waits for the end of the process, and returns the output that was not looked at before.
+    fn ends(mut self) -> String {
+        assert_eq!(self.process.exit_code(), Some(0));
+        while let Ok(bytes) = self.bytes.recv_timeout(PATIENCE) {
+            self.written += &String::from_utf8_lossy(&bytes);
+        }
+        self.written
     }
 
     fn answer(&self, line: &str) {
@@ -156,6 +169,39 @@ fn assert_collects(bench: &Bench, own: &Path) {
     let said = String::from_utf8_lossy(&collected.stderr);
     assert_eq!(collected.status.code(), Some(0), "{said}");
     assert!(out.exists());
+}
+
+#[test]
+fn a_line_of_the_log_is_not_glued_to_the_progress() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let out = bench.path("a.mcap");
+    let _sensor = bench.sensor(&[]);
+    let mut recording = Session::record(&config, &["--sockets", "--out", out.to_str().unwrap()]);
+    recording.says(" 0 presses (Ctrl-C ends it)");
+    let mut subscriber = bench.subscriber();
+    recording.says(" 1 press (Ctrl-C ends it)");
+    loop {
+        let event = subscriber.next().unwrap();
+        if event["type"] == "press" && event["state"] == "begin" && event["press"] == 2 {
+            break;
+        }
+    }
+    recording.process.signal(Signal::TERM);
+    let output = recording.ends();
+    // What a line shows at last: `\x1b[K` clears what was there.
+    let mut lines = output
+        .lines()
+        .filter_map(|line| line.split("\x1b[K").last());
+    let aborted = lines.clone().find(|line| line.contains("aborted"));
+    assert!(
+        aborted.is_some_and(|line| line.contains("WARN") && !line.contains("Ctrl-C")),
+        "{output:?}"
+    );
+    assert!(
+        lines.any(|line| line.starts_with("recorded ") && line.contains(" frames, 1 press: ")),
+        "{output:?}"
+    );
 }
 
 #[test]

@@ -87,7 +87,10 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
             };
             // On a terminal the progress line replaces the log.
             let is_shown = io::stderr().is_terminal();
-            let _log = Log::start(setup.config.log, if is_shown { "warn" } else { "info" })?;
+            let log = Log::start(setup.config.log, if is_shown { "warn" } else { "info" })?;
+            if is_shown {
+                log.clear_progress();
+            }
             Ok(record::run(args, setup, end).await?)
         }
         Command::Recover(args) => finish_blocking(signals, move || recover::run(&args)).await,

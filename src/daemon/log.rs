@@ -119,6 +119,12 @@ impl Log {
         })
     }
 
+    /// From now on, each line on stderr first clears the line that the cursor is in. Call this if
+    /// stderr is a terminal on which the process shows a line of progress.
+    pub fn clear_progress(&self) {
+        self.lines.clear_progress();
+    }
+
     /// Writes in the format of `settings` from now on.
     ///
     /// # Errors

@@ -6,6 +6,7 @@
 
 mod session;
 
+use std::cell::Cell;
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::future::Future;
@@ -157,16 +158,23 @@ pub async fn run(
             None => std::future::pending().await,
         }
     };
+    let is_ending = Cell::new(false);
     let end = async {
         tokio::select! {
             () = shutdown => {}
             () = over => {}
         }
+        is_ending.set(true);
+        clear();
     };
     let recorded = tokio::select! {
         recorded = record(setup, sockets, &path, labels, progress, end) => recorded,
-        () = show(&path, &counted) => unreachable!("it goes on as long as it is waited for"),
+        () = show(&path, &counted, &is_ending) => {
+            unreachable!("it goes on as long as it is waited for")
+        }
     };
+    // The recording may have ended by itself.
+    clear();
     if matches!(
         recorded,
         Err(Error::Create { .. } | Error::Unavailable { .. })
@@ -174,16 +182,18 @@ pub async fn run(
         return recorded;
     }
     let Progress { frames, presses } = *counted.borrow();
+    let seen = said_frames(frames);
     if io::stderr().is_terminal() {
         eprintln!(
-            "\r\x1b[Krecorded {frames} frames, {presses} presses: {}",
+            "recorded {seen}, {}: {}",
+            said_presses(presses),
             said(&path)
         );
     }
     if recorded.is_ok() && presses == 0 {
         let path = said(&path);
         eprintln!(
-            "warning: {path}: no press in {frames} frames: was the sensor pressed, is it live, and \
+            "warning: {path}: no press in {seen}: was the sensor pressed, is it live, and \
              is press.contact_threshold_n low enough?"
         );
     }
@@ -230,28 +240,46 @@ fn said(path: &Path) -> String {
     super::shown(&path.display().to_string())
 }
 
+fn said_frames(frames: u64) -> String {
+    format!("{frames} frame{}", if frames == 1 { "" } else { "s" })
+}
+
+fn said_presses(presses: u64) -> String {
+    format!("{presses} press{}", if presses == 1 { "" } else { "es" })
+}
+
+/// Clears the line of progress. On a terminal only, because only a terminal has one.
+fn clear() {
+    let mut stderr = io::stderr();
+    if stderr.is_terminal() {
+        let _ = stderr.write_all(b"\r\x1b[K");
+    }
+}
+
 /// The time between two lines of progress.
 const PROGRESS: Duration = Duration::from_millis(500);
 
-/// Shows the progress on a terminal, always in the same line.
-async fn show(path: &Path, counted: &watch::Receiver<Progress>) {
+/// Shows the progress on a terminal, always in the same line, until the recording is ending.
+async fn show(path: &Path, counted: &watch::Receiver<Progress>, is_ending: &Cell<bool>) {
     let mut stderr = io::stderr();
     if !stderr.is_terminal() {
         return std::future::pending().await;
     }
     let start = Instant::now();
-    loop {
+    while !is_ending.get() {
         let Progress { frames, presses } = *counted.borrow();
+        let (frames, presses) = (said_frames(frames), said_presses(presses));
         let seconds = start.elapsed().as_secs();
         let path = said(path);
         // If the terminal has gone, its signal ends the recording.
         let _ = write!(
             stderr,
-            "\r\x1b[Krecording {path}: {seconds} s, {frames} frames, {presses} presses (Ctrl-C ends it)"
+            "\r\x1b[Krecording {path}: {seconds} s, {frames}, {presses} (Ctrl-C ends it)"
         );
         let _ = stderr.flush();
         tokio::time::sleep(PROGRESS).await;
     }
+    std::future::pending().await
 }
 
 /// Checks the label `level`, which a data set is made from. A wrong level must be found before

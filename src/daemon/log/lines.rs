@@ -24,6 +24,8 @@ enum Message {
     Line(Vec<u8>),
     /// An entry for the journal.
     Entry(Vec<u8>),
+    /// From now on, clear the terminal's line before each line.
+    ClearProgress,
     /// A request for an answer as soon as all earlier lines are written.
     Flush(SyncSender<()>),
 }
@@ -60,6 +62,11 @@ impl Lines {
         self.pass(Message::Entry(entry));
     }
 
+    /// Clears the terminal's line before each line from now on.
+    pub(super) fn clear_progress(&self) {
+        self.pass(Message::ClearProgress);
+    }
+
     fn pass(&self, message: Message) {
         if let Err(TrySendError::Full(_)) = self.thread.try_send(message) {
             self.lost.fetch_add(1, Ordering::Relaxed);
@@ -91,11 +98,12 @@ fn next(messages: &Receiver<Message>, limit: &Limit) -> Option<Message> {
 }
 
 fn write(messages: &Receiver<Message>, journal: &UnixDatagram, lost: &AtomicU64, limit: &Limit) {
+    let mut before: &[u8] = b"";
     while let Some(message) = next(messages, limit) {
         // A write that fails cannot be logged: stderr is closed, or the journal is gone.
         match message {
             Message::Line(line) => {
-                let _ = io::stderr().write_all(&line);
+                let _ = io::stderr().write_all(&[before, &line].concat());
                 let lines = lost.swap(0, Ordering::Relaxed);
                 if lines > 0 {
                     let _ = writeln!(io::stderr(), "log: {lines} lines lost: read too slowly");
@@ -108,6 +116,7 @@ fn write(messages: &Receiver<Message>, journal: &UnixDatagram, lost: &AtomicU64,
                     let _ = journal.send_to(&journal::lost(lines), journal::SOCKET);
                 }
             }
+            Message::ClearProgress => before = b"\r\x1b[K",
             Message::Flush(written) => {
                 let _ = written.try_send(());
             }

@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use tokio::sync::{mpsc, watch};
 
-use super::{Error, check_level, levels, record, said};
+use super::{Error, check_level, clear, levels, record, said};
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::record::Progress;
@@ -140,8 +140,9 @@ pub(super) async fn run(
     }
     let directory = said(directory);
     say(&format!(
-        "\nrecorded {} objects in this session; next: hrn-train collect --out D.npz {directory}/*.mcap\n",
-        list.added
+        "\nrecorded {} object{} in this session; next: hrn-train collect --out D.npz {directory}/*.mcap\n",
+        list.added,
+        if list.added == 1 { "" } else { "s" },
     ));
     Ok(())
 }
@@ -206,6 +207,7 @@ async fn record_object(
             };
             record(setup.clone(), sockets, &path, labels.clone(), progress, end).await
         };
+        clear();
         let presses = counted.borrow().presses;
         if presses == 0 || matches!(next, Next::Redo) {
             // A recording without a press would stop `hrn-train collect`.
