@@ -49,7 +49,7 @@ impl Default for Description {
     fn default() -> Self {
         Self {
             name: "sensor".to_owned(),
-            frame_rate_hz: 5.0,
+            frame_rate_hz: DEFAULT_FRAME_RATE_HZ,
             stale_after_ms: None,
             frame: wire::Settings::default(),
             calibration: tare::Settings::default(),
@@ -146,6 +146,9 @@ pub enum SensorError {
     #[error("early_confidence: found {0:?}, expected 0 to 1")]
     EarlyConfidence(f32),
 }
+
+/// The frame rate of the paper's sensor.
+pub const DEFAULT_FRAME_RATE_HZ: f64 = 5.0;
 
 /// The accepted frame rates: a wider range than that of any sensor, but every period is still a
 /// sane time to wait.

@@ -15,6 +15,7 @@ use serde::de::value::Error as NameError;
 
 use super::faults::{self, Faults, Line};
 use super::player::{BITS_A_BYTE, Pace, Player};
+use crate::sensor::DEFAULT_FRAME_RATE_HZ;
 use crate::simulator::{Material, SensorProfile, Sequence, SequenceSettings};
 use crate::wire::{Layout, LayoutError, Preset, Settings as Frame};
 
@@ -32,7 +33,7 @@ pub struct Args {
     #[arg(long, value_name = "P", default_value = "jx255n", value_parser = preset)]
     preset: Preset,
     /// Frames per second, 0.1 to 1000
-    #[arg(long, value_name = "F", default_value_t = 5.0, value_parser = frame_rate_hz)]
+    #[arg(long, value_name = "F", default_value_t = DEFAULT_FRAME_RATE_HZ, value_parser = frame_rate_hz)]
     fps: f64,
     /// Material to press; repeat the option for several in turn [default: all eight]
     #[arg(long = "material", value_name = "M")]

@@ -22,6 +22,7 @@ use super::simulate::positive;
 use super::{doctor, shown};
 use crate::daemon::serial::{Link, Turn};
 use crate::recording::{self, Entry, FileKind, Input, Reader};
+use crate::sensor::DEFAULT_FRAME_RATE_HZ;
 use crate::wire::Settings;
 
 /// Arguments of `sniff`.
@@ -177,7 +178,7 @@ fn configuration(args: &Args, frame_rate_hz: Option<f64>) -> String {
                 (hz * 10.0).round().max(1.0) / 10.0
             );
         }
-        None => text += "# frame_rate_hz = 5.0\n",
+        None => text += &format!("# frame_rate_hz = {DEFAULT_FRAME_RATE_HZ:?}\n"),
     }
     text
 }
