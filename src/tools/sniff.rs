@@ -260,10 +260,7 @@ fn toml(path: &Path, bytes: usize, best: &Proposal, next: Option<&Proposal>) -> 
     match next {
         Some(next) => {
             let keys = keys(&next.settings).trim_end().replace('\n', ", ");
-            remark(format!(
-                "preferred to the next because {}",
-                best.reason(next)
-            ));
+            remark(comparison(best, next));
             remark(format!("next: {}", said(next)));
             remark(format!("    {keys}"));
         }
@@ -276,6 +273,19 @@ fn toml(path: &Path, bytes: usize, best: &Proposal, next: Option<&Proposal>) -> 
         "bytes do not show order, mask and invert, nor which side of the sensor is up".to_owned(),
     );
     toml + "[sensor.frame]\n" + &keys(&best.settings)
+}
+
+/// Why `best` is preferred to `next`, or what would tell them apart.
+fn comparison(best: &Proposal, next: &Proposal) -> String {
+    match best.reason(next) {
+        Some(reason) => format!("preferred to the next because {reason}"),
+        None if best.is_same_but_for_the_ends(next) => {
+            "cannot be told from the next, because a header and a tail look the same here: record \
+             from the moment the sensor is switched on, or read its data sheet"
+                .to_owned()
+        }
+        None => "nothing tells it from the next: read the sensor's data sheet".to_owned(),
+    }
 }
 
 fn said(proposal: &Proposal) -> String {

@@ -6,7 +6,7 @@
 use std::cmp::Reverse;
 
 use super::candidates::{candidates, marked_array, packed_array, text_array};
-use crate::frame::{Array, COLS, ROWS};
+use crate::frame::{Array, COLS, ROWS, RawFrame};
 use crate::wire::{Cell, Checksum, Decoder, Layout, LengthField, Preset, Settings};
 
 /// The number of pieces that candidates are first tried on. The pieces come from all over the
@@ -61,6 +61,11 @@ pub(super) struct Proposal {
     /// The values for the criteria of [`MERITS`], in the same order. More is better.
     merits: [u64; MERITS.len()],
 }
+
+/// The place of the criterion for checksums in [`MERITS`].
+const CHECKED: usize = 0;
+/// The place of the criterion for constant bytes in [`MERITS`].
+const CONSTANT: usize = 3;
 
 /// The criteria for preferring a layout. The first one in which two layouts differ decides.
 const MERITS: [&str; 9] = [
@@ -153,11 +158,35 @@ impl Proposal {
         })
     }
 
-    /// The reason why this proposal ranks before `other`.
-    pub(super) fn reason(&self, other: &Self) -> &'static str {
+    /// The reason why this proposal ranks before `other`. `None` if there is no reason: the bytes
+    /// do not tell the two apart.
+    pub(super) fn reason(&self, other: &Self) -> Option<&'static str> {
         let mut merits = self.merits.iter().zip(&other.merits);
-        let decisive = merits.position(|(ours, theirs)| ours > theirs);
-        decisive.map_or("nothing tells them apart", |merit| MERITS[merit])
+        let decisive = merits.position(|(ours, theirs)| ours > theirs)?;
+        let is_in_order = self.bits == ALL_IN_ORDER && [CHECKED, CONSTANT].contains(&decisive);
+        Some(if is_in_order {
+            "every byte of its frames is in order"
+        } else {
+            MERITS[decisive]
+        })
+    }
+
+    /// Whether the two layouts write the same stream, except for its first and last bytes. One then
+    /// has a header where the other has a tail.
+    pub(super) fn is_same_but_for_the_ends(&self, other: &Self) -> bool {
+        let frame = RawFrame {
+            counts: std::array::from_fn(|taxel| taxel as u16),
+        };
+        let encoded = |proposal: &Self| {
+            let mut bytes = Vec::new();
+            let layout = Layout::new(&proposal.settings).ok()?;
+            layout.encode(&frame, &mut bytes);
+            Some(bytes)
+        };
+        let (Some(ours), Some(theirs)) = (encoded(self), encoded(other)) else {
+            return false;
+        };
+        ours.len() == theirs.len() && theirs.repeat(2).windows(ours.len()).any(|at| at == ours)
     }
 
     /// The number of bytes in frames that differ from the one before.
