@@ -95,6 +95,12 @@ pub fn usage(program: &str, error: &clap::Error) -> ExitCode {
     let text = error.to_string();
     let told = text.split("\n\nUsage:").next().unwrap_or_default();
     let told = told.split("\n\nFor more").next().unwrap_or_default();
+    // clap also proposes names that have little in common with the name given, such as `calibrate`
+    // for `frobnicate`. The help has them all.
+    let told = match error.kind() {
+        ErrorKind::InvalidSubcommand => told.split("\n\n").next().unwrap_or_default(),
+        _ => told,
+    };
     let told: Vec<&str> = told.split_whitespace().collect();
     let mut told = told
         .join(" ")

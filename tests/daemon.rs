@@ -592,6 +592,8 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         fails(&beyond_any_sensor, 2, &[beyond_any_sensor[1]]);
     }
     for (label, found) in [
+    let nothing_alike = "'frobnicate': see `hardnessd --help`";
+    fails(&["frobnicate"], 2, &[nothing_alike]);
         ("object=99999999999", "object: found \"99999999999\""),
         ("note=\u{202e}7", "found \"\\u{202e}7\""),
         ("=7", "found no key"),
