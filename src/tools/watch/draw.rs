@@ -184,7 +184,7 @@ impl Page<'_> {
             };
         }
         if link == Link::Lost && reason.is_some_and(is_unplugged) {
-            line.insert_str(" LOST ".len(), " unplugged: plug it in again;");
+            line.insert_str(" LOST ".len(), &format!(" {UNPLUGGED_WORDS};"));
         }
         let rate_hz = sensor.status.as_ref().and_then(|one| one.frame_rate_hz);
         if let (Link::Live, Some(rate_hz)) = (link, rate_hz) {
@@ -354,15 +354,19 @@ impl Page<'_> {
     }
 }
 
+/// The reasons that mean that the device was unplugged. `page.html` repeats them and the words for
+/// them, and a test compares the two.
+pub(super) const UNPLUGGED: [&str; 4] = [
+    "end of file",
+    "Input/output error",
+    "No such device",
+    "no such device",
+];
+pub(super) const UNPLUGGED_WORDS: &str = "unplugged: plug it in again";
+
 /// Whether this reason means that the device was unplugged.
 fn is_unplugged(reason: &str) -> bool {
-    let gone = [
-        "end of file",
-        "Input/output error",
-        "No such device",
-        "no such device",
-    ];
-    gone.iter().any(|gone| reason.contains(gone))
+    UNPLUGGED.iter().any(|gone| reason.contains(gone))
 }
 
 /// Press, phase, verdict, probabilities in per cent and age. Force and notes follow if there is

@@ -11,7 +11,7 @@ use ratatui_crossterm::crossterm::event::{Event, KeyCode, KeyEvent, KeyModifiers
 use rustix::termios::LocalModes;
 use serde_json::{Value, json};
 
-use super::draw::draw;
+use super::draw::{UNPLUGGED, UNPLUGGED_WORDS, draw};
 use super::look::Look;
 use super::screen::{Screen, key};
 use super::view::{Clock, Key, Link, Loss, View};
@@ -601,6 +601,15 @@ fn lost_says_unplugged_where_it_is() {
         text.contains(" LOST  last frame") && !text.contains("unplugged"),
         "{text}"
     );
+}
+
+#[test]
+fn the_live_page_has_the_same_words_for_an_unplugged_device() {
+    let page = include_str!("../../daemon/page.html");
+    let reasons = format!("const UNPLUGGED = {UNPLUGGED:?};\n");
+    let words = format!("const UNPLUGGED_WORDS = {UNPLUGGED_WORDS:?};\n");
+    assert!(page.contains(&reasons), "{reasons}");
+    assert!(page.contains(&words), "{words}");
 }
 
 #[test]
