@@ -95,101 +95,29 @@ impl Failure {
     pub fn code(&self) -> u8 {
         match self {
             Self::Stopped(stop) => stop.code(),
-
-            Self::Config(error)
-            | Self::Demo(demo::Error::Config(error))
-            | Self::Replay(replay::Error::Config(error))
-            | Self::Check(check::Error::Config(error)) => of_config(error),
-
-            Self::Daemon(error)
-            | Self::Demo(demo::Error::Daemon(error))
-            | Self::Record(record::Error::Daemon(error))
-            | Self::Calibrate(calibrate::Error::Daemon(error))
-            | Self::Check(check::Error::Daemon { source: error, .. }) => of_daemon(error),
-
-            Self::Demo(demo::Error::Missed { .. } | demo::Error::Closed)
-            | Self::Recover(recover::Error::Nothing { .. } | recover::Error::Foreign { .. })
-            | Self::Replay(
-                replay::Error::Recording { .. }
-                | replay::Error::Sensor { .. }
-                | replay::Error::NoFrame { .. },
-            )
-            | Self::Tail(tail::Error::Timeout { .. })
-            | Self::Calibrate(
-                calibrate::Error::Arm(_)
-                | calibrate::Error::Force(_)
-                | calibrate::Error::Taxels(_)
-                | calibrate::Error::Count { .. }
-                | calibrate::Error::Recording { .. },
-            )
-            | Self::Doctor(doctor::Error::Faults { .. })
-            | Self::Sniff(sniff::Error::Recording { .. } | sniff::Error::Unexplained { .. }) => {
-                FAILED
-            }
-
-            Self::Simulate(simulate::Error::Layout(_) | simulate::Error::Baud { .. })
-            | Self::Replay(replay::Error::OwnMotion { .. })
-            | Self::Calibrate(
-                calibrate::Error::NoSensor { .. }
-                | calibrate::Error::Unasked
-                | calibrate::Error::NoFile,
-            )
-            | Self::Record(
-                record::Error::Level { .. }
-                | record::Error::Twice { .. }
-                | record::Error::Asked { .. }
-                | record::Error::NoTerminal,
-            ) => USAGE,
+            Self::Config(error) => of_config(error),
+            Self::Missing(_) => NO_INPUT,
+            Self::Log(_) => CONFIG,
+            Self::Daemon(error) => of_daemon(error),
+            Self::Demo(error) => of_demo(error),
+            Self::Simulate(error) => of_simulate(error),
+            Self::Record(error) => of_record(error),
+            Self::Recover(error) => of_recover(error),
+            Self::Replay(error) => of_replay(error),
+            Self::Tail(error) => of_tail(error),
             #[cfg(feature = "watch")]
             Self::Watch(watch::Error::NoTerminal) => USAGE,
-
-            Self::Simulate(simulate::Error::Faults(error)) if error.is_unreadable() => NO_INPUT,
-            Self::Simulate(simulate::Error::Faults(_)) => FAILED,
-            Self::Replay(replay::Error::Motion { source, .. }) if source.is_unreadable() => {
-                NO_INPUT
-            }
-            Self::Replay(replay::Error::Motion { .. }) => FAILED,
-            Self::Missing(_)
-            | Self::Check(check::Error::Missing(_))
-            | Self::Calibrate(calibrate::Error::Missing { .. })
-            | Self::Recover(recover::Error::Unreadable { .. })
-            | Self::Replay(replay::Error::Unreadable { .. })
-            | Self::Sniff(sniff::Error::Unreadable { .. }) => NO_INPUT,
-
-            Self::Tail(
-                tail::Error::Connect(_)
-                | tail::Error::Mute { .. }
-                | tail::Error::Foreign { .. }
-                | tail::Error::Refused { .. },
-            )
-            | Self::Record(record::Error::Unavailable { .. })
-            | Self::Sniff(sniff::Error::Unavailable { .. }) => UNAVAILABLE,
-
-            Self::Demo(demo::Error::Io { .. })
-            | Self::Simulate(simulate::Error::Recording { .. } | simulate::Error::Pty { .. })
-            | Self::Record(record::Error::Create { .. } | record::Error::Session { .. })
-            | Self::Recover(recover::Error::Broken { .. } | recover::Error::Write { .. })
-            | Self::Replay(replay::Error::Broken { .. } | replay::Error::Print(_))
-            | Self::Tail(tail::Error::Print(_))
-            | Self::Check(check::Error::Print(_))
-            | Self::Calibrate(
-                calibrate::Error::Temporary { .. }
-                | calibrate::Error::Out { .. }
-                | calibrate::Error::Print(_),
-            )
-            | Self::Doctor(doctor::Error::Print(_))
-            | Self::Sniff(sniff::Error::Print(_) | sniff::Error::Write { .. }) => IO,
-
             #[cfg(feature = "watch")]
             Self::Watch(watch::Error::Terminal(_)) => IO,
             #[cfg(feature = "zenoh")]
             Self::Fleet(fleet::Error::Unavailable { .. }) => UNAVAILABLE,
             #[cfg(feature = "zenoh")]
             Self::Fleet(fleet::Error::Thread(_) | fleet::Error::Print(_)) => IO,
-
-            Self::Log(_)
-            | Self::Demo(demo::Error::Layout(_))
-            | Self::Check(check::Error::FrameRate { .. }) => CONFIG,
+            Self::Check(error) => of_check(error),
+            Self::Calibrate(error) => of_calibrate(error),
+            Self::Doctor(doctor::Error::Faults { .. }) => FAILED,
+            Self::Doctor(doctor::Error::Print(_)) => IO,
+            Self::Sniff(error) => of_sniff(error),
         }
     }
 }
@@ -218,5 +146,106 @@ fn of_daemon(error: &daemon::Error) -> u8 {
         }
         daemon::Error::Record(_) => IO,
         daemon::Error::Stopped(_) => FAILED,
+    }
+}
+
+fn of_demo(error: &demo::Error) -> u8 {
+    match error {
+        demo::Error::Config(error) => of_config(error),
+        demo::Error::Daemon(error) => of_daemon(error),
+        demo::Error::Missed { .. } | demo::Error::Closed => FAILED,
+        demo::Error::Io { .. } => IO,
+        demo::Error::Layout(_) => CONFIG,
+    }
+}
+
+fn of_simulate(error: &simulate::Error) -> u8 {
+    match error {
+        simulate::Error::Faults(error) if error.is_unreadable() => NO_INPUT,
+        simulate::Error::Faults(_) => FAILED,
+        simulate::Error::Layout(_) | simulate::Error::Baud { .. } => USAGE,
+        simulate::Error::Recording { .. } | simulate::Error::Pty { .. } => IO,
+    }
+}
+
+fn of_record(error: &record::Error) -> u8 {
+    match error {
+        record::Error::Level { .. }
+        | record::Error::Twice { .. }
+        | record::Error::Asked { .. }
+        | record::Error::NoTerminal => USAGE,
+        record::Error::Session { .. } | record::Error::Create { .. } => IO,
+        record::Error::Unavailable { .. } => UNAVAILABLE,
+        record::Error::Daemon(error) => of_daemon(error),
+    }
+}
+
+fn of_recover(error: &recover::Error) -> u8 {
+    match error {
+        recover::Error::Unreadable { .. } => NO_INPUT,
+        recover::Error::Nothing { .. } | recover::Error::Foreign { .. } => FAILED,
+        recover::Error::Broken { .. } | recover::Error::Write { .. } => IO,
+    }
+}
+
+fn of_replay(error: &replay::Error) -> u8 {
+    match error {
+        replay::Error::Config(error) => of_config(error),
+        replay::Error::Unreadable { .. } => NO_INPUT,
+        replay::Error::Motion { source, .. } if source.is_unreadable() => NO_INPUT,
+        replay::Error::Motion { .. }
+        | replay::Error::Recording { .. }
+        | replay::Error::Sensor { .. }
+        | replay::Error::NoFrame { .. } => FAILED,
+        replay::Error::OwnMotion { .. } => USAGE,
+        replay::Error::Broken { .. } | replay::Error::Print(_) => IO,
+    }
+}
+
+fn of_tail(error: &tail::Error) -> u8 {
+    match error {
+        tail::Error::Connect(_)
+        | tail::Error::Mute { .. }
+        | tail::Error::Foreign { .. }
+        | tail::Error::Refused { .. } => UNAVAILABLE,
+        tail::Error::Timeout { .. } => FAILED,
+        tail::Error::Print(_) => IO,
+    }
+}
+
+fn of_check(error: &check::Error) -> u8 {
+    match error {
+        check::Error::Config(error) => of_config(error),
+        check::Error::Daemon { source, .. } => of_daemon(source),
+        check::Error::Missing(_) => NO_INPUT,
+        check::Error::FrameRate { .. } => CONFIG,
+        check::Error::Print(_) => IO,
+    }
+}
+
+fn of_calibrate(error: &calibrate::Error) -> u8 {
+    match error {
+        calibrate::Error::Daemon(error) => of_daemon(error),
+        calibrate::Error::NoSensor { .. }
+        | calibrate::Error::Unasked
+        | calibrate::Error::NoFile => USAGE,
+        calibrate::Error::Missing { .. } => NO_INPUT,
+        calibrate::Error::Arm(_)
+        | calibrate::Error::Force(_)
+        | calibrate::Error::Taxels(_)
+        | calibrate::Error::Count { .. }
+        | calibrate::Error::Recording { .. } => FAILED,
+        calibrate::Error::Temporary { .. }
+        | calibrate::Error::Out { .. }
+        | calibrate::Error::Print(_) => IO,
+    }
+}
+
+fn of_sniff(error: &sniff::Error) -> u8 {
+    match error {
+        sniff::Error::Unreadable { .. } => NO_INPUT,
+        sniff::Error::Recording { .. } | sniff::Error::Unexplained { .. } => FAILED,
+        sniff::Error::Unavailable { .. } => UNAVAILABLE,
+        sniff::Error::Print(_) | sniff::Error::Write { .. } => IO,
     }
 }
