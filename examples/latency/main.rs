@@ -36,7 +36,7 @@ struct Args {
     /// What is measured
     #[arg(long, value_enum, default_value_t = Kind::Hardnessd)]
     server: Kind,
-    /// Its program
+    /// Path of hardnessd, for --server hardnessd
     #[arg(long, default_value = "target/release/hardnessd")]
     program: PathBuf,
     /// Sensors
@@ -57,13 +57,13 @@ struct Args {
     /// How the server is scheduled
     #[arg(long, value_enum, default_value_t = Scheduling::Other)]
     scheduling: Scheduling,
-    /// How long
+    /// Seconds to measure, after 2 s to warm up
     #[arg(long, default_value_t = 60.0)]
     seconds: f64,
     /// More lines of the daemon's configuration
     #[arg(long, default_value = "")]
     configuration: String,
-    /// Be the process that only copies: where it reads
+    /// Copy bytes from this device to a client; --server bare starts this program again with it
     #[arg(long, hide = true)]
     copy: Option<PathBuf>,
 }

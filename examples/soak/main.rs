@@ -22,7 +22,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitCode, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::thread::{self, sleep};
+use std::thread::{self, JoinHandle, sleep};
 use std::time::{Duration, Instant};
 
 use account::{account, growth, usage};
@@ -33,7 +33,7 @@ use hardnessd::daemon::{Daemon, Reload};
 use hardnessd::random::Stream;
 use hardnessd::recording::Reader;
 use hardnessd::trial;
-use listener::{Link, come_and_go, hear};
+use listener::{Heard, Link, come_and_go, hear};
 use player::{FAULTS, Player, library, plug};
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::signal::unix::{SignalKind, signal};
@@ -49,7 +49,7 @@ const KEPT: usize = 16;
 
 #[derive(Parser)]
 struct Args {
-    /// How long to play, at least 2
+    /// Minutes to play, at least 2
     #[arg(long, default_value_t = 120.0)]
     minutes: f64,
     /// Sensors
@@ -58,7 +58,7 @@ struct Args {
     /// Seed of the faults
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Be the daemon
+    /// Run as the daemon with this configuration; soak starts itself again with it
     #[arg(long, hide = true)]
     daemon: Option<PathBuf>,
 }
@@ -194,6 +194,7 @@ fn soak(args: &Args) -> Result<Vec<String>, Failure> {
     Ok(problems)
 }
 
+/// Plays to the daemon until its time is over, ends it, and returns the problems.
 fn attend(
     args: &Args,
     daemon: &mut Child,
@@ -203,71 +204,10 @@ fn attend(
     config: &Path,
 ) -> Result<Vec<String>, Failure> {
     let pid = Pid::from_raw(i32::try_from(daemon.id())?).ok_or("no process")?;
-    let start = Instant::now();
-    while UnixStream::connect(socket).is_err() {
-        if start.elapsed() > PATIENCE || daemon.try_wait()?.is_some() {
-            return Err("the daemon does not start".into());
-        }
-        sleep(PERIOD);
-    }
-    let over = Arc::new(AtomicBool::new(false));
-    let mut listening = Vec::new();
-    for number in 0..17 {
-        // The first subscriber's links tell the players about their sensors.
-        let links: Vec<_> = links
-            .iter()
-            .map(|link| {
-                if number == 0 {
-                    Arc::clone(link)
-                } else {
-                    Arc::default()
-                }
-            })
-            .collect();
-        let connection = UnixStream::connect(socket)?;
-        listening.push(thread::spawn(move || hear(connection, &links)));
-    }
-    let mut guests = Vec::new();
-    for seed in 0..2 {
-        let (socket, over) = (socket.to_owned(), Arc::clone(&over));
-        guests.push(thread::spawn(move || come_and_go(&socket, seed, &over)));
-    }
-    let mut deaf = UnixStream::connect(socket)?;
-    deaf.write_all(b"{\"subscribe\":[\"frame\",\"press\",\"hardness\",\"status\"]}\n")?;
-
-    let start = Instant::now();
-    let length = Duration::from_secs_f64(60.0 * args.minutes);
-    let playing: Vec<_> = players
-        .into_iter()
-        .map(|player| thread::spawn(move || player.play(start + length)))
-        .collect();
-    let (mut samples, mut reloads, mut recorded) = (Vec::new(), 0, 0);
-    while playing.iter().any(|player| !player.is_finished()) {
-        if daemon.try_wait()?.is_some() {
-            return Err("the daemon has ended".into());
-        }
-        let second = start.elapsed().as_secs();
-        if second / 10 > reloads {
-            reloads += 1;
-            configure(config, args.sensors, 0.001 * (reloads % 2) as f64)?;
-            kill_process(pid, Signal::HUP)?;
-            let files = recordings(&config.with_file_name("rec"))?;
-            for old in files.iter().rev().skip(KEPT) {
-                fs::remove_file(old)?;
-                recorded += 1;
-            }
-        }
-        samples.push((start.elapsed(), usage(daemon)?));
-        sleep(Duration::from_secs(1));
-    }
-    let mut sent = Vec::new();
-    for player in playing {
-        sent.push(player.join().map_err(|_| "a player panicked")??);
-    }
-    over.store(true, Relaxed);
-    for guest in guests {
-        guest.join().map_err(|_| "a guest panicked")??;
-    }
+    await_start(daemon, socket)?;
+    let mut audience = Audience::gather(links, socket)?;
+    let played = Played::of(args, daemon, pid, players, config)?;
+    audience.send_guests_away()?;
     // Let the subscribers read the events so far.
     sleep(Duration::from_secs(1));
     kill_process(pid, Signal::TERM)?;
@@ -276,33 +216,176 @@ fn attend(
     if !ended.success() {
         problems.push(format!("the daemon ended with {ended}"));
     }
-    for (number, listener) in listening.into_iter().enumerate() {
+    for (number, listener) in audience.listening.into_iter().enumerate() {
         let heard = listener.join().map_err(|_| "a subscriber panicked")??;
-        problems.extend(
-            heard
-                .problems
-                .iter()
-                .map(|problem| format!("subscriber {number}: {problem}")),
-        );
         if number == 0 {
             println!(
                 "{} sensors for {:.1} minutes, {} events",
                 args.sensors, args.minutes, heard.events
             );
         }
-        for problem in account(&sent, &heard.ends, number == 0) {
-            // All subscribers report the same problem, so keep it once.
-            if !problems.contains(&problem) {
-                problems.push(problem);
+        judge(number, &heard, &played.sent, &mut problems);
+    }
+    played.print();
+    problems.extend(growth(&played.usages));
+    Ok(problems)
+}
+
+/// Waits until the daemon listens.
+fn await_start(daemon: &mut Child, socket: &Path) -> Result<(), Failure> {
+    let start = Instant::now();
+    while UnixStream::connect(socket).is_err() {
+        if start.elapsed() > PATIENCE || daemon.try_wait()?.is_some() {
+            return Err("the daemon does not start".into());
+        }
+        sleep(PERIOD);
+    }
+    Ok(())
+}
+
+/// The subscribers of the daemon.
+struct Audience {
+    /// Subscribers that read everything until the daemon ends.
+    listening: Vec<JoinHandle<Result<Heard, Failure>>>,
+    /// Subscribers that come and go.
+    guests: Vec<JoinHandle<Result<(), Failure>>>,
+    /// Tells the guests to come no more.
+    over: Arc<AtomicBool>,
+    /// A subscriber that never reads.
+    _deaf: UnixStream,
+}
+
+impl Audience {
+    fn gather(links: &[Arc<Link>], socket: &Path) -> Result<Self, Failure> {
+        let mut listening = Vec::new();
+        for number in 0..17 {
+            // The first subscriber's links tell the players about their sensors.
+            let links: Vec<_> = links
+                .iter()
+                .map(|link| {
+                    if number == 0 {
+                        Arc::clone(link)
+                    } else {
+                        Arc::default()
+                    }
+                })
+                .collect();
+            let connection = UnixStream::connect(socket)?;
+            listening.push(thread::spawn(move || hear(connection, &links)));
+        }
+        let over = Arc::new(AtomicBool::new(false));
+        let mut guests = Vec::new();
+        for seed in 0..2 {
+            let (socket, over) = (socket.to_owned(), Arc::clone(&over));
+            guests.push(thread::spawn(move || come_and_go(&socket, seed, &over)));
+        }
+        let mut deaf = UnixStream::connect(socket)?;
+        deaf.write_all(b"{\"subscribe\":[\"frame\",\"press\",\"hardness\",\"status\"]}\n")?;
+        Ok(Self {
+            listening,
+            guests,
+            over,
+            _deaf: deaf,
+        })
+    }
+
+    fn send_guests_away(&mut self) -> Result<(), Failure> {
+        self.over.store(true, Relaxed);
+        for guest in self.guests.drain(..) {
+            guest.join().map_err(|_| "a guest panicked")??;
+        }
+        Ok(())
+    }
+}
+
+/// What was played, and what the daemon needed meanwhile.
+struct Played {
+    sent: Vec<Player>,
+    /// Moments, and the daemon's usage then.
+    usages: Vec<(Duration, [u64; 3])>,
+    reloads: u64,
+    /// The number of recordings that were removed.
+    removed: u64,
+}
+
+impl Played {
+    /// Plays until the time is over. Meanwhile it reloads the daemon, removes old recordings and
+    /// looks at the daemon's usage.
+    fn of(
+        args: &Args,
+        daemon: &mut Child,
+        pid: Pid,
+        players: Vec<Player>,
+        config: &Path,
+    ) -> Result<Self, Failure> {
+        let start = Instant::now();
+        let length = Duration::from_secs_f64(60.0 * args.minutes);
+        let playing: Vec<_> = players
+            .into_iter()
+            .map(|player| thread::spawn(move || player.play(start + length)))
+            .collect();
+        let (mut usages, mut reloads, mut removed) = (Vec::new(), 0, 0);
+        while playing.iter().any(|player| !player.is_finished()) {
+            if daemon.try_wait()?.is_some() {
+                return Err("the daemon has ended".into());
             }
+            let second = start.elapsed().as_secs();
+            if second / 10 > reloads {
+                reloads += 1;
+                configure(config, args.sensors, 0.001 * (reloads % 2) as f64)?;
+                kill_process(pid, Signal::HUP)?;
+                removed += remove_old(&config.with_file_name("rec"))?;
+            }
+            usages.push((start.elapsed(), usage(daemon)?));
+            sleep(Duration::from_secs(1));
+        }
+        let mut sent = Vec::new();
+        for player in playing {
+            sent.push(player.join().map_err(|_| "a player panicked")??);
+        }
+        Ok(Self {
+            sent,
+            usages,
+            reloads,
+            removed,
+        })
+    }
+
+    fn print(&self) {
+        let faults = FAULTS.iter().enumerate().map(|(kind, name)| {
+            let count: u64 = self.sent.iter().map(|player| player.faults[kind]).sum();
+            format!("{count} {name}")
+        });
+        println!("faults: {}", faults.collect::<Vec<_>>().join(", "));
+        println!(
+            "reloads: {}; recordings removed meanwhile: {}",
+            self.reloads, self.removed
+        );
+    }
+}
+
+/// Removes all recordings but the last [`KEPT`], and returns their number.
+fn remove_old(directory: &Path) -> io::Result<u64> {
+    let mut removed = 0;
+    for old in recordings(directory)?.iter().rev().skip(KEPT) {
+        fs::remove_file(old)?;
+        removed += 1;
+    }
+    Ok(removed)
+}
+
+/// Adds the problems of one subscriber to `problems`.
+fn judge(number: usize, heard: &Heard, sent: &[Player], problems: &mut Vec<String>) {
+    problems.extend(
+        heard
+            .problems
+            .iter()
+            .map(|problem| format!("subscriber {number}: {problem}")),
+    );
+    for problem in account(sent, &heard.ends, number == 0) {
+        // All subscribers report the same problem, so keep it once.
+        if !problems.contains(&problem) {
+            problems.push(problem);
         }
     }
-    let faults = FAULTS.iter().enumerate().map(|(kind, name)| {
-        let count: u64 = sent.iter().map(|player| player.faults[kind]).sum();
-        format!("{count} {name}")
-    });
-    println!("faults: {}", faults.collect::<Vec<_>>().join(", "));
-    println!("reloads: {reloads}; recordings removed meanwhile: {recorded}");
-    problems.extend(growth(&samples));
-    Ok(problems)
 }
