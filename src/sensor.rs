@@ -102,7 +102,7 @@ impl Description {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SensorError {
     /// The name cannot be part of a topic, a file name or a log line.
-    #[error("name: found {0:?}, expected [a-z][a-z0-9_]*")]
+    #[error("name: found {0:?}, expected a letter a to z, then letters a to z, digits or _")]
     Name(String),
     /// The name is too long for a topic, a file name or a log line.
     #[error("name: found {found} characters, expected at most {MOST_NAME_CHARS}")]
@@ -310,7 +310,7 @@ mod tests {
         };
         check(
             &|d| d.name = "Arm".to_owned(),
-            "name: found \"Arm\", expected [a-z]",
+            "name: found \"Arm\", expected a letter a to z, then",
         );
         check(
             &|d| d.name = "\u{202e}".to_owned(),

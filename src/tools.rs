@@ -152,7 +152,8 @@ fn configuration_in_place_of_an_option(error: &clap::Error) -> Option<&str> {
 fn open(path: &Path) -> io::Result<File> {
     let file = File::open(path)?;
     if file.metadata()?.is_dir() {
-        return Err(io::ErrorKind::IsADirectory.into());
+        // In the system's words, as for a configuration that is a directory.
+        return Err(rustix::io::Errno::ISDIR.into());
     }
     Ok(file)
 }
@@ -199,6 +200,15 @@ mod tests {
         }
         let told = Told::Within(cause());
         assert_eq!(line(&told), "x: no such file, expected a new file");
+    }
+
+    #[test]
+    fn a_directory_is_refused_in_the_system_s_words() {
+        let directory = tempfile::tempdir().unwrap();
+        let refused = Told::Bare(open(directory.path()).unwrap_err());
+        assert_eq!(line(&refused), "x: cannot read: Is a directory");
+        let refused = Told::Bare(std::fs::read(directory.path()).unwrap_err());
+        assert_eq!(line(&refused), "x: cannot read: Is a directory");
     }
 
     #[test]

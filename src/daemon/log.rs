@@ -71,7 +71,7 @@ impl Drop for Log {
 pub enum Error {
     /// There is no journal.
     #[error(
-        "log.format: found \"journald\", expected a journal at {}",
+        "log.format: there is no journal at {} for \"journald\": set \"text\" or \"json\"",
         journal::SOCKET
     )]
     Journal(#[source] std::io::Error),

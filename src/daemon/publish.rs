@@ -66,7 +66,8 @@ pub enum Error {
     Zenoh(#[from] zenoh::Error),
     /// The service manager listens at a path that the configuration does not name.
     #[error(
-        "socket activation: found a socket at {found}, expected publish.unix.path or control_path"
+        "socket activation: the service manager listens at {found}, which the configuration does \
+         not name: set publish.unix.path or control_path to it"
     )]
     Unasked {
         /// The path that the service manager listens at.

@@ -9,7 +9,6 @@ mod file;
 mod worker;
 
 use std::fs::File;
-use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -17,6 +16,7 @@ use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
 use std::time::Duration;
 
 use rustix::fs::{Access, AtFlags, CWD};
+use rustix::io::Errno;
 use tokio::sync::{oneshot, watch};
 
 use self::worker::Worker;
@@ -93,7 +93,7 @@ pub enum Error {
         reason: String,
     },
     /// The directory of the configuration cannot be written to.
-    #[error("record.dir: found {path}: {source}, expected a directory that can be written to")]
+    #[error("record.dir: cannot write to {path}: {source}: set a directory that can be written to")]
     Directory {
         /// The directory, or the nearest path above it that exists.
         path: PathBuf,
@@ -128,7 +128,7 @@ pub(crate) fn check(settings: &config::Record) -> Result<(), Error> {
         let may = Access::WRITE_OK | Access::EXEC_OK;
         rustix::fs::accessat(CWD, there, may, AtFlags::EACCESS).map_err(std::io::Error::from)
     } else {
-        Err(ErrorKind::NotADirectory.into())
+        Err(Errno::NOTDIR.into())
     };
     found.map_err(|source| Error::Directory {
         path: there.to_owned(),

@@ -36,7 +36,7 @@ pub struct Reload {
 pub(super) enum Refusal {
     #[error(transparent)]
     Config(#[from] config::Error),
-    #[error("{key}: found another value, expected the one it started with: restart to change it")]
+    #[error("{key} has changed, which a running daemon cannot take over: restart it")]
     Fixed { key: String },
     #[error(transparent)]
     Log(#[from] log::Error),

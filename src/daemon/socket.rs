@@ -30,7 +30,7 @@ const LOOK_EVERY: Duration = Duration::from_secs(1);
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// A process already listens at the path.
-    #[error("{key}: found {path}, in use by another process, expected a free path")]
+    #[error("{key}: {path} is in use by another process: end that process, or set another path")]
     InUse {
         /// The key of the configuration.
         key: &'static str,
@@ -38,7 +38,7 @@ pub enum Error {
         path: PathBuf,
     },
     /// The path has another kind of file.
-    #[error("{key}: found {path}, which is no socket, expected a socket or nothing there")]
+    #[error("{key}: {path} is no socket: remove it, or set another path")]
     NoSocket {
         /// The key of the configuration.
         key: &'static str,
@@ -46,7 +46,7 @@ pub enum Error {
         path: PathBuf,
     },
     /// Neither the directory of the socket nor the directory above it exists.
-    #[error("{key}: found {path} in no directory, expected one, or one to make it in")]
+    #[error("{key}: {path} is in no directory: make the directory, or set another path")]
     NoDirectory {
         /// The key of the configuration.
         key: &'static str,

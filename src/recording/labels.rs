@@ -11,7 +11,7 @@ pub type Labels = BTreeMap<String, String>;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum LabelError {
     /// The label has no key.
-    #[error("found no key, expected KEY=VALUE")]
+    #[error("the label has no key: write KEY=VALUE")]
     NoKey,
     /// The key or the value has hidden characters, so a reader would see something else.
     #[error("found {0:?}, expected text without control or bidirectional characters")]
@@ -106,7 +106,7 @@ mod tests {
         }
         let long = "x".repeat(1001);
         for (key, value, expected) in [
-            ("", "7", "found no key"),
+            ("", "7", "the label has no key: write KEY=VALUE"),
             (
                 "object",
                 "99999999999",

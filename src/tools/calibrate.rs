@@ -83,10 +83,10 @@ pub enum Error {
         names: Vec<String>,
     },
     /// Weights were given, but not for `calibrate force`.
-    #[error("--newtons: found weights, expected none: they are for `calibrate force`")]
+    #[error("--newtons is only for `calibrate force`: leave it out")]
     Unasked,
     /// A file was given, but not for `calibrate taxels`.
-    #[error("--out: found a file, expected none: it is for `calibrate taxels`")]
+    #[error("--out is only for `calibrate taxels`: leave it out")]
     NoFile,
     /// The daemon cannot serve, or has stopped.
     #[error(transparent)]

@@ -4,7 +4,7 @@ use std::net::{IpAddr, SocketAddr};
 use std::path::Path;
 
 use super::error::Error;
-use super::{Config, Model, Ros2, SensorTable, Zenoh};
+use super::{Config, Model, Publish, Record, Ros2, SensorTable, Unix, Zenoh};
 use crate::sensor::Sensor;
 use crate::wording;
 
@@ -18,6 +18,34 @@ pub(super) fn check(config: &Config, path: &Path) -> Result<Vec<Sensor>, Error> 
         expected,
     };
     let publish = &config.publish;
+    check_built(publish, path)?;
+    check_robot(&config.robot, &value)?;
+    let sensors = check_sensors(config, path)?;
+    check_model(&config.model, &value)?;
+    check_unix(&publish.unix, path)?;
+    if let Some(record) = &config.record {
+        check_record(record, &value)?;
+    }
+    if let Some(zenoh) = &publish.zenoh {
+        check_zenoh(zenoh, &config.robot, &value)?;
+    }
+    if let Some(ros2) = &publish.ros2 {
+        check_ros2(ros2, &config.sensors, path)?;
+    }
+    check_listeners(config, path)?;
+    Ok(sensors)
+}
+
+fn clash(path: &Path, key: impl Into<String>, problem: String) -> Error {
+    Error::Clash {
+        path: path.to_owned(),
+        key: key.into(),
+        problem,
+    }
+}
+
+/// Checks that this program was built with the features that the tables need.
+fn check_built(publish: &Publish, path: &Path) -> Result<(), Error> {
     for (feature, built, given) in [
         (
             "foxglove",
@@ -34,7 +62,13 @@ pub(super) fn check(config: &Config, path: &Path) -> Result<Vec<Sensor>, Error> 
             });
         }
     }
-    let robot = &config.robot;
+    Ok(())
+}
+
+fn check_robot(
+    robot: &str,
+    value: &impl Fn(String, String, &'static str) -> Error,
+) -> Result<(), Error> {
     let chars = robot.chars().count();
     if chars > MOST_ROBOT_CHARS {
         let found = format!("{chars} characters");
@@ -44,9 +78,14 @@ pub(super) fn check(config: &Config, path: &Path) -> Result<Vec<Sensor>, Error> 
         let expected = "a name without control or bidirectional characters";
         return Err(value("robot".to_owned(), format!("{robot:?}"), expected));
     }
+    Ok(())
+}
+
+fn check_sensors(config: &Config, path: &Path) -> Result<Vec<Sensor>, Error> {
     if config.sensors.is_empty() {
-        let expected = "at least one [[sensor]] with a port";
-        return Err(value("sensor".to_owned(), "none".to_owned(), expected));
+        return Err(Error::NoSensor {
+            path: path.to_owned(),
+        });
     }
     let mut sensors = Vec::with_capacity(config.sensors.len());
     for (index, given) in config.sensors.iter().enumerate() {
@@ -58,35 +97,48 @@ pub(super) fn check(config: &Config, path: &Path) -> Result<Vec<Sensor>, Error> 
         })?);
         check_port(given, &config.sensors[..index], path)?;
     }
-    check_model(&config.model, &value)?;
-    if config.publish.unix.max_clients == 0 {
-        let key = "publish.unix.max_clients".to_owned();
-        return Err(value(key, "0".to_owned(), "1 or more"));
+    Ok(sensors)
+}
+
+fn check_unix(unix: &Unix, path: &Path) -> Result<(), Error> {
+    if unix.max_clients == 0 {
+        return Err(Error::Value {
+            path: path.to_owned(),
+            key: "publish.unix.max_clients".to_owned(),
+            found: "0".to_owned(),
+            expected: "1 or more",
+        });
     }
-    if let Some(record) = &config.record {
-        for (key, found, least) in [
-            ("record.rotate_mb", record.rotate_mb, 1),
-            ("record.rotate_s", record.rotate_s, 1),
-            ("record.keep_free_mb", record.keep_free_mb, 0),
-        ] {
-            if !(least..=MOST).contains(&found) {
-                let expected = "1 to 1000000000 (keep_free_mb also 0)";
-                return Err(value(key.to_owned(), found.to_string(), expected));
-            }
+    if unix.enabled && unix.control_path() == unix.path() {
+        let problem = format!(
+            "{} is the socket of events too: set another path",
+            unix.control_path().display()
+        );
+        return Err(clash(path, "publish.unix.control_path", problem));
+    }
+    Ok(())
+}
+
+fn check_record(
+    record: &Record,
+    value: &impl Fn(String, String, &'static str) -> Error,
+) -> Result<(), Error> {
+    for (key, found, least) in [
+        ("record.rotate_mb", record.rotate_mb, 1),
+        ("record.rotate_s", record.rotate_s, 1),
+        ("record.keep_free_mb", record.keep_free_mb, 0),
+    ] {
+        if !(least..=MOST).contains(&found) {
+            let expected = "1 to 1000000000 (keep_free_mb also 0)";
+            return Err(value(key.to_owned(), found.to_string(), expected));
         }
     }
-    let unix = &config.publish.unix;
-    if unix.enabled && unix.control_path() == unix.path() {
-        let key = "publish.unix.control_path".to_owned();
-        let found = unix.control_path().display().to_string();
-        return Err(value(key, found, "another path than that of events"));
-    }
-    if let Some(zenoh) = &publish.zenoh {
-        check_zenoh(zenoh, &config.robot, &value)?;
-    }
-    if let Some(ros2) = &publish.ros2 {
-        check_ros2(ros2, &config.sensors, &value)?;
-    }
+    Ok(())
+}
+
+/// Checks that all tables that listen on the network can do so at the same time.
+fn check_listeners(config: &Config, path: &Path) -> Result<(), Error> {
+    let publish = &config.publish;
     let listeners = [
         (
             "publish.tcp.listen",
@@ -103,12 +155,14 @@ pub(super) fn check(config: &Config, path: &Path) -> Result<Vec<Sensor>, Error> 
             if let (Some(listen), Some(other)) = (listen, other)
                 && meet(listen, other)
             {
-                let found = format!("{listen} beside {other_key} = {other}");
-                return Err(value(key.to_owned(), found, "another address or port"));
+                let problem = format!(
+                    "{listen} cannot be used beside {other_key} = {other}: set another address or port"
+                );
+                return Err(clash(path, key, problem));
             }
         }
     }
-    Ok(sensors)
+    Ok(())
 }
 
 fn check_zenoh(
@@ -137,11 +191,13 @@ fn check_zenoh(
     Ok(())
 }
 
-fn check_ros2(
-    ros2: &Ros2,
-    sensors: &[SensorTable],
-    value: &impl Fn(String, String, &'static str) -> Error,
-) -> Result<(), Error> {
+fn check_ros2(ros2: &Ros2, sensors: &[SensorTable], path: &Path) -> Result<(), Error> {
+    let value = |key: String, found: String, expected| Error::Value {
+        path: path.to_owned(),
+        key,
+        found,
+        expected,
+    };
     let found = match ros2.chosen_domain_id() {
         Ok(id) if id > LAST_DOMAIN_ID => Some(format!("{id} (by default $ROS_DOMAIN_ID)")),
         Ok(_) => None,
@@ -186,10 +242,11 @@ fn check_ros2(
         }
     }
     match sensors.iter().find(|sensor| !token(&sensor.name)) {
-        Some(sensor) => Err(value(
+        Some(sensor) => Err(clash(
+            path,
             format!("sensor.name of {:?}", sensor.name),
-            "two _ in a row".to_owned(),
-            "a name that ROS takes, beside publish.ros2",
+            "ROS takes no name with two _ in a row: rename the sensor, or remove publish.ros2"
+                .to_owned(),
         )),
         None => Ok(()),
     }
@@ -217,21 +274,10 @@ const MOST: u64 = 1_000_000_000;
 /// Checks that a sensor has a name and a port of its own.
 fn check_port(sensor: &SensorTable, earlier: &[SensorTable], path: &Path) -> Result<(), Error> {
     let name = &sensor.name;
-    let value = |key: &str, found: String, expected| {
-        let key = format!("sensor.{key} of {name:?}");
-        Err(Error::Value {
-            path: path.to_owned(),
-            key,
-            found,
-            expected,
-        })
-    };
+    let key = |key| format!("sensor.{key} of {name:?}");
     if earlier.iter().any(|other| other.name == *name) {
-        return value(
-            "name",
-            format!("{name:?} twice"),
-            "a name of its own for each sensor",
-        );
+        let problem = "two sensors have this name: give each a name of its own".to_owned();
+        return Err(clash(path, key("name"), problem));
     }
     // A device that exists may have several names.
     let device = |sensor: &SensorTable| {
@@ -239,8 +285,12 @@ fn check_port(sensor: &SensorTable, earlier: &[SensorTable], path: &Path) -> Res
         port.canonicalize().unwrap_or_else(|_| port.clone())
     };
     if let Some(other) = earlier.iter().find(|other| device(other) == device(sensor)) {
-        let found = format!("{}, as for {:?}", sensor.port.display(), other.name);
-        return value("port", found, "a port of its own for each sensor");
+        let problem = format!(
+            "{} is the port of {:?} too: give each sensor a port of its own",
+            sensor.port.display(),
+            other.name
+        );
+        return Err(clash(path, key("port"), problem));
     }
     Ok(())
 }

@@ -24,7 +24,7 @@ pub enum Error {
         source: std::io::Error,
     },
     /// The file is longer than any configuration. It may be another file, or an endless device.
-    #[error("{path}: found more than {MAX_BYTES} bytes, expected a configuration")]
+    #[error("{path}: more than {MAX_BYTES} bytes: no configuration is so long: name another file")]
     TooLong {
         /// The path of the configuration.
         path: PathBuf,
@@ -51,6 +51,22 @@ pub enum Error {
         /// The values that can be used.
         expected: &'static str,
     },
+    /// Two values cannot be used together.
+    #[error("{path}: {key}: {problem}")]
+    Clash {
+        /// The path of the configuration.
+        path: PathBuf,
+        /// The key to change, as it is written in the file.
+        key: String,
+        /// The problem, and the remedy.
+        problem: String,
+    },
+    /// The configuration has no sensor.
+    #[error("{path}: no sensor: add a [[sensor]] with a port")]
+    NoSensor {
+        /// The path of the configuration.
+        path: PathBuf,
+    },
     /// A value of a sensor's description cannot be used.
     #[error("{path}: {}{problem}", table_of(sensor, problem))]
     Sensor {
@@ -64,8 +80,8 @@ pub enum Error {
     /// A table belongs to a feature that this program was built without. Such a table is never
     /// ignored.
     #[error(
-        "{path}: publish.{feature}: found a table, expected none: built without the feature \
-         {feature:?}"
+        "{path}: publish.{feature}: this hardnessd was built without {feature}: build it with \
+         --features {feature}, or remove the table"
     )]
     NotBuilt {
         /// The path of the configuration.

@@ -137,7 +137,7 @@ fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Error {
         return Error::Syntax {
             path: path.to_owned(),
             place: Place::of(text, start),
-            problem: "sensor.port: found none, expected the path of a device".to_owned(),
+            problem: "sensor.port is missing: set it to a path under /dev/serial/by-id/".to_owned(),
         };
     }
     if let Some(start) = single_brackets(text, error.message()) {

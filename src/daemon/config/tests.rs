@@ -37,14 +37,21 @@ fn every_key_but_port_has_a_default() {
 #[test]
 fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
     let cases: [(&str, &[&str]); 41] = [
-        ("[[sensor]]\nname = \"a\"", &["1:1", "sensor.port", "none"]),
+        (
+            "[[sensor]]\nname = \"a\"",
+            &["1:1: sensor.port is missing: set it to a path under /dev/serial/by-id/"],
+        ),
         (
             "# Two.\n[[sensor]]\nport = \"p\"\n\n[[sensor]]\nname = \"b\"",
-            &["5:1", "sensor.port: found none, expected the path"],
+            &["5:1: sensor.port is missing: set it"],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[[sensor]]\nname = \"b\"\nport = \"./p\"",
-            &["sensor.port of \"b\"", "as for \"sensor\"", "of its own"],
+            &[
+                "sensor.port of \"b\"",
+                "is the port of \"sensor\"",
+                "of its own",
+            ],
         ),
         (
             "[[sensor]]\nport = \"\"",
@@ -73,7 +80,7 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
         (
             "[[sensor]]\nport = \"p\"\n[http]\nlisten = \"127.0.0.1:99\"\n\
              [publish.tcp]\nlisten = \"0.0.0.0:99\"",
-            &["http.listen: found 127.0.0.1:99", "0.0.0.0:99", "another"],
+            &["http.listen: 127.0.0.1:99 cannot", "0.0.0.0:99", "another"],
         ),
         (
             "robot = \"\\u202Eevil\"\n[[sensor]]\nport = \"p\"",
@@ -84,7 +91,7 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
             &["robot: found \"\"", "expected a name"],
         ),
         ("bad", &["1:"]),
-        ("[log]", &["sensor", "found none"]),
+        ("[log]", &["no sensor: add a [[sensor]] with a port"]),
         (
             "[[sensor]]\nport = \"p\"\nbauds = 9",
             &["3:1", "`bauds`", "`baud`"],
@@ -100,7 +107,7 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
         ("[[sensor]]\nport = \"p\"\nname = \"Arm\"", &["name", "Arm"]),
         (
             "[[sensor]]\nport = \"p\"\n[[sensor]]\nport = \"q\"",
-            &["name", "twice"],
+            &["name", "two sensors have this name"],
         ),
         (
             "[[sensor]]\nport = \"p\"\nframe_rate_hz = nan",
@@ -534,8 +541,10 @@ fn a_table_of_a_part_that_was_not_built_in_is_refused_by_name() {
             assert!(loaded.is_ok(), "{loaded:?}");
         } else {
             let error = loaded.unwrap_err();
-            let expected =
-                format!("publish.{feature}: found a table, expected none: built without");
+            let expected = format!(
+                "publish.{feature}: this hardnessd was built without {feature}: build it with \
+                 --features {feature}, or remove the table"
+            );
             assert!(error.contains(&expected), "{error}");
         }
     }
