@@ -717,33 +717,62 @@ class Control:
 
 
 def _readable(event: Event) -> str:
-    """An event as one line of text."""
+    """An event as one line of text, the same as that of `hardnessd tail`."""
     if event["type"] == "disconnected":
         return f"-- disconnected: {event['reason']} --"
     if event["type"] == "gap":
         lost = "an unknown number of" if event["lost"] is None else event["lost"]
         return f"-- gap: {lost} events lost --"
-    start = f"{event['time'][11:23]}  {event['sensor']:<12}  {event['type']:<8}  "
-    if event["type"] == "frame":
-        force_n, area = sum(event["newtons"]), event["contact_area_taxels"]
-        return start + f"#{event['frame']:<4} {'':<8}  {area:>3} taxels  {force_n:>6.2f} N"
-    if event["type"] == "status":
-        rate = "" if event["frame_rate_hz"] is None else f", {event['frame_rate_hz']:.1f} frames/s"
-        text = f"{event['state']:<14}  {event['frames']} frames, {event['frames_damaged']} damaged{rate}"
-        return start + text + (f"  ({event['reason']})" if event["reason"] else "")
-    if event["type"] == "press":
+    if event["type"] == "hardness":
+        clock, text = _published(event), _verdict(event)
+    elif event["type"] == "press":
+        clock = event["time"][11:23]
         text = f"#{event['press']:<4} {event['state']:<8}  frame {event['frame']}"
-        return start + text + (f"  ({event['reason']})" if event["reason"] else "")
-    label = f"rejected: {event['rejected']}" if event["rejected"] else f"{event['level']} {event['label']}"
+        text += "" if event["state"] == "begin" else f", {event['frames']} in contact"
+        text += _reason(event["reason"]) + _context(event["context"])
+    elif event["type"] == "status":
+        clock = event["time"][11:23]
+        text = f"{event['state']:<10}  {event['frames']} frames, {event['frames_damaged']} damaged"
+        text += "" if event["frame_rate_hz"] is None else f", {event['frame_rate_hz']:.1f} frames/s"
+        text += _reason(event["reason"])
+    else:
+        clock, newtons = event["time"][11:23], event["newtons"]
+        text = f"#{event['frame']:<13}  {sum(newtons):>6.2f} N, highest taxel {max(newtons):.2f} N"
+    return f"{clock}  {event['sensor']:<12}  {event['type']:<8}  {text}".rstrip()
+
+
+def _published(event: Hardness) -> str:
+    """The time of day of publication. `time` is that of the chosen frame, and lines are in the order
+    in which events are published."""
+    if event["age_at_publish_ms"] is None:
+        return event["time"][11:23]
+    published = datetime.datetime.fromisoformat(event["time"].replace("Z", "+00:00"))
+    published += datetime.timedelta(milliseconds=event["age_at_publish_ms"])
+    return f"{published:%H:%M:%S.%f}"[:12]
+
+
+def _verdict(event: Hardness) -> str:
+    label = f"{event['level']} {event['label']}" if event["level"] else f"rejected: {event['rejected']}"
+    probabilities = " ".join(f"{100 * p:.0f}" for p in event["probabilities"])
+    text = f"#{event['press']:<4} {event['phase']:<8}  {label:<24} {100 * event['confidence']:>3.0f} %"
+    text += f" [{probabilities}]  {event['contact_area_taxels']:>3} taxels  {event['force_n']:>6.2f} N"
+    # An older daemon sends no Shore hardness.
+    shore = event.get("shore")
+    if shore is not None:
+        text += f"  Shore {shore['value']:.0f} ({shore['low']:.0f} to {shore['high']:.0f})"
     if event["age_at_publish_ms"] is not None:
-        # `time` is that of the chosen frame. Lines are in the order in which events are published.
-        published = datetime.datetime.fromisoformat(event["time"].replace("Z", "+00:00"))
-        published += datetime.timedelta(milliseconds=event["age_at_publish_ms"])
-        start = f"{published:%H:%M:%S.%f}"[:12] + start[12:]
-    text = f"#{event['press']:<4} {event['phase']:<8}  {label:<24} {event['confidence']:>4.0%}"
-    text += f"  {event['contact_area_taxels']:>3} taxels  {event['force_n']:>6.2f} N"
-    text += f"  frame {event['frame']} at {event['time'][11:23]}"
-    return start + text + (f"  ({', '.join(event['notes'])})" if event["notes"] else "")
+        text += f"  frame {event['frame']} at {event['time'][11:23]}"
+    return text + _reason(", ".join(event["notes"])) + _context(event["context"])
+
+
+def _reason(text: Optional[str]) -> str:
+    return f"  ({text})" if text else ""
+
+
+def _context(context: Optional[Message]) -> str:
+    if context is None:
+        return ""
+    return "  " + json.dumps(context, ensure_ascii=False, separators=(",", ":"))
 
 
 def _types(text: str) -> List[str]:
@@ -804,6 +833,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     over = threading.Timer(args.timeout or 0, client.close)
     over.daemon = True
     count = 0
+    reason: Optional[str] = None
     if isinstance(sys.stdout, io.TextIOWrapper):
         # A label may have letters that this terminal lacks.
         sys.stdout.reconfigure(errors="replace")
@@ -811,6 +841,13 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
         if args.timeout:
             over.start()
         for event in client:
+            if event["type"] != "disconnected":
+                reason = None
+            elif event["reason"] == reason:
+                # The client gives this event for each failed try. One line says it.
+                continue
+            else:
+                reason = event["reason"]
             try:
                 text = json.dumps(event) if args.json else _readable(event)
             except (KeyError, TypeError, ValueError):

@@ -250,6 +250,17 @@ def program(bench):
         assert [json.loads(line)["type"] for line in lines] == ["hardness"] * 2, lines
         shown = done(events, "--count", "3", "--types", "press,status,hardness,frame").stdout
         assert re.match(r"\d\d:\d\d:\d\d\.\d{3}  forearm       status    live  ", shown), shown
+        # The client and `hardnessd tail` print the same lines. The one that connects later misses some.
+        more = ["--types", "press,hardness,status", "--count", "12"]
+        tail = subprocess.Popen(
+            [bench.binary, "tail", "--socket", events, *more], stdout=subprocess.PIPE, text=True
+        )
+        ours = done(events, *more).stdout.splitlines()
+        theirs = tail.communicate(timeout=60)[0].splitlines()
+        numbered = [[line for line in lines if " #" in line] for lines in (ours, theirs)]
+        same = [line for line in numbered[0] if line in numbered[1]]
+        assert len(same) >= 4 and any(" hardness " in line for line in same), (ours, theirs)
+        assert "".join(same) in "".join(numbered[0]) and "".join(same) in "".join(numbered[1]), (ours, theirs)
         for code, arguments, said in [
             (1, [events, "--types", "hardness", "--timeout", "0.01"], "timed out after 0.01 s (0 events)"),
             (1, [bench.path("nobody.sock"), "--timeout", "0.5"], "timed out after 0.5 s (0 events)"),
@@ -262,7 +273,8 @@ def program(bench):
             ended = done(*arguments)
             assert ended.returncode == code and said in ended.stderr, (arguments, ended)
             assert "Traceback" not in ended.stderr, ended
-        assert "-- disconnected: " in done(bench.path("nobody.sock"), "--timeout", "0.5").stdout
+        nobody = done(bench.path("nobody.sock"), "--timeout", "0.5").stdout
+        assert nobody == f"-- disconnected: {bench.path('nobody.sock')}: No such file or directory --\n", nobody
         piped = subprocess.run(
             ["bash", "-c", '"$@" | head -n 1; echo "${PIPESTATUS[0]}"', "-", *start, events, "--types", "frame"],
             capture_output=True, text=True, timeout=60,
