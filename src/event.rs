@@ -22,6 +22,29 @@ pub const PROTOCOL: u32 = 1;
 pub const CONTEXT_BYTES: usize = 1024;
 
 /// A numbered or live event of one sensor.
+///
+/// # Example
+///
+/// The hub gives a status its number and publishes it as a line.
+///
+/// ```
+/// use hardnessd::event::{Event, Kind, LinkState, Status};
+///
+/// let mut event = Event::Status(Status {
+///     seq: None,
+///     sensor: "forearm".to_owned(),
+///     time: jiff::Timestamp::UNIX_EPOCH,
+///     state: LinkState::Live,
+///     reason: None,
+///     frames: 41,
+///     frames_damaged: 0,
+///     bytes_skipped: 0,
+///     frame_rate_hz: Some(5.0),
+/// });
+/// event.number(9);
+/// assert_eq!((event.kind(), event.seq()), (Kind::Status, Some(9)));
+/// assert!(event.to_line().starts_with(r#"{"type":"status","seq":9,"sensor":"forearm","#));
+/// ```
 #[expect(
     clippy::large_enum_variant,
     reason = "a few hundred bytes, beside a frame's three thousand on the heap"
@@ -251,6 +274,35 @@ pub enum Note {
 }
 
 /// A verdict.
+///
+/// # Example
+///
+/// A recording of two presses on foam has two final verdicts.
+///
+/// ```
+/// use std::sync::Arc;
+/// use std::time::Duration;
+///
+/// use hardnessd::event::{Event, Phase};
+/// use hardnessd::frame::Stamp;
+/// use hardnessd::pipeline::{Clock, Pipeline};
+/// use hardnessd::sensor::{Description, Sensor};
+/// use hardnessd::verdict::{BUILT_IN, Hrn};
+///
+/// let hrn = Arc::new(Hrn::load(BUILT_IN)?);
+/// let mut pipeline = Pipeline::new(Sensor::new(Description::default())?, hrn, Clock::FrameRate);
+/// let at = Stamp {
+///     mono: Duration::ZERO,
+///     wall: jiff::Timestamp::UNIX_EPOCH,
+/// };
+/// let events = pipeline.push(&std::fs::read("fixtures/foam.5hz.bin")?, at);
+/// let labels = events.iter().filter_map(|event| match event {
+///     Event::Hardness(verdict) if verdict.phase == Phase::Final => verdict.label.as_deref(),
+///     _ => None,
+/// });
+/// assert_eq!(labels.collect::<Vec<_>>(), ["firm", "firm"]);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Hardness {
     /// The event's number in the run.
@@ -301,7 +353,7 @@ pub struct Hardness {
     pub age_at_publish_ms: Option<f64>,
     /// The time since the arrival of the byte that made the verdict possible; null in a replay.
     pub latency_us: Option<u64>,
-    /// The Shore hardness with its 90 % interval; null unless the model judges courses.
+    /// The Shore hardness with its 90 % interval; null if the model has no such output.
     #[serde(serialize_with = "shore")]
     pub shore: Option<Shore>,
     /// The levels that the model cannot tell apart; null without a conformal threshold.

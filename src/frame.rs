@@ -17,6 +17,17 @@ pub const COLS: usize = 28;
 pub const TAXELS: usize = ROWS * COLS;
 
 /// A frame in sensor counts. Taxels outside a smaller array are 0.
+///
+/// # Example
+///
+/// ```
+/// use hardnessd::frame::{Array, RawFrame};
+///
+/// let array = Array { rows: 10, cols: 12 };
+/// let mut raw = RawFrame::default();
+/// raw.counts[array.place(0, 0)] = 200;
+/// assert_eq!(format!("{raw:?}"), "RawFrame { sum: 200, peak: Some(200) }");
+/// ```
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct RawFrame {
     /// `[ROWS, COLS]` flattened, row-major, in counts.
@@ -205,6 +216,28 @@ impl Array {
 
 /// The arrival time on two clocks: one that never jumps, for durations, and the calendar, for
 /// people.
+///
+/// # Example
+///
+/// Somebody sets the calendar back by an hour during a press of 1.5 s.
+///
+/// ```
+/// use std::time::Duration;
+///
+/// use hardnessd::frame::Stamp;
+///
+/// let began = Stamp {
+///     mono: Duration::from_secs(100),
+///     wall: "2026-11-21T10:00:00Z".parse()?,
+/// };
+/// let ended = Stamp {
+///     mono: Duration::from_millis(101_500),
+///     wall: "2026-11-21T09:00:01.5Z".parse()?,
+/// };
+/// assert_eq!(ended.mono - began.mono, Duration::from_millis(1500));
+/// assert!(ended.wall < began.wall);
+/// # Ok::<(), jiff::Error>(())
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Stamp {
     /// The time by CLOCK_MONOTONIC.

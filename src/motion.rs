@@ -14,6 +14,8 @@ use serde::{Deserialize, Serialize};
 pub use self::settings::{SPEEDS_MM_S, Settings, SettingsError};
 
 /// The position of the arm at one moment.
+///
+/// [`Track`] has an example.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(into = "(i64, f64)", from = "(i64, f64)")]
 pub struct Point {

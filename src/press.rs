@@ -91,6 +91,32 @@ impl Abort {
 }
 
 /// A change of a press.
+///
+/// # Example
+///
+/// A touch of one frame begins a press that gets no verdict.
+///
+/// ```
+/// use std::time::Duration;
+///
+/// use hardnessd::frame::{Frame, Stamp};
+/// use hardnessd::press::{Abort, Change, Marks, Moment, PressTracker, Settings};
+///
+/// let mut tracker = PressTracker::new(Settings::default());
+/// let mut touched = Frame::default();
+/// touched.newtons[400..409].fill(0.5);
+/// let mut changes = Vec::new();
+/// for (number, frame) in (0..).zip([touched, Frame::default(), Frame::default()]) {
+///     let stamp = Stamp {
+///         mono: Duration::from_millis(200 * number),
+///         wall: jiff::Timestamp::UNIX_EPOCH,
+///     };
+///     let at = Moment { frame: number, stamp };
+///     changes.extend(tracker.push(&frame, Marks::default(), at));
+/// }
+/// assert!(matches!(changes[0], Change::Begin { press: 1, .. }));
+/// assert!(matches!(changes[1], Change::Aborted { frames: 1, reason: Abort::Short, .. }));
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub enum Change {
     /// A press began with this frame.

@@ -35,6 +35,33 @@ use crate::verdict::Hrn;
 
 /// One thing that happens to a pipeline. Only a change of the sensor's description is an entry of
 /// its own ([`Entry::Settings`]).
+///
+/// # Example
+///
+/// A recorded input goes into a pipeline as it did live.
+///
+/// ```
+/// use std::sync::Arc;
+/// use std::time::Duration;
+///
+/// use hardnessd::event::{Event, LinkState};
+/// use hardnessd::frame::Stamp;
+/// use hardnessd::pipeline::{Clock, Pipeline};
+/// use hardnessd::recording::Input;
+/// use hardnessd::sensor::{Description, Sensor};
+/// use hardnessd::verdict::{BUILT_IN, Hrn};
+///
+/// let sensor = Sensor::new(Description::default())?;
+/// let mut pipeline = Pipeline::new(sensor, Arc::new(Hrn::load(BUILT_IN)?), Clock::Arrival);
+/// let at = Stamp {
+///     mono: Duration::from_secs(1),
+///     wall: jiff::Timestamp::UNIX_EPOCH,
+/// };
+/// assert!(Input::Opened.feed(&mut pipeline, at).is_empty());
+/// let events = Input::Lost("unplugged".into()).feed(&mut pipeline, at);
+/// assert!(matches!(&events[..], [Event::Status(status)] if status.state == LinkState::Lost));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub enum Input<'a> {
     /// The port is open.
@@ -103,6 +130,26 @@ impl Input<'_> {
 }
 
 /// An entry of a recording for one sensor. Entries are in order of time.
+///
+/// # Example
+///
+/// This counts the bytes of a sensor in a recording, and how often the configuration was read again.
+///
+/// ```
+/// use hardnessd::recording::{Entry, Input, Reader};
+///
+/// let file = std::fs::File::open("fixtures/earlier.mcap")?;
+/// let (mut bytes, mut reloads) = (0, 0);
+/// for found in Reader::new(file) {
+///     match found?.entry {
+///         Entry::Input(Input::Bytes(chunk)) => bytes += chunk.len(),
+///         Entry::Settings(_) => reloads += 1,
+///         Entry::Input(_) | Entry::State(_) => {}
+///     }
+/// }
+/// assert!(bytes > 0 && reloads == 1, "{bytes} bytes, {reloads} reloads");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub enum Entry {
     /// Something happened to the sensor.

@@ -270,6 +270,24 @@ pub enum ModelError {
 }
 
 /// The verdict of an HRN on a press.
+///
+/// # Example
+///
+/// The card of a model has the labels of its levels.
+///
+/// ```
+/// use hardnessd::frame::Frame;
+/// use hardnessd::verdict::{BUILT_IN, Hrn};
+///
+/// let hrn = Hrn::load(BUILT_IN)?;
+/// let mut frame = Frame::default();
+/// frame.newtons[400..404].fill(2.0);
+/// let verdict = hrn.judge(&frame)?;
+/// let level = &hrn.card().levels[usize::from(verdict.level) - 1];
+/// println!("{} ({:.0} %)", level.label, 100.0 * verdict.confidence);
+/// assert_eq!(level.level, verdict.level);
+/// # Ok::<(), hardnessd::verdict::ModelError>(())
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct Verdict {
     /// The 1-based argmax of the probabilities (Eq. 10). Of equal probabilities, the lower level

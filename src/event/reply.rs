@@ -6,6 +6,15 @@ use super::line;
 use crate::tare::Offsets;
 
 /// A line that is not an event of a sensor: `hello`, `gap`, `error` or `ok`.
+///
+/// # Example
+///
+/// ```
+/// use hardnessd::event::Reply;
+///
+/// let gap = Reply::Gap { lost: Some(3) };
+/// assert_eq!(gap.to_line(), "{\"type\":\"gap\",\"lost\":3}\n");
+/// ```
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "type", rename_all = "lowercase")]
 pub enum Reply {
@@ -57,6 +66,30 @@ impl Reply {
 }
 
 /// The greeting: the server, its sensors and its model.
+///
+/// # Example
+///
+/// ```
+/// use hardnessd::event::{Hello, ModelCard, PROTOCOL, Reply};
+///
+/// let hello = Hello {
+///     protocol: PROTOCOL,
+///     server: "hardnessd",
+///     version: "0.2.0",
+///     robot: "arm-7".to_owned(),
+///     run: "5f0c".to_owned(),
+///     boot_id: String::new(),
+///     seq: 41,
+///     sensors: Vec::new(),
+///     model: ModelCard {
+///         sha256: "0123456789ab".to_owned(),
+///         validation: "simulated data only".to_owned(),
+///         levels: Vec::new(),
+///     },
+/// };
+/// let line = Reply::Hello(hello).to_line();
+/// assert!(line.starts_with(r#"{"type":"hello","protocol":1,"server":"hardnessd","#));
+/// ```
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Hello {
     /// [`PROTOCOL`](super::PROTOCOL).

@@ -3,6 +3,19 @@
 use serde::{Deserialize, Serialize};
 
 /// The `[sensor.arm]` table.
+///
+/// # Example
+///
+/// ```
+/// use hardnessd::motion::Settings;
+///
+/// let settings = Settings { stiffness_n_per_mm: Some(12.0), ..Settings::default() };
+/// assert!(settings.check().is_ok());
+///
+/// let settings = Settings { speed_mm_s: Some(0.0), ..Settings::default() };
+/// let error = settings.check().unwrap_err();
+/// assert_eq!(error.to_string(), "speed_mm_s: found 0.0, expected 0.001 to 1000 mm/s");
+/// ```
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {

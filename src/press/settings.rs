@@ -6,6 +6,19 @@ use crate::frame::TAXELS;
 use crate::wording::as_written;
 
 /// The `[press]` table.
+///
+/// # Example
+///
+/// ```
+/// use hardnessd::press::Settings;
+///
+/// let settings = Settings { max_seconds: 5.0, ..Settings::default() };
+/// assert!(settings.check().is_ok());
+///
+/// let settings = Settings { begin_area_taxels: 3, end_area_taxels: 4, ..Settings::default() };
+/// let error = settings.check().unwrap_err();
+/// assert_eq!(error.to_string(), "end_area_taxels: found 4, expected 1 to 3");
+/// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {

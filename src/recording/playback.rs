@@ -10,6 +10,25 @@ use crate::sensor::SensorError;
 use crate::verdict::Hrn;
 
 /// The pipelines of a recording's sensors. They get the same inputs as the recorded ones.
+///
+/// # Example
+///
+/// ```
+/// use std::sync::Arc;
+///
+/// use hardnessd::event::Kind;
+/// use hardnessd::recording::{Playback, Reader};
+/// use hardnessd::verdict::{BUILT_IN, Hrn};
+///
+/// let mut playback = Playback::new(Arc::new(Hrn::load(BUILT_IN)?));
+/// let mut events = Vec::new();
+/// for found in Reader::new(std::fs::File::open("fixtures/earlier.mcap")?) {
+///     events.extend(playback.feed(found?)?);
+/// }
+/// events.extend(playback.end());
+/// assert!(events.iter().any(|event| event.kind() == Kind::Hardness));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug)]
 pub struct Playback {
     hrn: Arc<Hrn>,

@@ -14,6 +14,34 @@ const KEPT: Duration = Duration::from_secs(60);
 const KEPT_BYTES: usize = 32 << 20;
 
 /// Entries of one sensor, in stretches that each begin with a state.
+///
+/// # Example
+///
+/// A ring keeps entries from the first state on.
+///
+/// ```
+/// use std::sync::Arc;
+/// use std::time::Duration;
+///
+/// use hardnessd::frame::Stamp;
+/// use hardnessd::pipeline::{Clock, Pipeline};
+/// use hardnessd::recording::{Entry, Input, Labels, Ring, State};
+/// use hardnessd::sensor::{Description, Sensor};
+/// use hardnessd::verdict::{BUILT_IN, Hrn};
+///
+/// let sensor = Sensor::new(Description::default())?;
+/// let pipeline = Pipeline::new(sensor, Arc::new(Hrn::load(BUILT_IN)?), Clock::Arrival);
+/// let at = Stamp {
+///     mono: Duration::from_secs(1),
+///     wall: jiff::Timestamp::UNIX_EPOCH,
+/// };
+/// let mut ring = Ring::default();
+/// ring.push(at, Entry::Input(Input::Opened));
+/// ring.push(at, Entry::State(Box::new(State::of(&pipeline, Labels::new()))));
+/// ring.push(at, Entry::Input(Input::Tick));
+/// assert_eq!(ring.all().count(), 2);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug, Default)]
 pub struct Ring {
     stretches: VecDeque<Stretch>,

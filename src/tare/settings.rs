@@ -16,6 +16,24 @@ pub const NEWTONS_PER_COUNT: f32 = 0.04;
 pub const PITCH_MM: f64 = 3.5;
 
 /// The `[sensor.calibration]` table.
+///
+/// # Example
+///
+/// One taxel of four reads twice the force of the others, and one is dead.
+///
+/// ```
+/// use hardnessd::frame::Array;
+/// use hardnessd::tare::{Gains, Settings};
+///
+/// let settings = Settings {
+///     gains: Some(Gains::Taxels(vec![vec![1.0, 0.5], vec![1.0, 1.0]])),
+///     dead_taxels: vec![[1, 1]],
+///     ..Settings::default()
+/// };
+/// assert!(settings.check(Array { rows: 2, cols: 2 }).is_ok());
+/// let error = settings.check(Array::FULL).unwrap_err();
+/// assert_eq!(error.to_string(), "gains: found 2 rows of 2, expected 28 of 28");
+/// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
@@ -40,6 +58,8 @@ pub struct Settings {
 }
 
 /// The factor of each taxel's newtons.
+///
+/// [`Settings`] has an example.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(untagged)]
 pub enum Gains {

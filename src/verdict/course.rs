@@ -24,6 +24,29 @@ pub struct CourseMoment {
 }
 
 /// A press over time.
+///
+/// # Example
+///
+/// A model of format 2 judges a whole press, here one of two frames.
+///
+/// ```
+/// use hardnessd::frame::Frame;
+/// use hardnessd::verdict::{Course, CourseMoment, Hrn};
+///
+/// let moment = |time_s, approach_mm, newtons| {
+///     let mut frame = Frame::default();
+///     frame.newtons[400..404].fill(newtons);
+///     CourseMoment { time_s, approach_mm: Some(approach_mm), frame }
+/// };
+/// let course = Course {
+///     moments: vec![moment(0.0, 0.0, 0.2), moment(0.1, 0.5, 2.0)],
+///     arm_n_per_mm: 10.0,
+/// };
+/// let verdict = Hrn::load(&std::fs::read("models/course.onnx")?)?.judge_course(&course)?;
+/// let shore = verdict.shore.unwrap();
+/// assert!(shore.low <= shore.value && shore.value <= shore.high);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Course {
     /// The frames in contact, from the one that began the press, ascending in time.

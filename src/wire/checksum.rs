@@ -4,6 +4,8 @@ use crc::{CRC_16_IBM_3740, CRC_16_MODBUS, Crc, Table};
 use serde::{Deserialize, Serialize};
 
 /// A checksum over all bytes of the frame before it, sent little-endian.
+///
+/// [`Settings`](super::Settings) has an example.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Checksum {

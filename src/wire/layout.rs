@@ -16,6 +16,26 @@ enum Framing {
 }
 
 /// A checked layout.
+///
+/// # Example
+///
+/// A layout writes a frame as the sensor would, and knows the size of the array.
+///
+/// ```
+/// use hardnessd::frame::{Array, RawFrame};
+/// use hardnessd::wire::{Layout, LayoutError, Settings};
+///
+/// let settings = Settings { rows: Some(10), ..Settings::default() };
+/// let layout = Layout::new(&settings)?;
+/// assert_eq!(layout.array(), Array { rows: 10, cols: 28 });
+/// let mut bytes = Vec::new();
+/// layout.encode(&RawFrame::default(), &mut bytes);
+/// assert_eq!(bytes.len(), layout.max_frame_bytes());
+///
+/// let settings = Settings { rows: Some(29), ..Settings::default() };
+/// assert!(matches!(Layout::new(&settings), Err(LayoutError::Size { key: "rows", .. })));
+/// # Ok::<(), LayoutError>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Layout {
     framing: Framing,

@@ -37,6 +37,21 @@ impl fmt::Display for Preset {
 }
 
 /// The `[sensor.frame]` table: a preset and its overrides.
+///
+/// # Example
+///
+/// A sensor of 16x16 taxels sends the frames of `jq`, with a checksum.
+///
+/// ```
+/// use hardnessd::wire::{Checksum, Layout, Settings};
+///
+/// let table = "preset = 'jq'\nchecksum = 'sum8'\nrows = 16\ncols = 16\n";
+/// let settings: Settings = toml::from_str(table)?;
+/// assert_eq!(settings.checksum, Some(Checksum::Sum8));
+/// // Four bytes of sync, 256 cells, one byte of checksum.
+/// assert_eq!(Layout::new(&settings)?.max_frame_bytes(), 261);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
