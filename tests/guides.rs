@@ -2,13 +2,17 @@
 //! sensor, and expects every line that they show.
 //! A `console` block has commands after `$ ` and their output, in which `...` matches anything. A
 //! `toml` or `python` block that begins with `# NAME` is a file of that name. Commands that need a
-//! machine of their own (`sudo`, `systemctl`) are in `sh` blocks. This test does not run those.
+//! machine of their own (`sudo`, `systemctl`) are in `sh` blocks. This test does not run those, but
+//! every `hardnessd` and `hrn-train` in a block of any page must be a valid command line. The unit
+//! tests of `hrn-train` check its own.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
 )]
 
 mod bench;
+#[path = "bench/pages.rs"]
+mod pages;
 
 use std::fs;
 use std::net::TcpListener;
@@ -17,30 +21,14 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use bench::BINARY;
+use clap::Parser as _;
+use clap::error::ErrorKind;
+use hardnessd::tools::args::Args;
+use pages::{Call, blocks, calls, calls_of, names_of};
 use rustix::process::{Pid, Signal, kill_process_group};
 
 fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
-}
-
-/// The fenced blocks of a page, with kind and content.
-fn blocks(text: &str) -> Vec<(String, String)> {
-    let mut blocks = Vec::new();
-    let mut lines = text.lines();
-    while let Some(line) = lines.next() {
-        let fence = line.trim_start();
-        let Some(kind) = fence.strip_prefix("```") else {
-            continue;
-        };
-        let indent = line.len() - fence.len();
-        let block: Vec<&str> = lines
-            .by_ref()
-            .map(|line| line.get(indent..).unwrap_or_default())
-            .take_while(|line| *line != "```")
-            .collect();
-        blocks.push((kind.to_owned(), block.join("\n")));
-    }
-    blocks
 }
 
 /// Whether `shown` occurs in the output `came`. `...` matches anything, also several lines.
@@ -94,7 +82,12 @@ fn follow(guide: &str) {
     }
     assert!(!expected.is_empty(), "{guide} has no commands");
     let output = run(&script, place.path());
-    let mut rest = output.as_str();
+    check(guide, &output, expected);
+}
+
+/// Compares the output of a script with what each of its commands should print.
+fn check(guide: &str, output: &str, expected: Vec<(String, String)>) {
+    let mut rest = output;
     for (command, shown) in expected {
         let (came, after) = rest
             .split_once("@@ ")
@@ -168,4 +161,163 @@ fn dots_match_anything_and_the_rest_must_come() {
     assert!(occurs("a ... c\n...\ne", "x\na b c\nd\ne\n"));
     assert!(!occurs("a ... d", "a b c"));
     assert!(occurs("", "anything"));
+}
+
+/// Whether this build has the command: some come with a feature.
+fn is_built(call: &Call) -> bool {
+    match call.words.get(1).map(String::as_str) {
+        Some("watch") => cfg!(feature = "watch"),
+        Some("fleet") => cfg!(feature = "zenoh"),
+        _ => true,
+    }
+}
+
+#[test]
+fn every_command_of_the_daemon_in_the_pages_is_a_valid_one() {
+    let calls = calls_of("hardnessd");
+    assert!(calls.len() > 50, "found {} commands", calls.len());
+    let wrong = calls
+        .iter()
+        .filter(|call| is_built(call))
+        .filter_map(|call| {
+            let error = Args::try_parse_from(&call.words).err()?;
+            Some((call, error.to_string()))
+        });
+    let wrong: Vec<_> = wrong.collect();
+    assert!(wrong.is_empty(), "{wrong:#?}");
+}
+
+#[test]
+fn every_option_of_the_daemon_in_a_sentence_exists() {
+    let names = names_of("hardnessd");
+    assert!(names.len() > 30, "found {} commands", names.len());
+    let unknown = [ErrorKind::UnknownArgument, ErrorKind::InvalidSubcommand];
+    let wrong = names
+        .iter()
+        .filter(|name| is_built(name))
+        .filter_map(|name| {
+            let error = Args::try_parse_from(&name.words).err()?;
+            let is_unknown = unknown.contains(&error.kind());
+            is_unknown.then(|| (name, error.to_string()))
+        });
+    let wrong: Vec<_> = wrong.collect();
+    assert!(wrong.is_empty(), "{wrong:#?}");
+}
+
+#[test]
+fn commands_are_read_as_a_shell_reads_them() {
+    let text = "```sh\nmore='--seed 3 --json'\nfor n in 1 2; do hardnessd demo $more --presses $n; done\n\
+                until [ -e x ]; do sleep 1; done; cargo run -- tail \\\n    --types 'a b' | head\n```\n\
+                ```console\n$ sudo hardnessd check \\\n>   --confg x\nhardnessd output\n```\n";
+    let words: Vec<Vec<String>> = calls("a page", text)
+        .into_iter()
+        .map(|call| call.words)
+        .collect();
+    assert_eq!(
+        words,
+        [
+            &[
+                "hardnessd",
+                "demo",
+                "--seed",
+                "3",
+                "--json",
+                "--presses",
+                "1"
+            ][..],
+            &[
+                "hardnessd",
+                "demo",
+                "--seed",
+                "3",
+                "--json",
+                "--presses",
+                "2"
+            ],
+            &["hardnessd", "tail", "--types", "a b"],
+            &["hardnessd", "check", "--confg", "x"],
+        ]
+    );
+    let is_valid: Vec<bool> = words
+        .iter()
+        .map(|words| Args::try_parse_from(words).is_ok())
+        .collect();
+    assert_eq!(is_valid, [true, true, false, false]);
+}
+
+#[test]
+fn the_readmes_demonstration_has_the_verdicts_that_it_shows() {
+    let text = fs::read_to_string(root().join("README.md")).unwrap();
+    let command = calls("README.md", &text)
+        .into_iter()
+        .find(|call| call.words.get(1).is_some_and(|word| word == "demo"))
+        .expect("the README begins with the demonstration");
+    let shown = blocks(&text)
+        .into_iter()
+        .find_map(|(_, block)| block.contains("\npress 1 ").then_some(block))
+        .expect("the README shows the presses");
+    let place = tempfile::tempdir().unwrap();
+    let script = format!("{} --speed 10 2>/dev/null", command.words.join(" "));
+    let output = run(&script, place.path());
+    let verdicts: Vec<String> = output
+        .lines()
+        .map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap())
+        .filter(|event| event["phase"] == "final")
+        .map(|event| {
+            format!(
+                "{} {:.0} % {:.1} N",
+                event["label"].as_str().unwrap(),
+                100.0 * event["confidence"].as_f64().unwrap(),
+                event["force_n"].as_f64().unwrap()
+            )
+        })
+        .collect();
+    let shown: Vec<String> = shown
+        .lines()
+        .filter_map(|line| line.split_once("->"))
+        .map(|(_, verdict)| {
+            let words = verdict.split_whitespace().filter(|word| *word != "ok");
+            words.collect::<Vec<_>>().join(" ")
+        })
+        .collect();
+    assert_eq!(shown.len(), 4);
+    assert_eq!(verdicts, shown);
+}
+
+/// The commands of the reference page that finish in seconds. `compare` without `--plan` trains for
+/// hours.
+#[cfg(feature = "train")]
+#[test]
+fn the_reference_page_shows_commands_that_work() {
+    let page = fs::read_to_string(root().join("docs/command-line.md")).unwrap();
+    let place = tempfile::tempdir().unwrap();
+    fs::copy(root().join("models/hrn.onnx"), place.path().join("M.onnx")).unwrap();
+    let mut script = String::from(
+        "exec 2>&1\nhrn-train simulate --out data.npz --objects 1 --test-objects 1 --presses 2\n\
+         cp data.npz D.npz\necho \"@@ $?\"\n",
+    );
+    let mut expected = vec![("simulate".to_owned(), "data.npz: 16 samples".to_owned())];
+    let blocks = blocks(&page).into_iter().filter(|(kind, _)| kind == "sh");
+    for command in
+        blocks.flat_map(|(_, block)| block.lines().map(str::to_owned).collect::<Vec<_>>())
+    {
+        let shown = if command.contains(" adopt ") {
+            "H.onnx: sha256 "
+        } else if command.contains(" --plan ") {
+            ""
+        } else {
+            continue;
+        };
+        script += &format!("{command}\necho \"@@ $?\"\n");
+        expected.push((command, shown.to_owned()));
+    }
+    assert_eq!(expected.len(), 3, "{expected:?}");
+    for more in [
+        "hrn-train check-model H.onnx",
+        "grep -c 'hrn-train train' runs.sh",
+    ] {
+        script += &format!("{more}\necho \"@@ $?\"\n");
+        expected.push((more.to_owned(), String::new()));
+    }
+    check("command-line.md", &run(&script, place.path()), expected);
 }

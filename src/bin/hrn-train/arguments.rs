@@ -418,3 +418,51 @@ impl From<SplitName> for Split {
         }
     }
 }
+
+#[cfg(test)]
+#[path = "../../../tests/bench/pages.rs"]
+mod pages;
+
+#[cfg(test)]
+mod tests {
+    use clap::error::ErrorKind;
+
+    use super::*;
+
+    #[test]
+    fn every_command_of_the_trainer_in_the_pages_is_a_valid_one() {
+        let calls = pages::calls_of("hrn-train");
+        assert!(calls.len() > 60, "found {} commands", calls.len());
+        let wrong = calls.iter().filter_map(|call| {
+            let error = Arguments::try_parse_from(&call.words).err()?;
+            Some((call, error.to_string()))
+        });
+        let wrong: Vec<_> = wrong.collect();
+        assert!(wrong.is_empty(), "{wrong:#?}");
+    }
+
+    #[test]
+    fn every_option_of_the_trainer_in_a_sentence_exists() {
+        let names = pages::names_of("hrn-train");
+        assert!(names.len() > 15, "found {} commands", names.len());
+        let unknown = [ErrorKind::UnknownArgument, ErrorKind::InvalidSubcommand];
+        let wrong = names.iter().filter_map(|name| {
+            let error = Arguments::try_parse_from(&name.words).err()?;
+            let is_unknown = unknown.contains(&error.kind());
+            is_unknown.then(|| (name, error.to_string()))
+        });
+        let wrong: Vec<_> = wrong.collect();
+        assert!(wrong.is_empty(), "{wrong:#?}");
+    }
+
+    #[test]
+    fn an_unknown_option_or_a_missing_one_is_no_valid_command() {
+        let page = "```sh\nhrn-train export run --out m.onnx\nhrn-train export run --to m.onnx\n\
+                    hrn-train export run\n```\n";
+        let is_valid: Vec<bool> = pages::calls("a page", page)
+            .iter()
+            .map(|call| Arguments::try_parse_from(&call.words).is_ok())
+            .collect();
+        assert_eq!(is_valid, [true, false, false]);
+    }
+}
