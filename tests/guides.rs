@@ -181,7 +181,7 @@ fn every_command_of_the_daemon_in_the_pages_is_a_valid_one() {
         .filter(|call| is_built(call))
         .filter_map(|call| {
             let error = Args::try_parse_from(&call.words).err()?;
-            Some((call, error.to_string()))
+            Some(format!("{call}: {error}"))
         });
     let wrong: Vec<_> = wrong.collect();
     assert!(wrong.is_empty(), "{wrong:#?}");
@@ -198,7 +198,7 @@ fn every_option_of_the_daemon_in_a_sentence_exists() {
         .filter_map(|name| {
             let error = Args::try_parse_from(&name.words).err()?;
             let is_unknown = unknown.contains(&error.kind());
-            is_unknown.then(|| (name, error.to_string()))
+            is_unknown.then(|| format!("{name}: {error}"))
         });
     let wrong: Vec<_> = wrong.collect();
     assert!(wrong.is_empty(), "{wrong:#?}");

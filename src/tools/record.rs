@@ -279,7 +279,7 @@ async fn show(path: &Path, counted: &watch::Receiver<Progress>, is_ending: &Cell
         let _ = stderr.flush();
         tokio::time::sleep(PROGRESS).await;
     }
-    std::future::pending().await
+    std::future::pending::<()>().await;
 }
 
 /// Checks the label `level`, which a data set is made from. A wrong level must be found before

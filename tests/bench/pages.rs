@@ -4,6 +4,7 @@
 //! that write down their arguments, and every other program does nothing. So quotes, variables,
 //! loops and continued lines mean what they mean to the reader.
 
+use std::fmt;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -15,6 +16,12 @@ pub(crate) struct Call {
     pub(crate) page: String,
     /// The program, then its arguments.
     pub(crate) words: Vec<String>,
+}
+
+impl fmt::Display for Call {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: {}", self.page, self.words.join(" "))
+    }
 }
 
 /// Replaces every program by one that does nothing, and ours by ones that write down their

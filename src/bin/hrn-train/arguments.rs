@@ -435,7 +435,7 @@ mod tests {
         assert!(calls.len() > 60, "found {} commands", calls.len());
         let wrong = calls.iter().filter_map(|call| {
             let error = Arguments::try_parse_from(&call.words).err()?;
-            Some((call, error.to_string()))
+            Some(format!("{call}: {error}"))
         });
         let wrong: Vec<_> = wrong.collect();
         assert!(wrong.is_empty(), "{wrong:#?}");
@@ -449,7 +449,7 @@ mod tests {
         let wrong = names.iter().filter_map(|name| {
             let error = Arguments::try_parse_from(&name.words).err()?;
             let is_unknown = unknown.contains(&error.kind());
-            is_unknown.then(|| (name, error.to_string()))
+            is_unknown.then(|| format!("{name}: {error}"))
         });
         let wrong: Vec<_> = wrong.collect();
         assert!(wrong.is_empty(), "{wrong:#?}");
