@@ -311,17 +311,33 @@ fn short(text: &str) -> String {
 /// Panics if there are not `rows * cols` values.
 pub fn to_bytes(values: &[f32], rows: usize, cols: usize) -> Vec<u8> {
     assert_eq!(values.len(), rows * cols, "a value for each row and column");
-    let mut text =
-        format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({rows}, {cols}), }}");
-    // Magic, version, length and text together are a multiple of 64 bytes, and the text ends with a
-    // newline.
+    let text = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({rows}, {cols}), }}");
+    let mut bytes = padded(&text);
+    bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+    bytes
+}
+
+/// The header of an array whose elements follow row by row, as `ndarray-npy` writes it. `descr` is
+/// the type of the elements, as in [`Header`].
+pub fn header_bytes(descr: &str, shape: &[usize]) -> Vec<u8> {
+    let lengths: Vec<String> = shape.iter().map(usize::to_string).collect();
+    // A tuple of one number ends with a comma in Python.
+    let comma = if shape.len() == 1 { "," } else { "" };
+    let lengths = lengths.join(", ");
+    padded(&format!(
+        "{{'descr': '{descr}', 'fortran_order': False, 'shape': ({lengths}{comma})}}"
+    ))
+}
+
+/// Magic, version and length before a header's text, and spaces and a newline after it. All
+/// together are a multiple of 64 bytes.
+fn padded(text: &str) -> Vec<u8> {
     const BEFORE_TEXT: usize = 10;
     let length = (BEFORE_TEXT + text.len() + 1).next_multiple_of(64) - BEFORE_TEXT;
-    text = format!("{text:<width$}\n", width = length - 1);
+    let text = format!("{text:<width$}\n", width = length - 1);
     let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
     bytes.extend((length as u16).to_le_bytes());
     bytes.extend(text.as_bytes());
-    bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
     bytes
 }
 

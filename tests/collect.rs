@@ -444,3 +444,205 @@ fn what_cannot_be_collected_is_said_and_nothing_is_written() {
         assert!(!out.exists());
     }
 }
+
+/// Raw recordings that differ only in the noise after the last frame.
+fn fleet(bench: &Bench, count: usize) -> Vec<PathBuf> {
+    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/foam.5hz.bin");
+    let bytes = std::fs::read(fixture).unwrap();
+    let one = |noise: usize| {
+        let path = bench.path(&format!("{noise:02}.bin"));
+        std::fs::write(&path, [&bytes[..], &vec![0; noise]].concat()).unwrap();
+        path
+    };
+    (0..count).map(one).collect()
+}
+
+/// The parts in a directory, and when they were written.
+fn parts(directory: &Path) -> Vec<(PathBuf, std::time::SystemTime)> {
+    let entries = std::fs::read_dir(directory).into_iter().flatten();
+    let paths = entries.map(|entry| entry.unwrap().path());
+    let parts = paths.filter(|path| path.extension().is_some_and(|name| name == "npz"));
+    let mut parts: Vec<_> = parts
+        .map(|path| (path.clone(), path.metadata().unwrap().modified().unwrap()))
+        .collect();
+    parts.sort();
+    parts
+}
+
+#[test]
+fn a_fleet_gives_the_same_bytes_in_parallel_and_after_a_kill() {
+    const COUNT: usize = 8;
+    let bench = Bench::new();
+    let captures = fleet(&bench, COUNT);
+    for sequences in [&[][..], &["--sequences"]] {
+        let mut arguments = [sequences, &["--level", "2", "--jobs", "1"]].concat();
+        arguments.extend(captures.iter().map(|path| text(path)));
+        let out = bench.path("serial.npz");
+        assert!(collect(&out, &arguments).status.success());
+        let expected = std::fs::read(&out).unwrap();
+        assert!(!bench.path("serial.npz.collecting").exists());
+        // Such a small data set has the same bytes as if it had been in memory as a whole.
+        let (meta, memory) = (meta(&out).unwrap(), std::io::Cursor::new(Vec::new()));
+        let whole = match sequences {
+            [] => dataset::write(memory, &Dataset::read(&out).unwrap().samples, &meta),
+            _ => Courses::read(&out).unwrap().write(memory, &meta),
+        };
+        assert!(whole.unwrap().into_inner() == expected);
+        assert_eq!(meta["captures"].as_array().unwrap().len(), COUNT);
+
+        let parallel = bench.path("parallel.npz");
+        arguments[sequences.len() + 3] = "4";
+        assert!(collect(&parallel, &arguments).status.success());
+        assert!(std::fs::read(&parallel).unwrap() == expected);
+
+        // A killed call leaves whole parts, and the next one continues with them.
+        arguments[sequences.len() + 3] = "1";
+        let directory = bench.path(&format!("parts{}", sequences.len()));
+        arguments.splice(0..0, ["--parts", text(&directory)]);
+        let killed = bench.path("killed.npz");
+        let _ = std::fs::remove_file(&killed);
+        let mut child = Command::new(env!("CARGO_BIN_EXE_hrn-train"))
+            .args(["collect", "--out", text(&killed)])
+            .args(&arguments)
+            .spawn()
+            .unwrap();
+        bench::wait_for("two parts", || parts(&directory).len() >= 2);
+        child.kill().unwrap();
+        child.wait().unwrap();
+        let left = parts(&directory);
+        assert!(left.len() < COUNT && !killed.exists(), "{left:?}");
+        assert!(collect(&killed, &arguments).status.success());
+        assert!(std::fs::read(&killed).unwrap() == expected);
+        let all = parts(&directory);
+        assert_eq!(all.len(), COUNT);
+        assert!(left.iter().all(|part| all.contains(part)));
+        // A part is not made again, except a damaged one.
+        std::fs::write(&all[0].0, "damaged").unwrap();
+        assert!(collect(&killed, &arguments).status.success());
+        assert!(std::fs::read(&killed).unwrap() == expected);
+        assert_eq!(parts(&directory)[1..], all[1..]);
+    }
+}
+
+#[test]
+fn what_cannot_be_used_is_left_out_with_its_reason() {
+    let bench = Bench::new();
+    let config = bench.configure("record.toml", "events.sock", "");
+    let [near, far, damaged] =
+        ["b.mcap", "a/deep/a.mcap", "a/cut.mcap"].map(|name| bench.path("fleet").join(name));
+    std::fs::create_dir_all(far.parent().unwrap()).unwrap();
+    let _sensor = bench.sensor(&[]);
+    record(&config, &near, &["level=1", "object=7"], &[]);
+    std::fs::copy(&near, &far).unwrap();
+    let mut bytes = std::fs::read(&near).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle..middle + 200].fill(0xff);
+    std::fs::write(&damaged, &bytes).unwrap();
+    // Neither of these is a recording.
+    std::fs::write(bench.path("fleet/a/notes.txt"), "pressed by hand").unwrap();
+    std::fs::write(bench.path("fleet/empty.mcap"), "").unwrap();
+    let fleet = bench.path("fleet");
+    let label_less = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/foam.5hz.bin");
+    let none = bench.path("none.mcap");
+    let all = [text(&label_less), text(&fleet), text(&none)];
+
+    let out = bench.path("fleet.npz");
+    let list = bench.path("fleet.npz.left-out.tsv");
+    let expected = "give its level with --level (to leave out such recordings: --skip-unusable)";
+    let output = collect(&out, &all);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(2), "{said}");
+    assert!(
+        said.contains(expected) && said.lines().count() == 1,
+        "{said}"
+    );
+    assert!(!out.exists() && !list.exists());
+
+    let output = collect(&out, &[&["--skip-unusable"], &all[..]].concat());
+    assert!(output.status.success(), "{output:?}");
+    let account = String::from_utf8(output.stdout).unwrap();
+    let count = format!("{}: 3 recordings left out\n", list.display());
+    assert!(account.ends_with(&count), "{account}");
+    let lines = std::fs::read_to_string(&list).unwrap();
+    let lines: Vec<(&str, &str)> = lines
+        .lines()
+        .map(|line| line.split_once('\t').unwrap())
+        .collect();
+    assert_eq!(lines.len(), 3, "{lines:?}");
+    for ((path, reason), (expected, part)) in lines.into_iter().zip([
+        (&label_less, "the recording has no label `level`"),
+        (&damaged, "damaged"),
+        (&none, "No such file"),
+    ]) {
+        assert_eq!(path, text(expected));
+        assert!(reason.contains(part) && !reason.contains(path), "{reason}");
+    }
+    // In the order of the paths.
+    let meta = meta(&out).unwrap();
+    let names = meta["captures"].as_array().unwrap().iter();
+    let names: Vec<&Value> = names.map(|capture| &capture["name"]).collect();
+    assert_eq!(names, ["a.mcap", "b.mcap"]);
+    let only = bench.path("only.npz");
+    collected(&only, &[text(&far), text(&near)]);
+    assert!(std::fs::read(&only).unwrap() == std::fs::read(&out).unwrap());
+
+    // A data set needs one recording at least.
+    let before = std::fs::read(&out).unwrap();
+    let output = collect(&out, &["--skip-unusable", text(&none), text(&label_less)]);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("no recording can be used: "), "{said}");
+    assert!(std::fs::read(&out).unwrap() == before);
+    assert_eq!(std::fs::read_to_string(&list).unwrap().lines().count(), 2);
+    let empty = bench.path("nothing");
+    std::fs::create_dir(&empty).unwrap();
+    let output = collect(&out, &["--skip-unusable", text(&empty)]);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(
+        said.contains("nothing: no recording is in this directory"),
+        "{said}"
+    );
+}
+
+#[test]
+fn the_most_recordings_decide_what_a_data_set_has() {
+    let bench = Bench::new();
+    let config = bench.configure(
+        "narrow.toml",
+        "events.sock",
+        "[sensor.calibration]\npitch_mm = 2.0\n",
+    );
+    let captures = fleet(&bench, 3);
+    let [stray, capture] = ["stray.mcap", "named.mcap"].map(|name| bench.path(name));
+    let sensor = bench.sensor(&[]);
+    record(&config, &stray, &[], &[]);
+    drop(sensor);
+    let _sensor = bench.sensor(&[]);
+    record(
+        &bench.configure("wide.toml", "events.sock", ""),
+        &capture,
+        &["material=oak"],
+        &[],
+    );
+    let mut arguments = vec![
+        "--skip-unusable",
+        "--level",
+        "2",
+        text(&stray),
+        text(&capture),
+    ];
+    arguments.extend(captures.iter().map(|path| text(path)));
+    let out = bench.path("most.npz");
+    let samples = collected(&out, &arguments);
+    assert!(samples.iter().all(|sample| sample.material.is_none()));
+    assert_eq!(meta(&out).unwrap()["captures"].as_array().unwrap().len(), 3);
+    let list = std::fs::read_to_string(bench.path("most.npz.left-out.tsv")).unwrap();
+    let first = text(&captures[0]);
+    let expected = format!(
+        "{}\ttaxel pitch: found 2 mm, expected 3.5 mm, that of {first}\n{}\t",
+        stray.display(),
+        capture.display()
+    );
+    assert!(list.starts_with(&expected), "{list}");
+    assert!(list.contains("00.bin: has no material, and "), "{list}");
+}

@@ -1,14 +1,20 @@
 //! `hrn-train collect`.
 
+use std::fmt::Write as _;
+use std::fs;
+use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
+use std::thread;
 
-use anyhow::Context as _;
+use anyhow::{Context as _, bail};
 use hardnessd::daemon::config::{Config, SensorTable, Setup};
-use hardnessd::train::data::collect::{self, Capture, Labelling};
-use hardnessd::train::run::disk::write_whole;
+use hardnessd::train::data::collect::{
+    self, CollectError, Collection, Earlier, Labelling, Parts, Unusable,
+};
+use hardnessd::train::run::disk::{lock, write_streamed, write_whole};
 
 use super::arguments::Collect;
-use super::files::write;
+use super::failure::NotCollected;
 
 pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     let setup = match &arguments.config {
@@ -20,85 +26,147 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     };
     let sensor = setup.sensors.first();
     let sensor = sensor.context("the configuration has no sensor")?;
-    let captures = arguments
-        .captures
-        .iter()
-        .map(|path| Capture::read(path, sensor, &setup.hrn))
-        .collect::<Result<Vec<_>, _>>()?;
-    if arguments.sequences {
-        return collect_courses(arguments, &captures);
-    }
-    let before = if arguments.append {
-        collect::existing(&arguments.out)?
+    let captures = collect::captures(&arguments.captures)?;
+    let out = &arguments.out;
+    let earlier = if arguments.append {
+        Earlier::read(out, arguments.sequences)?
     } else {
         None
     };
-    let presses: usize = captures.iter().map(Capture::presses).sum();
-    let all = before
-        .as_ref()
-        .map_or(0, |(dataset, _)| dataset.samples.len())
-        + presses;
-    let is_added_to = before.is_some();
-    let bytes = collect::to_bytes(&captures, labelling(arguments), before)?;
-    if is_added_to {
-        write_whole(&arguments.out, &bytes)?;
-    } else {
-        write(&arguments.out, &bytes)?;
-    }
-    let out = arguments.out.display();
-    let collected = presses_of(presses);
-    Ok(format!(
-        "{out}: {collected} collected, {all} in all; an object's further presses must go into \
-         this file, not another\n"
-    ))
-}
-
-/// A number of presses as text.
-fn presses_of(count: usize) -> String {
-    format!("{count} press{}", if count == 1 { "" } else { "es" })
-}
-
-fn labelling(arguments: &Collect) -> Labelling {
-    Labelling {
+    let earlier_presses = earlier.as_ref().map(Earlier::presses);
+    let directory = Directory::of(arguments)?;
+    let _locked = lock(&directory.path)?;
+    let parts = Parts::new(
+        directory.path.clone(),
+        sensor.clone(),
+        setup.hrn.clone(),
+        arguments.sequences,
+    );
+    let labelling = Labelling {
         level: arguments.level,
         object: arguments.object,
         split: arguments.split.into(),
-    }
-}
-
-fn collect_courses(arguments: &Collect, captures: &[Capture]) -> anyhow::Result<String> {
-    let before = if arguments.append {
-        collect::existing_courses(&arguments.out)?
-    } else {
-        None
     };
-    let is_added_to = before.is_some();
-    let before_count = before
-        .as_ref()
-        .map_or(0, |(courses, ..)| courses.presses.len());
-    let (mut whole, mut known) = (0, 0);
-    for capture in captures {
-        let of_capture = capture.courses();
-        (whole, known) = (whole + of_capture.0, known + of_capture.1);
+    let unusable = match arguments.skip_unusable {
+        true => Unusable::LeftOut,
+        false => Unusable::Ends,
+    };
+    let jobs = arguments.jobs.unwrap_or_else(|| {
+        let cores = thread::available_parallelism();
+        cores.unwrap_or(NonZeroUsize::MIN)
+    });
+    let collection = collect::collect(&captures, &parts, labelling, earlier, jobs, unusable);
+    let collection = collection.map_err(|error| match error.downcast::<CollectError>() {
+        Ok(error) if captures.len() > 1 => NotCollected(error).into(),
+        Ok(error) => error.into(),
+        Err(error) => error,
+    })?;
+    if arguments.skip_unusable {
+        write_left_out(&collection, out)?;
     }
-    let left_out = captures.iter().map(Capture::presses).sum::<usize>() - whole;
-    if whole == 0 {
-        anyhow::bail!(
+    if collection.left_out.len() == captures.len() {
+        let list = left_out_of(out);
+        bail!("no recording can be used: {} says why", list.display());
+    }
+    if collection.presses == 0 {
+        bail!(
             "the recordings lack the begin of every press: start to record before you touch the sensor"
         );
     }
-    let bytes = collect::courses_to_bytes(captures, labelling(arguments), before)?;
-    if is_added_to {
-        write_whole(&arguments.out, &bytes)?;
-    } else {
-        write(&arguments.out, &bytes)?;
+    let is_replaced = earlier_presses.is_none() && out.is_file();
+    write_streamed(out, |file| collection.write(file))?;
+    if is_replaced {
+        eprintln!("{}: replaced the earlier file", out.display());
     }
-    let collected = presses_of(whole);
-    Ok(format!(
-        "{}: {collected} collected, {known} of them with the arm's approach, {left_out} left out \
-         because the recording lacks their begin, {} in all; an object's further presses must go into this \
-         file, not another\n",
-        arguments.out.display(),
-        before_count + whole
-    ))
+    let all = earlier_presses.unwrap_or_default() + collection.presses;
+    Ok(account(arguments, &collection, all))
+}
+
+/// The directory of the parts. Without `--parts` it is removed at the end.
+struct Directory {
+    path: PathBuf,
+    is_kept: bool,
+}
+
+impl Directory {
+    fn of(arguments: &Collect) -> anyhow::Result<Self> {
+        let (path, is_kept) = match &arguments.parts {
+            Some(parts) => (parts.clone(), true),
+            None => (beside(&arguments.out), false),
+        };
+        match fs::create_dir(&path) {
+            Err(error) if !path.is_dir() => Err(error)
+                .with_context(|| format!("{}: the directory cannot be created", path.display())),
+            _ => Ok(Self { path, is_kept }),
+        }
+    }
+}
+
+impl Drop for Directory {
+    fn drop(&mut self) {
+        if !self.is_kept {
+            // What is left behind costs disk space only.
+            let _ = fs::remove_dir_all(&self.path);
+        }
+    }
+}
+
+/// The directory of the parts for one call: beside the data set, which needs as much space. If that
+/// is a pipe or a device, among temporary files.
+fn beside(out: &Path) -> PathBuf {
+    if out.exists() && !out.is_file() {
+        let name = format!("hrn-train-collect-{}", std::process::id());
+        return std::env::temp_dir().join(name);
+    }
+    with_more(out, ".collecting")
+}
+
+fn left_out_of(out: &Path) -> PathBuf {
+    with_more(out, ".left-out.tsv")
+}
+
+/// A path with `more` after its file name.
+fn with_more(path: &Path, more: &str) -> PathBuf {
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(more);
+    path.with_file_name(name)
+}
+
+fn write_left_out(collection: &Collection, out: &Path) -> anyhow::Result<()> {
+    let mut list = String::new();
+    for (path, reason) in &collection.left_out {
+        let path = path.display().to_string();
+        let one = |text: &str| text.replace(char::is_control, " ");
+        let _ = writeln!(list, "{}\t{}", one(&path), one(reason));
+    }
+    write_whole(&left_out_of(out), list.as_bytes())
+}
+
+/// A number with a noun, whose plural is `many`.
+fn counted(count: usize, one: &str, many: &str) -> String {
+    format!("{count} {}", if count == 1 { one } else { many })
+}
+
+fn account(arguments: &Collect, collection: &Collection, all: usize) -> String {
+    let out = &arguments.out;
+    let collected = counted(collection.presses, "press", "presses");
+    let mut account = format!("{}: {collected} collected, ", out.display());
+    if arguments.sequences {
+        let (known, partial) = (collection.known, collection.partial);
+        let _ = write!(
+            account,
+            "{known} of them with the arm's approach, {partial} left out because the recording lacks \
+             their begin, "
+        );
+    }
+    let _ = writeln!(
+        account,
+        "{all} in all; an object's further presses must go into this file, not another"
+    );
+    if arguments.skip_unusable {
+        let left_out = counted(collection.left_out.len(), "recording", "recordings");
+        let list = left_out_of(out);
+        let _ = writeln!(account, "{}: {left_out} left out", list.display());
+    }
+    account
 }

@@ -58,6 +58,11 @@ pub(super) enum WrongUsage {
     NotOneRobot,
 }
 
+/// One of several captures cannot be collected.
+#[derive(Debug, thiserror::Error)]
+#[error("{0} (to leave out such recordings: --skip-unusable)")]
+pub(super) struct NotCollected(#[source] pub(super) CollectError);
+
 /// The command line asks for no objects at all.
 #[derive(Debug, thiserror::Error)]
 #[error("--objects and --test-objects: found 0 and 0, expected one or more of either")]

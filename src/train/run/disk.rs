@@ -4,7 +4,7 @@
 //! that it is complete at all times, also after SIGKILL or a full disk.
 
 use std::fs::{self, File};
-use std::io::{self, ErrorKind, Write as _};
+use std::io::{self, Cursor, ErrorKind, Seek, Write};
 use std::path::Path;
 
 use anyhow::{Context as _, bail};
@@ -17,6 +17,24 @@ use rustix::fs::FlockOperation;
 ///
 /// Returns the errors of writing. A file that existed before is then unchanged.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    write_streamed(path, |out| Ok(out.write_all(bytes)?))
+}
+
+/// A place that is written in any order.
+pub trait Place: Write + Seek {}
+
+impl<T: Write + Seek> Place for T {}
+
+/// Like [`write_whole`], with the content that `write` writes, bit by bit. For a pipe or a device,
+/// the content is held in memory until it is whole.
+///
+/// # Errors
+///
+/// Returns the errors of `write` and of writing.
+pub fn write_streamed(
+    path: &Path,
+    write: impl FnOnce(&mut dyn Place) -> anyhow::Result<()>,
+) -> anyhow::Result<()> {
     let attempt = || -> anyhow::Result<()> {
         if let Some(directory) = path.parent()
             && !directory.as_os_str().is_empty()
@@ -30,34 +48,41 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
             File::create(path)?;
         }
         match fs::metadata(path) {
-            Ok(found) if found.is_file() => replace(&fs::canonicalize(path)?, bytes),
-            Ok(_) => Ok(File::options().write(true).open(path)?.write_all(bytes)?),
-            Err(_) => replace(path, bytes),
+            Ok(found) if found.is_file() => replace(&fs::canonicalize(path)?, write),
+            Ok(_) => {
+                let mut bytes = Cursor::new(Vec::new());
+                write(&mut bytes)?;
+                let mut file = File::options().write(true).open(path)?;
+                Ok(file.write_all(bytes.get_ref())?)
+            }
+            Err(_) => replace(path, write),
         }
     };
     attempt().with_context(|| path.display().to_string())
 }
 
-fn replace(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+fn replace(
+    path: &Path,
+    write: impl FnOnce(&mut dyn Place) -> anyhow::Result<()>,
+) -> anyhow::Result<()> {
     let mut name = path.file_name().unwrap_or_default().to_owned();
     name.push(".part");
     let part = path.with_file_name(name);
     let mut file = create_anew(&part).with_context(|| part.display().to_string())?;
-    let mut attempt = || -> io::Result<()> {
-        file.write_all(bytes)?;
+    let attempt = || -> anyhow::Result<()> {
+        write(&mut file)?;
         file.sync_all()?;
         fs::rename(&part, path)?;
         // The rename is on the disk only after the directory is flushed.
         let directory = path
             .parent()
             .filter(|parent| !parent.as_os_str().is_empty());
-        File::open(directory.unwrap_or(Path::new(".")))?.sync_all()
+        Ok(File::open(directory.unwrap_or(Path::new(".")))?.sync_all()?)
     };
     attempt().inspect_err(|_| {
         // A part left behind would fill the disk further. Its removal may fail for the same reason.
         let _ = fs::remove_file(&part);
-    })?;
-    Ok(())
+    })
 }
 
 /// Creates a file anew. It first removes what a killed process left, which may not be writable. It
@@ -74,7 +99,7 @@ fn create_anew(path: &Path) -> io::Result<File> {
 /// # Errors
 ///
 /// Returns an error if another process holds the lock, or the directory cannot be opened.
-pub(in crate::train) fn lock(directory: &Path) -> anyhow::Result<File> {
+pub fn lock(directory: &Path) -> anyhow::Result<File> {
     let context = || directory.display().to_string();
     let file = File::open(directory).with_context(context)?;
     match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {

@@ -1,9 +1,9 @@
-//! One recording of a known object, and the presses in it.
+//! The presses in one recording, and what its labels say of them.
 
-use std::fs::File;
-use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
 
 use super::CollectError;
 use super::selection::{Judged, Selection};
@@ -12,69 +12,28 @@ use crate::pipeline::{Clock, Pipeline};
 use crate::recording::{Entry, FileKind, Found, Labels, Playback, Reader};
 use crate::sensor::Sensor;
 use crate::train::data::dataset;
-use crate::verdict::{Hrn, sha256_hex};
+use crate::verdict::Hrn;
 
-/// The samples of one capture.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Capture {
+/// A capture without its frames.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct Head {
+    #[serde(skip)]
     pub(super) path: PathBuf,
     pub(super) sha256: String,
     pub(super) labels: Labels,
     /// Distance between the sensor's taxels.
     pub(super) pitch_mm: f64,
-    pub(super) presses: Vec<Judged>,
+    /// The number of presses that were judged.
+    pub(super) judged: usize,
+    /// The number of presses for the data set: all, or those that are recorded from their begin.
+    pub(super) presses: usize,
+    /// The number of these whose approach is known.
+    pub(super) known: usize,
+    /// The number of frames of these presses.
+    pub(super) frames: usize,
 }
 
-impl Capture {
-    /// Reads a capture. `sensor` is the sensor of a capture that does not describe its own, and
-    /// `hrn` judges the presses.
-    ///
-    /// # Errors
-    ///
-    /// Returns an error if the capture cannot be read, is damaged, describes an impossible sensor
-    /// or sensors of different pitches, or has no press that was judged.
-    pub fn read(path: &Path, sensor: &Sensor, hrn: &Arc<Hrn>) -> Result<Self, CollectError> {
-        let path = path.to_owned();
-        let mut bytes = Vec::new();
-        let read = File::open(&path).and_then(|file| BufReader::new(file).read_to_end(&mut bytes));
-        if let Err(source) = read {
-            return Err(CollectError::Unreadable { path, source });
-        }
-        let mut selection = Selection::default();
-        let (labels, pitch_mm) = if FileKind::of(&bytes) == FileKind::Recording {
-            play(&bytes, hrn, &path, &mut selection)?
-        } else {
-            let mut pipeline = Pipeline::new(sensor.clone(), hrn.clone(), Clock::FrameRate);
-            selection.describe(sensor.name(), sensor.description());
-            selection.take(pipeline.push(&bytes, NOT_LOOKED_AT), NOT_LOOKED_AT);
-            selection.take(pipeline.end_of_recording(None), NOT_LOOKED_AT);
-            (Labels::new(), sensor.description().calibration.pitch_mm)
-        };
-        if selection.presses.is_empty() {
-            return Err(CollectError::NoPress { path });
-        }
-        Ok(Self {
-            sha256: sha256_hex(&bytes),
-            path,
-            labels,
-            pitch_mm,
-            presses: selection.presses,
-        })
-    }
-
-    /// The number of presses.
-    pub fn presses(&self) -> usize {
-        self.presses.len()
-    }
-
-    /// The number of presses that are recorded from their begin, and the number of those with a
-    /// known approach.
-    pub fn courses(&self) -> (usize, usize) {
-        let whole = self.presses.iter().filter(|press| press.is_whole());
-        let known = whole.clone().filter(|press| press.is_known());
-        (whole.count(), known.count())
-    }
-
+impl Head {
     /// The label `key` as a number, if there is one.
     pub(super) fn number(
         &self,
@@ -124,6 +83,49 @@ impl Capture {
             key: "level",
             found: level.to_string(),
             expected: EXPECTED,
+        })
+    }
+}
+
+/// The presses of a capture, with its labels and its pitch.
+pub(super) struct Presses {
+    pub(super) labels: Labels,
+    pub(super) pitch_mm: f64,
+    pub(super) judged: Vec<Judged>,
+}
+
+impl Presses {
+    /// Finds the presses in `bytes`, the content of `path`. `sensor` is the sensor of a capture
+    /// that does not describe its own, and `hrn` judges the presses.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the capture is damaged, describes an impossible sensor or sensors of
+    /// different pitches, or has no press that was judged.
+    pub(super) fn of(
+        bytes: &[u8],
+        path: &Path,
+        sensor: &Sensor,
+        hrn: &Arc<Hrn>,
+    ) -> Result<Self, CollectError> {
+        let mut selection = Selection::default();
+        let (labels, pitch_mm) = if FileKind::of(bytes) == FileKind::Recording {
+            play(bytes, hrn, path, &mut selection)?
+        } else {
+            let mut pipeline = Pipeline::new(sensor.clone(), hrn.clone(), Clock::FrameRate);
+            selection.describe(sensor.name(), sensor.description());
+            selection.take(pipeline.push(bytes, NOT_LOOKED_AT), NOT_LOOKED_AT);
+            selection.take(pipeline.end_of_recording(None), NOT_LOOKED_AT);
+            (Labels::new(), sensor.description().calibration.pitch_mm)
+        };
+        if selection.presses.is_empty() {
+            let path = path.to_owned();
+            return Err(CollectError::NoPress { path });
+        }
+        Ok(Self {
+            labels,
+            pitch_mm,
+            judged: selection.presses,
         })
     }
 }

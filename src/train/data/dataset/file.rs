@@ -192,12 +192,20 @@ pub(in crate::train::data) trait Element: Copy {
     const DESCRIPTIONS: &'static [&'static str];
     /// Reads `count` elements.
     fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, NpyError>;
+    /// The bytes of elements, as the first of [`Self::DESCRIPTIONS`] says.
+    fn bytes(values: &[Self]) -> Vec<u8>;
 }
 impl Element for f32 {
     const NAME: &'static str = "f32";
     const DESCRIPTIONS: &'static [&'static str] = &["<f4"];
     fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, NpyError> {
         npy::elements(reader, count, Self::from_le_bytes)
+    }
+    fn bytes(values: &[Self]) -> Vec<u8> {
+        values
+            .iter()
+            .flat_map(|value| value.to_le_bytes())
+            .collect()
     }
 }
 impl Element for u32 {
@@ -206,6 +214,12 @@ impl Element for u32 {
     fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, NpyError> {
         npy::elements(reader, count, Self::from_le_bytes)
     }
+    fn bytes(values: &[Self]) -> Vec<u8> {
+        values
+            .iter()
+            .flat_map(|value| value.to_le_bytes())
+            .collect()
+    }
 }
 impl Element for u16 {
     const NAME: &'static str = "u16";
@@ -213,12 +227,24 @@ impl Element for u16 {
     fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, NpyError> {
         npy::elements(reader, count, Self::from_le_bytes)
     }
+    fn bytes(values: &[Self]) -> Vec<u8> {
+        values
+            .iter()
+            .flat_map(|value| value.to_le_bytes())
+            .collect()
+    }
 }
 impl Element for u8 {
     const NAME: &'static str = "u8";
     const DESCRIPTIONS: &'static [&'static str] = &["|u1", "<u1", ">u1"];
     fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, NpyError> {
         npy::elements(reader, count, Self::from_le_bytes)
+    }
+    fn bytes(values: &[Self]) -> Vec<u8> {
+        values
+            .iter()
+            .flat_map(|value| value.to_le_bytes())
+            .collect()
     }
 }
 
