@@ -95,7 +95,7 @@ pub fn collect(
             let head = head.with_context(|| format!("{}: is gone", ready.part.display()))?;
             collection.add(&head, ready.part, labelling)
         });
-        match added.map_err(|error| error.downcast::<CollectError>()) {
+        match added.map_err(anyhow::Error::downcast::<CollectError>) {
             Ok(()) => {}
             Err(Ok(error)) if unusable == Unusable::LeftOut => {
                 let reason = error.reason(path);

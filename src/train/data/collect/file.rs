@@ -127,12 +127,9 @@ impl Collection {
         let shores = of.iter().map(|press| press.shore).collect();
         let shore = |used: &Used| used.shore.unwrap_or(f32::NAN);
         self.add_labels(npz, "shore", shores, shore)?;
-        let measured: [(_, fn(&Press) -> f32); 2] = [
-            ("force", |press| press.force_n),
-            ("arm_n_per_mm", |press| press.arm_n_per_mm),
-        ];
-        for (name, value) in measured {
-            let values = of.iter().map(value).collect();
+        let forces: Vec<f32> = of.iter().map(|press| press.force_n).collect();
+        let arms = of.iter().map(|press| press.arm_n_per_mm).collect();
+        for (name, values) in [("force", forces), ("arm_n_per_mm", arms)] {
             let added = |used: &Used| parts::array(&used.part, name, &[], used.presses);
             npz.add::<f32>(name, &[n], once(Ok(values)).chain(self.each(added)))?;
         }
