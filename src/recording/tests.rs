@@ -217,7 +217,7 @@ fn a_sensor_that_cannot_be_is_refused_wherever_it_is_described() {
     // A dead taxel of the smaller array has no place in the larger one, nor the other way round.
     other.description.frame.rows = Some(2);
     other.description.calibration.gains = None;
-    let of_name = "name: found \"\\u{1b}[2J\\n\", expected [a-z]";
+    let of_name = "name: found \"\\u{1b}[2J\\n\", expected a letter a to z";
     let of_press = "press.early_settle_s: found -1.0";
     for (last, told) in [
         (state(bad.clone()), of_press),

@@ -5,7 +5,7 @@
 
 Claims: onnxruntime's probabilities and Shore hardness of 1,000 simulated presses are those of the daemon's own
 code, and a press that a sensor sees at 5, 20 and 100 frames/s gets the same level in most cases. OBJECTS: how many
-of each level, 6 unless told.
+of each level; 6 by default.
 """
 
 import csv
