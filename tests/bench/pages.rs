@@ -138,7 +138,11 @@ pub(crate) fn calls(page: &str, text: &str) -> Vec<Call> {
     fs::create_dir(&work).unwrap();
     let ended = Command::new("timeout")
         .args(["60", "bash", "-c", &format!("{STAGE}\n{script}\nwait\n")])
-        .current_dir(work)
+        // Nothing of the caller: `~` and `$HOME` are the block's own directory.
+        .env_clear()
+        .envs(std::env::var_os("PATH").map(|path| ("PATH", path)))
+        .env("HOME", &work)
+        .current_dir(&work)
         .env("CALLS", &calls)
         .stdin(Stdio::null())
         .stdout(Stdio::null())

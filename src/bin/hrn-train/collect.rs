@@ -1,7 +1,7 @@
 //! `hrn-train collect`.
 
 use std::fmt::Write as _;
-use std::fs;
+use std::fs::{self, File};
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::thread;
@@ -28,16 +28,21 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     let sensor = sensor.context("the configuration has no sensor")?;
     let captures = collect::captures(&arguments.captures)?;
     let out = &arguments.out;
+    check_out(arguments)?;
+    // The first lock keeps other calls from the data set, the second from the parts. The data set is
+    // read under the lock, so that no other call adds to it meanwhile.
+    let own = Directory::locked(beside(out), false)?;
+    let kept = arguments.parts.as_ref();
+    let kept = kept.map(|parts| Directory::locked(parts.clone(), true));
+    let kept = kept.transpose()?;
     let earlier = if arguments.append {
         Earlier::read(out, arguments.sequences)?
     } else {
         None
     };
     let earlier_presses = earlier.as_ref().map(Earlier::presses);
-    let directory = Directory::of(arguments)?;
-    let _locked = lock(&directory.path)?;
     let parts = Parts::new(
-        directory.path.clone(),
+        kept.as_ref().unwrap_or(&own).path.clone(),
         sensor.clone(),
         setup.hrn.clone(),
         arguments.sequences,
@@ -82,22 +87,41 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     Ok(account(arguments, &collection, all))
 }
 
-/// The directory of the parts. Without `--parts` it is removed at the end.
+/// Returns an error if the data set or the list of what was left out cannot be at `--out`, before
+/// anything is read.
+fn check_out(arguments: &Collect) -> anyhow::Result<()> {
+    let out = &arguments.out;
+    if out.is_dir() {
+        bail!("{}: is a directory: name a file", out.display());
+    }
+    if arguments.skip_unusable && out.exists() && !out.is_file() {
+        bail!(
+            "{}: is no file, so no list of what is left out can be beside it: name a file, or leave \
+             --skip-unusable out",
+            out.display()
+        );
+    }
+    Ok(())
+}
+
+/// A directory that this call alone uses. It is removed at the end unless it is kept.
 struct Directory {
     path: PathBuf,
     is_kept: bool,
+    /// The lock. The field is dropped after the directory is removed.
+    _locked: File,
 }
 
 impl Directory {
-    fn of(arguments: &Collect) -> anyhow::Result<Self> {
-        let (path, is_kept) = match &arguments.parts {
-            Some(parts) => (parts.clone(), true),
-            None => (beside(&arguments.out), false),
-        };
+    fn locked(path: PathBuf, is_kept: bool) -> anyhow::Result<Self> {
         match fs::create_dir(&path) {
             Err(error) if !path.is_dir() => Err(error)
                 .with_context(|| format!("{}: the directory cannot be created", path.display())),
-            _ => Ok(Self { path, is_kept }),
+            _ => Ok(Self {
+                _locked: lock(&path)?,
+                path,
+                is_kept,
+            }),
         }
     }
 }
@@ -111,8 +135,9 @@ impl Drop for Directory {
     }
 }
 
-/// The directory of the parts for one call: beside the data set, which needs as much space. If that
-/// is a pipe or a device, among temporary files.
+/// The directory of one call, which locks the data set and has the parts without `--parts`. It is
+/// beside the data set, which needs as much space. If that is a pipe or a device, it is among
+/// temporary files.
 fn beside(out: &Path) -> PathBuf {
     if out.exists() && !out.is_file() {
         let name = format!("hrn-train-collect-{}", std::process::id());

@@ -16,6 +16,8 @@ use crate::event::Kind;
 const MOST_ROBOTS: usize = 4096;
 /// Sensors beyond these, of all robots together, are left out.
 const MOST_SENSORS: usize = 4096;
+/// The largest number of sensors of one robot, so that one robot cannot take the place of all others.
+const MOST_SENSORS_A_ROBOT: usize = 256;
 /// Numbers that wait to know which run they are of.
 const MOST_WAITING: usize = 512;
 
@@ -104,7 +106,8 @@ impl Fleet {
                 robot.count(&heard);
                 about = Some(heard.sensor.clone());
                 if !robot.sensors.contains_key(&heard.sensor) {
-                    if self.sensors == MOST_SENSORS {
+                    let is_full = robot.sensors.len() == MOST_SENSORS_A_ROBOT;
+                    if is_full || self.sensors == MOST_SENSORS {
                         self.left_out += 1;
                         return;
                     }

@@ -109,7 +109,7 @@ pub(super) fn table(fleet: &Fleet, now: Timestamp) -> String {
         robots - there
     );
     if fleet.left_out() > 0 {
-        text += &format!(", {} left out", fleet.left_out());
+        text += &format!(", {} messages left out", fleet.left_out());
     }
     text + "\n"
 }
@@ -380,7 +380,7 @@ hall/3  palm    live   2 s    20.0      3        #7 fi\u{1b}r\u{202e}m 93 %  12 
             fleet.learn(stranger(n, event(&status(Some(1)), 0)), at(0));
         }
         assert_eq!(fleet.robots().count(), 4096);
-        assert!(table(&fleet, at(0)).ends_with(", 1808 left out\n"));
+        assert!(table(&fleet, at(0)).ends_with(", 1808 messages left out\n"));
         // A robot that is gone makes room.
         fleet.learn(stranger(7, What::Gone), at(1));
         fleet.learn(stranger(9999, What::Came), at(2));

@@ -58,6 +58,8 @@ pub enum Unusable {
 struct Ready {
     part: PathBuf,
     shape: Shape,
+    /// The number of its label `object`.
+    object: Option<u32>,
 }
 
 /// Collects `captures`, after the samples of `earlier` if there are any, `jobs` at a time. The
@@ -89,6 +91,8 @@ pub fn collect(
     };
     let sequences = parts.are_sequences();
     let mut collection = Collection::begun(earlier, begin, labelling.split, sequences);
+    let labelled = ready.iter().flatten().filter_map(|ready| ready.object);
+    collection.keep_free(labelled.max());
     for (path, ready) in captures.iter().zip(ready) {
         let added = ready.map_err(anyhow::Error::from).and_then(|ready| {
             let head = parts::head(&ready.part, path);
@@ -164,11 +168,16 @@ fn ready(path: &Path, parts: &Parts, labelling: Labelling, number: usize) -> any
     // Wrong labels are found here and not after hours of work on the others.
     head.level(labelling.level)?;
     head.shore()?;
-    if labelling.object.is_none() {
-        head.number("object", "a number")?;
-    }
+    let object = match labelling.object {
+        Some(_) => None,
+        None => head.number("object", "a number")?,
+    };
     let shape = Shape::of(&head, parts.are_sequences());
-    Ok(Ready { part, shape })
+    Ok(Ready {
+        part,
+        shape,
+        object,
+    })
 }
 
 /// The first capture of the most frequent shape, so that a stray capture does not decide what the

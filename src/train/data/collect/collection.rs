@@ -352,6 +352,15 @@ impl Collection {
         Ok(())
     }
 
+    /// Makes the number of a new object greater than `labelled`, the greatest number in a label. So a
+    /// capture without a label never shares the number of one with a label.
+    pub(super) fn keep_free(&mut self, labelled: Option<u32>) {
+        if let Some(labelled) = labelled {
+            let next = labelled.checked_add(1);
+            self.new_object = self.new_object.and_then(|new| Some(new.max(next?)));
+        }
+    }
+
     /// The object of a capture: the given number, its label's number, or a new one.
     fn object(&self, head: &Head, labelling: Labelling) -> anyhow::Result<u32> {
         if let Some(object) = labelling.object {

@@ -423,7 +423,8 @@ fn array_of<T: Element>(
         return Err(ArrayError::Shape { name, shape });
     };
     let bytes = count.saturating_mul(size_of::<T>()) as u64;
-    if bytes > FREE_BYTES.max(packed.saturating_mul(MOST_PACKED)) {
+    // Where the number of elements is known, other arrays bound it, and equal values pack to a thousandth.
+    if n.is_none() && bytes > FREE_BYTES.max(packed.saturating_mul(MOST_PACKED)) {
         return Err(ArrayError::Packed { bytes, packed });
     }
     let values = T::read(reader, count)?;
