@@ -246,7 +246,7 @@ async fn print_events(
             // Read the lines that have arrived before checking for a timeout.
             biased;
             () = &mut shutdown => return Ok(()),
-            printed = wait(printing.as_mut().as_pin_mut()) => {
+            printed = super::wait(printing.as_mut().as_pin_mut()) => {
                 printing.set(None);
                 let printed: io::Result<bool> = printed;
                 if !printed.map_err(io("stdout"))? || Some(finals) == presses {
@@ -269,28 +269,13 @@ async fn print_events(
                 ended.map_err(io("pty"))?;
                 last_byte = Some(Instant::now());
             }
-            () = until(patience), if printing.is_none() => {
+            () = super::until(patience), if printing.is_none() => {
                 if missed {
                     return Ok(());
                 }
                 return Err(Error::Missed { found: finals, presses: presses.unwrap_or(0) });
             }
         }
-    }
-}
-
-/// The output of the future. Without a future, this never completes.
-async fn wait<T: Future>(one: Option<T>) -> T::Output {
-    match one {
-        Some(one) => one.await,
-        None => std::future::pending().await,
-    }
-}
-
-async fn until(moment: Option<Instant>) {
-    match moment {
-        Some(moment) => tokio::time::sleep_until(moment).await,
-        None => std::future::pending().await,
     }
 }
 

@@ -99,7 +99,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     loop {
         tokio::select! {
             () = &mut shutdown => return Ok(()),
-            printed = wait(printing.as_mut().as_pin_mut()) => {
+            printed = super::wait(printing.as_mut().as_pin_mut()) => {
                 printing.set(None);
                 let printed: io::Result<bool> = printed;
                 if !printed.map_err(Error::Print)? || is_over {
@@ -111,7 +111,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
                 fleet.learn(news, jiff::Timestamp::now());
                 continue;
             }
-            () = until(end), if printing.is_none() => is_over = true,
+            () = super::until(end), if printing.is_none() => is_over = true,
             _ = tick.tick() => {}
         }
         let now = jiff::Timestamp::now();
@@ -137,20 +137,5 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
             false => view::table(&fleet, now),
         };
         printing.set(Some(super::print_apart(text.into_bytes())));
-    }
-}
-
-/// The output of what there is to wait for.
-async fn wait<T: Future>(one: Option<T>) -> T::Output {
-    match one {
-        Some(one) => one.await,
-        None => std::future::pending().await,
-    }
-}
-
-async fn until(moment: Option<Instant>) {
-    match moment {
-        Some(moment) => tokio::time::sleep_until(moment).await,
-        None => std::future::pending().await,
     }
 }

@@ -20,7 +20,8 @@ const MOST_NEWTONS: f32 = 1e6;
 /// The largest ratio of an array's size to its packed size. Frames of presses are packed to a
 /// tenth, and arrays of zeros to a thousandth.
 const MOST_PACKED: u64 = 256;
-/// An array up to this size may have any ratio.
+/// An array up to this size, or up to that of a larger array of the same file, may have any ratio.
+/// An approach that is never known is all zeros, however many frames there are.
 const FREE_BYTES: u64 = 16 << 20;
 
 /// Reads the samples in `bytes`, the content of the file `path`.
@@ -252,6 +253,8 @@ impl Element for u8 {
 pub(in crate::train::data) struct File<'a> {
     zip: ZipArchive<Cursor<&'a [u8]>>,
     path: &'a Path,
+    /// The size of the largest array that was read, in bytes.
+    largest: u64,
 }
 
 impl<'a> File<'a> {
@@ -262,7 +265,11 @@ impl<'a> File<'a> {
         let zip = ZipArchive::new(Cursor::new(bytes)).map_err(|_| DatasetError::NotNpz {
             path: path.to_owned(),
         })?;
-        Ok(Self { zip, path })
+        Ok(Self {
+            zip,
+            path,
+            largest: 0,
+        })
     }
 
     pub(in crate::train::data) fn error(
@@ -297,16 +304,20 @@ impl<'a> File<'a> {
         let lengths: String = inner.iter().map(|length| format!(",{length}")).collect();
         let count = n.map_or_else(|| "N".to_owned(), |n| n.to_string());
         let expected = format!("{} [{count}{lengths}]", T::NAME);
+        let free = FREE_BYTES.max(self.largest);
         let read = self
             .zip
             .by_name(&name)
             .map_err(ArrayError::from)
             .and_then(|mut reader| {
                 let packed = reader.compressed_size();
-                array_of::<T>(&mut reader, packed, inner, n)
+                array_of::<T>(&mut reader, packed, inner, n, free)
             });
         match read {
-            Ok(values) => Ok(Some(values)),
+            Ok(values) => {
+                self.largest = self.largest.max(size_of_val(&*values) as u64);
+                Ok(Some(values))
+            }
             Err(found) => Err(self.error(array, found.to_string(), expected)),
         }
     }
@@ -396,12 +407,13 @@ enum ArrayError {
 }
 
 /// Reads an array of `n` (or any number of) elements of shape `inner`, row-major, from `packed`
-/// bytes.
+/// bytes. Up to `free` bytes may have been packed in any ratio.
 fn array_of<T: Element>(
     reader: &mut impl Read,
     packed: u64,
     inner: &[usize],
     n: Option<usize>,
+    free: u64,
 ) -> Result<Vec<T>, ArrayError> {
     let Header {
         descr,
@@ -423,8 +435,7 @@ fn array_of<T: Element>(
         return Err(ArrayError::Shape { name, shape });
     };
     let bytes = count.saturating_mul(size_of::<T>()) as u64;
-    // Where the number of elements is known, other arrays bound it, and equal values pack to a thousandth.
-    if n.is_none() && bytes > FREE_BYTES.max(packed.saturating_mul(MOST_PACKED)) {
+    if bytes > free.max(packed.saturating_mul(MOST_PACKED)) {
         return Err(ArrayError::Packed { bytes, packed });
     }
     let values = T::read(reader, count)?;
@@ -444,4 +455,19 @@ fn array_of<T: Element>(
         place
     };
     Ok((0..count).map(|index| values[place(index)]).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_array_as_large_as_another_may_be_all_zeros() {
+        let zeros = ndarray::Array1::<u8>::zeros(20 << 20);
+        let mut bytes = Vec::new();
+        ndarray_npy::WriteNpyExt::write_npy(&zeros, &mut bytes).unwrap();
+        let read = |free| array_of::<u8>(&mut &*bytes, 100, &[], Some(20 << 20), free);
+        assert!(matches!(read(FREE_BYTES), Err(ArrayError::Packed { .. })));
+        assert!(read(20 << 20).is_ok_and(|values| values.len() == 20 << 20));
+    }
 }
