@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The Python client against the real daemon.
 
-    python3 -m venv venv && venv/bin/pip install './clients/python[datasets,recordings]'
+    python3 -m venv venv && venv/bin/pip install './clients/python[dataset,recording]'
     venv/bin/python tests/peers/client.py target/debug/hardnessd
 
 Claims, for Client and AsyncClient alike: over connections that break at random, each numbered event
@@ -333,7 +333,7 @@ def readme(bench):
     text = (ROOT / "clients/python/README.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", text, re.S)
     for block in blocks:
-        if "recordings.open" in block:
+        if "recording.open" in block:
             continue
         env = {**os.environ, "RUNTIME_DIRECTORY": os.path.dirname(bench.path("events.sock"))}
         ends = "Control" in block

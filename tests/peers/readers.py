@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The Python client's readers, on data sets and recordings that our programs write.
 
-    python3 -m venv venv && venv/bin/pip install './clients/python[datasets,recordings]' mypy
+    python3 -m venv venv && venv/bin/pip install './clients/python[dataset,recording]' mypy
     venv/bin/python tests/peers/readers.py target/debug
 
 Claims: a data set reads as numpy reads it, and what is none is refused with the array's name; a recording
@@ -23,7 +23,7 @@ import time
 import hardnessd
 import numpy as np
 from bench import Bench
-from hardnessd import datasets, recordings
+from hardnessd import dataset, recording
 
 ROOT = pathlib.Path(__file__).parents[2]
 CLIENT = ROOT / "clients/python"
@@ -42,7 +42,7 @@ def data_sets(binaries, directory):
     path = directory / "data.npz"
     sizes = ["--objects", "2", "--test-objects", "1", "--presses", "4", "--seed", "1"]
     subprocess.run([binaries / "hrn-train", "simulate", "--out", path, *sizes], check=True, capture_output=True)
-    presses = datasets.load(path)
+    presses = dataset.load(path)
     with np.load(path) as file:
         arrays = {name: file[name] for name in file.files}
     for name in ("frames", "level", "object", "material", "force", "split", "shore"):
@@ -56,7 +56,7 @@ def data_sets(binaries, directory):
 
     least = {"frames": arrays["frames"], "level": arrays["level"]}
     np.savez(directory / "least.npz", more=np.arange(3), **least)
-    read = datasets.load(directory / "least.npz")
+    read = dataset.load(directory / "least.npz")
     assert read.object is None and read.meta == {} and len(read.part("train")) == len(read)
     assert list(read.others) == ["more"]
     for name, array, said in [
@@ -69,12 +69,12 @@ def data_sets(binaries, directory):
     ]:
         given = {key: value for key, value in {**arrays, name: array}.items() if value is not None}
         np.savez(directory / "wrong.npz", **given)
-        refused(datasets.load, directory / "wrong.npz", said)
+        refused(dataset.load, directory / "wrong.npz", said)
     for content in (b"", b"PK\x03\x04", b"frames\n", path.read_bytes()[:-200]):
         (directory / "wrong.npz").write_bytes(content)
-        refused(datasets.load, directory / "wrong.npz", "not a data set")
+        refused(dataset.load, directory / "wrong.npz", "not a data set")
     np.save(directory / "one.npy", arrays["level"])
-    refused(datasets.load, directory / "one.npy", "not a data set")
+    refused(dataset.load, directory / "one.npy", "not a data set")
     return len(presses)
 
 
@@ -98,7 +98,7 @@ def a_recording(binary, directory, model=None):
         reader.join()
         (path,) = pathlib.Path(bench.path("rec")).glob("hardnessd-*.mcap")
         (directory / "take.mcap").write_bytes(path.read_bytes())
-    with recordings.open(directory / "take.mcap") as take:
+    with recording.open(directory / "take.mcap") as take:
         assert take.about["robot"] == "arm-7" and take.sensors["forearm"]["name"] == "forearm"
         events = {event["seq"]: event for event in take.events()}
         numbered = [event for event in live if "seq" in event]
@@ -135,7 +135,7 @@ def damaged(directory):
     broken = directory / "broken.mcap"
 
     def read(path):
-        with recordings.open(path) as take:
+        with recording.open(path) as take:
             return len(list(take.events())) + len(list(take.frames()))
 
     random.seed(1)
@@ -186,7 +186,7 @@ def types(directory):
 
 def readme(directory):
     blocks = re.findall(r"```python\n(.*?)```", (CLIENT / "README.md").read_text(), re.S)
-    (block,) = [block for block in blocks if "recordings.open" in block]
+    (block,) = [block for block in blocks if "recording.open" in block]
     subprocess.run([sys.executable, "-c", block], cwd=directory, check=True, stdout=subprocess.DEVNULL)
 
 

@@ -1,12 +1,12 @@
 """Data sets: the `.npz` files that `hrn-train simulate` and `hrn-train collect` write.
 
-    from hardnessd import datasets
+    from hardnessd import dataset
 
-    presses = datasets.load("data.npz")
+    presses = dataset.load("data.npz")
     test = presses.part("test")
     print(test.frames.shape, test.level)
 
-It needs numpy: pip install './clients/python[datasets]'
+It needs numpy: pip install './clients/python[dataset]'
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Recordings: the MCAP files that `hardnessd record` and the daemon's [record] table write.
 
-    from hardnessd import recordings
+    from hardnessd import recording
 
-    with recordings.open("take.mcap") as take:
+    with recording.open("take.mcap") as take:
         print(take.labels, take.sensors)
         for event in take.events():
             if event["type"] == "hardness":
@@ -10,7 +10,7 @@
         for sensor, time_ns, newtons in take.frames():
             ...
 
-It needs mcap and mcap-ros2-support: pip install './clients/python[recordings]'
+It needs mcap and mcap-ros2-support: pip install './clients/python[recording]'
 
 Events are those of the daemon, as it published them. `hardnessd replay` computes them again.
 """
