@@ -20,6 +20,7 @@ use self::robots::{ASK, Fleet};
 use self::session::{PATIENCE, Session, WAITING};
 use super::simulate::positive;
 use crate::daemon::config::Endpoint;
+use crate::daemon::now;
 
 /// Arguments of `fleet`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -91,7 +92,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         .seconds
         .and_then(|s| Duration::try_from_secs_f64(s).ok());
     let end = end.and_then(|end| Instant::now().checked_add(end));
-    let mut asked = jiff::Timestamp::now();
+    let mut asked = now().mono;
     let mut dropped = 0;
     // While a slow reader takes what is printed, news are still taken in.
     let mut printing = std::pin::pin!(None);
@@ -108,16 +109,17 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
                 continue;
             }
             Some(news) = news.recv() => {
-                fleet.learn(news, jiff::Timestamp::now());
+                fleet.learn(news);
                 continue;
             }
             () = super::until(end), if printing.is_none() => is_over = true,
             _ = tick.tick() => {}
         }
-        let now = jiff::Timestamp::now();
+        let now = now();
         fleet.settle(now);
-        if now.duration_since(asked) >= ASK {
-            asked = now;
+        session.ask_for_lost_tokens();
+        if now.mono - asked >= ASK {
+            asked = now.mono;
             let there = fleet.robots().filter(|(_, robot)| robot.is_there);
             there.for_each(|(site, _)| session.ask(site));
         }
@@ -137,5 +139,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
             false => view::table(&fleet, now),
         };
         printing.set(Some(super::print_apart(text.into_bytes())));
+        // The text of a large fleet may take longer than a tick. News are taken in before the next one.
+        tick.reset();
     }
 }

@@ -8,7 +8,8 @@ Claims: two daemons behind a router show with state, age and last verdict, in th
 daemon is gone, and back after its start; a robot that was cut off (SECONDS long, 15 by default) is gone within the
 lease of 10 s, and after it is back the events missed are counted exactly; without a router the command says so in
 one line with exit code 69; with the two routers of docs/fleet.md, one on the robot, only a robot with the
-certificate of its name is let in; what strangers put at such keys reaches no terminal as it is.
+certificate of its name is let in; what strangers put at such keys reaches no terminal as it is; after a flood in
+which messages were dropped, each robot is there or gone as its token is.
 """
 
 import argparse
@@ -112,14 +113,17 @@ class Proxy:
 class Fleet:
     """The newest line of each sensor in `fleet --json`."""
 
-    def __init__(self, binary, endpoint):
+    def __init__(self, binary, endpoint, stderr=None):
         self.command = [binary, "fleet", "--json", "--connect", endpoint]
-        self.process = subprocess.Popen(self.command, stdout=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(self.command, stdout=subprocess.PIPE, stderr=stderr, text=True)
         self.newest, self.lines = {}, []
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self):
         for text in self.process.stdout:
+            # The last line may be cut, because the process was ended.
+            if not text.endswith("\n"):
+                break
             line = json.loads(text)
             self.lines.append(line)
             self.newest[line["robot"]] = line
@@ -326,6 +330,62 @@ def strangers(binary):
     assert b"\x1b" not in out and "\u202e".encode() not in out and b"xxx" not in out, out
 
 
+FLOOD = """
+import sys, time, zenoh
+config, seconds = zenoh.Config.from_json5(sys.argv[1]), float(sys.argv[2])
+session = zenoh.open(config)
+# A large status for each of many sensors, so that the lines of all of them take long.
+many = '{"type":"status","sensor":"%s","state":"live","x":[' + ",".join(["[]"] * 2600) + "]}"
+robots = [f"flood-{number}" for number in range(12)]
+tokens = [session.liveliness().declare_token(f"tactile/{name}") for name in robots]
+end = time.monotonic() + seconds
+turn = 0
+while time.monotonic() < end:
+    for name in robots:
+        for sensor in range(200):
+            session.put(f"tactile/{name}/s{sensor}/status", many % f"s{sensor}")
+            for _ in range(20):
+                session.put(f"tactile/{name}/s{sensor}/press", '{"type":"press","sensor":"s%d"}' % sensor)
+print("over", flush=True)
+sys.stdin.read()
+"""
+
+
+def flood(binary, seconds=20):
+    """Tokens come and go while more messages come than are taken."""
+    names = [f"arm-{number}" for number in range(200)]
+    with Router() as router, client(router.endpoint) as robots, tempfile.TemporaryFile("w+") as said:
+        tokens = {name: robots.liveliness().declare_token(f"tactile/{name}") for name in names[::2]}
+        with Fleet(binary, router.endpoint, stderr=said) as fleet:
+            fleet.until("the robots", lambda newest: all(name in newest for name in tokens))
+            config = {"mode": "client", "connect": {"endpoints": [router.endpoint]}}
+            command = [sys.executable, "-c", FLOOD, json.dumps(config), str(seconds)]
+            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+            stranger = subprocess.Popen(command, **pipes)
+            try:
+                # Each robot comes or goes once, spread over the flood.
+                for name in names:
+                    time.sleep(0.9 * seconds / len(names))
+                    if name in tokens:
+                        tokens.pop(name).undeclare()
+                    else:
+                        tokens[name] = robots.liveliness().declare_token(f"tactile/{name}")
+                assert stranger.stdout.readline() == "over\n"
+                over = time.monotonic()
+                is_right = lambda newest: all(  # noqa: E731
+                    name in newest and newest[name]["there"] == (name in tokens) for name in names
+                )
+                fleet.until("every state", is_right)
+                took_s = time.monotonic() - over
+            finally:
+                stranger.kill()
+                stranger.wait()
+        said.seek(0)
+        dropped = [int(line.split()[1]) for line in said if "were dropped" in line]
+    assert dropped, "nothing was dropped: the flood was too small"
+    return len(names), dropped[-1], took_s
+
+
 def other_ways(binary):
     """A daemon in place of a router, and a router that is started again."""
     endpoint = free()
@@ -368,4 +428,5 @@ if __name__ == "__main__":
     print("a daemon in place of a router is enough; a router that is started again is found")
     strangers(given.binary)
     print("strangers: bounded and escaped")
+    print("a flood: %d tokens came or went, %d messages were dropped; every state was right after %.1f s" % flood(given.binary))
     print("without a router:", without_a_router(given.binary))

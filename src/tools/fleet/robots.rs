@@ -4,13 +4,15 @@
 //! the router can claim to be robots, so everything that is kept has a bound.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
 
-use jiff::{SignedDuration, Timestamp};
+use jiff::Timestamp;
 use serde_json::Value;
 
 use super::numbers::Numbers;
 use super::session::{Heard, Hello, News, What};
 use crate::event::Kind;
+use crate::frame::Stamp;
 
 /// Robots beyond these are kept only in the place of one that is gone.
 const MOST_ROBOTS: usize = 4096;
@@ -22,13 +24,13 @@ const MOST_SENSORS_A_ROBOT: usize = 256;
 const MOST_WAITING: usize = 512;
 
 /// An event that was sent before a `hello` comes at most this long after it.
-const ON_ITS_WAY: SignedDuration = SignedDuration::from_secs(2);
+const ON_ITS_WAY: Duration = Duration::from_secs(2);
 
 /// A robot is asked every [`ASK`]. One that has said nothing for so long does not answer.
-const SILENT: SignedDuration = SignedDuration::from_secs(25);
+const SILENT: Duration = Duration::from_secs(25);
 
 /// How often each robot is asked what is true now.
-pub(super) const ASK: SignedDuration = SignedDuration::from_secs(10);
+pub(super) const ASK: Duration = Duration::from_secs(10);
 
 /// Every robot that was heard of.
 #[derive(Debug, Default)]
@@ -47,7 +49,9 @@ pub(super) struct Robot {
     /// Whether its token is there.
     pub(super) is_there: bool,
     /// When its token went.
-    pub(super) gone: Option<Timestamp>,
+    pub(super) gone: Option<Stamp>,
+    /// The time of the newest word of its token, by CLOCK_MONOTONIC.
+    token_heard: Duration,
     /// What it last said of itself.
     pub(super) hello: Option<Hello>,
     pub(super) sensors: BTreeMap<String, Sensor>,
@@ -60,15 +64,15 @@ pub(super) struct Robot {
     numbers: Option<Numbers>,
     /// While it is not known which run the robot is in: the numbers that came.
     waiting: Option<Vec<u64>>,
-    /// The number of the newest `hello`, and when it came.
-    claimed: Option<(Timestamp, u64)>,
+    /// The number of the newest `hello`, and when it came, by CLOCK_MONOTONIC.
+    claimed: Option<(Duration, u64)>,
 }
 
 /// A sensor, by its newest events.
 #[derive(Debug)]
 pub(super) struct Sensor {
     /// When the last word of it came.
-    pub(super) heard: Timestamp,
+    pub(super) heard: Stamp,
     /// JSON, empty before the first.
     pub(super) status: String,
     /// The last final verdict: JSON, empty before the first.
@@ -78,9 +82,26 @@ pub(super) struct Sensor {
 }
 
 impl Fleet {
-    /// Takes in what is new of a robot.
-    pub(super) fn learn(&mut self, news: News, now: Timestamp) {
-        let News { site, what } = news;
+    /// Takes in what is new.
+    pub(super) fn learn(&mut self, news: News) {
+        match news {
+            News::Robot { site, what, at } => self.learn_of(site, what, at),
+            News::Tokens(asked) => self.miss_tokens(asked),
+        }
+    }
+
+    /// Every token that was there at that time has come. A robot without one is gone.
+    fn miss_tokens(&mut self, asked: Stamp) {
+        for (site, robot) in &mut self.robots {
+            if robot.is_there && robot.token_heard < asked.mono {
+                robot.go(asked);
+                let new = self.new.entry(site.clone()).or_default();
+                new.extend(robot.sensors.keys().cloned());
+            }
+        }
+    }
+
+    fn learn_of(&mut self, site: String, what: What, at: Stamp) {
         if !self.robots.contains_key(&site) {
             // An answer or an end makes nobody known.
             if matches!(what, What::Gone | What::Asked) {
@@ -94,9 +115,15 @@ impl Fleet {
         let robot = self.robots.entry(site.clone()).or_default();
         let mut about = None;
         match what {
-            What::Came => robot.come(),
-            What::Gone => (robot.is_there, robot.gone) = (false, Some(now)),
-            What::Hello(hello) => robot.meet(hello, now),
+            // It says what was true before something newer came.
+            What::There | What::Came | What::Gone if at.mono < robot.token_heard => return,
+            What::There if robot.is_there => {
+                robot.token_heard = at.mono;
+                return;
+            }
+            What::There | What::Came => robot.come(at),
+            What::Gone => robot.go(at),
+            What::Hello(hello) => robot.meet(hello, at),
             // A robot that never says its run is not waited for. One that did is asked again.
             What::Asked if robot.waiting.is_some() && robot.hello.is_none() => {
                 robot.settle_run(None);
@@ -113,7 +140,7 @@ impl Fleet {
                     }
                     self.sensors += 1;
                 }
-                robot.hear(heard);
+                robot.hear(heard, at);
             }
         }
         let new = self.new.entry(site).or_default();
@@ -126,7 +153,7 @@ impl Fleet {
     /// Makes room by the robot that is gone for longest.
     fn forget_one(&mut self) -> bool {
         let gone = self.robots.iter().filter(|(_, robot)| !robot.is_there);
-        let first = gone.min_by_key(|(_, robot)| robot.gone);
+        let first = gone.min_by_key(|(_, robot)| robot.gone.map(|gone| gone.mono));
         let Some(site) = first.map(|(site, _)| site.clone()) else {
             return false;
         };
@@ -137,7 +164,7 @@ impl Fleet {
     }
 
     /// Counts as missed what was sent a while ago and did not come.
-    pub(super) fn settle(&mut self, now: Timestamp) {
+    pub(super) fn settle(&mut self, now: Stamp) {
         for (site, robot) in &mut self.robots {
             if robot.settle(now) {
                 let new = self.new.entry(site.clone()).or_default();
@@ -168,14 +195,19 @@ impl Fleet {
 }
 
 impl Robot {
-    fn come(&mut self) {
-        (self.is_there, self.gone) = (true, None);
+    fn come(&mut self, at: Stamp) {
+        (self.is_there, self.gone, self.token_heard) = (true, None, at.mono);
         // Until its hello comes, it may be in another run.
         self.waiting.get_or_insert_default();
         self.claimed = None;
     }
 
-    fn meet(&mut self, hello: Hello, now: Timestamp) {
+    fn go(&mut self, at: Stamp) {
+        (self.is_there, self.token_heard) = (false, at.mono);
+        self.gone.get_or_insert(at);
+    }
+
+    fn meet(&mut self, hello: Hello, at: Stamp) {
         let run = hello.run.clone();
         let is_other = self.hello.as_ref().is_some_and(|known| known.run != run);
         if is_other || self.waiting.is_some() {
@@ -184,7 +216,7 @@ impl Robot {
         // The first one of a robot may be older than this subscription.
         let is_known = self.hello.is_some();
         if is_known && self.claimed.is_none() {
-            self.claimed = Some((now, hello.seq));
+            self.claimed = Some((at.mono, hello.seq));
         }
         self.hello = Some(hello);
     }
@@ -237,9 +269,9 @@ impl Robot {
         }
     }
 
-    fn hear(&mut self, heard: Heard) {
+    fn hear(&mut self, heard: Heard, at: Stamp) {
         let sensor = self.sensors.entry(heard.sensor).or_insert_with(|| Sensor {
-            heard: heard.at,
+            heard: at,
             status: String::new(),
             verdict: String::new(),
             verdict_heard: None,
@@ -253,20 +285,20 @@ impl Robot {
             Kind::Hardness if heard.is_final && !is_older(&sensor.verdict) => {
                 // The time at which a verdict first came stays.
                 if !heard.is_answer || heard.text != sensor.verdict {
-                    sensor.verdict_heard = Some(heard.at);
+                    sensor.verdict_heard = Some(at.wall);
                 }
                 sensor.verdict = heard.text;
             }
             Kind::Hardness | Kind::Press | Kind::Frame => {}
         }
-        sensor.heard = sensor.heard.max(heard.at);
+        sensor.heard = at;
     }
 
-    fn settle(&mut self, now: Timestamp) -> bool {
+    fn settle(&mut self, now: Stamp) -> bool {
         let Some((at, number)) = self.claimed else {
             return false;
         };
-        if now.duration_since(at) < ON_ITS_WAY || self.waiting.is_some() {
+        if now.mono.saturating_sub(at) < ON_ITS_WAY || self.waiting.is_some() {
             return false;
         }
         self.claimed = None;
@@ -286,11 +318,11 @@ impl Robot {
     }
 
     /// The state of a sensor. What is out of date is never shown as current.
-    pub(super) fn state(&self, sensor: &Sensor, now: Timestamp) -> String {
+    pub(super) fn state(&self, sensor: &Sensor, now: Stamp) -> String {
         if self.gone.is_some() {
             return "gone".to_owned();
         }
-        if now.duration_since(sensor.heard) > SILENT {
+        if now.mono.saturating_sub(sensor.heard.mono) > SILENT {
             return "no answer".to_owned();
         }
         let status = read(&sensor.status);

@@ -7,12 +7,11 @@
 use std::borrow::Cow;
 use std::io;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc as std_mpsc;
 use std::thread;
 use std::time::Duration;
 
-use jiff::Timestamp;
 use serde::Deserialize;
 use serde_json::Value;
 use tokio::sync::{mpsc, oneshot};
@@ -22,23 +21,35 @@ use zenoh::query::{ConsolidationMode, QueryTarget};
 use zenoh::sample::{Sample, SampleKind};
 
 use crate::daemon::config::Endpoint;
+use crate::daemon::now;
 use crate::daemon::zenoh::searching;
 use crate::event::Kind;
-
-/// What is new of a robot. `site` is the robot's part of the keys.
-#[derive(Debug)]
-pub(super) struct News {
-    pub(super) site: String,
-    pub(super) what: What,
-}
+use crate::frame::Stamp;
 
 /// What is new.
 #[derive(Debug)]
+pub(super) enum News {
+    /// Of one robot.
+    Robot {
+        /// The robot's part of the keys.
+        site: String,
+        what: What,
+        /// When it came. For [`What::There`], when it was asked.
+        at: Stamp,
+    },
+    /// The tokens were asked for at this time, and each one that was there has come as [`What::There`].
+    Tokens(Stamp),
+}
+
+/// What is new of a robot.
+#[derive(Debug)]
 pub(super) enum What {
-    /// Its token is there.
+    /// Its token came.
     Came,
     /// Its token is gone.
     Gone,
+    /// Its token was there when it was asked.
+    There,
     /// It sent an event, or answered with one.
     Event(Heard),
     /// It answered with its `hello`.
@@ -57,8 +68,6 @@ pub(super) struct Heard {
     pub(super) is_final: bool,
     /// Whether it came as an answer. It may have been sent long ago.
     pub(super) is_answer: bool,
-    /// When it came.
-    pub(super) at: Timestamp,
     /// Its JSON on one line. Empty for what is only counted.
     pub(super) text: String,
 }
@@ -84,7 +93,11 @@ pub(super) const WAITING: usize = 4096;
 /// Questions that wait to be sent. One more is dropped: it is asked again later.
 const QUESTIONS: usize = 4096;
 
-/// How long the router may take to answer at the beginning.
+/// Tokens that wait to be taken after a question for all of them. If there are more, it is asked again.
+const TOKENS: usize = 65_536;
+
+/// How long the router may take to answer at the beginning, and with its tokens. The library says only that there
+/// are no more tokens, if it gives up first, after 10 s.
 pub(super) const PATIENCE: Duration = Duration::from_secs(5);
 
 /// How long a robot may take to answer.
@@ -106,8 +119,24 @@ const LONGEST_WORD_BYTES: usize = 64;
 
 /// An open session. It ends with the process.
 pub(super) struct Session {
-    questions: std_mpsc::SyncSender<String>,
-    dropped: Arc<AtomicU64>,
+    questions: std_mpsc::SyncSender<Question>,
+    dropped: Arc<Dropped>,
+}
+
+/// What is asked.
+enum Question {
+    /// A robot's `hello`, its statuses and its last verdicts.
+    Robot(String),
+    /// Which tokens are there.
+    Tokens,
+}
+
+/// What was dropped, because it came faster than it was taken.
+#[derive(Default)]
+struct Dropped {
+    news: AtomicU64,
+    /// Whether a token that came or went was dropped since the tokens were last asked for.
+    is_token: AtomicBool,
 }
 
 impl Session {
@@ -119,7 +148,7 @@ impl Session {
         let (questions, asked) = std_mpsc::sync_channel(QUESTIONS);
         let (opened, outcome) = oneshot::channel();
         let connect = connect.to_vec();
-        let dropped = Arc::new(AtomicU64::new(0));
+        let dropped = Arc::new(Dropped::default());
         let outlet = Outlet {
             news,
             dropped: Arc::clone(&dropped),
@@ -144,12 +173,21 @@ impl Session {
 
     /// Asks a robot for its `hello`, its statuses and its last verdicts.
     pub(super) fn ask(&self, site: &str) {
-        let _ = self.questions.try_send(site.to_owned());
+        let _ = self.questions.try_send(Question::Robot(site.to_owned()));
+    }
+
+    /// Asks which tokens are there, if one that came or went was dropped.
+    pub(super) fn ask_for_lost_tokens(&self) {
+        if self.dropped.is_token.swap(false, Ordering::Relaxed)
+            && self.questions.try_send(Question::Tokens).is_err()
+        {
+            self.dropped.is_token.store(true, Ordering::Relaxed);
+        }
     }
 
     /// How many news were dropped, because they came faster than they were taken.
     pub(super) fn dropped(&self) -> u64 {
-        self.dropped.load(Ordering::Relaxed)
+        self.dropped.news.load(Ordering::Relaxed)
     }
 }
 
@@ -157,15 +195,23 @@ impl Session {
 #[derive(Clone)]
 struct Outlet {
     news: mpsc::Sender<News>,
-    dropped: Arc<AtomicU64>,
+    dropped: Arc<Dropped>,
 }
 
 impl Outlet {
     fn put(&self, site: &str, what: What) {
-        let site = site.to_owned();
-        if self.news.try_send(News { site, what }).is_err() {
-            self.dropped.fetch_add(1, Ordering::Relaxed);
+        let is_token = matches!(what, What::Came | What::Gone);
+        let (site, at) = (site.to_owned(), now());
+        if self.news.try_send(News::Robot { site, what, at }).is_err() {
+            self.dropped.news.fetch_add(1, Ordering::Relaxed);
+            self.dropped.is_token.fetch_or(is_token, Ordering::Relaxed);
         }
+    }
+
+    /// Waits until there is room.
+    fn put_in_turn(&self, news: News) {
+        // An error says that the program ends.
+        let _ = self.news.blocking_send(news);
     }
 }
 
@@ -180,7 +226,7 @@ impl Link {
     fn open(
         connect: &[Endpoint],
         outlet: &Outlet,
-        asks: &std_mpsc::SyncSender<String>,
+        asks: &std_mpsc::SyncSender<Question>,
     ) -> Result<Self, zenoh::Error> {
         let session = zenoh::open(searching(connect, PATIENCE)?).wait()?;
         // All that has a number, so that a number that does not come tells of an event that was
@@ -204,7 +250,7 @@ impl Link {
                 match sample.kind() {
                     SampleKind::Put => {
                         outlet.put(site, What::Came);
-                        let _ = asks.try_send(site.to_owned());
+                        let _ = asks.try_send(Question::Robot(site.to_owned()));
                     }
                     SampleKind::Delete => outlet.put(site, What::Gone),
                 }
@@ -218,26 +264,66 @@ impl Link {
     }
 
     /// Sends questions until the program ends.
-    fn ask(self, outlet: &Outlet, asked: &std_mpsc::Receiver<String>) {
-        while let Ok(site) = asked.recv() {
-            let last = Last {
-                site: site.clone(),
-                outlet: outlet.clone(),
-            };
-            let question = self
-                .session
-                .get(format!("{ROOT}{site}/**"))
-                // A storage that answers too must not answer in the robot's place.
-                .target(QueryTarget::All)
-                .consolidation(ConsolidationMode::None)
-                .timeout(ANSWER)
-                .callback(move |reply| {
-                    if let Ok(sample) = reply.result() {
-                        take(sample, &last.outlet, true);
-                    }
-                });
-            // A robot that cannot be asked is known by what it sends next.
-            let _ = question.wait();
+    fn ask(self, outlet: &Outlet, asked: &std_mpsc::Receiver<Question>) {
+        while let Ok(question) = asked.recv() {
+            match question {
+                Question::Robot(site) => self.ask_robot(site, outlet),
+                Question::Tokens => self.ask_for_tokens(outlet),
+            }
+        }
+    }
+
+    fn ask_robot(&self, site: String, outlet: &Outlet) {
+        let question = self.session.get(format!("{ROOT}{site}/**"));
+        let outlet = outlet.clone();
+        let last = Last { site, outlet };
+        let question = question
+            // A storage that answers too must not answer in the robot's place.
+            .target(QueryTarget::All)
+            .consolidation(ConsolidationMode::None)
+            .timeout(ANSWER)
+            .callback(move |reply| {
+                if let Ok(sample) = reply.result() {
+                    take(sample, &last.outlet, true);
+                }
+            });
+        // A robot that cannot be asked is known by what it sends next.
+        let _ = question.wait();
+    }
+
+    /// Asks which tokens are there, and waits for the answers.
+    fn ask_for_tokens(&self, outlet: &Outlet) {
+        let asked = now();
+        let (there, answers) = std_mpsc::sync_channel(TOKENS);
+        let is_whole = Arc::new(AtomicBool::new(true));
+        let whole = Arc::clone(&is_whole);
+        let question = self
+            .session
+            .liveliness()
+            .get(format!("{ROOT}**"))
+            .timeout(PATIENCE)
+            // It is dropped after the last answer, and `there` with it.
+            .callback(move |reply| {
+                let is_taken = match reply.result() {
+                    Ok(token) => site(token.key_expr().as_str())
+                        .is_none_or(|site| there.try_send(site.to_owned()).is_ok()),
+                    // More answers would come too late.
+                    Err(_) => false,
+                };
+                whole.fetch_and(is_taken, Ordering::Relaxed);
+            });
+        let is_sent = question.wait().is_ok();
+        for site in answers {
+            let what = What::There;
+            outlet.put_in_turn(News::Robot {
+                site,
+                what,
+                at: asked,
+            });
+        }
+        match is_sent && is_whole.load(Ordering::Relaxed) {
+            true => outlet.put_in_turn(News::Tokens(asked)),
+            false => outlet.dropped.is_token.store(true, Ordering::Relaxed),
         }
     }
 }
@@ -306,7 +392,6 @@ fn event<'a>(key: &'a str, bytes: &[u8], is_answer: bool) -> Option<(&'a str, He
         seq: said.seq,
         is_final,
         is_answer,
-        at: Timestamp::now(),
         text,
     };
     Some((site, heard))
@@ -326,7 +411,67 @@ fn hello<'a>(key: &'a str, bytes: &[u8]) -> Option<(&'a str, Hello)> {
 
 #[cfg(test)]
 mod tests {
+    use std::net::TcpListener;
+    use std::time::Instant;
+
+    use super::super::robots::Fleet;
     use super::*;
+
+    fn wait_for(what: &str, mut there: impl FnMut() -> bool) {
+        let start = Instant::now();
+        while !there() {
+            assert!(start.elapsed() < Duration::from_secs(30), "{what}");
+            thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    #[test]
+    fn a_token_that_was_dropped_is_asked_for() {
+        let address = TcpListener::bind("127.0.0.1:0").and_then(|free| free.local_addr());
+        let endpoint = format!("tcp/{}", address.unwrap());
+        let mut config = zenoh::Config::default();
+        for (key, value) in [
+            ("mode", r#""router""#),
+            ("listen/endpoints", &format!("[{endpoint:?}]")),
+            ("scouting/multicast/enabled", "false"),
+        ] {
+            config.insert_json5(key, value).unwrap();
+        }
+        let router = zenoh::open(config).wait().unwrap();
+        let token = |name: &str| {
+            let key = format!("{ROOT}{name}");
+            router.liveliness().declare_token(key).wait().unwrap()
+        };
+        let [stays, goes, goes_too] = ["stays", "goes", "goes/too"].map(token);
+        // There is room for one.
+        let (sender, mut news) = mpsc::channel(1);
+        let runtime = tokio::runtime::Builder::new_current_thread();
+        let endpoints = [Endpoint::try_from(endpoint).unwrap()];
+        let opened = Session::open(&endpoints, sender.clone());
+        let opened = { runtime }.build().unwrap().block_on(opened);
+        let session = opened.unwrap().unwrap();
+        let is_lost = || session.dropped.is_token.load(Ordering::Relaxed);
+        let mut fleet = Fleet::default();
+        let mut mended = |expected: &[&str]| {
+            wait_for("a token that is dropped", is_lost);
+            wait_for("all tokens", || {
+                session.ask_for_lost_tokens();
+                while let Ok(news) = news.try_recv() {
+                    fleet.learn(news);
+                }
+                let there = fleet.robots().filter(|(_, robot)| robot.is_there);
+                there.map(|(site, _)| &**site).eq(expected.iter().copied())
+            });
+        };
+        mended(&["goes", "goes/too", "stays"]);
+        // There is none for what comes now.
+        let (site, what, at) = (String::new(), What::Asked, now());
+        let _ = sender.try_send(News::Robot { site, what, at });
+        drop((goes, goes_too));
+        let comes = token("comes");
+        mended(&["comes", "stays"]);
+        drop((stays, comes));
+    }
 
     #[test]
     fn an_event_is_taken_only_from_its_own_key() {

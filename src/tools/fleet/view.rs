@@ -8,6 +8,7 @@ use jiff::Timestamp;
 use serde_json::{Value, json};
 
 use super::robots::{Fleet, Robot, Sensor, read, time};
+use crate::frame::Stamp;
 use crate::wording;
 
 /// Clears the terminal, so that a table takes the place of the last one.
@@ -17,7 +18,7 @@ pub(super) const CLEAR: &str = "\u{1b}[2J\u{1b}[H";
 const WIDEST: usize = 40;
 
 /// A line for each sensor of which something is new, and for each such robot without sensors.
-pub(super) fn lines(fleet: &mut Fleet, now: Timestamp) -> String {
+pub(super) fn lines(fleet: &mut Fleet, now: Stamp) -> String {
     let mut lines = String::new();
     for (site, sensors) in fleet.take_new() {
         let Some(robot) = fleet.robot(&site) else {
@@ -35,7 +36,7 @@ pub(super) fn lines(fleet: &mut Fleet, now: Timestamp) -> String {
     lines
 }
 
-fn line(site: &str, robot: &Robot, of: Option<(&str, &Sensor)>, now: Timestamp) -> String {
+fn line(site: &str, robot: &Robot, of: Option<(&str, &Sensor)>, now: Stamp) -> String {
     let hello = robot.hello.as_ref();
     let sensor = of.map(|(_, sensor)| sensor);
     let json =
@@ -44,7 +45,7 @@ fn line(site: &str, robot: &Robot, of: Option<(&str, &Sensor)>, now: Timestamp) 
     let line = json!({
         "robot": site,
         "there": robot.is_there,
-        "gone_s": robot.gone.map(|gone| seconds(now, gone)),
+        "gone_s": robot.gone.map(|gone| since(now, gone)),
         "run": hello.map(|hello| &hello.run),
         "version": hello.map(|hello| &hello.version),
         "model": hello.map(|hello| hello.model.sha256.chars().take(12).collect::<String>()),
@@ -53,9 +54,9 @@ fn line(site: &str, robot: &Robot, of: Option<(&str, &Sensor)>, now: Timestamp) 
         "restarts": robot.restarts,
         "sensor": of.map(|(name, _)| name),
         "state": sensor.map(|sensor| robot.state(sensor, now)),
-        "heard": sensor.map(|sensor| sensor.heard),
+        "heard": sensor.map(|sensor| sensor.heard.wall),
         "status": json(|sensor| &sensor.status),
-        "verdict_age_s": time(&verdict).map(|then| seconds(now, then)),
+        "verdict_age_s": time(&verdict).map(|then| aged(now, then)),
         "verdict_heard": sensor.and_then(|sensor| sensor.verdict_heard),
         "verdict": verdict,
     });
@@ -83,7 +84,7 @@ const HEAD: [&str; 9] = [
 ];
 
 /// Every sensor of every robot.
-pub(super) fn table(fleet: &Fleet, now: Timestamp) -> String {
+pub(super) fn table(fleet: &Fleet, now: Stamp) -> String {
     let mut rows = vec![HEAD.map(str::to_owned)];
     let (mut robots, mut there) = (0, 0);
     for (site, robot) in fleet.robots() {
@@ -91,7 +92,7 @@ pub(super) fn table(fleet: &Fleet, now: Timestamp) -> String {
         there += usize::from(robot.is_there);
         if robot.sensors.is_empty() {
             let state = match robot.gone {
-                Some(gone) => format!("gone {}", age(seconds(now, gone))),
+                Some(gone) => format!("gone {}", age(since(now, gone))),
                 None => "no answer".to_owned(),
             };
             let mut row = [const { String::new() }; 9];
@@ -114,7 +115,7 @@ pub(super) fn table(fleet: &Fleet, now: Timestamp) -> String {
     text + "\n"
 }
 
-fn row(site: &str, robot: &Robot, name: &str, sensor: &Sensor, now: Timestamp) -> [String; 9] {
+fn row(site: &str, robot: &Robot, name: &str, sensor: &Sensor, now: Stamp) -> [String; 9] {
     let state = robot.state(sensor, now);
     let is_current = !["gone", "no answer"].contains(&&*state);
     let (status, verdict) = (read(&sensor.status), read(&sensor.verdict));
@@ -124,14 +125,14 @@ fn row(site: &str, robot: &Robot, name: &str, sensor: &Sensor, now: Timestamp) -
         shown(site),
         shown(name),
         match robot.gone {
-            Some(gone) => format!("gone {}", age(seconds(now, gone))),
+            Some(gone) => format!("gone {}", age(since(now, gone))),
             None => shown(&state),
         },
-        age(seconds(now, sensor.heard)),
+        age(since(now, sensor.heard)),
         rate.map_or_else(String::new, |hz| format!("{hz:.1}")),
         damaged.map_or_else(String::new, |damaged| damaged.to_string()),
         judged(&verdict),
-        time(&verdict).map_or_else(String::new, |then| age(seconds(now, then))),
+        time(&verdict).map_or_else(String::new, |then| age(aged(now, then))),
         missed(robot),
     ]
 }
@@ -157,9 +158,17 @@ fn judged(verdict: &Value) -> String {
     format!("#{press} {what} {sure:.0} %")
 }
 
-/// Seconds since `then`. Clocks of two machines differ: what is of the future is new.
-fn seconds(now: Timestamp, then: Timestamp) -> f64 {
-    let seconds = now.duration_since(then).as_secs_f64().max(0.0);
+/// Seconds since `then`, by the clock of this machine that nobody sets.
+fn since(now: Stamp, then: Stamp) -> f64 {
+    rounded(now.mono.saturating_sub(then.mono).as_secs_f64())
+}
+
+/// Seconds since a robot's `then`. Clocks of two machines differ: what is of the future is new.
+fn aged(now: Stamp, then: Timestamp) -> f64 {
+    rounded(now.wall.duration_since(then).as_secs_f64().max(0.0))
+}
+
+fn rounded(seconds: f64) -> f64 {
     (seconds * 1e3).round() / 1e3
 }
 
@@ -197,27 +206,32 @@ fn aligned<const N: usize>(rows: &[[String; N]]) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::super::session::{Heard, Hello, Model, News, What};
     use super::*;
     use crate::event::Kind;
 
-    fn at(second: i64) -> Timestamp {
-        Timestamp::from_second(1_795_255_200 + second).unwrap()
+    fn at(second: u64) -> Stamp {
+        Stamp {
+            mono: Duration::from_secs(1000 + second),
+            wall: Timestamp::UNIX_EPOCH + Duration::from_secs(1_795_255_200 + second),
+        }
     }
 
-    fn learn(fleet: &mut Fleet, what: What, second: i64) {
+    fn learn(fleet: &mut Fleet, what: What, second: u64) {
         let site = "hall/3".to_owned();
-        fleet.learn(News { site, what }, at(second));
+        let at = at(second);
+        fleet.learn(News::Robot { site, what, at });
     }
 
-    fn event(json: &Value, second: i64) -> What {
+    fn event(json: &Value) -> What {
         What::Event(Heard {
             kind: Kind::named(json["type"].as_str().unwrap()).unwrap(),
             sensor: json["sensor"].as_str().unwrap().to_owned(),
             seq: json["seq"].as_u64(),
             is_final: json["phase"] == "final",
             is_answer: json["seq"].is_null(),
-            at: at(second),
             text: json.to_string(),
         })
     }
@@ -243,11 +257,11 @@ mod tests {
         learn(&mut fleet, What::Came, 0);
         learn(&mut fleet, hello("a", 5), 0);
         let verdict = json!({"type": "hardness", "phase": "final", "sensor": "palm", "press": 7,
-            "label": "fi\u{1b}r\u{202e}m", "confidence": 0.934, "time": at(-10).to_string(), "seq": 7});
+            "label": "fi\u{1b}r\u{202e}m", "confidence": 0.934, "time": (at(0).wall - Duration::from_secs(10)).to_string(), "seq": 7});
         let early = json!({"type": "hardness", "phase": "early", "sensor": "palm", "press": 8,
             "label": "soft", "seq": 8});
         for json in [&status(Some(6)), &verdict, &early] {
-            learn(&mut fleet, event(json, 0), 0);
+            learn(&mut fleet, event(json), 0);
         }
         fleet
     }
@@ -256,7 +270,7 @@ mod tests {
         text.split_whitespace().collect::<Vec<_>>().join(" ")
     }
 
-    fn one_line(fleet: &mut Fleet, second: i64) -> Value {
+    fn one_line(fleet: &mut Fleet, second: u64) -> Value {
         serde_json::from_str(&lines(fleet, at(second))).unwrap()
     }
 
@@ -282,7 +296,7 @@ hall/3  palm    live   2 s    20.0      3        #7 fi\u{1b}r\u{202e}m 93 %  12 
             "{found}"
         );
         learn(&mut fleet, What::Came, 9);
-        learn(&mut fleet, event(&status(None), 9), 9);
+        learn(&mut fleet, event(&status(None)), 9);
         let found = table(&fleet, at(9));
         assert!(
             found.contains("live") && !found.contains("gone "),
@@ -319,13 +333,13 @@ hall/3  palm    live   2 s    20.0      3        #7 fi\u{1b}r\u{202e}m 93 %  12 
         let mut fleet = fleet();
         learn(&mut fleet, What::Gone, 3);
         learn(&mut fleet, What::Came, 60);
-        learn(&mut fleet, event(&status(Some(20)), 60), 60);
+        learn(&mut fleet, event(&status(Some(20))), 60);
         // The event of the number 22 is on its way.
         learn(&mut fleet, hello("a", 22), 60);
         assert_eq!(one_line(&mut fleet, 60)["missed"], 11);
         fleet.settle(at(61));
         assert_eq!(lines(&mut fleet, at(61)), "");
-        learn(&mut fleet, event(&status(Some(21)), 61), 61);
+        learn(&mut fleet, event(&status(Some(21))), 61);
         fleet.settle(at(63));
         let line = one_line(&mut fleet, 63);
         let counts = ["missed", "received", "restarts"].map(|key| line[key].as_u64().unwrap());
@@ -338,7 +352,7 @@ hall/3  palm    live   2 s    20.0      3        #7 fi\u{1b}r\u{202e}m 93 %  12 
         learn(&mut fleet, What::Gone, 3);
         learn(&mut fleet, What::Came, 4);
         for seq in [3, 4] {
-            learn(&mut fleet, event(&status(Some(seq)), 4), 4);
+            learn(&mut fleet, event(&status(Some(seq))), 4);
         }
         // It did not answer in time. The next question is answered.
         learn(&mut fleet, What::Asked, 4);
@@ -351,39 +365,94 @@ hall/3  palm    live   2 s    20.0      3        #7 fi\u{1b}r\u{202e}m 93 %  12 
     }
 
     #[test]
+    fn tokens_that_are_asked_for_mend_what_was_dropped() {
+        let mut fleet = Fleet::default();
+        let mut learn = |name: &str, what, second| {
+            let (site, at) = (name.to_owned(), at(second));
+            fleet.learn(News::Robot { site, what, at });
+        };
+        for name in ["stayed", "went", "was replaced"] {
+            learn(name, What::Came, 0);
+            learn(name, hello("a", 0), 0);
+        }
+        // The end of one and the beginning of another are dropped.
+        learn("came", event(&status(Some(1))), 5);
+        // Asked at 10. These are older and newer than the answers.
+        learn("went before", What::Came, 8);
+        learn("came since", What::Came, 11);
+        for name in ["stayed", "came", "was replaced", "went since"] {
+            learn(name, What::There, 10);
+        }
+        learn("went since", What::Gone, 11);
+        learn("was replaced", What::Came, 12);
+        learn("went since", What::There, 10);
+        fleet.learn(News::Tokens(at(10)));
+        let there: Vec<_> = fleet.robots().filter(|(_, robot)| robot.is_there).collect();
+        let there: Vec<&str> = there.into_iter().map(|(name, _)| &**name).collect();
+        assert_eq!(there, ["came", "came since", "stayed", "was replaced"]);
+        let new: Value = lines(&mut fleet, at(13))
+            .lines()
+            .find(|line| line.contains(r#""went""#))
+            .map(|line| serde_json::from_str(line).unwrap())
+            .unwrap();
+        assert_eq!(
+            (&new["there"], &new["gone_s"]),
+            (&json!(false), &json!(3.0))
+        );
+    }
+
+    #[test]
+    fn a_clock_that_is_set_changes_no_time_but_the_age_of_a_verdict() {
+        let mut fleet = fleet();
+        learn(&mut fleet, What::Gone, 3);
+        for wall in [0, 1_795_300_000] {
+            let wall = Timestamp::UNIX_EPOCH + Duration::from_secs(wall);
+            let found = table(&fleet, Stamp { wall, ..at(8) });
+            assert!(found.contains("gone 5 s  8 s "), "{found}");
+        }
+        learn(&mut fleet, What::Came, 9);
+        let wall = Timestamp::UNIX_EPOCH;
+        assert!(table(&fleet, Stamp { wall, ..at(30) }).contains("no answer"));
+        learn(&mut fleet, hello("a", 20), 30);
+        fleet.settle(Stamp { wall, ..at(33) });
+        assert_eq!(one_line(&mut fleet, 33)["missed"], 12);
+    }
+
+    #[test]
     fn an_answer_that_is_older_than_what_is_known_changes_nothing() {
         let mut fleet = fleet();
-        let said = |state: &str, second: i64, seq: Option<u64>| {
+        let said = |state: &str, second: u64, seq: Option<u64>| {
             json!({"type": "status", "sensor": "palm", "state": state, "seq": seq,
-                "time": at(second).to_string()})
+                "time": at(second).wall.to_string()})
         };
-        learn(&mut fleet, event(&said("stale", 20, Some(9)), 20), 20);
-        learn(&mut fleet, event(&said("live", 10, None), 40), 40);
+        learn(&mut fleet, event(&said("stale", 20, Some(9))), 20);
+        learn(&mut fleet, event(&said("live", 10, None)), 40);
         let line = one_line(&mut fleet, 40);
         assert_eq!(
             (&line["state"], &line["heard"]),
-            (&json!("stale"), &json!(at(20).to_string()))
+            (&json!("stale"), &json!(at(20).wall.to_string()))
         );
-        learn(&mut fleet, event(&said("stale", 20, None), 41), 41);
-        assert_eq!(one_line(&mut fleet, 41)["heard"], at(41).to_string());
+        learn(&mut fleet, event(&said("stale", 20, None)), 41);
+        assert_eq!(one_line(&mut fleet, 41)["heard"], at(41).wall.to_string());
     }
 
     #[test]
     fn a_crowd_of_strangers_is_bounded() {
         let mut fleet = Fleet::default();
-        let stranger = |n: u32, what| News {
+        let stranger = |n: u32, what, second| News::Robot {
             site: format!("x{n}"),
             what,
+            at: at(second),
         };
         for n in 0..5000 {
-            fleet.learn(stranger(n, What::Came), at(0));
-            fleet.learn(stranger(n, event(&status(Some(1)), 0)), at(0));
+            fleet.learn(stranger(n, What::Came, 0));
+            fleet.learn(stranger(n, event(&status(Some(1))), 0));
         }
         assert_eq!(fleet.robots().count(), 4096);
         assert!(table(&fleet, at(0)).ends_with(", 1808 messages left out\n"));
         // A robot that is gone makes room.
-        fleet.learn(stranger(7, What::Gone), at(1));
-        fleet.learn(stranger(9999, What::Came), at(2));
+        fleet.learn(stranger(7, What::Gone, 1));
+        fleet.learn(stranger(9999, What::Came, 2));
         assert!(fleet.robot("x9999").is_some() && fleet.robot("x7").is_none());
     }
 }
