@@ -39,8 +39,9 @@ pub use level::{Borders, LEVELS, LevelRange, level_of};
 pub use material::{Material, Split, UnknownMaterial};
 pub use motion::{ARM_N_PER_MM, Approach, Motion};
 pub use object::{Shapes, UnknownShapes};
+pub(crate) use sensor::FULL_SCALE_COUNTS;
 pub use sensor::{SensorProfile, UnknownProfile};
-pub use sequence::{Sequence, SequenceFrame, SequenceSettings};
+pub use sequence::{REST_S, Sequence, SequenceFrame, SequenceSettings};
 pub use settings::{DatasetSettings, Materials, UnknownMaterials};
 
 pub use crate::tare::NEWTONS_PER_COUNT;

@@ -1,5 +1,8 @@
 //! Faults of a sensor and its cable, with the real binary on a real pty: what subscribers see, and
 //! when. `docs/reliability.md` has the same as a table.
+//!
+//! Most faults come from a script of `hardnessd simulate`. The test itself writes the bytes where it
+//! decides at which byte, or at which moment of the daemon, a fault comes.
 #![allow(
     clippy::unwrap_used,
     reason = "clippy knows no helper of a test as a test"
@@ -14,7 +17,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use bench::{Bench, Daemon, Subscriber, hardnessd, wait_for};
+use bench::{Bench, Daemon, Process, Subscriber, hardnessd, wait_for};
 use hardnessd::frame::{RawFrame, Stamp};
 use hardnessd::pipeline::{Clock, Pipeline};
 use hardnessd::random::Stream;
@@ -129,35 +132,29 @@ impl Cable {
 
 /// A daemon with a sensor on a cable, which is live and tared.
 struct Rig {
-    bench: Bench,
-    daemon: Daemon,
+    _bench: Bench,
+    _daemon: Daemon,
     cable: Cable,
     subscriber: Subscriber,
 }
 
 impl Rig {
-    /// Starts a rig whose sensor is live and tared. `tables` are added to the configuration.
-    fn start(tables: &str) -> Self {
-        let mut rig = Self::connect(tables);
+    fn start() -> Self {
+        let bench = Bench::new();
+        let cable = Cable::plug(bench.path("port"));
+        let daemon = Daemon::start(&configure(&bench, ""));
+        let mut subscriber = bench.subscriber();
+        subscriber.until(&json!({"state": "stale"}));
+        let mut rig = Self {
+            _bench: bench,
+            _daemon: daemon,
+            cable,
+            subscriber,
+        };
         rig.cable.wake();
         rig.cable.play(&rest(), 8);
         rig.sees(&json!({"state": "live", "reason": null}));
         rig
-    }
-
-    /// Starts a rig whose port is open, before any byte has come.
-    fn connect(tables: &str) -> Self {
-        let bench = Bench::new();
-        let cable = Cable::plug(bench.path("port"));
-        let daemon = Daemon::start(&configure(&bench, tables));
-        let mut subscriber = bench.subscriber();
-        subscriber.until(&json!({"state": "stale"}));
-        Self {
-            bench,
-            daemon,
-            cable,
-            subscriber,
-        }
     }
 
     fn sees(&mut self, fields: &Value) -> Value {
@@ -167,22 +164,13 @@ impl Rig {
     /// The status after all bytes so far.
     fn status(&mut self) -> Value {
         self.cable.drain();
-        self.subscriber.say(r#"{"get":"status"}"#);
-        // Only the status of an event has a number, and this one is an answer.
-        self.sees(&json!({"type": "status", "seq": null}))
+        status(&mut self.subscriber)
     }
 
     /// Ends the press under way, and checks that it is number `press` and has a verdict.
     fn release(&mut self, press: u64) -> Value {
         self.cable.play(&rest(), 4);
-        let end = self.sees(&json!({"type": "press", "state": "end"}));
-        assert_eq!(
-            (&end["press"], &end["reason"]),
-            (&json!(press), &json!(null))
-        );
-        let verdict = self.sees(&json!({"phase": "final"}));
-        assert_eq!(verdict["press"], press);
-        end
+        released(&mut self.subscriber, press)
     }
 
     /// Makes a press, and checks that it is number `press`.
@@ -192,12 +180,97 @@ impl Rig {
         assert_eq!(begin["press"], press);
         self.release(press)
     }
+}
+
+/// The first frame that a fault of a script may strike, unless it strikes all from the first. By
+/// then the daemon has opened the port and tared.
+const READY: u32 = 600;
+
+/// A daemon with a sensor that `hardnessd simulate` plays. Nothing but a script presses it.
+struct Played {
+    bench: Bench,
+    daemon: Daemon,
+    subscriber: Subscriber,
+    _sensor: Process,
+}
+
+impl Played {
+    /// Starts the daemon, then the sensor with the faults of `script`. `tables` are added to the
+    /// configuration.
+    fn start(tables: &str, script: &[String]) -> Self {
+        let bench = Bench::new();
+        let daemon = Daemon::start(&configure(&bench, tables));
+        let subscriber = bench.subscriber();
+        let path = bench.path("faults.toml");
+        fs::write(&path, script.concat()).unwrap();
+        let faults = path.to_str().unwrap();
+        // The line is so fast that no frame is late, even if it comes twice.
+        let more = ["--faults", faults, "--rest", "3600", "--baud", "4000000"];
+        let sensor = bench.sensor_at("port", 100, &more);
+        Self {
+            bench,
+            daemon,
+            subscriber,
+            _sensor: sensor,
+        }
+    }
+
+    fn sees(&mut self, fields: &Value) -> Value {
+        self.subscriber.until(fields)
+    }
+
+    fn released(&mut self, press: u64) -> Value {
+        released(&mut self.subscriber, press)
+    }
 
     fn reload(&mut self, tables: &str) {
         configure(&self.bench, tables);
         self.daemon.process.signal(Signal::HUP);
         self.daemon.logged("reloaded");
     }
+}
+
+/// A fault of a script, from a frame of the sensor on.
+fn fault(kind: &str, frame: u32, keys: &str) -> String {
+    let at_s = (f64::from(frame) - 0.5).max(0.0) / 100.0;
+    format!("[[fault]]\nkind = \"{kind}\"\nat_s = {at_s}\n{keys}\n")
+}
+
+/// A fault of a script, for a number of frames.
+fn during(kind: &str, frame: u32, frames: u32, keys: &str) -> String {
+    let for_s = f64::from(frames) / 100.0;
+    fault(kind, frame, &format!("for_s = {for_s}\n{keys}"))
+}
+
+/// The load of [`pressed`], in a script.
+fn touch(frame: u32, frames: u32) -> String {
+    let load = "rows = [11, 16]\ncols = [11, 16]\nnewtons = 0.8";
+    during("contact", frame, frames, load)
+}
+
+/// The status as an answer.
+fn status(subscriber: &mut Subscriber) -> Value {
+    subscriber.say(r#"{"get":"status"}"#);
+    // Only the status of an event has a number, and this one is an answer.
+    subscriber.until(&json!({"type": "status", "seq": null}))
+}
+
+/// Waits for the end of a press, and checks that it is number `press`, ends by its release and has
+/// a verdict.
+fn released(subscriber: &mut Subscriber, press: u64) -> Value {
+    let end = subscriber.until(&json!({"type": "press", "state": "end"}));
+    assert_eq!(
+        (&end["press"], &end["reason"]),
+        (&json!(press), &json!(null))
+    );
+    let verdict = subscriber.until(&json!({"phase": "final"}));
+    assert_eq!(verdict["press"], press);
+    end
+}
+
+/// How much `key` grew from one status to another.
+fn growth(before: &Value, after: &Value, key: &str) -> u64 {
+    after[key].as_u64().unwrap() - before[key].as_u64().unwrap()
 }
 
 fn configure(bench: &Bench, tables: &str) -> PathBuf {
@@ -220,7 +293,7 @@ fn since(moment: SystemTime, event: &Value) -> Duration {
 
 #[test]
 fn unplugged_after_any_byte_of_a_frame_a_press_is_aborted_and_no_frame_is_made_up() {
-    let mut rig = Rig::start("");
+    let mut rig = Rig::start();
     let mut shortest = Duration::MAX;
     let mut skipped = 0;
     for (press, byte) in (1..).zip([0, 1, 2, 4, 395, 788, 789]) {
@@ -251,7 +324,7 @@ fn unplugged_after_any_byte_of_a_frame_a_press_is_aborted_and_no_frame_is_made_u
 
 #[test]
 fn plugged_in_elsewhere_behind_its_link_a_sensor_is_read_on_within_its_pause() {
-    let mut rig = Rig::start("");
+    let mut rig = Rig::start();
     rig.press(1);
     let mut shortest = Duration::MAX;
     for press in 2..5 {
@@ -281,7 +354,7 @@ fn plugged_in_elsewhere_behind_its_link_a_sensor_is_read_on_within_its_pause() {
 
 #[test]
 fn flipped_dropped_and_doubled_bytes_cost_their_frame_and_no_press() {
-    let mut rig = Rig::start("");
+    let mut rig = Rig::start();
     let before = rig.status();
     let whole = rig.cable.bytes(&pressed());
     rig.cable.play(&pressed(), 3);
@@ -300,7 +373,7 @@ fn flipped_dropped_and_doubled_bytes_cost_their_frame_and_no_press() {
         }
     }
     let after = rig.status();
-    let more = |key: &str| after[key].as_u64().unwrap() - before[key].as_u64().unwrap();
+    let more = |key| growth(&before, &after, key);
     assert_eq!((more("frames"), more("frames_damaged")), (good, 9));
     // Three of the damaged frames have a byte less, three a byte more.
     assert_eq!(more("bytes_skipped"), 9 * 790);
@@ -310,241 +383,195 @@ fn flipped_dropped_and_doubled_bytes_cost_their_frame_and_no_press() {
 
 #[test]
 fn a_frame_that_comes_twice_is_two_frames_of_the_same_press() {
-    let mut rig = Rig::start("");
-    for _ in 0..6 {
-        let frame = rig.cable.bytes(&pressed());
-        rig.cable.write(&[&frame[..], &frame[..]].concat());
-        std::thread::sleep(PERIOD);
-    }
-    assert_eq!(rig.release(1)["frames"], 12);
-    assert_eq!(rig.status()["frames_damaged"], 0);
+    let twice = fault("repeat", READY, "frames = 6");
+    let mut played = Played::start("", &[touch(READY, 6), twice]);
+    let before = played.sees(&json!({"type": "status", "state": "live"}));
+    assert_eq!(played.released(1)["frames"], 12);
+    let after = status(&mut played.subscriber);
+    assert_eq!(growth(&before, &after, "frames_damaged"), 0);
 }
 
 #[test]
 fn half_a_frame_and_silence_are_stale_and_its_other_half_makes_it_whole() {
-    let mut rig = Rig::start("");
-    rig.subscriber
+    let script = [
+        touch(READY, 200),
+        during("half", READY + 5, 60, "other_half = true"),
+        during("half", READY + 70, 60, ""),
+    ];
+    let mut played = Played::start("", &script);
+    played
+        .subscriber
         .say(r#"{"subscribe":["status","press","hardness","frame"]}"#);
-    let frame = rig.cable.bytes(&pressed());
-    let (head, tail) = frame.split_at(400);
-    rig.cable.play(&pressed(), 5);
-    rig.cable.write(head);
-    let begin = rig.sees(&json!({"type": "press", "state": "begin"}));
+    let begin = played.sees(&json!({"type": "press", "state": "begin"}));
     let last = begin["frame"].as_u64().unwrap() + 4;
-    let last = rig.sees(&json!({"type": "frame", "frame": last}));
+    let last = played.sees(&json!({"type": "frame", "frame": last}));
     let last: jiff::Timestamp = last["time"].as_str().unwrap().parse().unwrap();
-    let stale = rig.sees(&json!({"type": "status", "state": "stale"}));
+    let stale = played.sees(&json!({"type": "status", "state": "stale"}));
     assert_eq!(stale["reason"], "no frame for 300 ms");
     let silent = since(last.into(), &stale);
     assert_eq!(silent.as_millis(), 300, "stamped when it became so");
-    rig.cable.write(tail);
-    rig.sees(&json!({"type": "status", "state": "live"}));
+    let live = played.sees(&json!({"type": "status", "state": "live"}));
+    // The frame is whole with its other half.
+    let more = |key| growth(&stale, &live, key);
+    assert_eq!((more("frames"), more("bytes_skipped")), (1, 0));
 
     // Without its other half, the half frame is skipped.
-    let before = rig.status();
-    rig.cable.write(head);
-    rig.sees(&json!({"type": "status", "state": "stale"}));
-    rig.cable.write(&frame);
-    rig.sees(&json!({"type": "status", "state": "live"}));
-    let after = rig.status();
-    let more = |key: &str| after[key].as_u64().unwrap() - before[key].as_u64().unwrap();
-    assert_eq!((more("frames"), more("bytes_skipped")), (1, 400));
-    // There are 5 frames, one in two halves, and one more.
-    assert_eq!(rig.release(1)["frames"], 7);
+    let stale = played.sees(&json!({"type": "status", "state": "stale"}));
+    let live = played.sees(&json!({"type": "status", "state": "live"}));
+    let more = |key| growth(&stale, &live, key);
+    assert_eq!((more("frames"), more("bytes_skipped")), (1, 395));
+    // 59 frames stay unsent in the first silence. In the second, half a frame is lost with them.
+    assert_eq!(played.released(1)["frames"], 200 - 59 - 60);
 }
 
 #[test]
 fn a_burst_after_a_stall_loses_no_frame_and_no_press() {
-    let mut rig = Rig::start("");
-    let frames = rig.status()["frames"].as_u64().unwrap();
-    rig.cable.play(&pressed(), 5);
-    let held = rig.cable.bytes(&pressed()).repeat(40);
-    rig.sees(&json!({"type": "status", "state": "stale"}));
-    rig.cable.write(&held);
-    rig.sees(&json!({"type": "status", "state": "live"}));
-    assert_eq!(rig.release(1)["frames"], 45);
-    let status = rig.status();
-    assert_eq!(status["frames"], frames + 49);
-    assert_eq!(status["bytes_skipped"], 0);
-}
-
-/// The bytes that a UART reads at `ratio` times the rate of the sender of `bytes`. It waits for a
-/// start bit, and samples the line in the middle of each of its own bits.
-fn misread(bytes: &[u8], ratio: f64) -> Vec<u8> {
-    let bits = bytes.iter().flat_map(|byte| {
-        let data = (0..8).map(move |bit| byte >> bit & 1 == 1);
-        std::iter::once(false).chain(data).chain([true])
-    });
-    let line: Vec<bool> = bits.collect();
-    let level = |time: f64| line.get(time as usize).copied().unwrap_or(true);
-    let mut read = Vec::new();
-    let mut time = 0.0;
-    while (time as usize) < line.len() {
-        if level(time) {
-            time = time.floor() + 1.0;
-            continue;
-        }
-        let middle = |bit: f64| time + (bit + 0.5) / ratio;
-        let byte = (0..8).fold(0, |byte, bit| {
-            byte | u8::from(level(middle(f64::from(bit) + 1.0))) << bit
-        });
-        read.push(byte);
-        time = middle(9.0);
-        // After a byte without its stop bit, the line must rise first.
-        while !level(time) && (time as usize) < line.len() {
-            time = time.floor() + 1.0;
-        }
-    }
-    read
+    let script = [touch(READY, 45), during("stall", READY + 5, 40, "")];
+    let mut played = Played::start("", &script);
+    played.sees(&json!({"type": "press", "state": "begin"}));
+    let stale = played.sees(&json!({"type": "status", "state": "stale"}));
+    played.sees(&json!({"type": "status", "state": "live"}));
+    assert_eq!(played.released(1)["frames"], 45);
+    let after = status(&mut played.subscriber);
+    assert_eq!(growth(&stale, &after, "bytes_skipped"), 0);
+    assert_eq!(growth(&stale, &after, "frames_damaged"), 0);
 }
 
 #[test]
 fn at_a_wrong_baud_rate_there_is_no_frame_no_press_and_a_stale_sensor() {
-    let mut rig = Rig::connect("");
-    let sent = rig.cable.bytes(&pressed()).repeat(20);
-    assert_eq!(misread(&sent, 1.0), sent);
-    for ratio in [0.25, 0.5, 0.9, 1.1, 2.0, 4.0] {
-        rig.cable.write(&misread(&sent, ratio));
+    let ratios = [0.25, 0.5, 0.9, 1.1, 2.0, 4.0];
+    let each = READY / 6;
+    let mut script = vec![touch(0, READY)];
+    for (turn, ratio) in (0..).zip(ratios) {
+        let ratio = format!("ratio = {ratio}");
+        script.push(during("wrong-baud", turn * each, each, &ratio));
     }
-    let status = rig.status();
+    script.push(touch(READY + 50, 10));
+    let mut played = Played::start("", &script);
+    let mut was_stale = false;
+    let live = loop {
+        let event = played.subscriber.next().unwrap();
+        assert_ne!(event["type"], "press", "{event}");
+        was_stale |= event["state"] == "stale";
+        if event["state"] == "live" {
+            break event;
+        }
+    };
+    // At the right rate, the sensor is live at once and has no press yet.
+    assert!(was_stale);
     assert_eq!(
-        (&status["state"], &status["frames"]),
-        (&json!("stale"), &json!(0))
+        (&live["frames"], &live["reason"]),
+        (&json!(1), &json!(null))
     );
-    assert!(
-        status["bytes_skipped"].as_u64().unwrap() > 10_000,
-        "{status}"
-    );
-    // At the right rate, the sensor is live and has no press yet.
-    rig.cable.play(&rest(), 8);
-    let live = rig.sees(&json!({"type": "status", "state": "live"}));
-    assert_eq!(live["seq"], 2, "one event before: it was stale");
-    rig.press(1);
+    assert!(live["bytes_skipped"].as_u64().unwrap() > 10_000, "{live}");
+    assert_eq!(played.released(1)["frames"], 10);
 }
 
 #[test]
 fn a_taxel_that_sticks_begins_no_press_but_holds_one_until_it_is_named() {
     let press = "[press]\nmax_seconds = 0.5\n";
-    let mut rig = Rig::start(press);
-    let stuck = |mut raw: RawFrame| {
-        raw.counts[0] = 255;
-        raw
-    };
-    rig.cable.play(&stuck(rest()), 30);
-    rig.cable.play(&stuck(pressed()), 10);
-    let begin = rig.sees(&json!({"type": "press"}));
+    let script = [
+        fault("stuck", READY, "rows = [0, 0]\ncols = [0, 0]"),
+        touch(READY + 100, 10),
+        touch(READY + 600, 10),
+    ];
+    let mut played = Played::start(press, &script);
+    let begin = played.sees(&json!({"type": "press"}));
     assert_eq!(
         (&begin["press"], &begin["state"]),
         (&json!(1), &json!("begin"))
     );
-    rig.cable.play(&stuck(rest()), 60);
-    let end = rig.sees(&json!({"type": "press", "state": "end"}));
+    let end = played.sees(&json!({"type": "press", "state": "end"}));
     assert_eq!(end["reason"], "timeout");
-    let verdict = rig.sees(&json!({"phase": "final"}));
+    let verdict = played.sees(&json!({"phase": "final"}));
     assert!(
         verdict["notes"]
             .as_array()
             .unwrap()
             .contains(&json!("saturated"))
     );
-    rig.reload(&format!(
+    // The press began with the touch, and not with the taxel a second earlier.
+    assert_eq!(verdict["contact_area_taxels"], 37);
+    played.reload(&format!(
         "[sensor.calibration]\ndead_taxels = [[0, 0]]\n{press}"
     ));
-    rig.cable.play(&stuck(rest()), 4);
-    rig.cable.play(&stuck(pressed()), 10);
-    rig.cable.play(&stuck(rest()), 4);
-    let end = rig.sees(&json!({"type": "press", "state": "end"}));
-    assert_eq!((&end["press"], &end["reason"]), (&json!(2), &json!(null)));
+    assert_eq!(played.released(2)["frames"], 10);
 }
 
 #[test]
 fn a_dead_row_is_missing_in_the_contact_until_it_is_named() {
-    let mut rig = Rig::start("");
-    let mut dead = pressed();
-    dead.counts[13 * 28..14 * 28].fill(0);
-    let mut areas = Vec::new();
+    let script = [
+        touch(READY, 10),
+        touch(READY + 500, 10),
+        // It strikes the taxels after the contacts, so that they do not load the row.
+        fault("dead", READY, "rows = [13, 13]"),
+    ];
+    let mut played = Played::start("", &script);
+    let first = played.sees(&json!({"phase": "final"}));
     let row: Vec<[usize; 2]> = (0..28).map(|column| [13, column]).collect();
-    for _ in 0..2 {
-        rig.cable.play(&dead, 10);
-        rig.cable.play(&rest(), 4);
-        let verdict = rig.sees(&json!({"phase": "final"}));
-        areas.push(verdict["contact_area_taxels"].as_u64().unwrap());
-        rig.reload(&format!("[sensor.calibration]\ndead_taxels = {row:?}\n"));
-    }
+    played.reload(&format!("[sensor.calibration]\ndead_taxels = {row:?}\n"));
+    let second = played.sees(&json!({"phase": "final"}));
+    let areas = [first, second].map(|verdict| verdict["contact_area_taxels"].clone());
     // Some neighbours of a dead taxel beside the contact are in the contact.
     assert_eq!(areas, [30, 38]);
 }
 
 #[test]
 fn drift_is_no_press_below_the_threshold_and_above_it_one_that_ends_by_the_clock() {
-    let mut rig = Rig::start("[press]\nmax_seconds = 0.5\n");
-    let drifted = |counts: u16| {
-        let mut raw = rest();
-        raw.counts.fill(counts);
-        raw
-    };
-    // A count is 0.04 N, and the threshold is 0.07 N.
-    rig.cable.play(&drifted(1), 60);
-    rig.cable.play(&drifted(2), 60);
-    let begin = rig.sees(&json!({"type": "press"}));
+    // A count is 0.04 N, and the threshold is 0.07 N. A taxel reads a count after 0.3 s, and two
+    // from 0.9 s on.
+    let script = [
+        during("drift", READY, 120, "newtons_per_hour = 240.0"),
+        touch(READY + 500, 10),
+    ];
+    let mut played = Played::start("[press]\nmax_seconds = 0.5\n", &script);
+    let begin = played.sees(&json!({"type": "press"}));
     assert_eq!(
         (&begin["press"], &begin["state"]),
         (&json!(1), &json!("begin"))
     );
-    let end = rig.sees(&json!({"type": "press", "state": "end"}));
+    let end = played.sees(&json!({"type": "press", "state": "end"}));
     assert_eq!(end["reason"], "timeout");
     let begun: jiff::Timestamp = begin["time"].as_str().unwrap().parse().unwrap();
     let held = since(begun.into(), &end);
     assert!((450..1000).contains(&held.as_millis()), "{held:?}");
-    let verdict = rig.sees(&json!({"phase": "final"}));
+    let verdict = played.sees(&json!({"phase": "final"}));
     assert!(
         verdict["notes"]
             .as_array()
             .unwrap()
             .contains(&json!("at_edge"))
     );
+    // 784 taxels of two counts each.
+    assert_eq!(verdict["force_n"], 62.72);
     // A long drift is only one press, and a tare removes the drift.
-    rig.cable.play(&drifted(2), 60);
-    let control = rig.bench.path("control.sock");
-    let taring =
-        std::thread::spawn(move || Subscriber::connect(&control).ask(r#"{"tare":"forearm"}"#));
-    let start = Instant::now();
-    while !taring.is_finished() && start.elapsed() < bench::PATIENCE {
-        rig.cable.play(&drifted(2), 1);
-    }
-    let tared = taring.join().unwrap();
+    let control = played.bench.path("control.sock");
+    let tared = Subscriber::connect(&control).ask(r#"{"tare":"forearm"}"#);
     assert_eq!(tared["type"], "ok", "{tared}");
-    rig.cable.play(&drifted(2), 4);
-    let mut pressed = pressed();
-    pressed.counts.iter_mut().for_each(|count| *count += 2);
-    rig.cable.play(&pressed, 10);
-    rig.cable.play(&drifted(2), 4);
-    let begin = rig.sees(&json!({"type": "press"}));
+    let begin = played.sees(&json!({"type": "press"}));
     assert_eq!(
         (&begin["press"], &begin["state"]),
         (&json!(2), &json!("begin"))
     );
-    let end = rig.sees(&json!({"type": "press", "state": "end"}));
-    assert_eq!(end["reason"], Value::Null);
+    assert_eq!(played.released(2)["frames"], 10);
 }
 
 #[test]
 fn pressed_while_it_tares_a_sensor_says_so_and_tares_when_it_is_released() {
-    let mut rig = Rig::connect("");
-    rig.cable.play(&pressed(), 30);
-    let told = rig.sees(&json!({"type": "status", "reason": "tare: contact"}));
+    let script = [touch(0, READY), touch(READY + 50, 10)];
+    let mut played = Played::start("", &script);
+    let told = played.sees(&json!({"type": "status", "reason": "tare: contact"}));
     assert_eq!(
         (&told["state"], &told["frames"]),
         (&json!("live"), &json!(5))
     );
-    rig.cable.play(&rest(), 8);
-    let told = rig.subscriber.next().unwrap();
+    let told = played.subscriber.next().unwrap();
     assert_eq!(
         (&told["type"], &told["state"], &told["reason"]),
         (&json!("status"), &json!("live"), &json!(null)),
         "and no press before it"
     );
-    rig.press(1);
+    assert_eq!(played.released(1)["frames"], 10);
 }
 
 #[test]

@@ -31,7 +31,7 @@ const CROSSTALK_LINE: f32 = 0.004;
 const NOISE_RATIO: f64 = 0.015;
 const NOISE_N: f64 = 0.012;
 const DEAD_SHARE: f64 = 0.003;
-const FULL_SCALE_COUNTS: f32 = 255.0;
+pub(crate) const FULL_SCALE_COUNTS: u16 = 255;
 /// Median of the lognormal activation thresholds. Their +3 sigma is the paper's "minimum
 /// discrimination" of 0.2 N, read as a bound that holds for every taxel.
 const THRESHOLD_MEDIAN_N: f64 = 0.05;
@@ -190,7 +190,7 @@ impl Sensor {
                 };
             let rounded = (read / NEWTONS_PER_COUNT)
                 .round()
-                .clamp(0.0, FULL_SCALE_COUNTS);
+                .clamp(0.0, f32::from(FULL_SCALE_COUNTS));
             // A reading of one count becomes 0.
             *counts = if rounded < 2.0 { 0 } else { rounded as u16 };
         }

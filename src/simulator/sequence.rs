@@ -30,6 +30,8 @@ pub struct SequenceSettings {
     pub forces_n: Vec<f32>,
     /// The number of presses; `None` for an endless sequence.
     pub presses: Option<u32>,
+    /// Least rest before the first press and after each, s.
+    pub rest_s: f64,
     /// Distribution of shapes.
     pub shapes: Shapes,
     /// Spread of the sensor.
@@ -45,6 +47,7 @@ impl Default for SequenceSettings {
             materials: Material::ALL[4..].to_vec(),
             forces_n: Vec::new(),
             presses: None,
+            rest_s: REST_S,
             shapes: Shapes::Matched,
             profile: SensorProfile::Clean,
         }
@@ -69,9 +72,9 @@ pub struct SequenceFrame {
 /// An iterator over the frames of a sequence; see [`SequenceSettings`].
 ///
 /// The sequence begins with at least 2 s and ten frames without load, so that tare has its frames
-/// at any rate. It rests at least 1 s and five frames after each press, which is held for at least
-/// three. A press too light to begin one (3 taxels) is made anew with more force, so that a press
-/// tracker sees `presses` presses.
+/// at any rate. Each press is held for at least three frames. The rest after it has at least five
+/// frames. No rest is shorter than [`SequenceSettings::rest_s`]. A press too light to begin one
+/// (3 taxels) is made anew with more force, so that a press tracker sees `presses` presses.
 pub struct Sequence {
     settings: SequenceSettings,
     root: Stream,
@@ -91,8 +94,10 @@ pub struct Sequence {
 
 /// Least rest before the first press, in s and in frames.
 const FIRST_REST: (f64, f64) = (2.0, 10.0);
-/// Least rest after a press, in s and in frames.
-const REST: (f64, f64) = (1.0, 5.0);
+/// Least rest after a press, unless the settings say otherwise, s.
+pub const REST_S: f64 = 1.0;
+/// Least rest after a press, in frames.
+const REST_FRAMES: f64 = 5.0;
 /// The least number of frames that a press is held.
 const HOLD_FRAMES: f64 = 3.0;
 /// Greatest delay of a press, s. Each press gets a random delay, so that presses are not in step
@@ -119,7 +124,8 @@ impl Sequence {
         // a data set.
         let root = Stream::new(settings.seed, "sequence");
         let sensor = Sensor::new(settings.profile, &root.child(0));
-        let mut sequence = Self {
+        Self {
+            free_s: FIRST_REST.0.max(FIRST_REST.1 / rate).max(settings.rest_s),
             settings,
             root,
             sensor,
@@ -128,11 +134,8 @@ impl Sequence {
             ready: VecDeque::new(),
             made: 0,
             frames: 0,
-            free_s: FIRST_REST.0.max(FIRST_REST.1 / rate),
             last: None,
-        };
-        sequence.rest(None);
-        sequence
+        }
     }
 
     /// The true gain of each taxel, which a calibration should find; 0 for a dead taxel.
@@ -153,29 +156,33 @@ impl Sequence {
         presses.is_some_and(|presses| self.made >= presses)
     }
 
-    /// Makes frames without load until `free_s`.
-    fn rest(&mut self, material: Option<Material>) {
+    /// Whether the rest before the next press lasts.
+    fn rests(&self) -> bool {
+        self.frames as f64 / self.settings.frame_rate_hz <= self.free_s
+    }
+
+    /// Makes a frame without load. A rest may be long, so its frames are made one at a time.
+    fn rest(&mut self) -> SequenceFrame {
         let next_s = (!self.is_done()).then(|| self.next_draws().0);
         let approach = Approach {
             last: self.last,
             next: next_s.map(|touch_s| (touch_s, Arm::default().speed_mm_s)),
         };
-        while self.frames as f64 / self.settings.frame_rate_hz <= self.free_s {
-            self.film
-                .advance(&[0.0; TAXELS], 1.0 / self.settings.frame_rate_hz);
-            let raw = RawFrame::default();
-            self.ready.push_back(SequenceFrame {
-                raw,
-                press: self.made,
-                material,
-                loaded: false,
-                approach,
-            });
-            self.frames += 1;
+        self.film
+            .advance(&[0.0; TAXELS], 1.0 / self.settings.frame_rate_hz);
+        self.frames += 1;
+        let materials = &self.settings.materials;
+        let pressed = self.made.checked_sub(1);
+        SequenceFrame {
+            raw: RawFrame::default(),
+            press: self.made,
+            material: pressed.map(|press| materials[press as usize % materials.len()]),
+            loaded: false,
+            approach,
         }
     }
 
-    /// Makes the next press and the rest after it.
+    /// Makes the next press.
     fn press(&mut self) {
         let (touch_s, mut draws) = self.next_draws();
         let material = self.settings.materials[self.made as usize % self.settings.materials.len()];
@@ -189,6 +196,7 @@ impl Sequence {
         let patch = draw_patch(&body.substance.texture, face.roughness, &mut draws.child(1));
         let pose = Pose::draw(&face, &mut draws.child(2));
         let rate = self.settings.frame_rate_hz;
+        let rest_s = self.settings.rest_s.max(REST_FRAMES / rate);
         let hold_s = draws.range(0.8, 1.5).max(HOLD_FRAMES / rate);
         let specimen = Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch);
         for attempt in 1.. {
@@ -214,8 +222,8 @@ impl Sequence {
                     }));
                 self.film = film;
                 self.frames = next;
-                self.free_s = touch_s + course.duration_s() + REST.0.max(REST.1 / rate);
-                return self.rest(Some(material));
+                self.free_s = touch_s + course.duration_s() + rest_s;
+                return;
             }
             force_n *= HARDER;
         }
@@ -249,8 +257,13 @@ impl Iterator for Sequence {
     type Item = SequenceFrame;
 
     fn next(&mut self) -> Option<SequenceFrame> {
-        if self.ready.is_empty() && !self.is_done() {
-            self.press();
+        if self.ready.is_empty() {
+            if self.rests() {
+                return Some(self.rest());
+            }
+            if !self.is_done() {
+                self.press();
+            }
         }
         self.ready.pop_front()
     }
@@ -363,6 +376,24 @@ mod tests {
     }
 
     #[test]
+    fn a_longer_rest_comes_before_and_after_each_press() {
+        let settings = |rest_s| SequenceSettings {
+            seed: 7,
+            presses: Some(3),
+            rest_s,
+            ..SequenceSettings::default()
+        };
+        check(&settings(30.0));
+        let frames: Vec<SequenceFrame> = Sequence::new(settings(30.0)).collect();
+        for press in 0..=3 {
+            let own = frames.iter().filter(|frame| frame.press == press);
+            let rests = own.filter(|frame| !frame.loaded).count();
+            // 30 s at 5 frames/s, and the delay of the next press.
+            assert!((149..155).contains(&rests), "{press}: {rests}");
+        }
+    }
+
+    #[test]
     fn a_press_too_light_is_made_anew_with_more_force() {
         check(&SequenceSettings {
             seed: 4,
@@ -436,6 +467,7 @@ mod tests {
                         materials: Material::ALL.to_vec(),
                         forces_n,
                         presses: Some(40),
+                        rest_s: REST_S,
                         shapes,
                         profile,
                     });

@@ -230,12 +230,14 @@ fn of_calibrate(error: &calibrate::Error) -> u8 {
         | calibrate::Error::Unasked
         | calibrate::Error::NoFile => USAGE,
         calibrate::Error::Missing { .. } => NO_INPUT,
+        calibrate::Error::Recording { source, .. } if source.is_io() => IO,
         calibrate::Error::Arm(_)
         | calibrate::Error::Force(_)
         | calibrate::Error::Taxels(_)
         | calibrate::Error::Count { .. }
         | calibrate::Error::Recording { .. } => FAILED,
         calibrate::Error::Temporary { .. }
+        | calibrate::Error::Taken { .. }
         | calibrate::Error::Out { .. }
         | calibrate::Error::Print(_) => IO,
     }

@@ -74,19 +74,22 @@ impl Pty {
         &self.path
     }
 
-    /// Writes as much as there is room for. The rest is lost, as on a line without a reader.
+    /// Writes as much as there is room for, and returns how many bytes that is. On a line without a
+    /// reader the rest is lost.
     ///
     /// # Errors
     ///
     /// Fails if the system reports an error other than a full buffer.
-    pub(crate) fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
+    pub(crate) fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         self.forget_unread()?;
         match rustix::io::write(&self.master, bytes) {
-            Ok(written) => self.written += written as u64,
-            Err(Errno::AGAIN) => {}
-            Err(error) => return Err(error.into()),
+            Ok(written) => {
+                self.written += written as u64;
+                Ok(written)
+            }
+            Err(Errno::AGAIN) => Ok(0),
+            Err(error) => Err(error.into()),
         }
-        Ok(())
     }
 
     fn forget_unread(&mut self) -> io::Result<()> {

@@ -16,7 +16,7 @@ use serde::de::value::Error as NameError;
 use super::faults::{self, Faults, Line};
 use super::player::{BITS_A_BYTE, Pace, Player};
 use crate::sensor::DEFAULT_FRAME_RATE_HZ;
-use crate::simulator::{Material, SensorProfile, Sequence, SequenceSettings};
+use crate::simulator::{Material, REST_S, SensorProfile, Sequence, SequenceSettings};
 use crate::wire::{Layout, LayoutError, Preset, Settings as Frame};
 
 /// Arguments of `simulate`.
@@ -51,6 +51,9 @@ pub struct Args {
     /// End after N presses [default: no limit]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     presses: Option<u32>,
+    /// Least rest before the first press and after each, in seconds, 1 to 3600
+    #[arg(long, value_name = "S", default_value_t = REST_S, value_parser = rest_s)]
+    rest: f64,
     /// Play X times as fast, 0.000001 to 1000000000
     #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = positive)]
     speed: f64,
@@ -200,6 +203,7 @@ fn sequence(args: &Args) -> SequenceSettings {
         },
         forces_n: args.forces.iter().map(|&force| force as f32).collect(),
         presses: args.presses,
+        rest_s: args.rest,
         profile: args.sensor_profile,
         ..SequenceSettings::default()
     }
@@ -238,10 +242,10 @@ fn write(
     let frame_rate_hz = settings.frame_rate_hz;
     let mut bytes = Vec::with_capacity(layout.max_frame_bytes());
     for (index, frame) in (0_u32..).zip(Sequence::new(settings)) {
-        bytes.clear();
-        layout.encode(&frame.raw, &mut bytes);
-        if faults.strike(f64::from(index) / frame_rate_hz, &mut bytes) == Line::Up {
-            file.write_all(&bytes)?;
+        let time_s = f64::from(index) / frame_rate_hz;
+        match faults.encode(time_s, frame.raw, layout, &mut bytes) {
+            Line::Up | Line::AtOnce => file.write_all(&bytes)?,
+            Line::Silent | Line::Unplugged => {}
         }
         // A process that ends during a write may leave a part of a frame.
         if stopped.try_recv() == Err(TryRecvError::Disconnected) {
@@ -303,6 +307,11 @@ fn frame_rate_hz(text: &str) -> Result<f64, OutOfRange> {
 /// material takes minutes to bear 1,000 N, and the sensor shows no more than 10 N a taxel.
 fn force_n(text: &str) -> Result<f64, OutOfRange> {
     within(text, 0.01, 200.0)
+}
+
+/// Parses `--rest`.
+fn rest_s(text: &str) -> Result<f64, OutOfRange> {
+    within(text, REST_S, 3600.0)
 }
 
 /// The option's value is not a number, or is out of range.

@@ -4,6 +4,12 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
+use super::bytes::{Damage, OfBytes};
+use super::cable::{self, OfCable};
+use super::taxels::{Change, OfTaxels, Region};
+use super::times::{Frames, Span};
+use crate::frame::{COLS, ROWS};
+use crate::simulator::FULL_SCALE_COUNTS;
 use crate::wording;
 
 /// The file format, for `--help`.
@@ -14,17 +20,43 @@ pub(crate) const FORMAT: &str = r#"The faults of --faults FILE, a TOML file; tim
   kind = "unplug"        # the pty and its link go, and come back after `for_s`
   for_s = 1.5
 
+The cable:
   kind = "silence"       # frames stay unsent for `for_s`; the port stays open
+  kind = "half"          # the same, but half of the first frame is sent. With `other_half = true`
+                         # its other half comes at the end
+  kind = "stall"         # frames are held back for `for_s`, then come all at once
+  kind = "wrong-baud"    # bytes as a reader at `ratio` times the sensor's baud rate reads them
+
+Bytes of frames:
   kind = "noise"         # `bytes` random bytes before each of `frames` frames
   kind = "drop-bytes"    # `bytes` of each of `frames` frames are not sent
   kind = "flip"          # `bits` of each of `frames` frames are inverted
+  kind = "repeat"        # each of `frames` frames comes twice
 
-`for_s` is needed where it applies; `bytes`, `bits` and `frames` are 1 unless given, and `bytes`
-and `bits` at most 1000000."#;
+Taxels, those in `rows = [first, last]` and `cols = [first, last]`, counted from 0:
+  kind = "stuck"         # they read `counts`
+  kind = "dead"          # they read 0
+  kind = "contact"       # each reads `newtons` more
+  kind = "drift"         # each reads `newtons_per_hour` more every hour. After `for_s` it stays so
+
+unplug, silence, half and stall need `for_s`, which is at most 60 for a stall. The other faults of
+the cable and of taxels last to the end without it. `bytes`, `bits` and `frames` are 1 unless given,
+and `bytes` and `bits` at most 1000000. `ratio` is 0.01 to 100, `counts` 255 unless given. stuck,
+dead and contact need `rows` or `cols`; one that is not given means all. A drift may be negative,
+but no taxel reads below 0 or above 255."#;
 
 /// The most bytes or bits of a frame that a fault may strike. It is far more than a frame has: a
 /// line at 115,200 baud needs a minute and a half for this many bytes.
 const MOST_STRUCK: usize = 1_000_000;
+
+/// The longest stall, in seconds. It bounds the memory for the frames that are held back.
+const LONGEST_STALL_S: f64 = 60.0;
+
+/// The least and the greatest ratio of a wrong baud rate.
+const RATIOS: (f64, f64) = (0.01, 100.0);
+
+/// The most newtons, and newtons an hour, that a taxel can read more: far more than its full scale.
+const MOST_NEWTONS: f64 = 1e6;
 
 /// The reason why a script cannot be played.
 #[derive(Debug, thiserror::Error)]
@@ -84,9 +116,42 @@ pub enum Unfit {
     /// The time is not a number of seconds above 0.
     #[error("for_s: found {0}, expected seconds above 0")]
     Span(f64),
-    /// The fault needs a time and has none.
-    #[error("for_s: this kind of fault needs it, in seconds")]
-    NoSpan,
+    /// The stall holds back too many frames.
+    #[error("for_s: found {0}, expected at most {LONGEST_STALL_S} for a stall")]
+    Stall(f64),
+    /// A number outside its range.
+    #[error("{key}: found {found}, expected {least} to {most}")]
+    Range {
+        /// The key.
+        key: &'static str,
+        /// The value in the script.
+        found: f64,
+        /// The least possible value.
+        least: f64,
+        /// The greatest possible value.
+        most: f64,
+    },
+    /// The force is not above 0.
+    #[error("newtons: found {0}, expected more than 0")]
+    NoForce(f64),
+    /// The rows or columns are not two numbers of the array, in order.
+    #[error("{key}: found {found:?}, expected [first, last] of 0 to {}", sides - 1)]
+    Side {
+        /// The key.
+        key: &'static str,
+        /// The numbers in the script.
+        found: Vec<usize>,
+        /// The number of rows, or of columns.
+        sides: usize,
+    },
+    /// The fault needs a key and does not have it.
+    #[error("{key}: this kind of fault needs it, {form}")]
+    Needed {
+        /// The key.
+        key: &'static str,
+        /// The unit or the form of the value.
+        form: &'static str,
+    },
 }
 
 impl Error {
@@ -112,6 +177,13 @@ struct Table {
     bytes: Option<usize>,
     bits: Option<usize>,
     frames: Option<u64>,
+    other_half: Option<bool>,
+    ratio: Option<f64>,
+    rows: Option<Vec<usize>>,
+    cols: Option<Vec<usize>>,
+    counts: Option<u16>,
+    newtons: Option<f64>,
+    newtons_per_hour: Option<f64>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
@@ -119,41 +191,47 @@ struct Table {
 enum Kind {
     Unplug,
     Silence,
+    Half,
+    Stall,
+    WrongBaud,
     Noise,
     DropBytes,
     Flip,
+    Repeat,
+    Stuck,
+    Dead,
+    Contact,
+    Drift,
 }
 
-/// A fault of the line for a time, or a fault of a number of frames.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Fault {
-    Unplug {
-        from_s: f64,
-        to_s: f64,
-    },
-    Silence {
-        from_s: f64,
-        to_s: f64,
-    },
-    Noise {
-        from_s: f64,
-        bytes: usize,
-        frames: u64,
-    },
-    DropBytes {
-        from_s: f64,
-        bytes: usize,
-        frames: u64,
-    },
-    Flip {
-        from_s: f64,
-        bits: usize,
-        frames: u64,
-    },
+impl Kind {
+    /// The keys that a fault of this kind may have, beside `at_s` and `kind`.
+    fn keys(self) -> &'static [&'static str] {
+        match self {
+            Kind::Unplug | Kind::Silence | Kind::Stall => &["for_s"],
+            Kind::Half => &["for_s", "other_half"],
+            Kind::WrongBaud => &["for_s", "ratio"],
+            Kind::Noise | Kind::DropBytes => &["bytes", "frames"],
+            Kind::Flip => &["bits", "frames"],
+            Kind::Repeat => &["frames"],
+            Kind::Stuck => &["for_s", "rows", "cols", "counts"],
+            Kind::Dead => &["for_s", "rows", "cols"],
+            Kind::Contact => &["for_s", "rows", "cols", "newtons"],
+            Kind::Drift => &["for_s", "rows", "cols", "newtons_per_hour"],
+        }
+    }
+}
+
+/// The faults of a script, in its order.
+#[derive(Debug, Default)]
+pub(super) struct Faults {
+    pub(super) taxels: Vec<OfTaxels>,
+    pub(super) bytes: Vec<OfBytes>,
+    pub(super) cable: Vec<OfCable>,
 }
 
 /// Reads a script.
-pub(super) fn load(path: &Path) -> Result<Vec<Fault>, Error> {
+pub(super) fn load(path: &Path) -> Result<Faults, Error> {
     let text = std::fs::read_to_string(path).map_err(|source| Error::Unreadable {
         path: path.to_owned(),
         source,
@@ -164,76 +242,207 @@ pub(super) fn load(path: &Path) -> Result<Vec<Fault>, Error> {
     })
 }
 
-pub(super) fn parse(text: &str) -> Result<Vec<Fault>, Problem> {
+pub(super) fn parse(text: &str) -> Result<Faults, Problem> {
     let script: Script =
         toml::from_str(text).map_err(|error| Problem::Syntax(wording::of_toml(text, &error)))?;
-    let faults = script.faults.iter().enumerate();
-    faults
-        .map(|(index, table)| {
-            table.fault().map_err(|value| Problem::Value {
-                number: index + 1,
-                value,
-            })
-        })
-        .collect()
+    let mut faults = Faults::default();
+    for (index, table) in script.faults.iter().enumerate() {
+        let number = index + 1;
+        let added = table.add_to(&mut faults);
+        added.map_err(|value| Problem::Value { number, value })?;
+    }
+    Ok(faults)
 }
 
 impl Table {
-    fn fault(&self) -> Result<Fault, Unfit> {
+    /// Adds the fault to the others.
+    fn add_to(&self, faults: &mut Faults) -> Result<(), Unfit> {
         if !(self.at_s.is_finite() && self.at_s >= 0.0) {
             return Err(Unfit::Moment(self.at_s));
         }
-        let of_time = matches!(self.kind, Kind::Unplug | Kind::Silence);
-        let misplaced = [
-            ("for_s", self.for_s.is_some() && !of_time),
-            ("frames", self.frames.is_some() && of_time),
-            ("bits", self.bits.is_some() && self.kind != Kind::Flip),
-            (
-                "bytes",
-                self.bytes.is_some() && !matches!(self.kind, Kind::Noise | Kind::DropBytes),
-            ),
-        ];
-        if let Some((key, _)) = misplaced.iter().find(|(_, misplaced)| *misplaced) {
+        if let Some(key) = self.misplaced() {
             return Err(Unfit::Misplaced(key));
         }
-        for (key, number) in [("bytes", self.bytes), ("bits", self.bits)] {
-            if let Some(found) = number.filter(|&number| number > MOST_STRUCK) {
-                return Err(Unfit::TooMany { key, found });
+        match self.kind {
+            Kind::Unplug => faults.cable.push(self.of_cable(cable::Kind::Unplug)?),
+            Kind::Silence => faults.cable.push(self.of_cable(cable::Kind::Silence)?),
+            Kind::Half => {
+                let kind = cable::Kind::Half {
+                    other_half: self.other_half.unwrap_or(false),
+                    has_begun: false,
+                };
+                faults.cable.push(self.of_cable(kind)?);
+            }
+            Kind::Stall => {
+                let fault = self.of_cable(cable::Kind::Stall)?;
+                match self.for_s {
+                    Some(for_s) if for_s > LONGEST_STALL_S => return Err(Unfit::Stall(for_s)),
+                    _ => faults.cable.push(fault),
+                }
+            }
+            Kind::WrongBaud => {
+                let form = "the reader's baud rate over the sensor's";
+                let ratio = number("ratio", self.ratio, RATIOS, form)?;
+                faults.cable.push(OfCable {
+                    span: self.span()?,
+                    kind: cable::Kind::WrongBaud { ratio },
+                });
+            }
+            Kind::Noise => {
+                let bytes = struck("bytes", self.bytes)?;
+                faults.bytes.push(self.of_bytes(Damage::Noise { bytes }));
+            }
+            Kind::DropBytes => {
+                let bytes = struck("bytes", self.bytes)?;
+                faults
+                    .bytes
+                    .push(self.of_bytes(Damage::DropBytes { bytes }));
+            }
+            Kind::Flip => {
+                let bits = struck("bits", self.bits)?;
+                faults.bytes.push(self.of_bytes(Damage::Flip { bits }));
+            }
+            Kind::Repeat => faults.bytes.push(self.of_bytes(Damage::Repeat)),
+            Kind::Stuck => {
+                let counts = self.counts.unwrap_or(FULL_SCALE_COUNTS);
+                faults.taxels.push(self.of_some(Change::Stuck { counts })?);
+            }
+            Kind::Dead => {
+                let change = Change::Stuck { counts: 0 };
+                faults.taxels.push(self.of_some(change)?);
+            }
+            Kind::Contact => {
+                let range = (0.0, MOST_NEWTONS);
+                let newtons = number("newtons", self.newtons, range, "for each taxel")?;
+                if newtons == 0.0 {
+                    return Err(Unfit::NoForce(newtons));
+                }
+                faults
+                    .taxels
+                    .push(self.of_some(Change::Contact { newtons })?);
+            }
+            Kind::Drift => {
+                let newtons_per_hour = number(
+                    "newtons_per_hour",
+                    self.newtons_per_hour,
+                    (-MOST_NEWTONS, MOST_NEWTONS),
+                    "for each taxel",
+                )?;
+                let change = Change::Drift { newtons_per_hour };
+                faults.taxels.push(self.of_taxels(change)?);
             }
         }
-        let from_s = self.at_s;
-        let (bytes, bits) = (self.bytes.unwrap_or(1), self.bits.unwrap_or(1));
-        let frames = self.frames.unwrap_or(1);
-        let to_s = || match self.for_s {
-            Some(for_s) if for_s.is_finite() && for_s > 0.0 => Ok(from_s + for_s),
-            Some(for_s) => Err(Unfit::Span(for_s)),
-            None => Err(Unfit::NoSpan),
+        Ok(())
+    }
+
+    /// A key that the kind does not have.
+    fn misplaced(&self) -> Option<&'static str> {
+        let given = [
+            ("for_s", self.for_s.is_some()),
+            ("bytes", self.bytes.is_some()),
+            ("bits", self.bits.is_some()),
+            ("frames", self.frames.is_some()),
+            ("other_half", self.other_half.is_some()),
+            ("ratio", self.ratio.is_some()),
+            ("rows", self.rows.is_some()),
+            ("cols", self.cols.is_some()),
+            ("counts", self.counts.is_some()),
+            ("newtons", self.newtons.is_some()),
+            ("newtons_per_hour", self.newtons_per_hour.is_some()),
+        ];
+        let mut given = given.into_iter().filter(|(_, is_given)| *is_given);
+        let misplaced = given.find(|(key, _)| !self.kind.keys().contains(key));
+        misplaced.map(|(key, _)| key)
+    }
+
+    /// The time of the fault, which does not end without `for_s`.
+    fn span(&self) -> Result<Span, Unfit> {
+        let to_s = match self.for_s {
+            Some(for_s) if for_s.is_finite() && for_s > 0.0 => self.at_s + for_s,
+            Some(for_s) => return Err(Unfit::Span(for_s)),
+            None => f64::INFINITY,
         };
-        Ok(match self.kind {
-            Kind::Unplug => Fault::Unplug {
-                from_s,
-                to_s: to_s()?,
+        let from_s = self.at_s;
+        Ok(Span { from_s, to_s })
+    }
+
+    /// A fault of the cable that needs `for_s`.
+    fn of_cable(&self, kind: cable::Kind) -> Result<OfCable, Unfit> {
+        let span = self.span()?;
+        if self.for_s.is_none() {
+            let (key, form) = ("for_s", "in seconds");
+            return Err(Unfit::Needed { key, form });
+        }
+        Ok(OfCable { span, kind })
+    }
+
+    fn of_bytes(&self, damage: Damage) -> OfBytes {
+        let frames = Frames {
+            from_s: self.at_s,
+            left: self.frames.unwrap_or(1),
+        };
+        OfBytes { frames, damage }
+    }
+
+    /// A fault of taxels that must say which.
+    fn of_some(&self, change: Change) -> Result<OfTaxels, Unfit> {
+        if self.rows.is_none() && self.cols.is_none() {
+            let (key, form) = ("rows or cols", "as [first, last]");
+            return Err(Unfit::Needed { key, form });
+        }
+        self.of_taxels(change)
+    }
+
+    fn of_taxels(&self, change: Change) -> Result<OfTaxels, Unfit> {
+        Ok(OfTaxels {
+            span: self.span()?,
+            region: Region {
+                rows: side("rows", self.rows.as_deref(), ROWS)?,
+                cols: side("cols", self.cols.as_deref(), COLS)?,
             },
-            Kind::Silence => Fault::Silence {
-                from_s,
-                to_s: to_s()?,
-            },
-            Kind::Noise => Fault::Noise {
-                from_s,
-                bytes,
-                frames,
-            },
-            Kind::DropBytes => Fault::DropBytes {
-                from_s,
-                bytes,
-                frames,
-            },
-            Kind::Flip => Fault::Flip {
-                from_s,
-                bits,
-                frames,
-            },
+            change,
         })
+    }
+}
+
+/// How many bytes or bits of a frame a fault strikes.
+fn struck(key: &'static str, given: Option<usize>) -> Result<usize, Unfit> {
+    match given.unwrap_or(1) {
+        found if found > MOST_STRUCK => Err(Unfit::TooMany { key, found }),
+        number => Ok(number),
+    }
+}
+
+/// A number that the fault needs.
+fn number(
+    key: &'static str,
+    given: Option<f64>,
+    (least, most): (f64, f64),
+    form: &'static str,
+) -> Result<f64, Unfit> {
+    let found = given.ok_or(Unfit::Needed { key, form })?;
+    if (least..=most).contains(&found) {
+        return Ok(found);
+    }
+    Err(Unfit::Range {
+        key,
+        found,
+        least,
+        most,
+    })
+}
+
+/// The first and the last row or column. The parser would drop the rest of a list longer than a
+/// pair, so the script has a list of any length.
+fn side(key: &'static str, given: Option<&[usize]>, sides: usize) -> Result<[usize; 2], Unfit> {
+    match given {
+        None => Ok([0, sides - 1]),
+        Some(&[first, last]) if first <= last && last < sides => Ok([first, last]),
+        Some(found) => Err(Unfit::Side {
+            key,
+            found: found.to_vec(),
+            sides,
+        }),
     }
 }
 
@@ -268,6 +477,78 @@ mod tests {
             (
                 "[[fault]]\nat_s = \"soon\"\nkind = \"flip\"",
                 "expected a number",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"half\"",
+                "for_s: this kind of fault needs it, in seconds",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"silence\"\nfor_s = 1.0\nother_half = true",
+                "other_half: this kind of fault does not have it",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"stall\"\nfor_s = 61",
+                "for_s: found 61, expected at most 60 for a stall",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"repeat\"\nfor_s = 1.0",
+                "for_s: this kind of fault does not have it",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"wrong-baud\"",
+                "ratio: this kind of fault needs it, the reader's baud rate",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"wrong-baud\"\nratio = 0",
+                "ratio: found 0, expected 0.01 to 100",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"stuck\"\ncounts = 255",
+                "rows or cols: this kind of fault needs it, as [first, last]",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"stuck\"\nrows = [0, 0]\ncounts = 70000",
+                "expected a whole number from 0 to 65535",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"dead\"\nrows = [13, 28]",
+                "fault 1: rows: found [13, 28], expected [first, last] of 0 to 27",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"dead\"\ncols = [14, 13]",
+                "cols: found [14, 13]",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"dead\"\nrows = [1, 2, 3]",
+                "rows: found [1, 2, 3]",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"dead\"\nrows = 13",
+                "expected a list",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"contact\"\nrows = [1, 2]",
+                "newtons: this kind of fault needs it, for each taxel",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"contact\"\nrows = [1, 2]\nnewtons = 0.0",
+                "newtons: found 0, expected more than 0",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"contact\"\nrows = [1, 2]\nnewtons = -1",
+                "newtons: found -1, expected 0 to 1000000",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"drift\"",
+                "newtons_per_hour: this kind of fault needs it",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"drift\"\nnewtons_per_hour = nan",
+                "newtons_per_hour: found NaN",
+            ),
+            (
+                "[[fault]]\nat_s = 1.0\nkind = \"drift\"\nnewtons_per_hour = 1\nfor_s = 0",
+                "for_s: found 0, expected seconds above 0",
             ),
         ] {
             let problem = parse(script).unwrap_err().to_string();
