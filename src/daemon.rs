@@ -55,7 +55,7 @@ use self::serial::Link;
 use crate::event::{Hello, ModelCard, PROTOCOL, SensorCard, Status};
 use crate::frame::Stamp;
 use crate::pipeline::{Clock, Pipeline};
-use crate::recording::{About, Labels, RecordedSensor};
+use crate::recording::{About, Found, Labels, RecordedSensor};
 
 /// The most commands that wait for a sensor. When the queue is full, the tasks that send wait.
 const QUESTIONS: usize = 16;
@@ -98,14 +98,32 @@ pub struct Daemon {
     target: Option<Target>,
 }
 
-/// The current time of CLOCK_MONOTONIC and of the wall clock.
+/// The current time of CLOCK_MONOTONIC and of the wall clock. If another process interrupts this one
+/// between the two readings, the clocks are read again.
 pub(crate) fn now() -> Stamp {
-    let mono = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    let mono = || {
+        let mono = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+        Duration::try_from(mono).expect("CLOCK_MONOTONIC counts from 0 at boot")
+    };
+    let mut before = mono();
+    for _ in 0..MOST_READINGS {
+        let wall = jiff::Timestamp::now();
+        let after = mono();
+        if after.saturating_sub(before) <= READING {
+            return Stamp { mono: before, wall };
+        }
+        before = after;
+    }
     Stamp {
-        mono: Duration::try_from(mono).expect("CLOCK_MONOTONIC counts from 0 at boot"),
+        mono: before,
         wall: jiff::Timestamp::now(),
     }
 }
+
+/// Reading both clocks takes no longer than this, unless another process interrupts it.
+const READING: Duration = Duration::from_micros(100);
+/// How often the clocks are read again.
+const MOST_READINGS: usize = 3;
 
 /// Checks that a daemon can write where `config` says. The check binds nothing, so it cannot detect
 /// a path that another process uses or an address that the network refuses.
@@ -220,7 +238,8 @@ impl Daemon {
             .as_ref()
             .map_or(EventRecorder::default(), Recorder::of_hub);
         let hub = hub::start(hello, events);
-        let (sensors, tasks) = start_sensors(&setup, recorder.as_ref(), &hub);
+        let viewers = publishers.viewers();
+        let (sensors, tasks) = start_sensors(&setup, recorder.as_ref(), viewers.as_ref(), &hub);
         let (orders, receiver) = watch::channel(());
         publishers.announce();
         let publishers = publishers.serve(&hub, &sensors, &receiver);
@@ -243,6 +262,7 @@ impl Daemon {
 fn start_sensors(
     setup: &Setup,
     recorder: Option<&Recorder>,
+    viewers: Option<&mpsc::Sender<Found>>,
     hub: &hub::Handle,
 ) -> (Sensors, JoinSet<()>) {
     let mut tasks = JoinSet::new();
@@ -255,6 +275,7 @@ fn start_sensors(
         let recorder = recorder.map_or(SensorRecorder::default(), |recorder| {
             recorder.of_sensor(index)
         });
+        let recorder = recorder.with_viewers(viewers.cloned());
         tasks.spawn(sensor::serve(pipeline, link, recorder, hub.clone(), inbox));
         let name = port.name.clone();
         sensors.push(SensorHandle { name, commands });

@@ -98,7 +98,8 @@ pub struct StepBack {
 pub struct Track {
     /// The points, ascending in time.
     points: VecDeque<Point>,
-    /// The first and the last moment of each stretch in which time stepped back.
+    /// The first and the last moment of each stretch in which moments are uncertain: time stepped
+    /// back, or this machine's calendar clock was set.
     doubts: VecDeque<(i64, i64)>,
     /// The number of points since the start.
     told: u64,
@@ -138,6 +139,15 @@ impl Track {
             self.forget(point.at_ns);
         }
         first_back.map_or(Ok(()), Err)
+    }
+
+    /// Takes in that this machine's calendar clock was set since the latest point. Moments from
+    /// calendar times are uncertain from the latest point to `until_ns`, because nobody knows by
+    /// which setting the robot or this machine took them.
+    pub fn clock_set(&mut self, until_ns: i64) {
+        let latest = self.points.back().map(|point| point.at_ns);
+        let from = latest.unwrap_or(-FURTHEST_NS);
+        self.doubt(from, until_ns.max(from));
     }
 
     fn doubt(&mut self, from: i64, to: i64) {
@@ -180,8 +190,8 @@ impl Track {
     /// frames, and ascend. The arm's stamps are `delay_ms` earlier. A moment after the latest
     /// position has `None`.
     ///
-    /// Returns `None` if there is a gap, a jump or a step back in time between `begin` and the last
-    /// moment, or if the points do not cover `begin`.
+    /// Returns `None` if there is a gap, a jump, a step back in time or a set clock between `begin`
+    /// and the last moment, or if the points do not cover `begin`.
     pub fn approach(
         &self,
         begin: Duration,

@@ -16,6 +16,10 @@ use std::time::Duration;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
+#[cfg(feature = "train")]
+pub(crate) use self::course::{approach_by_speed, approach_speed_mm_s, says_something};
+#[cfg(feature = "train")]
+pub(crate) use self::events::{FIRST_LOOK, look_after};
 use self::link::Link;
 pub use self::memory::Memory;
 use crate::event::{Event, FrameEvent, LinkState, Phase, Tared};
@@ -232,10 +236,20 @@ impl Pipeline {
         self.track.push(points)
     }
 
+    /// Takes in that this machine's calendar clock was set: see [`Track::clock_set`].
+    pub fn clock_set(&mut self, until_ns: i64) {
+        self.track.clock_set(until_ns);
+    }
+
     /// The number of positions since the start, and the number of them that came too late for their
     /// verdict.
     pub fn motion_counts(&self) -> (u64, u64) {
         self.track.counts()
+    }
+
+    /// The positions of the arm.
+    pub(crate) fn track(&self) -> &Track {
+        &self.track
     }
 
     /// Takes out the missing verdicts. Each is returned once.

@@ -21,6 +21,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 pub use self::labels::{LabelError, Labels, check_label};
+#[cfg(feature = "foxglove")]
+pub(crate) use self::message::MOTION;
 pub use self::playback::{Playback, PlaybackError, PlaybackProblem};
 pub use self::reader::{Found, Reader};
 pub use self::recover::{RecoverError, Recovered, recover};
@@ -80,6 +82,9 @@ pub enum Input<'a> {
     Context(Option<Value>),
     /// Positions of the arm from the robot.
     Motion(Cow<'a, [Point]>),
+    /// This machine's calendar clock was set. Moments from calendar times are uncertain up to this
+    /// moment of CLOCK_MONOTONIC, in nanoseconds.
+    ClockSet(i64),
     /// The daemon stops.
     Shutdown,
 }
@@ -108,6 +113,10 @@ impl Input<'_> {
                 let _ = pipeline.tell(&points);
                 Vec::new()
             }
+            Input::ClockSet(until_ns) => {
+                pipeline.clock_set(until_ns);
+                Vec::new()
+            }
             Input::Shutdown => pipeline.shutdown(),
         }
     }
@@ -124,6 +133,7 @@ impl Input<'_> {
             Input::Tare => Input::Tare,
             Input::Context(context) => Input::Context(context.clone()),
             Input::Motion(points) => Input::Motion(Cow::Owned(points.to_vec())),
+            Input::ClockSet(until_ns) => Input::ClockSet(*until_ns),
             Input::Shutdown => Input::Shutdown,
         }
     }

@@ -383,20 +383,22 @@ impl Tare {
         frame
     }
 
-    /// Moves the baseline towards `raw`, by [`MOST_STEP_N`] at most, if the settings allow it. A
-    /// taxel that reads the contact threshold or more keeps its baseline.
+    /// Moves the baseline towards `raw`, by [`MOST_STEP_N`] at most, if the settings allow it. While
+    /// a live taxel reads the contact threshold or more, something touches the sensor, and no
+    /// baseline moves: the taxels around the touch read a part of it.
     ///
     /// Call this function once a second at most, and never during a press.
     pub fn follow(&mut self, raw: &RawFrame) {
-        if !self.follows {
+        let above = |place: usize| f32::from(raw.counts[place]) - self.baseline[place];
+        let is_touched =
+            |place: &usize| self.scale.newtons(above(*place), *place) >= self.contact.threshold_n;
+        if !self.follows || self.live().iter().any(is_touched) {
             return;
         }
         for (place, baseline) in self.baseline.iter_mut().enumerate() {
             let above = f32::from(raw.counts[place]) - *baseline;
-            if self.scale.newtons(above, place) < self.contact.threshold_n {
-                let most = self.scale.counts(MOST_STEP_N, place);
-                *baseline += above.clamp(-most, most);
-            }
+            let most = self.scale.counts(MOST_STEP_N, place);
+            *baseline += above.clamp(-most, most);
         }
     }
 

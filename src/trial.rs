@@ -93,6 +93,23 @@ pub fn load(bytes: &[u8], most: Option<Duration>) -> Result<Hrn, ModelError> {
     Hrn::load(bytes)
 }
 
+/// Tries a model file, without a limit for the time of a verdict. Succeeds if the trial completes,
+/// even if it refuses the file: [`Hrn::load`] and [`Hrn::read`] then return an error of their own
+/// here, which names the refused part.
+///
+/// # Errors
+///
+/// Returns [`ModelError::Trial`] if the trial does not complete, and [`ModelError::TooLarge`].
+pub fn survives(bytes: &[u8]) -> Result<(), ModelError> {
+    if bytes.len() > verdict::MAX_FILE_BYTES {
+        return Err(ModelError::TooLarge { found: bytes.len() });
+    }
+    if IS_TRIER.get().is_some() {
+        let _ = answered(child(), bytes, DEADLINE)?;
+    }
+    Ok(())
+}
+
 /// The command that starts this program again, even if another one has been installed in its place.
 fn child() -> Command {
     let mut command = Command::new("/proc/self/exe");
@@ -104,7 +121,17 @@ fn child() -> Command {
 }
 
 /// Runs a trial of the file in a child. Returns how long a verdict takes.
-fn tried(mut command: Command, bytes: &[u8], deadline: Duration) -> Result<Duration, ModelError> {
+fn tried(command: Command, bytes: &[u8], deadline: Duration) -> Result<Duration, ModelError> {
+    answered(command, bytes, deadline)?.map_err(ModelError::Trial)
+}
+
+/// Runs a trial of the file in a child. Returns how long a verdict takes, or why the child refuses
+/// the file. A trial that does not complete is an error.
+fn answered(
+    mut command: Command,
+    bytes: &[u8],
+    deadline: Duration,
+) -> Result<Result<Duration, String>, ModelError> {
     let trial = |problem: String| ModelError::Trial(format!("model: {problem}"));
     let mut child = command
         .stdin(Stdio::piped())
@@ -118,9 +145,10 @@ fn tried(mut command: Command, bytes: &[u8], deadline: Duration) -> Result<Durat
     let ended = child.wait();
     match answer {
         Some(Answer::Good { verdict_us }) => {
-            Ok(Duration::try_from_secs_f64(verdict_us / 1e6).unwrap_or(Duration::MAX))
+            let verdict = Duration::try_from_secs_f64(verdict_us / 1e6);
+            Ok(Ok(verdict.unwrap_or(Duration::MAX)))
         }
-        Some(Answer::Refused(problem)) => Err(ModelError::Trial(problem)),
+        Some(Answer::Refused(problem)) => Ok(Err(problem)),
         Some(Answer::Panicked(problem)) => Err(trial(format!(
             "the inference library failed on it: {problem}"
         ))),
@@ -303,6 +331,22 @@ mod tests {
             none.to_string().contains("no process to try it in"),
             "{none}"
         );
+    }
+
+    #[test]
+    fn a_refusal_is_told_from_a_trial_that_does_not_complete() {
+        let answered = |script: &str| {
+            let mut command = Command::new("sh");
+            command.args(["-c", script]);
+            answered(command, b"", DEADLINE).map_err(|error| error.to_string())
+        };
+        let refused = answered(r#"echo '{"Refused":"model of clay"}'"#).unwrap();
+        assert_eq!(refused, Err("model of clay".to_owned()));
+        let good = answered(r#"echo '{"Good":{"verdict_us":2000.0}}'"#).unwrap();
+        assert_eq!(good, Ok(Duration::from_millis(2)));
+        let panicked = answered(r#"echo '{"Panicked":"at sea"}'"#).unwrap_err();
+        assert!(panicked.contains("failed on it: at sea"), "{panicked}");
+        assert!(answered("exit 3").is_err());
     }
 
     #[test]

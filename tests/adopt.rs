@@ -9,8 +9,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+use hardnessd::frame::Frame;
 use hardnessd::simulator::Split;
-use hardnessd::train::data::dataset::Dataset;
+use hardnessd::train::data::dataset::{self, Dataset, Sample};
 use hardnessd::verdict::Hrn;
 use prost::Message;
 use tract_onnx::pb;
@@ -220,6 +221,109 @@ fn a_foreign_model_is_told_all_that_it_lacks_and_adopted() {
             }
         }
     }
+}
+
+/// Writes a data set with four presses of three levels, whose `meta` states these levels.
+fn three_levels(path: &Path, levels: &serde_json::Value) {
+    three_levels_of(path, &serde_json::json!({ "levels": levels }));
+}
+
+/// The same with this `meta`.
+fn three_levels_of(path: &Path, meta: &serde_json::Value) {
+    let sample = |level: u8| Sample {
+        frame: Frame {
+            newtons: [0.1 * f32::from(level); 784],
+        },
+        level,
+        object: Some(u32::from(level)),
+        material: None,
+        force_n: None,
+        split: Split::Train,
+        shore: None,
+        source: 0,
+    };
+    let samples: Vec<Sample> = [1, 2, 3, 3].into_iter().map(sample).collect();
+    dataset::write(fs::File::create(path).unwrap(), &samples, meta).unwrap();
+}
+
+#[test]
+fn the_levels_of_an_adopted_model_are_those_of_its_data() {
+    let directory = tempfile::tempdir().unwrap();
+    let [data, out] = ["data.npz", "out.onnx"].map(|name| directory.path().join(name));
+    let of_three = write(directory.path(), "three.onnx", &model("logits", 3, 17));
+    let levels = serde_json::json!([
+        {"level": 1, "label": "stone", "shore": ">80"},
+        {"level": 2, "label": "fruit", "shore": "40-80"},
+        {"level": 3, "label": "jelly", "shore": "<40"},
+    ]);
+    let adopt = || {
+        let [data, out] = [&data, &out].map(|path| path.to_str().unwrap());
+        hrn_train(&["adopt", &of_three, "--data", data, "--out", out])
+    };
+    three_levels(&data, &levels);
+    let adopted = adopt();
+    assert!(adopted.status.success(), "{}", stderr(&adopted));
+    let hrn = Hrn::load(&fs::read(&out).unwrap()).unwrap();
+    assert_eq!(serde_json::to_value(&hrn.card().levels).unwrap(), levels);
+
+    three_levels(&data, &serde_json::json!(["stone", "fruit", "jelly"]));
+    let refused = stderr(&adopt());
+    assert!(
+        refused.contains("expected `level`, `label` and `shore`"),
+        "{refused}"
+    );
+    // Data that state no levels have the four of the paper.
+    for meta in [
+        serde_json::json!({ "levels": null }),
+        serde_json::json!([]),
+        serde_json::json!("x"),
+    ] {
+        three_levels_of(&data, &meta);
+        let refused = stderr(&adopt());
+        assert!(refused.contains("found 3 levels, expected 4"), "{refused}");
+    }
+}
+
+#[test]
+fn a_model_of_presses_is_checked_against_its_own_format() {
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
+    let shipped = models.join("course.onnx");
+    let checked = hrn_train(&["check-model", shipped.to_str().unwrap()]);
+    let lines = stdout(&checked);
+    assert_eq!(checked.status.code(), Some(0), "{lines}");
+    let ok = lines.lines().filter(|line| line.starts_with("ok "));
+    assert_eq!(ok.count(), 17, "{lines}");
+
+    let mut proto = pb::ModelProto::decode(&fs::read(&shipped).unwrap()[..]).unwrap();
+    for entry in &mut proto.metadata_props {
+        if entry.key == "hrn.conformal" {
+            entry.value = r#"{"alpha":0.1,"threshold":2}"#.to_owned();
+        }
+    }
+    let (directory, data) = data();
+    let changed = write(directory.path(), "changed.onnx", &proto);
+    let checked = hrn_train(&["check-model", &changed]);
+    let lines = stdout(&checked);
+    assert_eq!(checked.status.code(), Some(78), "{lines}");
+    assert!(
+        lines.contains("missing  hrn.conformal: model metadata `hrn.conformal`: found "),
+        "{lines}"
+    );
+    assert!(
+        lines.contains("ok       graph\n") && !lines.contains("not looked at"),
+        "{lines}"
+    );
+    assert!(lines.contains("takes models of one frame only"), "{lines}");
+
+    let out = directory.path().join("out.onnx");
+    let [data, out] = [&data, &out].map(|path| path.to_str().unwrap());
+    let adopted = hrn_train(&["adopt", &changed, "--data", data, "--out", out]);
+    let message = stderr(&adopted);
+    assert_eq!(adopted.status.code(), Some(78), "{message}");
+    assert!(
+        message.contains("adopt takes models of one frame"),
+        "{message}"
+    );
 }
 
 #[test]

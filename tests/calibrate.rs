@@ -212,6 +212,96 @@ fn presses_of_a_recording_say_the_gains_and_a_recording_holds_them() {
     };
     assert!(!left.iter().any(is_gains), "{left:?}");
     assert_eq!(taxels(&path("nowhere.bin")).status.code(), Some(66));
-    let without = hardnessd(&["calibrate", "taxels", "--config", config, "--from", &from]);
-    assert_eq!(without.status.code(), Some(2), "{without:?}");
+
+    // Without --out, the file lies beside the configuration, and replaces nothing.
+    let beside =
+        |from: &str| hardnessd(&["calibrate", "taxels", "--config", config, "--from", from]);
+    let none = beside(&path("none.bin"));
+    assert_eq!(none.status.code(), Some(1), "{none:?}");
+    assert!(!fs::exists(&out).unwrap());
+    let made = beside(&from);
+    assert!(made.status.success(), "{made:?}");
+    assert_eq!(String::from_utf8(made.stdout).unwrap(), text);
+    let gains = fs::read(&out).unwrap();
+    assert!(gains.len() > 4 * 784, "{}", gains.len());
+    fs::write(&out, "of somebody else").unwrap();
+    let refused = beside(&from);
+    assert_eq!(refused.status.code(), Some(74), "{refused:?}");
+    let why = String::from_utf8(refused.stderr).unwrap();
+    assert!(
+        why.contains("gains.npy exists already: name the file for the gains with --out"),
+        "{why}"
+    );
+    assert_eq!(why.lines().count(), 1, "{why}");
+    assert_eq!(fs::read(&out).unwrap(), b"of somebody else");
+    // A file that --out names is replaced.
+    assert!(taxels(&from).status.success());
+    assert_eq!(fs::read(&out).unwrap(), gains);
+}
+
+#[test]
+fn the_other_sensors_neither_count_nor_have_to_be_there() {
+    let bench = Bench::new();
+    let more = "[[sensor]]\nname = \"wrist\"\nport = \"port-2\"\nframe_rate_hz = 20.0\n";
+    let config = bench.configure("hardnessd.toml", "events.sock", more);
+    let config = config.to_str().unwrap();
+    let weigh = || {
+        let force = ["--sensor", "forearm", "--newtons", "15"];
+        hardnessd(&[&["calibrate", "force", "--config", config], &force[..]].concat())
+    };
+    let slow = ["--speed", "0.5"];
+    let forearm = bench.sensor(&slow);
+    let unplugged = weigh();
+    assert!(unplugged.status.success(), "{unplugged:?}");
+    drop(forearm);
+    // The wrist is pressed again and again, quickly.
+    let _wrist = bench.sensor_at("port-2", 20, &["--speed", "20"]);
+    let _forearm = bench.sensor(&slow);
+    let pressed = weigh();
+    assert!(pressed.status.success(), "{pressed:?}");
+}
+
+#[test]
+fn weights_of_a_recording_are_read_with_its_own_settings() {
+    let bench = Bench::new();
+    // Four presses, of a daemon with another configuration.
+    let recording = concat!(env!("CARGO_MANIFEST_DIR"), "/fixtures/earlier.mcap");
+    let weigh = |calibration: &str| {
+        let path = bench.path("hardnessd.toml");
+        let sensor = "[[sensor]]\nname = \"forearm\"\nport = \"port\"\n[sensor.calibration]\n";
+        fs::write(&path, format!("{sensor}{calibration}")).unwrap();
+        let weights = ["--newtons", "12.7", "12.6", "9", "9.9", "--from", recording];
+        let config = ["calibrate", "force", "--config", path.to_str().unwrap()];
+        let output = hardnessd(&[&config[..], &weights[..]].concat());
+        assert!(output.status.success(), "{output:?}");
+        value(
+            &String::from_utf8(output.stdout).unwrap(),
+            "newtons_per_count",
+        )
+    };
+    // The weights are what the recorded events say, with the recorded 0.04.
+    let then = weigh("");
+    assert!((0.038..0.043).contains(&then), "{then}");
+    let now = weigh("newtons_per_count = 0.01\nexponent = 1.3\n");
+    assert_eq!(now, then);
+}
+
+#[test]
+fn a_recording_that_the_system_cannot_read_is_an_io_error() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let config = config.to_str().unwrap();
+    for what in ["arm", "taxels"] {
+        let calibrate = ["calibrate", what, "--config", config];
+        let output = hardnessd(&[&calibrate[..], &["--from", "/proc/self/mem"]].concat());
+        assert_eq!(output.status.code(), Some(74), "{output:?}");
+        let why = String::from_utf8(output.stderr).unwrap();
+        assert!(why.contains("/proc/self/mem: "), "{why}");
+    }
+    // A file that is no recording is read, and is of no use.
+    let foreign = bench.path("foreign.mcap");
+    fs::write(&foreign, b"\x89MCAP0\r\nnothing more").unwrap();
+    let foreign = ["arm", "--from", foreign.to_str().unwrap()];
+    let output = hardnessd(&[&["calibrate", "--config", config], &foreign[..]].concat());
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
 }

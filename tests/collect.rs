@@ -365,6 +365,72 @@ fn a_model_is_of_the_pitch_of_its_recordings_and_pitches_do_not_mix() {
 }
 
 #[test]
+fn a_model_of_presses_is_of_the_pitch_of_its_recordings() {
+    let bench = Bench::new();
+    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/foam.5hz.bin");
+    let narrow = "[sensor.calibration]\npitch_mm = 2.0\n";
+    let narrow = bench.configure("narrow.toml", "events.sock", narrow);
+    let settings = bench.path("settings.toml");
+    std::fs::write(&settings, "[training]\nepochs = 1\n").unwrap();
+    let [fine, coarse] = ["fine.npz", "coarse.npz"].map(|name| bench.path(name));
+    for level in ["1", "2", "3", "4"] {
+        for (out, config) in [(&fine, &["--config", text(&narrow)][..]), (&coarse, &[])] {
+            let append: &[&str] = if out.exists() { &["--append"] } else { &[] };
+            let told = ["--sequences", "--level", level, text(&fixture)];
+            let output = collect(out, &[append, config, &told].concat());
+            assert!(output.status.success(), "{output:?}");
+        }
+    }
+    let course = |command: &[&str]| {
+        let output = Command::new(env!("CARGO_BIN_EXE_hrn-train"))
+            .args(command)
+            .output()
+            .unwrap();
+        let errors = String::from_utf8(output.stderr).unwrap();
+        (output.status.code(), errors)
+    };
+    let run = bench.path("course");
+    let train = ["train", "--method", "course", "--config", text(&settings)];
+    let whole = ["--out", text(&run), "--data", text(&fine)];
+    let (code, errors) = course(&[&train[..], &whole].concat());
+    assert_eq!(code, Some(0), "{errors}");
+    let model = run.join("hrn.onnx");
+    let hrn = Hrn::load(&std::fs::read(&model).unwrap()).unwrap();
+    assert_eq!(hrn.card().pitch_mm, 2.0);
+
+    let evaluate = [
+        "evaluate",
+        "--split",
+        "train",
+        "--model",
+        text(&model),
+        "--data",
+    ];
+    let warning = "coarse.npz: taxel pitch: found 3.5 mm, expected 2 mm, that of the model\n";
+    for (data, said) in [(&fine, ""), (&coarse, warning)] {
+        let (code, errors) = course(&[&evaluate[..], &[text(data)]].concat());
+        assert_eq!(code, Some(0), "{errors}");
+        assert_eq!(errors.is_empty(), said.is_empty(), "{errors}");
+        assert!(errors.ends_with(said), "{errors}");
+    }
+    let other = bench.path("mixed");
+    let mixed = [
+        "--out",
+        text(&other),
+        "--data",
+        text(&fine),
+        "--data",
+        text(&coarse),
+    ];
+    let (code, errors) = course(&[&train[..], &mixed].concat());
+    assert_eq!(code, Some(1), "{errors}");
+    assert!(
+        errors.contains("coarse.npz: taxel pitch: found 3.5 mm"),
+        "{errors}"
+    );
+}
+
+#[test]
 fn nothing_of_a_data_set_is_lost_when_it_is_added_to() {
     let bench = Bench::new();
     let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/foam.5hz.bin");
@@ -522,6 +588,37 @@ fn a_fleet_gives_the_same_bytes_in_parallel_and_after_a_kill() {
         assert!(std::fs::read(&killed).unwrap() == expected);
         assert_eq!(parts(&directory)[1..], all[1..]);
     }
+}
+
+#[test]
+fn a_changed_program_without_a_commit_of_its_own_takes_no_parts_of_another() {
+    let bench = Bench::new();
+    // Bytes after its last section change nothing but the file.
+    let changed = bench.path("hrn-train");
+    let mut copy = Command::new("sh");
+    copy.args(["-c", r#"cp "$1" "$2" && echo changed >> "$2""#, "sh"]);
+    copy.args([env!("CARGO_BIN_EXE_hrn-train"), text(&changed)]);
+    assert!(copy.status().unwrap().success());
+    let captures = fleet(&bench, 2);
+    let [directory, out] = ["parts", "out.npz"].map(|name| bench.path(name));
+    let mut arguments = vec!["--level", "2", "--parts", text(&directory)];
+    arguments.extend(captures.iter().map(|path| text(path)));
+    let with = |program: &Path| {
+        let mut command = Command::new(program);
+        let done = command
+            .args(["collect", "--out", text(&out)])
+            .args(&arguments);
+        assert!(done.status().unwrap().success());
+        parts(&directory)
+    };
+    let first = with(Path::new(env!("CARGO_BIN_EXE_hrn-train")));
+    assert_eq!(first, with(Path::new(env!("CARGO_BIN_EXE_hrn-train"))));
+    let of_both = with(&changed);
+    assert!(first.iter().all(|part| of_both.contains(part)));
+    let commit = env!("HARDNESSD_REVISION");
+    let is_of_commit = !commit.ends_with("-dirty") && commit != "no checkout";
+    let expected = if is_of_commit { 2 } else { 4 };
+    assert_eq!((first.len(), of_both.len()), (2, expected), "{commit}");
 }
 
 #[test]

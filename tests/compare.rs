@@ -119,6 +119,39 @@ fn whole() -> &'static Comparison {
 }
 
 #[test]
+fn the_counts_of_objects_add_up_to_the_accuracies() {
+    let csv = whole().text("objects.csv");
+    let mut lines = csv.lines();
+    assert_eq!(
+        lines.next(),
+        Some("run,set,level,object,geometry,right,samples")
+    );
+    let mut sums = std::collections::BTreeMap::<(String, String), [f64; 2]>::new();
+    let mut geometries = std::collections::BTreeMap::<String, u32>::new();
+    for line in lines {
+        let fields: Vec<&str> = line.split(',').collect();
+        let [run, set, _, _, geometry, right, samples] = fields[..] else {
+            panic!("{line}");
+        };
+        let sum = sums.entry((run.to_owned(), set.to_owned())).or_default();
+        sum[0] += right.parse::<f64>().unwrap();
+        sum[1] += samples.parse::<f64>().unwrap();
+        *geometries.entry(set.to_owned()).or_default() += u32::from(!geometry.is_empty());
+    }
+    let results = whole().json("results.json");
+    for result in &results {
+        for set in ["paper_split", "fresh", "matched"] {
+            let run = result["run"].as_str().unwrap().to_owned();
+            let [right, samples] = sums[&(run, set.to_owned())];
+            assert_eq!(result[set]["accuracy"], right / samples, "{set}");
+        }
+    }
+    // Only the sets that are not of the paper's shapes have geometries.
+    assert_eq!(geometries["fresh"], 0);
+    assert_eq!(geometries["matched"], 80 * results.len() as u32);
+}
+
+#[test]
 fn results_have_the_documented_fields_and_agree_with_evaluate() {
     let results = whole().json("results.json");
     let rows: Vec<(&str, u64, u64)> = results

@@ -11,7 +11,7 @@ use std::process::{Command, Output};
 
 use hardnessd::train::data::courses::Courses;
 use hardnessd::train::model::course::course_of;
-use hardnessd::verdict::{Format, Hrn};
+use hardnessd::verdict::{Course, Format, Hrn};
 use serde_json::Value;
 
 fn hrn_train(directory: &Path, arguments: &str) -> Output {
@@ -42,10 +42,13 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
     let directory = tempfile::tempdir().unwrap();
     let at = directory.path();
     std::fs::write(at.join("settings.toml"), SETTINGS).unwrap();
+    // Half of the 20 objects are enough for sets of levels.
+    let held_out = format!("{SETTINGS}\n[validation]\nshare = 0.5\n");
+    std::fs::write(at.join("half.toml"), held_out).unwrap();
     let simulate = "simulate --sequences --materials broad --shapes wide --objects 5 --test-objects 2 \
                     --presses 3 --fps 5..20 --seed 3 --out d.npz";
     succeed(at, simulate);
-    let train = "train --method course --data d.npz --config settings.toml --seed 1";
+    let train = "train --method course --data d.npz --config half.toml --seed 1";
     let said = succeed(at, &format!("{train} --out whole"));
     assert!(said.contains("Shore OO"), "{said}");
 
@@ -67,8 +70,32 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
     // The daemon's own code loads the file, and the approach changes its verdicts.
     let hrn = Hrn::load(&whole).unwrap();
     assert_eq!(hrn.format(), Format::Course { most_frames: 48 });
+    assert_eq!(hrn.card().metrics["not_promised"], Value::Null);
     let courses = Courses::read(&at.join("d.npz")).unwrap();
     let mut course = course_of(&courses, 0);
+    // The file says on which presses the model was trained: at 2 to 20 mm/s, 5 to 20 frames/s and
+    // with arms of 3 to 30 N/mm.
+    let range = hrn.card().range;
+    assert!(range.of_presses().iter().all(Option::is_some), "{range:?}");
+    assert!(range.speed_mm_s.unwrap()[1] < 25.0 && range.arm_n_per_mm.unwrap()[1] < 45.0);
+    let all = (0..courses.presses.len()).map(|press| course_of(&courses, press));
+    let held: Vec<_> = all.filter(|course| range.holds(course)).collect();
+    assert!(4 * held.len() > 3 * courses.presses.len(), "{range:?}");
+    let went = |course: &&Course| course.extents()[3].is_some_and(|[mm, _]| mm > 0.5);
+    let seen = held.iter().find(went).unwrap();
+    let mut long = seen.clone();
+    long.moments.last_mut().unwrap().time_s = 60.0;
+    let mut fast = seen.clone();
+    for moment in &mut fast.moments {
+        moment.approach_mm = moment.approach_mm.map(|mm| 100.0 * mm);
+    }
+    let mut soft = seen.clone();
+    soft.arm_n_per_mm = 0.5;
+    for other in [long, fast, soft] {
+        assert!(!range.holds(&other), "{other:?}");
+    }
+    let inspected = succeed(at, "inspect whole/hrn.onnx");
+    assert!(inspected.contains(" mm/s in training\n"), "{inspected}");
     let told = hrn.judge_course(&course).unwrap();
     assert!(told.shore.is_some() && told.levels.is_some());
     course
@@ -112,7 +139,19 @@ fn adapt(at: &Path, start: &[u8]) {
     let own = std::fs::read(at.join("own/hrn.onnx")).unwrap();
     let (before, after) = (Hrn::load(start).unwrap(), Hrn::load(&own).unwrap());
     assert_eq!(after.card().method, "adapt");
-    assert_eq!(after.card().conformal, before.card().conformal);
+    // No object was held out, so nothing shows whether the sets of the start hold on this sensor.
+    assert!(before.card().conformal.is_some());
+    assert_eq!(after.card().conformal, None);
+    let not_promised = &after.card().metrics["not_promised"];
+    assert!(
+        not_promised.as_str().unwrap().contains("found 0"),
+        "{not_promised}"
+    );
+    let inspected = succeed(at, "inspect own/hrn.onnx");
+    assert!(
+        inspected.contains("there are no sets of levels"),
+        "{inspected}"
+    );
     succeed(
         at,
         "adapt --data own.npz --config settings.toml --start own/hrn.onnx --out again",
@@ -212,10 +251,21 @@ fn a_model_for_one_robot_takes_no_notice_of_the_arm() {
     let simulate = "simulate --sequences --materials broad --objects 3 --test-objects 1 --presses 2 --fps 10 \
                     --speed 8 --arm 10 --seed 4 --out d.npz";
     succeed(at, simulate);
-    succeed(
-        at,
-        "train --method course --one-robot --data d.npz --config settings.toml --out one",
-    );
+    let train = "train --method course --one-robot --data d.npz --config settings.toml --out one";
+    let output = hrn_train(at, train);
+    assert!(output.status.success(), "{output:?}");
+    // Two of the twelve objects are held out: too few for any promise of 90 %.
+    let errors = String::from_utf8(output.stderr).unwrap();
+    let expected = "held-out objects: found 2, expected at least 9: there are no sets";
+    assert!(errors.contains(expected), "{errors}");
+    let hrn = Hrn::load(&std::fs::read(at.join("one/hrn.onnx")).unwrap()).unwrap();
+    assert_eq!(hrn.card().conformal, None);
+    let not_promised = &hrn.card().metrics["not_promised"];
+    assert!(not_promised.as_str().unwrap().starts_with(expected));
+    // The model never knew the arm, so its file states no range of it.
+    let range = hrn.card().range;
+    assert!(range.duration_s.is_some() && range.frame_period_s.is_some());
+    assert_eq!((range.speed_mm_s, range.arm_n_per_mm), (None, None));
     let told = std::fs::read_to_string(at.join("one/settings.toml")).unwrap();
     assert!(told.contains("unknown = 1.0"), "{told}");
     let output = hrn_train(

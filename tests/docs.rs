@@ -493,6 +493,22 @@ fn anchors(text: &str) -> BTreeSet<String> {
 }
 
 #[test]
+fn no_page_has_a_gap_for_a_figure() {
+    let mut all = Vec::new();
+    pages(&root(), &mut all);
+    for page in all {
+        let text = fs::read_to_string(&page).unwrap();
+        let is_gap = |word: &&str| {
+            let word = word.trim_matches(|c: char| !c.is_alphanumeric() && c != '@');
+            let is_marked = word.len() > 2 && word.starts_with('@') && word.ends_with('@');
+            is_marked || word == "XX" || word == "TODO"
+        };
+        let found: Vec<&str> = text.split_whitespace().filter(is_gap).collect();
+        assert!(found.is_empty(), "{}: {found:?}", page.display());
+    }
+}
+
+#[test]
 fn links_between_pages_lead_somewhere() {
     let mut all = Vec::new();
     pages(&root(), &mut all);

@@ -102,7 +102,17 @@ fn bad_files() -> Vec<(&'static str, Vec<u8>, &'static str)> {
     vec![
         (
             "an axis far outside",
-            changed(|graph| attribute(node(graph, "Flatten"), "axis").i = 2_147_483_647),
+            changed(|graph| {
+                let reshape = node(graph, "Reshape");
+                reshape.op_type = "Flatten".to_owned();
+                reshape.input.truncate(1);
+                reshape.attribute = vec![pb::AttributeProto {
+                    name: "axis".to_owned(),
+                    r#type: AttributeType::Int as i32,
+                    i: 2_147_483_647,
+                    ..Default::default()
+                }];
+            }),
             "`axis`: found 2147483647, expected -8 to 8",
         ),
         (

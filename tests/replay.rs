@@ -242,3 +242,74 @@ fn bytes_one_at_a_time_or_split_anywhere_give_the_same_events() {
         assert_eq!(events([head, tail].into_iter()), expected, "split at {at}");
     }
 }
+
+/// What came of the presses of a recording.
+#[derive(Debug, Default, PartialEq)]
+struct Outcome {
+    /// The level of each press that ended by its release.
+    released: Vec<u64>,
+    /// The number of presses that ended by `max_seconds`.
+    timed_out: usize,
+}
+
+/// Replays a recording with or without `auto_tare`.
+fn outcome(recording: &Path, auto_tare: bool) -> Outcome {
+    let config = recording.with_extension("toml");
+    let text = format!(
+        "[[sensor]]\nname = \"forearm\"\nport = \"none\"\n\
+         [sensor.calibration]\nauto_tare = {auto_tare}\n"
+    );
+    std::fs::write(&config, text).unwrap();
+    let events = replay(recording, &["--config", config.to_str().unwrap()]);
+    let mut outcome = Outcome::default();
+    let mut is_released = false;
+    for line in events.lines() {
+        let event: Value = serde_json::from_str(line).unwrap();
+        if event["state"] == "end" {
+            is_released = event["reason"].is_null();
+            outcome.timed_out += usize::from(event["reason"] == "timeout");
+        }
+        if event["phase"] == "final" && is_released {
+            outcome.released.push(event["level"].as_u64().unwrap());
+        }
+    }
+    outcome
+}
+
+/// The figures are in `docs/configuration.md`, "Slow drift".
+#[test]
+fn with_auto_tare_an_hour_of_drift_costs_no_press() {
+    let directory = tempfile::tempdir().unwrap();
+    let script = directory.path().join("drift.toml");
+    let drift = "[[fault]]\nat_s = 0.0\nkind = \"drift\"\nnewtons_per_hour = 0.5\n";
+    std::fs::write(&script, drift).unwrap();
+    let simulate = |name: &str, more: &[&str]| {
+        let path = directory.path().join(name);
+        let simulated = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
+            .args(["simulate", "--presses", "60", "--rest", "60", "--to"])
+            .arg(&path)
+            .args(more)
+            .status()
+            .unwrap();
+        assert!(simulated.success());
+        path
+    };
+    let steady = simulate("steady.bin", &[]);
+    let drifting = simulate("drift.bin", &["--faults", script.to_str().unwrap()]);
+    let frames = std::fs::metadata(&drifting).unwrap().len() / 790;
+    assert!(frames > 5 * 3600, "more than an hour: {frames} frames");
+
+    let presses = |outcome: &Outcome| (outcome.released.len(), outcome.timed_out);
+    let without_drift = outcome(&steady, false);
+    assert_eq!(presses(&without_drift), (60, 0));
+    assert_eq!(outcome(&steady, true), without_drift);
+    // Once the drift is above the contact threshold, it is a press that never ends.
+    let fixed = outcome(&drifting, false);
+    assert_eq!(presses(&fixed), (6, 1), "{fixed:?}");
+    let following = outcome(&drifting, true);
+    assert_eq!(presses(&following), (60, 0), "{following:?}");
+    let levels = following.released.iter().zip(&without_drift.released);
+    let same = levels.filter(|(with, without)| with == without).count();
+    println!("{same} of 60 levels are those without drift");
+    assert!(same >= 56, "{following:?} {without_drift:?}");
+}

@@ -408,9 +408,9 @@ pub(super) async fn move_arm(
     points: &[Told],
 ) -> Result<(), Refused> {
     // Read the clocks now, because the sensor's task may have other work to do first.
-    let points = motion::placed(points, crate::daemon::now())?;
+    let placed = motion::placed(points, crate::daemon::now())?;
     let (reply, taken) = oneshot::channel();
-    let command = Command::Motion(points, reply);
+    let command = Command::Motion(placed, reply);
     tell(sensors, "motion.sensor", sensor, command).await?;
     taken.await.map_err(|_| Refused::Stopping("motion"))??;
     Ok(())

@@ -9,12 +9,14 @@ mod error;
 mod publish;
 mod check;
 mod parse;
+mod read;
 
 use std::env;
 use std::net::SocketAddr;
 use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Instant;
 
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -22,6 +24,7 @@ pub use self::error::Error;
 pub use self::publish::{
     Endpoint, EndpointError, Foxglove, Mode, ModeError, Publish, Ros2, Tcp, Unix, Zenoh,
 };
+use self::read::Until;
 use super::log;
 use crate::sensor::{Description, Sensor};
 use crate::verdict::Hrn;
@@ -245,7 +248,7 @@ impl Config {
     /// Returns an [`Error`] if the file cannot be read or is not TOML, if it has an unknown key, a
     /// value of another type or a path that cannot be used, or if a file of gains cannot be used.
     pub fn load(path: &Path) -> Result<Self, Error> {
-        parse::load(path)
+        parse::load(path, None)
     }
 
     /// Checks every value, and whether the values fit together. Returns the sensors in their order.
@@ -343,6 +346,13 @@ impl Setup {
         Self::of(config, path)
     }
 
+    /// Reads a configuration and its model, but does not wait longer than `until` for a program that
+    /// writes a file of them.
+    pub(super) fn load_until(path: &Path, until: Instant) -> Result<Self, Error> {
+        let config = parse::load(path, Some(until))?;
+        Self::of_until(config, path, Some(until))
+    }
+
     /// Checks `config` and loads its model. `path` is only for messages.
     ///
     /// # Errors
@@ -350,10 +360,14 @@ impl Setup {
     /// Returns the errors of [`Config::check`], and an error if the model cannot be read or is
     /// refused.
     pub fn of(config: Config, path: &Path) -> Result<Self, Error> {
+        Self::of_until(config, path, None)
+    }
+
+    fn of_until(config: Config, path: &Path, until: Until) -> Result<Self, Error> {
         let sensors = config.check(path)?;
         let rates = config.sensors.iter().map(|sensor| sensor.frame_rate_hz);
         let most = trial::verdict_most(rates.fold(0.0, f64::max));
-        let hrn = Arc::new(parse::model(&config.model, most, path)?);
+        let hrn = Arc::new(parse::model(&config.model, most, path, until)?);
         Ok(Self {
             config,
             sensors,

@@ -1,8 +1,9 @@
 //! A live server for Foxglove and Lichtblick: the topics of a recording, over the websocket
 //! protocol `foxglove.sdk.v1`.
 //!
-//! In: lines of the hub. Out: the messages that a recording has of these lines, under the same
-//! names and with the same definitions, so one layout fits both. A viewer that connects later gets
+//! In: lines of the hub, and the arm's positions as the sensors' tasks get them. Out: the messages
+//! that a recording has of these, under the same names and with the same definitions, so one layout
+//! fits both. A viewer that connects later gets
 //! the last final verdict and the last status of each sensor. The server has no capability that
 //! accepts data from a viewer, so a viewer cannot change anything. One thread does all this.
 
@@ -25,6 +26,7 @@ use super::config;
 use super::hub::Line;
 use super::relay::Worker;
 use crate::event::{Event, Phase};
+use crate::recording::{Found, MOTION};
 use crate::ros::{self, Topic};
 
 /// The reason the server could not start.
@@ -54,6 +56,9 @@ const BACKLOG: usize = 512;
 /// the next event.
 const NEWCOMERS: usize = 64;
 
+/// The most lines of positions that wait for the thread. When there are more, they are dropped.
+const POSITIONS: usize = 256;
+
 /// The time for the last messages to reach the viewers, because the library does not report when a
 /// viewer has everything.
 const LAST_MESSAGES: Duration = Duration::from_millis(50);
@@ -68,7 +73,8 @@ pub(super) struct Sensor {
     pub(super) pitch_mm: f64,
 }
 
-/// Listens as `settings` say and announces the topics of `sensors`.
+/// Listens as `settings` say and announces the topics of `sensors`. Also returns the queue for the
+/// positions of the arm.
 ///
 /// # Errors
 ///
@@ -77,13 +83,15 @@ pub(super) fn open(
     settings: &config::Foxglove,
     robot: &str,
     sensors: Vec<Sensor>,
-) -> Result<Worker<Vec<Line>>, Error> {
+) -> Result<(Worker<Vec<Line>>, mpsc::Sender<Found>), Error> {
     let (address, robot) = (settings.listen, robot.to_owned());
-    Worker::start(
+    let (viewers, positions) = mpsc::channel(POSITIONS);
+    let worker = Worker::start(
         "foxglove",
         move |_, _| Foxglove::open(address, &robot, &sensors),
-        Foxglove::work,
-    )
+        |foxglove: Foxglove, lines| foxglove.work(lines, positions),
+    )?;
+    Ok((worker, viewers))
 }
 
 /// A message of a topic, with its time in nanoseconds since 1970.
@@ -145,7 +153,7 @@ impl Foxglove {
         })
     }
 
-    fn work(self, mut lines: mpsc::Receiver<Vec<Line>>) {
+    fn work(self, mut lines: mpsc::Receiver<Vec<Line>>, mut positions: mpsc::Receiver<Found>) {
         let Self {
             mut topics,
             mut newcomers,
@@ -160,8 +168,13 @@ impl Foxglove {
                         Some(lines) => lines.iter().for_each(|line| topics.publish(line)),
                         None => break,
                     },
+                    Some(found) = positions.recv() => topics.show(&found),
                     Some((topic, viewer)) = newcomers.recv() => topics.greet(&topic, viewer),
                 }
+            }
+            // What was recorded before the end is shown too.
+            while let Ok(found) = positions.try_recv() {
+                topics.show(&found);
             }
             tokio::time::sleep(LAST_MESSAGES).await;
             // A timeout is not a failure: the runtime drops the remaining connections.
@@ -181,6 +194,7 @@ impl Topics {
                 ros::HARDNESS,
                 ros::PRESS,
                 ros::STATUS,
+                MOTION,
             ] {
                 let name = full_name(&sensor.name, topic);
                 let schema = Schema::new(topic.schema, "ros2msg", topic.text().into_bytes());
@@ -218,6 +232,15 @@ impl Topics {
             if greets(event) {
                 self.last.insert(name, message);
             }
+        }
+    }
+
+    /// Sends positions of the arm.
+    fn show(&self, found: &Found) {
+        let (topic, bytes) = found.message();
+        if let Some(channel) = self.channels.get(&full_name(&found.sensor, topic)) {
+            let at_ns = u64::try_from(found.at.wall.as_nanosecond()).unwrap_or(0);
+            Message { at_ns, bytes }.send(channel, None);
         }
     }
 

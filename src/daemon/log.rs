@@ -286,6 +286,15 @@ pub(crate) fn unjudged(unjudged: &Unjudged) {
     );
 }
 
+/// Logs that this machine's calendar clock was set, by `by_ms`, while positions of the arm came.
+pub(crate) fn clock_set(sensor: &str, by_ms: f64) {
+    warn!(
+        sensor,
+        by_ms,
+        "this machine's calendar clock was set: the approach of a press under way is unknown"
+    );
+}
+
 /// Logs the context that a controller reports of its work.
 pub(crate) fn context(sensor: &str, context: Option<&serde_json::Value>) {
     info!(

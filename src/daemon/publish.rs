@@ -4,6 +4,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
+use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tracing::info;
 
@@ -26,6 +27,7 @@ use super::systemd;
 use super::tcp::{self, Tcp};
 #[cfg(feature = "zenoh")]
 use super::zenoh;
+use crate::recording::Found;
 
 /// The mode of the control socket's file: only the daemon's own user may connect.
 const CONTROL_MODE: u32 = 0o600;
@@ -86,7 +88,7 @@ pub(crate) struct Publishers {
     tcp: Option<Tcp>,
     http: Option<Tcp>,
     #[cfg(feature = "foxglove")]
-    foxglove: Option<Worker<Vec<Line>>>,
+    foxglove: Option<(Worker<Vec<Line>>, mpsc::Sender<Found>)>,
     #[cfg(feature = "ros2")]
     ros2: Option<Worker<ros2::Job>>,
     #[cfg(feature = "zenoh")]
@@ -155,6 +157,18 @@ impl Publishers {
         self.http.as_ref().map(Tcp::address)
     }
 
+    /// The queue for the positions of the arm, if a publisher shows them.
+    #[cfg(feature = "foxglove")]
+    pub(crate) fn viewers(&self) -> Option<mpsc::Sender<Found>> {
+        self.foxglove.as_ref().map(|(_, viewers)| viewers.clone())
+    }
+
+    /// No publisher of this build shows the positions of the arm.
+    #[cfg(not(feature = "foxglove"))]
+    pub(crate) fn viewers(&self) -> Option<mpsc::Sender<Found>> {
+        None
+    }
+
     /// Logs where subscribers connect.
     pub(crate) fn announce(&self) {
         for (way, socket) in [("events", &self.socket), ("control", &self.control)] {
@@ -216,7 +230,7 @@ impl Publishers {
             tasks.spawn(accept(listener, Http::MOST_CONNECTIONS, http, stop.clone()));
         }
         #[cfg(feature = "foxglove")]
-        if let Some(foxglove) = foxglove {
+        if let Some((foxglove, _)) = foxglove {
             tasks.spawn(foxglove.serve(hub.clone(), sensors.clone()));
         }
         #[cfg(feature = "ros2")]

@@ -17,14 +17,15 @@ use std::time::Duration;
 
 use rustix::fs::{Access, AtFlags, CWD};
 use rustix::io::Errno;
-use tokio::sync::{oneshot, watch};
+use tokio::sync::{mpsc, oneshot, watch};
+use tracing::warn;
 
 use self::worker::Worker;
 use super::config;
 use crate::event::{Event, Kind};
 use crate::frame::Stamp;
 use crate::pipeline::Pipeline;
-use crate::recording::{About, Entry, Input, Labels, RecordedSensor, State};
+use crate::recording::{About, Entry, Found, Input, Labels, RecordedSensor, State};
 use crate::sensor::Sensor;
 use crate::verdict::Hrn;
 
@@ -220,14 +221,18 @@ impl Recorder {
 
     /// The recorder for the task of the sensor with this `index`.
     pub(crate) fn of_sensor(&self, index: usize) -> SensorRecorder {
-        SensorRecorder(Some(Box::new(Active {
+        let active = Active {
             jobs: self.jobs.clone(),
             index,
             labels: self.labels.clone(),
             noted: None,
             bytes: 0,
             counted: (0, 0),
-        })))
+        };
+        SensorRecorder {
+            active: Some(Box::new(active)),
+            viewers: None,
+        }
     }
 
     /// The recorder for the hub.
@@ -250,9 +255,13 @@ impl Recorder {
     }
 }
 
-/// Records the inputs of one sensor. Without a recorder, it does nothing.
+/// Records the inputs of one sensor. Without a recorder, it records nothing.
 #[derive(Debug, Default)]
-pub(crate) struct SensorRecorder(Option<Box<Active>>);
+pub(crate) struct SensorRecorder {
+    active: Option<Box<Active>>,
+    /// The viewers of the arm's positions.
+    viewers: Option<mpsc::Sender<Found>>,
+}
 
 #[derive(Debug)]
 struct Active {
@@ -269,6 +278,11 @@ struct Active {
 }
 
 impl SensorRecorder {
+    /// Also passes the positions of the arm on to `viewers`, as a recording has them.
+    pub(crate) fn with_viewers(self, viewers: Option<mpsc::Sender<Found>>) -> Self {
+        Self { viewers, ..self }
+    }
+
     /// Records `input` and feeds it to `pipeline`.
     pub(crate) fn feed(
         &mut self,
@@ -282,14 +296,24 @@ impl SensorRecorder {
 
     /// Records `input`, which is about to be fed to `pipeline`.
     pub(crate) fn note(&mut self, pipeline: &Pipeline, input: &Input<'_>, at: Stamp) {
-        if let Some(active) = &mut self.0 {
+        if let Some(active) = &mut self.active {
             active.follow(pipeline, at, Entry::Input(input.to_owned()));
+        }
+        if let (Some(viewers), Input::Motion(_)) = (&self.viewers, input) {
+            let found = Found {
+                sensor: pipeline.sensor().name().to_owned(),
+                at,
+                entry: Entry::Input(input.to_owned()),
+            };
+            if let Err(mpsc::error::TrySendError::Full(_)) = viewers.try_send(found) {
+                warn!("viewers are too slow for the positions of the arm");
+            }
         }
     }
 
     /// Records that `pipeline` will use `sensor` and `hrn` from now on.
     pub(crate) fn reload(&mut self, pipeline: &Pipeline, sensor: &Sensor, hrn: &Hrn, at: Stamp) {
-        if let Some(active) = &mut self.0 {
+        if let Some(active) = &mut self.active {
             let described = RecordedSensor::new(sensor, hrn);
             active.follow(pipeline, at, Entry::Settings(Box::new(described)));
         }
@@ -298,7 +322,7 @@ impl SensorRecorder {
     /// Requests the last minute as a file. The answer comes when the file is written.
     pub(crate) fn blackbox(&self, reply: oneshot::Sender<Result<PathBuf, NoBlackbox>>) {
         // If there is no room for the job, `reply` is dropped with the job, which the caller sees.
-        match &self.0 {
+        match &self.active {
             Some(active) => {
                 let sensor = active.index;
                 active.jobs.tell(Job::Blackbox { sensor, reply });

@@ -1,22 +1,27 @@
 //! Reads the configuration again while the daemon runs (SIGHUP).
 //!
 //! In: the path of the file, and the current setup. Out: the new setup, or the reason why nothing
-//! changes. A separate thread reads the file and the model within [`PATIENCE`]. A thread that takes
-//! longer is abandoned: its file may be a pipe that no program writes to, and such a thread cannot
-//! be ended. So at most [`MOST_READERS`] threads may be left behind.
+//! changes. A separate thread reads the file and the model within [`PATIENCE`]. It does not wait
+//! longer for a pipe that no program writes to. If it takes longer all the same, it is abandoned: a
+//! file system may hang, and a thread that reads from it cannot be ended. So at most
+//! [`MOST_READERS`] threads may be left behind.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tokio::sync::{Semaphore, TryAcquireError, mpsc, oneshot};
 
 use super::config::{self, Setup};
 use super::log::{self, Log};
 
-/// How long reading the configuration and its model may take. The built-in model takes well under
-/// a second.
+/// How long reading the files of a configuration may take. The built-in model takes well under a
+/// second.
 const PATIENCE: Duration = Duration::from_secs(10);
+
+/// A thread is abandoned this long after [`PATIENCE`], so that a thread that gives up by itself can
+/// report which file kept it waiting.
+const MARGIN: Duration = Duration::from_secs(1);
 
 /// The most threads that read at a time: the current one, and those that were abandoned.
 const MOST_READERS: usize = 4;
@@ -69,7 +74,8 @@ impl Readers {
         path: PathBuf,
     ) -> impl Future<Output = Result<Setup, Refusal>> + use<> {
         let readers = Arc::clone(&self.0);
-        async move { load(readers, path, PATIENCE, Setup::load).await }
+        let read = |path: &Path| Setup::load_until(path, Instant::now() + PATIENCE);
+        async move { load(readers, path, PATIENCE + MARGIN, read).await }
     }
 }
 

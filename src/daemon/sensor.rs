@@ -15,9 +15,10 @@ use tokio::time::Instant;
 use super::hub;
 use super::log;
 use super::record::{NoBlackbox, SensorRecorder};
+use super::request::motion::{Calendar, Placed};
 use super::serial::{Link, Turn};
 use crate::event::{Event, Kind, Status, Tared};
-use crate::motion::{Point, StepBack};
+use crate::motion::StepBack;
 use crate::pipeline::Pipeline;
 use crate::recording::Input;
 use crate::sensor::Sensor;
@@ -35,7 +36,7 @@ pub(crate) enum Command {
     /// context.
     Context(Option<Value>, oneshot::Sender<()>),
     /// Take positions of the arm that the robot reports. The answer comes when they are taken.
-    Motion(Vec<Point>, oneshot::Sender<Result<(), StepBack>>),
+    Motion(Placed, oneshot::Sender<Result<(), StepBack>>),
     /// Write the last minute to a file. The answer is the path of the file.
     Blackbox(oneshot::Sender<Result<PathBuf, NoBlackbox>>),
     /// Use another description and model from now on. Values that only a restart can change must
@@ -103,6 +104,7 @@ pub(crate) async fn serve(
     // The client that waits for the outcome of a tare.
     let mut taring = None;
     let mut unjudged = 0;
+    let mut calendar = Calendar::default();
     loop {
         let deadline = pipeline.deadline();
         let events = tokio::select! {
@@ -131,11 +133,10 @@ pub(crate) async fn serve(
                     let _ = reply.send(());
                     continue;
                 }
-                Some(Command::Motion(points, reply)) => {
-                    let input = Input::Motion(points.as_slice().into());
-                    recorder.note(&pipeline, &input, super::now());
+                Some(Command::Motion(placed, reply)) => {
+                    let taken = hear(&mut pipeline, &mut recorder, &mut calendar, &placed);
                     // The client may have gone.
-                    let _ = reply.send(pipeline.tell(&points));
+                    let _ = reply.send(taken);
                     continue;
                 }
                 Some(Command::Blackbox(reply)) => {
@@ -182,6 +183,23 @@ pub(crate) async fn serve(
     }
 }
 
+/// Records positions of the arm and passes them on to the pipeline. If this machine's calendar
+/// clock was set since the last positions with calendar times, the pipeline learns that first.
+fn hear(
+    pipeline: &mut Pipeline,
+    recorder: &mut SensorRecorder,
+    calendar: &mut Calendar,
+    placed: &Placed,
+) -> Result<(), StepBack> {
+    if let Some(set) = placed.converted.and_then(|now| calendar.set(now)) {
+        log::clock_set(pipeline.sensor().name(), set.by_ms);
+        recorder.feed(pipeline, Input::ClockSet(set.until_ns), super::now());
+    }
+    let input = Input::Motion(placed.points.as_slice().into());
+    recorder.note(pipeline, &input, super::now());
+    pipeline.tell(&placed.points)
+}
+
 /// Answers the client that requested a tare, when the outcome is known.
 fn answer(
     pipeline: &mut Pipeline,
@@ -218,5 +236,99 @@ async fn until(deadline: Option<Duration>) {
             tokio::time::sleep_until(Instant::now() + left).await;
         }
         None => std::future::pending().await,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::{SignedDuration, Timestamp};
+    use serde_json::json;
+
+    use super::*;
+    use crate::daemon::request::{Change, Request, motion, parse};
+    use crate::frame::{RawFrame, Stamp};
+    use crate::pipeline::Clock;
+    use crate::recording::tests;
+
+    /// The approach at each frame of the presses that [`pressed`] makes. The robot moves at 20 mm/s
+    /// and sends a line every 20 ms, with calendar times or with those of CLOCK_MONOTONIC. At 2 s
+    /// this machine's calendar clock is set by `set_ms`. The robot's own clock stays.
+    fn approaches(by_calendar: bool, set_ms: i64) -> Vec<(u64, Option<f64>)> {
+        let mut pipeline = Pipeline::new(tests::sensor(), tests::hrn(), Clock::Arrival);
+        let (mut recorder, mut calendar) = (SensorRecorder::default(), Calendar::default());
+        let mut found = Vec::new();
+        for ms in (0..6_000_u64).step_by(20) {
+            let by_robot = Timestamp::UNIX_EPOCH + SignedDuration::from_millis(ms.cast_signed());
+            let set = if ms < 2_000 { 0 } else { set_ms };
+            let now = Stamp {
+                mono: Duration::from_millis(5_000_000 + ms),
+                wall: by_robot + SignedDuration::from_millis(set),
+            };
+            let moment = if by_calendar {
+                json!(by_robot.to_string())
+            } else {
+                json!(now.mono.as_nanos() as u64)
+            };
+            let line = json!({"motion": {"sensor": "forearm", "at": [[moment, 0.02 * ms as f64]]}});
+            let request = parse(line.to_string().as_bytes()).request;
+            let Ok(Request::Change(Change::Motion(told))) = request else {
+                panic!("{request:?}");
+            };
+            let placed = motion::placed(&told.points, now).unwrap();
+            // Points after a step back are taken in too.
+            let _ = hear(&mut pipeline, &mut recorder, &mut calendar, &placed);
+            if ms % 200 != 0 {
+                continue;
+            }
+            let mut raw = RawFrame::default();
+            if pressed(ms) {
+                raw.counts[300..336].fill(60);
+            }
+            let mut bytes = Vec::new();
+            pipeline.sensor().layout().encode(&raw, &mut bytes);
+            for event in pipeline.push(&bytes, now) {
+                if let Event::Frame(frame) = event
+                    && pressed(ms)
+                {
+                    found.push((ms, frame.approach_mm));
+                }
+            }
+        }
+        found
+    }
+
+    /// There are two presses.
+    fn pressed(ms: u64) -> bool {
+        (1_400..3_000).contains(&ms) || (4_000..5_000).contains(&ms)
+    }
+
+    #[test]
+    fn a_calendar_clock_that_is_set_in_a_press_makes_its_approach_unknown_and_no_other() {
+        // 20 ms are the distance of two points.
+        for (by_calendar, set_ms, is_unknown) in [
+            (true, 0, false),
+            (false, -200, false),
+            (true, 1, false),
+            (true, -200, true),
+            (true, 15, true),
+            (true, 200, true),
+        ] {
+            for (ms, approach_mm) in approaches(by_calendar, set_ms) {
+                let told = format!("{approach_mm:?} at {ms} ms, set by {set_ms} ms");
+                match ms {
+                    2_000..3_000 if is_unknown => assert_eq!(approach_mm, None, "{told}"),
+                    // The first position after the begin may come later.
+                    4_000..4_400 if set_ms != 0 => {}
+                    _ => {
+                        let begin = if ms < 4_000 { 1_400 } else { 4_000 };
+                        let way_mm = 0.02 * (ms - begin) as f64;
+                        // The newest position may be as old as the setting is large.
+                        let lag_mm = 0.02 * set_ms.unsigned_abs() as f64;
+                        let found = approach_mm.expect(&told);
+                        assert!((found - way_mm).abs() <= lag_mm + 1e-6, "{told}");
+                    }
+                }
+            }
+        }
     }
 }

@@ -110,6 +110,34 @@ fn a_step_back_is_told_and_time_goes_on_from_there() {
 }
 
 #[test]
+fn where_a_clock_was_set_is_unknown_and_presses_on_either_side_are_not() {
+    let mut track = Track::default();
+    track.push(&steady(0, 2000, 50)).unwrap();
+    track.clock_set(2300 * MS);
+    track.push(&steady(2200, 4000, 50)).unwrap();
+    let known = |begin, last| {
+        track
+            .approach(at(begin), &[at(begin), at(last)], 0.0)
+            .is_some()
+    };
+    assert!(known(1000, 1990));
+    assert!(!known(1000, 2000));
+    assert!(!known(1900, 3000));
+    assert!(
+        !known(2250, 3000),
+        "its points may be of the earlier setting"
+    );
+    assert!(known(2301, 3000));
+    // Without a position before it, everything up to then is uncertain.
+    let mut track = Track::default();
+    track.clock_set(500 * MS);
+    track.push(&steady(0, 2000, 50)).unwrap();
+    assert!(track.is_possible());
+    assert_eq!(track.approach(at(400), &[at(900)], 0.0), None);
+    assert!(track.approach(at(501), &[at(900)], 0.0).is_some());
+}
+
+#[test]
 fn moments_after_the_latest_position_are_unknown_by_themselves() {
     let points = steady(0, 2000, 50);
     let expected = [Some(0.0), Some(5.0), None];

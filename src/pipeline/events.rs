@@ -8,17 +8,26 @@ use crate::sensor::Description;
 use crate::verdict::{Format, ModelError, Verdict};
 
 /// The number of frames in contact that an early verdict on the course needs.
-const FIRST_LOOK: u64 = 3;
+pub(crate) const FIRST_LOOK: u64 = 3;
 /// The course is judged again when the press has grown by its frames divided by this number, at
 /// least by one frame. A verdict at each of a thousand frames would cost more than it is worth.
 const LOOK_SHARE: u64 = 8;
 /// The value of `next_look` once the early verdict has come.
 const NO_LOOK: u64 = u64::MAX;
 
-/// The data that only a verdict on the course has.
+/// The number of frames in contact at which the course is judged again after `frames`.
+pub(crate) fn look_after(frames: u64) -> u64 {
+    frames + (frames / LOOK_SHARE).max(1)
+}
+
+/// What a verdict says of the arm.
+#[derive(Clone, Copy)]
 struct Told {
-    rests_on: event::Course,
+    /// Only for a model of the course.
+    course: Option<event::Course>,
     stiffness_n_per_mm: Option<f64>,
+    /// Whether the model was trained on presses like this one. Always so for a model of a frame.
+    is_trained: bool,
 }
 
 impl Pipeline {
@@ -34,7 +43,12 @@ impl Pipeline {
                 if self.hrn.format() == Format::Frame && self.seen.next_look != NO_LOOK {
                     self.seen.next_look = NO_LOOK;
                     let verdict = self.hrn.judge(&peak.frame);
-                    events.extend(self.judged(press, Phase::Early, &peak, verdict, None));
+                    let told = Told {
+                        course: None,
+                        stiffness_n_per_mm: self.stiffness_so_far(),
+                        is_trained: true,
+                    };
+                    events.extend(self.judged(press, Phase::Early, &peak, verdict, told));
                 }
             }
             Change::End {
@@ -100,7 +114,7 @@ impl Pipeline {
         let Some(so_far) = self.tracker.so_far() else {
             return;
         };
-        self.seen.next_look = frames + (frames / LOOK_SHARE).max(1);
+        self.seen.next_look = look_after(frames);
         let known = self.known(&so_far, Phase::Early);
         if (known.frames.len() as u64) < FIRST_LOOK {
             return;
@@ -109,28 +123,46 @@ impl Pipeline {
         let Some(Event::Hardness(verdict)) = self.judge(Phase::Early, &so_far, &peak) else {
             return;
         };
-        if verdict.confidence >= self.sensor.description().early_confidence {
+        // A press has one early verdict at most, so none is spent on a rejection. A later look may
+        // give a level.
+        let is_sure = verdict.confidence >= self.sensor.description().early_confidence;
+        if is_sure && verdict.rejected.is_none() {
             self.seen.next_look = NO_LOOK;
             events.push(Event::Hardness(verdict));
         }
     }
 
+    /// The slope of force against indentation in the press under way. If the press timed out with
+    /// this frame, only the final verdict has the slope.
+    fn stiffness_so_far(&self) -> Option<f64> {
+        let so_far = self.tracker.so_far()?;
+        let known = self.known(&so_far, Phase::Early);
+        known.stiffness_n_per_mm(self.sensor.description().arm.stiffness_n_per_mm)
+    }
+
     /// The verdict on a press up to now. `peak` is its best frame.
     fn judge(&mut self, phase: Phase, so_far: &SoFar, peak: &Peak) -> Option<Event> {
-        let press = so_far.press();
-        let Format::Course { most_frames } = self.hrn.format() else {
-            let verdict = self.hrn.judge(&peak.frame);
-            return self.judged(press, phase, peak, verdict, None);
-        };
         let known = self.known(so_far, phase);
         let arm_n_per_mm = self.sensor.description().arm.stiffness_n_per_mm;
-        let course = known.course(arm_n_per_mm, most_frames);
-        let told = Told {
-            rests_on: known.rests_on,
-            stiffness_n_per_mm: known.stiffness_n_per_mm(arm_n_per_mm),
+        let stiffness_n_per_mm = known.stiffness_n_per_mm(arm_n_per_mm);
+        let (verdict, course, is_trained) = match self.hrn.format() {
+            Format::Frame => (self.hrn.judge(&peak.frame), None, true),
+            Format::Course { most_frames } => {
+                let course = known.course(arm_n_per_mm, most_frames);
+                let is_trained = self.hrn.card().range.holds(&course);
+                (
+                    self.hrn.judge_course(&course),
+                    Some(known.rests_on),
+                    is_trained,
+                )
+            }
         };
-        let verdict = self.hrn.judge_course(&course);
-        self.judged(press, phase, peak, verdict, Some(told))
+        let told = Told {
+            course,
+            stiffness_n_per_mm,
+            is_trained,
+        };
+        self.judged(so_far.press(), phase, peak, verdict, told)
     }
 
     /// The event of a verdict. A model that fails on its own check frames was already refused at
@@ -142,7 +174,7 @@ impl Pipeline {
         phase: Phase,
         peak: &Peak,
         verdict: Result<Verdict, ModelError>,
-        told: Option<Told>,
+        told: Told,
     ) -> Option<Event> {
         let Description {
             min_confidence,
@@ -192,7 +224,7 @@ impl Pipeline {
             level,
             label,
             rejected,
-            notes: self.notes(peak),
+            notes: self.notes(peak, told.is_trained),
             probabilities: verdict.probabilities,
             confidence: verdict.confidence,
             frame,
@@ -207,18 +239,19 @@ impl Pipeline {
             latency_us: None,
             shore: verdict.shore,
             levels: verdict.levels,
-            course: told.as_ref().map(|told| told.rests_on),
-            stiffness_n_per_mm: told.and_then(|told| told.stiffness_n_per_mm),
+            course: told.course,
+            stiffness_n_per_mm: told.stiffness_n_per_mm,
             arrival: self.arrival,
         }))
     }
 
-    fn notes(&self, peak: &Peak) -> Vec<Note> {
+    fn notes(&self, peak: &Peak, is_trained: bool) -> Vec<Note> {
         let range = &self.hrn.card().range;
         let [least_n, most_n] = range.force_n.map(f64::from);
         let [least_taxels, most_taxels] = range.contact_area_taxels;
         let trained = (least_n..=most_n).contains(&peak.force_n)
-            && (least_taxels..=most_taxels).contains(&peak.contact_area_taxels);
+            && (least_taxels..=most_taxels).contains(&peak.contact_area_taxels)
+            && is_trained;
         [
             (Note::AtEdge, peak.marks.at_edge),
             (Note::Saturated, peak.marks.saturated),

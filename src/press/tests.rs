@@ -240,6 +240,8 @@ fn settled_contact_is_reported_once_and_never_while_the_load_rises() {
     check(&rising, "b1@0");
     // The force is too small for an early verdict.
     check(&[(5, 0.9); 5], "b1@0");
+    // The force of the current frame counts, not the largest one.
+    check(&[(5, 1.02), (5, 1.02), (5, 0.98)], "b1@0");
 }
 
 #[test]

@@ -30,7 +30,7 @@ pub(super) const INPUT: Topic = Topic {
 };
 
 /// The positions of the arm, from the robot.
-pub(super) const MOTION: Topic = Topic {
+pub(crate) const MOTION: Topic = Topic {
     name: "motion",
     schema: "tactile_interfaces/msg/Motion",
     definition: include_str!("../../clients/ros2/tactile_interfaces/msg/Motion.msg"),
@@ -101,6 +101,7 @@ pub(super) fn encode_entry(sensor: &str, at: Stamp, entry: &Entry) -> Vec<u8> {
         }
         Entry::Settings(sensor) => (8, json(sensor)),
         Entry::State(state) => (9, json(state)),
+        Entry::Input(Input::ClockSet(until_ns)) => (10, json(until_ns)),
     };
     ros::to_cdr(&InputMessage {
         header,
@@ -166,6 +167,10 @@ pub(super) fn decode_entry(bytes: &[u8]) -> Result<(String, Stamp, Entry), Error
         9 => {
             let state: State = serde_json::from_slice(&data).map_err(unreadable)?;
             Entry::State(Box::new(state))
+        }
+        10 => {
+            let until_ns: i64 = serde_json::from_slice(&data).map_err(unreadable)?;
+            Entry::Input(Input::ClockSet(until_ns))
         }
         other => return Err(foreign(format!("an input of kind {other}"))),
     };

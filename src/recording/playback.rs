@@ -5,6 +5,7 @@ use std::sync::Arc;
 use super::{Entry, Found, Labels};
 use crate::event::Event;
 use crate::frame::Stamp;
+use crate::motion::Track;
 use crate::pipeline::{Clock, FixedError, Pipeline, Unjudged};
 use crate::sensor::SensorError;
 use crate::verdict::Hrn;
@@ -149,6 +150,13 @@ impl Playback {
         players
             .flat_map(|player| player.pipeline.unjudged())
             .collect()
+    }
+
+    /// The positions of a sensor's arm, as its pipeline knows them.
+    pub(crate) fn track(&self, sensor: &str) -> Option<&Track> {
+        let mut players = self.players.iter();
+        let player = players.find(|player| player.pipeline.sensor().name() == sensor)?;
+        Some(player.pipeline.track())
     }
 
     /// The number of sensors so far.

@@ -10,6 +10,8 @@ use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use super::message::{self, INPUT, MOTION};
 use super::{Entry, Error};
 use crate::frame::Stamp;
+#[cfg(feature = "foxglove")]
+use crate::ros::Topic;
 
 /// An entry of a sensor, and its moment.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,6 +22,15 @@ pub struct Found {
     pub at: Stamp,
     /// The entry.
     pub entry: Entry,
+}
+
+#[cfg(feature = "foxglove")]
+impl Found {
+    /// The message that a recording has of the entry, with its channel.
+    pub(crate) fn message(&self) -> (Topic, Vec<u8>) {
+        let bytes = message::encode_entry(&self.sensor, self.at, &self.entry);
+        (message::topic_of(&self.entry), bytes)
+    }
 }
 
 /// The longest record that is read, and the longest chunk once it is unpacked. A chunk of ours ends

@@ -48,6 +48,64 @@ fn at(ms: u64) -> Stamp {
     }
 }
 
+/// A recording that begins just before a press, and its sensor. The press loads in four frames, one
+/// every 200 ms, and holds for one. An arm at 5 mm/s sends positions if `sends`, all of them before
+/// the recording begins.
+pub(crate) fn of_a_press(
+    change: impl FnOnce(&mut Description),
+    context: Option<Value>,
+    sends: bool,
+) -> (Vec<u8>, Sensor) {
+    let mut described = Description {
+        name: "forearm".to_owned(),
+        ..Description::default()
+    };
+    change(&mut described);
+    let (sensor, hrn) = (Sensor::new(described).unwrap(), hrn());
+    let about = About {
+        robot: "arm-7".to_owned(),
+        run: "r".to_owned(),
+        boot_id: "b".to_owned(),
+        reason: None,
+        labels: labels(),
+        sensors: vec![RecordedSensor::new(&sensor, &hrn)],
+    };
+    let mut writer = Writer::new(Vec::new(), &about).unwrap();
+    let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::Arrival);
+    let bytes = |counts: u16| {
+        let mut raw = RawFrame::default();
+        raw.counts[400..409].fill(counts);
+        let mut bytes = Vec::new();
+        sensor.layout().encode(&raw, &mut bytes);
+        bytes
+    };
+    let tare_frames = u64::from(sensor.description().calibration.tare_frames);
+    for frame in 0..=tare_frames {
+        pipeline.push(&bytes(0), at(200 * frame));
+    }
+    let begin_ms = 200 * (tare_frames + 1);
+    if sends {
+        let point = |step: u64| Point {
+            at_ns: i64::try_from(at(begin_ms - 200 + 50 * step).mono.as_nanos()).unwrap(),
+            mm: 0.25 * step as f64,
+        };
+        let points: Vec<Point> = (0..40).map(point).collect();
+        pipeline.tell(&points).unwrap();
+    }
+    pipeline.set_context(context);
+    let state = State::of(&pipeline, labels());
+    let came = at(begin_ms);
+    writer
+        .entry(0, came, &Entry::State(Box::new(state)))
+        .unwrap();
+    for (frame, counts) in (0..).zip([20, 40, 60, 80, 80, 0, 0]) {
+        let input = Input::Bytes(bytes(counts).into());
+        let came = at(begin_ms + 200 * frame);
+        writer.entry(0, came, &Entry::Input(input)).unwrap();
+    }
+    (writer.finish().unwrap(), sensor)
+}
+
 /// The inputs of a story and their times: two presses of a second and a half, a context, damage, a
 /// tare, a loss and a return.
 fn story() -> Vec<(Stamp, Input<'static>)> {
@@ -71,6 +129,11 @@ fn story() -> Vec<(Stamp, Input<'static>)> {
         match frame {
             12 => story.push((at(ms), Input::Context(Some(json!({"tag": "x"}))))),
             35 => story.push((at(ms), Input::Tare)),
+            // The clock is set in the first press.
+            24 => {
+                let until = at(ms + 60).mono.as_nanos();
+                story.push((at(ms), Input::ClockSet(i64::try_from(until).unwrap())));
+            }
             54 => {
                 story.push((at(ms), Input::Lost("end of file".into())));
                 story.push((at(ms + 1), Input::Unavailable("no such device".into())));
@@ -171,6 +234,15 @@ fn a_recording_gives_the_very_events_it_was_made_of() {
         _ => None,
     });
     let rejected: Vec<_> = verdicts.collect();
+    // The clock is set in the first press, before its fourth frame.
+    let known = events.iter().filter_map(|event| match event {
+        Event::Frame(frame) => frame.approach_mm.map(|_| frame.frame),
+        _ => None,
+    });
+    assert_eq!(
+        known.collect::<Vec<_>>(),
+        [21, 22, 23, 50, 51, 52, 53, 54, 55, 56]
+    );
     assert_eq!(rejected.first(), Some(&None));
     assert_eq!(rejected.last(), Some(&Some(Rejection::LowForce)));
     assert_eq!(play(&file), events);

@@ -120,28 +120,34 @@ fn gains_of_another_array_or_beyond_any_film_are_refused() {
 }
 
 #[test]
-fn a_baseline_follows_by_its_bound_where_nothing_is_in_contact() {
-    let settings = |auto_tare| Settings {
-        auto_tare,
-        tare_frames: 1,
-        gains: gains(ROWS, COLS, |_, col| if col == 1 { 2.0 } else { 1.0 }),
-        ..Settings::default()
-    };
-    // The taxels read one count more: 0.04 N, and 0.08 N at column 1, which is a contact.
+fn a_baseline_follows_by_its_bound_while_no_live_taxel_is_in_contact() {
+    // The taxels read one count more, 0.04 N, but the gain of column 1 makes it 0.08 N there, which
+    // is a contact.
     let drifted = RawFrame {
         counts: [3; TAXELS],
     };
-    let newtons = |auto_tare, seconds| {
-        let mut tare = Tare::new(&settings(auto_tare), Array::FULL, CONTACT);
+    let newtons = |auto_tare, gain: f32, dead_taxels: &[[usize; 2]], seconds| {
+        let settings = Settings {
+            auto_tare,
+            tare_frames: 1,
+            gains: gains(ROWS, COLS, |_, col| if col == 1 { gain } else { 1.0 }),
+            ..settings(dead_taxels)
+        };
+        let mut tare = Tare::new(&settings, Array::FULL, CONTACT);
         tare.observe(&raw(&[]));
         (0..seconds).for_each(|_| tare.follow(&drifted));
         tare.apply(&drifted).newtons
     };
-    assert_eq!(newtons(false, 36_000)[0], 0.04);
-    let after_a_minute = newtons(true, 60);
+    assert_eq!(newtons(false, 1.0, &[], 36_000)[0], 0.04);
+    let after_a_minute = newtons(true, 1.0, &[], 60);
     assert!((after_a_minute[0] - (0.04 - 60.0 / 3600.0)).abs() < 1e-5);
-    assert_eq!(after_a_minute[1], 0.08);
-    assert_eq!(newtons(true, 150)[0], 0.0);
+    assert_eq!(newtons(true, 1.0, &[], 150)[0], 0.0);
+    // A contact anywhere keeps every baseline.
+    let touched = newtons(true, 2.0, &[], 36_000);
+    assert_eq!((touched[0], touched[1]), (0.04, 0.08));
+    // A dead taxel is no contact.
+    let column: Vec<[usize; 2]> = (0..ROWS).map(|row| [row, 1]).collect();
+    assert_eq!(newtons(true, 2.0, &column, 150)[0], 0.0);
 }
 
 #[test]

@@ -8,6 +8,7 @@
 mod arm;
 mod force;
 mod gather;
+mod out;
 mod taxels;
 
 use std::fs::{self, File};
@@ -22,6 +23,7 @@ use clap::{Args as ClapArgs, ValueEnum};
 use tokio::sync::watch;
 
 use self::gather::{Press, Unreadable};
+use self::out::Out;
 use super::configuration::Configuration;
 use super::simulate::{OutOfRange, within};
 use crate::daemon::config::Setup;
@@ -55,8 +57,9 @@ pub struct Args {
     /// Take the presses from these recordings, and leave the sensor alone
     #[arg(long, value_name = "FILE", num_args = 1..)]
     from: Vec<PathBuf>,
-    /// taxels: write the gains to this file, which `gains` of the configuration names
-    #[arg(long, value_name = "FILE.npy", required_if_eq("what", "taxels"))]
+    /// taxels: write the gains to this file, which `gains` of the configuration names [default: gains.npy beside the
+    /// configuration, if there is none yet]
+    #[arg(long, value_name = "FILE.npy")]
     out: Option<PathBuf>,
 }
 
@@ -132,10 +135,16 @@ pub enum Error {
         /// The number of weights.
         expected: usize,
     },
+    /// The default path of the gains is in use.
+    #[error("{path} exists already: name the file for the gains with --out")]
+    Taken {
+        /// The default path.
+        path: PathBuf,
+    },
     /// The gains cannot be written.
     #[error("{path}: {source}")]
     Out {
-        /// The path on the command line.
+        /// The path of the gains.
         path: PathBuf,
         /// The system's error.
         source: io::Error,
@@ -184,7 +193,10 @@ pub async fn run(
     }
     let sensor = chosen(&args, &setup)?;
     // Test the output file now, before anybody presses two hundred times.
-    let out = args.out.clone().map(Out::begin).transpose()?;
+    let out = match args.what {
+        What::Taxels => Some(Out::begin(args.out.clone(), config)?),
+        What::Arm | What::Force => None,
+    };
     let presses = if args.from.is_empty() {
         match live(&args, setup, &sensor, shutdown).await? {
             Some(presses) => presses,
@@ -206,8 +218,7 @@ pub async fn run(
                 return Err(Error::Count { found, expected });
             }
             let weights = args.newtons.iter().copied().zip(&presses);
-            let calibration = &sensor.description().calibration;
-            of_force(&force::Fit::of(&weights.collect::<Vec<_>>(), calibration)?)
+            of_force(&force::Fit::of(&weights.collect::<Vec<_>>(), &sensor)?)
         }
         What::Taxels => {
             let plain: Vec<taxels::Plain> = presses.iter().map(plain).collect();
@@ -215,8 +226,8 @@ pub async fn run(
             let array = sensor.layout().array();
             let fit = taxels::Fit::of(&plain, array, dead)?;
             let bytes = npy::to_bytes(&fit.gains, array.rows, array.cols);
-            let out = out.expect("the command line demands --out of taxels");
-            let path = as_in(config, &out.path);
+            let out = out.expect("the gains have a file");
+            let path = as_in(config, out.path());
             out.finish(&bytes)?;
             of_taxels(&fit, array, dead, &path)
         }
@@ -227,14 +238,18 @@ pub async fn run(
     Ok(())
 }
 
-/// The presses that the sensor sends from now on; `None` if `shutdown` comes first.
+/// The presses that the sensor sends from now on; `None` if `shutdown` comes first. The other
+/// sensors of the configuration stay closed: their presses would count, and a missing one would end
+/// the command.
 async fn live(
     args: &Args,
-    setup: Setup,
+    mut setup: Setup,
     sensor: &Sensor,
     shutdown: impl Future<Output = ()>,
 ) -> Result<Option<Vec<Press>>, Error> {
     let hrn = setup.hrn.clone();
+    setup.sensors.retain(|one| one.name() == sensor.name());
+    setup.config.sensors.retain(|one| one.name == sensor.name());
     let path =
         std::env::temp_dir().join(format!("hardnessd-calibrate-{}.mcap", std::process::id()));
     let temporary = |source| Error::Temporary {
@@ -322,45 +337,6 @@ fn plain(press: &Press) -> taxels::Plain {
         }
     }
     taxels::Plain { frames }
-}
-
-/// A file that is being made, at a temporary path until it is whole.
-struct Out {
-    path: PathBuf,
-    part: PathBuf,
-}
-
-impl Out {
-    /// Makes the temporary file, which shows that the file can be made.
-    fn begin(path: PathBuf) -> Result<Self, Error> {
-        let mut part = path.clone().into_os_string();
-        part.push(format!(".{}.part", std::process::id()));
-        let out = Self {
-            path,
-            part: part.into(),
-        };
-        out.tried(File::create_new(&out.part).map(drop))?;
-        Ok(out)
-    }
-
-    fn finish(self, bytes: &[u8]) -> Result<(), Error> {
-        self.tried(fs::write(&self.part, bytes))?;
-        self.tried(fs::rename(&self.part, &self.path))
-    }
-
-    fn tried(&self, result: io::Result<()>) -> Result<(), Error> {
-        result.map_err(|source| Error::Out {
-            path: self.path.clone(),
-            source,
-        })
-    }
-}
-
-impl Drop for Out {
-    fn drop(&mut self) {
-        // After a success, the temporary file is gone already.
-        let _ = fs::remove_file(&self.part);
-    }
 }
 
 /// A path as the configuration may name it: relative, if it lies beside the configuration.

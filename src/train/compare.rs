@@ -1,10 +1,11 @@
 //! Trains every method under every seed, and writes the tables, such as the paper's Tables 2 and 3.
 //!
 //! In: a data set. Out, in a directory: `data/` with the test sets, `runs/` with one run's
-//! directory per method and seed, `logs/`, and `results.json`, `tables.md` and `report.html`. These
-//! three are written anew whenever a run ends, and cover all finished runs in the directory, from
-//! this call or an earlier one. This process trains nothing. Each run is a process of its own, so
-//! that runs can be stopped, resumed and distributed. Finished runs are not repeated.
+//! directory per method and seed, `logs/`, and `results.json`, `objects.csv`, `tables.md` and
+//! `report.html`. These four are written anew whenever a run ends, and cover all finished runs in
+//! the directory, from this call or an earlier one. This process trains nothing. Each run is a
+//! process of its own, so that runs can be stopped, resumed and distributed. Finished runs are not
+//! repeated.
 
 mod children;
 pub mod course_results;
@@ -140,9 +141,10 @@ fn write_results(plan: &Plan, runs: &[PlannedRun], sets: &[TestSet]) -> anyhow::
     write_tables(&plan.out)
 }
 
-/// Writes `tables.md` and `report.html` from the files in a comparison's directory.
+/// Writes `objects.csv`, `tables.md` and `report.html` from the files in a comparison's directory.
 fn write_tables(out: &Path) -> anyhow::Result<()> {
     let comparison = Comparison::read(out)?.context("results.json was written just now")?;
+    write_whole(&out.join("objects.csv"), comparison.objects().as_bytes())?;
     let markdown = tables::markdown(&comparison);
     write_whole(&out.join("tables.md"), markdown.as_bytes())?;
     write_whole(

@@ -270,7 +270,7 @@ pub(super) fn read_metadata(proto: &pb::ModelProto) -> Result<(Card, Checks), Mo
         }
     };
     let range: Range = json("hrn.range", text("hrn.range")?, "trained force and area")?;
-    check_range(&range)?;
+    check_range(&range, &format)?;
     let check = text("hrn.check")?;
     let (checks, conformal) = if format == "1" {
         let check: Check = json("hrn.check", check, "frames and probabilities")?;
@@ -388,18 +388,25 @@ fn check_levels(levels: &[Level]) -> Result<(), ModelError> {
     Ok(())
 }
 
-fn check_range(range: &Range) -> Result<(), ModelError> {
+fn check_range(range: &Range, format: &str) -> Result<(), ModelError> {
     let [force_low, force_high] = range.force_n;
     let [area_low, area_high] = range.contact_area_taxels;
     let force_ordered = force_low.is_finite() && force_high.is_finite() && force_low <= force_high;
-    if force_ordered && area_low <= area_high {
+    let of_presses = range.of_presses();
+    let mut of_presses = of_presses.iter().flatten();
+    let expected = if format == "1" && of_presses.clone().next().is_some() {
+        "`force_n` and `contact_area_taxels` alone: the others are of format 2"
+    } else if !of_presses.all(|&[low, high]| high.is_finite() && 0.0 <= low && low <= high) {
+        "[least, greatest] of finite numbers, in the ranges of format 2 from 0"
+    } else if !force_ordered || area_low > area_high {
+        "[least, greatest] of finite numbers"
+    } else {
         return Ok(());
-    }
-    let expected = "[least, greatest] of finite numbers".to_owned();
+    };
     Err(ModelError::KeyInvalid {
         key: "hrn.range",
         found: format!("{range:?}"),
-        expected,
+        expected: expected.to_owned(),
     })
 }
 

@@ -15,7 +15,7 @@ use tract_onnx::pb;
 
 use super::{CheckedCourse, Course, CourseCheck, CourseMoment, Frame};
 
-/// The file for presses of `most` frames, with `more` metadata.
+/// The file for presses of `most` frames. `more` adds or replaces metadata.
 pub fn course_model(most: usize, more: &[(&str, Value)]) -> Vec<u8> {
     encoded(most, more, |_| {})
 }
@@ -48,6 +48,7 @@ pub fn encoded(
             ]),
         ),
     ];
+    metadata.retain(|(key, _)| !more.iter().any(|(other, _)| other == key));
     metadata.extend(more.iter().cloned());
     let mut proto = pb::ModelProto {
         ir_version: 8,

@@ -6,7 +6,7 @@
 
 Claims: every field of every event, decoded by the definitions that the server announces, is what the Unix socket
 says; a late viewer gets the last verdict and status; a recording has the same topics with the same
-definitions, and the layout in clients/foxglove fits both; a viewer that never reads, one that sends nonsense
+definitions and, of the positions of the arm, the same bytes; and the layout in clients/foxglove fits both; a viewer that never reads, one that sends nonsense
 and many that say nothing cost no other subscriber an event; and an address in use is one line and 74.
 """
 
@@ -29,7 +29,7 @@ from websockets.sync.client import connect
 
 LAYOUT = pathlib.Path(__file__).resolve().parents[2] / "clients/foxglove/hardnessd.json"
 TABLE = '[publish.foxglove]\nlisten = "127.0.0.1:0"\n'
-TOPICS = ["contact", "frame", "grid", "hardness", "press", "status"]
+TOPICS = ["contact", "frame", "grid", "hardness", "motion", "press", "status"]
 PROTOCOL = "foxglove.sdk.v1"
 
 
@@ -56,6 +56,8 @@ class Viewer:
         self.topics = {channel["topic"]: channel for channel in self.channels.values()}
         self.decoders = {number: decoder(channel) for number, channel in self.channels.items()}
         self.messages = queue.Queue()
+        # The positions of the arm as they came: the time and the bytes of each line.
+        self.motion = []
         # The number of a subscription is not that of its channel.
         wanted = [{"id": 1000 + number, "channelId": number} for number in self.channels]
         self.socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
@@ -71,7 +73,10 @@ class Viewer:
             assert operation == 1, operation
             channel = self.channels[subscription - 1000]
             message = self.decoders[channel["id"]](data[13:])
-            self.messages.put((channel["topic"].rsplit("/", 1)[1], time_ns, message))
+            topic = channel["topic"].rsplit("/", 1)[1]
+            if topic == "motion":
+                self.motion.append((time_ns, data[13:]))
+            self.messages.put((topic, time_ns, message))
 
     def until(self, there):
         """All that came, with the first for which `there(topic, message)` last."""
@@ -155,6 +160,11 @@ def compare(got, events):
             else:
                 assert (message.height, message.width, message.encoding, message.step) == (28, 28, "32FC1", 112)
             assert all(abs(a - b) <= 0.0005 + 1e-6 for a, b in zip(newtons, event["newtons"], strict=True))
+        elif topic == "motion":
+            assert message.header.frame_id == "forearm" and len(message.at_ns) == len(message.approach_mm) > 0, message
+            # The simulated robot sends its positions at once.
+            assert all(abs(message.mono_ns - at_ns) < 5_000_000_000 for at_ns in message.at_ns), message
+            assert all(-1000 < mm < 1000 for mm in message.approach_mm), message
         else:
             continue
         compared[topic] += 1
@@ -171,6 +181,8 @@ def rfc3339(time_ns):
 
 def check_recording(path, viewer, got):
     """A recording has the same topics, definitions and bytes."""
+    # The daemon has closed the connection.
+    viewer.reader.join(timeout=10)
     with open(path, "rb") as file:
         summary = make_reader(file).get_summary()
         recorded = {}
@@ -183,6 +195,10 @@ def check_recording(path, viewer, got):
             decoder(viewer.topics[channel.topic])(message.data)
             for _, channel, message in make_reader(file).iter_messages(topics=["/tactile/forearm/contact"])
         ]
+        moved = make_reader(file).iter_messages(topics=["/tactile/forearm/motion"])
+        moved = [(message.log_time, message.data) for _, _, message in moved]
+    # The recorder has no lines that the viewer has not, and the other way round.
+    assert moved == viewer.motion and len(moved) > 50, (len(moved), len(viewer.motion))
     recorded = {message.frame: message.force_n for message in contacts}
     live = {message.frame: message.force_n for topic, _, message in got if topic == "contact"}
     assert live.items() <= recorded.items() and len(live) > 50

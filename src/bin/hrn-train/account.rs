@@ -30,6 +30,23 @@ pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
         });
     let [least_n, most_n] = card.range.force_n;
     let [least_taxels, most_taxels] = card.range.contact_area_taxels;
+    let names = [
+        ("duration     ", "s"),
+        ("frame period ", "s"),
+        ("arm's speed  ", "mm/s"),
+        ("approach     ", "mm"),
+        ("arm          ", "N/mm"),
+    ];
+    let of_presses: String = names
+        .iter()
+        .zip(card.range.of_presses())
+        .filter_map(|((name, unit), range)| {
+            let [least, most] = range?;
+            Some(format!(
+                "{name} {least:.2} to {most:.2} {unit} in training\n"
+            ))
+        })
+        .collect();
     format!(
         "{}\n\
          sha256        {}\n\
@@ -40,6 +57,7 @@ pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
          pitch         {} mm\n\
          force         {least_n:.2} to {most_n:.2} N in training\n\
          contact area  {least_taxels} to {most_taxels} taxels in training\n\
+         {of_presses}\
          {temperature}\
          data          {}\n\
          metrics       {}\n\

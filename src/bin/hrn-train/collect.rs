@@ -46,7 +46,7 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
         sensor.clone(),
         setup.hrn.clone(),
         arguments.sequences,
-    );
+    )?;
     let labelling = Labelling {
         level: arguments.level,
         object: arguments.object,

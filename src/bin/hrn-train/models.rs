@@ -6,10 +6,11 @@ use std::process::ExitCode;
 use anyhow::Context as _;
 use hardnessd::tools::{self, exit};
 use hardnessd::train::data::courses::Courses;
-use hardnessd::train::data::dataset::Dataset;
+use hardnessd::train::data::dataset::{self, Dataset};
 use hardnessd::train::model::adopt::{self, Told};
 use hardnessd::train::model::course::{self, CourseEvaluation};
-use hardnessd::train::model::{export, review};
+use hardnessd::train::model::export;
+use hardnessd::train::model::review::{self, Format, Review};
 use hardnessd::trial;
 use hardnessd::verdict::Hrn;
 
@@ -24,13 +25,7 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
         return evaluate_courses(arguments, &hrn);
     }
     let dataset = Dataset::read(&arguments.data)?;
-    let (of_model, of_data) = (hrn.card().pitch_mm, dataset.pitch_mm() as f32);
-    if of_model != of_data {
-        eprintln!(
-            "warning: {}: taxel pitch: found {of_data} mm, expected {of_model} mm, that of the model",
-            arguments.data.display()
-        );
-    }
+    warn_of_pitch(&arguments.data, dataset.pitch_mm(), &hrn);
     dataset.warn_of_object_in_both_splits();
     let indices = dataset.labelled(arguments.split.into())?;
     let evaluation = export::evaluate(&hrn, &dataset, &indices)?;
@@ -50,8 +45,20 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     })
 }
 
+/// Prints a warning if the data are of a sensor with another pitch than the model's.
+fn warn_of_pitch(data: &Path, pitch_mm: f64, hrn: &Hrn) {
+    let (of_model, of_data) = (hrn.card().pitch_mm, pitch_mm as f32);
+    if of_model != of_data {
+        eprintln!(
+            "warning: {}: taxel pitch: found {of_data} mm, expected {of_model} mm, that of the model",
+            data.display()
+        );
+    }
+}
+
 fn evaluate_courses(arguments: &Evaluate, hrn: &Hrn) -> anyhow::Result<String> {
-    let courses = Courses::read(&arguments.data)?;
+    let (courses, sources) = Courses::read_all(std::slice::from_ref(&arguments.data))?;
+    warn_of_pitch(&arguments.data, dataset::pitch_mm(&sources), hrn);
     let verdicts = course::verdicts(hrn, &courses, arguments.split.into(), |course| course)?;
     anyhow::ensure!(
         !verdicts.is_empty(),
@@ -97,8 +104,8 @@ const SLOWEST_HZ: f64 = 5.0;
 /// even if the model does not pass.
 pub(super) fn check_model(path: &Path) -> ExitCode {
     let checked = read(path).map_err(anyhow::Error::from).and_then(|bytes| {
-        let findings = review::review(&bytes);
-        let mut lines = format!("{}: {}\n", path.display(), review::wanted());
+        let Review { format, findings } = review::review(&bytes, trial::survives);
+        let mut lines = format!("{}: {}\n", path.display(), format.wanted());
         for finding in &findings {
             lines += &format!("{finding}\n");
         }
@@ -118,6 +125,9 @@ pub(super) fn check_model(path: &Path) -> ExitCode {
                 "`hrn-train adopt {} --data D.npz --out H.onnx` adds what is missing\n",
                 path.display()
             );
+        } else if format == Format::Course {
+            lines += "`hrn-train adopt` takes models of one frame only: add what is missing yourself \
+                      (docs/formats.md)\n";
         }
         tools::print(lines.as_bytes())?;
         Ok(passes)
@@ -143,7 +153,7 @@ pub(super) fn adopt_model(arguments: &Adopt) -> anyhow::Result<String> {
             .unwrap_or_else(|| format!("adopted from {}", name.display())),
         validation: arguments.validation.clone(),
     };
-    let adopted = adopt::adopt(&bytes, &dataset, &told);
+    let adopted = adopt::adopt(&bytes, &dataset, &told, trial::survives);
     let (model, done, evaluation) =
         adopted.with_context(|| arguments.model.display().to_string())?;
     write(&arguments.out, &model)?;

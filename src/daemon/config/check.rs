@@ -170,22 +170,25 @@ fn check_zenoh(
     robot: &str,
     value: &impl Fn(String, String, &'static str) -> Error,
 ) -> Result<(), Error> {
-    // These characters have a meaning in zenoh's key expressions.
-    let is_key =
-        |key: &str| !key.split('/').any(str::is_empty) && !key.contains(['*', '$', '?', '#']);
+    // These characters have a meaning in zenoh's key expressions. The log and `fleet` show a site.
+    let is_key = |key: &str| {
+        !key.split('/').any(str::is_empty)
+            && !key.contains(['*', '$', '?', '#'])
+            && wording::is_plain(key)
+    };
     let site = zenoh.site(robot);
     if !is_key(site) {
         return Err(value(
             "publish.zenoh.site".to_owned(),
             format!("{site:?} (by default the robot's name)"),
-            "parts of a key, without * $ ? #",
+            "parts of a key, without * $ ? #, control or bidirectional characters",
         ));
     }
     if let Some(motion) = zenoh.motion.as_ref().filter(|motion| !is_key(motion)) {
         return Err(value(
             "publish.zenoh.motion".to_owned(),
             format!("{motion:?}"),
-            "a key such as \"arm-7/motion\", without * $ ? #",
+            "a key such as \"arm-7/motion\", without * $ ? #, control or bidirectional characters",
         ));
     }
     Ok(())

@@ -1,21 +1,20 @@
 //! Reads the file into a [`Config`], and loads the model that the file names.
 
-use std::fs::File;
-use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use toml::de::DeTable;
 
 use super::error::{Error, MAX_BYTES, Place};
+use super::read::{Until, read};
 use super::{Config, Model};
 use crate::npy::{self, NpyError};
 use crate::tare::Gains;
 use crate::verdict::{self, Hrn};
 use crate::{trial, wording};
 
-pub(super) fn load(path: &Path) -> Result<Config, Error> {
-    let bytes = read(path, MAX_BYTES).map_err(|source| Error::Unreadable {
+pub(super) fn load(path: &Path, until: Until) -> Result<Config, Error> {
+    let bytes = read(path, MAX_BYTES, until).map_err(|source| Error::Unreadable {
         path: path.to_owned(),
         source,
     })?;
@@ -37,7 +36,7 @@ pub(super) fn load(path: &Path) -> Result<Config, Error> {
             path,
         )?;
         if let Some(given) = &mut sensor.calibration.gains {
-            *given = gains(given, directory, &sensor.name, path)?;
+            *given = gains(given, directory, &sensor.name, path, until)?;
         }
     }
     let unix = &mut config.publish.unix;
@@ -59,7 +58,13 @@ pub(super) fn load(path: &Path) -> Result<Config, Error> {
 }
 
 /// Reads the gains from the file that the configuration names.
-fn gains(given: &Gains, directory: &Path, sensor: &str, path: &Path) -> Result<Gains, Error> {
+fn gains(
+    given: &Gains,
+    directory: &Path,
+    sensor: &str,
+    path: &Path,
+    until: Until,
+) -> Result<Gains, Error> {
     let key = format!("sensor.calibration.gains of {sensor:?}");
     let Gains::File(file) = given else {
         return Err(Error::Value {
@@ -77,7 +82,7 @@ fn gains(given: &Gains, directory: &Path, sensor: &str, path: &Path) -> Result<G
         file: file.clone(),
         source,
     };
-    let bytes = read(&file, MAX_BYTES).map_err(|source| refused(NpyError::Io(source)))?;
+    let bytes = read(&file, MAX_BYTES, until).map_err(|source| refused(NpyError::Io(source)))?;
     let rows = npy::table(&mut bytes.as_slice()).map_err(refused)?;
     Ok(Gains::Taxels(rows))
 }
@@ -103,16 +108,6 @@ fn resolve(
     }
     *given = directory.join(&*given);
     Ok(())
-}
-
-/// Reads at most one byte more than `most` from a file. That byte shows that the file is too long.
-/// The file may be a pipe, such as `<(...)` of a shell. Then this waits for the program that writes
-/// to the pipe.
-fn read(path: &Path, most: usize) -> io::Result<Vec<u8>> {
-    let mut bytes = Vec::new();
-    let file = File::open(path)?;
-    file.take(most as u64 + 1).read_to_end(&mut bytes)?;
-    Ok(bytes)
 }
 
 fn text<'a>(bytes: &'a [u8], path: &Path) -> Result<&'a str, Error> {
@@ -192,16 +187,21 @@ fn sensor_without_port(text: &str) -> Option<usize> {
 
 /// Loads the model. If it is a file, another process tries it first. `most` is the longest time
 /// that a verdict may take.
-pub(super) fn model(model: &Model, most: Duration, path: &Path) -> Result<Hrn, Error> {
+pub(super) fn model(
+    model: &Model,
+    most: Duration,
+    path: &Path,
+    until: Until,
+) -> Result<Hrn, Error> {
     let hrn = match &model.path {
         None => Hrn::load(verdict::BUILT_IN),
         Some(file) => {
-            let bytes =
-                read(file, verdict::MAX_FILE_BYTES).map_err(|source| Error::ModelUnreadable {
-                    path: path.to_owned(),
-                    model: file.clone(),
-                    source,
-                })?;
+            let bytes = read(file, verdict::MAX_FILE_BYTES, until);
+            let bytes = bytes.map_err(|source| Error::ModelUnreadable {
+                path: path.to_owned(),
+                model: file.clone(),
+                source,
+            })?;
             trial::load(&bytes, Some(most))
         }
     };

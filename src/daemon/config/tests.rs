@@ -1,4 +1,5 @@
 use std::path::Path;
+use std::time::Duration;
 
 use super::*;
 use crate::npy;
@@ -428,6 +429,70 @@ fn a_model_of_another_hash_is_refused() {
     );
 }
 
+/// Makes a pipe that no program writes to.
+fn pipe(path: &Path) {
+    let mode = rustix::fs::Mode::RUSR | rustix::fs::Mode::WUSR;
+    rustix::fs::mknodat(rustix::fs::CWD, path, rustix::fs::FileType::Fifo, mode, 0).unwrap();
+}
+
+#[test]
+fn a_reload_gives_a_pipe_up_and_a_pipe_that_a_program_writes_is_read() {
+    let directory = tempfile::tempdir().unwrap();
+    let place = |name: &str| directory.path().join(name);
+    let config = place("hardnessd.toml");
+    let text = format!(
+        "{LEAST}[sensor.frame]\nrows = 1\ncols = 2\n[sensor.calibration]\ngains = \"gains.npy\"\n\
+         [model]\npath = \"model.onnx\"\n"
+    );
+    let files = [
+        (
+            "hardnessd.toml",
+            text.into_bytes(),
+            "cannot read: it did not end in time",
+        ),
+        (
+            "gains.npy",
+            npy::to_bytes(&[1.0, 1.5], 1, 2),
+            "gains.npy: it did not end in time",
+        ),
+        (
+            "model.onnx",
+            crate::verdict::BUILT_IN.to_vec(),
+            "model.onnx: it did not end in time",
+        ),
+    ];
+    for (name, bytes, _) in &files {
+        std::fs::write(place(name), bytes).unwrap();
+    }
+    let load = |wait: Duration| {
+        let loaded = Setup::load_until(&config, Instant::now() + wait);
+        loaded.map(drop).map_err(|error| error.to_string())
+    };
+    let patience = Duration::from_secs(60);
+    assert_eq!(load(patience), Ok(()));
+    for (name, bytes, expected) in &files {
+        let place = place(name);
+        std::fs::remove_file(&place).unwrap();
+        pipe(&place);
+        let begun = Instant::now();
+        let error = load(Duration::from_millis(500)).unwrap_err();
+        assert!(error.contains(expected), "{error}");
+        assert!(
+            error.contains("hardnessd.toml: ") && !error.contains('\n'),
+            "{error}"
+        );
+        assert!(begun.elapsed() < Duration::from_secs(30));
+        std::thread::scope(|scope| {
+            // Opening the pipe for writing waits for its reader.
+            scope.spawn(|| std::fs::write(&place, bytes));
+            assert_eq!(load(patience), Ok(()), "{name}");
+        });
+        std::fs::remove_file(&place).unwrap();
+        std::fs::write(&place, bytes).unwrap();
+        assert_eq!(load(patience), Ok(()), "{name}");
+    }
+}
+
 #[test]
 fn only_what_a_sensor_can_change_while_it_runs_may_differ_in_a_reload() {
     let old = load(LEAST).unwrap();
@@ -472,6 +537,25 @@ fn only_what_a_sensor_can_change_while_it_runs_may_differ_in_a_reload() {
     }
 }
 
+#[cfg(feature = "zenoh")]
+#[test]
+fn a_key_of_zenoh_looks_the_same_wherever_it_is_shown() {
+    for (key, value) in [
+        ("site", "hall\\u202E/3"),
+        ("site", "hall\\u0007"),
+        ("motion", "arm\\u2066-7/motion"),
+    ] {
+        let error = load(&format!("{LEAST}[publish.zenoh]\n{key} = \"{value}\"\n")).unwrap_err();
+        let expected = format!("publish.zenoh.{key}: found ");
+        assert!(error.contains(&expected), "{error}");
+        let rest = "control or bidirectional characters";
+        assert!(
+            error.contains(rest) && crate::wording::is_plain(&error),
+            "{error:?}"
+        );
+    }
+}
+
 #[cfg(all(feature = "ros2", feature = "zenoh"))]
 #[test]
 fn zenoh_and_ros2_take_what_their_networks_do() {
@@ -495,8 +579,8 @@ fn zenoh_and_ros2_take_what_their_networks_do() {
             &["ros2.motion", "foot", "the name of a [[sensor]]"],
         ),
         (
-            "ros2]\nmotion = { forearm = \"approach\" }",
-            &["ros2.motion.forearm", "\"approach\"", "/arm_7/approach"],
+            "ros2]\nmotion = { sensor = \"approach\" }",
+            &["ros2.motion.sensor", "\"approach\"", "/arm_7/approach"],
         ),
         (
             "ros2]\ndomain_id = 233",

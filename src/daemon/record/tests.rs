@@ -17,7 +17,11 @@ fn recorder(sender: SyncSender<Job>) -> (SensorRecorder, Pipeline) {
         bytes: 0,
         counted: (0, 0),
     };
-    (SensorRecorder(Some(Box::new(active))), pipeline)
+    let recorder = SensorRecorder {
+        active: Some(Box::new(active)),
+        viewers: None,
+    };
+    (recorder, pipeline)
 }
 
 fn at(ms: u64) -> Stamp {
@@ -99,4 +103,24 @@ fn a_flood_is_bounded_in_the_black_box() {
         let kept: usize = ring.all().map(|(_, entry)| entry.weight()).sum();
         assert!((28 << 20..=36 << 20).contains(&kept), "{kept} bytes");
     }
+}
+
+#[test]
+fn viewers_get_the_positions_of_the_arm_also_without_a_recording() {
+    let pipeline = Pipeline::new(tests::sensor(), tests::hrn(), Clock::Arrival);
+    let (viewers, mut shown) = mpsc::channel(1);
+    let mut recorder = SensorRecorder::default().with_viewers(Some(viewers));
+    let point = crate::motion::Point {
+        at_ns: 5_000_000,
+        mm: 1.5,
+    };
+    let motion = Input::Motion(vec![point].into());
+    recorder.note(&pipeline, &Input::Tick, at(6));
+    recorder.note(&pipeline, &motion, at(7));
+    // There is no room for another line, and nothing waits for it.
+    recorder.note(&pipeline, &motion, at(8));
+    let found = shown.try_recv().unwrap();
+    assert_eq!((found.sensor.as_str(), found.at), ("forearm", at(7)));
+    assert_eq!(found.entry, Entry::Input(motion.to_owned()));
+    assert!(shown.try_recv().is_err());
 }

@@ -108,12 +108,22 @@ fn nanoseconds(number: &Value) -> Option<u64> {
     number.as_u64().or_else(rounded)
 }
 
+/// Positions on CLOCK_MONOTONIC.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Placed {
+    pub(crate) points: Vec<Point>,
+    /// The time of both clocks by which calendar times were converted. `None` if no point has a
+    /// calendar time.
+    pub(crate) converted: Option<Stamp>,
+}
+
 /// The points on CLOCK_MONOTONIC. `now` is the current time of both clocks.
 ///
 /// # Errors
 ///
 /// Fails if a point is more than [`AHEAD_NS`] ahead of `now`, or older than [`HELD`].
-pub(crate) fn placed(told: &[Told], now: Stamp) -> Result<Vec<Point>, Unusable> {
+pub(crate) fn placed(told: &[Told], now: Stamp) -> Result<Placed, Unusable> {
+    let is_converted = told.iter().any(|told| matches!(told.at, Moment::Wall(_)));
     let mono_now = now.mono.as_nanos() as i128;
     let point = |(index, told): (usize, &Told)| {
         let away = match told.at {
@@ -129,7 +139,56 @@ pub(crate) fn placed(told: &[Told], now: Stamp) -> Result<Vec<Point>, Unusable> 
             }),
         }
     };
-    told.iter().enumerate().map(point).collect()
+    Ok(Placed {
+        points: told
+            .iter()
+            .enumerate()
+            .map(point)
+            .collect::<Result<_, _>>()?,
+        converted: is_converted.then_some(now),
+    })
+}
+
+/// If the difference of the two clocks changes by more than this, the calendar clock was set.
+/// Otherwise the difference is constant, because the kernel slews both clocks together. At 20 mm/s
+/// an arm moves by 0.04 mm in this time.
+const SET_NS: i128 = 2_000_000;
+
+/// This machine's calendar clock, as the positions of one sensor were converted by it.
+#[derive(Debug, Default)]
+pub(crate) struct Calendar {
+    /// Calendar time minus CLOCK_MONOTONIC, in nanoseconds, when the clock was last found set, or
+    /// at the first positions with calendar times.
+    offset_ns: Option<i128>,
+}
+
+/// A setting of the calendar clock.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct ClockSet {
+    /// How far the clock was set, in milliseconds. It is negative if the clock was set back.
+    pub(crate) by_ms: f64,
+    /// The moment of CLOCK_MONOTONIC, in nanoseconds, up to which converted times are uncertain.
+    pub(crate) until_ns: i64,
+}
+
+impl Calendar {
+    /// Whether the calendar clock was set between the last converted positions and those of `now`.
+    pub(crate) fn set(&mut self, now: Stamp) -> Option<ClockSet> {
+        let mono_ns = now.mono.as_nanos() as i128;
+        let offset_ns = now.wall.as_nanosecond() - mono_ns;
+        let by_ns = offset_ns - *self.offset_ns.get_or_insert(offset_ns);
+        if by_ns.abs() <= SET_NS {
+            return None;
+        }
+        self.offset_ns = Some(offset_ns);
+        // A robot on this machine may have taken times before the setting. If the clock was set
+        // back, they are ahead by as much.
+        let until_ns = mono_ns + by_ns.abs().min(AHEAD_NS);
+        Some(ClockSet {
+            by_ms: by_ns as f64 / 1e6,
+            until_ns: i64::try_from(until_ns).unwrap_or(i64::MAX),
+        })
+    }
 }
 
 #[cfg(test)]
@@ -150,7 +209,7 @@ mod tests {
     fn place(at: &Value) -> Result<Vec<(i64, f64)>, String> {
         let told = points(at).map_err(|error| error.to_string())?;
         let placed = placed(&told, now()).map_err(|error| error.to_string())?;
-        Ok(placed.into_iter().map(Into::into).collect())
+        Ok(placed.points.into_iter().map(Into::into).collect())
     }
 
     #[test]
@@ -164,6 +223,48 @@ mod tests {
         let expected = [(499_999_000_000, 3.5), (500_000_000_000, -1.0)];
         assert_eq!(placed.as_ref().unwrap()[..2], expected);
         assert_eq!(placed.unwrap()[2], (500_250_000_000, 4.0));
+    }
+
+    #[test]
+    fn the_clocks_are_kept_only_of_calendar_times() {
+        let converted = |at: Value| placed(&points(&at).unwrap(), now()).unwrap().converted;
+        assert_eq!(converted(json!([[5e11, 1]])), None);
+        let mixed = json!([[5e11, 1], ["2026-11-21T10:00:00.1Z", 2]]);
+        assert_eq!(converted(mixed), Some(now()));
+    }
+
+    #[test]
+    fn a_calendar_clock_that_is_set_is_noticed_once_and_a_late_reading_is_not() {
+        let mut calendar = Calendar::default();
+        // The time `ms` later, with a calendar clock that was set by `set_ms` in total.
+        let later = |ms: i64, set_ms: i64| Stamp {
+            mono: now().mono + Duration::from_millis(ms.unsigned_abs()),
+            wall: now().wall + jiff::SignedDuration::from_millis(ms + set_ms),
+        };
+        let mut set = |ms, set_ms| {
+            calendar
+                .set(later(ms, set_ms))
+                .map(|set| (set.by_ms, set.until_ns))
+        };
+        assert_eq!(set(0, 0), None);
+        assert_eq!(set(3_600_000, 2), None);
+        let second = 1_000_000_000;
+        assert_eq!(
+            set(4_000_000, -200),
+            Some((-200.0, 4_500 * second + second / 5))
+        );
+        assert_eq!(set(4_000_020, -200), None);
+        assert_eq!(
+            set(4_001_000, 3_600_000),
+            Some((3_600_200.0, 4_502 * second))
+        );
+        assert_eq!(set(4_001_020, 3_600_000), None);
+        // Small settings add up.
+        assert_eq!(set(4_001_040, 3_600_002), None);
+        assert_eq!(
+            set(4_002_000, 3_600_004),
+            Some((4.0, 4_502 * second + 4_000_000))
+        );
     }
 
     #[test]

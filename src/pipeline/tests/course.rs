@@ -113,17 +113,17 @@ fn an_early_verdict_is_on_the_frames_whose_positions_have_come() {
 }
 
 #[test]
-fn without_positions_there_is_the_speed_while_the_force_grows() {
+fn without_positions_the_arm_moves_at_its_speed_and_then_holds() {
     let context = |speed: f64| Some(json!({"sensor": "forearm", "speed_mm_s": speed}));
     for (context, configured, value) in [
-        (context(5.0), None, 6.0),
-        (None, Some(5.0), 6.0),
-        (context(10.0), Some(5.0), 12.0),
+        (context(5.0), None, 9.0),
+        (None, Some(5.0), 9.0),
+        (context(10.0), Some(5.0), 18.0),
     ] {
         let mut pipeline = tared(&[], |described| described.arm.speed_mm_s = configured);
         pipeline.set_context(context);
         let found = judged(&mut pipeline, |_| Vec::new());
-        // This is the sum of 0, 1, 2 and 3 mm. While the arm holds, its position is unknown.
+        // At 5 mm/s, this is the sum of 0, 1, 2, 3 and again 3 mm.
         assert_eq!(given(&found[1]), [value, 5.0, 10.0]);
         assert_eq!(found[1].course, Some(RestsOn::Speed));
         assert!(found[1].stiffness_n_per_mm.is_some());
@@ -145,11 +145,21 @@ fn where_the_approach_is_unknown_nothing_is_said_of_the_arm() {
         points[30].mm += 30.0;
         let _ = pipeline.tell(&points);
     };
+    // The clock was set by the distance of two points, which nothing else shows.
+    let set = |pipeline: &mut Pipeline| {
+        pipeline.tell(&positions(1000, 2500)).unwrap();
+        pipeline.clock_set(2_550_000_000);
+        let mut shifted = positions(2550, 9000);
+        shifted
+            .iter_mut()
+            .for_each(|point| point.at_ns += 50_000_000);
+        pipeline.tell(&shifted).unwrap();
+    };
     let speed_beside_positions = |pipeline: &mut Pipeline| {
         pipeline.set_context(Some(json!({"speed_mm_s": 5.0})));
         let _ = pipeline.tell(&positions(1000, 1500));
     };
-    let prepare: [fn(&mut Pipeline); 4] = [|_| {}, late, jump, speed_beside_positions];
+    let prepare: [fn(&mut Pipeline); 5] = [|_| {}, late, jump, set, speed_beside_positions];
     for prepare in prepare {
         let mut pipeline = tared(&[], |_| {});
         prepare(&mut pipeline);
@@ -173,6 +183,30 @@ fn positions_after_the_final_verdict_are_counted() {
 }
 
 #[test]
+fn positions_that_say_nothing_of_the_press_are_no_course() {
+    // The first frame comes at 2.2 s and the second at 2.4 s. The sensor is released at 2.6 s.
+    let found = |first: RawFrame, until_ms: i64| {
+        let mut pipeline = tared(&[], |_| {});
+        let _ = pipeline.tell(&positions(1000, until_ms));
+        let mut events = Vec::new();
+        for (number, raw) in (6..).zip([first, raw(9, 80), raw(0, 0), raw(0, 0)]) {
+            let bytes = bytes(&pipeline, &raw);
+            events.extend(pipeline.push(&bytes, at(number * 200)));
+        }
+        let last = verdicts(events).pop().unwrap();
+        (last.frame, last.course, given(&last))
+    };
+    let known = Some(RestsOn::Positions);
+    assert_eq!(found(raw(9, 20), 2400), (6, known, [1.0, 2.0, 10.0]));
+    // The approach is known at the first frame only.
+    let unknown = Some(RestsOn::None);
+    assert_eq!(found(raw(9, 20), 2350), (6, unknown, [0.0, 2.0, 0.0]));
+    // If the first frame is the best one, the second one counts too.
+    assert_eq!(found(raw(12, 80), 2400), (5, known, [1.0, 2.0, 10.0]));
+    assert_eq!(found(raw(12, 80), 2350), (5, unknown, [0.0, 2.0, 0.0]));
+}
+
+#[test]
 fn levels_that_it_cannot_tell_apart_are_a_rejection() {
     let check = |threshold: f64, level, rejected, levels: &[u8]| {
         let conformal = json!({"alpha": 0.1, "threshold": threshold});
@@ -184,6 +218,48 @@ fn levels_that_it_cannot_tell_apart_are_a_rejection() {
     };
     check(0.5, Some(2), None, &[2]);
     check(0.09, None, Some(Rejection::Ambiguous), &[2, 3]);
+}
+
+#[test]
+fn a_press_unlike_those_of_training_is_noted() {
+    // The press takes 0.8 s, its frames come every 0.2 s, and the arm of 10 N/mm goes 3 mm at
+    // 5 mm/s. The early verdict is on its first four frames.
+    let check = |key: &str, range: [f64; 2], early: &[Note], last: &[Note]| {
+        let mut of = json!({"force_n": [0, 100], "contact_area_taxels": [1, 784]});
+        of[key] = json!(range);
+        let mut pipeline = tared(&[("hrn.range", of)], |_| {});
+        pipeline.tell(&positions(1000, 9000)).unwrap();
+        let found = judged(&mut pipeline, |_| Vec::new());
+        let notes: Vec<&[Note]> = found.iter().map(|verdict| &verdict.notes[..]).collect();
+        assert_eq!(notes, [early, last], "{key} {range:?}");
+    };
+    let (none, outside) = (&[][..], &[Note::OutsideTraining][..]);
+    for (key, number) in [
+        ("duration_s", 0.8),
+        ("frame_period_s", 0.2),
+        ("speed_mm_s", 5.0),
+        ("approach_mm", 3.0),
+        ("arm_n_per_mm", 10.0),
+    ] {
+        check(key, [0.5 * number, 2.0 * number], none, none);
+        check(key, [0.1 * number, 0.5 * number], outside, outside);
+        check(key, [1.5 * number, 2.0 * number], outside, outside);
+    }
+    check("duration_s", [0.1, 0.7], none, outside);
+    check("duration_s", [0.7, 2.0], outside, none);
+
+    // Where the approach is unknown, only time bounds it.
+    let unknown = |key: &str, expected: &[Note]| {
+        let mut of = json!({"force_n": [0, 100], "contact_area_taxels": [1, 784]});
+        of[key] = json!([90.0, 91.0]);
+        let mut pipeline = tared(&[("hrn.range", of)], |_| {});
+        let found = judged(&mut pipeline, |_| Vec::new());
+        assert_eq!(found.last().unwrap().notes, expected, "{key}");
+    };
+    for key in ["speed_mm_s", "approach_mm", "arm_n_per_mm"] {
+        unknown(key, none);
+    }
+    unknown("duration_s", outside);
 }
 
 #[test]
@@ -199,6 +275,27 @@ fn an_early_verdict_comes_once_and_only_if_it_is_sure() {
         assert_eq!(early, Vec::from_iter(expected));
         assert_eq!(found.len(), 1 + early.len());
     }
+}
+
+#[test]
+fn an_early_verdict_waits_until_it_is_no_rejection() {
+    // The third frame has 21.6 N, and the fourth has 28.8 N.
+    let mut pipeline = tared(&[], |described| {
+        described.early_confidence = 0.0;
+        described.min_force_n = 25.0;
+    });
+    let found = judged(&mut pipeline, |_| Vec::new());
+    assert_eq!((found[0].phase, found[0].frame), (Phase::Early, 8));
+    assert_eq!((found[0].rejected, found[0].level.is_some()), (None, true));
+    assert_eq!(found.len(), 2);
+
+    let conformal = json!({"alpha": 0.1, "threshold": 0.001});
+    let mut pipeline = tared(&[("hrn.conformal", conformal)], |described| {
+        described.early_confidence = 0.0;
+    });
+    let found = judged(&mut pipeline, |_| Vec::new());
+    let phases: Vec<_> = found.iter().map(|one| (one.phase, one.rejected)).collect();
+    assert_eq!(phases, [(Phase::Final, Some(Rejection::Ambiguous))]);
 }
 
 #[test]
@@ -224,15 +321,33 @@ fn a_long_press_is_thinned() {
 }
 
 #[test]
-fn a_model_of_frames_says_nothing_of_the_course() {
-    let mut pipeline = tared(&[], |_| {});
-    pipeline.hrn = Arc::new(Hrn::load(BUILT_IN).unwrap());
-    pipeline.tell(&positions(1000, 9000)).unwrap();
-    let found = judged(&mut pipeline, |_| Vec::new());
-    let last = found.last().unwrap();
-    assert_eq!((last.course, last.stiffness_n_per_mm), (None, None));
-    assert_eq!(last.levels, None);
-    assert!(last.shore.is_some(), "the built-in model's second head");
+fn a_model_of_frames_has_no_course_but_the_slope_is_known() {
+    let found = |told: &[Point], arm_n_per_mm| {
+        let mut pipeline = tared(&[], |d| d.arm.stiffness_n_per_mm = arm_n_per_mm);
+        pipeline.hrn = Arc::new(Hrn::load(BUILT_IN).unwrap());
+        pipeline.tell(told).unwrap();
+        let held = [20, 40, 60, 80, 80, 80, 80, 0, 0].map(|counts| raw(9, counts));
+        let mut events = Vec::new();
+        for (number, raw) in (6..).zip(held) {
+            let bytes = bytes(&pipeline, &raw);
+            events.extend(pipeline.push(&bytes, at(number * 200)));
+        }
+        let found = verdicts(events);
+        let phases: Vec<Phase> = found.iter().map(|verdict| verdict.phase).collect();
+        assert_eq!(phases, [Phase::Early, Phase::Final]);
+        found
+    };
+    for verdict in found(&positions(1000, 9000), Some(10.0)) {
+        let slope = verdict.stiffness_n_per_mm.unwrap();
+        assert!((slope - 14.4 / 0.56).abs() < 1e-3, "{slope}");
+        assert_eq!((verdict.course, &verdict.levels), (None, &None));
+        assert!(verdict.shore.is_some(), "the built-in model's second head");
+    }
+    for (told, arm_n_per_mm) in [(Vec::new(), Some(10.0)), (positions(1000, 9000), None)] {
+        for verdict in found(&told, arm_n_per_mm) {
+            assert_eq!(verdict.stiffness_n_per_mm, None);
+        }
+    }
 }
 
 #[test]

@@ -101,6 +101,28 @@ fn a_press_is_never_followed_however_slow_or_long() {
 }
 
 #[test]
+fn what_surrounds_a_touch_that_is_no_press_is_not_followed() {
+    // A point presses two taxels for an hour, too few for a press. The taxel beside them reads a
+    // part of it, a count.
+    let mut pipeline = following(true);
+    let mut beside = 0.0;
+    for second in 10..HOUR {
+        let mut raw = RawFrame::default();
+        raw.counts[400..402].fill(60);
+        raw.counts[402] = 1;
+        let bytes = bytes(&pipeline, &raw);
+        for event in pipeline.push(&bytes, at(1000 * second)) {
+            match event {
+                Event::Frame(frame) => beside = f64::from(frame.newtons[402]),
+                Event::Press(press) => panic!("{press:?}"),
+                _ => {}
+            }
+        }
+    }
+    assert!((beside - COUNT_N).abs() < 1e-6, "{beside}");
+}
+
+#[test]
 fn a_gap_and_a_busy_sensor_do_not_speed_it_up() {
     let mut pipeline = following(true);
     let raised = RawFrame {

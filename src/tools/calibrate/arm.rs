@@ -66,6 +66,17 @@ pub enum Unfit {
         /// The way of the arm while the sensor was pressed.
         moved_mm: f64,
     },
+    /// The best delay is not between the least and the greatest that are tried.
+    #[error(
+        "no delay from {least} to {most} ms fits: the best is {tried_ms:.0} ms or beyond. Do the stamps \
+         of the positions come from a clock that agrees with the clock of this machine?",
+        least = DELAYS_MS.0,
+        most = DELAYS_MS.1
+    )]
+    Beyond {
+        /// The delay at the end of the range.
+        tried_ms: f64,
+    },
 }
 
 /// The least and the greatest delay that are tried.
@@ -140,6 +151,13 @@ impl Fit {
                 .flatten();
             let moved_mm = way.map(|(mm, _)| mm).fold(0.0, f64::max);
             return Err(Unfit::NoDelay { moved_mm });
+        }
+        // The second search goes a step beyond the ends of the first, so a delay just inside is
+        // found.
+        for end_ms in [DELAYS_MS.0, DELAYS_MS.1] {
+            if (delay_ms - end_ms) * end_ms.signum() >= 0.0 {
+                return Err(Unfit::Beyond { tried_ms: end_ms });
+            }
         }
         let n_per_mm = slope(&known, delay_ms).ok_or(Unfit::Falling)?;
         let one = |press: &&Press| {
@@ -344,6 +362,16 @@ mod tests {
             Fit::of(&short),
             Err(Unfit::Few { presses: 2, .. })
         ));
+        // The delay is far beyond those that are tried, or just at their end.
+        for (delay_ms, tried_ms) in [(650.0, 600.0), (600.0, 600.0), (-340.0, -300.0)] {
+            let late = [1.7, 2.4].map(|mm| press(10.0, delay_ms, mm, 20.0));
+            assert_eq!(Fit::of(&late), Err(Unfit::Beyond { tried_ms }));
+        }
+        for delay_ms in [590.0, -290.0] {
+            let late = [1.7, 2.4].map(|mm| press(10.0, delay_ms, mm, 20.0));
+            let fit = Fit::of(&late).unwrap();
+            assert!((fit.delay_ms.value - delay_ms).abs() < 5.0, "{fit:?}");
+        }
         // The arm stands still while the force comes and goes.
         let mut still = [good(), good()];
         for press in &mut still {

@@ -1,11 +1,13 @@
 //! Computes newtons per count from known weights on the sensor.
 //!
-//! A weight of N newtons gives c1, c2, ... counts on the taxels, so N = a (c1^e + c2^e + ...). With
-//! e = 1, this is a line whose a is `newtons_per_count`. Film arrays are often nearer to another
-//! power.
+//! A weight of N newtons gives c1, c2, ... counts on taxels with the gains g1, g2, ..., so
+//! N = a (g1 c1^e + g2 c2^e + ...). With e = 1, this is a line whose a is `newtons_per_count`. Film
+//! arrays are often nearer to another power.
 
 use super::gather::Press;
-use crate::tare;
+use crate::frame::{Array, RawFrame, TAXELS};
+use crate::sensor::Sensor;
+use crate::tare::{self, Tare};
 
 /// The values that known weights give.
 #[derive(Debug, Clone, PartialEq)]
@@ -33,6 +35,25 @@ pub enum Unfit {
         /// The weight in newtons.
         newtons: f64,
     },
+    /// A taxel reads full scale, so the weight may be larger than the sum of the taxels.
+    #[error(
+        "press {press}, of {newtons} N, reaches full scale on a taxel: put the weight on more taxels, \
+         or take a lighter one"
+    )]
+    Saturated {
+        /// The number of the press, from 1.
+        press: usize,
+        /// The weight in newtons.
+        newtons: f64,
+    },
+}
+
+/// The counts of a taxel.
+#[derive(Debug, Clone, Copy)]
+struct Count {
+    counts: f64,
+    /// The gain of this taxel, and its part in the means that replace its dead neighbours.
+    share: f64,
 }
 
 /// The weight is at rest while the sum of counts has at least this share of its maximum.
@@ -49,17 +70,20 @@ const MOST_LEFT: f64 = 0.5;
 const STEP: f64 = 0.01;
 
 impl Fit {
-    /// Computes the values from `weights` in newtons, each with its press. `settings` are those
-    /// with which the presses were recorded.
-    pub(super) fn of(weights: &[(f64, &Press)], settings: &tare::Settings) -> Result<Self, Unfit> {
+    /// Computes the values from `weights` in newtons, each with its press. The values are for the
+    /// gains and the dead taxels of `sensor`. A press without a description was recorded with the
+    /// settings of `sensor`.
+    pub(super) fn of(weights: &[(f64, &Press)], sensor: &Sensor) -> Result<Self, Unfit> {
         let mut resting = Vec::with_capacity(weights.len());
-        for (press, (newtons, frames)) in (1..).zip(weights) {
-            let counts = rest(frames, settings);
+        for (press, &(newtons, recorded)) in (1..).zip(weights) {
+            if recorded.saturated {
+                return Err(Unfit::Saturated { press, newtons });
+            }
+            let counts = rest(recorded, sensor);
             if counts.is_empty() {
-                let newtons = *newtons;
                 return Err(Unfit::Nothing { press, newtons });
             }
-            resting.push((*newtons, counts));
+            resting.push((newtons, counts));
         }
         let (_, line_error) = scale(&resting, 1.0);
         let (lightest, heaviest) = resting
@@ -89,7 +113,7 @@ impl Fit {
         let alone = resting
             .iter()
             .map(|one| scale(std::slice::from_ref(one), exponent).0);
-        let read = |(newtons, counts): &(f64, Vec<f64>)| {
+        let read = |(newtons, counts): &(f64, Vec<Count>)| {
             (*newtons, newtons_per_count * raised(counts, exponent))
         };
         Ok(Self {
@@ -108,18 +132,37 @@ impl Fit {
 
 /// The counts of one frame of a press: the median frame, by its sum, of those in which the weight
 /// is at rest.
-fn rest(press: &Press, settings: &tare::Settings) -> Vec<f64> {
+fn rest(press: &Press, sensor: &Sensor) -> Vec<Count> {
+    let described = press.described.as_deref().cloned();
+    let recorded = described.and_then(|described| Sensor::new(described).ok());
+    let recorded = recorded.as_ref().unwrap_or(sensor);
+    let settings = &recorded.description().calibration;
     let (a, e) = (
         f64::from(settings.newtons_per_count),
         f64::from(settings.exponent),
     );
-    let counts = press.frames.iter().map(|frame| -> Vec<f64> {
-        let newtons = frame.iter().filter(|&&newtons| newtons > 0.0);
-        newtons
-            .map(|&newtons| (f64::from(newtons) / a).powf(1.0 / e))
+    let gains = effects(settings, recorded.layout().array());
+    let shares = shares(sensor, recorded);
+    let taxels: Vec<(f64, f64)> = gains
+        .iter()
+        .zip(shares)
+        .map(|(&[gain, _], share)| (gain, share))
+        .collect();
+    let counts = press.frames.iter().map(|frame| -> Vec<Count> {
+        let taxels = frame.iter().zip(&taxels);
+        let loaded = taxels.filter(|&(&newtons, &(gain, share))| {
+            // The newtons of a dead taxel are no measurement.
+            newtons > 0.0 && gain > 0.0 && share > 0.0
+        });
+        loaded
+            .map(|(&newtons, &(gain, share))| Count {
+                counts: (f64::from(newtons) / (a * gain)).powf(1.0 / e),
+                share,
+            })
             .collect()
     });
-    let mut counts: Vec<(f64, Vec<f64>)> = counts.map(|c| (c.iter().sum(), c)).collect();
+    let sum = |counts: &[Count]| counts.iter().map(|one| one.counts).sum::<f64>();
+    let mut counts: Vec<(f64, Vec<Count>)> = counts.map(|c| (sum(&c), c)).collect();
     let most = counts.iter().map(|one| one.0).fold(0.0, f64::max);
     counts.retain(|one| one.0 > 0.0 && one.0 >= RESTING_SHARE * most);
     counts.sort_by(|one, other| one.0.total_cmp(&other.0));
@@ -130,13 +173,53 @@ fn rest(press: &Press, settings: &tare::Settings) -> Vec<f64> {
         .map_or_else(Vec::new, |one| one.1)
 }
 
-fn raised(counts: &[f64], exponent: f64) -> f64 {
-    counts.iter().map(|count| count.powf(exponent)).sum()
+/// The share of each taxel of a frame in the total force that `sensor` reads. A taxel that was dead
+/// in the recording has no counts, so it counts as dead here too.
+fn shares(sensor: &Sensor, recorded: &Sensor) -> Vec<f64> {
+    let mut settings = sensor.description().calibration.clone();
+    let (array, of_recording) = (sensor.layout().array(), recorded.layout().array());
+    let dead = recorded.description().calibration.dead_taxels.iter();
+    settings.dead_taxels.extend(dead.filter_map(|&[row, col]| {
+        let (row, col) = array.position(of_recording.place(row, col))?;
+        Some([row, col])
+    }));
+    let effects = effects(&settings, array);
+    effects.into_iter().map(|[_, share]| share).collect()
+}
+
+/// What one count on each taxel of a frame adds to this taxel and to the total force, if
+/// `newtons_per_count` and `exponent` are 1. A count on a dead taxel adds nothing.
+fn effects(settings: &tare::Settings, array: Array) -> Vec<[f64; 2]> {
+    let settings = tare::Settings {
+        newtons_per_count: 1.0,
+        exponent: 1.0,
+        tare_frames: 0,
+        ..settings.clone()
+    };
+    // Only a tare looks at the thresholds of contact.
+    let contact = tare::Contact {
+        threshold_n: 1.0,
+        area_taxels: 1,
+    };
+    let tare = Tare::new(&settings, array, contact);
+    let mut raw = RawFrame::default();
+    let of_place = |place: usize| {
+        raw.counts[place] = 1;
+        let newtons = tare.apply(&raw).newtons;
+        raw.counts[place] = 0;
+        [newtons[place], newtons.iter().sum()].map(f64::from)
+    };
+    (0..TAXELS).map(of_place).collect()
+}
+
+fn raised(counts: &[Count], exponent: f64) -> f64 {
+    let raised = |one: &Count| one.share * one.counts.powf(exponent);
+    counts.iter().map(raised).sum()
 }
 
 /// The a that fits the weights best with this exponent, and the root mean square error that is
 /// left, as a part of the weight.
-fn scale(weights: &[(f64, Vec<f64>)], exponent: f64) -> (f64, f64) {
+fn scale(weights: &[(f64, Vec<Count>)], exponent: f64) -> (f64, f64) {
     let logs = weights
         .iter()
         .map(|(newtons, counts)| (newtons / raised(counts, exponent)).ln());
@@ -148,19 +231,53 @@ fn scale(weights: &[(f64, Vec<f64>)], exponent: f64) -> (f64, f64) {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use std::sync::Arc;
 
-    /// A press of `newtons` over 20 taxels of a film with the values `a` and `e`, as a sensor with
-    /// `settings` reads it.
-    fn press(newtons: f64, a: f64, e: f64, settings: &tare::Settings) -> Press {
-        let shares = (1..=20).map(|n| f64::from(n) / 210.0);
-        let read = |count: f64| {
-            let read = f64::from(settings.newtons_per_count) * count.powf(settings.exponent.into());
-            read as f32
-        };
-        let frame: Vec<f32> = shares
-            .map(|share| read((newtons * share / a).powf(1.0 / e)))
+    use super::*;
+    use crate::sensor::Description;
+    use crate::tare::Gains;
+
+    fn sensor(calibration: tare::Settings) -> Sensor {
+        Sensor::new(Description {
+            calibration,
+            ..Description::default()
+        })
+        .unwrap()
+    }
+
+    /// Gains of 0.5 to 2, and two dead taxels under the weight.
+    fn uneven() -> tare::Settings {
+        let gain = |row: usize, col: usize| 0.5 + 0.25 * ((3 * row + col) % 7) as f32;
+        let row = |row| (0..28).map(|col| gain(row, col)).collect();
+        tare::Settings {
+            gains: Some(Gains::Taxels((0..28).map(row).collect())),
+            dead_taxels: vec![[11, 12], [12, 13]],
+            ..tare::Settings::default()
+        }
+    }
+
+    /// A press of `newtons` over 20 taxels, as a sensor with `settings` reads it. A taxel with a
+    /// gain g gives c counts under a g c^e newtons. The taxels are those of `film`.
+    fn press(newtons: f64, (a, e): (f64, f64), film: &Sensor, settings: &tare::Settings) -> Press {
+        let loaded: Vec<usize> = (0..20).map(|n| 28 * (10 + n / 5) + 10 + n % 5).collect();
+        let own = effects(&film.description().calibration, film.layout().array());
+        // The total of all taxels, with the dead ones replaced, is `newtons` at this scale.
+        let shape: Vec<f64> = (1..=20)
+            .map(|n| (f64::from(n) / 20.0).powf(1.0 / e))
             .collect();
+        let total = loaded.iter().zip(&shape);
+        let total: f64 = total.map(|(&at, c)| own[at][1] * c.powf(e)).sum();
+        let scale = (newtons / (a * total)).powf(1.0 / e);
+        let read = effects(settings, Array::FULL);
+        let mut frame = vec![0.0_f32; TAXELS];
+        for (&at, shape) in loaded.iter().zip(&shape) {
+            let raised = (scale * shape).powf(f64::from(settings.exponent));
+            frame[at] = (f64::from(settings.newtons_per_count) * read[at][0] * raised) as f32;
+        }
+        // A dead taxel shows what is no measurement.
+        for &[row, col] in &settings.dead_taxels {
+            frame[28 * row + col] = 1.0;
+        }
         let half = frame.iter().map(|newtons| 0.5 * newtons).collect();
         Press {
             frames: vec![half, frame.clone(), frame.clone(), frame],
@@ -168,54 +285,110 @@ mod tests {
         }
     }
 
-    fn fit(a: f64, e: f64, weights: &[f64], settings: &tare::Settings) -> Fit {
-        let presses: Vec<Press> = weights.iter().map(|&n| press(n, a, e, settings)).collect();
+    fn fit(law: (f64, f64), weights: &[f64], settings: &tare::Settings) -> Fit {
+        let sensor = sensor(settings.clone());
+        let presses: Vec<Press> = weights
+            .iter()
+            .map(|&n| press(n, law, &sensor, settings))
+            .collect();
         let weights: Vec<(f64, &Press)> = weights.iter().copied().zip(&presses).collect();
-        Fit::of(&weights, settings).unwrap()
+        Fit::of(&weights, &sensor).unwrap()
     }
 
     #[test]
     fn a_line_is_found_whatever_the_present_settings() {
-        for exponent in [1.0, 1.5] {
-            let settings = tare::Settings {
-                exponent,
-                ..tare::Settings::default()
-            };
-            let fit = fit(0.031, 1.0, &[5.0, 10.0, 20.0], &settings);
-            assert!((fit.newtons_per_count - 0.031).abs() < 1e-6, "{fit:?}");
-            assert_eq!(fit.exponent, 1.0);
-            assert!(fit.line_error < 1e-6 && (fit.alone[1] - fit.alone[0]) < 1e-6);
+        for settings in [tare::Settings::default(), uneven()] {
+            for exponent in [1.0, 1.5] {
+                let settings = tare::Settings {
+                    exponent,
+                    ..settings.clone()
+                };
+                let fit = fit((0.031, 1.0), &[5.0, 10.0, 20.0], &settings);
+                assert!((fit.newtons_per_count - 0.031).abs() < 1e-6, "{fit:?}");
+                assert_eq!(fit.exponent, 1.0);
+                assert!(fit.line_error < 1e-6 && (fit.alone[1] - fit.alone[0]) < 1e-6);
+            }
         }
     }
 
     #[test]
     fn a_power_law_is_found_where_the_weights_can_say_it() {
-        let settings = tare::Settings::default();
-        let found = fit(0.01, 1.4, &[2.0, 5.0, 10.0, 20.0], &settings);
-        assert!((found.exponent - 1.4).abs() < 0.011, "{found:?}");
-        assert!(
-            (found.newtons_per_count / 0.01 - 1.0).abs() < 0.05,
-            "{found:?}"
-        );
-        for (newtons, read) in &found.weights {
-            assert!((read / newtons - 1.0).abs() < 0.01, "{found:?}");
+        for settings in [tare::Settings::default(), uneven()] {
+            let found = fit((0.01, 1.4), &[2.0, 5.0, 10.0, 20.0], &settings);
+            assert!((found.exponent - 1.4).abs() < 0.011, "{found:?}");
+            assert!(
+                (found.newtons_per_count / 0.01 - 1.0).abs() < 0.05,
+                "{found:?}"
+            );
+            for (newtons, read) in &found.weights {
+                assert!((read / newtons - 1.0).abs() < 0.01, "{found:?}");
+            }
+            // Two different weights cannot determine an exponent.
+            let two = fit((0.01, 1.4), &[2.0, 20.0, 20.0], &settings);
+            assert_eq!(two.exponent, 1.0);
         }
-        // Two different weights cannot determine an exponent.
-        assert_eq!(fit(0.01, 1.4, &[2.0, 20.0, 20.0], &settings).exponent, 1.0);
     }
 
     #[test]
-    fn a_press_without_a_weight_is_named() {
-        let settings = tare::Settings::default();
-        let good = press(5.0, 0.04, 1.0, &settings);
-        let none = Press::default();
-        let found = Fit::of(&[(5.0, &good), (7.0, &none)], &settings);
-        assert_eq!(
-            found,
-            Err(Unfit::Nothing {
-                press: 2,
-                newtons: 7.0
+    fn a_press_is_read_with_the_settings_of_its_recording() {
+        // The sensor of the configuration has gains, and another scale than the recordings.
+        let present = tare::Settings {
+            newtons_per_count: 0.02,
+            ..uneven()
+        };
+        let configured = sensor(present.clone());
+        let recorded = [
+            tare::Settings::default(),
+            tare::Settings {
+                newtons_per_count: 0.04,
+                exponent: 1.3,
+                ..tare::Settings::default()
+            },
+            present,
+        ];
+        let weights = [5.0, 10.0, 20.0];
+        let presses: Vec<Press> = weights
+            .iter()
+            .zip(&recorded)
+            .map(|(&newtons, settings)| Press {
+                described: Some(Arc::new(sensor(settings.clone()).description().clone())),
+                ..press(newtons, (0.031, 1.0), &configured, settings)
             })
-        );
+            .collect();
+        let weights: Vec<(f64, &Press)> = weights.into_iter().zip(&presses).collect();
+        let fit = Fit::of(&weights, &configured).unwrap();
+        assert!((fit.newtons_per_count - 0.031).abs() < 1e-6, "{fit:?}");
+        assert!(fit.line_error < 1e-6, "{fit:?}");
+    }
+
+    #[test]
+    fn a_taxel_that_was_dead_in_the_recording_is_dead_for_the_fit() {
+        let recorded = sensor(tare::Settings {
+            dead_taxels: vec![[11, 12]],
+            ..tare::Settings::default()
+        });
+        let settings = &recorded.description().calibration;
+        let press = Press {
+            described: Some(Arc::new(recorded.description().clone())),
+            ..press(8.0, (0.031, 1.0), &recorded, settings)
+        };
+        let fit = Fit::of(&[(8.0, &press)], &sensor(tare::Settings::default())).unwrap();
+        assert!((fit.newtons_per_count - 0.031).abs() < 1e-6, "{fit:?}");
+    }
+
+    #[test]
+    fn a_press_that_measures_no_weight_is_named() {
+        let settings = tare::Settings::default();
+        let sensor = sensor(settings.clone());
+        let good = press(5.0, (0.04, 1.0), &sensor, &settings);
+        let newtons = 7.0;
+        let of = |other: &Press| Fit::of(&[(5.0, &good), (newtons, other)], &sensor);
+        let none = Press::default();
+        assert_eq!(of(&none), Err(Unfit::Nothing { press: 2, newtons }));
+        let full = Press {
+            saturated: true,
+            ..press(newtons, (0.04, 1.0), &sensor, &settings)
+        };
+        assert_eq!(of(&full), Err(Unfit::Saturated { press: 2, newtons }));
     }
 }

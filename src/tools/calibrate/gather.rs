@@ -6,11 +6,11 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
-use crate::event::{Event, PressState};
+use crate::event::{Event, Note, Phase, PressState};
 use crate::frame::Stamp;
 use crate::motion::Track;
 use crate::pipeline::{Clock, Pipeline};
-use crate::recording::{self, Entry, FileKind, Input, Playback, PlaybackError, Reader};
+use crate::recording::{self, Entry, FileKind, Playback, PlaybackError, Reader};
 use crate::sensor::{Description, Sensor};
 use crate::verdict::Hrn;
 
@@ -25,8 +25,20 @@ pub(super) struct Press {
     pub(super) forces_n: Vec<f64>,
     /// The positions of the arm.
     pub(super) track: Track,
-    /// The description of the sensor at that time. `None` if the file has none.
+    /// The description of the sensor when the press ended. `None` if the file has none.
     pub(super) described: Option<Arc<Description>>,
+    /// Whether a taxel of the press's best frame read full scale.
+    pub(super) saturated: bool,
+}
+
+/// A press that waits for its last positions.
+struct Ended {
+    number: u64,
+    /// The first and the last frame.
+    frames: [u64; 2],
+    end: Duration,
+    described: Option<Arc<Description>>,
+    saturated: bool,
 }
 
 /// A frame of the sensor.
@@ -45,6 +57,13 @@ pub enum Unreadable {
     /// The recording describes an impossible sensor.
     #[error(transparent)]
     Playback(#[from] PlaybackError),
+}
+
+impl Unreadable {
+    /// Whether the system could not read the file, whatever the file holds.
+    pub(in crate::tools) fn is_io(&self) -> bool {
+        matches!(self, Self::Recording(recording::Error::Io(_)))
+    }
 }
 
 impl From<std::io::Error> for Unreadable {
@@ -71,7 +90,7 @@ pub(super) fn presses(
 }
 
 fn of_recording(file: impl Read, sensor: &str, hrn: Arc<Hrn>) -> Result<Vec<Press>, Unreadable> {
-    let mut playback = Playback::new(hrn);
+    let (mut playback, none) = (Playback::new(hrn), Track::default());
     let mut gathered = Gathered::default();
     for found in Reader::new(file) {
         let found = found?;
@@ -79,20 +98,20 @@ fn of_recording(file: impl Read, sensor: &str, hrn: Arc<Hrn>) -> Result<Vec<Pres
             continue;
         }
         let at = found.at;
+        let track = playback.track(sensor).unwrap_or(&none);
         match &found.entry {
-            Entry::Input(Input::Motion(points)) => {
-                // An error means that the time of a point went back. The approach of its press is
-                // then unknown.
-                let _ = gathered.track.push(points);
-            }
             Entry::Settings(sensor) => gathered.describe(&sensor.description),
-            Entry::State(state) => gathered.describe(&state.sensor.description),
+            Entry::State(state) => {
+                // A state no longer has the positions of presses that have ended.
+                gathered.settle(Duration::MAX, track);
+                gathered.describe(&state.sensor.description);
+            }
             Entry::Input(_) => {}
         }
-        gathered.settle(at.mono);
+        gathered.settle(at.mono, track);
         gathered.take(playback.feed(found)?, at);
     }
-    Ok(gathered.end())
+    Ok(gathered.end(playback.track(sensor).unwrap_or(&none)))
 }
 
 fn of_bytes(mut file: impl Read, sensor: &Sensor, hrn: Arc<Hrn>) -> std::io::Result<Vec<Press>> {
@@ -104,14 +123,14 @@ fn of_bytes(mut file: impl Read, sensor: &Sensor, hrn: Arc<Hrn>) -> std::io::Res
         wall: Timestamp::UNIX_EPOCH,
     };
     let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::FrameRate);
-    let mut gathered = Gathered::default();
+    let (mut gathered, none) = (Gathered::default(), Track::default());
     gathered.describe(sensor.description());
     for chunk in bytes.chunks(CHUNK_BYTES) {
         gathered.take(pipeline.push(chunk, start), start);
-        gathered.settle(Duration::MAX);
+        gathered.settle(Duration::MAX, &none);
     }
     gathered.take(pipeline.end_of_recording(None), start);
-    Ok(gathered.end())
+    Ok(gathered.end(&none))
 }
 
 /// The number of bytes whose frames are held at a time.
@@ -121,15 +140,13 @@ const CHUNK_BYTES: usize = 1 << 16;
 #[derive(Default)]
 struct Gathered {
     presses: Vec<Press>,
-    track: Track,
     described: Option<Arc<Description>>,
     /// The frames of the press under way and of those in `ended`, and the newest frame.
     frames: Vec<Taken>,
     /// The number of the first frame of the press under way.
     began: Option<u64>,
-    /// The first and the last frame of each press that waits for its last positions, and when it
-    /// ended.
-    ended: Vec<(u64, u64, Duration)>,
+    /// The presses that wait for their last positions.
+    ended: Vec<Ended>,
 }
 
 impl Gathered {
@@ -156,25 +173,42 @@ impl Gathered {
                     PressState::Begin => self.began = Some(press.frame),
                     PressState::End => {
                         let first = self.began.take().unwrap_or(press.frame);
-                        let end = moment(at, press.time);
-                        self.ended.push((first, press.frame, end));
+                        self.ended.push(Ended {
+                            number: press.press,
+                            frames: [first, press.frame],
+                            end: moment(at, press.time),
+                            described: self.described.clone(),
+                            saturated: false,
+                        });
                     }
                     PressState::Aborted => self.began = None,
                 },
+                // The final verdict comes together with the end of its press.
+                Event::Hardness(verdict) if verdict.phase == Phase::Final => {
+                    let mut ended = self.ended.iter_mut();
+                    if let Some(press) = ended.find(|press| press.number == verdict.press) {
+                        press.saturated = verdict.notes.contains(&Note::Saturated);
+                    }
+                }
                 _ => {}
             }
         }
     }
 
-    /// Takes the presses whose positions have come by `now`.
-    fn settle(&mut self, now: Duration) {
-        while let Some(&(first, last, end)) = self.ended.first()
-            && now >= end.saturating_add(AFTER)
-        {
-            self.ended.remove(0);
+    /// Takes the presses whose positions have come by `now`. `track` has them.
+    fn settle(&mut self, now: Duration, track: &Track) {
+        let is_due = |press: &Ended| now >= press.end.saturating_add(AFTER);
+        while self.ended.first().is_some_and(is_due) {
+            let Ended {
+                frames: [first, last],
+                described,
+                saturated,
+                ..
+            } = self.ended.remove(0);
             let mut press = Press {
-                track: self.track.clone(),
-                described: self.described.clone(),
+                track: track.clone(),
+                described,
+                saturated,
                 ..Press::default()
             };
             let own = self.frames.iter();
@@ -188,8 +222,8 @@ impl Gathered {
         }
     }
 
-    fn end(mut self) -> Vec<Press> {
-        self.settle(Duration::MAX);
+    fn end(mut self, track: &Track) -> Vec<Press> {
+        self.settle(Duration::MAX, track);
         self.presses
     }
 }
@@ -199,4 +233,22 @@ fn moment(at: Stamp, time: Timestamp) -> Duration {
     let ago = at.wall.as_nanosecond() - time.as_nanosecond();
     let mono = at.mono.as_nanos() as i128 - ago;
     Duration::from_nanos(u64::try_from(mono).unwrap_or(0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::recording::tests::{hrn, of_a_press};
+
+    #[test]
+    fn a_press_has_the_positions_from_before_its_recording() {
+        let (recording, sensor) = of_a_press(|_| {}, None, true);
+        let presses = presses(recording.as_slice(), &sensor, hrn()).unwrap();
+        let [press] = &presses[..] else {
+            panic!("one press");
+        };
+        let found = press.track.approach(press.moments[0], &press.moments, 0.0);
+        let way = found.unwrap().last().copied().flatten();
+        assert!((way.unwrap() - 4.0).abs() < 1e-6, "{way:?}");
+    }
 }

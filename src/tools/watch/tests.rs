@@ -680,6 +680,14 @@ fn force_stands_against_approach_where_the_robot_tells_it() {
     hear(&mut view, 3200, press("begin"));
     hear(&mut view, 3400, at_mm(0.2, json!(0.5)));
     assert!(shown(&view, 3400, size, PLAIN).contains("to 0.5 mm, to 2 N"));
+    hear(&mut view, 3500, press("end"));
+    // Usually, the approach of a press's first frame is not known yet.
+    hear(&mut view, 5000, at_mm(0.1, json!(null)));
+    hear(&mut view, 5000, press("begin"));
+    hear(&mut view, 5200, at_mm(0.1, json!(0.2)));
+    hear(&mut view, 5400, at_mm(0.1, json!(0.3)));
+    let text = shown(&view, 5400, size, PLAIN);
+    assert!(text.contains("to 0.3 mm, to 1 N"), "{text}");
     every_size_of(&view);
 }
 

@@ -19,7 +19,7 @@ use crate::simulator::Split;
 use crate::train::data::courses::Courses;
 use crate::train::data::dataset;
 use crate::train::judge::baseline::Baseline;
-use crate::train::judge::metrics::{self, Evaluation, Judged};
+use crate::train::judge::metrics::{self, Clusters, Evaluation, Judged};
 use crate::train::judge::press_features::{self, PressOf};
 use crate::train::learn::course::{self, Press};
 use crate::train::model::course as model;
@@ -292,7 +292,7 @@ fn compare_with_first(rows: &mut [CourseRow], first: &str) {
     for row in rows.iter_mut().filter(|row| row.name != first) {
         for (own, others) in row.sets.iter_mut().zip(&reference.sets) {
             let pair = (own.objects.as_slice(), others.objects.as_slice());
-            let difference = metrics::difference_by_object(&[pair]);
+            let difference = metrics::difference_by_object(&[pair], Clusters::Objects);
             own.less_first = difference.map(|estimate| Difference {
                 mean: estimate.mean,
                 interval: estimate.interval,

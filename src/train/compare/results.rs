@@ -9,9 +9,9 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use super::digits::thousands;
-use super::sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS, TestSet, WORLDS};
+use super::sets::{self, FRESH, MATCHED, PAPER_SPLIT, SHIFTS, TestSet, WORLDS};
 use crate::train::data::dataset::LabelChoice;
-use crate::train::judge::metrics::{self, Bin, Evaluation, Judged, ObjectCount};
+use crate::train::judge::metrics::{self, Bin, Clusters, Evaluation, Judged, ObjectCount};
 use crate::train::model::export;
 use crate::train::run::disk::write_whole;
 use crate::train::run::history::History;
@@ -247,6 +247,33 @@ impl Comparison {
             swaps: read_json(&directory.join("swaps.json"))?.unwrap_or_default(),
             entries,
         }))
+    }
+
+    /// The correct verdicts of every run on each object, as CSV. All intervals can be computed from
+    /// them. `geometry` is empty where objects of different levels are not pressed alike.
+    pub fn objects(&self) -> String {
+        let mut csv = "run,set,level,object,geometry,right,samples\n".to_owned();
+        for (entry, details) in self.entries.iter().zip(&self.details) {
+            for (set, measured) in &details.worth.sets {
+                for count in measured.objects.iter().flatten() {
+                    let geometry = match sets::clusters(set) {
+                        Clusters::Objects => String::new(),
+                        Clusters::Geometries(number) => (count.object % number).to_string(),
+                    };
+                    let ObjectCount {
+                        level,
+                        object,
+                        right,
+                        samples,
+                    } = count;
+                    csv += &format!(
+                        "{},{set},{level},{object},{geometry},{right},{samples}\n",
+                        entry.run
+                    );
+                }
+            }
+        }
+        csv
     }
 
     /// The tables' rows in the order of the entries.

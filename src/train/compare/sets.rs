@@ -11,6 +11,7 @@ use anyhow::{Context as _, ensure};
 use crate::simulator::{self, Borders, DatasetSettings, Materials, SensorProfile, Shapes, Split};
 use crate::train::data::dataset::{Dataset, PITCH_MM};
 use crate::train::data::simulated;
+use crate::train::judge::metrics::Clusters;
 use crate::train::run::disk::write_whole;
 use crate::train::settings::Profile;
 use crate::verdict::sha256_hex;
@@ -70,6 +71,17 @@ pub(super) const WORLDS: [(&str, &str); 3] = [
         "random materials with those radii, edges and points",
     ),
 ];
+
+/// What is drawn together for the interval of an accuracy on a set. Except for the `paper` shapes,
+/// the test objects with the same number are pressed alike in every material.
+pub(super) fn clusters(set: &str) -> Clusters {
+    let worlds = WORLDS.iter().map(|(name, _)| *name);
+    if worlds.chain([MATCHED]).any(|paired| paired == set) {
+        Clusters::Geometries(FRESH_OBJECTS)
+    } else {
+        Clusters::Objects
+    }
+}
 
 /// Checks that no model learns from the fresh objects.
 ///

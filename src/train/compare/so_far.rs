@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::tables::Table;
+use crate::pipeline::{FIRST_LOOK, look_after};
 use crate::train::data::courses::{Courses, Press};
 use crate::train::judge::metrics::{self, Judged};
 use crate::train::model::course as model;
@@ -12,8 +13,6 @@ use crate::verdict::{Course, Hrn, Verdict};
 const SECONDS: [f32; 7] = [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4];
 /// The confidence of an early verdict: the default of `[model] early_confidence`.
 const CONFIDENCE: f32 = 0.95;
-/// The least number of frames of an early verdict.
-const LEAST_FRAMES: usize = 3;
 
 /// The evaluation of verdicts before the end of presses.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -55,6 +54,10 @@ fn until(course: &Course, frames: usize) -> Course {
 
 /// Judges presses before their end. `finals` are the final verdicts on the same presses.
 ///
+/// An early verdict comes as the daemon gives it: the press is judged at the same numbers of frames,
+/// and a verdict that is ambiguous does not count. The frames are those of the data, which has at
+/// most 48 of each press, so a daemon judges a longer press more often than this.
+///
 /// # Errors
 ///
 /// Fails if the model fails to judge a press.
@@ -69,13 +72,19 @@ pub(super) fn of(
     for (place, (press, last)) in places.zip(finals) {
         let course = model::course_of(courses, place);
         let frames = course.moments.len();
-        let mut is_early = false;
+        let mut next_look = Some(FIRST_LOOK);
         // The probabilities after each number of frames; those at the end are known.
         let mut said = Vec::with_capacity(frames);
         for count in 1..frames {
             let verdict = hrn.judge_course(&until(&course, count))?;
-            if !is_early && count >= LEAST_FRAMES && verdict.confidence >= CONFIDENCE {
-                is_early = true;
+            let is_ambiguous = verdict.levels.as_ref().is_some_and(|set| set.len() > 1);
+            let is_look = next_look == Some(count as u64);
+            if is_look {
+                next_look = Some(look_after(count as u64));
+            }
+            if is_look && verdict.confidence >= CONFIDENCE && !is_ambiguous {
+                // A press has one early verdict at most.
+                next_look = None;
                 early += 1;
                 right += usize::from(verdict.level == press.level);
                 changed += usize::from(verdict.level != last.level);

@@ -123,9 +123,11 @@ pub fn provenance(comparison: &Comparison) -> String {
         }
     }
     lines.push(
-        "Simulated data, unless you gave your own. Intervals are 95 %, by a bootstrap over objects \
-         within each level and, where there are several, over seeds: those of one seed do not cover \
-         how much another seed, or another rounding, changes. ± is the standard deviation over seeds."
+        "Simulated data, unless you gave your own. Intervals are 95 %. Where all materials are pressed \
+         alike (matched, wide, broad), they are by a bootstrap over the geometries, elsewhere over the \
+         objects within each level. With several seeds, the variance over seeds is added, and the \
+         interval is Student's. The interval of one seed does not cover how much another seed, or \
+         another rounding, changes. ± is the standard deviation over seeds."
             .to_owned(),
     );
     lines.join("\n")

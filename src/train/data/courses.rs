@@ -11,7 +11,7 @@ use ndarray::{ArrayView1, ArrayView3};
 use ndarray_npy::{NpzWriter, WriteNpzError};
 
 use super::dataset::file::{self, File};
-use super::dataset::{DatasetError, Source, levels};
+use super::dataset::{DatasetError, Source, levels, objects_after, pitch_mm};
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::simulator::{LabelledCourse, NEWTONS_PER_COUNT, Split};
 
@@ -150,24 +150,38 @@ impl Courses {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Courses::read`].
+    /// Returns the errors of [`Courses::read`]. Also returns an error if the sensors of the files
+    /// have different pitches, or the files have more objects than a u32 can number.
     pub fn read_all(paths: &[PathBuf]) -> Result<(Self, Vec<Source>), DatasetError> {
         let (mut all, mut sources) = (Self::default(), Vec::new());
+        let mut first_object = 0;
         for path in paths {
             let bytes = file::read(path)?;
             let mut file = File::open(&bytes, path)?;
             let meta = file.meta()?;
             let name = path.file_name().unwrap_or_default().to_string_lossy();
             sources.push(file::source(&bytes, &file, name.into_owned(), &meta)?);
-            all.append(Self::parse(&bytes, path)?);
+            let (expected, found) = (pitch_mm(&sources), pitch_mm(&sources[sources.len() - 1..]));
+            if found != expected {
+                return Err(DatasetError::Pitch {
+                    path: path.clone(),
+                    found,
+                    expected,
+                    first: paths[0].clone(),
+                });
+            }
+            let part = Self::parse(&bytes, path)?;
+            let last = part.presses.iter().map(|press| press.object).max();
+            let before;
+            (before, first_object) = objects_after(first_object, last, path.clone())?;
+            all.append(part, before);
         }
         Ok((all, sources))
     }
 
-    fn append(&mut self, other: Self) {
+    /// Adds the presses of another file. `objects` is added to their numbers of objects.
+    fn append(&mut self, other: Self, objects: u32) {
         let (rows, presses) = (self.press.len() as u32, self.presses.len() as u32);
-        let objects = self.presses.iter().map(|press| press.object + 1).max();
-        let objects = objects.unwrap_or_default();
         self.frames_mn.extend(other.frames_mn);
         self.press
             .extend(other.press.iter().map(|press| press + presses));
@@ -367,6 +381,64 @@ mod tests {
             let most = courses.rows(number).map(area).max();
             assert_eq!(most, Some(area(press.best as usize)), "press {number}");
         }
+    }
+
+    /// Writes a file with these objects and this pitch into a directory.
+    fn written(directory: &Path, name: &str, objects: &[u32], pitch_mm: f64) -> PathBuf {
+        let mut courses = Courses::default();
+        for &object in objects {
+            let press = Press {
+                level: 1,
+                object,
+                material: 0,
+                split: Split::Train,
+                shore: 80.0,
+                force_n: 1.0,
+                arm_n_per_mm: 0.0,
+                best: 0,
+            };
+            courses.push(press, [(0.0, None, &Frame::default())].into_iter());
+        }
+        let path = directory.join(name);
+        let bytes = courses.write(Cursor::new(Vec::new()), &json!({"pitch_mm": pitch_mm}));
+        std::fs::write(&path, bytes.unwrap().into_inner()).unwrap();
+        path
+    }
+
+    #[test]
+    fn objects_of_different_files_stay_apart_or_are_refused() {
+        let directory = tempfile::tempdir().unwrap();
+        let written = |name, objects: &[u32]| written(directory.path(), name, objects, 2.0);
+        let (few, most) = (written("few", &[0, 4]), written("most", &[0, u32::MAX]));
+        let (all, sources) = Courses::read_all(&[few.clone(), few.clone()]).unwrap();
+        let objects: Vec<u32> = all.presses.iter().map(|press| press.object).collect();
+        assert_eq!(objects, [0, 4, 5, 9]);
+        assert_eq!(pitch_mm(&sources), 2.0);
+        assert_eq!(
+            Courses::read_all(std::slice::from_ref(&most))
+                .unwrap()
+                .0
+                .presses
+                .len(),
+            2
+        );
+        for files in [[most.clone(), few.clone()], [few, most]] {
+            let error = Courses::read_all(&files).unwrap_err().to_string();
+            assert!(error.contains("array `object`: found"), "{error}");
+        }
+    }
+
+    #[test]
+    fn files_of_different_pitches_are_not_joined() {
+        let directory = tempfile::tempdir().unwrap();
+        let fine = written(directory.path(), "fine", &[0], 2.0);
+        let coarse = written(directory.path(), "coarse", &[0], 3.5);
+        let error = Courses::read_all(&[fine.clone(), fine, coarse]).unwrap_err();
+        let error = error.to_string();
+        assert!(
+            error.contains("coarse: taxel pitch: found 3.5 mm, expected 2 mm, that of "),
+            "{error}"
+        );
     }
 
     #[test]

@@ -36,6 +36,25 @@ pub(super) fn level(range: &LevelRange, shore: &str) -> Level {
     }
 }
 
+/// The levels that `meta` of a file states. If it states none, those of [`levels`].
+///
+/// # Errors
+///
+/// Returns an error if the file cannot be read, or `levels` of its `meta` is not as
+/// `docs/formats.md` says.
+pub fn stated_levels(path: &Path) -> Result<Vec<Level>, DatasetError> {
+    let stated = meta(path)?.get_mut("levels").map(serde_json::Value::take);
+    let Some(stated) = stated.filter(|stated| !stated.is_null()) else {
+        return Ok(levels());
+    };
+    serde_json::from_value(stated).map_err(|error| DatasetError::Array {
+        path: path.to_owned(),
+        array: "meta",
+        found: format!("`levels` with {error}"),
+        expected: "`level`, `label` and `shore` of each level".to_owned(),
+    })
+}
+
 /// How the samples are chosen whose labels may be used.
 #[derive(
     Debug,
@@ -237,6 +256,35 @@ pub enum DatasetError {
     },
 }
 
+/// Distance between the taxels of the sensor that was pressed, in mm. All sources have the same one.
+pub fn pitch_mm(sources: &[Source]) -> f64 {
+    let told = sources.first().and_then(|source| source.pitch_mm);
+    told.unwrap_or(PITCH_MM)
+}
+
+/// Numbers the objects of a file after those of other files, which have the numbers below `first`.
+/// `last` is the greatest number in the file. Gives what to add to its numbers, and the first
+/// number after them.
+pub(super) fn objects_after(
+    first: u64,
+    last: Option<u32>,
+    path: PathBuf,
+) -> Result<(u32, u64), DatasetError> {
+    let next = last.map_or(first, |last| first + u64::from(last) + 1);
+    match u32::try_from(first) {
+        Ok(before) if next <= u64::from(u32::MAX) + 1 => Ok((before, next)),
+        _ => Err(DatasetError::Array {
+            path,
+            array: "object",
+            found: last.unwrap_or_default().to_string(),
+            expected: format!(
+                "no number that, after {first} of other files, is beyond {}",
+                u32::MAX
+            ),
+        }),
+    }
+}
+
 impl Dataset {
     /// Reads an `.npz` file.
     ///
@@ -281,22 +329,8 @@ impl Dataset {
                 });
             }
             let last = part.samples.iter().filter_map(|sample| sample.object).max();
-            let next = last.map_or(first_object, |last| first_object + u64::from(last) + 1);
-            let too_many = DatasetError::Array {
-                path,
-                array: "object",
-                found: last.unwrap_or_default().to_string(),
-                expected: format!(
-                    "no number that, after {first_object} of other files, is beyond {}",
-                    u32::MAX
-                ),
-            };
-            let Ok(before) = u32::try_from(first_object) else {
-                return Err(too_many);
-            };
-            if next > u64::from(u32::MAX) + 1 {
-                return Err(too_many);
-            }
+            let before;
+            (before, first_object) = objects_after(first_object, last, path)?;
             all.samples
                 .extend(part.samples.into_iter().map(|sample| Sample {
                     object: sample.object.map(|object| object + before),
@@ -305,15 +339,13 @@ impl Dataset {
                 }));
             all.sources.extend(part.sources);
             all.paths.extend(part.paths);
-            first_object = next;
         }
         Ok(all)
     }
 
     /// Distance between the taxels of the sensor that was pressed, in mm.
     pub fn pitch_mm(&self) -> f64 {
-        let told = self.sources.first().and_then(|source| source.pitch_mm);
-        told.unwrap_or(PITCH_MM)
+        pitch_mm(&self.sources)
     }
 
     /// An object that has samples in both splits, if there is one.

@@ -12,7 +12,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::verdict::argmax;
 
-pub use by_object::{Estimate, ObjectCount, accuracy_by_object, by_object, difference_by_object};
+pub use by_object::{
+    Clusters, Estimate, ObjectCount, accuracy_by_object, by_object, difference_by_object,
+};
 
 /// Number of equal bins of the largest probability in the expected calibration error.
 const CALIBRATION_BINS: usize = 15;
@@ -103,7 +105,7 @@ impl Evaluation {
             ece: calibration_error(judged),
             nll: negative_log_likelihood(judged),
             accuracy_interval_by_object: by_object(judged)
-                .and_then(|objects| accuracy_by_object(&[&objects]))
+                .and_then(|objects| accuracy_by_object(&[&objects], Clusters::Objects))
                 .and_then(|estimate| estimate.interval),
         }
     }

@@ -10,6 +10,9 @@ use crate::train::learn::fit;
 
 /// Sets of levels and intervals of Shore hardness miss the truth in at most this share of cases.
 pub const ALPHA: f32 = 0.1;
+/// The fewest held-out objects with which [`ALPHA`] can be promised: with n objects, at least one in
+/// n + 1 cases may exceed the greatest value among them.
+pub const LEAST_OBJECTS: usize = 9;
 /// A quantile is the mean over this many draws of one press from each object.
 const DRAWS: usize = 50;
 
@@ -38,6 +41,8 @@ pub struct Calibration {
     /// A set of levels holds the levels of at least this probability. 0 means that there are no
     /// sets.
     pub threshold: f32,
+    /// The number of held-out objects, and of those whose Shore hardness was measured.
+    pub objects: [usize; 2],
 }
 
 impl Calibration {
@@ -46,10 +51,20 @@ impl Calibration {
         temperature: 1.0,
         widths: [0.0; 2],
         threshold: 0.0,
+        objects: [0; 2],
     };
 
-    /// Calibrates on held-out presses. `stream` draws presses of the objects.
-    pub fn of(presses: &[Judged], stream: &mut Stream, device: &Device) -> Self {
+    /// Calibrates on held-out presses. `stream` draws presses of the objects. Without held-out
+    /// presses, temperature and widths are those of `start`. With fewer than [`LEAST_OBJECTS`]
+    /// objects, only the widths are, and there are no sets.
+    pub fn of(presses: &[Judged], start: &Self, stream: &mut Stream, device: &Device) -> Self {
+        if presses.is_empty() {
+            return Self {
+                threshold: 0.0,
+                objects: [0; 2],
+                ..*start
+            };
+        }
         let level_and_logits = |press: &Judged| (press.level, press.logits.clone());
         let judged: Vec<_> = presses.iter().map(level_and_logits).collect();
         let temperature = fit::temperature(&judged);
@@ -59,20 +74,45 @@ impl Calibration {
             .iter()
             .zip(&probabilities)
             .map(|(press, row)| (press.object, -row[press.level]));
-        let Some(wrong) = quantile(&by_object(wrong), stream) else {
-            return Self::NONE;
-        };
+        let wrong = by_object(wrong);
+        let threshold = quantile(&wrong, stream).map_or(0.0, |wrong| -wrong);
         let outside = presses.iter().filter_map(|press| {
             let [_, low, high] = press.said;
             let shore = press.shore?;
             Some((press.object, (low - shore).max(shore - high)))
         });
-        let width = quantile(&by_object(outside), stream).unwrap_or(0.0);
+        let outside = by_object(outside);
+        let width = quantile(&outside, stream);
         Self {
             temperature,
-            widths: [width; 2],
-            threshold: -wrong,
+            widths: width.map_or(start.widths, |width| [width; 2]),
+            threshold,
+            objects: [wrong.len(), outside.len()],
         }
+    }
+
+    /// What the calibration cannot promise, and why, in one line. `None` if it promises both the
+    /// sets of levels and the interval of the Shore hardness.
+    pub fn missing(&self) -> Option<String> {
+        let [objects, _] = self.objects;
+        if objects >= LEAST_OBJECTS {
+            return self.missing_interval();
+        }
+        Some(format!(
+            "held-out objects: found {objects}, expected at least {LEAST_OBJECTS}: there are no sets \
+             of levels, and nothing promises that the interval of the Shore hardness holds"
+        ))
+    }
+
+    /// The same of the interval alone.
+    pub fn missing_interval(&self) -> Option<String> {
+        let [_, measured] = self.objects;
+        (measured < LEAST_OBJECTS).then(|| {
+            format!(
+                "held-out objects with a measured Shore hardness: found {measured}, expected at \
+                 least {LEAST_OBJECTS}: nothing promises that the interval of the Shore hardness holds"
+            )
+        })
     }
 }
 
@@ -87,12 +127,12 @@ fn by_object(values: impl Iterator<Item = (u32, f32)>) -> Vec<Vec<f32>> {
 
 /// The split-conformal quantile of 1 - [`ALPHA`] for exchangeable objects: with one press of each
 /// of n objects, the value of rank ceil((1 - alpha)(n + 1)), averaged over draws of the presses.
-/// `None` without objects.
+/// `None` with fewer objects than the rank: no value is then large enough.
 fn quantile(objects: &[Vec<f32>], stream: &mut Stream) -> Option<f32> {
-    if objects.is_empty() {
+    let rank = ((1.0 - ALPHA) * (objects.len() + 1) as f32).ceil() as usize;
+    if rank > objects.len() {
         return None;
     }
-    let rank = ((1.0 - ALPHA) * (objects.len() + 1) as f32).ceil() as usize;
     let mut sum = 0.0;
     for _ in 0..DRAWS {
         let mut drawn: Vec<f32> = objects
@@ -100,7 +140,7 @@ fn quantile(objects: &[Vec<f32>], stream: &mut Stream) -> Option<f32> {
             .map(|own| own[stream.below(own.len())])
             .collect();
         drawn.sort_by(f32::total_cmp);
-        sum += drawn[rank.min(drawn.len()) - 1];
+        sum += drawn[rank - 1];
     }
     Some(sum / DRAWS as f32)
 }
@@ -116,8 +156,63 @@ mod tests {
         let mut objects: Vec<Vec<f32>> = (1..=99_u8).map(|n| vec![f32::from(n)]).collect();
         objects[98] = vec![99.0; 1000];
         assert_eq!(quantile(&objects, &mut stream), Some(90.0));
-        // With too few objects for the rank, the quantile is the greatest value.
-        assert_eq!(quantile(&objects[..3], &mut stream), Some(3.0));
-        assert_eq!(quantile(&[], &mut stream), None);
+        // Of nine objects, the rank is the greatest value. Fewer objects are too few for it.
+        assert_eq!(quantile(&objects[..LEAST_OBJECTS], &mut stream), Some(9.0));
+        for few in 0..LEAST_OBJECTS {
+            assert_eq!(quantile(&objects[..few], &mut stream), None, "{few}");
+        }
+    }
+
+    /// Three presses of each of `objects` objects. The first `measured` have a Shore hardness, which
+    /// lies 4 above the interval.
+    fn judged(objects: u32, measured: u32) -> Vec<Judged> {
+        let press = |n: u32| Judged {
+            object: n / 3,
+            level: (n % 2) as usize,
+            shore: (n / 3 < measured).then_some(60.0),
+            logits: vec![1.0, 1.0],
+            said: [55.0, 54.0, 56.0],
+        };
+        (0..3 * objects).map(press).collect()
+    }
+
+    #[test]
+    fn few_objects_give_no_sets_and_promise_nothing() {
+        let (device, start) = (
+            Device::flex(),
+            Calibration {
+                temperature: 1.5,
+                widths: [2.0; 2],
+                threshold: 0.2,
+                objects: [40; 2],
+            },
+        );
+        let of = |objects, measured| {
+            let stream = &mut Stream::new(1, "calibration");
+            Calibration::of(&judged(objects, measured), &start, stream, &device)
+        };
+        let enough = of(9, 9);
+        assert!((enough.threshold - 0.5).abs() < 1e-3, "{enough:?}");
+        assert_eq!((enough.widths, enough.objects), ([4.0; 2], [9, 9]));
+        assert_eq!(enough.missing(), None);
+
+        let few = of(8, 8);
+        assert_eq!((few.threshold, few.widths), (0.0, start.widths));
+        let missing = few.missing().unwrap();
+        assert!(
+            missing.contains("found 8, expected at least 9"),
+            "{missing}"
+        );
+
+        let unmeasured = of(9, 2);
+        assert!(unmeasured.threshold > 0.0 && unmeasured.widths == start.widths);
+        let missing = unmeasured.missing().unwrap();
+        assert!(missing.contains("Shore hardness: found 2"), "{missing}");
+
+        // What was not calibrated on the new data keeps no threshold of the start.
+        let none = of(0, 0);
+        assert_eq!((none.temperature, none.widths), (1.5, start.widths));
+        assert_eq!((none.threshold, none.objects), (0.0, [0; 2]));
+        assert!(none.missing().unwrap().contains("found 0"));
     }
 }

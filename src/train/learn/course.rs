@@ -165,7 +165,8 @@ impl Trained {
 }
 
 /// Trains from random weights or from `start` with its calibration, or continues from the stage's
-/// last checkpoint in `run`.
+/// last checkpoint in `run`. Without held-out objects, the temperature and the interval's widths
+/// stay those of `start`, and there are no sets of levels, because nothing shows whether they hold.
 ///
 /// # Errors
 ///
@@ -175,18 +176,11 @@ pub fn fit(task: &Task, start: Option<(Start, Calibration)>, run: &Run) -> anyho
     let Some((start, calibration)) = start else {
         let initial = course::initial(task.levels, task.seed, task.device);
         let (weights, standard) = task.learnt(initial, task.standard(), run)?;
-        return Ok(task.calibrated(weights, standard));
+        return Ok(task.calibrated(weights, standard, &Calibration::NONE));
     };
     let (weights, standard) = task.learnt(start.weights.clone(), start.standard, run)?;
     let weights = weights.between(&start.weights, epochs::LEARNT_SHARE);
-    if task.held_out.is_empty() {
-        return Ok(Trained {
-            weights,
-            standard,
-            calibration,
-        });
-    }
-    Ok(task.calibrated(weights, standard))
+    Ok(task.calibrated(weights, standard, &calibration))
 }
 
 impl Task<'_> {
@@ -290,7 +284,7 @@ impl Task<'_> {
     }
 
     /// Calibrates on the presses of held-out objects, varied like the training presses.
-    fn calibrated(&self, weights: Weights, standard: Standard) -> Trained {
+    fn calibrated(&self, weights: Weights, standard: Standard, start: &Calibration) -> Trained {
         let mut trained = Trained {
             weights,
             standard,
@@ -314,7 +308,7 @@ impl Task<'_> {
                 said,
             })
             .collect();
-        trained.calibration = Calibration::of(&judged, &mut stream, self.device);
+        trained.calibration = Calibration::of(&judged, start, &mut stream, self.device);
         trained
     }
 }

@@ -112,10 +112,10 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
             }
         }
     };
-    let mut calibration = Calibration {
+    let calibration = Calibration {
         temperature: start.temperature,
         widths: start.widths,
-        threshold: 0.0,
+        ..Calibration::NONE
     };
     let Start {
         weights: initial,
@@ -150,13 +150,10 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
         Some(start) => weights.between(start, epochs::LEARNT_SHARE),
         None => weights,
     };
-    if !task.held_out.is_empty() {
-        calibration = task.calibration(&weights, &standard, &plan)?;
-    }
     Ok(Trained {
+        calibration: task.calibration(&weights, &standard, &plan, &calibration)?,
         weights,
         standard,
-        calibration,
     })
 }
 
@@ -255,12 +252,14 @@ impl Task<'_> {
         Tensor::from_data(TensorData::new(rows, [count, self.levels]), self.device)
     }
 
-    /// Calibrates on the frames of held-out objects, augmented like the training frames.
+    /// Calibrates on the frames of held-out objects, augmented like the training frames. Without
+    /// any, gives `start`.
     fn calibration(
         &self,
         weights: &Weights,
         standard: &Standard,
         plan: &Features,
+        start: &Calibration,
     ) -> anyhow::Result<Calibration> {
         let trained = Trained {
             weights: weights.clone(),
@@ -281,6 +280,6 @@ impl Task<'_> {
             }
         };
         let judged: Vec<Judged> = self.held_out.iter().zip(said).map(judged).collect();
-        Ok(Calibration::of(&judged, &mut stream, self.device))
+        Ok(Calibration::of(&judged, start, &mut stream, self.device))
     }
 }

@@ -80,6 +80,9 @@ pub fn train(
         device,
     };
     let trained = course::fit(&task, start, run)?;
+    if let Some(missing) = trained.calibration.missing() {
+        eprintln!("{missing}");
+    }
     finish(
         run,
         description,
@@ -100,11 +103,10 @@ pub fn start(hrn: &Hrn, bytes: &[u8], device: &Device) -> anyhow::Result<(Start,
     let constants = file::constants(bytes)?;
     let start = network::start(|name| constants.get(name), dataset::levels().len(), device);
     let start = start.ok_or_else(|| NoStart::of(hrn, "presses (course, adapt)"))?;
-    let conformal = hrn.card().conformal;
     let calibration = Calibration {
         temperature: start.temperature,
         widths: start.widths,
-        threshold: conformal.map_or(0.0, |conformal| conformal.threshold),
+        ..Calibration::NONE
     };
     Ok((start, calibration))
 }

@@ -32,6 +32,14 @@ pub struct Samples<'a> {
     pub unlabelled: &'a [usize],
 }
 
+impl Samples<'_> {
+    /// Whether a training sample has a measured Shore hardness.
+    fn has_shore(&self) -> bool {
+        let has_shore = |&index: &usize| self.dataset.samples[index].shore.is_some();
+        self.train.iter().any(has_shore)
+    }
+}
+
 /// Trains from random weights or from `start`, and writes the model and its evaluation to the run's
 /// directory. A resumed run continues from the files there.
 ///
@@ -60,6 +68,10 @@ pub fn train(
         device,
     };
     let trained = frame::fit(&task, start, run)?;
+    let missing = trained.calibration.missing_interval();
+    if let Some(missing) = missing.filter(|_| samples.has_shore()) {
+        eprintln!("{missing}");
+    }
     finish(samples, &trained, description, run, device)
 }
 
@@ -162,11 +174,10 @@ fn finish(
     );
     // Leave the Shore output out if no training sample has a measured hardness: the second head
     // then learnt nothing, or lost what the start knew.
-    let has_shore = |&index: &usize| samples.dataset.samples[index].shore.is_some();
     let recogniser = Recogniser {
         graph,
         raw_logits,
-        shore: samples.train.iter().any(has_shore).then_some(shore),
+        shore: samples.has_shore().then_some(shore),
         temperature: calibration.temperature,
     };
     export::finish(

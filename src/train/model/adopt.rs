@@ -17,7 +17,7 @@ use crate::simulator::Split;
 use crate::train::data::dataset::{self, Dataset};
 use crate::train::judge::metrics::Evaluation;
 use crate::train::net::graph::{INPUT, frame_input, integer, value_info};
-use crate::verdict::{Card, Check, Checks, Hrn};
+use crate::verdict::{COURSE_FRAMES, Card, Check, Checks, Hrn, ModelError, course_inputs};
 
 /// The least probability before a logarithm, because the file's probabilities may round to 0.
 const LEAST_PROBABILITY: f32 = 1e-30;
@@ -32,6 +32,15 @@ pub enum Foreign {
     #[error("inputs: found {found}, expected one, f32 [1,1,{ROWS},{COLS}]")]
     Inputs {
         /// The file's inputs or outputs, with type and shape.
+        found: String,
+    },
+    /// The inputs are those of format 2.
+    #[error(
+        "inputs: found {found}, those of the course of a press (format 2): adopt takes models of one \
+         frame; docs/formats.md says how to write the metadata yourself"
+    )]
+    OfCourse {
+        /// The file's inputs, with type and shape.
         found: String,
     },
     /// No output of the expected shape is called `logits` or `probabilities`, or both differ in
@@ -82,19 +91,32 @@ pub fn mend(proto: &mut pb::ModelProto) -> Result<(Vec<String>, usize), Foreign>
     Ok((done, levels))
 }
 
+/// The inputs of a graph. Before ONNX IR 4, its weights are also listed among the inputs.
+fn inputs(graph: &pb::GraphProto) -> impl Iterator<Item = &pb::ValueInfoProto> {
+    let is_weight = |name: &str| graph.initializer.iter().any(|tensor| tensor.name == name);
+    let inputs = graph.input.iter();
+    inputs.filter(move |input| !is_weight(&input.name))
+}
+
+/// Whether an input has the name of one of format 2.
+pub(super) fn has_course_inputs(proto: &pb::ModelProto) -> bool {
+    let of_course = course_inputs(COURSE_FRAMES.1).map(|(name, _)| name);
+    let mut inputs = proto.graph.iter().flat_map(inputs);
+    inputs.any(|input| of_course.contains(&input.name.as_str()))
+}
+
 /// Mends the input only, and adds the changes to `done`.
 pub(super) fn mend_input(
     proto: &mut pb::ModelProto,
     done: &mut Vec<String>,
 ) -> Result<(), Foreign> {
+    let is_of_course = has_course_inputs(proto);
     let graph = proto.graph.get_or_insert_default();
-    let is_weight = |name: &str| graph.initializer.iter().any(|tensor| tensor.name == name);
-    let inputs: Vec<&pb::ValueInfoProto> = graph
-        .input
-        .iter()
-        .filter(|input| !is_weight(&input.name))
-        .collect();
+    let inputs: Vec<&pb::ValueInfoProto> = inputs(graph).collect();
     let found = || describe(&inputs);
+    if is_of_course {
+        return Err(Foreign::OfCourse { found: found() });
+    }
     let [input] = inputs[..] else {
         return Err(Foreign::Inputs { found: found() });
     };
@@ -229,7 +251,8 @@ pub(super) fn set(proto: &mut pb::ModelProto, card: &Card, checks: &Checks) -> a
 
 /// Adopts a file. Returns the file with its metadata, the changes in its graph, and its evaluation
 /// on the test split if the data set has one. The daemon's own inference library computes the
-/// probabilities of the check frames here.
+/// probabilities of the check frames here. `attempt` tries the file before it is loaded, and
+/// returns an error if loading it would end this process.
 ///
 /// # Errors
 ///
@@ -240,10 +263,11 @@ pub fn adopt(
     bytes: &[u8],
     dataset: &Dataset,
     told: &Told,
+    attempt: impl FnOnce(&[u8]) -> Result<(), ModelError>,
 ) -> anyhow::Result<(Vec<u8>, Vec<String>, Option<Evaluation>)> {
     let mut proto = decode(bytes)?;
     let (done, found) = mend(&mut proto)?;
-    let levels = dataset::levels();
+    let levels = dataset::stated_levels(&dataset.path())?;
     let expected = levels.len();
     ensure!(
         found == expected,
@@ -271,7 +295,9 @@ pub fn adopt(
         probabilities: vec![vec![0.0; expected]; frames.len()],
     };
     set(&mut proto, &card, &Checks::Frames(check.clone()))?;
-    let hrn = Hrn::read(&proto.encode_to_vec())?;
+    let unchecked = proto.encode_to_vec();
+    attempt(&unchecked)?;
+    let hrn = Hrn::read(&unchecked)?;
     let computed = |frame: &&Frame| Ok(hrn.judge(frame)?.probabilities);
     let computed: anyhow::Result<Vec<Vec<f32>>> = frames.iter().map(computed).collect();
     check.probabilities = computed?;

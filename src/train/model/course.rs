@@ -82,7 +82,12 @@ pub fn finish(
         temperature,
         widths,
         threshold,
+        ..
     } = trained.calibration;
+    let mut metrics = json!({ "temperature": temperature });
+    if let Some(missing) = trained.calibration.missing() {
+        metrics["not_promised"] = json!(missing);
+    }
     let checked: Vec<usize> = check_presses(courses, train);
     let of_checked: Vec<Press> = checked
         .iter()
@@ -103,15 +108,17 @@ pub fn finish(
         presses: presses_checked.collect(),
     });
     let best_frame = |&press: &usize| courses.frame(courses.presses[press].best as usize);
+    let learnt = train.iter().map(|&press| &presses[press]);
+    let of_presses = description.settings.reports.ranges(learnt);
     let mut card = Card {
         format: "2".to_owned(),
         levels: levels.clone(),
-        pitch_mm: dataset::PITCH_MM as f32,
+        pitch_mm: dataset::pitch_mm(&description.data) as f32,
         method: description.method.clone(),
         data: data(&description.data)?,
-        metrics: json!({ "temperature": temperature }),
+        metrics,
         validation: validation(&description.data).to_owned(),
-        range: range(train.iter().map(best_frame)),
+        range: range(train.iter().map(best_frame)).with_presses(of_presses),
         conformal: (threshold > 0.0).then_some(Conformal {
             alpha: ALPHA,
             threshold,

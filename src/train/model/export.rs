@@ -193,6 +193,7 @@ pub(super) fn range(frames: impl Iterator<Item = Frame>) -> Range {
     let mut range = Range {
         force_n: [f32::INFINITY, 0.0],
         contact_area_taxels: [u32::MAX, 0],
+        ..Range::ANY
     };
     for frame in frames {
         let (force_n, area) = (

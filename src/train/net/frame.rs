@@ -139,11 +139,10 @@ pub fn graph(
 
     let mut b = Builder(graph);
     let (columns, _) = frames::nodes(&mut b, INPUT, 1);
-    let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
-    let along = || vec![integer("axis", 1)];
-    let columns = b.with("Concat", &columns, "columns", along());
     let columns = standard.nodes(&mut b, &columns);
-    let joint = b.with("Concat", &[&pooled, &columns], "both", along());
+    let columns = b.reshaped(&columns, &[1, FEATURES], "columns");
+    let along = vec![integer("axis", 1)];
+    let joint = b.with("Concat", &[&pooled, &columns], "both", along);
     let joint = b.dense(weights, "joint", [POOLED + FEATURES, LAST], &joint);
     let joint = b.node("Relu", &[&joint], "joint");
     let outputs = b.dense(weights, "head", [LAST, levels + shore::OUTPUTS], &joint);

@@ -5,6 +5,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
+use crate::frame::ROWS;
 use crate::random::Stream;
 use crate::train::net::graph::{self, Graph};
 use crate::train::net::image::Scale;
@@ -162,14 +163,37 @@ pub(super) fn trunk_nodes(
         let slope = vec![graph::number("alpha", LEAKY_SLOPE)];
         x = graph.node("LeakyRelu", &[&x], &format!("{name}.out"), slope);
     }
-    let mut pooled = graph.node("GlobalMaxPool", &[&x], "greatest", Vec::new());
-    if with_means {
-        let means = graph.node("GlobalAveragePool", &[&x], "means", Vec::new());
-        let along = vec![graph::integer("axis", 1)];
-        pooled = graph.node("Concat", &[&pooled, &means], "pooled", along);
+    pool_nodes(graph, &x, with_means)
+}
+
+/// Adds the nodes from the last layer's images to [`network::pooled`], `[1, 64]` or `[1, 128]`. A
+/// pool of the images' size and a matrix product give the same as ONNX's global pools, for which
+/// the inference library takes many times as long.
+fn pool_nodes(graph: &mut Graph, x: &str, with_means: bool) -> String {
+    let size = TRUNK
+        .iter()
+        .fold(ROWS, |size, layer| layer.geometry(size).small());
+    let places = size * size;
+    let kernel = vec![graph::integers("kernel_shape", &[size as i64; 2])];
+    let greatest = graph.node("MaxPool", &[x], "greatest", kernel);
+    let row = graph.indices("a row", &[1, FEATURES as i64]);
+    let greatest = graph.node(
+        "Reshape",
+        &[&greatest, &row],
+        "greatest in a row",
+        Vec::new(),
+    );
+    if !with_means {
+        return greatest;
     }
-    let axis = vec![graph::integer("axis", 1)];
-    graph.node("Flatten", &[&pooled], "features", axis)
+    let rows = graph.indices("a row for each channel", &[FEATURES as i64, places as i64]);
+    let channels = graph.node("Reshape", &[x, &rows], "channels", Vec::new());
+    let share = vec![1.0 / places as f32; places];
+    let share = graph.constant("share of a place", &[places, 1], &share);
+    let means = graph.node("MatMul", &[&channels, &share], "means", Vec::new());
+    let means = graph.node("Reshape", &[&means, &row], "means in a row", Vec::new());
+    let along = vec![graph::integer("axis", 1)];
+    graph.node("Concat", &[&greatest, &means], "pooled", along)
 }
 
 #[cfg(test)]

@@ -43,10 +43,10 @@ impl Standard {
         ((x - self.mean[column]) / self.deviation[column]).clamp(-CLIP, CLIP)
     }
 
-    /// Adds the nodes that bring `x` `[rows, columns]` to the scale, and returns their output's
-    /// name.
+    /// Adds the nodes that bring `x` to the scale, and returns their output's name. Each column is
+    /// a row of `x` `[columns, n]`.
     pub(super) fn nodes(&self, b: &mut Builder, x: &str) -> String {
-        let dims = [self.mean.len()];
+        let dims = [self.mean.len(), 1];
         let mean = b.0.constant("column means", &dims, &self.mean);
         let deviation = b.0.constant("column deviations", &dims, &self.deviation);
         let centred = b.node("Sub", &[x, &mean], "centred");

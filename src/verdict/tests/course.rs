@@ -173,6 +173,93 @@ fn what_is_not_as_agreed_is_refused() {
     }
 }
 
+fn with_range(format: &str, key: &str, range: &Value) -> Result<Hrn, ModelError> {
+    let mut of = json!({"force_n": [0, 100], "contact_area_taxels": [1, 784]});
+    of[key] = range.clone();
+    if format == "2" {
+        return Hrn::load(&course_model(8, &[("hrn.range", of)]));
+    }
+    let mut changed = proto();
+    *value(&mut changed, "hrn.range") = of.to_string();
+    Hrn::load(&changed.encode_to_vec())
+}
+
+const OF_PRESSES: [&str; 5] = [
+    "duration_s",
+    "frame_period_s",
+    "speed_mm_s",
+    "approach_mm",
+    "arm_n_per_mm",
+];
+
+#[test]
+fn the_range_of_presses_is_optional_and_checked() {
+    let hrn = Hrn::load(&course_model(8, &[])).unwrap();
+    assert_eq!(hrn.card().range.of_presses(), [None; 5]);
+    for (place, key) in OF_PRESSES.into_iter().enumerate() {
+        let hrn = with_range("2", key, &json!([0.5, 2])).unwrap();
+        let mut expected = [None; 5];
+        expected[place] = Some([0.5, 2.0]);
+        assert_eq!(hrn.card().range.of_presses(), expected);
+        let written = serde_json::to_value(hrn.card().range).unwrap();
+        assert_eq!(written[key], json!([0.5, 2.0]));
+        assert_eq!(written.as_object().unwrap().len(), 3, "{written}");
+        for refused in [
+            json!([2, 0.5]),
+            json!([-1, 2]),
+            json!([1]),
+            json!([0, 1e39]),
+            json!("fast"),
+        ] {
+            let error = with_range("2", key, &refused).unwrap_err().to_string();
+            assert!(error.contains("`hrn.range`: found"), "{key}: {error}");
+        }
+        let error = with_range("1", key, &json!([0.5, 2])).unwrap_err();
+        let error = error.to_string();
+        assert!(error.contains("the others are of format 2"), "{error}");
+    }
+    let error = with_range("2", "speed", &json!([0.5, 2])).unwrap_err();
+    assert!(error.to_string().contains("unknown field"), "{error}");
+}
+
+#[test]
+fn a_press_is_held_by_the_range_that_it_lies_in() {
+    // Four frames at 0, 0.2, 0.4 and 0.6 s. The arm goes 1 mm in each 0.2 s, and is of 7.5 N/mm.
+    let known = course(4, true);
+    let numbers = [0.6, 0.2, 5.0, 3.0, 7.5];
+    for ((key, number), place) in OF_PRESSES.into_iter().zip(numbers).zip(0..) {
+        let [low, high] = known.extents()[place].unwrap();
+        assert!((low / number - 1.0).abs() < 1e-5 && low == high, "{key}");
+        for (range, is_held) in [([0.5, 1.5], true), ([1.1, 1.5], false), ([0.5, 0.9], false)] {
+            let range = range.map(|part: f32| part * number);
+            let hrn = with_range("2", key, &json!(range)).unwrap();
+            assert_eq!(hrn.card().range.holds(&known), is_held, "{key} {range:?}");
+            // Where nothing is known of the arm, its ranges exclude nothing.
+            let mut unknown = course(4, false);
+            unknown.arm_n_per_mm = 0.0;
+            let held = hrn.card().range.holds(&unknown);
+            assert_eq!(held, is_held || place > 1, "{key} {range:?}");
+        }
+    }
+}
+
+#[test]
+fn an_approach_that_ends_before_the_second_frame_may_have_been_faster() {
+    let speed = |way: &[f32]| {
+        let mut course = course(way.len(), true);
+        for (moment, &mm) in course.moments.iter_mut().zip(way) {
+            moment.approach_mm = Some(mm);
+        }
+        course.extents()[2]
+    };
+    assert_eq!(speed(&[0.0, 1.0, 1.0]), Some([5.0, f32::INFINITY]));
+    let [low, high] = speed(&[0.0, 1.0, 2.0, 2.0]).unwrap();
+    assert!((low - 5.0).abs() < 1e-5 && low == high);
+    // An arm that stands still, or is known at the first frame alone, has no speed.
+    assert_eq!(speed(&[0.0, 0.0]), None);
+    assert_eq!(speed(&[0.0]), None);
+}
+
 /// A network with the nodes of a trained one: convolutions over each frame and over time, and a
 /// GRU. The weights of its last layer are 0, so its outputs are known.
 fn network(most: usize) -> Vec<u8> {

@@ -3,10 +3,11 @@ use std::sync::Arc;
 use super::super::{gather, plain};
 use super::*;
 use crate::event::{Event, Phase};
+use crate::motion::Point;
 use crate::pipeline::{Clock, Pipeline};
 use crate::random::Stream;
 use crate::sensor::{Description, Sensor};
-use crate::simulator::{Material, SensorProfile, Sequence, SequenceSettings};
+use crate::simulator::{ARM_N_PER_MM, Material, SensorProfile, Sequence, SequenceSettings};
 use crate::tare::Gains;
 use crate::verdict::{BUILT_IN, Hrn};
 
@@ -105,16 +106,23 @@ fn too_few_presses_say_nothing() {
 }
 
 /// The bytes of presses on one simulated sensor: first `for_gains` presses, then the others, with
-/// the levels of the others and the true gains.
+/// the arm's position at each frame, the levels of the others and the true gains.
 struct Played {
     first: Vec<u8>,
-    then: Vec<u8>,
+    then: Vec<(Vec<u8>, f64)>,
     levels: Vec<u8>,
     gains: Vec<f32>,
 }
 
+/// The frame rate at which models/course.md has the figures of the course model.
+const RATE_HZ: f64 = 20.0;
+
 fn sensor(gains: Option<Gains>, dead_taxels: Vec<[usize; 2]>) -> Sensor {
-    let mut described = Description::default();
+    let mut described = Description {
+        frame_rate_hz: RATE_HZ,
+        ..Description::default()
+    };
+    described.arm.stiffness_n_per_mm = Some(ARM_N_PER_MM);
     // The sensor needs no tare: it reads 0 at rest, and the bytes may begin with a press.
     described.calibration.tare_frames = 0;
     described.calibration.gains = gains;
@@ -128,6 +136,7 @@ fn play(seed: u64, for_gains: u32, for_verdicts: u32, profile: SensorProfile) ->
         seed,
         materials: Material::ALL.to_vec(),
         presses: Some(for_gains + for_verdicts),
+        frame_rate_hz: RATE_HZ,
         profile,
         ..SequenceSettings::default()
     };
@@ -139,15 +148,16 @@ fn play(seed: u64, for_gains: u32, for_verdicts: u32, profile: SensorProfile) ->
         gains: sequence.gains().to_vec(),
     };
     let mut last = 0;
-    for frame in sequence {
-        let is_first = frame.press <= for_gains;
-        let bytes = if is_first {
-            &mut played.first
-        } else {
-            &mut played.then
-        };
-        layout.layout().encode(&frame.raw, bytes);
-        if !is_first && frame.press != last {
+    for (number, frame) in sequence.enumerate() {
+        if frame.press <= for_gains {
+            layout.layout().encode(&frame.raw, &mut played.first);
+            continue;
+        }
+        let mut bytes = Vec::new();
+        layout.layout().encode(&frame.raw, &mut bytes);
+        let mm = frame.approach.mm(number as f64 / RATE_HZ);
+        played.then.push((bytes, mm));
+        if frame.press != last {
             last = frame.press;
             played.levels.push(frame.material.unwrap().level());
         }
@@ -155,14 +165,19 @@ fn play(seed: u64, for_gains: u32, for_verdicts: u32, profile: SensorProfile) ->
     played
 }
 
-/// The share of right verdicts, on test materials alone.
+/// The share of right verdicts, on test materials alone. The model is told how the arm moves.
 fn right(played: &Played, sensor: Sensor, hrn: &Arc<Hrn>) -> f64 {
     let mut pipeline = Pipeline::new(sensor, hrn.clone(), Clock::FrameRate);
     let start = crate::frame::Stamp {
         mono: std::time::Duration::ZERO,
         wall: jiff::Timestamp::UNIX_EPOCH,
     };
-    let mut events = pipeline.push(&played.then, start);
+    let mut events = Vec::new();
+    for (number, (bytes, mm)) in played.then.iter().enumerate() {
+        let at_ns = (number as f64 / RATE_HZ * 1e9).round() as i64;
+        pipeline.tell(&[Point { at_ns, mm: *mm }]).unwrap();
+        events.extend(pipeline.push(bytes, start));
+    }
     events.extend(pipeline.end_of_recording(None));
     let (mut right, mut all) = (0, 0);
     for event in events {
@@ -219,18 +234,19 @@ fn gains_of_a_raw_simulated_sensor_are_found_from_its_presses() {
 #[test]
 #[ignore = "minutes: cargo test --features train --lib worth_of_gains -- --ignored --nocapture"]
 fn print_the_worth_of_gains() {
-    let hrn = Arc::new(Hrn::load(BUILT_IN).unwrap());
+    let course = std::fs::read("models/course.onnx").unwrap();
+    let models = [BUILT_IN, &course].map(|bytes| Arc::new(Hrn::load(bytes).unwrap()));
     let rows = |gains: &[f32]| {
         Some(Gains::Taxels(
             gains.chunks(28).map(<[f32]>::to_vec).collect(),
         ))
     };
-    for presses in [100, 300, 1000] {
+    for presses in [100, 1000] {
         let (mut lines, sensors) = (Vec::new(), 3);
         for seed in 0..sensors {
             let played = play(100 + seed, presses, 800, SensorProfile::Raw);
             let clean = play(100 + seed, presses, 800, SensorProfile::Clean);
-            let fit = fitted(&played, &hrn);
+            let fit = fitted(&played, &models[0]);
             let truth: Vec<f32> = played
                 .gains
                 .iter()
@@ -239,27 +255,35 @@ fn print_the_worth_of_gains() {
             let dead = (0..TAXELS)
                 .filter(|&k| played.gains[k] < 0.1)
                 .map(|k| [k / 28, k % 28]);
-            lines.push([
-                fit.presses.iter().filter(|&&n| n > 1).count() as f64,
-                correlation(&fit, &played.gains),
-                fit.error,
-                right(&played, sensor(None, Vec::new()), &hrn),
-                right(&played, sensor(rows(&fit.gains), fit.dead.clone()), &hrn),
-                right(&played, sensor(rows(&truth), dead.collect()), &hrn),
-                right(&clean, sensor(None, Vec::new()), &hrn),
-            ]);
+            let sensors = [
+                (&played, sensor(None, Vec::new())),
+                (&played, sensor(rows(&fit.gains), fit.dead.clone())),
+                (&played, sensor(rows(&truth), dead.collect())),
+                (&clean, sensor(None, Vec::new())),
+            ];
+            let verdicts = models.iter().flat_map(|hrn| {
+                let of = |(played, sensor): &(&Played, Sensor)| right(played, sensor.clone(), hrn);
+                sensors.iter().map(of).collect::<Vec<_>>()
+            });
+            let taxels = fit.presses.iter().filter(|&&n| n > 1).count() as f64;
+            let about = [taxels, correlation(&fit, &played.gains), fit.error];
+            lines.push(about.into_iter().chain(verdicts).collect::<Vec<_>>());
         }
         let mean = |at: usize| lines.iter().map(|line| line[at]).sum::<f64>() / sensors as f64;
         println!(
-            "{presses} presses: {:.0} taxels, correlation {:.2}, error {:.3}; right without {:.3}, with {:.3}, \
-             with the true gains {:.3}, clean {:.3}",
+            "{presses} presses: {:.0} taxels, correlation {:.2}, error {:.3}",
             mean(0),
             mean(1),
             mean(2),
-            mean(3),
-            mean(4),
-            mean(5),
-            mean(6)
         );
+        for (name, first) in [("one frame", 3), ("course", 7)] {
+            println!(
+                "  {name}: right without {:.3}, with {:.3}, with the true gains {:.3}, clean {:.3}",
+                mean(first),
+                mean(first + 1),
+                mean(first + 2),
+                mean(first + 3),
+            );
+        }
     }
 }

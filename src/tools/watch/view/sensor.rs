@@ -31,6 +31,8 @@ pub(in crate::tools::watch) struct Sensor {
     /// Approach in mm and force in newtons of the frames of the present or last press, where the
     /// approach is known.
     way: Vec<(f32, f32)>,
+    /// Whether the last point of `way` is of the newest frame.
+    is_way_current: bool,
     pub(in crate::tools::watch) press: Option<Press>,
     /// The verdicts, the newest press first.
     pub(in crate::tools::watch) verdicts: VecDeque<Verdict>,
@@ -123,9 +125,11 @@ impl Sensor {
                     reason: event["reason"].as_str().map(plain),
                 };
                 if press.state == "begin" {
-                    // The newest frame is the first one of this press.
-                    let first = self.way.len().saturating_sub(1);
-                    self.way.drain(..first);
+                    // The newest frame is the first one of this press. Its approach is often
+                    // unknown, because the position after it has not come yet. All points are then
+                    // of the press before.
+                    let first = usize::from(self.is_way_current);
+                    self.way.drain(..self.way.len().saturating_sub(first));
                 }
                 // The daemon may send past events after present ones.
                 let is_older = |known: &Press| (known.number, known.at) > (press.number, press.at);
@@ -193,11 +197,10 @@ impl Sensor {
             self.trace.pop_front();
         }
         self.trace.push_back(load);
-        if let Some(mm) = event["approach_mm"].as_f64()
-            && self.way.len() < MOST_WAY
-        {
-            self.way.push((mm as f32, load.force_n));
-        }
+        let mm = event["approach_mm"].as_f64();
+        let mm = mm.filter(|_| self.way.len() < MOST_WAY);
+        self.way.extend(mm.map(|mm| (mm as f32, load.force_n)));
+        self.is_way_current = mm.is_some();
         self.frame = Some(Frame {
             at,
             newtons,

@@ -2,7 +2,7 @@
 
 use crate::train::compare::digits::rounded;
 use crate::train::compare::results::{Details, Entry, Row, SwapEntry};
-use crate::train::compare::sets::{FRESH, MATCHED, PAPER_SPLIT};
+use crate::train::compare::sets::{self, FRESH, MATCHED, PAPER_SPLIT};
 use crate::train::judge::metrics::{self, Estimate, Evaluation, ObjectCount};
 use crate::train::judge::paper;
 
@@ -68,7 +68,7 @@ fn objects<'a>(row: &Row<'a>, set: &str) -> Vec<(u64, &'a [ObjectCount])> {
 pub fn accuracy(row: &Row, set: &str) -> Option<Estimate> {
     let objects = objects(row, set);
     let seeds: Vec<&[ObjectCount]> = objects.into_iter().map(|(_, objects)| objects).collect();
-    metrics::accuracy_by_object(&seeds)
+    metrics::accuracy_by_object(&seeds, sets::clusters(set))
 }
 
 pub(super) fn interval(row: &Row, set: &str) -> String {
@@ -96,7 +96,8 @@ pub(super) fn minus_reference(row: &Row, rows: &[Row], set: &str) -> String {
         Some((own, other.1))
     };
     let pairs: Vec<(&[ObjectCount], &[ObjectCount])> = own.iter().filter_map(pair).collect();
-    metrics::difference_by_object(&pairs).map_or("-".to_owned(), difference_text)
+    metrics::difference_by_object(&pairs, sets::clusters(set))
+        .map_or("-".to_owned(), difference_text)
 }
 
 /// A method's accuracy minus that of `features` over the assignments, seeds and labels that both

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::CollectError;
 use super::selection::{Judged, Selection};
 use crate::frame::Stamp;
+use crate::motion::Track;
 use crate::pipeline::{Clock, Pipeline};
 use crate::recording::{Entry, FileKind, Found, Labels, Playback, Reader};
 use crate::sensor::Sensor;
@@ -114,8 +115,9 @@ impl Presses {
         } else {
             let mut pipeline = Pipeline::new(sensor.clone(), hrn.clone(), Clock::FrameRate);
             selection.describe(sensor.name(), sensor.description());
-            selection.take(pipeline.push(bytes, NOT_LOOKED_AT), NOT_LOOKED_AT);
-            selection.take(pipeline.end_of_recording(None), NOT_LOOKED_AT);
+            let none = Track::default();
+            selection.take(pipeline.push(bytes, NOT_LOOKED_AT), NOT_LOOKED_AT, &none);
+            selection.take(pipeline.end_of_recording(None), NOT_LOOKED_AT, &none);
             (Labels::new(), sensor.description().calibration.pitch_mm)
         };
         if selection.presses.is_empty() {
@@ -143,7 +145,7 @@ fn play(
     selection: &mut Selection,
 ) -> Result<(Labels, f64), CollectError> {
     let mut playback = Playback::new(hrn.clone());
-    let mut pitch_mm = None;
+    let (mut pitch_mm, none) = (None, Track::default());
     for found in Reader::new(bytes) {
         let found = found.map_err(|source| CollectError::Recording {
             path: path.to_owned(),
@@ -153,17 +155,17 @@ fn play(
             let expected = *pitch_mm.get_or_insert(found);
             check_pitch(path, found, expected, path)?;
         }
-        let at = found.at;
+        let (at, sensor) = (found.at, found.sensor.clone());
         selection.note(&found);
         let events = playback.feed(found);
         let events = events.map_err(|source| CollectError::Sensor {
             path: path.to_owned(),
             source,
         })?;
-        selection.take(events, at);
+        selection.take(events, at, playback.track(&sensor).unwrap_or(&none));
     }
     // A press that is still under way gets no verdict.
-    selection.take(playback.end(), NOT_LOOKED_AT);
+    selection.take(playback.end(), NOT_LOOKED_AT, &none);
     // A recording without a sensor has no press either, so this pitch is never used.
     Ok((playback.labels(), pitch_mm.unwrap_or(dataset::PITCH_MM)))
 }
@@ -192,4 +194,51 @@ pub(super) fn check_pitch(
         expected,
         first: first.to_owned(),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::recording::tests::{hrn, of_a_press};
+
+    /// The approach at each frame of the press of a recording, and the stiffness of the arm.
+    fn approach((bytes, sensor): &(Vec<u8>, Sensor)) -> (Vec<Option<f32>>, f32) {
+        let presses = Presses::of(bytes, Path::new("a.mcap"), sensor, &hrn()).unwrap();
+        let [press] = &presses.judged[..] else {
+            panic!("one press");
+        };
+        let rounded = press.moments.iter().map(|moment| {
+            let mm = moment.approach_mm?;
+            Some((mm * 1e3).round() / 1e3)
+        });
+        (rounded.collect(), press.arm_n_per_mm)
+    }
+
+    #[test]
+    fn positions_from_before_the_recording_are_those_of_its_state() {
+        let recording = of_a_press(|d| d.arm.stiffness_n_per_mm = Some(10.0), None, true);
+        let (found, arm_n_per_mm) = approach(&recording);
+        assert_eq!(found, [0.0, 1.0, 2.0, 3.0, 4.0].map(Some));
+        assert_eq!(arm_n_per_mm, 10.0);
+    }
+
+    #[test]
+    fn without_positions_the_approach_is_that_of_the_speed() {
+        let check = |configured, context, sends, expected: [f32; 5]| {
+            let recording = of_a_press(|d| d.arm.speed_mm_s = configured, context, sends);
+            assert_eq!(approach(&recording).0, expected.map(Some));
+        };
+        let context = Some(json!({"speed_mm_s": 10.0}));
+        // The arm stops when loading ends, with the fourth frame.
+        check(Some(5.0), None, false, [0.0, 1.0, 2.0, 3.0, 3.0]);
+        check(Some(5.0), context.clone(), false, [0.0, 2.0, 4.0, 6.0, 6.0]);
+        check(None, context.clone(), false, [0.0, 2.0, 4.0, 6.0, 6.0]);
+        // Where there are positions, the speed does not count.
+        check(Some(9.0), context, true, [0.0, 1.0, 2.0, 3.0, 4.0]);
+
+        let recording = of_a_press(|d| d.arm.stiffness_n_per_mm = Some(10.0), None, false);
+        assert_eq!(approach(&recording), (vec![None; 5], 0.0));
+    }
 }

@@ -23,8 +23,17 @@ use crate::train::data::dataset::file::{self, Element, File};
 use crate::train::data::dataset::stream::Stream;
 use crate::verdict::{Hrn, sha256_hex};
 
-/// The program that made a part. Another revision may find other presses.
-const MAKER: &str = concat!(env!("CARGO_PKG_VERSION"), " ", env!("HARDNESSD_REVISION"));
+/// Names the program that makes parts, because another one may find other presses. A commit says what the program
+/// was built from. If there is none, or the sources were changed after it, only the program's own bytes do.
+fn maker(commit: &str, program: &Path) -> anyhow::Result<String> {
+    let version = env!("CARGO_PKG_VERSION");
+    // These words are of `build.rs`.
+    if commit != "no checkout" && !commit.ends_with("-dirty") {
+        return Ok(format!("{version} {commit}"));
+    }
+    let bytes = fs::read(program).with_context(|| program.display().to_string())?;
+    Ok(format!("{version} {commit} {}", sha256_hex(&bytes)))
+}
 
 /// A directory of parts.
 #[derive(Debug, Clone)]
@@ -33,19 +42,32 @@ pub struct Parts {
     sensor: Sensor,
     hrn: Arc<Hrn>,
     sequences: bool,
+    maker: String,
 }
 
 impl Parts {
     /// Parts in `directory`, which must exist. `sensor` is the sensor of captures that do not
     /// describe their own, `hrn` judges the presses, and `sequences` says whether all frames of a
     /// press are wanted.
-    pub fn new(directory: PathBuf, sensor: Sensor, hrn: Arc<Hrn>, sequences: bool) -> Self {
-        Self {
+    ///
+    /// # Errors
+    ///
+    /// Fails if this program cannot be read. A build of a commit does not read it.
+    pub fn new(
+        directory: PathBuf,
+        sensor: Sensor,
+        hrn: Arc<Hrn>,
+        sequences: bool,
+    ) -> anyhow::Result<Self> {
+        // The program that runs, even if another one was built in its place.
+        let program = Path::new("/proc/self/exe");
+        Ok(Self {
             directory,
             sensor,
             hrn,
             sequences,
-        }
+            maker: maker(env!("HARDNESSD_REVISION"), program)?,
+        })
     }
 
     pub(super) fn are_sequences(&self) -> bool {
@@ -101,8 +123,8 @@ impl Parts {
             FileKind::Recording => String::new(),
             FileKind::Raw => format!("{:?}", self.sensor),
         };
-        let (model, sequences) = (self.hrn.sha256(), self.sequences);
-        let decides = format!("{MAKER} {model} {sequences} {sha256} {sensor}");
+        let (maker, model, sequences) = (&self.maker, self.hrn.sha256(), self.sequences);
+        let decides = format!("{maker} {model} {sequences} {sha256} {sensor}");
         format!("{}.npz", sha256_hex(decides.as_bytes()))
     }
 }
@@ -189,4 +211,35 @@ fn add_head(mut part: Stream<Cursor<Vec<u8>>>, head: &Head) -> anyhow::Result<Ve
     let text = serde_json::to_vec(head)?;
     part.add("meta", &[text.len()], block(text))?;
     Ok(part.finish()?.into_inner())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn two_programs_of_one_commit_are_told_apart_unless_the_commit_says_all() {
+        let directory = tempfile::tempdir().unwrap();
+        let [one, other] = ["one", "other"].map(|name| {
+            let path = directory.path().join(name);
+            fs::write(&path, name).unwrap();
+            path
+        });
+        for (commit, are_same) in [
+            ("0123456789ab", true),
+            ("v0.2.0-3-g0123456789ab", true),
+            ("0123456789ab-dirty", false),
+            ("no checkout", false),
+        ] {
+            let first = maker(commit, &one).unwrap();
+            assert_eq!(first, maker(commit, &one).unwrap(), "{commit}");
+            assert_eq!(
+                first == maker(commit, &other).unwrap(),
+                are_same,
+                "{commit}"
+            );
+            let missing = maker(commit, &directory.path().join("none"));
+            assert_eq!(missing.is_ok(), are_same, "{commit}");
+        }
+    }
 }

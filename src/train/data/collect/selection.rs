@@ -8,8 +8,9 @@ use jiff::Timestamp;
 use crate::event::{Event, Hardness, Phase, PressState};
 use crate::frame::{Frame, Stamp};
 use crate::motion::Track;
+use crate::pipeline::{approach_by_speed, approach_speed_mm_s, says_something};
 use crate::press::thinned;
-use crate::recording::{Entry, Found, Input};
+use crate::recording::{Entry, Found};
 use crate::sensor::Description;
 use crate::simulator::MOST_FRAMES;
 
@@ -57,7 +58,7 @@ pub(super) struct Selection {
     pub(super) presses: Vec<Judged>,
 }
 
-/// The frames, press and arm of one sensor.
+/// The frames and the press of one sensor.
 #[derive(Debug, Default)]
 struct Held {
     /// The frames of the press under way. Without a press, the newest frame.
@@ -66,7 +67,8 @@ struct Held {
     /// Numbers of the first and the last frame of the press.
     began: Option<u64>,
     last: u64,
-    track: Track,
+    /// The speed of the approach when the press under way began, if it is known.
+    speed_mm_s: Option<f64>,
     described: Description,
 }
 
@@ -78,14 +80,9 @@ struct Shown {
 }
 
 impl Selection {
-    /// Takes the arm's positions and the sensor's description from an entry of a recording.
+    /// Takes the sensor's description from an entry of a recording.
     pub(super) fn note(&mut self, found: &Found) {
         match &found.entry {
-            Entry::Input(Input::Motion(points)) => {
-                let held = self.held.entry(found.sensor.clone()).or_default();
-                // A step back makes the approach of its press unknown.
-                let _ = held.track.push(points);
-            }
             Entry::Settings(sensor) => self.describe(&found.sensor, &sensor.description),
             Entry::State(state) => self.describe(&found.sensor, &state.sensor.description),
             Entry::Input(_) => {}
@@ -99,8 +96,9 @@ impl Selection {
         }
     }
 
-    /// Takes the events of the input that arrived at `at`.
-    pub(super) fn take(&mut self, events: Vec<Event>, at: Stamp) {
+    /// Takes the events of the input that arrived at `at`. `track` has the positions of the arm, as
+    /// the pipeline of these events knows them.
+    pub(super) fn take(&mut self, events: Vec<Event>, at: Stamp, track: &Track) {
         for event in events {
             let held = self.held.entry(event.sensor().to_owned()).or_default();
             match event {
@@ -119,12 +117,16 @@ impl Selection {
                 Event::Press(press) => {
                     held.is_pressed = press.state == PressState::Begin;
                     match press.state {
-                        PressState::Begin => held.began = Some(press.frame),
+                        PressState::Begin => {
+                            held.began = Some(press.frame);
+                            let (context, arm) = (press.context.as_ref(), &held.described.arm);
+                            held.speed_mm_s = approach_speed_mm_s(context, arm);
+                        }
                         PressState::End | PressState::Aborted => held.last = press.frame,
                     }
                 }
                 Event::Hardness(verdict) if verdict.phase == Phase::Final => {
-                    self.presses.extend(held.judged(&verdict));
+                    self.presses.extend(held.judged(&verdict, track));
                 }
                 Event::Hardness(_) | Event::Status(_) => {}
             }
@@ -134,7 +136,7 @@ impl Selection {
 
 impl Held {
     /// The press that has just ended.
-    fn judged(&mut self, verdict: &Hardness) -> Option<Judged> {
+    fn judged(&mut self, verdict: &Hardness, track: &Track) -> Option<Judged> {
         // The chosen frame of a press that began before the recording may be missing from it.
         let chosen = self.frames.get(&verdict.frame)?;
         let mut judged = Judged {
@@ -162,9 +164,19 @@ impl Held {
         let moments: Vec<Duration> = pressed.iter().map(|(_, shown)| shown.mono).collect();
         let arm = &self.described.arm;
         let (begin, end) = (moments[0], moments[moments.len() - 1]);
-        let told = self.track.is_told(end, arm.delay_ms);
-        let way = told.then(|| self.track.approach(begin, &moments, arm.delay_ms));
-        let way = way.flatten().unwrap_or_else(|| vec![None; moments.len()]);
+        // The approach is what the daemon would give a model: from positions, or else from the speed.
+        let way = if track.is_told(end, arm.delay_ms) {
+            track.approach(begin, &moments, arm.delay_ms)
+        } else {
+            self.speed_mm_s.map(|speed_mm_s| {
+                let shown = pressed.iter().map(|(_, shown)| &shown.newtons);
+                let force_n = |newtons: &Vec<f32>| newtons.iter().map(|&n| f64::from(n)).sum();
+                let forces_n: Vec<f64> = shown.map(force_n).collect();
+                approach_by_speed(speed_mm_s, &moments, &forces_n)
+            })
+        };
+        let way = way.filter(|way| says_something(way, best));
+        let way = way.unwrap_or_else(|| vec![None; moments.len()]);
         let mut before_s = -1.0_f32;
         for place in thinned(pressed.len(), best, MOST_FRAMES) {
             // Two frames may have arrived at the same moment, but times in a file must ascend.

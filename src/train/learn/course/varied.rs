@@ -5,11 +5,17 @@ use super::Press;
 use crate::random::Stream;
 use crate::train::net::frames::FEATURES;
 use crate::train::settings::ArmReports;
+use crate::verdict::{Extents, extents};
 
 /// The least number of frames of a press that is judged before its end or seen by a slower sensor.
 const LEAST_FRAMES: usize = 3;
 /// The slowest sensor sees one frame of this many.
 const MOST_FRAMES_A_STEP: usize = 8;
+/// This share of the training presses lies below a range of [`ArmReports::ranges`], and the same
+/// share above. The longest of a hundred thousand presses says little about training.
+const TAIL: f64 = 0.001;
+/// A range is at least this much wider at both ends, relatively, so that rounding does not count.
+const MARGIN: f64 = 0.01;
 
 impl ArmReports {
     /// The press as a robot might report it.
@@ -60,7 +66,79 @@ impl ArmReports {
     }
 }
 
+impl ArmReports {
+    /// The ranges of the training presses as training changes them: with the robot's errors, judged
+    /// before the end, and as a slower sensor sees them. Of each number, one in a thousand presses
+    /// lies below the range and one in a thousand above.
+    pub fn ranges<'a>(&self, presses: impl Iterator<Item = &'a Press> + Clone) -> Extents {
+        let whole = ranges_of(presses.clone().map(|press| press.extents(usize::MAX)));
+        let early = presses.clone().map(|press| press.extents(LEAST_FRAMES));
+        let slower = presses.map(|press| {
+            let step = (press.moments.len() / LEAST_FRAMES).clamp(1, MOST_FRAMES_A_STEP);
+            let [_, period, ..] = press.extents(usize::MAX);
+            let slower = period.map(|ends| ends.map(|period_s| period_s * step as f32));
+            [None, slower, None, None, None]
+        });
+        let mut ranges = whole;
+        if self.early > 0.0 {
+            ranges = joined(ranges, ranges_of(early));
+        }
+        if self.slower > 0.0 {
+            ranges = joined(ranges, ranges_of(slower));
+        }
+        if self.unknown >= 1.0 {
+            ranges[2..].fill(None);
+        }
+        if self.unknown_arm >= 1.0 {
+            ranges[4] = None;
+        }
+        let errors = [0.0, 0.0, self.position, self.position, self.arm];
+        for (range, error) in ranges.iter_mut().zip(errors) {
+            let error = error.max(MARGIN) as f32;
+            *range = range.map(|[least, most]| {
+                let most = (most * (1.0 + error)).min(f32::MAX);
+                [least * (1.0 - error), most]
+            });
+        }
+        ranges
+    }
+}
+
+/// The range of each number: between the quantiles [`TAIL`] and 1 - [`TAIL`] of the presses for
+/// which it is known.
+fn ranges_of(presses: impl Iterator<Item = Extents>) -> Extents {
+    let all: Vec<Extents> = presses.collect();
+    std::array::from_fn(|number| {
+        let known = all.iter().filter_map(|press| press[number]);
+        let known = known.filter(|[low, _]| low.is_finite());
+        let (mut lows, mut highs): (Vec<f32>, Vec<f32>) =
+            known.map(|[low, high]| (low, high)).unzip();
+        lows.sort_unstable_by(f32::total_cmp);
+        highs.sort_unstable_by(f32::total_cmp);
+        let tail = (TAIL * lows.len() as f64) as usize;
+        // Where a press only bounds a number, the other presses tell its ends.
+        let least = *highs.get(tail)?;
+        let most = *lows.get(lows.len().checked_sub(1 + tail)?)?;
+        Some([least.min(most).max(0.0), most.max(0.0)])
+    })
+}
+
+/// The ranges that hold both.
+fn joined(one: Extents, other: Extents) -> Extents {
+    std::array::from_fn(|number| match (one[number], other[number]) {
+        (Some([least, most]), Some([low, high])) => Some([least.min(low), most.max(high)]),
+        (range, None) | (None, range) => range,
+    })
+}
+
 impl Press {
+    /// The numbers of the press's first `frames` frames that `hrn.range` states.
+    fn extents(&self, frames: usize) -> Extents {
+        let moments = self.moments.iter().take(frames);
+        let moments: Vec<_> = moments.map(|m| (m.time_s, m.approach_mm)).collect();
+        extents(&moments, self.arm_n_per_mm)
+    }
+
     /// Keeps every k-th frame, from a randomly chosen first one. The first frame kept becomes the
     /// press's begin, from which times and the approach count.
     fn slow_down(&mut self, stream: &mut Stream) {
@@ -201,5 +279,98 @@ mod tests {
                 .iter()
                 .all(|p| p.moments.len() >= 3 && p.features.len() == p.moments.len() * FEATURES)
         );
+    }
+
+    /// A press at `speed_mm_s` of ten frames, with this time between them.
+    fn pressed(speed_mm_s: f32, period_s: f32) -> Press {
+        let mut press = press();
+        for (place, moment) in (0_u8..).zip(&mut press.moments) {
+            moment.time_s = period_s * f32::from(place);
+            moment.approach_mm = Some(speed_mm_s * moment.time_s);
+        }
+        press
+    }
+
+    const EXACT: ArmReports = ArmReports {
+        unknown: 0.0,
+        unknown_arm: 0.0,
+        exact: 1.0,
+        position: 0.0,
+        arm: 0.0,
+        clock_frames: 0.0,
+        early: 0.0,
+        slower: 0.0,
+    };
+
+    fn check_ranges(reports: &ArmReports, expected: [Option<[f32; 2]>; 5]) {
+        let presses = [pressed(4.0, 0.1), pressed(8.0, 0.05)];
+        let found = reports.ranges(presses.iter());
+        for (found, expected) in found.into_iter().zip(expected) {
+            let (Some(found), Some(expected)) = (found, expected) else {
+                assert_eq!(found, expected, "{reports:?}");
+                continue;
+            };
+            for (found, expected) in found.into_iter().zip(expected) {
+                assert!((found / expected - 1.0).abs() < 1e-4, "{found} {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn ranges_are_those_of_the_presses_as_training_varies_them() {
+        let wider =
+            |[least, most]: [f32; 2], by: f32| Some([least * (1.0 - by), most * (1.0 + by)]);
+        let (duration, period) = (wider([0.45, 0.9], 0.01), wider([0.05, 0.1], 0.01));
+        let (speed, way) = ([4.0, 8.0], [3.6, 3.6]);
+        let exact = [
+            duration,
+            period,
+            wider(speed, 0.01),
+            wider(way, 0.01),
+            wider([10.0; 2], 0.01),
+        ];
+        check_ranges(&EXACT, exact);
+        // The first three frames of the faster sensor, and every third frame of the slower one.
+        let early = ArmReports {
+            early: 0.1,
+            slower: 0.1,
+            position: 0.1,
+            arm: 0.3,
+            ..EXACT
+        };
+        let varied = [
+            wider([0.1, 0.9], 0.01),
+            wider([0.05, 0.3], 0.01),
+            wider(speed, 0.1),
+            wider([0.8, 3.6], 0.1),
+            wider([10.0; 2], 0.3),
+        ];
+        check_ranges(&early, varied);
+        let unknown = [duration, period, None, None, None];
+        check_ranges(
+            &ArmReports {
+                unknown: 1.0,
+                ..EXACT
+            },
+            unknown,
+        );
+        let [duration, period, speed, way, _] = exact;
+        let unknown_arm = ArmReports {
+            unknown_arm: 1.0,
+            ..EXACT
+        };
+        check_ranges(&unknown_arm, [duration, period, speed, way, None]);
+        assert_eq!(EXACT.ranges([].iter()), [None; 5]);
+    }
+
+    #[test]
+    fn one_press_of_many_is_no_range() {
+        let mut presses: Vec<Press> = (0..2000).map(|_| pressed(5.0, 0.1)).collect();
+        presses[7] = pressed(5.0, 10.0);
+        let [duration, ..] = EXACT.ranges(presses.iter());
+        assert!(duration.unwrap()[1] < 1.0, "{duration:?}");
+        // Of a thousand presses, one is more than the tail.
+        let [duration, ..] = EXACT.ranges(presses[..999].iter());
+        assert!(duration.unwrap()[1] > 90.0, "{duration:?}");
     }
 }

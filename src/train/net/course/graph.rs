@@ -24,7 +24,7 @@ pub(super) const LEAST_ARM: f32 = 0.1;
 pub(super) const TINY_N: f32 = 1e-4;
 
 impl Builder {
-    /// The columns of [`super::motion`], `[FRAMES, 1]` each.
+    /// The columns of [`super::motion`], `[1, FRAMES]` each.
     fn motion(&mut self, force: &str) -> Vec<String> {
         let time = self.logarithm("time_s", MOST_S, TIME_S);
         let [zero, one, last] = [0, 1, FRAMES as i64 - 1]
@@ -64,7 +64,7 @@ impl Builder {
         // The product with the mask repeats the stiffness for every frame.
         let stiffness = self.node("Mul", &["mask", &stiffness], "stiffness");
 
-        let rows = [
+        vec![
             time,
             step,
             "known".to_owned(),
@@ -72,10 +72,7 @@ impl Builder {
             depth,
             linear,
             stiffness,
-        ];
-        rows.iter()
-            .map(|row| self.reshaped(row, &[FRAMES, 1], &format!("column {row}")))
-            .collect()
+        ]
     }
 
     /// A residual convolution over time of `x` `[1, HIDDEN, FRAMES]`.
@@ -108,6 +105,38 @@ impl Builder {
         let added = self.node("Relu", &[&sum], &format!("{name}.added"));
         let all = self.node("Add", &[x, &added], &format!("{name}.all"));
         self.node("Mul", &[&all, mask], &format!("{name}.out"))
+    }
+
+    /// The pools over time of `x` `[1, HIDDEN, FRAMES]`, `[1, POOLS * HIDDEN]`. Both means are one
+    /// matrix product.
+    fn pooled(&mut self, x: &str, force: &str) -> String {
+        let along = |axis| vec![integer("axis", axis)];
+        let there = self.node("Mul", &[force, "mask"], "forces there");
+        let shares = self.with("Concat", &["mask", &there], "shares", along(0));
+        self.0.constant("ones", &[FRAMES, 1], &[1.0; FRAMES]);
+        self.0.constant("tiny force", &[2, 1], &[0.0, TINY_N]);
+        let total = self.node("Gemm", &[&shares, "ones", "tiny force"], "sums of shares");
+        let by_channel = self.reshaped(x, &[HIDDEN, FRAMES], "by channel");
+        let transposed = vec![integer("transB", 1)];
+        let sums = self.with(
+            "Gemm",
+            &[&shares, &by_channel],
+            "sums over time",
+            transposed,
+        );
+        let means = self.node("Div", &[&sums, &total], "means over time");
+        let means = self.reshaped(&means, &[1, 2 * HIDDEN], "means in a row");
+        let [zero, half, all, axis] = [0, HIDDEN, 2 * HIDDEN, 1].map(|value| {
+            self.0
+                .indices(&format!("means at {value}"), &[value as i64])
+        });
+        let mean = self.node("Slice", &[&means, &zero, &half, &axis], "mean");
+        let weighted = self.node("Slice", &[&means, &half, &all, &axis], "weighted mean");
+        let image = self.reshaped(x, &[1, HIDDEN, 1, FRAMES], "as an image");
+        let kernel = vec![integers("kernel_shape", &[1, FRAMES as i64])];
+        let greatest = self.with("MaxPool", &[&image], "greatest", kernel);
+        let greatest = self.reshaped(&greatest, &[1, HIDDEN], "greatest over time");
+        self.with("Concat", &[&mean, &greatest, &weighted], "pooled", along(1))
     }
 }
 
@@ -149,22 +178,23 @@ pub fn graph(
     widths: [f32; 2],
 ) -> (Graph, String, String) {
     let mut b = Builder(Graph::default());
-    let (mut columns, force) = frames::nodes(&mut b, "frames", FRAMES);
-    let force = b.reshaped(&force, &[1, FRAMES], "forces");
-    columns.extend(b.motion(&force));
-    let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
+    let (features, force) = frames::nodes(&mut b, "frames", FRAMES);
+    let motion = b.motion(&force);
+    let mut columns = vec![features.as_str()];
+    columns.extend(motion.iter().map(String::as_str));
     let along = |axis| vec![integer("axis", axis)];
-    let all = b.with("Concat", &columns, "columns", along(1));
+    let all = b.with("Concat", &columns, "columns", along(0));
     let x = standard.nodes(&mut b, &all);
 
-    let x = b.dense(weights, "embed", [COLUMNS, HIDDEN], &x);
+    let matrix = weights.numbers("embed.matrix");
+    let matrix = b.0.constant("embed.matrix", &[COLUMNS, HIDDEN], &matrix);
+    let bias = weights.numbers("embed.bias");
+    let bias = b.0.constant("embed.bias", &[HIDDEN], &bias);
+    let bias = b.reshaped(&bias, &[HIDDEN, 1], "embed.bias of rows");
+    // [COLUMNS, FRAMES] -> [HIDDEN, FRAMES]
+    let transposed = vec![integer("transA", 1)];
+    let x = b.with("Gemm", &[&matrix, &x, &bias], "embed.sum", transposed);
     let x = b.node("Relu", &[&x], "embedded");
-    let x = b.with(
-        "Transpose",
-        &[&x],
-        "by channel",
-        vec![integers("perm", &[1, 0])],
-    );
     let x = b.reshaped(&x, &[1, HIDDEN, FRAMES], "over time");
     let mask = b.reshaped("mask", &[1, 1, FRAMES], "mask over time");
     let mut x = b.node("Mul", &[&x, &mask], "first");
@@ -172,25 +202,7 @@ pub fn graph(
         x = b.convolution(weights, layer, &x, &mask);
     }
 
-    let axis = b.0.indices("time axis", &[2]);
-    let summed = |b: &mut Builder, x: &str, name: &str| {
-        b.with("ReduceSum", &[x, &axis], name, vec![integer("keepdims", 0)])
-    };
-    let sum = summed(&mut b, &x, "sum over time");
-    let count = summed(&mut b, &mask, "frames there");
-    let mean = b.node("Div", &[&sum, &count], "mean over time");
-    let options = vec![integers("axes", &[2]), integer("keepdims", 0)];
-    let greatest = b.with("ReduceMax", &[&x], "greatest over time", options);
-    let over_time = b.reshaped(&force, &[1, 1, FRAMES], "forces over time");
-    let there = b.node("Mul", &[&over_time, &mask], "forces there");
-    let weighted = b.node("Mul", &[&x, &there], "weighted");
-    let weighted = summed(&mut b, &weighted, "weighted sum");
-    let total = summed(&mut b, &there, "force of all");
-    let tiny = b.scalar("tiny force", TINY_N);
-    let total = b.node("Add", &[&total, &tiny], "force of all raised");
-    let weighted = b.node("Div", &[&weighted, &total], "weighted mean");
-    let pooled = b.with("Concat", &[&mean, &greatest, &weighted], "pooled", along(1));
-
+    let pooled = b.pooled(&x, &force);
     let joint = b.dense(weights, "joint", [POOLS * HIDDEN, LAST], &pooled);
     let joint = b.node("Relu", &[&joint], "joint");
     let outputs = b.dense(weights, "head", [LAST, levels + shore::OUTPUTS], &joint);
