@@ -6,6 +6,7 @@
 //! ready to be sent. The daemon starts without its sensors and waits for them.
 
 mod accept;
+pub mod busy;
 mod client;
 pub mod config;
 pub mod descriptors;

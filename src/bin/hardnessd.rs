@@ -10,7 +10,7 @@ use std::time::Duration;
 use clap::Parser;
 use hardnessd::daemon::config::{Error as ConfigError, Setup};
 use hardnessd::daemon::log::{Log, Settings as LogSettings};
-use hardnessd::daemon::{Daemon, Reload};
+use hardnessd::daemon::{Daemon, Reload, busy};
 use hardnessd::tools::args::{Args, Command};
 use hardnessd::tools::exit::{self, Failure, Stop};
 #[cfg(feature = "zenoh")]
@@ -33,6 +33,8 @@ fn main() -> ExitCode {
     }
     let runtime = match tokio::runtime::Builder::new_current_thread()
         .enable_all()
+        .on_thread_unpark(busy::begins)
+        .on_thread_park(busy::ends)
         .build()
     {
         Ok(runtime) => runtime,

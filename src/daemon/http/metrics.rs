@@ -4,6 +4,8 @@
 //! Every scrape asks the hub and the sensors, so nothing is counted twice. A series exists from the
 //! start with the value 0, so that its first change is seen.
 
+use std::sync::atomic::AtomicU64;
+
 use prometheus_client::encoding::text;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
@@ -11,6 +13,7 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
 
+use crate::daemon::busy;
 use crate::daemon::hub::{Counts, Survey, Verdicts};
 use crate::daemon::sensor::Vitals;
 use crate::event::{self, LinkState};
@@ -19,7 +22,7 @@ pub(super) const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0
 
 type Labels = Vec<(&'static str, String)>;
 type Counters = Family<Labels, Counter>;
-type Gauges = Family<Labels, Gauge<f64, std::sync::atomic::AtomicU64>>;
+type Gauges = Family<Labels, Gauge<f64, AtomicU64>>;
 
 /// The state of the hub and the sensors in the text format. Every series has the label `robot`.
 pub(super) fn encode(survey: &Survey, vitals: &[Vitals]) -> String {
@@ -58,6 +61,10 @@ pub(super) fn encode(survey: &Survey, vitals: &[Vitals]) -> String {
         counter.inc_by(count);
         registry.register(name, help, counter);
     }
+    let busy: Gauge<f64, AtomicU64> = Gauge::default();
+    busy.set(busy::longest().as_secs_f64());
+    let help = "Longest time that the daemon worked without a wait";
+    registry.register_with_unit("longest_work", help, Unit::Seconds, busy);
     let mut text = String::new();
     text::encode(&mut text, &registry).expect("writing to a string cannot fail");
     text
