@@ -1,8 +1,12 @@
 #!/usr/bin/env python3
-"""Accuracies and their 95 % intervals, computed again from the committed counts of objects.
+"""Accuracies or their differences, with 95 % intervals, computed again from the committed counts of objects.
 
     pip install numpy scipy
-    python3 results/intervals.py results/quick [SET]        # SET: matched unless you name another
+    python3 results/intervals.py results/quick-three-seeds                   # accuracies, set `matched`
+    python3 results/intervals.py results/quick-three-seeds --less hrn15      # each accuracy minus that of hrn15
+    python3 results/intervals.py results/quick-three-seeds --set fresh       # another set of objects.csv
+
+A difference is taken object by object under the same seed, so what is hard for both methods cancels out.
 
 With one seed, the interval is that of a bootstrap over the geometries, or over the objects of each level where the
 set has no geometries. With several seeds, the variance of the mean over the seeds is added, and the interval is
@@ -10,11 +14,11 @@ Student's, with the degrees of freedom of Welch and Satterthwaite. The draws are
 may differ by some tenths of a point.
 """
 
+import argparse
 import collections
 import csv
 import pathlib
 import re
-import sys
 
 import numpy
 import scipy.stats
@@ -38,8 +42,19 @@ def read(path, wanted):
     return counts
 
 
-def interval(seeds):
-    """The accuracy over all seeds, and its interval. `seeds` has [right, samples] by cluster."""
+def less(seeds, others):
+    """[right minus the other method's right, samples] by cluster, of the seeds that both methods have."""
+    return [
+        {
+            cluster: [right - others[seed][cluster][0], samples]
+            for cluster, (right, samples) in seeds[seed].items()
+        }
+        for seed in sorted(seeds.keys() & others.keys())
+    ]
+
+
+def interval(seeds, least):
+    """The share over all seeds, and its interval, from `least` to 1. `seeds` has [right, samples] by cluster."""
     clusters = sorted(seeds[0])
     sums = numpy.array([[seed[cluster] for cluster in clusters] for seed in seeds], float)
     of_seeds = sums.sum(1)
@@ -63,15 +78,28 @@ def interval(seeds):
     total = sum(variance for variance, _ in parts)
     free = total**2 / sum(variance**2 / degrees for variance, degrees in parts)
     reach = scipy.stats.t.ppf(0.975, free) * total**0.5
-    return mean, max(mean - reach, 0), min(mean + reach, 1)
+    return mean, max(mean - reach, least), min(mean + reach, 1)
 
 
 def main():
-    folder = pathlib.Path(sys.argv[1])
-    wanted = sys.argv[2] if len(sys.argv) > 2 else "matched"
-    for method, seeds in read(folder / "objects.csv", wanted).items():
-        mean, low, high = interval(list(seeds.values()))
-        print(f"{method:22} {len(seeds)} seeds  {100 * mean:.1f}  {100 * low:.1f} to {100 * high:.1f}")
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folder", type=pathlib.Path)
+    parser.add_argument("--set", default="matched")
+    parser.add_argument("--less", metavar="METHOD")
+    options = parser.parse_args()
+    methods = read(options.folder / "objects.csv", options.set)
+    if not methods:
+        parser.error(f"objects.csv has no set {options.set}")
+    if options.less and options.less not in methods:
+        parser.error(f"found no {options.less}; the methods are {', '.join(methods)}")
+    for method, seeds in methods.items():
+        if method == options.less:
+            continue
+        sign, counts, least = "", list(seeds.values()), 0
+        if options.less:
+            sign, counts, least = "+", less(seeds, methods[options.less]), -1
+        mean, low, high = (f"{100 * value:{sign}.1f}" for value in interval(counts, least))
+        print(f"{method:22} {len(counts)} seeds  {mean}  {low} to {high}")
 
 
 main()
