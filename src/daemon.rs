@@ -246,6 +246,7 @@ impl Daemon {
         let publishers = publishers.serve(&hub, &sensors, &receiver);
         announce(&setup, &run);
         systemd::ready();
+        busy::forget();
         Ok(Running {
             setup,
             run,

@@ -27,7 +27,14 @@ pub fn ends() {
     LONGEST.end();
 }
 
-/// The longest time without a wait since the start of the process. It is 0 if the runtime calls
+/// Forgets the time so far. The daemon calls this when it has started, because nobody waits for it
+/// before that.
+pub(super) fn forget() {
+    LONGEST.0.store(0, Ordering::Relaxed);
+    begins();
+}
+
+/// The longest time without a wait since the daemon has started. It is 0 if the runtime calls
 /// neither [`begins`] nor [`ends`].
 pub fn longest() -> Duration {
     LONGEST.get()
