@@ -184,7 +184,8 @@ def check_recording(path, viewer, got):
     # The daemon has closed the connection.
     viewer.reader.join(timeout=10)
     with open(path, "rb") as file:
-        summary = make_reader(file).get_summary()
+        reader = make_reader(file)
+        summary = reader.get_summary()
         recorded = {}
         for channel in summary.channels.values():
             schema = summary.schemas[channel.schema_id]
@@ -193,9 +194,9 @@ def check_recording(path, viewer, got):
             assert recorded[topic] == (channel["schemaName"], channel["schema"], "cdr"), topic
         contacts = [
             decoder(viewer.topics[channel.topic])(message.data)
-            for _, channel, message in make_reader(file).iter_messages(topics=["/tactile/forearm/contact"])
+            for _, channel, message in reader.iter_messages(topics=["/tactile/forearm/contact"])
         ]
-        moved = make_reader(file).iter_messages(topics=["/tactile/forearm/motion"])
+        moved = reader.iter_messages(topics=["/tactile/forearm/motion"])
         moved = [(message.log_time, message.data) for _, _, message in moved]
     # The recorder has no lines that the viewer has not, and the other way round.
     assert moved == viewer.motion and len(moved) > 50, (len(moved), len(viewer.motion))
