@@ -290,6 +290,22 @@ fn trained(bench: &Bench, data: &[&Path]) -> Card {
 }
 
 #[test]
+fn training_says_which_levels_it_cannot_learn() {
+    let bench = Bench::new();
+    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/foam.5hz.bin");
+    let data = bench.path("one.npz");
+    collected(&data, &["--level", "1", text(&fixture)]);
+    let output = train(&bench, &[&data]);
+    let said = String::from_utf8(output.stderr).unwrap();
+    for expected in [
+        "no labelled training press is of level 2, 3 or 4: the model never learns to say it",
+        "all training presses of level 1 are of one object",
+    ] {
+        assert!(said.contains(expected), "{said}");
+    }
+}
+
+#[test]
 fn a_model_is_of_the_pitch_of_its_recordings_and_pitches_do_not_mix() {
     const NARROW: &str = "[sensor.calibration]\npitch_mm = 2.0\n";
     let bench = Bench::new();
@@ -428,6 +444,28 @@ fn a_model_of_presses_is_of_the_pitch_of_its_recordings() {
         errors.contains("coarse.npz: taxel pitch: found 3.5 mm"),
         "{errors}"
     );
+}
+
+#[test]
+fn a_recording_is_not_collected_twice() {
+    let bench = Bench::new();
+    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/foam.5hz.bin");
+    let copy = bench.path("copy.bin");
+    std::fs::copy(&fixture, &copy).unwrap();
+    let (fixture, copy) = (text(&fixture), text(&copy));
+    let out = bench.path("own.npz");
+    let expected = format!("{copy}: the same recording as foam.5hz.bin");
+
+    // Neither in one call,
+    assert_refused(&out, &["--level", "1", fixture, copy], &expected);
+    // nor in a later one.
+    let labels = ["--level", "1", "--object", "3"];
+    let samples = collected(&out, &[&labels[..], &[fixture]].concat());
+    let again = [&labels[..], &["--append", copy]].concat();
+    assert_refused(&out, &again, &expected);
+    // It may be the recording of another object, because its labels may have been wrong.
+    let other = ["--append", "--level", "1", "--object", "4", copy];
+    assert_eq!(collected(&out, &other).len(), 2 * samples.len());
 }
 
 #[test]

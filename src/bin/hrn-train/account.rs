@@ -1,5 +1,6 @@
 //! Text about a model, about an evaluation and about a data set.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::Path;
 
@@ -191,6 +192,49 @@ pub(super) fn of_data(dataset: &Dataset) -> String {
         );
     }
     text
+}
+
+/// Warnings about levels with few training presses, or none. `presses` has the level of each labelled
+/// training press, and its object where it is known.
+pub(super) fn of_levels(presses: impl Iterator<Item = (u8, Option<u32>)>) -> String {
+    let mut objects: BTreeMap<u8, BTreeSet<Option<u32>>> = BTreeMap::new();
+    for (level, object) in presses {
+        objects.entry(level).or_default().insert(object);
+    }
+    let levels = dataset::levels();
+    let all = || levels.iter().map(|level| level.level);
+    let missing: Vec<u8> = all().filter(|level| !objects.contains_key(level)).collect();
+    let of_one = |level: &u8| {
+        let objects = objects.get(level);
+        objects.is_some_and(|objects| objects.len() == 1 && !objects.contains(&None))
+    };
+    let of_one: Vec<u8> = all().filter(of_one).collect();
+    let mut text = String::new();
+    if !missing.is_empty() {
+        let _ = writeln!(
+            text,
+            "warning: no labelled training press is of level {}: the model never learns to say it",
+            listed(&missing)
+        );
+    }
+    if !of_one.is_empty() {
+        let _ = writeln!(
+            text,
+            "warning: all training presses of level {} are of one object: the model may learn the object and \
+             not the hardness",
+            listed(&of_one)
+        );
+    }
+    text
+}
+
+/// Numbers as in a sentence: 2, 3 or 4.
+fn listed(numbers: &[u8]) -> String {
+    let texts: Vec<String> = numbers.iter().map(u8::to_string).collect();
+    match texts.split_last() {
+        Some((last, rest)) if !rest.is_empty() => format!("{} or {last}", rest.join(", ")),
+        _ => texts.concat(),
+    }
 }
 
 /// Verdicts as CSV, one line each after the header: object, true level, verdict's level,

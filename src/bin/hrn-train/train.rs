@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use burn::tensor::Device;
+use hardnessd::simulator::Split;
 use hardnessd::train::data::courses::Courses;
 use hardnessd::train::data::dataset::{Dataset, DatasetError, LabelChoice};
 use hardnessd::train::methods::{self, Method, Request};
@@ -54,6 +55,12 @@ pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
     let run = Run::open(&arguments.out, &description, arguments.resume)?
         .taking_from(arguments.from.clone());
     eprint!("{}", account::of_data(&dataset));
+    let labelled = dataset
+        .samples
+        .iter()
+        .filter(|sample| sample.split == Split::Train && sample.level > 0);
+    let labelled = labelled.map(|sample| (sample.level, sample.object));
+    eprint!("{}", account::of_levels(labelled));
     if arguments.profile == Profile::Smoke {
         eprintln!("--profile smoke: tries the commands in seconds; too short to learn anything");
     }
@@ -80,6 +87,10 @@ fn train_course(arguments: &Train) -> anyhow::Result<String> {
     let description = methods::course::description(Method::Course, &courses, sources, told)?;
     let device = device(arguments.device)?;
     let run = Run::open(&arguments.out, &description, arguments.resume)?;
+    let labelled = courses.labelled(Split::Train);
+    let labelled = labelled.map(|place| &courses.presses[place]);
+    let labelled = labelled.map(|press| (press.level, Some(press.object)));
+    eprint!("{}", account::of_levels(labelled));
     let begun = Instant::now();
     let evaluation = methods::course::train(&courses, None, &description, &run, &device)?;
     Ok(account_of_run(

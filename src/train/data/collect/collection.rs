@@ -190,6 +190,27 @@ pub(super) struct Used {
     pub(super) before: (usize, usize),
 }
 
+/// What makes two captures the same presses of the same object.
+#[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Identity {
+    sha256: String,
+    level: u8,
+    object: u32,
+    is_test: bool,
+}
+
+impl Identity {
+    /// The identity of an element of `meta.captures`. `None` if another program wrote it differently.
+    fn of(capture: &Value) -> Option<Self> {
+        Some(Self {
+            sha256: capture["sha256"].as_str()?.to_owned(),
+            level: capture["level"].as_u64()?.try_into().ok()?,
+            object: capture["object"].as_u64()?.try_into().ok()?,
+            is_test: capture["split"].as_str()? == Split::Test.name(),
+        })
+    }
+}
+
 /// A data set under construction. It holds a few hundred bytes of each capture; the frames stay in
 /// the parts.
 #[derive(Debug)]
@@ -203,6 +224,8 @@ pub struct Collection {
     meta: BTreeMap<String, String>,
     /// The JSON of the elements of `meta.captures`.
     captures: String,
+    /// The captures that gave samples, and their names.
+    known_captures: BTreeMap<Identity, String>,
     /// The file of the first samples.
     first: PathBuf,
     objects: BTreeSet<Object>,
@@ -259,8 +282,13 @@ impl Collection {
             .split(", ")
             .filter(|one| !["", &collected].contains(one));
         let generators: Vec<&str> = others.chain([&*collected]).collect();
-        let captures = meta["captures"].as_array().into_iter().flatten();
-        let captures: Vec<String> = captures.map(Value::to_string).collect();
+        let captures = meta["captures"].as_array().map_or(&[][..], Vec::as_slice);
+        let name = |capture: &Value| capture["name"].as_str().unwrap_or_default().to_owned();
+        let known_captures = captures
+            .iter()
+            .filter_map(|capture| Some((Identity::of(capture)?, name(capture))))
+            .collect();
+        let captures: Vec<String> = captures.iter().map(Value::to_string).collect();
         let mut texts: BTreeMap<String, String> = meta
             .as_object()
             .into_iter()
@@ -280,6 +308,7 @@ impl Collection {
             materials: serde_json::from_value(meta["materials"].clone()).unwrap_or_default(),
             meta: texts,
             captures: captures.join(","),
+            known_captures,
             earlier: samples,
             used: Vec::new(),
             shape,
@@ -312,6 +341,19 @@ impl Collection {
         let level = head.level(labelling.level)?;
         let object = self.object(head, labelling)?;
         let shore = head.shore()?;
+        let identity = Identity {
+            sha256: head.sha256.clone(),
+            level,
+            object,
+            is_test: self.split == Split::Test,
+        };
+        if let Some(first) = self.known_captures.get(&identity) {
+            return Err(CollectError::Twice {
+                path: path.clone(),
+                first: first.clone(),
+            }
+            .into());
+        }
         let shape = Shape::of(head, self.is_of_courses);
         if head.presses > 0 {
             shape.check(path, &self.shape, &self.first)?;
@@ -322,8 +364,9 @@ impl Collection {
         if head.presses > 0 {
             self.check_split(path, object, material, level)?;
         }
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
         let said = json!({
-            "name": path.file_name().unwrap_or_default().to_string_lossy(),
+            "name": name,
             "sha256": head.sha256,
             "level": level,
             "object": object,
@@ -335,6 +378,7 @@ impl Collection {
             self.captures.push(',');
         }
         self.captures.push_str(&said.to_string());
+        self.known_captures.insert(identity, name.into_owned());
         self.used.push(Used {
             part,
             level,

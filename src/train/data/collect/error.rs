@@ -96,6 +96,17 @@ pub enum CollectError {
         /// The data set to which the capture is added.
         first: PathBuf,
     },
+    /// The same recording was collected before, with the same labels.
+    #[error(
+        "{path}: the same recording as {first}, whose presses are in the data set already: leave it out, because \
+         presses that are there twice count twice"
+    )]
+    Twice {
+        /// The capture.
+        path: PathBuf,
+        /// The name of the earlier capture.
+        first: String,
+    },
     /// The capture names a material for which no number is left.
     #[error(
         "{path}: label material: {name:?} is one too many: a data set has at most 256 materials"
