@@ -11,7 +11,7 @@ use anyhow::ensure;
 use burn::tensor::Device;
 
 use crate::simulator::Split;
-use crate::train::data::dataset::{Dataset, DatasetError, LabelChoice};
+use crate::train::data::dataset::{Dataset, DatasetError, LabelChoice, Sample};
 use crate::train::judge::metrics::Evaluation;
 use crate::train::net::generator::COMPONENTS;
 use crate::train::net::losses::Game;
@@ -272,10 +272,12 @@ pub fn check(method: Method, dataset: &Dataset, description: &Description) -> an
             | Method::FixMatch
             | Method::SelfTraining
     );
+    let Validation { share, .. } = description.settings.validation;
+    let (_, held_out) = dataset.hold_out(&labelled, share, description.seed);
     ensure!(
-        !needs_unlabelled || !unlabelled(dataset, &labelled).is_empty(),
-        "no unlabelled training samples are left for {} beside its {} labelled ones: use fewer with \
-         --labels",
+        !needs_unlabelled || !unlabelled(dataset, &labelled, &held_out).is_empty(),
+        "no unlabelled training samples are left for {} beside its {} labelled ones and the held-out \
+         objects: use fewer with --labels",
         method.name(),
         description.labels
     );
@@ -375,7 +377,7 @@ pub fn train(
         dataset,
         train: &train,
         validation: &validation,
-        unlabelled: &unlabelled(dataset, &labelled),
+        unlabelled: &unlabelled(dataset, &labelled, &validation),
         description,
         run,
         device,
@@ -408,12 +410,20 @@ pub fn train(
     stages.finish(&trained)
 }
 
-/// The training samples whose level is not used: all except `labelled`.
-fn unlabelled(dataset: &Dataset, labelled: &[usize]) -> Vec<usize> {
+/// The training samples whose level is not used: all except `labelled` and the other presses of the
+/// objects in `held_out`. A method that learnt from those would be judged on what it has seen.
+fn unlabelled(dataset: &Dataset, labelled: &[usize], held_out: &[usize]) -> Vec<usize> {
+    let samples = &dataset.samples;
     let labelled: BTreeSet<usize> = labelled.iter().copied().collect();
-    let wanted =
-        |index: &usize| dataset.samples[*index].split == Split::Train && !labelled.contains(index);
-    (0..dataset.samples.len()).filter(wanted).collect()
+    let is_held_out = |sample: &Sample| {
+        let mut held_out = held_out.iter().map(|&index| &samples[index]);
+        held_out.any(|held| held.shares_object_with(sample))
+    };
+    let wanted = |index: &usize| {
+        let sample = &samples[*index];
+        sample.split == Split::Train && !labelled.contains(index) && !is_held_out(sample)
+    };
+    (0..samples.len()).filter(wanted).collect()
 }
 
 #[cfg(test)]
@@ -421,11 +431,47 @@ mod tests {
     use super::*;
     use clap::ValueEnum as _;
 
+    use crate::simulator;
+
     #[test]
     fn names_are_those_of_the_command_line() {
         for method in Method::value_variants() {
             let value = method.to_possible_value().unwrap();
             assert_eq!(value.get_name(), method.name());
+        }
+    }
+
+    #[test]
+    fn presses_of_held_out_objects_are_not_learnt_from() {
+        let settings = simulator::DatasetSettings {
+            objects: 4,
+            test_objects: 1,
+            presses: 3,
+            ..simulator::DatasetSettings::default()
+        };
+        let simulated = simulator::dataset(&settings, 1, |_| {});
+        let bytes = crate::train::data::simulated::to_bytes(&settings, simulated).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("data.npz");
+        std::fs::write(&path, bytes).unwrap();
+        let mut dataset = Dataset::read(&path).unwrap();
+        // One press of each object is unlabelled.
+        let samples = &mut dataset.samples;
+        samples
+            .iter_mut()
+            .step_by(3)
+            .for_each(|sample| sample.level = 0);
+        let labelled = dataset.labelled(Split::Train).unwrap();
+        let all = unlabelled(&dataset, &labelled, &[]);
+        let (_, held_out) = dataset.hold_out(&labelled, 0.5, 1);
+        let kept = unlabelled(&dataset, &labelled, &held_out);
+        assert!(!kept.is_empty() && kept.len() < all.len());
+        let held: BTreeSet<_> = held_out
+            .iter()
+            .map(|&k| dataset.samples[k].object)
+            .collect();
+        for index in kept {
+            assert!(!held.contains(&dataset.samples[index].object), "{index}");
         }
     }
 

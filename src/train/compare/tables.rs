@@ -18,8 +18,8 @@ use cells::{
 };
 
 pub use cells::{
-    REFERENCE, accuracy, difference_text, evaluations, interval_text, mean, mean_confusion,
-    paper_row, swap_groups,
+    accuracy, difference_text, evaluations, interval_text, mean, mean_confusion, paper_row,
+    reference, swap_groups,
 };
 
 /// A table.

@@ -14,6 +14,7 @@ use super::dataset::file::{self, File};
 use super::dataset::{DatasetError, Source, levels, objects_after, pitch_mm};
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::simulator::{LabelledCourse, NEWTONS_PER_COUNT, Split};
+use crate::verdict::COURSE_FRAMES;
 
 /// Newtons per unit of [`Courses::frames_mn`].
 const NEWTONS: f32 = 1e-3;
@@ -279,6 +280,12 @@ impl Courses {
                 return Err(file.error("best", found, expected));
             }
             let times = &courses.time_s[rows];
+            let used = times.iter().filter(|&&time_s| time_s >= 0.0).count();
+            if !(1..=COURSE_FRAMES.1).contains(&used) {
+                let found = format!("{used} frames at 0 s or later in press {number}");
+                let expected = format!("1 to {}", COURSE_FRAMES.1);
+                return Err(file.error("time_s", found, expected));
+            }
             if !times.is_sorted_by(|a, b| a < b) {
                 let found = format!("times that stand still or go back in press {number}");
                 return Err(file.error("time_s", found, "ascending ones".to_owned()));
@@ -453,6 +460,36 @@ mod tests {
         check(|bad| bad.press[0] = 1, "array `press`");
         check(|bad| bad.time_s[1] = -9.0, "array `time_s`: found times");
         check(|bad| bad.time_s[1] = f32::NAN, "array `time_s`: found NaN");
+        check(
+            |bad| {
+                let rows = bad.rows(0);
+                let count = rows.len() as f32;
+                rows.for_each(|row| bad.time_s[row] = row as f32 - count);
+            },
+            "array `time_s`: found 0 frames at 0 s or later in press 0, expected 1 to 48",
+        );
+        check(
+            |bad| {
+                // The first two presses become one that is too long.
+                let second = bad.rows(1);
+                let added = 60 - bad.rows(0).len().min(59);
+                let (row, frame) = (bad.rows(0).start, bad.frames_mn[..TAXELS].to_vec());
+                assert!(second.start > row);
+                for _ in 0..added {
+                    bad.frames_mn.splice(0..0, frame.clone());
+                    bad.press.insert(0, 0);
+                    bad.approach_mm.insert(0, 0.0);
+                    bad.known.insert(0, 1);
+                    bad.time_s.insert(0, 0.0);
+                }
+                bad.presses
+                    .iter_mut()
+                    .for_each(|press| press.best += added as u32);
+                let rows = bad.rows(0);
+                rows.for_each(|row| bad.time_s[row] = row as f32);
+            },
+            "frames at 0 s or later in press 0, expected 1 to 48",
+        );
         check(
             |bad| bad.presses[0].best = 99_999,
             "array `best`: found 99999 of press 0",

@@ -58,7 +58,8 @@ fn mixed(frame: &Frame, share: f32) -> Frame {
     image
 }
 
-/// The frame with each dead taxel replaced by the mean of its live neighbours, as `tare` does.
+/// The frame with each dead taxel replaced by the mean of the live taxels beside it. `tare` takes the
+/// diagonal ones too.
 fn filled(frame: &Frame, is_dead: &[bool]) -> Frame {
     let mut image = *frame;
     for place in (0..TAXELS).filter(|&place| is_dead[place]) {

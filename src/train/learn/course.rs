@@ -229,7 +229,7 @@ impl Task<'_> {
             let known = press
                 .moments
                 .iter()
-                .map(|moment| moment.approach_mm.unwrap_or(f32::NAN));
+                .flat_map(|moment| [moment.time_s, moment.approach_mm.unwrap_or(f32::NAN)]);
             let label = [
                 f32::from(press.level),
                 press.shore.unwrap_or(f32::NAN),

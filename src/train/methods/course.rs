@@ -118,8 +118,9 @@ fn hold_out(presses: &[Press], all: &[usize], share: f64, seed: u64) -> (Vec<usi
     objects.sort_unstable();
     objects.dedup();
     Stream::new(seed, "held-out objects").shuffle(&mut objects);
+    // At least one object stays to learn from.
     let count = (share * objects.len() as f64).round() as usize;
-    let held = &objects[..count];
+    let held = &objects[..count.min(objects.len().saturating_sub(1))];
     all.iter()
         .partition(|&&place| !held.contains(&presses[place].object))
 }

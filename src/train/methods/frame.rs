@@ -133,7 +133,7 @@ pub fn adapt(
         dataset,
         train: &kept,
         held_out: &held_out,
-        unlabelled: &super::unlabelled(dataset, &labelled),
+        unlabelled: &super::unlabelled(dataset, &labelled, &held_out),
     };
     train("adapt", &samples, Some(start), description, run, device)
 }

@@ -3,11 +3,12 @@
 use crate::train::compare::digits::rounded;
 use crate::train::compare::results::{Details, Entry, Row, SwapEntry};
 use crate::train::compare::sets::{self, FRESH, MATCHED, PAPER_SPLIT};
+use crate::train::data::dataset::LabelChoice;
 use crate::train::judge::metrics::{self, Estimate, Evaluation, ObjectCount};
 use crate::train::judge::paper;
 
 /// The method that the other methods are compared with.
-pub const REFERENCE: &str = "ours";
+const REFERENCE: &str = "ours";
 
 /// The method that every network must surpass.
 const FEATURES: &str = "features";
@@ -82,12 +83,21 @@ pub fn interval_text(interval: Option<[f64; 2]>) -> String {
     })
 }
 
+/// The row that the others are compared with. If the method has several numbers of labels, its own number
+/// comes first.
+pub fn reference<'a, 'b>(rows: &'a [Row<'b>]) -> Option<&'a Row<'b>> {
+    rows.iter().find(|row| {
+        let entry = row.runs[0].0;
+        entry.method == REFERENCE && entry.label_choice == LabelChoice::Object
+    })
+}
+
 /// The difference from the reference's accuracy, paired with its runs of the same seeds.
 pub(super) fn minus_reference(row: &Row, rows: &[Row], set: &str) -> String {
-    let Some(reference) = rows.iter().find(|row| row.title == REFERENCE) else {
+    let Some(reference) = reference(rows) else {
         return "-".to_owned();
     };
-    if row.title == REFERENCE {
+    if std::ptr::eq(row, reference) {
         return String::new();
     }
     let (own, others) = (objects(row, set), objects(reference, set));
