@@ -122,6 +122,8 @@ fn known_weights_say_the_newtons_of_a_count() {
         asked.contains("put 5 N on the sensor, wait until it rests"),
         "{asked}"
     );
+    let free = asked.find("leave the sensor free until its zero is taken");
+    assert!(free < asked.find("put 15 N") && free.is_some(), "{asked}");
 
     let output = calibrate(&bench, &["--newtons", "0"]).output().unwrap();
     assert_eq!(output.status.code(), Some(2), "{output:?}");

@@ -62,6 +62,8 @@ pub(crate) enum Target {
 pub struct Progress {
     /// The number of whole frames of all sensors.
     pub frames: u64,
+    /// The number of these frames that came after their sensor's zero was taken.
+    pub tared: u64,
     /// The number of presses that were not aborted, so that they have a verdict.
     pub presses: u64,
 }

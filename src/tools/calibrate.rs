@@ -157,6 +157,9 @@ pub enum Error {
 /// How long to wait for positions after the last press.
 const LAST_POSITIONS: Duration = Duration::from_secs(1);
 
+/// Weights that disagree by more than this share get a warning.
+const DOUBTFUL_ERROR: f64 = 0.1;
+
 /// The number of presses if `--presses` does not give it.
 const ARM_PRESSES: u64 = 5;
 const TAXEL_PRESSES: u64 = 200;
@@ -203,8 +206,9 @@ pub async fn run(
             None => return Ok(()),
         }
     } else {
+        let with_track = matches!(args.what, What::Arm);
         let (files, sensor, hrn) = (args.from.clone(), sensor.clone(), setup.hrn.clone());
-        let read = tokio::task::spawn_blocking(move || recorded(&files, &sensor, &hrn));
+        let read = tokio::task::spawn_blocking(move || recorded(&files, &sensor, &hrn, with_track));
         tokio::select! {
             read = read => read.expect("recordings are read without a panic")?,
             () = shutdown => return Ok(()),
@@ -218,11 +222,28 @@ pub async fn run(
                 return Err(Error::Count { found, expected });
             }
             let weights = args.newtons.iter().copied().zip(&presses);
-            of_force(&force::Fit::of(&weights.collect::<Vec<_>>(), &sensor)?)
+            let fit = force::Fit::of(&weights.collect::<Vec<_>>(), &sensor)?;
+            let error = fit.error();
+            if error > DOUBTFUL_ERROR {
+                eprintln!(
+                    "warning: the weights disagree by {:.0} %: was each put on alone, in this order, after \
+                     the zero was taken? If so, leave out the weight with the greatest error",
+                    100.0 * error
+                );
+            }
+            of_force(&fit)
         }
         What::Taxels => {
+            let (full, presses): (Vec<Press>, _) =
+                presses.into_iter().partition(|press| press.saturated);
+            if !full.is_empty() {
+                eprintln!(
+                    "warning: {} of the presses reached full scale on a taxel and are left out: press more softly",
+                    full.len()
+                );
+            }
             let plain: Vec<taxels::Plain> = presses.iter().map(plain).collect();
-            let dead = &sensor.description().calibration.dead_taxels;
+            let dead = &dead_taxels(&sensor, &presses);
             let array = sensor.layout().array();
             let fit = taxels::Fit::of(&plain, array, dead)?;
             let bytes = npy::to_bytes(&fit.gains, array.rows, array.cols);
@@ -271,14 +292,15 @@ async fn live(
     let sockets = Sockets::Configured;
     let daemon = Daemon::recording(setup, path.clone(), file, labels, progress, sockets)?;
     let wanted = args.wanted();
-    say_next(args, 0);
+    eprintln!("leave the sensor free until its zero is taken");
     let enough = async {
-        let mut seen = 0;
-        while seen < wanted && counted.changed().await.is_ok() {
-            let presses = counted.borrow_and_update().presses;
-            if presses > seen {
-                seen = presses;
-                say_next(args, seen);
+        // The presses at the last prompt.
+        let mut said = None;
+        while said < Some(wanted) && counted.changed().await.is_ok() {
+            let Progress { tared, presses, .. } = *counted.borrow_and_update();
+            if tared > 0 && said != Some(presses) {
+                said = Some(presses);
+                say_next(args, presses);
             }
         }
         tokio::time::sleep(LAST_POSITIONS).await;
@@ -296,7 +318,7 @@ async fn live(
         return Ok(None);
     }
     recorded.seek(SeekFrom::Start(0)).map_err(temporary)?;
-    let read = gather::presses(recorded, sensor, hrn);
+    let read = gather::presses(recorded, sensor, hrn, matches!(args.what, What::Arm));
     read.map(Some).map_err(|source| Error::Recording {
         path: "what was recorded".to_owned(),
         source,
@@ -304,20 +326,38 @@ async fn live(
 }
 
 /// The presses that recordings hold.
-fn recorded(files: &[PathBuf], sensor: &Sensor, hrn: &Arc<Hrn>) -> Result<Vec<Press>, Error> {
+fn recorded(
+    files: &[PathBuf],
+    sensor: &Sensor,
+    hrn: &Arc<Hrn>,
+    with_track: bool,
+) -> Result<Vec<Press>, Error> {
     let mut presses = Vec::new();
     for path in files {
         let file = super::open(path).map_err(|source| Error::Missing {
             path: path.clone(),
             source,
         })?;
-        let read = gather::presses(file, sensor, hrn.clone());
+        let read = gather::presses(file, sensor, hrn.clone(), with_track);
         presses.extend(read.map_err(|source| Error::Recording {
             path: path.display().to_string(),
             source,
         })?);
     }
     Ok(presses)
+}
+
+/// The dead taxels of the sensor, and those that were dead in a recording: what these show is no
+/// measurement.
+fn dead_taxels(sensor: &Sensor, presses: &[Press]) -> Vec<[usize; 2]> {
+    let mut dead = sensor.description().calibration.dead_taxels.clone();
+    let described = presses.iter().filter_map(|press| press.described.as_ref());
+    for taxel in described.flat_map(|described| &described.calibration.dead_taxels) {
+        if !dead.contains(taxel) {
+            dead.push(*taxel);
+        }
+    }
+    dead
 }
 
 /// A press without the gains that were in force when it was recorded.
@@ -416,7 +456,7 @@ fn of_force(fit: &force::Fit) -> String {
                 100.0 * error
             )
         }
-        None => "power law          needs three different weights, one twice another\n".to_owned(),
+        None => "power law          needs four different weights, one twice another\n".to_owned(),
     };
     text += &format!(
         "\n[sensor.calibration]\nnewtons_per_count = {newtons_per_count:.5}\nexponent = {exponent:.2}\n"

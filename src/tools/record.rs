@@ -181,7 +181,11 @@ pub async fn run(
     ) {
         return recorded;
     }
-    let Progress { frames, presses } = *counted.borrow();
+    let Progress {
+        frames,
+        tared,
+        presses,
+    } = *counted.borrow();
     let seen = said_frames(frames);
     if io::stderr().is_terminal() {
         eprintln!(
@@ -192,10 +196,17 @@ pub async fn run(
     }
     if recorded.is_ok() && presses == 0 {
         let path = said(&path);
-        eprintln!(
-            "warning: {path}: no press in {seen}: was the sensor pressed, is it live, and \
-             is press.contact_threshold_n low enough?"
-        );
+        if frames > 0 && tared == 0 {
+            eprintln!(
+                "warning: {path}: no press in {seen}, because the zero was not taken: leave the sensor free at \
+                 the start, and record longer"
+            );
+        } else {
+            eprintln!(
+                "warning: {path}: no press in {seen}: was the sensor pressed, is it live, and \
+                 is press.contact_threshold_n low enough?"
+            );
+        }
     }
     recorded
 }
@@ -267,7 +278,9 @@ async fn show(path: &Path, counted: &watch::Receiver<Progress>, is_ending: &Cell
     }
     let start = Instant::now();
     while !is_ending.get() {
-        let Progress { frames, presses } = *counted.borrow();
+        let Progress {
+            frames, presses, ..
+        } = *counted.borrow();
         let (frames, presses) = (said_frames(frames), said_presses(presses));
         let seconds = start.elapsed().as_secs();
         let path = said(path);

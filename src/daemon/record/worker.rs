@@ -252,7 +252,10 @@ impl Worker {
 
     fn event(&mut self, event: &Event) -> Result<(), Failure> {
         match event {
-            Event::Frame(_) => self.progress.frames += 1,
+            Event::Frame(frame) => {
+                self.progress.frames += 1;
+                self.progress.tared += u64::from(frame.tared);
+            }
             Event::Press(press) if press.state == PressState::End => self.progress.presses += 1,
             _ => {}
         }

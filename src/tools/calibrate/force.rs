@@ -59,7 +59,7 @@ struct Count {
 /// The weight is at rest while the sum of counts has at least this share of its maximum.
 const RESTING_SHARE: f64 = 0.8;
 /// An exponent needs at least this number of different weights.
-const LEAST_WEIGHTS: usize = 3;
+const LEAST_WEIGHTS: usize = 4;
 /// For an exponent, the heaviest weight must be at least this many times the lightest.
 const LEAST_RATIO: f64 = 2.0;
 /// No exponent is proposed if the relative error of a line is at most this.
@@ -127,6 +127,16 @@ impl Fit {
             line_error,
             power,
         })
+    }
+}
+
+impl Fit {
+    /// Root mean square error of the proposed values, as a part of the weight.
+    pub(super) fn error(&self) -> f64 {
+        match self.power {
+            Some((exponent, error)) if exponent == self.exponent => error,
+            _ => self.line_error,
+        }
     }
 }
 

@@ -76,22 +76,31 @@ impl From<std::io::Error> for Unreadable {
 const AFTER: Duration = Duration::from_millis(800);
 
 /// The presses of `sensor` in a file. A recording tells sensors apart by name. In a file of raw
-/// bytes, all bytes are those of `sensor`.
+/// bytes, all bytes are those of `sensor`. The presses have the positions of the arm `with_track`.
 pub(super) fn presses(
     file: impl Read,
     sensor: &Sensor,
     hrn: Arc<Hrn>,
+    with_track: bool,
 ) -> Result<Vec<Press>, Unreadable> {
     let (kind, file) = FileKind::read(file)?;
     match kind {
-        FileKind::Recording => of_recording(BufReader::new(file), sensor.name(), hrn),
+        FileKind::Recording => of_recording(BufReader::new(file), sensor.name(), hrn, with_track),
         FileKind::Raw => Ok(of_bytes(file, sensor, hrn)?),
     }
 }
 
-fn of_recording(file: impl Read, sensor: &str, hrn: Arc<Hrn>) -> Result<Vec<Press>, Unreadable> {
+fn of_recording(
+    file: impl Read,
+    sensor: &str,
+    hrn: Arc<Hrn>,
+    with_track: bool,
+) -> Result<Vec<Press>, Unreadable> {
     let (mut playback, none) = (Playback::new(hrn), Track::default());
-    let mut gathered = Gathered::default();
+    let mut gathered = Gathered {
+        with_track,
+        ..Gathered::default()
+    };
     for found in Reader::new(file) {
         let found = found?;
         if found.sensor != sensor {
@@ -140,6 +149,8 @@ const CHUNK_BYTES: usize = 1 << 16;
 #[derive(Default)]
 struct Gathered {
     presses: Vec<Press>,
+    /// Whether a press takes a copy of the arm's positions.
+    with_track: bool,
     described: Option<Arc<Description>>,
     /// The frames of the press under way and of those in `ended`, and the newest frame.
     frames: Vec<Taken>,
@@ -206,7 +217,10 @@ impl Gathered {
                 ..
             } = self.ended.remove(0);
             let mut press = Press {
-                track: track.clone(),
+                track: match self.with_track {
+                    true => track.clone(),
+                    false => Track::default(),
+                },
                 described,
                 saturated,
                 ..Press::default()
@@ -243,7 +257,7 @@ mod tests {
     #[test]
     fn a_press_has_the_positions_from_before_its_recording() {
         let (recording, sensor) = of_a_press(|_| {}, None, true);
-        let presses = presses(recording.as_slice(), &sensor, hrn()).unwrap();
+        let presses = presses(recording.as_slice(), &sensor, hrn(), true).unwrap();
         let [press] = &presses[..] else {
             panic!("one press");
         };

@@ -197,13 +197,8 @@ async fn record_object(
         let mut next = Next::KeepAndQuit;
         let (progress, mut counted) = watch::channel(Progress::default());
         let recorded = {
-            let tare_frames = setup
-                .sensors
-                .iter()
-                .map(|sensor| u64::from(sensor.description().calibration.tare_frames));
-            let tare_frames = tare_frames.max().unwrap_or_default();
             let end = async {
-                next = wait_for_user(user, &mut counted, tare_frames).await;
+                next = wait_for_user(user, &mut counted).await;
             };
             record(setup.clone(), sockets, &path, labels.clone(), progress, end).await
         };
@@ -229,16 +224,16 @@ async fn record_object(
 }
 
 /// Counts presses in one line until the user decides what to do next.
-async fn wait_for_user(
-    user: &mut User<'_>,
-    counted: &mut watch::Receiver<Progress>,
-    tare_frames: u64,
-) -> Next {
+async fn wait_for_user(user: &mut User<'_>, counted: &mut watch::Receiver<Progress>) -> Next {
     loop {
-        let Progress { frames, presses } = *counted.borrow_and_update();
+        let Progress {
+            frames,
+            tared,
+            presses,
+        } = *counted.borrow_and_update();
         let line = if frames == 0 {
             "waiting for the sensor".to_owned()
-        } else if frames <= tare_frames {
+        } else if tared == 0 {
             "taking the zero".to_owned()
         } else {
             format!("presses: {presses}; Enter: next object, r: redo this one, q: quit")

@@ -211,7 +211,8 @@ fn correlation(fit: &Fit, truth: &[f32]) -> f64 {
 
 fn fitted(played: &Played, hrn: &Arc<Hrn>) -> Fit {
     let plain_sensor = sensor(None, Vec::new());
-    let presses = gather::presses(played.first.as_slice(), &plain_sensor, hrn.clone()).unwrap();
+    let presses =
+        gather::presses(played.first.as_slice(), &plain_sensor, hrn.clone(), false).unwrap();
     let plain: Vec<Plain> = presses.iter().map(plain).collect();
     Fit::of(&plain, Array::FULL, &[]).unwrap()
 }
