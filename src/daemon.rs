@@ -16,6 +16,7 @@ mod http;
 mod hub;
 pub(crate) mod lines;
 pub mod log;
+mod pace;
 pub mod publish;
 pub mod realtime;
 pub mod record;

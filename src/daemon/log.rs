@@ -295,6 +295,17 @@ pub(crate) fn clock_set(sensor: &str, by_ms: f64) {
     );
 }
 
+/// Logs that a sensor sends frames at another rate than its configuration says.
+pub(crate) fn pace(sensor: &str, frame_rate_hz: f64, measured_hz: f64) {
+    let measured_hz = (10.0 * measured_hz).round() / 10.0;
+    warn!(
+        sensor,
+        frame_rate_hz,
+        measured_hz,
+        "the sensor sends frames at another rate: set frame_rate_hz to it"
+    );
+}
+
 /// Logs the context that a controller reports of its work.
 pub(crate) fn context(sensor: &str, context: Option<&serde_json::Value>) {
     info!(

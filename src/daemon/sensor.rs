@@ -14,6 +14,7 @@ use tokio::time::Instant;
 
 use super::hub;
 use super::log;
+use super::pace::Pace;
 use super::record::{NoBlackbox, SensorRecorder};
 use super::request::motion::{Calendar, Placed};
 use super::serial::{Link, Turn};
@@ -105,6 +106,7 @@ pub(crate) async fn serve(
     let mut taring = None;
     let mut unjudged = 0;
     let mut calendar = Calendar::default();
+    let mut pace = Pace::default();
     loop {
         let deadline = pipeline.deadline();
         let events = tokio::select! {
@@ -148,6 +150,7 @@ pub(crate) async fn serve(
                     let reloaded = pipeline.reload(*sensor, hrn);
                     reloaded.expect("a configuration that differs in what is fixed was refused");
                     answer(&mut pipeline, &mut taring);
+                    pace = Pace::default();
                     continue;
                 }
                 Some(Command::Finish) | None => {
@@ -167,12 +170,15 @@ pub(crate) async fn serve(
             }
             () = until(deadline) => recorder.feed(&mut pipeline, Input::Tick, super::now()),
         };
-        if events
-            .iter()
-            .map(Event::kind)
-            .any(|kind| kind == Kind::Frame)
-        {
+        let kinds = events.iter().map(Event::kind);
+        let frames = kinds.filter(|&kind| kind == Kind::Frame).count();
+        if frames > 0 {
             link.proven();
+            let configured_hz = pipeline.sensor().description().frame_rate_hz;
+            let differs = pace.differs(frames as u32, super::now().mono, configured_hz);
+            if let Some(measured_hz) = differs {
+                log::pace(pipeline.sensor().name(), configured_hz, measured_hz);
+            }
         }
         answer(&mut pipeline, &mut taring);
         for failed in pipeline.unjudged() {

@@ -9,8 +9,8 @@ use crate::event::{Event, LinkState, Status};
 use crate::frame::Stamp;
 use crate::tare::Aim;
 
-/// After a silence of this many periods, the pending bytes are settled: later bytes do not belong
-/// to them.
+/// After a silence of this many periods, the pending bytes are settled: a frame that only waited for
+/// the header of the next one is then whole.
 const PAUSE_PERIODS: f64 = 0.5;
 
 /// The state of the port.
@@ -69,7 +69,15 @@ impl Pipeline {
             Link::Closed { reason } => (LinkState::Connecting, reason.clone()),
             Link::Opened { .. } => (LinkState::Connecting, None),
             Link::Live { .. } => (LinkState::Live, tare()),
-            Link::Silent => (LinkState::Stale, no_frame_for(self.sensor.late_after())),
+            Link::Silent => {
+                let mut reason = no_frame_for(self.sensor.late_after());
+                if self.decoder.received() > 0
+                    && let Some(reason) = &mut reason
+                {
+                    reason.push_str(", but bytes come: is the baud rate or the layout wrong?");
+                }
+                (LinkState::Stale, reason)
+            }
             Link::Stale => (LinkState::Stale, no_frame_for(self.sensor.stale_after())),
             Link::Lost { reason } => (LinkState::Lost, Some(reason.clone())),
         }

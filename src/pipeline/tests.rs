@@ -288,6 +288,18 @@ fn a_port_open_without_frames_is_stale_too() {
 }
 
 #[test]
+fn bytes_that_never_make_a_frame_are_told() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    pipeline.opened(at(0));
+    assert!(pipeline.push(&[0x00; 100], at(100)).is_empty());
+    let reason = "no frame for 500 ms, but bytes come: is the baud rate or the layout wrong?";
+    assert_eq!(
+        words(&pipeline.tick(at(500))),
+        [format!("Stale ({reason})")]
+    );
+}
+
+#[test]
 fn how_long_a_live_sensor_may_be_silent_can_be_told() {
     let check = |hz, stale_after_ms, expected_ms: u64| {
         let mut pipeline = pipeline_of(|described| {
