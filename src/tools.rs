@@ -114,11 +114,20 @@ pub fn usage(program: &str, error: &clap::Error) -> ExitCode {
     }
     if let Some(file) = configuration_in_place_of_an_option(error) {
         told += &format!(": write --config {file}");
+    } else if is_fleet_without_zenoh(error) {
+        told = "fleet: this build has no zenoh: build it with --features zenoh".to_owned();
     } else if let Some(command) = where_to_look(error, &text) {
         told += &format!(": see `{command} --help`");
     }
     eprintln!("{program}: {}", shown(&told));
     ExitCode::from(exit::USAGE)
+}
+
+/// Whether the command line has `fleet`, which only a build with zenoh has.
+fn is_fleet_without_zenoh(error: &clap::Error) -> bool {
+    let unknown = error.get(ContextKind::InvalidSubcommand);
+    !cfg!(feature = "zenoh")
+        && matches!(unknown, Some(ContextValue::String(command)) if command == "fleet")
 }
 
 /// The command whose help lists what is missing or unknown.
@@ -149,12 +158,18 @@ fn configuration_in_place_of_an_option(error: &clap::Error) -> Option<&str> {
 }
 
 /// Opens a file to read from. Refuses a directory at once, because the system would refuse it only
-/// at the first read, after the work has begun.
+/// at the first read, after the work has begun. Refuses a serial port, because reading one waits
+/// for bytes and never ends.
 fn open(path: &Path) -> io::Result<File> {
     let file = File::open(path)?;
     if file.metadata()?.is_dir() {
         // In the system's words, as for a configuration that is a directory.
         return Err(rustix::io::Errno::ISDIR.into());
+    }
+    if rustix::termios::isatty(&file) {
+        return Err(io::Error::other(
+            "found a serial port or a terminal, expected a file (`hardnessd sniff --port` listens to a port)",
+        ));
     }
     Ok(file)
 }

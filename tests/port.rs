@@ -114,6 +114,18 @@ fn sniff_says_why_it_has_no_proposal() {
     fs::write(&noise, (0..40_000).map(|_| random()).collect::<Vec<u8>>()).unwrap();
     check(&[noise.to_str().unwrap()], 1, "no layout");
     check(&["/no/such.bin"], 66, "/no/such.bin");
+    // A port in place of a file would be read for ever.
+    let _sensor = bench.sensor(&[]);
+    let port = bench.path("port").display().to_string();
+    let new = bench.path("new.mcap").display().to_string();
+    for command in [&["sniff"][..], &["replay"], &["recover", "--out", &new]] {
+        let (code, _, stderr) = run(&[command, &[port.as_str()]].concat());
+        assert_eq!(code, 66, "{stderr}");
+        assert!(
+            stderr.contains("found a serial port or a terminal"),
+            "{stderr}"
+        );
+    }
     // The message gives the cause once.
     let (_, _, stderr) = run(&["sniff", "/no/such.bin"]);
     assert_eq!(stderr.matches("No such file").count(), 1, "{stderr}");

@@ -66,7 +66,7 @@ pub enum Error {
         max: usize,
     },
     /// The system refused.
-    #[error("{key}: {path}: cannot {what}: {source}")]
+    #[error("{key}: {path}: cannot {what}: {source}{}", remedy(source))]
     Io {
         /// The key of the configuration.
         key: &'static str,
@@ -77,6 +77,16 @@ pub enum Error {
         /// The system's error.
         source: io::Error,
     },
+}
+
+/// What to do about an error of the system.
+fn remedy(source: &io::Error) -> &'static str {
+    match source.kind() {
+        io::ErrorKind::PermissionDenied => {
+            ": set another path there, or XDG_RUNTIME_DIR to a directory of yours"
+        }
+        _ => "",
+    }
 }
 
 /// A listening socket. When it is dropped, its file is removed.

@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
+use rustix::fs::Access;
 
 use super::configuration::{self, Configuration};
 use super::player::BITS_A_BYTE;
@@ -92,6 +93,14 @@ pub fn run(args: &Args) -> Result<(), Error> {
     }
     lines += &model(&setup);
     let unix = &setup.config.publish.unix;
+    if unix.enabled {
+        for (key, socket) in [
+            ("publish.unix.path", unix.path()),
+            ("publish.unix.control_path", unix.control_path()),
+        ] {
+            warn_of_permissions(key, &socket, path);
+        }
+    }
     lines += &if unix.enabled {
         let (path, mode) = (unix.path(), String::from(unix.mode));
         format!(
@@ -138,6 +147,29 @@ pub fn run(args: &Args) -> Result<(), Error> {
     super::print(lines.as_bytes())
         .map(drop)
         .map_err(Error::Print)
+}
+
+/// Warns if you may not make a socket at `socket`. It is no error, because the daemon may run as another
+/// user.
+fn warn_of_permissions(key: &str, socket: &Path, path: &Path) {
+    let above = socket.ancestors().skip(1);
+    let mut above = above.map(|one| {
+        if one == Path::new("") {
+            Path::new(".")
+        } else {
+            one
+        }
+    });
+    let Some(directory) = above.find(|one| one.is_dir()) else {
+        return;
+    };
+    if rustix::fs::access(directory, Access::WRITE_OK).is_err() {
+        eprintln!(
+            "warning: {}: {key}: you may not write to {}, but the user who runs the daemon must",
+            path.display(),
+            directory.display()
+        );
+    }
 }
 
 /// Warns if the array is smaller than the model's frame, and says where its taxels are in that

@@ -9,8 +9,10 @@ use std::fs;
 use std::io::{self, ErrorKind};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use clap::Args as ClapArgs;
+use rustix::net::sockopt;
 use tokio::io::{AsyncRead, AsyncWriteExt};
 use tokio::net::{TcpStream, UnixStream, tcp, unix};
 
@@ -172,6 +174,14 @@ async fn find() -> Result<Connection, Error> {
     Err(denied.unwrap_or_else(|| Error::Nowhere { places: tried() }))
 }
 
+/// Lets the system notice within a minute that the robot is gone, as the daemon does for its clients.
+fn keep_alive(stream: &TcpStream) -> io::Result<()> {
+    sockopt::set_socket_keepalive(stream, true)?;
+    sockopt::set_tcp_keepidle(stream, Duration::from_secs(30))?;
+    sockopt::set_tcp_keepintvl(stream, Duration::from_secs(10))?;
+    Ok(sockopt::set_tcp_keepcnt(stream, 3)?)
+}
+
 impl Connection {
     async fn open(address: Address) -> Result<Self, Error> {
         let opened: io::Result<(Box<dyn AsyncRead + Send + Unpin>, Output)> = match &address {
@@ -179,9 +189,10 @@ impl Connection {
                 let (input, output) = stream.into_split();
                 (Box::new(input) as Box<_>, Output::Unix(output))
             }),
-            Address::Tcp(address) => TcpStream::connect(address).await.map(|stream| {
+            Address::Tcp(address) => TcpStream::connect(address).await.and_then(|stream| {
+                keep_alive(&stream)?;
                 let (input, output) = stream.into_split();
-                (Box::new(input) as Box<_>, Output::Tcp(output))
+                Ok((Box::new(input) as Box<_>, Output::Tcp(output)))
             }),
         };
         match opened {

@@ -150,7 +150,12 @@ fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Error {
         .split_once('=')
         .map(|(key, _)| key.trim())
         .filter(|key| !key.is_empty());
-    let message = wording::plain(error.message());
+    let message = match wording::plain(error.message()) {
+        twice if error.message() == "duplicate key" && key.is_none() => {
+            format!("{}: {twice}: put its keys below the first one", line.trim())
+        }
+        message => message,
+    };
     Error::Syntax {
         path: path.to_owned(),
         place: Place::of(text, start),

@@ -357,6 +357,18 @@ fn no_message_speaks_of_types_of_a_program() {
 }
 
 #[test]
+fn a_table_that_is_there_twice_is_named() {
+    let text = "[[sensor]]\nport = \"p\"\n[press]\nmin_frames = 2\n[press]\nend_area_taxels = 2\n";
+    let error = load(text).unwrap_err();
+    assert!(
+        error.ends_with(
+            ":5:2: [press]: found it twice, expected it once: put its keys below the first one"
+        ),
+        "{error}"
+    );
+}
+
+#[test]
 fn a_file_that_is_no_utf_8_is_a_bad_one_and_its_place_is_named() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("hardnessd.toml");
