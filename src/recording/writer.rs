@@ -191,6 +191,9 @@ impl<W: Write> Writer<W> {
     ///
     /// Returns an error if the entry cannot be written. The writer must not be used after that.
     pub fn entry(&mut self, sensor: usize, at: Stamp, entry: &Entry) -> Result<(), Error> {
+        if let Entry::Settings(settings) = entry {
+            self.sensors[sensor] = (**settings).clone();
+        }
         let bytes = message::encode_entry(self.sensors[sensor].name(), at, entry);
         let topic = message::topic_of(entry);
         self.write(channel_id(sensor, topic), at.wall, &bytes)
