@@ -38,6 +38,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import datetime
+import errno
 import glob
 import io
 import json
@@ -318,23 +319,55 @@ def _short(line: bytes) -> str:
     return text + "..." if len(line) > 60 else text
 
 
+def _shown(address: Address) -> str:
+    return "{}:{}".format(*address) if isinstance(address, tuple) else os.fspath(address)
+
+
+def _silence(address: Address, seconds: float) -> str:
+    """What to say where a connection is open, but no line came."""
+    if isinstance(_destination(address), str):
+        return f"no line within {seconds:g} s"
+    return (
+        f"no event within {seconds:g} s: events are at `listen` of [publish.tcp], port 8255 by default. "
+        "Port 8256 is the web page"
+    )
+
+
+def _keep_alive(peer: Any) -> None:
+    """Lets the system notice within a minute that the robot is gone: as the daemon does for its clients."""
+    peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    # Not every system has these. Without them it takes two hours.
+    for name, value in (("TCP_KEEPIDLE", 30), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 3)):
+        if hasattr(socket, name):
+            peer.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+
+
 class Connection:
     """Lines to and from the daemon, as they are. `timeout_s` is the limit for each wait."""
 
     def __init__(self, address: Address, timeout_s: Optional[float] = None) -> None:
         destination = _destination(address)
         patience_s = HELLO_S if timeout_s is None else timeout_s
-        if isinstance(destination, str):
-            self.socket = socket.socket(socket.AF_UNIX)
-            self.socket.settimeout(patience_s)
-            try:
-                self._connect(destination, time.monotonic() + patience_s)
-            except OSError:
-                self.socket.close()
-                raise
-        else:
-            self.socket = socket.create_connection(destination, patience_s)
-            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        try:
+            if isinstance(destination, str):
+                self.socket = socket.socket(socket.AF_UNIX)
+                self.socket.settimeout(patience_s)
+                try:
+                    self._connect(destination, time.monotonic() + patience_s)
+                except OSError:
+                    self.socket.close()
+                    raise
+            else:
+                self.socket = socket.create_connection(destination, patience_s)
+                _keep_alive(self.socket)
+        except socket.timeout as error:
+            why = f"no answer within {patience_s:g} s"
+            raise TimeoutError(errno.ETIMEDOUT, why, _shown(address)) from error
+        except OSError as error:
+            # The system does not name the address in its message.
+            if error.errno is not None:
+                error.filename = _shown(address)
+            raise
         self.socket.settimeout(timeout_s)
         self._bytes = bytearray()
 
@@ -437,9 +470,8 @@ class _Follower:
 
 
 def _disconnected(address: Address, error: BaseException) -> Disconnected:
-    where = "{}:{}".format(*address) if isinstance(address, tuple) else os.fspath(address)
     why = getattr(error, "strerror", None) or str(error) or f"no answer within {HELLO_S:g} s"
-    return {"type": "disconnected", "reason": f"{where}: {why}"}
+    return {"type": "disconnected", "reason": f"{_shown(address)}: {why}"}
 
 
 class _Subscriber:
@@ -519,7 +551,11 @@ class Client(_Subscriber):
             # Another thread may have closed the client while there was no connection to close.
             if self._closed.is_set():
                 return
-            connection.send(self._follower.subscription(connection.receive()))
+            try:
+                hello = connection.receive()
+            except TimeoutError as error:
+                raise TimeoutError(_silence(self._found, HELLO_S)) from error
+            connection.send(self._follower.subscription(hello))
             connection.socket.settimeout(None)
             while not self._closed.is_set():
                 event = self._follower.take(connection.receive())
@@ -611,9 +647,11 @@ class AsyncClient(_Subscriber):
         reader, writer = await asyncio.wait_for(connecting, HELLO_S)
         try:
             if not isinstance(destination, str):
-                peer = writer.get_extra_info("socket")
-                peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-            hello = await asyncio.wait_for(self._receive(reader), HELLO_S)
+                _keep_alive(writer.get_extra_info("socket"))
+            try:
+                hello = await asyncio.wait_for(self._receive(reader), HELLO_S)
+            except asyncio.TimeoutError as error:
+                raise TimeoutError(_silence(self._found, HELLO_S)) from error
             writer.write(json.dumps(self._follower.subscription(hello)).encode() + b"\n")
         except BaseException:
             writer.close()
@@ -858,7 +896,10 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
             count += event["type"] in args.types
             if count == args.count:
                 return 0
-        print(f"timed out after {args.timeout:g} s ({count} events)", file=sys.stderr)
+        said = f"timed out after {args.timeout:g} s ({count} events)"
+        if client.hello is None and client.connection and reason is None:
+            said = f"{_shown(client._found)}: {_silence(client._found, args.timeout)}\n{said}"
+        print(said, file=sys.stderr)
         return 1
     except Refused as error:
         print(f"the daemon refused: {error}", file=sys.stderr)

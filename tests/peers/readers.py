@@ -139,7 +139,10 @@ def damaged(directory):
             return len(list(take.events())) + len(list(take.frames()))
 
     random.seed(1)
-    for content in (b"", b"not one", whole[: len(whole) // 2], whole[:-1]):
+    for content in (b"", b"not one"):
+        broken.write_bytes(content)
+        refused(read, broken, "no MCAP recording")
+    for content in (whole[: len(whole) // 2], whole[:-1]):
         broken.write_bytes(content)
         refused(read, broken, "hardnessd recover")
     refusals = 0

@@ -33,6 +33,13 @@ _ARRAYS: Tuple[Tuple[str, str, Tuple[int, ...]], ...] = (
     ("shore", "float32", ()),
 )
 
+# What a file that begins with these bytes is.
+_KINDS: Dict[bytes, str] = {
+    b"\x89MCA": "a recording (MCAP). Read it with hardnessd.recording, or collect its presses with "
+    "`hrn-train collect`",
+    b"\x93NUM": "a single array (.npy)",
+}
+
 
 @dataclass(frozen=True)
 class DataSet:
@@ -83,8 +90,14 @@ class DataSet:
 def load(path: Union[str, "os.PathLike[str]"]) -> DataSet:
     """Reads a data set. Raises ValueError if the file is none, OSError if it cannot be read."""
     try:
-        with open(path, "rb") as content, np.load(content, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        with open(path, "rb") as content:
+            # numpy takes what it does not know for pickled objects, and proposes to load them unsafely.
+            begin = content.read(4)
+            if not begin.startswith(b"PK"):
+                raise ValueError(_KINDS.get(begin, "no zip archive"))
+            content.seek(0)
+            with np.load(content, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
     except (ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
         raise ValueError(f"{os.fspath(path)}: not a data set (.npz): {error}") from error
     for name in ("frames", "level"):

@@ -47,6 +47,9 @@ _NULL: Dict[str, Union[int, str, bytes]] = {
 }
 
 
+# The first bytes of an MCAP file.
+_MAGIC = b"\x89MCAP0\r\n"
+
 # The constant BYTES of tactile_interfaces/msg/Input.
 _BYTES = 0
 
@@ -83,6 +86,9 @@ class Recording:
         self.path = os.fspath(path)
         self._file = builtins.open(path, "rb")
         try:
+            if self._file.read(len(_MAGIC)) != _MAGIC:
+                raise Damaged(f"{self.path}: no MCAP recording, as `hardnessd record` writes it")
+            self._file.seek(0)
             with self._reading():
                 self._reader = make_reader(
                     self._file, validate_crcs=True, decoder_factories=[DecoderFactory()]
@@ -155,10 +161,13 @@ class Recording:
             raise self._damaged(error) from error
 
     def _damaged(self, error: Exception) -> Damaged:
-        why = repr(error)[:80]
+        name = type(error).__name__
+        why = " ".join(f"{name}: {error}".split()) if str(error) else name
+        if len(why) > 80:
+            why = why[:77] + "..."
         return Damaged(
-            f"{self.path}: no recording, a damaged one, or one that is still written ({why}): "
-            f"`hardnessd recover {self.path} --out GOOD.mcap` saves what is whole"
+            f"{self.path}: a damaged recording, or one that is still being written: "
+            f"`hardnessd recover {self.path} --out GOOD.mcap` saves what is whole. Found: {why}"
         )
 
 
