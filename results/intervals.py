@@ -76,6 +76,8 @@ def interval(seeds, least):
         (draws.var(ddof=1), len(clusters) - len(strata)),
     ]
     total = sum(variance for variance, _ in parts)
+    if total == 0:
+        return mean, mean, mean
     free = total**2 / sum(variance**2 / degrees for variance, degrees in parts)
     reach = scipy.stats.t.ppf(0.975, free) * total**0.5
     return mean, max(mean - reach, least), min(mean + reach, 1)
@@ -98,6 +100,8 @@ def main():
         sign, counts, least = "", list(seeds.values()), 0
         if options.less:
             sign, counts, least = "+", less(seeds, methods[options.less]), -1
+        if not counts:
+            continue
         mean, low, high = (f"{100 * value:{sign}.1f}" for value in interval(counts, least))
         print(f"{method:22} {len(counts)} seeds  {mean}  {low} to {high}")
 

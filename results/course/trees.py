@@ -104,8 +104,8 @@ def of_press(frames: np.ndarray, time: np.ndarray, approach: np.ndarray, known: 
     return row
 
 
-def read(path: Path) -> dict[str, np.ndarray]:
-    """The features of every press of a file, with level, Shore hardness and kind of material."""
+def read(path: Path, split: int) -> dict[str, np.ndarray]:
+    """The features of every press of a split (0 train, 1 test), with level, Shore hardness and kind of material."""
     with np.load(path) as file:
         data = {name: file[name] for name in file}
     meta = json.loads(bytes(data["meta"]))
@@ -120,7 +120,8 @@ def read(path: Path) -> dict[str, np.ndarray]:
     x = np.array(presses, np.float32)
     x[~np.isfinite(x)] = np.nan
     kind = np.array(meta["materials"])[data["material"]]
-    return {"x": x, "level": data["level"].astype(int), "shore": data["shore"], "kind": kind}
+    found = {"x": x, "level": data["level"].astype(int), "shore": data["shore"], "kind": kind}
+    return {name: values[data["split"] == split] for name, values in found.items()}
 
 
 def main() -> None:
@@ -129,7 +130,7 @@ def main() -> None:
     parser.add_argument("--test", nargs="+", type=Path, required=True)
     parser.add_argument("--rounds", type=int, default=300)
     arguments = parser.parse_args()
-    files = [read(path) for path in arguments.data]
+    files = [read(path, 0) for path in arguments.data]
     x, level, shore = (np.concatenate([file[name] for file in files]) for name in ("x", "level", "shore"))
     # Some features are never known, such as the approach before the first frame.
     used = [column for column in range(x.shape[1]) if len(np.unique(x[np.isfinite(x[:, column]), column])) > 2]
@@ -141,7 +142,7 @@ def main() -> None:
     classifier.fit(x, level, sample_weight=weights / weights.mean())
     regressor = HistGradientBoostingRegressor(**settings).fit(x, shore)
     for path in arguments.test:
-        test = read(path)
+        test = read(path, 1)
         test["x"] = test["x"][:, used]
         right = classifier.predict(test["x"]) == test["level"]
         errors = regressor.predict(test["x"]) - test["shore"]
