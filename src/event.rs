@@ -269,7 +269,8 @@ pub enum Note {
     AtEdge,
     /// A taxel reads full scale.
     Saturated,
-    /// The force or the area is outside the range of the model's training.
+    /// The force or the area is outside the range of the model's training. With a model of format 2,
+    /// also the duration, the frame rate, the speed, the depth or the arm.
     OutsideTraining,
 }
 
