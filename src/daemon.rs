@@ -14,6 +14,7 @@ pub mod descriptors;
 pub mod foxglove;
 mod http;
 mod hub;
+mod lane;
 pub(crate) mod lines;
 pub mod log;
 mod pace;

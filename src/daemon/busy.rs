@@ -40,6 +40,25 @@ pub fn longest() -> Duration {
     LONGEST.get()
 }
 
+/// Work for this long without a wait is followed by a pause. `LimitRTTIME` in the unit is 500 ms.
+const MOST: Duration = Duration::from_millis(20);
+const PAUSE: Duration = Duration::from_micros(100);
+
+/// Pauses this thread for a moment if it has worked for long without a wait. In real-time scheduling the
+/// system kills a process whose thread never waits, and clients that ask without end leave it no wait of
+/// its own. Call it after the work for a client.
+pub(super) fn rest() {
+    let worked = match (BEGUN.get(), used()) {
+        (Some(begun), Some(now)) => now.saturating_sub(begun),
+        _ => return,
+    };
+    if worked > MOST {
+        ends();
+        std::thread::sleep(PAUSE);
+        begins();
+    }
+}
+
 /// The processor time of this thread.
 fn used() -> Option<Duration> {
     Duration::try_from(clock_gettime(ClockId::ThreadCPUTime)).ok()

@@ -19,7 +19,9 @@ use tracing::debug;
 
 use self::pace::Pace;
 use super::accept::Serve;
+use super::busy;
 use super::hub::{self, Closed, Line};
+use super::lane::Lane;
 use super::lines::{Heard, Lines};
 use super::record::NoBlackbox;
 use super::request::motion::{Positions, Told};
@@ -112,6 +114,8 @@ pub(crate) struct Service {
     pub(crate) max_clients: usize,
     pub(crate) hub: hub::Handle,
     pub(crate) sensors: Sensors,
+    /// The turns of the connections that ask much.
+    pub(crate) lane: Lane,
 }
 
 impl Service {
@@ -268,7 +272,7 @@ impl<S: Stream> Client<S> {
         let mut hearing = true;
         let mut doing: Option<Doing> = None;
         let mut pause = HALF_CLOSED_CHECKS.0;
-        let mut pace = Pace::new();
+        let mut pace = Pace::new(self.service.lane.clone());
         loop {
             tokio::select! {
                 biased;
@@ -289,8 +293,9 @@ impl<S: Stream> Client<S> {
                 }
                 heard = hear(&mut self.input, &pace), if hearing && doing.is_none() => match heard? {
                     Heard::Line(line) => {
-                        pace.count();
+                        pace.count(line.len());
                         doing = self.heed(id, &line, &mut next).await?;
+                        busy::rest();
                     }
                     Heard::TooLong => {
                         let message = format!(

@@ -29,12 +29,15 @@ use hyper::service::{Service, service_fn};
 use hyper::{Method, Request, StatusCode, Uri};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
+use rustix::net::sockopt;
 use sha2::{Digest, Sha256};
 use tokio::net::TcpStream;
 use tracing::debug;
 
 use super::accept::{Serve, Stop, stopped};
+use super::busy;
 use super::hub::{self, Closed};
+use super::lane::Lane;
 use super::sensor::Sensors;
 use crate::event::LinkState;
 
@@ -51,6 +54,14 @@ const BUFFER_BYTES: usize = 64 * 1024;
 /// The longest target of a request in bytes: as many as every server should accept (RFC 9112,
 /// section 3).
 const LONGEST_TARGET: usize = 8_000;
+
+/// The time of a request in the lane, and the time of the requests that do not wait: 50 at once, and after
+/// that 500 a second over all connections.
+const REQUEST_TIME: Duration = Duration::from_millis(2);
+const FREE_TIME: Duration = Duration::from_millis(100);
+
+/// A connection whose other end takes nothing for this long is closed.
+const UNREAD_PATIENCE: Duration = Duration::from_secs(30);
 
 /// How long the pipelines may take to answer.
 const PATIENCE: Duration = Duration::from_secs(1);
@@ -78,6 +89,8 @@ pub(crate) struct Http {
     listen: SocketAddr,
     routes: TowerToHyperService<Router>,
     stop: Stop,
+    /// The turns of all requests.
+    lane: Lane,
 }
 
 /// The sources of the answers.
@@ -112,11 +125,14 @@ impl Http {
             listen,
             routes: TowerToHyperService::new(routes),
             stop,
+            lane: Lane::new(),
         }
     }
 
     /// Answers a request. `local` is this machine's address of the connection.
     async fn respond(&self, request: Request<Incoming>, local: SocketAddr) -> Response {
+        self.lane.take(REQUEST_TIME, FREE_TIME).await;
+        busy::rest();
         let mut response = if !host::is_ours(&request, self.listen, local) {
             let message = "the Host header is not an address of this machine: use localhost or \
                            the address in [http] listen";
@@ -203,6 +219,8 @@ impl Serve<TcpStream> for Http {
             let Ok(local) = stream.local_addr() else {
                 return;
             };
+            // The system closes it then. On failure it stays open.
+            let _ = sockopt::set_tcp_user_timeout(&stream, UNREAD_PATIENCE.as_millis() as u32);
             let mut stop = http.stop.clone();
             let service =
                 service_fn(async |request| Ok::<_, Infallible>(http.respond(request, local).await));

@@ -17,6 +17,7 @@ use super::http::Http;
 use super::hub;
 #[cfg(feature = "foxglove")]
 use super::hub::Line;
+use super::lane::Lane;
 #[cfg(any(feature = "foxglove", feature = "ros2", feature = "zenoh"))]
 use super::relay::Worker;
 #[cfg(feature = "ros2")]
@@ -200,6 +201,7 @@ impl Publishers {
             zenoh,
         } = self;
         let service = |access| Service {
+            lane: Lane::new(),
             access,
             max_clients,
             hub: hub.clone(),

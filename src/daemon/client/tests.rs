@@ -16,6 +16,7 @@ async fn events_go_on_and_requests_wait_while_a_command_is_carried_out() {
     let (commands, mut inbox) = mpsc::channel(1);
     let name = "a".to_owned();
     let service = Service {
+        lane: Lane::new(),
         access: Access::Control,
         max_clients: 1,
         hub: hub.clone(),
