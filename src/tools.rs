@@ -87,7 +87,7 @@ pub fn usage(program: &str, error: &clap::Error) -> ExitCode {
     ) {
         return match error.print() {
             Err(failure) if !error.use_stderr() && failure.kind() != io::ErrorKind::BrokenPipe => {
-                eprintln!("{program}: stdout: {failure}");
+                crate::say!("{program}: stdout: {failure}");
                 ExitCode::from(exit::IO)
             }
             _ => ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(exit::USAGE)),
@@ -119,7 +119,7 @@ pub fn usage(program: &str, error: &clap::Error) -> ExitCode {
     } else if let Some(command) = where_to_look(error, &text) {
         told += &format!(": see `{command} --help`");
     }
-    eprintln!("{program}: {}", shown(&told));
+    crate::say!("{program}: {}", shown(&told));
     ExitCode::from(exit::USAGE)
 }
 

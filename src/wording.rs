@@ -1,6 +1,25 @@
 //! Words for people: plain messages for a parser's errors, and a check for text that is safe to
 //! show.
 
+/// Writes a line to stderr, like `eprintln!`, but goes on if nobody can read it: the disk is full, or the
+/// terminal has gone. `eprintln!` panics then, and a panic ends the process.
+#[macro_export]
+macro_rules! say {
+    ($($text:tt)*) => {{
+        use std::io::Write as _;
+        let _ = writeln!(std::io::stderr(), $($text)*);
+    }};
+}
+
+/// Like [`say!`], without the end of the line.
+#[macro_export]
+macro_rules! say_part {
+    ($($text:tt)*) => {{
+        use std::io::Write as _;
+        let _ = write!(std::io::stderr(), $($text)*);
+    }};
+}
+
 /// The error of a TOML text in plain words: the line, and what was found and expected.
 pub fn of_toml(text: &str, error: &toml::de::Error) -> String {
     let before = &text[..error.span().map_or(0, |span| span.start).min(text.len())];

@@ -39,7 +39,7 @@ fn main() -> ExitCode {
     {
         Ok(runtime) => runtime,
         Err(error) => {
-            eprintln!("hardnessd: no runtime: {error}");
+            hardnessd::say!("hardnessd: no runtime: {error}");
             return ExitCode::from(exit::IO);
         }
     };
@@ -52,7 +52,7 @@ fn main() -> ExitCode {
     let signals = match signals {
         Ok(signals) => signals,
         Err(error) => {
-            eprintln!("hardnessd: no signals: {error}");
+            hardnessd::say!("hardnessd: no signals: {error}");
             return ExitCode::from(exit::IO);
         }
     };
@@ -67,7 +67,7 @@ fn main() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("hardnessd: {}", tools::line(&error));
+            hardnessd::say!("hardnessd: {}", tools::line(&error));
             ExitCode::from(error.code())
         }
     }

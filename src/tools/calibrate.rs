@@ -225,7 +225,7 @@ pub async fn run(
             let fit = force::Fit::of(&weights.collect::<Vec<_>>(), &sensor)?;
             let error = fit.error();
             if error > DOUBTFUL_ERROR {
-                eprintln!(
+                crate::say!(
                     "warning: the weights disagree by {:.0} %: was each put on alone, in this order, after \
                      the zero was taken? If so, leave out the weight with the greatest error",
                     100.0 * error
@@ -237,7 +237,7 @@ pub async fn run(
             let (full, presses): (Vec<Press>, _) =
                 presses.into_iter().partition(|press| press.saturated);
             if !full.is_empty() {
-                eprintln!(
+                crate::say!(
                     "warning: {} of the presses reached full scale on a taxel and are left out: press more softly",
                     full.len()
                 );
@@ -292,7 +292,7 @@ async fn live(
     let sockets = Sockets::Configured;
     let daemon = Daemon::recording(setup, path.clone(), file, labels, progress, sockets)?;
     let wanted = args.wanted();
-    eprintln!("leave the sensor free until its zero is taken");
+    crate::say!("leave the sensor free until its zero is taken");
     let enough = async {
         // The presses at the last prompt.
         let mut said = None;
@@ -404,21 +404,21 @@ fn chosen(args: &Args, setup: &Setup) -> Result<Sensor, Error> {
 /// Says on stderr what to do next, after `seen` presses.
 fn say_next(args: &Args, seen: u64) {
     match args.what {
-        What::Arm if seen == 0 => eprintln!(
+        What::Arm if seen == 0 => crate::say!(
             "press something rigid {} times, while the robot tells where its arm is",
             args.wanted()
         ),
-        What::Taxels if seen == 0 => eprintln!(
+        What::Taxels if seen == 0 => crate::say!(
             "press something wide and soft {} times, each time at another place, up to the edges; or press \
              the whole array evenly",
             args.wanted()
         ),
-        What::Arm | What::Taxels => eprintln!("press {seen} of {}", args.wanted()),
+        What::Arm | What::Taxels => crate::say!("press {seen} of {}", args.wanted()),
         What::Force => match args.newtons.get(seen as usize) {
             Some(newtons) => {
-                eprintln!("put {newtons} N on the sensor, wait until it rests, and take it off");
+                crate::say!("put {newtons} N on the sensor, wait until it rests, and take it off");
             }
-            None => eprintln!("done"),
+            None => crate::say!("done"),
         },
     }
 }

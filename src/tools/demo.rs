@@ -133,10 +133,10 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let robot = player.robot(config.publish.unix.control_path(), None);
     let daemon = Daemon::bind(Setup::of(config, Path::new("demo"))?)?;
     if let Some(address) = daemon.http_address() {
-        eprintln!("live page: http://{address}/");
+        crate::say!("live page: http://{address}/");
     }
     let listen = "`hardnessd watch` and `hardnessd tail` find it";
-    eprintln!("socket: {} ({listen})", socket.display());
+    crate::say!("socket: {} ({listen})", socket.display());
     let subscriber = UnixStream::connect(&socket).await.map_err(io("socket"))?;
     let (stop, stopped) = oneshot::channel::<()>();
     let daemon = daemon.run(

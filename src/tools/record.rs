@@ -188,7 +188,7 @@ pub async fn run(
     } = *counted.borrow();
     let seen = said_frames(frames);
     if io::stderr().is_terminal() {
-        eprintln!(
+        crate::say!(
             "recorded {seen}, {}: {}",
             said_presses(presses),
             said(&path)
@@ -197,12 +197,12 @@ pub async fn run(
     if recorded.is_ok() && presses == 0 {
         let path = said(&path);
         if frames > 0 && tared == 0 {
-            eprintln!(
+            crate::say!(
                 "warning: {path}: no press in {seen}, because the zero was not taken: leave the sensor free at \
                  the start, and record longer"
             );
         } else {
-            eprintln!(
+            crate::say!(
                 "warning: {path}: no press in {seen}: was the sensor pressed, is it live, and \
                  is press.contact_threshold_n low enough?"
             );

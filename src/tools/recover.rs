@@ -122,7 +122,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
             });
         }
     };
-    eprintln!("{}", account(&recovered));
+    crate::say!("{}", account(&recovered));
     Ok(())
 }
 

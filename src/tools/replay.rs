@@ -199,7 +199,7 @@ fn play_recording(path: &Path, file: impl Read, setup: Setup, pace: Pace) -> Res
         return Ok(());
     }
     if let Some(model) = playback.other_model() {
-        eprintln!(
+        crate::say!(
             "warning: {}: recorded with model {}, played with another",
             path.display(),
             model.get(..12).unwrap_or(model)
@@ -341,7 +341,7 @@ fn warn(unjudged: Vec<Unjudged>) {
     } in unjudged
     {
         let phase = crate::event::name(&phase);
-        eprintln!("warning: sensor {sensor:?}: no {phase} verdict on press {press}: {error}");
+        crate::say!("warning: sensor {sensor:?}: no {phase} verdict on press {press}: {error}");
     }
 }
 

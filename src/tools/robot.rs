@@ -61,7 +61,7 @@ impl Robot {
             if let Err(Ended::Refused(message)) = self.tell().await
                 && !complained
             {
-                eprintln!("warning: {}: {message}", self.socket.display());
+                crate::say!("warning: {}: {message}", self.socket.display());
                 complained = true;
             }
             tokio::time::sleep(RETRY).await;

@@ -157,7 +157,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     }
     let (baud, warning) = baud(&args, &layout)?;
     if let Some(warning) = warning {
-        eprintln!("{warning}");
+        crate::say!("{warning}");
     }
     let what = args
         .link

@@ -155,7 +155,7 @@ fn tell(args: &Args, bytes: &[u8]) -> Result<(), Error> {
     } else {
         "set its port and frame_rate_hz, which a file does not say"
     };
-    eprintln!("wrote {}: {next}", shown(&out.display().to_string()));
+    crate::say!("wrote {}: {next}", shown(&out.display().to_string()));
     Ok(())
 }
 
@@ -231,7 +231,7 @@ async fn listen(path: &Path, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> 
             match link.turn().await {
                 Turn::Opened => {
                     let path = shown(&path.display().to_string());
-                    eprintln!("listening at {path} for {seconds} s: press the sensor");
+                    crate::say!("listening at {path} for {seconds} s: press the sensor");
                 }
                 Turn::Bytes(read) => bytes.extend_from_slice(read),
                 Turn::Unavailable(reason) | Turn::Lost(reason) => {

@@ -141,7 +141,7 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
     // This comes after the connection is made: if no daemon answers, the error must be the only
     // line.
     if args.source.given().is_none() {
-        eprintln!(
+        crate::say!(
             "hardnessd: events of {}",
             super::shown(&address.to_string())
         );

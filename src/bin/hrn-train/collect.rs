@@ -81,7 +81,7 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     let is_replaced = earlier_presses.is_none() && out.is_file();
     write_streamed(out, |file| collection.write(file))?;
     if is_replaced {
-        eprintln!("{}: replaced the earlier file", out.display());
+        hardnessd::say!("{}: replaced the earlier file", out.display());
     }
     let all = earlier_presses.unwrap_or_default() + collection.presses;
     Ok(account(arguments, &collection, all))

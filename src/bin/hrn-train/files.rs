@@ -1,16 +1,31 @@
 //! Files named on the command line.
 
+use std::fs::File;
+use std::io::{self, Read as _};
 use std::path::Path;
 
 use anyhow::Context as _;
 use hardnessd::train::run::disk::write_whole;
 use hardnessd::trial;
-use hardnessd::verdict::Hrn;
+use hardnessd::verdict::{Hrn, MAX_FILE_BYTES};
 
 use super::failure::Unreadable;
 
+/// Reads a model or settings. A file that is too long for either is refused, as the daemon refuses it.
 pub(super) fn read(path: &Path) -> Result<Vec<u8>, Unreadable> {
-    std::fs::read(path).map_err(|source| Unreadable {
+    let read = || {
+        let mut bytes = Vec::new();
+        let file = File::open(path)?;
+        file.take(MAX_FILE_BYTES as u64 + 1)
+            .read_to_end(&mut bytes)?;
+        if bytes.len() > MAX_FILE_BYTES {
+            return Err(io::Error::other(format!(
+                "found more than {MAX_FILE_BYTES} bytes, expected at most so many"
+            )));
+        }
+        Ok(bytes)
+    };
+    read().map_err(|source| Unreadable {
         path: path.to_owned(),
         source,
     })
@@ -21,7 +36,7 @@ pub(super) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let is_replaced = path.is_file();
     write_whole(path, bytes)?;
     if is_replaced {
-        eprintln!("{}: replaced the earlier file", path.display());
+        hardnessd::say!("{}: replaced the earlier file", path.display());
     }
     Ok(())
 }

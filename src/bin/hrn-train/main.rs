@@ -39,7 +39,7 @@ fn main() -> ExitCode {
         _ => None,
     };
     if let Err(error) = signals::end_at_signals(how_to_continue) {
-        eprintln!("hrn-train: signals: {error}");
+        hardnessd::say!("hrn-train: signals: {error}");
         return ExitCode::from(exit::IO);
     }
     let done = match arguments.command {
@@ -60,7 +60,7 @@ fn main() -> ExitCode {
     match done.and_then(|account| Ok(tools::print(account.as_bytes())?)) {
         Ok(_) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("hrn-train: {}", tools::line(error.as_ref()));
+            hardnessd::say!("hrn-train: {}", tools::line(error.as_ref()));
             ExitCode::from(exit_code(&error))
         }
     }

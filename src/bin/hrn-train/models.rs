@@ -49,7 +49,7 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
 fn warn_of_pitch(data: &Path, pitch_mm: f64, hrn: &Hrn) {
     let (of_model, of_data) = (hrn.card().pitch_mm, pitch_mm as f32);
     if of_model != of_data {
-        eprintln!(
+        hardnessd::say!(
             "warning: {}: taxel pitch: found {of_data} mm, expected {of_model} mm, that of the model",
             data.display()
         );
@@ -136,7 +136,7 @@ pub(super) fn check_model(path: &Path) -> ExitCode {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::from(exit::CONFIG),
         Err(error) => {
-            eprintln!("hrn-train: {}", tools::line(error.as_ref()));
+            hardnessd::say!("hrn-train: {}", tools::line(error.as_ref()));
             ExitCode::from(exit_code(&error))
         }
     }

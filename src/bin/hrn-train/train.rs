@@ -54,15 +54,17 @@ pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
     let device = device(arguments.device)?;
     let run = Run::open(&arguments.out, &description, arguments.resume)?
         .taking_from(arguments.from.clone());
-    eprint!("{}", account::of_data(&dataset));
+    hardnessd::say_part!("{}", account::of_data(&dataset));
     let labelled = dataset
         .samples
         .iter()
         .filter(|sample| sample.split == Split::Train && sample.level > 0);
     let labelled = labelled.map(|sample| (sample.level, sample.object));
-    eprint!("{}", account::of_levels(labelled));
+    hardnessd::say_part!("{}", account::of_levels(labelled));
     if arguments.profile == Profile::Smoke {
-        eprintln!("--profile smoke: tries the commands in seconds; too short to learn anything");
+        hardnessd::say!(
+            "--profile smoke: tries the commands in seconds; too short to learn anything"
+        );
     }
     let begun = Instant::now();
     let evaluation = methods::train(arguments.method, &dataset, &description, &run, &device)?;
@@ -90,7 +92,7 @@ fn train_course(arguments: &Train) -> anyhow::Result<String> {
     let labelled = courses.labelled(Split::Train);
     let labelled = labelled.map(|place| &courses.presses[place]);
     let labelled = labelled.map(|press| (press.level, Some(press.object)));
-    eprint!("{}", account::of_levels(labelled));
+    hardnessd::say_part!("{}", account::of_levels(labelled));
     let begun = Instant::now();
     let evaluation = methods::course::train(&courses, None, &description, &run, &device)?;
     Ok(account_of_run(
@@ -128,7 +130,7 @@ pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
     let description = request.description(&dataset)?;
     methods::check(method, &dataset, &description)?;
     let run = Run::open(&arguments.out, &description, arguments.resume)?;
-    eprint!("{}", account::of_data(&dataset));
+    hardnessd::say_part!("{}", account::of_data(&dataset));
     let begun = Instant::now();
     let evaluation = methods::frame::adapt(&dataset, start, &description, &run, &device)?;
     Ok(account_of_run(

@@ -245,14 +245,14 @@ impl Board {
             .with_style(style)
             .with_prefix(name.to_owned());
         if self.total.is_hidden() {
-            eprintln!("{name}: started");
+            crate::say!("{name}: started");
         }
         self.bars.insert_before(&self.total, bar)
     }
 
     fn say(&self, line: &str) {
         if self.total.is_hidden() {
-            eprintln!("{line}");
+            crate::say!("{line}");
         } else {
             // Only this call prints past the bars. It fails when the terminal is gone, where nobody
             // reads the line.
@@ -268,7 +268,7 @@ impl Board {
         });
         if self.total.is_hidden() && ended {
             let (done, all) = (self.total.position(), self.total.length());
-            eprintln!("{done} of {} runs{left}", all.unwrap_or_default());
+            crate::say!("{done} of {} runs{left}", all.unwrap_or_default());
         }
         self.total.set_message(left);
     }

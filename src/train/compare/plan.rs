@@ -252,7 +252,7 @@ impl PlannedRun {
             .unwrap_or_else(|error| Some(format!("{error:#}")));
         if let Some(difference) = &difference {
             let run = self.directory.display();
-            eprintln!("{run}: not requested, and left out of the tables; {difference}");
+            crate::say!("{run}: not requested, and left out of the tables; {difference}");
         }
         difference.is_none()
     }

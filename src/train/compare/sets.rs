@@ -104,7 +104,7 @@ pub(super) fn check_seed(dataset: &Dataset) -> anyhow::Result<()> {
 pub(super) fn warn_of_pitch(dataset: &Dataset) {
     let pitch_mm = dataset.pitch_mm();
     if pitch_mm != PITCH_MM {
-        eprintln!(
+        crate::say!(
             "warning: {}: taxel pitch: found {pitch_mm} mm, expected {PITCH_MM} mm, that of the \
              simulated test objects",
             dataset.path().display()
@@ -200,7 +200,7 @@ fn simulations(profile: Profile) -> [(&'static str, DatasetSettings); 8] {
 fn simulated(directory: &Path, name: &str, settings: &DatasetSettings) -> anyhow::Result<PathBuf> {
     let path = file_of(directory, name, settings)?;
     if !path.exists() {
-        eprintln!("simulating {}", path.display());
+        crate::say!("simulating {}", path.display());
         let samples = simulated::simulate(settings);
         write_whole(&path, &simulated::to_bytes(settings, samples)?)?;
     }

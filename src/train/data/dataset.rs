@@ -366,7 +366,7 @@ impl Dataset {
     /// Prints a warning if an object has samples in both splits.
     pub fn warn_of_object_in_both_splits(&self) {
         if let Some(object) = self.object_in_both_splits() {
-            eprintln!(
+            crate::say!(
                 "warning: {}: object {object} is in both splits: its presses are near-copies, so a test \
                  on some of them overrates a model that learnt from the others",
                 self.path().display()

@@ -81,7 +81,7 @@ pub fn train(
     };
     let trained = course::fit(&task, start, run)?;
     if let Some(missing) = trained.calibration.missing() {
-        eprintln!("{missing}");
+        crate::say!("{missing}");
     }
     finish(
         run,

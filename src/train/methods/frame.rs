@@ -70,7 +70,7 @@ pub fn train(
     let trained = frame::fit(&task, start, run)?;
     let missing = trained.calibration.missing_interval();
     if let Some(missing) = missing.filter(|_| samples.has_shore()) {
-        eprintln!("{missing}");
+        crate::say!("{missing}");
     }
     finish(samples, &trained, description, run, device)
 }

@@ -65,7 +65,7 @@ pub(in crate::train) fn report(
     message: String,
 ) {
     if bar.is_hidden() {
-        eprintln!("{stage}: epoch {epoch} of {epochs}: {message}");
+        crate::say!("{stage}: epoch {epoch} of {epochs}: {message}");
     } else {
         bar.set_message(message);
     }

@@ -1,6 +1,7 @@
 //! Data sets as `.npz` files: arrays with the names, types and shapes of `docs/formats.md`.
 
 use std::io::{Cursor, Read, Seek, Write};
+use std::os::unix::fs::FileTypeExt as _;
 use std::path::Path;
 
 use ndarray::{ArrayView, ArrayView1, ArrayView3};
@@ -101,7 +102,14 @@ pub(super) fn parse(bytes: &[u8], path: &Path, name: String) -> Result<Dataset, 
 }
 
 pub(in crate::train::data) fn read(path: &Path) -> Result<Vec<u8>, DatasetError> {
-    std::fs::read(path).map_err(|source| DatasetError::Unreadable {
+    let read = || {
+        // A device has no end.
+        if std::fs::metadata(path)?.file_type().is_char_device() {
+            return Err(std::io::Error::other("found a device, expected a data set"));
+        }
+        std::fs::read(path)
+    };
+    read().map_err(|source| DatasetError::Unreadable {
         path: path.to_owned(),
         source,
     })
