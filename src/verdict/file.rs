@@ -12,6 +12,12 @@ use super::{
     MIN_OPSET, ModelError, Range,
 };
 use crate::frame::{COLS, ROWS, TAXELS};
+use crate::wording::is_plain;
+
+/// The longest `label` and `shore` of a level: every event carries a label.
+const LONGEST_LABEL_BYTES: usize = 255;
+/// The longest text of another key.
+const LONGEST_LINE_BYTES: usize = 16_384;
 
 pub(super) fn check_opset(proto: &pb::ModelProto) -> Result<(), ModelError> {
     let found = proto
@@ -234,11 +240,13 @@ pub(super) fn read_metadata(proto: &pb::ModelProto) -> Result<(Card, Checks), Mo
     };
     let line = |key: &'static str| {
         let value = text(key)?;
-        if value.trim().is_empty() || value.chars().any(char::is_control) {
-            let expected = "text without control characters".to_owned();
+        if value.trim().is_empty() || !is_plain(value) || value.len() > LONGEST_LINE_BYTES {
+            let expected = format!(
+                "text without control or bidirectional characters, of at most {LONGEST_LINE_BYTES} bytes"
+            );
             return Err(ModelError::KeyInvalid {
                 key,
-                found: format!("{value:?}"),
+                found: shown(value),
                 expected,
             });
         }
@@ -375,17 +383,28 @@ fn check_levels(levels: &[Level]) -> Result<(), ModelError> {
         });
     }
     for text in levels.iter().flat_map(|level| [&level.label, &level.shore]) {
-        if text.is_empty() || text.chars().any(char::is_control) {
-            let expected =
-                "`label` and `shore`, neither empty nor with control characters".to_owned();
+        if text.is_empty() || !is_plain(text) || text.len() > LONGEST_LABEL_BYTES {
+            let expected = format!(
+                "`label` and `shore` of 1 to {LONGEST_LABEL_BYTES} bytes, without control or bidirectional \
+                 characters"
+            );
             return Err(ModelError::KeyInvalid {
                 key,
-                found: format!("{text:?}"),
+                found: shown(text),
                 expected,
             });
         }
     }
     Ok(())
+}
+
+/// The beginning of a text, quoted.
+fn shown(text: &str) -> String {
+    let begin: String = text.chars().take(60).collect();
+    match begin.len() < text.len() {
+        true => format!("{begin:?}... of {} bytes", text.len()),
+        false => format!("{text:?}"),
+    }
 }
 
 fn check_range(range: &Range, format: &str) -> Result<(), ModelError> {
