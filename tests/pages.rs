@@ -122,10 +122,8 @@ fn links_between_pages_lead_somewhere() {
 
 /// The pages and files that the Debian package installs beside each other, by their path there.
 fn packaged() -> BTreeMap<PathBuf, PathBuf> {
-    let manifest: toml::Value = fs::read_to_string(root().join("Cargo.toml"))
-        .unwrap()
-        .parse()
-        .unwrap();
+    let manifest = fs::read_to_string(root().join("Cargo.toml")).unwrap();
+    let manifest: toml::Value = toml::from_str(&manifest).unwrap();
     let assets = manifest["package"]["metadata"]["deb"]["assets"].as_array();
     let mut found = BTreeMap::new();
     for asset in assets.unwrap() {
