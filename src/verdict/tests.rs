@@ -186,11 +186,17 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
         },
     );
     check(
-        "`hrn.levels`: found \"ha\\u{1b}rd\", expected `label` and `shore`, neither",
+        "`hrn.levels`: found \"ha\\u{1b}rd\", expected `label` and `shore` of 1 to 255 bytes",
         |p| {
             *value(p, "hrn.levels") = value(p, "hrn.levels").replace("hard", "ha\\u001brd");
         },
     );
+    check("... of 300 bytes, expected `label` and `shore`", |p| {
+        *value(p, "hrn.levels") = value(p, "hrn.levels").replace("hard", &"h".repeat(300));
+    });
+    check("`hrn.validation`: found \"aaaa", |p| {
+        *value(p, "hrn.validation") = "a".repeat(20_000);
+    });
     check(
         "`hrn.range`: found",
         set("hrn.range", "{\"force_n\":[1,2]}"),

@@ -12,9 +12,10 @@ use crate::daemon::lane::Lane;
 const REQUESTS_AT_ONCE: u32 = 64;
 const REQUEST_EVERY: Duration = Duration::from_micros(500);
 
-/// The time in the lane for each KiB of a request: four times as long as it takes to read. So the
-/// connections of a lane together take at most a quarter of the thread.
-const LANE_TIME: Duration = Duration::from_micros(60);
+/// The time in the lane of a request, and of each KiB of it: several times as long as it takes to answer
+/// and to read. So the connections of a lane together take a part of the thread only.
+const LANE_REQUEST_TIME: Duration = Duration::from_micros(200);
+const LANE_KIB_TIME: Duration = Duration::from_micros(60);
 /// A request that is longer always waits for the lane.
 const SHORT_BYTES: usize = 4096;
 
@@ -52,7 +53,7 @@ impl Pace {
         let parts = u32::try_from(1 + bytes / 1024).unwrap_or(u32::MAX);
         self.due = self.due.max(now) + REQUEST_EVERY * parts;
         if bytes > SHORT_BYTES || self.due > now + REQUESTS_AT_ONCE * REQUEST_EVERY {
-            let time = LANE_TIME * parts;
+            let time = LANE_REQUEST_TIME + LANE_KIB_TIME * parts;
             self.turn = self.lane.reserve(time) + time;
         }
     }
@@ -97,7 +98,7 @@ mod tests {
             }
         }
         // 600 requests of 63 parts each, less the last one of each connection.
-        let least = 540 * 63 * LANE_TIME;
+        let least = 540 * 63 * LANE_KIB_TIME;
         assert!(start.elapsed() >= least, "{:?}", start.elapsed());
         // A connection that asks little does not wait behind them.
         let quiet = Pace::new(lane);
