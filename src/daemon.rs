@@ -12,12 +12,12 @@ pub mod config;
 pub mod descriptors;
 #[cfg(feature = "foxglove")]
 pub mod foxglove;
+mod frame_rate;
 mod http;
 mod hub;
 mod lane;
 pub(crate) mod lines;
 pub mod log;
-mod pace;
 pub mod publish;
 pub mod realtime;
 pub mod record;

@@ -296,7 +296,7 @@ pub(crate) fn clock_set(sensor: &str, by_ms: f64) {
 }
 
 /// Logs that a sensor sends frames at another rate than its configuration says.
-pub(crate) fn pace(sensor: &str, frame_rate_hz: f64, measured_hz: f64) {
+pub(crate) fn frame_rate(sensor: &str, frame_rate_hz: f64, measured_hz: f64) {
     let measured_hz = (10.0 * measured_hz).round() / 10.0;
     warn!(
         sensor,

@@ -12,9 +12,9 @@ use serde_json::Value;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
 
+use super::frame_rate::FrameRate;
 use super::hub;
 use super::log;
-use super::pace::Pace;
 use super::record::{NoBlackbox, SensorRecorder};
 use super::request::motion::{Calendar, Placed};
 use super::serial::{Link, Turn};
@@ -106,7 +106,7 @@ pub(crate) async fn serve(
     let mut taring = None;
     let mut unjudged = 0;
     let mut calendar = Calendar::default();
-    let mut pace = Pace::default();
+    let mut frame_rate = FrameRate::default();
     loop {
         let deadline = pipeline.deadline();
         let events = tokio::select! {
@@ -150,7 +150,7 @@ pub(crate) async fn serve(
                     let reloaded = pipeline.reload(*sensor, hrn);
                     reloaded.expect("a configuration that differs in what is fixed was refused");
                     answer(&mut pipeline, &mut taring);
-                    pace = Pace::default();
+                    frame_rate = FrameRate::default();
                     continue;
                 }
                 Some(Command::Finish) | None => {
@@ -175,9 +175,9 @@ pub(crate) async fn serve(
         if frames > 0 {
             link.proven();
             let configured_hz = pipeline.sensor().description().frame_rate_hz;
-            let differs = pace.differs(frames as u32, super::now().mono, configured_hz);
+            let differs = frame_rate.differs(frames as u32, super::now().mono, configured_hz);
             if let Some(measured_hz) = differs {
-                log::pace(pipeline.sensor().name(), configured_hz, measured_hz);
+                log::frame_rate(pipeline.sensor().name(), configured_hz, measured_hz);
             }
         }
         answer(&mut pipeline, &mut taring);

@@ -5,8 +5,7 @@
 //! a killed process leaves no half one.
 
 use std::fs;
-use std::io::{self, Cursor};
-use std::os::unix::fs::FileTypeExt as _;
+use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -83,7 +82,7 @@ impl Parts {
     /// Returns a [`CollectError`] if the capture gives no samples, and another error if the part
     /// cannot be written.
     pub(super) fn of(&self, path: &Path, number: usize) -> anyhow::Result<(PathBuf, Head)> {
-        let bytes = read(path).map_err(|source| CollectError::Unreadable {
+        let bytes = file::whole(path).map_err(|source| CollectError::Unreadable {
             path: path.to_owned(),
             source,
         })?;
@@ -128,14 +127,6 @@ impl Parts {
         let decides = format!("{maker} {model} {sequences} {sha256} {sensor}");
         format!("{}.npz", sha256_hex(decides.as_bytes()))
     }
-}
-
-/// Reads a capture. Refuses a device, because a serial port never ends.
-fn read(path: &Path) -> io::Result<Vec<u8>> {
-    if fs::metadata(path)?.file_type().is_char_device() {
-        return Err(io::Error::other("found a device, expected a recording"));
-    }
-    fs::read(path)
 }
 
 /// The head of a part. `None` if the part is missing or damaged.

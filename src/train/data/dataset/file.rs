@@ -101,15 +101,16 @@ pub(super) fn parse(bytes: &[u8], path: &Path, name: String) -> Result<Dataset, 
     })
 }
 
+/// Reads a whole file. Refuses a device, such as a serial port, because it has no end.
+pub(in crate::train::data) fn whole(path: &Path) -> std::io::Result<Vec<u8>> {
+    if std::fs::metadata(path)?.file_type().is_char_device() {
+        return Err(std::io::Error::other("found a device, expected a file"));
+    }
+    std::fs::read(path)
+}
+
 pub(in crate::train::data) fn read(path: &Path) -> Result<Vec<u8>, DatasetError> {
-    let read = || {
-        // A device has no end.
-        if std::fs::metadata(path)?.file_type().is_char_device() {
-            return Err(std::io::Error::other("found a device, expected a data set"));
-        }
-        std::fs::read(path)
-    };
-    read().map_err(|source| DatasetError::Unreadable {
+    whole(path).map_err(|source| DatasetError::Unreadable {
         path: path.to_owned(),
         source,
     })

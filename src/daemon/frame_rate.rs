@@ -12,16 +12,16 @@ const PAUSE: Duration = Duration::from_secs(1);
 /// Rates that differ by this factor or more are different.
 const FACTOR: f64 = 1.5;
 
-/// The pace of one sensor.
+/// The frame rate of one sensor, as it is measured.
 #[derive(Debug, Default)]
-pub(super) struct Pace {
+pub(super) struct FrameRate {
     last: Option<Duration>,
     frames: u32,
     span: Duration,
     is_told: bool,
 }
 
-impl Pace {
+impl FrameRate {
     /// Takes in `frames` frames that arrived at `now`. Returns the measured rate in frames/s if it is
     /// not `configured_hz`, the first time only.
     pub(super) fn differs(
@@ -59,14 +59,14 @@ mod tests {
     /// The rates that are told while 500 frames come at `real_hz`, `at_once` at a time, with a pause of
     /// 5 s after every 20.
     fn told(real_hz: f64, at_once: u32, configured_hz: f64) -> Vec<f64> {
-        let mut pace = Pace::default();
+        let mut frame_rate = FrameRate::default();
         let mut now = Duration::ZERO;
         let chunks = (0..500 / at_once).filter_map(|number| {
             now += Duration::from_secs_f64(f64::from(at_once) / real_hz);
             if number % 20 == 0 {
                 now += Duration::from_secs(5);
             }
-            pace.differs(at_once, now, configured_hz)
+            frame_rate.differs(at_once, now, configured_hz)
         });
         chunks.collect()
     }
