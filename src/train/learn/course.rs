@@ -95,8 +95,8 @@ impl Press {
             .collect()
     }
 
-    /// The network's inputs: the standardised columns, and the force of each moment.
-    fn inputs(&self, standard: &Standard) -> (Vec<f32>, Vec<f32>) {
+    /// The network's inputs.
+    fn inputs(&self, standard: &Standard) -> course::Inputs {
         let columns = self.columns();
         let standardised = columns.iter().enumerate();
         let rows = standardised
@@ -157,7 +157,7 @@ impl Trained {
                 .iter()
                 .map(|press| press.inputs(&self.standard))
                 .collect();
-            let outputs = course::outputs(&self.weights, &course::Batch::new(&inputs, device));
+            let outputs = course::outputs(&self.weights, &inputs, device);
             judged.extend(shore::of_outputs(&outputs, levels, self.calibration.widths));
         }
         judged
@@ -253,32 +253,23 @@ impl Task<'_> {
         }: Batch,
     ) -> (f64, usize) {
         let mut stream = self.stream("variation").child(step);
-        let inputs: Vec<_> = places
-            .iter()
-            .map(|&place| {
-                self.reports
-                    .varied(&self.presses[place], &mut stream)
-                    .inputs(standard)
-            })
-            .collect();
-        let levels_of = places.iter().map(|&place| self.presses[place].level);
+        let vary = |&place: &usize| self.reports.varied(&self.presses[place], &mut stream);
+        let mut presses: Vec<Press> = places.iter().map(vary).collect();
+        presses.sort_by_key(|press| press.moments.len());
+        let inputs: Vec<_> = presses.iter().map(|press| press.inputs(standard)).collect();
+        let levels_of = presses.iter().map(|press| press.level);
         let targets = hrn::targets(levels_of, self.levels, self.device).mul(weights.clone());
-        let measured: Vec<Option<f32>> = places
-            .iter()
-            .map(|&place| self.presses[place].shore)
-            .collect();
+        let measured: Vec<Option<f32>> = presses.iter().map(|press| press.shore).collect();
 
         let tracked = learner.weights.tracked();
-        let outputs = course::outputs(&tracked, &course::Batch::new(&inputs, self.device));
+        let outputs = course::outputs(&tracked, &inputs, self.device);
         let (loss, judged) = shore::loss(outputs, targets, &measured);
         let mut gradients = loss.backward();
         learner.step(&tracked, &mut gradients, rate);
-        let right = places
+        let right = presses
             .iter()
             .zip(judged.chunks(self.levels))
-            .filter(|(place, logits)| {
-                argmax(logits).0 + 1 == usize::from(self.presses[**place].level)
-            })
+            .filter(|(press, logits)| argmax(logits).0 + 1 == usize::from(press.level))
             .count();
         (f64::from(numbers(&loss)[0]), right)
     }

@@ -24,14 +24,46 @@ pub const FRAMES: usize = COURSE_FRAMES.1;
 pub const MOTION: usize = 7;
 /// The number of columns of a moment.
 pub const COLUMNS: usize = FEATURES + MOTION;
-/// Width of the hidden layers, and of the layer before the outputs.
-const HIDDEN: usize = 48;
+/// Width of the layer before the outputs.
 const LAST: usize = 64;
-/// Moments under a kernel, and the distance between them in each convolution.
+/// The number of moments under a kernel.
 const KERNEL: usize = 5;
-const DILATIONS: [usize; 3] = [1, 2, 4];
 /// The number of pools of a press: mean, greatest, and mean weighted by force.
 const POOLS: usize = 3;
+/// The number of presses that are computed together.
+const PRESSES_AT_ONCE: usize = 32;
+
+/// The size of a network. Files of earlier revisions have smaller ones.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Size {
+    /// Width of the hidden layers.
+    hidden: usize,
+    /// The number of convolutions over time.
+    convolutions: usize,
+}
+
+impl Size {
+    /// The size of new networks.
+    const NEW: Self = Self {
+        hidden: 64,
+        convolutions: 4,
+    };
+
+    fn of(weights: &Weights) -> Self {
+        let names = weights.entries.iter().map(|weight| &weight.name);
+        let is_convolution = |name: &&String| name.starts_with("conv") && name.ends_with(".matrix");
+        Self {
+            hidden: weights.dims("embed.bias")[0],
+            convolutions: names.filter(is_convolution).count(),
+        }
+    }
+}
+
+/// The distance between the moments under the kernel of convolution number `layer`, from 1.
+fn dilation(layer: usize) -> usize {
+    1 << (layer - 1)
+}
+
 /// The measurements of a press at one moment, beside the frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Moment {
@@ -76,38 +108,42 @@ pub fn motion(moments: &[Moment], arm_n_per_mm: f32) -> Vec<[f32; MOTION]> {
     moments.iter().map(row).collect()
 }
 
-/// A batch of presses as the network takes them.
+/// The inputs of one press: the standardised columns of its frames, and the frames' forces.
+pub type Inputs = (Vec<f32>, Vec<f32>);
+
+/// A batch of presses as the network takes them. `frames` is the number of frames of the longest.
 #[derive(Debug, Clone)]
-pub struct Batch {
-    /// Standardised columns, 0 where there is no frame: `[batch, FRAMES, COLUMNS]`.
-    pub columns: Tensor<3>,
-    /// 1 where there is a frame: `[batch, FRAMES, 1]`.
-    pub mask: Tensor<3>,
-    /// Each frame's share of the press's force: `[batch, FRAMES, 1]`.
-    pub weights: Tensor<3>,
+struct Batch {
+    /// Standardised columns, 0 where there is no frame: `[batch, frames, COLUMNS]`.
+    columns: Tensor<3>,
+    /// 1 where there is a frame: `[batch, frames, 1]`.
+    mask: Tensor<3>,
+    /// Each frame's share of the press's force: `[batch, frames, 1]`.
+    weights: Tensor<3>,
 }
 
 impl Batch {
-    /// Makes a batch of presses, each with its standardised columns and the forces of its frames.
-    pub fn new(presses: &[(Vec<f32>, Vec<f32>)], device: &Device) -> Self {
+    fn new(presses: &[Inputs], device: &Device) -> Self {
         let batch = presses.len();
-        let mut columns = vec![0.0; batch * FRAMES * COLUMNS];
-        let (mut mask, mut weights) = (vec![0.0; batch * FRAMES], vec![0.0; batch * FRAMES]);
+        let longest = presses.iter().map(|(_, forces)| forces.len()).max();
+        let frames = longest.unwrap_or_default();
+        let mut columns = vec![0.0; batch * frames * COLUMNS];
+        let (mut mask, mut weights) = (vec![0.0; batch * frames], vec![0.0; batch * frames]);
         for (press, (rows, forces)) in presses.iter().enumerate() {
-            columns[press * FRAMES * COLUMNS..][..rows.len()].copy_from_slice(rows);
+            columns[press * frames * COLUMNS..][..rows.len()].copy_from_slice(rows);
             let sum = forces.iter().sum::<f32>() + graph::TINY_N;
             for (place, &force_n) in forces.iter().enumerate() {
-                mask[press * FRAMES + place] = 1.0;
-                weights[press * FRAMES + place] = force_n / sum;
+                mask[press * frames + place] = 1.0;
+                weights[press * frames + place] = force_n / sum;
             }
         }
         let tensor = |values, dims: [usize; 3]| {
             Tensor::<3>::from_data(TensorData::new(values, dims), device)
         };
         Self {
-            columns: tensor(columns, [batch, FRAMES, COLUMNS]),
-            mask: tensor(mask, [batch, FRAMES, 1]),
-            weights: tensor(weights, [batch, FRAMES, 1]),
+            columns: tensor(columns, [batch, frames, COLUMNS]),
+            mask: tensor(mask, [batch, frames, 1]),
+            weights: tensor(weights, [batch, frames, 1]),
         }
     }
 }
@@ -115,6 +151,14 @@ impl Batch {
 /// Initial weights for `levels` levels: N(0, 2 / inputs) before a ReLU. The variance is smaller
 /// where a residual layer adds and before the outputs, so that outputs begin near 1.
 pub fn initial(levels: usize, seed: u64, device: &Device) -> Weights {
+    of_size(Size::NEW, levels, seed, device)
+}
+
+fn of_size(size: Size, levels: usize, seed: u64, device: &Device) -> Weights {
+    let Size {
+        hidden,
+        convolutions,
+    } = size;
     let root = Stream::new(seed, "course weights");
     let mut weights = Weights::default();
     let mut add = |name: &str, dims: &[usize], gain: f64| {
@@ -130,15 +174,11 @@ pub fn initial(levels: usize, seed: u64, device: &Device) -> Weights {
             device,
         );
     };
-    add("embed", &[COLUMNS, HIDDEN], 2.0);
-    for layer in 0..DILATIONS.len() {
-        add(
-            &format!("conv{}", layer + 1),
-            &[KERNEL, HIDDEN, HIDDEN],
-            0.25,
-        );
+    add("embed", &[COLUMNS, hidden], 2.0);
+    for layer in 1..=convolutions {
+        add(&format!("conv{layer}"), &[KERNEL, hidden, hidden], 0.25);
     }
-    add("joint", &[POOLS * HIDDEN, LAST], 2.0);
+    add("joint", &[POOLS * hidden, LAST], 2.0);
     add("head", &[LAST, levels + shore::OUTPUTS], 0.2);
     weights
 }
@@ -150,36 +190,49 @@ pub fn start<'a>(
     levels: usize,
     device: &Device,
 ) -> Option<Start> {
+    let size = graph::size(&constant)?;
     let weight = |name: &str| graph::weight(name, &constant);
-    Start::of_constants(initial(levels, 0, device), COLUMNS, weight, device)
+    Start::of_constants(of_size(size, levels, 0, device), COLUMNS, weight, device)
 }
 
-/// Logits and Shore outputs `[batch, L + 3]`.
-pub fn outputs(weights: &Weights, batch: &Batch) -> Tensor<2> {
+/// Logits and Shore outputs `[presses, L + 3]`. Presses with similar numbers of frames should follow each
+/// other: [`PRESSES_AT_ONCE`] are computed together, and the frames that a press lacks beside the longest
+/// of these cost as much time as its own.
+pub fn outputs(weights: &Weights, presses: &[Inputs], device: &Device) -> Tensor<2> {
+    let parts = presses.chunks(PRESSES_AT_ONCE);
+    let parts = parts.map(|part| of_batch(weights, &Batch::new(part, device)));
+    Tensor::cat(parts.collect(), 0)
+}
+
+fn of_batch(weights: &Weights, batch: &Batch) -> Tensor<2> {
     let [presses, frames, _] = batch.mask.dims();
+    let Size {
+        hidden,
+        convolutions,
+    } = Size::of(weights);
     let mask = || batch.mask.clone();
     let rows = presses * frames;
     let flat = batch.columns.clone().reshape([rows, COLUMNS]);
     let x = activation::relu(dense(weights, "embed", flat));
-    let mut x = x.reshape([presses, frames, HIDDEN]).mul(mask());
-    for (layer, dilation) in (1..).zip(DILATIONS) {
-        let name = format!("conv{layer}");
-        let zeros = Tensor::<3>::zeros([presses, KERNEL / 2 * dilation, HIDDEN], &x.device());
+    let mut x = x.reshape([presses, frames, hidden]).mul(mask());
+    for layer in 1..=convolutions {
+        let (name, dilation) = (format!("conv{layer}"), dilation(layer));
+        let zeros = Tensor::<3>::zeros([presses, KERNEL / 2 * dilation, hidden], &x.device());
         let padded = Tensor::cat(vec![zeros.clone(), x.clone(), zeros], 1);
         let shifted = (0..KERNEL).map(|tap| {
             let first = tap * dilation;
             padded
                 .clone()
-                .slice([0..presses, first..first + frames, 0..HIDDEN])
+                .slice([0..presses, first..first + frames, 0..hidden])
         });
-        let patches = Tensor::cat(shifted.collect(), 2).reshape([rows, KERNEL * HIDDEN]);
+        let patches = Tensor::cat(shifted.collect(), 2).reshape([rows, KERNEL * hidden]);
         let added = activation::relu(dense(weights, &name, patches));
-        x = x.add(added.reshape([presses, frames, HIDDEN])).mul(mask());
+        x = x.add(added.reshape([presses, frames, hidden])).mul(mask());
     }
     let mean = x.clone().sum_dim(1).div(mask().sum_dim(1));
     let greatest = x.clone().max_dim(1);
     let weighted = x.mul(batch.weights.clone()).sum_dim(1);
-    let pooled = Tensor::cat(vec![mean, greatest, weighted], 2).reshape([presses, POOLS * HIDDEN]);
+    let pooled = Tensor::cat(vec![mean, greatest, weighted], 2).reshape([presses, POOLS * hidden]);
     let joint = activation::relu(dense(weights, "joint", pooled));
     dense(weights, "head", joint)
 }
@@ -216,7 +269,7 @@ mod tests {
             (rows.collect::<Vec<f32>>(), vec![1.0; frames])
         };
         let presses: Vec<_> = (3..35).map(|frames| press(frames, &mut stream)).collect();
-        let outputs = outputs(&weights, &Batch::new(&presses, &device));
+        let outputs = outputs(&weights, &presses, &device);
         let values = crate::train::net::network::numbers(&outputs);
         let variance = values.iter().map(|x| x * x).sum::<f32>() / values.len() as f32;
         assert!((0.1..10.0).contains(&variance), "{variance}");
@@ -228,14 +281,8 @@ mod tests {
         let weights = initial(4, 1, &device);
         let rows: Vec<f32> = (0..5 * COLUMNS).map(|k| (k % 7) as f32 - 3.0).collect();
         let other = (vec![2.0; FRAMES * COLUMNS], vec![3.0; FRAMES]);
-        let alone = outputs(
-            &weights,
-            &Batch::new(&[(rows.clone(), vec![1.0; 5])], &device),
-        );
-        let beside = outputs(
-            &weights,
-            &Batch::new(&[other, (rows, vec![1.0; 5])], &device),
-        );
+        let alone = outputs(&weights, &[(rows.clone(), vec![1.0; 5])], &device);
+        let beside = outputs(&weights, &[other, (rows, vec![1.0; 5])], &device);
         let alone = crate::train::net::network::numbers(&alone);
         let beside = crate::train::net::network::numbers(&beside);
         for (a, b) in alone.iter().zip(&beside[alone.len()..]) {
