@@ -65,6 +65,13 @@ fn without_numbers(text: &str) -> String {
     told
 }
 
+/// Escapes the hidden characters of each line. Without this, the name of a file could control the
+/// terminal.
+pub fn lines(text: &str) -> String {
+    let lines: Vec<String> = text.split('\n').map(shown).collect();
+    lines.join("\n")
+}
+
 /// Escapes hidden characters. Without this, the name of a file or a process could break the line or
 /// control the terminal.
 fn shown(text: &str) -> String {

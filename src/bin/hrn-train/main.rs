@@ -57,7 +57,7 @@ fn main() -> ExitCode {
         Command::Adopt(arguments) => models::adopt_model(&arguments),
         Command::Inspect { model } => models::inspect(&model),
     };
-    match done.and_then(|account| Ok(tools::print(account.as_bytes())?)) {
+    match done.and_then(|account| Ok(tools::print(tools::lines(&account).as_bytes())?)) {
         Ok(_) => ExitCode::SUCCESS,
         Err(error) => {
             hardnessd::say!("hrn-train: {}", tools::line(error.as_ref()));

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use anyhow::Context as _;
 use hardnessd::tools::{self, exit};
-use hardnessd::train::data::courses::Courses;
+use hardnessd::train::data::courses::{self, Courses};
 use hardnessd::train::data::dataset::{self, Dataset};
 use hardnessd::train::model::adopt::{self, Told};
 use hardnessd::train::model::course::{self, CourseEvaluation};
@@ -129,7 +129,7 @@ pub(super) fn check_model(path: &Path) -> ExitCode {
             lines += "`hrn-train adopt` takes models of one frame only: add what is missing yourself \
                       (docs/formats.md)\n";
         }
-        tools::print(lines.as_bytes())?;
+        tools::print(tools::lines(&lines).as_bytes())?;
         Ok(passes)
     });
     match checked {
@@ -144,7 +144,7 @@ pub(super) fn check_model(path: &Path) -> ExitCode {
 
 pub(super) fn adopt_model(arguments: &Adopt) -> anyhow::Result<String> {
     let bytes = read(&arguments.model)?;
-    let dataset = Dataset::read(&arguments.data)?;
+    let dataset = courses::single_frames(&arguments.data)?;
     let name = arguments.model.file_name().unwrap_or_default();
     let told = Told {
         method: arguments

@@ -6,7 +6,8 @@ use std::time::Instant;
 use anyhow::Context as _;
 use burn::tensor::Device;
 use hardnessd::simulator::Split;
-use hardnessd::train::data::courses::Courses;
+use hardnessd::tools;
+use hardnessd::train::data::courses::{self, Courses};
 use hardnessd::train::data::dataset::{Dataset, DatasetError, LabelChoice};
 use hardnessd::train::methods::{self, Method, Request};
 use hardnessd::train::run::Run;
@@ -54,7 +55,7 @@ pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
     let device = device(arguments.device)?;
     let run = Run::open(&arguments.out, &description, arguments.resume)?
         .taking_from(arguments.from.clone());
-    hardnessd::say_part!("{}", account::of_data(&dataset));
+    hardnessd::say_part!("{}", tools::lines(&account::of_data(&dataset)));
     let labelled = dataset
         .samples
         .iter()
@@ -130,7 +131,7 @@ pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
     let description = request.description(&dataset)?;
     methods::check(method, &dataset, &description)?;
     let run = Run::open(&arguments.out, &description, arguments.resume)?;
-    hardnessd::say_part!("{}", account::of_data(&dataset));
+    hardnessd::say_part!("{}", tools::lines(&account::of_data(&dataset)));
     let begun = Instant::now();
     let evaluation = methods::frame::adapt(&dataset, start, &description, &run, &device)?;
     Ok(account_of_run(
@@ -164,8 +165,10 @@ fn adapt_course(arguments: &Adapt) -> anyhow::Result<String> {
 
 /// The data of several files, joined.
 fn dataset_of(paths: &[PathBuf]) -> anyhow::Result<Dataset> {
-    let parts: Result<Vec<Dataset>, DatasetError> =
-        paths.iter().map(|path| Dataset::read(path)).collect();
+    let parts: Result<Vec<Dataset>, DatasetError> = paths
+        .iter()
+        .map(|path| courses::single_frames(path))
+        .collect();
     let parts = parts?;
     for part in &parts {
         part.warn_of_object_in_both_splits();

@@ -11,7 +11,7 @@ use ndarray::{ArrayView1, ArrayView3};
 use ndarray_npy::{NpzWriter, WriteNpzError};
 
 use super::dataset::file::{self, File};
-use super::dataset::{DatasetError, Source, levels, objects_after, pitch_mm};
+use super::dataset::{Dataset, DatasetError, Sample, Source, levels, objects_after, pitch_mm};
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::simulator::{LabelledCourse, NEWTONS_PER_COUNT, Split};
 use crate::verdict::COURSE_FRAMES;
@@ -56,6 +56,20 @@ pub struct Press {
     pub arm_n_per_mm: f32,
     /// The row of the frame that a model of single frames judges.
     pub best: u32,
+}
+
+/// Reads a file of single frames, or of whole presses. A press gives the frame with its largest contact
+/// area.
+///
+/// # Errors
+///
+/// Returns the errors of [`Dataset::read`] and [`Courses::read`].
+pub fn single_frames(path: &Path) -> Result<Dataset, DatasetError> {
+    if !Courses::is_at(path)? {
+        return Dataset::read(path);
+    }
+    let (courses, mut sources) = Courses::read_all(&[path.to_owned()])?;
+    Ok(courses.best_frames(path, sources.remove(0)))
 }
 
 /// An array with a value for each press: its name, and the value.
@@ -113,6 +127,25 @@ impl Courses {
             best: first + press.best,
             ..press
         });
+    }
+
+    /// The frame of each press with the largest contact area, as a data set of single frames.
+    fn best_frames(&self, path: &Path, source: Source) -> Dataset {
+        let sample = |press: &Press| Sample {
+            frame: self.frame(press.best as usize),
+            level: press.level,
+            object: Some(press.object),
+            material: Some(press.material),
+            force_n: Some(press.force_n),
+            split: press.split,
+            shore: Some(press.shore).filter(|shore| shore.is_finite()),
+            source: 0,
+        };
+        Dataset {
+            samples: self.presses.iter().map(sample).collect(),
+            sources: vec![source],
+            paths: vec![path.to_owned()],
+        }
     }
 
     /// Indices of a split's presses whose level is known.
