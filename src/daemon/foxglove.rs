@@ -26,7 +26,7 @@ use super::config;
 use super::hub::Line;
 use super::relay::Worker;
 use crate::event::{Event, Phase};
-use crate::recording::{Found, MOTION};
+use crate::recording::{Entry, Found, MOTION};
 use crate::ros::{self, Topic};
 
 /// The reason the server could not start.
@@ -56,8 +56,9 @@ const BACKLOG: usize = 512;
 /// the next event.
 const NEWCOMERS: usize = 64;
 
-/// The most lines of positions that wait for the thread. When there are more, they are dropped.
-const POSITIONS: usize = 256;
+/// The most lines of positions and new settings that wait for the thread. When there are more, they are
+/// dropped.
+const ENTRIES: usize = 256;
 
 /// The time for the last messages to reach the viewers, because the library does not report when a
 /// viewer has everything.
@@ -74,7 +75,7 @@ pub(super) struct Sensor {
 }
 
 /// Listens as `settings` say and announces the topics of `sensors`. Also returns the queue for the
-/// positions of the arm.
+/// positions of the arm and for new settings.
 ///
 /// # Errors
 ///
@@ -85,11 +86,11 @@ pub(super) fn open(
     sensors: Vec<Sensor>,
 ) -> Result<(Worker<Vec<Line>>, mpsc::Sender<Found>), Error> {
     let (address, robot) = (settings.listen, robot.to_owned());
-    let (viewers, positions) = mpsc::channel(POSITIONS);
+    let (viewers, entries) = mpsc::channel(ENTRIES);
     let worker = Worker::start(
         "foxglove",
         move |_, _| Foxglove::open(address, &robot, &sensors),
-        |foxglove: Foxglove, lines| foxglove.work(lines, positions),
+        |foxglove: Foxglove, lines| foxglove.work(lines, entries),
     )?;
     Ok((worker, viewers))
 }
@@ -153,7 +154,7 @@ impl Foxglove {
         })
     }
 
-    fn work(self, mut lines: mpsc::Receiver<Vec<Line>>, mut positions: mpsc::Receiver<Found>) {
+    fn work(self, mut lines: mpsc::Receiver<Vec<Line>>, mut entries: mpsc::Receiver<Found>) {
         let Self {
             mut topics,
             mut newcomers,
@@ -168,13 +169,13 @@ impl Foxglove {
                         Some(lines) => lines.iter().for_each(|line| topics.publish(line)),
                         None => break,
                     },
-                    Some(found) = positions.recv() => topics.show(&found),
+                    Some(found) = entries.recv() => topics.follow(&found),
                     Some((topic, viewer)) = newcomers.recv() => topics.greet(&topic, viewer),
                 }
             }
             // What was recorded before the end is shown too.
-            while let Ok(found) = positions.try_recv() {
-                topics.show(&found);
+            while let Ok(found) = entries.try_recv() {
+                topics.follow(&found);
             }
             tokio::time::sleep(LAST_MESSAGES).await;
             // A timeout is not a failure: the runtime drops the remaining connections.
@@ -235,8 +236,13 @@ impl Topics {
         }
     }
 
-    /// Sends positions of the arm.
-    fn show(&self, found: &Found) {
+    /// Sends positions of the arm, or uses the taxel distance of new settings from now on.
+    fn follow(&mut self, found: &Found) {
+        if let Entry::Settings(settings) = &found.entry {
+            let pitch_mm = settings.description.calibration.pitch_mm;
+            self.pitches_mm.insert(found.sensor.clone(), pitch_mm);
+            return;
+        }
         let (topic, bytes) = found.message();
         if let Some(channel) = self.channels.get(&full_name(&found.sensor, topic)) {
             let at_ns = u64::try_from(found.at.wall.as_nanosecond()).unwrap_or(0);

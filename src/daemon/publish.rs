@@ -158,7 +158,7 @@ impl Publishers {
         self.http.as_ref().map(Tcp::address)
     }
 
-    /// The queue for the positions of the arm, if a publisher shows them.
+    /// The queue for the positions of the arm and for new settings, if a publisher shows them.
     #[cfg(feature = "foxglove")]
     pub(crate) fn viewers(&self) -> Option<mpsc::Sender<Found>> {
         self.foxglove.as_ref().map(|(_, viewers)| viewers.clone())

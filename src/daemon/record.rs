@@ -261,7 +261,7 @@ impl Recorder {
 #[derive(Debug, Default)]
 pub(crate) struct SensorRecorder {
     active: Option<Box<Active>>,
-    /// The viewers of the arm's positions.
+    /// The viewers of the arm's positions and of new settings.
     viewers: Option<mpsc::Sender<Found>>,
 }
 
@@ -280,7 +280,8 @@ struct Active {
 }
 
 impl SensorRecorder {
-    /// Also passes the positions of the arm on to `viewers`, as a recording has them.
+    /// Also passes the positions of the arm and the settings after a reload on to `viewers`, as a
+    /// recording has them.
     pub(crate) fn with_viewers(self, viewers: Option<mpsc::Sender<Found>>) -> Self {
         Self { viewers, ..self }
     }
@@ -301,23 +302,36 @@ impl SensorRecorder {
         if let Some(active) = &mut self.active {
             active.follow(pipeline, at, Entry::Input(input.to_owned()));
         }
-        if let (Some(viewers), Input::Motion(_)) = (&self.viewers, input) {
-            let found = Found {
-                sensor: pipeline.sensor().name().to_owned(),
-                at,
-                entry: Entry::Input(input.to_owned()),
+        if matches!(input, Input::Motion(_)) {
+            self.show(pipeline, at, || Entry::Input(input.to_owned()));
+        }
+    }
+
+    /// Passes an entry on to the viewers, if there are any.
+    fn show(&self, pipeline: &Pipeline, at: Stamp, entry: impl FnOnce() -> Entry) {
+        let Some(viewers) = &self.viewers else {
+            return;
+        };
+        let found = Found {
+            sensor: pipeline.sensor().name().to_owned(),
+            at,
+            entry: entry(),
+        };
+        if let Err(mpsc::error::TrySendError::Full(found)) = viewers.try_send(found) {
+            let lost = match found.entry {
+                Entry::Settings(_) => "the sensor's new settings",
+                _ => "the positions of the arm",
             };
-            if let Err(mpsc::error::TrySendError::Full(_)) = viewers.try_send(found) {
-                warn!("viewers are too slow for the positions of the arm");
-            }
+            warn!("viewers are too slow for {lost}");
         }
     }
 
     /// Records that `pipeline` will use `sensor` and `hrn` from now on.
     pub(crate) fn reload(&mut self, pipeline: &Pipeline, sensor: &Sensor, hrn: &Hrn, at: Stamp) {
+        let settings = || Entry::Settings(Box::new(RecordedSensor::new(sensor, hrn)));
+        self.show(pipeline, at, settings);
         if let Some(active) = &mut self.active {
-            let described = RecordedSensor::new(sensor, hrn);
-            active.follow(pipeline, at, Entry::Settings(Box::new(described)));
+            active.follow(pipeline, at, settings());
         }
     }
 

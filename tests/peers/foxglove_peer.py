@@ -6,8 +6,9 @@
 
 Claims: every field of every event, decoded by the definitions that the server announces, is what the Unix socket
 says; a late viewer gets the last verdict and status; a recording has the same topics with the same
-definitions and, of the positions of the arm, the same bytes; and the layout in clients/foxglove fits both; a viewer that never reads, one that sends nonsense
-and many that say nothing cost no other subscriber an event; and an address in use is one line and 74.
+definitions and, of the positions of the arm, the same bytes; and the layout in clients/foxglove fits both; a new pitch
+holds from the reload on; a viewer that never reads, one that sends nonsense and many that say nothing cost no other
+subscriber an event; and an address in use is one line and 74.
 """
 
 import json
@@ -15,6 +16,7 @@ import math
 import os
 import pathlib
 import queue
+import signal
 import socket
 import struct
 import subprocess
@@ -309,6 +311,24 @@ def strangers(binary):
         return alone_kb, crowded_kb
 
 
+def a_new_pitch(binary):
+    """The sizes of a grid's cells before a reload with another pitch, and after it."""
+    with Bench(binary, more=TABLE) as bench:
+        daemon = bench.daemon()
+        bench.sensor("forearm", "--force", "15", "--seed", "3")
+        viewer = Viewer(bench.address("foxglove"))
+        before = viewer.until(lambda topic, message: topic == "grid")[-1][2].cell_size.x
+        config = pathlib.Path(bench.path("hardnessd.toml"))
+        table = "[sensor.calibration]\npitch_mm = 2.0\n"
+        lines = config.read_text().splitlines(keepends=True)
+        end = next((n for n, line in enumerate(lines) if line.startswith("[") and "sensor" not in line), len(lines))
+        config.write_text("".join(lines[:end]) + table + "".join(lines[end:]))
+        daemon.send_signal(signal.SIGHUP)
+        after = viewer.until(lambda topic, message: topic == "grid" and message.cell_size.x != before)[-1][2].cell_size.x
+    assert math.isclose(before, 0.0035) and math.isclose(after, 0.002), (before, after)
+    return before, after
+
+
 def an_address_in_use(binary):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -327,4 +347,5 @@ if __name__ == "__main__":
     print("messages as on the socket:", same_as_the_socket(binary))
     print("a frozen viewer: %d frames, none missed; verdicts after %d us at most; stop in %.2f s" % a_frozen_viewer(binary))
     print("strangers: 2000 frames, none missed; resident %d kB before, %d kB after" % strangers(binary))
+    print("a reload: cells of %g m, then of %g m" % a_new_pitch(binary))
     print("an address in use:", an_address_in_use(binary))

@@ -124,3 +124,18 @@ fn viewers_get_the_positions_of_the_arm_also_without_a_recording() {
     assert_eq!(found.entry, Entry::Input(motion.to_owned()));
     assert!(shown.try_recv().is_err());
 }
+
+#[test]
+fn viewers_get_the_settings_after_a_reload() {
+    let pipeline = Pipeline::new(tests::sensor(), tests::hrn(), Clock::Arrival);
+    let (viewers, mut shown) = mpsc::channel(1);
+    let mut recorder = SensorRecorder::default().with_viewers(Some(viewers));
+    let mut description = tests::sensor().description().clone();
+    description.calibration.pitch_mm = 2.0;
+    let changed = Sensor::new(description).unwrap();
+    recorder.reload(&pipeline, &changed, &tests::hrn(), at(7));
+    let Entry::Settings(settings) = shown.try_recv().unwrap().entry else {
+        panic!("no settings");
+    };
+    assert_eq!(settings.description.calibration.pitch_mm, 2.0);
+}
