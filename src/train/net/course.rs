@@ -24,45 +24,16 @@ pub const FRAMES: usize = COURSE_FRAMES.1;
 pub const MOTION: usize = 7;
 /// The number of columns of a moment.
 pub const COLUMNS: usize = FEATURES + MOTION;
-/// Width of the layer before the outputs.
+/// Width of the hidden layers, and of the layer before the outputs.
+const HIDDEN: usize = 48;
 const LAST: usize = 64;
-/// The number of moments under a kernel.
+/// Moments under a kernel, and the distance between them in each convolution.
 const KERNEL: usize = 5;
+const DILATIONS: [usize; 3] = [1, 2, 4];
 /// The number of pools of a press: mean, greatest, and mean weighted by force.
 const POOLS: usize = 3;
-/// The number of presses that are computed together.
+/// The number of presses that are computed together. Their patches then fit into a core's cache.
 const PRESSES_AT_ONCE: usize = 32;
-
-/// The size of a network. Files of earlier revisions have smaller ones.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Size {
-    /// Width of the hidden layers.
-    hidden: usize,
-    /// The number of convolutions over time.
-    convolutions: usize,
-}
-
-impl Size {
-    /// The size of new networks.
-    const NEW: Self = Self {
-        hidden: 64,
-        convolutions: 4,
-    };
-
-    fn of(weights: &Weights) -> Self {
-        let names = weights.entries.iter().map(|weight| &weight.name);
-        let is_convolution = |name: &&String| name.starts_with("conv") && name.ends_with(".matrix");
-        Self {
-            hidden: weights.dims("embed.bias")[0],
-            convolutions: names.filter(is_convolution).count(),
-        }
-    }
-}
-
-/// The distance between the moments under the kernel of convolution number `layer`, from 1.
-fn dilation(layer: usize) -> usize {
-    1 << (layer - 1)
-}
 
 /// The measurements of a press at one moment, beside the frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -151,14 +122,6 @@ impl Batch {
 /// Initial weights for `levels` levels: N(0, 2 / inputs) before a ReLU. The variance is smaller
 /// where a residual layer adds and before the outputs, so that outputs begin near 1.
 pub fn initial(levels: usize, seed: u64, device: &Device) -> Weights {
-    of_size(Size::NEW, levels, seed, device)
-}
-
-fn of_size(size: Size, levels: usize, seed: u64, device: &Device) -> Weights {
-    let Size {
-        hidden,
-        convolutions,
-    } = size;
     let root = Stream::new(seed, "course weights");
     let mut weights = Weights::default();
     let mut add = |name: &str, dims: &[usize], gain: f64| {
@@ -174,11 +137,15 @@ fn of_size(size: Size, levels: usize, seed: u64, device: &Device) -> Weights {
             device,
         );
     };
-    add("embed", &[COLUMNS, hidden], 2.0);
-    for layer in 1..=convolutions {
-        add(&format!("conv{layer}"), &[KERNEL, hidden, hidden], 0.25);
+    add("embed", &[COLUMNS, HIDDEN], 2.0);
+    for layer in 0..DILATIONS.len() {
+        add(
+            &format!("conv{}", layer + 1),
+            &[KERNEL, HIDDEN, HIDDEN],
+            0.25,
+        );
     }
-    add("joint", &[POOLS * hidden, LAST], 2.0);
+    add("joint", &[POOLS * HIDDEN, LAST], 2.0);
     add("head", &[LAST, levels + shore::OUTPUTS], 0.2);
     weights
 }
@@ -190,9 +157,8 @@ pub fn start<'a>(
     levels: usize,
     device: &Device,
 ) -> Option<Start> {
-    let size = graph::size(&constant)?;
     let weight = |name: &str| graph::weight(name, &constant);
-    Start::of_constants(of_size(size, levels, 0, device), COLUMNS, weight, device)
+    Start::of_constants(initial(levels, 0, device), COLUMNS, weight, device)
 }
 
 /// Logits and Shore outputs `[presses, L + 3]`. Presses with similar numbers of frames should follow each
@@ -206,33 +172,29 @@ pub fn outputs(weights: &Weights, presses: &[Inputs], device: &Device) -> Tensor
 
 fn of_batch(weights: &Weights, batch: &Batch) -> Tensor<2> {
     let [presses, frames, _] = batch.mask.dims();
-    let Size {
-        hidden,
-        convolutions,
-    } = Size::of(weights);
     let mask = || batch.mask.clone();
     let rows = presses * frames;
     let flat = batch.columns.clone().reshape([rows, COLUMNS]);
     let x = activation::relu(dense(weights, "embed", flat));
-    let mut x = x.reshape([presses, frames, hidden]).mul(mask());
-    for layer in 1..=convolutions {
-        let (name, dilation) = (format!("conv{layer}"), dilation(layer));
-        let zeros = Tensor::<3>::zeros([presses, KERNEL / 2 * dilation, hidden], &x.device());
+    let mut x = x.reshape([presses, frames, HIDDEN]).mul(mask());
+    for (layer, dilation) in (1..).zip(DILATIONS) {
+        let name = format!("conv{layer}");
+        let zeros = Tensor::<3>::zeros([presses, KERNEL / 2 * dilation, HIDDEN], &x.device());
         let padded = Tensor::cat(vec![zeros.clone(), x.clone(), zeros], 1);
         let shifted = (0..KERNEL).map(|tap| {
             let first = tap * dilation;
             padded
                 .clone()
-                .slice([0..presses, first..first + frames, 0..hidden])
+                .slice([0..presses, first..first + frames, 0..HIDDEN])
         });
-        let patches = Tensor::cat(shifted.collect(), 2).reshape([rows, KERNEL * hidden]);
+        let patches = Tensor::cat(shifted.collect(), 2).reshape([rows, KERNEL * HIDDEN]);
         let added = activation::relu(dense(weights, &name, patches));
-        x = x.add(added.reshape([presses, frames, hidden])).mul(mask());
+        x = x.add(added.reshape([presses, frames, HIDDEN])).mul(mask());
     }
     let mean = x.clone().sum_dim(1).div(mask().sum_dim(1));
     let greatest = x.clone().max_dim(1);
     let weighted = x.mul(batch.weights.clone()).sum_dim(1);
-    let pooled = Tensor::cat(vec![mean, greatest, weighted], 2).reshape([presses, POOLS * hidden]);
+    let pooled = Tensor::cat(vec![mean, greatest, weighted], 2).reshape([presses, POOLS * HIDDEN]);
     let joint = activation::relu(dense(weights, "joint", pooled));
     dense(weights, "head", joint)
 }

@@ -2,7 +2,7 @@
 
 use tract_onnx::pb;
 
-use super::{COLUMNS, FRAMES, KERNEL, LAST, POOLS, Size, dilation};
+use super::{COLUMNS, DILATIONS, FRAMES, HIDDEN, KERNEL, LAST, POOLS};
 use crate::train::net::builder::Builder;
 use crate::train::net::frames;
 use crate::train::net::graph::{Graph, integer, integers};
@@ -75,22 +75,21 @@ impl Builder {
         ]
     }
 
-    /// A residual convolution over time of `x` `[1, hidden, FRAMES]`.
+    /// A residual convolution over time of `x` `[1, HIDDEN, FRAMES]`.
     fn convolution(&mut self, weights: &Weights, layer: usize, x: &str, mask: &str) -> String {
-        let (name, dilation) = (format!("conv{layer}"), dilation(layer));
-        let hidden = Size::of(weights).hidden;
+        let (name, dilation) = (format!("conv{layer}"), DILATIONS[layer - 1]);
         let rows = weights.numbers(&format!("{name}.matrix"));
         let mut kernel = vec![0.0; rows.len()];
         for (place, value) in rows.into_iter().enumerate() {
-            kernel[in_kernel(place, hidden)] = value;
+            kernel[in_kernel(place)] = value;
         }
         let kernel = self.0.constant(
             &format!("{name}.kernel"),
-            &[hidden, hidden, KERNEL],
+            &[HIDDEN, HIDDEN, KERNEL],
             &kernel,
         );
         let bias = weights.numbers(&format!("{name}.bias"));
-        let bias = self.0.constant(&format!("{name}.bias"), &[hidden], &bias);
+        let bias = self.0.constant(&format!("{name}.bias"), &[HIDDEN], &bias);
         let padding = (KERNEL / 2 * dilation) as i64;
         let attributes = vec![
             integers("kernel_shape", &[KERNEL as i64]),
@@ -108,16 +107,16 @@ impl Builder {
         self.node("Mul", &[&all, mask], &format!("{name}.out"))
     }
 
-    /// The pools over time of `x` `[1, hidden, FRAMES]`, `[1, POOLS * hidden]`. Both means are one
+    /// The pools over time of `x` `[1, HIDDEN, FRAMES]`, `[1, POOLS * HIDDEN]`. Both means are one
     /// matrix product.
-    fn pooled(&mut self, x: &str, hidden: usize, force: &str) -> String {
+    fn pooled(&mut self, x: &str, force: &str) -> String {
         let along = |axis| vec![integer("axis", axis)];
         let there = self.node("Mul", &[force, "mask"], "forces there");
         let shares = self.with("Concat", &["mask", &there], "shares", along(0));
         self.0.constant("ones", &[FRAMES, 1], &[1.0; FRAMES]);
         self.0.constant("tiny force", &[2, 1], &[0.0, TINY_N]);
         let total = self.node("Gemm", &[&shares, "ones", "tiny force"], "sums of shares");
-        let by_channel = self.reshaped(x, &[hidden, FRAMES], "by channel");
+        let by_channel = self.reshaped(x, &[HIDDEN, FRAMES], "by channel");
         let transposed = vec![integer("transB", 1)];
         let sums = self.with(
             "Gemm",
@@ -126,36 +125,26 @@ impl Builder {
             transposed,
         );
         let means = self.node("Div", &[&sums, &total], "means over time");
-        let means = self.reshaped(&means, &[1, 2 * hidden], "means in a row");
-        let [zero, half, all, axis] = [0, hidden, 2 * hidden, 1].map(|value| {
+        let means = self.reshaped(&means, &[1, 2 * HIDDEN], "means in a row");
+        let [zero, half, all, axis] = [0, HIDDEN, 2 * HIDDEN, 1].map(|value| {
             self.0
                 .indices(&format!("means at {value}"), &[value as i64])
         });
         let mean = self.node("Slice", &[&means, &zero, &half, &axis], "mean");
         let weighted = self.node("Slice", &[&means, &half, &all, &axis], "weighted mean");
-        let image = self.reshaped(x, &[1, hidden, 1, FRAMES], "as an image");
+        let image = self.reshaped(x, &[1, HIDDEN, 1, FRAMES], "as an image");
         let kernel = vec![integers("kernel_shape", &[1, FRAMES as i64])];
         let greatest = self.with("MaxPool", &[&image], "greatest", kernel);
-        let greatest = self.reshaped(&greatest, &[1, hidden], "greatest over time");
+        let greatest = self.reshaped(&greatest, &[1, HIDDEN], "greatest over time");
         self.with("Concat", &[&mean, &greatest, &weighted], "pooled", along(1))
     }
 }
 
 /// The place in the kernel `[out, in, tap]` of the number at `place` of a matrix `[tap, in, out]`.
-fn in_kernel(place: usize, hidden: usize) -> usize {
-    let (tap, rest) = (place / (hidden * hidden), place % (hidden * hidden));
-    let (input, output) = (rest / hidden, rest % hidden);
-    (output * hidden + input) * KERNEL + tap
-}
-
-/// The size of the network in an exported graph, by its constants. `None` if they are of another network.
-pub(super) fn size<'a>(constant: impl Fn(&str) -> Option<&'a Constant>) -> Option<Size> {
-    let (dims, _) = constant("embed.bias")?;
-    let is_there = |layer: &usize| constant(&format!("conv{layer}.kernel")).is_some();
-    Some(Size {
-        hidden: *dims.first()?,
-        convolutions: (1..).take_while(is_there).count(),
-    })
+fn in_kernel(place: usize) -> usize {
+    let (tap, rest) = (place / (HIDDEN * HIDDEN), place % (HIDDEN * HIDDEN));
+    let (input, output) = (rest / HIDDEN, rest % HIDDEN);
+    (output * HIDDEN + input) * KERNEL + tap
 }
 
 /// A weight of [`super::initial`] from the constants of an exported graph, which holds the
@@ -171,17 +160,13 @@ pub(super) fn weight<'a>(
         return constant(name).cloned();
     };
     let (dims, kernel) = constant(&format!("{layer}.kernel"))?;
-    let &[hidden, inputs, taps] = dims.as_slice() else {
-        return None;
-    };
-    let is_kernel = inputs == hidden && taps == KERNEL && kernel.len() == hidden * hidden * KERNEL;
-    let places = 0..kernel.len();
-    let matrix = || {
-        places
-            .map(|place| kernel[in_kernel(place, hidden)])
+    let is_kernel = *dims == [HIDDEN, HIDDEN, KERNEL] && kernel.len() == HIDDEN * HIDDEN * KERNEL;
+    let matrix = |kernel: &[f32]| {
+        (0..kernel.len())
+            .map(|place| kernel[in_kernel(place)])
             .collect()
     };
-    is_kernel.then(|| (vec![KERNEL, hidden, hidden], matrix()))
+    is_kernel.then(|| (vec![KERNEL, HIDDEN, HIDDEN], matrix(kernel)))
 }
 
 /// The graph from the inputs of format 2 to raw logits `[1, levels]` and Shore OO `[1, 3]`, and the
@@ -192,10 +177,6 @@ pub fn graph(
     levels: usize,
     widths: [f32; 2],
 ) -> (Graph, String, String) {
-    let Size {
-        hidden,
-        convolutions,
-    } = Size::of(weights);
     let mut b = Builder(Graph::default());
     let (features, force) = frames::nodes(&mut b, "frames", FRAMES);
     let motion = b.motion(&force);
@@ -206,23 +187,23 @@ pub fn graph(
     let x = standard.nodes(&mut b, &all);
 
     let matrix = weights.numbers("embed.matrix");
-    let matrix = b.0.constant("embed.matrix", &[COLUMNS, hidden], &matrix);
+    let matrix = b.0.constant("embed.matrix", &[COLUMNS, HIDDEN], &matrix);
     let bias = weights.numbers("embed.bias");
-    let bias = b.0.constant("embed.bias", &[hidden], &bias);
-    let bias = b.reshaped(&bias, &[hidden, 1], "embed.bias of rows");
-    // [COLUMNS, FRAMES] -> [hidden, FRAMES]
+    let bias = b.0.constant("embed.bias", &[HIDDEN], &bias);
+    let bias = b.reshaped(&bias, &[HIDDEN, 1], "embed.bias of rows");
+    // [COLUMNS, FRAMES] -> [HIDDEN, FRAMES]
     let transposed = vec![integer("transA", 1)];
     let x = b.with("Gemm", &[&matrix, &x, &bias], "embed.sum", transposed);
     let x = b.node("Relu", &[&x], "embedded");
-    let x = b.reshaped(&x, &[1, hidden, FRAMES], "over time");
+    let x = b.reshaped(&x, &[1, HIDDEN, FRAMES], "over time");
     let mask = b.reshaped("mask", &[1, 1, FRAMES], "mask over time");
     let mut x = b.node("Mul", &[&x, &mask], "first");
-    for layer in 1..=convolutions {
+    for layer in 1..=DILATIONS.len() {
         x = b.convolution(weights, layer, &x, &mask);
     }
 
-    let pooled = b.pooled(&x, hidden, &force);
-    let joint = b.dense(weights, "joint", [POOLS * hidden, LAST], &pooled);
+    let pooled = b.pooled(&x, &force);
+    let joint = b.dense(weights, "joint", [POOLS * HIDDEN, LAST], &pooled);
     let joint = b.node("Relu", &[&joint], "joint");
     let outputs = b.dense(weights, "head", [LAST, levels + shore::OUTPUTS], &joint);
     let (raw_logits, shore) = shore::nodes(&mut b, &outputs, levels, widths);
