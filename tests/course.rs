@@ -9,7 +9,7 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
-use hardnessd::train::data::courses::Courses;
+use hardnessd::train::data::courses::{Courses, single_frames};
 use hardnessd::train::model::course::course_of;
 use hardnessd::verdict::{Course, Format, Hrn};
 use serde_json::Value;
@@ -273,6 +273,31 @@ fn a_model_for_one_robot_takes_no_notice_of_the_arm() {
         "train --method frame --one-robot --data d.npz --out two",
     );
     assert_eq!(output.status.code(), Some(2));
+}
+
+#[test]
+fn a_method_of_single_frames_learns_from_the_best_frame_of_each_press() {
+    let directory = tempfile::tempdir().unwrap();
+    let at = directory.path();
+    let simulate = "simulate --sequences --materials broad --objects 4 --test-objects 2 --presses 3 --out d.npz";
+    succeed(at, simulate);
+    let courses = Courses::read(&at.join("d.npz")).unwrap();
+    let dataset = single_frames(&at.join("d.npz")).unwrap();
+    assert_eq!(dataset.samples.len(), courses.presses.len());
+    for (sample, press) in dataset.samples.iter().zip(&courses.presses) {
+        assert_eq!(sample.frame, courses.frame(press.best as usize));
+        let of_press = (press.level, Some(press.object), Some(press.shore));
+        assert_eq!((sample.level, sample.object, sample.shore), of_press);
+    }
+    // A name must not control the terminal, in what goes well either.
+    let run = "run\u{1b}[2J";
+    succeed(
+        at,
+        "train --method features --profile smoke --data d.npz --out r",
+    );
+    std::fs::rename(at.join("r"), at.join(run)).unwrap();
+    let said = succeed(at, &format!("export {run} --out m\u{1b}.onnx"));
+    assert!(said.starts_with("m\\u{1b}.onnx: sha256 "), "{said}");
 }
 
 #[test]
