@@ -162,8 +162,8 @@ pub fn start<'a>(
 }
 
 /// Logits and Shore outputs `[presses, L + 3]`. Presses with similar numbers of frames should follow each
-/// other: [`PRESSES_AT_ONCE`] are computed together, and the frames that a press lacks beside the longest
-/// of these cost as much time as its own.
+/// other: some are computed together, and the frames that a press lacks beside the longest of these cost
+/// as much time as its own.
 pub fn outputs(weights: &Weights, presses: &[Inputs], device: &Device) -> Tensor<2> {
     let parts = presses.chunks(PRESSES_AT_ONCE);
     let parts = parts.map(|part| of_batch(weights, &Batch::new(part, device)));
