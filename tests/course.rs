@@ -289,15 +289,6 @@ fn a_method_of_single_frames_learns_from_the_best_frame_of_each_press() {
         let of_press = (press.level, Some(press.object), Some(press.shore));
         assert_eq!((sample.level, sample.object, sample.shore), of_press);
     }
-    // A name must not control the terminal, in what goes well either.
-    let run = "run\u{1b}[2J";
-    succeed(
-        at,
-        "train --method features --profile smoke --data d.npz --out r",
-    );
-    std::fs::rename(at.join("r"), at.join(run)).unwrap();
-    let said = succeed(at, &format!("export {run} --out m\u{1b}.onnx"));
-    assert!(said.starts_with("m\\u{1b}.onnx: sha256 "), "{said}");
 }
 
 #[test]

@@ -577,6 +577,29 @@ fn a_reader_that_goes_ends_it_quietly() {
 }
 
 #[test]
+fn a_name_does_not_control_the_terminal() {
+    let directory = tempfile::tempdir().unwrap();
+    let run = directory.path().join("run");
+    let run = run.to_str().unwrap();
+    let data = data().1.to_str().unwrap();
+    succeed(&[
+        "train",
+        "--method",
+        "features",
+        "--profile",
+        "smoke",
+        "--data",
+        data,
+        "--out",
+        run,
+    ]);
+    let model = directory.path().join("m\u{1b}[2J.onnx");
+    let said = succeed(&["export", run, "--out", model.to_str().unwrap()]);
+    let shown = model.to_str().unwrap().replace('\u{1b}', "\\u{1b}");
+    assert!(said.starts_with(&format!("{shown}: sha256 ")), "{said}");
+}
+
+#[test]
 fn a_full_disk_is_an_error_and_leaves_the_last_checkpoint_intact() {
     let whole = Trial::new("ample disk");
     whole.train("8", &[]);
