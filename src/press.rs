@@ -16,6 +16,7 @@ use serde::{Deserialize, Serialize};
 
 use self::course::Course;
 pub use self::settings::{Settings, SettingsError};
+pub use self::settling::first_settled;
 use self::settling::{Load, Settling};
 pub use self::thin::thinned;
 use crate::frame::{Frame, Stamp, TAXELS};

@@ -223,6 +223,7 @@ fn compare(at: &Path, told: &Value) {
     let count = |what: &str| page.matches(what).count();
     assert!(count("force against approach, level ") >= 2, "{page}");
     assert_eq!(count("accuracy against time, d"), 1);
+    assert_eq!(count("accuracy against force, d"), 1);
     assert_eq!(count("calibration of d"), 1);
     // Most presses have ended after 6.4 s, so most verdicts of that time are final.
     let so_far = model["so_far"]["after"].as_array().unwrap();
@@ -232,6 +233,11 @@ fn compare(at: &Path, told: &Value) {
         "{so_far:?}"
     );
     assert!(so_far.is_sorted_by(|a, b| going_on(a) >= going_on(b)));
+    // Every press reaches 0.5 N, and fewer reach more.
+    let at_force = model["so_far"]["at_force"].as_array().unwrap();
+    let reached = |at: &Value| at["reached"].as_f64().unwrap();
+    assert!(reached(&at_force[0]) > 0.9, "{at_force:?}");
+    assert!(at_force.is_sorted_by(|a, b| reached(a) >= reached(b)));
 
     for (model, code) in [("missing.onnx", 66), ("d.npz", 78)] {
         let command = format!("compare --course --data d.npz --test d.npz --model {model} --out c");

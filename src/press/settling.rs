@@ -6,6 +6,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::Settings;
+use crate::frame::Frame;
 
 /// The latest frames whose area and force are all near the largest ones so far.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -56,6 +57,24 @@ impl Settling {
             && self.near.len() >= SETTLED_FRAMES
             && self.near.front().is_some_and(covers)
     }
+}
+
+/// The place of the first of `frames` of a press with which its contact has settled, or `None` if it
+/// never settles. Each frame comes with the time since the press began.
+pub fn first_settled<'a>(
+    frames: impl Iterator<Item = (Duration, &'a Frame)>,
+    settings: &Settings,
+) -> Option<usize> {
+    let mut settling = Settling::default();
+    let is_settled = |(at, frame): (Duration, &Frame)| {
+        let load = Load {
+            at,
+            contact_area_taxels: frame.contact_area_taxels(settings.contact_threshold_n),
+            force_n: frame.force_n(),
+        };
+        settling.push(load, settings)
+    };
+    frames.map(is_settled).position(|settled| settled)
 }
 
 /// An early verdict needs this many settled frames.

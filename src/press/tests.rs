@@ -252,6 +252,20 @@ fn settling_needs_its_time_at_high_rates() {
 }
 
 #[test]
+fn the_frame_that_settles_a_recorded_press_is_the_trackers() {
+    let settled_at = |loads: &[(usize, f32)]| {
+        let frames: Vec<Frame> = loads.iter().map(|&(area, n)| frame(area, n)).collect();
+        let stamped = frames.iter().zip(0..);
+        let stamped = stamped.map(|(frame, number)| (moment(number, 5).stamp.mono, frame));
+        first_settled(stamped, &Settings::default())
+    };
+    let loads = [(5, 2.), (9, 6.), (12, 10.), (12, 9.9), (12, 9.8), (12, 9.8)];
+    check(&loads, "b1@0 s@4:2");
+    assert_eq!(settled_at(&loads), Some(4));
+    assert_eq!(settled_at(&loads[..4]), None);
+}
+
+#[test]
 fn an_aborted_press_leaves_the_tracker_idle() {
     let mut tracker = PressTracker::new(Settings::default());
     assert_eq!(tracker.abort(Abort::Lost), None);

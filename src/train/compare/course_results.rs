@@ -107,7 +107,7 @@ pub(super) fn tables(rows: &[CourseRow]) -> Vec<Table> {
     for row in rows {
         for on in &row.sets {
             if let Some(so_far) = &on.so_far {
-                all.push(so_far::table(&row.name, &on.set, so_far));
+                all.extend(so_far::tables(&row.name, &on.set, so_far));
             }
         }
     }

@@ -4,7 +4,7 @@ use super::Page;
 use super::figures;
 use super::plot::{Anchor, Scale, Svg, axes};
 use crate::train::compare::course_results::{self, CourseRow, OnSet};
-use crate::train::compare::so_far::SoFar;
+use crate::train::compare::so_far::{After, AtForce, SoFar};
 
 /// The force of a press against the approach of the arm.
 #[derive(Debug, Clone, PartialEq)]
@@ -44,6 +44,12 @@ pub fn courses(rows: &[CourseRow], first: &str, curves: &Option<(&str, Vec<Curve
              presses that had not ended (dashed). For a press that had ended, the final verdict counts."
         ));
         let picture = |on: &OnSet| Some(against_time(on.so_far.as_ref()?, &on.set));
+        page.panels(sets().filter_map(picture).collect());
+        page.note(&format!(
+            "{first}: share of correct levels at the first frame of at least each force (blue), and share of \
+             presses that reach the force (dashed). Only these are judged."
+        ));
+        let picture = |on: &OnSet| Some(against_force(on.so_far.as_ref()?, &on.set));
         page.panels(sets().filter_map(picture).collect());
         for table in before_end {
             page.subtitle(&table.title);
@@ -89,35 +95,80 @@ fn force_against_approach(curves: &[Curve]) -> Vec<String> {
 
 /// Accuracy against the time since a press began.
 fn against_time(so_far: &SoFar, set: &str) -> String {
-    let seconds = so_far.after.iter().map(|after| f64::from(after.seconds));
-    let (least, most) = seconds.fold((1.0_f64, 1.0_f64), |(least, most), seconds| {
-        (least.min(seconds), most.max(seconds))
-    });
+    let point = |after: &After| Point {
+        at: f64::from(after.seconds),
+        accuracy: after.accuracy,
+        presses: after.going_on,
+        tip: format!(
+            "after {} s: {:.1} % correct, {:.1} % still pressed",
+            after.seconds,
+            100.0 * after.accuracy,
+            100.0 * after.going_on
+        ),
+    };
+    let points: Vec<Point> = so_far.after.iter().map(point).collect();
+    shares(
+        &points,
+        "seconds",
+        &format!("accuracy against time, {set}"),
+        set,
+    )
+}
+
+/// Accuracy against the force that a press has reached.
+fn against_force(so_far: &SoFar, set: &str) -> String {
+    let point = |at: &AtForce| {
+        let accuracy = at.accuracy?;
+        Some(Point {
+            at: at.newtons,
+            accuracy,
+            presses: at.reached,
+            tip: format!(
+                "from {} N: {:.1} % correct, {:.1} % reach it",
+                at.newtons,
+                100.0 * accuracy,
+                100.0 * at.reached
+            ),
+        })
+    };
+    let points: Vec<Point> = so_far.at_force.iter().filter_map(point).collect();
+    shares(
+        &points,
+        "newtons",
+        &format!("accuracy against force, {set}"),
+        set,
+    )
+}
+
+/// A point of [`shares`].
+struct Point {
+    at: f64,
+    accuracy: f64,
+    presses: f64,
+    tip: String,
+}
+
+/// Accuracy (a line with marks) and a share of presses (dashed) on a logarithmic axis.
+fn shares(points: &[Point], axis: &str, title: &str, set: &str) -> String {
+    let (least, most) = points
+        .iter()
+        .fold((1.0_f64, 1.0_f64), |(least, most), point| {
+            (least.min(point.at), most.max(point.at))
+        });
     // With a margin, so that the ends of the axis show decades.
     let x = Scale::logarithmic((0.8 * least, 1.6 * most), (38.0, 244.0));
     let y = Scale::linear((0.0, 100.0), (146.0, 40.0));
     let mut svg = Svg::new(260.0, 181.0);
     svg.text("name", (0.0, 12.0), Anchor::Start, set);
-    axes(&mut svg, (&x, "seconds"), (&y, "%"), (3, 4));
-    let at = |share: f64, seconds: f32| (x.at(f64::from(seconds)), y.at(100.0 * share));
-    let going_on = so_far
-        .after
-        .iter()
-        .map(|after| at(after.going_on, after.seconds));
-    svg.path("diagonal", &going_on.collect::<Vec<_>>());
-    let accuracy = so_far
-        .after
-        .iter()
-        .map(|after| at(after.accuracy, after.seconds));
-    svg.path("train", &accuracy.collect::<Vec<_>>());
-    for after in &so_far.after {
-        let tip = format!(
-            "after {} s: {:.1} % correct, {:.1} % still pressed",
-            after.seconds,
-            100.0 * after.accuracy,
-            100.0 * after.going_on
-        );
-        svg.dot("mark", at(after.accuracy, after.seconds), 3.0, &tip);
+    axes(&mut svg, (&x, axis), (&y, "%"), (3, 4));
+    let place = |point: &Point, share: f64| (x.at(point.at), y.at(100.0 * share));
+    let path = |of: fn(&Point) -> f64| -> Vec<(f64, f64)> {
+        points.iter().map(|point| place(point, of(point))).collect()
+    };
+    svg.path("diagonal", &path(|point| point.presses));
+    svg.path("train", &path(|point| point.accuracy));
+    for point in points {
+        svg.dot("mark", place(point, point.accuracy), 3.0, &point.tip);
     }
-    svg.finish(&format!("accuracy against time, {set}"))
+    svg.finish(title)
 }
