@@ -383,8 +383,20 @@ fn a_file_that_adopt_cannot_mend_is_said_to_be_one() {
         lines.contains("missing  opset: ONNX opset 9: expected 17 or newer\n"),
         "{lines}"
     );
-    assert!(lines.contains("missing  graph: not looked at"), "{lines}");
+    // One problem hides no other one.
+    assert!(lines.contains("ok       graph\n"), "{lines}");
+    assert!(
+        lines.contains("adopt    hrn.levels: ") && !lines.contains("unseen"),
+        "{lines}"
+    );
     assert!(!lines.contains("hrn-train adopt"), "{lines}");
+
+    let text = directory.path().join("text.onnx");
+    std::fs::write(&text, "no model").unwrap();
+    let checked = hrn_train(&["check-model", text.to_str().unwrap()]);
+    let lines = stdout(&checked);
+    assert!(lines.contains("missing  file: "), "{lines}");
+    assert!(lines.contains("unseen   graph: not looked at"), "{lines}");
 
     let mut forbidden = model("logits", 4, 17);
     forbidden.graph.as_mut().unwrap().node[0].op_type = "Hardmax".to_owned();

@@ -12,6 +12,7 @@ value.
 import json
 import os
 import pathlib
+import shutil
 import signal
 import struct
 import subprocess
@@ -92,9 +93,8 @@ def check(path, live):
     return counts, metadata
 
 
-def bag(directory, recordings, counts):
-    """A bag of these recordings says what is in them, and opens by its metadata."""
-    out = directory / "take"
+def bag(out, recordings, counts):
+    """A bag of these recordings in the new directory `out` says what is in them, and opens by its metadata."""
     subprocess.run([sys.executable, str(BAG), "--out", str(out), *map(str, recordings)], check=True)
     with Reader(out) as reader:
         assert "storage_identifier: mcap" in (out / "metadata.yaml").read_text()
@@ -128,7 +128,10 @@ def daemon(binary):
         live = [json.loads(line) for line in tail.communicate(timeout=10)[0].splitlines()]
         (recording,) = pathlib.Path(bench.path("rec")).glob("hardnessd-*.mcap")
         counts, metadata = check(recording, live)
-        bag(pathlib.Path(bench.path(".")), [recording], counts)
+        bag(pathlib.Path(bench.path("take")), [recording], counts)
+        # Two files become one bag.
+        second = pathlib.Path(shutil.copy(recording, bench.path("second.mcap")))
+        bag(pathlib.Path(bench.path("both")), [recording, second], {kind: 2 * n for kind, n in counts.items()})
         assert metadata["hardnessd.recording"]["robot"] == "arm-7"
         assert json.loads(metadata["hardnessd.sensor"]["settings"])["name"] == "forearm"
         finals = [event for event in live if event.get("phase") == "final"]

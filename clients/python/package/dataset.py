@@ -100,6 +100,11 @@ def load(path: Union[str, "os.PathLike[str]"]) -> DataSet:
                 arrays = {name: file[name] for name in file.files}
     except (ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
         raise ValueError(f"{os.fspath(path)}: not a data set (.npz): {error}") from error
+    if "frames_mn" in arrays:
+        raise ValueError(
+            f"{os.fspath(path)}: it has whole presses (--sequences), and this module reads single frames: "
+            "docs/formats.md says how to read them"
+        )
     for name in ("frames", "level"):
         if name not in arrays:
             raise ValueError(f"{os.fspath(path)}: {name}: found none, expected an array")

@@ -38,6 +38,8 @@ const KEYS: [&str; 10] = [
 ];
 /// The key that only a file of format 2 may have.
 const CONFORMAL: &str = "hrn.conformal";
+/// The problem of a part that the loader did not reach.
+const UNSEEN: &str = "not looked at, because of the other problem";
 /// The number of check frames or check presses.
 const CHECKS: usize = 8;
 
@@ -80,6 +82,7 @@ impl fmt::Display for Finding {
         match problem {
             None => write!(out, "ok       {part}"),
             Some(problem) if *is_mended => write!(out, "adopt    {part}: {problem}"),
+            Some(problem) if problem == UNSEEN => write!(out, "unseen   {part}: {problem}"),
             Some(problem) => write!(out, "missing  {part}: {problem}"),
         }
     }
@@ -117,7 +120,7 @@ pub fn review(bytes: &[u8], mut attempt: impl FnMut(&[u8]) -> Result<(), ModelEr
                 let is_known = problems.iter().any(|(known, ..)| *known == part);
                 let is_mended = !is_known && format.mend_part(&mut proto, part);
                 if !is_known {
-                    let is_adopted = is_mended && format == Format::Frame;
+                    let is_adopted = is_mended && format == Format::Frame && part != "opset";
                     problems.push((part, error.to_string(), is_adopted));
                 }
                 has_own_check &= part != "hrn.check";
@@ -140,9 +143,7 @@ pub fn review(bytes: &[u8], mut attempt: impl FnMut(&[u8]) -> Result<(), ModelEr
             part,
             problem: match problem {
                 Some((_, problem, _)) => Some(problem.clone()),
-                None if !is_reached => {
-                    Some("not looked at, because of the other problem".to_owned())
-                }
+                None if !is_reached => Some(UNSEEN.to_owned()),
                 None => None,
             },
             is_mended: problem.is_some_and(|(_, _, is_mended)| *is_mended),
@@ -212,9 +213,15 @@ fn part(error: &ModelError) -> &'static str {
 
 impl Format {
     /// Mends a part, and returns whether it did. The values only have to be right in form. Of format
-    /// 1, it mends what `adopt` would mend.
+    /// 1, it mends what `adopt` would mend. It also claims a newer opset, so that the parts after it
+    /// can be looked at.
     fn mend_part(self, proto: &mut pb::ModelProto, part: &str) -> bool {
         match part {
+            "opset" => {
+                let mut sets = proto.opset_import.iter_mut();
+                let of_onnx = sets.find(|set| ["", "ai.onnx"].contains(&set.domain.as_str()));
+                of_onnx.map(|set| set.version = MIN_OPSET).is_some()
+            }
             "input" if self == Self::Frame => mend_input(proto, &mut Vec::new()).is_ok(),
             "outputs" if self == Self::Frame => mend_outputs(proto, &mut Vec::new()).is_ok(),
             part if part.starts_with("hrn.") => {

@@ -1,6 +1,9 @@
 """Starts the daemon beside ROS 2, and a viewer of one sensor's pictures.
 
-    ros2 launch tactile_interfaces hardnessd.launch.py config:=/etc/hardnessd.toml sensor:=forearm
+    ros2 launch tactile_interfaces hardnessd.launch.py program:=target/release/hardnessd \\
+        config:=hardnessd.toml namespace:=/arm_7 sensor:=forearm
+
+The program must be built with the feature `ros2`. The one of the Debian package is not.
 """
 
 from launch import LaunchDescription
@@ -12,13 +15,19 @@ from launch_ros.actions import Node
 
 def generate_launch_description():
     config = LaunchConfiguration("config")
-    image = ["/tactile/", LaunchConfiguration("sensor"), "/image"]
+    image = [LaunchConfiguration("namespace"), "/tactile/", LaunchConfiguration("sensor"), "/image"]
     return LaunchDescription(
         [
             DeclareLaunchArgument("config", default_value="/etc/hardnessd.toml", description="the daemon's configuration"),
+            DeclareLaunchArgument("program", default_value="hardnessd", description="the daemon, with the feature ros2"),
+            DeclareLaunchArgument("namespace", default_value="", description="namespace of [publish.ros2], as /arm_7"),
             DeclareLaunchArgument("sensor", default_value="forearm", description="the sensor to look at"),
             DeclareLaunchArgument("view", default_value="true", description="whether to show its pictures"),
-            ExecuteProcess(cmd=["hardnessd", "run", "--config", config], output="screen", sigterm_timeout="2"),
+            ExecuteProcess(
+                cmd=[LaunchConfiguration("program"), "run", "--config", config],
+                output="screen",
+                sigterm_timeout="2",
+            ),
             Node(
                 package="rqt_image_view",
                 executable="rqt_image_view",
