@@ -38,6 +38,37 @@ impl Found {
 /// that loads every taxel. It has less than 6 MiB.
 pub(super) const LONGEST_RECORD_BYTES: usize = 8 << 20;
 
+/// The bytes of a record's opcode and length.
+pub(super) const RECORD_HEAD_BYTES: u64 = 9;
+
+/// The number of unpacked bytes that a file of `bytes` bytes may hold. The recording of a silent sensor
+/// holds 55 times its bytes, its densest chunk 185 times. A file that claims more would cost much time
+/// for few bytes: zstd packs zeros to a ten-thousandth.
+pub(super) fn most_unpacked(bytes: u64) -> u64 {
+    (64 << 20) + 256 * bytes
+}
+
+/// Parses a record. The crate panics on an attachment whose lengths do not fit, so they are checked
+/// first.
+pub(super) fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, mcap::McapError> {
+    if opcode == op::ATTACHMENT && attachment_bytes(body) != Some(body.len() as u64) {
+        return Err(mcap::McapError::UnexpectedEof);
+    }
+    mcap::parse_record(opcode, body)
+}
+
+/// The length that an attachment's record must have by its own lengths: two times, a name, a media
+/// type, the data and a checksum.
+fn attachment_bytes(body: &[u8]) -> Option<u64> {
+    let text = |at: u64| {
+        let bytes = body.get(usize::try_from(at).ok()?..)?.first_chunk()?;
+        Some(at + 4 + u64::from(u32::from_le_bytes(*bytes)))
+    };
+    let data_at = text(text(16)?)?;
+    let bytes = body.get(usize::try_from(data_at).ok()?..)?.first_chunk()?;
+    u64::from_le_bytes(*bytes).checked_add(data_at + 8 + 4)
+}
+
 /// A function that reads a message.
 type Decode = fn(&[u8]) -> Result<(String, Stamp, Entry), Error>;
 
@@ -65,6 +96,8 @@ pub struct Reader<R> {
     schemas: BTreeMap<u16, Decode>,
     channels: BTreeMap<u16, Decode>,
     bytes: u64,
+    /// The length of all records so far, unpacked.
+    unpacked: u64,
     /// Whether the summary, an error or the end was reached.
     done: bool,
 }
@@ -81,6 +114,7 @@ impl<R: Read> Reader<R> {
             schemas: BTreeMap::new(),
             channels: BTreeMap::new(),
             bytes: 0,
+            unpacked: 0,
             done: false,
         }
     }
@@ -113,7 +147,14 @@ impl<R: Read> Reader<R> {
                     // The summary only repeats what was read.
                     return Ok(None);
                 }
-                LinearReadEvent::Record { opcode, data } => mcap::parse_record(opcode, data)?,
+                LinearReadEvent::Record { opcode, data } => {
+                    self.unpacked += RECORD_HEAD_BYTES + data.len() as u64;
+                    if self.unpacked > most_unpacked(self.bytes) {
+                        let problem = "the recording unpacks to more than 256 times its bytes";
+                        return Err(Error::Damaged(problem.to_owned()));
+                    }
+                    parse(opcode, data)?
+                }
             };
             match found {
                 Record::Schema { header, .. } if header.name == INPUT.schema => {

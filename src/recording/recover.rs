@@ -3,7 +3,8 @@
 //! One scan goes from front to back and trusts no index. It takes each chunk whose checksum fits.
 //! If a record does not fill its length, the next record's place is unknown. The scan then searches
 //! for the bytes that every compressed chunk has at the same place. Whatever the file holds, the
-//! scan reads no more than a few times its length, and holds one chunk of bounded size.
+//! scan reads no more than a few times its length, unpacks no more than [`most_unpacked`] allows, and
+//! holds one chunk of bounded size.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Read, Seek, SeekFrom, Write};
@@ -14,7 +15,7 @@ use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::write::NoSeek;
 
 use super::message;
-use super::reader::LONGEST_RECORD_BYTES;
+use super::reader::{LONGEST_RECORD_BYTES, RECORD_HEAD_BYTES, most_unpacked, parse};
 use super::{Entry, Error, writer};
 
 /// The result of recovering a damaged recording.
@@ -50,8 +51,6 @@ pub enum RecoverError {
     Write(#[from] Error),
 }
 
-/// The bytes of a record's opcode and length.
-const RECORD_HEAD_BYTES: u64 = 9;
 /// The place in a chunk's record of the chunk's unpacked length: after opcode, length and two
 /// times.
 const UNPACKED_AT: usize = RECORD_HEAD_BYTES as usize + 16;
@@ -91,6 +90,8 @@ struct Scan<R> {
     /// The place where the scan continues.
     place: u64,
     chunks: u64,
+    /// The unpacked length of the chunks so far.
+    unpacked: u64,
     lost: Vec<(u64, u64)>,
     complete: bool,
     /// The number of bytes read as records that turned out not to be records.
@@ -111,6 +112,7 @@ impl<R: Read + Seek> Scan<R> {
             // The magic is skipped unread, so damage to it loses nothing.
             place: MAGIC.len() as u64,
             chunks: 0,
+            unpacked: 0,
             lost: Vec::new(),
             complete: false,
             wasted: 0,
@@ -146,7 +148,7 @@ impl<R: Read + Seek> Scan<R> {
             };
             self.place = end;
             match record {
-                Record::Chunk { header, .. } => match records(&header, &body) {
+                Record::Chunk { header, .. } => match self.unpack(&header, &body, end) {
                     Some(records) => {
                         self.chunks += 1;
                         return Ok(Some(records));
@@ -157,6 +159,21 @@ impl<R: Read + Seek> Scan<R> {
             }
         }
         Ok(None)
+    }
+
+    /// The records of a chunk that ends at `end`, if it is whole and the file may still unpack it.
+    fn unpack(
+        &mut self,
+        header: &ChunkHeader,
+        body: &[u8],
+        end: u64,
+    ) -> Option<Vec<Record<'static>>> {
+        let unpacked = self.unpacked.saturating_add(header.uncompressed_size);
+        if unpacked > most_unpacked(end) {
+            return None;
+        }
+        self.unpacked = unpacked;
+        records(header, body)
     }
 
     /// The opcode and the end of the record at `place`, if there can be a record.
@@ -243,7 +260,7 @@ fn is_chunk_head(head: &[u8], left: u64) -> bool {
 /// Parses a record if it fills its bytes to the last one. If it does not, its length is damaged,
 /// and its end is unknown.
 fn exact(opcode: u8, body: &[u8]) -> Option<Record<'_>> {
-    let record = mcap::parse_record(opcode, body).ok()?;
+    let record = parse(opcode, body).ok()?;
     let text = |text: &str| 4 + text.len();
     let map = |map: &BTreeMap<String, String>| {
         4 + map.iter().map(|(k, v)| text(k) + text(v)).sum::<usize>()
@@ -289,7 +306,7 @@ fn records(header: &ChunkHeader, body: &[u8]) -> Option<Vec<Record<'static>>> {
                 reader.notify_read(read);
             }
             LinearReadEvent::Record { opcode, data } => {
-                let record = mcap::parse_record(opcode, data).ok()?;
+                let record = parse(opcode, data).ok()?;
                 // Records that are not copied take no memory.
                 if let Record::Schema { .. } | Record::Channel(_) | Record::Message { .. } = record
                 {

@@ -524,7 +524,7 @@ fn a_chunk_that_would_fill_the_memory_is_lost_and_no_other() {
     let (file, _) = recorded(10, 7);
     let (whole, _) = recover(Cursor::new(&file), Vec::new()).unwrap();
     // 250 MB of zeros pack into some kilobytes.
-    let zeros = mcap_zeros(250 << 20);
+    let zeros = packed(&[], 250 << 20);
     assert!(zeros.len() < 32 << 10, "{}", zeros.len());
     let middle = chunk_starts(&file)[3];
     let mut bomb = file[..middle].to_vec();
@@ -545,12 +545,66 @@ fn a_chunk_that_would_fill_the_memory_is_lost_and_no_other() {
     assert_eq!(found.messages, whole.messages);
 }
 
-/// `length` zeros, packed as zstd does: frames of a raw header and blocks of one repeated byte.
-fn mcap_zeros(length: usize) -> Vec<u8> {
+#[test]
+fn an_attachment_with_wrong_lengths_is_an_error_and_no_panic() {
+    let (file, _) = recorded(10, 7);
+    let middle = chunk_starts(&file)[3];
+    let head = [&[0; 16][..], &[0; 4], &[0; 4]].concat();
+    for (data, rest, is_whole) in [
+        (0_u64, 4, true),
+        (3, 7, true),
+        // No room for the checksum, or for the length of the data.
+        (0, 3, false),
+        (1, 4, false),
+        (u64::MAX, 4, false),
+    ] {
+        let mut body = [&head[..], &data.to_le_bytes()].concat();
+        body.extend(vec![0; rest]);
+        let mut with = file[..middle].to_vec();
+        with.push(mcap::records::op::ATTACHMENT);
+        with.extend((body.len() as u64).to_le_bytes());
+        with.extend(&body);
+        with.extend(&file[middle..]);
+        let error = Reader::new(&with[..]).find_map(Result::err);
+        assert_eq!(error.is_none(), is_whole, "{data} {rest}: {error:?}");
+        let (found, good) = recover(Cursor::new(&with), Vec::new()).unwrap();
+        assert_eq!(found.lost.is_empty(), is_whole, "{data} {rest}");
+        assert_eq!(play(&good), play(&file));
+    }
+}
+
+#[test]
+fn small_chunks_of_a_small_file_unpack_to_a_bounded_length() {
+    let (file, _) = recorded(10, 7);
+    let (whole, _) = recover(Cursor::new(&file), Vec::new()).unwrap();
+    let middle = chunk_starts(&file)[3];
+    // Each of these chunks is small enough. It has one record of zeros. Together they have 700 MiB.
+    let zeros = 7 << 20;
+    let head = [&[0x80][..], &(zeros as u64).to_le_bytes()].concat();
+    let (length, packed) = ((head.len() + zeros) as u64, packed(&head, zeros));
+    let mut hostile = file[..middle].to_vec();
+    for _ in 0..100 {
+        hostile.extend(chunk(length, &packed));
+    }
+    hostile.extend(&file[middle..]);
+    let most = reader::most_unpacked(hostile.len() as u64);
+    assert!(most < 50 * length, "{most} of {} bytes", hostile.len());
+    let (found, _) = recover(Cursor::new(&hostile), Vec::new()).unwrap();
+    assert!(found.lost.len() > 50, "{}", found.lost.len());
+    assert_eq!(found.messages, whole.messages, "the other chunks fit");
+    let error = Reader::new(&hostile[..]).find_map(Result::err).unwrap();
+    assert!(error.to_string().contains("256 times"), "{error}");
+}
+
+/// `begin` and then `zeros` zeros, packed as zstd does: a block of raw bytes, and blocks of one
+/// repeated byte.
+fn packed(begin: &[u8], zeros: usize) -> Vec<u8> {
     const BLOCK: usize = 128 << 10;
     // The header: magic, a window of 128 KiB, no checksum, no length.
     let mut packed = vec![0x28, 0xb5, 0x2f, 0xfd, 0x00, 0x38];
-    let blocks = length / BLOCK;
+    packed.extend(&(begin.len() << 3).to_le_bytes()[..3]);
+    packed.extend(begin);
+    let blocks = zeros / BLOCK;
     for block in 0..blocks {
         let last = usize::from(block + 1 == blocks);
         let head = (BLOCK << 3) | (1 << 1) | last;
