@@ -46,7 +46,7 @@ pub fn line(error: &(dyn Error + 'static)) -> String {
         }
         cause = error.source();
     }
-    shown(&without_numbers(&line))
+    wording::escaped(&without_numbers(&line))
 }
 
 /// Removes the numbers of the system's errors, such as ` (os error 2)`: the system's words are
@@ -68,19 +68,8 @@ fn without_numbers(text: &str) -> String {
 /// Escapes the hidden characters of each line. Without this, the name of a file could control the
 /// terminal.
 pub fn lines(text: &str) -> String {
-    let lines: Vec<String> = text.split('\n').map(shown).collect();
+    let lines: Vec<String> = text.split('\n').map(wording::escaped).collect();
     lines.join("\n")
-}
-
-/// Escapes hidden characters. Without this, the name of a file or a process could break the line or
-/// control the terminal.
-fn shown(text: &str) -> String {
-    let shown = |c: char| {
-        let escaped = wording::is_hidden(c).then(|| c.escape_default());
-        let plain = escaped.is_none().then_some(c);
-        escaped.into_iter().flatten().chain(plain)
-    };
-    text.chars().flat_map(shown).collect()
 }
 
 /// Prints clap's error on one line, and returns exit code 2. Prints the help or the version instead
@@ -126,7 +115,7 @@ pub fn usage(program: &str, error: &clap::Error) -> ExitCode {
     } else if let Some(command) = where_to_look(error, &text) {
         told += &format!(": see `{command} --help`");
     }
-    crate::say!("{program}: {}", shown(&told));
+    crate::say!("{program}: {}", wording::escaped(&told));
     ExitCode::from(exit::USAGE)
 }
 

@@ -40,6 +40,26 @@ pub(crate) fn is_hidden(c: char) -> bool {
     c.is_control() || bidi || matches!(c, '\u{2028}' | '\u{2029}')
 }
 
+/// Escapes hidden characters. Without this, the name of a file or a process could break the line or
+/// control the terminal.
+pub(crate) fn escaped(text: &str) -> String {
+    let shown = |c: char| {
+        let escaped = is_hidden(c).then(|| c.escape_default());
+        let plain = escaped.is_none().then_some(c);
+        escaped.into_iter().flatten().chain(plain)
+    };
+    text.chars().flat_map(shown).collect()
+}
+
+/// The text, or its beginning if it is long. A stranger's file must not fill the log with one line.
+pub(crate) fn brief(text: &str) -> String {
+    const MOST_CHARS: usize = 300;
+    match text.char_indices().nth(MOST_CHARS) {
+        Some((end, _)) => format!("{}...", &text[..end]),
+        None => text.to_owned(),
+    }
+}
+
 /// The number as it was written, for example 0.1, and not the f64 that equals the f32.
 pub(crate) fn as_written(value: f32) -> f64 {
     let text = format!("{value:?}");
@@ -140,6 +160,13 @@ mod tests {
         ] {
             assert!(!is_plain(&format!("arm{hidden}7")), "{hidden:?}");
         }
+    }
+
+    #[test]
+    fn hidden_characters_are_escaped_and_long_texts_cut() {
+        assert_eq!(escaped("a\u{202e}b\u{9b}é"), "a\\u{202e}b\\u{9b}é");
+        assert_eq!(brief("short"), "short");
+        assert_eq!(brief(&"é".repeat(400)), "é".repeat(300) + "...");
     }
 
     #[test]

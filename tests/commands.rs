@@ -63,7 +63,9 @@ fn whoever_holds_the_port_is_named_and_what_to_do() {
         .unwrap();
     let process = format!("held by process {}, the daemon", daemon.process.0.id());
     assert!(
-        said.contains(&process) && said.contains("systemctl stop hardnessd"),
+        said.contains(&process)
+            && said.contains("(hardnessd run; its scheduling is ordinary")
+            && said.contains("systemctl stop hardnessd"),
         "{said}"
     );
     assert!(!out.exists());

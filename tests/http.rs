@@ -378,6 +378,13 @@ fn readiness_follows_the_sensors_and_liveness_does_not() {
     assert_eq!(forearm["last"]["phase"], "final");
     assert_eq!(forearm["contact_threshold_n"], 0.07);
     assert!(forearm["last_frame_age_s"].as_f64().unwrap() > 0.0);
+    // A test has no right to real time, so its daemon has the test's own scheduling.
+    let process = &status["process"];
+    assert_eq!(
+        (&process["scheduling"], &process["priority"]),
+        (&json!("other"), &json!(0))
+    );
+    assert!(process["memory_locked"].is_boolean(), "{process}");
 }
 
 #[test]

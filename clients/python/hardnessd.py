@@ -902,7 +902,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
         print(said, file=sys.stderr)
         return 1
     except Refused as error:
-        print(f"the daemon refused: {error}", file=sys.stderr)
+        print("the daemon refused: " + "".join(c for c in str(error) if c.isprintable()), file=sys.stderr)
         return 1
     except (ValueError, OverflowError) as error:
         print(f"{args.address}: no address: {error}", file=sys.stderr)

@@ -24,6 +24,7 @@ use self::lines::Lines;
 use crate::event::{Event, LinkState, PressState, Tared, name};
 use crate::pipeline::Unjudged;
 use crate::tare::RetareError;
+use crate::wording;
 
 /// The `[log]` table.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -310,7 +311,7 @@ pub(crate) fn frame_rate(sensor: &str, frame_rate_hz: f64, measured_hz: f64) {
 pub(crate) fn context(sensor: &str, context: Option<&serde_json::Value>) {
     info!(
         sensor,
-        context = context.map(tracing::field::display),
+        context = context.map(|context| wording::escaped(&context.to_string())),
         "context"
     );
 }

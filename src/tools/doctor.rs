@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use clap::Args as ClapArgs;
 
 use self::checks::{User, examine, in_the_way, ports, refused};
-use super::shown;
+use crate::wording::escaped;
 
 /// Arguments of `doctor`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -81,7 +81,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
             lines.push(format!("{}: {fault}", port.display()));
         }
     }
-    let told: String = lines.iter().map(|line| shown(line) + "\n").collect();
+    let told: String = lines.iter().map(|line| escaped(line) + "\n").collect();
     super::print(told.as_bytes()).map_err(Error::Print)?;
     match found {
         0 => Ok(()),

@@ -27,6 +27,7 @@ use crate::daemon::record::{Error as RecordError, Progress};
 use crate::daemon::{self, Daemon, Sockets};
 use crate::recording::{LabelError, Labels, check_label};
 use crate::verdict::Level;
+use crate::wording::escaped;
 
 /// Arguments of `record`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -248,7 +249,7 @@ fn port_of(sensor: &crate::daemon::config::SensorTable) -> (String, PathBuf) {
 }
 
 fn said(path: &Path) -> String {
-    super::shown(&path.display().to_string())
+    escaped(&path.display().to_string())
 }
 
 fn said_frames(frames: u64) -> String {

@@ -18,12 +18,13 @@ use std::time::Duration;
 use clap::{ArgGroup, Args as ClapArgs};
 
 use self::proposal::{Proposal, propose};
+use super::doctor;
 use super::simulate::positive;
-use super::{doctor, shown};
 use crate::daemon::serial::{Link, Turn};
 use crate::recording::{self, Entry, FileKind, Input, Reader};
 use crate::sensor::DEFAULT_FRAME_RATE_HZ;
 use crate::wire::Settings;
+use crate::wording::escaped;
 
 /// Arguments of `sniff`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -155,7 +156,7 @@ fn tell(args: &Args, bytes: &[u8]) -> Result<(), Error> {
     } else {
         "set its port and frame_rate_hz, which a file does not say"
     };
-    crate::say!("wrote {}: {next}", shown(&out.display().to_string()));
+    crate::say!("wrote {}: {next}", escaped(&out.display().to_string()));
     Ok(())
 }
 
@@ -230,7 +231,7 @@ async fn listen(path: &Path, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> 
         while bytes.len() < MOST_BYTES {
             match link.turn().await {
                 Turn::Opened => {
-                    let path = shown(&path.display().to_string());
+                    let path = escaped(&path.display().to_string());
                     crate::say!("listening at {path} for {seconds} s: press the sensor");
                 }
                 Turn::Bytes(read) => bytes.extend_from_slice(read),
@@ -254,7 +255,7 @@ async fn listen(path: &Path, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> 
 fn toml(path: &Path, bytes: usize, best: &Proposal, next: Option<&Proposal>) -> String {
     let mut toml = String::new();
     let mut remark =
-        |words: String| writeln!(toml, "# {}", shown(&words)).expect("a string takes it all");
+        |words: String| writeln!(toml, "# {}", escaped(&words)).expect("a string takes it all");
     remark(format!("{}: {bytes} bytes", path.display()));
     remark(format!("explained: {}", said(best)));
     match next {

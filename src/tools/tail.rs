@@ -7,7 +7,7 @@
 mod readable;
 
 use std::future::Future;
-use std::io;
+use std::io::{self, IsTerminal};
 use std::time::Duration;
 
 use clap::Args as ClapArgs;
@@ -16,6 +16,7 @@ use serde_json::{Value, json};
 use super::connect::{self, Address, Connection, Source};
 use super::simulate::positive;
 use crate::event::{Kind, PROTOCOL};
+use crate::wording;
 
 /// Arguments of `tail`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -143,7 +144,7 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
     if args.source.given().is_none() {
         crate::say!(
             "hardnessd: events of {}",
-            super::shown(&address.to_string())
+            wording::escaped(&address.to_string())
         );
     }
     loop {
@@ -154,7 +155,9 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
         if !counts && kind != "gap" {
             continue;
         }
-        let text = if args.json {
+        let text = if args.json && io::stdout().is_terminal() {
+            json_escaped(&line)
+        } else if args.json {
             line
         } else {
             readable::line(&event)
@@ -168,6 +171,19 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
             return Ok(());
         }
     }
+}
+
+/// The same JSON without hidden characters, for a terminal. They are inside strings only.
+fn json_escaped(line: &str) -> String {
+    let mut escaped = String::with_capacity(line.len());
+    for c in line.chars() {
+        if wording::is_hidden(c) {
+            escaped += &format!("\\u{:04x}", u32::from(c));
+        } else {
+            escaped.push(c);
+        }
+    }
+    escaped
 }
 
 /// Fails unless this is a daemon's first line.
@@ -194,5 +210,19 @@ async fn next(daemon: &mut Connection) -> Result<(String, Value), Error> {
             address: daemon.address().clone(),
             found: "a line that is no JSON".to_owned(),
         }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn on_a_terminal_the_same_json_has_no_hidden_characters() {
+        let line = "{\"label\":\"a\u{202e}b\u{9b}é\"}";
+        let safe = json_escaped(line);
+        assert_eq!(safe, r#"{"label":"a\u202eb\u009bé"}"#);
+        let [same, of] = [&safe, line].map(|text| serde_json::from_str::<Value>(text).unwrap());
+        assert_eq!(same, of);
     }
 }

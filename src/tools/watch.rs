@@ -70,7 +70,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         && let Ok(connection) = args.source.connect().await
     {
         let address = connection.address().to_string();
-        crate::say!("hardnessd: watching {}", super::shown(&address));
+        crate::say!("hardnessd: watching {}", crate::wording::escaped(&address));
     }
     let mut screen = Screen::open().map_err(Error::Terminal)?;
     let mut keys = keys().map_err(Error::Terminal)?;

@@ -1,7 +1,8 @@
 //! Checks that every value can be used, and that all of them can be used together.
 
+use std::collections::{HashMap, HashSet};
 use std::net::{IpAddr, SocketAddr};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::error::Error;
 use super::{Config, Model, Publish, Record, Ros2, SensorTable, Unix, Zenoh};
@@ -81,32 +82,48 @@ fn check_robot(
     Ok(())
 }
 
+/// Twice as many sensors as a core can read at 100 frames/s.
+const MOST_SENSORS: usize = 1000;
+
 fn check_sensors(config: &Config, path: &Path) -> Result<Vec<Sensor>, Error> {
     if config.sensors.is_empty() {
         return Err(Error::NoSensor {
             path: path.to_owned(),
         });
     }
-    let mut sensors = Vec::with_capacity(config.sensors.len());
-    for (index, given) in config.sensors.iter().enumerate() {
+    let count = config.sensors.len();
+    if count > MOST_SENSORS {
+        return Err(Error::Value {
+            path: path.to_owned(),
+            key: "sensor".to_owned(),
+            found: format!("{count} tables"),
+            expected: "at most 1000",
+        });
+    }
+    let mut sensors = Vec::with_capacity(count);
+    let mut taken = Taken::default();
+    for given in &config.sensors {
         let sensor = Sensor::new(config.describe(given));
         sensors.push(sensor.map_err(|problem| Error::Sensor {
             path: path.to_owned(),
             sensor: given.name.clone(),
             problem,
         })?);
-        check_port(given, &config.sensors[..index], path)?;
+        taken.add(given, path)?;
     }
     Ok(sensors)
 }
 
+/// More connections than a process may have open files.
+const MOST_CLIENTS: usize = 1_000_000;
+
 fn check_unix(unix: &Unix, path: &Path) -> Result<(), Error> {
-    if unix.max_clients == 0 {
+    if !(1..=MOST_CLIENTS).contains(&unix.max_clients) {
         return Err(Error::Value {
             path: path.to_owned(),
             key: "publish.unix.max_clients".to_owned(),
-            found: "0".to_owned(),
-            expected: "1 or more",
+            found: unix.max_clients.to_string(),
+            expected: "1 to 1000000",
         });
     }
     if unix.enabled && unix.control_path() == unix.path() {
@@ -274,28 +291,34 @@ fn meet(one: SocketAddr, other: SocketAddr) -> bool {
 /// bytes still fits in a `u64`. As seconds it is 31 years.
 const MOST: u64 = 1_000_000_000;
 
-/// Checks that a sensor has a name and a port of its own.
-fn check_port(sensor: &SensorTable, earlier: &[SensorTable], path: &Path) -> Result<(), Error> {
-    let name = &sensor.name;
-    let key = |key| format!("sensor.{key} of {name:?}");
-    if earlier.iter().any(|other| other.name == *name) {
-        let problem = "two sensors have this name: give each a name of its own".to_owned();
-        return Err(clash(path, key("name"), problem));
-    }
-    // A device that exists may have several names.
-    let device = |sensor: &SensorTable| {
+/// The names and the ports that sensors have so far.
+#[derive(Default)]
+struct Taken<'a> {
+    names: HashSet<&'a str>,
+    /// The sensor of each device. A device that exists may have several names.
+    devices: HashMap<PathBuf, &'a str>,
+}
+
+impl<'a> Taken<'a> {
+    /// Checks that a sensor has a name and a port of its own.
+    fn add(&mut self, sensor: &'a SensorTable, path: &Path) -> Result<(), Error> {
+        let name = &sensor.name;
+        let key = |key| format!("sensor.{key} of {name:?}");
+        if !self.names.insert(name) {
+            let problem = "two sensors have this name: give each a name of its own".to_owned();
+            return Err(clash(path, key("name"), problem));
+        }
         let port = &sensor.port;
-        port.canonicalize().unwrap_or_else(|_| port.clone())
-    };
-    if let Some(other) = earlier.iter().find(|other| device(other) == device(sensor)) {
-        let problem = format!(
-            "{} is the port of {:?} too: give each sensor a port of its own",
-            sensor.port.display(),
-            other.name
-        );
-        return Err(clash(path, key("port"), problem));
+        let device = port.canonicalize().unwrap_or_else(|_| port.clone());
+        if let Some(other) = self.devices.insert(device, name) {
+            let problem = format!(
+                "{} is the port of {other:?} too: give each sensor a port of its own",
+                port.display()
+            );
+            return Err(clash(path, key("port"), problem));
+        }
+        Ok(())
     }
-    Ok(())
 }
 
 fn check_model(

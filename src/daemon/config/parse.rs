@@ -88,8 +88,8 @@ fn gains(
 }
 
 /// Resolves a path of the configuration against its directory. An empty path is refused, because it
-/// would be the directory itself. A path with a control character is refused, because it would
-/// break a line of the log.
+/// would be the directory itself. A path with a hidden character is refused, because it would break
+/// or disguise a line of the log.
 fn resolve(
     given: &mut PathBuf,
     directory: &Path,
@@ -98,7 +98,7 @@ fn resolve(
     path: &Path,
 ) -> Result<(), Error> {
     let text = given.to_string_lossy();
-    if text.is_empty() || text.chars().any(char::is_control) {
+    if text.is_empty() || !wording::is_plain(&text) {
         return Err(Error::Value {
             path: path.to_owned(),
             key,
@@ -159,10 +159,10 @@ fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Error {
     Error::Syntax {
         path: path.to_owned(),
         place: Place::of(text, start),
-        problem: match key {
+        problem: wording::brief(&match key {
             Some(key) if !message.contains(&format!("`{key}`")) => format!("{key}: {message}"),
             _ => message,
-        },
+        }),
     }
 }
 

@@ -37,7 +37,7 @@ fn every_key_but_port_has_a_default() {
 
 #[test]
 fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
-    let cases: [(&str, &[&str]); 41] = [
+    let cases: [(&str, &[&str]); 43] = [
         (
             "[[sensor]]\nname = \"a\"",
             &["1:1: sensor.port is missing: set it to a path under /dev/serial/by-id/"],
@@ -153,6 +153,14 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
         (
             "[[sensor]]\nport = \"p\"\n[publish.unix]\nmax_clients = 0",
             &["publish.unix.max_clients", "0"],
+        ),
+        (
+            "[[sensor]]\nport = \"p\"\n[publish.unix]\nmax_clients = 9223372036854775807",
+            &["publish.unix.max_clients", "1 to 1000000"],
+        ),
+        (
+            "[[sensor]]\nport = \"p\u{202e}\"",
+            &["sensor.port", "the path of a device"],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[publish.tcp]\nlisten = \"here:8255\"",
@@ -644,4 +652,24 @@ fn a_table_of_a_part_that_was_not_built_in_is_refused_by_name() {
             assert!(error.contains(&expected), "{error}");
         }
     }
+}
+
+#[test]
+fn many_sensors_are_checked_at_once_and_more_are_refused() {
+    let table = |index: usize| format!("[[sensor]]\nname = \"s{index}\"\nport = \"p{index}\"\n");
+    let most: String = (0..1000).map(table).collect();
+    assert!(load(&most).is_ok());
+    let error = load(&format!("{most}{}", table(1000))).unwrap_err();
+    assert!(error.contains("sensor: found 1001 tables"), "{error}");
+    let twice = most + "[[sensor]]\nname = \"twice\"\nport = \"p7\"\n";
+    let error = load(&twice.replacen(&table(8), "", 1)).unwrap_err();
+    assert!(error.contains("is the port of \"s7\" too"), "{error}");
+}
+
+#[test]
+fn a_long_key_does_not_make_a_long_line() {
+    let error = load(&format!("a{} = 1", ".a".repeat(40))).unwrap_err();
+    assert!(error.len() < 1_000 && error.contains("a.a.a"), "{error}");
+    let error = load(&format!("{} = 1", "a".repeat(100_000))).unwrap_err();
+    assert!(error.len() < 1_000, "{} bytes", error.len());
 }

@@ -6,6 +6,8 @@ use std::time::Duration;
 use jiff::Timestamp;
 use serde_json::Value;
 
+use crate::wording;
+
 /// The line of one event, without its newline.
 pub(super) fn line(event: &Value) -> String {
     let text = |key: &str| event[key].as_str().unwrap_or_default();
@@ -25,7 +27,7 @@ pub(super) fn line(event: &Value) -> String {
         _ => line += &event.to_string(),
     }
     // A reason comes from the system and a label from a model file. Neither may move the cursor.
-    line.retain(|c| !c.is_control());
+    line.retain(|c| !wording::is_hidden(c));
     line.truncate(line.trim_end().len());
     line
 }
@@ -169,7 +171,7 @@ mod tests {
         let time = "2026-11-21T10:00:00.123456Z";
         check(
             json!({"type": "status", "sensor": "forearm", "time": time, "state": "lost",
-                   "reason": "end\u{1b} of file", "frames": 120, "frames_damaged": 2,
+                   "reason": "end\u{1b} of\u{202e} file", "frames": 120, "frames_damaged": 2,
                    "frame_rate_hz": 4.96}),
             "10:00:00.123  forearm       status    lost        120 frames, 2 damaged, \
              5.0 frames/s  (end of file)",

@@ -396,6 +396,10 @@ fn without_colours_pressure_is_told_by_characters_and_nothing_but_ascii_is_writt
     let named = told(&[(0, named)]);
     assert!(shown(&named, 0, (80, 24), PLAIN).starts_with("b?r-7 "));
     assert!(shown(&named, 0, (80, 24), COLOURS).starts_with("b\u{e4}r-7 "));
+    let mut turned = hello("a", &["forearm"]);
+    turned["robot"] = json!("b\u{202e}r-7");
+    let turned = told(&[(0, turned)]);
+    assert!(shown(&turned, 0, (80, 24), COLOURS).starts_with("br-7 "));
 }
 
 #[test]

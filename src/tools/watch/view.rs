@@ -13,6 +13,7 @@ use serde_json::{Value, json};
 pub(super) use self::sensor::{Frame, Load, Sensor, Verdict, WINDOW};
 use crate::event::PROTOCOL;
 use crate::frame::Stamp;
+use crate::wording;
 
 /// The time between two requests for the totals. Without a request, the daemon sends them only when
 /// the state changes.
@@ -340,8 +341,8 @@ fn text(event: &Value, key: &str) -> String {
     event[key].as_str().map(plain).unwrap_or_default()
 }
 
-/// Text without control characters. A reason comes from the system and a label from a model file:
+/// Text without hidden characters. A reason comes from the system and a label from a model file:
 /// neither may move the cursor.
 fn plain(text: &str) -> String {
-    text.chars().filter(|c| !c.is_control()).collect()
+    text.chars().filter(|&c| !wording::is_hidden(c)).collect()
 }
