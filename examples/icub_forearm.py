@@ -1,7 +1,8 @@
 """What contact area and force tell of hardness on a real robot's forearm.
 
 An iCub lowered its forearm on 19 flat materials, 11 touches each. For each touch this takes area and
-force at the moment of the greatest area, which is the moment that hardnessd judges.
+force at the moment of the greatest area, which is the moment that a model of one frame judges. It also takes
+the course of the touch: areas while the force grew, and times.
 
     git clone https://github.com/clear-nus/TactileLearning
     pip install numpy scikit-learn
@@ -71,18 +72,36 @@ def chosen(touch):
     return taxels, pressure
 
 
-def columns(moments, names):
+# Shares of the greatest force at which the course of a touch is read off.
+SHARES = (0.25, 0.5, 0.75)
+# Added to times before their logarithm: two and a half readings of the skin.
+SHORTEST_S = 0.05
+
+
+def course(touch):
+    """Areas at shares of the greatest force, then seconds from these shares to it, and seconds of the hold."""
+    time_s, taxels, pressure = np.array(touch, float).T
+    top = pressure.argmax()
+    at = [int(np.argmax(pressure >= share * pressure[top])) for share in SHARES]
+    held = np.flatnonzero(pressure >= SHARES[-1] * pressure[top])[-1]
+    return [*taxels[at], *(time_s[top] - time_s[at]), time_s[held] - time_s[top]]
+
+
+def columns(touches, names):
     """Logarithms: by Hertz, area and force of one material on one shape lie on a line."""
-    area, force = np.log(np.array(moments, float)).T
-    return np.stack([{"area": area, "force": force}[name] for name in names], 1)
+    area, force = np.log(np.array([chosen(touch) for touch in touches], float)).T
+    of_course = np.array([course(touch) for touch in touches])
+    areas, times = of_course[:, : len(SHARES)], of_course[:, len(SHARES) :]
+    found = {"area": area, "force": force, "areas before": np.log(areas), "times": np.log(times + SHORTEST_S)}
+    return np.column_stack([found[name] for name in names])
 
 
 def left_out(materials, names):
-    """Share of touches that are told stiff or soft rightly by a model that never met their material."""
+    """Of each material, how many touches are told stiff or soft rightly by a model that never met it."""
     right = {}
     for material in STIFF + SOFT:
         others = [other for other in STIFF + SOFT if other != material]
-        x = columns([moment for other in others for moment in materials[other]], names)
+        x = columns([touch for other in others for touch in materials[other]], names)
         y = [other in STIFF for other in others for _ in materials[other]]
         model = make_pipeline(StandardScaler(), LogisticRegression()).fit(x, y)
         told = model.predict(columns(materials[material], names))
@@ -91,25 +110,25 @@ def left_out(materials, names):
 
 
 def main(path):
-    touches = read(path)
-    missing = sorted(set(STIFF + SOFT) - set(touches))
+    materials = read(path)
+    missing = sorted(set(STIFF + SOFT) - set(materials))
     if missing:
         sys.exit(f"{path}: no touches of {', '.join(missing)}")
-    materials = {name: [chosen(touch) for touch in of] for name, of in touches.items()}
     print(f"{len(materials)} materials, {sum(map(len, materials.values()))} touches")
-    for names in (["area", "force"], ["area"], ["force"]):
+    one_moment, course_too = ["area", "force"], ["area", "force", "areas before"]
+    for names in (one_moment, ["area"], ["force"], course_too, [*course_too, "times"]):
         right = left_out(materials, names)
         count = sum(len(materials[name]) for name in right)
         missed = [f"{len(materials[name]) - right[name]} of {name}" for name in right if right[name] < len(materials[name])]
         share = 100 * sum(right.values()) / count
-        print(f"{' and '.join(names)}: {share:.1f} % of {count} touches; missed: {', '.join(missed)}")
+        print(f"{', '.join(names)}: {share:.1f} % of {count} touches; missed: {', '.join(missed)}")
     print("from stiff to soft, by a model of all these touches:")
-    x = columns([moment for name in STIFF + SOFT for moment in materials[name]], ["area", "force"])
+    x = columns([touch for name in STIFF + SOFT for touch in materials[name]], one_moment)
     y = [name in STIFF for name in STIFF + SOFT for _ in materials[name]]
     model = make_pipeline(StandardScaler(), LogisticRegression()).fit(x, y)
-    order = {name: np.median(model.decision_function(columns(of, ["area", "force"]))) for name, of in materials.items()}
+    order = {name: np.median(model.decision_function(columns(of, one_moment))) for name, of in materials.items()}
     for name in sorted(order, key=order.get, reverse=True):
-        area, force = np.median(materials[name], axis=0)
+        area, force = np.median([chosen(touch) for touch in materials[name]], axis=0)
         kind = "stiff" if name in STIFF else "soft" if name in SOFT else "not said"
         print(f"{order[name]:6.1f}  {area:3.0f} taxels, pressure {force:4.0f}  {name}, {kind}")
 

@@ -2,7 +2,7 @@
 """Accuracy of a course model if the robot sends no positions, but its speed is known.
 
     hrn-train simulate --sequences --seed 51 --objects 0 --test-objects 60 --presses 6 --fps 20..20 \\
-        --unknown 0 --exact 1 --materials broad --gaps --shapes matched --out others.npz
+        --materials broad --gaps --shapes matched --out others.npz
     pip install numpy onnxruntime
     python3 results/course/speed.py models/course.onnx others.npz
 

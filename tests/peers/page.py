@@ -7,10 +7,11 @@
 
 Claims: events arrive and are drawn; a silent and a lost sensor show within 1 s, on their tabs too, and
 no old value stands as a current one: map and verdict are grey, and the scale stays; what comes late,
-after a connection broke, is shown as old as it is, whatever the browser's clock says; sensors can be
-chosen; a phone of 360 px is wide enough, and presses are numbered on it; no console error and no
-breach of the page's policy; a daemon that goes is said, and the page finds it again by itself. With
---pictures it leaves one of each state, light, dark and narrow.
+after a connection broke, is shown as old as it is, whatever the browser's clock says; force against
+approach is drawn where an arm's positions come, and hidden elsewhere; sensors can be chosen; a phone of
+360 px is wide enough, and presses are numbered on it; no console error and no breach of the page's
+policy; a daemon that goes is said, and the page finds it again by itself. With --pictures it leaves
+one of each state, light, dark and narrow.
 """
 
 import argparse
@@ -119,6 +120,18 @@ class Page:
             }
             return found.size;""")
 
+    def curve(self):
+        """Over what share of the width the curve of force against approach is drawn."""
+        return self.run("""
+            const canvas = document.getElementById("way"), { width, height } = canvas, from = Math.round(width / 10);
+            const { data } = canvas.getContext("2d").getImageData(from, 0, width - from, height);
+            const columns = new Set();
+            for (let at = 0; at < data.length; at += 4) {
+              const c = data.slice(at, at + 3);
+              if (data[at + 3] && Math.max(...c) - Math.min(...c) > 60) { columns.add(at / 4 % (width - from)); }
+            }
+            return columns.size / width;""")
+
     def is_grey(self):
         """Whether the map has no colour at all."""
         return self.run("""
@@ -157,6 +170,15 @@ def events_arrive(page, bench, sensors):
     for scheme in ["light", "dark"]:
         page.look(scheme=scheme)
         page.picture(f"live-{scheme}")
+
+
+def force_against_approach_is_drawn(page):
+    wait_for("force against approach", lambda: page.shown("approach"))
+    wait_for("its press", lambda: re.search(r"press \d+", page.text("way-press")))
+    wait_for("the curve", lambda: page.curve() > 0.3)
+    page.run("document.getElementById('approach').scrollIntoView()")
+    page.picture("approach-dark")
+    page.run("scrollTo(0, 0)")
 
 
 def fits_a_phone(page):
@@ -240,6 +262,8 @@ def sensors_can_be_chosen(page):
     chosen = page.driver.find_element(By.CSS_SELECTOR, "nav [aria-pressed=true]")
     assert chosen.text.startswith("wrist")
     wait_for("its verdict", lambda: page.text("label") not in ("", "none yet"))
+    # Nobody sends positions of its arm.
+    assert not page.shown("approach")
 
 
 def the_daemon_may_go_and_come(page, bench, daemon):
@@ -273,11 +297,13 @@ def main(binary, pictures):
     page = Page(pictures)
     try:
         with Bench(binary, ("forearm", "wrist"), more=http) as bench:
-            sensors = {"forearm": bench.sensor("forearm"), "wrist": bench.sensor("wrist", "--seed", "4")}
+            motion = ("--motion", bench.path("control.sock"))
+            sensors = {"forearm": bench.sensor("forearm", *motion), "wrist": bench.sensor("wrist", "--seed", "4")}
             daemon = bench.daemon()
             page.look()
             page.driver.get(f"http://{bench.address('http')}/")
             events_arrive(page, bench, sensors)
+            force_against_approach_is_drawn(page)
             fits_a_phone(page)
             what_comes_late_is_as_old_as_it_is(page, bench, sensors)
             delays = loss_shows_at_once(page, bench, sensors)
