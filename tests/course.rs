@@ -9,7 +9,10 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
+use hardnessd::simulator::{self, CourseSettings, DatasetSettings, LawName, Materials, Shapes};
 use hardnessd::train::data::courses::{Courses, single_frames};
+use hardnessd::train::judge::press_features::{PressOf, of_hertz};
+use hardnessd::train::learn::course;
 use hardnessd::train::model::course::course_of;
 use hardnessd::verdict::{Course, Format, Hrn};
 use serde_json::Value;
@@ -321,4 +324,59 @@ fn the_committed_model_is_the_one_of_its_card() {
     assert_eq!(hrn.format(), Format::Course { most_frames: 48 });
     let card = std::fs::read_to_string(models.join("course.md")).unwrap();
     assert!(card.contains(hrn.sha256()), "{}", hrn.sha256());
+}
+
+/// Checks the simulated courses against a law that the simulator does not use: Hertz's, fitted to
+/// what a robot would know of a press of a solid.
+#[test]
+fn the_modulus_that_hertz_finds_in_a_press_is_that_of_the_material() {
+    for (shapes, least) in [(Shapes::Matched, 0.9), (Shapes::Wide, 0.85)] {
+        let (fits, correlation) = moduli_by_hertz(shapes);
+        println!("{shapes:?}: {fits} of 100 presses, correlation {correlation:.3}");
+        assert!(
+            fits > 80 && correlation > least,
+            "{shapes:?}: {fits} {correlation}"
+        );
+    }
+}
+
+/// The number of presses of 100 solids that have a fit, and the correlation of the logarithms of the
+/// fitted and the true modulus.
+fn moduli_by_hertz(shapes: Shapes) -> (usize, f64) {
+    let settings = CourseSettings {
+        objects: DatasetSettings {
+            seed: 9,
+            materials: Materials::Broad,
+            laws: vec![LawName::Solid].try_into().unwrap(),
+            shapes,
+            objects: 25,
+            test_objects: 0,
+            presses: 1,
+            ..DatasetSettings::default()
+        },
+        frame_rate_hz: [20.0, 20.0],
+        ..CourseSettings::default()
+    };
+    let simulated = simulator::courses(&settings, 2, |_| {});
+    let presses = course::presses(&Courses::of(&simulated)).unwrap();
+    let pairs: Vec<(f64, f64)> = presses
+        .iter()
+        .zip(&simulated)
+        .filter_map(|(press, made)| {
+            let fit = of_hertz(&PressOf {
+                frames: &press.features,
+                moments: &press.moments,
+                arm_n_per_mm: press.arm_n_per_mm,
+            });
+            (fit[0] == 1.0).then(|| (f64::from(fit[1]), f64::from(made.young_mpa.ln())))
+        })
+        .collect();
+    let mean = |of: fn(&(f64, f64)) -> f64| pairs.iter().map(of).sum::<f64>() / pairs.len() as f64;
+    let (x, y) = (mean(|pair| pair.0), mean(|pair| pair.1));
+    let sum = |of: &dyn Fn(f64, f64) -> f64| -> f64 {
+        pairs.iter().map(|pair| of(pair.0 - x, pair.1 - y)).sum()
+    };
+    let both = (sum(&|a, _| a * a) * sum(&|_, b| b * b)).sqrt();
+    let correlation = sum(&|a, b| a * b) / both;
+    (pairs.len(), correlation)
 }
