@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::io::{ErrorKind, Read};
 
 use mcap::MAGIC;
-use mcap::records::{Record, op};
+use mcap::records::{ChunkHeader, Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
 use super::message::{self, INPUT, MOTION};
@@ -38,8 +38,67 @@ impl Found {
 /// that loads every taxel. It has less than 6 MiB.
 pub(super) const LONGEST_RECORD_BYTES: usize = 8 << 20;
 
-/// The bytes of a record's opcode and length.
-pub(super) const RECORD_HEAD_BYTES: u64 = 9;
+/// The chunks of a file so far.
+#[derive(Debug, Default)]
+pub(super) struct Chunks {
+    /// Their unpacked length.
+    unpacked: u64,
+}
+
+impl Chunks {
+    /// The schemas, channels and messages of a chunk, whose record has the bytes `body`. The file had
+    /// `read` bytes up to its end. The unpacked length is checked before the chunk is unpacked, and
+    /// the checksum before any record is used. The chunk is read apart from the file, because the
+    /// crate reads past the end of a chunk without compression.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the chunk is damaged, too long, or makes the file unpack to more than
+    /// [`most_unpacked`].
+    pub(super) fn records(
+        &mut self,
+        header: &ChunkHeader,
+        body: &[u8],
+        read: u64,
+    ) -> Result<Vec<Record<'static>>, Error> {
+        let length = header.uncompressed_size;
+        if length > LONGEST_RECORD_BYTES as u64 {
+            return Err(mcap::McapError::ChunkTooLarge(length).into());
+        }
+        if self.unpacked + length > most_unpacked(read) {
+            let problem = "the recording unpacks to more than 256 times its bytes";
+            return Err(Error::Damaged(problem.to_owned()));
+        }
+        self.unpacked += length;
+        let options = LinearReaderOptions::default()
+            .with_skip_start_magic(true)
+            .with_skip_end_magic(true)
+            .with_prevalidate_chunk_crcs(true)
+            .with_record_length_limit(LONGEST_RECORD_BYTES);
+        let mut reader = LinearReader::new_with_options(options);
+        let head = [&[op::CHUNK], &(body.len() as u64).to_le_bytes()[..]].concat();
+        let mut chunk = head.as_slice().chain(body);
+        let mut records = Vec::new();
+        while let Some(event) = reader.next_event() {
+            match event? {
+                LinearReadEvent::ReadRequest(wanted) => {
+                    let read = chunk.read(reader.insert(wanted))?;
+                    reader.notify_read(read);
+                }
+                LinearReadEvent::Record { opcode, data } => {
+                    let record = parse(opcode, data)?;
+                    // Records that are not used take no memory.
+                    if let Record::Schema { .. } | Record::Channel(_) | Record::Message { .. } =
+                        record
+                    {
+                        records.push(record.into_owned());
+                    }
+                }
+            }
+        }
+        Ok(records)
+    }
+}
 
 /// The number of unpacked bytes that a file of `bytes` bytes may hold. The recording of a silent sensor
 /// holds 55 times its bytes, its densest chunk 185 times. A file that claims more would cost much time
@@ -96,8 +155,9 @@ pub struct Reader<R> {
     schemas: BTreeMap<u16, Decode>,
     channels: BTreeMap<u16, Decode>,
     bytes: u64,
-    /// The length of all records so far, unpacked.
-    unpacked: u64,
+    chunks: Chunks,
+    /// The records of the current chunk that are still to come.
+    pending: std::vec::IntoIter<Record<'static>>,
     /// Whether the summary, an error or the end was reached.
     done: bool,
 }
@@ -106,7 +166,7 @@ impl<R: Read> Reader<R> {
     /// A reader of `source`.
     pub fn new(source: R) -> Self {
         let options = LinearReaderOptions::default()
-            .with_prevalidate_chunk_crcs(true)
+            .with_emit_chunks(true)
             .with_record_length_limit(LONGEST_RECORD_BYTES);
         Self {
             source,
@@ -114,17 +174,24 @@ impl<R: Read> Reader<R> {
             schemas: BTreeMap::new(),
             channels: BTreeMap::new(),
             bytes: 0,
-            unpacked: 0,
+            chunks: Chunks::default(),
+            pending: Vec::new().into_iter(),
             done: false,
         }
     }
 
     fn read(&mut self) -> Result<Option<Found>, Error> {
         loop {
+            if let Some(record) = self.pending.next() {
+                if let Some(found) = self.take(record)? {
+                    return Ok(Some(found));
+                }
+                continue;
+            }
             let Some(event) = self.linear.next_event() else {
                 return Ok(None);
             };
-            let found = match event? {
+            let record = match event? {
                 LinearReadEvent::ReadRequest(wanted) => {
                     let read = loop {
                         match self.source.read(self.linear.insert(wanted)) {
@@ -147,36 +214,44 @@ impl<R: Read> Reader<R> {
                     // The summary only repeats what was read.
                     return Ok(None);
                 }
-                LinearReadEvent::Record { opcode, data } => {
-                    self.unpacked += RECORD_HEAD_BYTES + data.len() as u64;
-                    if self.unpacked > most_unpacked(self.bytes) {
-                        let problem = "the recording unpacks to more than 256 times its bytes";
-                        return Err(Error::Damaged(problem.to_owned()));
+                LinearReadEvent::Record { opcode, data } => match parse(opcode, data)? {
+                    Record::Chunk { header, .. } => {
+                        let records = self.chunks.records(&header, data, self.bytes)?;
+                        self.pending = records.into_iter();
+                        continue;
                     }
-                    parse(opcode, data)?
-                }
+                    record => record.into_owned(),
+                },
             };
-            match found {
-                Record::Schema { header, .. } if header.name == INPUT.schema => {
-                    self.schemas.insert(header.id, message::decode_entry);
-                }
-                Record::Schema { header, .. } if header.name == MOTION.schema => {
-                    self.schemas.insert(header.id, message::decode_motion);
-                }
-                Record::Channel(channel) => {
-                    if let Some(&decode) = self.schemas.get(&channel.schema_id) {
-                        self.channels.insert(channel.id, decode);
-                    }
-                }
-                Record::Message { header, data } => {
-                    if let Some(decode) = self.channels.get(&header.channel_id) {
-                        let (sensor, at, entry) = decode(&data)?;
-                        return Ok(Some(Found { sensor, at, entry }));
-                    }
-                }
-                _ => {}
+            if let Some(found) = self.take(record)? {
+                return Ok(Some(found));
             }
         }
+    }
+
+    /// Learns from a schema or a channel. Returns the entry of a message that is read.
+    fn take(&mut self, record: Record<'static>) -> Result<Option<Found>, Error> {
+        match record {
+            Record::Schema { header, .. } if header.name == INPUT.schema => {
+                self.schemas.insert(header.id, message::decode_entry);
+            }
+            Record::Schema { header, .. } if header.name == MOTION.schema => {
+                self.schemas.insert(header.id, message::decode_motion);
+            }
+            Record::Channel(channel) => {
+                if let Some(&decode) = self.schemas.get(&channel.schema_id) {
+                    self.channels.insert(channel.id, decode);
+                }
+            }
+            Record::Message { header, data } => {
+                if let Some(decode) = self.channels.get(&header.channel_id) {
+                    let (sensor, at, entry) = decode(&data)?;
+                    return Ok(Some(Found { sensor, at, entry }));
+                }
+            }
+            _ => {}
+        }
+        Ok(None)
     }
 }
 

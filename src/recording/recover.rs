@@ -3,19 +3,18 @@
 //! One scan goes from front to back and trusts no index. It takes each chunk whose checksum fits.
 //! If a record does not fill its length, the next record's place is unknown. The scan then searches
 //! for the bytes that every compressed chunk has at the same place. Whatever the file holds, the
-//! scan reads no more than a few times its length, unpacks no more than [`most_unpacked`] allows, and
+//! scan reads no more than a few times its length, unpacks a bounded length ([`Chunks`]), and
 //! holds one chunk of bounded size.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Read, Seek, SeekFrom, Write};
 
 use mcap::MAGIC;
-use mcap::records::{Channel, ChunkHeader, Record, op};
-use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use mcap::records::{Channel, Record, op};
 use mcap::write::NoSeek;
 
 use super::message;
-use super::reader::{LONGEST_RECORD_BYTES, RECORD_HEAD_BYTES, most_unpacked, parse};
+use super::reader::{Chunks, LONGEST_RECORD_BYTES, parse};
 use super::{Entry, Error, writer};
 
 /// The result of recovering a damaged recording.
@@ -51,6 +50,8 @@ pub enum RecoverError {
     Write(#[from] Error),
 }
 
+/// The bytes of a record's opcode and length.
+const RECORD_HEAD_BYTES: u64 = 9;
 /// The place in a chunk's record of the chunk's unpacked length: after opcode, length and two
 /// times.
 const UNPACKED_AT: usize = RECORD_HEAD_BYTES as usize + 16;
@@ -78,7 +79,7 @@ pub fn recover<R: Read + Seek, W: Write>(
         copy.take(records)?;
     }
     copy.done.lost = scan.lost;
-    copy.done.chunks = scan.chunks;
+    copy.done.chunks = scan.whole;
     copy.done.complete = scan.complete;
     Ok(copy.finish()?)
 }
@@ -89,9 +90,9 @@ struct Scan<R> {
     length: u64,
     /// The place where the scan continues.
     place: u64,
-    chunks: u64,
-    /// The unpacked length of the chunks so far.
-    unpacked: u64,
+    /// The number of whole chunks.
+    whole: u64,
+    chunks: Chunks,
     lost: Vec<(u64, u64)>,
     complete: bool,
     /// The number of bytes read as records that turned out not to be records.
@@ -111,8 +112,8 @@ impl<R: Read + Seek> Scan<R> {
             length,
             // The magic is skipped unread, so damage to it loses nothing.
             place: MAGIC.len() as u64,
-            chunks: 0,
-            unpacked: 0,
+            whole: 0,
+            chunks: Chunks::default(),
             lost: Vec::new(),
             complete: false,
             wasted: 0,
@@ -148,32 +149,17 @@ impl<R: Read + Seek> Scan<R> {
             };
             self.place = end;
             match record {
-                Record::Chunk { header, .. } => match self.unpack(&header, &body, end) {
-                    Some(records) => {
-                        self.chunks += 1;
+                Record::Chunk { header, .. } => match self.chunks.records(&header, &body, end) {
+                    Ok(records) => {
+                        self.whole += 1;
                         return Ok(Some(records));
                     }
-                    None => self.lost.push((place, end - place)),
+                    Err(_) => self.lost.push((place, end - place)),
                 },
                 record => return Ok(Some(vec![record.into_owned()])),
             }
         }
         Ok(None)
-    }
-
-    /// The records of a chunk that ends at `end`, if it is whole and the file may still unpack it.
-    fn unpack(
-        &mut self,
-        header: &ChunkHeader,
-        body: &[u8],
-        end: u64,
-    ) -> Option<Vec<Record<'static>>> {
-        let unpacked = self.unpacked.saturating_add(header.uncompressed_size);
-        if unpacked > most_unpacked(end) {
-            return None;
-        }
-        self.unpacked = unpacked;
-        records(header, body)
     }
 
     /// The opcode and the end of the record at `place`, if there can be a record.
@@ -282,40 +268,6 @@ fn exact(opcode: u8, body: &[u8]) -> Option<Record<'_>> {
         _ => return None,
     };
     (bytes == body.len()).then_some(record)
-}
-
-/// The records of a chunk that are copied, if the chunk is whole. Its unpacked length is checked
-/// before it is unpacked, and its checksum before any record is used.
-fn records(header: &ChunkHeader, body: &[u8]) -> Option<Vec<Record<'static>>> {
-    if header.uncompressed_size > LONGEST_RECORD_BYTES as u64 {
-        return None;
-    }
-    let options = LinearReaderOptions::default()
-        .with_skip_start_magic(true)
-        .with_skip_end_magic(true)
-        .with_prevalidate_chunk_crcs(true)
-        .with_record_length_limit(LONGEST_RECORD_BYTES);
-    let mut reader = LinearReader::new_with_options(options);
-    let head = [&[op::CHUNK], &(body.len() as u64).to_le_bytes()[..]].concat();
-    let mut chunk = head.as_slice().chain(body);
-    let mut records = Vec::new();
-    while let Some(event) = reader.next_event() {
-        match event.ok()? {
-            LinearReadEvent::ReadRequest(wanted) => {
-                let read = chunk.read(reader.insert(wanted)).ok()?;
-                reader.notify_read(read);
-            }
-            LinearReadEvent::Record { opcode, data } => {
-                let record = parse(opcode, data).ok()?;
-                // Records that are not copied take no memory.
-                if let Record::Schema { .. } | Record::Channel(_) | Record::Message { .. } = record
-                {
-                    records.push(record.into_owned());
-                }
-            }
-        }
-    }
-    Some(records)
 }
 
 /// The new file.
