@@ -35,7 +35,7 @@ mod tracked;
 pub use broad::{LawName, Laws, NoLaw, UnknownLaw};
 pub use courses::{CourseMoment, CourseSettings, LabelledCourse, MOST_FRAMES, courses};
 pub use dataset::{LabelledSample, dataset};
-pub use level::{Borders, LEVELS, LevelRange, level_of};
+pub use level::{Borders, LEVELS, LevelRange, borders, level_of};
 pub use material::{Material, Split, UnknownMaterial};
 pub use motion::{ARM_N_PER_MM, Approach, Motion};
 pub use object::{Shapes, UnknownShapes};

@@ -2,6 +2,7 @@
 //! to the format.
 
 pub mod file;
+pub mod evaluated;
 pub mod export;
 pub mod course;
 pub mod adopt;

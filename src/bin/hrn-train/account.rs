@@ -8,8 +8,8 @@ use hardnessd::simulator::Split;
 use hardnessd::train::compare::digits::{rounded, thousands};
 use hardnessd::train::data::dataset::{self, Dataset};
 use hardnessd::train::judge::metrics::Evaluation;
-use hardnessd::train::model::course::CourseEvaluation;
-use hardnessd::verdict::{Hrn, Verdict};
+use hardnessd::train::model::evaluated::{Case, Evaluated, NEAR_BORDER};
+use hardnessd::verdict::Hrn;
 
 /// The card of the model read from `path`.
 pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
@@ -76,7 +76,7 @@ pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
 }
 
 /// The figures of an evaluation on whole presses.
-pub(super) fn of_courses(evaluation: &CourseEvaluation) -> String {
+pub(super) fn of_evaluated(evaluation: &Evaluated) -> String {
     let percent = |share: f64| share * 100.0;
     let mut text = of_evaluation(&evaluation.levels);
     let _ = writeln!(
@@ -85,15 +85,16 @@ pub(super) fn of_courses(evaluation: &CourseEvaluation) -> String {
         percent(evaluation.beyond_neighbour)
     );
     if let Some(shore) = &evaluation.shore {
-        let levels = shore.rmse_by_level.iter();
-        let levels: Vec<String> = levels
-            .map(|rmse| rmse.map_or("-".to_owned(), |rmse| format!("{rmse:.1}")))
-            .collect();
+        let shown = |rmse: Option<f64>| rmse.map_or("-".to_owned(), |rmse| format!("{rmse:.1}"));
+        let levels = shore.rmse_by_level.iter().copied();
+        let levels: Vec<String> = levels.map(shown).collect();
         let _ = writeln!(
             text,
-            "Shore OO           rmse {:.2} (by level {}); 90 % interval holds {:.1} %, {:.1} wide",
+            "Shore OO           rmse {:.2} (by level {}; within {NEAR_BORDER} of a border {}); 90 % interval holds \
+             {:.1} %, {:.1} wide",
             shore.rmse,
             levels.join(", "),
+            shown(shore.rmse_near_borders),
             percent(shore.coverage),
             shore.width
         );
@@ -238,18 +239,20 @@ fn listed(numbers: &[u8]) -> String {
 }
 
 /// Verdicts as CSV, one line each after the header: object, true level, verdict's level,
-/// probabilities, and Shore OO with its interval. Unknown values are empty.
-pub(super) fn csv<'a>(verdicts: impl Iterator<Item = (Option<u32>, u8, &'a Verdict)>) -> String {
+/// probabilities, Shore OO with its interval, and the true Shore OO. Unknown values are empty.
+pub(super) fn csv(cases: &[Case]) -> String {
     let mut text = String::new();
-    for (object, level, verdict) in verdicts {
+    for case in cases {
+        let (verdict, level) = (&case.verdict, case.level);
         if text.is_empty() {
             text += "object,level,judged";
             for level in 1..=verdict.probabilities.len() {
                 let _ = write!(text, ",probability_{level}");
             }
-            text += ",shore,shore_low,shore_high\n";
+            text += ",shore,shore_low,shore_high,true_shore\n";
         }
-        let object = object.map(|object| object.to_string()).unwrap_or_default();
+        let object = case.object.map(|object| object.to_string());
+        let object = object.unwrap_or_default();
         let _ = write!(text, "{object},{level},{}", verdict.level);
         for probability in &verdict.probabilities {
             let _ = write!(text, ",{probability:.6}");
@@ -264,7 +267,8 @@ pub(super) fn csv<'a>(verdicts: impl Iterator<Item = (Option<u32>, u8, &'a Verdi
             }
             None => text += ",,,",
         }
-        text.push('\n');
+        let truth = case.shore.map(|shore| format!("{shore:.3}"));
+        let _ = writeln!(text, ",{}", truth.unwrap_or_default());
     }
     text
 }

@@ -8,7 +8,8 @@ use hardnessd::tools::{self, exit};
 use hardnessd::train::data::courses::{self, Courses};
 use hardnessd::train::data::dataset::{self, Dataset};
 use hardnessd::train::model::adopt::{self, Told};
-use hardnessd::train::model::course::{self, CourseEvaluation};
+use hardnessd::train::model::course;
+use hardnessd::train::model::evaluated::{Case, Evaluated};
 use hardnessd::train::model::export;
 use hardnessd::train::model::review::{self, Format, Review};
 use hardnessd::trial;
@@ -28,20 +29,19 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     warn_of_pitch(&arguments.data, dataset.pitch_mm(), &hrn);
     dataset.warn_of_object_in_both_splits();
     let indices = dataset.labelled(arguments.split.into())?;
-    let evaluation = export::evaluate(&hrn, &dataset, &indices)?;
+    say(arguments, &hrn, &export::cases(&hrn, &dataset, &indices)?)
+}
+
+/// Writes the verdicts if that is asked for. Returns the evaluation as text.
+fn say(arguments: &Evaluate, hrn: &Hrn, cases: &[Case]) -> anyhow::Result<String> {
     if let Some(path) = &arguments.verdicts {
-        let samples = indices.iter().map(|&index| &dataset.samples[index]);
-        let verdicts = samples.map(|sample| Ok((sample, hrn.judge(&sample.frame)?)));
-        let verdicts: Vec<_> = verdicts.collect::<anyhow::Result<_>>()?;
-        let rows = verdicts
-            .iter()
-            .map(|(sample, verdict)| (sample.object, sample.level, verdict));
-        write(path, account::csv(rows).as_bytes())?;
+        write(path, account::csv(cases).as_bytes())?;
     }
+    let evaluation = Evaluated::of(cases, hrn.card().levels.len());
     Ok(if arguments.json {
         serde_json::to_string(&evaluation)? + "\n"
     } else {
-        account::of_evaluation(&evaluation)
+        account::of_evaluated(&evaluation)
     })
 }
 
@@ -65,17 +65,7 @@ fn evaluate_courses(arguments: &Evaluate, hrn: &Hrn) -> anyhow::Result<String> {
         "{}: no press of this split has a level: choose the other --split, or other data",
         arguments.data.display()
     );
-    if let Some(path) = &arguments.verdicts {
-        let rows = verdicts.iter();
-        let rows = rows.map(|(press, verdict)| (Some(press.object), press.level, verdict));
-        write(path, account::csv(rows).as_bytes())?;
-    }
-    let evaluation = CourseEvaluation::of(&verdicts, hrn.card().levels.len());
-    Ok(if arguments.json {
-        serde_json::to_string(&evaluation)? + "\n"
-    } else {
-        account::of_courses(&evaluation)
-    })
+    say(arguments, hrn, &course::cases(&verdicts))
 }
 
 pub(super) fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {

@@ -99,7 +99,7 @@ fn train_course(arguments: &Train) -> anyhow::Result<String> {
     Ok(account_of_run(
         begun,
         &run,
-        evaluation.as_ref().map(account::of_courses),
+        evaluation.as_ref().map(account::of_evaluated),
     ))
 }
 
@@ -159,7 +159,7 @@ fn adapt_course(arguments: &Adapt) -> anyhow::Result<String> {
     Ok(account_of_run(
         begun,
         &run,
-        evaluation.as_ref().map(account::of_courses),
+        evaluation.as_ref().map(account::of_evaluated),
     ))
 }
 

@@ -23,6 +23,7 @@ use crate::train::judge::metrics::{self, Clusters, Evaluation, Judged};
 use crate::train::judge::press_features::{self, PressOf};
 use crate::train::learn::course::{self, Press};
 use crate::train::model::course as model;
+use crate::train::model::evaluated;
 use crate::train::net::course::Moment;
 use crate::train::net::frames::FEATURES;
 use crate::train::run::disk::write_whole;
@@ -234,8 +235,9 @@ fn of_model(name: &str, hrn: &Hrn, sets: &[TestSet]) -> anyhow::Result<Vec<Cours
         let on = |set: &TestSet| {
             let verdicts = model::verdicts(hrn, &set.courses, Split::Test, told)?;
             let levels = hrn.card().levels.len();
-            let rmse = model::shore(&verdicts, levels).map(|shore| shore.rmse);
-            let mut on = on_set(&set.name, &model::judged(&verdicts), levels, rmse);
+            let cases = model::cases(&verdicts);
+            let rmse = evaluated::shore(&cases, levels).map(|shore| shore.rmse);
+            let mut on = on_set(&set.name, &evaluated::judged(&cases), levels, rmse);
             if is_whole {
                 on.so_far = Some(so_far::of(
                     hrn,

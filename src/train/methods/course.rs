@@ -12,7 +12,8 @@ use crate::train::data::courses::Courses;
 use crate::train::data::dataset::{self, LabelChoice, Source};
 use crate::train::learn::conformal::Calibration;
 use crate::train::learn::course::{self, Press, Task};
-use crate::train::model::course::{CourseEvaluation, finish};
+use crate::train::model::course::finish;
+use crate::train::model::evaluated::Evaluated;
 use crate::train::model::file;
 use crate::train::net::course as network;
 use crate::train::net::start::Start;
@@ -60,7 +61,7 @@ pub fn train(
     description: &Description,
     run: &Run,
     device: &Device,
-) -> anyhow::Result<Option<CourseEvaluation>> {
+) -> anyhow::Result<Option<Evaluated>> {
     let presses = course::presses(courses)?;
     let all: Vec<usize> = courses.labelled(Split::Train).collect();
     let Description { settings, seed, .. } = description;

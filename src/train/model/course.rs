@@ -1,16 +1,15 @@
-//! Exports a trained network of courses to a model file of format 2, and evaluates that file.
+//! Exports a trained network of courses to a model file of format 2, and judges presses with it.
 
 use anyhow::ensure;
 use burn::tensor::Device;
-use serde::{Deserialize, Serialize};
 use serde_json::json;
 
+use super::evaluated::{Case, Evaluated};
 use super::export::{data, range, validation};
 use super::file;
 use crate::simulator::Split;
 use crate::train::data::courses::{self, Courses};
 use crate::train::data::dataset;
-use crate::train::judge::metrics::{Evaluation, Judged};
 use crate::train::learn::conformal::{ALPHA, Calibration};
 use crate::train::learn::course::{Press, Trained};
 use crate::train::learn::fit;
@@ -23,45 +22,6 @@ use crate::verdict::{
 
 /// Check presses per level (`docs/formats.md`).
 const CHECKS_A_LEVEL: usize = 2;
-
-/// The evaluation of a model on whole presses, which `evaluate --json` prints for data of whole
-/// presses.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct CourseEvaluation {
-    /// The evaluation of the levels.
-    #[serde(flatten)]
-    pub levels: Evaluation,
-    /// Share of presses whose level is off by more than one.
-    pub beyond_neighbour: f64,
-    /// The evaluation of the Shore hardness; null for a model or data without it.
-    pub shore: Option<ShoreEvaluation>,
-    /// The evaluation of the sets of levels; null for a model without them.
-    pub sets: Option<SetEvaluation>,
-}
-
-/// The evaluation of the Shore hardness.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct ShoreEvaluation {
-    /// Root mean square error, in Shore OO.
-    pub rmse: f64,
-    /// Root mean square error of each level; null for a level without presses.
-    pub rmse_by_level: Vec<Option<f64>>,
-    /// Share of presses whose interval contains the true hardness. The model promises 0.9.
-    pub coverage: f64,
-    /// Mean width of the intervals, in Shore OO.
-    pub width: f64,
-}
-
-/// The evaluation of the sets of levels.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct SetEvaluation {
-    /// Share of presses whose set contains the true level. The model promises 0.9.
-    pub coverage: f64,
-    /// Share of presses whose set has more than one level. Such verdicts are rejected as ambiguous.
-    pub ambiguous: f64,
-    /// Accuracy on the presses that are not ambiguous; null if there are none.
-    pub accuracy_of_others: Option<f64>,
-}
 
 /// Writes the model and its evaluation on the test split to the run's directory. `train` are the
 /// indices of the training presses.
@@ -76,7 +36,7 @@ pub fn finish(
     (presses, train): (&[Press], &[usize]),
     trained: &Trained,
     device: &Device,
-) -> anyhow::Result<Option<CourseEvaluation>> {
+) -> anyhow::Result<Option<Evaluated>> {
     let levels = dataset::levels();
     let Calibration {
         temperature,
@@ -136,7 +96,7 @@ pub fn finish(
     };
     let hrn = Hrn::load(&write(&card)?)?;
     let test = verdicts(&hrn, courses, Split::Test, |course| course)?;
-    let evaluation = (!test.is_empty()).then(|| CourseEvaluation::of(&test, levels.len()));
+    let evaluation = (!test.is_empty()).then(|| Evaluated::of(&cases(&test), levels.len()));
     if let Some(evaluation) = &evaluation {
         card.metrics["test"] = json!(evaluation);
         let json = serde_json::to_vec_pretty(evaluation)?;
@@ -176,89 +136,15 @@ pub fn verdicts(
     Ok(verdicts)
 }
 
-/// The verdicts in the form that the metrics take.
-pub fn judged(verdicts: &[(courses::Press, Verdict)]) -> Vec<Judged> {
-    let judged = |(press, verdict): &(courses::Press, Verdict)| Judged {
+/// Verdicts on presses in the form that is evaluated.
+pub fn cases(verdicts: &[(courses::Press, Verdict)]) -> Vec<Case> {
+    let case = |(press, verdict): &(courses::Press, Verdict)| Case {
         level: press.level,
-        probabilities: verdict.probabilities.clone(),
+        shore: Some(press.shore).filter(|shore| shore.is_finite()),
         object: Some(press.object),
+        verdict: verdict.clone(),
     };
-    verdicts.iter().map(judged).collect()
-}
-
-impl CourseEvaluation {
-    /// Evaluates verdicts on labelled presses; there must be at least one.
-    pub fn of(verdicts: &[(courses::Press, Verdict)], levels: usize) -> Self {
-        let n = verdicts.len() as f64;
-        let far = verdicts
-            .iter()
-            .filter(|(press, verdict)| press.level.abs_diff(verdict.level) > 1);
-        Self {
-            levels: Evaluation::of(&judged(verdicts), levels),
-            beyond_neighbour: far.count() as f64 / n,
-            shore: shore(verdicts, levels),
-            sets: sets(verdicts),
-        }
-    }
-}
-
-/// The evaluation of the Shore hardness of verdicts; `None` for a model or presses without it.
-pub fn shore(verdicts: &[(courses::Press, Verdict)], levels: usize) -> Option<ShoreEvaluation> {
-    let both = |(press, verdict): &(courses::Press, Verdict)| {
-        let shore = verdict.shore?;
-        press
-            .shore
-            .is_finite()
-            .then_some((press.level, f64::from(press.shore), shore))
-    };
-    let told: Vec<(u8, f64, Shore)> = verdicts.iter().filter_map(both).collect();
-    if told.is_empty() {
-        return None;
-    }
-    let rmse = |of: &dyn Fn(u8) -> bool| {
-        let errors: Vec<f64> = told
-            .iter()
-            .filter(|(level, ..)| of(*level))
-            .map(|(_, truth, shore)| (f64::from(shore.value) - truth).powi(2))
-            .collect();
-        (!errors.is_empty()).then(|| (errors.iter().sum::<f64>() / errors.len() as f64).sqrt())
-    };
-    let n = told.len() as f64;
-    let held = told
-        .iter()
-        .filter(|(_, truth, shore)| (f64::from(shore.low)..=f64::from(shore.high)).contains(truth));
-    Some(ShoreEvaluation {
-        rmse: rmse(&|_| true).expect("there are presses"),
-        rmse_by_level: (1..=levels as u8)
-            .map(|level| rmse(&|of| of == level))
-            .collect(),
-        coverage: held.count() as f64 / n,
-        width: told
-            .iter()
-            .map(|(.., shore)| f64::from(shore.high - shore.low))
-            .sum::<f64>()
-            / n,
-    })
-}
-
-fn sets(verdicts: &[(courses::Press, Verdict)]) -> Option<SetEvaluation> {
-    let of = |(press, verdict): &(courses::Press, Verdict)| {
-        let set = verdict.levels.clone()?;
-        Some((set.contains(&press.level), set.len() > 1))
-    };
-    let sets: Vec<(bool, bool)> = verdicts.iter().filter_map(of).collect();
-    if sets.is_empty() {
-        return None;
-    }
-    let n = sets.len() as f64;
-    let share = |count: usize| count as f64 / n;
-    let single: Vec<bool> = sets.iter().filter(|set| !set.1).map(|set| set.0).collect();
-    let right = single.iter().filter(|&&holds| holds).count();
-    Some(SetEvaluation {
-        coverage: share(sets.iter().filter(|set| set.0).count()),
-        ambiguous: share(sets.len() - single.len()),
-        accuracy_of_others: (!single.is_empty()).then(|| right as f64 / single.len() as f64),
-    })
+    verdicts.iter().map(case).collect()
 }
 
 /// The course of a press as the daemon would give it to a model.

@@ -7,6 +7,7 @@
 use anyhow::ensure;
 use serde_json::json;
 
+use super::evaluated::{self, Case};
 use super::file;
 use crate::frame::Frame;
 use crate::press;
@@ -105,29 +106,37 @@ pub fn evaluate(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Resu
     Ok(Evaluation::of(&judged, hrn.card().levels.len()))
 }
 
-/// Judges labelled samples with a model.
+/// Judges labelled samples with a model, in the form that the metrics take.
 ///
 /// # Errors
 ///
 /// Fails if the model has fewer levels than the data, or fails to judge a frame.
 pub fn judge(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Vec<Judged>> {
+    Ok(evaluated::judged(&cases(hrn, dataset, indices)?))
+}
+
+/// Judges labelled samples with a model.
+///
+/// # Errors
+///
+/// Fails if the model has fewer levels than the data, or fails to judge a frame.
+pub fn cases(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Vec<Case>> {
     let levels = hrn.card().levels.len();
-    let mut judged = Vec::with_capacity(indices.len());
-    for &index in indices {
+    let case = |&index: &usize| {
         let sample = &dataset.samples[index];
         ensure!(
             usize::from(sample.level) <= levels,
             "the model has {levels} levels, and the data has a sample of level {}",
             sample.level
         );
-        let probabilities = hrn.judge(&sample.frame)?.probabilities;
-        judged.push(Judged {
+        Ok(Case {
             level: sample.level,
-            probabilities,
+            shore: sample.shore.filter(|shore| shore.is_finite()),
             object: sample.object,
-        });
-    }
-    Ok(judged)
+            verdict: hrn.judge(&sample.frame)?,
+        })
+    };
+    indices.iter().map(case).collect()
 }
 
 fn evaluations_by_source(hrn: &Hrn, dataset: &Dataset) -> anyhow::Result<serde_json::Value> {
