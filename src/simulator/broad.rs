@@ -1,8 +1,8 @@
 //! Broad materials: each object gets a material that is drawn for it.
 //!
 //! In: a stream. Out: a [`Body`] whose modulus follows from the Shore hardness by the durometer, so
-//! that the label is the durometer's reading. The ranges contain the eight named materials and are
-//! not centred on them.
+//! that the label is the durometer's reading. The ranges contain each number of the eight named
+//! materials. They are not made around them, though the middle of three ranges is near one of them.
 
 use serde::{Deserialize, Serialize};
 

@@ -12,7 +12,7 @@ use burn::tensor::Device;
 
 use crate::simulator::Split;
 use crate::train::data::dataset::{Dataset, DatasetError, LabelChoice, Sample};
-use crate::train::judge::metrics::Evaluation;
+use crate::train::model::evaluated::Evaluated;
 use crate::train::net::generator::COMPONENTS;
 use crate::train::net::losses::Game;
 use crate::train::run::{Description, Run};
@@ -357,7 +357,7 @@ pub fn train(
     description: &Description,
     run: &Run,
     device: &Device,
-) -> anyhow::Result<Option<Evaluation>> {
+) -> anyhow::Result<Option<Evaluated>> {
     let labelled = chosen(dataset, description)?;
     if method == Method::Features {
         return features::train(dataset, &labelled, description, run);

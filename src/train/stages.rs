@@ -11,10 +11,10 @@ use crate::frame::Frame;
 use crate::random::Stream;
 use crate::simulator::Split;
 use crate::train::data::dataset::{Dataset, Sample};
-use crate::train::judge::metrics::Evaluation;
 use crate::train::judge::sheet::{self, Strip};
 use crate::train::learn::fit::{self, Trained};
 use crate::train::learn::gan::{self, Gan};
+use crate::train::model::evaluated::Evaluated;
 use crate::train::model::export::{self, Recogniser};
 use crate::train::net::generator;
 use crate::train::net::hrn;
@@ -325,7 +325,7 @@ impl Stages<'_> {
     /// # Errors
     ///
     /// Fails if the daemon's loader refuses the model, or the run's directory cannot be written.
-    pub fn finish(&self, trained: &Trained) -> anyhow::Result<Option<Evaluation>> {
+    pub fn finish(&self, trained: &Trained) -> anyhow::Result<Option<Evaluated>> {
         let scale = self.scale();
         self.draw_mistakes(trained)?;
         let (graph, raw_logits) = hrn::graph(&trained.weights, &trained.statistics, scale);

@@ -75,7 +75,7 @@ pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
     )
 }
 
-/// The figures of an evaluation on whole presses.
+/// The figures of an evaluation.
 pub(super) fn of_evaluated(evaluation: &Evaluated) -> String {
     let percent = |share: f64| share * 100.0;
     let mut text = of_evaluation(&evaluation.levels);
@@ -112,8 +112,8 @@ pub(super) fn of_evaluated(evaluation: &Evaluated) -> String {
     text
 }
 
-/// The figures of an evaluation, and its confusion matrix with a row for each true level.
-pub(super) fn of_evaluation(evaluation: &Evaluation) -> String {
+/// The figures of the levels, and the confusion matrix with a row for each true level.
+fn of_evaluation(evaluation: &Evaluation) -> String {
     let percent = |share: f64| share * 100.0;
     let interval = evaluation.accuracy_interval_by_object.map_or_else(
         || "no interval without two objects of a level".to_owned(),

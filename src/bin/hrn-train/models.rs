@@ -154,7 +154,7 @@ pub(super) fn adopt_model(arguments: &Adopt) -> anyhow::Result<String> {
     }
     account += &format!("{}: sha256 {}\n", arguments.out.display(), hrn.sha256());
     if let Some(evaluation) = evaluation {
-        account += &account::of_evaluation(&evaluation);
+        account += &account::of_evaluated(&evaluation);
     }
     Ok(account)
 }

@@ -72,7 +72,7 @@ pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
     Ok(account_of_run(
         begun,
         &run,
-        evaluation.as_ref().map(account::of_evaluation),
+        evaluation.as_ref().map(account::of_evaluated),
     ))
 }
 
@@ -137,7 +137,7 @@ pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
     Ok(account_of_run(
         begun,
         &run,
-        evaluation.as_ref().map(account::of_evaluation),
+        evaluation.as_ref().map(account::of_evaluated),
     ))
 }
 

@@ -8,7 +8,7 @@ use crate::frame::Frame;
 use crate::train::data::dataset::{self, Dataset};
 use crate::train::judge::baseline::Baseline;
 use crate::train::judge::features;
-use crate::train::judge::metrics::Evaluation;
+use crate::train::model::evaluated::Evaluated;
 use crate::train::model::export::{self, Recogniser};
 use crate::train::run::history::Row;
 use crate::train::run::{Description, Run};
@@ -24,7 +24,7 @@ pub fn train(
     labelled: &[usize],
     description: &Description,
     run: &Run,
-) -> anyhow::Result<Option<Evaluation>> {
+) -> anyhow::Result<Option<Evaluated>> {
     let begun = Instant::now();
     let frames = labelled.iter().map(|&index| &dataset.samples[index].frame);
     let rows = features::features(frames).context("features")?;

@@ -7,9 +7,9 @@ use burn::tensor::Device;
 use crate::frame::Frame;
 use crate::simulator::Split;
 use crate::train::data::dataset::{self, Dataset};
-use crate::train::judge::metrics::Evaluation;
 use crate::train::learn::fit;
 use crate::train::learn::frame::{self, Task, Trained};
+use crate::train::model::evaluated::Evaluated;
 use crate::train::model::export::{self, Recogniser};
 use crate::train::model::file;
 use crate::train::net::frame as network;
@@ -53,7 +53,7 @@ pub fn train(
     description: &Description,
     run: &Run,
     device: &Device,
-) -> anyhow::Result<Option<Evaluation>> {
+) -> anyhow::Result<Option<Evaluated>> {
     let levels = dataset::levels().len();
     let settings = &description.settings;
     let task = Task {
@@ -125,7 +125,7 @@ pub fn adapt(
     description: &Description,
     run: &Run,
     device: &Device,
-) -> anyhow::Result<Option<Evaluation>> {
+) -> anyhow::Result<Option<Evaluated>> {
     let labelled = dataset.labelled(Split::Train)?;
     let share = description.settings.validation.share;
     let (kept, held_out) = dataset.hold_out(&labelled, share, description.seed);
@@ -145,7 +145,7 @@ fn finish(
     description: &Description,
     run: &Run,
     device: &Device,
-) -> anyhow::Result<Option<Evaluation>> {
+) -> anyhow::Result<Option<Evaluated>> {
     let levels = dataset::levels().len();
     let plan = Features::new().context("features")?;
     let calibration = trained.calibration;

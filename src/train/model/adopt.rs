@@ -10,12 +10,12 @@ use prost::Message as _;
 use serde_json::json;
 use tract_onnx::pb;
 
+use super::evaluated::Evaluated;
 use super::export;
 use super::file;
 use crate::frame::{COLS, Frame, ROWS};
 use crate::simulator::Split;
 use crate::train::data::dataset::{self, Dataset};
-use crate::train::judge::metrics::Evaluation;
 use crate::train::net::graph::{INPUT, frame_input, integer, value_info};
 use crate::verdict::{COURSE_FRAMES, Card, Check, Checks, Hrn, ModelError, course_inputs};
 
@@ -264,7 +264,7 @@ pub fn adopt(
     dataset: &Dataset,
     told: &Told,
     attempt: impl FnOnce(&[u8]) -> Result<(), ModelError>,
-) -> anyhow::Result<(Vec<u8>, Vec<String>, Option<Evaluation>)> {
+) -> anyhow::Result<(Vec<u8>, Vec<String>, Option<Evaluated>)> {
     let mut proto = decode(bytes)?;
     let (done, found) = mend(&mut proto)?;
     let levels = dataset::stated_levels(&dataset.path())?;
@@ -302,11 +302,14 @@ pub fn adopt(
     let computed: anyhow::Result<Vec<Vec<f32>>> = frames.iter().map(computed).collect();
     check.probabilities = computed?;
     let evaluation = match dataset.labelled(Split::Test) {
-        Ok(test) => Some(export::evaluate(&hrn, dataset, &test)?),
+        Ok(test) => {
+            let cases = export::cases(&hrn, dataset, &test)?;
+            Some(Evaluated::of(&cases, hrn.card().levels.len()))
+        }
         Err(_) => None,
     };
     if let Some(evaluation) = &evaluation {
-        card.metrics["test"] = json!(evaluation);
+        card.metrics["test"] = json!(evaluation.levels);
     }
     set(&mut proto, &card, &Checks::Frames(check))?;
     let adopted = proto.encode_to_vec();

@@ -7,7 +7,7 @@
 use anyhow::ensure;
 use serde_json::json;
 
-use super::evaluated::{self, Case};
+use super::evaluated::{self, Case, Evaluated};
 use super::file;
 use crate::frame::Frame;
 use crate::press;
@@ -47,7 +47,7 @@ pub fn finish(
     train: &[usize],
     recogniser: &Recogniser,
     probabilities: impl Fn(&[&Frame]) -> anyhow::Result<Vec<Vec<f32>>>,
-) -> anyhow::Result<Option<Evaluation>> {
+) -> anyhow::Result<Option<Evaluated>> {
     let frames = check_frames(dataset, train);
     let checks = Checks::Frames(Check {
         probabilities: probabilities(&frames)?,
@@ -81,11 +81,14 @@ pub fn finish(
     // The metrics are measured on a file without them and then added; the graph does not change.
     let hrn = Hrn::load(&write(&card)?)?;
     let evaluation = match dataset.labelled(Split::Test) {
-        Ok(test) => Some(evaluate(&hrn, dataset, &test)?),
+        Ok(test) => {
+            let cases = cases(&hrn, dataset, &test)?;
+            Some(Evaluated::of(&cases, hrn.card().levels.len()))
+        }
         Err(_) => None,
     };
     if let Some(evaluation) = &evaluation {
-        card.metrics["test"] = json!(evaluation);
+        card.metrics["test"] = json!(evaluation.levels);
         if dataset.sources.len() > 1 {
             card.metrics["test_by_source"] = evaluations_by_source(&hrn, dataset)?;
         }
