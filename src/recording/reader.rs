@@ -38,6 +38,10 @@ impl Found {
 /// that loads every taxel. It has less than 6 MiB.
 pub(super) const LONGEST_RECORD_BYTES: usize = 8 << 20;
 
+/// The bytes of a chunk's record before its data, without the name of the compression: two times, the
+/// unpacked length, the checksum, the name's length, and the data's length.
+const CHUNK_HEADER_BYTES: u64 = 8 + 8 + 8 + 4 + 4 + 8;
+
 /// The chunks of a file so far.
 #[derive(Debug, Default)]
 pub(super) struct Chunks {
@@ -48,8 +52,8 @@ pub(super) struct Chunks {
 impl Chunks {
     /// The schemas, channels and messages of a chunk, whose record has the bytes `body`. The file had
     /// `read` bytes up to its end. The unpacked length is checked before the chunk is unpacked, and
-    /// the checksum before any record is used. The chunk is read apart from the file, because the
-    /// crate reads past the end of a chunk without compression.
+    /// the checksum before any record is used. The chunk is read apart from the file and without
+    /// what may follow its data, because the crate reads past the data of a chunk without compression.
     ///
     /// # Errors
     ///
@@ -76,6 +80,11 @@ impl Chunks {
             .with_prevalidate_chunk_crcs(true)
             .with_record_length_limit(LONGEST_RECORD_BYTES);
         let mut reader = LinearReader::new_with_options(options);
+        let data_at = CHUNK_HEADER_BYTES + header.compression.len() as u64;
+        let end = usize::try_from(data_at.saturating_add(header.compressed_size)).ok();
+        let Some(body) = end.and_then(|end| body.get(..end)) else {
+            return Err(mcap::McapError::UnexpectedEoc.into());
+        };
         let head = [&[op::CHUNK], &(body.len() as u64).to_le_bytes()[..]].concat();
         let mut chunk = head.as_slice().chain(body);
         let mut records = Vec::new();
@@ -128,8 +137,17 @@ fn attachment_bytes(body: &[u8]) -> Option<u64> {
     u64::from_le_bytes(*bytes).checked_add(data_at + 8 + 4)
 }
 
+/// The decoder of the messages of a schema, if they are read.
+pub(super) fn decoder(schema: &str) -> Option<Decode> {
+    match schema {
+        _ if schema == INPUT.schema => Some(message::decode_entry),
+        _ if schema == MOTION.schema => Some(message::decode_motion),
+        _ => None,
+    }
+}
+
 /// A function that reads a message.
-type Decode = fn(&[u8]) -> Result<(String, Stamp, Entry), Error>;
+pub(super) type Decode = fn(&[u8]) -> Result<(String, Stamp, Entry), Error>;
 
 /// Reads a recording from its beginning. It yields the entries in order, and ends after the first
 /// error.
@@ -232,11 +250,10 @@ impl<R: Read> Reader<R> {
     /// Learns from a schema or a channel. Returns the entry of a message that is read.
     fn take(&mut self, record: Record<'static>) -> Result<Option<Found>, Error> {
         match record {
-            Record::Schema { header, .. } if header.name == INPUT.schema => {
-                self.schemas.insert(header.id, message::decode_entry);
-            }
-            Record::Schema { header, .. } if header.name == MOTION.schema => {
-                self.schemas.insert(header.id, message::decode_motion);
+            Record::Schema { header, .. } => {
+                if let Some(decode) = decoder(&header.name) {
+                    self.schemas.insert(header.id, decode);
+                }
             }
             Record::Channel(channel) => {
                 if let Some(&decode) = self.schemas.get(&channel.schema_id) {

@@ -14,7 +14,7 @@ use mcap::records::{Channel, Record, op};
 use mcap::write::NoSeek;
 
 use super::message;
-use super::reader::{Chunks, LONGEST_RECORD_BYTES, parse};
+use super::reader::{Chunks, LONGEST_RECORD_BYTES, decoder, parse};
 use super::{Entry, Error, writer};
 
 /// The result of recovering a damaged recording.
@@ -35,6 +35,9 @@ pub struct Recovered {
     pub lost: Vec<(u64, u64)>,
     /// The number of messages in whole chunks whose channel is unknown.
     pub messages_unknown: u64,
+    /// The number of messages in whole chunks that cannot be read. A chunk without a checksum may
+    /// have them.
+    pub messages_damaged: u64,
     /// Whether the file had its end.
     pub complete: bool,
 }
@@ -315,15 +318,24 @@ impl<W: Write> Copy<W> {
                         self.done.messages_unknown += 1;
                         continue;
                     }
+                    let Channel {
+                        topic, schema_id, ..
+                    } = &self.channels[&header.channel_id];
+                    let schema = self.schemas.get(schema_id);
+                    let decode = schema.and_then(|(name, ..)| decoder(name));
+                    match decode.map(|decode| decode(&data)) {
+                        Some(Err(_)) => {
+                            self.done.messages_damaged += 1;
+                            continue;
+                        }
+                        Some(Ok((_, _, Entry::State(_)))) if writer::is_input(topic) => {
+                            self.done.states += 1;
+                        }
+                        _ => {}
+                    }
+                    self.done.messages_foreign += u64::from(!writer::is_topic_of_ours(topic));
                     self.out.write_to_known_channel(&header, &data)?;
                     self.done.messages += 1;
-                    let topic = &self.channels[&header.channel_id].topic;
-                    self.done.messages_foreign += u64::from(!writer::is_topic_of_ours(topic));
-                    if writer::is_input(topic) {
-                        let entry = message::decode_entry(&data);
-                        let is_state = matches!(entry, Ok((_, _, Entry::State(_))));
-                        self.done.states += u64::from(is_state);
-                    }
                     let time = header.log_time;
                     let (first, last) = self.done.span_ns.unwrap_or((time, time));
                     self.done.span_ns = Some((first.min(time), last.max(time)));
@@ -396,7 +408,10 @@ impl<W: Write> Copy<W> {
 impl Recovered {
     /// Whether the file was whole.
     pub fn is_whole(&self) -> bool {
-        self.complete && self.lost.is_empty() && self.messages_unknown == 0
+        self.complete
+            && self.lost.is_empty()
+            && self.messages_unknown == 0
+            && self.messages_damaged == 0
     }
 }
 

@@ -212,6 +212,7 @@ fn account(recovered: &Recovered) -> String {
         span_ns,
         lost,
         messages_unknown,
+        messages_damaged,
         complete,
         messages_foreign: _,
         states,
@@ -227,6 +228,9 @@ fn account(recovered: &Recovered) -> String {
     }
     if *messages_unknown > 0 {
         text += &format!("\nlost {messages_unknown} messages of channels that nothing describes");
+    }
+    if *messages_damaged > 0 {
+        text += &format!("\nlost {messages_damaged} messages that cannot be read");
     }
     if !complete {
         text += "\nthe end was missing: the recording was cut off, or it is still being written";
