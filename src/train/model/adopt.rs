@@ -302,10 +302,7 @@ pub fn adopt(
     let computed: anyhow::Result<Vec<Vec<f32>>> = frames.iter().map(computed).collect();
     check.probabilities = computed?;
     let evaluation = match dataset.labelled(Split::Test) {
-        Ok(test) => {
-            let cases = export::cases(&hrn, dataset, &test)?;
-            Some(Evaluated::of(&cases, hrn.card().levels.len()))
-        }
+        Ok(test) => Some(export::evaluate(&hrn, dataset, &test)?),
         Err(_) => None,
     };
     if let Some(evaluation) = &evaluation {

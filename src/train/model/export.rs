@@ -13,7 +13,7 @@ use crate::frame::Frame;
 use crate::press;
 use crate::simulator::Split;
 use crate::train::data::dataset::{self, Dataset, Kind, Source};
-use crate::train::judge::metrics::{Evaluation, Judged};
+use crate::train::judge::metrics::Judged;
 use crate::train::net::graph::Graph;
 use crate::train::run::{Description, Run};
 use crate::verdict::{Card, Check, Checks, Hrn, Range};
@@ -81,10 +81,7 @@ pub fn finish(
     // The metrics are measured on a file without them and then added; the graph does not change.
     let hrn = Hrn::load(&write(&card)?)?;
     let evaluation = match dataset.labelled(Split::Test) {
-        Ok(test) => {
-            let cases = cases(&hrn, dataset, &test)?;
-            Some(Evaluated::of(&cases, hrn.card().levels.len()))
-        }
+        Ok(test) => Some(evaluate(&hrn, dataset, &test)?),
         Err(_) => None,
     };
     if let Some(evaluation) = &evaluation {
@@ -104,9 +101,9 @@ pub fn finish(
 /// # Errors
 ///
 /// Fails if the model has fewer levels than the data, or fails to judge a frame.
-pub fn evaluate(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Evaluation> {
-    let judged = judge(hrn, dataset, indices)?;
-    Ok(Evaluation::of(&judged, hrn.card().levels.len()))
+pub fn evaluate(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Evaluated> {
+    let cases = cases(hrn, dataset, indices)?;
+    Ok(Evaluated::of(&cases, hrn.card().levels.len()))
 }
 
 /// Judges labelled samples with a model, in the form that the metrics take.
@@ -149,7 +146,7 @@ fn evaluations_by_source(hrn: &Hrn, dataset: &Dataset) -> anyhow::Result<serde_j
         let of_source = |index: &usize| dataset.samples[*index].source == number;
         let indices: Vec<usize> = test.iter().copied().filter(of_source).collect();
         if !indices.is_empty() {
-            let evaluation = serde_json::to_value(evaluate(hrn, dataset, &indices)?)?;
+            let evaluation = serde_json::to_value(evaluate(hrn, dataset, &indices)?.levels)?;
             by_source.insert(source.name.clone(), evaluation);
         }
     }
