@@ -115,9 +115,9 @@ impl Hub {
         }
     }
 
-    /// Numbers `event` and offers it to every subscriber that wants it. `now` is a time of
-    /// CLOCK_MONOTONIC.
-    fn publish(&mut self, mut event: Event, now: Duration) {
+    /// Numbers `event` and offers it to every subscriber that wants it. Returns whether there was
+    /// anything to offer. `now` is a time of CLOCK_MONOTONIC.
+    fn publish(&mut self, mut event: Event, now: Duration) -> bool {
         let kind = event.kind();
         if let Event::Hardness(verdict) = &mut event {
             // Round to microseconds, because further digits are noise of the clock.
@@ -135,7 +135,7 @@ impl Hub {
         self.recorder.event(&event);
         let mut subscribers = self.subscribers.values();
         if kind == Kind::Frame && !subscribers.any(|subscriber| subscriber.wants(kind)) {
-            return;
+            return false;
         }
         let event = Arc::new(event);
         let line = Line::from(event.clone());
@@ -155,6 +155,7 @@ impl Hub {
         for subscriber in self.subscribers.values_mut() {
             self.tally.dropped += subscriber.offer(&line);
         }
+        true
     }
 
     fn keep(&mut self, held: Held) {
@@ -168,11 +169,6 @@ impl Hub {
     /// The number of the oldest event that is held.
     fn oldest(&self) -> u64 {
         self.hello.seq + 1 - self.held.len() as u64
-    }
-
-    fn at(&self, seq: u64) -> Option<&Held> {
-        let place = seq.checked_sub(self.oldest())?;
-        self.held.get(usize::try_from(place).ok()?)
     }
 
     /// Adds a subscriber, with the default subscription from now on.
@@ -229,14 +225,23 @@ impl Hub {
         Ok(())
     }
 
+    /// Whether lines wait for a subscriber.
+    fn has_lines(&self, id: u64) -> bool {
+        let subscriber = self.subscribers.get(&id);
+        subscriber.is_some_and(Subscriber::has_lines)
+    }
+
     /// The next lines of a subscriber; empty if there are none.
     fn take(&mut self, id: u64) -> Vec<Line> {
-        let Some(mut subscriber) = self.subscribers.remove(&id) else {
+        let oldest = self.oldest();
+        let Some(subscriber) = self.subscribers.get_mut(&id) else {
             return Vec::new();
         };
-        let lines = subscriber.take(|seq| self.at(seq).map(|held| held.line.clone()));
+        let lines = subscriber.take(|seq| {
+            let place = usize::try_from(seq.checked_sub(oldest)?).ok()?;
+            Some(self.held.get(place)?.line.clone())
+        });
         self.tally.gaps += std::mem::take(&mut subscriber.gaps);
-        self.subscribers.insert(id, subscriber);
         lines
     }
 }

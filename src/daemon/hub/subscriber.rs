@@ -113,6 +113,11 @@ impl Subscriber {
         lost
     }
 
+    /// Whether lines wait to be fetched.
+    pub(super) fn has_lines(&self) -> bool {
+        self.missing.is_some() || !self.replay.is_empty() || !self.queue.is_empty()
+    }
+
     /// The subscriber's next batch of lines. `held` looks up a numbered event.
     pub(super) fn take(&mut self, held: impl Fn(u64) -> Option<Line>) -> Vec<Line> {
         let mut lines = Vec::new();

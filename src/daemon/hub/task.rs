@@ -165,15 +165,16 @@ async fn serve(mut hub: Hub, mut inbox: mpsc::Receiver<Command>) {
         // If a reply cannot be sent, its subscriber has just disconnected.
         match command {
             Command::Publish { events } => {
+                let mut was_offered = false;
                 for event in events {
-                    hub.publish(event, now().mono);
+                    was_offered |= hub.publish(event, now().mono);
                 }
-                for id in waiting.keys().copied().collect::<Vec<_>>() {
-                    let lines = hub.take(id);
-                    if !lines.is_empty()
-                        && let Some(reply) = waiting.remove(&id)
-                    {
-                        let _ = reply.send(lines);
+                // Most events are frames that nobody wants, so most of the time there is nothing
+                // to look for.
+                if was_offered {
+                    let ready = waiting.extract_if(|id, _| hub.has_lines(*id));
+                    for (id, reply) in ready.collect::<Vec<_>>() {
+                        let _ = reply.send(hub.take(id));
                     }
                 }
             }
