@@ -66,6 +66,20 @@ fn text(path: &Path) -> &str {
 }
 
 #[test]
+fn presses_of_level_0_are_unlabelled() {
+    let bench = Bench::new();
+    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/foam.5hz.bin");
+    let out = bench.path("unlabelled.npz");
+    let samples = collected(&out, &["--level", "0", "--object", "9", text(&fixture)]);
+    assert!(samples.iter().all(|s| s.level == 0 && s.object == Some(9)));
+    assert_are_those(&samples, &judged(&fixture));
+    // Such presses do not count as presses of a level.
+    let dataset = Dataset::read(&out).unwrap();
+    let error = dataset.labelled(Split::Train).unwrap_err().to_string();
+    assert!(error.contains("unlabelled.npz"), "{error}");
+}
+
+#[test]
 fn samples_are_the_frames_that_the_daemon_judges() {
     let bench = Bench::new();
     let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/foam.5hz.bin");

@@ -374,6 +374,56 @@ mod tests {
     }
 
     #[test]
+    fn the_layers_begin_with_unit_variance() {
+        let weights = initial(1, &device());
+        let statistics = statistics(&weights, 2, 1, &device());
+        for layer in 0..LAYERS.len() {
+            let (_, variance) = statistics.layer(layer);
+            let variances = numbers(&variance);
+            let normalised = variances.iter().map(|v| v / (v + BATCH_NORM_EPSILON));
+            let mean = normalised.sum::<f32>() / variances.len() as f32;
+            assert!(mean > 0.9, "layer {layer}: {mean} of {variances:?}");
+        }
+    }
+
+    #[test]
+    fn frames_that_are_not_presses_are_drawn_again() {
+        // The images are dark, and not every draw has enough light taxels for a press.
+        let mut weights = initial(1, &device());
+        let mut change = |name: &str, with: fn(Tensor<1>) -> Tensor<1>| {
+            let weight = weights.entries.iter_mut().find(|w| w.name == name).unwrap();
+            weight.values = with(weight.values.clone());
+        };
+        change("mixture.sigma", |sigma| sigma.ones_like());
+        change("deconv3.kernel", |kernel| kernel.mul_scalar(3.0));
+        change("deconv3.bias", |bias| bias.sub_scalar(3.4));
+        let statistics = statistics(&weights, 2, 1, &device());
+        let making = Making {
+            weights: &weights,
+            statistics: &statistics,
+            scale: Scale {
+                full_scale_n: 10.2,
+                log_above_n: 0.0,
+            },
+            sensor: Sensor::of([].iter()),
+            device: &device(),
+        };
+        let eta = noise(4, &mut Stream::new(1, "drawn"), &device());
+        let mut fixed = Normalisation::Fixed(&statistics);
+        let once = frames(
+            &images(&weights, eta, &mut fixed),
+            making.scale,
+            making.sensor,
+        );
+        let presses = |frames: &[Frame]| frames.iter().filter(|frame| is_press(frame)).count();
+        let drawn = generate(&making, 4, &mut Stream::new(1, "drawn"));
+        let (before, after) = (presses(&once), presses(&drawn));
+        assert_eq!((once.len(), drawn.len()), (4 * COMPONENTS, 4 * COMPONENTS));
+        assert!((100..195).contains(&before), "{before}");
+        assert_eq!(after, drawn.len());
+    }
+
+    #[test]
     fn statistics_fixed_give_what_training_saw() {
         let weights = initial(2, &device());
         let eta = noise(2, &mut Stream::new(3, "noise"), &device());
