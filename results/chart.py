@@ -44,7 +44,7 @@ def accuracies(profile):
     found = {}
     for line in text.splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
-        interval = re.fullmatch(r"([\d.]+) to ([\d.]+)", cells[3]) if len(cells) == 8 else None
+        interval = re.fullmatch(r"([\d.]+) to ([\d.]+)", cells[3]) if len(cells) in (8, 11) else None
         if interval:
             found[cells[0]] = float(cells[2].split()[0]), float(interval[1]), float(interval[2])
     return found

@@ -236,15 +236,17 @@ fn a_finished_comparison_does_nothing_again() {
     let comparison = Comparison::new("twice", "features,features", &["--swaps"]);
     let first = comparison.run();
     assert!(first.contains("features-1: done"), "{first}");
-    assert!(first.contains("features-24-swapped-13: done"), "{first}");
+    assert!(first.contains("features-24-swapped-13-2: done"), "{first}");
     let (models, results) = (comparison.models(), comparison.text("results.json"));
-    // There are two seeds. In this profile, there are also 4 assignments of the materials' roles,
-    // with many labels and with few.
-    assert_eq!(models.len(), 2 * (2 + 4));
+    // There are two seeds. In this profile, there are also 4 assignments of the materials' roles.
+    // Each is run with many labels and with few.
+    assert_eq!(models.len(), 2 * 2 * (1 + 4));
     // A method that is named twice counts once.
     assert_eq!(comparison.json("results.json").len(), 2 * 2);
     let swaps = comparison.json("swaps.json");
-    assert_eq!(swaps.len(), 2 * 4);
+    assert_eq!(swaps.len(), 2 * 2 * 4);
+    let table = comparison.text("tables.md");
+    assert!(table.contains("| features | 24 | 2 | 4 |"), "{table}");
     assert!(swaps.iter().all(|swap| swap["test"]["n"] == 4 * 20 * 10));
     let again = comparison.run();
     assert!(!again.contains("done"), "{again}");
@@ -252,7 +254,7 @@ fn a_finished_comparison_does_nothing_again() {
     assert_eq!(comparison.text("results.json"), results);
 
     // Add runs of another method that are as good as finished.
-    for run in ["1", "swapped-13"] {
+    for run in ["1", "swapped-13-1"] {
         let from = comparison.out.join(format!("runs/features-24-{run}"));
         let to = comparison.out.join(format!("runs/ours-{run}"));
         std::fs::create_dir(&to).unwrap();
@@ -273,7 +275,7 @@ fn a_finished_comparison_does_nothing_again() {
     );
     assert_eq!((all.len(), &all[4]["run"]), (5, &Value::from("ours-1")));
     let all = comparison.json("swaps.json");
-    assert_eq!((all.len(), &all[8]["method"]), (9, &Value::from("ours")));
+    assert_eq!((all.len(), &all[16]["method"]), (17, &Value::from("ours")));
 
     // A run with other settings does not belong to the comparison.
     let told = comparison.text("runs/features-1/settings.toml");
@@ -380,6 +382,21 @@ fn a_plan_runs_in_any_shell_and_the_comparison_finds_what_it_made() {
         .unwrap();
     assert!(less.status.success(), "{less:?}");
     assert_eq!(merged.json("results.json").len(), 3);
+}
+
+#[test]
+fn a_plan_has_the_runs_with_swapped_materials() {
+    let comparison = Comparison::new("planned-swaps", "features", &["--swaps", "--plan"]);
+    let planned = comparison.command().output().unwrap();
+    assert!(planned.status.success(), "{planned:?}");
+    let lines = String::from_utf8(planned.stdout).unwrap();
+    // Two numbers of labels, two seeds, four assignments. The one without a swap shares its
+    // training with the comparison's own run, so it follows on the same line.
+    assert_eq!(lines.lines().count(), 2 * 2 * 4, "{lines}");
+    assert_eq!(lines.matches("-swapped-none-").count(), 2 * 2, "{lines}");
+    for line in lines.lines().filter(|line| line.contains("-swapped-none-")) {
+        assert!(line.contains(" && ") && line.contains("--from"), "{line}");
+    }
 }
 
 #[test]
@@ -512,7 +529,7 @@ fn a_failing_run_is_named_and_the_others_go_on() {
     let more = ["--jobs", "1", "--swaps"].as_slice();
     let comparison = Comparison::new("failing", "hrn100,features", more);
     // One file stops the swaps before they begin. Another is where a run needs a directory.
-    let swapped = comparison.out.join("runs/features-swapped-none");
+    let swapped = comparison.out.join("runs/features-swapped-none-1");
     std::fs::create_dir_all(&swapped).unwrap();
     std::fs::write(swapped.join("settings.toml"), "neither").unwrap();
     std::fs::create_dir_all(comparison.out.join("runs/hrn100-1")).unwrap();
@@ -526,7 +543,7 @@ fn a_failing_run_is_named_and_the_others_go_on() {
         "{last}"
     );
     assert!(
-        last.contains("features-swapped-none/settings.toml"),
+        last.contains("features-swapped-none-1/settings.toml"),
         "{last}"
     );
     assert_eq!(comparison.json("results.json").len(), 5);

@@ -45,9 +45,12 @@ use crate::train::run::disk::{lock, write_whole};
 pub fn plan(plan: &Plan) -> anyhow::Result<String> {
     let dataset = checked(plan)?;
     let recipes = recipes(plan, &dataset)?;
+    let swaps = Swaps::of(plan, &recipes)?;
     make_directories(plan)?;
     let runs = planned(plan, &recipes, &dataset)?;
-    let jobs: Vec<Job> = in_order(unfinished(&runs, &plan.out)?);
+    let swapped = swaps.map_or(Ok(Vec::new()), |swaps| swaps.planned(plan))?;
+    let every = runs.iter().chain(swapped.iter().map(|(run, _)| run));
+    let jobs: Vec<Job> = in_order(unfinished(every, &plan.out)?);
     plan::command_lines(&jobs)
 }
 

@@ -296,12 +296,13 @@ pub(super) struct Compare {
     #[arg(long, default_value = "paper")]
     pub(super) profile: Profile,
     /// Run nothing: print a command line for each run that is not finished, to spread over machines
-    #[arg(long, conflicts_with = "swaps")]
+    #[arg(long)]
     pub(super) plan: bool,
     /// Runs at a time, each on one thread [default: as many as there are cores]
     #[arg(long, value_name = "J")]
     pub(super) jobs: Option<std::num::NonZeroUsize>,
-    /// Also swap the two materials of each level: 16 times features and hrn15-tuned, 4 times ours
+    /// Also swap the two materials of each level: 16 times features, hrn15-strong and hrn15-tuned, 4 times
+    /// ours
     #[arg(long)]
     pub(super) swaps: bool,
     /// Compare models of whole presses instead, with simpler controls that are fitted on --data. Nothing else is

@@ -131,7 +131,7 @@ pub(super) fn planned(
     let mut runs = Vec::new();
     for recipe in recipes {
         let asked = if plan.asks(recipe) { plan.seeds } else { 0 };
-        let mut seeds = recipe.seeds_in(&directory)?;
+        let mut seeds = seeds_in(&directory, &recipe.name())?;
         seeds.extend(1..=asked);
         for seed in seeds {
             let run = PlannedRun {
@@ -149,6 +149,18 @@ pub(super) fn planned(
         }
     }
     Ok(runs)
+}
+
+/// The seeds of the runs called `NAME-SEED` in a directory.
+pub(super) fn seeds_in(runs: &Path, name: &str) -> anyhow::Result<BTreeSet<u64>> {
+    let prefix = format!("{name}-");
+    let mut seeds = BTreeSet::new();
+    for entry in std::fs::read_dir(runs).with_context(|| runs.display().to_string())? {
+        let name = entry?.file_name();
+        let name = name.to_str().and_then(|name| name.strip_prefix(&prefix));
+        seeds.extend(name.and_then(|seed| seed.parse::<u64>().ok()));
+    }
+    Ok(seeds)
 }
 
 impl Recipe {
@@ -170,18 +182,6 @@ impl Recipe {
             name += "-random";
         }
         name
-    }
-
-    /// The seeds of the recipe's runs in a directory.
-    fn seeds_in(&self, runs: &Path) -> anyhow::Result<BTreeSet<u64>> {
-        let prefix = self.name() + "-";
-        let mut seeds = BTreeSet::new();
-        for entry in std::fs::read_dir(runs).with_context(|| runs.display().to_string())? {
-            let name = entry?.file_name();
-            let name = name.to_str().and_then(|name| name.strip_prefix(&prefix));
-            seeds.extend(name.and_then(|seed| seed.parse::<u64>().ok()));
-        }
-        Ok(seeds)
     }
 
     /// The description of the recipe's run with a seed.

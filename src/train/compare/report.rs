@@ -117,8 +117,8 @@ pub fn comparison(comparison: &Comparison) -> anyhow::Result<String> {
         page.table(&tables::swaps(&comparison.swaps));
         page.figure(
             &figures::swaps(&tables::swap_groups(&comparison.swaps)),
-            "Each dot is an assignment of the two materials of each level to training and test; the \
-             ring is the paper's.",
+            "Each dot is a run: an assignment of the two materials of each level to training and test, \
+             and a seed. Rings are the paper's assignment.",
         );
     }
     let provenance = tables::provenance(comparison);
@@ -144,6 +144,15 @@ pub fn run(details: &Details) -> anyhow::Result<String> {
         page.table(&tables::evaluation(&evaluation));
         let counts = tables::mean_confusion(&[&evaluation]);
         page.panels(vec![figures::confusion(&counts, "counts")]);
+    }
+    page.section("sets", "On other shapes and materials");
+    if details.worth.sets.is_empty() {
+        page.note(
+            "Not measured: the run belongs to no comparison. The test split has the shapes and materials of \
+             the data set alone. hrn-train evaluate judges the run on any other data set.",
+        );
+    } else {
+        page.table(&tables::sets(&details.worth));
     }
     page.section("steps", "Training");
     page.table(&tables::stages(&details.history));

@@ -11,7 +11,7 @@ use std::path::PathBuf;
 use anyhow::Context as _;
 
 use super::children::{self, Failure};
-use super::plan::{Plan, PlannedRun, Recipe, unfinished};
+use super::plan::{Plan, PlannedRun, Recipe, seeds_in, unfinished};
 use super::results::{SwapEntry, read_json};
 use super::sets;
 use crate::simulator::{DatasetSettings, LabelledSample, Material};
@@ -22,8 +22,6 @@ use crate::train::methods::Method;
 use crate::train::run::disk::write_whole;
 use crate::train::settings::Profile;
 
-/// The seed of every run.
-const SEED: u64 = 1;
 /// Four assignments in which every level is swapped twice.
 const FEW: [[bool; 4]; 4] = [
     [false, false, false, false],
@@ -37,10 +35,14 @@ fn assignments(recipe: &Recipe, profile: Profile) -> Vec<[bool; 4]> {
     let all = || (0..16).map(|bits| std::array::from_fn(|level| bits >> level & 1 == 1));
     match (recipe.method, recipe.choice, profile) {
         (_, LabelChoice::Random, _) => Vec::new(),
-        (Method::Features | Method::Hrn15Tuned, _, Profile::Paper | Profile::Quick) => {
-            all().collect()
+        (
+            Method::Features | Method::Hrn15Strong | Method::Hrn15Tuned,
+            _,
+            Profile::Paper | Profile::Quick,
+        ) => all().collect(),
+        (Method::Features | Method::Hrn15Strong | Method::Hrn15Tuned | Method::Ours, ..) => {
+            FEW.to_vec()
         }
-        (Method::Features | Method::Hrn15Tuned | Method::Ours, ..) => FEW.to_vec(),
         _ => Vec::new(),
     }
 }
@@ -92,33 +94,52 @@ impl Swaps {
         Ok(Some(Self { every, settings }))
     }
 
+    /// Every run that the plan requests, and the finished runs of earlier plans. Simulates what
+    /// they learn from.
+    ///
+    /// # Errors
+    ///
+    /// Fails if a file cannot be read or written.
+    pub(super) fn planned(&self, plan: &Plan) -> anyhow::Result<Vec<SwappedRun>> {
+        let directory = plan.out.join("runs");
+        let mut parts = None;
+        let mut runs = Vec::with_capacity(self.every.len());
+        for (recipe, swapped) in &self.every {
+            let called = format!("{}-swapped-{}", recipe.name(), name(*swapped));
+            let asked = if plan.asks(recipe) { plan.seeds } else { 0 };
+            let mut seeds = seeds_in(&directory, &called)?;
+            seeds.extend(1..=asked);
+            if seeds.is_empty() {
+                continue;
+            }
+            let file = file(plan, self.settings, *swapped, &mut parts)?;
+            let dataset = Dataset::read(&file)?;
+            for seed in seeds {
+                let run = PlannedRun {
+                    recipe: *recipe,
+                    told: recipe.told(seed, plan.profile, &dataset)?,
+                    data: file.clone(),
+                    directory: directory.join(format!("{called}-{seed}")),
+                    // Without a swap, the training is the comparison's own run, judged on more
+                    // objects.
+                    shares_with: (*swapped == [false; 4])
+                        .then(|| format!("{}-{seed}", recipe.name())),
+                };
+                if (1..=asked).contains(&seed) || run.counts() {
+                    runs.push((run, *swapped));
+                }
+            }
+        }
+        Ok(runs)
+    }
+
     /// Runs the unfinished runs and writes `swaps.json`.
     ///
     /// # Errors
     ///
     /// Fails if a file cannot be read or written, or a directory holds a run with other settings.
     pub(super) fn run(&self, plan: &Plan) -> anyhow::Result<Vec<Failure>> {
-        let mut parts = None;
-        let mut runs = Vec::with_capacity(self.every.len());
-        for (recipe, swapped) in &self.every {
-            let name = format!("{}-swapped-{}", recipe.name(), name(*swapped));
-            let directory = plan.out.join("runs").join(name);
-            if !plan.asks(recipe) && !directory.is_dir() {
-                continue;
-            }
-            let file = file(plan, self.settings, *swapped, &mut parts)?;
-            let run = PlannedRun {
-                recipe: *recipe,
-                told: recipe.told(SEED, plan.profile, &Dataset::read(&file)?)?,
-                data: file,
-                directory,
-                // Without a swap, the training is the comparison's own run, judged on more objects.
-                shares_with: (*swapped == [false; 4]).then(|| format!("{}-{SEED}", recipe.name())),
-            };
-            if plan.asks(recipe) || run.counts() {
-                runs.push((run, *swapped));
-            }
-        }
+        let runs = self.planned(plan)?;
         let open = unfinished(runs.iter().map(|(run, _)| run), &plan.out)?;
         let jobs = open.into_iter().map(|(_, job)| job).collect();
         let failures = children::run(jobs, plan.jobs, |_| Ok(()))?;
@@ -142,6 +163,9 @@ impl Swaps {
         Ok(failures)
     }
 }
+
+/// A run, and the levels whose materials are swapped in it.
+pub(super) type SwappedRun = (PlannedRun, [bool; 4]);
 
 /// The samples without any swap, and with all levels swapped.
 type Parts = [Vec<LabelledSample>; 2];

@@ -5,16 +5,17 @@
 
 mod cells;
 
+use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
 use super::digits::{number, thousands};
-use crate::train::compare::results::{Comparison, Row, SwapEntry};
+use crate::train::compare::results::{Comparison, Row, SwapEntry, Worth};
 use crate::train::compare::sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS, WORLDS};
 use crate::train::judge::metrics::{self, Evaluation};
 use crate::train::run::history::{History, Stage};
 use cells::{
-    before_temperature, beside, deviation, interval, least, mean_over_seeds, minus_features,
-    minus_reference, most, of_entries, percent_of, with_spread,
+    before_temperature, beside, deviation, interval, least, mean_of_assignments, mean_over_seeds,
+    minus_features, minus_reference, most, of_entries, percent_of, with_spread,
 };
 
 pub use cells::{
@@ -155,30 +156,38 @@ fn all(comparison: &Comparison) -> Vec<Table> {
 pub fn headline(rows: &[Row]) -> Table {
     let note = "20 fresh objects of each test material, shapes alike for all materials, so that \
                 the shape does not show the hardness. \"Minus ours\": difference of accuracies on the \
-                same frames under the same seeds. Seconds are those of one thread; stages \
+                same frames under the same seeds. The last columns of accuracies are of other shapes \
+                (wide) and random materials (broad). Seconds are those of one thread; stages \
                 that a method shares with another are counted for both.";
-    let head = [
-        "method",
-        "labels",
-        "accuracy, %",
-        "95 %",
-        "minus ours, points",
-        "kappa, quadratic",
-        "steps",
-        "seconds",
+    let accuracy = |row: &Row, set: &str| with_spread(row, set, |e| Some(100.0 * e.accuracy), 1);
+    let mut head = vec![
+        "method".to_owned(),
+        "labels".to_owned(),
+        "accuracy, %".to_owned(),
+        "95 %".to_owned(),
+        "minus ours, points".to_owned(),
     ];
-    let mut table = Table::new("Summary", note, &head);
+    head.extend(WORLDS.map(|(set, _)| format!("{}, %", set.replace('_', " "))));
+    head.extend(["kappa, quadratic", "steps", "seconds"].map(str::to_owned));
+    let mut table = Table {
+        head,
+        ..Table::new("Summary", note, &[])
+    };
     for row in rows {
-        table.rows.push(vec![
+        let mut cells = vec![
             row.title.clone(),
             thousands(row.runs[0].0.labels as u64),
-            with_spread(row, MATCHED, |e| Some(100.0 * e.accuracy), 1),
+            accuracy(row, MATCHED),
             interval(row, MATCHED),
             minus_reference(row, rows, MATCHED),
+        ];
+        cells.extend(WORLDS.map(|(set, _)| accuracy(row, set)));
+        cells.extend([
             with_spread(row, MATCHED, |e| e.kappa_quadratic, 3),
             thousands(mean(&of_entries(row, |entry| entry.steps as f64)).round() as u64),
             thousands(mean(&of_entries(row, |entry| entry.seconds)).round() as u64),
         ]);
+        table.rows.push(cells);
     }
     table
 }
@@ -487,15 +496,39 @@ pub fn evaluation(evaluation: &Evaluation) -> Table {
     table
 }
 
+/// The table of a run's results on the test sets of a comparison.
+pub fn sets(worth: &Worth) -> Table {
+    let told = described(&[&SHIFTS[..], &WORLDS[..]].concat());
+    let note = format!(
+        "Materials that the model has not learnt from, 20 objects of each. fresh: the paper's shapes; matched: \
+         the same shapes for all materials; {told}. One frame fixes only the ratio of radius and modulus, so \
+         varying shapes lower the accuracy of every model."
+    );
+    let head = ["set", "accuracy, %", "95 %", "calibration error, %"];
+    let mut table = Table::new("Other test sets", &note, &head);
+    for (name, measured) in worth.sets.iter().filter(|(name, _)| *name != PAPER_SPLIT) {
+        let evaluation = &measured.evaluation;
+        table.rows.push(vec![
+            name.replace('_', " "),
+            number(100.0 * evaluation.accuracy, 1),
+            interval_text(evaluation.accuracy_interval_by_object),
+            number(100.0 * evaluation.ece, 1),
+        ]);
+    }
+    table
+}
+
 /// The table of runs with swapped materials.
 pub fn swaps(swaps: &[SwapEntry]) -> Table {
     let note = "The two materials of some levels in each other's roles, each time learnt anew and \
-                judged on 20 objects of each material, in the paper's shapes: accuracy in per cent over \
-                the assignments. The choice of materials alone causes its spread. \"Minus \
-                features\": over the same assignments and labels, least to most.";
+                judged on 20 objects of each material, in the paper's shapes: accuracy in per cent. Each \
+                assignment counts with its mean over seeds. The choice of materials alone causes the \
+                spread over the assignments. \"Minus features\": over the same assignments, seeds and \
+                labels, least to most of the assignments.";
     let head = [
         "method",
         "labels",
+        "seeds",
         "assignments",
         "as in the paper",
         "mean",
@@ -506,16 +539,16 @@ pub fn swaps(swaps: &[SwapEntry]) -> Table {
     ];
     let mut table = Table::new("Materials swapped", note, &head);
     for group in swap_groups(swaps) {
-        let percents: Vec<f64> = group
-            .iter()
-            .map(|swap| 100.0 * swap.test.accuracy)
-            .collect();
-        let unswapped = group.iter().find(|swap| swap.swapped_levels == [false; 4]);
+        let by_assignment = mean_of_assignments(&group);
+        let percents: Vec<f64> = by_assignment.values().copied().collect();
+        let seeds: BTreeSet<u64> = group.iter().map(|swap| swap.seed).collect();
+        let unswapped = by_assignment.get(&[false; 4]);
         table.rows.push(vec![
             group[0].method.clone(),
             thousands(group[0].labels as u64),
-            group.len().to_string(),
-            unswapped.map_or("-".to_owned(), |swap| number(100.0 * swap.test.accuracy, 1)),
+            seeds.len().to_string(),
+            percents.len().to_string(),
+            unswapped.map_or("-".to_owned(), |&percent| number(percent, 1)),
             number(mean(&percents), 1),
             deviation(&percents).map_or("-".to_owned(), |sd| number(sd, 1)),
             number(least(&percents), 1),

@@ -420,10 +420,15 @@ pub(super) fn swaps(groups: &[Vec<&SwapEntry>]) -> String {
                 .map(|(level, _): (u8, _)| level.to_string())
                 .collect();
             let tip = match levels.as_slice() {
-                [] => format!("as in the paper: {:.1} %", percent(swap)),
+                [] => format!(
+                    "as in the paper, seed {}: {:.1} %",
+                    swap.seed,
+                    percent(swap)
+                ),
                 levels => format!(
-                    "levels {} swapped: {:.1} %",
+                    "levels {} swapped, seed {}: {:.1} %",
                     levels.join(", "),
+                    swap.seed,
                     percent(swap)
                 ),
             };

@@ -1,5 +1,7 @@
 //! The text of the tables' cells, which summarises a row's runs.
 
+use std::collections::BTreeMap;
+
 use crate::train::compare::digits::rounded;
 use crate::train::compare::results::{Details, Entry, Row, SwapEntry};
 use crate::train::compare::sets::{self, FRESH, MATCHED, PAPER_SPLIT};
@@ -110,22 +112,41 @@ pub(super) fn minus_reference(row: &Row, rows: &[Row], set: &str) -> String {
         .map_or("-".to_owned(), difference_text)
 }
 
+/// The accuracy of every assignment in per cent, as the mean over its seeds.
+pub(super) fn mean_of_assignments(group: &[&SwapEntry]) -> BTreeMap<[bool; 4], f64> {
+    let mut percents: BTreeMap<[bool; 4], Vec<f64>> = BTreeMap::new();
+    for swap in group {
+        let own = percents.entry(swap.swapped_levels).or_default();
+        own.push(100.0 * swap.test.accuracy);
+    }
+    let means = percents.into_iter().map(|(key, own)| (key, mean(&own)));
+    means.collect()
+}
+
 /// A method's accuracy minus that of `features` over the assignments, seeds and labels that both
-/// have: mean, least and most, in points.
+/// have: the mean, and the least and greatest assignment, in points.
 pub(super) fn minus_features(group: &[&SwapEntry], swaps: &[SwapEntry]) -> String {
     if group[0].method == FEATURES {
         return String::new();
     }
     let key = |swap: &SwapEntry| (swap.seed, swap.labels, swap.swapped_levels);
-    let of_features = |own: &&SwapEntry| {
+    let (mut both, mut of_features) = (Vec::new(), Vec::new());
+    for own in group {
         let mut others = swaps.iter().filter(|swap| swap.method == FEATURES);
-        let other = others.find(|swap| key(swap) == key(own))?;
-        Some(100.0 * (own.test.accuracy - other.test.accuracy))
-    };
-    let points: Vec<f64> = group.iter().filter_map(of_features).collect();
-    if points.is_empty() {
+        if let Some(other) = others.find(|swap| key(swap) == key(own)) {
+            both.push(*own);
+            of_features.push(other);
+        }
+    }
+    if both.is_empty() {
         return "-".to_owned();
     }
+    let (own, others) = (
+        mean_of_assignments(&both),
+        mean_of_assignments(&of_features),
+    );
+    let points = own.into_iter().zip(others.into_values());
+    let points: Vec<f64> = points.map(|((_, own), other)| own - other).collect();
     let (low, high) = (least(&points), most(&points));
     format!("{:+.1} ({low:+.1} to {high:+.1})", mean(&points))
 }

@@ -53,7 +53,7 @@ fn steps_are_means_over_seeds_to_the_nearest_step() {
     let comparison = comparison(&[(1_000, "a"), (1_000, "a"), (1_001, "a"), (1_002, "a")]);
     let rows = comparison.rows();
     // The mean is 1,000.75.
-    assert_eq!(headline(&rows).rows[0][6], "1,001");
+    assert_eq!(headline(&rows).rows[0][9], "1,001");
     assert_eq!(price(&rows).rows[0][2], "1,001");
     assert_eq!(price(&rows).rows[0][4], "hrn 1,001");
 }
