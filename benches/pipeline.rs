@@ -1,8 +1,11 @@
 //! The cost of one press from bytes to verdict, and of its parts: `cargo bench --bench pipeline`.
 //!
-//! The bytes are a recording of two presses on foam at 5 frames/s, 41 frames. Only compare lines of
-//! one run with each other, not with those of another day.
+//! The bytes are a recording of two presses on foam at 5 frames/s, 41 frames. A bench called
+//! `..._floor` is the least that the machine needs for the same work: a copy of the same bytes, or as
+//! many multiply-adds. `docs/performance.md` has the ratios. Only compare lines of one run with each
+//! other, not with those of another day.
 
+use std::hint::black_box;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -14,6 +17,7 @@ use hardnessd::pipeline::{Clock, Pipeline};
 use hardnessd::sensor::{Description, Sensor};
 use hardnessd::verdict::{BUILT_IN, Hrn};
 use hardnessd::wire::{self, Decoder, Layout};
+use tract_onnx::prelude::tract_ndarray::Array2;
 
 /// The approximate size of one read of a serial port at 115,200 baud.
 const CHUNK_BYTES: usize = 64;
@@ -59,6 +63,21 @@ fn decode(bencher: Bencher, chunk_bytes: usize) {
         });
 }
 
+/// Measures a copy of the bytes that [`decode`] decodes.
+#[divan::bench(args = [1, CHUNK_BYTES, 4096])]
+fn decode_floor(bencher: Bencher, chunk_bytes: usize) {
+    let bytes = recording();
+    bencher
+        .counter(BytesCount::new(bytes.len()))
+        .with_inputs(|| Vec::with_capacity(bytes.len()))
+        .bench_local_refs(|copy: &mut Vec<u8>| {
+            for chunk in bytes.chunks(chunk_bytes) {
+                copy.extend_from_slice(black_box(chunk));
+            }
+            copy.len()
+        });
+}
+
 /// Measures bytes to events, with an early and a final verdict for each press. An item is a press.
 #[divan::bench]
 fn bytes_to_events(bencher: Bencher) {
@@ -93,11 +112,35 @@ fn bytes_to_events(bencher: Bencher) {
         });
 }
 
+/// Measures a copy of the bytes that [`bytes_to_events`] reads, and as many multiply-adds as its
+/// verdicts make: early and final of two presses. An item is a press.
+#[divan::bench]
+fn bytes_to_events_floor(bencher: Bencher) {
+    let bytes = recording();
+    let [left, right] = [[404, 100], [100, 100]].map(|dims| Array2::from_elem(dims, 0.5_f32));
+    bencher
+        .counter(ItemsCount::new(2_usize))
+        .with_inputs(|| Vec::with_capacity(bytes.len()))
+        .bench_local_refs(|copy: &mut Vec<u8>| {
+            for chunk in bytes.chunks(CHUNK_BYTES) {
+                copy.extend_from_slice(black_box(chunk));
+            }
+            black_box(&left).dot(black_box(&right))
+        });
+}
+
 /// Measures a frame to a verdict.
 #[divan::bench]
 fn judge(bencher: Bencher) {
     let hrn = hrn();
     bencher.bench_local(|| hrn.judge_check(2));
+}
+
+/// Measures as many multiply-adds as [`judge`] makes, 1.01 million, as a matrix product.
+#[divan::bench]
+fn judge_floor(bencher: Bencher) {
+    let [left, right] = [[101, 100], [100, 100]].map(|dims| Array2::from_elem(dims, 0.5_f32));
+    bencher.bench_local(|| black_box(&left).dot(black_box(&right)));
 }
 
 /// Measures loading a model file, including its check frames. Start and reload do this.
