@@ -577,8 +577,19 @@ fn a_report_needs_no_network_and_has_all_its_sections() {
         out.to_str().unwrap(),
     ]);
     let page = std::fs::read_to_string(&out).unwrap();
-    let sections = ["evaluation", "steps", "calibration", "samples", "settings"];
+    let sections = [
+        "evaluation",
+        "sets",
+        "steps",
+        "calibration",
+        "samples",
+        "settings",
+    ];
     check_page(&page, &sections);
+    assert!(
+        page.contains("<td>broad wide</td>"),
+        "the comparison's other sets"
+    );
     assert!(
         page.contains("data:image/png;base64,"),
         "its own pictures are in it"
