@@ -1,0 +1,159 @@
+#!/usr/bin/env python3
+"""The evaluations behind models/README.md: simulates the test sets, judges the models, writes what they reached.
+
+    cargo build --release --features train
+    git show c57c8aa:models/hrn.onnx > before.onnx
+    python3 results/default-model/evaluate.py target/release/hrn-train before.onnx --work WORK
+    python3 results/default-model/evaluate.py --table          # prints the tables from the committed files
+
+Three other models are trained first: `features` on the presses of the default model, and `features` and the default
+model's method on its random materials alone. The last two know none of the eight named materials. WORK keeps data sets and these runs, 1 GB, so an
+interrupted call goes on. Written beside this file:
+
+- evaluations.json: the command of every set, and what `evaluate --json` prints for every set and model;
+- objects.csv: for every set, model and object its level, its presses, the right ones, those whose true Shore hardness
+  lies in the model's interval, and the sum of squared Shore errors (the last two empty where one is unknown).
+"""
+
+import argparse
+import collections
+import csv
+import json
+import pathlib
+import subprocess
+
+HERE = pathlib.Path(__file__).resolve().parent
+BROAD = "--materials broad --gaps --objects 300 --test-objects 0 --presses 10"
+NAMED = "--objects 25 --test-objects 0"
+TRAINING = {
+    "n_paper": f"--seed 101 --shapes paper {NAMED}",
+    "n_matched": f"--seed 102 --shapes matched {NAMED}",
+    "fw": f"--seed 601 --shapes wide {BROAD}",
+    "fm": f"--seed 602 --shapes matched {BROAD}",
+    "fw2": f"--seed 603 --shapes wide {BROAD}",
+    "fm2": f"--seed 604 --shapes matched {BROAD}",
+}# Name -> the method, and what it learns from.
+TRAINED = {
+    "features": ("features", list(TRAINING)),
+    "features, random alone": ("features", ["fw", "fm", "fw2", "fm2"]),
+    "frame, random alone": ("frame", ["fw", "fm", "fw2", "fm2"]),
+}
+MODELS = ["default", "before", *TRAINED]
+
+
+def sets():
+    """Name -> the options of `simulate`, and the split to judge."""
+    found = {}
+    raw = {"": "", ", raw": " --sensor-profile raw"}
+    others = "--sequences --materials broad --seed 51 --objects 0 --test-objects 60 --presses 6 --fps 20..20"
+    for profile, option in raw.items():
+        for shapes in ("matched", "wide"):
+            found[f"other materials, {shapes}{profile}"] = f"{others} --gaps --shapes {shapes}{option}", "test"
+    for shapes in ("matched", "wide"):
+        found[f"other materials, {shapes}, no gaps"] = f"{others} --shapes {shapes}", "test"
+    for profile, option in raw.items():
+        for seed, shapes in ((201, "paper"), (202, "matched"), (203, "wide")):
+            own = f"--seed {seed} --objects 0 --test-objects 20 --shapes {shapes}{option}"
+            found[f"the four test materials, {shapes}{profile}"] = own, "test"
+    for seed, shapes in ((202, "matched"), (203, "wide")):
+        # With all roles swapped, the materials that others train on are the test.
+        own = f"--seed {seed} --objects 0 --test-objects 20 --shapes {shapes} --swapped-levels 1234"
+        found[f"the four training materials, {shapes}"] = own, "test"
+    for shapes in ("matched", "wide"):
+        own = f"--materials broad --gaps --seed 701 --objects 60 --test-objects 0 --presses 10 --shapes {shapes}"
+        found[f"candidates: other materials, {shapes}"] = own, "train"
+    own = "--seed 703 --objects 10 --test-objects 10 --presses 12 --shapes matched"
+    found["candidates: training materials, matched"] = own, "train"
+    return found
+
+
+def run(*command):
+    print("$", *command, flush=True)
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+def simulated(trainer, path, options):
+    if not path.exists():
+        run(trainer, "simulate", *options.split(), "--out", str(path))
+
+
+def by_object(verdicts):
+    """Object -> level, presses, right ones, those in the interval, and the sum of squared Shore errors."""
+    counts = collections.OrderedDict()
+    with open(verdicts, newline="") as file:
+        for row in csv.DictReader(file):
+            own = counts.setdefault(int(row["object"]), [row["level"], 0, 0, 0, 0.0])
+            own[1] += 1
+            own[2] += row["level"] == row["judged"]
+            if row["shore"] and row["true_shore"]:
+                truth = float(row["true_shore"])
+                own[3] += float(row["shore_low"]) <= truth <= float(row["shore_high"])
+                own[4] += (float(row["shore"]) - truth) ** 2
+            else:
+                own[3:] = ["", ""]
+    return counts
+
+
+def measure(trainer, before, work):
+    work.mkdir(exist_ok=True)
+    for name, options in TRAINING.items():
+        simulated(trainer, work / f"{name}.npz", options)
+    models = {"default": HERE.parent.parent / "models/hrn.onnx", "before": before}
+    for name, (method, sources) in TRAINED.items():
+        directory = work / name.replace(",", "").replace(" ", "-")
+        models[name] = directory / "hrn.onnx"
+        if not models[name].exists():
+            data = [word for source in sources for word in ("--data", str(work / f"{source}.npz"))]
+            profile = ["--method", method, "--profile", "quick"]
+            run(trainer, "train", *profile, "--out", str(directory), "--resume", *data)
+    written = {"revision": run(trainer, "--version").strip(), "sets": {}, "evaluations": {}}
+    rows = []
+    for number, (name, (options, split)) in enumerate(sets().items()):
+        data = work / f"set-{number}.npz"
+        simulated(trainer, data, options)
+        written["sets"][name] = {"simulate": options, "split": split}
+        for model, path in models.items():
+            verdicts = work / "verdicts.csv"
+            common = ["--model", str(path), "--data", str(data), "--split", split, "--verdicts", str(verdicts)]
+            text = run(trainer, "evaluate", *common, "--json")
+            written["evaluations"].setdefault(name, {})[model] = json.loads(text)
+            for key, (level, n, right, held, squares) in by_object(verdicts).items():
+                squares = squares if squares == "" else f"{squares:.1f}"
+                rows.append([name, model, key, level, n, right, held, squares])
+    (HERE / "evaluations.json").write_text(json.dumps(written, indent=1) + "\n")
+    with open(HERE / "objects.csv", "w", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(["set", "model", "object", "level", "presses", "right", "in_interval", "squared_errors"])
+        table.writerows(rows)
+
+
+def table():
+    written = json.loads((HERE / "evaluations.json").read_text())
+    print("| Presses | Default model | Shore RMSE | Its interval holds | Beyond the neighbour |", end=" ")
+    print(" | ".join(MODELS[1:]), "|")
+    for name, found in written["evaluations"].items():
+        own, shore = found["default"], found["default"]["shore"]
+        low, high = (100 * end for end in own["accuracy_interval_by_object"])
+        cells = [name, f"{100 * own['accuracy']:.1f} % ({low:.1f} to {high:.1f})"]
+        cells.append(f"{shore['rmse']:.1f}" if shore else "-")
+        cells.append(f"{100 * shore['coverage']:.1f} %" if shore else "-")
+        cells.append(f"{100 * own['beyond_neighbour']:.1f} %")
+        cells += [f"{100 * found[model]['accuracy']:.1f} %" for model in MODELS[1:]]
+        print("|", " | ".join(cells), "|")
+    print("\n| Presses | Level 1 | Level 2 | Level 3 | Level 4 | Near a border |")
+    for name, found in written["evaluations"].items():
+        if shore := found["default"]["shore"]:
+            errors = [*shore["rmse_by_level"], shore["rmse_near_borders"]]
+            print("|", name, "|", " | ".join("-" if e is None else f"{e:.1f}" for e in errors), "|")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("trainer", nargs="?")
+    parser.add_argument("before", nargs="?", type=pathlib.Path)
+    parser.add_argument("--work", type=pathlib.Path, default=pathlib.Path("default-model-work"))
+    parser.add_argument("--table", action="store_true")
+    given = parser.parse_args()
+    if not given.table:
+        measure(given.trainer, given.before, given.work)
+    table()
