@@ -307,6 +307,23 @@ mod tests {
         Device::flex()
     }
 
+    fn making<'a>(
+        weights: &'a Weights,
+        statistics: &'a Statistics,
+        device: &'a Device,
+    ) -> Making<'a> {
+        Making {
+            weights,
+            statistics,
+            scale: Scale {
+                full_scale_n: 10.2,
+                log_above_n: 0.0,
+            },
+            sensor: Sensor::of([].iter()),
+            device,
+        }
+    }
+
     #[test]
     fn the_network_has_the_papers_number_of_parameters() {
         let weights = initial(1, &device());
@@ -346,16 +363,8 @@ mod tests {
         let statistics = statistics(&weights, 2, 1, &device());
         let mut stream = Stream::new(1, "generated");
         let samples = Generation::default().samples_a_component as usize;
-        let making = Making {
-            weights: &weights,
-            statistics: &statistics,
-            scale: Scale {
-                full_scale_n: 10.2,
-                log_above_n: 0.0,
-            },
-            sensor: Sensor::of([].iter()),
-            device: &device(),
-        };
+        let device = device();
+        let making = making(&weights, &statistics, &device);
         let frames = generate(&making, samples, &mut stream);
         // Thirty for each of the paper's 375 labelled samples per level.
         assert_eq!((samples, frames.len()), (225, 30 * 375));
@@ -398,17 +407,9 @@ mod tests {
         change("deconv3.kernel", |kernel| kernel.mul_scalar(3.0));
         change("deconv3.bias", |bias| bias.sub_scalar(3.4));
         let statistics = statistics(&weights, 2, 1, &device());
-        let making = Making {
-            weights: &weights,
-            statistics: &statistics,
-            scale: Scale {
-                full_scale_n: 10.2,
-                log_above_n: 0.0,
-            },
-            sensor: Sensor::of([].iter()),
-            device: &device(),
-        };
-        let eta = noise(4, &mut Stream::new(1, "drawn"), &device());
+        let device = device();
+        let making = making(&weights, &statistics, &device);
+        let eta = noise(4, &mut Stream::new(1, "drawn"), &device);
         let mut fixed = Normalisation::Fixed(&statistics);
         let once = frames(
             &images(&weights, eta, &mut fixed),
