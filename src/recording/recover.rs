@@ -278,7 +278,8 @@ struct Copy<W: Write> {
     out: mcap::Writer<NoSeek<W>>,
     schemas: BTreeMap<u16, (String, String, Vec<u8>)>,
     channels: BTreeMap<u16, Channel>,
-    /// The channels that the new file already has.
+    /// The schemas and the channels that the new file already has.
+    described: BTreeSet<u16>,
     begun: BTreeSet<u16>,
     done: Recovered,
 }
@@ -289,6 +290,7 @@ impl<W: Write> Copy<W> {
             out: writer::options().create(NoSeek::new(good))?,
             schemas: BTreeMap::new(),
             channels: BTreeMap::new(),
+            described: BTreeSet::new(),
             begun: BTreeSet::new(),
             done: Recovered::default(),
         })
@@ -307,11 +309,16 @@ impl<W: Write> Copy<W> {
             match record {
                 Record::Metadata(metadata) => self.out.write_metadata(&metadata)?,
                 Record::Schema { header, data } => {
-                    let schema = (header.name, header.encoding, data.into_owned());
-                    self.schemas.insert(header.id, schema);
+                    // A later record of the same number is damage: the new file can have one.
+                    if !self.described.contains(&header.id) {
+                        let schema = (header.name, header.encoding, data.into_owned());
+                        self.schemas.insert(header.id, schema);
+                    }
                 }
                 Record::Channel(channel) => {
-                    self.channels.insert(channel.id, channel);
+                    if !self.begun.contains(&channel.id) {
+                        self.channels.insert(channel.id, channel);
+                    }
                 }
                 Record::Message { header, data } => {
                     if !self.begin(header.channel_id, &data)? {
@@ -361,6 +368,7 @@ impl<W: Write> Copy<W> {
         if let Some((name, encoding, data)) = self.schemas.get(&schema_id) {
             self.out
                 .add_schema_with_id(schema_id, name, encoding, data)?;
+            self.described.insert(schema_id);
         } else if schema_id != 0 {
             return Ok(false);
         }
