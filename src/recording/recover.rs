@@ -308,17 +308,13 @@ impl<W: Write> Copy<W> {
         for record in records {
             match record {
                 Record::Metadata(metadata) => self.out.write_metadata(&metadata)?,
-                Record::Schema { header, data } => {
-                    // A later record of the same number is damage: the new file can have one.
-                    if !self.described.contains(&header.id) {
-                        let schema = (header.name, header.encoding, data.into_owned());
-                        self.schemas.insert(header.id, schema);
-                    }
+                // The new file has one schema and one channel of a number. A later one is damage.
+                Record::Schema { header, data } if !self.described.contains(&header.id) => {
+                    let schema = (header.name, header.encoding, data.into_owned());
+                    self.schemas.insert(header.id, schema);
                 }
-                Record::Channel(channel) => {
-                    if !self.begun.contains(&channel.id) {
-                        self.channels.insert(channel.id, channel);
-                    }
+                Record::Channel(channel) if !self.begun.contains(&channel.id) => {
+                    self.channels.insert(channel.id, channel);
                 }
                 Record::Message { header, data } => {
                     if !self.begin(header.channel_id, &data)? {
