@@ -11,13 +11,16 @@ labelled, five are unlabelled, and the last twelve are the test. WORK keeps data
 goes on. adapt.json, beside this file, has what `evaluate --json` prints for every sensor, draw and model.
 """
 
-import argparse
 import json
 import pathlib
 import statistics
-import subprocess
+import sys
 
 HERE = pathlib.Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent))
+
+import trainer as training  # noqa: E402
+
 BUILT_IN = HERE.parent.parent / "models/hrn.onnx"
 DRAWS = (1, 2, 3)
 LABELLED, UNLABELLED = 3, 5
@@ -29,17 +32,15 @@ SENSORS = {
     "A, wide shapes": ("--shapes wide --cover 1.5", 1.0),
 }
 COMMON = "--materials broad --gaps --objects 20 --test-objects 0 --presses 20 --sensor-profile raw"
-TRAINED = {
-    "features": ["--method", "features"],
-    "hrn100": ["--method", "hrn100", "--profile", "quick"],
-    "frame": ["--method", "frame", "--profile", "quick"],
+# Name -> the directory of the run, its command, and which of the draw's sets it learns from.
+LEARNT = {
+    "adapt": ("adapt", ["adapt"], "labelled"),
+    "adapt, unlabelled too": ("adapt-both", ["adapt"], "both"),
+    "features": ("features", ["train", "--method", "features"], "labelled"),
+    "hrn100": ("hrn100", ["train", "--method", "hrn100", "--profile", "quick"], "labelled"),
+    "frame": ("frame", ["train", "--method", "frame", "--profile", "quick"], "labelled"),
 }
-MODELS = ("built-in", "adapt", "adapt, unlabelled too", *TRAINED)
-
-
-def run(*command):
-    print("$", *command, flush=True)
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+MODELS = ("built-in", *LEARNT)
 
 
 def split(path, factor, out):
@@ -68,30 +69,20 @@ def split(path, factor, out):
 
 
 def measure(trainer, work):
-    found = {}
+    found = {sensor: {model: [] for model in MODELS} for sensor in SENSORS}
     for sensor, (options, factor) in SENSORS.items():
         for draw in DRAWS:
             place = work / f"{sensor}-{draw}".replace(" ", "-").replace(",", "")
-            place.mkdir(parents=True, exist_ok=True)
-            if not (place / "test.npz").exists():
-                seeds = ["--seed", str(900 + draw), "--one-sensor", str(90 + draw)]
-                run(trainer, "simulate", *COMMON.split(), *options.split(), *seeds, "--out", str(place / "all.npz"))
-                split(place / "all.npz", factor, place)
-            labelled, both = str(place / "labelled.npz"), str(place / "both.npz")
-            commands = {"adapt": ["adapt", "--data", labelled], "adapt, unlabelled too": ["adapt", "--data", both]}
-            commands |= {name: ["train", *own, "--data", labelled] for name, own in TRAINED.items()}
-            for name in MODELS:
-                model = BUILT_IN
-                if name in commands:
-                    directory = place / name.split(",")[0] if name != MODELS[2] else place / "adapt-both"
-                    model = directory / "hrn.onnx"
-                    if not model.exists():
-                        run(trainer, *commands[name], "--out", str(directory), "--resume")
-                text = run(trainer, "evaluate", "--model", str(model), "--data", str(place / "test.npz"), "--json")
-                found.setdefault(sensor, {}).setdefault(name, []).append(json.loads(text))
-    written = {"revision": run(trainer, "--version").strip(), "common": COMMON, "sensors": SENSORS}
-    written["evaluations"] = found
-    (HERE / "adapt.json").write_text(json.dumps(written, indent=1) + "\n")
+            place.mkdir(exist_ok=True)
+            seeds = f"--seed {900 + draw} --one-sensor {90 + draw}"
+            split(trainer.simulated(place / "all.npz", f"{COMMON} {options} {seeds}"), factor, place)
+            models = {"built-in": BUILT_IN}
+            for name, (run, command, data) in LEARNT.items():
+                models[name] = trainer.learnt(place / run, *command, "--data", place / f"{data}.npz")
+            for name, model in models.items():
+                found[sensor][name].append(trainer.evaluated(model, place / "test.npz"))
+    written = {"common": COMMON, "sensors": SENSORS, "evaluations": found}
+    training.write(HERE / "adapt.json", trainer, written)
 
 
 def table():
@@ -106,11 +97,4 @@ def table():
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("trainer", nargs="?")
-    parser.add_argument("--work", type=pathlib.Path, default=pathlib.Path("adapt-work"))
-    parser.add_argument("--table", action="store_true")
-    given = parser.parse_args()
-    if not given.table:
-        measure(given.trainer, given.work)
-    table()
+    training.main(__doc__, measure, table)

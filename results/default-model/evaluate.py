@@ -15,14 +15,16 @@ interrupted call goes on. Written beside this file:
   lies in the model's interval, and the sum of squared Shore errors (the last two empty where one is unknown).
 """
 
-import argparse
-import collections
 import csv
 import json
 import pathlib
-import subprocess
+import sys
 
 HERE = pathlib.Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent))
+
+import trainer as training  # noqa: E402
+
 BROAD = "--materials broad --gaps --objects 300 --test-objects 0 --presses 10"
 NAMED = "--objects 25 --test-objects 0"
 TRAINING = {
@@ -32,7 +34,8 @@ TRAINING = {
     "fm": f"--seed 602 --shapes matched {BROAD}",
     "fw2": f"--seed 603 --shapes wide {BROAD}",
     "fm2": f"--seed 604 --shapes matched {BROAD}",
-}# Name -> the method, and what it learns from.
+}
+# Name -> the method, and what it learns from.
 TRAINED = {
     "features": ("features", list(TRAINING)),
     "features, random alone": ("features", ["fw", "fm", "fw2", "fm2"]),
@@ -67,19 +70,9 @@ def sets():
     return found
 
 
-def run(*command):
-    print("$", *command, flush=True)
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
-
-
-def simulated(trainer, path, options):
-    if not path.exists():
-        run(trainer, "simulate", *options.split(), "--out", str(path))
-
-
 def by_object(verdicts):
     """Object -> level, presses, right ones, those in the interval, and the sum of squared Shore errors."""
-    counts = collections.OrderedDict()
+    counts = {}
     with open(verdicts, newline="") as file:
         for row in csv.DictReader(file):
             own = counts.setdefault(int(row["object"]), [row["level"], 0, 0, 0, 0.0])
@@ -95,32 +88,26 @@ def by_object(verdicts):
 
 
 def measure(trainer, before, work):
-    work.mkdir(exist_ok=True)
-    for name, options in TRAINING.items():
-        simulated(trainer, work / f"{name}.npz", options)
+    data = {name: trainer.simulated(work / f"{name}.npz", options) for name, options in TRAINING.items()}
     models = {"default": HERE.parent.parent / "models/hrn.onnx", "before": before}
     for name, (method, sources) in TRAINED.items():
-        directory = work / name.replace(",", "").replace(" ", "-")
-        models[name] = directory / "hrn.onnx"
-        if not models[name].exists():
-            data = [word for source in sources for word in ("--data", str(work / f"{source}.npz"))]
-            profile = ["--method", method, "--profile", "quick"]
-            run(trainer, "train", *profile, "--out", str(directory), "--resume", *data)
-    written = {"revision": run(trainer, "--version").strip(), "sets": {}, "evaluations": {}}
+        command = ["train", "--method", method, "--profile", "quick"]
+        command += [word for source in sources for word in ("--data", data[source])]
+        models[name] = trainer.learnt(work / name.replace(",", "").replace(" ", "-"), *command)
+    found = {"sets": {}, "evaluations": {}}
     rows = []
     for number, (name, (options, split)) in enumerate(sets().items()):
-        data = work / f"set-{number}.npz"
-        simulated(trainer, data, options)
-        written["sets"][name] = {"simulate": options, "split": split}
+        test = trainer.simulated(work / f"set-{number}.npz", options)
+        found["sets"][name] = {"simulate": options, "split": split}
+        found["evaluations"][name] = {}
         for model, path in models.items():
             verdicts = work / "verdicts.csv"
-            common = ["--model", str(path), "--data", str(data), "--split", split, "--verdicts", str(verdicts)]
-            text = run(trainer, "evaluate", *common, "--json")
-            written["evaluations"].setdefault(name, {})[model] = json.loads(text)
+            evaluated = trainer.evaluated(path, test, "--split", split, "--verdicts", verdicts)
+            found["evaluations"][name][model] = evaluated
             for key, (level, n, right, held, squares) in by_object(verdicts).items():
                 squares = squares if squares == "" else f"{squares:.1f}"
                 rows.append([name, model, key, level, n, right, held, squares])
-    (HERE / "evaluations.json").write_text(json.dumps(written, indent=1) + "\n")
+    training.write(HERE / "evaluations.json", trainer, found)
     with open(HERE / "objects.csv", "w", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(["set", "model", "object", "level", "presses", "right", "in_interval", "squared_errors"])
@@ -148,12 +135,4 @@ def table():
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("trainer", nargs="?")
-    parser.add_argument("before", nargs="?", type=pathlib.Path)
-    parser.add_argument("--work", type=pathlib.Path, default=pathlib.Path("default-model-work"))
-    parser.add_argument("--table", action="store_true")
-    given = parser.parse_args()
-    if not given.table:
-        measure(given.trainer, given.before, given.work)
-    table()
+    training.main(__doc__, measure, table, "before")

@@ -10,13 +10,16 @@ that it trains on. No test material is looked at. WORK keeps the runs, so an int
 beside this file, has what `evaluate --json` prints.
 """
 
-import argparse
 import json
 import pathlib
 import statistics
-import subprocess
+import sys
 
 HERE = pathlib.Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent))
+
+import trainer as training  # noqa: E402
+
 SEEDS = (1, 2, 3)
 # full_scale_n, log_above_n.
 SCALES = [(10.2, 0.0), (1.0, 0.0), (0.3, 0.0), (10.2, 1.0), (10.2, 0.1), (10.2, 0.01)]
@@ -24,32 +27,21 @@ METHODS = ("hrn15", "hrn15-strong")
 HELD_OUT = "--seed 703 --objects 10 --test-objects 0 --presses 12 --shapes paper"
 
 
-def run(*command):
-    print("$", *command, flush=True)
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
-
-
 def measure(trainer, data, work):
-    work.mkdir(exist_ok=True)
-    held_out = work / "held-out.npz"
-    if not held_out.exists():
-        run(trainer, "simulate", *HELD_OUT.split(), "--out", str(held_out))
-    rows = []
+    held_out = trainer.simulated(work / "held-out.npz", HELD_OUT)
+    runs = []
     for method in METHODS:
         for full_scale_n, log_above_n in SCALES:
             config = work / f"{full_scale_n}-{log_above_n}.toml"
             config.write_text(f"full_scale_n = {full_scale_n}\n[network]\nlog_above_n = {log_above_n}\n")
             for seed in SEEDS:
+                own = ["--method", method, "--profile", "quick", "--seed", seed, "--config", config]
                 out = work / f"{method}-{full_scale_n}-{log_above_n}-{seed}"
-                if not (out / "hrn.onnx").exists():
-                    own = ["--method", method, "--profile", "quick", "--seed", str(seed), "--config", str(config)]
-                    run(trainer, "train", *own, "--data", data, "--out", str(out), "--resume")
-                judge = ["--model", str(out / "hrn.onnx"), "--data", str(held_out), "--split", "train", "--json"]
-                evaluation = json.loads(run(trainer, "evaluate", *judge))
+                model = trainer.learnt(out, "train", *own, "--data", data)
+                evaluation = trainer.evaluated(model, held_out, "--split", "train")
                 row = {"method": method, "full_scale_n": full_scale_n, "log_above_n": log_above_n, "seed": seed}
-                rows.append(row | {"evaluation": evaluation})
-    written = {"revision": run(trainer, "--version").strip(), "held_out": HELD_OUT, "runs": rows}
-    (HERE / "start.json").write_text(json.dumps(written, indent=1) + "\n")
+                runs.append(row | {"evaluation": evaluation})
+    training.write(HERE / "start.json", trainer, {"held_out": HELD_OUT, "runs": runs})
 
 
 def table():
@@ -66,12 +58,4 @@ def table():
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("trainer", nargs="?")
-    parser.add_argument("data", nargs="?")
-    parser.add_argument("--work", type=pathlib.Path, default=pathlib.Path("start-work"))
-    parser.add_argument("--table", action="store_true")
-    given = parser.parse_args()
-    if not given.table:
-        measure(given.trainer, given.data, given.work)
-    table()
+    training.main(__doc__, measure, table, "data")

@@ -1,0 +1,56 @@
+"""Calls `hrn-train` for the scripts in the directories beside this file.
+
+What a command made before is not made again, so an interrupted script goes on.
+"""
+
+import argparse
+import json
+import pathlib
+import subprocess
+
+
+class Trainer:
+    def __init__(self, program):
+        self.program = program
+
+    def run(self, *arguments):
+        """Runs a command, which is shown, and returns what it prints."""
+        command = [self.program, *map(str, arguments)]
+        print("$", *command, flush=True)
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+    def simulated(self, path, options):
+        """The data set at `path`, simulated with `options` unless it is there."""
+        if not path.exists():
+            self.run("simulate", *options.split(), "--out", path)
+        return path
+
+    def learnt(self, out, *command):
+        """The model of the run in `out`, which `command` makes or continues unless it is finished."""
+        model = out / "hrn.onnx"
+        if not model.exists():
+            self.run(*command, "--out", out, "--resume")
+        return model
+
+    def evaluated(self, model, data, *more):
+        """What `evaluate --json` prints."""
+        return json.loads(self.run("evaluate", "--model", model, "--data", data, *more, "--json"))
+
+
+def write(path, trainer, found):
+    """Writes what was found, with the program's revision."""
+    path.write_text(json.dumps({"revision": trainer.run("--version").strip()} | found, indent=1) + "\n")
+
+
+def main(description, measure, table, *inputs):
+    """Measures with the trainer, the `inputs` and the directory of --work, then prints the table. --table prints it only."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name in ("trainer", *inputs):
+        parser.add_argument(name, nargs="?", type=pathlib.Path)
+    parser.add_argument("--work", type=pathlib.Path, default=pathlib.Path("work"))
+    parser.add_argument("--table", action="store_true")
+    given = vars(parser.parse_args())
+    if not given["table"]:
+        given["work"].mkdir(parents=True, exist_ok=True)
+        measure(Trainer(given["trainer"]), *(given[name] for name in inputs), given["work"])
+    table()
