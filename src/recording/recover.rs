@@ -278,8 +278,9 @@ struct Copy<W: Write> {
     out: mcap::Writer<NoSeek<W>>,
     schemas: BTreeMap<u16, (String, String, Vec<u8>)>,
     channels: BTreeMap<u16, Channel>,
-    /// The schemas and the channels that the new file already has.
+    /// The schemas that the new file already has.
     described: BTreeSet<u16>,
+    /// The channels that the new file already has.
     begun: BTreeSet<u16>,
     done: Recovered,
 }

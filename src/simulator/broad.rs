@@ -2,7 +2,7 @@
 //!
 //! In: a stream. Out: a [`Body`] whose modulus follows from the Shore hardness by the durometer, so
 //! that the label is the durometer's reading. The ranges contain each number of the eight named
-//! materials, and are not centred on them: only three ranges have one of these numbers near the middle.
+//! materials. Three of them have such a number near their middle.
 
 use serde::{Deserialize, Serialize};
 
