@@ -10,11 +10,11 @@ use std::fmt::Write as _;
 
 use super::digits::{number, thousands};
 use crate::train::compare::results::{Comparison, Row, SwapEntry, Worth};
-use crate::train::compare::sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS, WORLDS};
+use crate::train::compare::sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS, WORLDS, clusters};
 use crate::train::judge::metrics::{self, Evaluation};
 use crate::train::run::history::{History, Stage};
 use cells::{
-    before_temperature, beside, deviation, interval, least, mean_of_assignments, mean_over_seeds,
+    before_temperature, beside, by_assignment, deviation, interval, least, mean_over_seeds,
     minus_features, minus_reference, most, of_entries, percent_of, with_spread,
 };
 
@@ -508,10 +508,13 @@ pub fn sets(worth: &Worth) -> Table {
     let mut table = Table::new("Other test sets", &note, &head);
     for (name, measured) in worth.sets.iter().filter(|(name, _)| *name != PAPER_SPLIT) {
         let evaluation = &measured.evaluation;
+        let objects = measured.objects.as_deref();
+        let estimate =
+            objects.and_then(|objects| metrics::accuracy_by_object(&[objects], clusters(name)));
         table.rows.push(vec![
             name.replace('_', " "),
             number(100.0 * evaluation.accuracy, 1),
-            interval_text(evaluation.accuracy_interval_by_object),
+            interval_text(estimate.and_then(|estimate| estimate.interval)),
             number(100.0 * evaluation.ece, 1),
         ]);
     }
@@ -539,10 +542,11 @@ pub fn swaps(swaps: &[SwapEntry]) -> Table {
     ];
     let mut table = Table::new("Materials swapped", note, &head);
     for group in swap_groups(swaps) {
-        let by_assignment = mean_of_assignments(&group);
-        let percents: Vec<f64> = by_assignment.values().copied().collect();
+        let percent = |swap: &&SwapEntry| (swap.swapped_levels, 100.0 * swap.test.accuracy);
+        let means = by_assignment(group.iter().map(percent));
+        let percents: Vec<f64> = means.values().copied().collect();
         let seeds: BTreeSet<u64> = group.iter().map(|swap| swap.seed).collect();
-        let unswapped = by_assignment.get(&[false; 4]);
+        let unswapped = means.get(&[false; 4]);
         table.rows.push(vec![
             group[0].method.clone(),
             thousands(group[0].labels as u64),

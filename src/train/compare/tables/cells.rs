@@ -112,14 +112,15 @@ pub(super) fn minus_reference(row: &Row, rows: &[Row], set: &str) -> String {
         .map_or("-".to_owned(), difference_text)
 }
 
-/// The accuracy of every assignment in per cent, as the mean over its seeds.
-pub(super) fn mean_of_assignments(group: &[&SwapEntry]) -> BTreeMap<[bool; 4], f64> {
-    let mut percents: BTreeMap<[bool; 4], Vec<f64>> = BTreeMap::new();
-    for swap in group {
-        let own = percents.entry(swap.swapped_levels).or_default();
-        own.push(100.0 * swap.test.accuracy);
+/// The mean value of every assignment over its seeds.
+pub(super) fn by_assignment(
+    values: impl IntoIterator<Item = ([bool; 4], f64)>,
+) -> BTreeMap<[bool; 4], f64> {
+    let mut found: BTreeMap<[bool; 4], Vec<f64>> = BTreeMap::new();
+    for (assignment, value) in values {
+        found.entry(assignment).or_default().push(value);
     }
-    let means = percents.into_iter().map(|(key, own)| (key, mean(&own)));
+    let means = found.into_iter().map(|(key, values)| (key, mean(&values)));
     means.collect()
 }
 
@@ -130,23 +131,17 @@ pub(super) fn minus_features(group: &[&SwapEntry], swaps: &[SwapEntry]) -> Strin
         return String::new();
     }
     let key = |swap: &SwapEntry| (swap.seed, swap.labels, swap.swapped_levels);
-    let (mut both, mut of_features) = (Vec::new(), Vec::new());
-    for own in group {
+    let of_features = |own: &&SwapEntry| {
         let mut others = swaps.iter().filter(|swap| swap.method == FEATURES);
-        if let Some(other) = others.find(|swap| key(swap) == key(own)) {
-            both.push(*own);
-            of_features.push(other);
-        }
-    }
-    if both.is_empty() {
+        let other = others.find(|swap| key(swap) == key(own))?;
+        let points = 100.0 * (own.test.accuracy - other.test.accuracy);
+        Some((own.swapped_levels, points))
+    };
+    let points = by_assignment(group.iter().filter_map(of_features));
+    let points: Vec<f64> = points.into_values().collect();
+    if points.is_empty() {
         return "-".to_owned();
     }
-    let (own, others) = (
-        mean_of_assignments(&both),
-        mean_of_assignments(&of_features),
-    );
-    let points = own.into_iter().zip(others.into_values());
-    let points: Vec<f64> = points.map(|((_, own), other)| own - other).collect();
     let (low, high) = (least(&points), most(&points));
     format!("{:+.1} ({low:+.1} to {high:+.1})", mean(&points))
 }
