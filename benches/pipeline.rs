@@ -44,6 +44,19 @@ fn pipeline(hrn: &Arc<Hrn>) -> Pipeline {
     Pipeline::new(sensor, Arc::clone(hrn), Clock::FrameRate)
 }
 
+/// Copies bytes as [`Decoder::push`] gets them.
+fn copy_chunks(bytes: &[u8], chunk_bytes: usize, copy: &mut Vec<u8>) {
+    for chunk in bytes.chunks(chunk_bytes) {
+        copy.extend_from_slice(black_box(chunk));
+    }
+}
+
+/// Two matrices whose product takes as many multiply-adds as `verdicts` of the built-in model: 1.01
+/// million each.
+fn factors(verdicts: usize) -> [Array2<f32>; 2] {
+    [[101 * verdicts, 100], [100, 100]].map(|dims| Array2::from_elem(dims, 0.5))
+}
+
 /// Measures bytes to frames.
 #[divan::bench(args = [1, CHUNK_BYTES, 4096])]
 fn decode(bencher: Bencher, chunk_bytes: usize) {
@@ -70,12 +83,7 @@ fn decode_floor(bencher: Bencher, chunk_bytes: usize) {
     bencher
         .counter(BytesCount::new(bytes.len()))
         .with_inputs(|| Vec::with_capacity(bytes.len()))
-        .bench_local_refs(|copy: &mut Vec<u8>| {
-            for chunk in bytes.chunks(chunk_bytes) {
-                copy.extend_from_slice(black_box(chunk));
-            }
-            copy.len()
-        });
+        .bench_local_refs(|copy| copy_chunks(&bytes, chunk_bytes, copy));
 }
 
 /// Measures bytes to events, with an early and a final verdict for each press. An item is a press.
@@ -117,14 +125,12 @@ fn bytes_to_events(bencher: Bencher) {
 #[divan::bench]
 fn bytes_to_events_floor(bencher: Bencher) {
     let bytes = recording();
-    let [left, right] = [[404, 100], [100, 100]].map(|dims| Array2::from_elem(dims, 0.5_f32));
+    let [left, right] = factors(4);
     bencher
         .counter(ItemsCount::new(2_usize))
         .with_inputs(|| Vec::with_capacity(bytes.len()))
-        .bench_local_refs(|copy: &mut Vec<u8>| {
-            for chunk in bytes.chunks(CHUNK_BYTES) {
-                copy.extend_from_slice(black_box(chunk));
-            }
+        .bench_local_refs(|copy| {
+            copy_chunks(&bytes, CHUNK_BYTES, copy);
             black_box(&left).dot(black_box(&right))
         });
 }
@@ -136,10 +142,10 @@ fn judge(bencher: Bencher) {
     bencher.bench_local(|| hrn.judge_check(2));
 }
 
-/// Measures as many multiply-adds as [`judge`] makes, 1.01 million, as a matrix product.
+/// Measures as many multiply-adds as [`judge`] makes, as a matrix product.
 #[divan::bench]
 fn judge_floor(bencher: Bencher) {
-    let [left, right] = [[101, 100], [100, 100]].map(|dims| Array2::from_elem(dims, 0.5_f32));
+    let [left, right] = factors(1);
     bencher.bench_local(|| black_box(&left).dot(black_box(&right)));
 }
 
