@@ -179,6 +179,43 @@ fn adapt_goes_on_from_the_built_in_model_and_from_what_it_made() {
 }
 
 #[test]
+fn adapt_finds_the_factor_of_newtons_that_are_twice_too_large() {
+    let mut samples = Dataset::read(Path::new(&place("own.npz"))).unwrap().samples;
+    for sample in &mut samples {
+        sample.frame = sample.frame.times(2.0);
+    }
+    let (data, model) = (place("twice.npz"), place("found/hrn.onnx"));
+    let file = std::fs::File::create(&data).unwrap();
+    dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+    let fixed = [
+        "adapt",
+        "--data",
+        &data,
+        "--config",
+        &place("settings.toml"),
+    ];
+    // The factor of the first model is part of the second one's start.
+    for more in [
+        ["--out", &place("found")].as_slice(),
+        &["--start", &model, "--out", &place("found-again")],
+    ] {
+        let output = done(&mut command(&[&fixed[..], more].concat()));
+        let said = String::from_utf8(output.stderr).unwrap();
+        let (_, factor) = said.split_once("forces times ").expect(&said);
+        let factor: f64 = factor.split_once(':').unwrap().0.parse().unwrap();
+        assert!((0.4..0.63).contains(&factor), "{said}");
+    }
+    let levels_right = |model: &str, frames: &str| {
+        let told = succeed(&["evaluate", "--model", model, "--data", frames, "--json"]);
+        let told: serde_json::Value = serde_json::from_str(&told).unwrap();
+        told["accuracy"].as_f64().unwrap()
+    };
+    let built_in = concat!(env!("CARGO_MANIFEST_DIR"), "/models/hrn.onnx");
+    let (before, found) = (levels_right(built_in, &data), levels_right(&model, &data));
+    assert!(found > before + 0.1, "{before} {found}");
+}
+
+#[test]
 fn a_model_of_another_network_is_no_start() {
     for (start, code, said) in [
         (

@@ -131,8 +131,8 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
     adapt(at, &whole);
 }
 
-/// Adapts a model. Without a real step the model stays the same. An adapted model can be adapted
-/// again.
+/// Adapts a model. Without a real step only the factor of the forces is new. An adapted model can be
+/// adapted again.
 fn adapt(at: &Path, start: &[u8]) {
     let simulate = "simulate --sequences --one-sensor 5 --cover 1 --objects 2 --test-objects 1 --presses 3 \
                     --fps 20 --seed 6 --out own.npz";
@@ -166,15 +166,26 @@ fn adapt(at: &Path, start: &[u8]) {
         "[training]\nepochs = 1\n[training.optimiser]\nlearning_rate = 1e-30\nweight_decay = 0.0\n",
     )
     .unwrap();
-    succeed(
+    let output = hrn_train(
         at,
         "adapt --data own.npz --config still.toml --start whole/hrn.onnx --out still",
     );
+    let said = String::from_utf8(output.stderr).unwrap();
+    let factor = said.split_once("forces times ").map_or(1.0, |(_, factor)| {
+        let factor: f32 = factor.split_once(':').unwrap().0.parse().unwrap();
+        // It is told with two digits, and is one of eight an octave.
+        2_f32.powf((factor.log2() * 8.0).round() / 8.0)
+    });
     let still = Hrn::load(&std::fs::read(at.join("still/hrn.onnx")).unwrap()).unwrap();
     let courses = Courses::read(&at.join("own.npz")).unwrap();
     for press in 0..courses.presses.len() {
         let course = course_of(&courses, press);
-        let [before, after] = [&before, &still].map(|hrn| hrn.judge_course(&course).unwrap());
+        let mut scaled = course.clone();
+        for moment in &mut scaled.moments {
+            moment.frame = moment.frame.times(factor);
+        }
+        let [before, after] =
+            [(&before, &scaled), (&still, &course)].map(|(hrn, of)| hrn.judge_course(of).unwrap());
         // The running average of unchanged weights has rounding errors.
         let pairs = before.probabilities.iter().zip(&after.probabilities);
         assert!(pairs.into_iter().all(|(a, b)| (a - b).abs() < 1e-5));
@@ -358,7 +369,7 @@ fn moduli_by_hertz(shapes: Shapes) -> (usize, f64) {
         ..CourseSettings::default()
     };
     let simulated = simulator::courses(&settings, 2, |_| {});
-    let presses = course::presses(&Courses::of(&simulated)).unwrap();
+    let presses = course::presses(&Courses::of(&simulated), 1.0).unwrap();
     let pairs: Vec<(f64, f64)> = presses
         .iter()
         .zip(&simulated)

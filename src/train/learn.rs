@@ -6,6 +6,7 @@ pub mod consistency;
 pub mod fit;
 pub mod epochs;
 pub mod conformal;
+pub mod force;
 pub mod frame;
 pub mod course;
 pub mod gan;

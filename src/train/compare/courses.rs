@@ -102,7 +102,7 @@ impl TestSet {
         let name = path.file_stem().unwrap_or(path.as_os_str());
         Ok(Self {
             name: name.to_string_lossy().into_owned(),
-            presses: course::presses(&courses)?,
+            presses: course::presses(&courses, 1.0)?,
             courses,
         })
     }
@@ -173,7 +173,7 @@ fn curves(sets: &[TestSet]) -> Option<(&str, Vec<Curve>)> {
 /// Fits the controls and judges the sets with them.
 fn controls(data: &[PathBuf], sets: &[TestSet]) -> anyhow::Result<Vec<CourseRow>> {
     let courses = read(data)?;
-    let presses = course::presses(&courses)?;
+    let presses = course::presses(&courses, 1.0)?;
     let learnt: Vec<&Press> = courses
         .labelled(Split::Train)
         .map(|place| &presses[place])

@@ -4,14 +4,18 @@
 //! calibration of sets of levels and intervals of Shore hardness on held-out objects. Metrics and
 //! checkpoints are written on the way. An interrupted run resumes with bit-identical results.
 
+use std::collections::BTreeSet;
+
 use burn::tensor::{Device, Tensor};
 
 use crate::frame::Frame;
 use crate::random::Stream;
 use crate::train::data::courses::Courses;
+use crate::train::data::dataset;
 use crate::train::learn::conformal::{Calibration, Judged};
 use crate::train::learn::epochs::{self, Batch};
 use crate::train::learn::learner::Learner;
+use crate::train::learn::{fit, force};
 use crate::train::net::course::{self, COLUMNS, FRAMES, Moment};
 use crate::train::net::frames::{self, FEATURES, Features};
 use crate::train::net::hrn;
@@ -51,19 +55,28 @@ pub struct Press {
     pub object: u32,
 }
 
-/// The presses of the data, each from the frame that began it.
+/// All presses of the data, each from the frame that began it, with all forces times
+/// `force_factor`.
 ///
 /// # Errors
 ///
 /// Fails if features cannot be computed.
-pub fn presses(courses: &Courses) -> anyhow::Result<Vec<Press>> {
+pub fn presses(courses: &Courses, force_factor: f32) -> anyhow::Result<Vec<Press>> {
+    let all: Vec<usize> = (0..courses.presses.len()).collect();
+    prepared(courses, &all, force_factor)
+}
+
+/// The presses of these numbers.
+fn prepared(courses: &Courses, numbers: &[usize], force_factor: f32) -> anyhow::Result<Vec<Press>> {
     let plan = Features::new()?;
-    let prepare = |(number, press): (usize, &crate::train::data::courses::Press)| {
+    let prepare = |&number: &usize| {
+        let press = &courses.presses[number];
         let rows = courses
             .rows(number)
             .filter(|&row| courses.time_s[row] >= 0.0);
         let rows: Vec<usize> = rows.take(FRAMES).collect();
-        let frames: Vec<Frame> = rows.iter().map(|&row| courses.frame(row)).collect();
+        let frame = |&row: &usize| courses.frame(row).times(force_factor);
+        let frames: Vec<Frame> = rows.iter().map(frame).collect();
         let features = plan.of(&frames)?;
         let moment = |(&row, of_frame): (&usize, &[f32])| Moment {
             time_s: courses.time_s[row],
@@ -83,7 +96,7 @@ pub fn presses(courses: &Courses) -> anyhow::Result<Vec<Press>> {
             object: press.object,
         })
     };
-    courses.presses.iter().enumerate().map(prepare).collect()
+    numbers.iter().map(prepare).collect()
 }
 
 impl Press {
@@ -137,7 +150,7 @@ pub struct Task<'a> {
 pub struct Trained {
     /// Weights of all layers.
     pub weights: Weights,
-    /// Mean and deviation of the columns.
+    /// The factor of the forces, which presses are prepared with, and mean and deviation of the columns.
     pub standard: Standard,
     /// The calibration of the verdicts.
     pub calibration: Calibration,
@@ -162,6 +175,37 @@ impl Trained {
         }
         judged
     }
+}
+
+/// The start, with the factor of the forces that makes the labels of the presses `train` most
+/// probable.
+///
+/// # Errors
+///
+/// Fails if features cannot be computed.
+pub fn with_force_factor(
+    mut start: Start,
+    courses: &Courses,
+    train: &[usize],
+    device: &Device,
+) -> anyhow::Result<Start> {
+    let labels = || train.iter().map(|&place| &courses.presses[place]);
+    let objects: BTreeSet<u32> = labels().map(|press| press.object).collect();
+    let trained = Trained {
+        weights: start.weights.clone(),
+        standard: start.standard.clone(),
+        calibration: Calibration::NONE,
+    };
+    let levels = dataset::levels().len();
+    let factor = force::factor(objects.len(), |factor| {
+        let presses = prepared(courses, train, start.standard.force_factor * factor)?;
+        let judged = trained.judge(&presses, levels, device);
+        let logits: Vec<Vec<f32>> = judged.into_iter().map(|(logits, _)| logits).collect();
+        let said = fit::probabilities(&logits, start.temperature, device);
+        Ok(force::mean_loss(&said, labels().map(|press| press.level)))
+    })?;
+    start.standard.force_factor *= factor;
+    Ok(start)
 }
 
 /// Trains from random weights or from `start` with its calibration, or continues from the stage's

@@ -4,6 +4,8 @@
 //! any. Out: weights, and the calibration of the verdicts. Training begins from random weights or
 //! from those of an exported file.
 
+use std::collections::BTreeSet;
+
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
 use crate::frame::Frame;
@@ -14,6 +16,7 @@ use crate::train::data::disturb;
 use crate::train::learn::conformal::{Calibration, Judged};
 use crate::train::learn::epochs::{self, Batch};
 use crate::train::learn::learner::Learner;
+use crate::train::learn::{fit, force};
 use crate::train::net::frame;
 use crate::train::net::frames::{FEATURES, Features};
 use crate::train::net::hrn;
@@ -61,7 +64,7 @@ pub struct Task<'a> {
 pub struct Trained {
     /// Weights of all layers.
     pub weights: Weights,
-    /// Mean and deviation of the features.
+    /// The factor of the forces, and mean and deviation of the features.
     pub standard: Standard,
     /// The calibration of the verdicts.
     pub calibration: Calibration,
@@ -91,7 +94,7 @@ impl Trained {
 }
 
 /// Trains from random weights or from `start`, or continues from the stage's last checkpoint in
-/// `run`.
+/// `run`. Before it goes on from `start`, it finds the factor of the sensor's forces.
 ///
 /// # Errors
 ///
@@ -101,7 +104,7 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
     let plan = Features::new()?;
     let kept = start.as_ref().map(|start| start.weights.clone());
     let start = match start {
-        Some(start) => start,
+        Some(start) => task.with_force_factor(start, &plan)?,
         None => {
             let rows = plan.of(&task.frames(task.train))?;
             Start {
@@ -129,7 +132,7 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
             .samples(task.dataset, task.train)
             .samples(task.dataset, task.held_out)
             .samples(task.dataset, unlabelled)
-            .numbers(standard.mean.iter().chain(&standard.deviation).copied())
+            .numbers(standard.numbers())
             .weights(&initial)
             .finish(),
         train: task.train,
@@ -165,6 +168,34 @@ impl Task<'_> {
     fn frames(&self, samples: &[usize]) -> Vec<Frame> {
         let frame = |&sample: &usize| self.dataset.samples[sample].frame;
         samples.iter().map(frame).collect()
+    }
+
+    /// The start, with the factor of the forces that makes the labels most probable.
+    fn with_force_factor(&self, mut start: Start, plan: &Features) -> anyhow::Result<Start> {
+        let samples = || {
+            self.train
+                .iter()
+                .map(|&sample| &self.dataset.samples[sample])
+        };
+        let objects: BTreeSet<Option<u32>> = samples().map(|sample| sample.object).collect();
+        let frames = self.frames(self.train);
+        let mut trained = Trained {
+            weights: start.weights.clone(),
+            standard: start.standard.clone(),
+            calibration: Calibration::NONE,
+        };
+        let factor = force::factor(objects.len(), |factor| {
+            trained.standard.force_factor = start.standard.force_factor * factor;
+            let judged = trained.judge(&frames, plan, self.levels, self.device)?;
+            let logits: Vec<Vec<f32>> = judged.into_iter().map(|(logits, _)| logits).collect();
+            let said = fit::probabilities(&logits, start.temperature, self.device);
+            Ok(force::mean_loss(
+                &said,
+                samples().map(|sample| sample.level),
+            ))
+        })?;
+        start.standard.force_factor *= factor;
+        Ok(start)
     }
 
     /// The frames of `samples`, each augmented as the settings say.

@@ -11,7 +11,8 @@ use crate::simulator::Split;
 use crate::train::data::courses::Courses;
 use crate::train::data::dataset::{self, LabelChoice, Source};
 use crate::train::learn::conformal::Calibration;
-use crate::train::learn::course::{self, Press, Task};
+use crate::train::learn::course::{self, Task};
+use crate::train::learn::force;
 use crate::train::model::course::finish;
 use crate::train::model::evaluated::Evaluated;
 use crate::train::model::file;
@@ -62,10 +63,23 @@ pub fn train(
     run: &Run,
     device: &Device,
 ) -> anyhow::Result<Option<Evaluated>> {
-    let presses = course::presses(courses)?;
     let all: Vec<usize> = courses.labelled(Split::Train).collect();
     let Description { settings, seed, .. } = description;
-    let (train, held_out) = hold_out(&presses, &all, settings.validation.share, *seed);
+    let (train, held_out) = hold_out(courses, &all, settings.validation.share, *seed);
+    let start = match start {
+        Some((start, calibration)) => Some((
+            course::with_force_factor(start, courses, &train, device)?,
+            calibration,
+        )),
+        None => None,
+    };
+    let force_factor = start
+        .as_ref()
+        .map_or(1.0, |(start, _)| start.standard.force_factor);
+    if let Some(account) = force::account(force_factor) {
+        crate::say!("{account}");
+    }
+    let presses = course::presses(courses, force_factor)?;
     let task = Task {
         stage: match start {
             Some(_) => "adapt",
@@ -114,8 +128,9 @@ pub fn start(hrn: &Hrn, bytes: &[u8], device: &Device) -> anyhow::Result<(Start,
 
 /// Splits presses by their objects into presses to learn from and presses to calibrate on. `share`
 /// is the share of the objects held out for calibration.
-fn hold_out(presses: &[Press], all: &[usize], share: f64, seed: u64) -> (Vec<usize>, Vec<usize>) {
-    let mut objects: Vec<u32> = all.iter().map(|&place| presses[place].object).collect();
+fn hold_out(courses: &Courses, all: &[usize], share: f64, seed: u64) -> (Vec<usize>, Vec<usize>) {
+    let object_of = |&place: &usize| courses.presses[place].object;
+    let mut objects: Vec<u32> = all.iter().map(object_of).collect();
     objects.sort_unstable();
     objects.dedup();
     Stream::new(seed, "held-out objects").shuffle(&mut objects);
@@ -123,5 +138,5 @@ fn hold_out(presses: &[Press], all: &[usize], share: f64, seed: u64) -> (Vec<usi
     let count = (share * objects.len() as f64).round() as usize;
     let held = &objects[..count.min(objects.len().saturating_sub(1))];
     all.iter()
-        .partition(|&&place| !held.contains(&presses[place].object))
+        .partition(|place| !held.contains(&object_of(place)))
 }

@@ -7,8 +7,8 @@ use burn::tensor::Device;
 use crate::frame::Frame;
 use crate::simulator::Split;
 use crate::train::data::dataset::{self, Dataset};
-use crate::train::learn::fit;
 use crate::train::learn::frame::{self, Task, Trained};
+use crate::train::learn::{fit, force};
 use crate::train::model::evaluated::Evaluated;
 use crate::train::model::export::{self, Recogniser};
 use crate::train::model::file;
@@ -68,6 +68,9 @@ pub fn train(
         device,
     };
     let trained = frame::fit(&task, start, run)?;
+    if let Some(account) = force::account(trained.standard.force_factor) {
+        crate::say!("{account}");
+    }
     let missing = trained.calibration.missing_interval();
     if let Some(missing) = missing.filter(|_| samples.has_shore()) {
         crate::say!("{missing}");

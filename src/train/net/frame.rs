@@ -84,7 +84,8 @@ impl Batch {
         standard: &Standard,
         device: &Device,
     ) -> anyhow::Result<Self> {
-        let rows = plan.of(frames)?;
+        let frames = standard.forces(frames.iter());
+        let rows = plan.of(&frames)?;
         let rows = rows.iter().enumerate();
         let rows: Vec<f32> = rows
             .map(|(at, &x)| standard.apply(at % FEATURES, x))
@@ -134,11 +135,10 @@ pub fn graph(
         bias: weights.numbers(&format!("{name}.bias")),
     };
     let layers: Vec<Folded> = TRUNK.iter().map(|of| layer(of.name)).collect();
-    let mut graph = Graph::default();
-    let pooled = hrn::trunk_nodes(&mut graph, &layers, SCALE, true);
-
-    let mut b = Builder(graph);
-    let (columns, _) = frames::nodes(&mut b, INPUT, 1);
+    let mut b = Builder(Graph::default());
+    let newtons = standard.forces_node(&mut b, INPUT);
+    let pooled = hrn::trunk_nodes(&mut b.0, &newtons, &layers, SCALE, true);
+    let (columns, _) = frames::nodes(&mut b, &newtons, 1);
     let columns = standard.nodes(&mut b, &columns);
     let columns = b.reshaped(&columns, &[1, FEATURES], "columns");
     let along = vec![integer("axis", 1)];
@@ -203,14 +203,19 @@ mod tests {
     fn the_graph_computes_what_training_does() {
         let device = Device::flex();
         let frames = frames();
-        let (batch, standard) = prepared(&frames, &device);
+        let (_, mut standard) = prepared(&frames, &device);
         let weights = initial(4, 2, &device);
-        let (graph, raw_logits, _) = graph(&weights, &standard, 4, [0.0; 2]);
-        let plan = Plan::new(graph, &raw_logits, &[1, 4]).unwrap();
-        let trained = numbers(&outputs(&weights, &batch));
-        for (frame, expected) in frames.iter().zip(trained.chunks(4 + shore::OUTPUTS)) {
-            for (found, expected) in plan.run(frame).unwrap().iter().zip(expected) {
-                assert!((found - expected).abs() < 1e-4, "{found} {expected}");
+        let features = Features::new().unwrap();
+        for force_factor in [1.0, 0.65] {
+            standard.force_factor = force_factor;
+            let (graph, raw_logits, _) = graph(&weights, &standard, 4, [0.0; 2]);
+            let plan = Plan::new(graph, &raw_logits, &[1, 4]).unwrap();
+            let batch = Batch::new(&frames, &features, &standard, &device).unwrap();
+            let trained = numbers(&outputs(&weights, &batch));
+            for (frame, expected) in frames.iter().zip(trained.chunks(4 + shore::OUTPUTS)) {
+                for (found, expected) in plan.run(frame).unwrap().iter().zip(expected) {
+                    assert!((found - expected).abs() < 1e-4, "{found} {expected}");
+                }
             }
         }
     }

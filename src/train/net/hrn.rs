@@ -127,7 +127,7 @@ pub fn graph(weights: &Weights, statistics: &Statistics, scale: Scale) -> (Graph
     let mut graph = Graph::default();
     let means = network::takes_means(weights);
     let folded = network::fold(weights, statistics);
-    let flat = trunk_nodes(&mut graph, &folded, scale, means);
+    let flat = trunk_nodes(&mut graph, graph::INPUT, &folded, scale, means);
     let features = weights.dims("head.matrix")[0];
     let bias = weights.numbers("head.bias");
     let matrix = weights.numbers("head.matrix");
@@ -141,12 +141,13 @@ pub fn graph(weights: &Weights, statistics: &Statistics, scale: Scale) -> (Graph
 /// them, `[1, 128]`. Returns the name of their output.
 pub(super) fn trunk_nodes(
     graph: &mut Graph,
+    newtons: &str,
     folded: &[network::Folded],
     scale: Scale,
     with_means: bool,
 ) -> String {
     // `network::trunk` raises the image by 1, too.
-    let mut x = scale.nodes(graph);
+    let mut x = scale.nodes(graph, newtons);
     for (layer, folded) in TRUNK.iter().zip(folded) {
         let name = layer.name;
         let dims = [layer.outputs, layer.inputs, layer.kernel, layer.kernel];

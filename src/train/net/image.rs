@@ -4,7 +4,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use serde::Serialize;
 
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
-use crate::train::net::graph::{self, Graph};
+use crate::train::net::graph::Graph;
 
 /// One scale for all frames, because force carries hardness: 0 N is -1, the full scale is 1.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -61,17 +61,17 @@ impl Scale {
         Tensor::from_data(TensorData::new(values, [batch, 1, ROWS, COLS]), device)
     }
 
-    /// Adds the nodes from the graph's input in newtons to the image raised by 1, so that the
+    /// Adds the nodes from `newtons` to the image raised by 1, so that the
     /// background is 0. Returns that value's name.
-    pub fn nodes(self, graph: &mut Graph) -> String {
+    pub fn nodes(self, graph: &mut Graph, newtons: &str) -> String {
         if self.log_above_n == 0.0 {
             let scale = graph.constant("scale", &[], &[(2.0 / self.full_scale_n) as f32]);
-            return graph.node("Mul", &[graph::INPUT, &scale], "image", Vec::new());
+            return graph.node("Mul", &[newtons, &scale], "image", Vec::new());
         }
         let scale = graph.constant("scale", &[], &[(1.0 / self.log_above_n) as f32]);
         let one = graph.constant("one", &[], &[1.0]);
         let factor = graph.constant("log factor", &[], &[self.log_factor()]);
-        let scaled = graph.node("Mul", &[graph::INPUT, &scale], "scaled", Vec::new());
+        let scaled = graph.node("Mul", &[newtons, &scale], "scaled", Vec::new());
         let raised = graph.node("Add", &[&scaled, &one], "raised", Vec::new());
         let log = graph.node("Log", &[&raised], "log", Vec::new());
         graph.node("Mul", &[&log, &factor], "image", Vec::new())

@@ -4,7 +4,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::train::net::network::Weights;
 use crate::train::net::shore;
-use crate::train::net::standard::Standard;
+use crate::train::net::standard::{FORCE_FACTOR, Standard};
 
 /// Shape and numbers of a constant of an exported graph.
 pub type Constant = (Vec<usize>, Vec<f32>);
@@ -14,7 +14,7 @@ pub type Constant = (Vec<usize>, Vec<f32>);
 pub struct Start {
     /// Weights of all layers.
     pub weights: Weights,
-    /// Mean and deviation of the columns.
+    /// The factor of the forces, and mean and deviation of the columns.
     pub standard: Standard,
     /// The temperature by which the logits are divided.
     pub temperature: f32,
@@ -48,6 +48,7 @@ impl Start {
         Some(Self {
             weights,
             standard: Standard {
+                force_factor: numbers(FORCE_FACTOR, 1).map_or(1.0, |factor| factor[0]),
                 mean: numbers("column means", columns)?,
                 deviation: numbers("column deviations", columns)?,
             },

@@ -178,7 +178,8 @@ pub fn graph(
     widths: [f32; 2],
 ) -> (Graph, String, String) {
     let mut b = Builder(Graph::default());
-    let (features, force) = frames::nodes(&mut b, "frames", FRAMES);
+    let newtons = standard.forces_node(&mut b, "frames");
+    let (features, force) = frames::nodes(&mut b, &newtons, FRAMES);
     let motion = b.motion(&force);
     let mut columns = vec![features.as_str()];
     columns.extend(motion.iter().map(String::as_str));
