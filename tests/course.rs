@@ -166,17 +166,13 @@ fn adapt(at: &Path, start: &[u8]) {
         "[training]\nepochs = 1\n[training.optimiser]\nlearning_rate = 1e-30\nweight_decay = 0.0\n",
     )
     .unwrap();
-    let output = hrn_train(
+    succeed(
         at,
         "adapt --data own.npz --config still.toml --start whole/hrn.onnx --out still",
     );
-    let said = String::from_utf8(output.stderr).unwrap();
-    let factor = said.split_once("forces times ").map_or(1.0, |(_, factor)| {
-        let factor: f32 = factor.split_once(':').unwrap().0.parse().unwrap();
-        // It is told with two digits, and is one of eight an octave.
-        2_f32.powf((factor.log2() * 8.0).round() / 8.0)
-    });
     let still = Hrn::load(&std::fs::read(at.join("still/hrn.onnx")).unwrap()).unwrap();
+    let factor = &still.card().metrics["force_factor"];
+    let factor = factor.as_f64().unwrap_or(1.0) as f32;
     let courses = Courses::read(&at.join("own.npz")).unwrap();
     for press in 0..courses.presses.len() {
         let course = course_of(&courses, press);

@@ -334,6 +334,7 @@ impl Stages<'_> {
             raw_logits,
             shore: None,
             temperature: trained.temperature,
+            force_factor: 1.0,
         };
         let probabilities = |frames: &[&Frame]| {
             let logits = trained.logits(frames.iter().copied(), scale, self.device);

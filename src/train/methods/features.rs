@@ -51,6 +51,7 @@ pub fn train(
         raw_logits,
         shore: None,
         temperature: 1.0,
+        force_factor: 1.0,
     };
     let probabilities = |frames: &[&Frame]| {
         let rows = features::features(frames.iter().copied())?;

@@ -182,6 +182,7 @@ fn finish(
         raw_logits,
         shore: samples.has_shore().then_some(shore),
         temperature: calibration.temperature,
+        force_factor: trained.standard.force_factor,
     };
     export::finish(
         run,

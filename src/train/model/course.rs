@@ -5,7 +5,7 @@ use burn::tensor::Device;
 use serde_json::json;
 
 use super::evaluated::{Case, Evaluated};
-use super::export::{data, range, validation};
+use super::export::{data, metrics, range, validation};
 use super::file;
 use crate::simulator::Split;
 use crate::train::data::courses::{self, Courses};
@@ -44,7 +44,7 @@ pub fn finish(
         threshold,
         ..
     } = trained.calibration;
-    let mut metrics = json!({ "temperature": temperature });
+    let mut metrics = metrics(temperature, trained.standard.force_factor);
     if let Some(missing) = trained.calibration.missing() {
         metrics["not_promised"] = json!(missing);
     }

@@ -32,6 +32,8 @@ pub struct Recogniser {
     pub shore: Option<String>,
     /// The divisor of the logits.
     pub temperature: f32,
+    /// The factor by which the graph multiplies forces first; 1 if it does not.
+    pub force_factor: f32,
 }
 
 /// Writes the model and its evaluation on the test split to the run's directory. `train` are the
@@ -59,7 +61,7 @@ pub fn finish(
         pitch_mm: dataset.pitch_mm() as f32,
         method: description.method.clone(),
         data: data(&description.data)?,
-        metrics: json!({ "temperature": recogniser.temperature }),
+        metrics: metrics(recogniser.temperature, recogniser.force_factor),
         validation: validation(&description.data).to_owned(),
         range: range(train.iter().map(|&index| dataset.samples[index].frame)),
         conformal: None,
@@ -70,6 +72,7 @@ pub fn finish(
             raw_logits,
             shore,
             temperature,
+            ..
         } = recogniser.clone();
         let outputs = file::Outputs {
             raw_logits,
@@ -94,6 +97,15 @@ pub fn finish(
     }
     run.write("hrn.onnx", &write(&card)?)?;
     Ok(evaluation)
+}
+
+/// What a file says of itself before it is measured.
+pub fn metrics(temperature: f32, force_factor: f32) -> serde_json::Value {
+    let mut metrics = json!({ "temperature": temperature });
+    if force_factor != 1.0 {
+        metrics["force_factor"] = json!(force_factor);
+    }
+    metrics
 }
 
 /// Judges samples with a model and evaluates its verdicts.
