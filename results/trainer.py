@@ -52,5 +52,5 @@ def main(description, measure, table, *inputs):
     given = vars(parser.parse_args())
     if not given["table"]:
         given["work"].mkdir(parents=True, exist_ok=True)
-        measure(Trainer(given["trainer"]), *(given[name] for name in inputs), given["work"])
+        measure(Trainer(given["trainer"].resolve()), *(given[name] for name in inputs), given["work"])
     table()

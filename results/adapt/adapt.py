@@ -6,9 +6,12 @@
     python3 results/adapt/adapt.py target/release/hrn-train --work WORK
     python3 results/adapt/adapt.py --table          # prints the table from the committed file
 
-A draw has 20 random objects of each level with 20 presses each, all on one sensor. Of each level, three objects are
-labelled, five are unlabelled, and the last twelve are the test. WORK keeps data sets and runs, so an interrupted call
-goes on. adapt.json, beside this file, has what `evaluate --json` prints for every sensor, draw and model.
+A draw has 20 objects of each level with 20 presses each, all on one sensor. Of each level, three objects are labelled,
+five are unlabelled, and the last twelve are the test. The objects are of random materials, or of the eight named ones.
+Then the two materials of a level take turns, so all three parts have both. One more model learns from 640 other objects
+of these materials on the same sensor: it shows how much the few objects leave to be learnt.
+
+WORK keeps data sets and runs, so an interrupted call goes on. adapt.json, beside this file, has what `evaluate --json` prints for every sensor, draw and model.
 """
 
 import json
@@ -24,64 +27,103 @@ import trainer as training  # noqa: E402
 BUILT_IN = HERE.parent.parent / "models/hrn.onnx"
 DRAWS = (1, 2, 3)
 LABELLED, UNLABELLED = 3, 5
-# Name -> options of `simulate`, and what the newtons are multiplied by.
-SENSORS = {
-    "A": ("--shapes matched --cover 1.5", 1.0),
-    "B": ("--shapes matched --cover 8", 1.0),
-    "A, newtons 1.5 times as large": ("--shapes matched --cover 1.5", 1.5),
-    "A, wide shapes": ("--shapes wide --cover 1.5", 1.0),
+PRESSES = "--presses 20 --sensor-profile raw"
+# Materials -> options of `simulate` for a number of objects of each level.
+MATERIALS = {
+    "random": lambda objects: f"--materials broad --gaps --objects {objects} --test-objects 0",
+    "named": lambda objects: f"--materials named --objects {objects // 2} --test-objects {objects // 2}",
 }
-COMMON = "--materials broad --gaps --objects 20 --test-objects 0 --presses 20 --sensor-profile raw"
+# Name -> the materials, more options, and what the newtons are multiplied by.
+SENSORS = {
+    "A": ("random", "--shapes matched --cover 1.5", 1.0),
+    "B": ("random", "--shapes matched --cover 8", 1.0),
+    "A, newtons 1.5 times as large": ("random", "--shapes matched --cover 1.5", 1.5),
+    "A, wide shapes": ("random", "--shapes wide --cover 1.5", 1.0),
+    "A, named materials": ("named", "--shapes matched --cover 1.5", 1.0),
+    "B, named materials": ("named", "--shapes matched --cover 8", 1.0),
+    "A, named materials, newtons 1.5 times as large": ("named", "--shapes matched --cover 1.5", 1.5),
+    "A, named materials, wide shapes": ("named", "--shapes wide --cover 1.5", 1.0),
+}
 # Name -> the directory of the run, its command, and which of the draw's sets it learns from.
 LEARNT = {
     "adapt": ("adapt", ["adapt"], "labelled"),
     "adapt, unlabelled too": ("adapt-both", ["adapt"], "both"),
     "features": ("features", ["train", "--method", "features"], "labelled"),
-    "hrn100": ("hrn100", ["train", "--method", "hrn100", "--profile", "quick"], "labelled"),
-    "frame": ("frame", ["train", "--method", "frame", "--profile", "quick"], "labelled"),
+    "hrn15-strong": ("strong", ["train", "--method", "hrn15-strong", "--labels", "240"], "labelled"),
+    "frame": ("frame", ["train", "--method", "frame"], "labelled"),
+    "frame, 640 objects": ("frame-many", ["train", "--method", "frame", "--profile", "quick"], "many"),
 }
 MODELS = ("built-in", *LEARNT)
 
 
-def split(path, factor, out):
-    """Writes the draw as three data sets: labelled, with unlabelled presses too, and the test."""
+def read(path, factor):
+    """A data set with scaled newtons, without the settings that no longer describe it."""
     import numpy
 
     data = dict(numpy.load(path))
     data["frames"] = (data["frames"] * factor).astype(numpy.float32)
-    place = numpy.zeros(len(data["level"]), int)
-    for level in (1, 2, 3, 4):
-        own = data["level"] == level
-        _, place[own] = numpy.unique(data["object"][own], return_inverse=True)
-    labelled, test = place < LABELLED, place >= LABELLED + UNLABELLED
     meta = json.loads(bytes(data["meta"]))
     meta["settings"] = None
     data["meta"] = numpy.frombuffer(json.dumps(meta).encode(), numpy.uint8)
+    return data
 
-    def write(name, kept, level=data["level"], split=0):
-        rows = {key: values[kept] for key, values in data.items() if key != "meta"}
-        rows |= {"level": level[kept], "split": numpy.full(kept.sum(), split, numpy.uint8), "meta": data["meta"]}
-        numpy.savez(out / f"{name}.npz", **rows)
 
-    write("labelled", labelled)
-    write("both", ~test, level=numpy.where(labelled, data["level"], 0).astype(numpy.uint8))
-    write("test", test, split=1)
+def write(path, data, kept, test=False, **changed):
+    """Writes the samples where `kept` is true."""
+    import numpy
+
+    changed["split"] = numpy.full(len(kept), test, numpy.uint8)
+    rows = {key: values[kept] for key, values in (data | changed).items() if key != "meta"}
+    numpy.savez(path, **rows, meta=data["meta"])
+
+
+def turns(data, taking_turns):
+    """The place of every sample's object among those of its level. Materials take turns, or objects keep their order."""
+    import numpy
+
+    place = numpy.zeros(len(data["level"]), int)
+    for level in (1, 2, 3, 4):
+        own = numpy.flatnonzero(data["level"] == level)
+        materials = data["material"][own] if taking_turns else numpy.zeros(len(own), int)
+        order = []
+        for material in numpy.unique(materials):
+            of_material = numpy.unique(data["object"][own[materials == material]])
+            order += [(turn, material, name) for turn, name in enumerate(of_material)]
+        places = {name: at for at, (_, _, name) in enumerate(sorted(order))}
+        place[own] = [places[name] for name in data["object"][own]]
+    return place
+
+
+def split(data, place, out):
+    """Writes the draw as three data sets: labelled, with unlabelled presses too, and the test."""
+    import numpy
+
+    labelled, test = place < LABELLED, place >= LABELLED + UNLABELLED
+    write(out / "labelled.npz", data, labelled)
+    write(out / "both.npz", data, ~test, level=numpy.where(labelled, data["level"], 0).astype(numpy.uint8))
+    write(out / "test.npz", data, test, test=True)
 
 
 def measure(trainer, work):
     found = {sensor: {model: [] for model in MODELS} for sensor in SENSORS}
-    for sensor, (options, factor) in SENSORS.items():
+    for sensor, (materials, more, factor) in SENSORS.items():
         for draw in DRAWS:
             place = work / f"{sensor}-{draw}".replace(" ", "-").replace(",", "")
             place.mkdir(exist_ok=True)
-            seeds = f"--seed {900 + draw} --one-sensor {90 + draw}"
-            split(trainer.simulated(place / "all.npz", f"{COMMON} {options} {seeds}"), factor, place)
+            options = f"{PRESSES} {more} --one-sensor {90 + draw}"
+            path = trainer.simulated(place / "all.npz", f"{MATERIALS[materials](20)} {options} --seed {900 + draw}")
+            data = read(path, factor)
+            split(data, turns(data, materials == "named"), place)
+            path = trainer.simulated(place / "many-all.npz", f"{MATERIALS[materials](160)} {options} --seed {950 + draw}")
+            data = read(path, factor)
+            write(place / "many.npz", data, data["level"] > 0)
             models = {"built-in": BUILT_IN}
             for name, (run, command, data) in LEARNT.items():
                 models[name] = trainer.learnt(place / run, *command, "--data", place / f"{data}.npz")
             for name, model in models.items():
                 found[sensor][name].append(trainer.evaluated(model, place / "test.npz"))
-    written = {"common": COMMON, "sensors": SENSORS, "evaluations": found}
+    sensors = {name: (MATERIALS[materials](20), *rest) for name, (materials, *rest) in SENSORS.items()}
+    written = {"common": PRESSES, "sensors": sensors, "evaluations": found}
     training.write(HERE / "adapt.json", trainer, written)
 
 
