@@ -4,8 +4,6 @@
 //! calibration of sets of levels and intervals of Shore hardness on held-out objects. Metrics and
 //! checkpoints are written on the way. An interrupted run resumes with bit-identical results.
 
-use std::collections::BTreeSet;
-
 use burn::tensor::{Device, Tensor};
 
 use crate::frame::Frame;
@@ -14,8 +12,8 @@ use crate::train::data::courses::Courses;
 use crate::train::data::dataset;
 use crate::train::learn::conformal::{Calibration, Judged};
 use crate::train::learn::epochs::{self, Batch};
+use crate::train::learn::force::{self, Label};
 use crate::train::learn::learner::Learner;
-use crate::train::learn::{fit, force};
 use crate::train::net::course::{self, COLUMNS, FRAMES, Moment};
 use crate::train::net::frames::{self, FEATURES, Features};
 use crate::train::net::hrn;
@@ -177,35 +175,32 @@ impl Trained {
     }
 }
 
-/// The start, with the factor of the forces that makes the labels of the presses `train` most
-/// probable.
+/// The start with its factor of the forces corrected by the labels of the presses `train`.
 ///
 /// # Errors
 ///
 /// Fails if features cannot be computed.
 pub fn with_force_factor(
-    mut start: Start,
+    start: Start,
     courses: &Courses,
     train: &[usize],
     device: &Device,
 ) -> anyhow::Result<Start> {
-    let labels = || train.iter().map(|&place| &courses.presses[place]);
-    let objects: BTreeSet<u32> = labels().map(|press| press.object).collect();
-    let trained = Trained {
-        weights: start.weights.clone(),
-        standard: start.standard.clone(),
-        calibration: Calibration::NONE,
-    };
-    let levels = dataset::levels().len();
-    let factor = force::factor(objects.len(), |factor| {
-        let presses = prepared(courses, train, start.standard.force_factor * factor)?;
-        let judged = trained.judge(&presses, levels, device);
-        let logits: Vec<Vec<f32>> = judged.into_iter().map(|(logits, _)| logits).collect();
-        let said = fit::probabilities(&logits, start.temperature, device);
-        Ok(force::mean_loss(&said, labels().map(|press| press.level)))
-    })?;
-    start.standard.force_factor *= factor;
-    Ok(start)
+    let presses = train.iter().map(|&place| &courses.presses[place]);
+    let labels: Vec<Label> = presses
+        .map(|press| (press.level, Some(press.object)))
+        .collect();
+    let weights = start.weights.clone();
+    force::corrected(start, &labels, device, |standard| {
+        let trained = Trained {
+            weights: weights.clone(),
+            standard: standard.clone(),
+            calibration: Calibration::NONE,
+        };
+        let presses = prepared(courses, train, standard.force_factor)?;
+        let judged = trained.judge(&presses, dataset::levels().len(), device);
+        Ok(judged.into_iter().map(|(logits, _)| logits).collect())
+    })
 }
 
 /// Trains from random weights or from `start` with its calibration, or continues from the stage's

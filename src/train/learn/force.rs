@@ -3,22 +3,63 @@
 //! A sensor may be calibrated wrongly, or have another cover. Then all its forces are too large or
 //! too small by about the same factor, and a model of other presses judges all of them too hard or
 //! too soft. A few labelled presses are enough to find one number.
+//!
+//! In: a model to start from, labels, and the model's logits for a factor. Out: the same model with
+//! the factor that makes the labels most probable.
+
+use std::collections::BTreeSet;
+
+use burn::tensor::Device;
+
+use crate::train::learn::fit;
+use crate::train::net::standard::Standard;
+use crate::train::net::start::Start;
 
 /// Steps of the search for an octave, and octaves on either side of 1.
 const STEPS: i32 = 8;
 const OCTAVES: i32 = 2;
 /// The standard deviation of the logarithm of the factor, before any press is seen: two sensors in
-/// three are off by less than 1.65.
+/// three are off by a factor of less than 1.65.
 const DEVIATION: f64 = 0.5;
+/// A level that is less probable than this counts as if it were as probable, so that no single
+/// press decides.
+const LEAST_PROBABILITY: f32 = 1e-6;
+
+/// The level 1..=L of a press, and the number of its object.
+pub type Label = (u8, Option<u32>);
+
+/// The start with its factor of the forces corrected. `logits` judges the labelled presses with the
+/// factor of the given standard.
+///
+/// # Errors
+///
+/// Returns an error of `logits`.
+pub fn corrected(
+    start: Start,
+    labels: &[Label],
+    device: &Device,
+    mut logits: impl FnMut(&Standard) -> anyhow::Result<Vec<Vec<f32>>>,
+) -> anyhow::Result<Start> {
+    let objects: BTreeSet<Option<u32>> = labels.iter().map(|&(_, object)| object).collect();
+    let with = |factor: f32| {
+        let mut standard = start.standard.clone();
+        standard.force_factor *= factor;
+        standard
+    };
+    let factor = most_probable(objects.len(), |factor| {
+        let said = fit::probabilities(&logits(&with(factor))?, start.temperature, device);
+        Ok(mean_loss(&said, labels))
+    })?;
+    Ok(Start {
+        standard: with(factor),
+        ..start
+    })
+}
 
 /// The factor that makes labels most probable, if it is lognormal about 1. `loss` gives the mean
 /// negative log-likelihood of the labels when all forces are multiplied by its argument. Presses of
 /// one object err alike, so the labels count as much as `objects` independent ones.
-///
-/// # Errors
-///
-/// Returns an error of `loss`.
-pub fn factor(
+fn most_probable(
     objects: usize,
     mut loss: impl FnMut(f32) -> anyhow::Result<f64>,
 ) -> anyhow::Result<f32> {
@@ -35,18 +76,19 @@ pub fn factor(
     Ok(best.1)
 }
 
-/// The mean negative log-likelihood of levels, each 1..=L, under rows of probabilities.
-pub fn mean_loss(probabilities: &[Vec<f32>], levels: impl Iterator<Item = u8>) -> f64 {
-    let of_one = |(row, level): (&Vec<f32>, u8)| {
-        // A level that is all but impossible costs no more than this, so that no single press decides.
-        -f64::from(row[usize::from(level) - 1].max(1e-6)).ln()
+/// The mean negative log-likelihood of the labels' levels under rows of probabilities.
+fn mean_loss(probabilities: &[Vec<f32>], labels: &[Label]) -> f64 {
+    let of_one = |(row, &(level, _)): (&Vec<f32>, &Label)| {
+        let probability = row[usize::from(level) - 1].max(LEAST_PROBABILITY);
+        -f64::from(probability).ln()
     };
-    let sum: f64 = probabilities.iter().zip(levels).map(of_one).sum();
+    let sum: f64 = probabilities.iter().zip(labels).map(of_one).sum();
     sum / probabilities.len().max(1) as f64
 }
 
-/// What the user is told of a factor, if it is not 1.
-pub fn account(factor: f32) -> Option<String> {
+/// What the user is told of the factor, if it is not 1.
+pub fn account(start: &Start) -> Option<String> {
+    let factor = start.standard.force_factor;
     ((factor - 1.0).abs() > 1e-3).then(|| {
         format!(
             "forces times {factor:.2}: by the labels, this sensor's newtons are {:.2} times those that the \
@@ -64,21 +106,20 @@ mod tests {
     fn the_factor_is_where_the_labels_are_most_probable() {
         // A model that is sure only at 0.5.
         let loss = |factor: f32| Ok(f64::from((factor / 0.5).ln().abs()));
-        assert_eq!(factor(12, loss).unwrap(), 0.5);
+        assert_eq!(most_probable(12, loss).unwrap(), 0.5);
     }
 
     #[test]
     fn without_evidence_the_factor_is_1() {
-        assert_eq!(factor(12, |_| Ok(1.0)).unwrap(), 1.0);
+        assert_eq!(most_probable(12, |_| Ok(1.0)).unwrap(), 1.0);
         let weak = |factor: f32| Ok(0.01 * f64::from((factor / 0.5).ln().abs()));
-        assert_eq!(factor(1, weak).unwrap(), 1.0);
-        assert_eq!(account(1.0), None);
+        assert_eq!(most_probable(1, weak).unwrap(), 1.0);
     }
 
     #[test]
     fn one_press_does_not_decide() {
         let rows = [vec![0.0, 1.0], vec![0.5, 0.5]];
-        let loss = mean_loss(&rows, [1, 2].into_iter());
+        let loss = mean_loss(&rows, &[(1, None), (2, None)]);
         let expected = (1e6_f64.ln() + 2.0_f64.ln()) / 2.0;
         assert!((loss - expected).abs() < 1e-3, "{loss}");
     }

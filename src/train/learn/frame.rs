@@ -4,8 +4,6 @@
 //! any. Out: weights, and the calibration of the verdicts. Training begins from random weights or
 //! from those of an exported file.
 
-use std::collections::BTreeSet;
-
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
 use crate::frame::Frame;
@@ -15,8 +13,8 @@ use crate::train::data::dataset::Dataset;
 use crate::train::data::disturb;
 use crate::train::learn::conformal::{Calibration, Judged};
 use crate::train::learn::epochs::{self, Batch};
+use crate::train::learn::force::{self, Label};
 use crate::train::learn::learner::Learner;
-use crate::train::learn::{fit, force};
 use crate::train::net::frame;
 use crate::train::net::frames::{FEATURES, Features};
 use crate::train::net::hrn;
@@ -94,7 +92,7 @@ impl Trained {
 }
 
 /// Trains from random weights or from `start`, or continues from the stage's last checkpoint in
-/// `run`. Before it goes on from `start`, it finds the factor of the sensor's forces.
+/// `run`.
 ///
 /// # Errors
 ///
@@ -104,7 +102,7 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
     let plan = Features::new()?;
     let kept = start.as_ref().map(|start| start.weights.clone());
     let start = match start {
-        Some(start) => task.with_force_factor(start, &plan)?,
+        Some(start) => start,
         None => {
             let rows = plan.of(&task.frames(task.train))?;
             Start {
@@ -161,6 +159,33 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
 }
 
 impl Task<'_> {
+    /// The start with its factor of the forces corrected by the labels of the training samples.
+    ///
+    /// # Errors
+    ///
+    /// Fails if features cannot be computed.
+    pub fn with_force_factor(&self, start: Start) -> anyhow::Result<Start> {
+        let plan = Features::new()?;
+        let samples = self
+            .train
+            .iter()
+            .map(|&sample| &self.dataset.samples[sample]);
+        let labels: Vec<Label> = samples
+            .map(|sample| (sample.level, sample.object))
+            .collect();
+        let frames = self.frames(self.train);
+        let weights = start.weights.clone();
+        force::corrected(start, &labels, self.device, |standard| {
+            let trained = Trained {
+                weights: weights.clone(),
+                standard: standard.clone(),
+                calibration: Calibration::NONE,
+            };
+            let judged = trained.judge(&frames, &plan, self.levels, self.device)?;
+            Ok(judged.into_iter().map(|(logits, _)| logits).collect())
+        })
+    }
+
     fn stream(&self, name: &str) -> Stream {
         Stream::new(self.seed, &format!("{} {name}", self.stage))
     }
@@ -168,34 +193,6 @@ impl Task<'_> {
     fn frames(&self, samples: &[usize]) -> Vec<Frame> {
         let frame = |&sample: &usize| self.dataset.samples[sample].frame;
         samples.iter().map(frame).collect()
-    }
-
-    /// The start, with the factor of the forces that makes the labels most probable.
-    fn with_force_factor(&self, mut start: Start, plan: &Features) -> anyhow::Result<Start> {
-        let samples = || {
-            self.train
-                .iter()
-                .map(|&sample| &self.dataset.samples[sample])
-        };
-        let objects: BTreeSet<Option<u32>> = samples().map(|sample| sample.object).collect();
-        let frames = self.frames(self.train);
-        let mut trained = Trained {
-            weights: start.weights.clone(),
-            standard: start.standard.clone(),
-            calibration: Calibration::NONE,
-        };
-        let factor = force::factor(objects.len(), |factor| {
-            trained.standard.force_factor = start.standard.force_factor * factor;
-            let judged = trained.judge(&frames, plan, self.levels, self.device)?;
-            let logits: Vec<Vec<f32>> = judged.into_iter().map(|(logits, _)| logits).collect();
-            let said = fit::probabilities(&logits, start.temperature, self.device);
-            Ok(force::mean_loss(
-                &said,
-                samples().map(|sample| sample.level),
-            ))
-        })?;
-        start.standard.force_factor *= factor;
-        Ok(start)
     }
 
     /// The frames of `samples`, each augmented as the settings say.

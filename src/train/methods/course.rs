@@ -66,19 +66,15 @@ pub fn train(
     let all: Vec<usize> = courses.labelled(Split::Train).collect();
     let Description { settings, seed, .. } = description;
     let (train, held_out) = hold_out(courses, &all, settings.validation.share, *seed);
-    let start = match start {
-        Some((start, calibration)) => Some((
-            course::with_force_factor(start, courses, &train, device)?,
-            calibration,
-        )),
-        None => None,
+    let corrected = |(start, calibration)| {
+        course::with_force_factor(start, courses, &train, device).map(|start| (start, calibration))
     };
-    let force_factor = start
-        .as_ref()
-        .map_or(1.0, |(start, _)| start.standard.force_factor);
-    if let Some(account) = force::account(force_factor) {
+    let start = start.map(corrected).transpose()?;
+    let of_start = start.as_ref().map(|(start, _)| start);
+    if let Some(account) = of_start.and_then(force::account) {
         crate::say!("{account}");
     }
+    let force_factor = of_start.map_or(1.0, |start| start.standard.force_factor);
     let presses = course::presses(courses, force_factor)?;
     let task = Task {
         stage: match start {

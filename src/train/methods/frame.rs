@@ -67,10 +67,13 @@ pub fn train(
         seed: description.seed,
         device,
     };
-    let trained = frame::fit(&task, start, run)?;
-    if let Some(account) = force::account(trained.standard.force_factor) {
+    let start = start
+        .map(|start| task.with_force_factor(start))
+        .transpose()?;
+    if let Some(account) = start.as_ref().and_then(force::account) {
         crate::say!("{account}");
     }
+    let trained = frame::fit(&task, start, run)?;
     let missing = trained.calibration.missing_interval();
     if let Some(missing) = missing.filter(|_| samples.has_shore()) {
         crate::say!("{missing}");

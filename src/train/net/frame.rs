@@ -84,7 +84,8 @@ impl Batch {
         standard: &Standard,
         device: &Device,
     ) -> anyhow::Result<Self> {
-        let frames = standard.forces(frames.iter());
+        let times = |frame: &Frame| frame.times(standard.force_factor);
+        let frames: Vec<Frame> = frames.iter().map(times).collect();
         let rows = plan.of(&frames)?;
         let rows = rows.iter().enumerate();
         let rows: Vec<f32> = rows

@@ -61,8 +61,8 @@ impl Scale {
         Tensor::from_data(TensorData::new(values, [batch, 1, ROWS, COLS]), device)
     }
 
-    /// Adds the nodes from `newtons` to the image raised by 1, so that the
-    /// background is 0. Returns that value's name.
+    /// Adds the nodes from `newtons` to the image raised by 1, so that the background is 0. Returns
+    /// that value's name.
     pub fn nodes(self, graph: &mut Graph, newtons: &str) -> String {
         if self.log_above_n == 0.0 {
             let scale = graph.constant("scale", &[], &[(2.0 / self.full_scale_n) as f32]);

@@ -1,6 +1,5 @@
 //! Forces and columns of numbers brought to one scale before a network sees them.
 
-use crate::frame::Frame;
 use crate::train::net::builder::Builder;
 
 /// The number of standard deviations from the mean at which a column is clipped, because a network
@@ -42,11 +41,6 @@ impl Standard {
             // The lower limit avoids a division by 0 for a column that never varies.
             deviation: variance.iter().map(|v| v.sqrt().max(1e-3) as f32).collect(),
         }
-    }
-
-    /// Frames with their forces times the factor.
-    pub fn forces<'a>(&self, frames: impl Iterator<Item = &'a Frame>) -> Vec<Frame> {
-        frames.map(|frame| frame.times(self.force_factor)).collect()
     }
 
     /// All numbers that an interrupted training must find unchanged.
