@@ -181,8 +181,8 @@ impl Settings {
         let paper = Self::default();
         match profile {
             Profile::Paper => paper,
-            // A tenth of the paper's steps in every stage. All methods take 34 minutes of one core
-            // per seed (`results/quick`).
+            // A tenth of the paper's steps in every stage. All methods take about an hour of one
+            // core per seed (`results/quick-three-seeds`).
             Profile::Quick => paper.with_epochs(50, 20),
             Profile::Smoke => Self {
                 generation: Generation {

@@ -4,9 +4,9 @@
 //! Images are kept as `[channels, rows, columns, batch]`. With the batch innermost, gathering the
 //! patches under a kernel copies whole runs of `batch` numbers. The product of the kernels
 //! `[outputs, inputs k k]` with these patches `[inputs k k, rows' columns' batch]` is already the
-//! next layer's image, and a channel's statistics are those of a row. An HRN step of 100 takes
-//! 9.5 ms of a core (`results/quick`). With burn's own convolution and the system's allocator it
-//! took more than twice as long as with these (`benches/train_step.rs`, 2026-11-21).
+//! next layer's image, and a channel's statistics are those of a row. With burn's own
+//! convolution and the system's allocator an HRN step takes more than twice as long as with these
+//! (`benches/train_step.rs`, 2026-11-21).
 //!
 //! [`patches`] and [`from_patches`] are each other's adjoint, so the transposed convolution is the
 //! same two steps in the other order, and so are all gradients.
