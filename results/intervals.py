@@ -5,6 +5,7 @@
     python3 results/intervals.py results/quick-three-seeds                   # accuracies, set `matched`
     python3 results/intervals.py results/quick-three-seeds --less hrn15      # each accuracy minus that of hrn15
     python3 results/intervals.py results/quick-three-seeds --set fresh       # another set of objects.csv
+    python3 results/intervals.py results/course --set others-matched         # a set of course.json
 
 A difference is taken object by object under the same seed, so what is hard for both methods cancels out.
 
@@ -17,6 +18,7 @@ may differ by some tenths of a point.
 import argparse
 import collections
 import csv
+import json
 import pathlib
 import re
 
@@ -24,6 +26,28 @@ import numpy
 import scipy.stats
 
 DRAWS = 20_000
+
+
+def of_objects(objects, geometries):
+    """[right, samples] by cluster. Objects whose numbers are equal modulo `geometries` are pressed alike."""
+    sums = {}
+    for number, right, samples in objects:
+        own = sums.setdefault(("", number % geometries), [0, 0])
+        own[0] += right
+        own[1] += samples
+    return sums
+
+
+def read_course(path, wanted):
+    """Right and all samples, by model, seed and cluster. The four materials of a shape have numbers that are apart by a
+    quarter of the objects."""
+    counts = {}
+    for model in json.loads(path.read_text()):
+        for found in model["sets"]:
+            if found["set"] == wanted:
+                objects = [(one["object"], one["right"], one["samples"]) for one in found["objects"]]
+                counts[model["name"]] = {1: of_objects(objects, len(objects) // 4)}
+    return counts
 
 
 def read(path, wanted):
@@ -89,9 +113,11 @@ def main():
     parser.add_argument("--set", default="matched")
     parser.add_argument("--less", metavar="METHOD")
     options = parser.parse_args()
-    methods = read(options.folder / "objects.csv", options.set)
+    course = options.folder / "course.json"
+    is_course = course.exists()
+    methods = read_course(course, options.set) if is_course else read(options.folder / "objects.csv", options.set)
     if not methods:
-        parser.error(f"objects.csv has no set {options.set}")
+        parser.error(f"there is no set {options.set}")
     if options.less and options.less not in methods:
         parser.error(f"found no {options.less}; the methods are {', '.join(methods)}")
     for method, seeds in methods.items():
@@ -106,4 +132,5 @@ def main():
         print(f"{method:22} {len(counts)} seeds  {mean}  {low} to {high}")
 
 
-main()
+if __name__ == "__main__":
+    main()
