@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Draws docs/labels.png, accuracy against labels.
+"""Draws docs/labels.png, accuracy against labels, and prints the tables of that section of docs/results.md.
 
-    pip install matplotlib && python results/labels.py
+    pip install matplotlib scipy && python results/labels.py
 
 `fixmatch` is in results/quick-three-seeds/results.json, the other methods are in results/labels/results.json. Both
 comparisons learnt from the same data under the same seeds. Runs that are in both have the same accuracies: the script
@@ -10,11 +10,13 @@ ends with an error if one differs.
 
 import json
 import pathlib
+import statistics
 
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
+import scipy.stats  # noqa: E402
 
 HERE = pathlib.Path(__file__).resolve().parent
 LOOKS = {
@@ -23,24 +25,58 @@ LOOKS = {
     "fixmatch": ("#9467bd", "D", "fixmatch: unlabelled presses, too"),
     "features": ("#d62728", "s", "features: logistic regression on 18 features"),
 }
+# Set -> its description.
+SETS = {
+    "matched": "the four test materials, matched shapes",
+    "wide": "the four test materials, wide shapes",
+    "broad": "random materials, matched shapes",
+    "broad_wide": "random materials, wide shapes",
+}
+BUDGETS = (60, 150, 375, 1500, 10000)
 
 
-def accuracies(folder):
+def accuracies(folder, wanted):
     """(method, labels) -> seed -> accuracy in per cent, of the runs whose labels are of whole objects."""
     found = {}
     for run in json.loads((HERE / folder / "results.json").read_text()):
         if run["method"] in LOOKS and run["label_choice"] == "object":
             seeds = found.setdefault((run["method"], run["labels"]), {})
-            seeds[run["seed"]] = 100 * run["matched"]["accuracy"]
+            seeds[run["seed"]] = 100 * ({"matched": run["matched"]} | run["shifts"])[wanted]["accuracy"]
     return found
 
 
-def main():
-    runs, later = accuracies("labels"), accuracies("quick-three-seeds")
+def joined(wanted):
+    """The accuracies on a set of both comparisons."""
+    runs, later = accuracies("labels", wanted), accuracies("quick-three-seeds", wanted)
     for shared in runs.keys() & later.keys():
         assert runs[shared] == later[shared], f"{shared} differs: {runs[shared]}, {later[shared]}"
-    runs.update(later)
-    figure, axes = plt.subplots(figsize=(8, 4.2), layout="constrained")
+    return runs | later
+
+
+def difference(seeds, others):
+    """The mean difference under the same seeds, with its 95 % interval by Student's t over them."""
+    values = [seeds[seed] - others[seed] for seed in seeds]
+    mean = statistics.mean(values)
+    reach = scipy.stats.t.ppf(0.975, len(values) - 1) * statistics.stdev(values) / len(values) ** 0.5
+    return f"{mean:+.1f} ({mean - reach:+.1f} to {mean + reach:+.1f})"
+
+
+def tables():
+    for wanted, title in SETS.items():
+        runs = joined(wanted)
+        print(f"{title}\n| Labels |", " | ".join(LOOKS), "|")
+        for labels in BUDGETS:
+            cells = (runs.get((method, labels)) for method in LOOKS)
+            print(f"| {labels:,} |", " | ".join(f"{statistics.mean(c.values()):.1f} %" if c else "" for c in cells), "|")
+        print("less hrn15-strong")
+        for labels in BUDGETS[:-1]:
+            own = runs["hrn15-strong", labels]
+            cells = (difference(runs[method, labels], own) for method in ("self-training", "fixmatch"))
+            print(f"| {labels:,} |", " | ".join(cells), "|")
+        print()
+
+
+def draw(axes, runs, title):
     for shift, (method, (colour, marker, label)) in zip((0.955, 0.985, 1.015, 1.045), LOOKS.items()):
         labels = sorted(number for name, number in runs if name == method)
         means = [sum(runs[method, n].values()) / len(runs[method, n]) for n in labels]
@@ -51,13 +87,22 @@ def main():
             seeds = runs[method, n].values()
             axes.plot([place] * len(seeds), list(seeds), marker, color=colour, markersize=5, alpha=0.6)
     axes.set_xscale("log")
-    ticks = [60, 150, 375, 1500, 10000]
-    axes.set_xticks(ticks, [f"{n:,}" for n in ticks])
+    axes.set_xticks(BUDGETS, [f"{n:,}" for n in BUDGETS])
     axes.minorticks_off()
-    axes.set_xlabel("labelled presses (50 of an object)")
-    axes.set_ylabel("accuracy, per cent (a mark for each seed)")
+    axes.set_title(title, fontsize=10)
     axes.grid(alpha=0.3)
-    axes.legend(loc="lower right")
+
+
+def main():
+    tables()
+    figure, grid = plt.subplots(2, 2, figsize=(10, 7), layout="constrained", sharex=True)
+    for axes, (wanted, title) in zip(grid.flat, SETS.items()):
+        draw(axes, joined(wanted), title)
+    for axes in grid[1]:
+        axes.set_xlabel("labelled presses (50 of an object)")
+    figure.supylabel("accuracy, per cent (a mark for each seed)", fontsize=10)
+    handles, names = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=2)
     figure.savefig(HERE.parent / "docs/labels.png", dpi=110)
 
 

@@ -1,9 +1,8 @@
 //! A frame as another sensor of the same kind would have given it.
 //!
 //! Gains, a light cover's crosstalk, noise, the activation threshold and dead taxels are drawn anew
-//! for each frame, over ranges wider than one sensor's (`docs/method.md`). Forces are rounded to
-//! counts. The press stays: total force changes by about ten per cent, and the contact keeps its
-//! place.
+//! for each frame, so that the frames are of many sensors. Forces are rounded to counts. The press
+//! stays: total force changes by about ten per cent, and the contact keeps its place.
 
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::random::Stream;

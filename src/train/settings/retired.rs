@@ -1,11 +1,11 @@
 //! Options that only earlier versions had, in the settings of their runs.
 //!
-//! `docs/method.md` says what the options did. None of them helped.
+//! None of them helped. `docs/method.md` names them.
 
 use super::SettingsError;
 
 /// The last revision that knew the options.
-const LAST_REVISION: &str = "637834a";
+const LAST_REVISION: &str = "e2a4848";
 /// The table, the key and the default of each option.
 const OPTIONS: [(&str, &str, Default); 5] = [
     ("", "minibatch_discrimination", Default::Off),
@@ -79,7 +79,7 @@ mod tests {
         let error = strip(&mut table).unwrap_err().to_string();
         assert_eq!(
             error,
-            "the run used `stgan.turns`, which is gone: read it with revision 637834a"
+            "the run used `stgan.turns`, which is gone: read it with revision e2a4848"
         );
     }
 }
