@@ -226,7 +226,7 @@ fn a_model_of_another_network_is_no_start() {
         (
             "models/course.onnx",
             78,
-            "starts from models of frames (frame, adapt)",
+            "starts from models of single frames (any method but features)",
         ),
         ("Cargo.toml", 78, "not an ONNX model"),
         ("missing.onnx", 66, "No such file"),
@@ -249,5 +249,100 @@ fn a_model_of_another_network_is_no_start() {
             "{error}"
         );
         assert!(!Path::new(&place("none")).exists(), "{error}");
+    }
+}
+
+/// A model of the paper's network that learnt the presses of `wide.npz` by heart.
+fn paper_network() -> &'static str {
+    static MODEL: OnceLock<String> = OnceLock::new();
+    MODEL.get_or_init(|| {
+        let (run, settings) = (place("paper-network"), place("by-heart.toml"));
+        let by_heart = "
+            [training]
+            epochs = 60
+            batch = 16
+            [training.optimiser]
+            rule = \"adam\"
+            learning_rate = 0.002
+        ";
+        std::fs::write(&settings, by_heart).unwrap();
+        let data = place("wide.npz");
+        let fixed = ["train", "--method", "hrn100", "--data", &data];
+        succeed(&[&fixed[..], &["--out", &run, "--config", &settings]].concat());
+        format!("{run}/hrn.onnx")
+    })
+}
+
+#[test]
+fn adapt_goes_on_from_the_papers_network_and_finds_its_factor_too() {
+    let mut samples = Dataset::read(Path::new(&place("wide.npz")))
+        .unwrap()
+        .samples;
+    for sample in &mut samples {
+        sample.frame = sample.frame.times(4.0);
+    }
+    let (data, first) = (place("wide-loud.npz"), place("paper-adapted/hrn.onnx"));
+    let file = std::fs::File::create(&data).unwrap();
+    dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+    // What was made can be a start, and its factor stays.
+    for (start, out) in [
+        (paper_network(), "paper-adapted"),
+        (&first, "paper-adapted-again"),
+    ] {
+        let (settings, out) = (place("settings.toml"), place(out));
+        let output = done(&mut command(&[
+            "adapt", "--data", &data, "--start", start, "--config", &settings, "--out", &out,
+        ]));
+        let said = String::from_utf8(output.stderr).unwrap();
+        let (_, factor) = said.split_once("forces times ").expect(&said);
+        let factor: f64 = factor.split_once(':').unwrap().0.parse().unwrap();
+        assert!((0.24..0.6).contains(&factor), "{said}");
+        let model = std::fs::read(Path::new(&out).join("hrn.onnx")).unwrap();
+        let card = Hrn::load(&model).unwrap().card().clone();
+        assert_eq!(card.method, "adapt");
+        let stated = card.metrics["force_factor"].as_f64().unwrap();
+        assert!((stated - factor).abs() < 0.01, "{stated} {factor}");
+    }
+    let right = |model: &str| {
+        let split = ["--split", "train", "--json"];
+        let told =
+            succeed(&[&["evaluate", "--model", model, "--data", &data], &split[..]].concat());
+        let told: serde_json::Value = serde_json::from_str(&told).unwrap();
+        told["accuracy"].as_f64().unwrap()
+    };
+    let (before, after) = (right(paper_network()), right(&first));
+    assert!(after > before + 0.1, "{before} {after}");
+}
+
+#[test]
+fn a_model_without_what_training_needs_is_no_start() {
+    let bytes = std::fs::read(paper_network()).unwrap();
+    let key = b"hrn.unfolded";
+    let place_of_key = bytes
+        .windows(key.len())
+        .position(|window| window == key)
+        .unwrap();
+    let mut without = bytes.clone();
+    without[place_of_key] = b'x';
+    let mut damaged = bytes;
+    let text = &mut damaged[place_of_key + key.len()..];
+    let gamma = text.windows(5).position(|word| word == b"gamma").unwrap();
+    text[gamma] = b'x';
+    for (name, bytes, said) in [
+        ("without.onnx", without, "has no `hrn.unfolded`"),
+        ("damaged.onnx", damaged, "hrn.unfolded"),
+    ] {
+        let path = place(name);
+        std::fs::write(&path, bytes).unwrap();
+        let (data, out) = (place("own.npz"), place("none"));
+        let output = command(&["adapt", "--data", &data, "--start", &path, "--out", &out])
+            .output()
+            .unwrap();
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(78), "{error}");
+        assert!(
+            error.contains(said) && error.lines().count() == 1,
+            "{error}"
+        );
     }
 }

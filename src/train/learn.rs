@@ -7,6 +7,7 @@ pub mod fit;
 pub mod epochs;
 pub mod conformal;
 pub mod force;
+pub mod adapt;
 pub mod frame;
 pub mod course;
 pub mod gan;

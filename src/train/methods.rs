@@ -1,5 +1,6 @@
 //! The methods of the table, each a sequence of the same stages.
 
+pub mod adapt;
 pub mod course;
 pub mod features;
 pub mod frame;
@@ -58,7 +59,7 @@ pub enum Method {
     /// Judges a frame and gives its Shore hardness: convolutions beside hand-made features, on all labels.
     /// The default model is of this method.
     Frame,
-    /// `hrn-train adapt`: continues a model of `frame`.
+    /// `hrn-train adapt`: continues the model of a file.
     #[value(skip)]
     Adapt,
     /// Judges the course of a press with the arm's motion, and gives its Shore hardness: a temporal
@@ -407,7 +408,7 @@ pub fn train(
         Method::Igan => stages.semi_supervised("igan", Game::FeatureMatching)?,
         _ => stages.trained("hrn", stages.random())?,
     };
-    stages.finish(&trained)
+    stages.finish(&trained, 1.0)
 }
 
 /// The training samples whose level is not used: all except `labelled` and the other presses of the

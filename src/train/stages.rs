@@ -12,6 +12,7 @@ use crate::random::Stream;
 use crate::simulator::Split;
 use crate::train::data::dataset::{Dataset, Sample};
 use crate::train::judge::sheet::{self, Strip};
+use crate::train::learn::adapt;
 use crate::train::learn::fit::{self, Trained};
 use crate::train::learn::gan::{self, Gan};
 use crate::train::model::evaluated::Evaluated;
@@ -21,6 +22,7 @@ use crate::train::net::hrn;
 use crate::train::net::image::Scale;
 use crate::train::net::losses::Game;
 use crate::train::net::network::Weights;
+use crate::train::net::unfolded::{Start, Unfolded};
 use crate::train::run::{Description, Run};
 use crate::train::settings::{AugmentationSettings, GanSettings, Settings, Training, Validation};
 use crate::verdict::argmax;
@@ -241,11 +243,35 @@ impl Stages<'_> {
     ///
     /// Fails if the run's directory cannot be read or written, or the training diverges.
     pub fn consistent(&self, stage: &'static str, initial: Weights) -> anyhow::Result<Trained> {
-        let task = fit::Task {
-            unlabelled: Some((self.unlabelled, self.settings().consistency)),
+        fit::fit(&self.consistent_task(stage), initial, self.run)
+    }
+
+    fn consistent_task(&self, stage: &'static str) -> fit::Task<'_> {
+        let has_unlabelled = !self.unlabelled.is_empty();
+        let consistency = self.settings().consistency;
+        fit::Task {
+            unlabelled: has_unlabelled.then_some((self.unlabelled, consistency)),
             ..self.fit_task(stage)
-        };
-        fit::fit(&task, initial, self.run)
+        }
+    }
+
+    /// The start with its factor of the forces corrected by the labelled samples.
+    ///
+    /// # Errors
+    ///
+    /// Fails as [`adapt::with_force_factor`] does.
+    pub fn with_force_factor(&self, start: Start) -> anyhow::Result<Start> {
+        adapt::with_force_factor(start, &self.fit_task("adapt"))
+    }
+
+    /// Continues to train an exported HRN on the labelled samples and, by consistency, on the
+    /// unlabelled ones, if there are any.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the run's directory cannot be read or written, or the training diverges.
+    pub fn adapted(&self, stage: &'static str, start: &Start) -> anyhow::Result<Trained> {
+        adapt::fit(&self.consistent_task(stage), start, self.run)
     }
 
     /// Trains HRN on the labelled samples and on the unlabelled ones that `teacher` judges with
@@ -320,12 +346,17 @@ impl Stages<'_> {
         task.finished(weights, self.settings().ustgan.epochs)
     }
 
-    /// Writes the model, its evaluation and a picture of its mistakes.
+    /// Writes the model, its evaluation and a picture of its mistakes. `force_factor` is the factor
+    /// of the forces that the scale of the image includes.
     ///
     /// # Errors
     ///
     /// Fails if the daemon's loader refuses the model, or the run's directory cannot be written.
-    pub fn finish(&self, trained: &Trained) -> anyhow::Result<Option<Evaluated>> {
+    pub fn finish(
+        &self,
+        trained: &Trained,
+        force_factor: f32,
+    ) -> anyhow::Result<Option<Evaluated>> {
         let scale = self.scale();
         self.draw_mistakes(trained)?;
         let (graph, raw_logits) = hrn::graph(&trained.weights, &trained.statistics, scale);
@@ -334,7 +365,13 @@ impl Stages<'_> {
             raw_logits,
             shore: None,
             temperature: trained.temperature,
-            force_factor: 1.0,
+            force_factor,
+            unfolded: Some(Unfolded::of(
+                &trained.weights,
+                &trained.statistics,
+                scale,
+                force_factor,
+            )),
         };
         let probabilities = |frames: &[&Frame]| {
             let logits = trained.logits(frames.iter().copied(), scale, self.device);

@@ -257,8 +257,8 @@ pub(super) struct Adapt {
     /// Directory of the run
     #[arg(long, value_name = "RUN")]
     pub(super) out: PathBuf,
-    /// Model to start from, made by `train --method frame` or `adapt` [default: the built-in one]. For
-    /// presses over time, one of `train --method course`
+    /// Model to start from, which `train` or `adapt` made by any method but `features` [default: the
+    /// built-in one]. For presses over time, one of `train --method course`
     #[arg(long, value_name = "M.onnx")]
     pub(super) start: Option<PathBuf>,
     /// Seed of everything random

@@ -7,8 +7,9 @@ use hardnessd::tools::exit;
 use hardnessd::train::data::collect::CollectError;
 use hardnessd::train::data::dataset::DatasetError;
 use hardnessd::train::methods::LabelsError;
-use hardnessd::train::methods::frame::NoStart;
+use hardnessd::train::methods::adapt::NoStart;
 use hardnessd::train::model::adopt::Foreign;
+use hardnessd::train::model::file::Damaged;
 use hardnessd::train::settings::SettingsError;
 use hardnessd::verdict::ModelError;
 
@@ -98,6 +99,7 @@ pub(super) fn exit_code(error: &anyhow::Error) -> u8 {
     } else if has(|e| {
         e.is::<ModelError>()
             || e.is::<NoStart>()
+            || e.is::<Damaged>()
             || e.is::<Foreign>()
             || e.is::<SettingsError>()
             || e.is::<ConfigError>()

@@ -113,10 +113,10 @@ pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
     let start = match &arguments.start {
         Some(path) => {
             let bytes = read(path)?;
-            methods::frame::start(&load(path)?, &bytes, &device)
+            methods::adapt::Start::read(&load(path)?, &bytes, &device)
                 .with_context(|| path.display().to_string())?
         }
-        None => methods::frame::start(&Hrn::load(BUILT_IN)?, BUILT_IN, &device)
+        None => methods::adapt::Start::read(&Hrn::load(BUILT_IN)?, BUILT_IN, &device)
             .context("the built-in model")?,
     };
     let dataset = dataset_of(&arguments.data)?;
@@ -126,14 +126,14 @@ pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
         seed: arguments.seed,
         labels: None,
         label_choice: LabelChoice::Object,
-        settings,
+        settings: start.settings(settings),
     };
     let description = request.description(&dataset)?;
     methods::check(method, &dataset, &description)?;
     let run = Run::open(&arguments.out, &description, arguments.resume)?;
     hardnessd::say_part!("{}", tools::lines(&account::of_data(&dataset)));
     let begun = Instant::now();
-    let evaluation = methods::frame::adapt(&dataset, start, &description, &run, &device)?;
+    let evaluation = methods::adapt::train(&dataset, start, &description, &run, &device)?;
     Ok(account_of_run(
         begun,
         &run,

@@ -181,7 +181,7 @@ impl Trained {
 ///
 /// Fails if features cannot be computed.
 pub fn with_force_factor(
-    start: Start,
+    mut start: Start,
     courses: &Courses,
     train: &[usize],
     device: &Device,
@@ -190,17 +190,18 @@ pub fn with_force_factor(
     let labels: Vec<Label> = presses
         .map(|press| (press.level, Some(press.object)))
         .collect();
-    let weights = start.weights.clone();
-    force::corrected(start, &labels, device, |standard| {
-        let trained = Trained {
-            weights: weights.clone(),
-            standard: standard.clone(),
-            calibration: Calibration::NONE,
-        };
-        let presses = prepared(courses, train, standard.force_factor)?;
+    let trained = Trained {
+        weights: start.weights.clone(),
+        standard: start.standard.clone(),
+        calibration: Calibration::NONE,
+    };
+    let factor = force::factor(&labels, start.temperature, device, |factor| {
+        let presses = prepared(courses, train, start.standard.force_factor * factor)?;
         let judged = trained.judge(&presses, dataset::levels().len(), device);
         Ok(judged.into_iter().map(|(logits, _)| logits).collect())
-    })
+    })?;
+    start.standard.force_factor *= factor;
+    Ok(start)
 }
 
 /// Trains from random weights or from `start` with its calibration, or continues from the stage's

@@ -166,9 +166,7 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
         Keep::Last => state.learner.evaluated(),
     };
     let mut trained = task.finished(weights, epochs)?;
-    if !validation_samples.is_empty() {
-        trained.temperature = temperature(&task.judge(&trained, validation_samples));
-    }
+    trained.temperature = task.fitted_temperature(&trained).unwrap_or(1.0);
     Ok(trained)
 }
 
@@ -389,6 +387,12 @@ impl Task<'_> {
             ensure_finite(self.stage, epochs, "logit", logit.into())?;
         }
         Ok(trained)
+    }
+
+    /// The temperature of least loss on the validation samples; `None` without any.
+    pub(super) fn fitted_temperature(&self, trained: &Trained) -> Option<f32> {
+        let (samples, _) = self.validation;
+        (!samples.is_empty()).then(|| temperature(&self.judge(trained, samples)))
     }
 
     /// Statistics of the normalised layers over the training samples, augmented as the settings

@@ -4,16 +4,14 @@
 //! too small by about the same factor, and a model of other presses judges all of them too hard or
 //! too soft. A few labelled presses are enough to find one number.
 //!
-//! In: a model to start from, labels, and the model's logits for a factor. Out: the same model with
-//! the factor that makes the labels most probable.
+//! In: labels, and a model's logits for a factor. Out: the factor that makes the labels most
+//! probable.
 
 use std::collections::BTreeSet;
 
 use burn::tensor::Device;
 
 use crate::train::learn::fit;
-use crate::train::net::standard::Standard;
-use crate::train::net::start::Start;
 
 /// Steps of the search for an octave, and octaves on either side of 1.
 const STEPS: i32 = 8;
@@ -28,31 +26,22 @@ const LEAST_PROBABILITY: f32 = 1e-6;
 /// The level 1..=L of a press, and the number of its object.
 pub type Label = (u8, Option<u32>);
 
-/// The start with its factor of the forces corrected. `logits` judges the labelled presses with the
-/// factor of the given standard.
+/// The factor of the forces that makes the labels most probable. `logits` judges the labelled
+/// presses with their forces times its argument; `temperature` divides the logits.
 ///
 /// # Errors
 ///
 /// Returns an error of `logits`.
-pub fn corrected(
-    start: Start,
+pub fn factor(
     labels: &[Label],
+    temperature: f32,
     device: &Device,
-    mut logits: impl FnMut(&Standard) -> anyhow::Result<Vec<Vec<f32>>>,
-) -> anyhow::Result<Start> {
+    mut logits: impl FnMut(f32) -> anyhow::Result<Vec<Vec<f32>>>,
+) -> anyhow::Result<f32> {
     let objects: BTreeSet<Option<u32>> = labels.iter().map(|&(_, object)| object).collect();
-    let with = |factor: f32| {
-        let mut standard = start.standard.clone();
-        standard.force_factor *= factor;
-        standard
-    };
-    let factor = most_probable(objects.len(), |factor| {
-        let said = fit::probabilities(&logits(&with(factor))?, start.temperature, device);
+    most_probable(objects.len(), |factor| {
+        let said = fit::probabilities(&logits(factor)?, temperature, device);
         Ok(mean_loss(&said, labels))
-    })?;
-    Ok(Start {
-        standard: with(factor),
-        ..start
     })
 }
 
@@ -86,9 +75,8 @@ fn mean_loss(probabilities: &[Vec<f32>], labels: &[Label]) -> f64 {
     sum / probabilities.len().max(1) as f64
 }
 
-/// What the user is told of the factor, if it is not 1.
-pub fn account(start: &Start) -> Option<String> {
-    let factor = start.standard.force_factor;
+/// What the user is told of a factor, if it is not 1.
+pub fn account(factor: f32) -> Option<String> {
     ((factor - 1.0).abs() > 1e-3).then(|| {
         format!(
             "forces times {factor:.2}: by the labels, this sensor's newtons are {:.2} times those that the \

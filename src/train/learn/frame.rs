@@ -164,7 +164,7 @@ impl Task<'_> {
     /// # Errors
     ///
     /// Fails if features cannot be computed.
-    pub fn with_force_factor(&self, start: Start) -> anyhow::Result<Start> {
+    pub fn with_force_factor(&self, mut start: Start) -> anyhow::Result<Start> {
         let plan = Features::new()?;
         let samples = self
             .train
@@ -174,16 +174,18 @@ impl Task<'_> {
             .map(|sample| (sample.level, sample.object))
             .collect();
         let frames = self.frames(self.train);
-        let weights = start.weights.clone();
-        force::corrected(start, &labels, self.device, |standard| {
-            let trained = Trained {
-                weights: weights.clone(),
-                standard: standard.clone(),
-                calibration: Calibration::NONE,
-            };
+        let mut trained = Trained {
+            weights: start.weights.clone(),
+            standard: start.standard.clone(),
+            calibration: Calibration::NONE,
+        };
+        let factor = force::factor(&labels, start.temperature, self.device, |factor| {
+            trained.standard.force_factor = start.standard.force_factor * factor;
             let judged = trained.judge(&frames, &plan, self.levels, self.device)?;
             Ok(judged.into_iter().map(|(logits, _)| logits).collect())
-        })
+        })?;
+        start.standard.force_factor *= factor;
+        Ok(start)
     }
 
     fn stream(&self, name: &str) -> Stream {

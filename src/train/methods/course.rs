@@ -5,7 +5,7 @@ use anyhow::ensure;
 use burn::tensor::Device;
 
 use super::Method;
-use super::frame::NoStart;
+use super::adapt::NoStart;
 use crate::random::Stream;
 use crate::simulator::Split;
 use crate::train::data::courses::Courses;
@@ -71,10 +71,10 @@ pub fn train(
     };
     let start = start.map(corrected).transpose()?;
     let of_start = start.as_ref().map(|(start, _)| start);
-    if let Some(account) = of_start.and_then(force::account) {
+    let force_factor = of_start.map_or(1.0, |start| start.standard.force_factor);
+    if let Some(account) = force::account(force_factor) {
         crate::say!("{account}");
     }
-    let force_factor = of_start.map_or(1.0, |start| start.standard.force_factor);
     let presses = course::presses(courses, force_factor)?;
     let task = Task {
         stage: match start {
@@ -113,7 +113,7 @@ pub fn train(
 pub fn start(hrn: &Hrn, bytes: &[u8], device: &Device) -> anyhow::Result<(Start, Calibration)> {
     let constants = file::constants(bytes)?;
     let start = network::start(|name| constants.get(name), dataset::levels().len(), device);
-    let start = start.ok_or_else(|| NoStart::of(hrn, "presses (course, adapt)"))?;
+    let start = start.ok_or_else(|| NoStart::of(hrn, "presses: course, or adapt of one"))?;
     let calibration = Calibration {
         temperature: start.temperature,
         widths: start.widths,

@@ -1,23 +1,20 @@
-//! The methods `frame` and `adapt`: the network that judges a frame and gives its Shore hardness,
-//! from random weights or from those of a model file.
+//! The network that judges a frame and gives its Shore hardness, from random weights (`frame`) or
+//! from those of a model file (`adapt`).
 
 use anyhow::Context as _;
 use burn::tensor::Device;
 
 use crate::frame::Frame;
-use crate::simulator::Split;
 use crate::train::data::dataset::{self, Dataset};
 use crate::train::learn::frame::{self, Task, Trained};
 use crate::train::learn::{fit, force};
 use crate::train::model::evaluated::Evaluated;
 use crate::train::model::export::{self, Recogniser};
-use crate::train::model::file;
 use crate::train::net::frame as network;
 use crate::train::net::frames::Features;
 use crate::train::net::start::Start;
 use crate::train::run::{Description, Run};
 use crate::train::stages;
-use crate::verdict::Hrn;
 
 /// The samples of a run, by their use.
 #[derive(Debug)]
@@ -70,7 +67,8 @@ pub fn train(
     let start = start
         .map(|start| task.with_force_factor(start))
         .transpose()?;
-    if let Some(account) = start.as_ref().and_then(force::account) {
+    let force_factor = start.as_ref().map_or(1.0, |s| s.standard.force_factor);
+    if let Some(account) = force::account(force_factor) {
         crate::say!("{account}");
     }
     let trained = frame::fit(&task, start, run)?;
@@ -79,69 +77,6 @@ pub fn train(
         crate::say!("{missing}");
     }
     finish(samples, &trained, description, run, device)
-}
-
-/// A model file that `adapt` cannot start from, because it holds another network.
-#[derive(Debug, thiserror::Error)]
-#[error(
-    "with such data adapt starts from models of {from} with {expected} levels: this one is of {method}, with \
-     {levels} levels"
-)]
-pub struct NoStart {
-    from: &'static str,
-    method: String,
-    levels: usize,
-    expected: usize,
-}
-
-impl NoStart {
-    /// The error for a file whose network is not one of `from`.
-    pub(super) fn of(hrn: &Hrn, from: &'static str) -> Self {
-        Self {
-            from,
-            method: hrn.card().method.clone(),
-            levels: hrn.card().levels.len(),
-            expected: dataset::levels().len(),
-        }
-    }
-}
-
-/// The start of `adapt`: the weights of a model file that the daemon's loader has accepted.
-///
-/// # Errors
-///
-/// Returns [`NoStart`] if the file holds another network.
-pub fn start(hrn: &Hrn, bytes: &[u8], device: &Device) -> anyhow::Result<Start> {
-    let levels = dataset::levels().len();
-    let constants = file::constants(bytes)?;
-    let start = network::start(|name| constants.get(name), levels, device);
-    Ok(start.ok_or_else(|| NoStart::of(hrn, "frames (frame, adapt)"))?)
-}
-
-/// Trains from `start` on all labelled training samples and, by consistency, on the unlabelled
-/// ones.
-///
-/// # Errors
-///
-/// Fails if the data has no labelled training samples, the training diverges, or the directory
-/// cannot be read or written.
-pub fn adapt(
-    dataset: &Dataset,
-    start: Start,
-    description: &Description,
-    run: &Run,
-    device: &Device,
-) -> anyhow::Result<Option<Evaluated>> {
-    let labelled = dataset.labelled(Split::Train)?;
-    let share = description.settings.validation.share;
-    let (kept, held_out) = dataset.hold_out(&labelled, share, description.seed);
-    let samples = Samples {
-        dataset,
-        train: &kept,
-        held_out: &held_out,
-        unlabelled: &super::unlabelled(dataset, &labelled, &held_out),
-    };
-    train("adapt", &samples, Some(start), description, run, device)
 }
 
 /// Writes the model, its evaluation and a picture of its mistakes.
@@ -186,6 +121,7 @@ fn finish(
         shore: samples.has_shore().then_some(shore),
         temperature: calibration.temperature,
         force_factor: trained.standard.force_factor,
+        unfolded: None,
     };
     export::finish(
         run,

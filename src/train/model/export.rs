@@ -15,6 +15,7 @@ use crate::simulator::Split;
 use crate::train::data::dataset::{self, Dataset, Kind, Source};
 use crate::train::judge::metrics::Judged;
 use crate::train::net::graph::Graph;
+use crate::train::net::unfolded::Unfolded;
 use crate::train::run::{Description, Run};
 use crate::verdict::{Card, Check, Checks, Hrn, Range};
 
@@ -34,6 +35,8 @@ pub struct Recogniser {
     pub temperature: f32,
     /// The factor by which the graph multiplies forces first; 1 if it does not.
     pub force_factor: f32,
+    /// What further training needs beside the graph, if it needs anything.
+    pub unfolded: Option<Unfolded>,
 }
 
 /// Writes the model and its evaluation on the test split to the run's directory. `train` are the
@@ -72,6 +75,7 @@ pub fn finish(
             raw_logits,
             shore,
             temperature,
+            unfolded,
             ..
         } = recogniser.clone();
         let outputs = file::Outputs {
@@ -79,7 +83,7 @@ pub fn finish(
             temperature,
             shore,
         };
-        file::write(graph, &outputs, card, &checks)
+        file::write(graph, &outputs, card, &checks, unfolded.as_ref())
     };
     // The metrics are measured on a file without them and then added; the graph does not change.
     let hrn = Hrn::load(&write(&card)?)?;

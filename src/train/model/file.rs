@@ -12,7 +12,11 @@ use tract_onnx::pb;
 use tract_onnx::prelude::Framework as _;
 
 use crate::train::net::graph::{Graph, frame_input, integer, model, value_info};
+use crate::train::net::unfolded::Unfolded;
 use crate::verdict::{COURSE_FRAMES, Card, Checks, Hrn, course_inputs};
+
+/// The metadata key of [`Unfolded`].
+const UNFOLDED: &str = "hrn.unfolded";
 
 /// The outputs of a graph.
 #[derive(Debug, Clone)]
@@ -26,7 +30,8 @@ pub struct Outputs {
     pub shore: Option<String>,
 }
 
-/// Writes the file: the logits over the temperature, their softmax, and the metadata.
+/// Writes the file: the logits over the temperature, their softmax, and the metadata. `unfolded` is
+/// what further training needs beside the graph.
 ///
 /// # Errors
 ///
@@ -36,6 +41,7 @@ pub fn write(
     outputs: &Outputs,
     card: &Card,
     checks: &Checks,
+    unfolded: Option<&Unfolded>,
 ) -> anyhow::Result<Vec<u8>> {
     let temperature = outputs.temperature;
     ensure!(
@@ -69,7 +75,14 @@ pub fn write(
             .map(|(name, dims)| value_info(name, dims))
             .collect(),
     };
-    let proto = model(graph, input, output, metadata(card, checks)?);
+    let mut metadata = metadata(card, checks)?;
+    if let Some(unfolded) = unfolded {
+        metadata.push(pb::StringStringEntryProto {
+            key: UNFOLDED.to_owned(),
+            value: serde_json::to_string(unfolded)?,
+        });
+    }
+    let proto = model(graph, input, output, metadata);
     let bytes = proto.encode_to_vec();
     let read_back = Hrn::load(&bytes).context("the exported model does not pass the daemon's")?;
     ensure!(
@@ -111,15 +124,38 @@ pub(super) fn metadata(
 /// Constants by name: the shape and the numbers of each.
 pub type Constants = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
+fn parsed(bytes: &[u8]) -> anyhow::Result<pb::ModelProto> {
+    let mut reader = bytes;
+    tract_onnx::onnx().proto_model_for_read(&mut reader)
+}
+
+/// The metadata `hrn.unfolded` of a file are damaged.
+#[derive(Debug, thiserror::Error)]
+#[error("hrn.unfolded: {0}")]
+pub struct Damaged(serde_json::Error);
+
+/// What a file that [`write()`] wrote has for further training beside its graph, if it has it.
+///
+/// # Errors
+///
+/// Fails if the bytes are not an ONNX model. Returns [`Damaged`] if the metadata are.
+pub fn unfolded(bytes: &[u8]) -> anyhow::Result<Option<Unfolded>> {
+    let entries = parsed(bytes)?.metadata_props;
+    let entry = entries.iter().find(|entry| entry.key == UNFOLDED);
+    let unfolded = entry.map(|entry| serde_json::from_str(&entry.value).map_err(Damaged));
+    Ok(unfolded.transpose()?)
+}
+
 /// The f32 constants of a file that [`write()`] wrote.
 ///
 /// # Errors
 ///
 /// Fails if the bytes are not an ONNX model.
 pub fn constants(bytes: &[u8]) -> anyhow::Result<Constants> {
-    let mut reader = bytes;
-    let proto = tract_onnx::onnx().proto_model_for_read(&mut reader)?;
-    let tensors = proto.graph.into_iter().flat_map(|graph| graph.initializer);
+    let tensors = parsed(bytes)?
+        .graph
+        .into_iter()
+        .flat_map(|graph| graph.initializer);
     let floats =
         tensors.filter(|tensor| tensor.data_type == pb::tensor_proto::DataType::Float as i32);
     let constant = |tensor: pb::TensorProto| {

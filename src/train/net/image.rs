@@ -1,13 +1,13 @@
 //! The scale from newtons to the image that a network sees, and back.
 
 use burn::tensor::{Device, Tensor, TensorData};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::train::net::graph::Graph;
 
 /// One scale for all frames, because force carries hardness: 0 N is -1, the full scale is 1.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Scale {
     /// The force on a taxel, in newtons, that becomes 1.
     pub full_scale_n: f64,
@@ -40,6 +40,16 @@ impl Scale {
             return (pixel + 1.0) * (full_scale_n / 2.0) as f32;
         }
         ((pixel + 1.0) / self.log_factor()).exp_m1() * log_above_n as f32
+    }
+
+    /// The scale under which newtons look as their product with `factor` does under this one.
+    #[must_use]
+    pub fn of_newtons_times(self, factor: f32) -> Self {
+        let factor = f64::from(factor);
+        Self {
+            full_scale_n: self.full_scale_n / factor,
+            log_above_n: self.log_above_n / factor,
+        }
     }
 
     /// The factor that makes log(1 + full scale / `log_above_n`) equal to 2.
@@ -94,6 +104,8 @@ mod tests {
             for newtons in [0.04_f32, 0.2, 0.7, 5.0] {
                 let back = scale.newtons(scale.pixel(newtons));
                 assert!((back - newtons).abs() < 1e-5 * newtons.max(1.0), "{back}");
+                let doubled = scale.of_newtons_times(2.0).pixel(newtons);
+                assert!((doubled - scale.pixel(2.0 * newtons)).abs() < 1e-6);
             }
         }
     }
