@@ -12,6 +12,8 @@ import subprocess
 class Trainer:
     def __init__(self, program):
         self.program = program
+        # The revisions of the program that made the runs.
+        self.revisions = set()
 
     def run(self, *arguments):
         """Runs a command, which is shown, and returns what it prints."""
@@ -30,6 +32,7 @@ class Trainer:
         model = out / "hrn.onnx"
         if not model.exists():
             self.run(*command, "--out", out, "--resume")
+        self.revisions.update((out / "revision").read_text().split("\n"))
         return model
 
     def evaluated(self, model, data, *more):
@@ -38,8 +41,9 @@ class Trainer:
 
 
 def write(path, trainer, found):
-    """Writes what was found, with the program's revision."""
-    path.write_text(json.dumps({"revision": trainer.run("--version").strip()} | found, indent=1) + "\n")
+    """Writes what was found, with the program's version, and the revisions that made the runs."""
+    program = {"program": trainer.run("--version").strip(), "revisions": sorted(trainer.revisions - {""})}
+    path.write_text(json.dumps(program | found, indent=1) + "\n")
 
 
 def main(description, measure, table, *inputs):

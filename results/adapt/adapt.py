@@ -8,10 +8,12 @@
 
 A draw has 20 objects of each level with 20 presses each, all on one sensor. Of each level, three objects are labelled,
 five are unlabelled, and the last twelve are the test. The objects are of random materials, or of the eight named ones.
-Then the two materials of a level take turns, so all three parts have both. One more model learns from 640 other objects
-of these materials on the same sensor: it shows how much the few objects leave to be learnt.
+Random materials are seldom of the middle levels, so more are simulated, and the first ones of each level are kept. The
+two named materials of a level take turns, so all three parts have both. One more model learns from 640 other objects of
+these materials on the same sensor, 160 of each level: it shows how much the few objects leave to be learnt.
 
-WORK keeps data sets and runs, so an interrupted call goes on. adapt.json, beside this file, has what `evaluate --json` prints for every sensor, draw and model.
+WORK keeps data sets and runs, so an interrupted call goes on. adapt.json, beside this file, has what `evaluate --json`
+prints for every sensor, draw and model.
 """
 
 import json
@@ -26,11 +28,12 @@ import trainer as training  # noqa: E402
 
 BUILT_IN = HERE.parent.parent / "models/hrn.onnx"
 DRAWS = (1, 2, 3)
-LABELLED, UNLABELLED = 3, 5
+# Objects of each level: of a draw, its labelled and its unlabelled ones, and of the last model.
+OBJECTS, LABELLED, UNLABELLED, MANY = 20, 3, 5, 160
 PRESSES = "--presses 20 --sensor-profile raw"
-# Materials -> options of `simulate` for a number of objects of each level.
+# Materials -> options of `simulate` that give at least a number of objects of each level.
 MATERIALS = {
-    "random": lambda objects: f"--materials broad --gaps --objects {objects} --test-objects 0",
+    "random": lambda objects: f"--materials broad --gaps --objects {4 * objects + 80} --test-objects 0",
     "named": lambda objects: f"--materials named --objects {objects // 2} --test-objects {objects // 2}",
 }
 # Name -> the materials, more options, and what the newtons are multiplied by.
@@ -77,7 +80,7 @@ def write(path, data, kept, test=False, **changed):
     numpy.savez(path, **rows, meta=data["meta"])
 
 
-def turns(data, taking_turns):
+def places(data, taking_turns):
     """The place of every sample's object among those of its level. Materials take turns, or objects keep their order."""
     import numpy
 
@@ -89,19 +92,29 @@ def turns(data, taking_turns):
         for material in numpy.unique(materials):
             of_material = numpy.unique(data["object"][own[materials == material]])
             order += [(turn, material, name) for turn, name in enumerate(of_material)]
-        places = {name: at for at, (_, _, name) in enumerate(sorted(order))}
-        place[own] = [places[name] for name in data["object"][own]]
+        place_of = {name: at for at, (_, _, name) in enumerate(sorted(order))}
+        place[own] = [place_of[name] for name in data["object"][own]]
     return place
 
 
-def split(data, place, out):
+def first(data, taking_turns, objects):
+    """The places, and which samples are of the first `objects` objects of their level. No level may have fewer."""
+    place = places(data, taking_turns)
+    for level in (1, 2, 3, 4):
+        there = place[data["level"] == level].max(initial=-1) + 1
+        assert there >= objects, f"level {level} has {there} objects, not {objects}"
+    return place, place < objects
+
+
+def split(data, taking_turns, out):
     """Writes the draw as three data sets: labelled, with unlabelled presses too, and the test."""
     import numpy
 
-    labelled, test = place < LABELLED, place >= LABELLED + UNLABELLED
+    place, kept = first(data, taking_turns, OBJECTS)
+    labelled, learnt = place < LABELLED, place < LABELLED + UNLABELLED
     write(out / "labelled.npz", data, labelled)
-    write(out / "both.npz", data, ~test, level=numpy.where(labelled, data["level"], 0).astype(numpy.uint8))
-    write(out / "test.npz", data, test, test=True)
+    write(out / "both.npz", data, learnt, level=numpy.where(labelled, data["level"], 0).astype(numpy.uint8))
+    write(out / "test.npz", data, kept & ~learnt, test=True)
 
 
 def measure(trainer, work):
@@ -111,18 +124,18 @@ def measure(trainer, work):
             place = work / f"{sensor}-{draw}".replace(" ", "-").replace(",", "")
             place.mkdir(exist_ok=True)
             options = f"{PRESSES} {more} --one-sensor {90 + draw}"
-            path = trainer.simulated(place / "all.npz", f"{MATERIALS[materials](20)} {options} --seed {900 + draw}")
-            data = read(path, factor)
-            split(data, turns(data, materials == "named"), place)
-            path = trainer.simulated(place / "many-all.npz", f"{MATERIALS[materials](160)} {options} --seed {950 + draw}")
-            data = read(path, factor)
-            write(place / "many.npz", data, data["level"] > 0)
+            taking_turns = materials == "named"
+            path = trainer.simulated(place / "all.npz", f"{MATERIALS[materials](OBJECTS)} {options} --seed {900 + draw}")
+            split(read(path, factor), taking_turns, place)
+            path = trainer.simulated(place / "many-all.npz", f"{MATERIALS[materials](MANY)} {options} --seed {950 + draw}")
+            many = read(path, factor)
+            write(place / "many.npz", many, first(many, taking_turns, MANY)[1])
             models = {"built-in": BUILT_IN}
             for name, (run, command, data) in LEARNT.items():
                 models[name] = trainer.learnt(place / run, *command, "--data", place / f"{data}.npz")
             for name, model in models.items():
                 found[sensor][name].append(trainer.evaluated(model, place / "test.npz"))
-    sensors = {name: (MATERIALS[materials](20), *rest) for name, (materials, *rest) in SENSORS.items()}
+    sensors = {name: (MATERIALS[materials](OBJECTS), *rest) for name, (materials, *rest) in SENSORS.items()}
     written = {"common": PRESSES, "sensors": sensors, "evaluations": found}
     training.write(HERE / "adapt.json", trainer, written)
 
