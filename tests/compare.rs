@@ -322,6 +322,46 @@ fn a_finished_comparison_does_nothing_again() {
 }
 
 #[test]
+fn a_run_without_its_model_counts_by_its_results() {
+    let comparison = Comparison::new("models-removed", "features", &[]);
+    comparison.run();
+    let results = comparison.text("results.json");
+    let of_run = |file: &str| comparison.out.join("runs/features-2").join(file);
+    for entry in std::fs::read_dir(of_run("")).unwrap() {
+        let path = entry.unwrap().path();
+        let kept = ["settings.toml", "revision", "metrics.csv", "compared.json"];
+        if !kept.iter().any(|kept| path.ends_with(kept)) {
+            if path.is_dir() {
+                std::fs::remove_dir_all(path).unwrap();
+            } else {
+                std::fs::remove_file(path).unwrap();
+            }
+        }
+    }
+    let said = comparison.run();
+    assert!(!said.contains("done"), "{said}");
+    assert_eq!(comparison.text("results.json"), results);
+
+    // If a test set is not among its results, its model is needed.
+    let mut kept: Value =
+        serde_json::from_str(&comparison.text("runs/features-2/compared.json")).unwrap();
+    kept["sets"].as_object_mut().unwrap().remove("raw").unwrap();
+    std::fs::write(of_run("compared.json"), kept.to_string()).unwrap();
+    let output = comparison.command().output().unwrap();
+    let error = String::from_utf8_lossy(&output.stderr);
+    assert!(!output.status.success(), "{error}");
+    assert!(
+        error.contains("features-2/hrn.onnx: needed, because"),
+        "{error}"
+    );
+
+    // A run that is removed altogether is run again.
+    std::fs::remove_dir_all(of_run("")).unwrap();
+    let said = comparison.run();
+    assert!(said.contains("features-2: done"), "{said}");
+}
+
+#[test]
 fn a_plan_runs_in_any_shell_and_the_comparison_finds_what_it_made() {
     let comparison = Comparison::new(
         "planned",

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, bail};
 
 use super::children::Job;
+use super::results::Worth;
 use crate::train::data::dataset::{Dataset, LabelChoice};
 use crate::train::methods::{self, LabelsError, Method, Request};
 use crate::train::run::{Description, Run};
@@ -236,9 +237,9 @@ pub(super) struct PlannedRun {
 }
 
 impl PlannedRun {
-    /// Whether the run's model exists.
+    /// Whether the run's model exists, or else what it reached.
     pub(super) fn is_finished(&self) -> bool {
-        self.directory.join("hrn.onnx").exists()
+        self.directory.join("hrn.onnx").exists() || Worth::is_kept(&self.directory)
     }
 
     /// Whether a run that was not requested belongs in the tables: it is finished, and its

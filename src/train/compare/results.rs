@@ -96,11 +96,34 @@ impl Worth {
         worth.ok().flatten().unwrap_or_default()
     }
 
-    /// Judges every set with the run's model, unless all results are known already.
+    /// Whether a run's directory has results, with or without the model.
+    pub(super) fn is_kept(run: &Path) -> bool {
+        !Self::read(run).sets.is_empty()
+    }
+
+    fn knows_all(&self, sets: &[TestSet]) -> bool {
+        sets.iter().all(|set| {
+            let measured = self.sets.get(set.name);
+            measured.is_some_and(|measured| measured.data_sha256 == set.sha256())
+        })
+    }
+
+    /// Judges every set with the run's model, unless all results are known already. Then the model
+    /// may be missing.
     pub(super) fn measure(run: &Path, sets: &[TestSet]) -> anyhow::Result<Self> {
         let model = run.join("hrn.onnx");
-        let bytes = std::fs::read(&model).with_context(|| model.display().to_string())?;
         let mut worth = Self::read(run);
+        let bytes = match std::fs::read(&model) {
+            Err(error) if error.kind() == ErrorKind::NotFound && worth.knows_all(sets) => {
+                return Ok(worth);
+            }
+            read => read.with_context(|| {
+                format!(
+                    "{}: needed, because compared.json does not have the results on all test sets",
+                    model.display()
+                )
+            })?,
+        };
         let model_sha256 = sha256_hex(&bytes);
         if worth.model_sha256 != model_sha256 {
             worth = Self {
@@ -108,11 +131,7 @@ impl Worth {
                 sets: BTreeMap::new(),
             };
         }
-        let known = |worth: &Self, set: &TestSet| {
-            let measured = worth.sets.get(set.name);
-            measured.is_some_and(|measured| measured.data_sha256 == set.sha256())
-        };
-        if sets.iter().all(|set| known(&worth, set)) {
+        if worth.knows_all(sets) {
             return Ok(worth);
         }
         let hrn = trial::load(&bytes, None).with_context(|| model.display().to_string())?;
