@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Draws docs/paper-steps.png from results/paper-sound/results.json: accuracy with the paper's own number of steps.
+"""Draws docs/paper-steps.png from results/paper-steps/results.json: accuracy with the paper's own number of steps.
 
     pip install matplotlib && python results/paper_steps.py
 """
@@ -38,7 +38,7 @@ SETS = {
 
 
 def main():
-    runs = json.loads((HERE / "paper-sound/results.json").read_text())
+    runs = json.loads((HERE / "paper-steps/results.json").read_text())
     figure, axes = plt.subplots(figsize=(8.4, 0.42 * len(METHODS) + 1.2), layout="constrained")
     names = []
     for method, (what, _) in METHODS.items():
@@ -64,7 +64,7 @@ def main():
             label = "the paper's figure, on its own data" if first else None
             axes.plot([paper], [place + 0.13], "o", mfc="none", mec="black", markersize=9, label=label)
     axes.set_yticks(range(len(names)), [title for _, title, _ in names])
-    axes.set_xlabel("accuracy, per cent (a stroke for each seed, the mark is their mean)")
+    axes.set_xlabel("accuracy, per cent (strokes: seeds; mark: mean)")
     axes.grid(axis="x", alpha=0.3)
     figure.legend(loc="outside lower center", ncols=3, fontsize=8)
     figure.savefig(HERE.parent / "docs/paper-steps.png", dpi=110)
