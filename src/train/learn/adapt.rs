@@ -14,7 +14,7 @@ use crate::train::run::Run;
 ///
 /// # Errors
 ///
-/// Never fails: judging samples with HRN has no errors.
+/// Fails as [`force::factor`] does; judging samples with HRN adds no error of its own.
 pub fn with_force_factor(mut start: Start, task: &Task) -> anyhow::Result<Start> {
     let samples = || task.train.iter().map(|&index| &task.dataset.samples[index]);
     let labels: Vec<Label> = samples()
