@@ -39,8 +39,8 @@ def of_objects(objects, geometries):
 
 
 def read_course(path, wanted):
-    """Right and all samples, by model, seed and cluster. The four materials of a shape have numbers that are apart by a
-    quarter of the objects."""
+    """Right and all samples, by model, seed and cluster. Each shape has four objects, whose numbers are equal modulo a
+    quarter of the number of objects."""
     counts = {}
     for model in json.loads(path.read_text()):
         for found in model["sets"]:

@@ -8,8 +8,10 @@
 
 A draw has 12 objects of random materials, three of each level, with 20 presses each, and 160 other objects, 40 of each
 level, with 6 presses each for the test, all on one sensor. Random materials are seldom of the middle levels, so more
-are simulated, and the first ones of each level are kept. WORK keeps data sets and runs, so an interrupted call goes on. course.json, beside
-this file, has what `evaluate --json` prints for every draw and model.
+are simulated, and the first ones of each level are kept.
+
+WORK keeps data sets and runs, so an interrupted call goes on. course.json, beside this file, has what
+`evaluate --json` prints for every draw and model.
 """
 
 import json

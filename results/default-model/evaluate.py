@@ -117,7 +117,7 @@ def measure(trainer, before, work):
 
 
 def clusters(objects, name):
-    """[right, samples] by cluster. Objects of paper shapes differ in shape. Others have those of another level's objects."""
+    """[right, samples] by cluster: each object of paper shapes, or the four objects that have another shape in common."""
     if "paper" in name:
         return {(level, number): [right, presses] for number, level, presses, right in objects}
     return intervals.of_objects([(n, right, presses) for n, _, presses, right in objects], len(objects) // 4)
