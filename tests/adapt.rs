@@ -328,8 +328,17 @@ fn a_model_without_what_training_needs_is_no_start() {
     let text = &mut damaged[place_of_key + key.len()..];
     let gamma = text.windows(5).position(|word| word == b"gamma").unwrap();
     text[gamma] = b'x';
+    // A scale of 0 N: the numbers can be read, and cannot be this network's.
+    let mut wrong = std::fs::read(paper_network()).unwrap();
+    let scale = b"\"full_scale_n\":10.2";
+    let at = wrong
+        .windows(scale.len())
+        .position(|window| window == scale)
+        .unwrap();
+    wrong[at + scale.len() - 4..at + scale.len()].copy_from_slice(b" 0.0");
     for (name, bytes, said) in [
-        ("without.onnx", without, "has no `hrn.unfolded`"),
+        ("without.onnx", without, "which is missing or wrong"),
+        ("wrong.onnx", wrong, "which is missing or wrong"),
         ("damaged.onnx", damaged, "hrn.unfolded"),
     ] {
         let path = place(name);

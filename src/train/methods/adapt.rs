@@ -36,9 +36,11 @@ pub enum NoStart {
         /// The number of levels of the data.
         expected: usize,
     },
-    /// The file's graph is the paper's network, and the rest of it is missing.
+    /// The file's graph is the paper's network, and what folding loses is missing, or is not this
+    /// network's.
     #[error(
-        "this file has no `hrn.unfolded`, which adapt needs: train its model again with this version"
+        "adapt needs the `hrn.unfolded` of this file, which is missing or wrong: train its model again with this \
+         version"
     )]
     Folded,
 }
@@ -80,8 +82,9 @@ impl Start {
             Some(unfolded) => unfolded.start(levels, constant, device).map(Self::Hrn),
         };
         // The other networks also have the means of their features.
-        let is_folded =
-            constants.contains_key("head.matrix") && !constants.contains_key("column means");
+        let is_folded = hrn.card().levels.len() == levels
+            && constants.contains_key("head.matrix")
+            && !constants.contains_key("column means");
         Ok(start.ok_or_else(|| match is_folded {
             true => NoStart::Folded,
             false => NoStart::of(hrn, "single frames (any method but features)"),
