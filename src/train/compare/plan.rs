@@ -204,8 +204,8 @@ impl Recipe {
     }
 
     /// The cost of a run, in thousands of HRN's steps in the `paper` profile. A step of a GAN
-    /// counts as six (by the seconds in `results/quick-three-seeds`). Stages taken from `ours` count nothing.
-    /// Other profiles have the same proportions.
+    /// counts as six (by the seconds in `results/quick-three-seeds`). Stages taken from `ours` count
+    /// nothing. Other profiles have the same proportions.
     fn effort(&self) -> f64 {
         match self.method {
             Method::Ours => 396.0,

@@ -322,20 +322,7 @@ mod tests {
 
     fn check_folding(pooling: Pooling, scale: Scale) {
         let frames: Vec<Frame> = (0..5).map(|n| blob(9.0 + n as f32, 14.0, 2.0)).collect();
-        let mut weights = initial(4, pooling, 9, &device());
-        // In an untrained network every gamma is 1 and every beta and bias is 0, which hides an
-        // omission.
-        for weight in &mut weights.entries {
-            if weight.dims.len() == 1 {
-                let mut stream = Stream::new(9, &weight.name);
-                let moved = network::numbers(&weight.values)
-                    .iter()
-                    .map(|value| value + 0.3 * stream.normal() as f32)
-                    .collect();
-                let length = weight.dims[0];
-                weight.values = Tensor::from_data(TensorData::new(moved, [length]), &device());
-            }
-        }
+        let weights = initial(4, pooling, 9, &device()).moved(9, &device());
         let x = scale.images(frames.iter(), &device());
         let mut statistics = Statistics::default();
         logits(

@@ -188,6 +188,24 @@ impl Weights {
         }
     }
 
+    /// The weights with every gamma, beta and bias moved. In an untrained network they are 1 and 0,
+    /// which hides an omission.
+    #[cfg(test)]
+    pub(super) fn moved(mut self, seed: u64, device: &Device) -> Self {
+        for weight in &mut self.entries {
+            if weight.dims.len() == 1 {
+                let mut stream = Stream::new(seed, &weight.name);
+                let moved = numbers(&weight.values)
+                    .iter()
+                    .map(|value| value + 0.3 * stream.normal() as f32)
+                    .collect();
+                let length = weight.dims[0];
+                weight.values = Tensor::from_data(TensorData::new(moved, [length]), device);
+            }
+        }
+        self
+    }
+
     /// The number of parameters in all weights.
     #[cfg(test)]
     pub(super) fn count(&self) -> usize {

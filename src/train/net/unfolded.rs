@@ -185,26 +185,7 @@ mod tests {
 
     use super::*;
     use crate::frame::{COLS, Frame};
-    use crate::random::Stream;
     use crate::train::net::network::{self, Normalisation};
-
-    /// A network whose gammas, betas and biases are not those of the start.
-    fn learnt(pooling: Pooling, device: &Device) -> Weights {
-        let mut weights = hrn::initial(4, pooling, 9, device);
-        for weight in &mut weights.entries {
-            if weight.dims.len() == 1 {
-                let mut stream = Stream::new(9, &weight.name);
-                let moved = numbers(&weight.values);
-                let moved: Vec<f32> = moved
-                    .iter()
-                    .map(|value| value + 0.3 * stream.normal() as f32)
-                    .collect();
-                let length = moved.len();
-                weight.values = Tensor::from_data(TensorData::new(moved, [length]), device);
-            }
-        }
-        weights
-    }
 
     #[test]
     fn a_file_gives_the_network_back() {
@@ -224,7 +205,7 @@ mod tests {
                     frame
                 })
                 .collect();
-            let weights = learnt(pooling, &device);
+            let weights = hrn::initial(4, pooling, 9, &device).moved(9, &device);
             let images = scale.images(frames.iter(), &device);
             let mut statistics = Statistics::default();
             let mut collect = Normalisation::Collect(&mut statistics);
