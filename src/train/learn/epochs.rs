@@ -15,9 +15,9 @@ use crate::train::run::history::Row;
 use crate::train::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
 use crate::train::settings::Training;
 
-/// Training that starts from a model's weights ends at this share of the way from them to the
-/// weights it learnt. A few objects show what the sensor is like, but say little of other
-/// materials, which the start knows (Wortsman et al. 2022, "Robust fine-tuning of zero-shot
+/// Training that starts from the weights of a model of one frame ends at this share of the way from
+/// them to the weights it learnt. A few objects show what the sensor is like, but say little of
+/// other materials, which the start knows (Wortsman et al. 2022, "Robust fine-tuning of zero-shot
 /// models").
 pub const LEARNT_SHARE: f32 = 0.5;
 
