@@ -60,10 +60,11 @@ def sets():
         for seed, shapes in ((201, "paper"), (202, "matched"), (203, "wide")):
             own = f"--seed {seed} --objects 0 --test-objects 20 --shapes {shapes}{option}"
             found[f"the four test materials, {shapes}{profile}"] = own, "test"
-    for seed, shapes in ((202, "matched"), (203, "wide")):
-        # With all roles swapped, the materials that others train on are the test.
-        own = f"--seed {seed} --objects 0 --test-objects 20 --shapes {shapes} --swapped-levels 1234"
-        found[f"the four training materials, {shapes}"] = own, "test"
+    for profile, option in raw.items():
+        for seed, shapes in ((202, "matched"), (203, "wide")):
+            # With all roles swapped, the materials that others train on are the test.
+            own = f"--seed {seed} --objects 0 --test-objects 20 --shapes {shapes} --swapped-levels 1234{option}"
+            found[f"the four training materials, {shapes}{profile}"] = own, "test"
     for shapes in ("matched", "wide"):
         own = f"--materials broad --gaps --seed 701 --objects 60 --test-objects 0 --presses 10 --shapes {shapes}"
         found[f"candidates: other materials, {shapes}"] = own, "train"
@@ -123,9 +124,9 @@ def clusters(objects, name):
     return intervals.of_objects([(n, right, presses) for n, _, presses, right in objects], len(objects) // 4)
 
 
-def of_all_eight(evaluations, shapes):
+def of_all_eight(evaluations, presses):
     """Model -> its accuracy on the eight named materials: the mean of two sets of the same size."""
-    halves = [evaluations[f"the four {role} materials, {shapes}"] for role in ("test", "training")]
+    halves = [evaluations[f"the four {role} materials, {presses}"] for role in ("test", "training")]
     return {model: sum(half[model]["accuracy"] for half in halves) / 2 for model in MODELS}
 
 
@@ -148,9 +149,9 @@ def table():
         cells += [f"{100 * found[model]['accuracy']:.1f} %" for model in MODELS[1:]]
         print("|", " | ".join(cells), "|")
     print("\n| Presses |", " | ".join(MODELS), "|")
-    for shapes in ("matched", "wide"):
-        shares = of_all_eight(written["evaluations"], shapes)
-        print(f"| All eight named materials, {shapes} |", " | ".join(f"{100 * s:.1f} %" for s in shares.values()), "|")
+    for presses in ("matched", "wide", "matched, raw", "wide, raw"):
+        shares = of_all_eight(written["evaluations"], presses)
+        print(f"| All eight named materials, {presses} |", " | ".join(f"{100 * s:.1f} %" for s in shares.values()), "|")
     print("\n| Presses | Level 1 | Level 2 | Level 3 | Level 4 | Near a border |")
     for name, found in written["evaluations"].items():
         if shore := found["default"]["shore"]:
