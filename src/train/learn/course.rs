@@ -35,8 +35,8 @@ mod varied;
 pub const BALANCE: f32 = 0.5;
 /// Training that starts from a model's weights ends at this share of the way from them to the
 /// weights it learnt: less of it than for models of one frame ([`epochs::LEARNT_SHARE`]). On four
-/// draws of other sensors and materials half of the way cost points where the model fitted the
-/// sensor. An eighth cost none, and was best with wrong newtons too (`docs/results.md`).
+/// draws of other sensors and materials, an eighth of the way was better than half by 2 points,
+/// with correct newtons and with wrong ones (`docs/results.md`).
 const LEARNT_SHARE: f32 = 0.125;
 /// Presses per pass without gradients.
 const JUDGED_AT_ONCE: usize = 250;
