@@ -42,7 +42,7 @@ def run(script, directory, path):
 def own_objects(text, directory, path):
     printed = run(commands(text), directory, path)
     # The last command is the replay: its verdicts are of the new model.
-    inspected = run("hrn-train inspect own.onnx", directory, path)
+    inspected = run("hrn-train inspect own-adapted/hrn.onnx", directory, path)
     model = re.search(r"sha256 +([0-9a-f]{12})", inspected)[1]
     events = [json.loads(line) for line in printed.splitlines() if line.startswith("{")]
     verdicts = [event for event in events if event.get("phase") == "final"]
