@@ -22,7 +22,7 @@ METHODS = {
     "sgan": "sgan (one GAN, Odena)",
     "igan": "igan (one GAN, Salimans)",
     "hrn15-long": "hrn15-long (no GAN, steps of ours)",
-    "hrn15-tuned": "hrn15-tuned (no GAN, Adam)",
+    "hrn15-tuned": "hrn15-tuned (no GAN, Adam, five times the epochs)",
     "nihrn": "nihrn (ours without USTGAN's start)",
     "ours": "ours (the paper's method)",
     "hrn15": "hrn15 (no GAN, the paper's baseline)",

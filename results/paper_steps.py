@@ -24,7 +24,7 @@ METHODS = {
     "hrn50": ("5,000 labels, no GAN", 86.6),
     "hrn100": ("10,000 labels, no GAN", 95.9),
     "hrn15-long": ("no GAN, the steps of ours", None),
-    "hrn15-tuned": ("no GAN, Adam", None),
+    "hrn15-tuned": ("no GAN, Adam, five times the epochs", None),
     "hrn15-strong": ("no GAN, a good recipe", None),
     "self-training": ("unlabelled presses, no GAN", None),
     "fixmatch": ("unlabelled presses, no GAN", None),

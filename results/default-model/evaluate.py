@@ -118,8 +118,9 @@ def measure(trainer, before, work):
 
 
 def clusters(objects, name):
-    """[right, samples] by cluster: each object of paper shapes, or the four objects that have another shape in common."""
-    if "paper" in name:
+    """[right, samples] by cluster: the four test objects that have a shape in common, otherwise each object. Objects of
+    paper shapes have no shape in common, and neither have the training objects that the candidates are judged on."""
+    if "paper" in name or name.startswith("candidates"):
         return {(level, number): [right, presses] for number, level, presses, right in objects}
     return intervals.of_objects([(n, right, presses) for n, _, presses, right in objects], len(objects) // 4)
 
