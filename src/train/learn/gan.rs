@@ -261,7 +261,7 @@ fn sigma_range(generator: &Weights) -> [f64; 3] {
 impl Task<'_> {
     /// The sensor that measured the real frames.
     pub fn sensor(&self) -> Sensor {
-        Sensor::of(self.frames(self.real).into_iter())
+        Sensor::of(&self.frames(self.real))
     }
 
     fn origin(&self, initial: &Gan) -> String {

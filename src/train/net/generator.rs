@@ -319,7 +319,7 @@ mod tests {
                 full_scale_n: 10.2,
                 log_above_n: 0.0,
             },
-            sensor: Sensor::of([].iter()),
+            sensor: Sensor::of(&[]),
             device,
         }
     }

@@ -12,7 +12,7 @@ use crate::frame::Frame;
 use crate::train::net::image::Scale;
 use crate::train::net::network::numbers;
 
-/// The number of frames from which step and threshold are read.
+/// The number of frames, spread over all of them, from which the step is read.
 const FRAMES: usize = 200;
 
 /// Step, threshold and greatest force of a sensor, as seen in its own frames.
@@ -27,23 +27,27 @@ pub struct Sensor {
 }
 
 impl Sensor {
-    /// Reads step and threshold off the frames of a sensor.
-    pub fn of<'a>(frames: impl Iterator<Item = &'a Frame>) -> Self {
-        let values: BTreeSet<u32> = frames
-            .take(FRAMES)
-            .flat_map(|frame| frame.newtons)
-            .filter(|newtons| *newtons > 0.0)
-            .map(f32::to_bits)
-            .collect();
-        // The bits of positive numbers have the same order as the numbers.
-        let values: Vec<f32> = values.into_iter().map(f32::from_bits).collect();
-        let (Some(&threshold_n), Some(&most_n)) = (values.first(), values.last()) else {
+    /// Reads step, threshold and greatest force off the frames of a sensor.
+    pub fn of(frames: &[&Frame]) -> Self {
+        let pressed = |frame: &&Frame| frame.newtons.into_iter().filter(|newtons| *newtons > 0.0);
+        let all = || frames.iter().flat_map(pressed);
+        let (Some(threshold_n), Some(most_n)) = (all().reduce(f32::min), all().reduce(f32::max))
+        else {
             return Self {
                 step_n: 0.0,
                 threshold_n: 0.0,
                 most_n: f32::INFINITY,
             };
         };
+        let every = frames.len().div_ceil(FRAMES);
+        let values: BTreeSet<u32> = frames
+            .iter()
+            .step_by(every)
+            .flat_map(pressed)
+            .map(f32::to_bits)
+            .collect();
+        // The bits of positive numbers have the same order as the numbers.
+        let values: Vec<f32> = values.into_iter().map(f32::from_bits).collect();
         let apart = values.windows(2).map(|pair| pair[1] - pair[0]);
         let step_n = apart
             .filter(|step| *step > 1e-4 * most_n)
@@ -107,20 +111,31 @@ mod tests {
     fn steps_and_threshold_are_read_off_the_frames() {
         let step = 0.04_f32;
         let counted = frame(&[2.0, 3.0, 7.0, 100.0].map(|counts| counts * step));
-        let sensor = Sensor::of([counted].iter());
+        let sensor = Sensor::of(&[&counted]);
         for (force, given) in [(0.05, 0.0), (0.07, 0.08), (0.11, 0.12), (9.0, 4.0)] {
             let found = sensor.newtons(force);
             assert!((found - given).abs() < 1e-6, "{force}: {found}");
         }
         let any = frame(&[0.081, 0.1234, 0.77, 0.7701]);
-        let sensor = Sensor::of([any].iter());
+        let sensor = Sensor::of(&[&any]);
         assert_eq!(sensor.newtons(0.5), 0.5);
         assert_eq!(sensor.newtons(0.04), 0.0);
     }
 
     #[test]
+    fn soft_objects_at_the_beginning_do_not_limit_the_force() {
+        let soft = frame(&[0.08, 0.12, 0.4]);
+        let hard = frame(&[0.04, 0.4, 10.2]);
+        let frames: Vec<&Frame> = std::iter::repeat_n(&soft, 1000).chain([&hard]).collect();
+        let sensor = Sensor::of(&frames);
+        assert_eq!(sensor.newtons(8.0), 8.0);
+        assert_eq!(sensor.newtons(20.0), 10.2);
+        assert_eq!(sensor.newtons(0.04), 0.04);
+    }
+
+    #[test]
     fn an_empty_data_set_changes_nothing() {
-        let sensor = Sensor::of([Frame::default()].iter());
+        let sensor = Sensor::of(&[&Frame::default()]);
         assert_eq!(sensor.newtons(0.3), 0.3);
     }
 }

@@ -182,7 +182,7 @@ fn gradients_of_a_whole_step_agree_with_finite_differences() {
 #[test]
 fn a_new_stage_starts_from_the_given_weights_with_fresh_moments() {
     let gan = initial(Game::RealOrFake, LEVELS, 5, &device());
-    let state = State::fresh(gan.clone(), &GanSettings::default(), Sensor::of([].iter()));
+    let state = State::fresh(gan.clone(), &GanSettings::default(), Sensor::of(&[]));
     let checkpoint = state.checkpoint("");
     assert_eq!(checkpoint.progress, Progress::default());
     for (side, weights) in SIDES.iter().zip([gan.generator, gan.discriminator]) {
