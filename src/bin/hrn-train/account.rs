@@ -116,7 +116,10 @@ pub(super) fn of_evaluated(evaluation: &Evaluated) -> String {
 fn of_evaluation(evaluation: &Evaluation) -> String {
     let percent = |share: f64| share * 100.0;
     let interval = evaluation.accuracy_interval_by_object.map_or_else(
-        || "no interval without two objects of a level".to_owned(),
+        || {
+            "no interval: it needs two objects of each level, and a right and a wrong verdict"
+                .to_owned()
+        },
         |[low, high]| {
             let (low, high) = (percent(low), percent(high));
             format!("95 % by object: {low:.1} to {high:.1} %")

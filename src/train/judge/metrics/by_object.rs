@@ -75,12 +75,13 @@ impl Clusters {
 pub struct Estimate {
     /// The value over all samples, and over the seeds if there are several.
     pub mean: f64,
-    /// Low and high end. `None` where no stratum has two clusters, because every draw is then the
-    /// same and says nothing about other objects.
+    /// Low and high end. `None` where a stratum has only one cluster, because nothing then says how
+    /// much its clusters vary.
     pub interval: Option<[f64; 2]>,
 }
 
-/// A method's accuracy over its seeds' judgements of the same samples; `None` if there are none.
+/// A method's accuracy over its seeds' judgements of the same samples; `None` if there are none. It
+/// has no interval if all samples were judged rightly, or none: every draw is then the same.
 pub fn accuracy_by_object(seeds: &[&[ObjectCount]], clusters: Clusters) -> Option<Estimate> {
     let right = |count: &ObjectCount| (*count, count.right as i64);
     let seeds: Vec<Vec<_>> = seeds
@@ -88,9 +89,11 @@ pub fn accuracy_by_object(seeds: &[&[ObjectCount]], clusters: Clusters) -> Optio
         .map(|counts| counts.iter().map(right).collect())
         .collect();
     let estimate = estimate(&seeds, clusters)?;
+    let varies = 0.0 < estimate.mean && estimate.mean < 1.0;
     Some(Estimate {
         interval: estimate
             .interval
+            .filter(|_| varies)
             .map(|[low, high]| [low.max(0.0), high.min(1.0)]),
         ..estimate
     })
@@ -168,7 +171,7 @@ fn estimate(seeds: &[Vec<(ObjectCount, i64)>], clusters: Clusters) -> Option<Est
         total.add(sum.value, sum.samples);
     }
     let mean = total.ratio();
-    if strata.iter().all(|sums| sums.len() < 2) {
+    if strata.iter().any(|sums| sums.len() < 2) {
         let interval = None;
         return Some(Estimate { mean, interval });
     }
@@ -279,11 +282,20 @@ mod tests {
         assert_eq!((accuracy.mean, accuracy.interval), (0.8, None));
         let difference = difference_by_object(&[(&first, &second)], Clusters::Objects).unwrap();
         assert_eq!((difference.mean, difference.interval), (-0.1, None));
+        // Nothing varies where all verdicts are right.
+        let right = counts(&[50, 50, 50]);
+        let accuracy = accuracy_by_object(&[&right], Clusters::Objects).unwrap();
+        assert_eq!((accuracy.mean, accuracy.interval), (1.0, None));
         let samples = [1, 2].map(|level| judged(level, [0.7, 0.1, 0.1, 0.1], u32::from(level)));
         let evaluation = Evaluation::of(&samples, 4);
         assert_eq!(evaluation.accuracy_interval_by_object, None);
         let two = [3, 4].map(|object| judged(1, [0.7, 0.1, 0.1, 0.1], object));
-        let evaluation = Evaluation::of(&[&samples[..], &two].concat(), 4);
+        // Three objects of level 1, and still one of level 2.
+        let samples = [&samples[..], &two].concat();
+        let evaluation = Evaluation::of(&samples, 4);
+        assert_eq!(evaluation.accuracy_interval_by_object, None);
+        let another = judged(2, [0.7, 0.1, 0.1, 0.1], 5);
+        let evaluation = Evaluation::of(&[&samples[..], &[another]].concat(), 4);
         assert!(evaluation.accuracy_interval_by_object.is_some());
     }
 
