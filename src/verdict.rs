@@ -21,6 +21,8 @@ pub use self::course::{
     COURSE_FRAMES, CheckedCourse, Course, CourseCheck, CourseMoment, Extents, Shore, course_inputs,
     extents,
 };
+#[cfg(feature = "train")]
+pub(crate) use self::file::check_levels;
 use crate::frame::{COLS, Frame, ROWS};
 
 /// The default model, built into the binary; `models/README.md` is its card.

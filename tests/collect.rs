@@ -15,6 +15,7 @@ use hardnessd::simulator::{self, DatasetSettings, Split};
 use hardnessd::train::data::courses::Courses;
 use hardnessd::train::data::dataset::{self, Dataset, Kind, Sample, meta};
 use hardnessd::train::data::simulated;
+use hardnessd::train::model::course::course_of;
 use hardnessd::verdict::{Card, Hrn};
 use serde_json::Value;
 
@@ -427,6 +428,18 @@ fn a_model_of_presses_is_of_the_pitch_of_its_recordings() {
     let model = run.join("hrn.onnx");
     let hrn = Hrn::load(&std::fs::read(&model).unwrap()).unwrap();
     assert_eq!(hrn.card().pitch_mm, 2.0);
+    // Nothing says how hard the objects are, so the interval is the whole scale.
+    assert!(
+        errors.contains("no labelled training press has a measured Shore hardness"),
+        "{errors}"
+    );
+    let courses = Courses::read(&fine).unwrap();
+    let shore = hrn
+        .judge_course(&course_of(&courses, 0))
+        .unwrap()
+        .shore
+        .unwrap();
+    assert_eq!((shore.low, shore.high), (0.0, 100.0));
 
     let evaluate = [
         "evaluate",

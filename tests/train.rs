@@ -369,13 +369,12 @@ fn the_whole_method_killed_in_any_stage_resumes_bit_for_bit_and_shares_its_stage
 }
 
 #[test]
-fn a_discriminators_statistics_are_over_what_it_learnt_from() {
+fn settings_of_recognisers_do_not_change_a_gan() {
     let [plain, augmented] = [("plain", ""), ("augmented", AUGMENTED)].map(|(name, more)| {
         let trial = Trial::of("sgan", name, &format!("{GAN_SETTINGS}{more}"));
         trial.train("1", &[]);
         trial
     });
-    // Settings of recognisers alone do not change it.
     plain.assert_same(&augmented);
 }
 
@@ -401,6 +400,12 @@ fn held_out_objects_are_used_or_it_is_said() {
             "share = 0.25\nkeep = \"best\"",
             78,
             "`validation.share`: found 0.25, expected 0: sgan and igan",
+        ),
+        (
+            "frame",
+            "share = 0.25\nkeep = \"best\"",
+            78,
+            "`validation.keep`: found best, expected last",
         ),
         // There are four objects a level.
         (

@@ -79,11 +79,11 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
         Command::Demo(args) => {
             // The events are the output. The log would repeat each of them.
             let _log = Log::start(LogSettings::default(), "error")?;
-            Ok(demo::run(args, signals.told()).await?)
+            Ok(demo::run(args, signals.received()).await?)
         }
-        Command::Simulate(args) => Ok(simulate::run(args, signals.told()).await?),
+        Command::Simulate(args) => Ok(simulate::run(args, signals.received()).await?),
         Command::Record(args) => {
-            let mut end = pin!(signals.told());
+            let mut end = pin!(signals.received());
             let Some(setup) = load(args.config.path()?, end.as_mut()).await? else {
                 return Ok(());
             };
@@ -97,11 +97,11 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
         }
         Command::Recover(args) => finish_blocking(signals, move || recover::run(&args)).await,
         Command::Replay(args) => finish(signals, replay::run(args)).await,
-        Command::Tail(args) => Ok(tail::run(args, signals.told()).await?),
+        Command::Tail(args) => Ok(tail::run(args, signals.received()).await?),
         #[cfg(feature = "watch")]
-        Command::Watch(args) => Ok(watch::run(args, signals.told()).await?),
+        Command::Watch(args) => Ok(watch::run(args, signals.received()).await?),
         #[cfg(feature = "zenoh")]
-        Command::Fleet(args) => Ok(fleet::run(args, signals.told()).await?),
+        Command::Fleet(args) => Ok(fleet::run(args, signals.received()).await?),
         Command::Check(args) => finish_blocking(signals, move || check::run(&args)).await,
         Command::Calibrate(args) => calibrate(args, signals).await,
         Command::Doctor(args) => finish_blocking(signals, move || doctor::run(&args)).await,
@@ -228,7 +228,7 @@ impl Signals {
     }
 
     /// Like [`Signals::end`], for a command that runs until a signal ends it.
-    async fn told(self) {
+    async fn received(self) {
         self.end().await;
     }
 

@@ -16,6 +16,7 @@ mod sets;
 mod so_far;
 pub mod results;
 mod swaps;
+pub mod table;
 pub mod tables;
 pub mod report;
 
@@ -77,8 +78,8 @@ fn make_directories(plan: &Plan) -> anyhow::Result<()> {
 /// Sorts the runs: the longest first, but each method's first seed before any method's second.
 fn in_order(mut open: Vec<(&PlannedRun, Job)>) -> Vec<Job> {
     open.sort_by(|(a, first), (b, second)| {
-        (a.told.seed)
-            .cmp(&b.told.seed)
+        (a.description.seed)
+            .cmp(&b.description.seed)
             .then(second.effort.total_cmp(&first.effort))
     });
     open.into_iter().map(|(_, job)| job).collect()
@@ -135,8 +136,8 @@ fn report_failures(failures: &[Failure], out: &Path) -> anyhow::Result<()> {
 fn write_results(plan: &Plan, runs: &[PlannedRun], sets: &[TestSet]) -> anyhow::Result<()> {
     let mut entries = Vec::new();
     for run in runs.iter().filter(|run| run.is_finished()) {
-        if let Some(told) = Run::told(&run.directory)? {
-            entries.push(Entry::of(&run.directory, &told, sets)?);
+        if let Some(description) = Run::description_at(&run.directory)? {
+            entries.push(Entry::of(&run.directory, &description, sets)?);
         }
     }
     let json = serde_json::to_vec_pretty(&entries)?;

@@ -2,6 +2,7 @@
 
 pub mod optimiser;
 pub mod learner;
+pub mod temperature;
 pub mod consistency;
 pub mod fit;
 pub mod epochs;

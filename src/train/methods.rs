@@ -12,7 +12,9 @@ use anyhow::ensure;
 use burn::tensor::Device;
 
 use crate::simulator::Split;
-use crate::train::data::dataset::{Dataset, DatasetError, LabelChoice, Sample};
+use crate::train::data::dataset::{
+    Dataset, DatasetError, LabelChoice, Sample, warn_of_other_levels,
+};
 use crate::train::model::evaluated::Evaluated;
 use crate::train::net::generator::COMPONENTS;
 use crate::train::net::losses::Game;
@@ -42,8 +44,8 @@ pub enum Method {
     Nihrn,
     /// Control: hrn15 with as many steps as the paper's whole method.
     Hrn15Long,
-    /// Control: hrn15 with Adam. It holds a quarter of its labelled objects out and keeps the weights
-    /// that are best on them.
+    /// Control: hrn15 with Adam and five times as many epochs. It holds a quarter of its labelled
+    /// objects out and keeps the weights that are best on them.
     Hrn15Tuned,
     /// Control: hrn15 with the default model's recipe: Adam, averaged weights, symmetries and shifts, a
     /// logarithmic image, mean pooling beside max pooling.
@@ -145,7 +147,7 @@ pub enum LabelsError {
     /// The data has no labelled training samples.
     #[error(transparent)]
     None(#[from] DatasetError),
-    /// More labels were requested than the data has, or too few for one of each level.
+    /// More labels were requested than the data has, or too few for one of each level and file.
     #[error(
         "--labels: found {asked}, expected at least {least} (one of each level and file) and at \
          most the data's {labelled}"
@@ -165,7 +167,7 @@ pub enum LabelsError {
 /// # Errors
 ///
 /// Fails if the data has no labelled training samples, or if `asked` is more than these or too few
-/// for one of each level.
+/// for one of each level and file.
 pub fn labels(
     method: Method,
     dataset: &Dataset,
@@ -232,6 +234,7 @@ impl Request {
             seed: self.seed,
             labels: labels(self.method, dataset, self.labels)?,
             label_choice: self.label_choice,
+            start: None,
             settings: self.settings,
             data: dataset.sources.clone(),
         };
@@ -292,6 +295,7 @@ pub fn check(method: Method, dataset: &Dataset, description: &Description) -> an
             level.level
         );
     }
+    warn_of_other_levels(&dataset.sources);
     check_validation(method, dataset, description, &labelled)
 }
 
@@ -304,6 +308,9 @@ fn check_validation(
     labelled: &[usize],
 ) -> anyhow::Result<()> {
     let Validation { share, keep, .. } = description.settings.validation;
+    if method == Method::Frame {
+        description.settings.validation.check_last()?;
+    }
     if share == 0.0 || method == Method::Features {
         return Ok(());
     }

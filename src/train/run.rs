@@ -39,6 +39,9 @@ pub struct Description {
     pub labels: usize,
     /// How the labelled samples are chosen.
     pub label_choice: LabelChoice,
+    /// SHA-256 of the model file that the run started from, if it was one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub start: Option<String>,
     /// Settings of the method.
     pub settings: Settings,
     /// The files from which the run learns.
@@ -119,12 +122,14 @@ impl Run {
     /// # Errors
     ///
     /// Returns an error if `settings.toml` exists but cannot be read.
-    pub fn told(directory: &Path) -> anyhow::Result<Option<Description>> {
+    pub fn description_at(directory: &Path) -> anyhow::Result<Option<Description>> {
         let path = directory.join("settings.toml");
         match fs::read(&path) {
             Ok(bytes) => {
-                let told = Description::read(&String::from_utf8_lossy(&bytes));
-                Ok(Some(told.with_context(|| path.display().to_string())?))
+                let description = Description::read(&String::from_utf8_lossy(&bytes));
+                Ok(Some(
+                    description.with_context(|| path.display().to_string())?,
+                ))
             }
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
             Err(error) => Err(error).with_context(|| path.display().to_string()),
@@ -146,7 +151,14 @@ impl Run {
             _lock: lock(directory)?,
             others: Vec::new(),
         };
-        match Self::told(directory)? {
+        let before = Self::description_at(directory)?;
+        if before.is_none() || resume {
+            for part in ["checkpoints", "samples"] {
+                let part = run.path(part);
+                fs::create_dir_all(&part).with_context(|| part.display().to_string())?;
+            }
+        }
+        match before {
             Some(before) if resume => {
                 if let Some(difference) = description.difference(&before) {
                     bail!(
@@ -163,10 +175,6 @@ impl Run {
                 directory.display()
             ),
             None => {}
-        }
-        for part in ["checkpoints", "samples"] {
-            let part = run.path(part);
-            fs::create_dir_all(&part).with_context(|| part.display().to_string())?;
         }
         run.write("revision", format!("{}\n", revision()).as_bytes())?;
         run.write("settings.toml", toml::to_string(description)?.as_bytes())?;

@@ -61,6 +61,20 @@ pub struct Validation {
     pub keep: Keep,
 }
 
+impl Validation {
+    /// Refuses [`Keep::Best`], for a network that uses its validation objects only after training.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`SettingsError::Keep`].
+    pub fn check_last(&self) -> Result<(), SettingsError> {
+        match self.keep {
+            Keep::Last => Ok(()),
+            Keep::Best => Err(SettingsError::Keep),
+        }
+    }
+}
+
 impl Default for Validation {
     fn default() -> Self {
         Self {

@@ -15,6 +15,7 @@ use crate::train::judge::sheet::{self, Strip};
 use crate::train::learn::adapt;
 use crate::train::learn::fit::{self, Trained};
 use crate::train::learn::gan::{self, Gan};
+use crate::train::learn::temperature;
 use crate::train::model::evaluated::Evaluated;
 use crate::train::model::export::{self, Recogniser};
 use crate::train::net::generator;
@@ -289,7 +290,7 @@ impl Stages<'_> {
         let mut dataset = self.dataset.clone();
         let frames = (self.unlabelled.iter()).map(|&index| &self.dataset.samples[index].frame);
         let logits = teacher.logits(frames, self.scale(), self.device);
-        let probabilities = fit::probabilities(&logits, teacher.temperature, self.device);
+        let probabilities = temperature::probabilities(&logits, teacher.temperature, self.device);
         let least = self.settings().consistency.confidence;
         let mut train = self.train.to_vec();
         for (&index, of_frame) in self.unlabelled.iter().zip(&probabilities) {
@@ -375,7 +376,7 @@ impl Stages<'_> {
         };
         let probabilities = |frames: &[&Frame]| {
             let logits = trained.logits(frames.iter().copied(), scale, self.device);
-            Ok(fit::probabilities(
+            Ok(temperature::probabilities(
                 &logits,
                 trained.temperature,
                 self.device,
@@ -402,7 +403,7 @@ impl Stages<'_> {
             .iter()
             .map(|&index| &self.dataset.samples[index].frame);
         let logits = trained.logits(frames, self.scale(), self.device);
-        let probabilities = fit::probabilities(&logits, trained.temperature, self.device);
+        let probabilities = temperature::probabilities(&logits, trained.temperature, self.device);
         draw_mistakes(self.run, self.dataset, (kind, indices), &probabilities)
     }
 }

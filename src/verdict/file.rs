@@ -367,7 +367,7 @@ fn json<T: for<'a> Deserialize<'a>>(
     })
 }
 
-fn check_levels(levels: &[Level]) -> Result<(), ModelError> {
+pub(crate) fn check_levels(levels: &[Level]) -> Result<(), ModelError> {
     let key = "hrn.levels";
     let numbers: Vec<u8> = levels.iter().map(|level| level.level).collect();
     let consecutive = numbers

@@ -7,7 +7,7 @@ use anyhow::Context as _;
 use hardnessd::tools::{self, exit};
 use hardnessd::train::data::courses::{self, Courses};
 use hardnessd::train::data::dataset::{self, Dataset};
-use hardnessd::train::model::adopt::{self, Told};
+use hardnessd::train::model::adopt::{self, Stated};
 use hardnessd::train::model::course;
 use hardnessd::train::model::evaluated::{Case, Evaluated};
 use hardnessd::train::model::export;
@@ -136,14 +136,14 @@ pub(super) fn adopt_model(arguments: &Adopt) -> anyhow::Result<String> {
     let bytes = read(&arguments.model)?;
     let dataset = courses::single_frames(&arguments.data)?;
     let name = arguments.model.file_name().unwrap_or_default();
-    let told = Told {
+    let stated = Stated {
         method: arguments
             .method
             .clone()
             .unwrap_or_else(|| format!("adopted from {}", name.display())),
         validation: arguments.validation.clone(),
     };
-    let adopted = adopt::adopt(&bytes, &dataset, &told, trial::survives);
+    let adopted = adopt::adopt(&bytes, &dataset, &stated, trial::survives);
     let (model, done, evaluation) =
         adopted.with_context(|| arguments.model.display().to_string())?;
     write(&arguments.out, &model)?;

@@ -95,17 +95,17 @@ pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
 }
 
 fn simulate_courses(arguments: &Simulate, objects: DatasetSettings) -> anyhow::Result<String> {
-    let (told, usual) = (&arguments.courses, CourseSettings::default());
+    let (asked, usual) = (&arguments.courses, CourseSettings::default());
     let settings = CourseSettings {
         objects,
-        frame_rate_hz: told.fps.unwrap_or(usual.frame_rate_hz),
-        speed_mm_s: told.speed.unwrap_or(usual.speed_mm_s),
-        arm_n_per_mm: told.arm.unwrap_or(usual.arm_n_per_mm),
-        hold_s: told.hold.unwrap_or(usual.hold_s),
-        position_error: told.position_error.unwrap_or(usual.position_error),
-        arm_error: told.arm_error.unwrap_or(usual.arm_error),
-        clock_error_frames: told.clock_error.unwrap_or(usual.clock_error_frames),
-        unknown_share: told.unknown.unwrap_or(usual.unknown_share),
+        frame_rate_hz: asked.fps.unwrap_or(usual.frame_rate_hz),
+        speed_mm_s: asked.speed.unwrap_or(usual.speed_mm_s),
+        arm_n_per_mm: asked.arm.unwrap_or(usual.arm_n_per_mm),
+        hold_s: asked.hold.unwrap_or(usual.hold_s),
+        position_error: asked.position_error.unwrap_or(usual.position_error),
+        arm_error: asked.arm_error.unwrap_or(usual.arm_error),
+        clock_error_frames: asked.clock_error.unwrap_or(usual.clock_error_frames),
+        unknown_share: asked.unknown.unwrap_or(usual.unknown_share),
     };
     let begun = Instant::now();
     let courses = simulated::simulate_courses(&settings);

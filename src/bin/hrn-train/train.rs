@@ -10,9 +10,9 @@ use hardnessd::tools;
 use hardnessd::train::data::courses::{self, Courses};
 use hardnessd::train::data::dataset::{Dataset, DatasetError, LabelChoice};
 use hardnessd::train::methods::{self, Method, Request};
-use hardnessd::train::run::Run;
+use hardnessd::train::run::{Description, Run};
 use hardnessd::train::settings::{ArmReports, Profile, Settings};
-use hardnessd::verdict::{BUILT_IN, Hrn};
+use hardnessd::verdict::{BUILT_IN, Hrn, sha256_hex};
 
 use super::account;
 use super::arguments::{Adapt, DeviceName, Train};
@@ -86,8 +86,8 @@ fn train_course(arguments: &Train) -> anyhow::Result<String> {
         settings.reports = ArmReports::ONE_ROBOT;
     }
     let (courses, sources) = Courses::read_all(&arguments.data)?;
-    let told = (arguments.profile, arguments.seed, settings);
-    let description = methods::course::description(Method::Course, &courses, sources, told)?;
+    let choices = (arguments.profile, arguments.seed, settings);
+    let description = methods::course::description(Method::Course, &courses, sources, choices)?;
     let device = device(arguments.device)?;
     let run = Run::open(&arguments.out, &description, arguments.resume)?;
     let labelled = courses.labelled(Split::Train);
@@ -110,14 +110,18 @@ pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
     let (method, profile) = (Method::Adapt, Profile::Paper);
     let settings = settings(method, profile, arguments.config.as_deref())?;
     let device = device(arguments.device)?;
-    let start = match &arguments.start {
+    let (start, sha256) = match &arguments.start {
         Some(path) => {
             let bytes = read(path)?;
-            methods::adapt::Start::read(&load(path)?, &bytes, &device)
-                .with_context(|| path.display().to_string())?
+            let start = methods::adapt::Start::read(&load(path)?, &bytes, &device)
+                .with_context(|| path.display().to_string())?;
+            (start, sha256_hex(&bytes))
         }
-        None => methods::adapt::Start::read(&Hrn::load(BUILT_IN)?, BUILT_IN, &device)
-            .context("the built-in model")?,
+        None => {
+            let start = methods::adapt::Start::read(&Hrn::load(BUILT_IN)?, BUILT_IN, &device)
+                .context("the built-in model")?;
+            (start, sha256_hex(BUILT_IN))
+        }
     };
     let dataset = dataset_of(&arguments.data)?;
     let request = Request {
@@ -126,9 +130,12 @@ pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
         seed: arguments.seed,
         labels: None,
         label_choice: LabelChoice::Object,
-        settings: start.settings(settings),
+        settings: start.settings(settings)?,
     };
-    let description = request.description(&dataset)?;
+    let description = Description {
+        start: Some(sha256),
+        ..request.description(&dataset)?
+    };
     methods::check(method, &dataset, &description)?;
     let run = Run::open(&arguments.out, &description, arguments.resume)?;
     hardnessd::say_part!("{}", tools::lines(&account::of_data(&dataset)));
@@ -151,8 +158,11 @@ fn adapt_course(arguments: &Adapt) -> anyhow::Result<String> {
     let start = methods::course::start(&load(path)?, &bytes, &device)
         .with_context(|| path.display().to_string())?;
     let (courses, sources) = Courses::read_all(&arguments.data)?;
-    let told = (profile, arguments.seed, settings);
-    let description = methods::course::description(method, &courses, sources, told)?;
+    let choices = (profile, arguments.seed, settings);
+    let description = Description {
+        start: Some(sha256_hex(&bytes)),
+        ..methods::course::description(method, &courses, sources, choices)?
+    };
     let run = Run::open(&arguments.out, &description, arguments.resume)?;
     let begun = Instant::now();
     let evaluation = methods::course::train(&courses, Some(start), &description, &run, &device)?;

@@ -3,7 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 use super::so_far::{self, SoFar};
-use super::tables::{self, Table};
+use super::table::Table;
+use super::tables;
 use crate::train::judge::metrics::{self, Bin, Evaluation, ObjectCount};
 
 /// A row of the tables: a control or model, and its results on each set.
@@ -28,10 +29,14 @@ pub struct OnSet {
     pub beyond_neighbour: f64,
     /// Root mean square error of the Shore hardness, in Shore OO; null without a Shore hardness.
     pub shore_rmse: Option<f64>,
+    /// The 95 % interval of the accuracy, by a bootstrap over the geometries where all materials are
+    /// pressed alike, otherwise over the objects. Null if it cannot be computed.
+    #[serde(default)]
+    pub interval: Option<[f64; 2]>,
     /// Presses judged correctly, by object.
     pub objects: Vec<ObjectCount>,
-    /// Accuracy minus that of the first model on the same presses, with its 95 % interval by
-    /// object; null for the first model.
+    /// Accuracy minus that of the first model on the same presses, with its 95 % interval of the same
+    /// kind; null for the first model.
     pub less_first: Option<Difference>,
     /// The evaluation of verdicts before the end of presses; null except for models of format 2.
     pub so_far: Option<SoFar>,
@@ -42,9 +47,12 @@ pub struct OnSet {
 pub struct Difference {
     /// The difference, as a share of the presses.
     pub mean: f64,
-    /// The 95 % interval, by a bootstrap over objects.
+    /// The 95 % interval.
     pub interval: Option<[f64; 2]>,
 }
+
+/// What the intervals are drawn over.
+const CLUSTERS: &str = "by shape where all materials are pressed alike, otherwise by object";
 
 /// The number of [`tables`] that have all rows. The others are each of one row and set.
 pub(super) const OVERVIEW: usize = 4;
@@ -71,15 +79,20 @@ pub(super) fn tables(rows: &[CourseRow]) -> Vec<Table> {
     let mut all = vec![
         of(
             "Accuracy",
-            "Per cent of the presses whose level is right, with a 95 % interval by object.",
+            &format!(
+                "Per cent of the presses whose level is right, with a 95 % interval {CLUSTERS}."
+            ),
             &|on| {
-                let interval = tables::interval_text(on.levels.accuracy_interval_by_object);
+                let interval = tables::interval_text(on.interval);
                 format!("{} ({interval})", percent(on.levels.accuracy))
             },
         ),
         of(
             "Compared with the first model",
-            "Accuracy minus that of the first model on the same presses, in points, with a 95 % interval by object.",
+            &format!(
+                "Accuracy minus that of the first model on the same presses, in points, with a 95 % interval \
+                 {CLUSTERS}."
+            ),
             &|on| {
                 on.less_first.map_or("-".to_owned(), |difference| {
                     tables::difference_text(metrics::Estimate {

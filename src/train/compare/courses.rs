@@ -13,11 +13,11 @@ use anyhow::{Context as _, ensure};
 
 use super::course_results::{self, CourseRow, Difference, OnSet};
 use super::report::{self, Curve};
-use super::so_far;
-use super::tables::Table;
+use super::table::Table;
+use super::{sets, so_far};
 use crate::simulator::Split;
 use crate::train::data::courses::Courses;
-use crate::train::data::dataset;
+use crate::train::data::{dataset, simulated};
 use crate::train::judge::baseline::Baseline;
 use crate::train::judge::metrics::{self, Clusters, Evaluation, Judged};
 use crate::train::judge::press_features::{self, PressOf};
@@ -87,6 +87,8 @@ impl Control {
 /// A set of test presses.
 struct TestSet {
     name: String,
+    /// What is drawn together for intervals.
+    clusters: Clusters,
     courses: Courses,
     presses: Vec<Press>,
 }
@@ -102,6 +104,7 @@ impl TestSet {
         let name = path.file_stem().unwrap_or(path.as_os_str());
         Ok(Self {
             name: name.to_string_lossy().into_owned(),
+            clusters: sets::clusters_of(simulated::settings_of_courses(path)?.as_ref()),
             presses: course::presses(&courses, 1.0)?,
             courses,
         })
@@ -129,7 +132,7 @@ pub fn compare_courses(plan: &CoursePlan) -> anyhow::Result<String> {
     for (name, hrn) in &plan.models {
         rows.extend(of_model(name, hrn, &sets)?);
     }
-    compare_with_first(&mut rows, &plan.models[0].0);
+    compare_with_first(&mut rows, &plan.models[0].0, &sets);
     let json = serde_json::to_vec_pretty(&rows)?;
     write_whole(&plan.out.join("course.json"), &json)?;
     let tables = course_results::tables(&rows);
@@ -208,7 +211,7 @@ fn controls(data: &[PathBuf], sets: &[TestSet]) -> anyhow::Result<Vec<CourseRow>
                     object: Some(set.presses[place].object),
                 })
                 .collect();
-            on_set(&set.name, &judged, levels, None)
+            on_set(set, &judged, levels, None)
         };
         CourseRow {
             name: control.name().to_owned(),
@@ -231,13 +234,13 @@ fn lifted(mut probabilities: Vec<f32>, lifts: &[f32]) -> Vec<f32> {
 
 /// A model's row. A model of format 2 also gets a row of its verdicts without the arm's motion.
 fn of_model(name: &str, hrn: &Hrn, sets: &[TestSet]) -> anyhow::Result<Vec<CourseRow>> {
-    let row = |name: String, told: &dyn Fn(Course) -> Course, is_whole: bool| {
+    let row = |name: String, change: &dyn Fn(Course) -> Course, is_whole: bool| {
         let on = |set: &TestSet| {
-            let verdicts = model::verdicts(hrn, &set.courses, Split::Test, told)?;
+            let verdicts = model::verdicts(hrn, &set.courses, Split::Test, change)?;
             let levels = hrn.card().levels.len();
             let cases = model::cases(&verdicts);
             let rmse = evaluated::shore(&cases, levels).map(|shore| shore.rmse);
-            let mut on = on_set(&set.name, &evaluated::judged(&cases), levels, rmse);
+            let mut on = on_set(set, &evaluated::judged(&cases), levels, rmse);
             if is_whole {
                 on.so_far = Some(so_far::of(
                     hrn,
@@ -256,14 +259,14 @@ fn of_model(name: &str, hrn: &Hrn, sets: &[TestSet]) -> anyhow::Result<Vec<Cours
     match hrn.format() {
         Format::Frame => Ok(vec![row(name.to_owned(), &|course| course, false)?]),
         Format::Course { .. } => Ok(vec![
-            row(format!("{name}, arm unknown"), &untold, false)?,
+            row(format!("{name}, arm unknown"), &without_arm, false)?,
             row(name.to_owned(), &|course| course, true)?,
         ]),
     }
 }
 
 /// The course of a press without the arm's motion and stiffness, as from a robot that reports none.
-fn untold(mut course: Course) -> Course {
+fn without_arm(mut course: Course) -> Course {
     course.arm_n_per_mm = 0.0;
     for moment in &mut course.moments {
         moment.approach_mm = None;
@@ -271,30 +274,33 @@ fn untold(mut course: Course) -> Course {
     course
 }
 
-fn on_set(set: &str, judged: &[Judged], levels: usize, shore_rmse: Option<f64>) -> OnSet {
+fn on_set(set: &TestSet, judged: &[Judged], levels: usize, shore_rmse: Option<f64>) -> OnSet {
     let is_far =
         |one: &&Judged| (argmax(&one.probabilities).0 + 1).abs_diff(usize::from(one.level)) > 1;
+    let objects = metrics::by_object(judged).unwrap_or_default();
+    let accuracy = metrics::accuracy_by_object(&[&objects], set.clusters);
     OnSet {
-        set: set.to_owned(),
+        set: set.name.clone(),
+        interval: accuracy.and_then(|estimate| estimate.interval),
         levels: Evaluation::of(judged, levels),
         calibration: metrics::calibration(judged),
         beyond_neighbour: judged.iter().filter(is_far).count() as f64 / judged.len() as f64,
         shore_rmse,
-        objects: metrics::by_object(judged).unwrap_or_default(),
+        objects,
         less_first: None,
         so_far: None,
     }
 }
 
 /// Fills in the differences to the row called `first`.
-fn compare_with_first(rows: &mut [CourseRow], first: &str) {
+fn compare_with_first(rows: &mut [CourseRow], first: &str, sets: &[TestSet]) {
     let Some(reference) = rows.iter().find(|row| row.name == first).cloned() else {
         return;
     };
     for row in rows.iter_mut().filter(|row| row.name != first) {
-        for (own, others) in row.sets.iter_mut().zip(&reference.sets) {
+        for ((own, others), set) in row.sets.iter_mut().zip(&reference.sets).zip(sets) {
             let pair = (own.objects.as_slice(), others.objects.as_slice());
-            let difference = metrics::difference_by_object(&[pair], Clusters::Objects);
+            let difference = metrics::difference_by_object(&[pair], set.clusters);
             own.less_first = difference.map(|estimate| Difference {
                 mean: estimate.mean,
                 interval: estimate.interval,

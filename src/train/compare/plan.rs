@@ -137,7 +137,7 @@ pub(super) fn planned(
         for seed in seeds {
             let run = PlannedRun {
                 recipe: *recipe,
-                told: recipe.told(seed, plan.profile, dataset)?,
+                description: recipe.description(seed, plan.profile, dataset)?,
                 data: plan.data.clone(),
                 directory: directory.join(format!("{}-{seed}", recipe.name())),
                 // These methods have the same USTGAN as `ours`, and the same generated samples.
@@ -186,7 +186,7 @@ impl Recipe {
     }
 
     /// The description of the recipe's run with a seed.
-    pub(super) fn told(
+    pub(super) fn description(
         &self,
         seed: u64,
         profile: Profile,
@@ -229,7 +229,7 @@ impl Recipe {
 #[derive(Debug)]
 pub(super) struct PlannedRun {
     pub(super) recipe: Recipe,
-    pub(super) told: Description,
+    pub(super) description: Description,
     pub(super) data: PathBuf,
     pub(super) directory: PathBuf,
     /// Name of a run that has stages in common with this run.
@@ -273,8 +273,8 @@ impl PlannedRun {
     /// The difference between the description in the directory and this run's; `None` if there is
     /// no difference or no run.
     fn difference(&self) -> anyhow::Result<Option<String>> {
-        let told = Run::told(&self.directory)?;
-        Ok(told.and_then(|told| told.difference(&self.told)))
+        let before = Run::description_at(&self.directory)?;
+        Ok(before.and_then(|before| before.difference(&self.description)))
     }
 
     fn job(&self, out: &Path) -> Job {
@@ -285,7 +285,7 @@ impl PlannedRun {
             .unwrap_or_default()
             .to_string_lossy()
             .into_owned();
-        let profile = clap::ValueEnum::to_possible_value(&self.told.profile);
+        let profile = clap::ValueEnum::to_possible_value(&self.description.profile);
         let mut arguments: Vec<String> = [
             "train",
             "--resume",
@@ -296,7 +296,7 @@ impl PlannedRun {
             "--out",
             &path(&self.directory),
             "--seed",
-            &self.told.seed.to_string(),
+            &self.description.seed.to_string(),
             "--profile",
             profile
                 .as_ref()

@@ -21,7 +21,8 @@ use self::plot::escaped;
 use crate::train::compare::digits;
 use crate::train::compare::results::{Comparison, Details, Measured, Row};
 use crate::train::compare::sets::{MATCHED, PAPER_SPLIT};
-use crate::train::compare::tables::{self, Table};
+use crate::train::compare::table::Table;
+use crate::train::compare::tables;
 use crate::train::judge::metrics::{Bin, Evaluation};
 
 const STYLE: &str = include_str!("report/style.css");
@@ -132,9 +133,8 @@ pub fn comparison(comparison: &Comparison) -> anyhow::Result<String> {
 /// Fails if the directory holds no run, or a file in it cannot be read or parsed.
 pub fn run(details: &Details) -> anyhow::Result<String> {
     let directory = details.directory.display();
-    let told = details.told.as_ref();
-    let told =
-        told.with_context(|| format!("{directory}: holds neither a comparison nor a run"))?;
+    let run = details.description.as_ref();
+    let run = run.with_context(|| format!("{directory}: holds neither a comparison nor a run"))?;
     let mut page = Page::default();
     let path = details.directory.join("evaluation.json");
     if let Ok(bytes) = std::fs::read(&path) {
@@ -179,12 +179,12 @@ pub fn run(details: &Details) -> anyhow::Result<String> {
         page.picture(&picture)?;
     }
     page.section("settings", "Settings");
-    let settings = toml::to_string(told).context("the run's settings")?;
+    let settings = toml::to_string(run).context("the run's settings")?;
     let _ = writeln!(page.body, "<pre>{}</pre>", escaped(&settings));
-    let title = format!("{}, seed {}", told.method, told.seed);
+    let title = format!("{}, seed {}", run.method, run.seed);
     let provenance = format!(
         "{} labels. {}.",
-        digits::thousands(told.labels as u64),
+        digits::thousands(run.labels as u64),
         details.revisions.replace('\n', ", ")
     );
     Ok(page.finish(&title, &provenance))

@@ -163,7 +163,11 @@ impl Worth {
 
 impl Entry {
     /// Reads the entry of a finished run.
-    pub(super) fn of(run: &Path, told: &Description, sets: &[TestSet]) -> anyhow::Result<Self> {
+    pub(super) fn of(
+        run: &Path,
+        description: &Description,
+        sets: &[TestSet],
+    ) -> anyhow::Result<Self> {
         let worth = Worth::measure(run, sets)?;
         let history = History::read(run)?;
         let simulated = "every comparison has the simulated sets";
@@ -172,11 +176,11 @@ impl Entry {
             .chain(&WORLDS)
             .filter_map(|(name, _)| Some(((*name).to_owned(), worth.evaluation(name)?)));
         Ok(Self {
-            method: told.method.clone(),
-            seed: told.seed,
-            profile: told.profile,
-            labels: told.labels,
-            label_choice: told.label_choice,
+            method: description.method.clone(),
+            seed: description.seed,
+            profile: description.profile,
+            labels: description.labels,
+            label_choice: description.label_choice,
             steps: history.steps(),
             seconds: history.seconds(),
             paper_split: worth.evaluation(PAPER_SPLIT),
@@ -209,7 +213,7 @@ pub struct Details {
     /// The run's directory.
     pub directory: PathBuf,
     /// The run's description.
-    pub told: Option<Description>,
+    pub description: Option<Description>,
     /// The program revisions that made the run, one per line.
     pub revisions: String,
     /// The results on each test set.
@@ -228,7 +232,7 @@ impl Details {
         let revisions = std::fs::read_to_string(directory.join("revision")).unwrap_or_default();
         Ok(Self {
             directory: directory.to_owned(),
-            told: Run::told(directory)?,
+            description: Run::description_at(directory)?,
             revisions: revisions.trim().to_owned(),
             worth: Worth::read(directory),
             history: History::read(directory)?,

@@ -83,6 +83,23 @@ pub(super) fn clusters(set: &str) -> Clusters {
     }
 }
 
+/// The same for the test presses of a file that `settings` made, or that no simulator made.
+pub(super) fn clusters_of(settings: Option<&DatasetSettings>) -> Clusters {
+    let Some(settings) = settings else {
+        return Clusters::Objects;
+    };
+    // An object's number counts all objects before it: the test objects of a material then begin at a
+    // multiple of their number only if the training objects do.
+    let (train, test) = (settings.objects, settings.test_objects);
+    let begin_at_multiples =
+        settings.materials == Materials::Broad || train.is_multiple_of(test.max(1));
+    if settings.shapes != Shapes::Paper && begin_at_multiples && test > 0 {
+        Clusters::Geometries(test)
+    } else {
+        Clusters::Objects
+    }
+}
+
 /// Checks that no model learns from the fresh objects.
 ///
 /// # Errors
@@ -214,7 +231,69 @@ pub(super) fn file_of(
     name: &str,
     settings: &DatasetSettings,
 ) -> anyhow::Result<PathBuf> {
-    let told = serde_json::to_string(settings).context("the simulator's settings")?;
-    let hash = sha256_hex(format!("{} {told}", simulator::VERSION).as_bytes());
+    let settings_json = serde_json::to_string(settings).context("the simulator's settings")?;
+    let hash = sha256_hex(format!("{} {settings_json}", simulator::VERSION).as_bytes());
     Ok(directory.join(format!("{name}-{}.npz", &hash[..8])))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn test_objects_are_drawn_together_where_they_are_pressed_alike() {
+        let settings = |materials, shapes, objects| DatasetSettings {
+            materials,
+            shapes,
+            objects,
+            test_objects: 5,
+            ..DatasetSettings::default()
+        };
+        let (named, broad) = (Materials::Named, Materials::Broad);
+        let alike = Clusters::Geometries(5);
+        for (settings, expected) in [
+            (Some(settings(broad, Shapes::Wide, 0)), alike),
+            (Some(settings(broad, Shapes::Matched, 3)), alike),
+            (Some(settings(named, Shapes::Wide, 10)), alike),
+            (Some(settings(named, Shapes::Wide, 3)), Clusters::Objects),
+            (Some(settings(broad, Shapes::Paper, 0)), Clusters::Objects),
+            (None, Clusters::Objects),
+        ] {
+            assert_eq!(clusters_of(settings.as_ref()), expected, "{settings:?}");
+        }
+    }
+
+    #[test]
+    fn the_test_objects_of_a_cluster_have_one_shape() {
+        let settings = DatasetSettings {
+            materials: Materials::Broad,
+            shapes: Shapes::Wide,
+            objects: 1,
+            test_objects: 2,
+            presses: 1,
+            ..DatasetSettings::default()
+        };
+        let Clusters::Geometries(number) = clusters_of(Some(&settings)) else {
+            panic!("wide shapes are alike");
+        };
+        let samples = simulator::dataset(&settings, 1, |_| {});
+        let tested: Vec<_> = samples
+            .iter()
+            .filter(|sample| sample.split == Split::Test)
+            .collect();
+        assert_eq!(tested.len(), 8);
+        // Objects of one shape are pressed with the same force; other shapes with another.
+        for one in &tested {
+            for other in &tested {
+                let is_alike = one.object % number == other.object % number;
+                assert_eq!(
+                    one.force_n == other.force_n,
+                    is_alike,
+                    "{} {}",
+                    one.object,
+                    other.object
+                );
+            }
+        }
+    }
 }

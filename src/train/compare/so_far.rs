@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::tables::Table;
+use super::table::Table;
 use crate::pipeline::{FIRST_LOOK, look_after};
 use crate::press;
 use crate::train::data::courses::{Courses, Press};

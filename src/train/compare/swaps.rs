@@ -117,7 +117,7 @@ impl Swaps {
             for seed in seeds {
                 let run = PlannedRun {
                     recipe: *recipe,
-                    told: recipe.told(seed, plan.profile, &dataset)?,
+                    description: recipe.description(seed, plan.profile, &dataset)?,
                     data: file.clone(),
                     directory: directory.join(format!("{called}-{seed}")),
                     // Without a swap, the training is the comparison's own run, judged on more
@@ -148,9 +148,9 @@ impl Swaps {
             let test: Option<Evaluation> = read_json(&run.directory.join("evaluation.json"))?;
             if let (true, Some(test)) = (run.is_finished(), test) {
                 entries.push(SwapEntry {
-                    method: run.told.method.clone(),
-                    seed: run.told.seed,
-                    labels: run.told.labels,
+                    method: run.description.method.clone(),
+                    seed: run.description.seed,
+                    labels: run.description.labels,
                     swapped_levels: *swapped_levels,
                     test,
                 });

@@ -9,6 +9,7 @@ use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
 use super::digits::{number, thousands};
+use super::table::Table;
 use crate::train::compare::results::{Comparison, Row, SwapEntry, Worth};
 use crate::train::compare::sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS, WORLDS, clusters};
 use crate::train::judge::metrics::{self, Evaluation};
@@ -22,67 +23,6 @@ pub use cells::{
     accuracy, difference_text, evaluations, interval_text, mean, mean_confusion, paper_row,
     reference, swap_groups,
 };
-
-/// A table.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Table {
-    /// The table's title.
-    pub title: String,
-    /// A note on how to read the table.
-    pub note: String,
-    /// Names of the columns.
-    pub head: Vec<String>,
-    /// The cells, row by row.
-    pub rows: Vec<Vec<String>>,
-}
-
-impl Table {
-    fn new(title: &str, note: &str, head: &[&str]) -> Self {
-        Self {
-            title: title.to_owned(),
-            note: note.to_owned(),
-            head: head.iter().map(|&name| name.to_owned()).collect(),
-            rows: Vec::new(),
-        }
-    }
-
-    /// The head and rows as plain text in columns.
-    pub fn text(&self) -> String {
-        let lines: Vec<&Vec<String>> = std::iter::once(&self.head).chain(&self.rows).collect();
-        let widths: Vec<usize> = (0..self.head.len())
-            .map(|column| lines.iter().map(|line| line[column].chars().count()).max())
-            .map(Option::unwrap_or_default)
-            .collect();
-        let mut text = String::new();
-        for line in lines {
-            let mut row = String::new();
-            for (column, (cell, &width)) in line.iter().zip(&widths).enumerate() {
-                if column == 0 {
-                    let _ = write!(row, "{cell:width$}");
-                } else {
-                    let _ = write!(row, "  {cell:>width$}");
-                }
-            }
-            text += row.trim_end();
-            text.push('\n');
-        }
-        text
-    }
-
-    /// A section of a page: the title, the note and the table, in Markdown.
-    pub fn section(&self) -> String {
-        format!("## {}\n\n{}", self.title, self.markdown())
-    }
-
-    fn markdown(&self) -> String {
-        let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
-        let rule: Vec<String> = (0..self.head.len())
-            .map(|column| if column == 0 { "---" } else { "---:" }.to_owned())
-            .collect();
-        let rows: String = self.rows.iter().map(|row| line(row)).collect();
-        format!("{}\n\n{}{}{rows}", self.note, line(&self.head), line(&rule))
-    }
-}
 
 /// The content of `tables.md`.
 pub fn markdown(comparison: &Comparison) -> String {
@@ -113,7 +53,7 @@ pub fn provenance(comparison: &Comparison) -> String {
             }
         }
         lines.push(made_by + ".");
-        for source in details.told.iter().flat_map(|told| &told.data) {
+        for source in details.description.iter().flat_map(|run| &run.data) {
             let seed = source
                 .seed
                 .map_or(String::new(), |seed| format!(" (seed {seed})"));
@@ -498,10 +438,10 @@ pub fn evaluation(evaluation: &Evaluation) -> Table {
 
 /// The table of a run's results on the test sets of a comparison.
 pub fn sets(worth: &Worth) -> Table {
-    let told = described(&[&SHIFTS[..], &WORLDS[..]].concat());
+    let sets = described(&[&SHIFTS[..], &WORLDS[..]].concat());
     let note = format!(
         "Materials that the model has not learnt from, 20 objects of each. fresh: the paper's shapes; matched: \
-         the same shapes for all materials; {told}. One frame fixes only the ratio of radius and modulus, so \
+         the same shapes for all materials; {sets}. One frame fixes only the ratio of radius and modulus, so \
          varying shapes lower the accuracy of every model."
     );
     let head = ["set", "accuracy, %", "95 %", "calibration error, %"];

@@ -3,6 +3,7 @@
 //! In: files, or the simulator's courses. Out: [`Courses`], with a row per kept frame and a row per
 //! press. `docs/formats.md` has the arrays.
 
+use std::collections::BTreeSet;
 use std::io::{Seek, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -11,7 +12,10 @@ use ndarray::{ArrayView1, ArrayView3};
 use ndarray_npy::{NpzWriter, WriteNpzError};
 
 use super::dataset::file::{self, File};
-use super::dataset::{Dataset, DatasetError, Sample, Source, levels, objects_after, pitch_mm};
+use super::dataset::{
+    Dataset, DatasetError, Sample, Source, levels, objects_after, pitch_mm,
+    warn_of_object_in_both_splits,
+};
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::simulator::{LabelledCourse, NEWTONS_PER_COUNT, Split};
 use crate::verdict::COURSE_FRAMES;
@@ -68,8 +72,8 @@ pub fn single_frames(path: &Path) -> Result<Dataset, DatasetError> {
     if !Courses::is_at(path)? {
         return Dataset::read(path);
     }
-    let (courses, mut sources) = Courses::read_all(&[path.to_owned()])?;
-    Ok(courses.best_frames(path, sources.remove(0)))
+    let (courses, source) = Courses::read_with_source(path)?;
+    Ok(courses.best_frames(path, source))
 }
 
 /// An array with a value for each press: its name, and the value.
@@ -180,7 +184,7 @@ impl Courses {
     }
 
     /// Reads several files as one, and gives the source of each. Objects of different files stay
-    /// apart.
+    /// apart. Prints a warning if an object of a file has presses in both splits.
     ///
     /// # Errors
     ///
@@ -190,11 +194,11 @@ impl Courses {
         let (mut all, mut sources) = (Self::default(), Vec::new());
         let mut first_object = 0;
         for path in paths {
-            let bytes = file::read(path)?;
-            let mut file = File::open(&bytes, path)?;
-            let meta = file.meta()?;
-            let name = path.file_name().unwrap_or_default().to_string_lossy();
-            sources.push(file::source(&bytes, &file, name.into_owned(), &meta)?);
+            let (part, source) = Self::read_with_source(path)?;
+            if let Some(object) = part.object_in_both_splits() {
+                warn_of_object_in_both_splits(path, object);
+            }
+            sources.push(source);
             let (expected, found) = (pitch_mm(&sources), pitch_mm(&sources[sources.len() - 1..]));
             if found != expected {
                 return Err(DatasetError::Pitch {
@@ -204,13 +208,33 @@ impl Courses {
                     first: paths[0].clone(),
                 });
             }
-            let part = Self::parse(&bytes, path)?;
             let last = part.presses.iter().map(|press| press.object).max();
             let before;
             (before, first_object) = objects_after(first_object, last, path.clone())?;
             all.append(part, before);
         }
         Ok((all, sources))
+    }
+
+    fn read_with_source(path: &Path) -> Result<(Self, Source), DatasetError> {
+        let bytes = file::read(path)?;
+        let mut file = File::open(&bytes, path)?;
+        let meta = file.meta()?;
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let source = file::source(&bytes, &file, name.into_owned(), &meta)?;
+        Ok((Self::parse(&bytes, path)?, source))
+    }
+
+    /// An object that has presses in both splits.
+    fn object_in_both_splits(&self) -> Option<u32> {
+        let of = |split| {
+            let presses = self.presses.iter();
+            presses
+                .filter(move |press| press.split == split)
+                .map(|press| press.object)
+        };
+        let trained: BTreeSet<u32> = of(Split::Train).collect();
+        of(Split::Test).find(|object| trained.contains(object))
     }
 
     /// Adds the presses of another file. `objects` is added to their numbers of objects.
@@ -273,6 +297,10 @@ impl Courses {
         file.within("level", &level, levels().len() as u8, "0 (unlabelled) to 4")?;
         file.within("split", &split, 1, "0 (train) or 1 (test)")?;
         file.within("known", &known, 1, "0 or 1")?;
+        if level.is_empty() {
+            let (found, expected) = ("no press".to_owned(), "at least one".to_owned());
+            return Err(file.error("level", found, expected));
+        }
         let ascends = press.first() == Some(&0)
             && press
                 .windows(2)
@@ -280,7 +308,7 @@ impl Courses {
         let last = press.last().map_or(0, |&last| last as usize + 1);
         if !ascends || last != level.len() {
             let found = format!("{last} presses, or a step that is not 0 or 1");
-            let expected = format!("0 to {}, each at least once", level.len() as i64 - 1);
+            let expected = format!("0 to {}, each at least once", level.len() - 1);
             return Err(file.error("press", found, expected));
         }
         let presses = (0..level.len()).map(|k| Press {

@@ -55,6 +55,34 @@ pub fn stated_levels(path: &Path) -> Result<Vec<Level>, DatasetError> {
     })
 }
 
+/// The levels that a model of these files states: those of the first file that states some, otherwise
+/// those of [`levels`].
+pub fn levels_of(sources: &[Source]) -> Vec<Level> {
+    let mut stated = sources.iter().filter_map(|source| source.levels.clone());
+    stated.next().unwrap_or_else(levels)
+}
+
+/// Prints a warning for each file that states other levels than the model will.
+pub fn warn_of_other_levels(sources: &[Source]) {
+    let shown = |levels: &[Level]| {
+        let each = levels
+            .iter()
+            .map(|level| format!("{} {}", level.label, level.shore));
+        each.collect::<Vec<_>>().join(", ")
+    };
+    let ours = levels_of(sources);
+    for source in sources {
+        if let Some(others) = source.levels.as_ref().filter(|others| **others != ours) {
+            crate::say!(
+                "warning: {}: levels: found {}, expected {}, which the model will state",
+                source.name,
+                shown(others),
+                shown(&ours)
+            );
+        }
+    }
+}
+
 /// How the samples are chosen whose labels may be used.
 #[derive(
     Debug,
@@ -124,6 +152,15 @@ impl Sample {
     }
 }
 
+/// Prints the warning that `object` of a file has presses in both splits.
+pub(super) fn warn_of_object_in_both_splits(path: &Path, object: u32) {
+    crate::say!(
+        "warning: {}: object {object} is in both splits: its presses are near-copies, so a test on some \
+         of them overrates a model that learnt from the others",
+        path.display()
+    );
+}
+
 /// Objects by source and level. Each object is a list of samples.
 type Groups = BTreeMap<(usize, u8), Vec<Vec<usize>>>;
 
@@ -140,6 +177,9 @@ pub struct Source {
     pub generator: Option<String>,
     /// Distance between the sensor's taxels, if the file names one.
     pub pitch_mm: Option<f64>,
+    /// The levels that the file states, if a model can state them.
+    #[serde(skip)]
+    pub levels: Option<Vec<Level>>,
 }
 
 /// The name of our simulator in `meta.generator`.
@@ -258,8 +298,8 @@ pub enum DatasetError {
 
 /// Distance between the taxels of the sensor that was pressed, in mm. All sources have the same one.
 pub fn pitch_mm(sources: &[Source]) -> f64 {
-    let told = sources.first().and_then(|source| source.pitch_mm);
-    told.unwrap_or(PITCH_MM)
+    let stated = sources.first().and_then(|source| source.pitch_mm);
+    stated.unwrap_or(PITCH_MM)
 }
 
 /// Numbers the objects of a file after those of other files, which have the numbers below `first`.
@@ -366,11 +406,7 @@ impl Dataset {
     /// Prints a warning if an object has samples in both splits.
     pub fn warn_of_object_in_both_splits(&self) {
         if let Some(object) = self.object_in_both_splits() {
-            crate::say!(
-                "warning: {}: object {object} is in both splits: its presses are near-copies, so a test \
-                 on some of them overrates a model that learnt from the others",
-                self.path().display()
-            );
+            warn_of_object_in_both_splits(&self.path(), object);
         }
     }
 
@@ -424,6 +460,20 @@ impl Dataset {
             (key, objects)
         };
         groups.into_iter().enumerate().map(shuffled).collect()
+    }
+
+    /// The number of the object of each of `indices`, from 0 in the order of their appearance. A
+    /// sample without a known object has an object of its own.
+    pub fn object_numbers(&self, indices: &[usize]) -> Vec<u32> {
+        let mut numbers = BTreeMap::new();
+        let number = |&index: &usize| {
+            let sample = &self.samples[index];
+            let object = sample.object.map_or(u64::MAX - index as u64, u64::from);
+            let next = numbers.len() as u32;
+            let key = (sample.source, sample.level, sample.material, object);
+            *numbers.entry(key).or_insert(next)
+        };
+        indices.iter().map(number).collect()
     }
 
     /// Takes `share` of the objects of every source and level out of `indices`. Gives the kept and

@@ -95,6 +95,17 @@ fn meta(objects: &DatasetSettings, settings: &serde_json::Value) -> serde_json::
     })
 }
 
+/// The settings of the objects that a file of whole presses was simulated with. `None` if no simulator
+/// made it.
+///
+/// # Errors
+///
+/// Returns an error if the file cannot be read.
+pub fn settings_of_courses(path: &Path) -> anyhow::Result<Option<DatasetSettings>> {
+    let mut meta = dataset::meta(path)?;
+    Ok(serde_json::from_value(meta["settings"]["objects"].take()).ok())
+}
+
 /// The settings that a file was simulated with.
 ///
 /// # Errors

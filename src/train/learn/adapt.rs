@@ -17,8 +17,9 @@ use crate::train::run::Run;
 /// Fails as [`force::factor`] does; judging samples with HRN adds no error of its own.
 pub fn with_force_factor(mut start: Start, task: &Task) -> anyhow::Result<Start> {
     let samples = || task.train.iter().map(|&index| &task.dataset.samples[index]);
-    let labels: Vec<Label> = samples()
-        .map(|sample| (sample.level, sample.object))
+    let levels = samples().map(|sample| sample.level);
+    let labels: Vec<Label> = levels
+        .zip(task.dataset.object_numbers(task.train))
         .collect();
     let known = Trained {
         weights: start.weights.clone(),

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use burn::tensor::Device;
 
 use crate::random::Stream;
-use crate::train::learn::fit;
+use crate::train::learn::temperature;
 
 /// Sets of levels and intervals of Shore hardness miss the truth in at most this share of cases.
 pub const ALPHA: f32 = 0.1;
@@ -54,9 +54,15 @@ impl Calibration {
         objects: [0; 2],
     };
 
-    /// Calibrates on held-out presses. `stream` draws presses of the objects. Without held-out
-    /// presses, temperature and widths are those of `start`. With fewer than [`LEAST_OBJECTS`]
-    /// objects, only the widths are, and there are no sets.
+    /// The calibration of a network that learnt no Shore hardness: its interval is the whole scale.
+    pub const WITHOUT_SHORE: Self = Self {
+        widths: [100.0; 2],
+        ..Self::NONE
+    };
+
+    /// Calibrates on held-out presses. `stream` draws presses of the objects. With fewer than
+    /// [`LEAST_OBJECTS`] objects there are no sets. With fewer than that many measured objects, the
+    /// widths stay those of `start`. Without held-out presses, the temperature does too.
     pub fn of(presses: &[Judged], start: &Self, stream: &mut Stream, device: &Device) -> Self {
         if presses.is_empty() {
             return Self {
@@ -67,9 +73,9 @@ impl Calibration {
         }
         let level_and_logits = |press: &Judged| (press.level, press.logits.clone());
         let judged: Vec<_> = presses.iter().map(level_and_logits).collect();
-        let temperature = fit::temperature(&judged);
+        let temperature = temperature::fit(&judged);
         let rows: Vec<Vec<f32>> = judged.into_iter().map(|(_, row)| row).collect();
-        let probabilities = fit::probabilities(&rows, temperature, device);
+        let probabilities = temperature::probabilities(&rows, temperature, device);
         let wrong = presses
             .iter()
             .zip(&probabilities)

@@ -8,7 +8,7 @@ use burn::tensor::{Tensor, TensorData, activation};
 
 use crate::train::learn::learner::Learner;
 use crate::train::net::hrn;
-use crate::train::net::network::{Normalisation, Weights, numbers};
+use crate::train::net::network::{Normalisation, numbers};
 use crate::train::settings::ConsistencySettings;
 use crate::verdict::argmax;
 
@@ -25,8 +25,7 @@ pub struct Views {
     pub strong: Tensor<4>,
 }
 
-/// Takes a step. Returns the loss, the logits of the labelled images before the step, and the share
-/// of unlabelled samples that the network learnt from.
+/// Takes a step. Returns the loss, and the logits of the labelled images before the step.
 ///
 /// Labelled and unlabelled images pass through the network separately, and each batch is normalised
 /// by its own statistics, because the strong views are of other sensors.
@@ -35,14 +34,14 @@ pub fn step(
     views: Views,
     settings: &ConsistencySettings,
     rate: f64,
-) -> (f64, Vec<f32>, f64) {
-    let teacher = hrn.evaluated();
-    let (pseudo, share) = pseudo_targets(&teacher, views.weak, settings.confidence);
+) -> (f64, Vec<f32>) {
+    let weak = hrn::logits(&hrn.evaluated(), views.weak, &mut Normalisation::Batch);
+    let pseudo = pseudo_targets(weak, settings.confidence);
     let tracked = hrn.weights.tracked();
     let logits = hrn::logits(&tracked, views.labelled, &mut Normalisation::Batch);
     let judged = numbers(&logits);
     let mut loss = hrn::cross_entropy(logits, views.targets);
-    if share > 0.0 {
+    if numbers(&pseudo).contains(&1.0) {
         let strong = hrn::logits(&tracked, views.strong, &mut Normalisation::Batch);
         // Where the teacher is not sure, the target is a row of zeros, which adds nothing to the
         // mean.
@@ -51,27 +50,22 @@ pub fn step(
     }
     let mut gradients = loss.backward();
     hrn.step(&tracked, &mut gradients, rate);
-    (f64::from(numbers(&loss)[0]), judged, share)
+    (f64::from(numbers(&loss)[0]), judged)
 }
 
-/// The targets `[batch, L]`, and the share of images with a target. A row has a 1 at the teacher's
-/// level where the teacher's probability reaches `confidence`, and only zeros elsewhere.
-fn pseudo_targets(teacher: &Weights, images: Tensor<4>, confidence: f64) -> (Tensor<2>, f64) {
-    let device = images.device();
-    let logits = hrn::logits(teacher, images, &mut Normalisation::Batch);
-    let [batch, levels] = logits.dims();
-    let probabilities = numbers(&activation::softmax(logits, 1));
-    let mut targets = vec![0.0_f32; batch * levels];
-    let mut sure = 0;
-    for (row, of_image) in probabilities.chunks(levels).enumerate() {
-        let (level, probability) = argmax(of_image);
+/// Targets `[batch, L]` from a teacher's logits `[batch, L]`. A row has a 1 at the most probable level
+/// where its probability reaches `confidence`, and only zeros elsewhere.
+pub fn pseudo_targets(logits: Tensor<2>, confidence: f64) -> Tensor<2> {
+    let (dims, device) = (logits.dims(), logits.device());
+    let mut rows = numbers(&activation::softmax(logits, 1));
+    for row in rows.chunks_mut(dims[1]) {
+        let (level, probability) = argmax(row);
+        row.fill(0.0);
         if f64::from(probability) >= confidence {
-            targets[row * levels + level] = 1.0;
-            sure += 1;
+            row[level] = 1.0;
         }
     }
-    let targets = Tensor::from_data(TensorData::new(targets, [batch, levels]), &device);
-    (targets, f64::from(sure) / batch as f64)
+    Tensor::from_data(TensorData::new(rows, dims), &device)
 }
 
 #[cfg(test)]
@@ -91,10 +85,13 @@ mod tests {
             .collect();
         let images = Tensor::from_data(TensorData::new(values, [6, 1, 28, 28]), &device);
         let teacher = hrn::initial(4, Pooling::Max, 1, &device);
-        let (all, share) = pseudo_targets(&teacher, images.clone(), 0.0);
-        assert_eq!((numbers(&all).iter().sum::<f32>(), share), (6.0, 1.0));
-        let (none, share) = pseudo_targets(&teacher, images.clone(), 1.0);
-        assert_eq!((numbers(&none).iter().sum::<f32>(), share), (0.0, 0.0));
+        let logits = hrn::logits(&teacher, images.clone(), &mut Normalisation::Batch);
+        let sum = |confidence| {
+            numbers(&pseudo_targets(logits.clone(), confidence))
+                .iter()
+                .sum::<f32>()
+        };
+        assert_eq!((sum(0.0), sum(1.0)), (6.0, 0.0));
 
         // If the teacher is sure of no image, the step is the supervised one.
         let views = |confidence| {
@@ -113,7 +110,7 @@ mod tests {
                 weak: images.clone(),
                 strong: images.clone(),
             };
-            let (loss, ..) = step(&mut learner, views, &settings, 0.1);
+            let (loss, _) = step(&mut learner, views, &settings, 0.1);
             (loss, learner.weights.numbers("head.bias"))
         };
         let (supervised, bias) = views(1.0);

@@ -192,9 +192,7 @@ pub fn with_force_factor(
     device: &Device,
 ) -> anyhow::Result<Start> {
     let presses = train.iter().map(|&place| &courses.presses[place]);
-    let labels: Vec<Label> = presses
-        .map(|press| (press.level, Some(press.object)))
-        .collect();
+    let labels: Vec<Label> = presses.map(|press| (press.level, press.object)).collect();
     let trained = Trained {
         weights: start.weights.clone(),
         standard: start.standard.clone(),
@@ -221,7 +219,11 @@ pub fn fit(task: &Task, start: Option<(Start, Calibration)>, run: &Run) -> anyho
     let Some((start, calibration)) = start else {
         let initial = course::initial(task.levels, task.seed, task.device);
         let (weights, standard) = task.learnt(initial, task.standard(), run)?;
-        return Ok(task.calibrated(weights, standard, &Calibration::NONE));
+        let calibration = match task.has_shore() {
+            true => Calibration::NONE,
+            false => Calibration::WITHOUT_SHORE,
+        };
+        return Ok(task.calibrated(weights, standard, &calibration));
     };
     let (weights, standard) = task.learnt(start.weights.clone(), start.standard, run)?;
     let weights = weights.between(&start.weights, LEARNT_SHARE);
@@ -229,6 +231,12 @@ pub fn fit(task: &Task, start: Option<(Start, Calibration)>, run: &Run) -> anyho
 }
 
 impl Task<'_> {
+    /// Whether a press to learn from has a measured Shore hardness.
+    pub fn has_shore(&self) -> bool {
+        let mut train = self.train.iter();
+        train.any(|&place| self.presses[place].shore.is_some())
+    }
+
     fn stream(&self, name: &str) -> Stream {
         Stream::new(self.seed, &format!("{} {name}", self.stage))
     }

@@ -7,7 +7,7 @@
 
 use std::time::Instant;
 
-use burn::tensor::{Device, Tensor, activation};
+use burn::tensor::{Device, Tensor};
 
 use crate::frame::Frame;
 use crate::random::Stream;
@@ -16,6 +16,7 @@ use crate::train::data::dataset::{self, Dataset};
 use crate::train::data::disturb;
 use crate::train::learn::consistency::{self, Views};
 use crate::train::learn::learner::Learner;
+use crate::train::learn::temperature::{self, LevelAndLogits};
 use crate::train::net::hrn;
 use crate::train::net::image::Scale;
 use crate::train::net::network::{Normalisation, Statistics, Weights, numbers};
@@ -63,7 +64,8 @@ pub struct Trained {
     pub weights: Weights,
     /// Mean and variance of each normalised layer over the training samples.
     pub statistics: Statistics,
-    /// The divisor of the logits; 1 without validation objects.
+    /// The divisor of the logits. Without validation objects it is 1, or the start's in
+    /// [`super::adapt`].
     pub temperature: f32,
 }
 
@@ -256,9 +258,7 @@ impl State {
                     weak,
                     strong,
                 };
-                let (loss, judged, _) =
-                    consistency::step(&mut self.learner, views, &settings, rate);
-                (loss, judged)
+                consistency::step(&mut self.learner, views, &settings, rate)
             }
         };
         self.progress.step += 1;
@@ -276,7 +276,7 @@ impl State {
         let trained = task.with_statistics(self.learner.evaluated());
         let (samples, settings) = task.validation;
         let judged = task.judge(&trained, samples);
-        let loss = mean_loss(&judged, 1.0);
+        let loss = temperature::mean_loss(&judged, 1.0);
         let right = judged
             .iter()
             .filter(|(level, logits)| argmax(logits).0 == *level)
@@ -392,7 +392,7 @@ impl Task<'_> {
     /// The temperature of least loss on the validation samples; `None` without any.
     pub(super) fn fitted_temperature(&self, trained: &Trained) -> Option<f32> {
         let (samples, _) = self.validation;
-        (!samples.is_empty()).then(|| temperature(&self.judge(trained, samples)))
+        (!samples.is_empty()).then(|| temperature::fit(&self.judge(trained, samples)))
     }
 
     /// Statistics of the normalised layers over the training samples, augmented as the settings
@@ -418,7 +418,7 @@ impl Task<'_> {
     }
 
     /// The level, from 0, and the logits of each of `indices`.
-    fn judge(&self, trained: &Trained, indices: &[usize]) -> Vec<(usize, Vec<f32>)> {
+    fn judge(&self, trained: &Trained, indices: &[usize]) -> Vec<LevelAndLogits> {
         let levels = indices.iter().map(|&index| self.level(index));
         levels.zip(self.logits(trained, indices)).collect()
     }
@@ -433,60 +433,5 @@ impl Task<'_> {
     /// The level of a labelled sample, from 0.
     fn level(&self, index: usize) -> usize {
         usize::from(self.dataset.samples[index].level) - 1
-    }
-}
-
-/// Mean cross-entropy of logits over `temperature`.
-fn mean_loss(judged: &[(usize, Vec<f32>)], temperature: f64) -> f64 {
-    let loss = |(level, logits): &(usize, Vec<f32>)| {
-        let scaled: Vec<f64> = logits.iter().map(|&l| f64::from(l) / temperature).collect();
-        let top = scaled.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        top + scaled.iter().map(|l| (l - top).exp()).sum::<f64>().ln() - scaled[*level]
-    };
-    judged.iter().map(loss).sum::<f64>() / judged.len() as f64
-}
-
-/// The temperature of least loss, between 1/8 and 8. The loss is convex in 1/T, so a shrinking
-/// bracket finds its minimum.
-pub fn temperature(judged: &[(usize, Vec<f32>)]) -> f32 {
-    let (mut low, mut high) = (0.125_f64, 8.0_f64);
-    for _ in 0..60 {
-        let (left, right) = (low + (high - low) / 3.0, high - (high - low) / 3.0);
-        if mean_loss(judged, 1.0 / left) < mean_loss(judged, 1.0 / right) {
-            high = right;
-        } else {
-            low = left;
-        }
-    }
-    (2.0 / (low + high)) as f32
-}
-
-/// The softmax of the logits over `temperature`, one row per row of logits.
-pub fn probabilities(logits: &[Vec<f32>], temperature: f32, device: &Device) -> Vec<Vec<f32>> {
-    let one = |row: &Vec<f32>| {
-        let scaled = Tensor::<1>::from_floats(row.as_slice(), device).div_scalar(temperature);
-        numbers(&activation::softmax(scaled, 0))
-    };
-    logits.iter().map(one).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_temperature_undoes_overconfidence() {
-        // The larger logit is right in 3 of 4 cases, but the logits are 4 times those of
-        // probability 3/4.
-        let honest = 3.0_f64.ln();
-        let judged: Vec<(usize, Vec<f32>)> = (0..8)
-            .map(|n| (usize::from(n % 4 == 0), vec![(4.0 * honest) as f32, 0.0]))
-            .collect();
-        assert!(
-            (temperature(&judged) - 4.0).abs() < 1e-3,
-            "{}",
-            temperature(&judged)
-        );
-        assert!(mean_loss(&judged, 4.0) < mean_loss(&judged, 1.0));
     }
 }

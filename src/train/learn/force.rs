@@ -11,7 +11,7 @@ use std::collections::BTreeSet;
 
 use burn::tensor::Device;
 
-use crate::train::learn::fit;
+use crate::train::learn::temperature;
 
 /// Steps of the search for an octave, and octaves on either side of 1.
 const STEPS: i32 = 8;
@@ -19,12 +19,11 @@ const OCTAVES: i32 = 2;
 /// The standard deviation of the logarithm of the factor, before any press is seen: two sensors in
 /// three are off by a factor of less than 1.65.
 const DEVIATION: f64 = 0.5;
-/// A level that is less probable than this counts as if it were as probable, so that no single
-/// press decides.
+/// Smaller probabilities are raised to this, so that no single press decides.
 const LEAST_PROBABILITY: f32 = 1e-6;
 
-/// The level 1..=L of a press, and the number of its object.
-pub type Label = (u8, Option<u32>);
+/// The level 1..=L of a press, and the number of its object. No two objects have the same number.
+pub type Label = (u8, u32);
 
 /// The factor of the forces that makes the labels most probable. `logits` judges the labelled
 /// presses with their forces times its argument; `temperature` divides the logits.
@@ -38,9 +37,9 @@ pub fn factor(
     device: &Device,
     mut logits: impl FnMut(f32) -> anyhow::Result<Vec<Vec<f32>>>,
 ) -> anyhow::Result<f32> {
-    let objects: BTreeSet<Option<u32>> = labels.iter().map(|&(_, object)| object).collect();
+    let objects: BTreeSet<u32> = labels.iter().map(|&(_, object)| object).collect();
     most_probable(objects.len(), |factor| {
-        let said = fit::probabilities(&logits(factor)?, temperature, device);
+        let said = temperature::probabilities(&logits(factor)?, temperature, device);
         Ok(mean_loss(&said, labels))
     })
 }
@@ -75,7 +74,7 @@ fn mean_loss(probabilities: &[Vec<f32>], labels: &[Label]) -> f64 {
     sum / probabilities.len().max(1) as f64
 }
 
-/// What the user is told of a factor, if it is not 1.
+/// A line about a factor, for the user. `None` if it is 1.
 pub fn account(factor: f32) -> Option<String> {
     ((factor - 1.0).abs() > 1e-3).then(|| {
         format!(
@@ -107,7 +106,7 @@ mod tests {
     #[test]
     fn one_press_does_not_decide() {
         let rows = [vec![0.0, 1.0], vec![0.5, 0.5]];
-        let loss = mean_loss(&rows, &[(1, None), (2, None)]);
+        let loss = mean_loss(&rows, &[(1, 0), (2, 1)]);
         let expected = (1e6_f64.ln() + 2.0_f64.ln()) / 2.0;
         assert!((loss - expected).abs() < 1e-3, "{loss}");
     }

@@ -4,7 +4,7 @@
 //! any. Out: weights, and the calibration of the verdicts. Training begins from random weights or
 //! from those of an exported file.
 
-use burn::tensor::{Device, Tensor, TensorData, activation};
+use burn::tensor::{Device, Tensor};
 
 use crate::frame::Frame;
 use crate::random::Stream;
@@ -12,6 +12,7 @@ use crate::train::data::augment;
 use crate::train::data::dataset::Dataset;
 use crate::train::data::disturb;
 use crate::train::learn::conformal::{Calibration, Judged};
+use crate::train::learn::consistency;
 use crate::train::learn::epochs::{self, Batch};
 use crate::train::learn::force::{self, Label};
 use crate::train::learn::learner::Learner;
@@ -130,6 +131,7 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
             .samples(task.dataset, task.train)
             .samples(task.dataset, task.held_out)
             .samples(task.dataset, unlabelled)
+            .numbers(task.shore())
             .numbers(standard.numbers())
             .weights(&initial)
             .finish(),
@@ -166,12 +168,12 @@ impl Task<'_> {
     /// Fails if features cannot be computed.
     pub fn with_force_factor(&self, mut start: Start) -> anyhow::Result<Start> {
         let plan = Features::new()?;
-        let samples = self
+        let levels = self
             .train
             .iter()
-            .map(|&sample| &self.dataset.samples[sample]);
-        let labels: Vec<Label> = samples
-            .map(|sample| (sample.level, sample.object))
+            .map(|&sample| self.dataset.samples[sample].level);
+        let labels: Vec<Label> = levels
+            .zip(self.dataset.object_numbers(self.train))
             .collect();
         let frames = self.frames(self.train);
         let mut trained = Trained {
@@ -186,6 +188,15 @@ impl Task<'_> {
         })?;
         start.standard.force_factor *= factor;
         Ok(start)
+    }
+
+    /// The measured Shore hardness of the training samples; NaN where there is none.
+    fn shore(&self) -> impl Iterator<Item = f32> {
+        let samples = self
+            .train
+            .iter()
+            .map(|&sample| &self.dataset.samples[sample]);
+        samples.map(|sample| sample.shore.unwrap_or(f32::NAN))
     }
 
     fn stream(&self, name: &str) -> Stream {
@@ -219,7 +230,9 @@ impl Task<'_> {
         let pseudo = match pseudo {
             Some((weak, strong)) => {
                 let outputs = frame::outputs(&learner.evaluated(), &of(&weak)?);
-                Some((self.sure_targets(&outputs), of(&strong)?))
+                let logits = outputs.slice([0..weak.len(), 0..self.levels]);
+                let targets = consistency::pseudo_targets(logits, self.unlabelled.1.confidence);
+                Some((targets, of(&strong)?))
             }
             None => None,
         };
@@ -266,22 +279,6 @@ impl Task<'_> {
         Some((weak, strong.collect()))
     }
 
-    /// Targets `[batch, L]` from the averaged weights' outputs for the weak views: a 1 at the most
-    /// probable level where its probability reaches the confidence, and only zeros elsewhere.
-    fn sure_targets(&self, outputs: &Tensor<2>) -> Tensor<2> {
-        let count = outputs.dims()[0];
-        let logits = outputs.clone().slice([0..count, 0..self.levels]);
-        let mut rows = numbers(&activation::softmax(logits, 1));
-        for row in rows.chunks_mut(self.levels) {
-            let (level, probability) = argmax(row);
-            row.fill(0.0);
-            if f64::from(probability) >= self.unlabelled.1.confidence {
-                row[level] = 1.0;
-            }
-        }
-        Tensor::from_data(TensorData::new(rows, [count, self.levels]), self.device)
-    }
-
     /// Calibrates on the frames of held-out objects, augmented like the training frames. Without
     /// any, gives `start`.
     fn calibration(
@@ -299,17 +296,20 @@ impl Task<'_> {
         let mut stream = self.stream("calibration");
         let frames = self.varied(self.held_out, &mut stream);
         let said = trained.judge(&frames, plan, self.levels, self.device)?;
-        let judged = |(&sample, (logits, said)): (&usize, (Vec<f32>, [f32; 3]))| {
-            let sample = &self.dataset.samples[sample];
-            Judged {
-                object: sample.object.unwrap_or(0),
-                level: usize::from(sample.level) - 1,
-                shore: sample.shore,
-                logits,
-                said,
-            }
-        };
-        let judged: Vec<Judged> = self.held_out.iter().zip(said).map(judged).collect();
+        let objects = self.dataset.object_numbers(self.held_out);
+        let judged =
+            |((&sample, object), (logits, said)): ((&usize, u32), (Vec<f32>, [f32; 3]))| {
+                let sample = &self.dataset.samples[sample];
+                Judged {
+                    object,
+                    level: usize::from(sample.level) - 1,
+                    shore: sample.shore,
+                    logits,
+                    said,
+                }
+            };
+        let held_out = self.held_out.iter().zip(objects);
+        let judged: Vec<Judged> = held_out.zip(said).map(judged).collect();
         Ok(Calibration::of(&judged, start, &mut stream, self.device))
     }
 }

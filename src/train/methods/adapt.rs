@@ -11,7 +11,7 @@ use crate::train::model::file;
 use crate::train::net::frame as network;
 use crate::train::net::{start, unfolded};
 use crate::train::run::{Description, Run};
-use crate::train::settings::{NetworkSettings, Settings};
+use crate::train::settings::{NetworkSettings, Settings, SettingsError};
 use crate::train::stages::Stages;
 use crate::verdict::Hrn;
 
@@ -92,10 +92,16 @@ impl Start {
     }
 
     /// The settings of the run: the start's network and image instead of the given ones.
-    #[must_use]
-    pub fn settings(&self, settings: Settings) -> Settings {
-        match self {
-            Self::Frame(_) => settings,
+    ///
+    /// # Errors
+    ///
+    /// Fails if the start is of [`Start::Frame`] and `validation.keep` is not `last`.
+    pub fn settings(&self, settings: Settings) -> Result<Settings, SettingsError> {
+        Ok(match self {
+            Self::Frame(_) => {
+                settings.validation.check_last()?;
+                settings
+            }
             Self::Hrn(start) => Settings {
                 full_scale_n: start.scale.full_scale_n,
                 network: NetworkSettings {
@@ -104,7 +110,7 @@ impl Start {
                 },
                 ..settings
             },
-        }
+        })
     }
 }
 

@@ -1,6 +1,8 @@
 //! The method `course`, and `adapt` on presses: the network that judges whole presses, from random
 //! weights or from those of a model file.
 
+use std::collections::{BTreeMap, BTreeSet};
+
 use anyhow::ensure;
 use burn::tensor::Device;
 
@@ -26,13 +28,15 @@ use crate::verdict::Hrn;
 ///
 /// # Errors
 ///
-/// Fails if the data has no labelled training presses.
+/// Fails if the data has no labelled training presses, or if `validation.keep` is not `last`.
 pub fn description(
     method: Method,
     courses: &Courses,
     sources: Vec<Source>,
     (profile, seed, settings): (Profile, u64, Settings),
 ) -> anyhow::Result<Description> {
+    settings.validation.check_last()?;
+    dataset::warn_of_other_levels(&sources);
     let labels = courses.labelled(Split::Train).count();
     ensure!(
         labels > 0,
@@ -45,6 +49,7 @@ pub fn description(
         seed,
         labels,
         label_choice: LabelChoice::Object,
+        start: None,
         settings,
         data: sources,
     })
@@ -94,6 +99,15 @@ pub fn train(
     if let Some(missing) = trained.calibration.missing() {
         crate::say!("{missing}");
     }
+    if !task.has_shore() {
+        let consequence = match description.method == Method::Adapt.name() {
+            true => "the Shore hardness stays as the start gives it",
+            false => {
+                "the model's Shore hardness says nothing, and its interval is always the whole scale"
+            }
+        };
+        crate::say!("no labelled training press has a measured Shore hardness: {consequence}");
+    }
     finish(
         run,
         description,
@@ -123,16 +137,64 @@ pub fn start(hrn: &Hrn, bytes: &[u8], device: &Device) -> anyhow::Result<(Start,
 }
 
 /// Splits presses by their objects into presses to learn from and presses to calibrate on. `share`
-/// is the share of the objects held out for calibration.
+/// is the share of each level's objects held out for calibration.
 fn hold_out(courses: &Courses, all: &[usize], share: f64, seed: u64) -> (Vec<usize>, Vec<usize>) {
-    let object_of = |&place: &usize| courses.presses[place].object;
-    let mut objects: Vec<u32> = all.iter().map(object_of).collect();
-    objects.sort_unstable();
-    objects.dedup();
-    Stream::new(seed, "held-out objects").shuffle(&mut objects);
-    // At least one object stays to learn from.
-    let count = (share * objects.len() as f64).round() as usize;
-    let held = &objects[..count.min(objects.len().saturating_sub(1))];
-    all.iter()
-        .partition(|place| !held.contains(&object_of(place)))
+    let mut by_level = BTreeMap::<u8, BTreeSet<u32>>::new();
+    for &place in all {
+        let press = &courses.presses[place];
+        let objects = by_level.entry(press.level).or_default();
+        objects.insert(press.object);
+    }
+    let stream = Stream::new(seed, "held-out objects");
+    let mut held = BTreeSet::new();
+    for (level, objects) in by_level {
+        let mut objects: Vec<u32> = objects.into_iter().collect();
+        stream.child(level.into()).shuffle(&mut objects);
+        // At least one object of the level stays to learn from.
+        let count = (share * objects.len() as f64).round() as usize;
+        let objects = &objects[..count.min(objects.len() - 1)];
+        held.extend(objects.iter().map(|&object| (level, object)));
+    }
+    let is_held = |place: &usize| {
+        let press = &courses.presses[*place];
+        held.contains(&(press.level, press.object))
+    };
+    all.iter().partition(|place| !is_held(place))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::train::data::courses::Press;
+
+    #[test]
+    fn every_level_keeps_an_object_to_learn_from() {
+        // Level 1 has six objects, level 2 two, and level 3 one, with three presses each.
+        let objects = [(1, 0..6_u32), (2, 6..8), (3, 8..9)];
+        let mut courses = Courses::default();
+        for (level, numbers) in objects {
+            for object in numbers.flat_map(|object| [object; 3]) {
+                courses.presses.push(Press {
+                    level,
+                    object,
+                    material: 0,
+                    split: Split::Train,
+                    shore: f32::NAN,
+                    force_n: 1.0,
+                    arm_n_per_mm: 0.0,
+                    best: 0,
+                });
+            }
+        }
+        let all: Vec<usize> = courses.labelled(Split::Train).collect();
+        for seed in 0..20 {
+            let (kept, held) = hold_out(&courses, &all, 0.5, seed);
+            let of = |places: &[usize], level| {
+                let presses = places.iter().map(|&place| &courses.presses[place]);
+                presses.filter(|press| press.level == level).count()
+            };
+            assert_eq!([1, 2, 3].map(|level| of(&kept, level)), [9, 3, 3]);
+            assert_eq!([1, 2, 3].map(|level| of(&held, level)), [9, 3, 0]);
+        }
+    }
 }

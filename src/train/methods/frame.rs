@@ -7,7 +7,7 @@ use burn::tensor::Device;
 use crate::frame::Frame;
 use crate::train::data::dataset::{self, Dataset};
 use crate::train::learn::frame::{self, Task, Trained};
-use crate::train::learn::{fit, force};
+use crate::train::learn::{force, temperature};
 use crate::train::model::evaluated::Evaluated;
 use crate::train::model::export::{self, Recogniser};
 use crate::train::net::frame as network;
@@ -94,7 +94,11 @@ fn finish(
         let frames: Vec<Frame> = frames.iter().copied().copied().collect();
         let judged = trained.judge(&frames, &plan, levels, device)?;
         let logits: Vec<Vec<f32>> = judged.into_iter().map(|(logits, _)| logits).collect();
-        Ok(fit::probabilities(&logits, calibration.temperature, device))
+        Ok(temperature::probabilities(
+            &logits,
+            calibration.temperature,
+            device,
+        ))
     };
     let (kind, shown) = if samples.held_out.is_empty() {
         ("training", samples.train)

@@ -57,7 +57,7 @@ pub enum Foreign {
 
 /// What the user states about a model besides its data.
 #[derive(Debug, Clone)]
-pub struct Told {
+pub struct Stated {
     /// The value of `hrn.method`.
     pub method: String,
     /// The value of `hrn.validation`. `None` derives it from the origin of the data.
@@ -262,7 +262,7 @@ pub(super) fn set(proto: &mut pb::ModelProto, card: &Card, checks: &Checks) -> a
 pub fn adopt(
     bytes: &[u8],
     dataset: &Dataset,
-    told: &Told,
+    stated: &Stated,
     attempt: impl FnOnce(&[u8]) -> Result<(), ModelError>,
 ) -> anyhow::Result<(Vec<u8>, Vec<String>, Option<Evaluated>)> {
     let mut proto = decode(bytes)?;
@@ -279,10 +279,10 @@ pub fn adopt(
         format: "1".to_owned(),
         levels,
         pitch_mm: dataset.pitch_mm() as f32,
-        method: told.method.clone(),
+        method: stated.method.clone(),
         data: export::data(&dataset.sources)?,
         metrics: json!({}),
-        validation: told
+        validation: stated
             .validation
             .clone()
             .unwrap_or_else(|| export::validation(&dataset.sources).to_owned()),

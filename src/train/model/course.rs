@@ -12,7 +12,7 @@ use crate::train::data::courses::{self, Courses};
 use crate::train::data::dataset;
 use crate::train::learn::conformal::{ALPHA, Calibration};
 use crate::train::learn::course::{Press, Trained};
-use crate::train::learn::fit;
+use crate::train::learn::temperature;
 use crate::train::net::course::{self, FRAMES};
 use crate::train::run::{Description, Run};
 use crate::verdict::{
@@ -37,14 +37,14 @@ pub fn finish(
     trained: &Trained,
     device: &Device,
 ) -> anyhow::Result<Option<Evaluated>> {
-    let levels = dataset::levels();
+    let levels = dataset::levels_of(&description.data);
     let Calibration {
         temperature,
         widths,
         threshold,
         ..
     } = trained.calibration;
-    let mut metrics = metrics(temperature, trained.standard.force_factor);
+    let mut metrics = metrics(description, temperature, trained.standard.force_factor);
     if let Some(missing) = trained.calibration.missing() {
         metrics["not_promised"] = json!(missing);
     }
@@ -55,7 +55,7 @@ pub fn finish(
         .collect();
     let judged = trained.judge(&of_checked, levels.len(), device);
     let logits: Vec<Vec<f32>> = judged.iter().map(|(logits, _)| logits.clone()).collect();
-    let probabilities = fit::probabilities(&logits, temperature, device);
+    let probabilities = temperature::probabilities(&logits, temperature, device);
     let check = |((&place, probabilities), (_, shore)): ((&usize, Vec<f32>), &(_, [f32; 3]))| {
         CheckedCourse {
             course: course_of(courses, place),
@@ -106,7 +106,7 @@ pub fn finish(
     Ok(evaluation)
 }
 
-/// The verdicts of a model on the labelled presses of a split, after `told` has changed each
+/// The verdicts of a model on the labelled presses of a split, after `change` has changed each
 /// course. A model of format 1 judges each press's best frame.
 ///
 /// # Errors
@@ -116,7 +116,7 @@ pub fn verdicts(
     hrn: &Hrn,
     courses: &Courses,
     split: Split,
-    told: impl Fn(Course) -> Course,
+    change: impl Fn(Course) -> Course,
 ) -> anyhow::Result<Vec<(courses::Press, Verdict)>> {
     let mut verdicts = Vec::new();
     for place in courses.labelled(split) {
@@ -129,7 +129,7 @@ pub fn verdicts(
         );
         let verdict = match hrn.format() {
             Format::Frame => hrn.judge(&courses.frame(press.best as usize))?,
-            Format::Course { .. } => hrn.judge_course(&told(course_of(courses, place)))?,
+            Format::Course { .. } => hrn.judge_course(&change(course_of(courses, place)))?,
         };
         verdicts.push((press, verdict));
     }

@@ -91,12 +91,12 @@ impl Evaluated {
 /// The evaluation of the Shore hardness of verdicts; `None` for a model or data without it.
 pub fn shore(cases: &[Case], levels: usize) -> Option<ShoreEvaluation> {
     let both = |case: &Case| Some((case.level, f64::from(case.shore?), case.verdict.shore?));
-    let told: Vec<(u8, f64, Shore)> = cases.iter().filter_map(both).collect();
-    if told.is_empty() {
+    let pairs: Vec<(u8, f64, Shore)> = cases.iter().filter_map(both).collect();
+    if pairs.is_empty() {
         return None;
     }
     let rmse = |of: &dyn Fn(u8, f64) -> bool| {
-        let errors: Vec<f64> = told
+        let errors: Vec<f64> = pairs
             .iter()
             .filter(|(level, truth, _)| of(*level, *truth))
             .map(|(_, truth, shore)| (f64::from(shore.value) - truth).powi(2))
@@ -105,8 +105,8 @@ pub fn shore(cases: &[Case], levels: usize) -> Option<ShoreEvaluation> {
     };
     let is_near =
         |truth: f64| simulator::borders().any(|border| (truth - border).abs() <= NEAR_BORDER);
-    let n = told.len() as f64;
-    let held = told
+    let n = pairs.len() as f64;
+    let held = pairs
         .iter()
         .filter(|(_, truth, shore)| (f64::from(shore.low)..=f64::from(shore.high)).contains(truth));
     Some(ShoreEvaluation {
@@ -116,7 +116,7 @@ pub fn shore(cases: &[Case], levels: usize) -> Option<ShoreEvaluation> {
             .collect(),
         rmse_near_borders: rmse(&|_, truth| is_near(truth)),
         coverage: held.count() as f64 / n,
-        width: told
+        width: pairs
             .iter()
             .map(|(.., shore)| f64::from(shore.high - shore.low))
             .sum::<f64>()

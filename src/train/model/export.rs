@@ -60,11 +60,11 @@ pub fn finish(
     });
     let mut card = Card {
         format: "1".to_owned(),
-        levels: dataset::levels(),
+        levels: dataset::levels_of(&description.data),
         pitch_mm: dataset.pitch_mm() as f32,
         method: description.method.clone(),
         data: data(&description.data)?,
-        metrics: metrics(recogniser.temperature, recogniser.force_factor),
+        metrics: metrics(description, recogniser.temperature, recogniser.force_factor),
         validation: validation(&description.data).to_owned(),
         range: range(train.iter().map(|&index| dataset.samples[index].frame)),
         conformal: None,
@@ -104,8 +104,15 @@ pub fn finish(
 }
 
 /// What a file says of itself before it is measured.
-pub fn metrics(temperature: f32, force_factor: f32) -> serde_json::Value {
+pub fn metrics(
+    description: &Description,
+    temperature: f32,
+    force_factor: f32,
+) -> serde_json::Value {
     let mut metrics = json!({ "temperature": temperature });
+    if let Some(start) = &description.start {
+        metrics["start"] = json!(start);
+    }
     if force_factor != 1.0 {
         metrics["force_factor"] = json!(force_factor);
     }
@@ -272,6 +279,7 @@ mod tests {
                 sha256: String::new(),
                 generator: generator.map(str::to_owned),
                 pitch_mm: None,
+                levels: None,
             };
             let sources: Vec<Source> = generators.iter().map(source).collect();
             assert_eq!(validation(&sources), expected, "{generators:?}");

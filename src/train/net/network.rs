@@ -271,8 +271,8 @@ pub fn add_trunk(weights: &mut Weights, stream: &Stream, device: &Device) {
     }
 }
 
-/// Adds the linear layer after the trunk, of `[features, outputs]`: 1 output for a discriminator,
-/// L for a recogniser.
+/// Adds the linear layer after the trunk, of `[features, outputs]`: L outputs for a recogniser, those
+/// of its game for a discriminator.
 pub fn add_head(weights: &mut Weights, dims: [usize; 2], stream: &Stream, device: &Device) {
     let [features, outputs] = dims;
     let values = truncated_normal(features * outputs, &mut stream.child(TRUNK.len() as u64));

@@ -14,6 +14,7 @@ fn description(name: &str, sha256: &str) -> Description {
         seed: 1,
         labels: 4,
         label_choice: LabelChoice::Object,
+        start: None,
         settings: Settings::of(Profile::Smoke),
         data: vec![Source {
             name: name.to_owned(),
@@ -21,6 +22,7 @@ fn description(name: &str, sha256: &str) -> Description {
             sha256: sha256.to_owned(),
             generator: None,
             pitch_mm: None,
+            levels: None,
         }],
     }
 }

@@ -16,6 +16,12 @@ pub enum SettingsError {
         /// The accepted range.
         expected: &'static str,
     },
+    /// `validation.keep` is `best`, and the network is not validated while it trains.
+    #[error(
+        "`validation.keep`: found best, expected last: this network uses held-out objects for its calibration \
+         only"
+    )]
+    Keep,
     /// A run of an earlier version used an option that no longer exists.
     #[error("the run used `{key}`, which is gone: read it with revision {last_revision}")]
     Retired {

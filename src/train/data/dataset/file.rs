@@ -13,7 +13,7 @@ use super::{Dataset, DatasetError, Sample, Source, levels};
 use crate::frame::{COLS, Frame, ROWS, TAXELS};
 use crate::npy::{self, Header, NpyError};
 use crate::simulator::Split;
-use crate::verdict::sha256_hex;
+use crate::verdict::{Level, check_levels, sha256_hex};
 
 /// A force above any sensor's, and low enough that sums of squares stay finite.
 const MOST_NEWTONS: f32 = 1e6;
@@ -138,6 +138,9 @@ pub(in crate::train::data) fn source(
         sha256: sha256_hex(bytes),
         generator: meta["generator"].as_str().map(str::to_owned),
         pitch_mm,
+        levels: serde_json::from_value(meta["levels"].clone()).ok().filter(
+            |stated: &Vec<Level>| stated.len() == levels().len() && check_levels(stated).is_ok(),
+        ),
     })
 }
 

@@ -346,6 +346,56 @@ fn labels_are_chosen_by_object_and_equally_from_each_level() {
 }
 
 #[test]
+fn objects_of_one_number_are_several_if_their_levels_differ() {
+    let sample = |level, object| Sample {
+        frame: Frame::default(),
+        level,
+        object,
+        material: None,
+        force_n: None,
+        split: Split::Train,
+        shore: None,
+        source: 0,
+    };
+    let (known, unknown) = (Some(7), None);
+    let samples = [
+        (1, known),
+        (2, known),
+        (1, known),
+        (1, unknown),
+        (1, unknown),
+    ];
+    let dataset = Dataset {
+        samples: samples
+            .map(|(level, object)| sample(level, object))
+            .to_vec(),
+        sources: Vec::new(),
+        paths: Vec::new(),
+    };
+    assert_eq!(dataset.object_numbers(&[0, 1, 2, 3, 4]), [0, 1, 0, 2, 3]);
+}
+
+#[test]
+fn a_model_states_the_levels_of_its_data() {
+    let stated = |shore: &str| Some(vec![level(&LEVELS[0], shore)]);
+    let source = |levels| Source {
+        name: "a.npz".to_owned(),
+        seed: None,
+        sha256: String::new(),
+        generator: None,
+        pitch_mm: None,
+        levels,
+    };
+    assert_eq!(levels_of(&[source(None)]), levels());
+    let several = [
+        source(None),
+        source(stated("70-90")),
+        source(stated("60-90")),
+    ];
+    assert_eq!(levels_of(&several), stated("70-90").unwrap());
+}
+
+#[test]
 fn joined_files_keep_their_objects_apart() {
     let part = parse(&bytes_of(&samples())).unwrap();
     let all = Dataset::joined(vec![part.clone(), part]).unwrap();
