@@ -296,20 +296,21 @@ impl Task<'_> {
         let mut stream = self.stream("calibration");
         let frames = self.varied(self.held_out, &mut stream);
         let said = trained.judge(&frames, plan, self.levels, self.device)?;
+        let samples = self
+            .held_out
+            .iter()
+            .map(|&sample| &self.dataset.samples[sample]);
         let objects = self.dataset.object_numbers(self.held_out);
-        let judged =
-            |((&sample, object), (logits, said)): ((&usize, u32), (Vec<f32>, [f32; 3]))| {
-                let sample = &self.dataset.samples[sample];
-                Judged {
-                    object,
-                    level: usize::from(sample.level) - 1,
-                    shore: sample.shore,
-                    logits,
-                    said,
-                }
-            };
-        let held_out = self.held_out.iter().zip(objects);
-        let judged: Vec<Judged> = held_out.zip(said).map(judged).collect();
+        let rows = samples.zip(objects).zip(said);
+        let judged: Vec<Judged> = rows
+            .map(|((sample, object), (logits, said))| Judged {
+                object,
+                level: usize::from(sample.level) - 1,
+                shore: sample.shore,
+                logits,
+                said,
+            })
+            .collect();
         Ok(Calibration::of(&judged, start, &mut stream, self.device))
     }
 }

@@ -73,7 +73,11 @@ pub fn train(
     }
     let trained = frame::fit(&task, start, run)?;
     let missing = trained.calibration.missing_interval();
-    if let Some(missing) = missing.filter(|_| samples.has_shore()) {
+    if !samples.has_shore() {
+        crate::say!(
+            "no labelled training press has a measured Shore hardness: the model does not give Shore hardness"
+        );
+    } else if let Some(missing) = missing {
         crate::say!("{missing}");
     }
     finish(samples, &trained, description, run, device)
