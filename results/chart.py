@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Draws docs/results.png from results/quick-three-seeds/objects.csv.
+"""Draws docs/results.png from results/quick/objects.csv.
 
     pip install matplotlib numpy scipy && python results/chart.py
 """
@@ -45,7 +45,7 @@ def main():
     names = list(METHODS)[::-1]
     border = WITH_MORE_LABELS - 0.5
     for axes, (wanted, title) in zip(panels, SETS.items()):
-        methods = intervals.read(HERE / "quick-three-seeds/objects.csv", wanted)
+        methods = intervals.read(HERE / "quick/objects.csv", wanted)
         for place, name in enumerate(names):
             mean, low, high = (100 * value for value in intervals.interval(list(methods[name].values()), 0))
             axes.errorbar(mean, place, xerr=[[mean - low], [high - mean]], fmt="o", color="#1f77b4", capsize=3)

@@ -2,9 +2,9 @@
 """Accuracies or their differences, with 95 % intervals, computed again from the committed counts of objects.
 
     pip install numpy scipy
-    python3 results/intervals.py results/quick-three-seeds                   # accuracies, set `matched`
-    python3 results/intervals.py results/quick-three-seeds --less hrn15      # each accuracy minus that of hrn15
-    python3 results/intervals.py results/quick-three-seeds --set fresh       # another set of objects.csv
+    python3 results/intervals.py results/quick                   # accuracies, set `matched`
+    python3 results/intervals.py results/quick --less hrn15      # each accuracy minus that of hrn15
+    python3 results/intervals.py results/quick --set fresh       # another set of objects.csv
     python3 results/intervals.py results/course --set others-matched         # a set of course.json
 
 A difference is taken object by object under the same seed, so what is hard for both methods cancels out.

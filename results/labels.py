@@ -3,7 +3,7 @@
 
     pip install matplotlib numpy scipy && python results/labels.py
 
-`fixmatch` is in results/quick-three-seeds/results.json, the other methods are in results/labels/results.json. Both
+`fixmatch` is in results/quick/results.json, the other methods are in results/labels/results.json. Both
 comparisons learnt from the same data under the same seeds. Runs that are in both have the same accuracies: the script
 ends with an error if one differs.
 
@@ -52,7 +52,7 @@ def accuracies(folder, wanted):
 
 def joined(wanted):
     """The accuracies on a set of both comparisons."""
-    runs, later = accuracies("labels", wanted), accuracies("quick-three-seeds", wanted)
+    runs, later = accuracies("labels", wanted), accuracies("quick", wanted)
     for shared in runs.keys() & later.keys():
         assert runs[shared] == later[shared], f"{shared} differs: {runs[shared]}, {later[shared]}"
     return runs | later
@@ -66,7 +66,7 @@ def difference(wanted, runs, method, labels):
     """A method's accuracy less that of hrn15-strong under the same seeds, in points, with its 95 % interval."""
     seeds, others = runs[method, labels], runs["hrn15-strong", labels]
     if labels == 1500:
-        counts = intervals.read(HERE / "quick-three-seeds/objects.csv", wanted)
+        counts = intervals.read(HERE / "quick/objects.csv", wanted)
         pairs = intervals.less(counts[method], counts["hrn15-strong"])
         return signed(*(100 * value for value in intervals.interval(pairs, -1)))
     values = [seeds[seed] - others[seed] for seed in seeds]

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Draws docs/gan-breaks.png from the runs of `ours` in results/paper-steps: how the USTGAN goes over 500 epochs.
+"""Draws docs/gan-breaks.png from the runs of `ours` in results/paper: how the USTGAN goes over 500 epochs.
 
     pip install matplotlib && python results/paper_gan.py
 """
@@ -14,7 +14,7 @@ import matplotlib.image  # noqa: E402
 import matplotlib.pyplot as plt  # noqa: E402
 
 HERE = pathlib.Path(__file__).resolve().parent
-RUNS = HERE / "paper-steps/runs"
+RUNS = HERE / "paper/runs"
 # Columns of metrics.csv -> their description.
 CURVES = {
     "loss": "loss of the discriminator",

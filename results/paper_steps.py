@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Draws docs/paper-steps.png from results/paper-steps/results.json: accuracy with the paper's own number of steps.
+"""Draws docs/paper-steps.png from results/paper/results.json: accuracy with the paper's own number of steps.
 
     pip install matplotlib && python results/paper_steps.py
 """
@@ -38,7 +38,7 @@ SETS = {
 
 
 def main():
-    runs = json.loads((HERE / "paper-steps/results.json").read_text())
+    runs = json.loads((HERE / "paper/results.json").read_text())
     figure, axes = plt.subplots(figsize=(8.4, 0.42 * len(METHODS) + 1.2), layout="constrained")
     names = []
     for method, (what, _) in METHODS.items():

@@ -196,7 +196,7 @@ impl Settings {
         match profile {
             Profile::Paper => paper,
             // A tenth of the paper's steps in every stage. All methods take about an hour of one
-            // core per seed (`results/quick-three-seeds`).
+            // core per seed (`results/quick`).
             Profile::Quick => paper.with_epochs(50, 20),
             Profile::Smoke => Self {
                 generation: Generation {

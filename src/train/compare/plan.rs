@@ -204,7 +204,7 @@ impl Recipe {
     }
 
     /// The cost of a run, in thousands of HRN's steps in the `paper` profile. A step of a GAN
-    /// counts as six (by the seconds in `results/quick-three-seeds`). Stages taken from `ours` count
+    /// counts as six (by the seconds in `results/quick`). Stages taken from `ours` count
     /// nothing. Other profiles have the same proportions.
     fn effort(&self) -> f64 {
         match self.method {
