@@ -151,7 +151,16 @@ fn adapt(at: &Path, start: &[u8]) {
                     --fps 20 --seed 6 --out own.npz";
     succeed(at, simulate);
     let adapt = "adapt --data own.npz --config settings.toml --start whole/hrn.onnx";
-    succeed(at, &format!("{adapt} --out own"));
+    let told = succeed(at, &format!("{adapt} --out own"));
+    let of_start = succeed(at, "evaluate --model whole/hrn.onnx --data own.npz");
+    let percent = |said: &str, name: &str| {
+        let (_, figure) = said.split_once(name).expect(said);
+        figure.split_once(' ').expect(said).0.to_owned()
+    };
+    assert_eq!(
+        percent(&told, "accuracy of its start  "),
+        percent(&of_start, "accuracy           ")
+    );
     let own = std::fs::read(at.join("own/hrn.onnx")).unwrap();
     let (before, after) = (Hrn::load(start).unwrap(), Hrn::load(&own).unwrap());
     assert_eq!(after.card().method, "adapt");

@@ -10,6 +10,8 @@ use hardnessd::tools;
 use hardnessd::train::data::courses::{self, Courses};
 use hardnessd::train::data::dataset::{Dataset, DatasetError, LabelChoice};
 use hardnessd::train::methods::{self, Method, Request};
+use hardnessd::train::model::evaluated::Evaluated;
+use hardnessd::train::model::{course, export};
 use hardnessd::train::run::{Description, Run};
 use hardnessd::train::settings::{ArmReports, Profile, Settings};
 use hardnessd::verdict::{BUILT_IN, Hrn, sha256_hex};
@@ -110,19 +112,14 @@ pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
     let (method, profile) = (Method::Adapt, Profile::Paper);
     let settings = settings(method, profile, arguments.config.as_deref())?;
     let device = device(arguments.device)?;
-    let (start, sha256) = match &arguments.start {
-        Some(path) => {
-            let bytes = read(path)?;
-            let start = methods::adapt::Start::read(&load(path)?, &bytes, &device)
-                .with_context(|| path.display().to_string())?;
-            (start, sha256_hex(&bytes))
-        }
+    let (model, bytes, name) = match &arguments.start {
+        Some(path) => (load(path)?, read(path)?, path.display().to_string()),
         None => {
-            let start = methods::adapt::Start::read(&Hrn::load(BUILT_IN)?, BUILT_IN, &device)
-                .context("the built-in model")?;
-            (start, sha256_hex(BUILT_IN))
+            let name = "the built-in model".to_owned();
+            (Hrn::load(BUILT_IN)?, BUILT_IN.to_vec(), name)
         }
     };
+    let start = methods::adapt::Start::read(&model, &bytes, &device).context(name)?;
     let dataset = dataset_of(&arguments.data)?;
     let request = Request {
         method,
@@ -133,7 +130,7 @@ pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
         settings: start.settings(settings)?,
     };
     let description = Description {
-        start: Some(sha256),
+        start: Some(sha256_hex(&bytes)),
         ..request.description(&dataset)?
     };
     methods::check(method, &dataset, &description)?;
@@ -141,11 +138,12 @@ pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
     hardnessd::say_part!("{}", tools::lines(&account::of_data(&dataset)));
     let begun = Instant::now();
     let evaluation = methods::adapt::train(&dataset, start, &description, &run, &device)?;
-    Ok(account_of_run(
-        begun,
-        &run,
-        evaluation.as_ref().map(account::of_evaluated),
-    ))
+    let beside_start = |evaluation: &Evaluated| {
+        let cases = export::cases(&model, &dataset, &dataset.labelled(Split::Test)?)?;
+        Ok(account::of_adapted(evaluation, &model, &cases))
+    };
+    let figures: anyhow::Result<Option<String>> = evaluation.as_ref().map(beside_start).transpose();
+    Ok(account_of_run(begun, &run, figures?))
 }
 
 /// Continues to train a model of whole presses.
@@ -155,7 +153,8 @@ fn adapt_course(arguments: &Adapt) -> anyhow::Result<String> {
     let settings = settings(method, profile, arguments.config.as_deref())?;
     let device = device(arguments.device)?;
     let bytes = read(path)?;
-    let start = methods::course::start(&load(path)?, &bytes, &device)
+    let model = load(path)?;
+    let start = methods::course::start(&model, &bytes, &device)
         .with_context(|| path.display().to_string())?;
     let (courses, sources) = Courses::read_all(&arguments.data)?;
     let choices = (profile, arguments.seed, settings);
@@ -166,11 +165,16 @@ fn adapt_course(arguments: &Adapt) -> anyhow::Result<String> {
     let run = Run::open(&arguments.out, &description, arguments.resume)?;
     let begun = Instant::now();
     let evaluation = methods::course::train(&courses, Some(start), &description, &run, &device)?;
-    Ok(account_of_run(
-        begun,
-        &run,
-        evaluation.as_ref().map(account::of_evaluated),
-    ))
+    let beside_start = |evaluation: &Evaluated| {
+        let verdicts = course::verdicts(&model, &courses, Split::Test, |course| course)?;
+        Ok(account::of_adapted(
+            evaluation,
+            &model,
+            &course::cases(&verdicts),
+        ))
+    };
+    let figures: anyhow::Result<Option<String>> = evaluation.as_ref().map(beside_start).transpose();
+    Ok(account_of_run(begun, &run, figures?))
 }
 
 /// The data of several files, joined.
