@@ -33,7 +33,8 @@ METHODS = {
 LABELS = {"hrn50": 5_000, "hrn100": 10_000}
 SETS = {
     "paper_split": ("#1f77b4", "o", "test split, as in the paper"),
-    "matched": ("#ff7f0e", "s", "fresh presses, the same shapes for all materials"),
+    "matched": ("#ff7f0e", "s", "fresh presses, `matched` shapes"),
+    "wide": ("#2ca02c", "^", "fresh presses, `wide` shapes"),
 }
 
 
@@ -49,8 +50,9 @@ def main():
             names.append((method, f"{method} ({what}), {seeds}", own))
     names.reverse()
     for place, (method, _, own) in enumerate(names):
-        for shift, (key, (colour, marker, label)) in zip((0.13, -0.13), SETS.items()):
-            percents = [100 * run[key]["accuracy"] for run in own if run[key]]
+        for shift, (key, (colour, marker, label)) in zip((0.22, 0, -0.22), SETS.items()):
+            found = [(run | run["shifts"])[key] for run in own]
+            percents = [100 * one["accuracy"] for one in found if one]
             if not percents:
                 continue
             at = [place + shift] * len(percents)
