@@ -19,6 +19,7 @@ import argparse
 import collections
 import csv
 import json
+import math
 import pathlib
 import re
 
@@ -107,6 +108,12 @@ def interval(seeds, least):
     return mean, max(mean - reach, least), min(mean + reach, 1)
 
 
+def percent(share, sign=""):
+    """A share in per cent, with one digit. Halves are rounded away from 0, as in the tables of hrn-train."""
+    text = f"{100 * share + math.copysign(1e-9, share):{sign}.1f}"
+    return "0.0" if text in ("+0.0", "-0.0") else text
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=pathlib.Path)
@@ -128,7 +135,7 @@ def main():
             sign, counts, least = "+", less(seeds, methods[options.less]), -1
         if not counts:
             continue
-        mean, low, high = (f"{100 * value:{sign}.1f}" for value in interval(counts, least))
+        mean, low, high = (percent(share, sign) for share in interval(counts, least))
         print(f"{method:22} {len(counts)} seeds  {mean}  {low} to {high}")
 
 
