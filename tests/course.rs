@@ -152,15 +152,11 @@ fn adapt(at: &Path, start: &[u8]) {
     succeed(at, simulate);
     let adapt = "adapt --data own.npz --config settings.toml --start whole/hrn.onnx";
     let told = succeed(at, &format!("{adapt} --out own"));
-    let of_start = succeed(at, "evaluate --model whole/hrn.onnx --data own.npz");
-    let percent = |said: &str, name: &str| {
-        let (_, figure) = said.split_once(name).expect(said);
-        figure.split_once(' ').expect(said).0.to_owned()
-    };
-    assert_eq!(
-        percent(&told, "accuracy of its start  "),
-        percent(&of_start, "accuracy           ")
-    );
+    let of_start = succeed(at, "evaluate --model whole/hrn.onnx --data own.npz --json");
+    let of_start: Value = serde_json::from_str(&of_start).unwrap();
+    let percent = 100.0 * of_start["accuracy"].as_f64().unwrap();
+    let last = format!("accuracy of its start  {percent:.1} %\n");
+    assert!(told.ends_with(&last), "{told}{last}");
     let own = std::fs::read(at.join("own/hrn.onnx")).unwrap();
     let (before, after) = (Hrn::load(start).unwrap(), Hrn::load(&own).unwrap());
     assert_eq!(after.card().method, "adapt");
