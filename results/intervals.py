@@ -2,10 +2,10 @@
 """Accuracies or their differences, with 95 % intervals, computed again from the committed counts of objects.
 
     pip install numpy scipy
-    python3 results/intervals.py results/quick                   # accuracies, set `matched`
-    python3 results/intervals.py results/quick --less hrn15      # each accuracy minus that of hrn15
-    python3 results/intervals.py results/quick --set fresh       # another set of objects.csv
-    python3 results/intervals.py results/course --set others-matched         # a set of course.json
+    python3 results/intervals.py results/quick                            # accuracies, set `matched`
+    python3 results/intervals.py results/quick --less hrn15               # each accuracy minus that of hrn15
+    python3 results/intervals.py results/quick --set fresh                # another set of objects.csv
+    python3 results/intervals.py results/course --set others-matched      # a set of course.json
 
 A difference is taken object by object under the same seed, so what is hard for both methods cancels out.
 
@@ -109,7 +109,7 @@ def interval(seeds, least):
 
 
 def percent(share, sign=""):
-    """A share in per cent, with one digit. Halves are rounded away from 0, as in the tables of hrn-train."""
+    """A share in per cent, with one digit. Halves are rounded away from 0."""
     text = f"{100 * share + math.copysign(1e-9, share):{sign}.1f}"
     return "0.0" if text in ("+0.0", "-0.0") else text
 
