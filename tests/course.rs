@@ -326,6 +326,33 @@ fn a_method_of_single_frames_learns_from_the_best_frame_of_each_press() {
 }
 
 #[test]
+fn levels_weigh_as_the_network_says_unless_the_settings_do() {
+    let directory = tempfile::tempdir().unwrap();
+    let at = directory.path();
+    succeed(
+        at,
+        "simulate --sequences --materials broad --shapes matched --objects 5 --test-objects 0 --presses 2 \
+         --fps 5..20 --seed 4 --out d.npz",
+    );
+    for (method, own) in [("frame", "1.0"), ("course", "0.5")] {
+        let model = |balance: Option<&str>| {
+            let line = balance.map(|balance| format!("level_balance = {balance}"));
+            let text = format!("[training]\nepochs = 1\n{}", line.unwrap_or_default());
+            std::fs::write(at.join("settings.toml"), text).unwrap();
+            let out = format!("{method}-{}", balance.unwrap_or("own"));
+            succeed(
+                at,
+                &format!("train --method {method} --data d.npz --config settings.toml --out {out}"),
+            );
+            std::fs::read(at.join(out).join("hrn.onnx")).unwrap()
+        };
+        let of_the_network = model(None);
+        assert!(of_the_network == model(Some(own)), "{method} {own}");
+        assert!(of_the_network != model(Some("0.0")), "{method} 0.0");
+    }
+}
+
+#[test]
 fn what_does_not_go_together_is_wrong_usage() {
     let directory = tempfile::tempdir().unwrap();
     let at = directory.path();

@@ -99,6 +99,11 @@ pub struct Training {
     pub averaging: f64,
     /// The number of epochs between two checkpoints. The last epoch always ends with one.
     pub checkpoint_every_epochs: u32,
+    /// How far the weights of levels with few samples are raised, from 0 to 1. With 0 all samples
+    /// count the same, with 1 all levels do. `None` is the network's own: 1 for a network that
+    /// judges a frame, 0.5 for one that judges a whole press. The paper's networks ignore it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub level_balance: Option<f64>,
     /// Settings of the optimiser.
     pub optimiser: OptimiserSettings,
     /// The changes made to a frame before each use.
@@ -112,6 +117,7 @@ impl Default for Training {
             epochs: 200,
             averaging: 0.0,
             checkpoint_every_epochs: 5,
+            level_balance: None,
             optimiser: OptimiserSettings::default(),
             augmentation: AugmentationSettings::default(),
         }
@@ -293,6 +299,9 @@ impl Training {
             self.averaging,
             self.checkpoint_every_epochs,
         )?;
+        let balance = self.level_balance.unwrap_or_default();
+        let fits = (0.0..=1.0).contains(&balance);
+        check(table, "level_balance", balance, fits, "0 to 1")?;
         self.optimiser.check(table)?;
         let shift = self.augmentation.shift_taxels;
         let key = "augmentation.shift_taxels";
@@ -372,6 +381,10 @@ mod tests {
             (
                 "[training]\nepochs = 0",
                 "`training.epochs`: found 0, expected 1 or more",
+            ),
+            (
+                "[training]\nlevel_balance = 2",
+                "`training.level_balance`: found 2, expected 0 to 1",
             ),
             (
                 "[stgan]\noptimiser.beta1 = 1",

@@ -193,7 +193,7 @@ fn controls(data: &[PathBuf], sets: &[TestSet]) -> anyhow::Result<Vec<CourseRow>
     // Raise the weights of levels with few presses halfway, as the method `course` does.
     let lifts: Vec<f32> = (0..levels)
         .map(|level| level_of.iter().filter(|&&of| of == level).count())
-        .map(|count| (count.max(1) as f32).powf(-course::BALANCE))
+        .map(|count| (count.max(1) as f32).powf(-course::LEVEL_BALANCE as f32))
         .collect();
     let row_of = |control: Control| {
         let rows: Vec<Vec<f32>> = learnt.iter().map(|press| control.row(press)).collect();

@@ -28,11 +28,11 @@ use crate::verdict::argmax;
 
 mod varied;
 
-/// How far the weights of levels with few samples are raised towards equal levels: halfway. Evenly
-/// spread Shore hardness gives few samples of the narrow levels. The course of a press separates
-/// these levels well enough that halfway costs no accuracy over samples, and gains most of what
-/// equal weights would gain over levels (`models/course.md`).
-pub const BALANCE: f32 = 0.5;
+/// How far the weights of levels with few samples are raised towards equal levels, unless the
+/// settings say otherwise: halfway. Evenly spread Shore hardness gives few samples of the narrow
+/// levels. The course of a press separates these levels well enough that halfway costs no accuracy
+/// over samples, and gains most of what equal weights would gain over levels (`models/course.md`).
+pub const LEVEL_BALANCE: f64 = 0.5;
 /// Training that starts from a model's weights ends at this share of the way from them to the
 /// weights it learnt: less of it than for models of one frame ([`epochs::LEARNT_SHARE`]). On four
 /// draws of other sensors and materials, an eighth of the way was better than half by 2 points,
@@ -266,7 +266,7 @@ impl Task<'_> {
         let level_weights = hrn::level_weights(
             self.train.iter().map(level_of),
             self.levels,
-            BALANCE,
+            self.settings.level_balance.unwrap_or(LEVEL_BALANCE) as f32,
             self.device,
         );
         let weights = epochs::run(&stage, initial, run, self.device, |learner, batch| {

@@ -28,10 +28,10 @@ use crate::train::run::checkpoint::Origin;
 use crate::train::settings::{ConsistencySettings, Training};
 use crate::verdict::argmax;
 
-/// How far the weights of levels with few samples are raised towards equal levels: 1, wholly.
-/// Evenly spread Shore hardness gives few samples of the narrow levels, and a network that weighs
-/// samples alike hardly ever names those levels.
-const BALANCE: f32 = 1.0;
+/// How far the weights of levels with few samples are raised towards equal levels, unless the
+/// settings say otherwise: 1, wholly. Evenly spread Shore hardness gives few samples of the narrow
+/// levels, and a network that weighs samples alike hardly ever names those levels.
+const LEVEL_BALANCE: f64 = 1.0;
 /// Frames per pass without gradients.
 const JUDGED_AT_ONCE: usize = 250;
 
@@ -143,7 +143,7 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
     let level_weights = hrn::level_weights(
         task.train.iter().map(level_of),
         task.levels,
-        BALANCE,
+        task.settings.level_balance.unwrap_or(LEVEL_BALANCE) as f32,
         task.device,
     );
     let weights = epochs::run(&stage, initial, run, task.device, |learner, batch| {

@@ -89,6 +89,7 @@ pub(super) fn adapt(profile: Profile) -> Settings {
         checkpoint_every_epochs: 10,
         optimiser: adam(settings.training.optimiser, 5e-4),
         augmentation: SYMMETRIES_AND_SHIFTS,
+        ..settings.training
     };
     settings.consistency.ratio = 1;
     settings
