@@ -250,9 +250,14 @@ fn adapt_finds_the_factor_of_newtons_that_are_twice_too_large() {
 
 #[test]
 fn a_model_of_another_network_is_no_start() {
+    let run = place("features");
+    let learn = ["train", "--method", "features", "--profile", "smoke"];
+    let where_to = ["--data", &place("wide.npz"), "--out", &run];
+    succeed(&[learn.as_slice(), &where_to].concat());
+    let features = format!("{run}/hrn.onnx");
     for (start, code, said) in [
         (
-            "models/features.onnx",
+            features.as_str(),
             78,
             "this one is of features, with 4 levels",
         ),
