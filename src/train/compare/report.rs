@@ -149,7 +149,8 @@ pub fn run(details: &Details) -> anyhow::Result<String> {
     if details.worth.sets.is_empty() {
         page.note(
             "Not measured: the run belongs to no comparison. The test split has the shapes and materials of \
-             the data set alone. hrn-train evaluate judges the run on any other data set.",
+             the data set alone. hrn-train evaluate judges the run on any other data set. hrn-train simulate \
+             --materials broad --shapes wide makes one of other materials and other shapes.",
         );
     } else {
         page.table(&tables::sets(&details.worth));
