@@ -2,7 +2,8 @@
 //!
 //! In: a stream. Out: a [`Body`] whose modulus follows from the Shore hardness by the durometer, so
 //! that the label is the durometer's reading. The ranges contain each number of the eight named
-//! materials. Three of them have such a number near their middle.
+//! materials, except for creep: three of them have one element, and a broad material has two. Three
+//! ranges have such a number near their middle.
 
 use serde::{Deserialize, Serialize};
 
