@@ -24,13 +24,14 @@ METHODS = {
     "hrn50": ("5,000 labels, no GAN", 86.6),
     "hrn100": ("10,000 labels, no GAN", 95.9),
     "hrn15-long": ("no GAN, the steps of ours", None),
-    "hrn15-tuned": ("no GAN, Adam, five times the epochs", None),
+    "hrn15-tuned": ("no GAN, Adam, stops early", None),
     "hrn15-strong": ("no GAN, a good recipe", None),
     "self-training": ("unlabelled presses, no GAN", None),
     "fixmatch": ("unlabelled presses, no GAN", None),
     "features": ("1,500 labels, 18 hand-made features", None),
+    "frame": ("10,000 labels, default model's method", None),
 }
-LABELS = {"hrn50": 5_000, "hrn100": 10_000}
+LABELS = {"hrn50": 5_000, "hrn100": 10_000, "frame": 10_000}
 SETS = {
     "paper_split": ("#1f77b4", "o", "test split, as in the paper"),
     "matched": ("#ff7f0e", "s", "fresh presses, `matched` shapes"),
