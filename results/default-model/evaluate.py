@@ -7,9 +7,10 @@
     pip install numpy scipy
     python3 results/default-model/evaluate.py --table          # prints the tables from the committed files
 
-Three other models are trained first: `features` on the presses of the default model, and `features` and the default
-model's method on its random materials alone. The last two know none of the eight named materials. WORK keeps data sets and these runs, 1 GB, so an
-interrupted call goes on. Written beside this file:
+Five other models are trained first: `features` on the presses of the default model, `features` and the default
+model's method on its random materials alone, and the other two candidates for the default model. Those of random
+materials alone know none of the eight named materials. WORK keeps data sets and these runs, 1 GB, so an interrupted
+call goes on. Written beside this file:
 
 - evaluations.json: the command of every set, and what `evaluate --json` prints for every set and model;
 - objects.csv: for every set, model and object its level, its presses, the right ones, those whose true Shore hardness
@@ -37,11 +38,18 @@ TRAINING = {
     "fw2": f"--seed 603 --shapes wide {BROAD}",
     "fm2": f"--seed 604 --shapes matched {BROAD}",
 }
-# Name -> the method, and what it learns from.
+RANDOM = ["fw", "fm", "fw2", "fm2"]
+# Name -> the method, what it learns from, and its settings.
 TRAINED = {
-    "features": ("features", list(TRAINING)),
-    "features, random alone": ("features", ["fw", "fm", "fw2", "fm2"]),
-    "frame, random alone": ("frame", ["fw", "fm", "fw2", "fm2"]),
+    "features": ("features", list(TRAINING), ""),
+    "features, random alone": ("features", RANDOM, ""),
+    "frame, random alone": ("frame", RANDOM, ""),
+    "frame, half balanced": ("frame", list(TRAINING), "training.level_balance = 0.5"),
+    "frame, random alone, not balanced, other sensors": (
+        "frame",
+        RANDOM,
+        "training.level_balance = 0.0\ntraining.augmentation.other_sensors = true",
+    ),
 }
 MODELS = ["default", "before", *TRAINED]
 
@@ -93,10 +101,13 @@ def by_object(verdicts):
 def measure(trainer, before, work):
     data = {name: trainer.simulated(work / f"{name}.npz", options) for name, options in TRAINING.items()}
     models = {"default": HERE.parent.parent / "models/hrn.onnx", "before": before}
-    for name, (method, sources) in TRAINED.items():
-        command = ["train", "--method", method, "--profile", "quick"]
+    for name, (method, sources, settings) in TRAINED.items():
+        run = work / name.replace(",", "").replace(" ", "-")
+        config = run.with_suffix(".toml")
+        config.write_text(settings)
+        command = ["train", "--method", method, "--profile", "quick", "--config", config]
         command += [word for source in sources for word in ("--data", data[source])]
-        models[name] = trainer.learnt(work / name.replace(",", "").replace(" ", "-"), *command)
+        models[name] = trainer.learnt(run, *command)
     found = {"sets": {}, "evaluations": {}}
     rows = []
     for number, (name, (options, split)) in enumerate(sets().items()):

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The choice of the image's scale: `hrn15` and `hrn15-strong` under several scales, judged on held-out training objects.
+"""The choice of the image's scale: `hrn15`, `hrn15-strong` and `frame` under several scales, judged on held-out training objects.
 
     cargo build --release --features train
     python3 results/start/start.py target/release/hrn-train paper101.npz --work WORK
@@ -23,7 +23,7 @@ import trainer as training  # noqa: E402
 SEEDS = (1, 2, 3)
 # full_scale_n, log_above_n.
 SCALES = [(10.2, 0.0), (1.0, 0.0), (0.3, 0.0), (10.2, 1.0), (10.2, 0.1), (10.2, 0.01)]
-METHODS = ("hrn15", "hrn15-strong")
+METHODS = ("hrn15", "hrn15-strong", "frame")
 HELD_OUT = "--seed 703 --objects 10 --test-objects 0 --presses 12 --shapes paper"
 
 
