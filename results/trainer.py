@@ -4,6 +4,7 @@ What a command made before is not made again, so an interrupted script goes on.
 """
 
 import argparse
+import csv
 import json
 import pathlib
 import subprocess
@@ -38,6 +39,44 @@ class Trainer:
     def evaluated(self, model, data, *more):
         """What `evaluate --json` prints."""
         return json.loads(self.run("evaluate", "--model", model, "--data", data, *more, "--json"))
+
+
+def by_object(verdicts):
+    """Object -> level, presses, right ones, those in the interval, and the sum of squared Shore errors."""
+    counts = {}
+    with open(verdicts, newline="") as file:
+        for row in csv.DictReader(file):
+            own = counts.setdefault(int(row["object"]), [row["level"], 0, 0, 0, 0.0])
+            own[1] += 1
+            own[2] += row["level"] == row["judged"]
+            if row["shore"] and row["true_shore"]:
+                truth = float(row["true_shore"])
+                own[3] += float(row["shore_low"]) <= truth <= float(row["shore_high"])
+                own[4] += (float(row["shore"]) - truth) ** 2
+            else:
+                own[3:] = ["", ""]
+    return counts
+
+
+CONFIDENCES = (0.5, 0.7, 0.9, 0.95)
+
+
+def by_confidence(verdicts):
+    """Confidence -> the presses whose verdict has at least this confidence, and the right ones among them."""
+    counts = {confidence: [0, 0] for confidence in CONFIDENCES}
+    with open(verdicts, newline="") as file:
+        for row in csv.DictReader(file):
+            sure = max(float(value) for key, value in row.items() if key.startswith("probability_"))
+            for confidence, own in counts.items():
+                if sure >= confidence:
+                    own[0] += 1
+                    own[1] += row["level"] == row["judged"]
+    return counts
+
+
+def shares(counts, presses):
+    """Cells of a table: for each confidence the share of the presses, and the share of right ones among these."""
+    return [f"{100 * n / presses:.0f} %, {100 * right / n:.0f} %" if n else "none" for n, right in counts.values()]
 
 
 def write(path, trainer, found):
