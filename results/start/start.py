@@ -8,6 +8,10 @@
 paper101.npz is of `hrn-train simulate --seed 101 --shapes paper`. The held-out objects are ten others of each material
 that it trains on. No test material is looked at. WORK keeps the runs, so an interrupted call goes on. start.json,
 beside this file, has what `evaluate --json` prints.
+
+`frame` takes its scale from the code: SCALE in src/train/net/frame.rs. So each of its rows needs a build of its own.
+Name them hrn-train-10.2-0.1 and so on, by the two numbers of SCALE, and put them beside the trainer. A row whose build
+is missing is left out.
 """
 
 import json
@@ -32,15 +36,21 @@ def measure(trainer, data, work):
     runs = []
     for method in METHODS:
         for full_scale_n, log_above_n in SCALES:
+            own_trainer = trainer
+            if method == "frame":
+                own_trainer = training.Trainer(trainer.program.with_name(f"hrn-train-{full_scale_n}-{log_above_n}"))
+                if not own_trainer.program.exists():
+                    continue
             config = work / f"{full_scale_n}-{log_above_n}.toml"
             config.write_text(f"full_scale_n = {full_scale_n}\n[network]\nlog_above_n = {log_above_n}\n")
             for seed in SEEDS:
                 own = ["--method", method, "--profile", "quick", "--seed", seed, "--config", config]
                 out = work / f"{method}-{full_scale_n}-{log_above_n}-{seed}"
-                model = trainer.learnt(out, "train", *own, "--data", data)
+                model = own_trainer.learnt(out, "train", *own, "--data", data)
                 evaluation = trainer.evaluated(model, held_out, "--split", "train")
                 row = {"method": method, "full_scale_n": full_scale_n, "log_above_n": log_above_n, "seed": seed}
                 runs.append(row | {"evaluation": evaluation})
+            trainer.revisions |= own_trainer.revisions
     training.write(HERE / "start.json", trainer, {"held_out": HELD_OUT, "runs": runs})
 
 
@@ -51,6 +61,9 @@ def table():
         cells = []
         for method in METHODS:
             own = [r for r in runs if (r["full_scale_n"], r["log_above_n"]) == scale and r["method"] == method]
+            if not own:
+                cells.append("-")
+                continue
             percents = [100 * run["evaluation"]["accuracy"] for run in own]
             seeds = ", ".join(f"{percent:.1f}" for percent in percents)
             cells.append(f"{statistics.mean(percents):.1f} % ({seeds})")
