@@ -12,7 +12,8 @@ model's method on its random materials alone, and the other two candidates for t
 materials alone know none of the eight named materials. WORK keeps data sets and these runs, 1 GB, so an interrupted
 call goes on. Written beside this file:
 
-- evaluations.json: the command of every set, and what `evaluate --json` prints for every set and model;
+- evaluations.json: the command of every set, what `evaluate --json` prints for every set and model, and how many
+  verdicts have at least a confidence, with the right ones among them;
 - objects.csv: for every set, model and object its level, its presses, the right ones, those whose true Shore hardness
   lies in the model's interval, and the sum of squared Shore errors (the last two empty where one is unknown).
 """
@@ -81,23 +82,6 @@ def sets():
     return found
 
 
-def by_object(verdicts):
-    """Object -> level, presses, right ones, those in the interval, and the sum of squared Shore errors."""
-    counts = {}
-    with open(verdicts, newline="") as file:
-        for row in csv.DictReader(file):
-            own = counts.setdefault(int(row["object"]), [row["level"], 0, 0, 0, 0.0])
-            own[1] += 1
-            own[2] += row["level"] == row["judged"]
-            if row["shore"] and row["true_shore"]:
-                truth = float(row["true_shore"])
-                own[3] += float(row["shore_low"]) <= truth <= float(row["shore_high"])
-                own[4] += (float(row["shore"]) - truth) ** 2
-            else:
-                own[3:] = ["", ""]
-    return counts
-
-
 def measure(trainer, before, work):
     data = {name: trainer.simulated(work / f"{name}.npz", options) for name, options in TRAINING.items()}
     models = {"default": HERE.parent.parent / "models/hrn.onnx", "before": before}
@@ -108,17 +92,19 @@ def measure(trainer, before, work):
         command = ["train", "--method", method, "--profile", "quick", "--config", config]
         command += [word for source in sources for word in ("--data", data[source])]
         models[name] = trainer.learnt(run, *command)
-    found = {"sets": {}, "evaluations": {}}
+    found = {"sets": {}, "evaluations": {}, "confident": {}}
     rows = []
     for number, (name, (options, split)) in enumerate(sets().items()):
         test = trainer.simulated(work / f"set-{number}.npz", options)
         found["sets"][name] = {"simulate": options, "split": split}
         found["evaluations"][name] = {}
+        found["confident"][name] = {}
         for model, path in models.items():
             verdicts = work / "verdicts.csv"
             evaluated = trainer.evaluated(path, test, "--split", split, "--verdicts", verdicts)
             found["evaluations"][name][model] = evaluated
-            for key, (level, n, right, held, squares) in by_object(verdicts).items():
+            found["confident"][name][model] = training.by_confidence(verdicts)
+            for key, (level, n, right, held, squares) in training.by_object(verdicts).items():
                 squares = squares if squares == "" else f"{squares:.1f}"
                 rows.append([name, model, key, level, n, right, held, squares])
     training.write(HERE / "evaluations.json", trainer, found)
@@ -142,6 +128,29 @@ def of_all_eight(evaluations, presses):
     return {model: sum(half[model]["accuracy"] for half in halves) / 2 for model in MODELS}
 
 
+def of_the_default_on_all_eight(evaluations, rows, presses):
+    """The default model's accuracy with its interval, its Shore error, and two shares, on the eight named materials. Each
+    shape has eight objects, because both sets have the same seed: the interval draws these eight together."""
+    names = [f"the four {role} materials, {presses}" for role in ("test", "training")]
+    shapes = {}
+    for name in names:
+        for shape, (right, samples) in clusters(of_set(rows, name), name).items():
+            before = shapes.get(shape, [0, 0])
+            shapes[shape] = [before[0] + right, before[1] + samples]
+    mean, low, high = (100 * value for value in intervals.interval([shapes], 0))
+    found = [evaluations[name]["default"] for name in names]
+    rmse = (sum(one["shore"]["rmse"] ** 2 for one in found) / 2) ** 0.5
+    holds = 50 * sum(one["shore"]["coverage"] for one in found)
+    beyond = 50 * sum(one["beyond_neighbour"] for one in found)
+    return f"{mean:.1f} % ({low:.1f} to {high:.1f}) | {rmse:.1f} | {holds:.1f} % | {beyond:.1f} %"
+
+
+def of_set(rows, name):
+    """Object, level, presses and right ones of every object of a set."""
+    keys = ("object", "level", "presses", "right")
+    return [tuple(int(row[key]) for key in keys) for row in rows if row["set"] == name]
+
+
 def table():
     with open(HERE / "objects.csv", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["model"] == "default"]
@@ -150,25 +159,33 @@ def table():
     print(" | ".join(MODELS[1:]), "|")
     for name, found in written["evaluations"].items():
         own, shore = found["default"], found["default"]["shore"]
-        objects = [
-            tuple(int(row[key]) for key in ("object", "level", "presses", "right")) for row in rows if row["set"] == name
-        ]
-        _, low, high = (100 * value for value in intervals.interval([clusters(objects, name)], 0))
+        _, low, high = (100 * value for value in intervals.interval([clusters(of_set(rows, name), name)], 0))
         cells = [name, f"{100 * own['accuracy']:.1f} % ({low:.1f} to {high:.1f})"]
         cells.append(f"{shore['rmse']:.1f}" if shore else "-")
         cells.append(f"{100 * shore['coverage']:.1f} %" if shore else "-")
         cells.append(f"{100 * own['beyond_neighbour']:.1f} %")
         cells += [f"{100 * found[model]['accuracy']:.1f} %" for model in MODELS[1:]]
         print("|", " | ".join(cells), "|")
-    print("\n| Presses |", " | ".join(MODELS), "|")
+    print("\n| Presses | Default model | Shore RMSE | Its interval holds | Beyond the neighbour |", end=" ")
+    print(" | ".join(MODELS[1:]), "|")
     for presses in ("matched", "wide", "matched, raw", "wide, raw"):
+        default = of_the_default_on_all_eight(written["evaluations"], rows, presses)
         shares = of_all_eight(written["evaluations"], presses)
-        print(f"| All eight named materials, {presses} |", " | ".join(f"{100 * s:.1f} %" for s in shares.values()), "|")
+        others = " | ".join(f"{100 * shares[model]:.1f} %" for model in MODELS[1:])
+        print(f"| All eight named materials, {presses} | {default} | {others} |")
     print("\n| Presses | Level 1 | Level 2 | Level 3 | Level 4 | Near a border |")
     for name, found in written["evaluations"].items():
         if shore := found["default"]["shore"]:
             errors = [*shore["rmse_by_level"], shore["rmse_near_borders"]]
             print("|", name, "|", " | ".join("-" if e is None else f"{e:.1f}" for e in errors), "|")
+    print("\n| Presses | Level 1 right | Level 2 | Level 3 | Level 4 | Calibration error |")
+    for name, found in written["evaluations"].items():
+        own = found["default"]
+        print("|", name, "|", " | ".join(f"{100 * share:.0f} %" for share in own["category_accuracy"]), end=" | ")
+        print(f"{own['ece']:.2f} |")
+    print("\n| Presses |", " | ".join(f"{confidence} or more" for confidence in training.CONFIDENCES), "|")
+    for name, found in written["confident"].items():
+        print("|", name, "|", " | ".join(training.shares(found["default"], written["evaluations"][name]["default"]["n"])), "|")
 
 
 if __name__ == "__main__":
