@@ -5,10 +5,11 @@
 
 use std::fs::{self, File};
 use std::io::{self, Cursor, ErrorKind, Seek, Write};
+use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::Path;
 
 use anyhow::{Context as _, bail};
-use rustix::fs::FlockOperation;
+use rustix::fs::{FlockOperation, OFlags};
 
 /// Writes a file under another name, flushes it and renames it. A link stays, and its target is
 /// written. If the path is not a file but, for example, a pipe or a device, it is written directly.
@@ -68,8 +69,11 @@ fn replace(
     let mut name = path.file_name().unwrap_or_default().to_owned();
     name.push(".part");
     let part = path.with_file_name(name);
-    let mut file = create_anew(&part).with_context(|| part.display().to_string())?;
+    let mut file = open_alone(&part).with_context(|| part.display().to_string())?;
     let attempt = || -> anyhow::Result<()> {
+        if let Ok(before) = fs::metadata(path) {
+            file.set_permissions(before.permissions())?;
+        }
         write(&mut file)?;
         file.sync_all()?;
         fs::rename(&part, path)?;
@@ -85,12 +89,50 @@ fn replace(
     })
 }
 
-/// Creates a file anew. It first removes what a killed process left, which may not be writable. It
-/// removes a link itself, not its target.
-fn create_anew(path: &Path) -> io::Result<File> {
-    match fs::remove_file(path) {
-        Err(error) if error.kind() != ErrorKind::NotFound => Err(error),
-        _ => File::create_new(path),
+/// Opens an empty file for this call alone. If another call or process writes it, this waits until
+/// that one has renamed or removed it. What a killed process left is removed or emptied; it may be
+/// unwritable, or a link, whose target stays.
+fn open_alone(path: &Path) -> io::Result<File> {
+    loop {
+        let mut options = File::options();
+        options.write(true).create(true).truncate(false);
+        let file = match options
+            .custom_flags(OFlags::NOFOLLOW.bits() as i32)
+            .open(path)
+        {
+            Ok(file) => file,
+            Err(error) if path.is_symlink() || error.kind() == ErrorKind::PermissionDenied => {
+                // If this removes nothing, the path cannot be written at all.
+                fs::remove_file(path).map_err(|_| error)?;
+                continue;
+            }
+            Err(error) => return Err(error),
+        };
+        // Some file systems have no locks. There, only one may write at a time.
+        let _ = rustix::fs::flock(&file, FlockOperation::LockExclusive);
+        // While this waited, the other one may have renamed or removed the file.
+        let (own, at_path) = (file.metadata()?, fs::symlink_metadata(path));
+        if at_path.is_ok_and(|found| (found.dev(), found.ino()) == (own.dev(), own.ino())) {
+            file.set_len(0)?;
+            return Ok(file);
+        }
+    }
+}
+
+/// Returns an error if a directory has files that a command would replace, but not the one that the
+/// command always writes first: then they are somebody else's.
+///
+/// # Errors
+///
+/// Names the directory and the file.
+pub fn refuse_foreign(directory: &Path, first: &str, others: &[&str]) -> anyhow::Result<()> {
+    let found = others.iter().find(|name| directory.join(name).exists());
+    match found {
+        Some(name) if !directory.join(first).exists() => bail!(
+            "{}: has {name} but no {first}, so it is of something else: choose another --out",
+            directory.display()
+        ),
+        _ => Ok(()),
     }
 }
 
@@ -155,6 +197,44 @@ mod tests {
         let error = format!("{error:#}");
         assert!(error.contains("file.part: Is a directory"), "{error}");
         assert_eq!(fs::read(path("file")).unwrap(), b"again");
+    }
+
+    #[test]
+    fn several_at_once_write_one_file_and_it_is_whole_at_all_times() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("file");
+        let whole = |writer: u8| vec![writer; 100_000];
+        write_whole(&path, &whole(0)).unwrap();
+        std::thread::scope(|scope| {
+            let writers = (1..=4).map(|writer| {
+                let path = &path;
+                scope.spawn(move || {
+                    for _ in 0..20 {
+                        write_whole(path, &whole(writer)).unwrap();
+                    }
+                })
+            });
+            let writers: Vec<_> = writers.collect();
+            while writers.iter().any(|writer| !writer.is_finished()) {
+                let found = fs::read(&path).unwrap();
+                assert!(found == whole(found[0]), "{} bytes", found.len());
+            }
+        });
+        assert_eq!(fs::read_dir(directory.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_file_keeps_its_permissions() {
+        use std::os::unix::fs::PermissionsExt as _;
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("file");
+        write_whole(&path, b"before").unwrap();
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o600)).unwrap();
+        write_whole(&path, b"after").unwrap();
+        assert_eq!(
+            fs::metadata(&path).unwrap().permissions().mode() & 0o777,
+            0o600
+        );
     }
 
     #[test]
