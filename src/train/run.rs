@@ -8,6 +8,7 @@ pub mod disk;
 pub mod history;
 pub mod progress;
 
+use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
@@ -16,10 +17,11 @@ use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 
 use crate::train::data::dataset::{LabelChoice, Source};
+use crate::train::net::network::Weights;
 use crate::train::settings::{Profile, Settings, SettingsError, retired};
 use crate::wording;
 use checkpoint::Checkpoint;
-use disk::{lock, write_whole};
+use disk::{lock, refuse_foreign, write_whole};
 use history::Metrics;
 
 /// The number of checkpoints kept for a stage: the newest, and one before it.
@@ -97,15 +99,27 @@ impl Description {
 }
 
 fn difference(table: &str, found: &toml::Table, expected: &toml::Table) -> Option<String> {
-    let mut keys = found.iter();
-    keys.find_map(|(key, found)| match (found, expected.get(key)?) {
-        (toml::Value::Table(found), toml::Value::Table(expected)) => {
-            difference(&format!("{table}{key}."), found, expected)
-        }
-        (found, expected) => (found != expected)
-            .then(|| format!("`{table}{key}`: found {found}, expected {expected}")),
-    })
+    let shown = |value: Option<&toml::Value>| value.map_or("none".to_owned(), ToString::to_string);
+    let keys: BTreeSet<&String> = found.keys().chain(expected.keys()).collect();
+    keys.into_iter()
+        .find_map(|key| match (found.get(key), expected.get(key)) {
+            (Some(toml::Value::Table(found)), Some(toml::Value::Table(expected))) => {
+                difference(&format!("{table}{key}."), found, expected)
+            }
+            (found, expected) => (found != expected).then(|| {
+                let (found, expected) = (shown(found), shown(expected));
+                format!("`{table}{key}`: found {found}, expected {expected}")
+            }),
+        })
 }
+
+/// Files that a run writes after its `settings.toml`.
+const OF_A_RUN: [&str; 4] = [
+    "hrn.onnx",
+    "metrics.csv",
+    "evaluation.json",
+    "compared.json",
+];
 
 /// A run's directory, locked against other processes while it is open.
 #[derive(Debug)]
@@ -152,6 +166,7 @@ impl Run {
             others: Vec::new(),
         };
         let before = Self::description_at(directory)?;
+        refuse_foreign(directory, "settings.toml", &OF_A_RUN)?;
         if before.is_none() || resume {
             for part in ["checkpoints", "samples"] {
                 let part = run.path(part);
@@ -218,7 +233,8 @@ impl Run {
     }
 
     /// A stage's newest checkpoint that can be read. Without any checkpoint, that of another run
-    /// which did all `epochs` of a stage of the same `origin`; it then becomes this run's too.
+    /// which did all `epochs` of a stage of the same `origin`; it then becomes this run's too. A
+    /// checkpoint must have the lists of `fresh`, the stage before its first step.
     ///
     /// # Errors
     ///
@@ -229,11 +245,17 @@ impl Run {
         stage: &str,
         origin: &str,
         epochs: u32,
+        fresh: &[(String, Weights)],
         device: &Device,
     ) -> anyhow::Result<Option<Checkpoint>> {
+        let read = |path: &Path| {
+            let checkpoint = Checkpoint::read(path, device)?;
+            checkpoint.check_like(fresh)?;
+            Ok::<_, anyhow::Error>(checkpoint)
+        };
         let mut failure = None;
         for path in checkpoints(&self.directory, stage)?.iter().rev() {
-            match Checkpoint::read(path, device) {
+            match read(path) {
                 Ok(checkpoint) => return Ok(Some(checkpoint)),
                 Err(error) => failure = Some(error.context(path.display().to_string())),
             }
@@ -247,7 +269,7 @@ impl Run {
             let Some(path) = checkpoints(other, stage).unwrap_or_default().pop() else {
                 continue;
             };
-            let Ok(checkpoint) = Checkpoint::read(&path, device) else {
+            let Ok(checkpoint) = read(&path) else {
                 continue;
             };
             let Ok(metrics) = metrics_of(other) else {

@@ -71,17 +71,16 @@ pub fn run(
         ..
     } = *stage.settings;
     let (name, origin) = (stage.name, &stage.origin);
-    let (mut progress, mut learner) = match run.latest(name, origin, epochs, device)? {
+    let fresh = Learner::fresh(initial, optimiser, averaging);
+    let kept = run.latest(name, origin, epochs, &fresh.lists(""), device)?;
+    let (mut progress, mut learner) = match kept {
         Some(checkpoint) => {
             run.check_origin(name, &checkpoint, origin)?;
             let steps = checkpoint.progress.step;
             let learner = Learner::resumed(&checkpoint, "", steps, optimiser, averaging)?;
             (checkpoint.progress, learner)
         }
-        None => (
-            Progress::default(),
-            Learner::fresh(initial, optimiser, averaging),
-        ),
+        None => (Progress::default(), fresh),
     };
     let count = stage.train.len();
     let steps = u64::from(epochs) * count.div_ceil(batch) as u64;

@@ -102,7 +102,9 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
     let steps_an_epoch = task.train.len().div_ceil(batch) as u64;
     let steps = u64::from(epochs) * steps_an_epoch;
     let origin = task.origin(&initial);
-    let mut state = match run.latest(task.stage, &origin, epochs, task.device)? {
+    let fresh = State::fresh(initial, task.settings);
+    let lists = fresh.learner.lists("");
+    let mut state = match run.latest(task.stage, &origin, epochs, &lists, task.device)? {
         Some(checkpoint) => {
             // Generated frames have no source file, and may differ in their last bits on another
             // device or with more threads. The run then continues from its weights all the same.
@@ -111,7 +113,7 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
             }
             State::resumed(&checkpoint, task.settings)?
         }
-        None => State::fresh(initial, task.settings),
+        None => fresh,
     };
     let mut metrics = run.metrics(task.stage, state.progress.step)?;
     let bar = progress_bar(task.stage, steps, state.progress.step);

@@ -87,12 +87,14 @@ pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
     let GanSettings { batch, epochs, .. } = *task.settings;
     let steps = u64::from(epochs) * task.real.len().div_ceil(batch) as u64;
     let origin = task.origin(&initial);
-    let mut state = match run.latest(task.stage, &origin, epochs, task.device)? {
+    let fresh = State::fresh(initial, task.settings, task.sensor());
+    let kept = fresh.checkpoint(&origin).lists;
+    let mut state = match run.latest(task.stage, &origin, epochs, &kept, task.device)? {
         Some(checkpoint) => {
             run.check_origin(task.stage, &checkpoint, &origin)?;
             State::resumed(&checkpoint, task.settings, task.sensor())?
         }
-        None => State::fresh(initial, task.settings, task.sensor()),
+        None => fresh,
     };
     let mut metrics = run.metrics(task.stage, state.progress.step)?;
     let mut reference = None;

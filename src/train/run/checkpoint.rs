@@ -9,11 +9,13 @@ use std::path::Path;
 
 use anyhow::{Context as _, bail, ensure};
 use burn::tensor::{Device, Tensor, TensorData};
-use ndarray::{Array1, ArrayD, ArrayView1, IxDyn};
-use ndarray_npy::{NpzReader, NpzWriter};
+use ndarray::{ArrayD, ArrayView1, IxDyn};
+use ndarray_npy::NpzWriter;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
+use zip::ZipArchive;
 
+use crate::npy::{self, Header};
 use crate::train::data::dataset::Dataset;
 use crate::train::net::network::{Weight, Weights, numbers};
 
@@ -141,36 +143,83 @@ impl Checkpoint {
     /// Returns an error if the file cannot be read or is damaged.
     pub fn read(path: &Path, device: &Device) -> anyhow::Result<Self> {
         let bytes = std::fs::read(path)?;
-        let mut npz = NpzReader::new(Cursor::new(bytes.as_slice()))?;
-        let progress: Array1<u8> = npz.by_name("progress")?;
-        let progress = serde_json::from_slice(&progress.to_vec())?;
-        let origin: Array1<u8> = npz.by_name("origin")?;
-        let origin = String::from_utf8(origin.to_vec())?;
+        let mut zip = ZipArchive::new(Cursor::new(bytes.as_slice()))?;
+        let (mut progress, mut origin) = (None, None);
         let mut lists: Vec<(String, Weights)> = Vec::new();
-        for name in npz.names()? {
+        for place in 0..zip.len() {
+            let mut packed = zip.by_index(place)?;
+            let name = packed.name().trim_end_matches(".npy").to_owned();
+            let Header {
+                descr,
+                shape,
+                fortran_order,
+            } = npy::header(&mut packed)?;
+            let count = shape
+                .iter()
+                .try_fold(1_usize, |count, &axis| count.checked_mul(axis));
+            let count = count.with_context(|| format!("array `{name}`: found shape {shape:?}"))?;
             if ["progress", "origin"].contains(&name.as_str()) {
+                let text = npy::elements(&mut packed, count, |[byte]: [u8; 1]| byte)?;
+                *(if name == "origin" {
+                    &mut origin
+                } else {
+                    &mut progress
+                }) = Some(text);
                 continue;
             }
             let Some((list, weight)) = name.split_once('/') else {
                 bail!("array `{name}` is no part of a checkpoint");
             };
-            let array: ArrayD<f32> = npz.by_name(&name)?;
+            ensure!(
+                descr == "<f4" && !fortran_order,
+                "array `{name}`: found {descr}, expected <f4 in C order"
+            );
+            let values = npy::elements(&mut packed, count, f32::from_le_bytes)?;
             if lists.last().is_none_or(|(last, _)| last != list) {
                 lists.push((list.to_owned(), Weights::default()));
             }
             let entries = &mut lists.last_mut().expect("pushed just now").1.entries;
             entries.push(Weight {
                 name: weight.to_owned(),
-                dims: array.shape().to_vec(),
-                values: flat(array.into_iter().collect(), device),
+                dims: shape,
+                values: flat(values, device),
             });
         }
         ensure!(!lists.is_empty(), "no weights in it");
         Ok(Self {
-            origin,
-            progress,
+            origin: String::from_utf8(origin.context("no `origin` in it")?)?,
+            progress: serde_json::from_slice(&progress.context("no `progress` in it")?)?,
             lists,
         })
+    }
+
+    /// Returns an error unless the checkpoint has each of the lists of `fresh`, with weights of the
+    /// same names and sizes. Its other lists must be like the first one of `fresh`.
+    ///
+    /// # Errors
+    ///
+    /// Names the list, and the weight if there is one.
+    pub fn check_like(&self, fresh: &[(String, Weights)]) -> anyhow::Result<()> {
+        for (name, _) in fresh {
+            self.list(name)?;
+        }
+        for (name, list) in &self.lists {
+            let like = fresh.iter().find(|(own, _)| own == name).or(fresh.first());
+            let like = like.map_or(&[][..], |(_, weights)| &weights.entries);
+            let shapes = |weights: &[Weight]| -> Vec<(String, Vec<usize>)> {
+                let shape = |weight: &Weight| (weight.name.clone(), weight.dims.clone());
+                weights.iter().map(shape).collect()
+            };
+            let (found, expected) = (shapes(&list.entries), shapes(like));
+            if let Some((weight, dims)) = expected.iter().find(|own| !found.contains(own)) {
+                bail!("array `{name}/{weight}`: found none of shape {dims:?}");
+            }
+            ensure!(
+                found == expected,
+                "`{name}` has other weights than this network"
+            );
+        }
+        Ok(())
     }
 }
 

@@ -93,7 +93,10 @@ fn every_program_that_had_a_part_in_a_run_is_named() {
     other.save("ustgan", &checkpoint).unwrap();
     other.metrics("ustgan", 0).unwrap();
     let run = open("run", false).taking_from(vec![path("other")]);
-    let taken = |origin| run.latest("ustgan", origin, 3, &device).unwrap();
+    let taken = |origin| {
+        run.latest("ustgan", origin, 3, &checkpoint.lists, &device)
+            .unwrap()
+    };
     assert!(taken("another").is_none());
     assert_eq!(revisions("run"), format!("{own}\n"));
     assert!(taken("same").is_some());
