@@ -100,6 +100,18 @@ impl Default for DatasetSettings {
 }
 
 impl DatasetSettings {
+    /// The most objects of a material, and the most presses of an object.
+    pub const MOST: u32 = 10_000;
+
+    /// Whether the numbers of objects and presses, the least force and the cover lie within the
+    /// ranges of `hrn-train simulate`.
+    pub fn is_possible(&self) -> bool {
+        self.objects.max(self.test_objects) <= Self::MOST
+            && (1..=Self::MOST).contains(&self.presses)
+            && (0.01..=25.0).contains(&self.lowest_force_n)
+            && (0.05..=100.0).contains(&self.cover_young_mpa)
+    }
+
     /// The split of a material: the paper's, or the other one if the material's level is swapped.
     /// An object's draws follow from the seed and the object's split, material and number. So all
     /// data sets of a seed contain the same objects of a material if it has the same role.

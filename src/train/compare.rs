@@ -35,7 +35,7 @@ use swaps::Swaps;
 use crate::train::data::dataset::Dataset;
 use crate::train::methods::{self, Method};
 use crate::train::run::Run;
-use crate::train::run::disk::{lock, write_whole};
+use crate::train::run::disk::{lock, refuse_foreign, write_whole};
 
 /// The command lines of the unfinished runs that [`compare`] would run, the longest first.
 /// [`compare`] finds the results that these commands leave in the directory.
@@ -68,6 +68,8 @@ fn checked(plan: &Plan) -> anyhow::Result<Dataset> {
 }
 
 fn make_directories(plan: &Plan) -> anyhow::Result<()> {
+    let written = ["objects.csv", "tables.md", "report.html", "swaps.json"];
+    refuse_foreign(&plan.out, "results.json", &written)?;
     for part in ["data", "runs", "logs"] {
         let part = plan.out.join(part);
         std::fs::create_dir_all(&part).with_context(|| part.display().to_string())?;

@@ -24,7 +24,7 @@ pub use network::NetworkSettings;
 pub use optimiser::OptimiserSettings;
 pub use reports::ArmReports;
 
-use bounds::{check, check_loop};
+use bounds::{MOST_SAMPLES_A_COMPONENT, check, check_loop};
 
 /// How long a run may take.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -266,7 +266,8 @@ impl Settings {
         self.stgan.check("stgan.")?;
         let generated = self.generation.samples_a_component;
         let key = "samples_a_component";
-        check("generation.", key, generated, generated > 0, "1 or more")?;
+        let fits = (1..=MOST_SAMPLES_A_COMPONENT).contains(&generated);
+        check("generation.", key, generated, fits, "1 to 10000")?;
         self.pretraining.check("pretraining.")?;
         self.training.check("training.")?;
         self.consistency.check()?;
@@ -393,6 +394,18 @@ mod tests {
             (
                 "[generation]\nsamples_a_component = 0",
                 "`generation.samples_a_component`: found 0",
+            ),
+            (
+                "[ustgan]\nsamples_a_component = 9223372036854775807",
+                "expected 1 to 10000",
+            ),
+            (
+                "[consistency]\nratio = 4611686018427387904",
+                "expected 1 to 1000",
+            ),
+            (
+                "[training]\nbatch = 4611686018427387904",
+                "expected 2 to 1000000",
             ),
             (
                 "[validation]\nkeep = \"best\"",

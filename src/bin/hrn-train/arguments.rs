@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use clap::builder::RangedU64ValueParser;
 use clap::{Parser, Subcommand, ValueEnum};
 use hardnessd::simulator::{DatasetSettings, LawName, Materials, SensorProfile, Shapes, Split};
 use hardnessd::train::data::dataset::LabelChoice;
@@ -66,7 +67,7 @@ pub(super) enum Command {
 
 /// The most objects of a material and presses of an object: more than fit in any memory, but few
 /// enough that all presses can be counted.
-const MOST: i64 = 10_000;
+const MOST: i64 = DatasetSettings::MOST as i64;
 
 #[derive(Debug, clap::Args)]
 pub(super) struct Simulate {
@@ -74,7 +75,7 @@ pub(super) struct Simulate {
     #[arg(long, value_name = "D.npz")]
     pub(super) out: PathBuf,
     /// Seed of everything random
-    #[arg(long, default_value_t = DatasetSettings::default().seed)]
+    #[arg(long, default_value_t = DatasetSettings::default().seed, value_parser = seed())]
     pub(super) seed: u64,
     /// Materials: named (the paper's eight) or broad (each object has a random one, and its level is
     /// what a simulated durometer reads)
@@ -111,7 +112,7 @@ pub(super) struct Simulate {
     #[arg(long, default_value = "clean")]
     pub(super) sensor_profile: SensorProfile,
     /// Press all objects on the same sensor, which is drawn with this seed
-    #[arg(long, value_name = "SEED")]
+    #[arg(long, value_name = "SEED", value_parser = seed())]
     pub(super) one_sensor: Option<u64>,
     /// Young's modulus of the sensor's cover in MPa, 0.05 to 100
     #[arg(long, value_name = "MPA", default_value_t = DatasetSettings::default().cover_young_mpa,
@@ -217,7 +218,7 @@ pub(super) struct Train {
     #[arg(long, value_name = "RUN")]
     pub(super) out: PathBuf,
     /// Seed of everything random
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, value_parser = seed())]
     pub(super) seed: u64,
     /// Length of the training
     #[arg(long, default_value = "paper")]
@@ -262,7 +263,7 @@ pub(super) struct Adapt {
     #[arg(long, value_name = "M.onnx")]
     pub(super) start: Option<PathBuf>,
     /// Seed of everything random
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, value_parser = seed())]
     pub(super) seed: u64,
     /// Settings that override the default ones (see config/hrn-train.toml)
     #[arg(long, value_name = "F.toml")]
@@ -290,7 +291,7 @@ pub(super) struct Compare {
     #[arg(long, value_name = "N", value_delimiter = ',', num_args = 1..)]
     pub(super) labels: Vec<usize>,
     /// Train with the seeds 1 to N
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=MOST as u64))]
     pub(super) seeds: u64,
     /// Length of each training run
     #[arg(long, default_value = "paper")]
@@ -325,6 +326,11 @@ fn lowest_force_n(text: &str) -> Result<f32, String> {
         Ok(force_n) if (0.01..=25.0).contains(&force_n) => Ok(force_n),
         _ => Err("expected newtons from 0.01 to 25".to_owned()),
     }
+}
+
+/// A seed. TOML, which keeps it, has no larger numbers.
+fn seed() -> RangedU64ValueParser {
+    clap::value_parser!(u64).range(..=i64::MAX as u64)
 }
 
 /// Parses a Young's modulus in MPa, from that of a gel to that of a hard plastic.

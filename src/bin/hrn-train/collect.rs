@@ -15,6 +15,7 @@ use hardnessd::train::run::disk::{lock, write_streamed, write_whole};
 
 use super::arguments::Collect;
 use super::failure::NotCollected;
+use super::files::apart;
 
 pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     let setup = match &arguments.config {
@@ -28,7 +29,7 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     let sensor = sensor.context("the configuration has no sensor")?;
     let captures = collect::captures(&arguments.captures)?;
     let out = &arguments.out;
-    check_out(arguments)?;
+    check_out(arguments, &captures)?;
     // The first lock keeps other calls from the data set, the second from the parts. The data set is
     // read under the lock, so that no other call adds to it meanwhile.
     let own = Directory::locked(beside(out), false)?;
@@ -89,8 +90,9 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
 
 /// Returns an error if the data set or the list of what was left out cannot be at `--out`, before
 /// anything is read.
-fn check_out(arguments: &Collect) -> anyhow::Result<()> {
+fn check_out(arguments: &Collect, captures: &[PathBuf]) -> anyhow::Result<()> {
     let out = &arguments.out;
+    apart("--out", out, captures.iter().map(PathBuf::as_path))?;
     if out.is_dir() {
         bail!("{}: is a directory: name a file", out.display());
     }

@@ -57,6 +57,10 @@ pub(super) enum WrongUsage {
     NoStart,
     #[error("--one-robot: works with `--method course` only")]
     NotOneRobot,
+    #[error("{0}: works with methods of single frames only")]
+    OfFrames(&'static str),
+    #[error("{}: {} is another file of this command: name a new one", .0, .1.display())]
+    Overwritten(&'static str, PathBuf),
 }
 
 /// One of several captures cannot be collected.

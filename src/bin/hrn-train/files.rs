@@ -9,7 +9,22 @@ use hardnessd::train::run::disk::write_whole;
 use hardnessd::trial;
 use hardnessd::verdict::{Hrn, MAX_FILE_BYTES};
 
-use super::failure::Unreadable;
+use super::failure::{Unreadable, WrongUsage};
+
+/// Refuses an output that is one of the command's other files.
+pub(super) fn apart<'a>(
+    option: &'static str,
+    out: &Path,
+    others: impl IntoIterator<Item = &'a Path>,
+) -> Result<(), WrongUsage> {
+    let file = |path: &Path| path.canonicalize().ok().filter(|path| path.is_file());
+    let same =
+        |other: &Path| other == out || file(other).is_some_and(|other| file(out) == Some(other));
+    match others.into_iter().find(|other| same(other)) {
+        Some(_) => Err(WrongUsage::Overwritten(option, out.to_owned())),
+        None => Ok(()),
+    }
+}
 
 /// Reads a model or settings. A file that is too long for either is refused, as the daemon refuses it.
 pub(super) fn read(path: &Path) -> Result<Vec<u8>, Unreadable> {

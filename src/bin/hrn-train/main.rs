@@ -33,9 +33,10 @@ fn main() -> ExitCode {
         Ok(arguments) => arguments,
         Err(error) => return tools::usage("hrn-train", &error),
     };
+    let words = std::env::args_os().map(|word| word.to_string_lossy().into_owned());
     let how_to_continue = match arguments.command {
-        Command::Train(_) | Command::Adapt(_) => Some(signals::resuming(std::env::args())),
-        Command::Compare(_) => Some(signals::again(std::env::args())),
+        Command::Train(_) | Command::Adapt(_) => Some(signals::resuming(words)),
+        Command::Compare(_) => Some(signals::again(words)),
         _ => None,
     };
     if let Err(error) = signals::end_at_signals(how_to_continue) {

@@ -1,6 +1,6 @@
 //! The commands on a model file: `evaluate`, `export`, `inspect`, `check-model` and `adopt`.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::Context as _;
@@ -18,9 +18,13 @@ use hardnessd::verdict::Hrn;
 use super::account;
 use super::arguments::{Adopt, Evaluate};
 use super::failure::{NoRun, exit_code};
-use super::files::{load, read, write};
+use super::files::{apart, load, read, write};
 
 pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
+    if let Some(verdicts) = &arguments.verdicts {
+        let inputs = [&arguments.model, &arguments.data];
+        apart("--verdicts", verdicts, inputs.map(PathBuf::as_path))?;
+    }
     let hrn = load(&arguments.model)?;
     if Courses::is_at(&arguments.data)? {
         return evaluate_courses(arguments, &hrn);
@@ -70,7 +74,7 @@ fn evaluate_courses(arguments: &Evaluate, hrn: &Hrn) -> anyhow::Result<String> {
 
 pub(super) fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {
     let model = run.join("hrn.onnx");
-    if run.is_dir() && !model.exists() {
+    if run.is_dir() && !model.try_exists().unwrap_or(true) {
         let hint = if run.join("settings.toml").exists() {
             "it was stopped: `hrn-train train --resume` with its options finishes it"
         } else {
@@ -78,8 +82,9 @@ pub(super) fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {
         };
         return Err(NoRun(run.to_owned(), hint).into());
     }
-    let hrn = load(&model)?;
-    write(out, &read(&model)?)?;
+    let bytes = read(&model)?;
+    let hrn = trial::load(&bytes, None).with_context(|| model.display().to_string())?;
+    write(out, &bytes)?;
     Ok(format!("{}: sha256 {}\n", out.display(), hrn.sha256()))
 }
 
@@ -133,6 +138,7 @@ pub(super) fn check_model(path: &Path) -> ExitCode {
 }
 
 pub(super) fn adopt_model(arguments: &Adopt) -> anyhow::Result<String> {
+    apart("--out", &arguments.out, [arguments.data.as_path()])?;
     let bytes = read(&arguments.model)?;
     let dataset = courses::single_frames(&arguments.data)?;
     let name = arguments.model.file_name().unwrap_or_default();
@@ -146,8 +152,8 @@ pub(super) fn adopt_model(arguments: &Adopt) -> anyhow::Result<String> {
     let adopted = adopt::adopt(&bytes, &dataset, &stated, trial::survives);
     let (model, done, evaluation) =
         adopted.with_context(|| arguments.model.display().to_string())?;
+    let hrn = trial::load(&model, None).with_context(|| arguments.model.display().to_string())?;
     write(&arguments.out, &model)?;
-    let hrn = load(&arguments.out)?;
     let mut account = String::new();
     for change in done {
         account += &format!("changed  {change}\n");

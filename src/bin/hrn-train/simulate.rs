@@ -11,7 +11,7 @@ use hardnessd::train::judge::sheet;
 
 use super::arguments::Simulate;
 use super::failure::{NoObjects, OtherMaterials};
-use super::files::write;
+use super::files::{apart, write};
 
 /// The settings of the simulation.
 fn simulated_settings(arguments: &Simulate) -> Result<DatasetSettings, OtherMaterials> {
@@ -63,6 +63,9 @@ pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
     let settings = simulated_settings(arguments)?;
     if settings.objects == 0 && settings.test_objects == 0 {
         return Err(NoObjects.into());
+    }
+    if let Some(sheet) = &arguments.sheet {
+        apart("--sheet", sheet, [arguments.out.as_path()])?;
     }
     if arguments.sequences {
         return simulate_courses(arguments, settings);

@@ -14,12 +14,13 @@ use hardnessd::train::model::evaluated::Evaluated;
 use hardnessd::train::model::{course, export};
 use hardnessd::train::run::{Description, Run};
 use hardnessd::train::settings::{ArmReports, Profile, Settings};
+use hardnessd::trial;
 use hardnessd::verdict::{BUILT_IN, Hrn, sha256_hex};
 
 use super::account;
 use super::arguments::{Adapt, DeviceName, Train};
 use super::failure::{NoCuda, Unreadable, WrongUsage};
-use super::files::{load, read};
+use super::files::read;
 
 pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
     if let Some(parent) = arguments.parent {
@@ -79,6 +80,17 @@ pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
 }
 
 fn train_course(arguments: &Train) -> anyhow::Result<String> {
+    let of_frames = [
+        ("--labels", arguments.labels.is_some()),
+        (
+            "--label-choice",
+            arguments.label_choice != LabelChoice::Object,
+        ),
+        ("--from", !arguments.from.is_empty()),
+    ];
+    if let Some((option, _)) = of_frames.into_iter().find(|(_, is_given)| *is_given) {
+        return Err(WrongUsage::OfFrames(option).into());
+    }
     let mut settings = settings(
         arguments.method,
         arguments.profile,
@@ -113,7 +125,10 @@ pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
     let settings = settings(method, profile, arguments.config.as_deref())?;
     let device = device(arguments.device)?;
     let (model, bytes, name) = match &arguments.start {
-        Some(path) => (load(path)?, read(path)?, path.display().to_string()),
+        Some(path) => {
+            let (model, bytes) = model_at(path)?;
+            (model, bytes, path.display().to_string())
+        }
         None => {
             let name = "the built-in model".to_owned();
             (Hrn::load(BUILT_IN)?, BUILT_IN.to_vec(), name)
@@ -152,8 +167,7 @@ fn adapt_course(arguments: &Adapt) -> anyhow::Result<String> {
     let (method, profile) = (Method::Adapt, Profile::Paper);
     let settings = settings(method, profile, arguments.config.as_deref())?;
     let device = device(arguments.device)?;
-    let bytes = read(path)?;
-    let model = load(path)?;
+    let (model, bytes) = model_at(path)?;
     let start = methods::course::start(&model, &bytes, &device)
         .with_context(|| path.display().to_string())?;
     let (courses, sources) = Courses::read_all(&arguments.data)?;
@@ -175,6 +189,13 @@ fn adapt_course(arguments: &Adapt) -> anyhow::Result<String> {
     };
     let figures: anyhow::Result<Option<String>> = evaluation.as_ref().map(beside_start).transpose();
     Ok(account_of_run(begun, &run, figures?))
+}
+
+/// A model file and its bytes, read once.
+fn model_at(path: &Path) -> anyhow::Result<(Hrn, Vec<u8>)> {
+    let bytes = read(path)?;
+    let model = trial::load(&bytes, None).with_context(|| path.display().to_string())?;
+    Ok((model, bytes))
 }
 
 /// The data of several files, joined.

@@ -26,7 +26,7 @@ use crate::train::model::course as model;
 use crate::train::model::evaluated;
 use crate::train::net::course::Moment;
 use crate::train::net::frames::FEATURES;
-use crate::train::run::disk::write_whole;
+use crate::train::run::disk::{refuse_foreign, write_whole};
 use crate::verdict::{Course, Format, Hrn, argmax};
 
 /// Presses of a level in the picture of force against approach. More would hide each other.
@@ -127,6 +127,7 @@ pub fn compare_courses(plan: &CoursePlan) -> anyhow::Result<String> {
         .map(|path| TestSet::read(path))
         .collect::<anyhow::Result<_>>()?;
     std::fs::create_dir_all(&plan.out).with_context(|| plan.out.display().to_string())?;
+    refuse_foreign(&plan.out, "course.json", &["course.md", "course.html"])?;
 
     let mut rows = controls(&plan.data, &sets)?;
     for (name, hrn) in &plan.models {

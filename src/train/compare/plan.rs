@@ -97,7 +97,9 @@ pub(super) fn recipes(plan: &Plan, dataset: &Dataset) -> anyhow::Result<Vec<Reci
                     && recipe.choice == LabelChoice::Object
                     && methods::labels(method, dataset, recipe.labels).ok() == Some(labels)
             };
-            if !recipes.iter().any(has) {
+            // A directory may have any name.
+            let is_possible = methods::labels(method, dataset, Some(labels)).is_ok();
+            if (is_possible || plan.labels.contains(&labels)) && !recipes.iter().any(has) {
                 recipes.push(Recipe {
                     labels: Some(labels),
                     is_extra: true,

@@ -19,7 +19,7 @@ pub use self::courses::{Curve, courses};
 
 use self::plot::escaped;
 use crate::train::compare::digits;
-use crate::train::compare::results::{Comparison, Details, Measured, Row};
+use crate::train::compare::results::{Comparison, Details, Measured, Row, ensure_square};
 use crate::train::compare::sets::{MATCHED, PAPER_SPLIT};
 use crate::train::compare::table::Table;
 use crate::train::compare::tables;
@@ -140,6 +140,7 @@ pub fn run(details: &Details) -> anyhow::Result<String> {
     if let Ok(bytes) = std::fs::read(&path) {
         let evaluation: Evaluation =
             serde_json::from_slice(&bytes).with_context(|| path.display().to_string())?;
+        ensure_square(&details.directory, std::iter::once(&evaluation))?;
         page.section("evaluation", "On the test split");
         page.table(&tables::evaluation(&evaluation));
         let counts = tables::mean_confusion(&[&evaluation]);

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use anyhow::Context as _;
+use anyhow::{Context as _, ensure};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
@@ -162,6 +162,11 @@ impl Worth {
 }
 
 impl Entry {
+    fn evaluations(&self) -> impl Iterator<Item = &Evaluation> {
+        let own = [&self.fresh, &self.matched].into_iter();
+        own.chain(&self.paper_split).chain(self.shifts.values())
+    }
+
     /// Reads the entry of a finished run.
     pub(super) fn of(
         run: &Path,
@@ -230,11 +235,13 @@ impl Details {
     /// Fails if a file exists but cannot be read or parsed.
     pub fn read(directory: &Path) -> anyhow::Result<Self> {
         let revisions = std::fs::read_to_string(directory.join("revision")).unwrap_or_default();
+        let worth = Worth::read(directory);
+        ensure_square(directory, worth.sets.values().map(|set| &set.evaluation))?;
         Ok(Self {
             directory: directory.to_owned(),
             description: Run::description_at(directory)?,
             revisions: revisions.trim().to_owned(),
-            worth: Worth::read(directory),
+            worth,
             history: History::read(directory)?,
         })
     }
@@ -261,13 +268,17 @@ impl Comparison {
         let Some(entries) = read_json::<Vec<Entry>>(&directory.join("results.json"))? else {
             return Ok(None);
         };
+        let swaps: Vec<SwapEntry> = read_json(&directory.join("swaps.json"))?.unwrap_or_default();
+        let all = entries.iter().flat_map(Entry::evaluations);
+        let all = all.chain(swaps.iter().map(|swap| &swap.test));
+        ensure_square(directory, all)?;
         let runs = directory.join("runs");
         let details = entries
             .iter()
             .map(|entry| Details::read(&runs.join(&entry.run)));
         Ok(Some(Self {
             details: details.collect::<anyhow::Result<_>>()?,
-            swaps: read_json(&directory.join("swaps.json"))?.unwrap_or_default(),
+            swaps,
             entries,
         }))
     }
@@ -328,6 +339,19 @@ impl Comparison {
         }
         rows
     }
+}
+
+/// Returns an error if an evaluation in a directory is damaged.
+pub(super) fn ensure_square<'a>(
+    directory: &Path,
+    mut evaluations: impl Iterator<Item = &'a Evaluation>,
+) -> anyhow::Result<()> {
+    ensure!(
+        evaluations.all(Evaluation::is_square),
+        "{}: an evaluation is damaged: `confusion` is not square",
+        directory.display()
+    );
+    Ok(())
 }
 
 /// Reads a JSON file; `None` if the file does not exist.

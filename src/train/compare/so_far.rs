@@ -170,7 +170,8 @@ pub(super) fn of(
 
 /// The place of the frame with which the contact has settled, by the daemon's default settings.
 fn settled(course: &Course) -> Option<usize> {
-    let time = |moment: &CourseMoment| Duration::from_secs_f32(moment.time_s);
+    let time =
+        |moment: &CourseMoment| Duration::try_from_secs_f32(moment.time_s).unwrap_or_default();
     let frames = course
         .moments
         .iter()

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use ndarray::{ArrayView1, ArrayView3};
 use ndarray_npy::{NpzWriter, WriteNpzError};
 
-use super::dataset::file::{self, File};
+use super::dataset::file::{self, FORCES_N, File, SHORE};
 use super::dataset::{
     Dataset, DatasetError, Sample, Source, levels, objects_after, pitch_mm,
     warn_of_object_in_both_splits,
@@ -286,14 +286,20 @@ impl Courses {
         let force_n: Vec<f32> = file.required("force", &[], count)?;
         let arm_n_per_mm: Vec<f32> = file.required("arm_n_per_mm", &[], count)?;
         let best: Vec<u32> = file.required("best", &[], count)?;
-        for (array, values) in [
-            ("time_s", &time_s),
-            ("approach_mm", &approach_mm),
-            ("force", &force_n),
-            ("arm_n_per_mm", &arm_n_per_mm),
+        for (array, values, range) in [
+            ("time_s", &time_s, -1e5..=1e5),
+            ("approach_mm", &approach_mm, -1e6..=1e6),
+            ("force", &force_n, FORCES_N),
+            ("arm_n_per_mm", &arm_n_per_mm, 0.0..=1e6),
         ] {
-            file.finite(array, values)?;
+            file.between(array, values, range)?;
         }
+        let known_shore: Vec<f32> = shore
+            .iter()
+            .copied()
+            .filter(|shore| !shore.is_nan())
+            .collect();
+        file.between("shore", &known_shore, SHORE)?;
         file.within("level", &level, levels().len() as u8, "0 (unlabelled) to 4")?;
         file.within("split", &split, 1, "0 (train) or 1 (test)")?;
         file.within("known", &known, 1, "0 or 1")?;

@@ -6,7 +6,7 @@
 use std::io::Cursor;
 use std::path::Path;
 
-use anyhow::Context as _;
+use anyhow::{Context as _, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 
@@ -102,8 +102,9 @@ fn meta(objects: &DatasetSettings, settings: &serde_json::Value) -> serde_json::
 ///
 /// Returns an error if the file cannot be read.
 pub fn settings_of_courses(path: &Path) -> anyhow::Result<Option<DatasetSettings>> {
-    let mut meta = dataset::meta(path)?;
-    Ok(serde_json::from_value(meta["settings"]["objects"].take()).ok())
+    let meta = dataset::meta(path)?;
+    let settings = meta.pointer("/settings/objects").cloned();
+    Ok(settings.and_then(|settings| serde_json::from_value(settings).ok()))
 }
 
 /// The settings that a file was simulated with.
@@ -113,11 +114,15 @@ pub fn settings_of_courses(path: &Path) -> anyhow::Result<Option<DatasetSettings
 /// Returns an error if the file cannot be read, or has no such settings.
 pub fn settings_of(path: &Path) -> anyhow::Result<DatasetSettings> {
     let meta = dataset::meta(path)?;
-    serde_json::from_value(meta["settings"].clone()).with_context(|| {
+    let expected = || {
         format!(
             "{}: `meta.settings`: found {}, expected the simulator's settings",
             path.display(),
             meta["settings"]
         )
-    })
+    };
+    let settings: DatasetSettings =
+        serde_json::from_value(meta["settings"].clone()).with_context(expected)?;
+    ensure!(settings.is_possible(), expected());
+    Ok(settings)
 }

@@ -84,6 +84,14 @@ pub struct Evaluation {
 }
 
 impl Evaluation {
+    /// Whether the counts are a square with a row for each level, as in any evaluation that was not
+    /// damaged.
+    pub fn is_square(&self) -> bool {
+        let levels = self.category_accuracy.len();
+        let mut rows = self.confusion.iter();
+        self.confusion.len() == levels && rows.all(|row| row.len() == levels)
+    }
+
     /// Evaluates `judged`, whose levels and rows of probabilities are all of 1..=`levels`.
     ///
     /// # Panics

@@ -23,6 +23,7 @@ use crate::train::net::standard::Standard;
 use crate::train::net::start::Start;
 use crate::train::run::Run;
 use crate::train::run::checkpoint::Origin;
+use crate::train::run::progress::ensure_finite_logits;
 use crate::train::settings::{ArmReports, Training};
 use crate::verdict::argmax;
 
@@ -223,11 +224,11 @@ pub fn fit(task: &Task, start: Option<(Start, Calibration)>, run: &Run) -> anyho
             true => Calibration::NONE,
             false => Calibration::WITHOUT_SHORE,
         };
-        return Ok(task.calibrated(weights, standard, &calibration));
+        return task.calibrated(weights, standard, &calibration);
     };
     let (weights, standard) = task.learnt(start.weights.clone(), start.standard, run)?;
     let weights = weights.between(&start.weights, LEARNT_SHARE);
-    Ok(task.calibrated(weights, standard, &calibration))
+    task.calibrated(weights, standard, &calibration)
 }
 
 impl Task<'_> {
@@ -328,12 +329,21 @@ impl Task<'_> {
     }
 
     /// Calibrates on the presses of held-out objects, varied like the training presses.
-    fn calibrated(&self, weights: Weights, standard: Standard, start: &Calibration) -> Trained {
+    fn calibrated(
+        &self,
+        weights: Weights,
+        standard: Standard,
+        start: &Calibration,
+    ) -> anyhow::Result<Trained> {
         let mut trained = Trained {
             weights,
             standard,
             calibration: Calibration::NONE,
         };
+        // Finite weights can still give a logit that is not. One press is enough for this check.
+        let first = self.presses[self.train[0]].clone();
+        let first = trained.judge(&[first], self.levels, self.device);
+        ensure_finite_logits(self.stage, self.settings.epochs, &first)?;
         let mut stream = self.stream("calibration");
         let presses: Vec<Press> = self
             .held_out
@@ -353,6 +363,6 @@ impl Task<'_> {
             })
             .collect();
         trained.calibration = Calibration::of(&judged, start, &mut stream, self.device);
-        trained
+        Ok(trained)
     }
 }

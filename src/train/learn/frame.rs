@@ -25,6 +25,7 @@ use crate::train::net::standard::Standard;
 use crate::train::net::start::Start;
 use crate::train::run::Run;
 use crate::train::run::checkpoint::Origin;
+use crate::train::run::progress::ensure_finite_logits;
 use crate::train::settings::{ConsistencySettings, Training};
 use crate::verdict::argmax;
 
@@ -153,11 +154,20 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
         Some(start) => weights.between(start, epochs::LEARNT_SHARE),
         None => weights,
     };
-    Ok(Trained {
+    let trained = Trained {
         calibration: task.calibration(&weights, &standard, &plan, &calibration)?,
         weights,
         standard,
-    })
+    };
+    // Finite weights can still give a logit that is not. One frame is enough for this check.
+    let first = trained.judge(
+        &task.frames(&task.train[..1]),
+        &plan,
+        task.levels,
+        task.device,
+    )?;
+    ensure_finite_logits(task.stage, task.settings.epochs, &first)?;
+    Ok(trained)
 }
 
 impl Task<'_> {

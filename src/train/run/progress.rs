@@ -24,6 +24,22 @@ pub(in crate::train) fn ensure_finite(
     Ok(())
 }
 
+/// Ends a stage whose network gives a logit that is not finite, as finite weights can.
+///
+/// # Errors
+///
+/// Returns an error if one of the logits is not finite.
+pub(in crate::train) fn ensure_finite_logits(
+    stage: &str,
+    epoch: u32,
+    judged: &[(Vec<f32>, [f32; 3])],
+) -> anyhow::Result<()> {
+    for logit in judged.iter().flat_map(|(logits, _)| logits) {
+        ensure_finite(stage, epoch, "logit", (*logit).into())?;
+    }
+    Ok(())
+}
+
 /// Ends a stage with weights that are NaN or infinite. The loss does not show them yet, because a
 /// step's loss is that of the weights before it.
 ///

@@ -32,6 +32,12 @@ pub enum SettingsError {
     },
 }
 
+/// The most samples that a component generates at once. Fifty components make half a million, which
+/// take 1.6 GB.
+pub(in crate::train) const MOST_SAMPLES_A_COMPONENT: u32 = 10_000;
+/// The most samples of a step.
+const MOST_SAMPLES: usize = 1_000_000;
+
 /// Checks the settings that every training loop has.
 pub(in crate::train) fn check_loop(
     table: &str,
@@ -41,7 +47,8 @@ pub(in crate::train) fn check_loop(
     checkpoint_every_epochs: u32,
 ) -> Result<(), SettingsError> {
     // Batch normalisation needs two samples.
-    check(table, "batch", batch as f64, batch > 1, "2 or more")?;
+    let fits = (2..=MOST_SAMPLES).contains(&batch);
+    check(table, "batch", batch as f64, fits, "2 to 1000000")?;
     check(table, "epochs", epochs, epochs > 0, "1 or more")?;
     let fits = (0.0..1.0).contains(&averaging);
     check(table, "averaging", averaging, fits, "0 to below 1")?;

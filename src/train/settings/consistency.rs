@@ -32,7 +32,8 @@ impl ConsistencySettings {
     pub(super) fn check(&self) -> Result<(), SettingsError> {
         let check =
             |key, found: f64, fits, expected| check("consistency.", key, found, fits, expected);
-        check("ratio", self.ratio as f64, self.ratio > 0, "1 or more")?;
+        let fits = (1..=1000).contains(&self.ratio);
+        check("ratio", self.ratio as f64, fits, "1 to 1000")?;
         let fits = (0.0..=1.0).contains(&self.confidence);
         check("confidence", self.confidence, fits, "0 to 1")?;
         check("weight", self.weight, self.weight >= 0.0, "0 or more")

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::bounds::{SettingsError, check, check_loop};
+use super::bounds::{MOST_SAMPLES_A_COMPONENT, SettingsError, check, check_loop};
 use super::optimiser::{OptimiserSettings, Rule};
 
 /// Settings for the training of generator and discriminator. The defaults are the paper's
@@ -64,7 +64,8 @@ impl GanSettings {
         )?;
         let samples = self.samples_a_component;
         let key = "samples_a_component";
-        check(table, key, samples as f64, samples > 0, "1 or more")?;
+        let fits = (1..=MOST_SAMPLES_A_COMPONENT as usize).contains(&samples);
+        check(table, key, samples as f64, fits, "1 to 10000")?;
         let (key, penalty) = ("sigma_penalty", self.sigma_penalty);
         check(table, key, penalty, penalty >= 0.0, "0 or more")?;
         let (key, every) = ("picture_every_epochs", self.picture_every_epochs);

@@ -1,6 +1,7 @@
 //! Data sets as `.npz` files: arrays with the names, types and shapes of `docs/formats.md`.
 
 use std::io::{Cursor, Read, Seek, Write};
+use std::ops::RangeInclusive;
 use std::os::unix::fs::FileTypeExt as _;
 use std::path::Path;
 
@@ -17,6 +18,12 @@ use crate::verdict::{Level, check_levels, sha256_hex};
 
 /// A force above any sensor's, and low enough that sums of squares stay finite.
 const MOST_NEWTONS: f32 = 1e6;
+/// The forces of presses.
+pub(in crate::train::data) const FORCES_N: RangeInclusive<f32> = -MOST_NEWTONS..=MOST_NEWTONS;
+/// What a durometer can show.
+pub(in crate::train::data) const SHORE: RangeInclusive<f32> = 0.0..=100.0;
+/// Distances between taxels, in mm.
+const PITCHES_MM: RangeInclusive<f64> = 0.01..=1000.0;
 
 /// The largest ratio of an array's size to its packed size. Frames of presses are packed to a
 /// tenth, and arrays of zeros to a thousandth.
@@ -62,9 +69,8 @@ pub(super) fn parse(bytes: &[u8], path: &Path, name: String) -> Result<Dataset, 
     let force: Option<Vec<f32>> = file.read("force", &[], Some(n))?;
     let split: Option<Vec<u8>> = file.read("split", &[], Some(n))?;
     let shore: Option<Vec<f32>> = file.read("shore", &[], Some(n))?;
-    for (array, values) in [("force", &force), ("shore", &shore)] {
-        file.finite(array, values.as_deref().unwrap_or_default())?;
-    }
+    file.between("force", force.as_deref().unwrap_or_default(), FORCES_N)?;
+    file.between("shore", shore.as_deref().unwrap_or_default(), SHORE)?;
     let levels = levels().len();
     file.within("level", &level, levels as u8, "0 (unlabelled) to 4")?;
     file.within(
@@ -123,24 +129,36 @@ pub(in crate::train::data) fn source(
     name: String,
     meta: &serde_json::Value,
 ) -> Result<Source, DatasetError> {
-    let pitch = &meta["pitch_mm"];
-    let pitch_mm = pitch.as_f64().filter(|&mm| mm > 0.0);
-    if !pitch.is_null() && pitch_mm.is_none() {
-        let (found, expected) = (
-            format!("pitch_mm {pitch}"),
-            "millimetres above 0".to_owned(),
-        );
-        return Err(file.error("meta", found, expected));
+    let refused = |key: &str, expected: &str| {
+        let found = format!("{key} {}", meta[key]);
+        file.error("meta", found, expected.to_owned())
+    };
+    let pitch_mm = meta["pitch_mm"]
+        .as_f64()
+        .filter(|mm| PITCHES_MM.contains(mm));
+    if !meta["pitch_mm"].is_null() && pitch_mm.is_none() {
+        return Err(refused("pitch_mm", "millimetres from 0.01 to 1000"));
+    }
+    let seed = meta["seed"].as_u64();
+    // A run keeps the seed in TOML, which has no larger numbers.
+    if seed.is_some_and(|seed| i64::try_from(seed).is_err()) {
+        return Err(refused("seed", "a number up to 9223372036854775807"));
+    }
+    let stated: Option<Vec<Level>> = serde_json::from_value(meta["levels"].clone()).ok();
+    let stated = stated.filter(|of| check_levels(of).is_ok());
+    if !meta["levels"].is_null() && stated.is_none() {
+        return Err(refused(
+            "levels",
+            "`level`, `label` and `shore` of each level, from 1 on",
+        ));
     }
     Ok(Source {
         name,
-        seed: meta["seed"].as_u64(),
+        seed,
         sha256: sha256_hex(bytes),
         generator: meta["generator"].as_str().map(str::to_owned),
         pitch_mm,
-        levels: serde_json::from_value(meta["levels"].clone()).ok().filter(
-            |stated: &Vec<Level>| stated.len() == levels().len() && check_levels(stated).is_ok(),
-        ),
+        levels: stated.filter(|of| of.len() == levels().len()),
     })
 }
 
@@ -369,16 +387,18 @@ impl<'a> File<'a> {
             .map_err(|error| self.error("meta", error.to_string(), "JSON in UTF-8".to_owned()))
     }
 
-    pub(in crate::train::data) fn finite(
+    pub(in crate::train::data) fn between(
         &self,
         array: &'static str,
         values: &[f32],
+        range: RangeInclusive<f32>,
     ) -> Result<(), DatasetError> {
-        match values.iter().position(|value| !value.is_finite()) {
+        match values.iter().position(|value| !range.contains(value)) {
             None => Ok(()),
             Some(place) => {
                 let found = format!("{} at {place}", values[place]);
-                Err(self.error(array, found, "finite numbers".to_owned()))
+                let expected = format!("{} to {}", range.start(), range.end());
+                Err(self.error(array, found, expected))
             }
         }
     }
