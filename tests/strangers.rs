@@ -165,10 +165,10 @@ fn a_checkpoint_of_another_network_is_refused_or_left_alone() {
     let whole = Checkpoint::read(&paths[0], &Device::flex()).unwrap();
     let mut missing = whole.clone();
     missing.lists[0].1.entries.remove(0);
-    let mut shorter = whole.clone();
+    let mut shorter = whole;
     let weight = &mut shorter.lists[0].1.entries[0];
     weight.dims = vec![3];
-    weight.values = weight.values.clone().slice([0..3]);
+    weight.values = weight.values.clone().narrow(0, 0, 3);
     for damaged in [missing, shorter] {
         let name = damaged.lists[0].0.clone();
         for path in &paths {
