@@ -113,6 +113,21 @@ fn a_directory_of_something_else_stays_as_it_is() {
 }
 
 #[test]
+fn a_directory_with_a_strange_name_does_not_end_a_comparison() {
+    let directory = bench();
+    let at = directory.path();
+    for name in ["hrn15-0-1", "hrn15-99999999999999-1"] {
+        let strange = at.join("cmp/runs").join(name);
+        fs::create_dir_all(&strange).unwrap();
+        fs::write(strange.join("hrn.onnx"), "somebody's").unwrap();
+    }
+    succeed(
+        at,
+        "compare --methods features --profile smoke --data d.npz --out cmp --plan",
+    );
+}
+
+#[test]
 fn what_a_model_could_not_state_is_refused_before_the_training() {
     let directory = bench();
     let at = directory.path();
