@@ -82,8 +82,10 @@ pub fn check_label(key: &str, value: &str) -> Result<(), LabelError> {
             number("object", is_one, "a whole number from 0 to 4294967295")
         }
         "shore" => {
-            let is_one = value.parse().is_ok_and(f32::is_finite);
-            number("shore", is_one, "a number")
+            let is_one = value
+                .parse()
+                .is_ok_and(|shore: f32| (0.0..=100.0).contains(&shore));
+            number("shore", is_one, "a number from 0 to 100")
         }
         _ => Ok(()),
     }
@@ -115,6 +117,8 @@ mod tests {
             ("object", "-1", "object: found \"-1\", expected a whole"),
             ("shore", "hard", "shore: found \"hard\", expected a number"),
             ("shore", "NaN", "shore: found \"NaN\", expected a number"),
+            ("shore", "101", "expected a number from 0 to 100"),
+            ("shore", "-1", "expected a number from 0 to 100"),
             ("note", "\u{202e}7", "found \"\\u{202e}7\", expected text"),
             ("a\nb", "7", "found \"a\\nb\", expected text"),
             (

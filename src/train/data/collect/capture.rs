@@ -12,7 +12,7 @@ use crate::motion::Track;
 use crate::pipeline::{Clock, Pipeline};
 use crate::recording::{Entry, FileKind, Found, Labels, Playback, Reader};
 use crate::sensor::Sensor;
-use crate::train::data::dataset;
+use crate::train::data::dataset::{self, file::SHORE};
 use crate::verdict::Hrn;
 
 /// A capture without its frames.
@@ -57,12 +57,12 @@ impl Head {
         let Some(label) = self.labels.get("shore") else {
             return Ok(None);
         };
-        let shore = label.parse().ok().filter(|shore: &f32| shore.is_finite());
+        let shore = label.parse().ok().filter(|shore| SHORE.contains(shore));
         let wrong = || CollectError::Label {
             path: self.path.clone(),
             key: "shore",
             found: format!("{label:?}"),
-            expected: "a number",
+            expected: "a number from 0 to 100",
         };
         shore.ok_or_else(wrong).map(Some)
     }
