@@ -74,9 +74,17 @@ def by_confidence(verdicts):
     return counts
 
 
-def shares(counts, presses):
-    """Cells of a table: for each confidence the share of the presses, and the share of right ones among these."""
-    return [f"{100 * n / presses:.0f} %, {100 * right / n:.0f} %" if n else "none" for n, right in counts.values()]
+def print_by_level_and_confidence(written, model):
+    """Prints how often each level is right, and what share of the presses has a confidence and how often it is right."""
+    print("\n| Presses | Level 1 right | Level 2 | Level 3 | Level 4 | Calibration error |")
+    for name, found in written["evaluations"].items():
+        levels = " | ".join(f"{100 * share:.0f} %" for share in found[model]["category_accuracy"])
+        print(f"| {name} | {levels} | {found[model]['ece']:.2f} |")
+    print("\n| Presses |", " | ".join(f"{confidence} or more" for confidence in CONFIDENCES), "|")
+    for name, found in written["confident"].items():
+        presses = written["evaluations"][name][model]["n"]
+        cells = [f"{100 * n / presses:.0f} %, {100 * right / n:.0f} %" if n else "-" for n, right in found[model].values()]
+        print("|", name, "|", " | ".join(cells), "|")
 
 
 def write(path, trainer, found):

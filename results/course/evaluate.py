@@ -124,8 +124,8 @@ def table():
     written = json.loads((HERE / "evaluations.json").read_text())
     evaluations = written["evaluations"]
 
-    def objects(name, model="course"):
-        return [row for row in rows if (row["set"], row["model"]) == (name, model)]
+    def objects(name):
+        return [row for row in rows if (row["set"], row["model"]) == (name, "course")]
 
     print("| Presses | Level right | Beyond the neighbour | Shore RMSE | Interval holds | Set holds |", end=" ")
     print("Ambiguous | Right if named | Default model |")
@@ -143,14 +143,7 @@ def table():
         shore = evaluations[name]["course"]["shore"]
         print("|", name, "|", " | ".join(f"{e:.1f}" for e in [*shore["rmse_by_level"], shore["rmse_near_borders"]]), "|")
 
-    print("\n| Presses | Level 1 right | Level 2 | Level 3 | Level 4 | Calibration error |")
-    for name, found in evaluations.items():
-        own = found["course"]
-        print("|", name, "|", " | ".join(f"{100 * share:.0f} %" for share in own["category_accuracy"]), end=" | ")
-        print(f"{own['ece']:.2f} |")
-    print("\n| Presses |", " | ".join(f"{confidence} or more" for confidence in training.CONFIDENCES), "|")
-    for name, found in written["confident"].items():
-        print("|", name, "|", " | ".join(training.shares(found["course"], evaluations[name]["course"]["n"])), "|")
+    training.print_by_level_and_confidence(written, "course")
 
     columns = [f"{who}, {shapes}" for who in ("others", "the four") for shapes in SHAPES]
     print("\nErrors of the robot\n\n| The robot errs |", " | ".join(columns), "|")

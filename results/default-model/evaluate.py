@@ -178,14 +178,7 @@ def table():
         if shore := found["default"]["shore"]:
             errors = [*shore["rmse_by_level"], shore["rmse_near_borders"]]
             print("|", name, "|", " | ".join("-" if e is None else f"{e:.1f}" for e in errors), "|")
-    print("\n| Presses | Level 1 right | Level 2 | Level 3 | Level 4 | Calibration error |")
-    for name, found in written["evaluations"].items():
-        own = found["default"]
-        print("|", name, "|", " | ".join(f"{100 * share:.0f} %" for share in own["category_accuracy"]), end=" | ")
-        print(f"{own['ece']:.2f} |")
-    print("\n| Presses |", " | ".join(f"{confidence} or more" for confidence in training.CONFIDENCES), "|")
-    for name, found in written["confident"].items():
-        print("|", name, "|", " | ".join(training.shares(found["default"], written["evaluations"][name]["default"]["n"])), "|")
+    training.print_by_level_and_confidence(written, "default")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 //! The settings of a simulated data set.
 
+use std::ops::RangeInclusive;
+
 use serde::{Deserialize, Serialize};
 
 use super::broad::Laws;
@@ -103,13 +105,19 @@ impl DatasetSettings {
     /// The most objects of a material, and the most presses of an object.
     pub const MOST: u32 = 10_000;
 
-    /// Whether the numbers of objects and presses, the least force and the cover lie within the
-    /// ranges of `hrn-train simulate`.
+    /// The range of the least nominal force, N.
+    pub const LOWEST_FORCES_N: RangeInclusive<f32> = 0.01..=25.0;
+
+    /// The range of the cover's Young's modulus, MPa: from that of a gel to that of a hard plastic.
+    pub const COVERS_MPA: RangeInclusive<f64> = 0.05..=100.0;
+
+    /// Whether the numbers of objects and presses, the least force and the cover lie within their
+    /// ranges.
     pub fn is_possible(&self) -> bool {
         self.objects.max(self.test_objects) <= Self::MOST
             && (1..=Self::MOST).contains(&self.presses)
-            && (0.01..=25.0).contains(&self.lowest_force_n)
-            && (0.05..=100.0).contains(&self.cover_young_mpa)
+            && Self::LOWEST_FORCES_N.contains(&self.lowest_force_n)
+            && Self::COVERS_MPA.contains(&self.cover_young_mpa)
     }
 
     /// The split of a material: the paper's, or the other one if the material's level is swapped.

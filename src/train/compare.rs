@@ -55,8 +55,10 @@ pub fn plan(plan: &Plan) -> anyhow::Result<String> {
     plan::command_lines(&jobs)
 }
 
-/// Reads and checks the plan's data, before anything is written.
+/// Reads and checks the plan's data, and checks its directory, before anything is written.
 fn checked(plan: &Plan) -> anyhow::Result<Dataset> {
+    let written = ["objects.csv", "tables.md", "report.html", "swaps.json"];
+    refuse_foreign(&plan.out, "results.json", &written)?;
     let dataset = Dataset::read(&plan.data)?;
     sets::check_seed(&dataset)?;
     sets::warn_of_pitch(&dataset);
@@ -68,8 +70,6 @@ fn checked(plan: &Plan) -> anyhow::Result<Dataset> {
 }
 
 fn make_directories(plan: &Plan) -> anyhow::Result<()> {
-    let written = ["objects.csv", "tables.md", "report.html", "swaps.json"];
-    refuse_foreign(&plan.out, "results.json", &written)?;
     for part in ["data", "runs", "logs"] {
         let part = plan.out.join(part);
         std::fs::create_dir_all(&part).with_context(|| part.display().to_string())?;

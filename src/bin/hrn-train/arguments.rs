@@ -323,7 +323,7 @@ pub(super) struct Compare {
 /// nominal force.
 fn lowest_force_n(text: &str) -> Result<f32, String> {
     match text.parse() {
-        Ok(force_n) if (0.01..=25.0).contains(&force_n) => Ok(force_n),
+        Ok(force_n) if DatasetSettings::LOWEST_FORCES_N.contains(&force_n) => Ok(force_n),
         _ => Err("expected newtons from 0.01 to 25".to_owned()),
     }
 }
@@ -336,7 +336,7 @@ fn seed() -> RangedU64ValueParser {
 /// Parses a Young's modulus in MPa, from that of a gel to that of a hard plastic.
 fn cover_mpa(text: &str) -> Result<f64, String> {
     match text.parse() {
-        Ok(mpa) if (0.05..=100.0).contains(&mpa) => Ok(mpa),
+        Ok(mpa) if DatasetSettings::COVERS_MPA.contains(&mpa) => Ok(mpa),
         _ => Err("expected MPa from 0.05 to 100".to_owned()),
     }
 }

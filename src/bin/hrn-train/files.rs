@@ -18,8 +18,8 @@ pub(super) fn apart<'a>(
     others: impl IntoIterator<Item = &'a Path>,
 ) -> Result<(), WrongUsage> {
     let file = |path: &Path| path.canonicalize().ok().filter(|path| path.is_file());
-    let same =
-        |other: &Path| other == out || file(other).is_some_and(|other| file(out) == Some(other));
+    let found = file(out);
+    let same = |other: &Path| other == out || (found.is_some() && file(other) == found);
     match others.into_iter().find(|other| same(other)) {
         Some(_) => Err(WrongUsage::Overwritten(option, out.to_owned())),
         None => Ok(()),
@@ -57,5 +57,12 @@ pub(super) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
 }
 
 pub(super) fn load(path: &Path) -> anyhow::Result<Hrn> {
-    trial::load(&read(path)?, None).with_context(|| path.display().to_string())
+    Ok(load_with_bytes(path)?.0)
+}
+
+/// A model and the bytes of its file, read once: the file may be a pipe.
+pub(super) fn load_with_bytes(path: &Path) -> anyhow::Result<(Hrn, Vec<u8>)> {
+    let bytes = read(path)?;
+    let model = trial::load(&bytes, None).with_context(|| path.display().to_string())?;
+    Ok((model, bytes))
 }

@@ -18,7 +18,7 @@ use hardnessd::verdict::Hrn;
 use super::account;
 use super::arguments::{Adopt, Evaluate};
 use super::failure::{NoRun, exit_code};
-use super::files::{apart, load, read, write};
+use super::files::{apart, load, load_with_bytes, read, write};
 
 pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     if let Some(verdicts) = &arguments.verdicts {
@@ -82,8 +82,7 @@ pub(super) fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {
         };
         return Err(NoRun(run.to_owned(), hint).into());
     }
-    let bytes = read(&model)?;
-    let hrn = trial::load(&bytes, None).with_context(|| model.display().to_string())?;
+    let (hrn, bytes) = load_with_bytes(&model)?;
     write(out, &bytes)?;
     Ok(format!("{}: sha256 {}\n", out.display(), hrn.sha256()))
 }

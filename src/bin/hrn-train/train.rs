@@ -14,13 +14,12 @@ use hardnessd::train::model::evaluated::Evaluated;
 use hardnessd::train::model::{course, export};
 use hardnessd::train::run::{Description, Run};
 use hardnessd::train::settings::{ArmReports, Profile, Settings};
-use hardnessd::trial;
 use hardnessd::verdict::{BUILT_IN, Hrn, sha256_hex};
 
 use super::account;
 use super::arguments::{Adapt, DeviceName, Train};
 use super::failure::{NoCuda, Unreadable, WrongUsage};
-use super::files::read;
+use super::files::{load_with_bytes, read};
 
 pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
     if let Some(parent) = arguments.parent {
@@ -126,7 +125,7 @@ pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
     let device = device(arguments.device)?;
     let (model, bytes, name) = match &arguments.start {
         Some(path) => {
-            let (model, bytes) = model_at(path)?;
+            let (model, bytes) = load_with_bytes(path)?;
             (model, bytes, path.display().to_string())
         }
         None => {
@@ -167,7 +166,7 @@ fn adapt_course(arguments: &Adapt) -> anyhow::Result<String> {
     let (method, profile) = (Method::Adapt, Profile::Paper);
     let settings = settings(method, profile, arguments.config.as_deref())?;
     let device = device(arguments.device)?;
-    let (model, bytes) = model_at(path)?;
+    let (model, bytes) = load_with_bytes(path)?;
     let start = methods::course::start(&model, &bytes, &device)
         .with_context(|| path.display().to_string())?;
     let (courses, sources) = Courses::read_all(&arguments.data)?;
@@ -189,13 +188,6 @@ fn adapt_course(arguments: &Adapt) -> anyhow::Result<String> {
     };
     let figures: anyhow::Result<Option<String>> = evaluation.as_ref().map(beside_start).transpose();
     Ok(account_of_run(begun, &run, figures?))
-}
-
-/// A model file and its bytes, read once.
-fn model_at(path: &Path) -> anyhow::Result<(Hrn, Vec<u8>)> {
-    let bytes = read(path)?;
-    let model = trial::load(&bytes, None).with_context(|| path.display().to_string())?;
-    Ok((model, bytes))
 }
 
 /// The data of several files, joined.

@@ -341,16 +341,20 @@ impl Comparison {
     }
 }
 
-/// Returns an error if an evaluation in a directory is damaged.
+/// Returns an error if an evaluation in a directory is damaged. All have the same number of levels.
 pub(super) fn ensure_square<'a>(
     directory: &Path,
-    mut evaluations: impl Iterator<Item = &'a Evaluation>,
+    evaluations: impl Iterator<Item = &'a Evaluation>,
 ) -> anyhow::Result<()> {
-    ensure!(
-        evaluations.all(Evaluation::is_square),
-        "{}: an evaluation is damaged: `confusion` is not square",
-        directory.display()
-    );
+    let mut levels = None;
+    for evaluation in evaluations {
+        let own = evaluation.confusion.len();
+        ensure!(
+            evaluation.is_square() && *levels.get_or_insert(own) == own,
+            "{}: an evaluation is damaged: `confusion` is not square, or of other levels",
+            directory.display()
+        );
+    }
     Ok(())
 }
 

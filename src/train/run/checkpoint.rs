@@ -158,13 +158,13 @@ impl Checkpoint {
                 .iter()
                 .try_fold(1_usize, |count, &axis| count.checked_mul(axis));
             let count = count.with_context(|| format!("array `{name}`: found shape {shape:?}"))?;
-            if ["progress", "origin"].contains(&name.as_str()) {
-                let text = npy::elements(&mut packed, count, |[byte]: [u8; 1]| byte)?;
-                *(if name == "origin" {
-                    &mut origin
-                } else {
-                    &mut progress
-                }) = Some(text);
+            let text = match name.as_str() {
+                "progress" => Some(&mut progress),
+                "origin" => Some(&mut origin),
+                _ => None,
+            };
+            if let Some(text) = text {
+                *text = Some(npy::elements(&mut packed, count, |[byte]: [u8; 1]| byte)?);
                 continue;
             }
             let Some((list, weight)) = name.split_once('/') else {
