@@ -117,8 +117,16 @@ mod tests {
             ("object", "-1", "object: found \"-1\", expected a whole"),
             ("shore", "hard", "shore: found \"hard\", expected a number"),
             ("shore", "NaN", "shore: found \"NaN\", expected a number"),
-            ("shore", "101", "expected a number from 0 to 100"),
-            ("shore", "-1", "expected a number from 0 to 100"),
+            (
+                "shore",
+                "101",
+                "shore: found \"101\", expected a number from 0 to 100",
+            ),
+            (
+                "shore",
+                "-1",
+                "shore: found \"-1\", expected a number from 0 to 100",
+            ),
             ("note", "\u{202e}7", "found \"\\u{202e}7\", expected text"),
             ("a\nb", "7", "found \"a\\nb\", expected text"),
             (
