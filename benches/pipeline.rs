@@ -11,12 +11,12 @@ use std::sync::Arc;
 
 use divan::Bencher;
 use divan::counter::{BytesCount, ItemsCount};
-use hardnessd::event::{Event, Phase};
-use hardnessd::frame::Stamp;
-use hardnessd::pipeline::{Clock, Pipeline};
-use hardnessd::sensor::{Description, Sensor};
-use hardnessd::verdict::{BUILT_IN, Hrn};
-use hardnessd::wire::{self, Decoder, Layout};
+use hardnessd_core::event::{Event, Phase};
+use hardnessd_core::frame::Stamp;
+use hardnessd_core::pipeline::{Clock, Pipeline};
+use hardnessd_core::sensor::{Description, Sensor};
+use hardnessd_core::verdict::{BUILT_IN, Hrn};
+use hardnessd_core::wire::{self, Decoder, Layout};
 use tract_onnx::prelude::tract_ndarray::Array2;
 
 /// The approximate size of one read of a serial port at 115,200 baud.

@@ -1,6 +1,6 @@
 """The training steps of `train_step.rs` in PyTorch, in turn with it: their ratio.
 
-    cargo bench --features train --bench train_step --no-run   # prints the executable
+    cargo bench -p hrn-train --bench train_step --no-run   # prints the executable
     python benches/pytorch_step.py EXECUTABLE [--threads N] [--rounds N]
 
 Needs torch and numpy. Both sides start from the same weights and images; the losses of the first

@@ -10,12 +10,12 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use hardnessd::event::{Event, Hardness, Phase, PressState};
-use hardnessd::frame::Stamp;
-use hardnessd::pipeline::{Clock, Pipeline};
-use hardnessd::sensor::{Description, Sensor};
-use hardnessd::simulator::{Material, Sequence, SequenceSettings};
-use hardnessd::verdict::{BUILT_IN, Hrn};
+use hardnessd_core::event::{Event, Hardness, Phase, PressState};
+use hardnessd_core::frame::Stamp;
+use hardnessd_core::pipeline::{Clock, Pipeline};
+use hardnessd_core::sensor::{Description, Sensor};
+use hardnessd_core::verdict::{BUILT_IN, Hrn};
+use hardnessd_simulator::{Material, Sequence, SequenceSettings};
 
 const SEED: u64 = 1;
 /// The share of a press's greatest force from which on the force no longer counts as rising.

@@ -3,7 +3,7 @@
     python3 -m venv venv
     venv/bin/pip install numpy scikit-learn onnx torch onnxscript matplotlib \
         './clients/python[dataset,recording]'
-    cargo build --release --features train
+    cargo build --release --workspace
     PATH=$PWD/target/release:$PATH venv/bin/python examples/own_model.py DIRECTORY
 
 DIRECTORY is made, and gets all files. Each `# %%` begins a cell: VS Code, Spyder and Jupyter (with

@@ -55,10 +55,10 @@ pub use self::reload::Reload;
 use self::running::Running;
 use self::sensor::{SensorHandle, Sensors};
 use self::serial::Link;
-use crate::event::{Hello, ModelCard, PROTOCOL, SensorCard, Status};
-use crate::frame::Stamp;
-use crate::pipeline::{Clock, Pipeline};
-use crate::recording::{About, Found, Labels, RecordedSensor};
+use hardnessd_core::event::{Hello, ModelCard, PROTOCOL, SensorCard, Status};
+use hardnessd_core::frame::Stamp;
+use hardnessd_core::pipeline::{Clock, Pipeline};
+use hardnessd_core::recording::{About, Found, Labels, RecordedSensor};
 
 /// The most commands that wait for a sensor. When the queue is full, the tasks that send wait.
 const QUESTIONS: usize = 16;

@@ -229,12 +229,12 @@ fn the_page_on_configuration_has_every_key_of_the_daemon_and_no_other() {
     assert_eq!(documented, shipped, "config/hardnessd.toml");
 }
 
-#[cfg(feature = "train")]
 #[test]
 fn the_page_on_configuration_has_every_key_of_the_trainer_and_no_other() {
-    use hardnessd::train::settings::Settings;
+    // A unit test of the trainer compares this file with its defaults.
+    let file = fs::read_to_string(root().join("config/hrn-train.toml")).unwrap();
     let mut defaults = BTreeMap::new();
-    leaves(&as_file(&Settings::default()), "", &mut defaults);
+    leaves(&toml::from_str(&file).unwrap(), "", &mut defaults);
     // The default of this key depends on the network.
     let without = ["pretraining", "training"].map(|table| format!("{table}.level_balance"));
     check_keys(&documented("The trainer"), &defaults, &without.into());
@@ -336,10 +336,9 @@ fn the_page_on_the_command_line_has_every_option_of_the_daemon_and_no_other() {
     check_options("hardnessd", Path::new(BINARY));
 }
 
-#[cfg(feature = "train")]
 #[test]
 fn the_page_on_the_command_line_has_every_option_of_the_trainer_and_no_other() {
-    check_options("hrn-train", Path::new(env!("CARGO_BIN_EXE_hrn-train")));
+    check_options("hrn-train", &bench::hrn_train());
 }
 
 #[test]

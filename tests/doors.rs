@@ -1,6 +1,6 @@
 //! Bytes from strangers, at every input of the programs. Whatever the bytes are, the program
 //! answers, never panics, and takes a bounded time. `doors/properties.rs` has the properties.
-//! `fuzz/` searches for bytes that break them, guided by coverage. `src/verdict/guard` also tries
+//! `fuzz/` searches for bytes that break them, guided by coverage. `crates/core/src/verdict/guard` also tries
 //! model files.
 
 #![allow(clippy::unwrap_used, reason = "a test")]
@@ -12,8 +12,10 @@ use std::io::Cursor;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use hardnessd::recording::{Reader, recover};
-use hardnessd::wire::{Cell, Checksum, Decoder, HexBytes, Layout, LengthField, Order, Settings};
+use hardnessd_core::recording::{Reader, recover};
+use hardnessd_core::wire::{
+    Cell, Checksum, Decoder, HexBytes, Layout, LengthField, Order, Settings,
+};
 use proptest::prelude::*;
 use proptest::test_runner::TestRunner;
 
@@ -110,7 +112,7 @@ proptest! {
         let mut bytes = Vec::new();
         for (is_frame, piece) in pieces {
             if is_frame {
-                let mut frame = hardnessd::frame::RawFrame::default();
+                let mut frame = hardnessd_core::frame::RawFrame::default();
                 for (count, byte) in frame.counts.iter_mut().zip(&piece) {
                     *count = u16::from(*byte);
                 }

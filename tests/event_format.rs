@@ -8,9 +8,9 @@
 
 use std::time::Duration;
 
-use hardnessd::event::*;
-use hardnessd::tare::Offsets;
-use hardnessd::verdict::Level;
+use hardnessd_core::event::*;
+use hardnessd_core::tare::Offsets;
+use hardnessd_core::verdict::Level;
 use jiff::Timestamp;
 use serde_json::json;
 

@@ -18,12 +18,12 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use bench::{Bench, Daemon, Process, Subscriber, hardnessd, wait_for};
-use hardnessd::frame::{RawFrame, Stamp};
-use hardnessd::pipeline::{Clock, Pipeline};
-use hardnessd::random::Stream;
-use hardnessd::sensor::{Description, Sensor};
-use hardnessd::verdict::{BUILT_IN, Hrn};
-use hardnessd::wire::{Layout, Settings};
+use hardnessd_core::frame::{RawFrame, Stamp};
+use hardnessd_core::pipeline::{Clock, Pipeline};
+use hardnessd_core::sensor::{Description, Sensor};
+use hardnessd_core::verdict::{BUILT_IN, Hrn};
+use hardnessd_core::wire::{Layout, Settings};
+use hardnessd_simulator::random::Stream;
 use pair::Pair;
 use rustix::process::Signal;
 use rustix::termios::OptionalActions;
@@ -608,7 +608,7 @@ fn a_wall_clock_that_jumps_changes_the_times_of_events_and_nothing_else() {
                 "frame {number}"
             );
         }
-        let timeless = |event: &hardnessd::event::Event| {
+        let timeless = |event: &hardnessd_core::event::Event| {
             let mut event = serde_json::to_value(event).unwrap();
             event.as_object_mut().unwrap().remove("time");
             event

@@ -286,7 +286,6 @@ fn the_readmes_demonstration_has_the_verdicts_that_it_shows() {
 
 /// The commands of the reference page that finish in seconds. `compare` without `--plan` trains for
 /// hours.
-#[cfg(feature = "train")]
 #[test]
 fn the_reference_page_shows_commands_that_work() {
     let page = fs::read_to_string(root().join("docs/command-line.md")).unwrap();

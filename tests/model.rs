@@ -8,7 +8,7 @@ mod bench;
 use std::fs;
 use std::path::PathBuf;
 
-use hardnessd::verdict::BUILT_IN;
+use hardnessd_core::verdict::BUILT_IN;
 use prost::Message as _;
 use rustix::process::Signal;
 use serde_json::json;

@@ -13,13 +13,8 @@ use std::path::Path;
 use std::time::Duration;
 
 use bench::{Bench, Daemon, Subscriber, hardnessd};
-use hardnessd::frame::Frame;
-use hardnessd::recording::{Entry, Input, Reader};
-use hardnessd::verdict::{CheckedCourse, Course, CourseCheck, CourseMoment};
+use hardnessd_core::recording::{Entry, Input, Reader};
 use serde_json::{Value, json};
-
-#[path = "bench/course_model.rs"]
-mod course_model;
 
 fn mono_ns() -> u64 {
     let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
@@ -159,7 +154,11 @@ fn timeless(mut event: Value) -> Value {
 #[test]
 fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_repeats_them() {
     let bench = Bench::new();
-    fs::write(bench.path("sums.onnx"), course_model::course_model(48, &[])).unwrap();
+    fs::write(
+        bench.path("sums.onnx"),
+        hardnessd_core::test_support::course_model::course_model(48, &[]),
+    )
+    .unwrap();
     let model = "[model]\npath = \"sums.onnx\"\nearly_confidence = 0.5\n";
     let record = "[record]\ndir = \"tape\"\nkeep_free_mb = 0\n";
     let config = bench.configure("hardnessd.toml", "events.sock", &format!("{model}{record}"));

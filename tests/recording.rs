@@ -14,8 +14,8 @@ use std::time::Duration;
 use bench::{
     BINARY, Bench, Daemon, PATIENCE, Process, Subscriber, by_terminal, hardnessd, wait_for,
 };
-use hardnessd::random::Stream;
-use hardnessd::recording::{Entry, Found, Input, Reader};
+use hardnessd_core::recording::{Entry, Found, Input, Reader};
+use hardnessd_simulator::random::Stream;
 use rustix::process::Signal;
 use serde_json::{Value, json};
 

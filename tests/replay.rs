@@ -9,11 +9,11 @@ use std::process::Command;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use hardnessd::event::Event;
-use hardnessd::frame::Stamp;
-use hardnessd::pipeline::{Clock, Pipeline};
-use hardnessd::sensor::{Description, Sensor};
-use hardnessd::verdict::{BUILT_IN, Hrn};
+use hardnessd_core::event::Event;
+use hardnessd_core::frame::Stamp;
+use hardnessd_core::pipeline::{Clock, Pipeline};
+use hardnessd_core::sensor::{Description, Sensor};
+use hardnessd_core::verdict::{BUILT_IN, Hrn};
 use serde_json::Value;
 
 fn fixtures() -> PathBuf {

@@ -144,7 +144,6 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
         files,
         ["001-yoga-mat.mcap", "002-a--b---c.mcap", "session.csv"]
     );
-    #[cfg(feature = "train")]
     assert_collects(&bench, &own);
 
     // The next session continues, and a session without a press leaves no file.
@@ -157,10 +156,9 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
 }
 
 /// `hrn-train` accepts the recordings unchanged.
-#[cfg(feature = "train")]
 fn assert_collects(bench: &Bench, own: &Path) {
     let out = bench.path("own.npz");
-    let collected = Command::new(env!("CARGO_BIN_EXE_hrn-train"))
+    let collected = Command::new(bench::hrn_train())
         .args(["collect", "--out"])
         .arg(&out)
         .args([own.join("001-yoga-mat.mcap"), own.join("002-a--b---c.mcap")])

@@ -32,10 +32,7 @@ fn says(lines: &Receiver<String>, parts: &[&str]) -> String {
 fn it_tells_verdicts_that_it_knows_nothing_without_a_daemon_and_goes_on_with_the_next() {
     // `cargo test` builds examples beside the tests.
     let example = Path::new(BINARY).with_file_name("examples/subscribe");
-    assert!(
-        example.exists(),
-        "first: cargo build --features train --example subscribe"
-    );
+    assert!(example.exists(), "first: cargo build --example subscribe");
     let bench = Bench::new();
     let mut subscribe = Process(
         Command::new(example)

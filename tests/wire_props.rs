@@ -4,9 +4,9 @@
     reason = "clippy knows no helper of a test as a test"
 )]
 
-use hardnessd::frame::{RawFrame, TAXELS};
-use hardnessd::random::Stream;
-use hardnessd::wire::{Decoded, Decoder, Layout, Preset, Settings};
+use hardnessd_core::frame::{RawFrame, TAXELS};
+use hardnessd_core::wire::{Decoded, Decoder, Layout, Preset, Settings};
+use hardnessd_simulator::random::Stream;
 use proptest::prelude::*;
 
 const PRESETS: [Preset; 8] = [
@@ -122,7 +122,7 @@ fn jx255n_is_790_bytes_and_its_bytes_are_frozen() {
     assert_eq!(bytes.len(), 790);
     assert_eq!(bytes[..5], [0xBB, 0xAA, 0x10, 0x03, 0x01]);
     // This is CRC-16/MODBUS over the 788 bytes before it, by crcmod's "modbus".
-    let crc = hardnessd::wire::Checksum::Crc16Modbus.of(&bytes[..788]);
+    let crc = hardnessd_core::wire::Checksum::Crc16Modbus.of(&bytes[..788]);
     assert_eq!(bytes[788..], crc.to_le_bytes());
     let u16_layout = Layout::new(&Settings {
         preset: Preset::Jx255nU16,
@@ -490,7 +490,7 @@ fn cells_masks_orders_and_small_arrays_land_in_place() {
     for cell in [0xFFFE_u16, 0x0FFD, 0x0FFC, 0x0FFB, 0x0FFA, 0x0FF9] {
         body.extend(cell.to_be_bytes());
     }
-    let crc = hardnessd::wire::Checksum::Crc16Ccitt.of(&body);
+    let crc = hardnessd_core::wire::Checksum::Crc16Ccitt.of(&body);
     body.extend(crc.to_le_bytes());
     body.extend([0x0D, 0x0A]);
     let (found, damaged) = decode(&layout, [body.as_slice()]);

@@ -7,8 +7,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
-use hardnessd::frame::RawFrame;
-use hardnessd::wire::{Layout, Settings};
+use hardnessd_core::frame::RawFrame;
+use hardnessd_core::wire::{Layout, Settings};
 use rustix::termios::OptionalActions;
 
 use crate::pair::Pair;

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::thread::sleep;
 use std::time::Duration;
 
-use hardnessd::random::Stream;
+use hardnessd_simulator::random::Stream;
 use serde_json::Value;
 
 use crate::Failure;

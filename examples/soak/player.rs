@@ -8,9 +8,9 @@ use std::sync::atomic::Ordering::Relaxed;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use hardnessd::random::Stream;
-use hardnessd::simulator::{Material, Sequence, SequenceSettings};
-use hardnessd::wire::{Layout, Settings};
+use hardnessd_core::wire::{Layout, Settings};
+use hardnessd_simulator::random::Stream;
+use hardnessd_simulator::{Material, Sequence, SequenceSettings};
 use rustix::termios::OptionalActions;
 
 use crate::listener::Link;

@@ -2,7 +2,7 @@
 """What `hrn-train adapt` is worth on sensors that the built-in model has not seen, beside other ways.
 
     pip install numpy
-    cargo build --release --features train
+    cargo build --release --workspace
     python3 results/adapt/adapt.py target/release/hrn-train --work WORK
     python3 results/adapt/adapt.py --table          # prints the table from the committed file
 

@@ -2,7 +2,7 @@
 """What `hrn-train adapt` is worth to the course model on a sensor that it has not seen.
 
     pip install numpy
-    cargo build --release --features train
+    cargo build --release --workspace
     python3 results/adapt/course.py target/release/hrn-train --work WORK
     python3 results/adapt/course.py --table         # prints the table from the committed file
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The evaluations behind models/course.md: simulates the test sets, judges both models, writes what they reached.
 
-    cargo build --release --features train
+    cargo build --release --workspace
     pip install numpy scipy
     python3 results/course/evaluate.py target/release/hrn-train --work WORK     # a quarter of an hour
     python3 results/course/evaluate.py --table          # prints the tables from the committed files

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The evaluations behind models/README.md: simulates the test sets, judges the models, writes what they reached.
 
-    cargo build --release --features train
+    cargo build --release --workspace
     git show c57c8aa:models/hrn.onnx > before.onnx
     python3 results/default-model/evaluate.py target/release/hrn-train before.onnx --work WORK
     pip install numpy scipy

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The choice of the image's scale: `hrn15`, `hrn15-strong` and `frame` under several scales, judged on held-out training objects.
 
-    cargo build --release --features train
+    cargo build --release --workspace
     python3 results/start/start.py target/release/hrn-train paper101.npz --work WORK
     python3 results/start/start.py --table          # prints the table from the committed file
 
@@ -9,7 +9,7 @@ paper101.npz is of `hrn-train simulate --seed 101 --shapes paper`. The held-out 
 that it trains on. No test material is looked at. WORK keeps the runs, so an interrupted call goes on. start.json,
 beside this file, has what `evaluate --json` prints.
 
-`frame` takes its scale from the code: SCALE in src/train/net/frame.rs. So each of its rows needs a build of its own.
+`frame` takes its scale from the code: SCALE in crates/train/src/net/frame.rs. So each of its rows needs a build of its own.
 Name them hrn-train-10.2-0.1 and so on, by the two numbers of SCALE, and put them beside the trainer. A row whose build
 is missing is left out.
 """

@@ -27,9 +27,9 @@ use super::record::NoBlackbox;
 use super::request::motion::{Positions, Told};
 use super::request::{self, Change, Request, motion};
 use super::sensor::{Command, Sensors};
-use crate::event::{Reply, Tared};
-use crate::motion::StepBack;
-use crate::tare::RetareError;
+use hardnessd_core::event::{Reply, Tared};
+use hardnessd_core::motion::StepBack;
+use hardnessd_core::tare::RetareError;
 
 /// The longest line that a subscriber may send (`docs/controller.md`).
 const LONGEST_LINE_BYTES: usize = 64 * 1024;

@@ -26,9 +26,9 @@ pub use self::publish::{
 };
 use self::read::Until;
 use super::log;
-use crate::sensor::{Description, Sensor};
-use crate::verdict::Hrn;
-use crate::{motion, press, tare, trial, wire};
+use hardnessd_core::sensor::{Description, Sensor};
+use hardnessd_core::verdict::Hrn;
+use hardnessd_core::{motion, press, tare, trial, wire};
 
 /// The whole configuration file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -25,9 +25,9 @@ use tracing::{info, warn};
 use super::config;
 use super::hub::Line;
 use super::relay::Worker;
-use crate::event::{Event, Phase};
-use crate::recording::{Entry, Found, MOTION};
-use crate::ros::{self, Topic};
+use hardnessd_core::event::{Event, Phase};
+use hardnessd_core::recording::{Entry, Found, MOTION};
+use hardnessd_core::ros::{self, Topic};
 
 /// The reason the server could not start.
 #[derive(Debug, thiserror::Error)]

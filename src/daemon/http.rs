@@ -39,7 +39,7 @@ use super::busy;
 use super::hub::{self, Closed};
 use super::lane::Lane;
 use super::sensor::Sensors;
-use crate::event::LinkState;
+use hardnessd_core::event::LinkState;
 
 /// The live page: one file, which loads nothing from elsewhere.
 const PAGE: &str = include_str!("page.html");
@@ -201,7 +201,7 @@ async fn ready(State(of): State<Sources>) -> impl IntoResponse {
     let mut ready = statuses.len() == of.sensors.0.len();
     for status in &statuses {
         ready &= status.state == LinkState::Live;
-        let state = crate::event::name(&status.state);
+        let state = hardnessd_core::event::name(&status.state);
         lines += &format!("{} {state}\n", status.sensor);
     }
     let code = if ready {
@@ -288,7 +288,7 @@ mod tests {
 
     #[test]
     fn the_page_has_the_one_colour_map() {
-        let table = format!("const VIRIDIS = {:?};", crate::colour::VIRIDIS);
+        let table = format!("const VIRIDIS = {:?};", hardnessd_core::colour::VIRIDIS);
         assert!(PAGE.contains(&table), "{table}");
     }
 }

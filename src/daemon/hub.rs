@@ -20,7 +20,7 @@ pub(crate) use self::task::{Closed, Handle, start};
 use super::log;
 use super::record::EventRecorder;
 use super::request::{Kinds, Subscription};
-use crate::event::{Event, Hello, Kind, Reply, Status};
+use hardnessd_core::event::{Event, Hello, Kind, Reply, Status};
 
 /// A line to send.
 #[derive(Debug, Clone, PartialEq)]
@@ -148,7 +148,7 @@ impl Hub {
             });
         }
         if let Event::Hardness(verdict) = &*event
-            && verdict.phase == crate::event::Phase::Final
+            && verdict.phase == hardnessd_core::event::Phase::Final
         {
             self.finals.insert(verdict.sensor.clone(), line.to_hold());
         }

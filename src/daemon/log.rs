@@ -21,10 +21,10 @@ use tracing_subscriber::{Registry, reload};
 use self::journal::Journal;
 use self::limit::Limit;
 use self::lines::Lines;
-use crate::event::{Event, LinkState, PressState, Tared, name};
-use crate::pipeline::Unjudged;
-use crate::tare::RetareError;
-use crate::wording;
+use hardnessd_core::event::{Event, LinkState, PressState, Tared, name};
+use hardnessd_core::pipeline::Unjudged;
+use hardnessd_core::tare::RetareError;
+use hardnessd_core::wording;
 
 /// The `[log]` table.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]

@@ -28,7 +28,7 @@ use super::systemd;
 use super::tcp::{self, Tcp};
 #[cfg(feature = "zenoh")]
 use super::zenoh;
-use crate::recording::Found;
+use hardnessd_core::recording::Found;
 
 /// The mode of the control socket's file: only the daemon's own user may connect.
 const CONTROL_MODE: u32 = 0o600;

@@ -22,12 +22,12 @@ use tracing::warn;
 
 use self::worker::Worker;
 use super::config;
-use crate::event::{Event, Kind};
-use crate::frame::Stamp;
-use crate::pipeline::Pipeline;
-use crate::recording::{About, Entry, Found, Input, Labels, RecordedSensor, State};
-use crate::sensor::Sensor;
-use crate::verdict::Hrn;
+use hardnessd_core::event::{Event, Kind};
+use hardnessd_core::frame::Stamp;
+use hardnessd_core::pipeline::Pipeline;
+use hardnessd_core::recording::{About, Entry, Found, Input, Labels, RecordedSensor, State};
+use hardnessd_core::sensor::Sensor;
+use hardnessd_core::verdict::Hrn;
 
 /// The most entries and events that wait: about 4 s of a sensor at 100 frames/s.
 const QUEUED: usize = 8192;
@@ -77,7 +77,7 @@ pub enum Error {
         /// The path of the recording.
         path: PathBuf,
         /// The error of the write.
-        source: crate::recording::Error,
+        source: hardnessd_core::recording::Error,
     },
     /// A sensor is missing at the start.
     #[error("sensor {sensor:?}: cannot record: {reason}")]
@@ -118,7 +118,7 @@ pub(crate) enum NoBlackbox {
     #[error("one was written less than a second ago: ask again in a second")]
     TooSoon,
     #[error(transparent)]
-    Write(#[from] crate::recording::Error),
+    Write(#[from] hardnessd_core::recording::Error),
 }
 
 /// Checks that this process may write to the directory of the recordings, or make it.

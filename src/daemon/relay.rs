@@ -19,7 +19,7 @@ use super::hub::{self, Line};
 use super::request::motion::Positions;
 use super::request::{Policy, Subscription};
 use super::sensor::Sensors;
-use crate::event::{Hello, Kind, Status};
+use hardnessd_core::event::{Hello, Kind, Status};
 
 /// The most jobs that wait for the thread: batches of lines, and queries between them.
 const JOBS: usize = 8;

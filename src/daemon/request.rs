@@ -10,7 +10,7 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 
 use self::motion::Positions;
-use crate::event::{CONTEXT_BYTES, Kind};
+use hardnessd_core::event::{CONTEXT_BYTES, Kind};
 
 /// A request that can be used.
 #[derive(Debug, Clone, PartialEq)]

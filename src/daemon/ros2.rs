@@ -25,8 +25,8 @@ use super::config;
 use super::hub::Line;
 use super::relay::{Door, Worker};
 use super::request::motion::{Positions, Told};
-use crate::event::{Event, FrameEvent, Status};
-use crate::ros::{self, Topic, tools};
+use hardnessd_core::event::{Event, FrameEvent, Status};
+use hardnessd_core::ros::{self, Topic, tools};
 
 /// The reason the node could not start.
 #[derive(Debug, thiserror::Error)]

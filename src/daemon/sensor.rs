@@ -18,13 +18,13 @@ use super::log;
 use super::record::{NoBlackbox, SensorRecorder};
 use super::request::motion::{Calendar, Placed};
 use super::serial::{Link, Turn};
-use crate::event::{Event, Kind, Status, Tared};
-use crate::motion::StepBack;
-use crate::pipeline::Pipeline;
-use crate::recording::Input;
-use crate::sensor::Sensor;
-use crate::tare::RetareError;
-use crate::verdict::Hrn;
+use hardnessd_core::event::{Event, Kind, Status, Tared};
+use hardnessd_core::motion::StepBack;
+use hardnessd_core::pipeline::Pipeline;
+use hardnessd_core::recording::Input;
+use hardnessd_core::sensor::Sensor;
+use hardnessd_core::tare::RetareError;
+use hardnessd_core::verdict::Hrn;
 
 /// A command to a sensor's task.
 #[derive(Debug)]
@@ -252,9 +252,9 @@ mod tests {
 
     use super::*;
     use crate::daemon::request::{Change, Request, motion, parse};
-    use crate::frame::{RawFrame, Stamp};
-    use crate::pipeline::Clock;
-    use crate::recording::tests;
+    use hardnessd_core::frame::{RawFrame, Stamp};
+    use hardnessd_core::pipeline::Clock;
+    use hardnessd_core::test_support as tests;
 
     /// The approach at each frame of the presses that [`pressed`] makes. The robot moves at 20 mm/s
     /// and sends a line every 20 ms, with calendar times or with those of CLOCK_MONOTONIC. At 2 s

@@ -8,7 +8,7 @@ use std::time::Duration;
 use listenfd::ListenFd;
 use sd_notify::NotifyState;
 
-use crate::event::{LinkState, Status};
+use hardnessd_core::event::{LinkState, Status};
 
 /// The Unix sockets that systemd listens on for us (sd_listen_fds(3)).
 ///

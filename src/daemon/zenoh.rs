@@ -26,7 +26,7 @@ use super::config;
 use super::hub::Line;
 use super::relay::{Door, Worker};
 use super::request::{self, Change, Request};
-use crate::event::{Event, Hello, Kind, Phase, Reply, Status};
+use hardnessd_core::event::{Event, Hello, Kind, Phase, Reply, Status};
 
 /// The reason the session could not be opened.
 #[derive(Debug, thiserror::Error)]

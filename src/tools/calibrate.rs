@@ -29,12 +29,12 @@ use super::simulate::{OutOfRange, within};
 use crate::daemon::config::Setup;
 use crate::daemon::record::Progress;
 use crate::daemon::{self, Daemon, Sockets};
-use crate::frame::Array;
-use crate::npy;
-use crate::recording::Labels;
-use crate::sensor::Sensor;
-use crate::tare::Gains;
-use crate::verdict::Hrn;
+use hardnessd_core::frame::Array;
+use hardnessd_core::npy;
+use hardnessd_core::recording::Labels;
+use hardnessd_core::sensor::Sensor;
+use hardnessd_core::tare::Gains;
+use hardnessd_core::verdict::Hrn;
 
 /// Arguments of `calibrate`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -225,7 +225,7 @@ pub async fn run(
             let fit = force::Fit::of(&weights.collect::<Vec<_>>(), &sensor)?;
             let error = fit.error();
             if error > DOUBTFUL_ERROR {
-                crate::say!(
+                hardnessd_core::say!(
                     "warning: the weights disagree by {:.0} %: was each put on alone, in this order, after \
                      the zero was taken? If so, leave out the weight with the greatest error",
                     100.0 * error
@@ -237,7 +237,7 @@ pub async fn run(
             let (full, presses): (Vec<Press>, _) =
                 presses.into_iter().partition(|press| press.saturated);
             if !full.is_empty() {
-                crate::say!(
+                hardnessd_core::say!(
                     "warning: {} of the presses reached full scale on a taxel and are left out: press more softly",
                     full.len()
                 );
@@ -292,7 +292,7 @@ async fn live(
     let sockets = Sockets::Configured;
     let daemon = Daemon::recording(setup, path.clone(), file, labels, progress, sockets)?;
     let wanted = args.wanted();
-    crate::say!("leave the sensor free until its zero is taken");
+    hardnessd_core::say!("leave the sensor free until its zero is taken");
     let enough = async {
         // The presses at the last prompt.
         let mut said = None;
@@ -404,21 +404,23 @@ fn chosen(args: &Args, setup: &Setup) -> Result<Sensor, Error> {
 /// Says on stderr what to do next, after `seen` presses.
 fn say_next(args: &Args, seen: u64) {
     match args.what {
-        What::Arm if seen == 0 => crate::say!(
+        What::Arm if seen == 0 => hardnessd_core::say!(
             "press something rigid {} times, while the robot tells where its arm is",
             args.wanted()
         ),
-        What::Taxels if seen == 0 => crate::say!(
+        What::Taxels if seen == 0 => hardnessd_core::say!(
             "press something wide and soft {} times, each time at another place, up to the edges; or press \
              the whole array evenly",
             args.wanted()
         ),
-        What::Arm | What::Taxels => crate::say!("press {seen} of {}", args.wanted()),
+        What::Arm | What::Taxels => hardnessd_core::say!("press {seen} of {}", args.wanted()),
         What::Force => match args.newtons.get(seen as usize) {
             Some(newtons) => {
-                crate::say!("put {newtons} N on the sensor, wait until it rests, and take it off");
+                hardnessd_core::say!(
+                    "put {newtons} N on the sensor, wait until it rests, and take it off"
+                );
             }
-            None => crate::say!("done"),
+            None => hardnessd_core::say!("done"),
         },
     }
 }

@@ -11,9 +11,9 @@ use super::configuration::{self, Configuration};
 use super::player::BITS_A_BYTE;
 use crate::daemon;
 use crate::daemon::config::{self, Endpoint, SensorTable, Setup};
-use crate::frame::{Array, COLS, ROWS};
-use crate::tare::{self, Gains};
-use crate::wire::Layout;
+use hardnessd_core::frame::{Array, COLS, ROWS};
+use hardnessd_core::tare::{self, Gains};
+use hardnessd_core::wire::Layout;
 
 /// Arguments of `check`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -83,7 +83,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
         warn_of_array(sensor, checked.layout().array(), path);
         let (ours, models) = (sensor.calibration.pitch_mm, setup.hrn.card().pitch_mm);
         if (ours - f64::from(models)).abs() > PITCH_TOLERANCE_MM {
-            crate::say!(
+            hardnessd_core::say!(
                 "warning: {}: sensor.calibration.pitch_mm of {:?}: found {ours:?}, \
                  expected the model's {models:?}",
                 path.display(),
@@ -132,7 +132,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
         if let Some(listen) = listen {
             lines += &format!("{way}{listen}\n");
             if !listen.ip().is_loopback() {
-                crate::say!(
+                hardnessd_core::say!(
                     "warning: {}: {key}: {listen} is open to anyone who can reach this machine; \
                      a loopback address, such as 127.0.0.1, is not",
                     path.display()
@@ -142,7 +142,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
     }
     lines += &networks(&setup, path);
     if let Some(shortage) = daemon::descriptors::shortage(&setup.config) {
-        crate::say!("warning: {}: {shortage}", path.display());
+        hardnessd_core::say!("warning: {}: {shortage}", path.display());
     }
     super::print(lines.as_bytes())
         .map(drop)
@@ -164,7 +164,7 @@ fn warn_of_permissions(key: &str, socket: &Path, path: &Path) {
         return;
     };
     if rustix::fs::access(directory, Access::WRITE_OK).is_err() {
-        crate::say!(
+        hardnessd_core::say!(
             "warning: {}: {key}: you may not write to {}, but the user who runs the daemon must",
             path.display(),
             directory.display()
@@ -180,7 +180,7 @@ fn warn_of_array(sensor: &SensorTable, array: Array, path: &Path) {
         return;
     }
     let place = array.place(0, 0);
-    crate::say!(
+    hardnessd_core::say!(
         "warning: {}: sensor.frame of {:?}: the array of {rows}x{cols} taxels begins at row {}, column {} \
          of the model's {ROWS}x{COLS}; the model was not trained on such arrays",
         path.display(),
@@ -209,7 +209,7 @@ fn networks(setup: &Setup, path: &Path) -> String {
             parsed.map_or(true, |address| !address.ip().is_loopback())
         };
         for endpoint in zenoh.listen.iter().filter(open) {
-            crate::say!(
+            hardnessd_core::say!(
                 "warning: {}: publish.zenoh.listen: {endpoint:?} is open to anyone who can reach it; \
                  a loopback address, such as 127.0.0.1, is not",
                 path.display()
@@ -251,7 +251,7 @@ fn line_of(sensor: &SensorTable, layout: &Layout, path: &Path) -> Result<String,
     }
     // Frames of these layouts vary in length, so this is only a warning.
     if paced && bytes_per_s > capacity {
-        crate::say!("warning: {}", error(longest));
+        hardnessd_core::say!("warning: {}", error(longest));
     }
     let array = layout.array();
     let frame_bytes = if shortest == longest {

@@ -30,9 +30,9 @@ use super::player::{BITS_A_BYTE, Pace, Player};
 use super::simulate::{OutOfRange, within};
 use crate::daemon::config::{Config, Http, SensorTable, Setup};
 use crate::daemon::{self, Daemon};
-use crate::motion;
-use crate::simulator::{ARM_N_PER_MM, SequenceSettings};
-use crate::wire::{Layout, LayoutError};
+use hardnessd_core::motion;
+use hardnessd_core::wire::{Layout, LayoutError};
+use hardnessd_simulator::{ARM_N_PER_MM, SequenceSettings};
 
 /// Arguments of `demo`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -133,10 +133,10 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let robot = player.robot(config.publish.unix.control_path(), None);
     let daemon = Daemon::bind(Setup::of(config, Path::new("demo"))?)?;
     if let Some(address) = daemon.http_address() {
-        crate::say!("live page: http://{address}/");
+        hardnessd_core::say!("live page: http://{address}/");
     }
     let listen = "`hardnessd watch` and `hardnessd tail` find it";
-    crate::say!("socket: {} ({listen})", socket.display());
+    hardnessd_core::say!("socket: {} ({listen})", socket.display());
     let subscriber = UnixStream::connect(&socket).await.map_err(io("socket"))?;
     let (stop, stopped) = oneshot::channel::<()>();
     let daemon = daemon.run(

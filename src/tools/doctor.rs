@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use clap::Args as ClapArgs;
 
 use self::checks::{User, examine, in_the_way, ports, refused};
-use crate::wording::escaped;
+use hardnessd_core::wording::escaped;
 
 /// Arguments of `doctor`.
 #[derive(Debug, Clone, ClapArgs)]

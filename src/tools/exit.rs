@@ -7,24 +7,13 @@ use super::watch;
 use super::{
     calibrate, check, configuration, demo, doctor, record, recover, replay, simulate, sniff, tail,
 };
+pub use hardnessd_core::exit::{CONFIG, FAILED, IO, NO_INPUT, UNAVAILABLE, USAGE};
+
 use crate::daemon;
 use crate::daemon::config::Error as ConfigError;
 use crate::daemon::publish::Error as PublishError;
 use crate::daemon::record::Error as RecordError;
 use crate::daemon::socket::Error as SocketError;
-
-/// The command failed, or its data is bad.
-pub const FAILED: u8 = 1;
-/// Wrong usage.
-pub const USAGE: u8 = 2;
-/// A file named on the command line is missing or unreadable.
-pub const NO_INPUT: u8 = 66;
-/// A device or the daemon is unavailable.
-pub const UNAVAILABLE: u8 = 69;
-/// I/O error.
-pub const IO: u8 = 74;
-/// Bad configuration or model, or a file that the configuration names.
-pub const CONFIG: u8 = 78;
 
 /// A signal that ends a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -18,9 +18,9 @@ use self::cable::Cable;
 pub(crate) use self::cable::Line;
 pub(crate) use self::script::{Error, FORMAT};
 use self::taxels::OfTaxels;
-use crate::frame::RawFrame;
-use crate::random::Stream;
-use crate::wire::Layout;
+use hardnessd_core::frame::RawFrame;
+use hardnessd_core::wire::Layout;
+use hardnessd_simulator::random::Stream;
 
 /// A script that is being played.
 #[derive(Debug)]
@@ -82,8 +82,8 @@ impl Faults {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::frame::TAXELS;
-    use crate::wire::{Decoder, Settings};
+    use hardnessd_core::frame::TAXELS;
+    use hardnessd_core::wire::{Decoder, Settings};
 
     /// A script at work on frames whose taxels all read `rest`.
     struct Played {

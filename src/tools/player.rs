@@ -14,8 +14,8 @@ use tokio::time::Instant;
 use super::faults::{Faults, Line};
 use super::pty::Pty;
 use super::robot::{Moving, Robot};
-use crate::simulator::{Approach, Sequence, SequenceFrame, SequenceSettings};
-use crate::wire::Layout;
+use hardnessd_core::wire::Layout;
+use hardnessd_simulator::{Approach, Sequence, SequenceFrame, SequenceSettings};
 
 /// Bits on the line for a byte: a start bit, eight data bits, a stop bit.
 pub(crate) const BITS_A_BYTE: f64 = 10.0;

@@ -25,9 +25,9 @@ use super::simulate::positive;
 use crate::daemon::config::Setup;
 use crate::daemon::record::{Error as RecordError, Progress};
 use crate::daemon::{self, Daemon, Sockets};
-use crate::recording::{LabelError, Labels, check_label};
-use crate::verdict::Level;
-use crate::wording::escaped;
+use hardnessd_core::recording::{LabelError, Labels, check_label};
+use hardnessd_core::verdict::Level;
+use hardnessd_core::wording::escaped;
 
 /// Arguments of `record`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -189,7 +189,7 @@ pub async fn run(
     } = *counted.borrow();
     let seen = said_frames(frames);
     if io::stderr().is_terminal() {
-        crate::say!(
+        hardnessd_core::say!(
             "recorded {seen}, {}: {}",
             said_presses(presses),
             said(&path)
@@ -198,12 +198,12 @@ pub async fn run(
     if recorded.is_ok() && presses == 0 {
         let path = said(&path);
         if frames > 0 && tared == 0 {
-            crate::say!(
+            hardnessd_core::say!(
                 "warning: {path}: no press in {seen}, because the zero was not taken: leave the sensor free at \
                  the start, and record longer"
             );
         } else {
-            crate::say!(
+            hardnessd_core::say!(
                 "warning: {path}: no press in {seen}: was the sensor pressed, is it live, and \
                  is press.contact_threshold_n low enough?"
             );

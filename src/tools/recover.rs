@@ -10,7 +10,7 @@ use clap::Args as ClapArgs;
 use jiff::Timestamp;
 use rustix::fs::OFlags;
 
-use crate::recording::{self, FileKind, RecoverError, Recovered};
+use hardnessd_core::recording::{self, FileKind, RecoverError, Recovered};
 
 /// Arguments of `recover`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -122,7 +122,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
             });
         }
     };
-    crate::say!("{}", account(&recovered));
+    hardnessd_core::say!("{}", account(&recovered));
     Ok(())
 }
 

@@ -17,10 +17,10 @@ use clap::Args as ClapArgs;
 use super::simulate::positive;
 use crate::daemon::config::{self, Config, SensorTable, Setup};
 use crate::daemon::now;
-use crate::event::{Event, Kind};
-use crate::motion::Point;
-use crate::pipeline::{Clock, Pipeline, Unjudged};
-use crate::recording::{self, FileKind, Playback, Reader};
+use hardnessd_core::event::{Event, Kind};
+use hardnessd_core::motion::Point;
+use hardnessd_core::pipeline::{Clock, Pipeline, Unjudged};
+use hardnessd_core::recording::{self, FileKind, Playback, Reader};
 
 /// Arguments of `replay`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -199,7 +199,7 @@ fn play_recording(path: &Path, file: impl Read, setup: Setup, pace: Pace) -> Res
         return Ok(());
     }
     if let Some(model) = playback.other_model() {
-        crate::say!(
+        hardnessd_core::say!(
             "warning: {}: recorded with model {}, played with another",
             path.display(),
             model.get(..12).unwrap_or(model)
@@ -340,8 +340,10 @@ fn warn(unjudged: Vec<Unjudged>) {
         error,
     } in unjudged
     {
-        let phase = crate::event::name(&phase);
-        crate::say!("warning: sensor {sensor:?}: no {phase} verdict on press {press}: {error}");
+        let phase = hardnessd_core::event::name(&phase);
+        hardnessd_core::say!(
+            "warning: sensor {sensor:?}: no {phase} verdict on press {press}: {error}"
+        );
     }
 }
 

@@ -15,7 +15,7 @@ use tokio::sync::watch;
 use tokio::time::{Instant, MissedTickBehavior};
 
 use crate::daemon::now;
-use crate::simulator::Approach;
+use hardnessd_simulator::Approach;
 
 /// The time between two positions.
 const STEP: Duration = Duration::from_millis(10);
@@ -61,7 +61,7 @@ impl Robot {
             if let Err(Ended::Refused(message)) = self.tell().await
                 && !complained
             {
-                crate::say!("warning: {}: {message}", self.socket.display());
+                hardnessd_core::say!("warning: {}: {message}", self.socket.display());
                 complained = true;
             }
             tokio::time::sleep(RETRY).await;

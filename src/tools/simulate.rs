@@ -15,9 +15,9 @@ use serde::de::value::Error as NameError;
 
 use super::faults::{self, Faults, Line};
 use super::player::{BITS_A_BYTE, Pace, Player};
-use crate::sensor::DEFAULT_FRAME_RATE_HZ;
-use crate::simulator::{Material, REST_S, SensorProfile, Sequence, SequenceSettings};
-use crate::wire::{Layout, LayoutError, Preset, Settings as Frame};
+use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
+use hardnessd_core::wire::{Layout, LayoutError, Preset, Settings as Frame};
+use hardnessd_simulator::{Material, REST_S, SensorProfile, Sequence, SequenceSettings};
 
 /// Arguments of `simulate`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -157,7 +157,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     }
     let (baud, warning) = baud(&args, &layout)?;
     if let Some(warning) = warning {
-        crate::say!("{warning}");
+        hardnessd_core::say!("{warning}");
     }
     let what = args
         .link

@@ -21,10 +21,10 @@ use self::proposal::{Proposal, propose};
 use super::doctor;
 use super::simulate::positive;
 use crate::daemon::serial::{Link, Turn};
-use crate::recording::{self, Entry, FileKind, Input, Reader};
-use crate::sensor::DEFAULT_FRAME_RATE_HZ;
-use crate::wire::Settings;
-use crate::wording::escaped;
+use hardnessd_core::recording::{self, Entry, FileKind, Input, Reader};
+use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
+use hardnessd_core::wire::Settings;
+use hardnessd_core::wording::escaped;
 
 /// Arguments of `sniff`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -156,7 +156,7 @@ fn tell(args: &Args, bytes: &[u8]) -> Result<(), Error> {
     } else {
         "set its port and frame_rate_hz, which a file does not say"
     };
-    crate::say!("wrote {}: {next}", escaped(&out.display().to_string()));
+    hardnessd_core::say!("wrote {}: {next}", escaped(&out.display().to_string()));
     Ok(())
 }
 
@@ -232,7 +232,7 @@ async fn listen(path: &Path, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> 
             match link.turn().await {
                 Turn::Opened => {
                     let path = escaped(&path.display().to_string());
-                    crate::say!("listening at {path} for {seconds} s: press the sensor");
+                    hardnessd_core::say!("listening at {path} for {seconds} s: press the sensor");
                 }
                 Turn::Bytes(read) => bytes.extend_from_slice(read),
                 Turn::Unavailable(reason) | Turn::Lost(reason) => {

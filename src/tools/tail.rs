@@ -15,8 +15,8 @@ use serde_json::{Value, json};
 
 use super::connect::{self, Address, Connection, Source};
 use super::simulate::positive;
-use crate::event::{Kind, PROTOCOL};
-use crate::wording;
+use hardnessd_core::event::{Kind, PROTOCOL};
+use hardnessd_core::wording;
 
 /// Arguments of `tail`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -142,7 +142,7 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
     // This comes after the connection is made: if no daemon answers, the error must be the only
     // line.
     if args.source.given().is_none() {
-        crate::say!(
+        hardnessd_core::say!(
             "hardnessd: events of {}",
             wording::escaped(&address.to_string())
         );

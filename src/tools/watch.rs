@@ -70,7 +70,10 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         && let Ok(connection) = args.source.connect().await
     {
         let address = connection.address().to_string();
-        crate::say!("hardnessd: watching {}", crate::wording::escaped(&address));
+        hardnessd_core::say!(
+            "hardnessd: watching {}",
+            hardnessd_core::wording::escaped(&address)
+        );
     }
     let mut screen = Screen::open().map_err(Error::Terminal)?;
     let mut keys = keys().map_err(Error::Terminal)?;

@@ -19,7 +19,20 @@ use std::time::{Duration, Instant};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-pub const BINARY: &str = env!("CARGO_BIN_EXE_hardnessd");
+pub const BINARY: &str = match option_env!("CARGO_BIN_EXE_hardnessd") {
+    Some(path) => path,
+    None => concat!(env!("CARGO_TARGET_TMPDIR"), "/../debug/hardnessd"),
+};
+
+/// The trainer, which `cargo test --workspace` builds beside the daemon.
+pub fn hrn_train() -> PathBuf {
+    let trainer = Path::new(BINARY).with_file_name("hrn-train");
+    assert!(
+        trainer.exists(),
+        "no hrn-train: run `cargo test --workspace`"
+    );
+    trainer
+}
 
 /// How long anything may take before a test fails. It is long, for a busy machine.
 pub const PATIENCE: Duration = Duration::from_secs(60);

@@ -16,11 +16,11 @@ use std::time::Duration;
 
 use hardnessd::daemon::Daemon;
 use hardnessd::daemon::config::{Config, Setup};
-use hardnessd::motion::{Point, Track};
-use hardnessd::recording::{Playback, Reader, recover};
 use hardnessd::tools::replay::motion as table;
-use hardnessd::verdict::{BUILT_IN, Hrn};
-use hardnessd::wire::{
+use hardnessd_core::motion::{Point, Track};
+use hardnessd_core::recording::{Playback, Reader, recover};
+use hardnessd_core::verdict::{BUILT_IN, Hrn};
+use hardnessd_core::wire::{
     Cell, Checksum, Decoder, HexBytes, Layout, LengthField, Order, Preset, Settings,
 };
 
@@ -41,8 +41,6 @@ pub const ALL: &[(&str, Property)] = &[
     ("lines", lines),
     ("model", model),
     ("motion", motion),
-    #[cfg(feature = "train")]
-    ("npz", npz),
     ("recording", recording),
     ("recover", recovered),
     ("wire", wire),
@@ -322,15 +320,6 @@ pub fn recovered(bytes: &[u8]) {
 pub fn model(bytes: &[u8]) {
     if let Ok(hrn) = Hrn::load(bytes) {
         hrn.judge_check(0).expect("a model that was loaded judges");
-    }
-}
-
-/// A data set is read or refused.
-#[cfg(feature = "train")]
-pub fn npz(bytes: &[u8]) {
-    use hardnessd::train::data::dataset::Dataset;
-    if let Err(error) = Dataset::read(&file("fuzzed.npz", bytes)) {
-        assert!(!error.to_string().contains('\n'), "{error}");
     }
 }
 

@@ -93,7 +93,7 @@ message("geometry_msgs", "Point", "float64 x\nfloat64 y\nfloat64 z")
 POSITION = message("geometry_msgs", "PointStamped", "std_msgs/Header header\ngeometry_msgs/Point point")
 # For viewers, all by reliable readers as RViz2 of Humble has them.
 SHOWN = {"contact": CONTACT, "image": IMAGE, "tactile_state": TACTILE}
-COLOURS = pathlib.Path(__file__).resolve().parents[2] / "src/colour.rs"
+COLOURS = pathlib.Path(__file__).resolve().parents[2] / "crates/core/src/colour.rs"
 COURSE = pathlib.Path(__file__).resolve().parents[2] / "models/course.onnx"
 
 RELIABLE = Policy.Reliability.Reliable(duration(seconds=1))

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 
 use super::error::Error;
 use super::{Config, Model, Publish, Record, Ros2, SensorTable, Unix, Zenoh};
-use crate::sensor::Sensor;
-use crate::wording;
+use hardnessd_core::sensor::Sensor;
+use hardnessd_core::wording;
 
 /// Checks a configuration whose paths are already resolved, and returns its sensors. `path` is only
 /// for messages.

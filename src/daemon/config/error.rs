@@ -3,9 +3,9 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-use crate::npy::NpyError;
-use crate::sensor::SensorError;
-use crate::verdict::ModelError;
+use hardnessd_core::npy::NpyError;
+use hardnessd_core::sensor::SensorError;
+use hardnessd_core::verdict::ModelError;
 
 /// The most bytes of a configuration file. They are enough for a hundred sensors with every taxel
 /// dead.

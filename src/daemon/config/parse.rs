@@ -8,10 +8,10 @@ use toml::de::DeTable;
 use super::error::{Error, MAX_BYTES, Place};
 use super::read::{Until, read};
 use super::{Config, Model};
-use crate::npy::{self, NpyError};
-use crate::tare::Gains;
-use crate::verdict::{self, Hrn};
-use crate::{trial, wording};
+use hardnessd_core::npy::{self, NpyError};
+use hardnessd_core::tare::Gains;
+use hardnessd_core::verdict::{self, Hrn};
+use hardnessd_core::{trial, wording};
 
 pub(super) fn load(path: &Path, until: Until) -> Result<Config, Error> {
     let bytes = read(path, MAX_BYTES, until).map_err(|source| Error::Unreadable {

@@ -2,7 +2,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use super::*;
-use crate::npy;
+use hardnessd_core::npy;
 
 fn load(text: &str) -> Result<Config, String> {
     let directory = tempfile::tempdir().unwrap();
@@ -477,7 +477,7 @@ fn a_reload_gives_a_pipe_up_and_a_pipe_that_a_program_writes_is_read() {
         ),
         (
             "model.onnx",
-            crate::verdict::BUILT_IN.to_vec(),
+            hardnessd_core::verdict::BUILT_IN.to_vec(),
             "model.onnx: it did not end in time",
         ),
     ];
@@ -570,7 +570,7 @@ fn a_key_of_zenoh_looks_the_same_wherever_it_is_shown() {
         assert!(error.contains(&expected), "{error}");
         let rest = "control or bidirectional characters";
         assert!(
-            error.contains(rest) && crate::wording::is_plain(&error),
+            error.contains(rest) && hardnessd_core::wording::is_plain(&error),
             "{error:?}"
         );
     }

@@ -17,7 +17,7 @@ use tokio::sync::{mpsc, oneshot};
 use super::{Sources, refusal};
 use crate::daemon::hub::{Ahead, Closed, Line};
 use crate::daemon::request::{Kinds, Policy, Since, Subscription, Unusable};
-use crate::event::Kind;
+use hardnessd_core::event::Kind;
 
 const LAST_EVENT_ID: &str = "Last-Event-ID";
 

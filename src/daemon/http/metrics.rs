@@ -16,7 +16,7 @@ use prometheus_client::registry::{Registry, Unit};
 use crate::daemon::busy;
 use crate::daemon::hub::{Counts, Survey, Verdicts};
 use crate::daemon::sensor::Vitals;
-use crate::event::{self, LinkState};
+use hardnessd_core::event::{self, LinkState};
 
 pub(super) const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 

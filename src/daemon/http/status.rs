@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use crate::daemon::hub::Survey;
 use crate::daemon::realtime::Standing;
 use crate::daemon::sensor::Vitals;
-use crate::event::{Event, Reply};
+use hardnessd_core::event::{Event, Reply};
 
 /// An object of `hello` as on a socket, `subscribers`, `process` (how the kernel runs the daemon,
 /// [`Standing`]), and a list of `sensors`. A sensor has its `status` and `last` (its last final

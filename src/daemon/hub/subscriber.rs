@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 
 use super::{HELD, Line};
 use crate::daemon::request::{Kinds, Policy, Subscription};
-use crate::event::{Kind, Reply};
+use hardnessd_core::event::{Kind, Reply};
 
 /// The most events that wait for a subscriber (`docs/controller.md`).
 const QUEUE: usize = 1024;

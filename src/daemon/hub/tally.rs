@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::event::{Event, Phase, PressState, Rejection};
+use hardnessd_core::event::{Event, Phase, PressState, Rejection};
 
 /// Counts over all sensors of a run.
 #[derive(Debug, Clone, Default)]

@@ -11,7 +11,7 @@ use super::{Ahead, Hub, Line, Survey};
 use crate::daemon::now;
 use crate::daemon::record::EventRecorder;
 use crate::daemon::request::Subscription;
-use crate::event::{Event, Hello};
+use hardnessd_core::event::{Event, Hello};
 
 /// A command to the hub's task.
 enum Command {

@@ -4,13 +4,13 @@ use serde_json::Value;
 
 use super::*;
 use crate::daemon::request::{Policy, Since};
-use crate::event::{FrameEvent, LinkState, ModelCard, PressState, Status};
+use hardnessd_core::event::{FrameEvent, LinkState, ModelCard, PressState, Status};
 
 const RUN: &str = "5eed";
 
 pub(in crate::daemon) fn hello() -> Hello {
     Hello {
-        protocol: crate::event::PROTOCOL,
+        protocol: hardnessd_core::event::PROTOCOL,
         server: "hardnessd",
         version: "0",
         robot: "arm-7".to_owned(),
@@ -45,7 +45,7 @@ fn status(sensor: &str) -> Event {
 }
 
 pub(in crate::daemon) fn press(sensor: &str) -> Event {
-    Event::Press(crate::event::Press {
+    Event::Press(hardnessd_core::event::Press {
         seq: None,
         sensor: sensor.to_owned(),
         time: jiff::Timestamp::UNIX_EPOCH,
@@ -59,7 +59,7 @@ pub(in crate::daemon) fn press(sensor: &str) -> Event {
 }
 
 fn frame(sensor: &str, number: u64) -> Event {
-    let newtons = vec![0.0; crate::frame::TAXELS];
+    let newtons = vec![0.0; hardnessd_core::frame::TAXELS];
     Event::Frame(FrameEvent::new(
         sensor.to_owned(),
         jiff::Timestamp::UNIX_EPOCH,

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
-use crate::recording::{self, About, Writer};
+use hardnessd_core::recording::{self, About, Writer};
 
 /// The bytes of a megabyte in the decimal sense, as in the sizes of disks.
 pub(super) const MB: u64 = 1_000_000;

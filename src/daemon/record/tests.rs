@@ -1,11 +1,12 @@
 use std::sync::mpsc::Receiver;
 
 use super::*;
-use crate::pipeline::Clock;
-use crate::recording::{Ring, tests};
+use hardnessd_core::pipeline::Clock;
+use hardnessd_core::recording::Ring;
+use hardnessd_core::test_support;
 
 fn recorder(sender: SyncSender<Job>) -> (SensorRecorder, Pipeline) {
-    let pipeline = Pipeline::new(tests::sensor(), tests::hrn(), Clock::Arrival);
+    let pipeline = Pipeline::new(test_support::sensor(), test_support::hrn(), Clock::Arrival);
     let active = Active {
         jobs: Jobs {
             sender,
@@ -107,10 +108,10 @@ fn a_flood_is_bounded_in_the_black_box() {
 
 #[test]
 fn viewers_get_the_positions_of_the_arm_also_without_a_recording() {
-    let pipeline = Pipeline::new(tests::sensor(), tests::hrn(), Clock::Arrival);
+    let pipeline = Pipeline::new(test_support::sensor(), test_support::hrn(), Clock::Arrival);
     let (viewers, mut shown) = mpsc::channel(1);
     let mut recorder = SensorRecorder::default().with_viewers(Some(viewers));
-    let point = crate::motion::Point {
+    let point = hardnessd_core::motion::Point {
         at_ns: 5_000_000,
         mm: 1.5,
     };
@@ -127,13 +128,13 @@ fn viewers_get_the_positions_of_the_arm_also_without_a_recording() {
 
 #[test]
 fn viewers_get_the_settings_after_a_reload() {
-    let pipeline = Pipeline::new(tests::sensor(), tests::hrn(), Clock::Arrival);
+    let pipeline = Pipeline::new(test_support::sensor(), test_support::hrn(), Clock::Arrival);
     let (viewers, mut shown) = mpsc::channel(1);
     let mut recorder = SensorRecorder::default().with_viewers(Some(viewers));
-    let mut description = tests::sensor().description().clone();
+    let mut description = test_support::sensor().description().clone();
     description.calibration.pitch_mm = 2.0;
     let changed = Sensor::new(description).unwrap();
-    recorder.reload(&pipeline, &changed, &tests::hrn(), at(7));
+    recorder.reload(&pipeline, &changed, &test_support::hrn(), at(7));
     let Entry::Settings(settings) = shown.try_recv().unwrap().entry else {
         panic!("no settings");
     };

@@ -14,9 +14,9 @@ use tracing::{info, warn};
 use super::file::{MB, Open, create, has_room};
 use super::{Error, Job, NoBlackbox, Progress, Target};
 use crate::daemon::config;
-use crate::event::{Event, LinkState, PressState};
-use crate::frame::Stamp;
-use crate::recording::{self, About, Entry, Input, Ring};
+use hardnessd_core::event::{Event, LinkState, PressState};
+use hardnessd_core::frame::Stamp;
+use hardnessd_core::recording::{self, About, Entry, Input, Ring};
 
 /// How often written entries are passed to the system. `kill -9` loses no more than this time.
 const FLUSH_EVERY: Duration = Duration::from_millis(500);

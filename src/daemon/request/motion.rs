@@ -5,8 +5,8 @@ use jiff::Timestamp;
 use serde_json::Value;
 
 use super::short;
-use crate::frame::Stamp;
-use crate::motion::{FURTHEST_MM, HELD, Point};
+use hardnessd_core::frame::Stamp;
+use hardnessd_core::motion::{FURTHEST_MM, HELD, Point};
 
 /// The most points in a line.
 const MOST_POINTS: usize = 256;

@@ -266,7 +266,7 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::motion::{Point, Track};
+    use hardnessd_core::motion::{Point, Track};
 
     /// A press of an arm of `n_per_mm` at 5 mm/s, to `depth_mm` and back, held for 0.4 s. Its
     /// stamps are `delay_ms` early. Frames come at `hz`, positions at 100 Hz.

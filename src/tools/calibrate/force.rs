@@ -5,9 +5,9 @@
 //! arrays are often nearer to another power.
 
 use super::gather::Press;
-use crate::frame::{Array, RawFrame, TAXELS};
-use crate::sensor::Sensor;
-use crate::tare::{self, Tare};
+use hardnessd_core::frame::{Array, RawFrame, TAXELS};
+use hardnessd_core::sensor::Sensor;
+use hardnessd_core::tare::{self, Tare};
 
 /// The values that known weights give.
 #[derive(Debug, Clone, PartialEq)]
@@ -244,8 +244,8 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
-    use crate::sensor::Description;
-    use crate::tare::Gains;
+    use hardnessd_core::sensor::Description;
+    use hardnessd_core::tare::Gains;
 
     fn sensor(calibration: tare::Settings) -> Sensor {
         Sensor::new(Description {

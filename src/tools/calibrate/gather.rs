@@ -6,13 +6,13 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
-use crate::event::{Event, Note, Phase, PressState};
-use crate::frame::Stamp;
-use crate::motion::Track;
-use crate::pipeline::{Clock, Pipeline};
-use crate::recording::{self, Entry, FileKind, Playback, PlaybackError, Reader};
-use crate::sensor::{Description, Sensor};
-use crate::verdict::Hrn;
+use hardnessd_core::event::{Event, Note, Phase, PressState};
+use hardnessd_core::frame::Stamp;
+use hardnessd_core::motion::Track;
+use hardnessd_core::pipeline::{Clock, Pipeline};
+use hardnessd_core::recording::{self, Entry, FileKind, Playback, PlaybackError, Reader};
+use hardnessd_core::sensor::{Description, Sensor};
+use hardnessd_core::verdict::Hrn;
 
 /// One press.
 #[derive(Debug, Default)]
@@ -252,7 +252,7 @@ fn moment(at: Stamp, time: Timestamp) -> Duration {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::recording::tests::{hrn, of_a_press};
+    use hardnessd_core::test_support::{hrn, of_a_press};
 
     #[test]
     fn a_press_has_the_positions_from_before_its_recording() {

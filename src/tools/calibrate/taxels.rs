@@ -6,7 +6,7 @@
 //! taxel is also compared with the array's median. The gains that fit all comparisons best are
 //! found by least squares, and drawn towards 1 where there are few presses.
 
-use crate::frame::{Array, TAXELS};
+use hardnessd_core::frame::{Array, TAXELS};
 
 /// A press without gains.
 pub(super) struct Plain {

@@ -4,7 +4,7 @@
 
 use serde_json::Value;
 
-use crate::simulator::Material;
+use hardnessd_simulator::Material;
 
 /// The counts of the presses so far.
 #[derive(Debug, Default)]

@@ -1,7 +1,7 @@
 //! Faults of a frame's bytes.
 
 use super::times::Frames;
-use crate::random::Stream;
+use hardnessd_simulator::random::Stream;
 
 /// A fault of some frames.
 #[derive(Debug, Clone, Copy, PartialEq)]

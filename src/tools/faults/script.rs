@@ -8,9 +8,9 @@ use super::bytes::{Damage, OfBytes};
 use super::cable::{self, OfCable};
 use super::taxels::{Change, OfTaxels, Region};
 use super::times::{Frames, Span};
-use crate::frame::{COLS, ROWS};
-use crate::simulator::FULL_SCALE_COUNTS;
-use crate::wording;
+use hardnessd_core::frame::{COLS, ROWS};
+use hardnessd_core::wording;
+use hardnessd_simulator::FULL_SCALE_COUNTS;
 
 /// The file format, for `--help`.
 pub(crate) const FORMAT: &str = r#"The faults of --faults FILE, a TOML file; times in the sensor's seconds from the start:

@@ -1,8 +1,8 @@
 //! Faults of taxels: the frame is whole, and what its taxels read is wrong.
 
 use super::times::Span;
-use crate::frame::{COLS, RawFrame};
-use crate::simulator::{FULL_SCALE_COUNTS, NEWTONS_PER_COUNT};
+use hardnessd_core::frame::{COLS, RawFrame};
+use hardnessd_simulator::{FULL_SCALE_COUNTS, NEWTONS_PER_COUNT};
 
 /// A fault of some taxels.
 #[derive(Debug, Clone, Copy, PartialEq)]

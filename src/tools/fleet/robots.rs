@@ -11,8 +11,8 @@ use serde_json::Value;
 
 use super::numbers::Numbers;
 use super::session::{Heard, Hello, News, What};
-use crate::event::Kind;
-use crate::frame::Stamp;
+use hardnessd_core::event::Kind;
+use hardnessd_core::frame::Stamp;
 
 /// Robots beyond these are kept only in the place of one that is gone.
 const MOST_ROBOTS: usize = 4096;

@@ -23,8 +23,8 @@ use zenoh::sample::{Sample, SampleKind};
 use crate::daemon::config::Endpoint;
 use crate::daemon::now;
 use crate::daemon::zenoh::searching;
-use crate::event::Kind;
-use crate::frame::Stamp;
+use hardnessd_core::event::Kind;
+use hardnessd_core::frame::Stamp;
 
 /// What is new.
 #[derive(Debug)]

@@ -8,8 +8,8 @@ use jiff::Timestamp;
 use serde_json::{Value, json};
 
 use super::robots::{Fleet, Robot, Sensor, read, time};
-use crate::frame::Stamp;
-use crate::wording;
+use hardnessd_core::frame::Stamp;
+use hardnessd_core::wording;
 
 /// Clears the terminal, so that a table takes the place of the last one.
 pub(super) const CLEAR: &str = "\u{1b}[2J\u{1b}[H";
@@ -210,7 +210,7 @@ mod tests {
 
     use super::super::session::{Heard, Hello, Model, News, What};
     use super::*;
-    use crate::event::Kind;
+    use hardnessd_core::event::Kind;
 
     fn at(second: u64) -> Stamp {
         Stamp {

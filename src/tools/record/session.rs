@@ -16,7 +16,7 @@ use super::{Error, check_level, clear, levels, record, said};
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::record::Progress;
-use crate::recording::{LabelError, Labels, check_label};
+use hardnessd_core::recording::{LabelError, Labels, check_label};
 
 /// The list of what was recorded, in the directory of a session.
 const LIST: &str = "session.csv";

@@ -3,7 +3,7 @@
 use std::io::{self, Read};
 use std::path::Path;
 
-use crate::motion::{FURTHEST_MM, Point};
+use hardnessd_core::motion::{FURTHEST_MM, Point};
 
 /// The most bytes of a file: more than a day of positions, 100 a second.
 const MOST_BYTES: u64 = 256 << 20;

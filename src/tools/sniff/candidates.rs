@@ -16,8 +16,8 @@
 
 use std::collections::BTreeMap;
 
-use crate::frame::{Array, COLS, ROWS};
-use crate::wire::{Cell, Checksum, HexBytes, LengthField, Preset, Settings};
+use hardnessd_core::frame::{Array, COLS, ROWS};
+use hardnessd_core::wire::{Cell, Checksum, HexBytes, LengthField, Preset, Settings};
 
 /// The smallest side of an array that is looked for. Any short repetition would fit a smaller
 /// array.

@@ -6,8 +6,8 @@
 use std::cmp::Reverse;
 
 use super::candidates::{candidates, marked_array, packed_array, text_array};
-use crate::frame::{Array, COLS, ROWS, RawFrame};
-use crate::wire::{Cell, Checksum, Decoder, Layout, LengthField, Preset, Settings};
+use hardnessd_core::frame::{Array, COLS, ROWS, RawFrame};
+use hardnessd_core::wire::{Cell, Checksum, Decoder, Layout, LengthField, Preset, Settings};
 
 /// The number of pieces that candidates are first tried on. The pieces come from all over the
 /// bytes, so that neither a bad beginning nor a long rest decides.
@@ -202,7 +202,7 @@ struct Tally {
     changed: u64,
     damaged: u64,
     roughness: u64,
-    last: Option<crate::frame::RawFrame>,
+    last: Option<hardnessd_core::frame::RawFrame>,
 }
 
 impl Tally {

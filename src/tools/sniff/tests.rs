@@ -2,10 +2,12 @@
 
 use super::proposal::propose;
 use super::toml;
-use crate::frame::RawFrame;
-use crate::random::Stream;
-use crate::simulator::{Material, Sequence, SequenceSettings};
-use crate::wire::{Cell, Checksum, Decoder, HexBytes, Layout, LengthField, Preset, Settings};
+use hardnessd_core::frame::RawFrame;
+use hardnessd_core::wire::{
+    Cell, Checksum, Decoder, HexBytes, Layout, LengthField, Preset, Settings,
+};
+use hardnessd_simulator::random::Stream;
+use hardnessd_simulator::{Material, Sequence, SequenceSettings};
 
 /// Rest, a press and rest: 20 to 50 frames.
 fn frames(seed: u64) -> Vec<RawFrame> {

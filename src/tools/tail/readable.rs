@@ -6,7 +6,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 use serde_json::Value;
 
-use crate::wording;
+use hardnessd_core::wording;
 
 /// The line of one event, without its newline.
 pub(super) fn line(event: &Value) -> String {

@@ -15,8 +15,8 @@ use super::draw::{UNPLUGGED, UNPLUGGED_WORDS, draw};
 use super::look::Look;
 use super::screen::{Screen, key};
 use super::view::{Clock, Key, Link, Loss, View};
-use crate::frame::{COLS, Stamp, TAXELS};
 use crate::tools::pty::pair::Pair;
+use hardnessd_core::frame::{COLS, Stamp, TAXELS};
 
 const COLOURS: Look = Look {
     colours: true,

@@ -11,9 +11,9 @@ use jiff::SignedDuration;
 use serde_json::{Value, json};
 
 pub(super) use self::sensor::{Frame, Load, Sensor, Verdict, WINDOW};
-use crate::event::PROTOCOL;
-use crate::frame::Stamp;
-use crate::wording;
+use hardnessd_core::event::PROTOCOL;
+use hardnessd_core::frame::Stamp;
+use hardnessd_core::wording;
 
 /// The time between two requests for the totals. Without a request, the daemon sends them only when
 /// the state changes.

@@ -2,14 +2,14 @@ use std::sync::Arc;
 
 use super::super::{gather, plain};
 use super::*;
-use crate::event::{Event, Phase};
-use crate::motion::Point;
-use crate::pipeline::{Clock, Pipeline};
-use crate::random::Stream;
-use crate::sensor::{Description, Sensor};
-use crate::simulator::{ARM_N_PER_MM, Material, SensorProfile, Sequence, SequenceSettings};
-use crate::tare::Gains;
-use crate::verdict::{BUILT_IN, Hrn};
+use hardnessd_core::event::{Event, Phase};
+use hardnessd_core::motion::Point;
+use hardnessd_core::pipeline::{Clock, Pipeline};
+use hardnessd_core::sensor::{Description, Sensor};
+use hardnessd_core::tare::Gains;
+use hardnessd_core::verdict::{BUILT_IN, Hrn};
+use hardnessd_simulator::random::Stream;
+use hardnessd_simulator::{ARM_N_PER_MM, Material, SensorProfile, Sequence, SequenceSettings};
 
 /// Round, smooth presses on every taxel in turn, as an array of `gains` reads them, with noise. The
 /// taxel in the middle of a press has 4 N.
@@ -168,7 +168,7 @@ fn play(seed: u64, for_gains: u32, for_verdicts: u32, profile: SensorProfile) ->
 /// The share of right verdicts, on test materials alone. The model is told how the arm moves.
 fn right(played: &Played, sensor: Sensor, hrn: &Arc<Hrn>) -> f64 {
     let mut pipeline = Pipeline::new(sensor, hrn.clone(), Clock::FrameRate);
-    let start = crate::frame::Stamp {
+    let start = hardnessd_core::frame::Stamp {
         mono: std::time::Duration::ZERO,
         wall: jiff::Timestamp::UNIX_EPOCH,
     };
@@ -233,7 +233,7 @@ fn gains_of_a_raw_simulated_sensor_are_found_from_its_presses() {
 
 /// Prints how much the calibration improves the verdicts. docs/new-sensor.md has the figures.
 #[test]
-#[ignore = "minutes: cargo test --features train --lib worth_of_gains -- --ignored --nocapture"]
+#[ignore = "minutes: cargo test --lib worth_of_gains -- --ignored --nocapture"]
 fn print_the_worth_of_gains() {
     let course = std::fs::read("models/course.onnx").unwrap();
     let models = [BUILT_IN, &course].map(|bytes| Arc::new(Hrn::load(bytes).unwrap()));

@@ -6,8 +6,8 @@ use std::time::Duration;
 use serde_json::Value;
 
 use super::{items, number, plain, text};
-use crate::frame::{Array, COLS, ROWS, TAXELS};
-use crate::sensor::LATE_PERIODS;
+use hardnessd_core::frame::{Array, COLS, ROWS, TAXELS};
+use hardnessd_core::sensor::LATE_PERIODS;
 
 /// How far back the curves go.
 pub(in crate::tools::watch) const WINDOW: Duration = Duration::from_secs(30);

@@ -1,0 +1,24 @@
+//! Bytes become frames, frames become presses, presses become verdicts and events.
+//!
+//! The modules are in reading order: each uses only the modules above it. They wait for nothing and ask
+//! no clock: callers pass in the bytes and the time at which they arrived. [`recording`] is given a
+//! reader or a writer. Only [`trial`] does I/O: it starts a child process that tries a model.
+
+pub mod frame;
+pub mod colour;
+pub mod wording;
+pub mod exit;
+pub mod npy;
+pub mod wire;
+pub mod tare;
+pub mod press;
+pub mod motion;
+pub mod sensor;
+pub mod verdict;
+pub mod event;
+pub mod ros;
+pub mod pipeline;
+pub mod recording;
+pub mod trial;
+#[cfg(any(test, feature = "test-support"))]
+pub mod test_support;

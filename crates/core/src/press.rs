@@ -1,0 +1,513 @@
+//! Presses: one contact each, from touch to release.
+//!
+//! In: tared [`Frame`]s with their numbers and arrival times. Out: [`Change`]s. The tracker reads
+//! no clock: the times of the frames decide how long a press lasts.
+
+mod course;
+mod packed;
+mod settings;
+mod settling;
+mod thin;
+
+use std::cmp::Ordering;
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use self::course::Course;
+pub use self::settings::{Settings, SettingsError};
+pub use self::settling::first_settled;
+use self::settling::{Load, Settling};
+pub use self::thin::thinned;
+use crate::frame::{Frame, Stamp, TAXELS};
+
+/// The number of a frame in a press, and when its last byte came.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Moment {
+    /// The number of the frame, per sensor.
+    pub frame: u64,
+    /// When the frame's last byte came.
+    pub stamp: Stamp,
+}
+
+/// Marks of a frame. They are decided by the settings at the frame's arrival, because the settings
+/// may have changed when the press is judged.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Marks {
+    /// Whether the contact touches the border of the array.
+    pub at_edge: bool,
+    /// Whether a live taxel reads full scale.
+    pub saturated: bool,
+}
+
+/// A frame of a press, in contact. The best frame has the maximal contact area. Of equal areas the
+/// greater force wins, then the earlier frame.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Peak {
+    /// The frame's number and arrival.
+    pub moment: Moment,
+    /// The frame itself.
+    pub frame: Frame,
+    /// The frame's marks.
+    #[serde(default)]
+    pub marks: Marks,
+    /// The contact area of the frame.
+    pub contact_area_taxels: u32,
+    /// The total force of the frame.
+    pub force_n: f64,
+}
+
+/// The end of a press that gets a verdict.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum End {
+    /// The press was released.
+    Release,
+    /// The press was held for `max_seconds`.
+    Timeout,
+}
+
+/// The reason why a press gets no verdict.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Abort {
+    /// The press had fewer than `min_frames` frames in contact.
+    Short,
+    /// The device was lost.
+    Lost,
+    /// The daemon stops.
+    Shutdown,
+    /// The recording ended.
+    EndOfRecording,
+}
+
+impl Abort {
+    /// The reason as it is published.
+    pub fn reason(self) -> &'static str {
+        match self {
+            Abort::Short => "short",
+            Abort::Lost => "lost",
+            Abort::Shutdown => "shutdown",
+            Abort::EndOfRecording => "end of recording",
+        }
+    }
+}
+
+/// A change of a press.
+///
+/// # Example
+///
+/// A touch of one frame begins a press that gets no verdict.
+///
+/// ```
+/// use std::time::Duration;
+///
+/// use hardnessd_core::frame::{Frame, Stamp};
+/// use hardnessd_core::press::{Abort, Change, Marks, Moment, PressTracker, Settings};
+///
+/// let mut tracker = PressTracker::new(Settings::default());
+/// let mut touched = Frame::default();
+/// touched.newtons[400..409].fill(0.5);
+/// let mut changes = Vec::new();
+/// for (number, frame) in (0..).zip([touched, Frame::default(), Frame::default()]) {
+///     let stamp = Stamp {
+///         mono: Duration::from_millis(200 * number),
+///         wall: jiff::Timestamp::UNIX_EPOCH,
+///     };
+///     let at = Moment { frame: number, stamp };
+///     changes.extend(tracker.push(&frame, Marks::default(), at));
+/// }
+/// assert!(matches!(changes[0], Change::Begin { press: 1, .. }));
+/// assert!(matches!(changes[1], Change::Aborted { frames: 1, reason: Abort::Short, .. }));
+/// ```
+#[derive(Debug, Clone, PartialEq)]
+pub enum Change {
+    /// A press began with this frame.
+    Begin {
+        /// The press's number.
+        press: u64,
+        /// The frame.
+        at: Moment,
+    },
+    /// The contact has settled.
+    Settled {
+        /// The press's number.
+        press: u64,
+        /// The best frame so far.
+        peak: Box<Peak>,
+    },
+    /// The press ended and is to be judged.
+    End {
+        /// The press's number.
+        press: u64,
+        /// The last frame in contact.
+        last: Moment,
+        /// The number of frames in contact.
+        frames: u64,
+        /// Whether the press was released or timed out.
+        end: End,
+        /// The best frame.
+        peak: Box<Peak>,
+        /// The frames in contact.
+        course: Box<SoFar>,
+    },
+    /// The press ended without a verdict.
+    Aborted {
+        /// The press's number.
+        press: u64,
+        /// The last frame in contact.
+        last: Moment,
+        /// The number of frames in contact.
+        frames: u64,
+        /// The reason why there is no verdict.
+        reason: Abort,
+    },
+}
+
+/// The frames in contact of a press up to now.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SoFar {
+    press: u64,
+    peak: Peak,
+    course: Course,
+}
+
+impl SoFar {
+    /// The press's number.
+    pub fn press(&self) -> u64 {
+        self.press
+    }
+
+    /// The frames up to `until`, and the place of the best frame among them. They are evenly spread
+    /// over the press, some hundred at most. A short press has all its frames.
+    pub fn until(&self, until: Duration) -> (Vec<&Peak>, usize) {
+        self.course.until(until, &self.peak)
+    }
+}
+
+/// Follows one sensor's presses.
+///
+/// # Example
+///
+/// Three frames of a touch and two of a release are one press.
+///
+/// ```
+/// use std::time::Duration;
+///
+/// use hardnessd_core::frame::{Frame, Stamp};
+/// use hardnessd_core::press::{Change, Marks, Moment, PressTracker, Settings};
+///
+/// let mut tracker = PressTracker::new(Settings::default());
+/// let free = Frame::default();
+/// let mut touched = free;
+/// touched.newtons[400..409].fill(0.5);
+/// let mut changes = Vec::new();
+/// for (number, frame) in (0..).zip([touched, touched, touched, free, free]) {
+///     let stamp = Stamp {
+///         mono: Duration::from_millis(200 * number),
+///         wall: jiff::Timestamp::UNIX_EPOCH,
+///     };
+///     let at = Moment { frame: number, stamp };
+///     changes.extend(tracker.push(&frame, Marks::default(), at));
+/// }
+/// assert!(matches!(changes[0], Change::Begin { press: 1, .. }));
+/// assert!(matches!(changes[1], Change::Settled { press: 1, .. }));
+/// assert!(matches!(changes[2], Change::End { press: 1, frames: 3, .. }));
+/// ```
+#[derive(Debug)]
+pub struct PressTracker {
+    settings: Settings,
+    state: State,
+    presses: u64,
+}
+
+/// The state of a [`PressTracker`], without its settings.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Memory {
+    state: State,
+    presses: u64,
+}
+
+impl Memory {
+    /// Whether a tracker can have this state after this many frames.
+    pub(crate) fn is_possible(&self, frames: u64) -> bool {
+        let is_press = |pressed: &Pressed| {
+            let peak = &pressed.peak;
+            pressed.press == self.presses
+                && pressed.frames <= frames
+                && peak.moment.frame < frames
+                && peak.contact_area_taxels as usize <= TAXELS
+                && peak.force_n == peak.frame.force_n()
+                && pressed.course.is_possible(frames)
+                && pressed.settling.as_ref().is_none_or(Settling::is_possible)
+        };
+        self.presses <= frames
+            && match &self.state {
+                State::Pressed(pressed) => is_press(pressed),
+                State::Idle | State::AwaitingRelease { .. } => true,
+            }
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+enum State {
+    Idle,
+    Pressed(Box<Pressed>),
+    /// The press timed out. The count is that of frames without contact since then.
+    AwaitingRelease {
+        released_frames: u32,
+    },
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Pressed {
+    press: u64,
+    began: Duration,
+    last: Moment,
+    frames: u64,
+    released_frames: u32,
+    peak: Peak,
+    /// The course of the press. Recordings from before models of courses do not have it.
+    #[serde(default)]
+    course: Course,
+    /// `None` once the early verdict has come.
+    settling: Option<Settling>,
+}
+
+impl PressTracker {
+    /// A tracker without a press. `settings` have passed [`Settings::check`].
+    pub fn new(settings: Settings) -> Self {
+        Self {
+            settings,
+            state: State::Idle,
+            presses: 0,
+        }
+    }
+
+    /// Takes over changed settings. They also apply to a press under way.
+    pub fn reload(&mut self, settings: Settings) {
+        self.settings = settings;
+    }
+
+    /// The tracker's state.
+    pub fn memory(&self) -> Memory {
+        Memory {
+            state: self.state.clone(),
+            presses: self.presses,
+        }
+    }
+
+    /// Continues from the state of another tracker.
+    pub fn recall(&mut self, memory: Memory) {
+        Memory {
+            state: self.state,
+            presses: self.presses,
+        } = memory;
+    }
+
+    /// Whether a press is under way.
+    pub fn is_pressed(&self) -> bool {
+        self.pressed().is_some()
+    }
+
+    /// Whether there is no press under way, and no press that timed out and is not yet released.
+    pub fn is_idle(&self) -> bool {
+        matches!(self.state, State::Idle)
+    }
+
+    /// The number of frames in contact of the press under way.
+    pub fn frames(&self) -> Option<u64> {
+        self.pressed().map(|pressed| pressed.frames)
+    }
+
+    /// The start time of the press under way.
+    pub fn began(&self) -> Option<Duration> {
+        self.pressed().map(|pressed| pressed.began)
+    }
+
+    /// The frames of the press under way.
+    pub fn so_far(&self) -> Option<SoFar> {
+        self.pressed().map(Pressed::so_far)
+    }
+
+    fn pressed(&self) -> Option<&Pressed> {
+        match &self.state {
+            State::Pressed(pressed) => Some(pressed),
+            State::Idle | State::AwaitingRelease { .. } => None,
+        }
+    }
+
+    /// Takes the next frame in. Returns its changes, in order.
+    pub fn push(&mut self, frame: &Frame, marks: Marks, at: Moment) -> Vec<Change> {
+        let area = frame.contact_area_taxels(self.settings.contact_threshold_n);
+        let touched = area >= self.settings.end_area_taxels;
+        let mut changes = Vec::new();
+        match &mut self.state {
+            State::Idle if area < self.settings.begin_area_taxels => return changes,
+            State::Idle => {
+                self.presses += 1;
+                let peak = Peak {
+                    moment: at,
+                    frame: *frame,
+                    marks,
+                    contact_area_taxels: area,
+                    force_n: frame.force_n(),
+                };
+                changes.push(Change::Begin {
+                    press: self.presses,
+                    at,
+                });
+                let mut course = Course::default();
+                course.push(peak.clone());
+                self.state = State::Pressed(Box::new(Pressed {
+                    press: self.presses,
+                    began: at.stamp.mono,
+                    last: at,
+                    frames: 1,
+                    released_frames: 0,
+                    settling: Some(Settling::default()),
+                    peak,
+                    course,
+                }));
+            }
+            State::Pressed(pressed) if touched => pressed.touch(frame, marks, at, area),
+            State::Pressed(pressed) => pressed.released_frames += 1,
+            State::AwaitingRelease { released_frames } => {
+                *released_frames = if touched { 0 } else { *released_frames + 1 };
+                if *released_frames >= self.settings.end_frames {
+                    self.state = State::Idle;
+                }
+                return changes;
+            }
+        }
+        self.conclude(frame, at, area, &mut changes);
+        changes
+    }
+
+    /// Ends a press under way without a verdict.
+    pub fn abort(&mut self, reason: Abort) -> Option<Change> {
+        match std::mem::replace(&mut self.state, State::Idle) {
+            State::Pressed(pressed) => Some(Change::Aborted {
+                press: pressed.press,
+                last: pressed.last,
+                frames: pressed.frames,
+                reason,
+            }),
+            other => {
+                self.state = other;
+                None
+            }
+        }
+    }
+
+    /// Adds the changes of this frame to the press: settled, released or timed out.
+    fn conclude(&mut self, frame: &Frame, at: Moment, area: u32, changes: &mut Vec<Change>) {
+        let State::Pressed(pressed) = &mut self.state else {
+            return;
+        };
+        if let Some(settling) = &mut pressed.settling {
+            let load = Load {
+                at: at.stamp.mono,
+                contact_area_taxels: area,
+                force_n: frame.force_n(),
+            };
+            if settling.push(load, &self.settings) {
+                pressed.settling = None;
+                changes.push(Change::Settled {
+                    press: pressed.press,
+                    peak: Box::new(pressed.peak.clone()),
+                });
+            }
+        }
+        let held = at.stamp.mono.saturating_sub(pressed.began).as_secs_f64();
+        let end = if pressed.released_frames >= self.settings.end_frames {
+            End::Release
+        } else if held >= self.settings.max_seconds {
+            End::Timeout
+        } else {
+            return;
+        };
+        let next = match end {
+            End::Release => State::Idle,
+            End::Timeout => State::AwaitingRelease {
+                released_frames: pressed.released_frames,
+            },
+        };
+        if let State::Pressed(pressed) = std::mem::replace(&mut self.state, next) {
+            changes.push(pressed.finish(end, self.settings.min_frames));
+        }
+    }
+}
+
+/// The largest share by which two equal forces may differ. Each taxel is an f32 and is rounded
+/// twice:
+/// when the baseline is subtracted, and when counts become newtons.
+const ROUNDING: f64 = 2.0 * f32::EPSILON as f64;
+
+impl Pressed {
+    fn touch(&mut self, frame: &Frame, marks: Marks, at: Moment, area: u32) {
+        self.last = at;
+        self.frames += 1;
+        self.released_frames = 0;
+        let touched = Peak {
+            moment: at,
+            frame: *frame,
+            marks,
+            contact_area_taxels: area,
+            force_n: frame.force_n(),
+        };
+        if is_greater(&touched, &self.peak) {
+            self.peak = touched.clone();
+        }
+        self.course.push(touched);
+    }
+
+    fn so_far(&self) -> SoFar {
+        SoFar {
+            press: self.press,
+            peak: self.peak.clone(),
+            course: self.course.clone(),
+        }
+    }
+
+    fn finish(self, end: End, min_frames: u64) -> Change {
+        let Pressed {
+            press,
+            last,
+            frames,
+            peak,
+            course,
+            ..
+        } = self;
+        if frames < min_frames {
+            return Change::Aborted {
+                press,
+                last,
+                frames,
+                reason: Abort::Short,
+            };
+        }
+        Change::End {
+            press,
+            last,
+            frames,
+            end,
+            course: Box::new(SoFar {
+                press,
+                peak: peak.clone(),
+                course,
+            }),
+            peak: Box::new(peak),
+        }
+    }
+}
+
+/// Whether `one` is better than `other`, which came before it.
+fn is_greater(one: &Peak, other: &Peak) -> bool {
+    match one.contact_area_taxels.cmp(&other.contact_area_taxels) {
+        Ordering::Less => false,
+        Ordering::Equal => one.force_n > other.force_n * (1.0 + ROUNDING),
+        Ordering::Greater => true,
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,351 @@
+//! Recordings: the bytes of sensors and when they came, as MCAP files that ROS tools open.
+//!
+//! In: what happens to a sensor's pipeline ([`Input`]), and the events that follow. Out: the bytes
+//! of a file. A [`Reader`] returns the inputs, and a [`Playback`] turns them into the same events.
+//! A file can be played from the first [`State`] of a sensor on. It has one every few seconds, so
+//! damage costs only the damaged stretch. Nothing here opens a file or asks the time. No other
+//! module uses the MCAP library.
+
+mod labels;
+mod message;
+mod playback;
+mod reader;
+mod recover;
+mod ring;
+mod writer;
+
+use std::borrow::Cow;
+use std::io::{self, Read};
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+pub use self::labels::{LabelError, Labels, check_label};
+pub use self::message::MOTION;
+pub use self::playback::{Playback, PlaybackError, PlaybackProblem};
+pub use self::reader::{Found, Reader};
+pub use self::recover::{RecoverError, Recovered, recover};
+pub use self::ring::Ring;
+pub use self::writer::{About, Writer};
+use crate::event::Event;
+use crate::frame::Stamp;
+use crate::motion::Point;
+use crate::pipeline::{self, Pipeline};
+use crate::sensor::{Description, Sensor, SensorError};
+use crate::verdict::Hrn;
+
+/// One thing that happens to a pipeline. Only a change of the sensor's description is an entry of
+/// its own ([`Entry::Settings`]).
+///
+/// # Example
+///
+/// A recorded input goes into a pipeline as it did live.
+///
+/// ```
+/// use std::sync::Arc;
+/// use std::time::Duration;
+///
+/// use hardnessd_core::event::{Event, LinkState};
+/// use hardnessd_core::frame::Stamp;
+/// use hardnessd_core::pipeline::{Clock, Pipeline};
+/// use hardnessd_core::recording::Input;
+/// use hardnessd_core::sensor::{Description, Sensor};
+/// use hardnessd_core::verdict::{BUILT_IN, Hrn};
+///
+/// let sensor = Sensor::new(Description::default())?;
+/// let mut pipeline = Pipeline::new(sensor, Arc::new(Hrn::load(BUILT_IN)?), Clock::Arrival);
+/// let at = Stamp {
+///     mono: Duration::from_secs(1),
+///     wall: jiff::Timestamp::UNIX_EPOCH,
+/// };
+/// assert!(Input::Opened.feed(&mut pipeline, at).is_empty());
+/// let events = Input::Lost("unplugged".into()).feed(&mut pipeline, at);
+/// assert!(matches!(&events[..], [Event::Status(status)] if status.state == LinkState::Lost));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Debug, Clone, PartialEq)]
+pub enum Input<'a> {
+    /// The port is open.
+    Opened,
+    /// The port could not be opened, for this reason.
+    Unavailable(Cow<'a, str>),
+    /// Bytes came.
+    Bytes(Cow<'a, [u8]>),
+    /// Time has passed.
+    Tick,
+    /// The device is gone, for this reason.
+    Lost(Cow<'a, str>),
+    /// A tare was requested.
+    Tare,
+    /// The controller's context.
+    Context(Option<Value>),
+    /// Positions of the arm from the robot.
+    Motion(Cow<'a, [Point]>),
+    /// This machine's calendar clock was set. Moments from calendar times are uncertain up to this
+    /// moment of CLOCK_MONOTONIC, in nanoseconds.
+    ClockSet(i64),
+    /// The daemon stops.
+    Shutdown,
+}
+
+impl Input<'_> {
+    /// Passes the input to `pipeline`. A refused tare and a step back in time are not reported: see
+    /// [`Pipeline::retare`] and [`Pipeline::tell`].
+    pub fn feed(self, pipeline: &mut Pipeline, at: Stamp) -> Vec<Event> {
+        match self {
+            Input::Opened => pipeline.opened(at),
+            Input::Unavailable(reason) => pipeline.unavailable(reason.into_owned(), at),
+            Input::Bytes(bytes) => pipeline.push(&bytes, at),
+            Input::Tick => pipeline.tick(at),
+            Input::Lost(reason) => pipeline.lost(reason.into_owned(), at),
+            Input::Tare => {
+                // A refused tare changes nothing and publishes nothing.
+                let _ = pipeline.retare();
+                Vec::new()
+            }
+            Input::Context(context) => {
+                pipeline.set_context(context);
+                Vec::new()
+            }
+            Input::Motion(points) => {
+                // Points after a step back are taken in too.
+                let _ = pipeline.tell(&points);
+                Vec::new()
+            }
+            Input::ClockSet(until_ns) => {
+                pipeline.clock_set(until_ns);
+                Vec::new()
+            }
+            Input::Shutdown => pipeline.shutdown(),
+        }
+    }
+
+    /// A copy that borrows nothing.
+    pub fn to_owned(&self) -> Input<'static> {
+        let text = |text: &Cow<'_, str>| Cow::Owned(text.clone().into_owned());
+        match self {
+            Input::Opened => Input::Opened,
+            Input::Unavailable(reason) => Input::Unavailable(text(reason)),
+            Input::Bytes(bytes) => Input::Bytes(Cow::Owned(bytes.clone().into_owned())),
+            Input::Tick => Input::Tick,
+            Input::Lost(reason) => Input::Lost(text(reason)),
+            Input::Tare => Input::Tare,
+            Input::Context(context) => Input::Context(context.clone()),
+            Input::Motion(points) => Input::Motion(Cow::Owned(points.to_vec())),
+            Input::ClockSet(until_ns) => Input::ClockSet(*until_ns),
+            Input::Shutdown => Input::Shutdown,
+        }
+    }
+}
+
+/// An entry of a recording for one sensor. Entries are in order of time.
+///
+/// # Example
+///
+/// This counts the bytes of a sensor in a recording, and how often the configuration was read again.
+///
+/// ```
+/// use hardnessd_core::recording::{Entry, Input, Reader};
+///
+/// let file = std::fs::File::open("fixtures/earlier.mcap")?;
+/// let (mut bytes, mut reloads) = (0, 0);
+/// for found in Reader::new(file) {
+///     match found?.entry {
+///         Entry::Input(Input::Bytes(chunk)) => bytes += chunk.len(),
+///         Entry::Settings(_) => reloads += 1,
+///         Entry::Input(_) | Entry::State(_) => {}
+///     }
+/// }
+/// assert!(bytes > 0 && reloads == 1, "{bytes} bytes, {reloads} reloads");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Debug, Clone, PartialEq)]
+pub enum Entry {
+    /// Something happened to the sensor.
+    Input(Input<'static>),
+    /// The configuration was read again. This sensor and model hold from then on.
+    Settings(Box<RecordedSensor>),
+    /// The whole state of the pipeline.
+    State(Box<State>),
+}
+
+impl Entry {
+    /// The approximate memory of the entry in bytes, including its time.
+    pub fn weight(&self) -> usize {
+        let beside = match self {
+            Entry::Input(Input::Bytes(bytes)) => bytes.len(),
+            Entry::Input(Input::Unavailable(reason) | Input::Lost(reason)) => reason.len(),
+            Entry::Input(Input::Context(context)) => context.as_ref().map_or(0, heap_bytes),
+            Entry::Input(Input::Motion(points)) => size_of_val::<[Point]>(points),
+            Entry::Input(_) => 0,
+            Entry::Settings(sensor) => text_bytes(sensor),
+            Entry::State(state) => text_bytes(state) + state.memory.context().map_or(0, heap_bytes),
+        };
+        size_of::<(Stamp, Self)>() + beside
+    }
+}
+
+/// The length as JSON. A state is mostly lists of numbers, and their JSON is about as long as their
+/// memory.
+fn text_bytes(value: &impl Serialize) -> usize {
+    serde_json::to_vec(value).map_or(0, |text| text.len())
+}
+
+/// The memory that a value points to. A small object takes many times the length of its text.
+fn heap_bytes(value: &Value) -> usize {
+    match value {
+        Value::Null | Value::Bool(_) | Value::Number(_) => 0,
+        Value::String(text) => text.len(),
+        Value::Array(items) => {
+            size_of_val(items.as_slice()) + items.iter().map(heap_bytes).sum::<usize>()
+        }
+        Value::Object(fields) => {
+            // A B-tree's nodes have 11 places, of which 5 may be taken.
+            let places = 11 * fields.len().div_ceil(5);
+            let held = fields
+                .iter()
+                .map(|(key, value)| key.len() + heap_bytes(value));
+            places * size_of::<(String, Value)>() + held.sum::<usize>()
+        }
+    }
+}
+
+/// The description of a sensor in a recording.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RecordedSensor {
+    /// The description of the sensor.
+    #[serde(flatten)]
+    pub description: Description,
+    /// The SHA-256 of the model.
+    pub model: String,
+}
+
+impl RecordedSensor {
+    /// The recorded description of `sensor` with the model `hrn`.
+    pub fn new(sensor: &Sensor, hrn: &Hrn) -> Self {
+        Self {
+            description: sensor.description().for_recording(sensor.stale_after()),
+            model: hrn.sha256().to_owned(),
+        }
+    }
+
+    /// The sensor's name.
+    pub fn name(&self) -> &str {
+        &self.description.name
+    }
+
+    /// Checks the description and returns the sensor.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`Sensor::new`], because a recording may hold anything.
+    pub fn check(&self) -> Result<Sensor, SensorError> {
+        Sensor::new(self.description.of_recording())
+    }
+}
+
+/// A sensor and the whole state of its pipeline. Another pipeline can continue from it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct State {
+    /// The sensor.
+    pub sensor: RecordedSensor,
+    /// The state of the pipeline.
+    pub memory: pipeline::Memory,
+    /// The recording's labels. They are repeated here because a checksum covers them here.
+    pub labels: Labels,
+}
+
+impl State {
+    /// The current state of `pipeline`.
+    pub fn of(pipeline: &Pipeline, labels: Labels) -> Self {
+        Self {
+            sensor: RecordedSensor::new(pipeline.sensor(), pipeline.hrn()),
+            memory: pipeline.memory(),
+            labels,
+        }
+    }
+}
+
+/// The first bytes of every recording.
+pub const MAGIC: &[u8] = mcap::MAGIC;
+
+/// The kind of a file with a sensor's bytes. Its first bytes decide, not its name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FileKind {
+    /// A recording, which is MCAP.
+    Recording,
+    /// The bytes of a sensor, without anything else.
+    Raw,
+}
+
+impl FileKind {
+    /// The kind of a file that begins with `start`. `start` has at least as many bytes as
+    /// [`MAGIC`], or all of a shorter file. A file that is empty or ends within the magic is a
+    /// damaged recording.
+    ///
+    /// # Example
+    ///
+    /// ```
+    /// use hardnessd_core::recording::{FileKind, MAGIC};
+    ///
+    /// assert_eq!(FileKind::of(MAGIC), FileKind::Recording);
+    /// assert_eq!(FileKind::of(&[0xBB, 0xAA, 0x10, 0x03, 0, 0, 0, 0, 0]), FileKind::Raw);
+    /// assert_eq!(FileKind::of(b""), FileKind::Recording);
+    /// ```
+    pub fn of(start: &[u8]) -> Self {
+        let start = &start[..start.len().min(MAGIC.len())];
+        if MAGIC.starts_with(start) {
+            FileKind::Recording
+        } else {
+            FileKind::Raw
+        }
+    }
+
+    /// Reads the kind of `source`. The returned reader begins where `source` began, because a pipe
+    /// cannot be read twice.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of reading.
+    pub fn read<R: Read>(mut source: R) -> io::Result<(Self, impl Read)> {
+        let mut start = Vec::with_capacity(MAGIC.len());
+        let most = MAGIC.len() as u64;
+        source.by_ref().take(most).read_to_end(&mut start)?;
+        Ok((Self::of(&start), io::Cursor::new(start).chain(source)))
+    }
+}
+
+/// The reason why a recording cannot be written or read.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// Reading or writing failed.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// The recording is damaged or cut off.
+    #[error("{0}: `hardnessd recover` saves what is whole")]
+    Damaged(String),
+    /// The file is MCAP of another program or of a later version, or not MCAP.
+    #[error("found {found}, expected {expected}")]
+    Foreign {
+        /// The content found.
+        found: String,
+        /// The expected content.
+        expected: &'static str,
+    },
+}
+
+impl From<mcap::McapError> for Error {
+    fn from(error: mcap::McapError) -> Self {
+        match error {
+            mcap::McapError::Io(error) => Error::Io(error),
+            mcap::McapError::BadMagic => Error::Foreign {
+                found: "no MCAP file".to_owned(),
+                expected: "a recording",
+            },
+            other => Error::Damaged(format!("the recording is damaged ({other})")),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,142 @@
+//! Labels: notes on what was pressed in a recording.
+
+use std::collections::BTreeMap;
+
+use crate::wording;
+
+/// Notes of the user by key, for example on the pressed object.
+pub type Labels = BTreeMap<String, String>;
+
+/// The reason why a label is refused.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum LabelError {
+    /// The label has no key.
+    #[error("the label has no key: write KEY=VALUE")]
+    NoKey,
+    /// The key or the value has hidden characters, so a reader would see something else.
+    #[error("found {0:?}, expected text without control or bidirectional characters")]
+    Hidden(String),
+    /// The label is too long.
+    #[error("found {found} characters, expected at most {MOST_CHARS}")]
+    Long {
+        /// The number of characters of the key and the value.
+        found: usize,
+    },
+    /// The value under this key must be a number.
+    #[error("{key}: found {found:?}, expected {expected}")]
+    Number {
+        /// The key.
+        key: &'static str,
+        /// The value of the label.
+        found: String,
+        /// The kind of number that `hrn-train collect` reads.
+        expected: &'static str,
+    },
+}
+
+/// The longest label: a label is a note, not a document.
+const MOST_CHARS: usize = 1000;
+
+/// Checks a label before it is written. `hrn-train collect` must be able to read the value under
+/// its key. Only the model can say whether a `level` is one of its levels.
+///
+/// # Errors
+///
+/// Returns a [`LabelError`] if the key is empty, a character is hidden, the label is too long, or
+/// the value of `object` or `shore` is not the right kind of number.
+///
+/// # Example
+///
+/// ```
+/// use hardnessd_core::recording::check_label;
+///
+/// assert!(check_label("object", "7").is_ok());
+/// assert!(check_label("material", "oak").is_ok());
+/// let error = check_label("object", "99999999999").unwrap_err();
+/// assert!(error.to_string().ends_with("expected a whole number from 0 to 4294967295"));
+/// ```
+pub fn check_label(key: &str, value: &str) -> Result<(), LabelError> {
+    if key.is_empty() {
+        return Err(LabelError::NoKey);
+    }
+    let found = key.chars().count() + value.chars().count();
+    if found > MOST_CHARS {
+        return Err(LabelError::Long { found });
+    }
+    for text in [key, value] {
+        if !wording::is_plain(text) {
+            return Err(LabelError::Hidden(text.to_owned()));
+        }
+    }
+    let number = |key, is_one: bool, expected| match is_one {
+        true => Ok(()),
+        false => Err(LabelError::Number {
+            key,
+            found: value.to_owned(),
+            expected,
+        }),
+    };
+    match key {
+        "object" => {
+            let is_one = value.parse::<u32>().is_ok();
+            number("object", is_one, "a whole number from 0 to 4294967295")
+        }
+        "shore" => {
+            let is_one = value
+                .parse()
+                .is_ok_and(|shore: f32| (0.0..=100.0).contains(&shore));
+            number("shore", is_one, "a number from 0 to 100")
+        }
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_label_that_its_reader_could_not_use_is_refused() {
+        for (key, value) in [
+            ("object", "7"),
+            ("object", "4294967295"),
+            ("shore", "35.5"),
+            ("material", ""),
+            ("note", "left of the centre, 3 N"),
+        ] {
+            assert_eq!(check_label(key, value), Ok(()), "{key}={value}");
+        }
+        let long = "x".repeat(1001);
+        for (key, value, expected) in [
+            ("", "7", "the label has no key: write KEY=VALUE"),
+            (
+                "object",
+                "99999999999",
+                "object: found \"99999999999\", expected a whole",
+            ),
+            ("object", "-1", "object: found \"-1\", expected a whole"),
+            ("shore", "hard", "shore: found \"hard\", expected a number"),
+            ("shore", "NaN", "shore: found \"NaN\", expected a number"),
+            (
+                "shore",
+                "101",
+                "shore: found \"101\", expected a number from 0 to 100",
+            ),
+            (
+                "shore",
+                "-1",
+                "shore: found \"-1\", expected a number from 0 to 100",
+            ),
+            ("note", "\u{202e}7", "found \"\\u{202e}7\", expected text"),
+            ("a\nb", "7", "found \"a\\nb\", expected text"),
+            (
+                "note",
+                &long,
+                "found 1005 characters, expected at most 1000",
+            ),
+        ] {
+            let error = check_label(key, value).unwrap_err().to_string();
+            assert!(error.starts_with(expected), "{error}");
+        }
+    }
+}

@@ -1,0 +1,183 @@
+//! The messages of a recording that hold a sensor's entries. Its events are ROS 2 messages.
+
+use byteorder::LittleEndian;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use super::{Entry, Error, Input, RecordedSensor, State};
+use crate::frame::Stamp;
+use crate::motion::Point;
+use crate::ros::{self, Blob, Header, Topic};
+
+/// The channels of a sensor, in the order of their numbers. The order never changes, because
+/// `recover` numbers the channels of a damaged file by it. Later channels have numbers of their own
+/// ([`LATER`]).
+pub(super) const TOPICS: [Topic; 5] = [INPUT, ros::FRAME, ros::HARDNESS, ros::PRESS, ros::STATUS];
+
+/// The later channels, each with the number of the first sensor's channel. These never change
+/// either.
+pub(super) const LATER: [(Topic, u16); 3] = [
+    (MOTION, 50_000),
+    (ros::CONTACT, 55_000),
+    (ros::GRID, 60_000),
+];
+
+pub(super) const INPUT: Topic = Topic {
+    name: "input",
+    schema: "tactile_interfaces/msg/Input",
+    definition: include_str!("../../../../clients/ros2/tactile_interfaces/msg/Input.msg"),
+};
+
+/// The positions of the arm, from the robot.
+pub const MOTION: Topic = Topic {
+    name: "motion",
+    schema: "tactile_interfaces/msg/Motion",
+    definition: include_str!("../../../../clients/ros2/tactile_interfaces/msg/Motion.msg"),
+};
+
+/// The topic for an entry.
+pub(super) fn topic_of(entry: &Entry) -> Topic {
+    match entry {
+        Entry::Input(Input::Motion(_)) => MOTION,
+        _ => INPUT,
+    }
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+struct MotionMessage {
+    header: Header,
+    mono_ns: u64,
+    at_ns: Vec<i64>,
+    approach_mm: Vec<f64>,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+struct InputMessage {
+    header: Header,
+    mono_ns: u64,
+    kind: u8,
+    data: Blob,
+}
+
+fn from_cdr<M: DeserializeOwned>(bytes: &[u8]) -> Result<M, Error> {
+    let foreign = |found: String| Error::Foreign {
+        found,
+        expected: "a message of ours",
+    };
+    let body = bytes
+        .strip_prefix(&ros::ENCAPSULATION)
+        .ok_or_else(|| foreign("bytes that are no little-endian CDR".to_owned()))?;
+    cdr_encoding::from_bytes::<M, LittleEndian>(body)
+        .map(|(message, _)| message)
+        .map_err(|error| foreign(format!("another message ({error})")))
+}
+
+fn json(value: &impl Serialize) -> Vec<u8> {
+    serde_json::to_vec(value).expect("plain structs of numbers and strings always serialise")
+}
+
+/// The message of an entry of `sensor` at `at`.
+pub(super) fn encode_entry(sensor: &str, at: Stamp, entry: &Entry) -> Vec<u8> {
+    let header = Header::new(at.wall, sensor);
+    let mono_ns = u64::try_from(at.mono.as_nanos()).unwrap_or(u64::MAX);
+    let text = |text: &str| text.as_bytes().to_vec();
+    let (kind, data) = match entry {
+        Entry::Input(Input::Bytes(bytes)) => (0, bytes.to_vec()),
+        Entry::Input(Input::Opened) => (1, Vec::new()),
+        Entry::Input(Input::Unavailable(reason)) => (2, text(reason)),
+        Entry::Input(Input::Lost(reason)) => (3, text(reason)),
+        Entry::Input(Input::Tick) => (4, Vec::new()),
+        Entry::Input(Input::Tare) => (5, Vec::new()),
+        Entry::Input(Input::Context(context)) => (6, json(context)),
+        Entry::Input(Input::Shutdown) => (7, Vec::new()),
+        Entry::Input(Input::Motion(points)) => {
+            return ros::to_cdr(&MotionMessage {
+                header,
+                mono_ns,
+                at_ns: points.iter().map(|point| point.at_ns).collect(),
+                approach_mm: points.iter().map(|point| point.mm).collect(),
+            });
+        }
+        Entry::Settings(sensor) => (8, json(sensor)),
+        Entry::State(state) => (9, json(state)),
+        Entry::Input(Input::ClockSet(until_ns)) => (10, json(until_ns)),
+    };
+    ros::to_cdr(&InputMessage {
+        header,
+        mono_ns,
+        kind,
+        data: Blob(data),
+    })
+}
+
+fn foreign(found: String) -> Error {
+    Error::Foreign {
+        found,
+        expected: "an input of this version",
+    }
+}
+
+fn stamp(header: &Header, mono_ns: u64) -> Result<Stamp, Error> {
+    let wall = header.time();
+    Ok(Stamp {
+        mono: std::time::Duration::from_nanos(mono_ns),
+        wall: wall.ok_or_else(|| foreign("a time that is none".to_owned()))?,
+    })
+}
+
+/// Reads the sensor, the moment and the positions of the arm from a message on [`MOTION`].
+pub(super) fn decode_motion(bytes: &[u8]) -> Result<(String, Stamp, Entry), Error> {
+    let message: MotionMessage = from_cdr(bytes)?;
+    let at = stamp(&message.header, message.mono_ns)?;
+    let (moments, positions) = (message.at_ns, message.approach_mm);
+    let same = moments.len() == positions.len();
+    let points = moments.into_iter().zip(positions);
+    let points: Vec<Point> = points.map(Point::from).collect();
+    if !same || !points.iter().all(Point::is_usable) {
+        return Err(foreign("positions that are none".to_owned()));
+    }
+    let motion = Input::Motion(points.into());
+    Ok((message.header.frame_id, at, Entry::Input(motion)))
+}
+
+/// Reads the sensor, the moment and the entry from a message on [`INPUT`].
+pub(super) fn decode_entry(bytes: &[u8]) -> Result<(String, Stamp, Entry), Error> {
+    let message: InputMessage = from_cdr(bytes)?;
+    let at = stamp(&message.header, message.mono_ns)?;
+    let data = message.data.0;
+    let text = |data: Vec<u8>| String::from_utf8_lossy(&data).into_owned().into();
+    let unreadable = |error: serde_json::Error| foreign(format!("other JSON ({error})"));
+    let entry = match message.kind {
+        0 => Entry::Input(Input::Bytes(data.into())),
+        1 => Entry::Input(Input::Opened),
+        2 => Entry::Input(Input::Unavailable(text(data))),
+        3 => Entry::Input(Input::Lost(text(data))),
+        4 => Entry::Input(Input::Tick),
+        5 => Entry::Input(Input::Tare),
+        6 => {
+            let context: Option<Value> = serde_json::from_slice(&data).map_err(unreadable)?;
+            Entry::Input(Input::Context(context))
+        }
+        7 => Entry::Input(Input::Shutdown),
+        8 => {
+            let sensor: RecordedSensor = serde_json::from_slice(&data).map_err(unreadable)?;
+            Entry::Settings(Box::new(sensor))
+        }
+        9 => {
+            let state: State = serde_json::from_slice(&data).map_err(unreadable)?;
+            Entry::State(Box::new(state))
+        }
+        10 => {
+            let until_ns: i64 = serde_json::from_slice(&data).map_err(unreadable)?;
+            Entry::Input(Input::ClockSet(until_ns))
+        }
+        other => return Err(foreign(format!("an input of kind {other}"))),
+    };
+    Ok((message.header.frame_id, at, entry))
+}
+
+/// The sensor's name in any message that this program writes.
+pub(super) fn sensor_of(bytes: &[u8]) -> Option<String> {
+    from_cdr::<Header>(bytes).ok().map(|header| header.frame_id)
+}

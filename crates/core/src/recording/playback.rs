@@ -1,0 +1,186 @@
+//! Turns the entries of a recording back into events.
+
+use std::sync::Arc;
+
+use super::{Entry, Found, Labels};
+use crate::event::Event;
+use crate::frame::Stamp;
+use crate::motion::Track;
+use crate::pipeline::{Clock, FixedError, Pipeline, Unjudged};
+use crate::sensor::SensorError;
+use crate::verdict::Hrn;
+
+/// The pipelines of a recording's sensors. They get the same inputs as the recorded ones.
+///
+/// # Example
+///
+/// ```
+/// use std::sync::Arc;
+///
+/// use hardnessd_core::event::Kind;
+/// use hardnessd_core::recording::{Playback, Reader};
+/// use hardnessd_core::verdict::{BUILT_IN, Hrn};
+///
+/// let mut playback = Playback::new(Arc::new(Hrn::load(BUILT_IN)?));
+/// let mut events = Vec::new();
+/// for found in Reader::new(std::fs::File::open("fixtures/earlier.mcap")?) {
+///     events.extend(playback.feed(found?)?);
+/// }
+/// events.extend(playback.end());
+/// assert!(events.iter().any(|event| event.kind() == Kind::Hardness));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Debug)]
+pub struct Playback {
+    hrn: Arc<Hrn>,
+    players: Vec<Player>,
+}
+
+#[derive(Debug)]
+struct Player {
+    pipeline: Pipeline,
+    last: Stamp,
+    labels: Labels,
+    /// The SHA-256 of the model during recording.
+    model: String,
+}
+
+/// The error of an entry that cannot be played.
+#[derive(Debug, thiserror::Error)]
+#[error("sensor {sensor:?}: {problem}")]
+pub struct PlaybackError {
+    sensor: String,
+    problem: PlaybackProblem,
+}
+
+/// The reason why an entry cannot be played.
+#[derive(Debug, thiserror::Error)]
+pub enum PlaybackProblem {
+    /// The description of the sensor is not valid.
+    #[error(transparent)]
+    Sensor(#[from] SensorError),
+    /// No pipeline can have this state.
+    #[error("memory: found what no pipeline can have come to, expected the memory of one")]
+    Memory,
+    /// The entry describes another sensor under the same name.
+    #[error(transparent)]
+    Fixed(#[from] FixedError),
+}
+
+impl Playback {
+    /// A playback without any sensor yet. The model is `hrn`.
+    pub fn new(hrn: Arc<Hrn>) -> Self {
+        Self {
+            hrn,
+            players: Vec::new(),
+        }
+    }
+
+    /// The events of one entry. An entry before its sensor's first state cannot be played and has
+    /// no events. `mono_ns` is null, because the moment belongs to another boot.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the sensor's description or state is not valid.
+    pub fn feed(&mut self, found: Found) -> Result<Vec<Event>, PlaybackError> {
+        let Found { sensor, at, entry } = found;
+        let played = self.play(&sensor, at, entry);
+        let mut events = played.map_err(|problem| PlaybackError { sensor, problem })?;
+        forget_boot(&mut events);
+        Ok(events)
+    }
+
+    fn play(
+        &mut self,
+        sensor: &str,
+        at: Stamp,
+        entry: Entry,
+    ) -> Result<Vec<Event>, PlaybackProblem> {
+        let mut players = self.players.iter_mut();
+        let known = players.find(|player| player.pipeline.sensor().name() == sensor);
+        let events = match (entry, known) {
+            (Entry::State(state), known) => {
+                if !state.memory.is_possible() {
+                    return Err(PlaybackProblem::Memory);
+                }
+                // If no entry is missing, the pipeline already has this state.
+                let described = state.sensor.check()?;
+                let mut pipeline = Pipeline::new(described, self.hrn.clone(), Clock::Arrival);
+                pipeline.recall(state.memory);
+                let player = Player {
+                    pipeline,
+                    last: at,
+                    labels: state.labels,
+                    model: state.sensor.model,
+                };
+                match known {
+                    Some(known) => *known = player,
+                    None => self.players.push(player),
+                }
+                Vec::new()
+            }
+            (Entry::Settings(described), Some(known)) => {
+                let sensor = described.check()?;
+                known.pipeline.reload(sensor, self.hrn.clone())?;
+                known.model = described.model;
+                Vec::new()
+            }
+            (Entry::Input(input), Some(known)) => {
+                known.last = at;
+                input.feed(&mut known.pipeline, at)
+            }
+            (_, None) => Vec::new(),
+        };
+        Ok(events)
+    }
+
+    /// The last events of every sensor, at the end of the recording.
+    pub fn end(&mut self) -> Vec<Event> {
+        let players = self.players.iter_mut();
+        let mut events: Vec<Event> = players
+            .flat_map(|player| player.pipeline.end_of_recording(Some(player.last)))
+            .collect();
+        forget_boot(&mut events);
+        events
+    }
+
+    /// Takes out the missing verdicts. Each is returned once.
+    pub fn unjudged(&mut self) -> Vec<Unjudged> {
+        let players = self.players.iter_mut();
+        players
+            .flat_map(|player| player.pipeline.unjudged())
+            .collect()
+    }
+
+    /// The positions of a sensor's arm, as its pipeline knows them.
+    pub fn track(&self, sensor: &str) -> Option<&Track> {
+        let mut players = self.players.iter();
+        let player = players.find(|player| player.pipeline.sensor().name() == sensor)?;
+        Some(player.pipeline.track())
+    }
+
+    /// The number of sensors so far.
+    pub fn sensors(&self) -> usize {
+        self.players.len()
+    }
+
+    /// The labels of the recording, from the part played so far.
+    pub fn labels(&self) -> Labels {
+        let players = self.players.first();
+        players.map_or_else(Labels::new, |player| player.labels.clone())
+    }
+
+    /// The SHA-256 of a model during recording, if it differs from the current model.
+    pub fn other_model(&self) -> Option<&str> {
+        let models = self.players.iter().map(|player| player.model.as_str());
+        models.into_iter().find(|model| *model != self.hrn.sha256())
+    }
+}
+
+fn forget_boot(events: &mut [Event]) {
+    for event in events {
+        if let Event::Hardness(verdict) = event {
+            verdict.mono_ns = None;
+        }
+    }
+}

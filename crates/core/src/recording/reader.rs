@@ -1,0 +1,284 @@
+//! Reads the bytes of an MCAP file back as entries.
+
+use std::collections::BTreeMap;
+use std::io::{ErrorKind, Read};
+
+use mcap::MAGIC;
+use mcap::records::{ChunkHeader, Record, op};
+use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+
+use super::message::{self, INPUT, MOTION};
+use super::{Entry, Error};
+use crate::frame::Stamp;
+use crate::ros::Topic;
+
+/// An entry of a sensor, and its moment.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Found {
+    /// The sensor's name.
+    pub sensor: String,
+    /// The moment of the entry.
+    pub at: Stamp,
+    /// The entry.
+    pub entry: Entry,
+}
+
+impl Found {
+    /// The message that a recording has of the entry, with its channel.
+    pub fn message(&self) -> (Topic, Vec<u8>) {
+        let bytes = message::encode_entry(&self.sensor, self.at, &self.entry);
+        (message::topic_of(&self.entry), bytes)
+    }
+}
+
+/// The longest record that is read, and the longest chunk once it is unpacked. A chunk of ours ends
+/// with the first message after 1 MiB. The longest message is a state in the middle of a long press
+/// that loads every taxel. It has less than 6 MiB.
+pub(super) const LONGEST_RECORD_BYTES: usize = 8 << 20;
+
+/// The bytes of a chunk's record before its data, without the name of the compression: two times, the
+/// unpacked length, the checksum, the name's length, and the data's length.
+const CHUNK_HEADER_BYTES: u64 = 8 + 8 + 8 + 4 + 4 + 8;
+
+/// The chunks of a file so far.
+#[derive(Debug, Default)]
+pub(super) struct Chunks {
+    /// Their unpacked length.
+    unpacked: u64,
+}
+
+impl Chunks {
+    /// The schemas, channels and messages of a chunk, whose record has the bytes `body`. The file had
+    /// `read` bytes up to its end. The unpacked length is checked before the chunk is unpacked, and
+    /// the checksum before any record is used. The chunk is read apart from the file and without
+    /// what may follow its data, because the crate reads past the data of a chunk without compression.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the chunk is damaged, too long, or makes the file unpack to more than
+    /// [`most_unpacked`].
+    pub(super) fn records(
+        &mut self,
+        header: &ChunkHeader,
+        body: &[u8],
+        read: u64,
+    ) -> Result<Vec<Record<'static>>, Error> {
+        let length = header.uncompressed_size;
+        if length > LONGEST_RECORD_BYTES as u64 {
+            return Err(mcap::McapError::ChunkTooLarge(length).into());
+        }
+        if self.unpacked + length > most_unpacked(read) {
+            let problem = "the recording unpacks to more than 256 times its bytes";
+            return Err(Error::Damaged(problem.to_owned()));
+        }
+        self.unpacked += length;
+        let options = LinearReaderOptions::default()
+            .with_skip_start_magic(true)
+            .with_skip_end_magic(true)
+            .with_prevalidate_chunk_crcs(true)
+            .with_record_length_limit(LONGEST_RECORD_BYTES);
+        let mut reader = LinearReader::new_with_options(options);
+        let data_at = CHUNK_HEADER_BYTES + header.compression.len() as u64;
+        let end = usize::try_from(data_at.saturating_add(header.compressed_size)).ok();
+        let Some(body) = end.and_then(|end| body.get(..end)) else {
+            return Err(mcap::McapError::UnexpectedEoc.into());
+        };
+        let head = [&[op::CHUNK], &(body.len() as u64).to_le_bytes()[..]].concat();
+        let mut chunk = head.as_slice().chain(body);
+        let mut records = Vec::new();
+        while let Some(event) = reader.next_event() {
+            match event? {
+                LinearReadEvent::ReadRequest(wanted) => {
+                    let read = chunk.read(reader.insert(wanted))?;
+                    reader.notify_read(read);
+                }
+                LinearReadEvent::Record { opcode, data } => {
+                    let record = parse(opcode, data)?;
+                    // Records that are not used take no memory.
+                    if let Record::Schema { .. } | Record::Channel(_) | Record::Message { .. } =
+                        record
+                    {
+                        records.push(record.into_owned());
+                    }
+                }
+            }
+        }
+        Ok(records)
+    }
+}
+
+/// The number of unpacked bytes that a file of `bytes` bytes may hold. The recording of a silent sensor
+/// holds 55 times its bytes, its densest chunk 185 times. A file that claims more would cost much time
+/// for few bytes: zstd packs zeros to a ten-thousandth.
+pub(super) fn most_unpacked(bytes: u64) -> u64 {
+    (64 << 20) + 256 * bytes
+}
+
+/// Parses a record. The crate panics on an attachment whose lengths do not fit, so they are checked
+/// first.
+pub(super) fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, mcap::McapError> {
+    if opcode == op::ATTACHMENT && attachment_bytes(body) != Some(body.len() as u64) {
+        return Err(mcap::McapError::UnexpectedEof);
+    }
+    mcap::parse_record(opcode, body)
+}
+
+/// The length that an attachment's record must have by its own lengths: two times, a name, a media
+/// type, the data and a checksum.
+fn attachment_bytes(body: &[u8]) -> Option<u64> {
+    let text = |at: u64| {
+        let bytes = body.get(usize::try_from(at).ok()?..)?.first_chunk()?;
+        Some(at + 4 + u64::from(u32::from_le_bytes(*bytes)))
+    };
+    let data_at = text(text(16)?)?;
+    let bytes = body.get(usize::try_from(data_at).ok()?..)?.first_chunk()?;
+    u64::from_le_bytes(*bytes).checked_add(data_at + 8 + 4)
+}
+
+/// The decoder of the messages of a schema, if they are read.
+pub(super) fn decoder(schema: &str) -> Option<Decode> {
+    match schema {
+        _ if schema == INPUT.schema => Some(message::decode_entry),
+        _ if schema == MOTION.schema => Some(message::decode_motion),
+        _ => None,
+    }
+}
+
+/// A function that reads a message.
+pub(super) type Decode = fn(&[u8]) -> Result<(String, Stamp, Entry), Error>;
+
+/// Reads a recording from its beginning. It yields the entries in order, and ends after the first
+/// error.
+///
+/// # Example
+///
+/// [`Writer`](super::Writer) has an example with a recording. This example reads bytes that are not
+/// a recording:
+///
+/// ```
+/// use hardnessd_core::recording::Reader;
+///
+/// let mut reader = Reader::new(&b"no recording"[..]);
+/// let error = reader.next().unwrap().unwrap_err();
+/// assert_eq!(error.to_string(), "found no MCAP file, expected a recording");
+/// assert!(reader.next().is_none());
+/// ```
+pub struct Reader<R> {
+    source: R,
+    linear: LinearReader,
+    /// The decoders of the messages that are read, by schema number. `channels` has them by channel
+    /// number.
+    schemas: BTreeMap<u16, Decode>,
+    channels: BTreeMap<u16, Decode>,
+    bytes: u64,
+    chunks: Chunks,
+    /// The records of the current chunk that are still to come.
+    pending: std::vec::IntoIter<Record<'static>>,
+    /// Whether the summary, an error or the end was reached.
+    done: bool,
+}
+
+impl<R: Read> Reader<R> {
+    /// A reader of `source`.
+    pub fn new(source: R) -> Self {
+        let options = LinearReaderOptions::default()
+            .with_emit_chunks(true)
+            .with_record_length_limit(LONGEST_RECORD_BYTES);
+        Self {
+            source,
+            linear: LinearReader::new_with_options(options),
+            schemas: BTreeMap::new(),
+            channels: BTreeMap::new(),
+            bytes: 0,
+            chunks: Chunks::default(),
+            pending: Vec::new().into_iter(),
+            done: false,
+        }
+    }
+
+    fn read(&mut self) -> Result<Option<Found>, Error> {
+        loop {
+            if let Some(record) = self.pending.next() {
+                if let Some(found) = self.take(record)? {
+                    return Ok(Some(found));
+                }
+                continue;
+            }
+            let Some(event) = self.linear.next_event() else {
+                return Ok(None);
+            };
+            let record = match event? {
+                LinearReadEvent::ReadRequest(wanted) => {
+                    let read = loop {
+                        match self.source.read(self.linear.insert(wanted)) {
+                            Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                            read => break read?,
+                        }
+                    };
+                    self.bytes += read as u64;
+                    if read == 0 && self.bytes < MAGIC.len() as u64 {
+                        // Such a short file holds nothing that could be saved.
+                        return Err(Error::Foreign {
+                            found: format!("{} bytes", self.bytes),
+                            expected: "a recording",
+                        });
+                    }
+                    self.linear.notify_read(read);
+                    continue;
+                }
+                LinearReadEvent::Record { opcode, .. } if opcode == op::DATA_END => {
+                    // The summary only repeats what was read.
+                    return Ok(None);
+                }
+                LinearReadEvent::Record { opcode, data } => match parse(opcode, data)? {
+                    Record::Chunk { header, .. } => {
+                        let records = self.chunks.records(&header, data, self.bytes)?;
+                        self.pending = records.into_iter();
+                        continue;
+                    }
+                    record => record.into_owned(),
+                },
+            };
+            if let Some(found) = self.take(record)? {
+                return Ok(Some(found));
+            }
+        }
+    }
+
+    /// Learns from a schema or a channel. Returns the entry of a message that is read.
+    fn take(&mut self, record: Record<'static>) -> Result<Option<Found>, Error> {
+        match record {
+            Record::Schema { header, .. } => {
+                if let Some(decode) = decoder(&header.name) {
+                    self.schemas.insert(header.id, decode);
+                }
+            }
+            Record::Channel(channel) => {
+                if let Some(&decode) = self.schemas.get(&channel.schema_id) {
+                    self.channels.insert(channel.id, decode);
+                }
+            }
+            Record::Message { header, data } => {
+                if let Some(decode) = self.channels.get(&header.channel_id) {
+                    let (sensor, at, entry) = decode(&data)?;
+                    return Ok(Some(Found { sensor, at, entry }));
+                }
+            }
+            _ => {}
+        }
+        Ok(None)
+    }
+}
+
+impl<R: Read> Iterator for Reader<R> {
+    type Item = Result<Found, Error>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.done {
+            return None;
+        }
+        let found = self.read().transpose();
+        self.done = !matches!(found, Some(Ok(_)));
+        found
+    }
+}

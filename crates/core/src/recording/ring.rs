@@ -1,0 +1,145 @@
+//! The last minute of one sensor, to look at a fault after it happened.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use super::Entry;
+use crate::frame::Stamp;
+
+/// The time for which entries are kept.
+const KEPT: Duration = Duration::from_secs(60);
+/// The most bytes that are kept, even if they cover less time. So neither a device that floods its
+/// line nor a controller that floods the control socket can fill the memory. The JX255N sends 5 MB
+/// a minute at 100 frames/s.
+const KEPT_BYTES: usize = 32 << 20;
+
+/// Entries of one sensor, in stretches that each begin with a state.
+///
+/// # Example
+///
+/// A ring keeps entries from the first state on.
+///
+/// ```
+/// use std::sync::Arc;
+/// use std::time::Duration;
+///
+/// use hardnessd_core::frame::Stamp;
+/// use hardnessd_core::pipeline::{Clock, Pipeline};
+/// use hardnessd_core::recording::{Entry, Input, Labels, Ring, State};
+/// use hardnessd_core::sensor::{Description, Sensor};
+/// use hardnessd_core::verdict::{BUILT_IN, Hrn};
+///
+/// let sensor = Sensor::new(Description::default())?;
+/// let pipeline = Pipeline::new(sensor, Arc::new(Hrn::load(BUILT_IN)?), Clock::Arrival);
+/// let at = Stamp {
+///     mono: Duration::from_secs(1),
+///     wall: jiff::Timestamp::UNIX_EPOCH,
+/// };
+/// let mut ring = Ring::default();
+/// ring.push(at, Entry::Input(Input::Opened));
+/// ring.push(at, Entry::State(Box::new(State::of(&pipeline, Labels::new()))));
+/// ring.push(at, Entry::Input(Input::Tick));
+/// assert_eq!(ring.all().count(), 2);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Debug, Default)]
+pub struct Ring {
+    stretches: VecDeque<Stretch>,
+}
+
+#[derive(Debug)]
+struct Stretch {
+    entries: Vec<(Stamp, Entry)>,
+    bytes: usize,
+}
+
+impl Ring {
+    /// Adds an entry, and drops the stretches that a minute does not need. Nothing is kept before
+    /// the first state.
+    pub fn push(&mut self, at: Stamp, entry: Entry) {
+        if matches!(entry, Entry::State(_)) {
+            self.stretches.push_back(Stretch {
+                entries: Vec::new(),
+                bytes: 0,
+            });
+        }
+        let Some(stretch) = self.stretches.back_mut() else {
+            return;
+        };
+        stretch.bytes += entry.weight();
+        stretch.entries.push((at, entry));
+        while self.is_longer_than_needed(at) {
+            self.stretches.pop_front();
+        }
+    }
+
+    fn is_longer_than_needed(&self, now: Stamp) -> bool {
+        let bytes: usize = self.stretches.iter().map(|stretch| stretch.bytes).sum();
+        let second = self.stretches.get(1);
+        second.is_some_and(|second| {
+            let (begin, _) = second.entries[0];
+            bytes > KEPT_BYTES || now.mono.saturating_sub(begin.mono) >= KEPT
+        })
+    }
+
+    /// Everything that is kept: a minute, and up to one more stretch. It begins with a state.
+    pub fn all(&self) -> impl Iterator<Item = &(Stamp, Entry)> {
+        self.stretches.iter().flat_map(|stretch| &stretch.entries)
+    }
+
+    /// The entries from the last state on.
+    pub fn latest(&self) -> impl Iterator<Item = &(Stamp, Entry)> {
+        self.stretches.back().into_iter().flat_map(|s| &s.entries)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pipeline::{Clock, Pipeline};
+    use crate::recording::{Input, Labels, State};
+    use crate::test_support;
+
+    fn at(seconds: u64) -> Stamp {
+        Stamp {
+            mono: Duration::from_secs(seconds),
+            wall: jiff::Timestamp::UNIX_EPOCH,
+        }
+    }
+
+    fn state() -> Entry {
+        let pipeline = Pipeline::new(test_support::sensor(), test_support::hrn(), Clock::Arrival);
+        Entry::State(Box::new(State::of(&pipeline, Labels::new())))
+    }
+
+    #[test]
+    fn a_minute_is_kept_and_begins_with_a_state() {
+        let mut ring = Ring::default();
+        let state = state();
+        ring.push(at(0), Entry::Input(Input::Tick));
+        assert_eq!(ring.all().count(), 0);
+        for second in 0..200 {
+            if second % 10 == 0 {
+                ring.push(at(second), state.clone());
+            }
+            ring.push(at(second), Entry::Input(Input::Tick));
+        }
+        let first = ring.all().next().unwrap();
+        assert!(matches!(first.1, Entry::State(_)));
+        assert_eq!(first.0, at(130));
+        assert_eq!(ring.latest().count(), 11);
+    }
+
+    #[test]
+    fn a_flood_is_kept_for_as_long_as_there_is_room() {
+        let mut ring = Ring::default();
+        let state = state();
+        let flood = Entry::Input(Input::Bytes(vec![0; 1 << 20].into()));
+        for second in 0..50 {
+            ring.push(at(second), state.clone());
+            ring.push(at(second), flood.clone());
+        }
+        let kept = ring.all().count() / 2;
+        assert!((30..=32).contains(&kept), "{kept}");
+    }
+}

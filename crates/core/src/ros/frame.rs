@@ -1,0 +1,194 @@
+//! The messages made from one frame.
+//!
+//! In: a frame event. Out: the frame as an image, as a grid that has a size in space, and as two
+//! numbers for plots.
+
+use jiff::Timestamp;
+use serde::Serialize;
+
+use super::{Blob, Header, Time, Topic, to_cdr};
+use crate::event::FrameEvent;
+use crate::frame::{COLS, ROWS};
+
+/// The frame as an image, in newtons.
+pub const FRAME: Topic = Topic {
+    name: "frame",
+    schema: "sensor_msgs/msg/Image",
+    definition: "\
+std_msgs/Header header
+uint32 height
+uint32 width
+string encoding
+uint8 is_bigendian
+uint32 step
+uint8[] data
+",
+};
+
+/// Force and contact area of the frame.
+pub const CONTACT: Topic = Topic {
+    name: "contact",
+    schema: "tactile_interfaces/msg/Contact",
+    definition: include_str!("../../../../clients/ros2/tactile_interfaces/msg/Contact.msg"),
+};
+
+/// The frame as a grid in space, for the 3D views of Foxglove and Lichtblick.
+pub const GRID: Topic = Topic {
+    name: "grid",
+    schema: "foxglove_msgs/msg/Grid",
+    definition: "\
+builtin_interfaces/Time timestamp
+string frame_id
+geometry_msgs/Pose pose
+uint32 column_count
+foxglove_msgs/Vector2 cell_size
+uint32 row_stride
+uint32 cell_stride
+foxglove_msgs/PackedElementField[] fields
+uint8[] data
+================================================================================
+MSG: geometry_msgs/Pose
+geometry_msgs/Point position
+geometry_msgs/Quaternion orientation
+================================================================================
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+================================================================================
+MSG: foxglove_msgs/Vector2
+float64 x
+float64 y
+================================================================================
+MSG: foxglove_msgs/PackedElementField
+string name
+uint32 offset
+uint8 type
+",
+};
+
+#[derive(Debug, Serialize)]
+pub(super) struct ImageMessage {
+    pub(super) header: Header,
+    pub(super) height: u32,
+    pub(super) width: u32,
+    pub(super) encoding: &'static str,
+    pub(super) is_bigendian: u8,
+    pub(super) step: u32,
+    pub(super) data: Blob,
+}
+
+#[derive(Debug, Serialize)]
+struct ContactMessage {
+    header: Header,
+    frame: u64,
+    force_n: f64,
+    contact_area_taxels: u32,
+    approach_mm: f64,
+    tared: bool,
+}
+
+#[derive(Debug, Serialize)]
+struct GridMessage<'a> {
+    timestamp: Time,
+    frame_id: &'a str,
+    pose: Pose,
+    column_count: u32,
+    cell_size: Vector2,
+    row_stride: u32,
+    cell_stride: u32,
+    fields: Vec<Field>,
+    data: Blob,
+}
+
+#[derive(Debug, Serialize)]
+struct Pose {
+    /// x, y, z.
+    position: [f64; 3],
+    /// x, y, z, w.
+    orientation: [f64; 4],
+}
+
+#[derive(Debug, Serialize)]
+struct Vector2 {
+    x: f64,
+    y: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct Field {
+    name: &'static str,
+    offset: u32,
+    kind: u8,
+}
+
+/// `PackedElementField`'s number for an f32.
+const FLOAT32: u8 = 7;
+
+/// Bytes of a taxel in newtons.
+const NEWTONS_BYTES: u32 = size_of::<f32>() as u32;
+
+/// The frame in newtons (`32FC1`), row 0 at the top.
+pub(super) fn image(frame: &FrameEvent) -> (Topic, Timestamp, Vec<u8>) {
+    let bytes = frame.newtons.iter().flat_map(|n| n.to_le_bytes()).collect();
+    let message = ImageMessage {
+        header: Header::new(frame.time, &frame.sensor),
+        height: ROWS as u32,
+        width: COLS as u32,
+        encoding: "32FC1",
+        is_bigendian: 0,
+        step: COLS as u32 * NEWTONS_BYTES,
+        data: Blob(bytes),
+    };
+    (FRAME, frame.time, to_cdr(&message))
+}
+
+/// The total force and the contact area of the frame.
+pub fn contact(frame: &FrameEvent) -> (Topic, Timestamp, Vec<u8>) {
+    let message = ContactMessage {
+        header: Header::new(frame.time, &frame.sensor),
+        frame: frame.frame,
+        force_n: frame.newtons.iter().copied().map(f64::from).sum(),
+        contact_area_taxels: frame.contact_area_taxels,
+        approach_mm: frame.approach_mm.unwrap_or(f64::NAN),
+        tared: frame.tared,
+    };
+    (CONTACT, frame.time, to_cdr(&message))
+}
+
+/// The frame as a grid in metres around the sensor's middle. Its y axis points up, so the frame's
+/// last row comes first.
+pub(super) fn grid(frame: &FrameEvent, pitch_mm: f64) -> (Topic, Timestamp, Vec<u8>) {
+    let pitch_m = pitch_mm / 1e3;
+    let rows = frame.newtons.chunks(COLS).rev();
+    let bytes = rows.flatten().flat_map(|n| n.to_le_bytes()).collect();
+    let corner = |taxels: usize| -0.5 * taxels as f64 * pitch_m;
+    let message = GridMessage {
+        timestamp: Time::new(frame.time),
+        frame_id: &frame.sensor,
+        pose: Pose {
+            position: [corner(COLS), corner(ROWS), 0.0],
+            orientation: [0.0, 0.0, 0.0, 1.0],
+        },
+        column_count: COLS as u32,
+        cell_size: Vector2 {
+            x: pitch_m,
+            y: pitch_m,
+        },
+        row_stride: COLS as u32 * NEWTONS_BYTES,
+        cell_stride: NEWTONS_BYTES,
+        fields: vec![Field {
+            name: "newtons",
+            offset: 0,
+            kind: FLOAT32,
+        }],
+        data: Blob(bytes),
+    };
+    (GRID, frame.time, to_cdr(&message))
+}

@@ -1,0 +1,400 @@
+//! The description of a sensor: how it writes frames, how counts become newtons, when a press
+//! begins and ends, and when a verdict is rejected.
+//!
+//! In: a [`Description`] from a configuration or a recording. Out: a [`Sensor`]. Every value of a
+//! [`Sensor`] is in its range, and the values fit each other, so no other module checks them again.
+
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use crate::wire::{self, Layout};
+use crate::{motion, press, tare};
+
+/// The description of a sensor. Its values are unchecked.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Description {
+    /// The sensor's name: `[a-z][a-z0-9_]*`.
+    pub name: String,
+    /// The number of frames that the sensor is expected to send in a second.
+    pub frame_rate_hz: f64,
+    /// The silence after which a live sensor is stale. `None` means the larger of 2.5 periods and
+    /// 50 ms.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stale_after_ms: Option<f64>,
+    /// How the sensor writes a frame.
+    pub frame: wire::Settings,
+    /// How counts become newtons.
+    pub calibration: tare::Settings,
+    /// The thresholds that begin and end a press.
+    pub press: press::Settings,
+    /// The arm that presses with this sensor.
+    #[serde(default)]
+    pub arm: motion::Settings,
+    /// A verdict below this confidence is rejected.
+    pub min_confidence: f32,
+    /// A verdict on a frame with less total force is rejected.
+    pub min_force_n: f64,
+    /// A model of the course gives an early verdict when its confidence reaches this value.
+    #[serde(default = "early_confidence")]
+    pub early_confidence: f32,
+}
+
+fn early_confidence() -> f32 {
+    Description::default().early_confidence
+}
+
+impl Default for Description {
+    /// A JX255N (paper, "Tactile sensor") named `sensor`; nothing is rejected.
+    fn default() -> Self {
+        Self {
+            name: "sensor".to_owned(),
+            frame_rate_hz: DEFAULT_FRAME_RATE_HZ,
+            stale_after_ms: None,
+            frame: wire::Settings::default(),
+            calibration: tare::Settings::default(),
+            press: press::Settings::default(),
+            arm: motion::Settings::default(),
+            min_confidence: 0.0,
+            min_force_n: 0.0,
+            early_confidence: 0.95,
+        }
+    }
+}
+
+impl Description {
+    /// The first key that differs and that a running pipeline cannot change.
+    pub fn fixed_difference(&self, other: &Self) -> Option<&'static str> {
+        let differs = [
+            ("name", self.name != other.name),
+            ("frame_rate_hz", self.frame_rate_hz != other.frame_rate_hz),
+            ("frame", self.frame != other.frame),
+        ];
+        let first = differs.iter().find(|(_, differs)| *differs);
+        first.map(|(key, _)| *key)
+    }
+
+    /// The description as a recording holds it. The stale time is always written, so a later
+    /// default does not change what a recording says.
+    pub fn for_recording(&self, stale_after: Duration) -> Self {
+        Self {
+            stale_after_ms: Some(stale_after.as_nanos() as f64 / 1e6),
+            ..self.clone()
+        }
+    }
+
+    /// The description that a recording means. Old recordings do not hold the stale time. It was
+    /// 2.5 periods then.
+    pub fn of_recording(&self) -> Self {
+        let late = || {
+            (FRAME_RATES_HZ.0..=FRAME_RATES_HZ.1)
+                .contains(&self.frame_rate_hz)
+                .then(|| late(self.frame_rate_hz))
+        };
+        match self.stale_after_ms {
+            Some(_) => self.clone(),
+            None => late().map_or_else(|| self.clone(), |late| self.for_recording(late)),
+        }
+    }
+}
+
+/// An unusable value of a [`Description`]. The message begins with the value's key.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum SensorError {
+    /// The name cannot be part of a topic, a file name or a log line.
+    #[error("name: found {0:?}, expected a letter a to z, then letters a to z, digits or _")]
+    Name(String),
+    /// The name is too long for a topic, a file name or a log line.
+    #[error("name: found {found} characters, expected at most {MOST_NAME_CHARS}")]
+    LongName {
+        /// The length of the name in characters.
+        found: usize,
+    },
+    /// The frame rate is outside [`FRAME_RATES_HZ`].
+    #[error(
+        "frame_rate_hz: found {0:?}, expected {least} to {most} frames a second",
+        least = FRAME_RATES_HZ.0,
+        most = FRAME_RATES_HZ.1
+    )]
+    FrameRate(f64),
+    /// The stale time is too short for any sensor, or too long for any user.
+    #[error(
+        "stale_after_ms: found {0:?}, expected {least} to {most} milliseconds",
+        least = STALE_AFTER_MS.0,
+        most = STALE_AFTER_MS.1
+    )]
+    StaleAfter(f64),
+    /// The layout of a frame is unusable.
+    #[error("frame.{0}")]
+    Frame(#[from] wire::LayoutError),
+    /// The calibration is unusable.
+    #[error("calibration.{0}")]
+    Calibration(#[from] tare::SettingsError),
+    /// The settings of presses are unusable.
+    #[error("press.{0}")]
+    Press(#[from] press::SettingsError),
+    /// The settings of the arm are unusable.
+    #[error("arm.{0}")]
+    Arm(#[from] motion::SettingsError),
+    /// The least confidence is not within 0 to 1.
+    #[error("min_confidence: found {0:?}, expected 0 to 1")]
+    MinConfidence(f32),
+    /// The least force is negative or not finite.
+    #[error("min_force_n: found {0:?}, expected newtons, 0 or more")]
+    MinForce(f64),
+    /// The confidence of early verdicts is not within 0 to 1.
+    #[error("early_confidence: found {0:?}, expected 0 to 1")]
+    EarlyConfidence(f32),
+}
+
+/// The frame rate of the paper's sensor.
+pub const DEFAULT_FRAME_RATE_HZ: f64 = 5.0;
+
+/// The accepted frame rates: a wider range than that of any sensor, but every period is still a
+/// sane time to wait.
+pub const FRAME_RATES_HZ: (f64, f64) = (0.01, 10_000.0);
+
+/// The accepted stale times: from a period of the highest rate to an hour. Nobody waits longer for
+/// a frame.
+const STALE_AFTER_MS: (f64, f64) = (0.1, 3_600_000.0);
+
+/// The longest name. A name is part of topics, of file names and of each line of the log.
+const MOST_NAME_CHARS: usize = 64;
+
+/// A frame is late after this many periods.
+pub const LATE_PERIODS: f64 = 2.5;
+
+/// The least stale time by default. USB adapters deliver every 16 ms, and a busy host reads some
+/// milliseconds later. With 2.5 periods, a sensor at 100 frames/s would often become stale and live
+/// again.
+const LEAST_STALE_AFTER: Duration = Duration::from_millis(50);
+
+/// A sensor whose description has been checked.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sensor {
+    description: Description,
+    layout: Layout,
+    stale_after: Duration,
+}
+
+impl Sensor {
+    /// Checks a description.
+    ///
+    /// # Errors
+    ///
+    /// Returns a [`SensorError`] for the first value that is out of its range or does not fit the
+    /// layout.
+    ///
+    /// # Example
+    ///
+    /// ```
+    /// use hardnessd_core::sensor::{Description, Sensor};
+    ///
+    /// let described = |frame_rate_hz| Description {
+    ///     name: "forearm".to_owned(),
+    ///     frame_rate_hz,
+    ///     ..Description::default()
+    /// };
+    /// let sensor = Sensor::new(described(100.0))?;
+    /// assert_eq!(sensor.period().as_millis(), 10);
+    /// assert_eq!(sensor.stale_after().as_millis(), 50);
+    ///
+    /// let error = Sensor::new(described(0.0)).unwrap_err();
+    /// assert!(error.to_string().starts_with("frame_rate_hz: found 0.0, expected"));
+    /// # Ok::<(), hardnessd_core::sensor::SensorError>(())
+    /// ```
+    pub fn new(description: Description) -> Result<Self, SensorError> {
+        let Description {
+            name,
+            frame_rate_hz,
+            stale_after_ms,
+            frame,
+            calibration,
+            press,
+            arm,
+            min_confidence,
+            min_force_n,
+            early_confidence,
+        } = &description;
+        let part = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
+        let found = name.chars().count();
+        if found > MOST_NAME_CHARS {
+            return Err(SensorError::LongName { found });
+        }
+        if !(name.starts_with(|first: char| first.is_ascii_lowercase()) && name.chars().all(part)) {
+            return Err(SensorError::Name(name.clone()));
+        }
+        if !(FRAME_RATES_HZ.0..=FRAME_RATES_HZ.1).contains(frame_rate_hz) {
+            return Err(SensorError::FrameRate(*frame_rate_hz));
+        }
+        let stale_after = match *stale_after_ms {
+            None => LEAST_STALE_AFTER.max(late(*frame_rate_hz)),
+            Some(ms) if (STALE_AFTER_MS.0..=STALE_AFTER_MS.1).contains(&ms) => of_ms(ms),
+            Some(ms) => return Err(SensorError::StaleAfter(ms)),
+        };
+        let layout = Layout::new(frame)?;
+        calibration.check(layout.array())?;
+        press.check()?;
+        arm.check()?;
+        if !(0.0..=1.0).contains(min_confidence) {
+            return Err(SensorError::MinConfidence(*min_confidence));
+        }
+        if !(min_force_n.is_finite() && *min_force_n >= 0.0) {
+            return Err(SensorError::MinForce(*min_force_n));
+        }
+        if !(0.0..=1.0).contains(early_confidence) {
+            return Err(SensorError::EarlyConfidence(*early_confidence));
+        }
+        Ok(Self {
+            layout,
+            stale_after,
+            description,
+        })
+    }
+
+    /// The checked description of the sensor.
+    pub fn description(&self) -> &Description {
+        &self.description
+    }
+
+    /// The sensor's name.
+    pub fn name(&self) -> &str {
+        &self.description.name
+    }
+
+    /// How the sensor writes a frame.
+    pub fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// The expected time from frame to frame.
+    pub fn period(&self) -> Duration {
+        period(self.description.frame_rate_hz)
+    }
+
+    /// The time after which a missing frame is late: 2.5 periods.
+    pub fn late_after(&self) -> Duration {
+        late(self.description.frame_rate_hz)
+    }
+
+    /// How long a live sensor may be silent before it is stale.
+    pub fn stale_after(&self) -> Duration {
+        self.stale_after
+    }
+}
+
+fn period(frame_rate_hz: f64) -> Duration {
+    Duration::from_secs_f64(1.0 / frame_rate_hz)
+}
+
+fn late(frame_rate_hz: f64) -> Duration {
+    period(frame_rate_hz).mul_f64(LATE_PERIODS)
+}
+
+fn of_ms(ms: f64) -> Duration {
+    Duration::from_nanos((ms * 1e6).round() as u64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::motion::Settings as Arm;
+
+    #[test]
+    fn a_value_that_no_sensor_has_is_refused_with_its_key() {
+        let check = |change: &dyn Fn(&mut Description), expected: &str| {
+            let mut described = Description::default();
+            change(&mut described);
+            let error = Sensor::new(described).unwrap_err().to_string();
+            assert!(error.starts_with(expected), "{error}");
+        };
+        check(
+            &|d| d.name = "Arm".to_owned(),
+            "name: found \"Arm\", expected a letter a to z, then",
+        );
+        check(
+            &|d| d.name = "\u{202e}".to_owned(),
+            "name: found \"\\u{202e}\"",
+        );
+        check(&|d| d.name.clear(), "name: found \"\"");
+        let long = "name: found 300 characters, expected at most 64";
+        check(&|d| d.name = "a".repeat(300), long);
+        for hz in [0.0, -5.0, 0.009, 10_001.0, f64::NAN, f64::INFINITY] {
+            check(&|d| d.frame_rate_hz = hz, "frame_rate_hz: found");
+        }
+        for ms in [0.0, -1.0, 3.7e6, f64::NAN] {
+            check(&|d| d.stale_after_ms = Some(ms), "stale_after_ms: found");
+        }
+        check(&|d| d.frame.rows = Some(29), "frame.rows: found 29");
+        let dead = "calibration.dead_taxels: found [5, 0]";
+        check(
+            &|d| {
+                d.frame.rows = Some(5);
+                d.calibration.dead_taxels = vec![[5, 0]];
+            },
+            dead,
+        );
+        check(
+            &|d| d.calibration.exponent = 5.0,
+            "calibration.exponent: found 5.0, expected 0.25 to 4",
+        );
+        check(&|d| d.press.end_frames = 0, "press.end_frames: found 0");
+        for (change, found) in [
+            (
+                Arm {
+                    stiffness_n_per_mm: Some(0.0),
+                    ..Arm::default()
+                },
+                "stiffness_n_per_mm: found 0.0",
+            ),
+            (
+                Arm {
+                    speed_mm_s: Some(-5.0),
+                    ..Arm::default()
+                },
+                "speed_mm_s: found -5.0",
+            ),
+            (
+                Arm {
+                    delay_ms: f64::NAN,
+                    ..Arm::default()
+                },
+                "delay_ms: found NaN",
+            ),
+        ] {
+            check(
+                &|d| d.arm = change.clone(),
+                &format!("arm.{found}, expected"),
+            );
+        }
+        check(&|d| d.early_confidence = 1.1, "early_confidence: found 1.1");
+        check(&|d| d.min_confidence = 1.5, "min_confidence: found 1.5");
+        check(&|d| d.min_force_n = f64::NAN, "min_force_n: found NaN");
+    }
+
+    #[test]
+    fn a_recording_holds_how_long_a_silence_is_stale_and_an_old_one_means_2_5_periods() {
+        for (hz, ms) in [(5.0, None), (100.0, None), (3.0, None), (100.0, Some(33.3))] {
+            let described = Description {
+                frame_rate_hz: hz,
+                stale_after_ms: ms,
+                ..Description::default()
+            };
+            let sensor = Sensor::new(described).unwrap();
+            let recorded = sensor.description().for_recording(sensor.stale_after());
+            let played = Sensor::new(recorded.of_recording()).unwrap();
+            assert_eq!(
+                played.stale_after(),
+                sensor.stale_after(),
+                "{hz} Hz, {ms:?}"
+            );
+            let old = Description {
+                stale_after_ms: None,
+                ..recorded
+            };
+            let played = Sensor::new(old.of_recording()).unwrap();
+            assert_eq!(played.stale_after(), sensor.late_after());
+        }
+    }
+}

@@ -1,0 +1,490 @@
+//! Tare: the unloaded baseline, and its subtraction.
+//!
+//! In: [`RawFrame`]s in counts. Out: [`Frame`]s in newtons, with dead taxels replaced, and the
+//! outcome of a tare. A tare under load would zero a press away, so no baseline is taken while
+//! something touches the sensor. The first tare is tried again. A tare on request is given up.
+
+mod settings;
+
+use serde::{Deserialize, Serialize};
+
+use self::settings::MOST_TARE_FRAMES;
+pub use self::settings::{
+    EXPONENTS, GAINS, Gains, NEWTONS_PER_COUNT, PITCH_MM, Settings, SettingsError,
+};
+use crate::frame::{Array, COLS, Frame, ROWS, RawFrame, TAXELS, taxels};
+
+/// The thresholds at which frames of a tare count as touched.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Contact {
+    /// A taxel is touched if it varies by this much.
+    pub threshold_n: f32,
+    /// The sensor is touched if this many taxels are.
+    pub area_taxels: u32,
+}
+
+/// The largest force by which [`Tare::follow`] moves a taxel's baseline in one step. One step a
+/// second is 1 N in an hour. Film arrays drift by half as much. A touch that is too light for a
+/// press, below 0.07 N on a taxel, takes four minutes to disappear.
+pub const MOST_STEP_N: f32 = 1.0 / 3600.0;
+
+/// The effect of a frame on the tare.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Progress {
+    /// No tare is under way.
+    Ready,
+    /// The frame is averaged into the tare under way.
+    Taking,
+    /// The frame was the last of the tare. The new baseline holds from the next frame on.
+    Taken,
+    /// Something touches the sensor, and the frames of the tare were discarded. A first tare begins
+    /// again. A tare on request has ended.
+    Contact,
+}
+
+/// A summary of a baseline over the array's live taxels.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Offsets {
+    /// The mean over the taxels.
+    pub mean_counts: f32,
+    /// The smallest value of a taxel.
+    pub least_counts: f32,
+    /// The largest value of a taxel.
+    pub most_counts: f32,
+}
+
+/// The reason why a requested tare is not taken. The offsets stay unchanged.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum RetareError {
+    /// A press is under way, and the tare would zero it away.
+    #[error("a press is under way: release the sensor and ask again")]
+    Pressed,
+    /// Something rests on the sensor, and the tare would zero it away.
+    #[error("something touches the sensor: free it and ask again")]
+    Touched,
+    /// The sensor sends no frames to average.
+    #[error("the sensor is not live: it sends no frames to average")]
+    NotLive,
+    /// Another tare is under way, and has to end first.
+    #[error("another tare is under way: wait for its answer")]
+    UnderWay,
+    /// `tare_frames` is 0.
+    #[error("no tare is configured: set calibration.tare_frames to 1 or more")]
+    NoFrames,
+}
+
+/// The offsets before and after a requested tare.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Retaken {
+    /// The offsets up to now.
+    pub old: Offsets,
+    /// The offsets from the next frame on.
+    pub new: Offsets,
+}
+
+/// The purpose of a tare under way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Aim {
+    /// The first baseline. It is tried again until nothing touches the sensor.
+    First {
+        /// Whether something touched the sensor during an earlier try.
+        met_contact: bool,
+    },
+    /// Another baseline, on request. The old baseline stays in force until the new one is taken.
+    /// The tare is given up when something touches the sensor.
+    Request,
+}
+
+/// The baseline of one sensor, and the tare under way, if there is one.
+///
+/// # Example
+///
+/// ```
+/// use hardnessd_core::frame::{Array, RawFrame, TAXELS};
+/// use hardnessd_core::tare::{Contact, Progress, Settings, Tare};
+///
+/// let contact = Contact { threshold_n: 0.07, area_taxels: 3 };
+/// let settings = Settings { tare_frames: 1, ..Settings::default() };
+/// let mut tare = Tare::new(&settings, Array::FULL, contact);
+/// let mut raw = RawFrame { counts: [2; TAXELS] };
+/// assert_eq!(tare.observe(&raw), Progress::Taken);
+///
+/// raw.counts[0] = 27;
+/// let frame = tare.apply(&raw);
+/// assert_eq!(frame.newtons[0], 25.0 * 0.04);
+/// assert_eq!(frame.newtons[1], 0.0);
+/// ```
+#[derive(Debug, Clone)]
+pub struct Tare {
+    scale: Scale,
+    /// The number of frames of a tare.
+    frames: u32,
+    /// `[ROWS, COLS]` in counts. All zeros until a tare is taken.
+    baseline: Box<[f32; TAXELS]>,
+    stage: Stage,
+    contact: Contact,
+    max_n: f32,
+    /// Whether the baseline follows drift.
+    follows: bool,
+    array: Array,
+    /// The place of each dead taxel, and the places of its live neighbours.
+    dead: Vec<(usize, Vec<usize>)>,
+}
+
+/// The conversion from counts to newtons.
+#[derive(Debug, Clone)]
+struct Scale {
+    newtons_per_count: f32,
+    exponent: f32,
+    /// The gain of each taxel.
+    gains: Box<[f32; TAXELS]>,
+}
+
+impl Scale {
+    fn new(settings: &Settings, array: Array) -> Self {
+        let mut gains = Box::new([1.0; TAXELS]);
+        if let Some(Gains::Taxels(rows)) = &settings.gains {
+            for (place, &gain) in array.places().zip(rows.iter().flatten()) {
+                gains[place] = gain;
+            }
+        }
+        Self {
+            newtons_per_count: settings.newtons_per_count,
+            exponent: settings.exponent,
+            gains,
+        }
+    }
+
+    /// The newtons of this many counts above the baseline, at a taxel.
+    fn newtons(&self, counts: f32, place: usize) -> f32 {
+        let counts = counts.max(0.0);
+        // An exponent of 1 skips `powf`, so the result has the same bits as before exponents
+        // existed.
+        let raised = if self.exponent == 1.0 {
+            counts
+        } else {
+            counts.powf(self.exponent)
+        };
+        raised * self.newtons_per_count * self.gains[place]
+    }
+
+    /// The counts above the baseline that give `newtons`, without the exponent.
+    fn counts(&self, newtons: f32, place: usize) -> f32 {
+        newtons / (self.newtons_per_count * self.gains[place])
+    }
+}
+
+/// The stage of a tare.
+#[derive(Debug, Clone)]
+enum Stage {
+    /// No tare is under way.
+    Idle,
+    Taking {
+        aim: Aim,
+        sums: Sums,
+    },
+    /// A requested tare has ended, and its outcome has not been fetched.
+    Ended(Result<Retaken, RetareError>),
+}
+
+impl Stage {
+    /// Begins a tare over `frames` frames. With 0 frames, no tare begins.
+    fn begin(aim: Aim, frames: u32) -> Self {
+        if frames == 0 {
+            return Self::Idle;
+        }
+        let sums = Sums::new(frames);
+        Self::Taking { aim, sums }
+    }
+}
+
+/// The state of a [`Tare`], without its settings and without the purpose of the tare under way.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Memory {
+    #[serde(with = "taxels")]
+    baseline: Box<[f32; TAXELS]>,
+    taking: Option<Sums>,
+}
+
+impl Memory {
+    /// Whether a tare can have this state. A recording may hold anything.
+    pub(crate) fn is_possible(&self) -> bool {
+        // The mean of counts, with room for rounding.
+        let is_count = |mean: &f32| (0.0..=65_536.0).contains(mean);
+        let are_sums = |sums: &Sums| {
+            let most = u64::from(sums.seen) * u64::from(u16::MAX);
+            sums.seen < sums.wanted
+                && sums.wanted <= MOST_TARE_FRAMES
+                && sums.sum.iter().all(|&sum| u64::from(sum) <= most)
+        };
+        self.baseline.iter().all(is_count) && self.taking.as_ref().is_none_or(are_sums)
+    }
+}
+
+/// The sums over the frames of a tare.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Sums {
+    wanted: u32,
+    seen: u32,
+    #[serde(with = "taxels")]
+    sum: Box<[u32; TAXELS]>,
+    #[serde(with = "taxels")]
+    least: Box<[u16; TAXELS]>,
+    #[serde(with = "taxels")]
+    most: Box<[u16; TAXELS]>,
+}
+
+impl Sums {
+    fn new(wanted: u32) -> Self {
+        Self {
+            wanted,
+            seen: 0,
+            sum: Box::new([0; TAXELS]),
+            least: Box::new([u16::MAX; TAXELS]),
+            most: Box::new([0; TAXELS]),
+        }
+    }
+
+    fn add(&mut self, raw: &RawFrame) {
+        self.seen += 1;
+        for (place, &count) in raw.counts.iter().enumerate() {
+            self.sum[place] += u32::from(count);
+            self.least[place] = self.least[place].min(count);
+            self.most[place] = self.most[place].max(count);
+        }
+    }
+}
+
+impl Tare {
+    /// A tare that is about to be taken. With `tare_frames` 0, the baseline stays zero.
+    ///
+    /// `settings` have passed [`Settings::check`] for `array`.
+    pub fn new(settings: &Settings, array: Array, contact: Contact) -> Self {
+        let first = Aim::First { met_contact: false };
+        Self {
+            scale: Scale::new(settings, array),
+            frames: settings.tare_frames,
+            baseline: Box::new([0.0; TAXELS]),
+            stage: Stage::begin(first, settings.tare_frames),
+            contact,
+            max_n: settings.tare_max_n,
+            follows: settings.auto_tare,
+            array,
+            dead: dead(settings, array),
+        }
+    }
+
+    /// Takes over changed settings. The baseline in force stays. If the number of frames of a tare
+    /// changes, a tare under way begins again. If the number becomes 0, a tare under way ends.
+    pub fn reload(&mut self, settings: &Settings, contact: Contact) {
+        let frames = settings.tare_frames;
+        self.stage = match std::mem::replace(&mut self.stage, Stage::Idle) {
+            Stage::Taking {
+                aim: Aim::Request, ..
+            } if frames == 0 => Stage::Ended(Err(RetareError::NoFrames)),
+            Stage::Taking { aim, .. } if frames != self.frames => Stage::begin(aim, frames),
+            stage => stage,
+        };
+        self.scale = Scale::new(settings, self.array);
+        self.frames = frames;
+        self.max_n = settings.tare_max_n;
+        self.follows = settings.auto_tare;
+        self.contact = contact;
+        self.dead = dead(settings, self.array);
+    }
+
+    /// The state of the tare.
+    pub fn memory(&self) -> Memory {
+        Memory {
+            baseline: self.baseline.clone(),
+            taking: match &self.stage {
+                Stage::Taking { sums, .. } => Some(sums.clone()),
+                Stage::Idle | Stage::Ended(_) => None,
+            },
+        }
+    }
+
+    /// Continues from the state of another tare. If a tare was under way, its purpose is `aim`.
+    pub fn recall(&mut self, memory: Memory, aim: Aim) {
+        self.baseline = memory.baseline;
+        let taking = memory.taking.map(|sums| Stage::Taking { aim, sums });
+        self.stage = taking.unwrap_or(Stage::Idle);
+    }
+
+    /// The purpose of the tare under way, if there is one.
+    pub fn aim(&self) -> Option<Aim> {
+        match &self.stage {
+            Stage::Taking { aim, .. } => Some(*aim),
+            Stage::Idle | Stage::Ended(_) => None,
+        }
+    }
+
+    /// Begins another tare. The baseline in force stays until the new one is taken.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if a tare is under way, or if the settings allow none. Nothing has changed
+    /// then.
+    pub fn retake(&mut self) -> Result<(), RetareError> {
+        if self.aim().is_some() {
+            return Err(RetareError::UnderWay);
+        }
+        if self.frames == 0 {
+            return Err(RetareError::NoFrames);
+        }
+        self.stage = Stage::begin(Aim::Request, self.frames);
+        Ok(())
+    }
+
+    /// Ends a requested tare. The baseline in force stays. A first tare continues.
+    pub fn give_up(&mut self, reason: RetareError) {
+        if self.aim() == Some(Aim::Request) {
+            self.stage = Stage::Ended(Err(reason));
+        }
+    }
+
+    /// The outcome of the requested tare. The next call returns `None`.
+    pub fn ended(&mut self) -> Option<Result<Retaken, RetareError>> {
+        match self.stage {
+            Stage::Ended(outcome) => {
+                self.stage = Stage::Idle;
+                Some(outcome)
+            }
+            Stage::Idle | Stage::Taking { .. } => None,
+        }
+    }
+
+    /// The baseline in force.
+    pub fn offsets(&self) -> Offsets {
+        let live = self.live();
+        let counts = || live.iter().map(|&place| self.baseline[place]);
+        Offsets {
+            mean_counts: counts().sum::<f32>() / live.len().max(1) as f32,
+            least_counts: counts().reduce(f32::min).unwrap_or(0.0),
+            most_counts: counts().reduce(f32::max).unwrap_or(0.0),
+        }
+    }
+
+    /// Converts counts to newtons: `newtons_per_count x max(0, counts - baseline)^exponent x gain`.
+    /// A dead taxel is replaced by the mean of its live neighbours.
+    pub fn apply(&self, raw: &RawFrame) -> Frame {
+        let mut frame = Frame::default();
+        for (place, newtons) in frame.newtons.iter_mut().enumerate() {
+            let counts = f32::from(raw.counts[place]) - self.baseline[place];
+            *newtons = self.scale.newtons(counts, place);
+        }
+        for (place, neighbours) in &self.dead {
+            let sum: f32 = neighbours
+                .iter()
+                .map(|&neighbour| frame.newtons[neighbour])
+                .sum();
+            frame.newtons[*place] = sum / neighbours.len().max(1) as f32;
+        }
+        frame
+    }
+
+    /// Moves the baseline towards `raw`, by [`MOST_STEP_N`] at most, if the settings allow it. While
+    /// a live taxel reads the contact threshold or more, something touches the sensor, and no
+    /// baseline moves: the taxels around the touch read a part of it.
+    ///
+    /// Call this function once a second at most, and never during a press.
+    pub fn follow(&mut self, raw: &RawFrame) {
+        let above = |place: usize| f32::from(raw.counts[place]) - self.baseline[place];
+        let is_touched =
+            |place: &usize| self.scale.newtons(above(*place), *place) >= self.contact.threshold_n;
+        if !self.follows || self.live().iter().any(is_touched) {
+            return;
+        }
+        for (place, baseline) in self.baseline.iter_mut().enumerate() {
+            let above = f32::from(raw.counts[place]) - *baseline;
+            let most = self.scale.counts(MOST_STEP_N, place);
+            *baseline += above.clamp(-most, most);
+        }
+    }
+
+    /// Whether a live taxel reads `full_scale` counts.
+    pub fn is_saturated(&self, raw: &RawFrame, full_scale: u16) -> bool {
+        self.array.places().any(|place| {
+            raw.counts[place] >= full_scale && !self.dead.iter().any(|(dead, _)| *dead == place)
+        })
+    }
+
+    /// Takes in a frame for the tare under way.
+    pub fn observe(&mut self, raw: &RawFrame) -> Progress {
+        let Stage::Taking { aim, sums } = &mut self.stage else {
+            return Progress::Ready;
+        };
+        sums.add(raw);
+        if sums.seen < sums.wanted {
+            return Progress::Taking;
+        }
+        let (aim, sums) = (*aim, sums.clone());
+        let mean = Box::new(std::array::from_fn(|place| {
+            sums.sum[place] as f32 / sums.seen as f32
+        }));
+        if self.is_touched(&sums, &mean) {
+            self.stage = match aim {
+                Aim::First { .. } => Stage::begin(Aim::First { met_contact: true }, sums.wanted),
+                Aim::Request => Stage::Ended(Err(RetareError::Touched)),
+            };
+            return Progress::Contact;
+        }
+        let old = self.offsets();
+        self.baseline = mean;
+        self.stage = match aim {
+            Aim::First { .. } => Stage::Idle,
+            Aim::Request => Stage::Ended(Ok(Retaken {
+                old,
+                new: self.offsets(),
+            })),
+        };
+        Progress::Taken
+    }
+
+    fn is_touched(&self, sums: &Sums, mean: &[f32; TAXELS]) -> bool {
+        let live = self.live();
+        let mut sorted: Vec<f32> = live.iter().map(|&place| mean[place]).collect();
+        sorted.sort_by(f32::total_cmp);
+        let median = sorted.get(sorted.len() / 2).copied().unwrap_or(0.0);
+        let varying = live.iter().filter(|&&place| {
+            let spread = f32::from(sums.most[place] - sums.least[place]);
+            self.scale.newtons(spread, place) >= self.contact.threshold_n
+        });
+        let high = live
+            .iter()
+            .filter(|&&place| self.scale.newtons(mean[place] - median, place) > self.max_n);
+        let limit = self.contact.area_taxels as usize;
+        varying.count() >= limit || high.count() >= limit
+    }
+
+    /// The places of the array's live taxels.
+    fn live(&self) -> Vec<usize> {
+        self.array
+            .places()
+            .filter(|place| !self.dead.iter().any(|(dead, _)| dead == place))
+            .collect()
+    }
+}
+
+fn dead(settings: &Settings, array: Array) -> Vec<(usize, Vec<usize>)> {
+    let mut is_dead = [false; TAXELS];
+    for &[row, col] in &settings.dead_taxels {
+        is_dead[array.place(row, col)] = true;
+    }
+    let live_neighbours = |place: usize| {
+        let (row, col) = (place / COLS, place % COLS);
+        let rows = row.saturating_sub(1)..=(row + 1).min(ROWS - 1);
+        rows.flat_map(|r| {
+            (col.saturating_sub(1)..=(col + 1).min(COLS - 1)).map(move |c| r * COLS + c)
+        })
+        .filter(|&at| at != place && !is_dead[at] && array.position(at).is_some())
+        .collect()
+    };
+    (0..TAXELS)
+        .filter(|&place| is_dead[place])
+        .map(|place| (place, live_neighbours(place)))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,123 @@
+//! A sensor, a model and a recorded press for tests, also for those of the other crates.
+#![allow(
+    clippy::unwrap_used,
+    clippy::missing_panics_doc,
+    reason = "this is test code, which clippy does not know as such"
+)]
+
+pub mod course_model;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use serde_json::Value;
+
+use crate::frame::{COLS, ROWS, RawFrame, Stamp};
+use crate::motion::Point;
+use crate::pipeline::{Clock, Pipeline};
+use crate::recording::{About, Entry, Input, Labels, RecordedSensor, State, Writer};
+use crate::sensor::{Description, Sensor};
+use crate::tare::{self, Gains};
+use crate::verdict::{BUILT_IN, Hrn};
+
+/// The built-in model.
+pub fn hrn() -> Arc<Hrn> {
+    Arc::new(Hrn::load(BUILT_IN).unwrap())
+}
+
+/// A sensor with a gain for each taxel and a baseline that follows drift.
+pub fn sensor() -> Sensor {
+    Sensor::new(described()).unwrap()
+}
+
+fn described() -> Description {
+    Description {
+        name: "forearm".to_owned(),
+        calibration: tare::Settings {
+            gains: Some(Gains::Taxels(vec![
+                (1..=COLS)
+                    .map(|n| n as f32 / 14.3)
+                    .collect();
+                ROWS
+            ])),
+            auto_tare: true,
+            ..tare::Settings::default()
+        },
+        ..Description::default()
+    }
+}
+
+/// The moment so many milliseconds after the first.
+pub fn at(ms: u64) -> Stamp {
+    let mono = Duration::from_millis(1_000_000 + ms) + Duration::from_nanos(7);
+    // The calendar is set back in the middle, which must not change any duration.
+    let step_s = if ms > 8_000 { -3_600 } else { 0 };
+    let wall = jiff::Timestamp::new(1_790_000_000 + step_s, 123_456_789).unwrap();
+    Stamp {
+        mono,
+        wall: wall.checked_add(Duration::from_millis(ms)).unwrap(),
+    }
+}
+
+/// A recording that begins just before a press, and its sensor. The press loads in four frames, one
+/// every 200 ms, and holds for one. An arm at 5 mm/s sends positions if `sends`, all of them before
+/// the recording begins.
+pub fn of_a_press(
+    change: impl FnOnce(&mut Description),
+    context: Option<Value>,
+    sends: bool,
+) -> (Vec<u8>, Sensor) {
+    let mut described = Description {
+        name: "forearm".to_owned(),
+        ..Description::default()
+    };
+    change(&mut described);
+    let (sensor, hrn) = (Sensor::new(described).unwrap(), hrn());
+    let about = About {
+        robot: "arm-7".to_owned(),
+        run: "r".to_owned(),
+        boot_id: "b".to_owned(),
+        reason: None,
+        labels: labels(),
+        sensors: vec![RecordedSensor::new(&sensor, &hrn)],
+    };
+    let mut writer = Writer::new(Vec::new(), &about).unwrap();
+    let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::Arrival);
+    let bytes = |counts: u16| {
+        let mut raw = RawFrame::default();
+        raw.counts[400..409].fill(counts);
+        let mut bytes = Vec::new();
+        sensor.layout().encode(&raw, &mut bytes);
+        bytes
+    };
+    let tare_frames = u64::from(sensor.description().calibration.tare_frames);
+    for frame in 0..=tare_frames {
+        pipeline.push(&bytes(0), at(200 * frame));
+    }
+    let begin_ms = 200 * (tare_frames + 1);
+    if sends {
+        let point = |step: u64| Point {
+            at_ns: i64::try_from(at(begin_ms - 200 + 50 * step).mono.as_nanos()).unwrap(),
+            mm: 0.25 * step as f64,
+        };
+        let points: Vec<Point> = (0..40).map(point).collect();
+        pipeline.tell(&points).unwrap();
+    }
+    pipeline.set_context(context);
+    let state = State::of(&pipeline, labels());
+    let came = at(begin_ms);
+    writer
+        .entry(0, came, &Entry::State(Box::new(state)))
+        .unwrap();
+    for (frame, counts) in (0..).zip([20, 40, 60, 80, 80, 0, 0]) {
+        let input = Input::Bytes(bytes(counts).into());
+        let came = at(begin_ms + 200 * frame);
+        writer.entry(0, came, &Entry::Input(input)).unwrap();
+    }
+    (writer.finish().unwrap(), sensor)
+}
+
+/// Labels of a recording.
+pub fn labels() -> Labels {
+    Labels::from([("level".to_owned(), "2".to_owned())])
+}

@@ -1,0 +1,712 @@
+//! A press becomes a verdict: loads an HRN from ONNX bytes and judges presses with it.
+//!
+//! In: the bytes of a model file as `hrn-train export` writes them, then frames in newtons
+//! (format 1) or the course of a press (format 2). Out: [`Verdict`]s. This module refuses a file
+//! unless all of it follows the format and it reproduces the probabilities that its trainer wrote
+//! into it. So a loaded [`Hrn`] computes what was evaluated. This module never reads a file itself,
+//! never prints and never trains.
+
+mod course;
+mod file;
+mod guard;
+
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use tract_onnx::prelude::*;
+
+use self::course::Input;
+pub use self::course::{
+    COURSE_FRAMES, CheckedCourse, Course, CourseCheck, CourseMoment, Extents, Shore, course_inputs,
+    extents,
+};
+pub use self::file::check_levels;
+use crate::frame::{COLS, Frame, ROWS};
+
+/// The default model, built into the binary; `models/README.md` is its card.
+pub const BUILT_IN: &[u8] = include_bytes!("../../../models/hrn.onnx");
+
+/// The largest accepted model file, in bytes: 64 MB.
+pub const MAX_FILE_BYTES: usize = 64_000_000;
+/// The oldest accepted ONNX operator set.
+pub const MIN_OPSET: i64 = 17;
+/// The largest accepted difference from the check frames' probabilities.
+pub const CHECK_TOLERANCE: f32 = 1e-4;
+/// The largest accepted difference from the check presses' Shore hardness.
+pub const SHORE_TOLERANCE: f32 = 1e-2;
+
+/// One hardness level, as `hello` publishes it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Level {
+    /// The level's number, from 1; 1 is the hardest.
+    pub level: u8,
+    /// A short name without control characters, such as `very-soft`.
+    pub label: String,
+    /// The Shore hardness that the level covers, such as `51-60`.
+    pub shore: String,
+}
+
+/// The range of forces and areas in training, and for a model of format 2 the range of its presses.
+/// A verdict on a press outside it has the note `outside_training`. A range of the presses that is
+/// `None` excludes nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Range {
+    /// The least and the greatest total force of a training frame, in newtons.
+    pub force_n: [f32; 2],
+    /// The least and the greatest contact area of a training frame, in taxels.
+    pub contact_area_taxels: [u32; 2],
+    /// The shortest and the longest training press, in seconds from its first to its last frame.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub duration_s: Option<[f32; 2]>,
+    /// The least and the greatest time between two frames that the model gets, in seconds: the
+    /// median of a press.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub frame_period_s: Option<[f32; 2]>,
+    /// The least and the greatest speed of the approach, in mm/s.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub speed_mm_s: Option<[f32; 2]>,
+    /// The least and the greatest approach of a training press at its furthest, in mm.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub approach_mm: Option<[f32; 2]>,
+    /// The least and the greatest stiffness of the arm, in N/mm.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub arm_n_per_mm: Option<[f32; 2]>,
+}
+
+impl Range {
+    /// The range of a model of which nothing is known: no frame is outside it.
+    pub const ANY: Self = Self {
+        force_n: [0.0, f32::MAX],
+        contact_area_taxels: [0, u32::MAX],
+        duration_s: None,
+        frame_period_s: None,
+        speed_mm_s: None,
+        approach_mm: None,
+        arm_n_per_mm: None,
+    };
+
+    /// The ranges of the presses, in the order of [`Extents`].
+    pub fn of_presses(&self) -> Extents {
+        [
+            self.duration_s,
+            self.frame_period_s,
+            self.speed_mm_s,
+            self.approach_mm,
+            self.arm_n_per_mm,
+        ]
+    }
+
+    /// The same range of frames with these ranges of the presses.
+    #[must_use]
+    pub fn with_presses(self, ranges: Extents) -> Self {
+        let [
+            duration_s,
+            frame_period_s,
+            speed_mm_s,
+            approach_mm,
+            arm_n_per_mm,
+        ] = ranges;
+        Self {
+            duration_s,
+            frame_period_s,
+            speed_mm_s,
+            approach_mm,
+            arm_n_per_mm,
+            ..self
+        }
+    }
+
+    /// Whether a press may be one of the range of the presses. An unknown number may.
+    pub fn holds(&self, course: &Course) -> bool {
+        let pairs = self.of_presses().into_iter().zip(course.extents());
+        pairs.into_iter().all(|pair| match pair {
+            (Some([least, most]), Some([low, high])) => low <= most && least <= high,
+            _ => true,
+        })
+    }
+}
+
+/// The description of a model in its file: the `hrn.*` metadata.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Card {
+    /// `hrn.format`: "1" or "2".
+    pub format: String,
+    /// `hrn.levels`: levels 1 to L in order.
+    pub levels: Vec<Level>,
+    /// `hrn.pitch_mm`: the distance between taxels in the training data.
+    pub pitch_mm: f32,
+    /// `hrn.method`: the method of training, such as `hrn100`.
+    pub method: String,
+    /// `hrn.data`: name, seed and hash of the training data, as the file has it.
+    pub data: String,
+    /// `hrn.metrics`: the trainer's measurements.
+    pub metrics: serde_json::Value,
+    /// `hrn.validation`: the data of the validation, such as `simulated data only`.
+    pub validation: String,
+    /// `hrn.range`: the forces, areas and presses in training.
+    pub range: Range,
+    /// `hrn.conformal`: only a file of format 2 may have it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub conformal: Option<Conformal>,
+}
+
+/// `hrn.conformal`: the threshold for the set of levels that a verdict cannot tell apart.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Conformal {
+    /// The set misses the true level in at most this share of presses.
+    pub alpha: f32,
+    /// The set holds every level of at least this probability, and the most likely one.
+    pub threshold: f32,
+}
+
+impl Conformal {
+    /// The levels of the set, ascending.
+    pub fn set(self, probabilities: &[f32]) -> Vec<u8> {
+        let (best, _) = argmax(probabilities);
+        let levels = (1..).zip(probabilities.iter().enumerate());
+        levels
+            .filter(|&(_, (place, &p))| place == best || p >= self.threshold)
+            .map(|(level, _)| level)
+            .collect()
+    }
+}
+
+/// The checks in a model file: inputs, and the trainer's outputs for them.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Checks {
+    /// The check frames of format 1.
+    Frames(Check),
+    /// The check presses of format 2.
+    Courses(CourseCheck),
+}
+
+impl Checks {
+    /// The number of check frames or check presses.
+    pub fn count(&self) -> usize {
+        match self {
+            Self::Frames(check) => check.frames.len(),
+            Self::Courses(check) => check.presses.len(),
+        }
+    }
+
+    /// The probabilities that the trainer computed for check `index`.
+    fn probabilities(&self, index: usize) -> &[f32] {
+        match self {
+            Self::Frames(check) => &check.probabilities[index],
+            Self::Courses(check) => &check.presses[index].probabilities,
+        }
+    }
+
+    /// The Shore hardness that the trainer computed for check `index`.
+    fn shore(&self, index: usize) -> Option<Shore> {
+        match self {
+            Self::Frames(_) => None,
+            Self::Courses(check) => Some(check.presses[index].shore),
+        }
+    }
+}
+
+/// `hrn.check` of format 1: frames and the probabilities that the trainer computed for them.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Check {
+    /// The frames: 784 newtons each, row-major. There are 8 frames, or two frames of each level.
+    pub frames: Vec<Vec<f32>>,
+    /// One row of L probabilities for each frame.
+    pub probabilities: Vec<Vec<f32>>,
+}
+
+/// The reason why a model file is refused, or why a judgement failed.
+#[derive(Debug, thiserror::Error)]
+pub enum ModelError {
+    /// The file has more than [`MAX_FILE_BYTES`].
+    #[error("model file of {found} bytes: at most {MAX_FILE_BYTES} are accepted")]
+    TooLarge {
+        /// The size of the file.
+        found: usize,
+    },
+    /// The bytes are no ONNX model.
+    #[error("not an ONNX model: {0}")]
+    NotOnnx(String),
+    /// The operator set is too old or missing.
+    #[error("ONNX opset {}: expected {MIN_OPSET} or newer", .found.map_or("missing".into(), |v| v.to_string()))]
+    Opset {
+        /// The default domain's version, if the file has one.
+        found: Option<i64>,
+    },
+    /// A tensor's data lies outside the file.
+    #[error("tensor `{tensor}` lies in an external file: expected all data inside the model file")]
+    ExternalData {
+        /// The name of the tensor.
+        tensor: String,
+    },
+    /// The inputs or outputs have wrong names, types or shapes.
+    #[error("model {what} {found}: expected {expected}")]
+    Signature {
+        /// `input`, `inputs` or `outputs`.
+        what: &'static str,
+        /// The names, types and shapes in the file.
+        found: String,
+        /// The names, types and shapes of the format.
+        expected: String,
+    },
+    /// A metadata key is missing.
+    #[error("model metadata `{key}` is missing")]
+    KeyMissing {
+        /// The key.
+        key: &'static str,
+    },
+    /// A metadata key has an unusable value.
+    #[error("model metadata `{key}`: found {found}, expected {expected}")]
+    KeyInvalid {
+        /// The key.
+        key: &'static str,
+        /// The value, or the problem with it.
+        found: String,
+        /// The expected value.
+        expected: String,
+    },
+    /// The file has an operator, an attribute, a tensor or a size that no model may have.
+    #[error("model {place}: {problem}")]
+    Guard {
+        /// The node, tensor, input or output.
+        place: String,
+        /// The problem with it.
+        problem: String,
+    },
+    /// The graph cannot be run.
+    #[error("model graph cannot be run: {0}")]
+    Graph(String),
+    /// The probabilities differ from the trainer's.
+    #[error(
+        "check frame {frame}: probabilities differ from the trainer's by up to {difference:.6}: \
+         expected at most {CHECK_TOLERANCE}"
+    )]
+    CheckDiffers {
+        /// The check's index in `hrn.check`.
+        frame: usize,
+        /// The largest difference in that check.
+        difference: f32,
+    },
+    /// The Shore hardness differs from the trainer's.
+    #[error(
+        "check press {press}: `shore` differs from the trainer's by up to {difference:.4}: expected \
+         at most {SHORE_TOLERANCE}"
+    )]
+    ShoreDiffers {
+        /// The press's index in `hrn.check`.
+        press: usize,
+        /// The largest difference of the three numbers.
+        difference: f32,
+    },
+    /// `probabilities` is not the softmax of `logits`.
+    #[error(
+        "check frame {frame}: `probabilities` differs from softmax(`logits`) by up to \
+         {difference:.6}: expected at most {CHECK_TOLERANCE}"
+    )]
+    NotSoftmax {
+        /// The check's index in `hrn.check`.
+        frame: usize,
+        /// The largest difference in that check.
+        difference: f32,
+    },
+    /// A judgement returned NaN or infinity.
+    #[error("model gave a number that is not finite in `{output}`")]
+    NotFinite {
+        /// The name of the output.
+        output: &'static str,
+    },
+    /// A judgement failed inside the inference library.
+    #[error("model could not judge a frame: {0}")]
+    Inference(String),
+    /// The trial process refused the file, or did not complete.
+    #[error("{0}")]
+    Trial(String),
+    /// A verdict takes so long that frames would have to wait.
+    #[error(
+        "model takes {:.1} ms for a verdict: expected at most {:.1} ms, a tenth of the fastest \
+         sensor's frame period (but 1 to 20 ms)",
+        .found.as_secs_f64() * 1e3,
+        .expected.as_secs_f64() * 1e3
+    )]
+    Slow {
+        /// The median processor time of a verdict.
+        found: Duration,
+        /// The time that the sensors allow for a verdict.
+        expected: Duration,
+    },
+}
+
+/// The verdict of an HRN on a press.
+///
+/// # Example
+///
+/// The card of a model has the labels of its levels.
+///
+/// ```
+/// use hardnessd_core::frame::Frame;
+/// use hardnessd_core::verdict::{BUILT_IN, Hrn};
+///
+/// let hrn = Hrn::load(BUILT_IN)?;
+/// let mut frame = Frame::default();
+/// frame.newtons[400..404].fill(2.0);
+/// let verdict = hrn.judge(&frame)?;
+/// let level = &hrn.card().levels[usize::from(verdict.level) - 1];
+/// println!("{} ({:.0} %)", level.label, 100.0 * verdict.confidence);
+/// assert_eq!(level.level, verdict.level);
+/// # Ok::<(), hardnessd_core::verdict::ModelError>(())
+/// ```
+#[derive(Debug, Clone, PartialEq)]
+pub struct Verdict {
+    /// The 1-based argmax of the probabilities (Eq. 10). Of equal probabilities, the lower level
+    /// wins.
+    pub level: u8,
+    /// `[L]`: the logits, after temperature.
+    pub logits: Vec<f32>,
+    /// `[L]`: the softmax of the logits.
+    pub probabilities: Vec<f32>,
+    /// The largest probability.
+    pub confidence: f32,
+    /// The Shore hardness. A model of format 2 always has it; a model of format 1 may.
+    pub shore: Option<Shore>,
+    /// The conformal set, if the file has a threshold.
+    pub levels: Option<Vec<u8>>,
+}
+
+/// The input that a model judges.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// Format 1: the frame of the largest contact area.
+    Frame,
+    /// Format 2: the course of a press.
+    Course {
+        /// The largest number of frames in a course.
+        most_frames: usize,
+    },
+}
+
+/// A hardness recognition network, ready to judge.
+///
+/// # Example
+///
+/// The built-in model judges one of the frames that it carries as a check.
+///
+/// ```
+/// use hardnessd_core::verdict::{BUILT_IN, Hrn};
+///
+/// let hrn = Hrn::load(BUILT_IN)?;
+/// let verdict = hrn.judge_check(0)?;
+/// assert_eq!(verdict.probabilities.len(), hrn.card().levels.len());
+/// assert_eq!(verdict.confidence, verdict.probabilities[usize::from(verdict.level) - 1]);
+/// # Ok::<(), hardnessd_core::verdict::ModelError>(())
+/// ```
+#[derive(Debug)]
+pub struct Hrn {
+    plan: Arc<TypedRunnableModel>,
+    format: Format,
+    /// The inputs of format 2, in the order of the file.
+    inputs: Vec<Input>,
+    logits_output: usize,
+    probabilities_output: usize,
+    /// A model of format 2 always has this output; a model of format 1 may.
+    shore_output: Option<usize>,
+    card: Card,
+    checks: Checks,
+    sha256: String,
+}
+
+impl Hrn {
+    /// Loads a model file and reproduces its check frames.
+    ///
+    /// # Errors
+    ///
+    /// Returns the [`ModelError`] for the first part of the file that breaks the format, or an
+    /// error as [`Hrn::judge`] if a check frame cannot be judged.
+    pub fn load(bytes: &[u8]) -> Result<Self, ModelError> {
+        let hrn = Self::read(bytes)?;
+        hrn.reproduce_check()?;
+        Ok(hrn)
+    }
+
+    /// Loads a model file without reproducing its check frames. The trainer uses it to compute
+    /// them.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`Hrn::load`], except those of the check frames.
+    pub fn read(bytes: &[u8]) -> Result<Self, ModelError> {
+        if bytes.len() > MAX_FILE_BYTES {
+            return Err(ModelError::TooLarge { found: bytes.len() });
+        }
+        // The file's types and shapes of values inside the graph are not needed, and are unchecked.
+        let onnx = tract_onnx::onnx().with_ignore_value_info(true);
+        let mut reader = bytes;
+        let mut proto = onnx
+            .proto_model_for_read(&mut reader)
+            .map_err(|error| ModelError::NotOnnx(root_cause(&error)))?;
+        let graph = match &proto.graph {
+            Some(graph) if proto.ir_version > 0 => graph,
+            _ => return Err(ModelError::NotOnnx("no graph in it".into())),
+        };
+        file::check_opset(&proto)?;
+        file::check_tensors_inside(graph)?;
+        let (card, checks) = file::read_metadata(&proto)?;
+        let (format, inputs) = file::check_signature(graph, &card, &checks)?;
+        guard::check(&proto, graph)?;
+        let position = |name: &str| graph.output.iter().position(|output| output.name == name);
+        let shore_output = position("shore");
+        let (Some(logits_output), Some(probabilities_output)) =
+            (position("logits"), position("probabilities"))
+        else {
+            return Err(ModelError::Graph("no outputs".into()));
+        };
+
+        let graph_error = |error: TractError| ModelError::Graph(root_cause(&error));
+        // The inference library would keep a copy of the metadata.
+        proto.metadata_props.clear();
+        let inference = onnx.model_for_proto_model(&proto).map_err(graph_error)?;
+        // The protobuf is as large as the weights. Only the plan is needed from here on.
+        drop(proto);
+        let shapes = match format {
+            Format::Frame => vec![vec![1, 1, ROWS, COLS]],
+            Format::Course { most_frames } => inputs
+                .iter()
+                .map(|input| input.shape(most_frames))
+                .collect(),
+        };
+        let inference = shapes
+            .iter()
+            .enumerate()
+            .try_fold(inference, |model, (at, shape)| {
+                model.with_input_fact(at, f32::fact(shape).into())
+            });
+        let optimized = inference
+            .and_then(InferenceModelExt::into_optimized)
+            .map_err(graph_error)?;
+        // The inference library does not compare a graph with the shapes that it declares.
+        let of_levels = |output| (output, f32::fact([1, card.levels.len()]));
+        let agreed = [of_levels(logits_output), of_levels(probabilities_output)];
+        let of_shore = shore_output.map(|output| (output, f32::fact([1, 3])));
+        for (output, agreed) in agreed.into_iter().chain(of_shore) {
+            let computed = optimized.output_fact(output).map_err(graph_error)?;
+            if computed.without_value() != agreed {
+                return Err(ModelError::Signature {
+                    what: "outputs",
+                    found: format!("computed as {computed:?}"),
+                    expected: format!("{agreed:?}"),
+                });
+            }
+        }
+        let plan = optimized.into_runnable().map_err(graph_error)?;
+
+        Ok(Self {
+            plan,
+            format,
+            inputs,
+            logits_output,
+            probabilities_output,
+            shore_output,
+            card,
+            checks,
+            sha256: sha256_hex(bytes),
+        })
+    }
+
+    /// SHA-256 of the whole file, 64 hexadecimal digits.
+    pub fn sha256(&self) -> &str {
+        &self.sha256
+    }
+
+    /// The description of the model in its file.
+    pub fn card(&self) -> &Card {
+        &self.card
+    }
+
+    /// The input that the model judges.
+    pub fn format(&self) -> Format {
+        self.format
+    }
+
+    /// The checks in the file.
+    pub fn checks(&self) -> &Checks {
+        &self.checks
+    }
+
+    /// Judges one frame. A model of format 2 judges it as a press with one frame and an unknown
+    /// approach.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`ModelError::NotFinite`] if an output is NaN or infinite, and
+    /// [`ModelError::Inference`] if the inference library fails.
+    pub fn judge(&self, frame: &Frame) -> Result<Verdict, ModelError> {
+        match self.format {
+            Format::Frame => {
+                let input = Tensor::from_shape(&[1, 1, ROWS, COLS], &frame.newtons);
+                self.run(tvec!(input.map_err(inference_error)?.into()))
+            }
+            Format::Course { .. } => self.judge_course(&Course {
+                moments: vec![CourseMoment {
+                    time_s: 0.0,
+                    approach_mm: None,
+                    frame: *frame,
+                }],
+                arm_n_per_mm: 0.0,
+            }),
+        }
+    }
+
+    /// Judges the course of a press. A model of format 1 judges its last frame.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`Self::judge`].
+    ///
+    /// # Panics
+    ///
+    /// Panics if the course has no frame, or has more frames than a model of format 2 takes.
+    pub fn judge_course(&self, course: &Course) -> Result<Verdict, ModelError> {
+        let last = course.moments.last().expect("a press has a frame");
+        let Format::Course { most_frames } = self.format else {
+            return self.judge(&last.frame);
+        };
+        let found = course.moments.len();
+        assert!(found <= most_frames, "{found} frames of {most_frames}");
+        let tensor = |input: &Input| Ok(input.tensor(course, most_frames)?.into());
+        let inputs: TractResult<TVec<TValue>> = self.inputs.iter().map(tensor).collect();
+        self.run(inputs.map_err(inference_error)?)
+    }
+
+    /// Judges one of [`Self::checks`].
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`Self::judge`].
+    pub fn judge_check(&self, index: usize) -> Result<Verdict, ModelError> {
+        match &self.checks {
+            Checks::Frames(check) => {
+                let mut frame = Frame::default();
+                frame.newtons.copy_from_slice(&check.frames[index]);
+                self.judge(&frame)
+            }
+            Checks::Courses(check) => self.judge_course(&check.presses[index].course),
+        }
+    }
+
+    fn run(&self, inputs: TVec<TValue>) -> Result<Verdict, ModelError> {
+        let outputs = self.plan.run(inputs).map_err(inference_error)?;
+        let read = |index: usize, output: &'static str| {
+            let view = outputs[index].try_as_plain_ram().map_err(inference_error)?;
+            let values = view.as_slice::<f32>().map_err(inference_error)?.to_vec();
+            if values.iter().all(|value| value.is_finite()) {
+                Ok(values)
+            } else {
+                Err(ModelError::NotFinite { output })
+            }
+        };
+        let logits = read(self.logits_output, "logits")?;
+        let probabilities = read(self.probabilities_output, "probabilities")?;
+        let (best, confidence) = argmax(&probabilities);
+        let level = self.card.levels[best].level;
+        let shore = match self.shore_output {
+            Some(output) => match read(output, "shore")?[..] {
+                // An interval has to contain its value, so widen it if it does not.
+                [value, low, high] => Some(Shore {
+                    value,
+                    low: low.min(value),
+                    high: high.max(value),
+                }),
+                _ => None,
+            },
+            None => None,
+        };
+        Ok(Verdict {
+            level,
+            logits,
+            shore,
+            levels: self.card.conformal.map(|set| set.set(&probabilities)),
+            probabilities,
+            confidence,
+        })
+    }
+
+    /// Judges every check frame or press. The first judgement also warms up the plan.
+    fn reproduce_check(&self) -> Result<(), ModelError> {
+        for index in 0..self.checks.count() {
+            let verdict = self.judge_check(index)?;
+            let expected = self.checks.probabilities(index);
+            let difference = largest_difference(&verdict.probabilities, expected);
+            if difference > CHECK_TOLERANCE {
+                return Err(ModelError::CheckDiffers {
+                    frame: index,
+                    difference,
+                });
+            }
+            let difference = largest_difference(&verdict.probabilities, &softmax(&verdict.logits));
+            if difference > CHECK_TOLERANCE {
+                return Err(ModelError::NotSoftmax {
+                    frame: index,
+                    difference,
+                });
+            }
+            if let (Some(found), Some(expected)) = (verdict.shore, self.checks.shore(index)) {
+                let [found, expected] = [found, expected].map(<[f32; 3]>::from);
+                let difference = largest_difference(&found, &expected);
+                if difference > SHORE_TOLERANCE {
+                    return Err(ModelError::ShoreDiffers {
+                        press: index,
+                        difference,
+                    });
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+#[expect(clippy::needless_pass_by_value, reason = "for `map_err`")]
+fn inference_error(error: TractError) -> ModelError {
+    ModelError::Inference(root_cause(&error))
+}
+
+/// The index and the value of the largest element. Of equal elements, the first wins.
+pub fn argmax(values: &[f32]) -> (usize, f32) {
+    let mut best = (0, f32::NEG_INFINITY);
+    for (index, &value) in values.iter().enumerate() {
+        if value > best.1 {
+            best = (index, value);
+        }
+    }
+    best
+}
+
+fn softmax(logits: &[f32]) -> Vec<f32> {
+    let (_, largest) = argmax(logits);
+    let exponentials: Vec<f32> = logits.iter().map(|logit| (logit - largest).exp()).collect();
+    let sum: f32 = exponentials.iter().sum();
+    exponentials.iter().map(|value| value / sum).collect()
+}
+
+fn largest_difference(left: &[f32], right: &[f32]) -> f32 {
+    left.iter()
+        .zip(right)
+        .map(|(l, r)| (l - r).abs())
+        .fold(0.0, f32::max)
+}
+
+/// The SHA-256 of `bytes` as 64 hexadecimal digits.
+pub fn sha256_hex(bytes: &[u8]) -> String {
+    hex::encode(Sha256::digest(bytes))
+}
+
+/// The innermost message. The outer messages name only tract's own stages.
+fn root_cause(error: &TractError) -> String {
+    error.root_cause().to_string()
+}
+
+#[cfg(test)]
+mod tests;

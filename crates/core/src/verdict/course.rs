@@ -1,0 +1,305 @@
+//! The course of a press, as input of a model of format 2.
+//!
+//! In: a press's frames with their times, the approach and the arm's stiffness. Out: the model's
+//! inputs as tensors, and presses as text for `hrn.check`.
+
+use serde::{Deserialize, Serialize};
+use tract_onnx::prelude::*;
+
+use crate::frame::sparse::{self, SparseError};
+use crate::frame::{COLS, Frame, ROWS, TAXELS};
+
+/// The fewest and the most frames that a model of format 2 may take.
+pub const COURSE_FRAMES: (usize, usize) = (3, 48);
+
+/// One frame of a press.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CourseMoment {
+    /// The seconds since the frame that began the press.
+    pub time_s: f32,
+    /// How far the arm went since the frame that began the press. `None` if it is unknown.
+    pub approach_mm: Option<f32>,
+    /// The taxels of the frame.
+    pub frame: Frame,
+}
+
+/// A press over time.
+///
+/// # Example
+///
+/// A model of format 2 judges a whole press, here one of two frames.
+///
+/// ```
+/// use hardnessd_core::frame::Frame;
+/// use hardnessd_core::verdict::{Course, CourseMoment, Hrn};
+///
+/// let moment = |time_s, approach_mm, newtons| {
+///     let mut frame = Frame::default();
+///     frame.newtons[400..404].fill(newtons);
+///     CourseMoment { time_s, approach_mm: Some(approach_mm), frame }
+/// };
+/// let course = Course {
+///     moments: vec![moment(0.0, 0.0, 0.2), moment(0.1, 0.5, 2.0)],
+///     arm_n_per_mm: 10.0,
+/// };
+/// let verdict = Hrn::load(&std::fs::read("models/course.onnx")?)?.judge_course(&course)?;
+/// let shore = verdict.shore.unwrap();
+/// assert!(shore.low <= shore.value && shore.value <= shore.high);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Course {
+    /// The frames in contact, from the one that began the press, ascending in time.
+    pub moments: Vec<CourseMoment>,
+    /// The stiffness of the arm. 0 if it is unknown.
+    pub arm_n_per_mm: f32,
+}
+
+/// Five numbers of a press, each between the two of its pair: its duration in seconds, the time
+/// between two of its frames in seconds, the speed of the approach in mm/s, the approach at its
+/// furthest in mm, and the stiffness of the arm in N/mm. `None` where the number is unknown.
+pub type Extents = [Option<[f32; 2]>; 5];
+
+/// The speed of an approach is measured up to this share of the approach at its furthest. Beyond it
+/// the arm slows down, or already holds its position.
+const SPEED_SHARE: f32 = 0.9;
+
+/// The numbers of a press with these frames: the time of each since the press began, and the
+/// approach where it is known. `arm_n_per_mm` is 0 if the stiffness is unknown.
+pub fn extents(moments: &[(f32, Option<f32>)], arm_n_per_mm: f32) -> Extents {
+    let exactly = |value: f32| [value, value];
+    let last = moments.last().map(|&(time_s, _)| exactly(time_s));
+    let mut periods: Vec<f32> = moments
+        .windows(2)
+        .map(|pair| pair[1].0 - pair[0].0)
+        .collect();
+    periods.sort_unstable_by(f32::total_cmp);
+    let period = periods.get(periods.len() / 2).copied().map(exactly);
+    let known = moments.iter().enumerate();
+    let known = known.filter_map(|(place, &(time_s, mm))| Some((place, time_s, mm?)));
+    let furthest = known.clone().map(|(.., mm)| mm).reduce(f32::max);
+    let reached = furthest
+        .filter(|&furthest| furthest > 0.0)
+        .and_then(|furthest| {
+            let mut known = known;
+            known.find(|&(_, time_s, mm)| time_s > 0.0 && mm >= SPEED_SHARE * furthest)
+        });
+    let speed = reached.map(|(place, time_s, mm)| {
+        // The arm may have stopped anywhere before the second frame, so it may have been faster.
+        [
+            mm / time_s,
+            if place > 1 {
+                mm / time_s
+            } else {
+                f32::INFINITY
+            },
+        ]
+    });
+    let arm = (arm_n_per_mm > 0.0).then(|| exactly(arm_n_per_mm));
+    [last, period, speed, furthest.map(exactly), arm]
+}
+
+impl Course {
+    /// The numbers that `hrn.range` may bound.
+    pub fn extents(&self) -> Extents {
+        let moment = |moment: &CourseMoment| (moment.time_s, moment.approach_mm);
+        let moments: Vec<_> = self.moments.iter().map(moment).collect();
+        extents(&moments, self.arm_n_per_mm)
+    }
+}
+
+/// An input of a model of format 2.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Input {
+    Frames,
+    TimeS,
+    ApproachMm,
+    Known,
+    Mask,
+    ArmNPerMm,
+}
+
+impl Input {
+    pub(super) const ALL: [Self; 6] = [
+        Self::Frames,
+        Self::TimeS,
+        Self::ApproachMm,
+        Self::Known,
+        Self::Mask,
+        Self::ArmNPerMm,
+    ];
+
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::Frames => "frames",
+            Self::TimeS => "time_s",
+            Self::ApproachMm => "approach_mm",
+            Self::Known => "known",
+            Self::Mask => "mask",
+            Self::ArmNPerMm => "arm_n_per_mm",
+        }
+    }
+
+    /// The shape of the input in a model of `most` frames.
+    pub(super) fn shape(self, most: usize) -> Vec<usize> {
+        match self {
+            Self::Frames => vec![1, most, ROWS, COLS],
+            Self::ArmNPerMm => vec![1, 1],
+            Self::TimeS | Self::ApproachMm | Self::Known | Self::Mask => vec![1, most],
+        }
+    }
+
+    /// The tensor of this input for `course`. Places after the last frame are 0.
+    pub(super) fn tensor(self, course: &Course, most: usize) -> TractResult<Tensor> {
+        let each = |value: fn(&CourseMoment) -> f32| {
+            let mut values: Vec<f32> = course.moments.iter().map(value).collect();
+            values.resize(most, 0.0);
+            values
+        };
+        let values = match self {
+            Self::Frames => {
+                let mut values = Vec::with_capacity(most * TAXELS);
+                for moment in &course.moments {
+                    values.extend_from_slice(&moment.frame.newtons);
+                }
+                values.resize(most * TAXELS, 0.0);
+                values
+            }
+            Self::TimeS => each(|moment| moment.time_s),
+            Self::ApproachMm => each(|moment| moment.approach_mm.unwrap_or(0.0)),
+            Self::Known => each(|moment| f32::from(u8::from(moment.approach_mm.is_some()))),
+            Self::Mask => each(|_| 1.0),
+            Self::ArmNPerMm => vec![course.arm_n_per_mm],
+        };
+        Tensor::from_shape(&self.shape(most), &values)
+    }
+}
+
+/// The names and shapes of the inputs of a model of format 2 that takes `most` frames.
+pub fn course_inputs(most: usize) -> [(&'static str, Vec<usize>); 6] {
+    Input::ALL.map(|input| (input.name(), input.shape(most)))
+}
+
+/// The Shore hardness from a model of format 2.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(into = "[f32; 3]", from = "[f32; 3]")]
+pub struct Shore {
+    /// The most likely Shore hardness.
+    pub value: f32,
+    /// The beginning of the 90 % interval.
+    pub low: f32,
+    /// The end of the 90 % interval.
+    pub high: f32,
+}
+
+impl From<[f32; 3]> for Shore {
+    fn from([value, low, high]: [f32; 3]) -> Self {
+        Self { value, low, high }
+    }
+}
+
+impl From<Shore> for [f32; 3] {
+    fn from(shore: Shore) -> Self {
+        [shore.value, shore.low, shore.high]
+    }
+}
+
+/// `hrn.check` of format 2: presses, and the outputs of the trainer's own software for them.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CourseCheck {
+    /// The presses: 8, or two of each level.
+    pub presses: Vec<CheckedCourse>,
+}
+
+/// A press of [`CourseCheck`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(into = "Written", try_from = "Written")]
+pub struct CheckedCourse {
+    /// The course of the press.
+    pub course: Course,
+    /// `[L]`: the trainer's probabilities.
+    pub probabilities: Vec<f32>,
+    /// The trainer's Shore hardness: value, low and high.
+    pub shore: Shore,
+}
+
+/// A press in the file: a list for each input, and each frame as [`sparse`] text.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Written {
+    time_s: Vec<f32>,
+    /// The approach at each frame. Null if it is unknown.
+    approach_mm: Vec<Option<f32>>,
+    arm_n_per_mm: f32,
+    frames: Vec<String>,
+    probabilities: Vec<f32>,
+    shore: Shore,
+}
+
+impl From<CheckedCourse> for Written {
+    fn from(checked: CheckedCourse) -> Self {
+        let Course {
+            moments,
+            arm_n_per_mm,
+        } = &checked.course;
+        Self {
+            time_s: moments.iter().map(|moment| moment.time_s).collect(),
+            approach_mm: moments.iter().map(|moment| moment.approach_mm).collect(),
+            arm_n_per_mm: *arm_n_per_mm,
+            frames: moments.iter().map(|m| sparse::write(&m.frame)).collect(),
+            probabilities: checked.probabilities,
+            shore: checked.shore,
+        }
+    }
+}
+
+/// The reason why lists are not a press.
+#[derive(Debug, thiserror::Error)]
+enum Unwritten {
+    #[error(
+        "{times} times, {positions} positions and {frames} frames in a press: as many of each, 1 to {}",
+        COURSE_FRAMES.1
+    )]
+    Lengths {
+        times: usize,
+        positions: usize,
+        frames: usize,
+    },
+    #[error("frame {0} of a press: {1}")]
+    Frame(usize, #[source] SparseError),
+}
+
+impl TryFrom<Written> for CheckedCourse {
+    type Error = Unwritten;
+
+    fn try_from(written: Written) -> Result<Self, Unwritten> {
+        let (times, positions) = (written.time_s.len(), written.approach_mm.len());
+        let frames = written.frames.len();
+        if times != frames || positions != frames || !(1..=COURSE_FRAMES.1).contains(&frames) {
+            return Err(Unwritten::Lengths {
+                times,
+                positions,
+                frames,
+            });
+        }
+        let rows = written.time_s.iter().zip(&written.approach_mm);
+        let moments = rows.zip(&written.frames).enumerate();
+        let moment = |(place, ((&time_s, &approach_mm), frame)): (usize, ((&f32, _), &String))| {
+            let frame = sparse::read(frame).map_err(|error| Unwritten::Frame(place, error))?;
+            Ok(CourseMoment {
+                time_s,
+                approach_mm,
+                frame,
+            })
+        };
+        Ok(Self {
+            course: Course {
+                moments: moments.map(moment).collect::<Result<_, _>>()?,
+                arm_n_per_mm: written.arm_n_per_mm,
+            },
+            probabilities: written.probabilities,
+            shore: written.shore,
+        })
+    }
+}

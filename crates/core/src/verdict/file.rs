@@ -1,0 +1,472 @@
+//! The checks of a model file before its graph is built (`docs/formats.md`).
+//!
+//! In: the file as ONNX's own messages. Out: the model's description, or the first part that breaks
+//! the format. Nothing here runs the model.
+
+use serde::Deserialize;
+use tract_onnx::pb;
+
+use super::course::Input;
+use super::{
+    COURSE_FRAMES, Card, Check, CheckedCourse, Checks, Conformal, CourseCheck, Format, Level,
+    MIN_OPSET, ModelError, Range,
+};
+use crate::frame::{COLS, ROWS, TAXELS};
+use crate::wording::is_plain;
+
+/// The longest `label` and `shore` of a level: every event carries a label.
+const LONGEST_LABEL_BYTES: usize = 255;
+/// The longest text of another key.
+const LONGEST_LINE_BYTES: usize = 16_384;
+
+pub(super) fn check_opset(proto: &pb::ModelProto) -> Result<(), ModelError> {
+    let found = proto
+        .opset_import
+        .iter()
+        .find(|import| import.domain.is_empty() || import.domain == "ai.onnx")
+        .map(|import| import.version);
+    match found {
+        Some(version) if version >= MIN_OPSET => Ok(()),
+        _ => Err(ModelError::Opset { found }),
+    }
+}
+
+/// Refuses tensors whose data lies outside the file, including those in subgraphs and attributes.
+pub(super) fn check_tensors_inside(graph: &pb::GraphProto) -> Result<(), ModelError> {
+    let inside = |tensor: &pb::TensorProto| {
+        let external = pb::tensor_proto::DataLocation::External as i32;
+        if tensor.data_location == Some(external) || !tensor.external_data.is_empty() {
+            return Err(ModelError::ExternalData {
+                tensor: tensor.name.clone(),
+            });
+        }
+        Ok(())
+    };
+    let sparse_inside = |sparse: &pb::SparseTensorProto| {
+        sparse
+            .values
+            .iter()
+            .chain(&sparse.indices)
+            .try_for_each(inside)
+    };
+    graph.initializer.iter().try_for_each(inside)?;
+    graph
+        .sparse_initializer
+        .iter()
+        .try_for_each(sparse_inside)?;
+    for attribute in graph.node.iter().flat_map(|node| &node.attribute) {
+        attribute
+            .t
+            .iter()
+            .chain(&attribute.tensors)
+            .try_for_each(inside)?;
+        attribute
+            .sparse_tensor
+            .iter()
+            .chain(&attribute.sparse_tensors)
+            .try_for_each(sparse_inside)?;
+        attribute
+            .g
+            .iter()
+            .chain(&attribute.graphs)
+            .try_for_each(check_tensors_inside)?;
+    }
+    Ok(())
+}
+
+/// Refuses inputs and outputs that break the format. Returns the format, and for format 2 the
+/// inputs in their order.
+pub(super) fn check_signature(
+    graph: &pb::GraphProto,
+    card: &Card,
+    checks: &Checks,
+) -> Result<(Format, Vec<Input>), ModelError> {
+    let levels = card.levels.len();
+    let describe = |values: &[&pb::ValueInfoProto]| {
+        values
+            .iter()
+            .map(|value| describe_value(value))
+            .collect::<Vec<_>>()
+            .join(", ")
+    };
+    // Before ONNX IR 4, every initialiser is also listed among the inputs.
+    let inputs: Vec<&pb::ValueInfoProto> = graph
+        .input
+        .iter()
+        .filter(|input| {
+            graph
+                .initializer
+                .iter()
+                .all(|tensor| tensor.name != input.name)
+        })
+        .collect();
+    let (format, inputs) = match checks {
+        Checks::Frames(_) => {
+            let (found, expected) = (describe(&inputs), format!("frame f32 [1,1,{ROWS},{COLS}]"));
+            if found != expected {
+                return Err(ModelError::Signature {
+                    what: "input",
+                    found,
+                    expected,
+                });
+            }
+            (Format::Frame, Vec::new())
+        }
+        Checks::Courses(check) => {
+            let (most_frames, inputs) = check_course_inputs(&inputs)?;
+            check_lengths(check, most_frames)?;
+            (Format::Course { most_frames }, inputs)
+        }
+    };
+    let mut outputs: Vec<&pb::ValueInfoProto> = graph.output.iter().collect();
+    outputs.sort_by(|left, right| left.name.cmp(&right.name));
+    let found = describe(&outputs);
+    let mut expected = format!("logits f32 [1,{levels}], probabilities f32 [1,{levels}]");
+    let with_shore = format!("{expected}, shore f32 [1,3]");
+    let may_lack_shore = format == Format::Frame;
+    let is_agreed = found == with_shore || (may_lack_shore && found == expected);
+    if !may_lack_shore {
+        expected = with_shore;
+    }
+    if !is_agreed {
+        return Err(ModelError::Signature {
+            what: "outputs",
+            found,
+            expected,
+        });
+    }
+    // The inference library assumes that a node computes each output.
+    for output in outputs {
+        if !graph
+            .node
+            .iter()
+            .any(|node| node.output.contains(&output.name))
+        {
+            return Err(ModelError::Graph(format!(
+                "no node computes `{}`",
+                output.name
+            )));
+        }
+    }
+    Ok((format, inputs))
+}
+
+/// The largest number of frames that a model of format 2 takes, and its inputs in their order.
+fn check_course_inputs(inputs: &[&pb::ValueInfoProto]) -> Result<(usize, Vec<Input>), ModelError> {
+    let (least, most) = COURSE_FRAMES;
+    let agreed = |input: Input, frames: &dyn std::fmt::Display| {
+        let shape = match input {
+            Input::Frames => format!("[1,{frames},{ROWS},{COLS}]"),
+            Input::ArmNPerMm => "[1,1]".to_owned(),
+            _ => format!("[1,{frames}]"),
+        };
+        format!("{} f32 {shape}", input.name())
+    };
+    let found: Vec<String> = inputs.iter().map(|input| describe_value(input)).collect();
+    for frames in least..=most {
+        let of = |described: &String| {
+            let mut all = Input::ALL.into_iter();
+            all.find(|&input| agreed(input, &frames) == *described)
+        };
+        let Some(read) = found.iter().map(of).collect::<Option<Vec<Input>>>() else {
+            continue;
+        };
+        if Input::ALL.iter().all(|input| read.contains(input)) && read.len() == Input::ALL.len() {
+            return Ok((frames, read));
+        }
+    }
+    Err(ModelError::Signature {
+        what: "inputs",
+        found: found.join(", "),
+        expected: format!(
+            "{}, T {least} to {most}",
+            Input::ALL.map(|input| agreed(input, &"T")).join(", ")
+        ),
+    })
+}
+
+/// Refuses check presses that have more frames than the model takes.
+fn check_lengths(check: &CourseCheck, most: usize) -> Result<(), ModelError> {
+    let mut lengths = check.presses.iter().map(|press| press.course.moments.len());
+    match lengths.find(|&found| found > most) {
+        Some(found) => Err(ModelError::KeyInvalid {
+            key: "hrn.check",
+            found: format!("a press of {found} frames"),
+            expected: format!("at most {most}, as the input `frames` has"),
+        }),
+        None => Ok(()),
+    }
+}
+
+/// A graph input or output as `name type [shape]`.
+fn describe_value(value: &pb::ValueInfoProto) -> String {
+    use pb::tensor_shape_proto::dimension::Value as Dimension;
+    use pb::type_proto::Value;
+    let Some(Value::TensorType(tensor)) = value.r#type.as_ref().and_then(|t| t.value.as_ref())
+    else {
+        return format!("{} of no tensor type", value.name);
+    };
+    let datum = match pb::tensor_proto::DataType::try_from(tensor.elem_type) {
+        Ok(pb::tensor_proto::DataType::Float) => "f32".to_owned(),
+        Ok(other) => format!("{other:?}").to_lowercase(),
+        Err(_) => format!("type {}", tensor.elem_type),
+    };
+    let dimensions: Vec<String> = tensor
+        .shape
+        .iter()
+        .flat_map(|shape| &shape.dim)
+        .map(|dimension| match &dimension.value {
+            Some(Dimension::DimValue(length)) => length.to_string(),
+            Some(Dimension::DimParam(name)) => name.clone(),
+            None => "?".to_owned(),
+        })
+        .collect();
+    format!("{} {datum} [{}]", value.name, dimensions.join(","))
+}
+
+/// Reads and checks all `hrn.*` keys.
+pub(super) fn read_metadata(proto: &pb::ModelProto) -> Result<(Card, Checks), ModelError> {
+    let text = |key: &'static str| {
+        let mut entries = proto.metadata_props.iter().filter(|entry| entry.key == key);
+        let first = entries.next().ok_or(ModelError::KeyMissing { key })?;
+        match entries.count() {
+            0 => Ok(first.value.as_str()),
+            more => Err(ModelError::KeyInvalid {
+                key,
+                found: format!("it {} times", 1 + more),
+                expected: "it once".to_owned(),
+            }),
+        }
+    };
+    let line = |key: &'static str| {
+        let value = text(key)?;
+        if value.trim().is_empty() || !is_plain(value) || value.len() > LONGEST_LINE_BYTES {
+            let expected = format!(
+                "text without control or bidirectional characters, of at most {LONGEST_LINE_BYTES} bytes"
+            );
+            return Err(ModelError::KeyInvalid {
+                key,
+                found: shown(value),
+                expected,
+            });
+        }
+        Ok(value.to_owned())
+    };
+
+    let format = text("hrn.format")?.to_owned();
+    if !["1", "2"].contains(&format.as_str()) {
+        let (found, expected) = (format!("{format:?}"), "\"1\" or \"2\"".to_owned());
+        return Err(ModelError::KeyInvalid {
+            key: "hrn.format",
+            found,
+            expected,
+        });
+    }
+    let levels: Vec<Level> = json("hrn.levels", text("hrn.levels")?, "the levels as in hello")?;
+    check_levels(&levels)?;
+    let pitch = text("hrn.pitch_mm")?;
+    let pitch_mm = match pitch.trim().parse::<f32>() {
+        Ok(value) if value.is_finite() && value > 0.0 => value,
+        _ => {
+            let expected = "millimetres above 0".to_owned();
+            let found = format!("{pitch:?}");
+            return Err(ModelError::KeyInvalid {
+                key: "hrn.pitch_mm",
+                found,
+                expected,
+            });
+        }
+    };
+    let range: Range = json("hrn.range", text("hrn.range")?, "trained force and area")?;
+    check_range(&range, &format)?;
+    let check = text("hrn.check")?;
+    let (checks, conformal) = if format == "1" {
+        let check: Check = json("hrn.check", check, "frames and probabilities")?;
+        check_check(&check, levels.len())?;
+        (Checks::Frames(check), None)
+    } else {
+        let check: CourseCheck = json("hrn.check", check, "presses with what the trainer says")?;
+        check_course_check(&check, levels.len())?;
+        let conformal = match text("hrn.conformal") {
+            Err(ModelError::KeyMissing { .. }) => None,
+            found => Some(read_conformal(found?)?),
+        };
+        (Checks::Courses(check), conformal)
+    };
+    let card = Card {
+        format,
+        levels,
+        pitch_mm,
+        method: line("hrn.method")?,
+        data: line("hrn.data")?,
+        metrics: json("hrn.metrics", text("hrn.metrics")?, "JSON")?,
+        validation: line("hrn.validation")?,
+        range,
+        conformal,
+    };
+    Ok((card, checks))
+}
+
+fn read_conformal(text: &str) -> Result<Conformal, ModelError> {
+    let key = "hrn.conformal";
+    let expected = "`alpha` between 0 and 1, and `threshold`, 0 to 1";
+    let conformal: Conformal = json(key, text, expected)?;
+    let Conformal { alpha, threshold } = conformal;
+    if alpha > 0.0 && alpha < 1.0 && (0.0..=1.0).contains(&threshold) {
+        return Ok(conformal);
+    }
+    Err(ModelError::KeyInvalid {
+        key,
+        found: format!("{conformal:?}"),
+        expected: expected.to_owned(),
+    })
+}
+
+fn check_course_check(check: &CourseCheck, levels: usize) -> Result<(), ModelError> {
+    let invalid = |found: String, expected: String| {
+        Err(ModelError::KeyInvalid {
+            key: "hrn.check",
+            found,
+            expected,
+        })
+    };
+    let count = check.presses.len();
+    if ![8, 2 * levels].contains(&count) {
+        return invalid(format!("{count} presses"), "8, or two a level".to_owned());
+    }
+    for CheckedCourse {
+        course,
+        probabilities,
+        ..
+    } in &check.presses
+    {
+        if probabilities.len() != levels {
+            let found = format!("{} probabilities of a press", probabilities.len());
+            return invalid(found, format!("{levels}"));
+        }
+        let numbers = course.moments.iter();
+        let mut numbers = numbers.flat_map(|m| [m.time_s, m.approach_mm.unwrap_or(0.0)]);
+        if !numbers.all(f32::is_finite) || course.arm_n_per_mm.is_nan() || course.arm_n_per_mm < 0.0
+        {
+            let expected = "finite times and positions, and an arm of 0 N/mm or more";
+            return invalid("another number in a press".to_owned(), expected.to_owned());
+        }
+    }
+    Ok(())
+}
+
+fn json<T: for<'a> Deserialize<'a>>(
+    key: &'static str,
+    value: &str,
+    expected: &str,
+) -> Result<T, ModelError> {
+    serde_json::from_str(value).map_err(|error| ModelError::KeyInvalid {
+        key,
+        found: error.to_string(),
+        expected: expected.to_owned(),
+    })
+}
+
+/// Checks the levels that a model states: numbers from 1, and labels that can be shown.
+pub fn check_levels(levels: &[Level]) -> Result<(), ModelError> {
+    let key = "hrn.levels";
+    let numbers: Vec<u8> = levels.iter().map(|level| level.level).collect();
+    let consecutive = numbers
+        .iter()
+        .zip(1..=u8::MAX)
+        .all(|(&number, wanted)| number == wanted);
+    if levels.len() < 2 || levels.len() > usize::from(u8::MAX) || !consecutive {
+        let expected = "levels 1, 2, ... in order, at least two".to_owned();
+        return Err(ModelError::KeyInvalid {
+            key,
+            found: format!("{numbers:?}"),
+            expected,
+        });
+    }
+    for text in levels.iter().flat_map(|level| [&level.label, &level.shore]) {
+        if text.is_empty() || !is_plain(text) || text.len() > LONGEST_LABEL_BYTES {
+            let expected = format!(
+                "`label` and `shore` of 1 to {LONGEST_LABEL_BYTES} bytes, without control or bidirectional \
+                 characters"
+            );
+            return Err(ModelError::KeyInvalid {
+                key,
+                found: shown(text),
+                expected,
+            });
+        }
+    }
+    Ok(())
+}
+
+/// The beginning of a text, quoted.
+fn shown(text: &str) -> String {
+    let begin: String = text.chars().take(60).collect();
+    match begin.len() < text.len() {
+        true => format!("{begin:?}... of {} bytes", text.len()),
+        false => format!("{text:?}"),
+    }
+}
+
+fn check_range(range: &Range, format: &str) -> Result<(), ModelError> {
+    let [force_low, force_high] = range.force_n;
+    let [area_low, area_high] = range.contact_area_taxels;
+    let force_ordered = force_low.is_finite() && force_high.is_finite() && force_low <= force_high;
+    let of_presses = range.of_presses();
+    let mut of_presses = of_presses.iter().flatten();
+    let expected = if format == "1" && of_presses.clone().next().is_some() {
+        "`force_n` and `contact_area_taxels` alone: the others are of format 2"
+    } else if !of_presses.all(|&[low, high]| high.is_finite() && 0.0 <= low && low <= high) {
+        "[least, greatest] of finite numbers, in the ranges of format 2 from 0"
+    } else if !force_ordered || area_low > area_high {
+        "[least, greatest] of finite numbers"
+    } else {
+        return Ok(());
+    };
+    Err(ModelError::KeyInvalid {
+        key: "hrn.range",
+        found: format!("{range:?}"),
+        expected: expected.to_owned(),
+    })
+}
+
+fn check_check(check: &Check, levels: usize) -> Result<(), ModelError> {
+    let usable = |newtons: &Vec<f32>| {
+        newtons.len() == TAXELS && newtons.iter().all(|n| n.is_finite() && *n >= 0.0)
+    };
+    // There are 8 check frames, or two a level. Only a model of four levels has both.
+    if [8, 2 * levels].contains(&check.frames.len())
+        && check.frames.len() == check.probabilities.len()
+        && check.frames.iter().all(usable)
+        && check.probabilities.iter().all(|row| row.len() == levels)
+    {
+        return Ok(());
+    }
+    let lengths = |rows: &[Vec<f32>]| {
+        let mut lengths: Vec<usize> = rows.iter().map(Vec::len).collect();
+        lengths.dedup();
+        lengths
+    };
+    let unusable = |n: &&f32| !(n.is_finite() && **n >= 0.0);
+    if let Some(newtons) = check.frames.iter().flatten().find(unusable) {
+        return Err(ModelError::KeyInvalid {
+            key: "hrn.check",
+            found: format!("{newtons} in a frame"),
+            expected: "newtons of 0 or more".to_owned(),
+        });
+    }
+    let found = format!(
+        "{} frames of lengths {:?}, {} rows of probabilities of lengths {:?}",
+        check.frames.len(),
+        lengths(&check.frames),
+        check.probabilities.len(),
+        lengths(&check.probabilities)
+    );
+    let expected =
+        format!("8 frames of {TAXELS} newtons, or two a level, as many rows of {levels}");
+    Err(ModelError::KeyInvalid {
+        key: "hrn.check",
+        found,
+        expected,
+    })
+}

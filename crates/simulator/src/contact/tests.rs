@@ -1,0 +1,302 @@
+use std::f64::consts::PI;
+
+use super::*;
+use crate::kernel::{self, Base, Layer};
+use crate::sensor::CELL_MM;
+
+/// Solves gaps that are given by radius, on a half-space of modulus E* or on a layer.
+struct Bed {
+    width: usize,
+    cell_mm: f64,
+    spectrum: Vec<f32>,
+    convolver: Convolver,
+}
+
+impl Bed {
+    fn half_space(width: usize, cell_mm: f64, plane_strain_mpa: f64) -> Self {
+        let mut convolver = Convolver::new(width);
+        let unit = cell_mm / plane_strain_mpa;
+        let spectrum = convolver.spectrum(|i, j| unit * kernel::half_space(i as f64, j as f64));
+        Self {
+            width,
+            cell_mm,
+            spectrum,
+            convolver,
+        }
+    }
+
+    fn layer(width: usize, nu: f64, plane_strain_mpa: f64, height_mm: f64) -> Self {
+        let mut convolver = Convolver::new(width);
+        let layer = Layer::new(nu, Base::Rigid);
+        let unit = CELL_MM / plane_strain_mpa;
+        let height = height_mm / CELL_MM;
+        let spectrum =
+            convolver.spectrum(|i, j| unit * layer.influence(i as f64, j as f64, height));
+        Self {
+            width,
+            cell_mm: CELL_MM,
+            spectrum,
+            convolver,
+        }
+    }
+
+    fn gap(&self, shape: impl Fn(f64) -> f64) -> Vec<f32> {
+        let at = |i: usize| (i as f64 + 0.5 - 0.5 * self.width as f64) * self.cell_mm;
+        (0..self.width * self.width)
+            .map(|k| shape(at(k / self.width).hypot(at(k % self.width))) as f32)
+            .collect()
+    }
+
+    /// Mean square distance from the centre, weighted with the pressure.
+    fn second_moment(&self, pressure: &[f32]) -> f64 {
+        let square = self.gap(|r| r * r);
+        let sum = |weight: &[f32]| -> f64 {
+            pressure
+                .iter()
+                .zip(weight)
+                .map(|(&p, &w)| f64::from(p) * f64::from(w))
+                .sum()
+        };
+        sum(&square) / sum(&vec![1.0; square.len()])
+    }
+
+    fn press(&mut self, gap: &[f32], force_n: f64, local: Local) -> (Vec<f32>, Contact) {
+        let mut pressure = vec![0.0; gap.len()];
+        let problem = Problem {
+            gap_mm: gap,
+            spectrum: &self.spectrum,
+            local,
+            force_n,
+            cell_mm: self.cell_mm,
+            tolerance: TOLERANCE,
+        };
+        let contact = solve(
+            &mut self.convolver,
+            &mut Fields::default(),
+            &problem,
+            &mut pressure,
+        );
+        assert!(contact.converged, "{contact:?}");
+        (pressure, contact)
+    }
+}
+
+fn peak(pressure: &[f32]) -> f64 {
+    f64::from(pressure.iter().copied().fold(0.0, f32::max))
+}
+
+fn near(seen: f64, expected: f64, tolerance: f64, what: &str) {
+    assert!(
+        (seen / expected - 1.0).abs() < tolerance,
+        "{what}: {seen}, {expected}"
+    );
+}
+
+#[test]
+fn sphere_on_half_space_is_hertz() {
+    // The gap is Hertz's paraboloid.
+    let (radius, modulus) = (27.0, 0.8);
+    let mut bed = Bed::half_space(48, CELL_MM, modulus);
+    let gap = bed.gap(|r| 0.5 * r * r / radius);
+    for force in [10.0, 15.0, 20.0, 25.0] {
+        let (pressure, contact) = bed.press(&gap, force, Local::None);
+        let a = (0.75 * force * radius / modulus).cbrt();
+        // The radius from counted cells errs by the cells on the rim. The second moment, 2 a^2 / 5,
+        // does not.
+        near(
+            (2.5 * bed.second_moment(&pressure)).sqrt(),
+            a,
+            0.01,
+            "contact radius",
+        );
+        near(contact.radius_mm, a, 0.03, "counted radius");
+        near(contact.approach_mm, a * a / radius, 0.01, "approach");
+        near(
+            peak(&pressure),
+            1.5 * force / (PI * a * a),
+            0.02,
+            "peak pressure",
+        );
+        let sum: f64 = pressure
+            .iter()
+            .map(|&p| f64::from(p) * CELL_MM * CELL_MM)
+            .sum();
+        near(sum, force, 1e-5, "force");
+    }
+}
+
+#[test]
+fn flat_punch_sinks_by_force_over_diameter_and_modulus() {
+    let (radius, modulus, force) = (14.0, 0.8, 10.0);
+    let mut bed = Bed::half_space(48, CELL_MM, modulus);
+    let gap = bed.gap(|r| if r < radius { 0.0 } else { 1e3 });
+    let (_, contact) = bed.press(&gap, force, Local::None);
+    near(
+        contact.approach_mm,
+        force / (2.0 * modulus * contact.radius_mm),
+        0.015,
+        "approach",
+    );
+    near(contact.radius_mm, radius, 0.01, "radius");
+}
+
+#[test]
+fn thin_layer_is_a_mattress() {
+    // Above a ratio of 20 of contact radius to thickness, the layer is a Winkler foundation with
+    // the confined modulus.
+    let (nu, modulus, height, radius, force) = (0.3, 3.0, 0.5, 4000.0, 40.0);
+    let mut bed = Bed::layer(96, nu, modulus, height);
+    let gap = bed.gap(|r| 0.5 * r * r / radius);
+    let (pressure, contact) = bed.press(&gap, force, Local::None);
+    let stiffness = modulus / (kernel::confined_compliance(nu) * height);
+    assert!(contact.radius_mm > 20.0 * height, "{contact:?}");
+    near(
+        peak(&pressure),
+        (force * stiffness / (PI * radius)).sqrt(),
+        0.01,
+        "peak pressure",
+    );
+}
+
+#[test]
+fn local_laws_obey_the_force_and_close_the_gap() {
+    let gap_of = |bed: &Bed| bed.gap(|r| 0.5 * r * r / 27.0);
+    let foam = Local::Foam {
+        plateau_mpa: 0.04,
+        exponent: 2.5,
+        strain: 0.5,
+        height_mm: 50.0,
+        factor: 1.0,
+        history_mpa: &[],
+    };
+    let flow = Local::Flow {
+        hardness_mpa: 0.1,
+        time_s: 1.0,
+    };
+    for local in [foam, flow] {
+        let mut bed = Bed::half_space(64, CELL_MM, 0.4);
+        let gap = gap_of(&bed);
+        let (pressure, contact) = bed.press(&gap, 12.0, local);
+        let mut displacement = vec![0.0; gap.len()];
+        bed.convolver
+            .convolve(&bed.spectrum, &pressure, &mut displacement);
+        let (mut worst, mut deepest) = (0.0_f64, 0.0_f64);
+        for (i, &p) in pressure.iter().enumerate() {
+            let (w, _) = local.at(i, p, contact.radius_mm);
+            let open = f64::from(displacement[i] + gap[i] + w) - contact.approach_mm;
+            if p > 0.01 {
+                worst = worst.max(open.abs());
+            } else if p == 0.0 {
+                deepest = deepest.max(-open);
+            }
+        }
+        // The approach is of the order of millimetres.
+        assert!(
+            worst < 0.02 * contact.approach_mm,
+            "{local:?}: open by {worst} mm"
+        );
+        assert!(
+            deepest < 0.02 * contact.approach_mm,
+            "{local:?}: {deepest} mm deep"
+        );
+    }
+}
+
+#[test]
+fn a_finer_tolerance_changes_little() {
+    let mut bed = Bed::half_space(48, CELL_MM, 0.8);
+    let gap = bed.gap(|r| 0.5 * r * r / 25.0 + 0.05 * (2.0 * r).sin());
+    let (coarse, _) = bed.press(&gap, 8.0, Local::None);
+    let mut fine = coarse.clone();
+    let problem = Problem {
+        gap_mm: &gap,
+        spectrum: &bed.spectrum,
+        local: Local::None,
+        force_n: 8.0,
+        cell_mm: CELL_MM,
+        tolerance: 1e-5,
+    };
+    let contact = solve(
+        &mut bed.convolver,
+        &mut Fields::default(),
+        &problem,
+        &mut fine,
+    );
+    assert!(contact.converged && contact.iterations > 1, "{contact:?}");
+    let moved: f64 = coarse
+        .iter()
+        .zip(&fine)
+        .map(|(&a, &b)| f64::from((a - b).abs()))
+        .sum();
+    let total: f64 = fine.iter().map(|&p| f64::from(p)).sum();
+    assert!(
+        moved < 0.01 * total,
+        "{} of the pressure moved",
+        moved / total
+    );
+}
+
+#[test]
+fn rough_contact_area_is_linear_in_the_load() {
+    // The roughness on a flat is well resolved: its shortest wave has 9 cells. Persson:
+    // A / A0 = sqrt(8 / pi) p / (E* h'), with h' the rms slope. The ratio to this is 1.0 to 1.15 if
+    // the cells on the rim are not counted whole: 0.118 of a cell's area is subtracted for each of
+    // its sides on the rim (Yastrebov, Anciaux and Molinari 2017). Here it is 1.21 to 1.26, with a
+    // finite window and a slope from differences, which is about 4 % low.
+    use crate::random::Stream;
+    use crate::substance::Texture;
+    use crate::texture::Patch;
+    let texture = Texture {
+        rms_um: 100.0,
+        shortest_mm: 8.0,
+        longest_mm: 20.0,
+        hurst: 0.7,
+        anisotropy: 1.0,
+    };
+    let (width, modulus) = (112, 0.8);
+    let patch = Patch::new(&texture, 1.0, CELL_MM, &mut Stream::new(8, "rough"));
+    let height = |i: usize, j: usize| patch.height_mm(i as f64 * CELL_MM, j as f64 * CELL_MM);
+    let gap: Vec<f32> = (0..width * width)
+        .map(|k| 1.0 - height(k % width, k / width))
+        .collect();
+    let (mut slope, mut count) = (0.0, 0.0);
+    for i in 0..127 {
+        for j in 0..128 {
+            slope += (f64::from(height(i + 1, j) - height(i, j)) / CELL_MM).powi(2);
+            count += 1.0;
+        }
+    }
+    let slope = (2.0 * slope / count).sqrt();
+    let mut bed = Bed::half_space(width, CELL_MM, modulus);
+    let nominal = (width as f64 * CELL_MM).powi(2);
+    let ratios: Vec<f64> = [1.0, 2.0, 4.0]
+        .into_iter()
+        .map(|force| {
+            let (pressure, _) = bed.press(&gap, force, Local::None);
+            let held = |k: usize| usize::from(pressure[k] > 0.0);
+            let area: usize = (0..width * width).map(held).sum();
+            let rim: usize = (0..width * width - width)
+                .map(|k| {
+                    let right = if k % width + 1 < width {
+                        held(k + 1)
+                    } else {
+                        held(k)
+                    };
+                    held(k).abs_diff(right) + held(k).abs_diff(held(k + width))
+                })
+                .sum();
+            let cells = area as f64 - 0.118 * rim as f64;
+            cells * CELL_MM * CELL_MM
+                / nominal
+                / ((8.0 / PI).sqrt() * force / nominal / (modulus * slope))
+        })
+        .collect();
+    assert!(
+        ratios.iter().all(|ratio| (1.0..1.35).contains(ratio)),
+        "{ratios:?}"
+    );
+    assert!(
+        ratios[0] / ratios[2] < 1.2 && ratios[2] / ratios[0] < 1.2,
+        "{ratios:?}"
+    );
+}

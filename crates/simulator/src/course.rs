@@ -1,0 +1,487 @@
+//! One press over time with a prescribed motion, `z(t) = d + F / k_arm`.
+//!
+//! Loading and unloading are solved at chosen forces, and the time of each force follows from the
+//! motion. In the hold, the solver seeks the force that keeps z. The state of each Kelvin element
+//! carries creep from step to step. Pressure is taken as linear in time within a step, for which
+//! the element's update is exact.
+
+use super::motion::{Arm, Motion};
+use super::press::{Bench, Specimen, Step, Window, touches_border};
+use super::sensor::taxel_forces;
+use super::substance::Law;
+use hardnessd_core::frame::TAXELS;
+
+/// A press from touch to separation.
+pub(super) struct Course {
+    /// The solved moments, ascending in time from the touch. Forces are linear between them.
+    moments: Vec<Moment>,
+    /// The arm's motion during the press.
+    pub(super) motion: Motion,
+}
+
+#[derive(Clone)]
+struct Moment {
+    time_s: f64,
+    force_n: f64,
+    taxels_n: [f32; TAXELS],
+}
+
+/// The number of forces solved while loading, and while unloading.
+const LEVELS: u32 = 14;
+/// Exponent of the spacing of the forces. They are denser at the touch, where the contact grows
+/// fastest.
+const SPACING: f64 = 1.7;
+/// Times of the hold that are solved, s. They are denser at first, where creep is fastest.
+const HOLD_S: [f64; 9] = [0.03, 0.07, 0.14, 0.25, 0.4, 0.6, 0.85, 1.15, 1.5];
+/// Tolerance of the position in the hold, as a part of the force.
+const HOLD_TOLERANCE: f64 = 1e-3;
+
+impl Course {
+    /// Presses to `force_n`, holds the position for `hold_s` and withdraws.
+    pub(super) fn new(
+        bench: &mut Bench,
+        specimen: &Specimen,
+        arm: Arm,
+        force_n: f64,
+        hold_s: f64,
+    ) -> Self {
+        Self::in_levels(bench, specimen, arm, force_n, hold_s, LEVELS)
+    }
+
+    fn in_levels(
+        bench: &mut Bench,
+        specimen: &Specimen,
+        arm: Arm,
+        force_n: f64,
+        hold_s: f64,
+        levels: u32,
+    ) -> Self {
+        // The contact is largest at the end of the hold, when everything has crept.
+        let (mut window, _, _) = bench.press(specimen, force_n, 1.0, hold_s);
+        loop {
+            let mut run = Run::new(bench, specimen, arm, window);
+            run.load(force_n, levels);
+            let (top_mm, load_s) = (run.travel_mm, run.time_s);
+            run.hold(hold_s);
+            run.unload(levels);
+            let Run { moments, fits, .. } = run;
+            match window.wider(specimen, force_n) {
+                Some(wider) if !fits => window = wider,
+                _ => {
+                    let motion = Motion {
+                        top_mm,
+                        load_s,
+                        hold_s,
+                        speed_mm_s: arm.speed_mm_s,
+                    };
+                    return Self { moments, motion };
+                }
+            }
+        }
+    }
+
+    /// Time from touch to separation, s.
+    pub(super) fn duration_s(&self) -> f64 {
+        self.moments.last().map_or(0.0, |moment| moment.time_s)
+    }
+
+    /// The taxel forces in newtons `time_s` after the touch; zero before and after the press.
+    pub(super) fn taxels_n(&self, time_s: f64) -> [f32; TAXELS] {
+        let after = self
+            .moments
+            .partition_point(|moment| moment.time_s <= time_s);
+        if after == 0 || after == self.moments.len() {
+            return [0.0; TAXELS];
+        }
+        let (a, b) = (&self.moments[after - 1], &self.moments[after]);
+        let part = ((time_s - a.time_s) / (b.time_s - a.time_s)) as f32;
+        std::array::from_fn(|k| a.taxels_n[k] + part * (b.taxels_n[k] - a.taxels_n[k]))
+    }
+}
+
+/// The state of a press while it is computed.
+struct Run<'a> {
+    bench: &'a mut Bench,
+    specimen: &'a Specimen,
+    arm: Arm,
+    window: Window,
+    gap_mm: Vec<f32>,
+    /// State of each Kelvin element, MPa.
+    crept: Vec<Vec<f32>>,
+    /// The displacement left by flow, mm; empty if there is none.
+    flowed_mm: Vec<f32>,
+    pressure: Vec<f32>,
+    force_n: f64,
+    /// Position z of the sensor's carrier, mm.
+    travel_mm: f64,
+    time_s: f64,
+    moments: Vec<Moment>,
+    fits: bool,
+}
+
+/// A step that is solved but not yet taken.
+struct Trial {
+    force_n: f64,
+    time_s: f64,
+    pressure: Vec<f32>,
+    travel_mm: f64,
+    radius_mm: f64,
+}
+
+impl<'a> Run<'a> {
+    fn new(bench: &'a mut Bench, specimen: &'a Specimen, arm: Arm, window: Window) -> Self {
+        let cells = window.width * window.width;
+        let touch = Moment {
+            time_s: 0.0,
+            force_n: 0.0,
+            taxels_n: [0.0; TAXELS],
+        };
+        Self {
+            bench,
+            specimen,
+            arm,
+            window,
+            gap_mm: specimen.gap_on(window),
+            crept: specimen
+                .substance
+                .creep()
+                .map(|_| vec![0.0; cells])
+                .collect(),
+            flowed_mm: Vec::new(),
+            pressure: vec![0.0; cells],
+            force_n: 0.0,
+            travel_mm: 0.0,
+            time_s: 0.0,
+            moments: vec![touch],
+            fits: true,
+        }
+    }
+
+    fn load(&mut self, force_n: f64, levels: u32) {
+        // Of the first step we only know that it is short. The later guesses are the length of the
+        // step before.
+        let mut guess_s = 0.05;
+        for level in 1..=levels {
+            let goal = force_n * (f64::from(level) / f64::from(levels)).powf(SPACING);
+            let before_s = self.time_s;
+            self.step_to_force(goal, guess_s, 1.0);
+            guess_s = self.time_s - before_s;
+        }
+    }
+
+    fn unload(&mut self, levels: u32) {
+        let top = self.force_n;
+        let mut guess_s = 0.05;
+        for level in (1..levels).rev() {
+            let goal = top * (f64::from(level) / f64::from(levels)).powf(SPACING);
+            let before_s = self.time_s;
+            self.step_to_force(goal, guess_s, -1.0);
+            guess_s = self.time_s - before_s;
+        }
+        // The press ends where the sensor leaves the surface, with its creep and dents at that
+        // time.
+        let (gap, _) = self.effective_gap(0.0);
+        let end_mm = f64::from(gap.iter().copied().fold(f32::INFINITY, f32::min));
+        let last_s = ((self.travel_mm - end_mm) / self.arm.speed_mm_s).max(LEAST_STEP_S);
+        self.moments.push(Moment {
+            time_s: self.time_s + last_s,
+            force_n: 0.0,
+            taxels_n: [0.0; TAXELS],
+        });
+    }
+
+    /// Moves in `direction` until the force is `goal_n`. The time of the step depends on the
+    /// travel, and the travel, through creep, on the time. Two or three rounds settle both.
+    fn step_to_force(&mut self, goal_n: f64, guess_s: f64, direction: f64) {
+        let mut time_s = guess_s.max(LEAST_STEP_S);
+        for round in 1.. {
+            let trial = self.attempt(goal_n, time_s);
+            let needed_s = (direction * (trial.travel_mm - self.travel_mm) / self.arm.speed_mm_s)
+                .max(LEAST_STEP_S);
+            if round == 3 || (needed_s - time_s).abs() < 0.05 * needed_s {
+                return self.take(Trial {
+                    time_s: needed_s,
+                    ..trial
+                });
+            }
+            time_s = needed_s;
+        }
+    }
+
+    /// Keeps z for `hold_s`, with forces from the secant method on `z(F)`.
+    fn hold(&mut self, hold_s: f64) {
+        let keep_mm = self.travel_mm;
+        let start_s = self.time_s;
+        let count = self.moments.len();
+        let mut slope = {
+            let (a, b) = (&self.moments[count - 2], &self.moments[count - 1]);
+            self.arm.speed_mm_s * (b.time_s - a.time_s) / (b.force_n - a.force_n)
+        };
+        let until = HOLD_S.iter().copied().take_while(|&at| at < hold_s - 0.01);
+        for at in until.chain([hold_s]) {
+            let time_s = start_s + at - self.time_s;
+            let mut trial = self.attempt(self.force_n, time_s);
+            for _ in 0..4 {
+                let off = trial.travel_mm - keep_mm;
+                if (off / slope).abs() < HOLD_TOLERANCE * trial.force_n {
+                    break;
+                }
+                let next = (trial.force_n - off / slope).max(0.2 * trial.force_n);
+                let (force_before, travel_before) = (trial.force_n, trial.travel_mm);
+                trial = self.attempt(next, time_s);
+                let seen = (trial.travel_mm - travel_before) / (trial.force_n - force_before);
+                if seen > 0.2 * slope && seen < 5.0 * slope {
+                    slope = seen;
+                }
+            }
+            self.take(trial);
+        }
+    }
+
+    /// Solves a step of `time_s` that ends at `force_n`.
+    fn attempt(&mut self, force_n: f64, time_s: f64) -> Trial {
+        let (gap, history) = self.effective_gap(time_s);
+        let factor = 1.0
+            + self
+                .specimen
+                .substance
+                .creep()
+                .map(|c| c.j * share(time_s, c.tau_s))
+                .sum::<f64>();
+        let mut pressure = self.pressure.clone();
+        let step = Step {
+            force_n,
+            factor,
+            history_mpa: &history,
+            time_s,
+        };
+        let contact = self
+            .bench
+            .solve(self.specimen, self.window.width, &gap, step, &mut pressure);
+        let travel_mm = contact.approach_mm + force_n / self.arm.n_per_mm;
+        Trial {
+            force_n,
+            time_s,
+            pressure,
+            travel_mm,
+            radius_mm: contact.radius_mm,
+        }
+    }
+
+    /// The gap with the creep and flow that earlier steps leave after another `time_s`, and the
+    /// remaining part of the effective pressure, which the foam's law needs separately.
+    fn effective_gap(&mut self, time_s: f64) -> (Vec<f32>, Vec<f32>) {
+        let mut gap = self.gap_mm.clone();
+        for (gap, &flowed) in gap.iter_mut().zip(&self.flowed_mm) {
+            *gap += flowed;
+        }
+        if self.moments.len() == 1 {
+            return (gap, Vec::new());
+        }
+        let mut history = vec![0.0_f32; gap.len()];
+        for (creep, crept) in self.specimen.substance.creep().zip(&self.crept) {
+            let (kept, old) = left(time_s, creep.tau_s);
+            let (kept, old) = ((creep.j * kept) as f32, (creep.j * old) as f32);
+            for ((history, &crept), &pressure) in history.iter_mut().zip(crept).zip(&self.pressure)
+            {
+                *history += kept * crept + old * pressure;
+            }
+        }
+        let displacement = self
+            .bench
+            .displacement(self.specimen, self.window.width, &history);
+        for (gap, u) in gap.iter_mut().zip(displacement) {
+            *gap += u;
+        }
+        (gap, history)
+    }
+
+    fn take(&mut self, trial: Trial) {
+        for (creep, crept) in self.specimen.substance.creep().zip(&mut self.crept) {
+            let (kept, old) = left(trial.time_s, creep.tau_s);
+            let new = share(trial.time_s, creep.tau_s) as f32;
+            let (kept, old) = (kept as f32, old as f32);
+            for ((crept, &before), &now) in
+                crept.iter_mut().zip(&self.pressure).zip(&trial.pressure)
+            {
+                *crept = kept * *crept + old * before + new * now;
+            }
+        }
+        if let Law::Plastic { .. } = self.specimen.substance.law {
+            self.flowed_mm.resize(trial.pressure.len(), 0.0);
+            let flow = self.specimen.flow(trial.time_s);
+            for (flowed, &pressure) in self.flowed_mm.iter_mut().zip(&trial.pressure) {
+                *flowed += flow.displacement_mm(pressure, trial.radius_mm);
+            }
+        }
+        self.fits &= self.window.is_whole() || !touches_border(&trial.pressure, self.window.width);
+        self.pressure = trial.pressure;
+        self.force_n = trial.force_n;
+        self.travel_mm = trial.travel_mm;
+        self.time_s += trial.time_s;
+        self.moments.push(Moment {
+            time_s: self.time_s,
+            force_n: self.force_n,
+            taxels_n: taxel_forces(&self.pressure, self.window.width, self.window.corner),
+        });
+    }
+}
+
+/// The least length of a step, so that time advances even where creep runs ahead of the motion.
+const LEAST_STEP_S: f64 = 1e-3;
+
+/// For a Kelvin element of time constant tau, `s' = (p - s) / tau`, under a pressure linear in time
+/// over `t`: the share of the new pressure in the new state, `1 - (tau / t) (1 - exp(-t / tau))`.
+fn share(time_s: f64, tau_s: f64) -> f64 {
+    if time_s <= 0.0 {
+        return 0.0;
+    }
+    let x = time_s / tau_s;
+    1.0 + (-x).exp_m1() / x
+}
+
+/// For the same element: the shares of the old state and of the old pressure in the new state.
+fn left(time_s: f64, tau_s: f64) -> (f64, f64) {
+    let kept = (-time_s / tau_s).exp();
+    (kept, 1.0 - kept - share(time_s, tau_s))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::material::Material;
+    use super::super::object::{Face, Pose};
+    use super::super::press::Specimen;
+    use super::super::texture::Patch;
+    use super::*;
+    use crate::random::Stream;
+
+    fn specimen(material: Material, face: &Face) -> Specimen {
+        let properties = material.properties();
+        let mut stream = Stream::new(4, "course");
+        let pose = Pose::draw(face, &mut stream.child(0));
+        let patch = Patch::new(&properties.substance.texture, 1.0, 0.875, &mut stream);
+        Specimen::new(
+            properties.substance,
+            properties.young_mpa(properties.shore.mean),
+            face,
+            &pose,
+            &patch,
+        )
+    }
+
+    fn total(taxels: &[f32; TAXELS]) -> f64 {
+        taxels.iter().map(|&force| f64::from(force)).sum()
+    }
+
+    #[test]
+    fn an_element_keeps_to_its_closed_form_at_50_hz() {
+        // z held by a spring 1/k in series with c (p + sum j s): with one element,
+        // c (p + j s) + p / k = z, s' = (p - s) / tau gives
+        // p = p0 (1 + b exp(-(1 + b) t / tau)) / (1 + b), p0 = z / (c + 1/k), b = j c / (c + 1/k).
+        let (c, arm, j, tau, z) = (0.12, 0.1, 0.30, 0.2, 2.0);
+        let b = j * c / (c + arm);
+        let start = z / (c + arm);
+        let (mut s, mut before, mut time) = (0.0, start, 0.0);
+        let mut worst = 0.0_f64;
+        for _ in 0..75 {
+            let step = 0.02;
+            let (kept, old) = left(step, tau);
+            let history = kept * s + old * before;
+            let now = (z - c * j * history) / (c + arm + c * j * share(step, tau));
+            s = history + share(step, tau) * now;
+            before = now;
+            time += step;
+            let expected = start * (1.0 + b * (-(1.0 + b) * time / tau).exp()) / (1.0 + b);
+            worst = worst.max((now / expected - 1.0).abs());
+        }
+        assert!(worst < 1e-2, "relaxation off by {worst}");
+    }
+
+    #[test]
+    fn force_relaxes_in_the_hold_as_creep_and_arm_say() {
+        // Soft candy's compliance grows by up to 60 %, which the arm and the growing contact share.
+        let specimen = specimen(Material::SoftCandy, &Face::ball(27.0));
+        let course = Course::new(&mut Bench::default(), &specimen, Arm::default(), 12.0, 1.5);
+        let top = course
+            .moments
+            .iter()
+            .map(|moment| moment.force_n)
+            .fold(0.0, f64::max);
+        let hold: Vec<&Moment> = course
+            .moments
+            .iter()
+            .skip_while(|moment| moment.force_n < top)
+            .take(10)
+            .collect();
+        assert!((top - 12.0).abs() < 1e-9);
+        assert!(
+            hold.windows(2)
+                .all(|pair| pair[1].force_n < pair[0].force_n)
+        );
+        let kept = hold[9].force_n / top;
+        assert!((0.75..0.97).contains(&kept), "{kept} of the force is left");
+    }
+
+    #[test]
+    fn carriage_moves_at_5_mm_a_second_and_taxels_carry_the_force() {
+        for material in [Material::Rubber, Material::Plasticine, Material::YogaMat] {
+            let specimen = specimen(material, &Face::ball(27.0));
+            let course = Course::new(&mut Bench::default(), &specimen, Arm::default(), 15.0, 1.0);
+            let mut last = -1.0;
+            for moment in &course.moments {
+                assert!(moment.time_s > last, "{material}: time stands still");
+                last = moment.time_s;
+                let sum = total(&moment.taxels_n);
+                assert!(
+                    (sum - moment.force_n).abs() < 0.03 * moment.force_n + 1e-6,
+                    "{material}: taxels carry {sum} N of {} N",
+                    moment.force_n
+                );
+            }
+            // Loading ends when z = d + F / k. The arm alone takes 15 N / 10 N/mm / 5 mm/s.
+            let top = course
+                .moments
+                .iter()
+                .find(|moment| moment.force_n > 14.99)
+                .unwrap();
+            assert!(
+                top.time_s > 0.3 && top.time_s < 2.5,
+                "{material}: {} s",
+                top.time_s
+            );
+        }
+    }
+
+    #[test]
+    fn twice_the_levels_change_the_taxels_less_than_their_noise() {
+        for material in [
+            Material::Rubber,
+            Material::Plasticine,
+            Material::Foam,
+            Material::Wood,
+        ] {
+            let specimen = specimen(material, &Face::ball(27.0));
+            let mut bench = Bench::default();
+            let [coarse, fine] = [LEVELS, 2 * LEVELS].map(|levels| {
+                Course::in_levels(&mut bench, &specimen, Arm::default(), 15.0, 1.0, levels)
+            });
+            let (mut off, mut sum) = (0.0, 0.0);
+            for frame in 0..200 {
+                let time_s = f64::from(frame) * 0.01;
+                let (a, b) = (coarse.taxels_n(time_s), fine.taxels_n(time_s));
+                off += a
+                    .iter()
+                    .zip(&b)
+                    .map(|(&a, &b)| f64::from((a - b).abs()))
+                    .sum::<f64>();
+                sum += total(&b);
+            }
+            // A taxel has 1.5 % of noise and 0.04 N of rounding.
+            assert!(
+                off < 0.015 * sum,
+                "{material}: {} of the force is elsewhere",
+                off / sum
+            );
+        }
+    }
+}

@@ -1,0 +1,563 @@
+//! A data set of whole presses: frames over time, with the arm's motion as the robot reports it.
+//!
+//! Objects, materials and sensors are those of [`super::dataset`]. Speed, stiffness of the arm,
+//! frame rate, hold and the robot's errors are drawn anew for each press. Test presses of the same
+//! number are made alike in every material, as for single frames.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use serde::{Deserialize, Serialize};
+
+use super::body::{Body, draw_patch};
+use super::course::Course;
+use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
+use super::material::Split;
+use super::motion::Arm;
+use super::object::{POSTURES, Pose};
+use super::press::{Bench, Specimen};
+use super::sensor::{Film, taxel_forces};
+use super::settings::DatasetSettings;
+use super::subject::{Subject, shared_out, units};
+use super::tracked::{Seen, begins_press, ideal_tare, one_press};
+use crate::random::Stream;
+use hardnessd_core::frame::{RawFrame, TAXELS};
+use hardnessd_core::press::thinned;
+use hardnessd_core::tare::NEWTONS_PER_COUNT;
+
+/// The settings of a simulated data set of presses.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct CourseSettings {
+    /// Objects, materials, shapes, sensors. `lowest_force_n` is the least force of an arm that
+    /// stops by force.
+    pub objects: DatasetSettings,
+    /// Least and greatest frame rate, drawn log-uniformly.
+    pub frame_rate_hz: [f64; 2],
+    /// Least and greatest speed of the arm, drawn log-uniformly.
+    pub speed_mm_s: [f64; 2],
+    /// Least and greatest stiffness of the arm, drawn log-uniformly.
+    pub arm_n_per_mm: [f64; 2],
+    /// Least and greatest time that the arm holds its position, drawn uniformly.
+    pub hold_s: [f64; 2],
+    /// Greatest relative error of the reported positions and speeds, constant over a press.
+    pub position_error: f64,
+    /// Greatest relative error of the reported stiffness.
+    pub arm_error: f64,
+    /// Greatest error of the reported times, in frames, constant over a press.
+    pub clock_error_frames: f64,
+    /// Share of the presses for which the robot reports nothing.
+    pub unknown_share: f64,
+}
+
+impl Default for CourseSettings {
+    /// 200 + 20 objects of the named materials in matched shapes, 6 presses each, and a robot
+    /// without errors.
+    fn default() -> Self {
+        Self {
+            objects: DatasetSettings {
+                presses: 6,
+                ..DatasetSettings::default()
+            },
+            frame_rate_hz: [5.0, 100.0],
+            speed_mm_s: [2.0, 20.0],
+            arm_n_per_mm: [3.0, 30.0],
+            hold_s: [0.2, 1.5],
+            position_error: 0.0,
+            arm_error: 0.0,
+            clock_error_frames: 0.0,
+            unknown_share: 0.0,
+        }
+    }
+}
+
+/// The most frames of a press, not counting those before its begin: as many as a model takes.
+pub const MOST_FRAMES: usize = 48;
+/// The number of frames kept before the frame that begins the press.
+const BEFORE: usize = 2;
+
+/// One press over time, with its labels.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LabelledCourse {
+    /// The kept frames, ascending in time.
+    pub moments: Vec<CourseMoment>,
+    /// Index of the frame that a model of one frame judges.
+    pub best: usize,
+    /// The arm's stiffness as reported; 0 if it is not reported.
+    pub arm_n_per_mm: f32,
+    /// Hardness level, 1 to 4.
+    pub level: u8,
+    /// Number of the object, unique in the data set.
+    pub object: u32,
+    /// Index of the material among [`super::material_names`].
+    pub material: u8,
+    /// Greatest force on the sensor.
+    pub force_n: f32,
+    /// The split of the object.
+    pub split: Split,
+    /// The object's Shore hardness.
+    pub shore: f32,
+    /// The object's Young's modulus, MPa.
+    pub young_mpa: f32,
+    /// Frames per second.
+    pub frame_rate_hz: f32,
+    /// The arm's true speed.
+    pub speed_mm_s: f32,
+}
+
+/// One frame of a press.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CourseMoment {
+    /// Counts after an ideal tare, at [`NEWTONS_PER_COUNT`] each.
+    pub counts: Box<[u16; TAXELS]>,
+    /// Time since the frame that began the press; negative before it.
+    pub time_s: f32,
+    /// How far the arm went since the begin, as reported; 0 if it is not reported.
+    pub approach_mm: f32,
+    /// Whether the approach is reported.
+    pub known: bool,
+}
+
+/// The condition that stops the arm.
+#[derive(Clone, Copy)]
+enum Stop {
+    Force(f64),
+    /// The arm stops at this distance in mm beyond the touch, or at 25 N.
+    Position(f64),
+}
+
+/// How far an arm that stops by position goes beyond the touch, log-uniform.
+const TRAVEL_MM: [f64; 2] = [1.0, 10.0];
+/// The least force of an arm that stops by position.
+const LEAST_FORCE_N: f64 = 0.3;
+/// The longest press. A tracker ends a press after this time.
+const LONGEST_S: f64 = 30.0;
+/// The least number of frames that a press is held, so that a slow sensor sees it.
+const HOLD_FRAMES: f64 = 3.0;
+
+/// The plan of one press, the same in every material.
+struct Plan {
+    posture: usize,
+    pose: Stream,
+    stop: Stop,
+    arm: Arm,
+    hold_s: f64,
+    period_s: f64,
+    /// Offset between the frames and the touch, as a part of a period.
+    phase: f64,
+    told: Told,
+}
+
+/// The errors of the robot's reports.
+#[derive(Clone, Copy)]
+struct Told {
+    is_known: bool,
+    position_factor: f64,
+    arm_factor: f64,
+    late_s: f64,
+}
+
+impl Plan {
+    fn draw(settings: &CourseSettings, stream: &mut Stream) -> Self {
+        let posture = stream.below(POSTURES);
+        let lowest = f64::from(settings.objects.lowest_force_n);
+        let force = Stop::Force(stream.range(lowest, HIGHEST_FORCE_N));
+        let position = Stop::Position(log_even(TRAVEL_MM, stream));
+        let stop = if stream.uniform() < 0.5 {
+            force
+        } else {
+            position
+        };
+        let arm = Arm {
+            n_per_mm: log_even(settings.arm_n_per_mm, stream),
+            speed_mm_s: log_even(settings.speed_mm_s, stream),
+        };
+        let [least, most] = settings.hold_s;
+        let period_s = 1.0 / log_even(settings.frame_rate_hz, stream);
+        let mut off = |most: f64| stream.range(-most, most);
+        let told = Told {
+            position_factor: 1.0 + off(settings.position_error),
+            arm_factor: 1.0 + off(settings.arm_error),
+            late_s: off(settings.clock_error_frames) * period_s,
+            is_known: stream.uniform() >= settings.unknown_share,
+        };
+        Self {
+            posture,
+            pose: stream.child(0),
+            stop,
+            arm,
+            hold_s: stream.range(least, most).max(HOLD_FRAMES * period_s),
+            period_s,
+            phase: stream.uniform(),
+            told,
+        }
+    }
+}
+
+fn log_even([low, high]: [f64; 2], stream: &mut Stream) -> f64 {
+    stream.range(low.ln(), high.ln()).exp()
+}
+
+/// Simulates the presses on `threads` threads, and calls `progress` with the number done. The
+/// presses are in the order of [`super::dataset`], and the result is the same for any number of
+/// threads. A press that never begins, however hard it is made, is left out.
+pub fn courses(
+    settings: &CourseSettings,
+    threads: usize,
+    progress: impl Fn(usize) + Sync,
+) -> Vec<LabelledCourse> {
+    let done = AtomicUsize::new(0);
+    let of = &settings.objects;
+    let bench = || Bench::under(of.cover_young_mpa);
+    shared_out(&units(of), threads, bench, |bench, object, unit| {
+        let subject = Subject::draw(of, unit);
+        let mut made = Vec::with_capacity(of.presses as usize);
+        for press in 0..u64::from(of.presses) {
+            let mut paired = subject.draws.geometry.child(3).child(press);
+            let plan = Plan::draw(settings, &mut paired);
+            made.extend(subject.course(bench, &plan, object, press));
+            progress(done.fetch_add(1, Ordering::Relaxed) + 1);
+        }
+        made
+    })
+}
+
+impl Subject {
+    /// Press number `press`; `None` if it never begins or lasts too long.
+    fn course(
+        &self,
+        bench: &mut Bench,
+        plan: &Plan,
+        object: u32,
+        press: u64,
+    ) -> Option<LabelledCourse> {
+        let Body {
+            substance,
+            young_mpa,
+            ..
+        } = self.body;
+        let face = self.object.face(plan.posture);
+        let mut roughness = self.draws.body.child(1).child(plan.posture as u64);
+        let patch = draw_patch(&substance.texture, face.roughness, &mut roughness);
+        let pose = Pose::draw(&face, &mut plan.pose.clone());
+        let specimen = Specimen::new(substance, young_mpa, &face, &pose, &patch);
+        let noise = self.draws.body.child(4).child(press);
+        let mut force_n = match plan.stop {
+            Stop::Force(force_n) => force_n,
+            Stop::Position(travel_mm) => bench.force_at(&specimen, plan.arm, travel_mm),
+        };
+        for attempt in 0..TRIES as u64 {
+            let mut noise = noise.child(attempt);
+            // One solve shows whether the press is worth the forty solves of a course.
+            if self.is_felt(bench, &specimen, plan, force_n, &mut noise) {
+                let course = Course::new(bench, &specimen, plan.arm, force_n, plan.hold_s);
+                // A material that flows faster than the arm follows never bears the force, and its
+                // press would last minutes.
+                if course.duration_s() > LONGEST_S {
+                    return None;
+                }
+                let frames = self.read(&course, plan, &mut noise);
+                let raws = frames.iter().map(|(_, raw)| raw);
+                if let Some(seen) = one_press(raws, plan.period_s) {
+                    let (moments, best) = kept(&frames, &seen, &course, plan);
+                    return Some(self.labelled(plan, object, force_n, moments, best));
+                }
+            }
+            force_n *= HARDER;
+        }
+        None
+    }
+
+    fn is_felt(
+        &self,
+        bench: &mut Bench,
+        specimen: &Specimen,
+        plan: &Plan,
+        force_n: f64,
+        noise: &mut Stream,
+    ) -> bool {
+        let ramp_s = force_n / plan.arm.n_per_mm / plan.arm.speed_mm_s;
+        let (window, pressure, _) = bench.press(specimen, force_n, ramp_s, 0.0);
+        let forces = taxel_forces(&pressure, window.width, window.corner);
+        begins_press(&ideal_tare(&self.sensor.read(&forces, 1.0, noise)))
+    }
+
+    /// The sensor's frames from a few before the touch to the release, with their times after the
+    /// touch.
+    fn read(&self, course: &Course, plan: &Plan, noise: &mut Stream) -> Vec<(f64, RawFrame)> {
+        let gain = self.sensor.press_gain(noise);
+        let mut film = Film::new();
+        let first_s = -(BEFORE as f64 + plan.phase) * plan.period_s;
+        (0_u32..)
+            .map(|number| first_s + f64::from(number) * plan.period_s)
+            .take_while(|&time_s| time_s < course.duration_s())
+            .map(|time_s| {
+                let forces = course.taxels_n(time_s);
+                let crept = film.advance(&forces, plan.period_s);
+                (time_s, self.sensor.read(&crept, gain, noise))
+            })
+            .collect()
+    }
+
+    fn labelled(
+        &self,
+        plan: &Plan,
+        object: u32,
+        force_n: f64,
+        moments: Vec<CourseMoment>,
+        best: usize,
+    ) -> LabelledCourse {
+        let told_n_per_mm = plan.arm.n_per_mm * plan.told.arm_factor;
+        LabelledCourse {
+            moments,
+            best,
+            arm_n_per_mm: if plan.told.is_known {
+                told_n_per_mm as f32
+            } else {
+                0.0
+            },
+            level: self.body.level,
+            object,
+            material: self.body.material,
+            force_n: force_n as f32,
+            split: self.split,
+            shore: self.body.shore as f32,
+            young_mpa: self.body.young_mpa as f32,
+            frame_rate_hz: (1.0 / plan.period_s) as f32,
+            speed_mm_s: plan.arm.speed_mm_s as f32,
+        }
+    }
+}
+
+/// The frames to keep, and the index of the best frame among them.
+fn kept(
+    frames: &[(f64, RawFrame)],
+    seen: &Seen,
+    course: &Course,
+    plan: &Plan,
+) -> (Vec<CourseMoment>, usize) {
+    let begin = seen.contact[0];
+    let best = seen
+        .contact
+        .binary_search(&seen.best)
+        .expect("the best frame is in contact");
+    let thin = thinned(seen.contact.len(), best, MOST_FRAMES);
+    let places: Vec<usize> = (begin.saturating_sub(BEFORE)..begin)
+        .chain(thin.iter().map(|&place| seen.contact[place]))
+        .collect();
+    let begin_s = frames[begin].0;
+    let Told {
+        is_known,
+        position_factor,
+        late_s,
+        ..
+    } = plan.told;
+    let told_mm = |time_s: f64| position_factor * course.motion.approach_mm(time_s - late_s);
+    let moment = |&place: &usize| {
+        let (time_s, raw) = &frames[place];
+        let approach_mm = told_mm(*time_s) - told_mm(begin_s);
+        CourseMoment {
+            counts: Box::new(raw.counts),
+            time_s: (time_s - begin_s) as f32,
+            approach_mm: if is_known { approach_mm as f32 } else { 0.0 },
+            known: is_known,
+        }
+    };
+    let best = places
+        .binary_search(&seen.best)
+        .expect("thinning keeps the best frame");
+    (places.iter().map(moment).collect(), best)
+}
+
+impl Bench {
+    /// The force at which an arm has gone `travel_mm` beyond the touch, at most 25 N.
+    fn force_at(&mut self, specimen: &Specimen, arm: Arm, travel_mm: f64) -> f64 {
+        let ramp_s = travel_mm / arm.speed_mm_s;
+        let mut travel = |force_n: f64| {
+            let approach_mm = self.press(specimen, force_n, ramp_s, 0.0).2.approach_mm;
+            approach_mm + force_n / arm.n_per_mm
+        };
+        // Use the secant method on ln F against ln z, where the contact is nearly a power law.
+        // Start from above.
+        let mut forces = [HIGHEST_FORCE_N, 0.3 * HIGHEST_FORCE_N];
+        let first = (travel(forces[0]) / travel_mm).ln();
+        if first <= 0.0 {
+            return HIGHEST_FORCE_N;
+        }
+        let mut off = [first, (travel(forces[1]) / travel_mm).ln()];
+        for _ in 0..4 {
+            let slope = (off[1] - off[0]) / (forces[1] / forces[0]).ln();
+            let next = forces[1] * (-off[1] / slope.max(0.2)).clamp(-2.0, 2.0).exp();
+            forces = [forces[1], next.clamp(LEAST_FORCE_N, HIGHEST_FORCE_N)];
+            if (forces[1] / forces[0]).ln().abs() < 0.02 {
+                break;
+            }
+            off = [off[1], (travel(forces[1]) / travel_mm).ln()];
+        }
+        forces[1]
+    }
+}
+
+impl LabelledCourse {
+    /// The total force that frame `place` reads, in newtons.
+    pub fn force_read_n(&self, place: usize) -> f64 {
+        let counts = self.moments[place].counts.iter();
+        counts.map(|&counts| f64::from(counts)).sum::<f64>() * f64::from(NEWTONS_PER_COUNT)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::object::Shapes;
+    use super::super::settings::Materials;
+    use super::*;
+
+    fn small() -> CourseSettings {
+        CourseSettings {
+            objects: DatasetSettings {
+                seed: 4,
+                materials: Materials::Broad,
+                shapes: Shapes::Wide,
+                objects: 1,
+                test_objects: 1,
+                presses: 4,
+                ..DatasetSettings::default()
+            },
+            ..CourseSettings::default()
+        }
+    }
+
+    #[test]
+    fn threads_do_not_show_and_courses_are_whole() {
+        let settings = small();
+        let made = courses(&settings, 2, |_| ());
+        assert!(made == courses(&settings, 1, |_| ()), "threads show");
+        assert!(made.len() >= 8 * 4 - 2, "{} presses begin", made.len());
+        for course in &made {
+            let times: Vec<f32> = course.moments.iter().map(|m| m.time_s).collect();
+            assert!(times.is_sorted_by(|a, b| a < b), "{times:?}");
+            let begin = times.iter().position(|&time_s| time_s == 0.0).unwrap();
+            assert!(begin <= BEFORE && times.len() - begin <= MOST_FRAMES);
+            let area = |place: usize| {
+                let contact = course.moments[place].counts.iter().filter(|&&c| c >= 2);
+                contact.count()
+            };
+            assert!(area(begin) >= 3 && (0..begin).all(|place| area(place) < 3));
+            assert!((0..times.len()).all(|place| area(place) <= area(course.best)));
+            // The approach is 0 at the begin, and stays within bounds.
+            let approach: Vec<f32> = course.moments.iter().map(|m| m.approach_mm).collect();
+            assert_eq!(approach[begin], 0.0);
+            assert!(course.moments.iter().all(|moment| moment.known));
+            assert!(
+                approach.iter().all(|mm| (-15.0..30.0).contains(mm)),
+                "{approach:?}"
+            );
+            let most = approach.iter().copied().fold(0.0, f32::max);
+            assert!(most <= course.speed_mm_s * times.last().unwrap() + 1e-3);
+            assert!((3.0..=30.0).contains(&course.arm_n_per_mm));
+            let ratio = course.force_read_n(course.best) / f64::from(course.force_n);
+            assert!((0.1..1.6).contains(&ratio), "reads {ratio} of the force");
+        }
+        // Test presses of the same number are paired over the objects, except those that never
+        // begin.
+        let motion = |object: u32| {
+            let own = made.iter().filter(move |course| course.object == object);
+            own.map(|course| (course.speed_mm_s, course.frame_rate_hz))
+                .collect::<Vec<_>>()
+        };
+        assert_eq!(motion(5), motion(7));
+    }
+
+    #[test]
+    fn an_arm_goes_as_deep_as_force_and_stiffness_say() {
+        // In the hold, z = d + F / k. Slow presses at high frame rates begin near the touch, so
+        // nearly all of z is reported. On a stiff object the arm takes nearly all of z.
+        let settings = CourseSettings {
+            frame_rate_hz: [50.0, 100.0],
+            speed_mm_s: [2.0, 4.0],
+            ..small()
+        };
+        for course in courses(&settings, 2, |_| ()) {
+            let most = course
+                .moments
+                .iter()
+                .map(|m| m.approach_mm)
+                .fold(0.0, f32::max);
+            let arm_mm = course.force_n / course.arm_n_per_mm;
+            let begin_mm = 0.5;
+            assert!(
+                most > arm_mm - begin_mm,
+                "{most} mm, of which the arm takes {arm_mm}"
+            );
+            if course.young_mpa > 100.0 {
+                assert!(most < arm_mm + 1.0, "{most} mm, the arm takes {arm_mm}");
+            }
+        }
+    }
+
+    #[test]
+    fn errors_are_in_what_is_told_and_nowhere_else() {
+        let truth = courses(&small(), 2, |_| ());
+        let wrong = courses(
+            &CourseSettings {
+                position_error: 0.1,
+                arm_error: 0.3,
+                clock_error_frames: 1.0,
+                unknown_share: 0.3,
+                ..small()
+            },
+            2,
+            |_| (),
+        );
+        assert_eq!(truth.len(), wrong.len());
+        let mut unknown = 0;
+        for (truth, wrong) in truth.iter().zip(&wrong) {
+            let frames = |course: &LabelledCourse| {
+                let moments = course.moments.iter();
+                moments
+                    .map(|m| (m.counts.clone(), m.time_s))
+                    .collect::<Vec<_>>()
+            };
+            assert!(frames(truth) == frames(wrong));
+            if wrong.arm_n_per_mm == 0.0 {
+                unknown += 1;
+                assert!(
+                    wrong
+                        .moments
+                        .iter()
+                        .all(|m| !m.known && m.approach_mm == 0.0)
+                );
+                continue;
+            }
+            let off = wrong.arm_n_per_mm / truth.arm_n_per_mm - 1.0;
+            assert!(off != 0.0 && off.abs() <= 0.3, "{off}");
+            let most = |course: &LabelledCourse| {
+                course
+                    .moments
+                    .iter()
+                    .map(|m| m.approach_mm)
+                    .fold(0.0, f32::max)
+            };
+            let slack = 0.1 * most(truth) + 2.2 * truth.speed_mm_s / truth.frame_rate_hz;
+            assert!((most(wrong) - most(truth)).abs() <= slack);
+        }
+        assert!((2..20).contains(&unknown), "{unknown} of {}", wrong.len());
+    }
+
+    #[test]
+    #[ignore = "measures speed: cargo test --release"]
+    fn print_rate() {
+        for materials in [Materials::Named, Materials::Broad] {
+            let mut settings = small();
+            settings.objects.materials = materials;
+            settings.objects.objects = 10;
+            let began = std::time::Instant::now();
+            let made = courses(&settings, 1, |_| ());
+            let frames: usize = made.iter().map(|course| course.moments.len()).sum();
+            println!(
+                "{materials:?}: {} presses, {frames} frames: {:.0} presses a minute on a thread",
+                made.len(),
+                60.0 * made.len() as f64 / began.elapsed().as_secs_f64()
+            );
+        }
+    }
+}

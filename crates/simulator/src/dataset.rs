@@ -1,0 +1,427 @@
+//! The whole simulated data set: objects, postures, forces, labels.
+//!
+//! The objects are distributed over threads. Every number depends on the seed and on the object,
+//! never on the thread.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use super::body::draw_patch;
+use super::material::Split;
+use super::motion::Arm;
+use super::object::{POSTURES, Pose};
+use super::press::{Bench, Specimen};
+use super::sensor::{Film, taxel_forces};
+use super::settings::DatasetSettings;
+use super::subject::{Subject, shared_out, units};
+use super::tracked::{begins_press, ideal_tare};
+use crate::random::Stream;
+use hardnessd_core::frame::Frame;
+
+impl DatasetSettings {
+    /// The number of samples that the settings make.
+    pub fn samples(&self) -> u64 {
+        units(self).len() as u64 * u64::from(self.presses)
+    }
+}
+
+/// The sample of one press, with its labels.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LabelledSample {
+    /// The frame after an ideal tare, in newtons.
+    pub frame: Frame,
+    /// Hardness level, 1 to 4.
+    pub level: u8,
+    /// Number of the object, unique in the data set.
+    pub object: u32,
+    /// Index of the material among [`super::material_names`].
+    pub material: u8,
+    /// Force on the sensor.
+    pub force_n: f32,
+    /// The split of the material, and so of the object.
+    pub split: Split,
+    /// The object's Shore hardness.
+    pub shore: f32,
+}
+
+pub(super) const HIGHEST_FORCE_N: f64 = 25.0;
+const FORCES: usize = 8;
+/// The number of presses of an object in each posture under each nominal force.
+const ROUND: usize = POSTURES * FORCES;
+const FORCE_JITTER: f64 = 0.08;
+/// Factor on the force when a press was too light to begin.
+pub(super) const HARDER: f64 = 1.5;
+/// The number of attempts at a press before it is taken as it is.
+pub(super) const TRIES: usize = 8;
+
+/// Simulates the data set on `threads` threads, and calls `progress` with the number of samples
+/// done. Samples are in the order of materials (as in [`super::Material::ALL`]) or of split and
+/// group, then of object, posture and press. The result is the same for any number of threads.
+pub fn dataset(
+    settings: &DatasetSettings,
+    threads: usize,
+    progress: impl Fn(usize) + Sync,
+) -> Vec<LabelledSample> {
+    let done = AtomicUsize::new(0);
+    let bench = || Bench::under(settings.cover_young_mpa);
+    shared_out(&units(settings), threads, bench, |bench, object, unit| {
+        let mut samples = Vec::with_capacity(settings.presses as usize);
+        Subject::draw(settings, unit).press_all(settings, bench, |sample| {
+            samples.push(LabelledSample { object, ..sample });
+            progress(done.fetch_add(1, Ordering::Relaxed) + 1);
+        });
+        samples
+    })
+}
+
+impl Subject {
+    /// Makes every press of the object. Postures are the outer loop, so that a face's texture and
+    /// kernels serve all its presses.
+    fn press_all(
+        &self,
+        settings: &DatasetSettings,
+        bench: &mut Bench,
+        mut take: impl FnMut(LabelledSample),
+    ) {
+        let body = &self.body;
+        let presses = press_numbers(settings.presses as usize);
+        for posture in 0..POSTURES {
+            let face = self.object.face(posture);
+            let mut roughness = self.draws.body.child(1).child(posture as u64);
+            let patch = draw_patch(&body.substance.texture, face.roughness, &mut roughness);
+            let of_posture = |press: &usize| press % POSTURES == posture;
+            for press in presses.iter().copied().filter(of_posture) {
+                let mut paired = self.draws.geometry.child(1).child(press as u64);
+                let pose = Pose::draw(&face, &mut paired);
+                let nominal = nominal_force_n(settings.lowest_force_n, press / POSTURES % FORCES);
+                let force_n = nominal * (1.0 + FORCE_JITTER * paired.normal()).clamp(0.7, 1.3);
+                let hold_s = paired.range(0.8, 1.5);
+                let specimen = Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch);
+                let mut noise = self.draws.body.child(2).child(press as u64);
+                let (force_n, frame) = self.press(bench, &specimen, force_n, hold_s, &mut noise);
+                take(LabelledSample {
+                    frame,
+                    level: body.level,
+                    object: 0,
+                    material: body.material,
+                    force_n: force_n as f32,
+                    split: self.split,
+                    shore: body.shore as f32,
+                });
+            }
+        }
+    }
+
+    /// Makes one press, harder each time until it reaches the begin area. Returns the force and the
+    /// frame.
+    fn press(
+        &self,
+        bench: &mut Bench,
+        specimen: &Specimen,
+        mut force_n: f64,
+        hold_s: f64,
+        noise: &mut Stream,
+    ) -> (f64, Frame) {
+        let arm = Arm::default();
+        let gain = self.sensor.press_gain(noise);
+        let mut tries = 0;
+        loop {
+            let ramp_s = (force_n / arm.n_per_mm + TYPICAL_DEPTH_MM) / arm.speed_mm_s;
+            let (window, pressure, _) = bench.press(specimen, force_n, ramp_s, hold_s);
+            let forces = taxel_forces(&pressure, window.width, window.corner);
+            let crept = Film::new().advance(&forces, hold_s + 0.5 * ramp_s);
+            let frame = ideal_tare(&self.sensor.read(&crept, gain, noise));
+            tries += 1;
+            if begins_press(&frame) || tries == TRIES {
+                return (force_n, frame);
+            }
+            force_n *= HARDER;
+        }
+    }
+}
+
+/// The numbers of an object's presses. Press n has posture n mod 6 and force n / 6 mod 8. Fewer
+/// than 48 presses are some of these 48, and the counts of any two postures, or of any two forces,
+/// differ by at most one.
+fn press_numbers(count: usize) -> Vec<usize> {
+    if count >= ROUND {
+        return (0..count).collect();
+    }
+    // In steps of five, each of the eight forces comes once, and neighbours are far apart. After
+    // half a round the forces shift by one, because each posture has met four forces by then and
+    // would meet the same ones again. The first force is in the middle.
+    let force = |place: usize| (FORCES / 2 + 5 * place + place / (ROUND / 2)) % FORCES;
+    let number = |place: usize| place % POSTURES + POSTURES * force(place);
+    let mut numbers: Vec<usize> = (0..count).map(number).collect();
+    numbers.sort_unstable();
+    numbers
+}
+
+/// Assumed indentation in the ramp of a sample. Sequences compute theirs.
+const TYPICAL_DEPTH_MM: f64 = 2.0;
+
+/// Force number `step` (0 to 7) of eight forces, evenly spaced from `lowest_n` to 25 N.
+fn nominal_force_n(lowest_n: f32, step: usize) -> f64 {
+    let lowest = f64::from(lowest_n);
+    lowest + (HIGHEST_FORCE_N - lowest) * step as f64 / (FORCES - 1) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::level::level_of;
+    use super::super::material::Material;
+    use super::super::object::Shapes;
+    use super::super::press::COVER_YOUNG_MPA;
+    use super::super::settings::Materials;
+    use super::*;
+
+    fn small(shapes: Shapes) -> DatasetSettings {
+        DatasetSettings {
+            seed: 3,
+            objects: 1,
+            test_objects: 2,
+            presses: 9,
+            shapes,
+            ..Default::default()
+        }
+    }
+
+    #[test]
+    fn threads_do_not_show_in_the_result() {
+        let settings = small(Shapes::Paper);
+        let most = AtomicUsize::new(0);
+        let one = dataset(&settings, 1, |_| ());
+        let three = dataset(&settings, 3, |done| {
+            most.fetch_max(done, Ordering::Relaxed);
+        });
+        assert!(one == three, "one thread and three give different samples");
+        assert_eq!(most.into_inner(), one.len());
+    }
+
+    #[test]
+    fn few_presses_are_of_all_postures_and_forces() {
+        // A whole round or more has all numbers in order.
+        for count in [48, 49, 50, 100] {
+            assert!(press_numbers(count).into_iter().eq(0..count), "{count}");
+        }
+        for count in 1..ROUND {
+            let numbers = press_numbers(count);
+            let times = |kinds: usize, of: fn(usize) -> usize| -> Vec<usize> {
+                let count = |kind| numbers.iter().filter(|&&n| of(n) == kind).count();
+                (0..kinds).map(count).collect()
+            };
+            let (postures, forces) = (
+                times(POSTURES, |n| n % POSTURES),
+                times(FORCES, |n| n / POSTURES),
+            );
+            for (times, name) in [(postures, "postures"), (forces, "forces")] {
+                assert_eq!(times.iter().sum::<usize>(), count);
+                let (least, most) = (times.iter().min(), times.iter().max());
+                assert!(
+                    most.unwrap() - least.unwrap() <= 1,
+                    "{count}: {name} {times:?}"
+                );
+            }
+            assert!(numbers.is_sorted_by(|a, b| a < b), "{numbers:?}");
+        }
+    }
+
+    #[test]
+    fn few_presses_are_some_of_the_many() {
+        let of = |presses| {
+            let settings = DatasetSettings {
+                presses,
+                test_objects: 0,
+                ..small(Shapes::Matched)
+            };
+            dataset(&settings, 2, |_| ())
+        };
+        let (five, fifty) = (of(5), of(50));
+        assert_eq!(five.len(), 4 * 5);
+        assert!(five.iter().all(|sample| fifty.contains(sample)));
+        let mean_n = |samples: &[LabelledSample]| {
+            samples.iter().map(|s| s.force_n).sum::<f32>() / samples.len() as f32
+        };
+        // The mean nominal force is 13 N.
+        assert!((10.0..14.0).contains(&mean_n(&five)), "{}", mean_n(&five));
+    }
+
+    #[test]
+    fn other_samples_are_another_version() {
+        // The sums are the newtons of all frames of each material. If they change on purpose,
+        // change them and raise VERSION. Differences of a few counts may come from another machine.
+        let samples = dataset(&small(Shapes::Matched), 2, |_| ());
+        let newtons = Material::ALL.map(|material| {
+            let own = samples.iter().filter(|s| s.material == material.index());
+            own.map(|sample| sample.frame.force_n()).sum::<f64>()
+        });
+        let expected = [
+            139.48, 130.56, 126.36, 135.24, 259.08, 260.00, 259.52, 259.32,
+        ];
+        let alike = |(found, expected): (&f64, &f64)| (found / expected - 1.0).abs() < 5e-3;
+        assert!(
+            newtons.iter().zip(&expected).all(alike),
+            "{newtons:.2?} of version {}",
+            super::super::VERSION
+        );
+    }
+
+    #[test]
+    fn samples_are_labelled_as_their_material() {
+        let samples = dataset(&small(Shapes::Matched), 2, |_| ());
+        assert_eq!(samples.len(), (4 + 4 * 2) * 9);
+        for sample in &samples {
+            let material = Material::ALL[usize::from(sample.material)];
+            assert_eq!(
+                (sample.level, sample.split),
+                (material.level(), material.split())
+            );
+            let shore = material.properties().shore;
+            assert!((shore.low..=shore.high).contains(&f64::from(sample.shore)));
+            assert!(begins_press(&sample.frame));
+            // Gains, crosstalk and film creep add force, and thresholds remove it.
+            let ratio = sample.frame.force_n() / f64::from(sample.force_n);
+            assert!(
+                (0.2..1.5).contains(&ratio),
+                "{material}: reads {ratio} of the force"
+            );
+        }
+        let objects: std::collections::BTreeSet<u32> = samples.iter().map(|s| s.object).collect();
+        assert_eq!(objects.len(), 12);
+    }
+
+    #[test]
+    fn a_material_presses_the_same_objects_in_its_role_whatever_the_others_roles() {
+        let swapped = |swapped_levels| DatasetSettings {
+            swapped_levels,
+            ..small(Shapes::Matched)
+        };
+        let of = |settings: &DatasetSettings, material: Material, split| -> Vec<_> {
+            let samples = dataset(settings, 2, |_| ());
+            let wanted = |s: &LabelledSample| (s.material, s.split) == (material.index(), split);
+            let known = |s: LabelledSample| (s.frame, s.level, s.force_n, s.shore);
+            samples.into_iter().filter(wanted).map(known).collect()
+        };
+        let (none, two, all) = (
+            swapped([false; 4]),
+            swapped([false, true, true, false]),
+            swapped([true; 4]),
+        );
+        // Rubber and foam are level 2. One object is for training, two are for test.
+        for (material, split, count) in [
+            (Material::Rubber, Split::Test, 2 * 9),
+            (Material::Foam, Split::Train, 9),
+        ] {
+            let (here, there) = (of(&two, material, split), of(&all, material, split));
+            assert_eq!(here.len(), count, "{material}");
+            assert!(here == there, "{material}: other objects");
+            assert!(of(&none, material, split).is_empty(), "{material}");
+        }
+        assert!(of(&two, Material::Wood, Split::Train) == of(&none, Material::Wood, Split::Train));
+    }
+
+    #[test]
+    fn another_sensor_changes_readings_and_nothing_else() {
+        let usual = DatasetSettings {
+            lowest_force_n: 15.0,
+            ..small(Shapes::Paper)
+        };
+        let other_gains = DatasetSettings {
+            sensor_seed: Some(77),
+            ..usual
+        };
+        let softer = DatasetSettings {
+            cover_young_mpa: 0.5 * COVER_YOUNG_MPA,
+            ..usual
+        };
+        let [before, other_gains, softer] =
+            [usual, other_gains, softer].map(|settings| dataset(&settings, 2, |_| ()));
+        let plain = |s: &LabelledSample| (s.object, s.material, s.shore.to_bits());
+        for after in [&other_gains, &softer] {
+            assert!(before.iter().map(plain).eq(after.iter().map(plain)));
+        }
+        let pairs = before.iter().zip(&other_gains);
+        assert!(pairs.into_iter().all(|(a, b)| a.frame != b.frame));
+        // Under a softer cover, a rigid object touches a larger area. A soft object yields itself.
+        let area = |samples: &[LabelledSample], level| -> f64 {
+            let of_level = samples.iter().filter(|sample| sample.level == level);
+            of_level
+                .map(|s| f64::from(s.frame.contact_area_taxels(0.07)))
+                .sum()
+        };
+        let ratio = |level| area(&softer, level) / area(&before, level);
+        assert!(ratio(1) > 1.1, "{}", ratio(1));
+        assert!((0.98..1.05).contains(&ratio(4)), "{}", ratio(4));
+    }
+
+    #[test]
+    fn broad_objects_are_labelled_by_their_shore_and_paired() {
+        for shapes in [Shapes::Matched, Shapes::Wide] {
+            let settings = DatasetSettings {
+                materials: Materials::Broad,
+                ..small(shapes)
+            };
+            let samples = dataset(&settings, 3, |_| ());
+            assert!(samples == dataset(&settings, 1, |_| ()), "threads show");
+            assert_eq!(samples.len(), 4 * (1 + 2) * 9);
+            for sample in &samples {
+                assert_eq!(sample.level, level_of(f64::from(sample.shore)));
+                assert!((8..12).contains(&sample.material));
+                assert!(begins_press(&sample.frame), "{sample:?}");
+            }
+            // Training objects are 0 to 3.
+            for object in 0..12 {
+                let own = samples.iter().filter(|sample| sample.object == object);
+                let split = if object < 4 {
+                    Split::Train
+                } else {
+                    Split::Test
+                };
+                let labels = own.map(|sample| (sample.split as u8, sample.shore.to_bits()));
+                let labels: std::collections::BTreeSet<_> = labels.collect();
+                assert_eq!(labels.len(), 1, "object {object}");
+                assert_eq!(labels.first().unwrap().0, split as u8);
+            }
+            // Test objects of the same number are pressed alike, whatever their material, except
+            // for presses that had to be harder to begin.
+            let forces = |object| {
+                let own = samples.iter().filter(move |sample| sample.object == object);
+                own.map(|sample| sample.force_n).collect::<Vec<_>>()
+            };
+            let (first, third) = (forces(4), forces(8));
+            let alike = first.iter().zip(&third).filter(|(a, b)| a == b).count();
+            assert!(alike >= 6, "{first:?} {third:?}");
+        }
+    }
+
+    #[test]
+    fn all_eight_materials_can_be_for_test() {
+        let settings = DatasetSettings {
+            all_test: true,
+            test_objects: 1,
+            presses: 2,
+            ..small(Shapes::Wide)
+        };
+        let samples = dataset(&settings, 2, |_| ());
+        assert_eq!(samples.len(), 8 * 2);
+        assert!(samples.iter().all(|sample| sample.split == Split::Test));
+        let forces: Vec<f32> = samples.iter().map(|sample| sample.force_n).collect();
+        // Rubber and foam are pressed alike.
+        assert_eq!(forces[2..4], forces[10..12]);
+    }
+
+    #[test]
+    #[ignore = "measures speed: cargo test --release"]
+    fn print_rate() {
+        let began = std::time::Instant::now();
+        let settings = DatasetSettings {
+            objects: 10,
+            test_objects: 1,
+            ..Default::default()
+        };
+        let count = dataset(&settings, 2, |_| ()).len();
+        println!(
+            "{:.0} samples a second on 2 threads",
+            count as f64 / began.elapsed().as_secs_f64()
+        );
+    }
+}

@@ -1,0 +1,497 @@
+//! A sequence of presses as a sensor would send it: raw frames at a steady rate.
+//!
+//! Frames come out one at a time, but a press is computed as a whole when its first frame is due
+//! (0.05 to 0.5 s of work). To play a sequence in real time, run it some frames ahead.
+
+use std::collections::VecDeque;
+
+use super::body::{Body, draw_patch};
+use super::course::Course;
+use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
+use super::material::Material;
+use super::motion::{Approach, Arm, Motion};
+use super::object::{Object, POSTURES, Pose, Shapes};
+use super::press::{Bench, Specimen};
+use super::sensor::{Film, Sensor, SensorProfile};
+use super::tracked::one_press;
+use crate::random::Stream;
+use hardnessd_core::frame::{RawFrame, TAXELS};
+
+/// The settings of a sequence: what to press, how often and how hard.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SequenceSettings {
+    /// The seed of everything random.
+    pub seed: u64,
+    /// Frames per second.
+    pub frame_rate_hz: f64,
+    /// Press k is of `materials[(k - 1) % n]`, each time on another object.
+    pub materials: Vec<Material>,
+    /// Greatest forces of the presses, used in turn. If empty, they are drawn from 5 to 25 N.
+    pub forces_n: Vec<f32>,
+    /// The number of presses; `None` for an endless sequence.
+    pub presses: Option<u32>,
+    /// Least rest before the first press and after each, s.
+    pub rest_s: f64,
+    /// Distribution of shapes.
+    pub shapes: Shapes,
+    /// Spread of the sensor.
+    pub profile: SensorProfile,
+}
+
+impl Default for SequenceSettings {
+    /// The four test materials in an endless sequence, at the paper's 5 frames/s.
+    fn default() -> Self {
+        Self {
+            seed: 0,
+            frame_rate_hz: 5.0,
+            materials: Material::ALL[4..].to_vec(),
+            forces_n: Vec::new(),
+            presses: None,
+            rest_s: REST_S,
+            shapes: Shapes::Matched,
+            profile: SensorProfile::Clean,
+        }
+    }
+}
+
+/// One frame, with the state of the press.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SequenceFrame {
+    /// The frame that the sensor sends.
+    pub raw: RawFrame,
+    /// Number of the press, from 1, which includes the rest after it. 0 before the first press.
+    pub press: u32,
+    /// Material of the current or last press; `None` before the first press.
+    pub material: Option<Material>,
+    /// Whether the object is being touched.
+    pub loaded: bool,
+    /// The arm's motion around this frame.
+    pub approach: Approach,
+}
+
+/// An iterator over the frames of a sequence; see [`SequenceSettings`].
+///
+/// The sequence begins with at least 2 s and ten frames without load, so that tare has its frames
+/// at any rate. Each press is held for at least three frames. The rest after it has at least five
+/// frames. No rest is shorter than [`SequenceSettings::rest_s`]. A press too light to begin one
+/// (3 taxels) is made anew with more force, so that a press tracker sees `presses` presses.
+pub struct Sequence {
+    settings: SequenceSettings,
+    root: Stream,
+    sensor: Sensor,
+    bench: Bench,
+    film: Film,
+    ready: VecDeque<SequenceFrame>,
+    /// The number of presses made so far.
+    made: u32,
+    /// The number of frames made so far. Frame n is taken at n / frame rate.
+    frames: u64,
+    /// Time at which the rest after the last press ends, s.
+    free_s: f64,
+    /// The time of the last press's touch, and the arm's motion in that press.
+    last: Option<(f64, Motion)>,
+}
+
+/// Least rest before the first press, in s and in frames.
+const FIRST_REST: (f64, f64) = (2.0, 10.0);
+/// Least rest after a press, unless the settings say otherwise, s.
+pub const REST_S: f64 = 1.0;
+/// Least rest after a press, in frames.
+const REST_FRAMES: f64 = 5.0;
+/// The least number of frames that a press is held.
+const HOLD_FRAMES: f64 = 3.0;
+/// Greatest delay of a press, s. Each press gets a random delay, so that presses are not in step
+/// with the frames.
+const DELAY_S: f64 = 0.25;
+
+impl Sequence {
+    /// The sequence that follows from `settings`.
+    ///
+    /// # Panics
+    ///
+    /// Panics if there are no materials, or the frame rate is not a positive finite number.
+    pub fn new(settings: SequenceSettings) -> Self {
+        assert!(
+            !settings.materials.is_empty(),
+            "a sequence needs a material to press"
+        );
+        let rate = settings.frame_rate_hz;
+        assert!(
+            rate.is_finite() && rate > 0.0,
+            "frame rate {rate} is not a positive number"
+        );
+        // The stream has a name of its own, so that a sequence shares no object and no sensor with
+        // a data set.
+        let root = Stream::new(settings.seed, "sequence");
+        let sensor = Sensor::new(settings.profile, &root.child(0));
+        Self {
+            free_s: FIRST_REST.0.max(FIRST_REST.1 / rate).max(settings.rest_s),
+            settings,
+            root,
+            sensor,
+            bench: Bench::default(),
+            film: Film::new(),
+            ready: VecDeque::new(),
+            made: 0,
+            frames: 0,
+            last: None,
+        }
+    }
+
+    /// The true gain of each taxel, which a calibration should find; 0 for a dead taxel.
+    pub fn gains(&self) -> &[f32] {
+        self.sensor.gains()
+    }
+
+    /// The touch time of the next press, and the stream that the press is drawn from, after its
+    /// first draw, the delay.
+    fn next_draws(&self) -> (f64, Stream) {
+        let mut draws = self.root.child(1).child(u64::from(self.made));
+        let delay_s = draws.range(0.0, DELAY_S);
+        (self.free_s + delay_s, draws)
+    }
+
+    fn is_done(&self) -> bool {
+        let presses = self.settings.presses;
+        presses.is_some_and(|presses| self.made >= presses)
+    }
+
+    /// Whether the rest before the next press lasts.
+    fn rests(&self) -> bool {
+        self.frames as f64 / self.settings.frame_rate_hz <= self.free_s
+    }
+
+    /// Makes a frame without load. A rest may be long, so its frames are made one at a time.
+    fn rest(&mut self) -> SequenceFrame {
+        let next_s = (!self.is_done()).then(|| self.next_draws().0);
+        let approach = Approach {
+            last: self.last,
+            next: next_s.map(|touch_s| (touch_s, Arm::default().speed_mm_s)),
+        };
+        self.film
+            .advance(&[0.0; TAXELS], 1.0 / self.settings.frame_rate_hz);
+        self.frames += 1;
+        let materials = &self.settings.materials;
+        let pressed = self.made.checked_sub(1);
+        SequenceFrame {
+            raw: RawFrame::default(),
+            press: self.made,
+            material: pressed.map(|press| materials[press as usize % materials.len()]),
+            loaded: false,
+            approach,
+        }
+    }
+
+    /// Makes the next press.
+    fn press(&mut self) {
+        let (touch_s, mut draws) = self.next_draws();
+        let material = self.settings.materials[self.made as usize % self.settings.materials.len()];
+        self.made += 1;
+        let drawn = draws.range(5.0, HIGHEST_FORCE_N);
+        let in_turn = (self.made as usize - 1).checked_rem(self.settings.forces_n.len());
+        let mut force_n = in_turn.map_or(drawn, |place| self.settings.forces_n[place].into());
+        let object = Object::draw(self.settings.shapes, material.level(), &mut draws.child(0));
+        let face = object.face(draws.below(POSTURES));
+        let body = Body::named(material, &mut draws.child(3));
+        let patch = draw_patch(&body.substance.texture, face.roughness, &mut draws.child(1));
+        let pose = Pose::draw(&face, &mut draws.child(2));
+        let rate = self.settings.frame_rate_hz;
+        let rest_s = self.settings.rest_s.max(REST_FRAMES / rate);
+        let hold_s = draws.range(0.8, 1.5).max(HOLD_FRAMES / rate);
+        let specimen = Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch);
+        for attempt in 1.. {
+            let course = Course::new(&mut self.bench, &specimen, Arm::default(), force_n, hold_s);
+            let mut noise = draws.child(4).child(attempt);
+            let mut film = self.film.clone();
+            let (frames, next) = self.play(&course, touch_s, &mut film, &mut noise);
+            if attempt as usize == TRIES
+                || one_press(frames.iter().map(|(raw, _)| raw), 1.0 / rate).is_some()
+            {
+                self.last = Some((touch_s, course.motion));
+                let approach = Approach {
+                    last: self.last,
+                    next: None,
+                };
+                self.ready
+                    .extend(frames.into_iter().map(|(raw, loaded)| SequenceFrame {
+                        raw,
+                        press: self.made,
+                        material: Some(material),
+                        loaded,
+                        approach,
+                    }));
+                self.film = film;
+                self.frames = next;
+                self.free_s = touch_s + course.duration_s() + rest_s;
+                return;
+            }
+            force_n *= HARDER;
+        }
+    }
+
+    /// The frames from now until the end of `course`, and the number of the frame after them.
+    fn play(
+        &self,
+        course: &Course,
+        touch_s: f64,
+        film: &mut Film,
+        noise: &mut Stream,
+    ) -> (Vec<(RawFrame, bool)>, u64) {
+        let period_s = 1.0 / self.settings.frame_rate_hz;
+        let gain = self.sensor.press_gain(noise);
+        let mut frames = Vec::new();
+        for number in self.frames.. {
+            let time_s = number as f64 * period_s - touch_s;
+            if time_s >= course.duration_s() {
+                return (frames, number);
+            }
+            let forces = course.taxels_n(time_s);
+            let crept = film.advance(&forces, period_s);
+            frames.push((self.sensor.read(&crept, gain, noise), time_s > 0.0));
+        }
+        unreachable!("frame numbers do not run out before a press of seconds ends")
+    }
+}
+
+impl Iterator for Sequence {
+    type Item = SequenceFrame;
+
+    fn next(&mut self) -> Option<SequenceFrame> {
+        if self.ready.is_empty() {
+            if self.rests() {
+                return Some(self.rest());
+            }
+            if !self.is_done() {
+                self.press();
+            }
+        }
+        self.ready.pop_front()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+    use hardnessd_core::frame::{Array, Stamp};
+    use hardnessd_core::press::{self, Change, End, Marks, Moment, PressTracker};
+    use hardnessd_core::tare::{self, Tare};
+
+    /// The presses that the daemon sees with its default settings, each with its number of frames
+    /// in contact.
+    fn tracked(frames: &[SequenceFrame], rate_hz: f64) -> Vec<(u32, u64)> {
+        let calibration = tare::Settings {
+            tare_frames: 0,
+            ..tare::Settings::default()
+        };
+        let settings = press::Settings::default();
+        let contact = tare::Contact {
+            threshold_n: settings.contact_threshold_n,
+            area_taxels: settings.begin_area_taxels,
+        };
+        let tare = Tare::new(&calibration, Array::FULL, contact);
+        let mut tracker = PressTracker::new(settings);
+        let mut seen = Vec::new();
+        for (number, frame) in (0_u32..).zip(frames) {
+            let mono = Duration::from_secs_f64(f64::from(number) / rate_hz);
+            let wall = jiff::Timestamp::UNIX_EPOCH;
+            let at = Moment {
+                frame: number.into(),
+                stamp: Stamp { mono, wall },
+            };
+            for change in tracker.push(&tare.apply(&frame.raw), Marks::default(), at) {
+                match change {
+                    Change::End {
+                        end: End::Release,
+                        frames,
+                        ..
+                    } => seen.push((frame.press, frames)),
+                    Change::Begin { .. } | Change::Settled { .. } => {}
+                    other => panic!("{other:?}"),
+                }
+            }
+        }
+        assert!(!tracker.is_pressed(), "the last press never ends");
+        seen
+    }
+
+    fn check(settings: &SequenceSettings) {
+        let rate = settings.frame_rate_hz;
+        let presses = settings.presses.unwrap();
+        let materials = settings.materials.clone();
+        let frames: Vec<SequenceFrame> = Sequence::new(settings.clone()).collect();
+        let expected: Vec<u32> = (1..=presses).collect();
+        let seen = tracked(&frames, rate);
+        let numbers: Vec<u32> = seen.iter().map(|&(press, _)| press).collect();
+        assert_eq!(numbers, expected, "{settings:?}");
+        // The presses are far shorter than 30 s, after which the daemon aborts a press.
+        assert!(seen.iter().all(|&(_, held)| (held as f64) < 15.0 * rate));
+        let first = frames.iter().position(|frame| frame.loaded).unwrap();
+        assert!(
+            first as f64 >= 10.0_f64.max(2.0 * rate),
+            "{first} frames of rest at {rate} Hz"
+        );
+        for frame in &frames {
+            assert!(
+                frame.loaded || frame.raw == RawFrame::default(),
+                "a count without load"
+            );
+            let material = frame
+                .press
+                .checked_sub(1)
+                .map(|k| materials[k as usize % materials.len()]);
+            assert_eq!(frame.material, material);
+        }
+        for press in 1..=presses {
+            let rest = frames
+                .iter()
+                .filter(|frame| frame.press == press && !frame.loaded)
+                .count();
+            assert!(
+                rest as f64 >= 5.0_f64.max(0.9 * rate),
+                "press {press} rests {rest} frames"
+            );
+        }
+    }
+
+    #[test]
+    fn a_tracker_sees_every_press_once() {
+        for (seed, frame_rate_hz, profile) in [
+            (1, 5.0, SensorProfile::Clean),
+            (2, 20.0, SensorProfile::Raw),
+            (3, 100.0, SensorProfile::Clean),
+            (4, 0.5, SensorProfile::Clean),
+            (5, 1.5, SensorProfile::Raw),
+        ] {
+            check(&SequenceSettings {
+                seed,
+                frame_rate_hz,
+                materials: Material::ALL.to_vec(),
+                presses: Some(8),
+                profile,
+                ..SequenceSettings::default()
+            });
+        }
+    }
+
+    #[test]
+    fn a_longer_rest_comes_before_and_after_each_press() {
+        let settings = |rest_s| SequenceSettings {
+            seed: 7,
+            presses: Some(3),
+            rest_s,
+            ..SequenceSettings::default()
+        };
+        check(&settings(30.0));
+        let frames: Vec<SequenceFrame> = Sequence::new(settings(30.0)).collect();
+        for press in 0..=3 {
+            let own = frames.iter().filter(|frame| frame.press == press);
+            let rests = own.filter(|frame| !frame.loaded).count();
+            // 30 s at 5 frames/s, and the delay of the next press.
+            assert!((149..155).contains(&rests), "{press}: {rests}");
+        }
+    }
+
+    #[test]
+    fn a_press_too_light_is_made_anew_with_more_force() {
+        check(&SequenceSettings {
+            seed: 4,
+            materials: vec![Material::Sponge, Material::Wood, Material::YogaMat],
+            forces_n: vec![0.3],
+            presses: Some(3),
+            ..SequenceSettings::default()
+        });
+    }
+
+    #[test]
+    fn the_arm_touches_when_the_sensor_is_loaded_and_never_jumps() {
+        let rate = 50.0;
+        let settings = SequenceSettings {
+            seed: 6,
+            frame_rate_hz: rate,
+            presses: Some(3),
+            ..Default::default()
+        };
+        let frames: Vec<SequenceFrame> = Sequence::new(settings).collect();
+        let mut before = None;
+        for (number, frame) in (0_u32..).zip(&frames) {
+            // Check four positions per frame.
+            for part in 0..4 {
+                let time_s = (f64::from(number) + 0.25 * f64::from(part)) / rate;
+                let now = frame.approach.mm(time_s);
+                let moved: f64 = before.replace(now).map_or(0.0, |before| now - before);
+                assert!(
+                    moved.abs() <= 1.1 * 5.0 * 0.25 / rate,
+                    "{moved} mm at {time_s} s"
+                );
+            }
+            let now = frame.approach.mm(f64::from(number) / rate);
+            assert!(!frame.loaded || now > -1e-9, "touches at {now} mm");
+            assert!(now < 15.0);
+        }
+        let top = |press| {
+            let own = (0_u32..)
+                .zip(&frames)
+                .filter(|(_, frame)| frame.press == press);
+            own.map(|(n, frame)| frame.approach.mm(f64::from(n) / rate))
+                .fold(0.0, f64::max)
+        };
+        assert!((1..=3).all(|press| top(press) > 0.4), "5 N and more");
+    }
+
+    #[test]
+    fn the_same_seed_gives_the_same_frames() {
+        let settings = |seed| SequenceSettings {
+            seed,
+            presses: Some(2),
+            ..Default::default()
+        };
+        let run = |seed| Sequence::new(settings(seed)).collect::<Vec<_>>();
+        assert_eq!(run(5), run(5));
+        assert_ne!(run(5), run(6));
+    }
+
+    #[test]
+    #[ignore = "many presses, some 60 s: run it after a change of physics or sensor"]
+    fn a_tracker_sees_every_one_of_many_presses_once() {
+        for seed in 0..6 {
+            for frame_rate_hz in [5.0, 100.0] {
+                for (forces_n, profile, shapes) in [
+                    (vec![], SensorProfile::Clean, Shapes::Matched),
+                    (vec![1.0], SensorProfile::Raw, Shapes::Paper),
+                ] {
+                    check(&SequenceSettings {
+                        seed,
+                        frame_rate_hz,
+                        materials: Material::ALL.to_vec(),
+                        forces_n,
+                        presses: Some(40),
+                        rest_s: REST_S,
+                        shapes,
+                        profile,
+                    });
+                }
+            }
+        }
+    }
+
+    #[test]
+    #[ignore = "measures speed: cargo test --release"]
+    fn print_speed() {
+        for material in Material::ALL {
+            let began = std::time::Instant::now();
+            let settings = SequenceSettings {
+                frame_rate_hz: 100.0,
+                materials: vec![material],
+                presses: Some(8),
+                ..SequenceSettings::default()
+            };
+            let seconds = Sequence::new(settings).count() as f64 / 100.0;
+            println!(
+                "{material}: {:.0} times real time",
+                seconds / began.elapsed().as_secs_f64()
+            );
+        }
+    }
+}

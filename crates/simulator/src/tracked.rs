@@ -1,0 +1,76 @@
+//! Simulated frames as the daemon sees them: after tare, and through its press tracker.
+//!
+//! In: raw frames at a steady rate, with the sensor unloaded before the first. Out: the frames in
+//! newtons, and the frames of the single press among them.
+
+use std::time::Duration;
+
+use hardnessd_core::frame::{Frame, RawFrame, Stamp};
+use hardnessd_core::press::{Change, End, Marks, Moment, PressTracker, Settings};
+use hardnessd_core::tare::NEWTONS_PER_COUNT;
+
+/// The frame after a tare with baseline 0.
+pub(super) fn ideal_tare(raw: &RawFrame) -> Frame {
+    Frame {
+        newtons: raw
+            .counts
+            .map(|counts| f32::from(counts) * NEWTONS_PER_COUNT),
+    }
+}
+
+/// Whether a press tracker with default settings begins a press with this frame.
+pub(super) fn begins_press(frame: &Frame) -> bool {
+    let Settings {
+        contact_threshold_n,
+        begin_area_taxels,
+        ..
+    } = Settings::default();
+    frame.contact_area_taxels(contact_threshold_n) >= begin_area_taxels
+}
+
+/// The single press among some frames, by the frames' indices.
+pub(super) struct Seen {
+    /// Frames in contact, from the one that began the press to its last.
+    pub(super) contact: Vec<usize>,
+    /// The frame that is judged.
+    pub(super) best: usize,
+}
+
+/// The press that a press tracker with default settings sees in these frames, when frames without
+/// load follow. `None` unless there is exactly one press and it ends with a release.
+pub(super) fn one_press<'a>(
+    frames: impl IntoIterator<Item = &'a RawFrame>,
+    period_s: f64,
+) -> Option<Seen> {
+    let settings = Settings::default();
+    let rest = std::iter::repeat_n(RawFrame::default(), settings.end_frames as usize);
+    let mut tracker = PressTracker::new(settings.clone());
+    let (mut contact, mut best) = (Vec::new(), None);
+    for (number, raw) in (0_u32..).zip(frames.into_iter().copied().chain(rest)) {
+        let at = Moment {
+            frame: number.into(),
+            stamp: Stamp {
+                mono: Duration::from_secs_f64(period_s * f64::from(number)),
+                wall: jiff::Timestamp::UNIX_EPOCH,
+            },
+        };
+        let frame = ideal_tare(&raw);
+        for change in tracker.push(&frame, Marks::default(), at) {
+            match change {
+                Change::Begin { .. } if best.is_some() => return None,
+                Change::Begin { .. } | Change::Settled { .. } => {}
+                Change::End {
+                    end: End::Release,
+                    peak,
+                    ..
+                } => best = Some(peak.moment.frame as usize),
+                Change::End { .. } | Change::Aborted { .. } => return None,
+            }
+        }
+        let area = frame.contact_area_taxels(settings.contact_threshold_n);
+        if tracker.is_pressed() && area >= settings.end_area_taxels {
+            contact.push(number as usize);
+        }
+    }
+    best.map(|best| Seen { contact, best })
+}

@@ -1,0 +1,485 @@
+//! The command line of the trainer.
+
+use std::path::PathBuf;
+
+use clap::builder::RangedU64ValueParser;
+use clap::{Parser, Subcommand, ValueEnum};
+use hardnessd_simulator::{DatasetSettings, LawName, Materials, SensorProfile, Shapes, Split};
+use hrn_train::data::dataset::LabelChoice;
+use hrn_train::methods::Method;
+use hrn_train::settings::Profile;
+
+/// Trains and evaluates the hardness recognition network.
+#[derive(Debug, Parser)]
+#[command(name = "hrn-train", version, after_long_help = EXIT_CODES)]
+pub(super) struct Arguments {
+    #[command(subcommand)]
+    pub(super) command: Command,
+}
+
+const EXIT_CODES: &str = "Exit codes: 0 done; 1 failed or bad data; 2 wrong usage; 66 a file named \
+    here is missing or unreadable; 69 no CUDA device; 74 I/O error; 78 bad settings, model or \
+    configuration; 130 and 143 after SIGINT and SIGTERM.";
+
+#[derive(Debug, Subcommand)]
+pub(super) enum Command {
+    /// Simulate a labelled data set (default: the paper's 10,000 + 1,000 samples)
+    Simulate(Simulate),
+    /// Make a data set from recordings of known objects, with the daemon's own decoding
+    Collect(Collect),
+    /// Train one method
+    Train(Train),
+    /// Continue to train a model on a few presses of your own sensor, labelled or not
+    Adapt(Adapt),
+    /// Train every method under several seeds and make the paper's tables; run it again to continue
+    Compare(Compare),
+    /// Run an exported model on a data set
+    Evaluate(Evaluate),
+    /// Write one page that shows a run or a comparison
+    Report {
+        /// Directory of the run or the comparison
+        directory: PathBuf,
+        /// Page to write; an existing file is replaced
+        #[arg(long, value_name = "R.html")]
+        out: PathBuf,
+    },
+    /// Write the model of a finished run to a file of its own
+    Export {
+        /// Directory of the run
+        run: PathBuf,
+        /// Model file to write; an existing file is replaced
+        #[arg(long, value_name = "M.onnx")]
+        out: PathBuf,
+    },
+    /// Check an ONNX file that was made elsewhere against the model format, line by line
+    CheckModel {
+        /// The model file
+        model: PathBuf,
+    },
+    /// Turn an ONNX file that was made elsewhere into a model that the daemon loads
+    Adopt(Adopt),
+    /// Check a model file as the daemon does and print its card
+    Inspect {
+        /// The model file
+        model: PathBuf,
+    },
+}
+
+/// The most objects of a material and presses of an object: more than fit in any memory, but few
+/// enough that all presses can be counted.
+const MOST: i64 = DatasetSettings::MOST as i64;
+
+#[derive(Debug, clap::Args)]
+pub(super) struct Simulate {
+    /// Data set to write; an existing file is replaced
+    #[arg(long, value_name = "D.npz")]
+    pub(super) out: PathBuf,
+    /// Seed of everything random
+    #[arg(long, default_value_t = DatasetSettings::default().seed, value_parser = seed())]
+    pub(super) seed: u64,
+    /// Materials: named (the paper's eight) or broad (each object has a random one, and its level is
+    /// what a simulated durometer reads)
+    #[arg(long, default_value = "named")]
+    pub(super) materials: Materials,
+    /// Laws that broad materials are drawn from: solid, plastic, foam, layered [default: all]
+    #[arg(long, value_name = "LAW", value_delimiter = ',', num_args = 1..)]
+    pub(super) laws: Vec<LawName>,
+    /// Leave the gaps between the levels that the paper's table has: no broad material has a Shore
+    /// hardness of 50 to 51, 60 to 61 or 70 to 71
+    #[arg(long)]
+    pub(super) gaps: bool,
+    /// Objects of each training material; with broad materials, four times as many in all
+    #[arg(long, default_value_t = DatasetSettings::default().objects,
+          value_parser = clap::value_parser!(u32).range(0..=MOST))]
+    pub(super) objects: u32,
+    /// Objects of each test material; with broad materials, four times as many in all
+    #[arg(long, default_value_t = DatasetSettings::default().test_objects,
+          value_parser = clap::value_parser!(u32).range(0..=MOST))]
+    pub(super) test_objects: u32,
+    /// Presses of each object: by default 50, with --sequences 6. The first 48 are six postures under eight
+    /// forces each; a smaller number takes some of these
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=MOST))]
+    pub(super) presses: Option<u32>,
+    /// The least nominal force, in newtons; the greatest is 25
+    #[arg(long, value_name = "N", default_value_t = DatasetSettings::default().lowest_force_n,
+          value_parser = lowest_force_n)]
+    pub(super) lowest_force: f32,
+    /// Distribution of shapes: matched (the same for all materials), wide (as matched, but radii from
+    /// 8 to 60 mm, edges and points) or paper (rigid objects flat, soft ones round)
+    #[arg(long, default_value = "matched")]
+    pub(super) shapes: Shapes,
+    /// Spread of the sensor's taxels: clean or raw
+    #[arg(long, default_value = "clean")]
+    pub(super) sensor_profile: SensorProfile,
+    /// Press all objects on the same sensor, which is drawn with this seed
+    #[arg(long, value_name = "SEED", value_parser = seed())]
+    pub(super) one_sensor: Option<u64>,
+    /// Young's modulus of the sensor's cover in MPa, 0.05 to 100
+    #[arg(long, value_name = "MPA", default_value_t = DatasetSettings::default().cover_young_mpa,
+          value_parser = cover_mpa)]
+    pub(super) cover: f64,
+    /// Levels whose two materials change roles, such as 24: the paper's test material trains
+    #[arg(long, value_name = "LEVELS", value_parser = swapped_levels)]
+    pub(super) swapped_levels: Option<[bool; 4]>,
+    /// Put all eight named materials into the test split
+    #[arg(long, conflicts_with = "swapped_levels")]
+    pub(super) all_test: bool,
+    /// Also draw samples of every material and a press of every level
+    #[arg(long, value_name = "S.png")]
+    pub(super) sheet: Option<PathBuf>,
+    /// Whole presses over time, with the arm's positions, in place of one frame a press
+    #[arg(long)]
+    pub(super) sequences: bool,
+    #[command(flatten)]
+    pub(super) courses: Courses,
+}
+
+/// Options of `--sequences`. Each press draws its own value between two numbers, or takes the one number.
+#[derive(Debug, clap::Args)]
+#[group(requires = "sequences")]
+pub(super) struct Courses {
+    /// Frames a second, 1 to 200 [default: 5..100]
+    #[arg(long, value_name = "LOW..HIGH", value_parser = range::<1, 200>)]
+    pub(super) fps: Option<[f64; 2]>,
+    /// Speed of the arm in mm/s, 1 to 100 [default: 2..20]
+    #[arg(long, value_name = "LOW..HIGH", value_parser = range::<1, 100>)]
+    pub(super) speed: Option<[f64; 2]>,
+    /// Stiffness of the arm in N/mm, 1 to 1000 [default: 3..30]
+    #[arg(long, value_name = "LOW..HIGH", value_parser = range::<1, 1000>)]
+    pub(super) arm: Option<[f64; 2]>,
+    /// Seconds that the arm holds its position, 0 to 10, and three frames at least [default: 0.2..1.5]
+    #[arg(long, value_name = "LOW..HIGH", value_parser = range::<0, 10>)]
+    pub(super) hold: Option<[f64; 2]>,
+    /// Reported positions are off by up to this share, 0 to 0.5, constant within a press [default: 0]
+    #[arg(long, value_name = "SHARE", value_parser = part::<50>)]
+    pub(super) position_error: Option<f64>,
+    /// The reported stiffness of the arm is off by up to this share, 0 to 0.9 [default: 0]
+    #[arg(long, value_name = "SHARE", value_parser = part::<90>)]
+    pub(super) arm_error: Option<f64>,
+    /// Times of positions are off by up to this many frames, 0 to 5, constant within a press [default: 0]
+    #[arg(long, value_name = "FRAMES", value_parser = part::<500>)]
+    pub(super) clock_error: Option<f64>,
+    /// Share of the presses in which the arm reports nothing, 0 to 1 [default: 0]
+    #[arg(long, value_name = "SHARE", value_parser = part::<100>)]
+    pub(super) unknown: Option<f64>,
+}
+
+#[derive(Debug, clap::Args)]
+pub(super) struct Collect {
+    /// Data set to write; an existing file is replaced
+    #[arg(long, value_name = "D.npz")]
+    pub(super) out: PathBuf,
+    /// Hardness level, 1 (hard) to 4, or 0: unlabelled [default: the recording's label "level"]
+    #[arg(long, value_name = "L", value_parser = clap::value_parser!(u8).range(0..=4))]
+    pub(super) level: Option<u8>,
+    /// Number of the object that was pressed. All its presses must be in one split of one data set
+    /// [default: the recording's label "object", else a new number]
+    #[arg(long, value_name = "K")]
+    pub(super) object: Option<u32>,
+    /// For training or for test
+    #[arg(long, default_value = "train")]
+    pub(super) split: SplitName,
+    /// Collect whole presses over time, not single frames; with the arm's approach where the recording
+    /// has it
+    #[arg(long)]
+    pub(super) sequences: bool,
+    /// Add to the data set, if it is there
+    #[arg(long)]
+    pub(super) append: bool,
+    /// Configuration whose first sensor describes raw bytes [default: a JX255N with default settings]
+    #[arg(long, value_name = "F")]
+    pub(super) config: Option<PathBuf>,
+    /// Leave out recordings that cannot be used. D.npz.left-out.tsv names each with the reason
+    #[arg(long)]
+    pub(super) skip_unusable: bool,
+    /// Keep the presses of each recording in this directory, and take them from there next time. A call
+    /// that was stopped continues
+    #[arg(long, value_name = "DIR")]
+    pub(super) parts: Option<PathBuf>,
+    /// Recordings at a time [default: as many as there are cores]
+    #[arg(long, value_name = "J")]
+    pub(super) jobs: Option<std::num::NonZeroUsize>,
+    /// Recordings of `record`, directories with recordings, or raw bytes back to back. If all have a
+    /// label "material" or "shore", the data set has that array; all or none must have it
+    #[arg(value_name = "CAPTURE", required = true)]
+    pub(super) captures: Vec<PathBuf>,
+}
+
+#[derive(Debug, clap::Args)]
+pub(super) struct Train {
+    /// What to train
+    #[arg(long)]
+    pub(super) method: Method,
+    /// Data to learn from; several files may be named. The files are joined, and objects of different files stay
+    /// different: all presses of an object must be in one file
+    #[arg(long, value_name = "D.npz", required = true, num_args = 1..)]
+    pub(super) data: Vec<PathBuf>,
+    /// Directory of the run
+    #[arg(long, value_name = "RUN")]
+    pub(super) out: PathBuf,
+    /// Seed of everything random
+    #[arg(long, default_value_t = 1, value_parser = seed())]
+    pub(super) seed: u64,
+    /// Length of the training
+    #[arg(long, default_value = "paper")]
+    pub(super) profile: Profile,
+    /// Settings that override the profile's (see config/hrn-train.toml)
+    #[arg(long, value_name = "F.toml")]
+    pub(super) config: Option<PathBuf>,
+    /// Continue a run that was stopped
+    #[arg(long)]
+    pub(super) resume: bool,
+    /// Reuse finished stages of another run where they are identical; may be repeated
+    #[arg(long, value_name = "RUN")]
+    pub(super) from: Vec<PathBuf>,
+    /// Number of labels to use [default: the method's share]
+    #[arg(long, value_name = "N")]
+    pub(super) labels: Option<usize>,
+    /// Which samples get their labels
+    #[arg(long, default_value = "object")]
+    pub(super) label_choice: LabelChoice,
+    /// With --method course: train for a robot that always moves in the same way and reports nothing of its
+    /// arm
+    #[arg(long)]
+    pub(super) one_robot: bool,
+    /// Where to compute
+    #[arg(long, default_value = "cpu")]
+    pub(super) device: DeviceName,
+    /// End when this process ends, the one that started this one
+    #[arg(long, hide = true, value_name = "PID")]
+    pub(super) parent: Option<i32>,
+}
+
+#[derive(Debug, clap::Args)]
+pub(super) struct Adapt {
+    /// Presses of your sensor, those of level 0 unlabelled; several files may be named
+    #[arg(long, value_name = "D.npz", required = true, num_args = 1..)]
+    pub(super) data: Vec<PathBuf>,
+    /// Directory of the run
+    #[arg(long, value_name = "RUN")]
+    pub(super) out: PathBuf,
+    /// Model to start from, which `train` or `adapt` made by any method but `features` [default: the
+    /// built-in one]. For presses over time, one of `train --method course`
+    #[arg(long, value_name = "M.onnx")]
+    pub(super) start: Option<PathBuf>,
+    /// Seed of everything random
+    #[arg(long, default_value_t = 1, value_parser = seed())]
+    pub(super) seed: u64,
+    /// Settings that override the default ones (see config/hrn-train.toml)
+    #[arg(long, value_name = "F.toml")]
+    pub(super) config: Option<PathBuf>,
+    /// Continue a run that was stopped
+    #[arg(long)]
+    pub(super) resume: bool,
+    /// Where to compute
+    #[arg(long, default_value = "cpu")]
+    pub(super) device: DeviceName,
+}
+
+#[derive(Debug, clap::Args)]
+pub(super) struct Compare {
+    /// The data set to learn from. With --course, several may be named
+    #[arg(long, value_name = "D.npz", num_args = 1.., required = true)]
+    pub(super) data: Vec<PathBuf>,
+    /// Directory of the comparison
+    #[arg(long, value_name = "DIR")]
+    pub(super) out: PathBuf,
+    /// Methods to run [default: all]. The tables also contain what was finished in DIR before
+    #[arg(long, value_name = "M", value_delimiter = ',', num_args = 1..)]
+    pub(super) methods: Vec<Method>,
+    /// Also run every method with each of these numbers of labels, for a curve of accuracy against labels
+    #[arg(long, value_name = "N", value_delimiter = ',', num_args = 1..)]
+    pub(super) labels: Vec<usize>,
+    /// Train with the seeds 1 to N
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=MOST as u64))]
+    pub(super) seeds: u64,
+    /// Length of each training run
+    #[arg(long, default_value = "paper")]
+    pub(super) profile: Profile,
+    /// Run nothing: print a command line for each run that is not finished, to spread over machines
+    #[arg(long)]
+    pub(super) plan: bool,
+    /// Runs at a time, each on one thread [default: as many as there are cores]
+    #[arg(long, value_name = "J")]
+    pub(super) jobs: Option<std::num::NonZeroUsize>,
+    /// Also swap the two materials of each level: 16 times features, hrn15-strong and hrn15-tuned, 4 times
+    /// ours
+    #[arg(long)]
+    pub(super) swaps: bool,
+    /// Compare models of whole presses instead, with simpler controls that are fitted on --data. Nothing else is
+    /// trained. All data must have whole presses (`simulate --sequences`)
+    #[arg(long, requires = "test", requires = "model",
+        conflicts_with_all = ["methods", "labels", "seeds", "profile", "plan", "jobs", "swaps"])]
+    pub(super) course: bool,
+    /// Test presses; may be given several times
+    #[arg(long, value_name = "T.npz", num_args = 1.., requires = "course")]
+    pub(super) test: Vec<PathBuf>,
+    /// Model files, of either format. The others are compared with the first
+    #[arg(long, value_name = "M.onnx", num_args = 1.., requires = "course")]
+    pub(super) model: Vec<PathBuf>,
+}
+
+/// Parses a force in newtons, from the least of `hardnessd simulate --force` to the greatest
+/// nominal force.
+fn lowest_force_n(text: &str) -> Result<f32, String> {
+    match text.parse() {
+        Ok(force_n) if DatasetSettings::LOWEST_FORCES_N.contains(&force_n) => Ok(force_n),
+        _ => Err("expected newtons from 0.01 to 25".to_owned()),
+    }
+}
+
+/// A seed. TOML, which keeps it, has no larger numbers.
+fn seed() -> RangedU64ValueParser {
+    clap::value_parser!(u64).range(..=i64::MAX as u64)
+}
+
+/// Parses a Young's modulus in MPa, from that of a gel to that of a hard plastic.
+fn cover_mpa(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(mpa) if DatasetSettings::COVERS_MPA.contains(&mpa) => Ok(mpa),
+        _ => Err("expected MPa from 0.05 to 100".to_owned()),
+    }
+}
+
+/// Parses `LOW..HIGH`, or one number for both, within bounds.
+fn range<const LEAST: u32, const MOST: u32>(text: &str) -> Result<[f64; 2], String> {
+    let (low, high) = text.split_once("..").unwrap_or((text, text));
+    let bounds = f64::from(LEAST)..=f64::from(MOST);
+    match (low.parse::<f64>(), high.parse::<f64>()) {
+        (Ok(low), Ok(high)) if bounds.contains(&low) && bounds.contains(&high) && low <= high => {
+            Ok([low, high])
+        }
+        _ => Err(format!(
+            "expected a number or LOW..HIGH, from {LEAST} to {MOST}"
+        )),
+    }
+}
+
+/// Parses a number from 0 to `HUNDREDTHS` / 100.
+fn part<const HUNDREDTHS: u32>(text: &str) -> Result<f64, String> {
+    let most = f64::from(HUNDREDTHS) / 100.0;
+    match text.parse() {
+        Ok(part) if (0.0..=most).contains(&part) => Ok(part),
+        _ => Err(format!("expected a number from 0 to {most}")),
+    }
+}
+
+/// Parses the digits of levels, in any order.
+fn swapped_levels(text: &str) -> Result<[bool; 4], String> {
+    let mut swapped = [false; 4];
+    for digit in text.chars() {
+        let place = digit.to_digit(10).and_then(|level| level.checked_sub(1));
+        match place.and_then(|place| swapped.get_mut(place as usize)) {
+            Some(level) => *level = true,
+            None => return Err("expected levels from 1 to 4, such as 24".to_owned()),
+        }
+    }
+    Ok(swapped)
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub(super) enum DeviceName {
+    Cpu,
+    /// The first CUDA device; needs a build with `--features cuda`
+    Cuda,
+}
+
+#[derive(Debug, clap::Args)]
+pub(super) struct Evaluate {
+    /// The model file
+    #[arg(long, value_name = "M.onnx")]
+    pub(super) model: PathBuf,
+    /// The data set
+    #[arg(long, value_name = "D.npz")]
+    pub(super) data: PathBuf,
+    /// Split to evaluate
+    #[arg(long, default_value = "test")]
+    pub(super) split: SplitName,
+    /// Also write every verdict as a line of CSV; an existing file is replaced
+    #[arg(long, value_name = "V.csv")]
+    pub(super) verdicts: Option<PathBuf>,
+    /// Print JSON
+    #[arg(long)]
+    pub(super) json: bool,
+}
+
+#[derive(Debug, clap::Args)]
+pub(super) struct Adopt {
+    /// The ONNX file
+    pub(super) model: PathBuf,
+    /// The data set that it learnt from
+    #[arg(long, value_name = "D.npz")]
+    pub(super) data: PathBuf,
+    /// Model file to write; an existing file is replaced
+    #[arg(long, value_name = "H.onnx")]
+    pub(super) out: PathBuf,
+    /// How it was made, in a few words [default: "adopted from" and the file's name]
+    #[arg(long, value_name = "TEXT")]
+    pub(super) method: Option<String>,
+    /// What it was tried on, in a few words [default: by the origin of the data]
+    #[arg(long, value_name = "TEXT")]
+    pub(super) validation: Option<String>,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub(super) enum SplitName {
+    Train,
+    Test,
+}
+
+impl From<SplitName> for Split {
+    fn from(name: SplitName) -> Self {
+        match name {
+            SplitName::Train => Split::Train,
+            SplitName::Test => Split::Test,
+        }
+    }
+}
+
+#[cfg(test)]
+#[path = "../../../../../tests/bench/pages.rs"]
+mod pages;
+
+#[cfg(test)]
+mod tests {
+    use clap::error::ErrorKind;
+
+    use super::*;
+
+    #[test]
+    fn every_command_of_the_trainer_in_the_pages_is_a_valid_one() {
+        let calls = pages::calls_of("hrn-train");
+        assert!(calls.len() > 60, "found {} commands", calls.len());
+        let wrong = calls.iter().filter_map(|call| {
+            let error = Arguments::try_parse_from(&call.words).err()?;
+            Some(format!("{call}: {error}"))
+        });
+        let wrong: Vec<_> = wrong.collect();
+        assert!(wrong.is_empty(), "{wrong:#?}");
+    }
+
+    #[test]
+    fn every_option_of_the_trainer_in_a_sentence_exists() {
+        let names = pages::names_of("hrn-train");
+        assert!(names.len() > 15, "found {} commands", names.len());
+        let unknown = [ErrorKind::UnknownArgument, ErrorKind::InvalidSubcommand];
+        let wrong = names.iter().filter_map(|name| {
+            let error = Arguments::try_parse_from(&name.words).err()?;
+            let is_unknown = unknown.contains(&error.kind());
+            is_unknown.then(|| format!("{name}: {error}"))
+        });
+        let wrong: Vec<_> = wrong.collect();
+        assert!(wrong.is_empty(), "{wrong:#?}");
+    }
+
+    #[test]
+    fn an_unknown_option_or_a_missing_one_is_no_valid_command() {
+        let page = "```sh\nhrn-train export run --out m.onnx\nhrn-train export run --to m.onnx\n\
+                    hrn-train export run\n```\n";
+        let is_valid: Vec<bool> = pages::calls("a page", page)
+            .iter()
+            .map(|call| Arguments::try_parse_from(&call.words).is_ok())
+            .collect();
+        assert_eq!(is_valid, [true, false, false]);
+    }
+}

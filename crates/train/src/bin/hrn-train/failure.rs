@@ -1,0 +1,121 @@
+//! The errors of commands, and the exit code of each.
+
+use std::path::PathBuf;
+
+use hardnessd_core::exit;
+use hrn_train::data::collect::CollectError;
+use hrn_train::data::dataset::DatasetError;
+use hrn_train::methods::LabelsError;
+use hrn_train::methods::adapt::NoStart;
+use hrn_train::model::adopt::Foreign;
+use hrn_train::model::file::Damaged;
+use hrn_train::settings::SettingsError;
+
+use super::configuration::ConfigurationError;
+use hardnessd_core::verdict::ModelError;
+
+/// A file named on the command line that cannot be read.
+#[derive(Debug, thiserror::Error)]
+#[error("{}: {source}", path.display())]
+pub(super) struct Unreadable {
+    pub(super) path: PathBuf,
+    pub(super) source: std::io::Error,
+}
+
+/// A directory named on the command line that has no model to take.
+#[derive(Debug, thiserror::Error)]
+#[error("{}: no finished run: {}", .0.display(), .1)]
+pub(super) struct NoRun(pub(super) PathBuf, pub(super) &'static str);
+
+/// The command line asks for a CUDA device, and there is none.
+#[derive(Debug, thiserror::Error)]
+#[cfg_attr(
+    feature = "cuda",
+    error(
+        "--device cuda: no CUDA device found: check the device and its driver with nvidia-smi, or use \
+         --device cpu"
+    )
+)]
+#[cfg_attr(
+    not(feature = "cuda"),
+    error(
+        "--device cuda: this build has no CUDA: build with --features cuda, or use --device cpu"
+    )
+)]
+pub(super) struct NoCuda;
+
+/// Options that do not go together.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum WrongUsage {
+    #[error("--methods: course judges whole presses: compare its models with --course")]
+    NotOfFrames,
+    #[error("--data: found {0} files, expected 1 without --course")]
+    ManyFiles(usize),
+    #[error(
+        "--start is missing: the data has whole presses, and the built-in model judges single frames: \
+         name a model of whole presses, such as models/course.onnx"
+    )]
+    NoStart,
+    #[error("--one-robot: works with `--method course` only")]
+    NotOneRobot,
+    #[error("{0}: works with methods of single frames only")]
+    OfFrames(&'static str),
+    #[error("{}: {} is another file of this command: name a new one", .0, .1.display())]
+    Overwritten(&'static str, PathBuf),
+}
+
+/// One of several captures cannot be collected.
+#[derive(Debug, thiserror::Error)]
+#[error("{0} (to leave out such recordings: --skip-unusable)")]
+pub(super) struct NotCollected(#[source] pub(super) CollectError);
+
+/// The command line asks for no objects at all.
+#[derive(Debug, thiserror::Error)]
+#[error("--objects and --test-objects: found 0 and 0, expected one or more of either")]
+pub(super) struct NoObjects;
+
+/// An option that has no meaning for these materials.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}: works with `--materials {1}` only")]
+pub(super) struct OtherMaterials(pub(super) &'static str, pub(super) &'static str);
+
+/// The exit code: 2 wrong usage, 66 unreadable input, 69 no such device, 78 bad configuration or
+/// model, 74 other I/O error, 1 any other error.
+pub(super) fn exit_code(error: &anyhow::Error) -> u8 {
+    let has = |test: fn(&(dyn std::error::Error + 'static)) -> bool| error.chain().any(test);
+    if has(|e| {
+        e.is::<NoObjects>()
+            || e.is::<OtherMaterials>()
+            || e.is::<WrongUsage>()
+            || matches!(e.downcast_ref(), Some(LabelsError::Range { .. }))
+            || matches!(e.downcast_ref(), Some(CollectError::NoLevel { .. }))
+    }) {
+        exit::USAGE
+    } else if has(|e| {
+        e.is::<Unreadable>()
+            || e.is::<NoRun>()
+            || matches!(e.downcast_ref(), Some(DatasetError::Unreadable { .. }))
+            || matches!(e.downcast_ref(), Some(CollectError::Unreadable { .. }))
+            || matches!(
+                e.downcast_ref(),
+                Some(ConfigurationError::Unreadable { .. })
+            )
+    }) {
+        exit::NO_INPUT
+    } else if has(<dyn std::error::Error>::is::<NoCuda>) {
+        exit::UNAVAILABLE
+    } else if has(|e| {
+        e.is::<ModelError>()
+            || e.is::<NoStart>()
+            || e.is::<Damaged>()
+            || e.is::<Foreign>()
+            || e.is::<SettingsError>()
+            || e.is::<ConfigurationError>()
+    }) {
+        exit::CONFIG
+    } else if has(<dyn std::error::Error>::is::<std::io::Error>) {
+        exit::IO
+    } else {
+        exit::FAILED
+    }
+}

@@ -1,0 +1,89 @@
+//! The trainer: one subcommand a stage, from simulated presses to the file the daemon loads.
+
+mod account;
+mod arguments;
+mod collect;
+mod compare;
+mod configuration;
+mod failure;
+mod files;
+mod models;
+mod signals;
+mod simulate;
+mod train;
+
+use std::io::{self, Write as _};
+use std::process::ExitCode;
+
+use clap::Parser as _;
+use hardnessd_core::trial;
+use hardnessd_core::{exit, wording};
+
+use self::arguments::{Arguments, Command};
+use self::failure::exit_code;
+
+/// A training step frees and asks for the same large buffers over and over. The system's allocator
+/// gives them back to the kernel each time, which took 40 % of a step.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+fn main() -> ExitCode {
+    if let Some(code) = trial::entry() {
+        return code;
+    }
+    let arguments = match Arguments::try_parse() {
+        Ok(arguments) => arguments,
+        Err(error) => return usage(&error),
+    };
+    let words = std::env::args_os().map(|word| word.to_string_lossy().into_owned());
+    let how_to_continue = match arguments.command {
+        Command::Train(_) | Command::Adapt(_) => Some(signals::resuming(words)),
+        Command::Compare(_) => Some(signals::again(words)),
+        _ => None,
+    };
+    if let Err(error) = signals::end_at_signals(how_to_continue) {
+        hardnessd_core::say!("hrn-train: signals: {error}");
+        return ExitCode::from(exit::IO);
+    }
+    let done = match arguments.command {
+        Command::Simulate(arguments) => simulate::simulate(&arguments),
+        Command::Collect(arguments) => collect::collect(&arguments),
+        // Training runs on a thread of the pool. From outside, every operation on several threads
+        // would first have to wake one of them.
+        Command::Train(arguments) => rayon::scope(|_| train::train(&arguments)),
+        Command::Adapt(arguments) => rayon::scope(|_| train::adapt(&arguments)),
+        Command::Compare(arguments) => compare::compare(arguments),
+        Command::Evaluate(arguments) => models::evaluate(&arguments),
+        Command::Report { directory, out } => compare::report_of(&directory, &out),
+        Command::Export { run, out } => models::export_run(&run, &out),
+        Command::CheckModel { model } => return models::check_model(&model),
+        Command::Adopt(arguments) => models::adopt_model(&arguments),
+        Command::Inspect { model } => models::inspect(&model),
+    };
+    match done.and_then(|account| Ok(print(&account)?)) {
+        Ok(_) => ExitCode::SUCCESS,
+        Err(error) => {
+            hardnessd_core::say!("hrn-train: {}", wording::line(error.as_ref()));
+            ExitCode::from(exit_code(&error))
+        }
+    }
+}
+
+/// Prints clap's error on one line, or the help or the version if the command line asks for it.
+fn usage(error: &clap::Error) -> ExitCode {
+    if error.use_stderr() {
+        hardnessd_core::say!("hrn-train: {}", wording::of_usage(&error.to_string()));
+        return ExitCode::from(exit::USAGE);
+    }
+    print(&error.to_string()).map_or(ExitCode::from(exit::IO), |()| ExitCode::SUCCESS)
+}
+
+/// Prints to stdout. If nobody reads any more, that is no error.
+fn print(text: &str) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    let text = wording::lines(text);
+    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+        written => written,
+    }
+}

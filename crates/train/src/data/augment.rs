@@ -1,0 +1,108 @@
+//! Augmentation that keeps the physics: the 8 symmetries of the square and integer shifts.
+//!
+//! Optionally also the changes of another sensor of the same kind (`disturb`).
+//!
+//! There is no zoom, no shear, no intensity jitter and no normalisation by a frame's own maximum,
+//! because hardness shows in the contact's width and force.
+
+use crate::data::disturb;
+use crate::settings::AugmentationSettings;
+use hardnessd_core::frame::{COLS, Frame, ROWS};
+use hardnessd_simulator::random::Stream;
+
+/// Symmetries of the square: mirror rows, mirror columns, transpose.
+const SYMMETRIES: usize = 8;
+
+/// Draws one variant of `frame`.
+pub fn vary(frame: &Frame, settings: AugmentationSettings, stream: &mut Stream) -> Frame {
+    let symmetry = if settings.symmetries {
+        stream.below(SYMMETRIES)
+    } else {
+        0
+    };
+    let reach = isize::from(settings.shift_taxels);
+    let mut shift = || stream.below(2 * settings.shift_taxels as usize + 1) as isize - reach;
+    let (rows, columns) = (shift(), shift());
+    let moved = shifted(&turned(frame, symmetry), rows, columns);
+    if settings.other_sensors && stream.below(2) == 1 {
+        return disturb::disturbed(&moved, stream);
+    }
+    moved
+}
+
+/// The image of `frame` under symmetry 0..8; 0 is the identity.
+fn turned(frame: &Frame, symmetry: usize) -> Frame {
+    const { assert!(ROWS == COLS, "a transposed frame must fit") };
+    let mut image = Frame::default();
+    for row in 0..ROWS {
+        for column in 0..COLS {
+            let (r, c) = if symmetry & 4 == 0 {
+                (row, column)
+            } else {
+                (column, row)
+            };
+            let r = if symmetry & 1 == 0 { r } else { ROWS - 1 - r };
+            let c = if symmetry & 2 == 0 { c } else { COLS - 1 - c };
+            image.newtons[row * COLS + column] = frame.newtons[r * COLS + c];
+        }
+    }
+    image
+}
+
+/// `frame` moved down by `rows` and right by `columns`.
+fn shifted(frame: &Frame, rows: isize, columns: isize) -> Frame {
+    let mut image = Frame::default();
+    for row in 0..ROWS {
+        for column in 0..COLS {
+            let from = (
+                row.checked_add_signed(-rows),
+                column.checked_add_signed(-columns),
+            );
+            if let (Some(r @ 0..ROWS), Some(c @ 0..COLS)) = from {
+                image.newtons[row * COLS + column] = frame.newtons[r * COLS + c];
+            }
+        }
+    }
+    image
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn corner() -> Frame {
+        let mut frame = Frame::default();
+        frame.newtons[COLS + 2] = 1.0; // row 1, column 2
+        frame
+    }
+
+    #[test]
+    fn the_symmetries_are_eight_different_ones_that_keep_force_and_area() {
+        let images: Vec<Frame> = (0..SYMMETRIES).map(|s| turned(&corner(), s)).collect();
+        assert_eq!(images[0], corner());
+        for (index, image) in images.iter().enumerate() {
+            assert_eq!(image.force_n(), 1.0);
+            assert!(
+                images[..index].iter().all(|earlier| earlier != image),
+                "symmetry {index}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_shift_brings_in_background_and_loses_what_leaves() {
+        let moved = shifted(&corner(), 3, -2);
+        assert_eq!(moved.newtons[4 * COLS], 1.0);
+        assert_eq!(moved.force_n(), 1.0);
+        assert_eq!(shifted(&corner(), 0, -3).force_n(), 0.0);
+    }
+
+    #[test]
+    fn without_settings_nothing_changes() {
+        let mut stream = Stream::new(1, "test");
+        assert_eq!(
+            vary(&corner(), AugmentationSettings::default(), &mut stream),
+            corner()
+        );
+    }
+}

@@ -1,0 +1,206 @@
+//! The presses that were judged, with all their frames, from the daemon's own events.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use jiff::Timestamp;
+
+use hardnessd_core::event::{Event, Hardness, Phase, PressState};
+use hardnessd_core::frame::{Frame, Stamp};
+use hardnessd_core::motion::Track;
+use hardnessd_core::pipeline::{approach_by_speed, approach_speed_mm_s, says_something};
+use hardnessd_core::press::thinned;
+use hardnessd_core::recording::{Entry, Found};
+use hardnessd_core::sensor::Description;
+use hardnessd_simulator::MOST_FRAMES;
+
+/// A press that was judged.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Judged {
+    /// The chosen frame.
+    pub(super) frame: Frame,
+    /// Total force of the chosen frame.
+    pub(super) force_n: f32,
+    /// The press's frames in contact, thinned. Empty if the recording does not have all of them.
+    pub(super) moments: Vec<Moment>,
+    /// Index of the chosen frame in `moments`.
+    pub(super) best: usize,
+    /// Stiffness of the arm. 0 if the stiffness or the approach is unknown.
+    pub(super) arm_n_per_mm: f32,
+}
+
+/// A frame of a press.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Moment {
+    /// Seconds since the press began.
+    pub(super) time_s: f32,
+    /// The approach since the press began, where it is known.
+    pub(super) approach_mm: Option<f32>,
+    pub(super) frame: Frame,
+}
+
+impl Judged {
+    pub(super) fn is_whole(&self) -> bool {
+        !self.moments.is_empty()
+    }
+
+    pub(super) fn is_known(&self) -> bool {
+        self.moments
+            .iter()
+            .any(|moment| moment.approach_mm.is_some())
+    }
+}
+
+/// The presses found so far, and what is held of each sensor to find more.
+#[derive(Debug, Default)]
+pub(super) struct Selection {
+    held: BTreeMap<String, Held>,
+    pub(super) presses: Vec<Judged>,
+}
+
+/// The frames and the press of one sensor.
+#[derive(Debug, Default)]
+struct Held {
+    /// The frames of the press under way. Without a press, the newest frame.
+    frames: BTreeMap<u64, Shown>,
+    is_pressed: bool,
+    /// Numbers of the first and the last frame of the press.
+    began: Option<u64>,
+    last: u64,
+    /// The speed of the approach when the press under way began, if it is known.
+    speed_mm_s: Option<f64>,
+    described: Description,
+}
+
+#[derive(Debug)]
+struct Shown {
+    mono: Duration,
+    area: u32,
+    newtons: Vec<f32>,
+}
+
+impl Selection {
+    /// Takes the sensor's description from an entry of a recording.
+    pub(super) fn note(&mut self, found: &Found) {
+        match &found.entry {
+            Entry::Settings(sensor) => self.describe(&found.sensor, &sensor.description),
+            Entry::State(state) => self.describe(&found.sensor, &state.sensor.description),
+            Entry::Input(_) => {}
+        }
+    }
+
+    pub(super) fn describe(&mut self, sensor: &str, description: &Description) {
+        let held = self.held.entry(sensor.to_owned()).or_default();
+        if held.described != *description {
+            held.described = description.clone();
+        }
+    }
+
+    /// Takes the events of the input that arrived at `at`. `track` has the positions of the arm, as
+    /// the pipeline of these events knows them.
+    pub(super) fn take(&mut self, events: Vec<Event>, at: Stamp, track: &Track) {
+        for event in events {
+            let held = self.held.entry(event.sensor().to_owned()).or_default();
+            match event {
+                Event::Frame(frame) => {
+                    if !held.is_pressed {
+                        held.frames.clear();
+                    }
+                    let shown = Shown {
+                        mono: moment(at, frame.time),
+                        area: frame.contact_area_taxels,
+                        newtons: frame.newtons,
+                    };
+                    held.frames.insert(frame.frame, shown);
+                }
+                // The press's first frame came just before this event.
+                Event::Press(press) => {
+                    held.is_pressed = press.state == PressState::Begin;
+                    match press.state {
+                        PressState::Begin => {
+                            held.began = Some(press.frame);
+                            let (context, arm) = (press.context.as_ref(), &held.described.arm);
+                            held.speed_mm_s = approach_speed_mm_s(context, arm);
+                        }
+                        PressState::End | PressState::Aborted => held.last = press.frame,
+                    }
+                }
+                Event::Hardness(verdict) if verdict.phase == Phase::Final => {
+                    self.presses.extend(held.judged(&verdict, track));
+                }
+                Event::Hardness(_) | Event::Status(_) => {}
+            }
+        }
+    }
+}
+
+impl Held {
+    /// The press that has just ended.
+    fn judged(&mut self, verdict: &Hardness, track: &Track) -> Option<Judged> {
+        // The chosen frame of a press that began before the recording may be missing from it.
+        let chosen = self.frames.get(&verdict.frame)?;
+        let mut judged = Judged {
+            frame: Frame::try_from(chosen.newtons.clone()).ok()?,
+            force_n: verdict.force_n as f32,
+            moments: Vec::new(),
+            best: 0,
+            arm_n_per_mm: 0.0,
+        };
+        let Some(first) = self.began.take() else {
+            return Some(judged);
+        };
+        let least = self.described.press.end_area_taxels;
+        let pressed = self.frames.range(first..=self.last.max(first));
+        let pressed: Vec<(u64, &Shown)> = pressed
+            .filter(|(_, shown)| shown.area >= least)
+            .map(|(&number, shown)| (number, shown))
+            .collect();
+        let Some(best) = pressed
+            .iter()
+            .position(|&(number, _)| number == verdict.frame)
+        else {
+            return Some(judged);
+        };
+        let moments: Vec<Duration> = pressed.iter().map(|(_, shown)| shown.mono).collect();
+        let arm = &self.described.arm;
+        let (begin, end) = (moments[0], moments[moments.len() - 1]);
+        // The approach is what the daemon would give a model: from positions, or else from the speed.
+        let way = if track.is_told(end, arm.delay_ms) {
+            track.approach(begin, &moments, arm.delay_ms)
+        } else {
+            self.speed_mm_s.map(|speed_mm_s| {
+                let shown = pressed.iter().map(|(_, shown)| &shown.newtons);
+                let force_n = |newtons: &Vec<f32>| newtons.iter().map(|&n| f64::from(n)).sum();
+                let forces_n: Vec<f64> = shown.map(force_n).collect();
+                approach_by_speed(speed_mm_s, &moments, &forces_n)
+            })
+        };
+        let way = way.filter(|way| says_something(way, best));
+        let way = way.unwrap_or_else(|| vec![None; moments.len()]);
+        let mut before_s = -1.0_f32;
+        for place in thinned(pressed.len(), best, MOST_FRAMES) {
+            // Two frames may have arrived at the same moment, but times in a file must ascend.
+            let time_s = moments[place].saturating_sub(begin).as_secs_f32();
+            before_s = time_s.max(before_s.next_up());
+            if place == best {
+                judged.best = judged.moments.len();
+            }
+            judged.moments.push(Moment {
+                time_s: before_s,
+                approach_mm: way[place].map(|mm| mm as f32),
+                frame: Frame::try_from(pressed[place].1.newtons.clone()).ok()?,
+            });
+        }
+        if judged.is_known() {
+            judged.arm_n_per_mm = arm.stiffness_n_per_mm.unwrap_or(0.0) as f32;
+        }
+        Some(judged)
+    }
+}
+
+/// The moment of an event on the clock of the positions.
+fn moment(at: Stamp, time: Timestamp) -> Duration {
+    let ago = at.wall.as_nanosecond() - time.as_nanosecond();
+    let mono = at.mono.as_nanos() as i128 - ago;
+    Duration::from_nanos(u64::try_from(mono).unwrap_or(0))
+}

@@ -1,0 +1,568 @@
+//! Presses over time as `.npz` files that numpy reads and writes.
+//!
+//! In: files, or the simulator's courses. Out: [`Courses`], with a row per kept frame and a row per
+//! press. `docs/formats.md` has the arrays.
+
+use std::collections::BTreeSet;
+use std::io::{Seek, Write};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use ndarray::{ArrayView1, ArrayView3};
+use ndarray_npy::{NpzWriter, WriteNpzError};
+
+use super::dataset::file::{self, FORCES_N, File, SHORE};
+use super::dataset::{
+    Dataset, DatasetError, Sample, Source, levels, objects_after, pitch_mm,
+    warn_of_object_in_both_splits,
+};
+use hardnessd_core::frame::{COLS, Frame, ROWS, TAXELS};
+use hardnessd_core::verdict::COURSE_FRAMES;
+use hardnessd_simulator::{LabelledCourse, NEWTONS_PER_COUNT, Split};
+
+/// Newtons per unit of [`Courses::frames_mn`].
+const NEWTONS: f32 = 1e-3;
+
+/// Presses over time. Each column is an array of the file.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Courses {
+    /// Taxels of the kept frames in millinewtons, `[frames, 784]`.
+    pub frames_mn: Vec<u16>,
+    /// The number of each frame's press, ascending.
+    pub press: Vec<u32>,
+    /// Seconds since the frame that began the press. Negative before that frame.
+    pub time_s: Vec<f32>,
+    /// The approach of the arm since that frame, in mm. 0 where it is unknown.
+    pub approach_mm: Vec<f32>,
+    /// 1 where the approach is known.
+    pub known: Vec<u8>,
+    /// Labels and measurements of each press.
+    pub presses: Vec<Press>,
+}
+
+/// Labels and measurements of one press.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Press {
+    /// The hardness level 1..=4, or 0 for unlabelled.
+    pub level: u8,
+    /// The number of the pressed object, unique in the file.
+    pub object: u32,
+    /// Index into `meta.materials`.
+    pub material: u8,
+    /// The split: train or test.
+    pub split: Split,
+    /// Shore hardness; NaN where it was not measured.
+    pub shore: f32,
+    /// Force of the press: the greatest applied force if simulated, the chosen frame's total force
+    /// if recorded.
+    pub force_n: f32,
+    /// Stiffness of the arm. 0 if unknown.
+    pub arm_n_per_mm: f32,
+    /// The row of the frame that a model of single frames judges.
+    pub best: u32,
+}
+
+/// Reads a file of single frames, or of whole presses. A press gives the frame with its largest contact
+/// area.
+///
+/// # Errors
+///
+/// Returns the errors of [`Dataset::read`] and [`Courses::read`].
+pub fn single_frames(path: &Path) -> Result<Dataset, DatasetError> {
+    if !Courses::is_at(path)? {
+        return Dataset::read(path);
+    }
+    let (courses, source) = Courses::read_with_source(path)?;
+    Ok(courses.best_frames(path, source))
+}
+
+/// An array with a value for each press: its name, and the value.
+type Column<T> = (&'static str, fn(&Press) -> T);
+
+impl Courses {
+    /// The columns of simulated presses.
+    pub fn of(courses: &[LabelledCourse]) -> Self {
+        let mut all = Self::default();
+        for (number, course) in (0_u32..).zip(courses) {
+            let first = all.press.len();
+            for moment in &course.moments {
+                let millinewtons = |&counts: &u16| {
+                    (f32::from(counts) * NEWTONS_PER_COUNT / NEWTONS).round() as u16
+                };
+                all.frames_mn.extend(moment.counts.iter().map(millinewtons));
+                all.press.push(number);
+                all.time_s.push(moment.time_s);
+                all.approach_mm.push(moment.approach_mm);
+                all.known.push(moment.known.into());
+            }
+            all.presses.push(Press {
+                level: course.level,
+                object: course.object,
+                material: course.material,
+                split: course.split,
+                shore: course.shore,
+                force_n: course.force_n,
+                arm_n_per_mm: course.arm_n_per_mm,
+                best: (first + course.best) as u32,
+            });
+        }
+        all
+    }
+
+    /// Adds a press. Each of `moments` is the time since the press began in s, the approach in mm
+    /// where known, and the frame. `press.best` counts from the first moment.
+    pub fn push<'a>(
+        &mut self,
+        press: Press,
+        moments: impl Iterator<Item = (f32, Option<f32>, &'a Frame)>,
+    ) {
+        let (first, number) = (self.press.len() as u32, self.presses.len() as u32);
+        for (time_s, approach_mm, frame) in moments {
+            // A u16 holds up to 65 N on a taxel, which is beyond the range of any film.
+            let millinewtons = |newtons: &f32| (newtons / NEWTONS).round() as u16;
+            self.frames_mn
+                .extend(frame.newtons.iter().map(millinewtons));
+            self.press.push(number);
+            self.time_s.push(time_s);
+            self.approach_mm.push(approach_mm.unwrap_or(0.0));
+            self.known.push(approach_mm.is_some().into());
+        }
+        self.presses.push(Press {
+            best: first + press.best,
+            ..press
+        });
+    }
+
+    /// The frame of each press with the largest contact area, as a data set of single frames.
+    fn best_frames(&self, path: &Path, source: Source) -> Dataset {
+        let sample = |press: &Press| Sample {
+            frame: self.frame(press.best as usize),
+            level: press.level,
+            object: Some(press.object),
+            material: Some(press.material),
+            force_n: Some(press.force_n),
+            split: press.split,
+            shore: Some(press.shore).filter(|shore| shore.is_finite()),
+            source: 0,
+        };
+        Dataset {
+            samples: self.presses.iter().map(sample).collect(),
+            sources: vec![source],
+            paths: vec![path.to_owned()],
+        }
+    }
+
+    /// Indices of a split's presses whose level is known.
+    pub fn labelled(&self, split: Split) -> impl Iterator<Item = usize> {
+        let presses = self.presses.iter().enumerate();
+        let wanted = presses.filter(move |(_, press)| press.split == split && press.level > 0);
+        wanted.map(|(place, _)| place)
+    }
+
+    /// The rows of press number `press`.
+    pub fn rows(&self, press: usize) -> Range<usize> {
+        let first = |press: usize| self.press.partition_point(|&of| (of as usize) < press);
+        first(press)..first(press + 1)
+    }
+
+    /// A kept frame in newtons.
+    pub fn frame(&self, row: usize) -> Frame {
+        let taxels = &self.frames_mn[row * TAXELS..][..TAXELS];
+        Frame {
+            newtons: std::array::from_fn(|k| f32::from(taxels[k]) * NEWTONS),
+        }
+    }
+
+    /// Whether the file has presses over time, and not single frames.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the file cannot be read.
+    pub fn is_at(path: &Path) -> Result<bool, DatasetError> {
+        let bytes = file::read(path)?;
+        Ok(File::open(&bytes, path)?.is_of_courses())
+    }
+
+    /// Reads several files as one, and gives the source of each. Objects of different files stay
+    /// apart. Prints a warning if an object of a file has presses in both splits.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`Courses::read`]. Also returns an error if the sensors of the files
+    /// have different pitches, or the files have more objects than a u32 can number.
+    pub fn read_all(paths: &[PathBuf]) -> Result<(Self, Vec<Source>), DatasetError> {
+        let (mut all, mut sources) = (Self::default(), Vec::new());
+        let mut first_object = 0;
+        for path in paths {
+            let (part, source) = Self::read_with_source(path)?;
+            if let Some(object) = part.object_in_both_splits() {
+                warn_of_object_in_both_splits(path, object);
+            }
+            sources.push(source);
+            let (expected, found) = (pitch_mm(&sources), pitch_mm(&sources[sources.len() - 1..]));
+            if found != expected {
+                return Err(DatasetError::Pitch {
+                    path: path.clone(),
+                    found,
+                    expected,
+                    first: paths[0].clone(),
+                });
+            }
+            let last = part.presses.iter().map(|press| press.object).max();
+            let before;
+            (before, first_object) = objects_after(first_object, last, path.clone())?;
+            all.append(part, before);
+        }
+        Ok((all, sources))
+    }
+
+    fn read_with_source(path: &Path) -> Result<(Self, Source), DatasetError> {
+        let bytes = file::read(path)?;
+        let mut file = File::open(&bytes, path)?;
+        let meta = file.meta()?;
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let source = file::source(&bytes, &file, name.into_owned(), &meta)?;
+        Ok((Self::parse(&bytes, path)?, source))
+    }
+
+    /// An object that has presses in both splits.
+    fn object_in_both_splits(&self) -> Option<u32> {
+        let of = |split| {
+            let presses = self.presses.iter();
+            presses
+                .filter(move |press| press.split == split)
+                .map(|press| press.object)
+        };
+        let trained: BTreeSet<u32> = of(Split::Train).collect();
+        of(Split::Test).find(|object| trained.contains(object))
+    }
+
+    /// Adds the presses of another file. `objects` is added to their numbers of objects.
+    fn append(&mut self, other: Self, objects: u32) {
+        let (rows, presses) = (self.press.len() as u32, self.presses.len() as u32);
+        self.frames_mn.extend(other.frames_mn);
+        self.press
+            .extend(other.press.iter().map(|press| press + presses));
+        self.time_s.extend(other.time_s);
+        self.approach_mm.extend(other.approach_mm);
+        self.known.extend(other.known);
+        self.presses
+            .extend(other.presses.into_iter().map(|press| Press {
+                object: press.object + objects,
+                best: press.best + rows,
+                ..press
+            }));
+    }
+
+    /// Reads a file.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the file cannot be read, or an array is missing or has another type,
+    /// shape or content than `docs/formats.md` says.
+    pub fn read(path: &Path) -> Result<Self, DatasetError> {
+        Self::parse(&file::read(path)?, path)
+    }
+
+    fn parse(bytes: &[u8], path: &Path) -> Result<Self, DatasetError> {
+        let mut file = File::open(bytes, path)?;
+        if file.is_of_frames() {
+            return Err(DatasetError::SingleFrames {
+                path: path.to_owned(),
+            });
+        }
+        let frames_mn: Vec<u16> = file.required("frames_mn", &[ROWS, COLS], None)?;
+        let rows = Some(frames_mn.len() / TAXELS);
+        let press: Vec<u32> = file.required("press", &[], rows)?;
+        let time_s: Vec<f32> = file.required("time_s", &[], rows)?;
+        let approach_mm: Vec<f32> = file.required("approach_mm", &[], rows)?;
+        let known: Vec<u8> = file.required("known", &[], rows)?;
+        let level: Vec<u8> = file.required("level", &[], None)?;
+        let count = Some(level.len());
+        let object: Vec<u32> = file.required("object", &[], count)?;
+        let material: Vec<u8> = file.required("material", &[], count)?;
+        let split: Vec<u8> = file.required("split", &[], count)?;
+        let shore: Vec<f32> = file.required("shore", &[], count)?;
+        let force_n: Vec<f32> = file.required("force", &[], count)?;
+        let arm_n_per_mm: Vec<f32> = file.required("arm_n_per_mm", &[], count)?;
+        let best: Vec<u32> = file.required("best", &[], count)?;
+        for (array, values, range) in [
+            ("time_s", &time_s, -1e5..=1e5),
+            ("approach_mm", &approach_mm, -1e6..=1e6),
+            ("force", &force_n, FORCES_N),
+            ("arm_n_per_mm", &arm_n_per_mm, 0.0..=1e6),
+        ] {
+            file.between(array, values, range)?;
+        }
+        let known_shore: Vec<f32> = shore
+            .iter()
+            .copied()
+            .filter(|shore| !shore.is_nan())
+            .collect();
+        file.between("shore", &known_shore, SHORE)?;
+        file.within("level", &level, levels().len() as u8, "0 (unlabelled) to 4")?;
+        file.within("split", &split, 1, "0 (train) or 1 (test)")?;
+        file.within("known", &known, 1, "0 or 1")?;
+        if level.is_empty() {
+            let (found, expected) = ("no press".to_owned(), "at least one".to_owned());
+            return Err(file.error("level", found, expected));
+        }
+        let ascends = press.first() == Some(&0)
+            && press
+                .windows(2)
+                .all(|pair| pair[1] == pair[0] || pair[1] == pair[0] + 1);
+        let last = press.last().map_or(0, |&last| last as usize + 1);
+        if !ascends || last != level.len() {
+            let found = format!("{last} presses, or a step that is not 0 or 1");
+            let expected = format!("0 to {}, each at least once", level.len() - 1);
+            return Err(file.error("press", found, expected));
+        }
+        let presses = (0..level.len()).map(|k| Press {
+            level: level[k],
+            object: object[k],
+            material: material[k],
+            split: if split[k] == 0 {
+                Split::Train
+            } else {
+                Split::Test
+            },
+            shore: shore[k],
+            force_n: force_n[k],
+            arm_n_per_mm: arm_n_per_mm[k],
+            best: best[k],
+        });
+        let courses = Self {
+            presses: presses.collect(),
+            frames_mn,
+            press,
+            time_s,
+            approach_mm,
+            known,
+        };
+        for (number, press) in courses.presses.iter().enumerate() {
+            let rows = courses.rows(number);
+            if !rows.contains(&(press.best as usize)) {
+                let found = format!("{} of press {number}", press.best);
+                let expected = format!("one of its frames, {rows:?}");
+                return Err(file.error("best", found, expected));
+            }
+            let times = &courses.time_s[rows];
+            let used = times.iter().filter(|&&time_s| time_s >= 0.0).count();
+            if !(1..=COURSE_FRAMES.1).contains(&used) {
+                let found = format!("{used} frames at 0 s or later in press {number}");
+                let expected = format!("1 to {}", COURSE_FRAMES.1);
+                return Err(file.error("time_s", found, expected));
+            }
+            if !times.is_sorted_by(|a, b| a < b) {
+                let found = format!("times that stand still or go back in press {number}");
+                return Err(file.error("time_s", found, "ascending ones".to_owned()));
+            }
+        }
+        Ok(courses)
+    }
+
+    /// Writes the file, compressed: most taxels of a frame are 0.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of writing to `out`.
+    pub fn write<W: Write + Seek>(
+        &self,
+        out: W,
+        meta: &serde_json::Value,
+    ) -> Result<W, WriteNpzError> {
+        let mut npz = NpzWriter::new_compressed(out);
+        let shape = (self.press.len(), ROWS, COLS);
+        let frames = ArrayView3::from_shape(shape, &self.frames_mn)
+            .expect("as many values as the shape asks for");
+        npz.add_array("frames_mn", &frames)?;
+        npz.add_array("press", &ArrayView1::from(&self.press))?;
+        npz.add_array("time_s", &ArrayView1::from(&self.time_s))?;
+        npz.add_array("approach_mm", &ArrayView1::from(&self.approach_mm))?;
+        npz.add_array("known", &ArrayView1::from(&self.known))?;
+        let bytes: [Column<u8>; 3] = [
+            ("level", |press| press.level),
+            ("material", |press| press.material),
+            ("split", |press| press.split as u8),
+        ];
+        for (name, of) in bytes {
+            let values: Vec<u8> = self.presses.iter().map(of).collect();
+            npz.add_array(name, &ArrayView1::from(&values))?;
+        }
+        let numbers: [Column<u32>; 2] = [
+            ("object", |press| press.object),
+            ("best", |press| press.best),
+        ];
+        for (name, of) in numbers {
+            let values: Vec<u32> = self.presses.iter().map(of).collect();
+            npz.add_array(name, &ArrayView1::from(&values))?;
+        }
+        let reals: [Column<f32>; 3] = [
+            ("shore", |press| press.shore),
+            ("force", |press| press.force_n),
+            ("arm_n_per_mm", |press| press.arm_n_per_mm),
+        ];
+        for (name, of) in reals {
+            let values: Vec<f32> = self.presses.iter().map(of).collect();
+            npz.add_array(name, &ArrayView1::from(&values))?;
+        }
+        npz.add_array("meta", &ArrayView1::from(meta.to_string().as_bytes()))?;
+        npz.finish()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Cursor;
+
+    use serde_json::json;
+
+    use super::*;
+    use hardnessd_simulator::{self, CourseSettings, DatasetSettings, Materials};
+
+    fn simulated() -> Courses {
+        let settings = CourseSettings {
+            objects: DatasetSettings {
+                seed: 2,
+                materials: Materials::Broad,
+                objects: 1,
+                test_objects: 0,
+                presses: 2,
+                ..DatasetSettings::default()
+            },
+            unknown_share: 0.5,
+            ..CourseSettings::default()
+        };
+        Courses::of(&hardnessd_simulator::courses(&settings, 2, |_| ()))
+    }
+
+    fn round_trip(courses: &Courses) -> Result<Courses, DatasetError> {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("courses.npz");
+        let bytes = courses.write(Cursor::new(Vec::new()), &json!({"seed": 2}));
+        std::fs::write(&path, bytes.unwrap().into_inner()).unwrap();
+        assert_eq!(super::super::dataset::meta(&path).unwrap()["seed"], 2);
+        Courses::read(&path)
+    }
+
+    #[test]
+    fn a_file_gives_back_what_was_written() {
+        let courses = simulated();
+        assert!(courses.presses.len() >= 6);
+        assert!(round_trip(&courses).unwrap() == courses);
+        for (number, press) in courses.presses.iter().enumerate() {
+            let area = |row: usize| courses.frame(row).contact_area_taxels(0.07);
+            let most = courses.rows(number).map(area).max();
+            assert_eq!(most, Some(area(press.best as usize)), "press {number}");
+        }
+    }
+
+    /// Writes a file with these objects and this pitch into a directory.
+    fn written(directory: &Path, name: &str, objects: &[u32], pitch_mm: f64) -> PathBuf {
+        let mut courses = Courses::default();
+        for &object in objects {
+            let press = Press {
+                level: 1,
+                object,
+                material: 0,
+                split: Split::Train,
+                shore: 80.0,
+                force_n: 1.0,
+                arm_n_per_mm: 0.0,
+                best: 0,
+            };
+            courses.push(press, [(0.0, None, &Frame::default())].into_iter());
+        }
+        let path = directory.join(name);
+        let bytes = courses.write(Cursor::new(Vec::new()), &json!({"pitch_mm": pitch_mm}));
+        std::fs::write(&path, bytes.unwrap().into_inner()).unwrap();
+        path
+    }
+
+    #[test]
+    fn objects_of_different_files_stay_apart_or_are_refused() {
+        let directory = tempfile::tempdir().unwrap();
+        let written = |name, objects: &[u32]| written(directory.path(), name, objects, 2.0);
+        let (few, most) = (written("few", &[0, 4]), written("most", &[0, u32::MAX]));
+        let (all, sources) = Courses::read_all(&[few.clone(), few.clone()]).unwrap();
+        let objects: Vec<u32> = all.presses.iter().map(|press| press.object).collect();
+        assert_eq!(objects, [0, 4, 5, 9]);
+        assert_eq!(pitch_mm(&sources), 2.0);
+        assert_eq!(
+            Courses::read_all(std::slice::from_ref(&most))
+                .unwrap()
+                .0
+                .presses
+                .len(),
+            2
+        );
+        for files in [[most.clone(), few.clone()], [few, most]] {
+            let error = Courses::read_all(&files).unwrap_err().to_string();
+            assert!(error.contains("array `object`: found"), "{error}");
+        }
+    }
+
+    #[test]
+    fn files_of_different_pitches_are_not_joined() {
+        let directory = tempfile::tempdir().unwrap();
+        let fine = written(directory.path(), "fine", &[0], 2.0);
+        let coarse = written(directory.path(), "coarse", &[0], 3.5);
+        let error = Courses::read_all(&[fine.clone(), fine, coarse]).unwrap_err();
+        let error = error.to_string();
+        assert!(
+            error.contains("coarse: taxel pitch: found 3.5 mm, expected 2 mm, that of "),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn what_contradicts_itself_is_refused() {
+        let good = simulated();
+        let check = |change: fn(&mut Courses), part: &str| {
+            let mut bad = good.clone();
+            change(&mut bad);
+            let error = round_trip(&bad).unwrap_err().to_string();
+            assert!(error.contains(part), "{error}");
+        };
+        check(|bad| bad.press[0] = 1, "array `press`");
+        check(|bad| bad.time_s[1] = -9.0, "array `time_s`: found times");
+        check(|bad| bad.time_s[1] = f32::NAN, "array `time_s`: found NaN");
+        check(
+            |bad| {
+                let rows = bad.rows(0);
+                let count = rows.len() as f32;
+                rows.for_each(|row| bad.time_s[row] = row as f32 - count);
+            },
+            "array `time_s`: found 0 frames at 0 s or later in press 0, expected 1 to 48",
+        );
+        check(
+            |bad| {
+                // The first two presses become one that is too long.
+                let second = bad.rows(1);
+                let added = 60 - bad.rows(0).len().min(59);
+                let (row, frame) = (bad.rows(0).start, bad.frames_mn[..TAXELS].to_vec());
+                assert!(second.start > row);
+                for _ in 0..added {
+                    bad.frames_mn.splice(0..0, frame.clone());
+                    bad.press.insert(0, 0);
+                    bad.approach_mm.insert(0, 0.0);
+                    bad.known.insert(0, 1);
+                    bad.time_s.insert(0, 0.0);
+                }
+                bad.presses
+                    .iter_mut()
+                    .for_each(|press| press.best += added as u32);
+                let rows = bad.rows(0);
+                rows.for_each(|row| bad.time_s[row] = row as f32);
+            },
+            "frames at 0 s or later in press 0, expected 1 to 48",
+        );
+        check(
+            |bad| bad.presses[0].best = 99_999,
+            "array `best`: found 99999 of press 0",
+        );
+        check(|bad| bad.known[0] = 2, "array `known`: found 2");
+        check(|bad| bad.presses[0].level = 5, "array `level`: found 5");
+        check(|bad| bad.presses.truncate(1), "array `press`");
+    }
+}

@@ -1,0 +1,541 @@
+//! Labelled and unlabelled frames, as `.npz` files that numpy reads and writes.
+//!
+//! In: files, or the simulator's samples. Out: a [`Dataset`], and choices of its samples that keep
+//! objects whole. Presses of one object are near-copies, so a model that was chosen by some of an
+//! object's frames has practically seen the others.
+
+pub(super) mod file;
+pub(super) mod stream;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+pub use self::file::{meta, write};
+use hardnessd_core::frame::Frame;
+use hardnessd_core::verdict::Level;
+use hardnessd_simulator::random::Stream;
+use hardnessd_simulator::{LEVELS, LabelledSample, LevelRange, Split};
+
+/// The distance between taxels, unless a file names another one.
+pub use hardnessd_core::tare::PITCH_MM;
+
+/// The four hardness levels of the paper's Table 1.
+pub fn levels() -> Vec<Level> {
+    LEVELS
+        .iter()
+        .map(|range| level(range, range.table))
+        .collect()
+}
+
+/// A level with its interval of Shore, as it is written in files.
+pub(super) fn level(range: &LevelRange, shore: &str) -> Level {
+    Level {
+        level: range.level,
+        label: range.label.to_owned(),
+        shore: shore.to_owned(),
+    }
+}
+
+/// The levels that `meta` of a file states. If it states none, those of [`levels`].
+///
+/// # Errors
+///
+/// Returns an error if the file cannot be read, or `levels` of its `meta` is not as
+/// `docs/formats.md` says.
+pub fn stated_levels(path: &Path) -> Result<Vec<Level>, DatasetError> {
+    let stated = meta(path)?.get_mut("levels").map(serde_json::Value::take);
+    let Some(stated) = stated.filter(|stated| !stated.is_null()) else {
+        return Ok(levels());
+    };
+    serde_json::from_value(stated).map_err(|error| DatasetError::Array {
+        path: path.to_owned(),
+        array: "meta",
+        found: format!("`levels` with {error}"),
+        expected: "`level`, `label` and `shore` of each level".to_owned(),
+    })
+}
+
+/// The levels that a model of these files states: those of the first file that states some, otherwise
+/// those of [`levels`].
+pub fn levels_of(sources: &[Source]) -> Vec<Level> {
+    let mut stated = sources.iter().filter_map(|source| source.levels.clone());
+    stated.next().unwrap_or_else(levels)
+}
+
+/// Prints a warning for each file that states other levels than the model will.
+pub fn warn_of_other_levels(sources: &[Source]) {
+    let shown = |levels: &[Level]| {
+        let each = levels
+            .iter()
+            .map(|level| format!("{} {}", level.label, level.shore));
+        each.collect::<Vec<_>>().join(", ")
+    };
+    let ours = levels_of(sources);
+    for source in sources {
+        if let Some(others) = source.levels.as_ref().filter(|others| **others != ours) {
+            hardnessd_core::say!(
+                "warning: {}: levels: found {}, expected {}, which the model will state",
+                source.name,
+                shown(others),
+                shown(&ours)
+            );
+        }
+    }
+}
+
+/// How the samples are chosen whose labels may be used.
+#[derive(
+    Debug,
+    Clone,
+    Copy,
+    Default,
+    PartialEq,
+    Eq,
+    clap::ValueEnum,
+    serde::Serialize,
+    serde::Deserialize,
+)]
+#[serde(rename_all = "lowercase")]
+pub enum LabelChoice {
+    /// By whole objects: what labelling some objects gives.
+    #[default]
+    Object,
+    /// Each by itself, so that near-copies of most unlabelled ones are labelled: probably the
+    /// paper's way.
+    Random,
+}
+
+/// The chosen frame of one press, with its labels and measurements.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sample {
+    /// The frame in newtons, after tare.
+    pub frame: Frame,
+    /// The hardness level 1..=4, or 0 for unlabelled.
+    pub level: u8,
+    /// The number of the pressed object, unique in the data set.
+    pub object: Option<u32>,
+    /// Index into the file's `meta.materials`.
+    pub material: Option<u8>,
+    /// Force of the press: the applied force if simulated, the chosen frame's total force if
+    /// recorded.
+    pub force_n: Option<f32>,
+    /// The split: train or test.
+    pub split: Split,
+    /// Measured Shore hardness.
+    pub shore: Option<f32>,
+    /// Index of the sample's file in [`Dataset::sources`].
+    pub source: usize,
+}
+
+impl From<LabelledSample> for Sample {
+    fn from(sample: LabelledSample) -> Self {
+        Self {
+            frame: sample.frame,
+            level: sample.level,
+            object: Some(sample.object),
+            material: Some(sample.material),
+            force_n: Some(sample.force_n),
+            split: sample.split,
+            shore: Some(sample.shore),
+            source: 0,
+        }
+    }
+}
+
+impl Sample {
+    /// Whether both samples are of one object: they have the same number and material, and not two
+    /// different levels. An unlabelled sample agrees with every level.
+    pub fn shares_object_with(&self, other: &Self) -> bool {
+        let same_level = self.level == other.level || self.level == 0 || other.level == 0;
+        let same_number = self.object.is_some() && self.object == other.object;
+        same_number && self.material == other.material && same_level
+    }
+}
+
+/// Prints the warning that `object` of a file has presses in both splits.
+pub(super) fn warn_of_object_in_both_splits(path: &Path, object: u32) {
+    hardnessd_core::say!(
+        "warning: {}: object {object} is in both splits: its presses are near-copies, so a test on some \
+         of them overrates a model that learnt from the others",
+        path.display()
+    );
+}
+
+/// Objects by source and level. Each object is a list of samples.
+type Groups = BTreeMap<(usize, u8), Vec<Vec<usize>>>;
+
+/// A file that samples came from.
+#[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct Source {
+    /// The file's name without its directory.
+    pub name: String,
+    /// The simulator's seed, if the file names one.
+    pub seed: Option<u64>,
+    /// SHA-256 of the file.
+    pub sha256: String,
+    /// The programs that made the file, separated by commas, if it names any.
+    pub generator: Option<String>,
+    /// Distance between the sensor's taxels, if the file names one.
+    pub pitch_mm: Option<f64>,
+    /// The levels that the file states, if a model can state them.
+    #[serde(skip)]
+    pub levels: Option<Vec<Level>>,
+}
+
+/// The name of our simulator in `meta.generator`.
+pub const SIMULATOR: &str = "hardnessd simulator";
+/// The name of `hrn-train collect` in `meta.generator`.
+pub const COLLECTOR: &str = "hrn-train collect";
+
+/// The kind of samples in a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// Samples of our simulator.
+    Simulated,
+    /// Samples of `hrn-train collect`.
+    Recorded,
+    /// Samples of another program, or of one that the file does not name.
+    Unknown,
+}
+
+impl Source {
+    /// The kinds of the samples, in the order of the programs that made them.
+    pub fn kinds(&self) -> Vec<Kind> {
+        let kind = |generator: &str| match generator {
+            _ if generator.starts_with(SIMULATOR) => Kind::Simulated,
+            _ if generator.starts_with(COLLECTOR) => Kind::Recorded,
+            _ => Kind::Unknown,
+        };
+        let generators = self.generator.as_deref().unwrap_or_default().split(", ");
+        generators.map(kind).collect()
+    }
+}
+
+/// Samples of one or several files.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Dataset {
+    /// The samples, in the order of the files.
+    pub samples: Vec<Sample>,
+    /// The files.
+    pub sources: Vec<Source>,
+    /// The paths of the files.
+    pub paths: Vec<PathBuf>,
+}
+
+/// The reason that a file is not a data set.
+#[derive(Debug, thiserror::Error)]
+pub enum DatasetError {
+    /// The file is missing or unreadable.
+    #[error("{}: {source}", path.display())]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// The system's error.
+        source: std::io::Error,
+    },
+    /// The file is not a zip archive of arrays.
+    #[error("{}: not an .npz file, or a damaged one", path.display())]
+    NotNpz {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file has presses over time where single frames are needed.
+    #[error(
+        "{}: has whole presses, not single frames: make it without --sequences (`train --method \
+         course` takes whole presses)",
+        path.display()
+    )]
+    WholePresses {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file has single frames where presses over time are needed.
+    #[error(
+        "{}: has single frames, not whole presses: make it with `simulate --sequences` or \
+         `collect --sequences`",
+        path.display()
+    )]
+    SingleFrames {
+        /// The file.
+        path: PathBuf,
+    },
+    /// An array is missing, or has another type, shape or content than expected.
+    #[error("{}: array `{array}`: found {found}, expected {expected}", path.display())]
+    Array {
+        /// The file.
+        path: PathBuf,
+        /// The array's name.
+        array: &'static str,
+        /// The type, shape or content found.
+        found: String,
+        /// The type, shape or content expected.
+        expected: String,
+    },
+    /// The split has no labelled sample.
+    #[error(
+        "{paths}: no sample of the {split} split has a level: add some with `collect --append \
+         --split {split} --level L`"
+    )]
+    EmptySplit {
+        /// The file, or files.
+        paths: String,
+        /// `train` or `test`.
+        split: &'static str,
+    },
+    /// The file has another taxel pitch than the files before it.
+    #[error("{}: taxel pitch: found {found} mm, expected {expected} mm, that of {}", path.display(), first.display())]
+    Pitch {
+        /// The file.
+        path: PathBuf,
+        /// The file's pitch, in mm.
+        found: f64,
+        /// The pitch of the files before it, in mm.
+        expected: f64,
+        /// One of the files before it.
+        first: PathBuf,
+    },
+}
+
+/// Distance between the taxels of the sensor that was pressed, in mm. All sources have the same one.
+pub fn pitch_mm(sources: &[Source]) -> f64 {
+    let stated = sources.first().and_then(|source| source.pitch_mm);
+    stated.unwrap_or(PITCH_MM)
+}
+
+/// Numbers the objects of a file after those of other files, which have the numbers below `first`.
+/// `last` is the greatest number in the file. Gives what to add to its numbers, and the first
+/// number after them.
+pub(super) fn objects_after(
+    first: u64,
+    last: Option<u32>,
+    path: PathBuf,
+) -> Result<(u32, u64), DatasetError> {
+    let next = last.map_or(first, |last| first + u64::from(last) + 1);
+    match u32::try_from(first) {
+        Ok(before) if next <= u64::from(u32::MAX) + 1 => Ok((before, next)),
+        _ => Err(DatasetError::Array {
+            path,
+            array: "object",
+            found: last.unwrap_or_default().to_string(),
+            expected: format!(
+                "no number that, after {first} of other files, is beyond {}",
+                u32::MAX
+            ),
+        }),
+    }
+}
+
+impl Dataset {
+    /// Reads an `.npz` file.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the file cannot be read, or an array is missing or has another type,
+    /// shape or content than `docs/formats.md` says. `object`, `material`, `force`, `shore`,
+    /// `split` (then all 0) and `meta` may be missing.
+    pub fn read(path: &Path) -> Result<Self, DatasetError> {
+        let bytes = file::read(path)?;
+        let name = path
+            .file_name()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned();
+        file::parse(&bytes, path, name)
+    }
+
+    /// Joins several files into one data set. Objects of different files stay apart.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the sensors of the files have different pitches, or the files have more
+    /// objects than a u32 can number.
+    pub fn joined(parts: Vec<Self>) -> Result<Self, DatasetError> {
+        let mut all = Self {
+            samples: Vec::new(),
+            sources: Vec::new(),
+            paths: Vec::new(),
+        };
+        let mut first_object = 0_u64;
+        for part in parts {
+            let (source, path) = (all.sources.len(), part.path());
+            let (found, expected) = (part.pitch_mm(), all.pitch_mm());
+            if source > 0 && found != expected {
+                let first = all.path();
+                return Err(DatasetError::Pitch {
+                    path,
+                    found,
+                    expected,
+                    first,
+                });
+            }
+            let last = part.samples.iter().filter_map(|sample| sample.object).max();
+            let before;
+            (before, first_object) = objects_after(first_object, last, path)?;
+            all.samples
+                .extend(part.samples.into_iter().map(|sample| Sample {
+                    object: sample.object.map(|object| object + before),
+                    source,
+                    ..sample
+                }));
+            all.sources.extend(part.sources);
+            all.paths.extend(part.paths);
+        }
+        Ok(all)
+    }
+
+    /// Distance between the taxels of the sensor that was pressed, in mm.
+    pub fn pitch_mm(&self) -> f64 {
+        pitch_mm(&self.sources)
+    }
+
+    /// An object that has samples in both splits, if there is one.
+    pub fn object_in_both_splits(&self) -> Option<u32> {
+        let mut tests: BTreeMap<Option<u32>, Vec<&Sample>> = BTreeMap::new();
+        for sample in &self.samples {
+            if sample.split == Split::Test {
+                tests.entry(sample.object).or_default().push(sample);
+            }
+        }
+        let is_tested = |sample: &&Sample| {
+            let mut tests = tests.get(&sample.object).into_iter().flatten();
+            sample.split == Split::Train && tests.any(|test| test.shares_object_with(sample))
+        };
+        self.samples.iter().find(is_tested)?.object
+    }
+
+    /// Prints a warning if an object has samples in both splits.
+    pub fn warn_of_object_in_both_splits(&self) {
+        if let Some(object) = self.object_in_both_splits() {
+            warn_of_object_in_both_splits(&self.path(), object);
+        }
+    }
+
+    /// The path of the first file.
+    pub fn path(&self) -> PathBuf {
+        self.paths.first().cloned().unwrap_or_default()
+    }
+
+    /// Indices of a split's labelled samples.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the split has no labelled sample.
+    pub fn labelled(&self, split: Split) -> Result<Vec<usize>, DatasetError> {
+        let wanted = |sample: &Sample| sample.split == split && sample.level > 0;
+        let indices: Vec<usize> = (0..self.samples.len())
+            .filter(|&index| wanted(&self.samples[index]))
+            .collect();
+        if indices.is_empty() {
+            let paths = self.paths.iter().map(|path| path.display().to_string());
+            return Err(DatasetError::EmptySplit {
+                paths: paths.collect::<Vec<_>>().join(", "),
+                split: split.name(),
+            });
+        }
+        Ok(indices)
+    }
+
+    /// The objects of `indices` by source and level, in a random order drawn from `stream`. A
+    /// sample without a known object counts as an object of its own.
+    fn objects(&self, indices: &[usize], stream: &Stream) -> Groups {
+        self.groups(indices, stream, |sample| sample.object)
+    }
+
+    fn groups(
+        &self,
+        indices: &[usize],
+        stream: &Stream,
+        object_of: impl Fn(&Sample) -> Option<u32>,
+    ) -> Groups {
+        let mut groups: BTreeMap<(usize, u8), BTreeMap<u64, Vec<usize>>> = BTreeMap::new();
+        for &index in indices {
+            let sample = &self.samples[index];
+            let object = object_of(sample).map_or(u64::MAX - index as u64, u64::from);
+            let group = groups.entry((sample.source, sample.level)).or_default();
+            group.entry(object).or_default().push(index);
+        }
+        let shuffled = |(number, (key, objects)): (usize, ((usize, u8), BTreeMap<_, Vec<_>>))| {
+            let mut objects: Vec<Vec<usize>> = objects.into_values().collect();
+            stream.child(number as u64).shuffle(&mut objects);
+            (key, objects)
+        };
+        groups.into_iter().enumerate().map(shuffled).collect()
+    }
+
+    /// The number of the object of each of `indices`, from 0 in the order of their appearance. A
+    /// sample without a known object has an object of its own.
+    pub fn object_numbers(&self, indices: &[usize]) -> Vec<u32> {
+        let mut numbers = BTreeMap::new();
+        let number = |&index: &usize| {
+            let sample = &self.samples[index];
+            let object = sample.object.map_or(u64::MAX - index as u64, u64::from);
+            let next = numbers.len() as u32;
+            let key = (sample.source, sample.level, sample.material, object);
+            *numbers.entry(key).or_insert(next)
+        };
+        indices.iter().map(number).collect()
+    }
+
+    /// Takes `share` of the objects of every source and level out of `indices`. Gives the kept and
+    /// the held-out indices, each in the data set's order.
+    pub fn hold_out(&self, indices: &[usize], share: f64, seed: u64) -> (Vec<usize>, Vec<usize>) {
+        let (mut kept, mut held) = (Vec::new(), Vec::new());
+        for objects in self
+            .objects(indices, &Stream::new(seed, "held out objects"))
+            .values()
+        {
+            // At least one object stays to learn from.
+            let count = (objects.len() as f64 * share).round() as usize;
+            let count = count.min(objects.len() - 1);
+            held.extend(objects[..count].iter().flatten());
+            kept.extend(objects[count..].iter().flatten());
+        }
+        kept.sort_unstable();
+        held.sort_unstable();
+        (kept, held)
+    }
+
+    /// Chooses `labels` of `indices`, with equal numbers for each level and source. A group with
+    /// too few samples gives all of them, and the other groups give more. By object, whole objects
+    /// are chosen, except that the last object of each group gives only as many presses as are
+    /// still wanted.
+    pub fn choose_labelled(
+        &self,
+        indices: &[usize],
+        labels: usize,
+        choice: LabelChoice,
+        seed: u64,
+    ) -> Vec<usize> {
+        let stream = Stream::new(seed, "labelled objects");
+        let groups = match choice {
+            LabelChoice::Object => self.objects(indices, &stream),
+            LabelChoice::Random => self.groups(indices, &stream, |_| None),
+        };
+        let size_of = |objects: &Vec<Vec<usize>>| objects.iter().map(Vec::len).sum();
+        let sizes: Vec<usize> = groups.values().map(size_of).collect();
+        let mut chosen = Vec::with_capacity(labels);
+        for (objects, wanted) in groups.into_values().zip(shares(&sizes, labels)) {
+            chosen.extend(objects.into_iter().flatten().take(wanted));
+        }
+        chosen.sort_unstable();
+        chosen
+    }
+}
+
+/// How many of `labels` each group gives. All groups give the same number, but none more than its
+/// size. If `labels` does not divide equally, the first groups that have more give one more.
+fn shares(sizes: &[usize], labels: usize) -> Vec<usize> {
+    let given = |each: usize| -> usize { sizes.iter().map(|size| each.min(*size)).sum() };
+    let each = (0..=labels).take_while(|&each| given(each) <= labels);
+    let each = each.last().unwrap_or_default();
+    let mut left = labels - given(each);
+    let share = |&size: &usize| {
+        let one_more = size > each && left > 0;
+        left -= usize::from(one_more);
+        each.min(size) + usize::from(one_more)
+    };
+    sizes.iter().map(share).collect()
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,128 @@
+//! Simulated data sets as files.
+//!
+//! In: the simulator's settings. Out: `.npz` files that carry the settings in `meta.settings`, so
+//! that the same objects can be pressed again under other conditions.
+
+use std::io::Cursor;
+use std::path::Path;
+
+use anyhow::{Context as _, ensure};
+use indicatif::{ProgressBar, ProgressStyle};
+use serde_json::json;
+
+use crate::data::courses::Courses;
+use crate::data::dataset::{self, SIMULATOR, Sample};
+use hardnessd_core::verdict::Level;
+use hardnessd_simulator::{
+    self, Borders, CourseSettings, DatasetSettings, LEVELS, LabelledCourse, LabelledSample,
+    LevelRange, Materials,
+};
+
+/// Simulates samples on all cores, with a progress bar on a terminal.
+pub fn simulate(settings: &DatasetSettings) -> Vec<LabelledSample> {
+    with_bar(settings.samples(), "samples", |threads, progress| {
+        hardnessd_simulator::dataset(settings, threads, progress)
+    })
+}
+
+/// Like [`simulate`], for whole presses.
+pub fn simulate_courses(settings: &CourseSettings) -> Vec<LabelledCourse> {
+    with_bar(
+        settings.objects.samples(),
+        "presses",
+        |threads, progress| hardnessd_simulator::courses(settings, threads, progress),
+    )
+}
+
+fn with_bar<T>(
+    total: u64,
+    what: &str,
+    make: impl FnOnce(usize, &(dyn Fn(usize) + Sync)) -> T,
+) -> T {
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let style = format!("{{bar:30}} {{pos}}/{{len}} {what}, {{per_sec}}, {{eta}} left");
+    let style = ProgressStyle::with_template(&style).expect("the template is right");
+    let bar = ProgressBar::new(total).with_style(style);
+    let made = make(threads, &|done| bar.set_position(done as u64));
+    bar.finish_and_clear();
+    made
+}
+
+/// The levels with their intervals of Shore. Those of the named materials are the paper's.
+fn levels(settings: &DatasetSettings) -> Vec<Level> {
+    let touching = |range: &LevelRange| dataset::level(range, range.touching);
+    match (settings.materials, settings.borders) {
+        (Materials::Broad, Borders::Touching) => LEVELS.iter().map(touching).collect(),
+        (Materials::Named, _) | (_, Borders::Gaps) => dataset::levels(),
+    }
+}
+
+/// The bytes of a file of samples that `settings` made.
+///
+/// # Errors
+///
+/// Returns an error if the archive cannot be built.
+pub fn to_bytes(
+    settings: &DatasetSettings,
+    samples: Vec<LabelledSample>,
+) -> anyhow::Result<Vec<u8>> {
+    let meta = meta(settings, &json!(settings));
+    let samples: Vec<Sample> = samples.into_iter().map(Sample::from).collect();
+    Ok(dataset::write(Cursor::new(Vec::new()), &samples, &meta)?.into_inner())
+}
+
+/// The bytes of a file of whole presses that `settings` made.
+///
+/// # Errors
+///
+/// Returns an error if the archive cannot be built.
+pub fn courses_to_bytes(
+    settings: &CourseSettings,
+    courses: &[LabelledCourse],
+) -> anyhow::Result<Vec<u8>> {
+    let meta = meta(&settings.objects, &json!(settings));
+    let out = Cursor::new(Vec::new());
+    Ok(Courses::of(courses).write(out, &meta)?.into_inner())
+}
+
+fn meta(objects: &DatasetSettings, settings: &serde_json::Value) -> serde_json::Value {
+    json!({
+        "materials": hardnessd_simulator::material_names(objects.materials),
+        "levels": levels(objects),
+        "seed": objects.seed,
+        "generator": format!("{SIMULATOR} {}", env!("CARGO_PKG_VERSION")),
+        "settings": settings,
+    })
+}
+
+/// The settings of the objects that a file of whole presses was simulated with. `None` if no simulator
+/// made it.
+///
+/// # Errors
+///
+/// Returns an error if the file cannot be read.
+pub fn settings_of_courses(path: &Path) -> anyhow::Result<Option<DatasetSettings>> {
+    let meta = dataset::meta(path)?;
+    let settings = meta.pointer("/settings/objects").cloned();
+    Ok(settings.and_then(|settings| serde_json::from_value(settings).ok()))
+}
+
+/// The settings that a file was simulated with.
+///
+/// # Errors
+///
+/// Returns an error if the file cannot be read, or has no such settings.
+pub fn settings_of(path: &Path) -> anyhow::Result<DatasetSettings> {
+    let meta = dataset::meta(path)?;
+    let expected = || {
+        format!(
+            "{}: `meta.settings`: found {}, expected the simulator's settings",
+            path.display(),
+            meta["settings"]
+        )
+    };
+    let settings: DatasetSettings =
+        serde_json::from_value(meta["settings"].clone()).with_context(expected)?;
+    ensure!(settings.is_possible(), expected());
+    Ok(settings)
+}

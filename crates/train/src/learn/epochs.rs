@@ -1,0 +1,136 @@
+//! The epochs of a network that is trained in one stage: the order of the samples, the rate of each
+//! step, checks, metrics and checkpoints. An interrupted run resumes from its checkpoint with
+//! bit-identical results.
+
+use std::time::Instant;
+
+use burn::tensor::Device;
+
+use crate::learn::learner::Learner;
+use crate::net::network::Weights;
+use crate::run::Run;
+use crate::run::checkpoint::{Checkpoint, Progress};
+use crate::run::history::Row;
+use crate::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
+use crate::settings::Training;
+use hardnessd_simulator::random::Stream;
+
+/// Training that starts from the weights of a model of one frame ends at this share of the way from
+/// them to the weights it learnt. A few objects show what the sensor is like, but say little of
+/// other materials, which the start knows (Wortsman et al. 2022, "Robust fine-tuning of zero-shot
+/// models").
+pub const LEARNT_SHARE: f32 = 0.5;
+
+/// The description of a training stage.
+#[derive(Debug)]
+pub struct Stage<'a> {
+    /// The name of the stage in its checkpoints and in `metrics.csv`.
+    pub name: &'static str,
+    /// A hash of everything that determines the weights. A checkpoint of another origin is refused.
+    pub origin: String,
+    /// Samples to learn from.
+    pub train: &'a [usize],
+    /// Settings of the training.
+    pub settings: &'a Training,
+    /// Seed of the order of the samples.
+    pub seed: u64,
+}
+
+/// One step's batch.
+#[derive(Debug, Clone, Copy)]
+pub struct Batch<'a> {
+    /// The samples of the batch.
+    pub samples: &'a [usize],
+    /// The number of the step, from 0.
+    pub step: u64,
+    /// Learning rate.
+    pub rate: f64,
+}
+
+/// Trains `initial`, or continues from the stage's last checkpoint in `run`. `step` takes a step
+/// and returns the batch's mean loss and how many of its samples were judged correctly before the
+/// step.
+///
+/// # Errors
+///
+/// Fails if the run's directory cannot be read or written, its checkpoint is of another origin, the
+/// loss or a weight is no longer finite, or `step` fails.
+pub fn run(
+    stage: &Stage,
+    initial: Weights,
+    run: &Run,
+    device: &Device,
+    mut step: impl FnMut(&mut Learner, Batch) -> anyhow::Result<(f64, usize)>,
+) -> anyhow::Result<Weights> {
+    let Training {
+        batch,
+        epochs,
+        optimiser,
+        averaging,
+        checkpoint_every_epochs,
+        ..
+    } = *stage.settings;
+    let (name, origin) = (stage.name, &stage.origin);
+    let fresh = Learner::fresh(initial, optimiser, averaging);
+    let kept = run.latest(name, origin, epochs, &fresh.lists(""), device)?;
+    let (mut progress, mut learner) = match kept {
+        Some(checkpoint) => {
+            run.check_origin(name, &checkpoint, origin)?;
+            let steps = checkpoint.progress.step;
+            let learner = Learner::resumed(&checkpoint, "", steps, optimiser, averaging)?;
+            (checkpoint.progress, learner)
+        }
+        None => (Progress::default(), fresh),
+    };
+    let count = stage.train.len();
+    let steps = u64::from(epochs) * count.div_ceil(batch) as u64;
+    let mut metrics = run.metrics(name, progress.step)?;
+    let bar = progress_bar(name, steps, progress.step);
+    let begun = Instant::now();
+    while progress.epoch < epochs {
+        let mut order = stage.train.to_vec();
+        let stream = Stream::new(stage.seed, &format!("{name} order"));
+        { stream.child(progress.epoch.into()) }.shuffle(&mut order);
+        let (mut loss_sum, mut right, mut rate) = (0.0, 0, 0.0);
+        for samples in order.chunks(batch) {
+            rate = optimiser.rate_at(progress.step, steps);
+            let batch = Batch {
+                samples,
+                step: progress.step,
+                rate,
+            };
+            let (loss, of_batch) = step(&mut learner, batch)?;
+            loss_sum += loss * samples.len() as f64;
+            right += of_batch;
+            progress.step += 1;
+            bar.inc(1);
+        }
+        progress.epoch += 1;
+        let Progress { epoch, step, .. } = progress;
+        let loss = loss_sum / count as f64;
+        ensure_finite(name, epoch, "loss", loss)?;
+        ensure_finite_weights(name, epoch, &learner.weights)?;
+        let accuracy = right as f64 / count as f64;
+        metrics.add(&Row {
+            step,
+            epoch,
+            loss,
+            learning_rate: rate,
+            accuracy: Some(accuracy),
+            seconds: begun.elapsed().as_secs_f64(),
+            ..Row::default()
+        })?;
+        let message = format!("loss {loss:.4}, accuracy {:.1} %", 100.0 * accuracy);
+        report(&bar, name, epoch, epochs, message);
+        if epoch == epochs || epoch.is_multiple_of(checkpoint_every_epochs) {
+            let checkpoint = Checkpoint {
+                origin: origin.clone(),
+                progress,
+                lists: learner.lists(""),
+            };
+            run.save(name, &checkpoint)?;
+        }
+    }
+    bar.finish_and_clear();
+    Ok(learner.evaluated())
+}

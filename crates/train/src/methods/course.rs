@@ -1,0 +1,202 @@
+//! The method `course`, and `adapt` on presses: the network that judges whole presses, from random
+//! weights or from those of a model file.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use anyhow::ensure;
+use burn::tensor::Device;
+
+use super::Method;
+use super::adapt::NoStart;
+use crate::data::courses::Courses;
+use crate::data::dataset::{self, LabelChoice, Source};
+use crate::learn::conformal::Calibration;
+use crate::learn::course::{self, Task};
+use crate::learn::force;
+use crate::model::course::finish;
+use crate::model::evaluated::Evaluated;
+use crate::model::file;
+use crate::net::course as network;
+use crate::net::start::Start;
+use crate::run::{Description, Run};
+use crate::settings::{Profile, Settings};
+use hardnessd_core::verdict::Hrn;
+use hardnessd_simulator::Split;
+use hardnessd_simulator::random::Stream;
+
+/// The description of a run of a method, which uses all labels.
+///
+/// # Errors
+///
+/// Fails if the data has no labelled training presses, or if `validation.keep` is not `last`.
+pub fn description(
+    method: Method,
+    courses: &Courses,
+    sources: Vec<Source>,
+    (profile, seed, settings): (Profile, u64, Settings),
+) -> anyhow::Result<Description> {
+    settings.validation.check_last()?;
+    dataset::warn_of_other_levels(&sources);
+    let labels = courses.labelled(Split::Train).count();
+    ensure!(
+        labels > 0,
+        "{}: no press of the train split has a level: collect some with `--sequences --level L`",
+        sources.first().map_or("", |source| &source.name)
+    );
+    Ok(Description {
+        method: method.name().to_owned(),
+        profile,
+        seed,
+        labels,
+        label_choice: LabelChoice::Object,
+        start: None,
+        settings,
+        data: sources,
+    })
+}
+
+/// Trains from random weights or from `start`, and writes the model and its evaluation to the run's
+/// directory. A resumed run continues from the files there.
+///
+/// # Errors
+///
+/// Fails if the training diverges, or the directory cannot be read or written.
+pub fn train(
+    courses: &Courses,
+    start: Option<(Start, Calibration)>,
+    description: &Description,
+    run: &Run,
+    device: &Device,
+) -> anyhow::Result<Option<Evaluated>> {
+    let all: Vec<usize> = courses.labelled(Split::Train).collect();
+    let Description { settings, seed, .. } = description;
+    let (train, held_out) = hold_out(courses, &all, settings.validation.share, *seed);
+    let corrected = |(start, calibration)| {
+        course::with_force_factor(start, courses, &train, device).map(|start| (start, calibration))
+    };
+    let start = start.map(corrected).transpose()?;
+    let of_start = start.as_ref().map(|(start, _)| start);
+    let force_factor = of_start.map_or(1.0, |start| start.standard.force_factor);
+    if let Some(account) = force::account(force_factor) {
+        hardnessd_core::say!("{account}");
+    }
+    let presses = course::presses(courses, force_factor)?;
+    let task = Task {
+        stage: match start {
+            Some(_) => "adapt",
+            None => "course",
+        },
+        presses: &presses,
+        train: &train,
+        held_out: &held_out,
+        levels: dataset::levels().len(),
+        reports: settings.reports,
+        settings: &settings.training,
+        seed: *seed,
+        device,
+    };
+    let trained = course::fit(&task, start, run)?;
+    if let Some(missing) = trained.calibration.missing() {
+        hardnessd_core::say!("{missing}");
+    }
+    if !task.has_shore() {
+        let consequence = match description.method == Method::Adapt.name() {
+            true => "the Shore hardness stays as the start gives it",
+            false => {
+                "the model's Shore hardness says nothing, and its interval is always the whole scale"
+            }
+        };
+        hardnessd_core::say!(
+            "no labelled training press has a measured Shore hardness: {consequence}"
+        );
+    }
+    finish(
+        run,
+        description,
+        courses,
+        (&presses, &train),
+        &trained,
+        device,
+    )
+}
+
+/// The start of `adapt`: the weights and calibration of a model file that the daemon's loader has
+/// accepted.
+///
+/// # Errors
+///
+/// Returns [`NoStart`] if the file holds another network.
+pub fn start(hrn: &Hrn, bytes: &[u8], device: &Device) -> anyhow::Result<(Start, Calibration)> {
+    let constants = file::constants(bytes)?;
+    let start = network::start(|name| constants.get(name), dataset::levels().len(), device);
+    let start = start.ok_or_else(|| NoStart::of(hrn, "presses: course, or adapt of one"))?;
+    let calibration = Calibration {
+        temperature: start.temperature,
+        widths: start.widths,
+        ..Calibration::NONE
+    };
+    Ok((start, calibration))
+}
+
+/// Splits presses by their objects into presses to learn from and presses to calibrate on. `share`
+/// is the share of each level's objects held out for calibration.
+fn hold_out(courses: &Courses, all: &[usize], share: f64, seed: u64) -> (Vec<usize>, Vec<usize>) {
+    let mut by_level = BTreeMap::<u8, BTreeSet<u32>>::new();
+    for &place in all {
+        let press = &courses.presses[place];
+        let objects = by_level.entry(press.level).or_default();
+        objects.insert(press.object);
+    }
+    let stream = Stream::new(seed, "held-out objects");
+    let mut held = BTreeSet::new();
+    for (level, objects) in by_level {
+        let mut objects: Vec<u32> = objects.into_iter().collect();
+        stream.child(level.into()).shuffle(&mut objects);
+        // At least one object of the level stays to learn from.
+        let count = (share * objects.len() as f64).round() as usize;
+        let objects = &objects[..count.min(objects.len() - 1)];
+        held.extend(objects.iter().map(|&object| (level, object)));
+    }
+    let is_held = |place: &usize| {
+        let press = &courses.presses[*place];
+        held.contains(&(press.level, press.object))
+    };
+    all.iter().partition(|place| !is_held(place))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::courses::Press;
+
+    #[test]
+    fn every_level_keeps_an_object_to_learn_from() {
+        // Level 1 has six objects, level 2 two, and level 3 one, with three presses each.
+        let objects = [(1, 0..6_u32), (2, 6..8), (3, 8..9)];
+        let mut courses = Courses::default();
+        for (level, numbers) in objects {
+            for object in numbers.flat_map(|object| [object; 3]) {
+                courses.presses.push(Press {
+                    level,
+                    object,
+                    material: 0,
+                    split: Split::Train,
+                    shore: f32::NAN,
+                    force_n: 1.0,
+                    arm_n_per_mm: 0.0,
+                    best: 0,
+                });
+            }
+        }
+        let all: Vec<usize> = courses.labelled(Split::Train).collect();
+        for seed in 0..20 {
+            let (kept, held) = hold_out(&courses, &all, 0.5, seed);
+            let of = |places: &[usize], level| {
+                let presses = places.iter().map(|&place| &courses.presses[place]);
+                presses.filter(|press| press.level == level).count()
+            };
+            assert_eq!([1, 2, 3].map(|level| of(&kept, level)), [9, 3, 3]);
+            assert_eq!([1, 2, 3].map(|level| of(&held, level)), [9, 3, 0]);
+        }
+    }
+}

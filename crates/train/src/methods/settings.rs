@@ -1,0 +1,135 @@
+//! The settings of the methods that do not take the defaults of a profile.
+
+use crate::settings::network::Pooling;
+use crate::settings::optimiser::{Rule, Schedule};
+use crate::settings::{
+    AugmentationSettings, Keep, NetworkSettings, OptimiserSettings, Profile, Settings, Training,
+    Validation,
+};
+
+/// The symmetries and shifts of frames that the methods which are not the paper's learn from.
+const SYMMETRIES_AND_SHIFTS: AugmentationSettings = AugmentationSettings {
+    symmetries: true,
+    shift_taxels: 3,
+    other_sensors: false,
+};
+
+/// The settings of `igan`. The rate is Salimans's. The average covers about a tenth of the steps.
+pub(super) fn igan(profile: Profile) -> Settings {
+    let mut settings = Settings::of(profile);
+    settings.ustgan.optimiser.learning_rate = 3e-3;
+    settings.ustgan.averaging = match profile {
+        Profile::Paper => 0.9999,
+        Profile::Quick => 0.999,
+        Profile::Smoke => 0.9,
+    };
+    settings
+}
+
+/// The settings of `hrn15-tuned`, which holds out two of a level's eight objects.
+pub(super) fn hrn15_tuned(profile: Profile) -> Settings {
+    let mut settings = Settings::of(profile);
+    settings.training.epochs *= 5;
+    settings.training.optimiser.rule = Rule::Adam;
+    settings.validation = Validation {
+        share: 0.25,
+        every_epochs: 1,
+        keep: Keep::Best,
+    };
+    settings
+}
+
+/// The settings of `hrn15-strong`, `fixmatch` and `self-training`.
+pub(super) fn strong(profile: Profile) -> Settings {
+    let mut settings = Settings::of(profile);
+    settings.network = NetworkSettings {
+        pooling: Pooling::MaxMean,
+        log_above_n: 0.1,
+    };
+    settings.training = Training {
+        averaging: 0.998,
+        checkpoint_every_epochs: 50,
+        optimiser: OptimiserSettings {
+            rule: Rule::Adam,
+            learning_rate: 2e-3,
+            schedule: Schedule::Cosine,
+            ..settings.training.optimiser
+        },
+        augmentation: SYMMETRIES_AND_SHIFTS,
+        ..settings.training
+    };
+    settings
+}
+
+/// The settings of `frame`.
+pub(super) fn frame(profile: Profile) -> Settings {
+    let mut settings = Settings::of(profile);
+    settings.training = Training {
+        epochs: match profile {
+            Profile::Paper => 60,
+            Profile::Quick => 20,
+            Profile::Smoke => 1,
+        },
+        averaging: averaging(profile),
+        optimiser: adam(settings.training.optimiser, 2e-3),
+        augmentation: SYMMETRIES_AND_SHIFTS,
+        ..settings.training
+    };
+    settings.validation.share = 0.15;
+    settings
+}
+
+/// The settings of `adapt`.
+pub(super) fn adapt(profile: Profile) -> Settings {
+    let mut settings = Settings::of(profile);
+    settings.training = Training {
+        batch: 50,
+        epochs: 60,
+        averaging: 0.99,
+        checkpoint_every_epochs: 10,
+        optimiser: adam(settings.training.optimiser, 5e-4),
+        augmentation: SYMMETRIES_AND_SHIFTS,
+        ..settings.training
+    };
+    settings.consistency.ratio = 1;
+    settings
+}
+
+/// The settings of `course`.
+pub(super) fn course(profile: Profile) -> Settings {
+    let mut settings = Settings::of(profile);
+    settings.training = Training {
+        batch: 128,
+        epochs: match profile {
+            Profile::Paper => 150,
+            Profile::Quick => 60,
+            Profile::Smoke => 1,
+        },
+        averaging: averaging(profile),
+        checkpoint_every_epochs: 10,
+        optimiser: adam(settings.training.optimiser, 2e-3),
+        ..settings.training
+    };
+    settings.validation.share = 0.15;
+    settings
+}
+
+/// The averaging of `frame` and `course`. The steps of a smoke test are too few for an average.
+fn averaging(profile: Profile) -> f64 {
+    match profile {
+        Profile::Smoke => 0.0,
+        Profile::Paper | Profile::Quick => 0.998,
+    }
+}
+
+/// Adam with weight decay, whose rate falls from `learning_rate` to 0 along a cosine. For the
+/// networks that are not the paper's.
+fn adam(others: OptimiserSettings, learning_rate: f64) -> OptimiserSettings {
+    OptimiserSettings {
+        rule: Rule::Adam,
+        learning_rate,
+        schedule: Schedule::Cosine,
+        weight_decay: 1e-2,
+        ..others
+    }
+}

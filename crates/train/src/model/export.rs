@@ -1,0 +1,288 @@
+//! Exports a trained recogniser to the file that the daemon loads, and evaluates that file.
+//!
+//! In: a graph with its temperature, the data it learnt from, and a function that computes its
+//! probabilities as training does. Out: `hrn.onnx`, which carries check frames that the daemon must
+//! reproduce, and `evaluation.json`, which is measured on the exported file.
+
+use anyhow::ensure;
+use serde_json::json;
+
+use super::evaluated::{self, Case, Evaluated};
+use super::file;
+use crate::data::dataset::{self, Dataset, Kind, Source};
+use crate::judge::metrics::Judged;
+use crate::net::graph::Graph;
+use crate::net::unfolded::Unfolded;
+use crate::run::{Description, Run};
+use hardnessd_core::frame::Frame;
+use hardnessd_core::press;
+use hardnessd_core::verdict::{Card, Check, Checks, Hrn, Range};
+use hardnessd_simulator::Split;
+
+/// Check frames per level (`docs/formats.md`).
+const CHECK_FRAMES_A_LEVEL: usize = 2;
+
+/// A recogniser as a graph.
+#[derive(Debug, Clone)]
+pub struct Recogniser {
+    /// The graph from newtons to logits.
+    pub graph: Graph,
+    /// Name of the logits in the graph, before temperature.
+    pub raw_logits: String,
+    /// Name of the Shore hardness in the graph, if it has one.
+    pub shore: Option<String>,
+    /// The divisor of the logits.
+    pub temperature: f32,
+    /// The factor by which the graph multiplies forces first; 1 if it does not.
+    pub force_factor: f32,
+    /// What further training needs beside the graph, if it needs anything.
+    pub unfolded: Option<Unfolded>,
+}
+
+/// Writes the model and its evaluation on the test split to the run's directory. `train` are the
+/// training samples, and `probabilities` computes the probabilities of frames without the file.
+///
+/// # Errors
+///
+/// Fails if the daemon's loader refuses the file, or the directory cannot be written.
+pub fn finish(
+    run: &Run,
+    description: &Description,
+    dataset: &Dataset,
+    train: &[usize],
+    recogniser: &Recogniser,
+    probabilities: impl Fn(&[&Frame]) -> anyhow::Result<Vec<Vec<f32>>>,
+) -> anyhow::Result<Option<Evaluated>> {
+    let frames = check_frames(dataset, train);
+    let checks = Checks::Frames(Check {
+        probabilities: probabilities(&frames)?,
+        frames: frames.iter().map(|frame| frame.newtons.to_vec()).collect(),
+    });
+    let mut card = Card {
+        format: "1".to_owned(),
+        levels: dataset::levels_of(&description.data),
+        pitch_mm: dataset.pitch_mm() as f32,
+        method: description.method.clone(),
+        data: data(&description.data)?,
+        metrics: metrics(description, recogniser.temperature, recogniser.force_factor),
+        validation: validation(&description.data).to_owned(),
+        range: range(train.iter().map(|&index| dataset.samples[index].frame)),
+        conformal: None,
+    };
+    let write = |card: &Card| {
+        let Recogniser {
+            graph,
+            raw_logits,
+            shore,
+            temperature,
+            unfolded,
+            ..
+        } = recogniser.clone();
+        let outputs = file::Outputs {
+            raw_logits,
+            temperature,
+            shore,
+        };
+        file::write(graph, &outputs, card, &checks, unfolded.as_ref())
+    };
+    // The metrics are measured on a file without them and then added; the graph does not change.
+    let hrn = Hrn::load(&write(&card)?)?;
+    let evaluation = match dataset.labelled(Split::Test) {
+        Ok(test) => Some(evaluate(&hrn, dataset, &test)?),
+        Err(_) => None,
+    };
+    if let Some(evaluation) = &evaluation {
+        card.metrics["test"] = json!(evaluation.levels);
+        if dataset.sources.len() > 1 {
+            card.metrics["test_by_source"] = evaluations_by_source(&hrn, dataset)?;
+        }
+        let json = serde_json::to_vec_pretty(evaluation)?;
+        run.write("evaluation.json", &json)?;
+    }
+    run.write("hrn.onnx", &write(&card)?)?;
+    Ok(evaluation)
+}
+
+/// What a file says of itself before it is measured.
+pub fn metrics(
+    description: &Description,
+    temperature: f32,
+    force_factor: f32,
+) -> serde_json::Value {
+    let mut metrics = json!({ "temperature": temperature });
+    if let Some(start) = &description.start {
+        metrics["start"] = json!(start);
+    }
+    if force_factor != 1.0 {
+        metrics["force_factor"] = json!(force_factor);
+    }
+    metrics
+}
+
+/// Judges samples with a model and evaluates its verdicts.
+///
+/// # Errors
+///
+/// Fails if the model has fewer levels than the data, or fails to judge a frame.
+pub fn evaluate(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Evaluated> {
+    let cases = cases(hrn, dataset, indices)?;
+    Ok(Evaluated::of(&cases, hrn.card().levels.len()))
+}
+
+/// Judges labelled samples with a model, in the form that the metrics take.
+///
+/// # Errors
+///
+/// Fails if the model has fewer levels than the data, or fails to judge a frame.
+pub fn judge(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Vec<Judged>> {
+    Ok(evaluated::judged(&cases(hrn, dataset, indices)?))
+}
+
+/// Judges labelled samples with a model.
+///
+/// # Errors
+///
+/// Fails if the model has fewer levels than the data, or fails to judge a frame.
+pub fn cases(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Vec<Case>> {
+    let levels = hrn.card().levels.len();
+    let case = |&index: &usize| {
+        let sample = &dataset.samples[index];
+        ensure!(
+            usize::from(sample.level) <= levels,
+            "the model has {levels} levels, and the data has a sample of level {}",
+            sample.level
+        );
+        Ok(Case {
+            level: sample.level,
+            shore: sample.shore.filter(|shore| shore.is_finite()),
+            object: sample.object,
+            verdict: hrn.judge(&sample.frame)?,
+        })
+    };
+    indices.iter().map(case).collect()
+}
+
+fn evaluations_by_source(hrn: &Hrn, dataset: &Dataset) -> anyhow::Result<serde_json::Value> {
+    let mut by_source = serde_json::Map::new();
+    let test = dataset.labelled(Split::Test)?;
+    for (number, source) in dataset.sources.iter().enumerate() {
+        let of_source = |index: &usize| dataset.samples[*index].source == number;
+        let indices: Vec<usize> = test.iter().copied().filter(of_source).collect();
+        if !indices.is_empty() {
+            let evaluation = serde_json::to_value(evaluate(hrn, dataset, &indices)?.levels)?;
+            by_source.insert(source.name.clone(), evaluation);
+        }
+    }
+    Ok(by_source.into())
+}
+
+/// Two frames of each level: those one third and two thirds through its samples.
+pub(super) fn check_frames<'a>(dataset: &'a Dataset, train: &[usize]) -> Vec<&'a Frame> {
+    let mut frames = Vec::new();
+    for level in dataset::levels() {
+        let of_level = |index: &usize| dataset.samples[*index].level == level.level;
+        let samples: Vec<usize> = train.iter().copied().filter(of_level).collect();
+        // A level without samples is checked on samples of other levels.
+        let samples = if samples.is_empty() {
+            train.to_vec()
+        } else {
+            samples
+        };
+        for part in 1..=CHECK_FRAMES_A_LEVEL {
+            let place = samples.len() * part / (CHECK_FRAMES_A_LEVEL + 1);
+            frames.push(&dataset.samples[samples[place]].frame);
+        }
+    }
+    frames
+}
+
+/// The value of `hrn.data`: name, seed and hash of the file, or a list of them for several files.
+pub(super) fn data(sources: &[Source]) -> serde_json::Result<String> {
+    let one = |source: &Source| json!({ "name": source.name, "seed": source.seed, "sha256": source.sha256 });
+    match sources {
+        [source] => serde_json::to_string(&one(source)),
+        _ => serde_json::to_string(&sources.iter().map(one).collect::<Vec<_>>()),
+    }
+}
+
+/// The value of `hrn.validation`.
+pub(super) fn validation(sources: &[Source]) -> &'static str {
+    let kinds: Vec<Kind> = sources.iter().flat_map(Source::kinds).collect();
+    let [simulated, recorded, unknown] =
+        [Kind::Simulated, Kind::Recorded, Kind::Unknown].map(|kind| kinds.contains(&kind));
+    match (simulated, recorded, unknown) {
+        (true, false, false) => "simulated data only",
+        (true, true, false) => "simulated and recorded data",
+        (false, true, false) => "recorded data",
+        (false, false, _) => "data of unknown origin",
+        (_, _, true) => "data partly of unknown origin",
+    }
+}
+
+/// The range of total force and contact area of the training frames.
+pub(super) fn range(frames: impl Iterator<Item = Frame>) -> Range {
+    let threshold_n = press::Settings::default().contact_threshold_n;
+    let mut range = Range {
+        force_n: [f32::INFINITY, 0.0],
+        contact_area_taxels: [u32::MAX, 0],
+        ..Range::ANY
+    };
+    for frame in frames {
+        let (force_n, area) = (
+            frame.force_n() as f32,
+            frame.contact_area_taxels(threshold_n),
+        );
+        range.force_n = [range.force_n[0].min(force_n), range.force_n[1].max(force_n)];
+        let [least, most] = range.contact_area_taxels;
+        range.contact_area_taxels = [least.min(area), most.max(area)];
+    }
+    range
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_model_is_said_to_be_of_what_is_told_of_its_data() {
+        for (generators, expected) in [
+            (
+                &[Some("hardnessd simulator 0.1.0")][..],
+                "simulated data only",
+            ),
+            (&[Some("hrn-train collect 0.1.0")], "recorded data"),
+            (
+                &[Some("hardnessd simulator 0.1.0, hrn-train collect 0.2.0")],
+                "simulated and recorded data",
+            ),
+            (
+                &[
+                    Some("hardnessd simulator 0.1.0"),
+                    Some("hrn-train collect 0.1.0"),
+                ],
+                "simulated and recorded data",
+            ),
+            (&[None], "data of unknown origin"),
+            (&[Some("finite elements")], "data of unknown origin"),
+            (
+                &[Some("hrn-train collect 0.1.0"), None],
+                "data partly of unknown origin",
+            ),
+            (
+                &[Some("unknown, hrn-train collect 0.1.0")],
+                "data partly of unknown origin",
+            ),
+        ] {
+            let source = |generator: &Option<&str>| Source {
+                name: String::new(),
+                seed: None,
+                sha256: String::new(),
+                generator: generator.map(str::to_owned),
+                pitch_mm: None,
+                levels: None,
+            };
+            let sources: Vec<Source> = generators.iter().map(source).collect();
+            assert_eq!(validation(&sources), expected, "{generators:?}");
+        }
+    }
+}

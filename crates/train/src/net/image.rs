@@ -1,0 +1,112 @@
+//! The scale from newtons to the image that a network sees, and back.
+
+use burn::tensor::{Device, Tensor, TensorData};
+use serde::{Deserialize, Serialize};
+
+use crate::net::graph::Graph;
+use hardnessd_core::frame::{COLS, Frame, ROWS, TAXELS};
+
+/// One scale for all frames, because force carries hardness: 0 N is -1, the full scale is 1.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Scale {
+    /// The force on a taxel, in newtons, that becomes 1.
+    pub full_scale_n: f64,
+    /// Above 0, the image is linear in log(1 + newtons / this value), so that light taxels differ
+    /// as clearly as heavy ones. With 0, it is linear in newtons.
+    pub log_above_n: f64,
+}
+
+impl Scale {
+    /// The image's value for a taxel of `newtons`.
+    pub fn pixel(self, newtons: f32) -> f32 {
+        let Self {
+            full_scale_n,
+            log_above_n,
+        } = self;
+        if log_above_n == 0.0 {
+            return newtons * (2.0 / full_scale_n) as f32 - 1.0;
+        }
+        let part = (newtons * (1.0 / log_above_n) as f32).ln_1p();
+        part * self.log_factor() - 1.0
+    }
+
+    /// The force on a taxel for a value of the image: the inverse of [`Scale::pixel`].
+    pub fn newtons(self, pixel: f32) -> f32 {
+        let Self {
+            full_scale_n,
+            log_above_n,
+        } = self;
+        if log_above_n == 0.0 {
+            return (pixel + 1.0) * (full_scale_n / 2.0) as f32;
+        }
+        ((pixel + 1.0) / self.log_factor()).exp_m1() * log_above_n as f32
+    }
+
+    /// The scale under which newtons look as their product with `factor` does under this one.
+    #[must_use]
+    pub fn of_newtons_times(self, factor: f32) -> Self {
+        let factor = f64::from(factor);
+        Self {
+            full_scale_n: self.full_scale_n / factor,
+            log_above_n: self.log_above_n / factor,
+        }
+    }
+
+    /// The factor that makes log(1 + full scale / `log_above_n`) equal to 2.
+    fn log_factor(self) -> f32 {
+        (2.0 / (self.full_scale_n / self.log_above_n).ln_1p()) as f32
+    }
+
+    /// Frames as images `[batch, 1, 28, 28]` in [-1, 1].
+    pub fn images<'a>(
+        self,
+        frames: impl ExactSizeIterator<Item = &'a Frame>,
+        device: &Device,
+    ) -> Tensor<4> {
+        let batch = frames.len();
+        let mut values = Vec::with_capacity(batch * TAXELS);
+        for frame in frames {
+            values.extend(frame.newtons.map(|newtons| self.pixel(newtons)));
+        }
+        Tensor::from_data(TensorData::new(values, [batch, 1, ROWS, COLS]), device)
+    }
+
+    /// Adds the nodes from `newtons` to the image raised by 1, so that the background is 0. Returns
+    /// that value's name.
+    pub fn nodes(self, graph: &mut Graph, newtons: &str) -> String {
+        if self.log_above_n == 0.0 {
+            let scale = graph.constant("scale", &[], &[(2.0 / self.full_scale_n) as f32]);
+            return graph.node("Mul", &[newtons, &scale], "image", Vec::new());
+        }
+        let scale = graph.constant("scale", &[], &[(1.0 / self.log_above_n) as f32]);
+        let one = graph.constant("one", &[], &[1.0]);
+        let factor = graph.constant("log factor", &[], &[self.log_factor()]);
+        let scaled = graph.node("Mul", &[newtons, &scale], "scaled", Vec::new());
+        let raised = graph.node("Add", &[&scaled, &one], "raised", Vec::new());
+        let log = graph.node("Log", &[&raised], "log", Vec::new());
+        graph.node("Mul", &[&log, &factor], "image", Vec::new())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn both_scales_put_the_ends_on_the_ends_and_come_back() {
+        for log_above_n in [0.0, 0.1] {
+            let scale = Scale {
+                full_scale_n: 10.2,
+                log_above_n,
+            };
+            assert_eq!(scale.pixel(0.0), -1.0);
+            assert!((scale.pixel(10.2) - 1.0).abs() < 1e-6);
+            for newtons in [0.04_f32, 0.2, 0.7, 5.0] {
+                let back = scale.newtons(scale.pixel(newtons));
+                assert!((back - newtons).abs() < 1e-5 * newtons.max(1.0), "{back}");
+                let doubled = scale.of_newtons_times(2.0).pixel(newtons);
+                assert!((doubled - scale.pixel(2.0 * newtons)).abs() < 1e-6);
+            }
+        }
+    }
+}

@@ -1,0 +1,229 @@
+//! The state of a stage in full precision, so that a killed run continues with the same bits.
+//!
+//! Every random choice follows from the run's seed and the step's number through counter-based
+//! streams, so the number of steps done is the position of every stream. The rest of the state is
+//! tensors.
+
+use std::io::Cursor;
+use std::path::Path;
+
+use anyhow::{Context as _, bail, ensure};
+use burn::tensor::{Device, Tensor, TensorData};
+use ndarray::{ArrayD, ArrayView1, IxDyn};
+use ndarray_npy::NpzWriter;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
+use zip::ZipArchive;
+
+use crate::data::dataset::Dataset;
+use crate::net::network::{Weight, Weights, numbers};
+use hardnessd_core::npy::{self, Header};
+
+/// The state from which a stage continues, beside its settings and data.
+#[derive(Debug, Clone)]
+pub struct Checkpoint {
+    /// The origin of the stage: see [`Origin`].
+    pub origin: String,
+    /// The progress of the stage.
+    pub progress: Progress,
+    /// The weights, and similar lists by name: Adam's moments, averaged weights, the best weights
+    /// so far.
+    pub lists: Vec<(String, Weights)>,
+}
+
+/// The progress of a stage.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Progress {
+    /// Epochs done.
+    pub epoch: u32,
+    /// Steps done.
+    pub step: u64,
+    /// Least validation loss so far.
+    pub best_loss: Option<f64>,
+}
+
+/// One hash of everything that determines a stage's result: its settings, seed, frames in their
+/// order with their levels, and initial weights. If stages of two runs have the same origin, it is
+/// enough to run one of them.
+#[derive(Debug)]
+pub struct Origin(Sha256);
+
+impl Origin {
+    /// Begins the origin of a stage with these settings and this seed.
+    pub fn new(stage: &str, settings: &impl Serialize, seed: u64) -> Self {
+        let settings = serde_json::to_vec(settings).expect("settings are plain numbers");
+        let mut hash = Sha256::new();
+        for part in [stage.as_bytes(), &seed.to_le_bytes(), &settings] {
+            hash.update((part.len() as u64).to_le_bytes());
+            hash.update(part);
+        }
+        Self(hash)
+    }
+
+    /// Adds samples.
+    #[must_use]
+    pub fn samples(mut self, dataset: &Dataset, indices: &[usize]) -> Self {
+        self.0.update((indices.len() as u64).to_le_bytes());
+        for &index in indices {
+            let sample = &dataset.samples[index];
+            self.0.update([sample.level]);
+            let newtons = sample.frame.newtons.iter();
+            let bytes: Vec<u8> = newtons.flat_map(|newtons| newtons.to_le_bytes()).collect();
+            self.0.update(bytes);
+        }
+        self
+    }
+
+    /// Adds numbers.
+    #[must_use]
+    pub fn numbers(mut self, numbers: impl Iterator<Item = f32>) -> Self {
+        let bytes: Vec<u8> = numbers.flat_map(f32::to_le_bytes).collect();
+        self.0.update((bytes.len() as u64).to_le_bytes());
+        self.0.update(bytes);
+        self
+    }
+
+    /// Adds weights.
+    #[must_use]
+    pub fn weights(mut self, weights: &Weights) -> Self {
+        for weight in &weights.entries {
+            self.0.update(&weight.name);
+            let values = numbers(&weight.values);
+            let bytes: Vec<u8> = values
+                .iter()
+                .flat_map(|value| value.to_le_bytes())
+                .collect();
+            self.0.update(bytes);
+        }
+        self
+    }
+
+    /// The hash in hexadecimal digits.
+    pub fn finish(self) -> String {
+        hex::encode(self.0.finalize())
+    }
+}
+
+impl Checkpoint {
+    /// The list called `name`.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if there is no such list.
+    pub fn list(&self, name: &str) -> anyhow::Result<&Weights> {
+        let found = self.lists.iter().find(|(list, _)| list == name);
+        found
+            .map(|(_, weights)| weights)
+            .with_context(|| format!("no `{name}` in the checkpoint"))
+    }
+
+    /// The bytes of the file: an `.npz` of f32 arrays, and `progress` as JSON.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the archive cannot be built.
+    pub fn to_bytes(&self) -> anyhow::Result<Vec<u8>> {
+        let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
+        let progress = serde_json::to_vec(&self.progress)?;
+        npz.add_array("progress", &ArrayView1::from(&progress))?;
+        npz.add_array("origin", &ArrayView1::from(self.origin.as_bytes()))?;
+        for (list, weights) in &self.lists {
+            for weight in &weights.entries {
+                let array = ArrayD::from_shape_vec(IxDyn(&weight.dims), numbers(&weight.values))?;
+                npz.add_array(format!("{list}/{}", weight.name), &array)?;
+            }
+        }
+        Ok(npz.finish()?.into_inner())
+    }
+
+    /// Reads a file that [`Checkpoint::to_bytes`] made.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the file cannot be read or is damaged.
+    pub fn read(path: &Path, device: &Device) -> anyhow::Result<Self> {
+        let bytes = std::fs::read(path)?;
+        let mut zip = ZipArchive::new(Cursor::new(bytes.as_slice()))?;
+        let (mut progress, mut origin) = (None, None);
+        let mut lists: Vec<(String, Weights)> = Vec::new();
+        for place in 0..zip.len() {
+            let mut packed = zip.by_index(place)?;
+            let name = packed.name().trim_end_matches(".npy").to_owned();
+            let Header {
+                descr,
+                shape,
+                fortran_order,
+            } = npy::header(&mut packed)?;
+            let count = shape
+                .iter()
+                .try_fold(1_usize, |count, &axis| count.checked_mul(axis));
+            let count = count.with_context(|| format!("array `{name}`: found shape {shape:?}"))?;
+            let text = match name.as_str() {
+                "progress" => Some(&mut progress),
+                "origin" => Some(&mut origin),
+                _ => None,
+            };
+            if let Some(text) = text {
+                *text = Some(npy::elements(&mut packed, count, |[byte]: [u8; 1]| byte)?);
+                continue;
+            }
+            let Some((list, weight)) = name.split_once('/') else {
+                bail!("array `{name}` is no part of a checkpoint");
+            };
+            ensure!(
+                descr == "<f4" && !fortran_order,
+                "array `{name}`: found {descr}, expected <f4 in C order"
+            );
+            let values = npy::elements(&mut packed, count, f32::from_le_bytes)?;
+            if lists.last().is_none_or(|(last, _)| last != list) {
+                lists.push((list.to_owned(), Weights::default()));
+            }
+            let entries = &mut lists.last_mut().expect("pushed just now").1.entries;
+            entries.push(Weight {
+                name: weight.to_owned(),
+                dims: shape,
+                values: flat(values, device),
+            });
+        }
+        ensure!(!lists.is_empty(), "no weights in it");
+        Ok(Self {
+            origin: String::from_utf8(origin.context("no `origin` in it")?)?,
+            progress: serde_json::from_slice(&progress.context("no `progress` in it")?)?,
+            lists,
+        })
+    }
+
+    /// Returns an error unless the checkpoint has each of the lists of `fresh`, with weights of the
+    /// same names and sizes. Its other lists must be like the first one of `fresh`.
+    ///
+    /// # Errors
+    ///
+    /// Names the list, and the weight if there is one.
+    pub fn check_like(&self, fresh: &[(String, Weights)]) -> anyhow::Result<()> {
+        for (name, _) in fresh {
+            self.list(name)?;
+        }
+        for (name, list) in &self.lists {
+            let like = fresh.iter().find(|(own, _)| own == name).or(fresh.first());
+            let like = like.map_or(&[][..], |(_, weights)| &weights.entries);
+            let shapes = |weights: &[Weight]| -> Vec<(String, Vec<usize>)> {
+                let shape = |weight: &Weight| (weight.name.clone(), weight.dims.clone());
+                weights.iter().map(shape).collect()
+            };
+            let (found, expected) = (shapes(&list.entries), shapes(like));
+            if let Some((weight, dims)) = expected.iter().find(|own| !found.contains(own)) {
+                bail!("array `{name}/{weight}`: found none of shape {dims:?}");
+            }
+            ensure!(
+                found == expected,
+                "`{name}` has other weights than this network"
+            );
+        }
+        Ok(())
+    }
+}
+
+fn flat(values: Vec<f32>, device: &Device) -> Tensor<1> {
+    let length = values.len();
+    Tensor::from_data(TensorData::new(values, [length]), device)
+}

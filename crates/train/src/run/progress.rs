@@ -1,0 +1,77 @@
+//! The progress of a stage as a bar or lines, and the end of a stage that has diverged.
+
+use anyhow::ensure;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use crate::net::network::{Weights, numbers};
+
+/// Ends a stage with a value that is NaN or infinite, because no further step would make it finite.
+///
+/// # Errors
+///
+/// Returns an error if `found`, the value of `what`, is not finite.
+pub(crate) fn ensure_finite(stage: &str, epoch: u32, what: &str, found: f64) -> anyhow::Result<()> {
+    ensure!(
+        found.is_finite(),
+        "{stage}: epoch {epoch}: {what}: found {found}, expected a finite number: the training has \
+         diverged"
+    );
+    Ok(())
+}
+
+/// Ends a stage whose network gives a logit that is not finite, as finite weights can.
+///
+/// # Errors
+///
+/// Returns an error if one of the logits is not finite.
+pub(crate) fn ensure_finite_logits(
+    stage: &str,
+    epoch: u32,
+    judged: &[(Vec<f32>, [f32; 3])],
+) -> anyhow::Result<()> {
+    for logit in judged.iter().flat_map(|(logits, _)| logits) {
+        ensure_finite(stage, epoch, "logit", (*logit).into())?;
+    }
+    Ok(())
+}
+
+/// Ends a stage with weights that are NaN or infinite. The loss does not show them yet, because a
+/// step's loss is that of the weights before it.
+///
+/// # Errors
+///
+/// Returns an error if one of `weights` is not finite.
+pub(crate) fn ensure_finite_weights(
+    stage: &str,
+    epoch: u32,
+    weights: &Weights,
+) -> anyhow::Result<()> {
+    for weight in &weights.entries {
+        for value in numbers(&weight.values) {
+            ensure_finite(stage, epoch, &weight.name, value.into())?;
+        }
+    }
+    Ok(())
+}
+
+/// A bar over a stage's steps.
+pub(crate) fn progress_bar(stage: &str, steps: u64, done: u64) -> ProgressBar {
+    let template = "{prefix} {bar:30} {pos}/{len} steps, {per_sec}, {eta} left {msg}";
+    let style = ProgressStyle::with_template(template).expect("the template is right");
+    // indicatif draws on a terminal only. Elsewhere `report` prints lines.
+    let bar = ProgressBar::new(steps)
+        .with_style(style)
+        .with_prefix(stage.to_owned());
+    bar.set_position(done);
+    bar.reset_eta();
+    bar
+}
+
+/// Shows the state of a stage after an epoch: beside the bar on a terminal, as a line elsewhere.
+pub(crate) fn report(bar: &ProgressBar, stage: &str, epoch: u32, epochs: u32, message: String) {
+    if bar.is_hidden() {
+        hardnessd_core::say!("{stage}: epoch {epoch} of {epochs}: {message}");
+    } else {
+        bar.set_message(message);
+    }
+}

@@ -1,0 +1,260 @@
+//! The daemon's binary: arguments, log, runtime, signals, exit codes.
+
+use std::future::Future;
+use std::io::{self, IsTerminal};
+use std::path::PathBuf;
+use std::pin::pin;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::Parser;
+use hardnessd::daemon::config::{Error as ConfigError, Setup};
+use hardnessd::daemon::log::{Log, Settings as LogSettings};
+use hardnessd::daemon::{Daemon, Reload, busy};
+use hardnessd::tools::args::{Args, Command};
+use hardnessd::tools::exit::{self, Failure, Stop};
+#[cfg(feature = "zenoh")]
+use hardnessd::tools::fleet;
+#[cfg(feature = "watch")]
+use hardnessd::tools::watch;
+use hardnessd::tools::{
+    self, calibrate, check, demo, doctor, record, recover, replay, simulate, sniff, tail,
+};
+use hardnessd_core::trial;
+use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::sync::mpsc;
+
+/// How long a write that is under way may take to finish.
+const LAST_LINES: Duration = Duration::from_millis(200);
+
+fn main() -> ExitCode {
+    if let Some(code) = trial::entry() {
+        return code;
+    }
+    let runtime = match tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .on_thread_unpark(busy::begins)
+        .on_thread_park(busy::ends)
+        .build()
+    {
+        Ok(runtime) => runtime,
+        Err(error) => {
+            hardnessd_core::say!("hardnessd: no runtime: {error}");
+            return ExitCode::from(exit::IO);
+        }
+    };
+    // Signals come before everything else, even the arguments: an early signal must not kill the
+    // process.
+    let signals = {
+        let _inside = runtime.enter();
+        Signals::catch()
+    };
+    let signals = match signals {
+        Ok(signals) => signals,
+        Err(error) => {
+            hardnessd_core::say!("hardnessd: no signals: {error}");
+            return ExitCode::from(exit::IO);
+        }
+    };
+    let args = match Args::try_parse() {
+        Ok(args) => args,
+        Err(error) => return tools::usage(&error),
+    };
+    let prints = !matches!(args.command, Command::Run(_));
+    let done = runtime.block_on(dispatch(args.command, signals));
+    // A thread may still wait for a port's driver or for the reader of stdout.
+    runtime.shutdown_timeout(if prints { LAST_LINES } else { Duration::ZERO });
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            hardnessd_core::say!("hardnessd: {}", tools::line(&error));
+            ExitCode::from(error.code())
+        }
+    }
+}
+
+async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
+    match command {
+        Command::Run(config) => run(config.path()?, signals).await,
+        Command::Demo(args) => {
+            // The events are the output. The log would repeat each of them.
+            let _log = Log::start(LogSettings::default(), "error")?;
+            Ok(demo::run(args, signals.received()).await?)
+        }
+        Command::Simulate(args) => Ok(simulate::run(args, signals.received()).await?),
+        Command::Record(args) => {
+            let mut end = pin!(signals.received());
+            let Some(setup) = load(args.config.path()?, end.as_mut()).await? else {
+                return Ok(());
+            };
+            // On a terminal the progress line replaces the log.
+            let is_shown = io::stderr().is_terminal();
+            let log = Log::start(setup.config.log, if is_shown { "warn" } else { "info" })?;
+            if is_shown {
+                log.clear_progress();
+            }
+            Ok(record::run(args, setup, end).await?)
+        }
+        Command::Recover(args) => finish_blocking(signals, move || recover::run(&args)).await,
+        Command::Replay(args) => finish(signals, replay::run(args)).await,
+        Command::Tail(args) => Ok(tail::run(args, signals.received()).await?),
+        #[cfg(feature = "watch")]
+        Command::Watch(args) => Ok(watch::run(args, signals.received()).await?),
+        #[cfg(feature = "zenoh")]
+        Command::Fleet(args) => Ok(fleet::run(args, signals.received()).await?),
+        Command::Check(args) => finish_blocking(signals, move || check::run(&args)).await,
+        Command::Calibrate(args) => calibrate(args, signals).await,
+        Command::Doctor(args) => finish_blocking(signals, move || doctor::run(&args)).await,
+        Command::Sniff(args) => finish(signals, sniff::run(args)).await,
+    }
+}
+
+/// Calibrates. At a signal, the daemon inside ends in order, and the command fails.
+async fn calibrate(args: calibrate::Args, signals: Signals) -> Result<(), Failure> {
+    let path = args.config.path()?;
+    let mut end = pin!(signals.end());
+    let setup = tokio::select! {
+        loaded = load(path.clone(), std::future::pending()) => loaded?,
+        stop = &mut end => return Err(Failure::Stopped(stop)),
+    };
+    let Some(setup) = setup else {
+        return Ok(());
+    };
+    let _log = Log::start(setup.config.log, "warn")?;
+    let mut stopped = None;
+    let shutdown = async { stopped = Some(end.await) };
+    calibrate::run(args, setup, &path, shutdown).await?;
+    stopped.map_or(Ok(()), |stop| Err(Failure::Stopped(stop)))
+}
+
+/// Waits until `work` ends. A signal before its end is a failure.
+async fn finish<E: Into<Failure>>(
+    signals: Signals,
+    work: impl Future<Output = Result<(), E>>,
+) -> Result<(), Failure> {
+    tokio::select! {
+        done = work => done.map_err(Into::into),
+        stop = signals.end() => Err(Failure::Stopped(stop)),
+    }
+}
+
+/// Like [`finish`], for work that blocks. The work runs on another thread.
+async fn finish_blocking<E: Into<Failure> + Send + 'static>(
+    signals: Signals,
+    work: impl FnOnce() -> Result<(), E> + Send + 'static,
+) -> Result<(), Failure> {
+    let done = tokio::task::spawn_blocking(work);
+    finish(signals, async {
+        done.await.expect("the work does not panic")
+    })
+    .await
+}
+
+/// Loads the configuration and its model. Returns `None` if `end` comes first. This runs on a
+/// thread of its own, because a file may be a pipe that sends nothing.
+async fn load(path: PathBuf, end: impl Future<Output = ()>) -> Result<Option<Setup>, ConfigError> {
+    tokio::select! {
+        loaded = tokio::task::spawn_blocking(move || Setup::load(&path)) => {
+            loaded.expect("a configuration is read without a panic").map(Some)
+        }
+        () = end => Ok(None),
+    }
+}
+
+async fn run(path: PathBuf, signals: Signals) -> Result<(), Failure> {
+    let (shutdown, mut hangup) = signals.apart();
+    let mut shutdown = pin!(async {
+        shutdown.await;
+    });
+    let Some(setup) = load(path.clone(), shutdown.as_mut()).await? else {
+        return Ok(());
+    };
+    let log = Log::start(setup.config.log, "info")?;
+    let daemon = Daemon::bind(setup)?;
+    let (request, requests) = mpsc::channel(1);
+    tokio::spawn(async move {
+        while hangup.recv().await.is_some() {
+            // If a request waits already, that request will see this change too.
+            let _ = request.try_send(());
+        }
+    });
+    Ok(daemon
+        .run(
+            shutdown,
+            Some(Reload {
+                requests,
+                path,
+                log,
+            }),
+        )
+        .await?)
+}
+
+/// The signals that this process handles.
+struct Signals {
+    interrupt: Signal,
+    terminate: Signal,
+    hangup: Signal,
+    /// Whether the process was started with SIGHUP ignored, as nohup(1) does.
+    outlives_terminal: bool,
+}
+
+impl Signals {
+    /// Catches the signals. From now on, none of them kills the process.
+    fn catch() -> io::Result<Self> {
+        // This can be seen only before the signal is caught.
+        let outlives_terminal = ignores_hangup();
+        // At the limit of a file's size, the write fails as on a full disk, and SIGXFSZ does not
+        // end the process.
+        drop(signal(SignalKind::from_raw(
+            rustix::process::Signal::XFSZ.as_raw(),
+        ))?);
+        Ok(Self {
+            interrupt: signal(SignalKind::interrupt())?,
+            terminate: signal(SignalKind::terminate())?,
+            hangup: signal(SignalKind::hangup())?,
+            outlives_terminal,
+        })
+    }
+
+    /// Waits for SIGINT, SIGTERM, or SIGHUP of a terminal that has gone.
+    async fn end(self) -> Stop {
+        let outlives_terminal = self.outlives_terminal;
+        let (shutdown, mut hangup) = self.apart();
+        tokio::select! {
+            stop = shutdown => stop,
+            _ = hangup.recv(), if !outlives_terminal => Stop::Hangup,
+        }
+    }
+
+    /// Like [`Signals::end`], for a command that runs until a signal ends it.
+    async fn received(self) {
+        self.end().await;
+    }
+
+    /// A future that waits for SIGINT or SIGTERM, and the signal SIGHUP by itself.
+    fn apart(self) -> (impl Future<Output = Stop>, Signal) {
+        let Self {
+            mut interrupt,
+            mut terminate,
+            hangup,
+            ..
+        } = self;
+        let shutdown = async move {
+            tokio::select! {
+                _ = interrupt.recv() => Stop::Interrupt,
+                _ = terminate.recv() => Stop::Terminate,
+            }
+        };
+        (shutdown, hangup)
+    }
+}
+
+/// Whether SIGHUP is ignored. By proc_pid_status(5), `SigIgn` is a mask in hex, and signal 1 is its
+/// lowest bit. If /proc is hidden, SIGHUP counts as not ignored.
+fn ignores_hangup() -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok())
+        .is_some_and(|mask| mask & 1 == 1)
+}
