@@ -34,7 +34,7 @@ def keep(target, name, content):
 
 def wire():
     fixture = (TOP / "fixtures/foam.5hz.bin").read_bytes()
-    # Three sizes of chunks, then the preset: see `layout` in tests/doors/properties.rs.
+    # Three sizes of chunks, then the preset: see `layout` in tests/daemon/properties.rs.
     keep("wire", "jx255n", bytes([7, 63, 255, 0]) + fixture[: 2 * FRAME_BYTES])
     cells = bytes([1, 2, 3, 250])
     for number, name in enumerate("jx255n jx255n-u16 jq jq-tail jq-u16 ff-tail ascii zero-run".split()):

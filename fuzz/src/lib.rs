@@ -1,9 +1,9 @@
 //! The properties of `tests/doors`, for the fuzz targets.
 
-#[path = "../../tests/doors/properties.rs"]
+#[path = "../../tests/daemon/properties.rs"]
 mod properties;
 #[cfg(feature = "train")]
-#[path = "../../crates/train/tests/doors/property.rs"]
+#[path = "../../crates/train/tests/trainer/property.rs"]
 mod trainer;
 
 pub use properties::*;

@@ -4,7 +4,7 @@
     python -m venv venv && venv/bin/pip install jsonschema
     venv/bin/python tests/peers/schema.py target/debug/hardnessd
 
-Claims: the frozen lines of tests/event_format.rs, all types of live lines and those of a replay are
+Claims: the frozen lines of crates/core/tests/core/event_format.rs, all types of live lines and those of a replay are
 valid. The schema names every field there is, and so do the type hints of the Python client. A wrong
 line does not pass.
 """
@@ -48,7 +48,7 @@ def unknown(value, schema):
 
 
 def frozen():
-    text = (ROOT / "tests/event_format.rs").read_text()
+    text = (ROOT / "crates/core/tests/core/event_format.rs").read_text()
     # A frame of three taxels and a hash of two digits are not meant to be real.
     lines = [line for line in re.findall(r'r#"(\{"type".*?\})"#', text)]
     real = [line for line in lines if '"newtons"' not in line and '"sha256":"00"' not in line]

@@ -437,7 +437,7 @@ impl From<SplitName> for Split {
 }
 
 #[cfg(test)]
-#[path = "../../../../../tests/bench/pages.rs"]
+#[path = "../../../../../tests/pages/commands.rs"]
 mod pages;
 
 #[cfg(test)]

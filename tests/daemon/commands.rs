@@ -1,0 +1,163 @@
+//! The messages of the commands around the daemon.
+
+use std::fs;
+use std::os::unix::fs::symlink;
+use std::process::{Command, Output, Stdio};
+
+use crate::bench::{BINARY, Bench, Process, hardnessd};
+use rustix::process::Signal;
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8(bytes.to_vec()).unwrap()
+}
+
+#[test]
+fn a_recording_without_a_press_is_warned_of() {
+    let bench = Bench::new();
+    // The sensor's first press comes after 2 s.
+    let _sensor = bench.sensor(&["--speed", "0.1"]);
+    let config = bench.configure("record.toml", "x.sock", "");
+    let out = bench.path("rest.mcap");
+    let record = |more: &[&str]| {
+        let mut command = Command::new(BINARY);
+        command.args(["record", "--config"]).arg(&config);
+        command.arg("--out").arg(&out).args(more).output().unwrap()
+    };
+    let Output { status, stderr, .. } = record(&["--seconds", "1.5"]);
+    let said = text(&stderr);
+    assert_eq!(status.code(), Some(0), "{said}");
+    let warning = said.lines().find(|line| line.starts_with("warning: "));
+    assert!(
+        warning.is_some_and(|line| line.contains("no press in ")),
+        "{said}"
+    );
+    assert!(out.exists());
+}
+
+#[test]
+fn whoever_holds_the_port_is_named_and_what_to_do() {
+    let bench = Bench::new();
+    let _sensor = bench.sensor(&[]);
+    let mut daemon = bench.daemon();
+    daemon.logged("live");
+    let config = bench.configure("record.toml", "x.sock", "");
+    let out = bench.path("held.mcap");
+    let mut command = Command::new(BINARY);
+    command
+        .args(["record", "--config"])
+        .arg(&config)
+        .arg("--out")
+        .arg(&out);
+    let Output { status, stderr, .. } = command.output().unwrap();
+    let said = text(&stderr);
+    assert_eq!(status.code(), Some(69), "{said}");
+    let said = said
+        .lines()
+        .find(|line| line.starts_with("hardnessd: "))
+        .unwrap();
+    let process = format!("held by process {}, the daemon", daemon.process.0.id());
+    assert!(
+        said.contains(&process)
+            && said.contains("(hardnessd run; its scheduling is ordinary")
+            && said.contains("systemctl stop hardnessd"),
+        "{said}"
+    );
+    assert!(!out.exists());
+}
+
+#[test]
+fn check_says_where_a_small_array_lies() {
+    let bench = Bench::new();
+    let config = bench.path("small.toml");
+    let small = "[[sensor]]\nport = \"port\"\n[sensor.frame]\nrows = 16\ncols = 10\n";
+    fs::write(&config, small).unwrap();
+    let Output { status, stderr, .. } = hardnessd(&["check", "--config", config.to_str().unwrap()]);
+    let said = text(&stderr);
+    assert_eq!(status.code(), Some(0), "{said}");
+    assert!(
+        said.contains("16x10 taxels begins at row 6, column 9"),
+        "{said}"
+    );
+    assert!(said.contains("not trained"), "{said}");
+}
+
+#[test]
+fn sniff_writes_a_configuration_that_check_takes() {
+    let bench = Bench::new();
+    let _sensor = bench.sensor(&[]);
+    let config = bench.path("sniffed.toml");
+    let port = bench.path("port");
+    let arguments = ["sniff", "--seconds", "4", "--port", port.to_str().unwrap()];
+    let sniff = || {
+        let mut command = Command::new(BINARY);
+        command
+            .args(arguments)
+            .arg("--out")
+            .arg(&config)
+            .output()
+            .unwrap()
+    };
+    let Output {
+        status,
+        stdout,
+        stderr,
+    } = sniff();
+    assert_eq!(status.code(), Some(0), "{}", text(&stderr));
+    assert_eq!(text(&stdout), "");
+    let written = fs::read_to_string(&config).unwrap();
+    assert!(
+        written.ends_with("[sensor.frame]\npreset = \"jx255n\"\n"),
+        "{written}"
+    );
+    let Output {
+        status,
+        stdout,
+        stderr,
+    } = hardnessd(&["check", "--config", config.to_str().unwrap()]);
+    assert_eq!(status.code(), Some(0), "{}{written}", text(&stderr));
+    assert!(
+        text(&stdout).contains("28x28 taxels in 790 bytes"),
+        "{written}"
+    );
+    // The file now exists, and must not be overwritten.
+    let Output { status, stderr, .. } = sniff();
+    assert_eq!(status.code(), Some(74), "{}", text(&stderr));
+    assert_eq!(fs::read_to_string(&config).unwrap(), written);
+}
+
+#[test]
+fn recover_follows_no_link() {
+    let bench = Bench::new();
+    let (out, target) = (bench.path("good.mcap"), bench.path("nowhere"));
+    symlink(&target, &out).unwrap();
+    fs::write(bench.path("broken.mcap"), "x").unwrap();
+    let mut command = Command::new(BINARY);
+    command
+        .arg("recover")
+        .arg(bench.path("broken.mcap"))
+        .arg("--out")
+        .arg(&out);
+    let Output { status, stderr, .. } = command.output().unwrap();
+    assert_eq!(status.code(), Some(74), "{}", text(&stderr));
+    assert!(
+        text(&stderr).contains("name a new one"),
+        "{}",
+        text(&stderr)
+    );
+    assert!(!target.exists() && out.is_symlink());
+}
+
+#[test]
+fn sniff_at_a_port_that_is_interrupted_has_not_finished() {
+    let bench = Bench::new();
+    let _sensor = bench.sensor(&[]);
+    for (signal, code) in [(Signal::INT, 130), (Signal::TERM, 143)] {
+        let mut command = Command::new(BINARY);
+        command.args(["sniff", "--port"]).arg(bench.path("port"));
+        command.stdout(Stdio::null()).stderr(Stdio::null());
+        let mut sniff = Process(command.spawn().unwrap());
+        std::thread::sleep(std::time::Duration::from_millis(300));
+        sniff.signal(signal);
+        assert_eq!(sniff.exit_code(), Some(code));
+    }
+}

@@ -1,0 +1,224 @@
+//! The first minute of a user: `demo` on a terminal, and commands that find a daemon and a
+//! configuration by themselves.
+
+use std::fs::{self, File};
+use std::io::{BufRead, BufReader, Read, Write};
+use std::os::unix::net::UnixListener;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+
+use crate::bench::{BINARY, Bench, Daemon, Process};
+use crate::pair::Pair;
+use rustix::process::Signal;
+use serde_json::Value;
+
+/// The program, with `runtime` as the user's runtime directory.
+fn program(runtime: &Path) -> Command {
+    let mut command = Command::new(BINARY);
+    command.env("XDG_RUNTIME_DIR", runtime);
+    command.env("TMPDIR", runtime);
+    command.env_remove("RUNTIME_DIRECTORY");
+    command
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8(bytes.to_vec()).unwrap()
+}
+
+/// The output of a program on a terminal until the program ends, and its exit code.
+fn on_a_terminal(mut command: Command, stop_after: Option<&str>) -> (String, Option<i32>) {
+    let Pair { master, device, .. } = Pair::open().unwrap();
+    command.stdout(Stdio::from(device)).stderr(Stdio::null());
+    let mut process = Process(command.spawn().unwrap());
+    // `command` holds the last descriptor of the device.
+    drop(command);
+    let mut written = Vec::new();
+    let mut master = File::from(master);
+    let mut read = [0; 4096];
+    while let Ok(length @ 1..) = master.read(&mut read) {
+        written.extend(&read[..length]);
+        if stop_after.is_some_and(|part| text(&written).contains(part)) {
+            process.signal(Signal::INT);
+        }
+    }
+    let written = text(&written).replace("\r\n", "\n");
+    (written, process.exit_code())
+}
+
+#[test]
+fn on_a_terminal_each_press_is_a_line_with_the_truth_beside_the_verdict() {
+    let bench = Bench::new();
+    let mut command = program(&bench.path(""));
+    command.args(["demo", "--presses", "4", "--speed", "4"]);
+    let (shown, code) = on_a_terminal(command, None);
+    assert_eq!(code, Some(0), "{shown}");
+    let lines: Vec<&str> = shown.lines().collect();
+    let pressed = [
+        "hard-plastic (level 1)",
+        "foam (level 2)",
+        "soft-candy (level 3)",
+        "yoga-mat (level 4)",
+    ];
+    assert_eq!(lines.len(), 5, "{shown}");
+    let mut right = 0;
+    for (number, (line, pressed)) in (1..).zip(lines.iter().zip(pressed)) {
+        assert!(
+            line.starts_with(&format!("press {number}  {pressed} ")),
+            "{line}"
+        );
+        let (_, verdict) = line.split_once("->").unwrap();
+        let marked = |mark| verdict.split_whitespace().any(|word| word == mark);
+        assert!(marked("ok") != marked("wrong"), "{line}");
+        assert!(verdict.contains(" % ") && verdict.ends_with(" N"), "{line}");
+        right += u32::from(marked("ok"));
+    }
+    let count = format!("4 presses: {right} right, {} wrong (", 4 - right);
+    assert!(lines[4].starts_with(&count), "{shown}");
+}
+
+#[test]
+fn a_demonstration_that_is_interrupted_counts_what_there_was() {
+    let bench = Bench::new();
+    let mut command = program(&bench.path(""));
+    command.args(["demo", "--speed", "4"]);
+    let (shown, code) = on_a_terminal(command, Some("press 2 "));
+    assert_eq!(code, Some(0), "{shown}");
+    assert!(
+        shown.lines().last().unwrap().contains(" presses: "),
+        "{shown}"
+    );
+}
+
+#[test]
+fn json_on_a_terminal_is_what_a_subscriber_reads() {
+    let bench = Bench::new();
+    let mut command = program(&bench.path(""));
+    command.args(["demo", "--presses", "1", "--speed", "8", "--json"]);
+    let (shown, code) = on_a_terminal(command, None);
+    assert_eq!(code, Some(0), "{shown}");
+    let events: Vec<Value> = shown
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect();
+    assert_eq!(events[0]["type"], "hello");
+    assert_eq!(events.last().unwrap()["phase"], "final");
+}
+
+/// One status from `tail`, with its exit code and its stderr.
+fn tail(runtime: &Path, arguments: &[&str]) -> (Option<i32>, Value, String) {
+    let mut command = program(runtime);
+    command.args(["tail", "--json", "--types", "status", "--count", "1"]);
+    let Output {
+        status,
+        stdout,
+        stderr,
+    } = command.args(arguments).output().unwrap();
+    let event = serde_json::from_slice(&stdout).unwrap_or_default();
+    (status.code(), event, text(&stderr))
+}
+
+#[test]
+fn a_running_demo_is_found_and_a_daemon_goes_before_it() {
+    let bench = Bench::new();
+    let runtime = bench.path("");
+    let (code, _, said) = tail(&runtime, &[]);
+    assert_eq!(code, Some(69));
+    assert!(
+        said.contains("hardnessd demo") && said.contains("--socket"),
+        "{said}"
+    );
+    let mut demo = program(&runtime);
+    demo.args(["demo", "--json"])
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped());
+    let mut demo = Process(demo.spawn().unwrap());
+    let mut told = BufReader::new(demo.0.stderr.take().unwrap()).lines();
+    assert!(
+        told.next()
+            .unwrap()
+            .unwrap()
+            .starts_with("live page: http://")
+    );
+    let socket = told.next().unwrap().unwrap();
+    let socket = socket.strip_prefix("socket: ").unwrap();
+    let socket = socket.split(' ').next().unwrap();
+    let (code, event, said) = tail(&runtime, &[]);
+    assert_eq!(
+        (code, &event["sensor"]),
+        (Some(0), &"demo".into()),
+        "{said}"
+    );
+    assert_eq!(said, format!("hardnessd: events of {socket}\n"));
+    let own = runtime.join("hardnessd/events.sock");
+    let config = bench.configure(
+        "own.toml",
+        own.to_str().unwrap(),
+        "[publish.tcp]\nlisten = \"127.0.0.1:0\"\n",
+    );
+    let mut daemon = Daemon::start(&config);
+    let (code, event, said) = tail(&runtime, &[]);
+    assert_eq!(
+        (code, &event["sensor"]),
+        (Some(0), &"forearm".into()),
+        "{said}"
+    );
+    assert_eq!(said, format!("hardnessd: events of {}\n", own.display()));
+    // A socket that is named is used without a message.
+    let (_, event, said) = tail(&runtime, &["--socket", socket]);
+    assert_eq!((&event["sensor"], said.as_str()), (&"demo".into(), ""));
+    let address = daemon.address("tcp").to_string();
+    let (code, event, said) = tail(&runtime, &["--connect", &address]);
+    assert_eq!(
+        (code, &event["sensor"]),
+        (Some(0), &"forearm".into()),
+        "{said}"
+    );
+    demo.signal(Signal::TERM);
+    assert_eq!(demo.exit_code(), Some(0));
+    assert!(!Path::new(socket).exists());
+}
+
+#[test]
+fn a_server_that_sends_no_newline_is_left_with_one_line() {
+    let bench = Bench::new();
+    let socket = bench.path("hostile.sock");
+    let listener = UnixListener::bind(&socket).unwrap();
+    let server = std::thread::spawn(move || {
+        let (mut stream, _) = listener.accept().unwrap();
+        while stream.write_all(&[b'x'; 65536]).is_ok() {}
+    });
+    let (code, _, said) = tail(&bench.path(""), &["--socket", socket.to_str().unwrap()]);
+    assert_eq!(code, Some(69), "{said}");
+    assert_eq!(said.lines().count(), 1, "{said}");
+    assert!(said.contains("longer than 1048576 bytes"), "{said}");
+    server.join().unwrap();
+}
+
+#[test]
+fn a_configuration_is_looked_for_where_none_is_named() {
+    let bench = Bench::new();
+    let here = bench.path("");
+    let check = || {
+        let mut command = program(&here);
+        let Output {
+            status,
+            stdout,
+            stderr,
+        } = command.arg("check").current_dir(&here).output().unwrap();
+        (status.code(), text(&stdout), text(&stderr))
+    };
+    if !Path::new("/etc/hardnessd.toml").exists() {
+        let (code, _, said) = check();
+        assert_eq!(code, Some(66));
+        assert!(
+            said.contains("--config") && said.lines().count() == 1,
+            "{said}"
+        );
+    }
+    let config = "robot = \"here\"\n[[sensor]]\nport = \"port\"\n";
+    fs::write(here.join("hardnessd.toml"), config).unwrap();
+    let (code, told, said) = check();
+    assert_eq!(code, Some(0), "{said}");
+    assert_eq!(said, "hardnessd: configuration ./hardnessd.toml\n");
+    assert!(told.starts_with("robot here\n"), "{told}");
+}

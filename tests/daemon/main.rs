@@ -1,0 +1,30 @@
+//! The real binary on a real pty: the daemon, its outputs and its tools.
+#![allow(
+    clippy::unwrap_used,
+    reason = "clippy knows no helper of a test as a test"
+)]
+
+#[path = "../bench/mod.rs"]
+mod bench;
+#[path = "../../src/tools/pty/pair.rs"]
+#[allow(dead_code, reason = "nobody here asks where the device is")]
+mod pair;
+
+mod calibrate;
+mod commands;
+mod daemon;
+mod demo;
+mod doors;
+mod faults;
+mod http;
+mod model;
+mod motion;
+mod port;
+mod publish;
+mod service;
+mod shipped;
+mod stdout;
+mod subscribe;
+#[cfg(feature = "watch")]
+mod watch;
+mod properties;

@@ -1,0 +1,232 @@
+//! Positions of the arm: sent to the real daemon on the control socket, recorded and replayed.
+
+use std::fs;
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::path::Path;
+use std::time::Duration;
+
+use crate::bench::{Bench, Daemon, Subscriber, hardnessd};
+use hardnessd_core::recording::{Entry, Input, Reader};
+use serde_json::{Value, json};
+
+fn mono_ns() -> u64 {
+    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    u64::try_from(Duration::try_from(now).unwrap().as_nanos()).unwrap()
+}
+
+/// The points in a recording, line by line.
+fn recorded(path: &Path) -> Vec<Vec<(i64, f64)>> {
+    let file = fs::File::open(path).unwrap();
+    let found = Reader::new(std::io::BufReader::new(file)).map(Result::unwrap);
+    found
+        .filter_map(|found| match found.entry {
+            Entry::Input(Input::Motion(points)) => {
+                Some(points.iter().map(|&point| point.into()).collect())
+            }
+            _ => None,
+        })
+        .collect()
+}
+
+#[test]
+fn positions_are_checked_counted_and_recorded() {
+    let bench = Bench::new();
+    let more = "[http]\nlisten = \"127.0.0.1:0\"\n[record]\ndir = \"tape\"\nkeep_free_mb = 0\n";
+    let mut daemon = Daemon::start(&bench.configure("hardnessd.toml", "events.sock", more));
+    let _sensor = bench.sensor(&[]);
+    bench
+        .subscriber()
+        .until(&json!({"type": "status", "state": "live"}));
+    let mut control = Subscriber::connect(&bench.path("control.sock"));
+    let mut tell = |sensor: &str, at: Value| {
+        control.ask(&json!({"motion": {"sensor": sensor, "at": at}, "id": 7}).to_string())
+    };
+    let now = mono_ns();
+    let ok = json!({"type": "ok", "id": 7});
+    assert_eq!(
+        tell("forearm", json!([[now - 2_000_000, 3.5], [now, 3.75]])),
+        ok
+    );
+    let wall = jiff::Timestamp::now().to_string();
+    assert_eq!(tell("forearm", json!([[wall, 4]])), ok);
+
+    let refused = |answer: Value, expected: &str| {
+        assert_eq!(
+            (&answer["type"], &answer["id"]),
+            (&json!("error"), &json!(7))
+        );
+        let message = answer["message"].as_str().unwrap();
+        assert!(message.starts_with(expected), "{message}");
+    };
+    refused(
+        tell("foot", json!([[now, 1]])),
+        "motion.sensor: found \"foot\"",
+    );
+    refused(tell("forearm", json!([])), "motion.at: found 0 points");
+    let old = json!([[now, 1], [now - 61_000_000_000, 1]]);
+    refused(tell("forearm", old), "motion.at[1]: found a moment 61");
+    // The points are taken nevertheless, because the robot may have set its clock back.
+    let back = json!([[mono_ns(), 4.5], [now, 5]]);
+    refused(tell("forearm", back), "motion.at[1]: found a step of");
+    let mut events = bench.subscriber();
+    let point = json!({"motion": {"sensor": "forearm", "at": [[now, 1]]}});
+    let answer = events.ask(&point.to_string());
+    let expected = "motion: this socket changes nothing: send it to the control socket";
+    assert_eq!(answer["message"], expected);
+
+    let address = daemon.address("http").to_string();
+    let mut stream = TcpStream::connect(&address).unwrap();
+    write!(
+        stream,
+        "GET /metrics HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n"
+    )
+    .unwrap();
+    let mut metrics = String::new();
+    stream.read_to_string(&mut metrics).unwrap();
+    let counter = "hardnessd_motion_points_total{robot=\"arm-7\",sensor=\"forearm\"} 5";
+    assert!(metrics.contains(counter), "{metrics}");
+
+    daemon.process.signal(rustix::process::Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    let tape = fs::read_dir(bench.path("tape"))
+        .unwrap()
+        .next()
+        .unwrap()
+        .unwrap()
+        .path();
+    let lines = recorded(&tape);
+    let at = i64::try_from(now).unwrap();
+    assert_eq!(lines[0], [(at - 2_000_000, 3.5), (at, 3.75)]);
+    assert_eq!(lines.iter().map(Vec::len).collect::<Vec<_>>(), [2, 1, 2]);
+    // This point was sent with a calendar time. The daemon reads both clocks at the same moment.
+    assert!((lines[1][0].0 - at).abs() < 60_000_000_000 && lines[1][0].1 == 4.0);
+    let replayed = hardnessd(&["replay", tape.to_str().unwrap()]);
+    assert!(replayed.status.success(), "{replayed:?}");
+}
+
+#[test]
+fn positions_of_raw_bytes_come_from_a_table() {
+    let bench = Bench::new();
+    let raw = bench.path("raw.bin");
+    let raw = raw.to_str().unwrap();
+    assert!(
+        hardnessd(&["simulate", "--presses", "1", "--to", raw])
+            .status
+            .success()
+    );
+    let table = bench.path("motion.csv");
+    let table = table.to_str().unwrap();
+    let check = |more: &[&str], code, expected: &str| {
+        let output = hardnessd(&[&["replay", raw, "--motion", table], more].concat());
+        assert_eq!(output.status.code(), Some(code), "{output:?}");
+        let errors = String::from_utf8(output.stderr).unwrap();
+        assert!(errors.contains(expected), "{errors}");
+        assert!(errors.lines().count() <= 1, "{errors}");
+        output.stdout
+    };
+    check(&[], 66, "motion.csv: cannot read");
+    fs::write(table, "time_s,approach_mm\n0,0\n0.1,x\n").unwrap();
+    check(
+        &[],
+        1,
+        "motion.csv:3: approach_mm: found \"x\", expected millimetres",
+    );
+    fs::write(table, "time_s,approach_mm\n0,0\n0.1,1\n").unwrap();
+    let events = check(&[], 0, "");
+    assert_eq!(check(&["--speed", "1e6"], 0, ""), events);
+}
+
+/// An event without the fields that only a live event has.
+fn timeless(mut event: Value) -> Value {
+    for key in ["mono_ns", "age_at_publish_ms", "latency_us"] {
+        event[key] = Value::Null;
+    }
+    event
+}
+
+#[test]
+fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_repeats_them() {
+    let bench = Bench::new();
+    fs::write(
+        bench.path("sums.onnx"),
+        hardnessd_core::test_support::course_model::course_model(48, &[]),
+    )
+    .unwrap();
+    let model = "[model]\npath = \"sums.onnx\"\nearly_confidence = 0.5\n";
+    let record = "[record]\ndir = \"tape\"\nkeep_free_mb = 0\n";
+    let config = bench.configure("hardnessd.toml", "events.sock", &format!("{model}{record}"));
+    let text = fs::read_to_string(&config).unwrap();
+    let arm = "frame_rate_hz = 20.0\narm = { stiffness_n_per_mm = 10.0, delay_ms = 34.3 }";
+    fs::write(&config, text.replace("frame_rate_hz = 20.0", arm)).unwrap();
+    let mut daemon = Daemon::start(&config);
+    let mut events = bench.subscriber();
+    let control = bench.path("control.sock");
+    let control = control.to_str().unwrap();
+    // At 230,400 baud a frame takes 34.3 ms.
+    let _sensor = bench.sensor(&["--material", "yoga-mat", "--motion", control]);
+    let mut finals = Vec::new();
+    let mut earlies = 0;
+    while finals.len() < 2 {
+        let verdict = events.until(&json!({"type": "hardness"}));
+        assert_eq!(verdict["course"], "positions", "{verdict}");
+        if verdict["phase"] == "early" {
+            earlies += 1;
+            continue;
+        }
+        // On hard plastic, nearly all of the way is the arm's own. The second press is on a yoga
+        // mat.
+        let stiffness = verdict["stiffness_n_per_mm"].as_f64();
+        let is_told = stiffness.is_some_and(|n_per_mm| (0.5..60.0).contains(&n_per_mm));
+        assert!(finals.is_empty() || is_told, "{verdict}");
+        let shore = |key: &str| verdict["shore"][key].as_f64().unwrap();
+        assert!(
+            (shore("high") - shore("value") - 10.0).abs() < 0.01,
+            "{verdict}"
+        );
+        // 15 N bend the arm by 1.5 mm, and the pressed object gives way too.
+        let frames = shore("value") - shore("low");
+        let mean_mm = shore("value") / frames;
+        assert!((0.8..8.0).contains(&mean_mm), "{verdict}");
+        finals.push(timeless(verdict));
+    }
+    assert!(earlies >= 1);
+    daemon.process.signal(rustix::process::Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+
+    let tape = fs::read_dir(bench.path("tape"))
+        .unwrap()
+        .next()
+        .unwrap()
+        .unwrap()
+        .path();
+    let replay = |more: &[&str]| {
+        let command = [
+            "replay",
+            tape.to_str().unwrap(),
+            "--config",
+            config.to_str().unwrap(),
+        ];
+        let output = hardnessd(&[&command[..], more].concat());
+        assert!(output.status.success(), "{output:?}");
+        output.stdout
+    };
+    let replayed = replay(&[]);
+    assert_eq!(replayed, replay(&["--speed", "1000"]));
+    let lines = replayed
+        .split(|&byte| byte == b'\n')
+        .filter(|line| !line.is_empty());
+    let found: Vec<Value> = lines
+        .map(|line| serde_json::from_slice(line).unwrap())
+        .filter(|event: &Value| event["type"] == "hardness" && event["phase"] == "final")
+        .take(2)
+        .collect();
+    assert_eq!(found.len(), 2);
+    for (mut found, mut live) in found.into_iter().zip(finals) {
+        // Only the live numbers count the statuses before the first state of the recording.
+        for event in [&mut found, &mut live] {
+            event.as_object_mut().unwrap().remove("seq");
+        }
+        assert_eq!(found, live);
+    }
+}

@@ -1,0 +1,319 @@
+//! `sniff` and `doctor` in use: the real binary, with recordings and ptys of the simulator.
+
+use std::fs;
+use std::io::Read as _;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::process::Command;
+
+use crate::bench::{BINARY, Bench, Daemon, Process, by_terminal, hardnessd, wait_for};
+use rustix::process::Signal;
+use serde_json::json;
+
+/// Runs the binary. Returns exit code, stdout and stderr.
+fn run(arguments: &[&str]) -> (i32, String, String) {
+    let output = hardnessd(arguments);
+    (
+        output.status.code().unwrap(),
+        String::from_utf8(output.stdout).unwrap(),
+        String::from_utf8(output.stderr).unwrap(),
+    )
+}
+
+fn recorded(bench: &Bench, preset: &str) -> String {
+    let path = bench.path("sensor.bin").to_str().unwrap().to_owned();
+    let played = ["--presses", "4", "--fps", "20", "--seed", "5"];
+    let arguments = [
+        &["simulate", "--to", &path, "--preset", preset],
+        &played[..],
+    ];
+    let (code, _, stderr) = run(&arguments.concat());
+    assert_eq!(code, 0, "{stderr}");
+    path
+}
+
+/// Runs `check` on a configuration with the proposal.
+fn checked(bench: &Bench, proposal: &str) -> String {
+    let text = format!("[[sensor]]\nname = \"forearm\"\nport = \"/dev/ttyACM0\"\n{proposal}");
+    let path = bench.path("proposed.toml");
+    fs::write(&path, text).unwrap();
+    let (code, stdout, stderr) = run(&["check", "--config", path.to_str().unwrap()]);
+    assert_eq!(code, 0, "{stderr}\n{proposal}");
+    stdout
+}
+
+#[test]
+fn a_recording_of_an_unknown_layout_is_named_and_the_proposal_runs() {
+    let bench = Bench::new();
+    for preset in [
+        "jx255n",
+        "jx255n-u16",
+        "jq",
+        "jq-tail",
+        "jq-u16",
+        "ff-tail",
+        "zero-run",
+    ] {
+        let (code, toml, stderr) = run(&["sniff", &recorded(&bench, preset)]);
+        assert_eq!(code, 0, "{preset}: {stderr}");
+        assert!(toml.contains("[sensor.frame]"), "{toml}");
+        // Without a checksum, a header and a tail look the same in the middle of a stream.
+        let named = format!("preset = \"{preset}\"");
+        let is_named = toml.contains(&named) || preset.starts_with("jq");
+        assert!(is_named, "{preset} is not named in\n{toml}");
+        // A capture decodes with the proposed layout.
+        let config = bench.path("proposed.toml");
+        checked(&bench, &toml);
+        let (code, events, stderr) = run(&[
+            "replay",
+            bench.path("sensor.bin").to_str().unwrap(),
+            "--config",
+            config.to_str().unwrap(),
+        ]);
+        assert_eq!(code, 0, "{stderr}");
+        let presses = events.matches("\"state\":\"begin\"").count();
+        assert_eq!(presses, 4, "{preset}: {toml}");
+    }
+}
+
+#[test]
+fn a_sensor_at_a_port_is_sniffed_while_it_plays() {
+    let bench = Bench::new();
+    let _sensor = bench.sensor(&["--speed", "4"]);
+    let port = bench.path("port").to_str().unwrap().to_owned();
+    let (code, toml, stderr) = run(&["sniff", "--port", &port, "--seconds", "2"]);
+    assert_eq!(code, 0, "{stderr}");
+    assert!(stderr.contains("press the sensor"), "{stderr}");
+    assert!(toml.contains("preset = \"jx255n\""), "{toml}");
+    checked(&bench, &toml);
+}
+
+#[test]
+fn sniff_says_why_it_has_no_proposal() {
+    let bench = Bench::new();
+    let check = |arguments: &[&str], code: i32, part: &str| {
+        let (found, stdout, stderr) = run(&[&["sniff"], arguments].concat());
+        assert_eq!(found, code, "{arguments:?}: {stderr}");
+        assert!(stderr.contains(part) && stdout.is_empty(), "{stderr}");
+        assert_eq!(stderr.lines().count(), 1, "{stderr}");
+    };
+    let noise = bench.path("noise.bin");
+    let mut state = 1_u32;
+    let mut random = || {
+        state ^= state << 13;
+        state ^= state >> 17;
+        state ^= state << 5;
+        state as u8
+    };
+    fs::write(&noise, (0..40_000).map(|_| random()).collect::<Vec<u8>>()).unwrap();
+    check(&[noise.to_str().unwrap()], 1, "no layout");
+    check(&["/no/such.bin"], 66, "/no/such.bin");
+    // A port in place of a file would be read for ever.
+    let _sensor = bench.sensor(&[]);
+    let port = bench.path("port").display().to_string();
+    let new = bench.path("new.mcap").display().to_string();
+    for command in [&["sniff"][..], &["replay"], &["recover", "--out", &new]] {
+        let (code, _, stderr) = run(&[command, &[port.as_str()]].concat());
+        assert_eq!(code, 66, "{stderr}");
+        assert!(
+            stderr.contains("found a serial port or a terminal"),
+            "{stderr}"
+        );
+    }
+    // The message gives the cause once.
+    let (_, _, stderr) = run(&["sniff", "/no/such.bin"]);
+    assert_eq!(stderr.matches("No such file").count(), 1, "{stderr}");
+    assert!(!stderr.contains("os error"), "{stderr}");
+    // This text has lines of many lengths: 60 % of it fit a layout, with 18 of 39 frames damaged.
+    check(&["/etc/passwd"], 1, "no layout");
+    check(
+        &["--port", "/dev/no-such"],
+        69,
+        "/dev/no-such: no such device",
+    );
+    check(&[], 2, "not provided: <FILE|--port <P>>");
+    check(&["x.bin", "--port", "y"], 2, "cannot be used with");
+}
+
+#[test]
+fn doctor_names_what_is_missing_and_who_holds_a_port() {
+    let bench = Bench::new();
+    let (code, stdout, _) = run(&["doctor", "--port", "/dev/no-such"]);
+    assert_eq!(code, 1);
+    assert!(
+        stdout.starts_with("/dev/no-such: no such device"),
+        "{stdout}"
+    );
+
+    // The port's name cannot split the line, nor send codes to the terminal.
+    let (_, stdout, _) = run(&["doctor", "--port", "/dev/no\nsuch\u{1b}[2J"]);
+    assert!(stdout.starts_with("/dev/no\\nsuch\\u{1b}[2J: "), "{stdout}");
+    assert_eq!(stdout.lines().count(), 1, "{stdout}");
+
+    // One line says that this is not a port, whatever else is reported.
+    for port in ["/dev/null", "/tmp", "Cargo.toml"] {
+        let (code, stdout, _) = run(&["doctor", "--port", port]);
+        assert_eq!(code, 1, "{stdout}");
+        assert_eq!(stdout.lines().count(), 1, "{stdout}");
+        assert!(stdout.contains("not a serial port"), "{stdout}");
+    }
+
+    let _sensor = bench.sensor(&[]);
+    let daemon = Daemon::start(&bench.configure("hardnessd.toml", "events.sock", ""));
+    bench.subscriber().until(&json!({"state": "live"}));
+    let port = bench.path("port").to_str().unwrap().to_owned();
+    let (code, stdout, stderr) = run(&["doctor", "--port", &port]);
+    assert_eq!(code, 1);
+    let holder = format!(
+        "held by process {}, the daemon (hardnessd run",
+        daemon.process.0.id()
+    );
+    assert!(stdout.contains(&holder), "{holder:?} not in {stdout}");
+    assert!(
+        stdout.contains(": sudo systemctl stop hardnessd"),
+        "{stdout}"
+    );
+    assert!(stderr.contains("1 fault found"), "{stderr}");
+}
+
+#[test]
+fn doctor_names_the_group_that_may_use_a_port() {
+    let bench = Bench::new();
+    let _sensor = bench.sensor(&[]);
+    let port = bench.path("port");
+    let device = fs::canonicalize(&port).unwrap();
+    let is_root = rustix::process::geteuid().is_root();
+    // Root is allowed everything, so run as another user, from a directory which that user may
+    // read.
+    let mut command = if is_root {
+        let copy = bench.path("hardnessd");
+        fs::copy(BINARY, &copy).unwrap();
+        let everyone = fs::Permissions::from_mode(0o755);
+        fs::set_permissions(copy.parent().unwrap(), everyone).unwrap();
+        let mut command = Command::new("setpriv");
+        command
+            .args(["--reuid", "65534", "--regid", "65534", "--clear-groups"])
+            .arg(copy);
+        command
+    } else {
+        fs::set_permissions(&device, fs::Permissions::from_mode(0o000)).unwrap();
+        Command::new(BINARY)
+    };
+    let output = command
+        .args(["doctor", "--port"])
+        .arg(&device)
+        .output()
+        .unwrap();
+    let stdout = String::from_utf8(output.stdout).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{stdout}");
+    assert!(stdout.contains("permission denied to "), "{stdout}");
+    assert!(stdout.contains("sudo "), "no cure in {stdout}");
+}
+
+#[test]
+fn a_simulated_sensor_ends_at_a_signal_and_takes_its_link_along() {
+    let bench = Bench::new();
+    let long = bench.path("long.bin");
+    for signal in [Signal::INT, Signal::TERM, Signal::HUP] {
+        let mut at_pty = bench.sensor(&[]);
+        let mut to_file = by_terminal();
+        to_file.args([
+            "simulate",
+            "--fps",
+            "1000",
+            "--presses",
+            "4000000000",
+            "--to",
+        ]);
+        let mut to_file = Process(to_file.arg(&long).spawn().unwrap());
+        wait_for("a frame", || {
+            fs::metadata(&long).is_ok_and(|file| file.len() > 0)
+        });
+        for process in [&mut at_pty, &mut to_file] {
+            let start = std::time::Instant::now();
+            process.signal(signal);
+            assert_eq!(process.exit_code(), Some(0), "{signal:?}");
+            let elapsed = start.elapsed();
+            assert!(elapsed.as_secs() < 1, "{signal:?}: {elapsed:?}");
+        }
+        assert!(
+            fs::symlink_metadata(bench.path("port")).is_err(),
+            "{signal:?}"
+        );
+        // The file has as many whole frames as there was time for.
+        assert_eq!(fs::metadata(&long).unwrap().len() % 790, 0);
+        fs::remove_file(&long).unwrap();
+    }
+}
+
+#[test]
+fn a_recording_that_does_not_fit_the_disk_leaves_nothing_behind() {
+    let bench = Bench::new();
+    let path = bench.path("long.bin").to_str().unwrap().to_owned();
+    // With this limit, the file ends as on a full disk.
+    let script = "ulimit -f 8; exec \"$@\"";
+    let mut simulate = Command::new("sh");
+    simulate.args(["-c", script, "sh", BINARY]);
+    let output = simulate
+        .args(["simulate", "--presses", "1", "--to", &path])
+        .output()
+        .unwrap();
+    let error = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(74), "{error}");
+    assert!(
+        error.starts_with(&format!("hardnessd: {path}: ")),
+        "{error}"
+    );
+    assert_eq!(error.lines().count(), 1, "{error}");
+    assert!(!Path::new(&path).exists());
+    // A device is not removed.
+    let (code, _, error) = run(&["simulate", "--presses", "1", "--to", "/dev/full"]);
+    assert_eq!(code, 74, "{error}");
+    assert!(Path::new("/dev/full").exists());
+}
+
+#[test]
+fn a_reader_gets_the_last_frame_of_a_simulated_sensor_whole() {
+    let bench = Bench::new();
+    let mut sensor = bench.sensor(&["--presses", "1"]);
+    let mut port = fs::File::open(bench.path("port")).unwrap();
+    let mut bytes = Vec::new();
+    let mut chunk = [0; 4096];
+    // Reading a pty at its end is an error.
+    while let Ok(read) = port.read(&mut chunk) {
+        bytes.extend_from_slice(&chunk[..read]);
+    }
+    assert_eq!(sensor.exit_code(), Some(0));
+    let last = bytes.len().checked_sub(790).expect("many frames");
+    assert_eq!(bytes[last..last + 4], [0xBB, 0xAA, 0x10, 0x03]);
+}
+
+#[test]
+fn a_link_that_became_anothers_is_left() {
+    let bench = Bench::new();
+    let mut sensor = bench.sensor(&[]);
+    let link = bench.path("port");
+    fs::remove_file(&link).unwrap();
+    std::os::unix::fs::symlink("/dev/null", &link).unwrap();
+    sensor.signal(Signal::HUP);
+    assert_eq!(sensor.exit_code(), Some(0));
+    assert_eq!(fs::read_link(&link).unwrap(), Path::new("/dev/null"));
+}
+
+/// Sniffing takes half a second. The test fails after ten, which are enough for a busy machine.
+#[test]
+fn ten_megabytes_are_sniffed_in_time() {
+    let bench = Bench::new();
+    let path = bench.path("long.bin").to_str().unwrap().to_owned();
+    let (code, _, stderr) = run(&["simulate", "--to", &path, "--fps", "100", "--presses", "40"]);
+    assert_eq!(code, 0, "{stderr}");
+    let bytes = fs::read(&path).unwrap();
+    wait_for("enough bytes", || bytes.len() > 10_000_000);
+    fs::write(Path::new(&path), &bytes[..10_000_000]).unwrap();
+    let start = std::time::Instant::now();
+    let (code, toml, stderr) = run(&["sniff", &path]);
+    let elapsed = start.elapsed();
+    assert_eq!(code, 0, "{stderr}");
+    assert!(toml.contains("preset = \"jx255n\""), "{toml}");
+    assert!(elapsed.as_secs() < 10, "{elapsed:?}");
+}

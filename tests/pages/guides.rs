@@ -1,0 +1,314 @@
+//! The guides in `docs/` are true: this test runs every command in them, unchanged, on a simulated
+//! sensor, and expects every line that they show.
+//! A `console` block has commands after `$ ` and their output, in which `...` matches anything. A
+//! `toml` or `python` block that begins with `# NAME` is a file of that name. Commands that need a
+//! machine of their own (`sudo`, `systemctl`) are in `sh` blocks. This test does not run those, but
+//! every `hardnessd` and `hrn-train` in a block of any page must be a valid command line. The unit
+//! tests of `hrn-train` check its own.
+
+use std::fs;
+use std::net::TcpListener;
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use crate::bench::BINARY;
+use crate::commands::{Call, blocks, calls, calls_of, names_of};
+use clap::Parser as _;
+use clap::error::ErrorKind;
+use hardnessd::tools::args::Args;
+use rustix::process::{Pid, Signal, kill_process_group};
+
+fn root() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// Whether `shown` occurs in the output `came`. `...` matches anything, also several lines.
+fn occurs(shown: &str, came: &str) -> bool {
+    let mut rest = came;
+    shown.split("...").all(|part| {
+        let part = part.trim_matches('\n');
+        match rest.find(part) {
+            Some(at) => {
+                rest = &rest[at + part.len()..];
+                true
+            }
+            None => false,
+        }
+    })
+}
+
+fn follow(guide: &str) {
+    let text = fs::read_to_string(root().join("docs").join(guide)).unwrap();
+    // Another program may use the ports of the guide on this machine.
+    let free = || {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        listener.local_addr().unwrap().port().to_string()
+    };
+    let text = text.replace("8255", &free()).replace("8256", &free());
+    // This machine may be busier than the reader's.
+    let text = text.replace("sleep 1\n", "sleep 3\n");
+    let place = tempfile::tempdir().unwrap();
+    let client = root().join("clients/python/hardnessd.py");
+    fs::copy(client, place.path().join("hardnessd.py")).unwrap();
+    let mut script = String::from("exec 2>&1\n");
+    let mut expected: Vec<(String, String)> = Vec::new();
+    for (kind, block) in blocks(&text) {
+        let name = block
+            .lines()
+            .next()
+            .and_then(|line| line.strip_prefix("# "));
+        match (kind.as_str(), name) {
+            ("toml" | "python", Some(name)) if !name.contains(' ') => {
+                script += &format!("cat > {name} <<'END OF FILE'\n{block}\nEND OF FILE\n");
+            }
+            ("console", _) => {
+                for part in format!("\n{block}").split("\n$ ").skip(1) {
+                    let (command, shown) = part.split_once('\n').unwrap_or((part, ""));
+                    script += &format!("{command}\necho \"@@ $?\"\n");
+                    expected.push((command.to_owned(), shown.to_owned()));
+                }
+            }
+            _ => {}
+        }
+    }
+    assert!(!expected.is_empty(), "{guide} has no commands");
+    let output = run(&script, place.path());
+    check(guide, &output, expected);
+}
+
+/// Compares the output of a script with what each of its commands should print.
+fn check(guide: &str, output: &str, expected: Vec<(String, String)>) {
+    let mut rest = output;
+    for (command, shown) in expected {
+        let (came, after) = rest
+            .split_once("@@ ")
+            .unwrap_or_else(|| panic!("{guide}: {command} did not end:\n{output}"));
+        let (code, after) = after.split_once('\n').unwrap();
+        assert_eq!(code, "0", "{guide}: {command}\n{came}");
+        assert!(
+            occurs(&shown, came),
+            "{guide}: {command}\nexpected\n{shown}\ncame\n{came}"
+        );
+        rest = after;
+    }
+}
+
+/// Runs a script to its end, then ends every process that the script left running.
+fn run(script: &str, place: &Path) -> String {
+    let binaries = Path::new(BINARY).parent().unwrap();
+    let path = std::env::var("PATH").unwrap();
+    let path = format!(
+        "{}:{}:{path}",
+        binaries.display(),
+        binaries.join("examples").display()
+    );
+    let child = Command::new("timeout")
+        .args(["--foreground", "240", "bash", "-c", script])
+        .current_dir(place)
+        .env("PATH", path)
+        .env("XDG_RUNTIME_DIR", place)
+        .env("RUST_LOG", "info")
+        .env_remove("RUNTIME_DIRECTORY")
+        .process_group(0)
+        .stdin(Stdio::null())
+        .stdout(fs::File::create(place.join(".output")).unwrap())
+        .stderr(Stdio::null())
+        .spawn();
+    let mut child = child.unwrap();
+    child.wait().unwrap();
+    let group = Pid::from_raw(i32::try_from(child.id()).unwrap()).unwrap();
+    // The group may already be empty.
+    let _ = kill_process_group(group, Signal::KILL);
+    fs::read_to_string(place.join(".output")).unwrap()
+}
+
+#[test]
+fn the_operators_guide_says_what_happens() {
+    follow("operator.md");
+}
+
+#[test]
+fn the_controllers_guide_says_what_happens() {
+    follow("controller.md");
+}
+
+#[test]
+fn the_guide_to_a_new_sensor_says_what_happens() {
+    follow("new-sensor.md");
+}
+
+#[test]
+fn the_guide_to_the_arms_motion_says_what_happens() {
+    follow("motion.md");
+}
+
+#[test]
+fn the_page_on_recordings_says_what_happens() {
+    follow("recordings.md");
+}
+
+#[test]
+fn dots_match_anything_and_the_rest_must_come() {
+    assert!(occurs("a ... c\n...\ne", "x\na b c\nd\ne\n"));
+    assert!(!occurs("a ... d", "a b c"));
+    assert!(occurs("", "anything"));
+}
+
+/// Whether this build has the command: some come with a feature.
+fn is_built(call: &Call) -> bool {
+    match call.words.get(1).map(String::as_str) {
+        Some("watch") => cfg!(feature = "watch"),
+        Some("fleet") => cfg!(feature = "zenoh"),
+        _ => true,
+    }
+}
+
+#[test]
+fn every_command_of_the_daemon_in_the_pages_is_a_valid_one() {
+    let calls = calls_of("hardnessd");
+    assert!(calls.len() > 50, "found {} commands", calls.len());
+    let wrong = calls
+        .iter()
+        .filter(|call| is_built(call))
+        .filter_map(|call| {
+            let error = Args::try_parse_from(&call.words).err()?;
+            Some(format!("{call}: {error}"))
+        });
+    let wrong: Vec<_> = wrong.collect();
+    assert!(wrong.is_empty(), "{wrong:#?}");
+}
+
+#[test]
+fn every_option_of_the_daemon_in_a_sentence_exists() {
+    let names = names_of("hardnessd");
+    assert!(names.len() > 30, "found {} commands", names.len());
+    let unknown = [ErrorKind::UnknownArgument, ErrorKind::InvalidSubcommand];
+    let wrong = names
+        .iter()
+        .filter(|name| is_built(name))
+        .filter_map(|name| {
+            let error = Args::try_parse_from(&name.words).err()?;
+            let is_unknown = unknown.contains(&error.kind());
+            is_unknown.then(|| format!("{name}: {error}"))
+        });
+    let wrong: Vec<_> = wrong.collect();
+    assert!(wrong.is_empty(), "{wrong:#?}");
+}
+
+#[test]
+fn commands_are_read_as_a_shell_reads_them() {
+    let text = "```sh\nmore='--seed 3 --json'\nfor n in 1 2; do hardnessd demo $more --presses $n; done\n\
+                until [ -e x ]; do sleep 1; done; cargo run -- tail \\\n    --types 'a b' | head\n```\n\
+                ```console\n$ sudo hardnessd check \\\n>   --confg x\nhardnessd output\n```\n";
+    let words: Vec<Vec<String>> = calls("a page", text)
+        .into_iter()
+        .map(|call| call.words)
+        .collect();
+    assert_eq!(
+        words,
+        [
+            &[
+                "hardnessd",
+                "demo",
+                "--seed",
+                "3",
+                "--json",
+                "--presses",
+                "1"
+            ][..],
+            &[
+                "hardnessd",
+                "demo",
+                "--seed",
+                "3",
+                "--json",
+                "--presses",
+                "2"
+            ],
+            &["hardnessd", "tail", "--types", "a b"],
+            &["hardnessd", "check", "--confg", "x"],
+        ]
+    );
+    let is_valid: Vec<bool> = words
+        .iter()
+        .map(|words| Args::try_parse_from(words).is_ok())
+        .collect();
+    assert_eq!(is_valid, [true, true, false, false]);
+}
+
+#[test]
+fn the_readmes_demonstration_has_the_verdicts_that_it_shows() {
+    let text = fs::read_to_string(root().join("README.md")).unwrap();
+    let command = calls("README.md", &text)
+        .into_iter()
+        .find(|call| call.words.get(1).is_some_and(|word| word == "demo"))
+        .expect("the README begins with the demonstration");
+    let shown = blocks(&text)
+        .into_iter()
+        .find_map(|(_, block)| block.contains("\npress 1 ").then_some(block))
+        .expect("the README shows the presses");
+    let place = tempfile::tempdir().unwrap();
+    let script = format!("{} --speed 10 2>/dev/null", command.words.join(" "));
+    let output = run(&script, place.path());
+    let verdicts: Vec<String> = output
+        .lines()
+        .map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap())
+        .filter(|event| event["phase"] == "final")
+        .map(|event| {
+            format!(
+                "{} {:.0} % {:.1} N",
+                event["label"].as_str().unwrap(),
+                100.0 * event["confidence"].as_f64().unwrap(),
+                event["force_n"].as_f64().unwrap()
+            )
+        })
+        .collect();
+    let shown: Vec<String> = shown
+        .lines()
+        .filter_map(|line| line.split_once("->"))
+        .map(|(_, verdict)| {
+            let words = verdict.split_whitespace().filter(|word| *word != "ok");
+            words.collect::<Vec<_>>().join(" ")
+        })
+        .collect();
+    assert_eq!(shown.len(), 4);
+    assert_eq!(verdicts, shown);
+}
+
+/// The commands of the reference page that finish in seconds. `compare` without `--plan` trains for
+/// hours.
+#[test]
+fn the_reference_page_shows_commands_that_work() {
+    let page = fs::read_to_string(root().join("docs/command-line.md")).unwrap();
+    let place = tempfile::tempdir().unwrap();
+    fs::copy(root().join("models/hrn.onnx"), place.path().join("M.onnx")).unwrap();
+    let mut script = String::from(
+        "exec 2>&1\nhrn-train simulate --out data.npz --objects 1 --test-objects 1 --presses 2\n\
+         cp data.npz D.npz\necho \"@@ $?\"\n",
+    );
+    let mut expected = vec![("simulate".to_owned(), "data.npz: 16 samples".to_owned())];
+    let blocks = blocks(&page).into_iter().filter(|(kind, _)| kind == "sh");
+    for command in
+        blocks.flat_map(|(_, block)| block.lines().map(str::to_owned).collect::<Vec<_>>())
+    {
+        let shown = if command.contains(" adopt ") {
+            "H.onnx: sha256 "
+        } else if command.contains(" --plan ") {
+            ""
+        } else {
+            continue;
+        };
+        script += &format!("{command}\necho \"@@ $?\"\n");
+        expected.push((command, shown.to_owned()));
+    }
+    assert_eq!(expected.len(), 3, "{expected:?}");
+    for more in [
+        "hrn-train check-model H.onnx",
+        "grep -c 'hrn-train train' runs.sh",
+    ] {
+        script += &format!("{more}\necho \"@@ $?\"\n");
+        expected.push((more.to_owned(), String::new()));
+    }
+    check("command-line.md", &run(&script, place.path()), expected);
+}

@@ -1,0 +1,708 @@
+//! Recordings of the real binary on a real pty: replayed, cut off, damaged, and on a bad disk.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use crate::bench::{
+    BINARY, Bench, Daemon, PATIENCE, Process, Subscriber, by_terminal, hardnessd, wait_for,
+};
+use hardnessd_core::recording::{Entry, Found, Input, Reader};
+use hardnessd_simulator::random::Stream;
+use rustix::process::Signal;
+use serde_json::{Value, json};
+
+/// A configuration without paths of sockets, for `record`.
+fn configure(bench: &Bench, fps: u32) -> PathBuf {
+    let path = bench.path("record.toml");
+    let text =
+        format!("[[sensor]]\nname = \"forearm\"\nport = \"port\"\nframe_rate_hz = {fps}.0\n");
+    fs::write(&path, text).unwrap();
+    path
+}
+
+/// A configuration whose sensor is stale only after 1.25 s, so that a busy machine causes no fault.
+fn configure_patient(bench: &Bench, record: &str) -> PathBuf {
+    let config = bench.configure("hardnessd.toml", "events.sock", record);
+    let text = fs::read_to_string(&config).unwrap();
+    fs::write(
+        &config,
+        text.replace("frame_rate_hz = 20.0", "frame_rate_hz = 2.0"),
+    )
+    .unwrap();
+    config
+}
+
+fn record(config: &Path, out: &Path, more: &[&str]) -> Process {
+    let mut command = by_terminal();
+    command.args(["record", "--config"]).arg(config);
+    command.arg("--out").arg(out).args(more);
+    let child = command.stderr(Stdio::null()).stdout(Stdio::null()).spawn();
+    Process(child.unwrap())
+}
+
+fn replay(recording: &Path) -> Vec<Value> {
+    let output = hardnessd(&["replay", recording.to_str().unwrap()]);
+    assert!(output.status.success(), "{recording:?}: {output:?}");
+    assert_eq!(
+        output.stdout,
+        hardnessd(&["replay", recording.to_str().unwrap(), "--speed", "1000"]).stdout,
+        "twice the same, whatever the speed"
+    );
+    let text = String::from_utf8(output.stdout).unwrap();
+    text.lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect()
+}
+
+/// An event without the fields that only a live event has.
+fn timeless(mut event: Value) -> Value {
+    for key in ["mono_ns", "age_at_publish_ms", "latency_us"] {
+        if let Some(value) = event.get_mut(key) {
+            *value = Value::Null;
+        }
+    }
+    event
+}
+
+fn entries(recording: &Path) -> Vec<Found> {
+    let file = fs::File::open(recording).unwrap();
+    Reader::new(std::io::BufReader::new(file))
+        .map(Result::unwrap)
+        .collect()
+}
+
+fn is_bytes(found: &Found) -> bool {
+    matches!(found.entry, Entry::Input(Input::Bytes(_)))
+}
+
+fn recordings_in(directory: &Path, what: &str) -> Vec<PathBuf> {
+    let Ok(found) = fs::read_dir(directory) else {
+        return Vec::new();
+    };
+    let mut found: Vec<PathBuf> = found.map(|entry| entry.unwrap().path()).collect();
+    found.retain(|path| {
+        path.file_name()
+            .unwrap()
+            .to_str()
+            .unwrap()
+            .starts_with(what)
+    });
+    found.sort();
+    found
+}
+
+fn mono() -> Duration {
+    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    Duration::try_from(now).unwrap()
+}
+
+#[test]
+fn a_replay_repeats_what_subscribers_read_live() {
+    let bench = Bench::new();
+    let script = bench.path("faults.toml");
+    fs::write(
+        &script,
+        "[[fault]]\nat_s = 2.0\nkind = \"flip\"\nframes = 3\n\
+         [[fault]]\nat_s = 4.0\nkind = \"drop-bytes\"\nbytes = 9\n\
+         [[fault]]\nat_s = 6.0\nkind = \"silence\"\nfor_s = 0.4\n\
+         [[fault]]\nat_s = 8.0\nkind = \"unplug\"\nfor_s = 0.3\n",
+    )
+    .unwrap();
+    let config = bench.configure(
+        "hardnessd.toml",
+        "events.sock",
+        "[record]\ndir = \"rec\"\nkeep_free_mb = 0\n",
+    );
+    let mut daemon = Daemon::start(&config);
+    let mut subscriber = bench.subscriber();
+    let mut sensor = bench.sensor(&["--presses", "3", "--faults", script.to_str().unwrap()]);
+    let mut control = Subscriber::connect(&bench.path("control.sock"));
+    let context = r#"{"context":{"sensor":"forearm","tag":"pick"}}"#;
+    assert_eq!(control.ask(context)["type"], "ok");
+    assert_eq!(sensor.exit_code(), Some(0));
+    daemon.process.signal(Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    let mut live: Vec<Value> = std::iter::from_fn(|| subscriber.next()).collect();
+    live.retain(|event| event["seq"].is_u64() && event["type"] != "hello");
+    let states: Vec<&Value> = live.iter().map(|event| &event["state"]).collect();
+    assert!(states.contains(&&json!("stale")) && states.contains(&&json!("lost")));
+    assert!(
+        live.iter()
+            .filter(|event| event["phase"] == "final")
+            .count()
+            >= 2
+    );
+
+    let recordings = recordings_in(&bench.path("rec"), "hardnessd-");
+    let [recording] = recordings.as_slice() else {
+        panic!("{recordings:?}");
+    };
+    let mut replayed = replay(recording);
+    let end = replayed.pop().unwrap();
+    assert_eq!(end["reason"], "end of recording");
+    // The subscriber connected a moment after the start.
+    let first = live[0]["seq"].as_u64().unwrap();
+    replayed.retain(|event| event["seq"].as_u64().unwrap() >= first);
+    let live: Vec<Value> = live.into_iter().map(timeless).collect();
+    assert_eq!(replayed, live);
+}
+
+/// The verdicts on one of two sensors, without their numbers, which run over both sensors.
+fn verdicts_of(events: &[Value], sensor: &str) -> Vec<Value> {
+    let verdicts = events
+        .iter()
+        .filter(|event| event["type"] == "hardness" && event["sensor"] == sensor);
+    verdicts
+        .map(|event| {
+            let mut event = timeless(event.clone());
+            event["seq"].take();
+            event
+        })
+        .collect()
+}
+
+#[test]
+fn two_sensors_in_one_recording_are_judged_as_they_were_live() {
+    let bench = Bench::new();
+    let more = "[[sensor]]\nname = \"wrist\"\nport = \"port-2\"\nframe_rate_hz = 20.0\n\
+                [record]\ndir = \"rec\"\nkeep_free_mb = 0\n";
+    let config = bench.configure("hardnessd.toml", "events.sock", more);
+    let mut daemon = Daemon::start(&config);
+    let mut subscriber = bench.subscriber();
+    let mut forearm = bench.sensor(&["--presses", "2"]);
+    let mut wrist = bench.sensor_at("port-2", 20, &["--presses", "3", "--seed", "2"]);
+    assert_eq!((forearm.exit_code(), wrist.exit_code()), (Some(0), Some(0)));
+    daemon.process.signal(Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    let live: Vec<Value> = std::iter::from_fn(|| subscriber.next()).collect();
+    let recordings = recordings_in(&bench.path("rec"), "hardnessd-");
+    let [recording] = recordings.as_slice() else {
+        panic!("{recordings:?}");
+    };
+    let replayed = replay(recording);
+    for (sensor, presses) in [("forearm", 2), ("wrist", 3)] {
+        let verdicts = verdicts_of(&live, sensor);
+        let finals = verdicts.iter().filter(|event| event["phase"] == "final");
+        assert_eq!(finals.count(), presses, "{sensor}");
+        assert_eq!(verdicts_of(&replayed, sensor), verdicts);
+    }
+
+    // `record` also records both sensors in one file.
+    let out = bench.path("both.mcap");
+    let mut recording = record(&config, &out, &[]);
+    // Without a sensor at a port, there is nothing to record.
+    assert_eq!(recording.exit_code(), Some(69));
+    let mut forearm = bench.sensor(&["--presses", "1"]);
+    let mut wrist = bench.sensor_at("port-2", 20, &["--presses", "1", "--seed", "2"]);
+    let mut recording = record(&config, &out, &[]);
+    forearm.exit_code();
+    wrist.exit_code();
+    assert_eq!(recording.exit_code(), Some(69), "the last one is lost");
+    let replayed = replay(&out);
+    for sensor in ["forearm", "wrist"] {
+        assert!(!verdicts_of(&replayed, sensor).is_empty(), "{sensor}");
+    }
+}
+
+#[test]
+fn a_terminal_that_goes_ends_a_recording_whole_unless_it_shall_outlive_it() {
+    let bench = Bench::new();
+    let _sensor = bench.sensor(&[]);
+    let config = configure(&bench, 20);
+    let recorded = |out: &Path| {
+        wait_for("the file", || {
+            fs::metadata(out).is_ok_and(|file| file.len() > 8_000)
+        });
+    };
+    let out = bench.path("a.mcap");
+    let mut recording = record(&config, &out, &[]);
+    recorded(&out);
+    recording.signal(Signal::HUP);
+    assert_eq!(recording.exit_code(), Some(0));
+    assert_eq!(replay(&out).last().unwrap()["reason"], "end of recording");
+
+    let out = bench.path("take1");
+    let mut command = Command::new("nohup");
+    command
+        .arg(BINARY)
+        .args(["record", "--config"])
+        .arg(&config);
+    command.arg("--out").arg(&out).stdout(Stdio::null());
+    let mut recording = Process(command.stderr(Stdio::null()).spawn().unwrap());
+    recorded(&out);
+    recording.signal(Signal::HUP);
+    let before = fs::metadata(&out).unwrap().len();
+    wait_for("more", || {
+        fs::metadata(&out).unwrap().len() > before + 8_000
+    });
+    recording.signal(Signal::TERM);
+    assert_eq!(recording.exit_code(), Some(0));
+    replay(&out);
+}
+
+#[test]
+fn record_writes_a_new_file_for_as_long_as_there_is_a_sensor() {
+    let bench = Bench::new();
+    let config = configure(&bench, 20);
+    let out = bench.path("a.mcap");
+    let labels = ["--label", "level=2", "--label", "object=7"];
+    // A label with a level that the model does not have is refused.
+    for level in ["level=9", "level=hard", "level=-1"] {
+        let config = config.to_str().unwrap();
+        let out = out.to_str().unwrap();
+        let output = hardnessd(&["record", "--config", config, "--out", out, "--label", level]);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(
+            said.contains("1 (hard), 2 (firm)") && said.lines().count() == 1,
+            "{said}"
+        );
+    }
+    let [at, to] = [&config, &out].map(|path| path.to_str().unwrap());
+    let twice = ["--label", "object=1", "--label", "object=2"];
+    let twice = [&["record", "--config", at, "--out", to], &twice[..]].concat();
+    let said = String::from_utf8(hardnessd(&twice).stderr).unwrap();
+    assert!(said.contains("--label object: given twice"), "{said}");
+    // Without anything to record, `record` says so and leaves no file.
+    let none = hardnessd(&["record", "--config", at, "--out", to]);
+    let said = String::from_utf8(none.stderr).unwrap();
+    assert_eq!(none.status.code(), Some(69), "{said}");
+    assert!(!said.contains("recorded"), "{said}");
+    assert!(!out.exists());
+
+    let _sensor = bench.sensor(&[]);
+    let seconds = [&labels[..], &["--seconds", "1.5"]].concat();
+    let mut recording = record(&config, &out, &seconds);
+    assert_eq!(recording.exit_code(), Some(0));
+    let found = entries(&out);
+    let Entry::State(state) = &found[0].entry else {
+        panic!("{:?}", found[0]);
+    };
+    assert_eq!(state.labels["object"], "7");
+    assert!(found.iter().filter(|found| is_bytes(found)).count() > 20);
+    let last = &found.last().unwrap().entry;
+    assert_eq!(*last, Entry::Input(Input::Shutdown));
+    let before = fs::read(&out).unwrap();
+    let mut again = record(&config, &out, &[]);
+    assert_eq!(again.exit_code(), Some(74));
+    assert_eq!(fs::read(&out).unwrap(), before);
+
+    // A signal also ends it. So does the loss of its sensor, with another exit code.
+    let second = bench.path("b.mcap");
+    let mut recording = record(&config, &second, &[]);
+    wait_for("a frame", || {
+        fs::metadata(&second).is_ok_and(|file| file.len() > 8_000)
+    });
+    recording.signal(Signal::INT);
+    assert_eq!(recording.exit_code(), Some(0));
+    replay(&second);
+    let third = bench.path("c.mcap");
+    let mut sensor = bench.sensor_at("port", 20, &["--presses", "1"]);
+    let mut recording = record(&config, &third, &[]);
+    assert_eq!(sensor.exit_code(), Some(0));
+    assert_eq!(recording.exit_code(), Some(69));
+    let events = replay(&third);
+    assert_eq!(
+        events
+            .iter()
+            .filter(|event| event["phase"] == "final")
+            .count(),
+        1
+    );
+    let lost = events
+        .iter()
+        .find(|event| event["state"] == "lost")
+        .unwrap();
+    assert!(lost["reason"].is_string(), "{lost}");
+}
+
+#[test]
+fn killed_at_any_moment_less_than_a_second_is_lost() {
+    kill_recordings(10);
+}
+
+/// This test takes minutes: run it by hand.
+#[test]
+#[ignore = "heavy"]
+fn killed_a_hundred_times_less_than_a_second_is_lost_each_time() {
+    let worst = kill_recordings(100);
+    println!("100 recordings killed, at most {worst:?} lost");
+}
+
+/// Kills `record` at random moments, and returns the most that one recording lost.
+fn kill_recordings(rounds: u32) -> Duration {
+    let mut worst = Duration::ZERO;
+    let bench = Bench::new();
+    let config = configure(&bench, 100);
+    let _sensor = bench.sensor_at("port", 100, &[]);
+    let mut moments = Stream::new(1, "moments of death");
+    for round in 0..rounds {
+        let out = bench.path(&format!("{round}.mcap"));
+        let good = bench.path(&format!("{round}.good.mcap"));
+        let mut recording = record(&config, &out, &[]);
+        wait_for("the file", || {
+            fs::metadata(&out).is_ok_and(|file| file.len() > 8_000)
+        });
+        std::thread::sleep(Duration::from_secs_f64(1.5 * moments.uniform()));
+        let before = mono();
+        recording.signal(Signal::KILL);
+        recording.exit_code();
+        let output = hardnessd(&[
+            "recover",
+            out.to_str().unwrap(),
+            "--out",
+            good.to_str().unwrap(),
+        ]);
+        assert!(output.status.success(), "{output:?}");
+        let found = entries(&good);
+        let last = found.iter().rfind(|found| is_bytes(found)).unwrap();
+        let lost = before.saturating_sub(last.at.mono);
+        assert!(
+            lost < Duration::from_secs(1),
+            "{lost:?} lost in round {round}"
+        );
+        worst = worst.max(lost);
+        // Nothing is missing in between: bytes came every 4 ms or so.
+        let moments: Vec<Duration> = found.iter().map(|found| found.at.mono).collect();
+        let gap = moments.windows(2).map(|two| two[1] - two[0]).max().unwrap();
+        assert!(gap < Duration::from_millis(500), "{gap:?} in round {round}");
+        let events = replay(&good);
+        assert_eq!(events.last().unwrap()["reason"], "end of recording");
+        fs::remove_file(out).unwrap();
+        fs::remove_file(good).unwrap();
+    }
+    worst
+}
+
+#[test]
+fn recover_says_what_it_saved_and_leaves_files_alone() {
+    let bench = Bench::new();
+    let path = |name: &str| bench.path(name).to_str().unwrap().to_owned();
+    let recover = |broken: &str, good: &str| {
+        let output = hardnessd(&["recover", &path(broken), "--out", &path(good)]);
+        let said = String::from_utf8(output.stderr).unwrap();
+        (output.status.code().unwrap(), said)
+    };
+    let (code, said) = recover("none.mcap", "good.mcap");
+    assert_eq!(code, 66, "{said}");
+    // This file, with a name like that of an unfinished recording, belongs to somebody else.
+    fs::write(path("good.mcap.part"), "theirs").unwrap();
+    fs::write(path("noise.mcap"), vec![7; 100_000]).unwrap();
+    let (code, said) = recover("noise.mcap", "good.mcap");
+    assert_eq!(code, 1, "{said}");
+    assert!(!bench.path("good.mcap").exists());
+    let output = Command::new(BINARY)
+        .args(["recover", "/dev/stdin", "--out", &path("good.mcap")])
+        .stdin(Stdio::piped())
+        .output()
+        .unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(66), "{said}");
+    assert!(said.contains("/dev/stdin: cannot read: "), "{said}");
+
+    let _sensor = bench.sensor(&[]);
+    let config = configure(&bench, 20);
+    let out = bench.path("a.mcap");
+    assert_eq!(
+        record(&config, &out, &["--seconds", "3"]).exit_code(),
+        Some(0)
+    );
+    let (code, said) = recover("a.mcap", "whole.mcap");
+    assert_eq!(code, 0, "{said}");
+    assert!(said.contains("lost nothing"), "{said}");
+    let (code, said) = recover("noise.mcap", "whole.mcap");
+    assert_eq!(code, 74, "{said}");
+    assert_eq!(replay(&bench.path("whole.mcap")), replay(&out));
+
+    // A recording that is cut off anywhere is played to its end, and ends with the same last events
+    // as raw bytes.
+    let whole = fs::read(&out).unwrap();
+    let mut aborted = 0;
+    for cut in [
+        0,
+        1,
+        8,
+        100,
+        whole.len() / 4,
+        whole.len() / 2,
+        whole.len() * 3 / 4,
+    ] {
+        fs::write(path("cut.mcap"), &whole[..cut]).unwrap();
+        let output = hardnessd(&["replay", &path("cut.mcap")]);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert_eq!(said.lines().count(), 1, "{said}");
+        let events = String::from_utf8(output.stdout).unwrap();
+        let events: Vec<&str> = events.lines().collect();
+        assert_eq!(events.is_empty(), cut <= 100, "{events:?}");
+        if let [.., before, last] = events.as_slice() {
+            assert!(last.contains(r#""reason":"end of recording""#), "{last}");
+            aborted += usize::from(before.contains("aborted"));
+        }
+        let presses = |state: &str| events.iter().filter(|event| event.contains(state)).count();
+        let (begun, ended) = (presses(r#""begin""#), presses(r#""end""#));
+        assert_eq!(begun, ended + presses(r#""aborted""#), "{events:?}");
+    }
+    assert!(aborted > 0, "no cut lies within a press");
+
+    let mut bytes = fs::read(&out).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 4;
+    fs::write(&out, bytes).unwrap();
+    // The remains of a killed try do not hinder the next one, and are removed.
+    fs::write(path("good.mcap.part.part"), &whole[..1000]).unwrap();
+    let (code, said) = recover("a.mcap", "good.mcap");
+    assert_eq!(code, 0, "{said}");
+    let left = fs::read_dir(bench.path("")).unwrap();
+    let parts = left.filter(|entry| {
+        let name = entry.as_ref().unwrap().file_name();
+        name.to_str().unwrap().ends_with(".part")
+    });
+    assert_eq!(parts.count(), 1);
+    let theirs = fs::read_to_string(path("good.mcap.part")).unwrap();
+    assert_eq!(theirs, "theirs");
+    replay(&bench.path("good.mcap"));
+}
+
+#[test]
+fn what_other_programs_recorded_is_no_recording_of_ours() {
+    let bench = Bench::new();
+    let path = |name: &str| bench.path(name).to_str().unwrap().to_owned();
+    let mut foreign = mcap::Writer::new(fs::File::create(path("foreign.mcap")).unwrap()).unwrap();
+    let channel = foreign.add_channel(
+        0,
+        "/camera/image",
+        "json",
+        &std::collections::BTreeMap::new(),
+    );
+    let header = mcap::records::MessageHeader {
+        channel_id: channel.unwrap(),
+        sequence: 1,
+        log_time: 1,
+        publish_time: 1,
+    };
+    foreign.write_to_known_channel(&header, b"{}").unwrap();
+    foreign.finish().unwrap();
+    for (arguments, found) in [
+        (
+            vec!["replay".to_owned(), path("foreign.mcap")],
+            "no state of a sensor, expected a recording of hardnessd",
+        ),
+        (
+            vec![
+                "recover".to_owned(),
+                path("foreign.mcap"),
+                "--out".to_owned(),
+                path("good.mcap"),
+            ],
+            "nothing to save: all 1 messages are of other programs",
+        ),
+    ] {
+        let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+        let output = hardnessd(&arguments);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert!(said.contains(found) && said.lines().count() == 1, "{said}");
+        assert!(!bench.path("good.mcap").exists());
+    }
+}
+
+#[test]
+fn the_last_minute_is_written_on_request_and_at_a_fault() {
+    let bench = Bench::new();
+    let record = "[record]\ndir = \"rec\"\ncontinuous = false\nkeep_free_mb = 0\n";
+    let config = configure_patient(&bench, record);
+    let mut daemon = Daemon::start(&config);
+    let mut sensor = bench.sensor(&["--presses", "2"]);
+    let mut subscriber = bench.subscriber();
+    let live = subscriber.until(&json!({"phase": "final"}));
+    let mut control = Subscriber::connect(&bench.path("control.sock"));
+    let answer = control.ask(r#"{"blackbox":"forearm","id":1}"#);
+    assert_eq!(answer["type"], "ok", "{answer}");
+    let again = control.ask(r#"{"blackbox":"forearm","id":2}"#);
+    assert_eq!((&again["type"], &again["id"]), (&"error".into(), &2.into()));
+    let written = PathBuf::from(answer["blackbox"].as_str().unwrap());
+    let events = replay(&written);
+    let verdict = events
+        .iter()
+        .find(|event| event["phase"] == "final")
+        .unwrap();
+    let mut live = timeless(live);
+    live["seq"] = verdict["seq"].clone();
+    assert_eq!(*verdict, live);
+    let unknown = control.ask(r#"{"blackbox":"wrist"}"#);
+    assert_eq!(unknown["type"], "error", "{unknown}");
+
+    assert_eq!(sensor.exit_code(), Some(0));
+    let line = daemon.logged("reason=\"lost\"");
+    assert!(line.contains("black box"), "{line}");
+    let boxes = recordings_in(&bench.path("rec"), "");
+    assert_eq!(boxes.len(), 2, "{boxes:?}");
+    let events = replay(boxes.iter().find(|path| **path != written).unwrap());
+    assert!(events.iter().any(|event| event["state"] == "lost"));
+    // A second fault within the minute writes no black box.
+    let _sensor = bench.sensor(&["--presses", "1"]);
+    subscriber.until(&json!({"state": "live"}));
+    subscriber.until(&json!({"state": "lost"}));
+    daemon.process.signal(Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    assert_eq!(recordings_in(&bench.path("rec"), "").len(), 2);
+}
+
+#[test]
+fn much_damage_is_a_fault() {
+    let bench = Bench::new();
+    let record = "[record]\ndir = \"rec\"\ncontinuous = false\nkeep_free_mb = 0\n";
+    let config = configure_patient(&bench, record);
+    let script = bench.path("faults.toml");
+    // Half of the frames are damaged, but never so many in a row that the sensor becomes stale.
+    let faults: String = (1..9)
+        .map(|at_s| format!("[[fault]]\nat_s = {at_s}.0\nkind = \"flip\"\nframes = 10\n"))
+        .collect();
+    fs::write(&script, faults).unwrap();
+    let mut daemon = Daemon::start(&config);
+    let _sensor = bench.sensor(&["--faults", script.to_str().unwrap()]);
+    let line = daemon.logged("black box");
+    assert!(line.contains("damaged frames"), "{line}");
+    let boxes = recordings_in(&bench.path("rec"), "blackbox-forearm-");
+    let events = replay(&boxes[0]);
+    let end = events.last().unwrap();
+    assert!(end["frames_damaged"].as_u64().unwrap() >= 50, "{end}");
+}
+
+#[test]
+fn files_end_in_time_and_each_can_be_played_by_itself() {
+    let bench = Bench::new();
+    let record = "[record]\ndir = \"rec\"\nrotate_s = 2\nkeep_free_mb = 0\n";
+    let config = bench.configure("hardnessd.toml", "events.sock", record);
+    let mut daemon = Daemon::start(&config);
+    let _sensor = bench.sensor(&[]);
+    let mut subscriber = bench.subscriber();
+    let mut verdicts = Vec::new();
+    while recordings_in(&bench.path("rec"), "hardnessd-").len() < 4 {
+        verdicts.push(subscriber.until(&json!({"phase": "final"})));
+    }
+    daemon.process.signal(Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    let mut played: Vec<(u64, Value)> = Vec::new();
+    for recording in recordings_in(&bench.path("rec"), "hardnessd-") {
+        for mut event in replay(&recording) {
+            if event["phase"] == "final" {
+                event["seq"] = Value::Null;
+                played.push((event["press"].as_u64().unwrap(), event));
+            }
+        }
+    }
+    for live in verdicts {
+        let press = live["press"].as_u64().unwrap();
+        let mut live = timeless(live);
+        live["seq"] = Value::Null;
+        let same: Vec<_> = played
+            .iter()
+            .filter(|(number, _)| *number == press)
+            .collect();
+        assert!(!same.is_empty(), "press {press} is in no file");
+        assert!(same.iter().all(|(_, event)| *event == live));
+    }
+}
+
+#[test]
+fn a_recording_that_is_deleted_begins_anew() {
+    let bench = Bench::new();
+    let record = "[record]\ndir = \"rec\"\nkeep_free_mb = 0\n";
+    let config = bench.configure("hardnessd.toml", "events.sock", record);
+    let mut daemon = Daemon::start(&config);
+    let _sensor = bench.sensor(&[]);
+    let mut subscriber = bench.subscriber();
+    subscriber.until(&json!({"phase": "final"}));
+    let directory = bench.path("rec");
+    let first = recordings_in(&directory, "hardnessd-").remove(0);
+    fs::remove_dir_all(&directory).unwrap();
+    let line = daemon.logged("the recording was deleted");
+    assert!(line.contains(first.to_str().unwrap()), "{line}");
+    daemon.logged("recording path=");
+    subscriber.until(&json!({"phase": "final"}));
+    daemon.process.signal(Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    let recordings = recordings_in(&directory, "hardnessd-");
+    assert_eq!(recordings.len(), 1, "{recordings:?}");
+    assert!(
+        replay(&recordings[0])
+            .iter()
+            .any(|event| event["phase"] == "final")
+    );
+}
+
+#[test]
+fn a_disk_that_is_full_or_fails_does_not_stop_the_sensor() {
+    // With too little free space, recording stops with one message, and nothing is written.
+    let bench = Bench::new();
+    let record = "[record]\ndir = \"rec\"\nkeep_free_mb = 1000000000\n";
+    let config = bench.configure("hardnessd.toml", "events.sock", record);
+    let mut daemon = Daemon::start(&config);
+    // The message may come before or after the daemon serves.
+    if !daemon
+        .heard
+        .iter()
+        .any(|line| line.contains("recording stopped"))
+    {
+        daemon.logged("recording stopped");
+    }
+    let mut sensor = bench.sensor(&["--presses", "1"]);
+    let mut subscriber = bench.subscriber();
+    subscriber.until(&json!({"phase": "final"}));
+    let mut control = Subscriber::connect(&bench.path("control.sock"));
+    let answer = control.ask(r#"{"blackbox":"forearm"}"#);
+    assert!(answer["message"].as_str().unwrap().contains("keep_free_mb"));
+    assert_eq!(sensor.exit_code(), Some(0));
+    daemon.process.signal(Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    let log = daemon.whole_log();
+    assert_eq!(log.matches("recording stopped").count(), 1, "{log}");
+    assert_eq!(recordings_in(&bench.path("rec"), ""), Vec::<PathBuf>::new());
+}
+
+#[test]
+fn recording_goes_on_when_writes_succeed_again() {
+    // No file may grow beyond 64 blocks of 1 KiB, which acts like a full disk. That is some 8 s of
+    // this sensor, so there is a moment when everything since its last state fits.
+    let bench = Bench::new();
+    let record = "[record]\ndir = \"rec\"\nkeep_free_mb = 0\n";
+    let config = bench.configure("hardnessd.toml", "events.sock", record);
+    let script = format!(
+        "ulimit -f 64; exec {BINARY} run --config {}",
+        config.display()
+    );
+    let child = Command::new("bash")
+        .args(["-c", &script])
+        .stderr(Stdio::null())
+        .spawn();
+    let mut daemon = Process(child.unwrap());
+    wait_for("the socket", || bench.path("events.sock").exists());
+    let _sensor = bench.sensor_at("port", 20, &[]);
+    let mut subscriber = bench.subscriber();
+    let start = std::time::Instant::now();
+    let mut verdicts = 0;
+    while recordings_in(&bench.path("rec"), "hardnessd-").len() < 2 {
+        subscriber.until(&json!({"phase": "final"}));
+        verdicts += 1;
+        assert!(start.elapsed() < PATIENCE, "no second file");
+    }
+    assert!(verdicts > 0);
+    daemon.signal(Signal::TERM);
+    assert_eq!(daemon.exit_code(), Some(0));
+    // An incomplete recording can be saved, and a file that could not be begun is removed.
+    for broken in recordings_in(&bench.path("rec"), "hardnessd-") {
+        let good = broken.with_extension("good");
+        let output = hardnessd(&[
+            "recover",
+            broken.to_str().unwrap(),
+            "--out",
+            good.to_str().unwrap(),
+        ]);
+        assert!(output.status.success(), "{output:?}");
+        assert!(!entries(&good).is_empty(), "{}", broken.display());
+    }
+}

@@ -1,0 +1,311 @@
+//! Recorded bytes give exactly the expected events, at any pace and in any chunks.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use hardnessd_core::event::Event;
+use hardnessd_core::frame::Stamp;
+use hardnessd_core::pipeline::{Clock, Pipeline};
+use hardnessd_core::sensor::{Description, Sensor};
+use hardnessd_core::verdict::{BUILT_IN, Hrn};
+use serde_json::Value;
+
+fn fixtures() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures")
+}
+
+/// Every recording, with the configuration for its rate and its golden events.
+fn recordings() -> Vec<(PathBuf, PathBuf, PathBuf)> {
+    let mut found: Vec<_> = std::fs::read_dir(fixtures())
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.extension().is_some_and(|extension| extension == "bin"))
+        .map(|path| {
+            let rate = Path::new(path.file_stem().unwrap()).extension().unwrap();
+            let config = fixtures().join(rate).with_extension("toml");
+            let golden = path.with_extension("jsonl");
+            (path, config, golden)
+        })
+        .collect();
+    found.sort();
+    found
+}
+
+fn replay(recording: &Path, more: &[&str]) -> String {
+    let output = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
+        .arg("replay")
+        .arg(recording)
+        .args(more)
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{recording:?}: {output:?}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// Asserts that events are equal, except for probabilities, which may differ by 1e-4 between
+/// machines.
+fn assert_same(found: &str, golden: &str, recording: &Path) {
+    let events = |text: &str| -> Vec<Value> {
+        text.lines()
+            .map(|line| serde_json::from_str(line).unwrap())
+            .collect()
+    };
+    let (mut found, mut golden) = (events(found), events(golden));
+    assert_eq!(found.len(), golden.len(), "{recording:?}");
+    for (found, golden) in found.iter_mut().zip(&mut golden) {
+        for key in ["probabilities", "confidence"] {
+            let numbers = |event: &mut Value| -> Vec<f64> {
+                match event.as_object_mut().unwrap().remove(key) {
+                    Some(Value::Array(numbers)) => numbers
+                        .iter()
+                        .map(|number| number.as_f64().unwrap())
+                        .collect(),
+                    Some(number) => vec![number.as_f64().unwrap()],
+                    None => vec![],
+                }
+            };
+            let (found, golden) = (numbers(found), numbers(golden));
+            assert_eq!(found.len(), golden.len());
+            for (found, golden) in found.iter().zip(golden) {
+                assert!(
+                    (found - golden).abs() <= 1e-4,
+                    "{recording:?}: {found} for {golden}"
+                );
+            }
+        }
+        assert_eq!(found, golden, "{recording:?}");
+    }
+}
+
+#[test]
+fn recordings_give_their_golden_events_twice_the_same() {
+    let recordings = recordings();
+    assert!(
+        recordings.len() >= 13,
+        "found {} recordings",
+        recordings.len()
+    );
+    for (recording, config, golden) in recordings {
+        let config = config.to_str().unwrap();
+        let events = replay(&recording, &["--config", config]);
+        assert_eq!(
+            events,
+            replay(&recording, &["--config", config]),
+            "{recording:?}"
+        );
+        assert_same(
+            &events,
+            &std::fs::read_to_string(golden).unwrap(),
+            &recording,
+        );
+    }
+}
+
+#[test]
+fn what_a_file_holds_its_first_bytes_say_and_not_its_name() {
+    let directory = tempfile::tempdir().unwrap();
+    for (fixture, name) in [
+        ("earlier.mcap", "take1"),
+        ("earlier.mcap", "take1.bin"),
+        ("foam.5hz.bin", "foam"),
+        ("foam.5hz.bin", "foam.mcap"),
+    ] {
+        let path = directory.path().join(name);
+        std::fs::copy(fixtures().join(fixture), &path).unwrap();
+        let golden = fixtures().join(fixture).with_extension("jsonl");
+        let golden = std::fs::read_to_string(golden).unwrap();
+        let config = fixtures().join("5hz.toml");
+        let events = replay(&path, &["--config", config.to_str().unwrap()]);
+        assert_same(&events, &golden, &path);
+    }
+}
+
+#[test]
+fn bytes_without_a_whole_frame_are_said_to_have_none() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("other.bin");
+    let mut frame = std::fs::read(fixtures().join("foam.5hz.bin")).unwrap();
+    // One frame has a damaged byte.
+    frame.truncate(790);
+    frame[400] ^= 1;
+    let text = "no frame ".repeat(100).into_bytes();
+    for (bytes, found) in [
+        (vec![0], "no whole frame in 1 bytes (0 damaged)"),
+        (text, "no whole frame in 900 bytes (0 damaged)"),
+        (frame, "no whole frame in 790 bytes (1 damaged)"),
+    ] {
+        std::fs::write(&path, bytes).unwrap();
+        let output = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
+            .arg("replay")
+            .arg(&path)
+            .output()
+            .unwrap();
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{stderr}");
+        assert_eq!(stderr.lines().count(), 1, "{stderr}");
+        for part in ["other.bin", found, "hardnessd sniff"] {
+            assert!(stderr.contains(part), "{part:?} not in {stderr}");
+        }
+        // The last status with the totals comes nevertheless.
+        let events = String::from_utf8(output.stdout).unwrap();
+        assert!(
+            events.contains("\"reason\":\"end of recording\""),
+            "{events}"
+        );
+    }
+}
+
+#[test]
+fn the_pace_of_a_replay_does_not_show() {
+    let recording = fixtures().join("flip.5hz.bin");
+    assert_eq!(
+        replay(&recording, &[]),
+        replay(&recording, &["--speed", "50"])
+    );
+}
+
+#[test]
+fn a_frame_comes_no_earlier_than_its_time_however_long_frames_are() {
+    let directory = tempfile::tempdir().unwrap();
+    for preset in ["ascii", "zero-run", "jx255n"] {
+        let path = |extension| directory.path().join(preset).with_extension(extension);
+        let simulated = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
+            .args(["simulate", "--presses", "1", "--preset", preset, "--to"])
+            .arg(path("bin"))
+            .status()
+            .unwrap();
+        assert!(simulated.success());
+        let config =
+            format!("[[sensor]]\nport = \"none\"\n[sensor.frame]\npreset = \"{preset}\"\n");
+        std::fs::write(path("toml"), config).unwrap();
+        let config = path("toml");
+        let start = Instant::now();
+        let more = ["--config", config.to_str().unwrap(), "--speed", "10"];
+        let events = replay(&path("bin"), &more);
+        let took = start.elapsed();
+        let last = events.lines().last().unwrap();
+        let frames = serde_json::from_str::<Value>(last).unwrap()["frames"].clone();
+        let frames = frames.as_f64().unwrap();
+        assert!(frames > 10.0, "{events}");
+        // The replay runs ten times as fast as 5 frames/s.
+        let least = Duration::from_secs_f64((frames - 1.0) / 50.0);
+        assert!(took >= least, "{preset}: {took:?} for {frames} frames");
+    }
+}
+
+#[test]
+fn a_recording_of_an_earlier_version_gives_the_events_it_gave_then() {
+    let recording = fixtures().join("earlier.mcap");
+    let golden = std::fs::read_to_string(fixtures().join("earlier.jsonl")).unwrap();
+    assert_same(&replay(&recording, &[]), &golden, &recording);
+}
+
+fn pipeline() -> Pipeline {
+    let sensor = Sensor::new(Description::default()).unwrap();
+    let hrn = Arc::new(Hrn::load(BUILT_IN).unwrap());
+    Pipeline::new(sensor, hrn, Clock::FrameRate)
+}
+
+fn events<'a>(chunks: impl Iterator<Item = &'a [u8]>) -> Vec<Event> {
+    let at = Stamp {
+        mono: Duration::ZERO,
+        wall: jiff::Timestamp::UNIX_EPOCH,
+    };
+    let mut pipeline = pipeline();
+    let mut events = Vec::new();
+    for chunk in chunks {
+        events.extend(pipeline.push(chunk, at));
+    }
+    events.extend(pipeline.end_of_recording(None));
+    events
+}
+
+#[test]
+fn bytes_one_at_a_time_or_split_anywhere_give_the_same_events() {
+    let bytes = std::fs::read(fixtures().join("drop-bytes.5hz.bin")).unwrap();
+    let expected = events(std::iter::once(bytes.as_slice()));
+    assert!(
+        expected
+            .iter()
+            .any(|event| matches!(event, Event::Hardness(_)))
+    );
+    assert_eq!(events(bytes.chunks(1)), expected);
+    // Split at every byte of the damaged frame and a bit around it.
+    for at in 790 * 17..790 * 18 + 20 {
+        let (head, tail) = bytes.split_at(at);
+        assert_eq!(events([head, tail].into_iter()), expected, "split at {at}");
+    }
+}
+
+/// What came of the presses of a recording.
+#[derive(Debug, Default, PartialEq)]
+struct Outcome {
+    /// The level of each press that ended by its release.
+    released: Vec<u64>,
+    /// The number of presses that ended by `max_seconds`.
+    timed_out: usize,
+}
+
+/// Replays a recording with or without `auto_tare`.
+fn outcome(recording: &Path, auto_tare: bool) -> Outcome {
+    let config = recording.with_extension("toml");
+    let text = format!(
+        "[[sensor]]\nname = \"forearm\"\nport = \"none\"\n\
+         [sensor.calibration]\nauto_tare = {auto_tare}\n"
+    );
+    std::fs::write(&config, text).unwrap();
+    let events = replay(recording, &["--config", config.to_str().unwrap()]);
+    let mut outcome = Outcome::default();
+    let mut is_released = false;
+    for line in events.lines() {
+        let event: Value = serde_json::from_str(line).unwrap();
+        if event["state"] == "end" {
+            is_released = event["reason"].is_null();
+            outcome.timed_out += usize::from(event["reason"] == "timeout");
+        }
+        if event["phase"] == "final" && is_released {
+            outcome.released.push(event["level"].as_u64().unwrap());
+        }
+    }
+    outcome
+}
+
+/// The figures are in `docs/configuration.md`, "Slow drift".
+#[test]
+fn with_auto_tare_an_hour_of_drift_costs_no_press() {
+    let directory = tempfile::tempdir().unwrap();
+    let script = directory.path().join("drift.toml");
+    let drift = "[[fault]]\nat_s = 0.0\nkind = \"drift\"\nnewtons_per_hour = 0.5\n";
+    std::fs::write(&script, drift).unwrap();
+    let simulate = |name: &str, more: &[&str]| {
+        let path = directory.path().join(name);
+        let simulated = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
+            .args(["simulate", "--presses", "60", "--rest", "60", "--to"])
+            .arg(&path)
+            .args(more)
+            .status()
+            .unwrap();
+        assert!(simulated.success());
+        path
+    };
+    let steady = simulate("steady.bin", &[]);
+    let drifting = simulate("drift.bin", &["--faults", script.to_str().unwrap()]);
+    let frames = std::fs::metadata(&drifting).unwrap().len() / 790;
+    assert!(frames > 5 * 3600, "more than an hour: {frames} frames");
+
+    let presses = |outcome: &Outcome| (outcome.released.len(), outcome.timed_out);
+    let without_drift = outcome(&steady, false);
+    assert_eq!(presses(&without_drift), (60, 0));
+    assert_eq!(outcome(&steady, true), without_drift);
+    // Once the drift is above the contact threshold, it is a press that never ends.
+    let fixed = outcome(&drifting, false);
+    assert_eq!(presses(&fixed), (6, 1), "{fixed:?}");
+    let following = outcome(&drifting, true);
+    assert_eq!(presses(&following), (60, 0), "{following:?}");
+    let levels = following.released.iter().zip(&without_drift.released);
+    let same = levels.filter(|(with, without)| with == without).count();
+    println!("{same} of 60 levels are those without drift");
+    assert!(same >= 56, "{following:?} {without_drift:?}");
+}

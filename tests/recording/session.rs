@@ -1,0 +1,223 @@
+//! `hardnessd record` on a real pty, with a simulated sensor: the questions and files of
+//! `--session`, and the line of progress.
+
+use std::fs::{self, File};
+use std::io::Read;
+use std::os::fd::OwnedFd;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::sync::mpsc::{self, Receiver};
+use std::time::{Duration, Instant};
+
+use crate::bench::{BINARY, Bench, PATIENCE, Process, hardnessd};
+use crate::pair::Pair;
+use rustix::process::Signal;
+
+/// A recording, and the terminal that it runs on.
+struct Session {
+    process: Process,
+    master: OwnedFd,
+    bytes: Receiver<Vec<u8>>,
+    /// The output that the test has not looked at yet.
+    written: String,
+}
+
+impl Session {
+    fn start(config: &Path, directory: &Path) -> Self {
+        Self::record(config, &["--session", directory.to_str().unwrap()])
+    }
+
+    fn record(config: &Path, more: &[&str]) -> Self {
+        let Pair { master, device, .. } = Pair::open().unwrap();
+        let end = || Stdio::from(device.try_clone().unwrap());
+        // `setsid` keeps the process from using the terminal that the test was started from.
+        let process = Command::new("setsid")
+            .args([BINARY, "record", "--config"])
+            .arg(config)
+            .args(more)
+            .stdin(end())
+            .stdout(end())
+            .stderr(end())
+            .spawn()
+            .unwrap();
+        let mut output = File::from(master.try_clone().unwrap());
+        let (sender, bytes) = mpsc::channel();
+        std::thread::spawn(move || {
+            let mut read = [0; 4096];
+            while let Ok(length @ 1..) = output.read(&mut read) {
+                if sender.send(read[..length].to_vec()).is_err() {
+                    return;
+                }
+            }
+        });
+        Self {
+            process: Process(process),
+            master,
+            bytes,
+            written: String::new(),
+        }
+    }
+
+    /// Waits for `part` in the output that was not looked at before.
+    fn says(&mut self, part: &str) {
+        let start = Instant::now();
+        loop {
+            if let Some(at) = self.written.find(part) {
+                self.written.drain(..at + part.len());
+                return;
+            }
+            let left = PATIENCE.saturating_sub(start.elapsed());
+            assert!(left > Duration::ZERO, "{part:?} not in {:?}", self.written);
+            if let Ok(bytes) = self.bytes.recv_timeout(left) {
+                self.written += &String::from_utf8_lossy(&bytes);
+            }
+        }
+    }
+
+    /// Waits for the end of the process, and returns the output that was not looked at before.
+    fn ends(mut self) -> String {
+        assert_eq!(self.process.exit_code(), Some(0));
+        while let Ok(bytes) = self.bytes.recv_timeout(PATIENCE) {
+            self.written += &String::from_utf8_lossy(&bytes);
+        }
+        self.written
+    }
+
+    fn answer(&self, line: &str) {
+        rustix::io::write(&self.master, format!("{line}\n").as_bytes()).unwrap();
+    }
+}
+
+#[test]
+fn a_session_asks_for_each_object_and_labels_its_recording() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let own = bench.path("own");
+    let _sensor = bench.sensor(&[]);
+
+    let mut session = Session::start(&config, &own);
+    session.says("object 1: its name: ");
+    session.answer("");
+    session.says("the name is empty");
+    session.answer("Yoga mat");
+    session.says("its level, 1 (hard)");
+    session.answer("7");
+    session.says("there is no level");
+    session.answer("4");
+    session.says("presses: 1");
+    session.answer("r");
+    session.says("again: Yoga mat");
+    session.says("presses: 2");
+    session.answer("");
+    session.says("object 2: its name: ");
+    session.answer("a \"b\", c");
+    session.says("its level");
+    session.answer("0");
+    session.says("presses: 1");
+    session.answer("q");
+    session.says("recorded 2 objects");
+    assert_eq!(session.process.exit_code(), Some(0));
+
+    let list = fs::read_to_string(own.join("session.csv")).unwrap();
+    let lines: Vec<&str> = list.lines().collect();
+    let [heading, first, second] = lines[..] else {
+        panic!("{list}");
+    };
+    assert_eq!(heading, "object,name,level,presses,file");
+    assert!(first.starts_with("1,\"Yoga mat\",4,"), "{first}");
+    assert!(second.starts_with("2,\"a \"\"b\"\", c\",0,"), "{second}");
+    let mut files: Vec<_> = fs::read_dir(&own)
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect();
+    files.sort();
+    assert_eq!(
+        files,
+        ["001-yoga-mat.mcap", "002-a--b---c.mcap", "session.csv"]
+    );
+    assert_collects(&bench, &own);
+
+    // The next session continues, and a session without a press leaves no file.
+    let mut session = Session::start(&config, &own);
+    session.says("object 3: its name: ");
+    session.answer("q");
+    session.says("recorded 0 objects");
+    assert_eq!(session.process.exit_code(), Some(0));
+    assert_eq!(fs::read_dir(&own).unwrap().count(), 3);
+}
+
+/// `hrn-train` accepts the recordings unchanged.
+fn assert_collects(bench: &Bench, own: &Path) {
+    let out = bench.path("own.npz");
+    let collected = Command::new(crate::bench::hrn_train())
+        .args(["collect", "--out"])
+        .arg(&out)
+        .args([own.join("001-yoga-mat.mcap"), own.join("002-a--b---c.mcap")])
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&collected.stderr);
+    assert_eq!(collected.status.code(), Some(0), "{said}");
+    assert!(out.exists());
+}
+
+#[test]
+fn a_line_of_the_log_is_not_glued_to_the_progress() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let out = bench.path("a.mcap");
+    let _sensor = bench.sensor(&[]);
+    let mut recording = Session::record(&config, &["--sockets", "--out", out.to_str().unwrap()]);
+    // The first line of the progress may come before there is a socket.
+    let start = Instant::now();
+    while !bench.path("events.sock").exists() {
+        assert!(start.elapsed() < PATIENCE, "no socket");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let mut subscriber = bench.subscriber();
+    recording.says(" 1 press (Ctrl-C ends it)");
+    loop {
+        let event = subscriber.next().unwrap();
+        if event["type"] == "press" && event["state"] == "begin" && event["press"] == 2 {
+            break;
+        }
+    }
+    recording.process.signal(Signal::TERM);
+    let output = recording.ends();
+    // What a line shows at last: `\x1b[K` clears what was there.
+    let mut lines = output
+        .lines()
+        .filter_map(|line| line.split("\x1b[K").last());
+    let aborted = lines.clone().find(|line| line.contains("aborted"));
+    assert!(
+        aborted.is_some_and(|line| line.contains("WARN") && !line.contains("Ctrl-C")),
+        "{output:?}"
+    );
+    assert!(
+        lines.any(|line| line.starts_with("recorded ") && line.contains(" frames, 1 press: ")),
+        "{output:?}"
+    );
+}
+
+#[test]
+fn a_session_needs_a_terminal_and_asks_for_its_labels_itself() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let own = bench.path("own");
+    let check = |more: &[&str], part: &str| {
+        let arguments = [
+            "record",
+            "--config",
+            config.to_str().unwrap(),
+            "--session",
+            own.to_str().unwrap(),
+        ];
+        let output = hardnessd(&[&arguments[..], more].concat());
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(said.contains(part) && said.lines().count() == 1, "{said}");
+    };
+    check(&[], "needs a terminal");
+    check(&["--label", "level=2"], "--session asks for it");
+    check(&["--out", "x.mcap"], "cannot be used with");
+    assert!(!own.exists());
+}
