@@ -44,9 +44,9 @@ fn presses_on_wood_say_the_arms_stiffness_and_delay() {
     assert!(output.status.success(), "{output:?}");
     let text = String::from_utf8(output.stdout).unwrap();
     // The simulated arm has 10 N/mm. The cover in series and the sensor's own scale make it less or
-    // a little more.
+    // a little more, and so do frames that a busy machine delays.
     let n_per_mm = value(&text, "stiffness_n_per_mm");
-    assert!((8.0..11.0).contains(&n_per_mm), "{text}");
+    assert!((8.0..12.0).contains(&n_per_mm), "{text}");
     // A frame takes 34.3 ms at 230,400 baud. A busy machine adds to it.
     let delay_ms = value(&text, "delay_ms");
     assert!((15.0..90.0).contains(&delay_ms), "{text}");

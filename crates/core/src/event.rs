@@ -296,7 +296,7 @@ pub enum Note {
 ///     mono: Duration::ZERO,
 ///     wall: jiff::Timestamp::UNIX_EPOCH,
 /// };
-/// let events = pipeline.push(&std::fs::read("fixtures/foam.5hz.bin")?, at);
+/// let events = pipeline.push(&std::fs::read("../../fixtures/foam.5hz.bin")?, at);
 /// let labels = events.iter().filter_map(|event| match event {
 ///     Event::Hardness(verdict) if verdict.phase == Phase::Final => verdict.label.as_deref(),
 ///     _ => None,

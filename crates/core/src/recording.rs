@@ -147,7 +147,7 @@ impl Input<'_> {
 /// ```
 /// use hardnessd_core::recording::{Entry, Input, Reader};
 ///
-/// let file = std::fs::File::open("fixtures/earlier.mcap")?;
+/// let file = std::fs::File::open("../../fixtures/earlier.mcap")?;
 /// let (mut bytes, mut reloads) = (0, 0);
 /// for found in Reader::new(file) {
 ///     match found?.entry {

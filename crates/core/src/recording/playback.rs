@@ -23,7 +23,7 @@ use crate::verdict::Hrn;
 ///
 /// let mut playback = Playback::new(Arc::new(Hrn::load(BUILT_IN)?));
 /// let mut events = Vec::new();
-/// for found in Reader::new(std::fs::File::open("fixtures/earlier.mcap")?) {
+/// for found in Reader::new(std::fs::File::open("../../fixtures/earlier.mcap")?) {
 ///     events.extend(playback.feed(found?)?);
 /// }
 /// events.extend(playback.end());

@@ -42,7 +42,7 @@ pub struct CourseMoment {
 ///     moments: vec![moment(0.0, 0.0, 0.2), moment(0.1, 0.5, 2.0)],
 ///     arm_n_per_mm: 10.0,
 /// };
-/// let verdict = Hrn::load(&std::fs::read("models/course.onnx")?)?.judge_course(&course)?;
+/// let verdict = Hrn::load(&std::fs::read("../../models/course.onnx")?)?.judge_course(&course)?;
 /// let shore = verdict.shore.unwrap();
 /// assert!(shore.low <= shore.value && shore.value <= shore.high);
 /// # Ok::<(), Box<dyn std::error::Error>>(())

@@ -2,7 +2,7 @@
 
 #[test]
 fn a_data_set_that_the_fuzzer_kept_is_read_or_refused() {
-    let corpus = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../../fuzz/corpus/npz");
+    let corpus = concat!(env!("CARGO_MANIFEST_DIR"), "/../../fuzz/corpus/npz");
     let files = std::fs::read_dir(corpus).expect("a corpus of data sets");
     let mut tried = 0;
     for file in files {
