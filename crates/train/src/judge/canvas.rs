@@ -1,9 +1,16 @@
 //! Frames, text and a colour scale as pixels of a PNG.
 
-use ab_glyph::{Font as _, FontRef, ScaleFont as _, point};
-use anyhow::Context as _;
-use epaint_default_fonts::UBUNTU_LIGHT;
+use std::convert::Infallible;
 
+use anyhow::Context as _;
+use embedded_graphics::Drawable as _;
+use embedded_graphics::Pixel;
+use embedded_graphics::draw_target::DrawTarget;
+use embedded_graphics::geometry::{OriginDimensions, Point, Size};
+use embedded_graphics::mono_font::MonoTextStyle;
+use embedded_graphics::mono_font::ascii::FONT_7X14;
+use embedded_graphics::pixelcolor::{Rgb888, RgbColor as _};
+use embedded_graphics::text::{Baseline, Text};
 use hardnessd_core::colour::viridis;
 use hardnessd_core::frame::{COLS, Frame, ROWS};
 
@@ -15,8 +22,6 @@ pub(super) const TILE: usize = COLS * ZOOM;
 pub(super) const GAP: usize = 8;
 /// Height of a line of text.
 pub(super) const TEXT: usize = 16;
-/// Height of the letters.
-const FONT_PIXELS: f32 = 14.0;
 /// Width of the names to the left.
 pub(super) const MARGIN: usize = 112;
 /// Ends of the colour scale, N: one count, and an 8-bit taxel's full scale.
@@ -49,35 +54,10 @@ impl Canvas {
 
     /// Writes a line of text whose box begins at (x, y) and is [`TEXT`] high.
     pub(super) fn text(&mut self, x: usize, y: usize, text: &str) {
-        let font = FontRef::try_from_slice(UBUNTU_LIGHT).expect("the crate's font is a font");
-        let scaled = font.as_scaled(FONT_PIXELS);
-        let baseline = y as f32 + scaled.ascent();
-        let mut at = x as f32;
-        for letter in text.chars() {
-            let id = font.glyph_id(letter);
-            let glyph = id.with_scale_and_position(FONT_PIXELS, point(at, baseline));
-            at += scaled.h_advance(id);
-            let Some(outline) = font.outline_glyph(glyph) else {
-                continue;
-            };
-            let bounds = outline.px_bounds();
-            outline.draw(|right, down, coverage| {
-                let (x, y) = (bounds.min.x as usize, bounds.min.y as usize);
-                self.blend(x + right as usize, y + down as usize, coverage);
-            });
-        }
-    }
-
-    /// Blends ink into a pixel; `coverage` is the share of the pixel that the ink covers.
-    fn blend(&mut self, x: usize, y: usize, coverage: f32) {
-        if x >= self.width || y >= self.height {
-            return;
-        }
-        let at = 3 * (y * self.width + x);
-        for (pixel, ink) in self.pixels[at..at + 3].iter_mut().zip(INK) {
-            let under = f32::from(*pixel);
-            *pixel = (under + coverage.min(1.0) * (f32::from(ink) - under)).round() as u8;
-        }
+        let ink = Rgb888::new(INK[0], INK[1], INK[2]);
+        let style = MonoTextStyle::new(&FONT_7X14, ink);
+        let place = Point::new(x as i32, y as i32);
+        let Ok(_) = Text::with_baseline(text, place, style, Baseline::Top).draw(self);
     }
 
     pub(super) fn tile(&mut self, tile: usize, top: usize, frame: &Frame, caption: &str) {
@@ -120,6 +100,33 @@ impl Canvas {
             .context("sheet: PNG pixels")?;
         writer.finish().context("sheet: PNG end")?;
         Ok(bytes)
+    }
+}
+
+impl OriginDimensions for Canvas {
+    fn size(&self) -> Size {
+        Size::new(self.width as u32, self.height as u32)
+    }
+}
+
+impl DrawTarget for Canvas {
+    type Color = Rgb888;
+    type Error = Infallible;
+
+    /// Sets pixels. Those outside the picture are left out.
+    fn draw_iter<I: IntoIterator<Item = Pixel<Rgb888>>>(
+        &mut self,
+        pixels: I,
+    ) -> Result<(), Infallible> {
+        for Pixel(Point { x, y }, colour) in pixels {
+            let (Ok(x), Ok(y)) = (usize::try_from(x), usize::try_from(y)) else {
+                continue;
+            };
+            if x < self.width && y < self.height {
+                self.fill(x, y, 1, 1, [colour.r(), colour.g(), colour.b()]);
+            }
+        }
+        Ok(())
     }
 }
 

@@ -921,7 +921,11 @@ fn bad_input_has_its_exit_code_and_one_line() {
             1,
             &empty_split,
         ),
-        (simulate(&["--objects", "4294967295"]), 2, "not in 0..=10000"),
+        (
+            simulate(&["--objects", "4294967295"]),
+            2,
+            "not in 0..=10000",
+        ),
         (simulate(&["--presses", "0"]), 2, "not in 1..=10000"),
         (
             simulate(&["--swapped-levels", "25"]),
