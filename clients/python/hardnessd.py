@@ -102,8 +102,11 @@ FIRST_PAUSE_S = 0.1
 LONGEST_PAUSE_S = 2.0
 
 HELLO_S = 5.0
-"""How long connecting, and the first line, may take. The daemon answers within 50 ms, but a service
-manager may have to start it first."""
+"""How long connecting may take, and how long the first line and the answer to the subscription may
+take together. The daemon answers within 50 ms, but a service manager may have to start it first."""
+
+MOST_EARLY_LINES = 4096
+"""As many events as the daemon holds. It never sends more lines before it answers a request."""
 
 Address = Union[str, "os.PathLike[str]", Tuple[str, int]]
 """Path of a Unix socket, "HOST:PORT", or (host, port)."""
@@ -343,7 +346,7 @@ def _keep_alive(peer: Any) -> None:
 
 
 class Connection:
-    """Lines to and from the daemon, as they are. `timeout_s` is the limit for each wait."""
+    """Lines to and from the daemon, as they are. `timeout_s` is the limit for each whole line."""
 
     def __init__(self, address: Address, timeout_s: Optional[float] = None) -> None:
         destination = _destination(address)
@@ -369,6 +372,7 @@ class Connection:
                 error.filename = _shown(address)
             raise
         self.socket.settimeout(timeout_s)
+        self._timeout_s = timeout_s
         self._bytes = bytearray()
 
     def _connect(self, path: str, deadline: float) -> None:
@@ -385,22 +389,34 @@ class Connection:
         """Sends one request."""
         self.socket.sendall(json.dumps(request).encode() + b"\n")
 
+    def _until(self) -> Optional[float]:
+        """When a wait that begins now ends."""
+        return None if self._timeout_s is None else time.monotonic() + self._timeout_s
+
     def receive(self) -> Message:
         """Returns the next line's object.
 
         Raises ConnectionError when the connection is closed, ProtocolError (a ConnectionError) when
-        the line is none of hardnessd, and TimeoutError when no line came in time.
+        the line is none of hardnessd, and TimeoutError when no whole line came in time.
         """
+        return self._receive(self._until())
+
+    def _receive(self, deadline: Optional[float]) -> Message:
         searched = 0
         while (end := self._bytes.find(b"\n", searched)) < 0:
             searched = len(self._bytes)
             if searched > LONGEST_LINE_BYTES:
                 raise LineTooLong
+            # A server that sends a byte now and then must not prolong the wait.
+            left_s = None if deadline is None else deadline - time.monotonic()
+            if left_s is not None and left_s <= 0:
+                raise TimeoutError("no whole line in time")
+            self.socket.settimeout(left_s)
             try:
                 received = self.socket.recv(1 << 16)
             except socket.timeout as error:
                 # Before Python 3.10, socket.timeout is not a TimeoutError.
-                raise TimeoutError(f"no line within {self.socket.gettimeout()} s") from error
+                raise TimeoutError("no whole line in time") from error
             if not received:
                 raise ConnectionError("the daemon closed the connection")
             self._bytes += received
@@ -429,7 +445,7 @@ class _Follower:
         # Numbers that came before the daemon took the subscription. The daemon does not send them
         # again on this connection, but it would on the next.
         self._early: Set[int] = set()
-        self._subscribed = False
+        self.subscribed = False
 
     def subscription(self, hello: Message) -> Message:
         """The answer to the first line of a connection."""
@@ -442,7 +458,7 @@ class _Follower:
         run, seq = hello.get("run"), hello.get("seq")
         if not isinstance(run, str) or not isinstance(seq, int):
             raise ProtocolError("hello has no run or no seq")
-        self.hello, self._run, self._subscribed = hello, run, False
+        self.hello, self._run, self.subscribed = hello, run, False
         request = {"subscribe": self.types, "policy": self.policy}
         if self.place is None:
             self.place = f"{run}:{seq}"
@@ -456,15 +472,17 @@ class _Follower:
         """The event in a later line, if it has one that was asked for and is new."""
         kind, seq = message["type"], message.get("seq")
         if kind == "ok":
-            self._subscribed = True
+            self.subscribed = True
         elif kind == "error":
             raise Refused(message.get("message", "the daemon refused the subscription"))
         elif kind == "gap" or (kind in self.types and seq not in self._early):
-            if seq is not None and self._subscribed:
+            if seq is not None and self.subscribed:
                 self.place = f"{self._run}:{seq}"
                 self._early = {number for number in self._early if number > seq}
             elif seq is not None:
                 self._early.add(seq)
+                if len(self._early) > MOST_EARLY_LINES:
+                    raise ProtocolError("too many events before the answer to the subscription")
             return cast(Event, message)
         return None
 
@@ -551,14 +569,15 @@ class Client(_Subscriber):
             # Another thread may have closed the client while there was no connection to close.
             if self._closed.is_set():
                 return
+            deadline = time.monotonic() + HELLO_S
             try:
-                hello = connection.receive()
+                hello = connection._receive(deadline)
             except TimeoutError as error:
                 raise TimeoutError(_silence(self._found, HELLO_S)) from error
             connection.send(self._follower.subscription(hello))
-            connection.socket.settimeout(None)
             while not self._closed.is_set():
-                event = self._follower.take(connection.receive())
+                line = connection._receive(None if self._follower.subscribed else deadline)
+                event = self._follower.take(line)
                 if event is not None:
                     yield event
         finally:
@@ -582,6 +601,7 @@ class AsyncClient(_Subscriber):
         super().__init__(address, types, policy, since)
         self._streams: Optional[Tuple[asyncio.StreamReader, asyncio.StreamWriter]] = None
         self._opening: Optional[asyncio.Task[None]] = None
+        self._deadline = 0.0
         self._pause_s = 0.0
         self._try_at = 0.0
         self._closed = False
@@ -622,7 +642,10 @@ class AsyncClient(_Subscriber):
     async def _step(self) -> Optional[Event]:
         """Connects, or reads a line. When it is cancelled, the next call continues where it was."""
         if self._streams:
-            return self._follower.take(await self._receive(self._streams[0]))
+            receiving = self._receive(self._streams[0])
+            if not self._follower.subscribed:
+                receiving = asyncio.wait_for(receiving, self._deadline - time.monotonic())
+            return self._follower.take(await receiving)
         if self._opening is None:
             self._opening = asyncio.ensure_future(self._open())
             # A failure that nobody waits for is no news.
@@ -645,6 +668,7 @@ class AsyncClient(_Subscriber):
             else asyncio.open_connection(*destination, limit=LONGEST_LINE_BYTES)
         )
         reader, writer = await asyncio.wait_for(connecting, HELLO_S)
+        self._deadline = time.monotonic() + HELLO_S
         try:
             if not isinstance(destination, str):
                 _keep_alive(writer.get_extra_info("socket"))
@@ -700,7 +724,7 @@ class Control:
 
     def tare(self, sensor: str) -> Tare:
         """Takes another tare. Returns the offsets before and after."""
-        return cast(Tare, self.request({"tare": sensor})[0]["tare"])
+        return cast(Tare, self._answer({"tare": sensor}, "tare"))
 
     def context(self, sensor: str, **fields: Any) -> None:
         """Says what is being done with the sensor. Its presses and verdicts then carry it.
@@ -719,7 +743,7 @@ class Control:
 
     def blackbox(self, sensor: str) -> str:
         """Has the daemon write the sensor's last minute to a recording. Returns the file's path."""
-        return cast(str, self.request({"blackbox": sensor})[0]["blackbox"])
+        return cast(str, self._answer({"blackbox": sensor}, "blackbox"))
 
     def last(self) -> List[Hardness]:
         """Returns each sensor's last final verdict."""
@@ -729,15 +753,24 @@ class Control:
         """Returns each sensor's status now."""
         return cast("List[Status]", self.request({"get": "status"})[1])
 
+    def _answer(self, request: Message, field: str) -> Any:
+        answer = self.request(request)[0]
+        if field not in answer:
+            raise ProtocolError(f"the answer lacks {field!r}")
+        return answer[field]
+
     def request(self, request: Message) -> Tuple[Message, List[Message]]:
         """Sends any request of the protocol. Returns its `ok`, and the lines sent before it."""
         self._requests += 1
+        deadline = self.connection._until()
         self.connection.send({**request, "id": self._requests})
         lines: List[Message] = []
         while True:
-            line = self.connection.receive()
+            line = self.connection._receive(deadline)
             if line["type"] not in ("ok", "error"):
                 lines.append(line)
+                if len(lines) > MOST_EARLY_LINES:
+                    raise ProtocolError("too many lines before the answer to a request")
             elif "id" not in line:
                 # The daemon has no room for this connection.
                 raise ConnectionError(line.get("message", "the daemon refused the connection"))
@@ -888,7 +921,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
                 reason = event["reason"]
             try:
                 text = json.dumps(event) if args.json else _readable(event)
-            except (KeyError, TypeError, ValueError):
+            except (AttributeError, KeyError, OverflowError, TypeError, ValueError):
                 # No event of hardnessd.
                 text = json.dumps(event)
             # A reason comes from the system, a label from a model file. Neither may move the cursor.

@@ -5,8 +5,8 @@
     venv/bin/python tests/peers/hostile.py
 
 Claims, for Client and AsyncClient alike: whatever a server sends, the client says in one `disconnected`
-event what is wrong with it, and tries again. It never holds much more than the longest line. Control and
-Connection raise an exception with the same words.
+event what is wrong with it, and tries again. It never holds much more than the longest line, and a time limit
+holds for a whole answer. Control and Connection raise an exception with the same words.
 """
 
 import asyncio
@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 
 import hardnessd
 
@@ -29,15 +30,17 @@ def line(message):
 
 
 class Server:
-    """Sends the same to each connection. Counts the bytes that one took, and the connections."""
+    """Sends the same to each connection. Counts the bytes that one took, and the connections.
 
-    def __init__(self, sent, endless=b"", stays=False):
+    `slowly` is the time between two bytes of the endless part."""
+
+    def __init__(self, sent, endless=b"", stays=False, slowly=0.0):
         self.directory = tempfile.TemporaryDirectory()
         self.path = os.path.join(self.directory.name, "events.sock")
         self.listener = socket.socket(socket.AF_UNIX)
         self.listener.bind(self.path)
         self.listener.listen()
-        self.sent, self.endless, self.stays = sent, endless, stays
+        self.sent, self.endless, self.stays, self.slowly = sent, endless, stays, slowly
         self.connections = 0
         self.most_bytes = 0
         threading.Thread(target=self.serve, daemon=True).start()
@@ -53,6 +56,9 @@ class Server:
             taken = 0
             try:
                 connection.sendall(self.sent)
+                while self.slowly and taken < 1000:
+                    taken += connection.send(self.endless[taken % len(self.endless) :][:1])
+                    time.sleep(self.slowly)
                 while self.endless and taken < 50_000_000:
                     taken += connection.send(self.endless)
                 if not self.stays:
@@ -139,14 +145,27 @@ def main():
     check(line({"type": "error", "message": [1]}), "[1]")
     check(hello[:-5], "the daemon closed the connection")
     check(hello + line({"type": "hail"}) + line(STATUS)[:-1], "the daemon closed the connection")
+    # Events without end in place of an answer to the subscription.
+    early = b"".join(line({**STATUS, "seq": seq}) for seq in range(5000))
+    with Server(hello + early, stays=True) as server:
+        for follow in (by_client, by_async_client):
+            last = follow(server.path, hardnessd.MOST_EARLY_LINES + 1)[-1]
+            assert "too many events before the answer" in last.get("reason", ""), last
     hardnessd.HELLO_S = 0.3
     check(b"", "no ", stays=True)
     check(hello[:-5], "no ", stays=True)
+    # A byte, or a line of no use, comes before each wait is over.
+    check(b"", "no ", endless=b"x", slowly=0.05)
+    check(hello, "no ", endless=b"x", slowly=0.05)
+    check(hello, "no ", endless=line({"type": "hail"}), slowly=0.005)
 
     by_control(b"", hardnessd.LineTooLong, "longer than", endless=endless)
+    by_control(hello, TimeoutError, "in time", endless=b"x", slowly=0.05)
+    by_control(hello, TimeoutError, "in time", endless=line({"type": "hail"}), slowly=0.005)
+    by_control(hello, hardnessd.ProtocolError, "too many lines", endless=line({"type": "hail"}))
     by_control(hello + b"5\n", hardnessd.ProtocolError, "not an object with a type")
     by_control(b"", ConnectionError, "the daemon closed the connection")
-    by_control(hello, TimeoutError, "no line within 0.5 s", stays=True)
+    by_control(hello, TimeoutError, "in time", stays=True)
     by_control(line({"type": "error", "message": "full"}), ConnectionError, "full")
     with tempfile.TemporaryDirectory() as directory:
         # Nobody is served for half a second, and one more is waiting than may.
