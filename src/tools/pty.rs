@@ -39,11 +39,11 @@ pub(crate) struct Pty {
 }
 
 impl Pty {
-    /// Makes a pair, and `link` to its device. An existing link is replaced, any other file is not.
+    /// Makes a pair, and `link` to its device.
     ///
     /// # Errors
     ///
-    /// Fails if the system has no pair to give, or a file that is no link exists at `link`.
+    /// Fails if the system has no pair to give, or `link` is there and leads somewhere.
     pub(crate) fn open(link: Option<&Path>) -> io::Result<Self> {
         let Pair {
             master,
@@ -131,11 +131,17 @@ impl Drop for Pty {
     }
 }
 
-/// Makes `link` point to `device`, in one atomic step.
+/// Makes `link` point to `device`, in one atomic step. It may replace only a link that leads nowhere,
+/// such as that of a killed process.
 fn place(device: &Path, link: &Path) -> io::Result<()> {
     match fs::symlink_metadata(link) {
         Ok(file) if !file.file_type().is_symlink() => {
             let found = "a file that is no link is there: remove it, or name another path";
+            return Err(io::Error::new(ErrorKind::AlreadyExists, found));
+        }
+        Ok(_) if link.exists() => {
+            let found = "a link to something else is there, perhaps that of another `hardnessd simulate`: \
+                         remove it, or name another path";
             return Err(io::Error::new(ErrorKind::AlreadyExists, found));
         }
         Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),

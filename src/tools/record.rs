@@ -148,6 +148,7 @@ pub async fn run(
     let path = args
         .out
         .expect("clap asks for it where there is no session");
+    let file = create(&path)?;
     let (progress, counted) = watch::channel(Progress::default());
     let over = async {
         match args.seconds {
@@ -169,17 +170,14 @@ pub async fn run(
         clear();
     };
     let recorded = tokio::select! {
-        recorded = record(setup, sockets, &path, labels, progress, end) => recorded,
+        recorded = record(setup, sockets, &path, file, labels, progress, end) => recorded,
         () = show(&path, &counted, &is_ending) => {
             unreachable!("it goes on as long as it is waited for")
         }
     };
     // The recording may have ended by itself.
     clear();
-    if matches!(
-        recorded,
-        Err(Error::Create { .. } | Error::Unavailable { .. })
-    ) {
+    if matches!(recorded, Err(Error::Unavailable { .. })) {
         return recorded;
     }
     let Progress {
@@ -212,25 +210,33 @@ pub async fn run(
     recorded
 }
 
-/// Records into a new file until `end` comes or no sensor is left. Removes the file if a sensor is
-/// missing at the start.
+/// Makes the file of a recording. A file that exists is left alone.
+fn create(path: &Path) -> Result<File, Error> {
+    File::create_new(path).map_err(|source| Error::Create {
+        path: path.to_owned(),
+        source,
+    })
+}
+
+/// Records into `file`, which [`create`] made at `path`, until `end` comes or no sensor is left.
+/// Removes the file if recording cannot begin.
 async fn record(
     setup: Setup,
     sockets: Sockets,
     path: &Path,
+    file: File,
     labels: Labels,
     progress: watch::Sender<Progress>,
     end: impl Future<Output = ()>,
 ) -> Result<(), Error> {
-    let file = File::create_new(path).map_err(|source| Error::Create {
-        path: path.to_owned(),
-        source,
-    })?;
     let ports: BTreeMap<String, PathBuf> = setup.config.sensors.iter().map(port_of).collect();
-    let daemon = Daemon::recording(setup, path.to_owned(), file, labels, progress, sockets)?;
+    let begun = Daemon::recording(setup, path.to_owned(), file, labels, progress, sockets);
+    let daemon = begun.inspect_err(|_| {
+        // The file holds nothing, and its path must be free for the next try.
+        let _ = fs::remove_file(path);
+    })?;
     match daemon.run(end, None).await {
         Err(daemon::Error::Record(RecordError::Unavailable { sensor, reason })) => {
-            // The file holds nothing, and its path must be free for the next try.
             let _ = fs::remove_file(path);
             let port = ports.get(&sensor).cloned().unwrap_or_default();
             let obstacle = doctor::obstacle(&port).unwrap_or(reason);

@@ -1,16 +1,15 @@
 //! `hardnessd recover`: saves the whole parts of a damaged recording in a new one.
 
-use std::ffi::OsString;
-use std::fs::{self, File, Metadata, TryLockError};
+use std::fs::{File, Permissions};
 use std::io::{self, BufReader, BufWriter, ErrorKind};
-use std::os::unix::fs::{FileExt, MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
 use jiff::Timestamp;
-use rustix::fs::OFlags;
+use tempfile::NamedTempFile;
 
-use hardnessd_core::recording::{self, FileKind, RecoverError, Recovered};
+use hardnessd_core::recording::{self, RecoverError, Recovered};
 
 /// Arguments of `recover`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -84,105 +83,57 @@ pub fn run(args: &Args) -> Result<(), Error> {
         path: args.out.clone(),
         source,
     };
-    // `file` stays open until all is done, because it holds the lock.
-    let (part, file) = is_new(&args.out)
-        .and_then(|()| part(&args.out))
+    let part = part(&args.out).map_err(|error| unwritten(error.into()))?;
+    let recovered = save(broken, part.as_file()).map_err(|error| match error {
+        RecoverError::Read(error) if error.kind() == ErrorKind::NotSeekable => unreadable(error),
+        RecoverError::Read(source) => Error::Broken {
+            path: args.broken.clone(),
+            source,
+        },
+        RecoverError::Write(error) => unwritten(error),
+    })?;
+    if !has_ours(&recovered) {
+        let path = args.broken.clone();
+        return Err(match recovered.messages {
+            0 => Error::Nothing { path, bytes },
+            messages => Error::Foreign { path, messages },
+        });
+    }
+    let put = part.persist_noclobber(&args.out);
+    put.map_err(|error| taken(error.error))
+        .and_then(|_| sync_directory(&args.out))
         .map_err(|error| unwritten(error.into()))?;
-    let saved = save(broken, &file).and_then(|recovered| {
-        if has_ours(&recovered) {
-            let put = is_new(&args.out)
-                .and_then(|()| fs::rename(&part, &args.out))
-                .and_then(|()| sync_directory(&args.out));
-            put.map_err(recording::Error::from)?;
-        }
-        Ok(recovered)
-    });
-    let recovered = match saved {
-        Ok(recovered) if has_ours(&recovered) => recovered,
-        other => {
-            // The file may have its final name already.
-            let _ = fs::remove_file(&part);
-            return Err(match other {
-                Ok(Recovered { messages, .. }) if messages > 0 => Error::Foreign {
-                    path: args.broken.clone(),
-                    messages,
-                },
-                Ok(_) => Error::Nothing {
-                    path: args.broken.clone(),
-                    bytes,
-                },
-                Err(RecoverError::Read(error)) if error.kind() == ErrorKind::NotSeekable => {
-                    unreadable(error)
-                }
-                Err(RecoverError::Read(source)) => Error::Broken {
-                    path: args.broken.clone(),
-                    source,
-                },
-                Err(RecoverError::Write(error)) => unwritten(error),
-            });
-        }
-    };
     hardnessd_core::say!("{}", account(&recovered));
     Ok(())
 }
 
-/// Fails if anything is at `out`, even a link to a file that does not exist.
-fn is_new(out: &Path) -> io::Result<()> {
+/// Makes a file beside `out`, so that a file at `out` is always whole. Unless the process is killed,
+/// the file is removed when it is dropped. Fails if anything is at `out`, even a link to a file that
+/// does not exist.
+fn part(out: &Path) -> io::Result<NamedTempFile> {
     if out.symlink_metadata().is_ok() {
-        let exists = "a file or link is there already: name a new one";
-        return Err(io::Error::new(ErrorKind::AlreadyExists, exists));
+        return Err(taken(ErrorKind::AlreadyExists.into()));
     }
-    Ok(())
+    tempfile::Builder::new()
+        .prefix(".recover-")
+        .permissions(Permissions::from_mode(0o666))
+        .tempfile_in(directory_of(out))
 }
 
-/// Makes and locks a file beside `out`, so that a file at `out` is always whole. An existing file
-/// belongs to somebody and is kept, unless an interrupted `recover` left it. The lock keeps two
-/// processes from writing the same file.
-fn part(out: &Path) -> io::Result<(PathBuf, File)> {
-    let mut end = OsString::from(".part");
-    loop {
-        let mut name = out.file_name().unwrap_or_default().to_owned();
-        name.push(&end);
-        let part = out.with_file_name(name);
-        let file = match File::create_new(&part) {
-            Err(error) if error.kind() == ErrorKind::AlreadyExists => match left_over(&part) {
-                Some(file) => file,
-                None => {
-                    end.push(".part");
-                    continue;
-                }
-            },
-            made => made?,
-        };
-        // On a file system without locks, nobody holds one, so other errors do not matter.
-        if let Err(TryLockError::WouldBlock) = file.try_lock() {
-            let held = "another `hardnessd recover` is writing it: wait for it";
-            return Err(io::Error::new(ErrorKind::ResourceBusy, held));
+/// An error of the system, in words for a file that exists.
+fn taken(error: io::Error) -> io::Error {
+    match error.kind() {
+        ErrorKind::AlreadyExists => {
+            let exists = "a file or link is there already: name a new one";
+            io::Error::new(ErrorKind::AlreadyExists, exists)
         }
-        // The process that held the lock may have renamed the file meanwhile.
-        let ours = file.metadata()?;
-        let is_ours = |there: Metadata| (there.dev(), there.ino()) == (ours.dev(), ours.ino());
-        if fs::metadata(&part).is_ok_and(is_ours) {
-            file.set_len(0)?;
-            return Ok((part, file));
-        }
+        _ => error,
     }
 }
 
-/// The file at `part`, if it is empty or begins like a recording. A link is not followed, because
-/// it may lead to somebody's file.
-fn left_over(part: &Path) -> Option<File> {
-    let no_link = OFlags::NOFOLLOW.bits().cast_signed();
-    let mut options = File::options();
-    let file = options
-        .read(true)
-        .write(true)
-        .custom_flags(no_link)
-        .open(part)
-        .ok()?;
-    let mut start = [0; recording::MAGIC.len()];
-    let read = file.read_at(&mut start, 0).ok()?;
-    (FileKind::of(&start[..read]) == FileKind::Recording).then_some(file)
+fn directory_of(file: &Path) -> &Path {
+    let directory = file.parent().filter(|path| !path.as_os_str().is_empty());
+    directory.unwrap_or(Path::new("."))
 }
 
 fn save(broken: File, part: &File) -> Result<Recovered, RecoverError> {
@@ -195,8 +146,7 @@ fn save(broken: File, part: &File) -> Result<Recovered, RecoverError> {
 
 /// Flushes the directory, because only then is the file's name on the disk.
 fn sync_directory(file: &Path) -> io::Result<()> {
-    let directory = file.parent().filter(|path| !path.as_os_str().is_empty());
-    File::open(directory.unwrap_or(Path::new(".")))?.sync_all()
+    File::open(directory_of(file))?.sync_all()
 }
 
 /// Whether any message of this program was saved.
@@ -252,35 +202,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn no_link_is_followed() {
-        let directory = tempfile::tempdir().unwrap();
-        let (out, theirs) = (
-            directory.path().join("good.mcap"),
-            directory.path().join("theirs"),
-        );
-        symlink(&theirs, &out).unwrap();
-        assert_eq!(is_new(&out).unwrap_err().kind(), ErrorKind::AlreadyExists);
-        // A link at the path of the part is not followed either.
-        fs::write(&theirs, recording::MAGIC).unwrap();
-        symlink(&theirs, directory.path().join("other.mcap.part")).unwrap();
-        let (part, _file) = part(&directory.path().join("other.mcap")).unwrap();
-        assert!(part.ends_with("other.mcap.part.part"), "{}", part.display());
-        assert_eq!(fs::read(&theirs).unwrap(), recording::MAGIC);
-    }
-
-    #[test]
-    fn two_do_not_write_one_file() {
+    fn a_link_counts_as_a_file_that_exists() {
         let directory = tempfile::tempdir().unwrap();
         let out = directory.path().join("good.mcap");
-        let (first, held) = part(&out).unwrap();
-        fs::write(&first, recording::MAGIC).unwrap();
-        let refused = part(&out).unwrap_err();
-        assert_eq!(refused.kind(), ErrorKind::ResourceBusy);
-        assert_eq!(fs::read(&first).unwrap(), recording::MAGIC);
-        // The first process ends before it has finished.
-        drop(held);
-        let (second, file) = part(&out).unwrap();
-        assert_eq!(second, first);
-        assert_eq!(file.metadata().unwrap().len(), 0);
+        symlink(directory.path().join("theirs"), &out).unwrap();
+        assert_eq!(part(&out).unwrap_err().kind(), ErrorKind::AlreadyExists);
     }
 }

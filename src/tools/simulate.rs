@@ -23,10 +23,10 @@ use hardnessd_simulator::{Material, REST_S, SensorProfile, Sequence, SequenceSet
 #[derive(Debug, Clone, ClapArgs)]
 #[command(after_long_help = faults::FORMAT)]
 pub struct Args {
-    /// Symbolic link to make to the pty; an old link is replaced
+    /// Symbolic link to make to the pty; a link that leads nowhere is replaced
     #[arg(long, value_name = "PATH")]
     link: Option<PathBuf>,
-    /// Write the sensor's raw bytes to this file instead, as fast as possible
+    /// Write the sensor's raw bytes to this new file instead, as fast as possible
     #[arg(long, value_name = "FILE", conflicts_with_all = ["link", "speed", "baud"], requires = "presses")]
     to: Option<PathBuf>,
     /// Layout of a frame
@@ -213,7 +213,8 @@ fn sequence(args: &Args) -> SequenceSettings {
 const LAST_FRAME: Duration = Duration::from_millis(500);
 
 /// Writes the bytes that a sensor sends, back to back, until the presses are over or the other end
-/// of `stopped` is dropped. If a write fails, the file is removed, unless it is a device.
+/// of `stopped` is dropped. A file that exists is left alone, but a device or a pipe is written to.
+/// If a write fails, the file is removed.
 fn record(
     path: &Path,
     layout: &Layout,
@@ -221,9 +222,12 @@ fn record(
     faults: Faults,
     stopped: &mpsc::Receiver<()>,
 ) -> std::io::Result<()> {
-    let file = File::create(path)?;
-    let written = write(&file, layout, settings, faults, stopped);
-    if written.is_err() && file.metadata().is_ok_and(|file| file.is_file()) {
+    if path.metadata().is_ok_and(|file| !file.is_file()) {
+        let device = File::options().write(true).open(path)?;
+        return write(&device, layout, settings, faults, stopped);
+    }
+    let written = write(&File::create_new(path)?, layout, settings, faults, stopped);
+    if written.is_err() {
         // The first error says more than a second one.
         let _ = std::fs::remove_file(path);
     }

@@ -273,6 +273,25 @@ fn a_recording_that_does_not_fit_the_disk_leaves_nothing_behind() {
 }
 
 #[test]
+fn a_simulation_leaves_files_and_links_of_others_alone() {
+    let bench = Bench::new();
+    let path = bench.path("theirs.bin").to_str().unwrap().to_owned();
+    fs::write(&path, "theirs").unwrap();
+    let (code, _, error) = run(&["simulate", "--presses", "1", "--to", &path]);
+    assert_eq!(code, 74, "{error}");
+    assert!(error.contains("File exists"), "{error}");
+    assert_eq!(fs::read(&path).unwrap(), b"theirs");
+
+    let _sensor = bench.sensor(&[]);
+    let link = bench.path("port");
+    let first = fs::read_link(&link).unwrap();
+    let (code, _, error) = run(&["simulate", "--link", link.to_str().unwrap()]);
+    assert_eq!(code, 74, "{error}");
+    assert!(error.contains("another `hardnessd simulate`"), "{error}");
+    assert_eq!(fs::read_link(&link).unwrap(), first);
+}
+
+#[test]
 fn a_reader_gets_the_last_frame_of_a_simulated_sensor_whole() {
     let bench = Bench::new();
     let mut sensor = bench.sensor(&["--presses", "1"]);

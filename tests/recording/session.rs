@@ -144,6 +144,40 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
     session.says("recorded 0 objects");
     assert_eq!(session.process.exit_code(), Some(0));
     assert_eq!(fs::read_dir(&own).unwrap().count(), 3);
+
+    // Numbers go on past files that the list lacks, as after a kill. A file that another program makes
+    // meanwhile is left alone.
+    fs::write(own.join("007-sponge.mcap"), "theirs").unwrap();
+    fs::remove_file(own.join("session.csv")).unwrap();
+    let mut session = Session::start(&config, &own);
+    session.says("object 8: its name: ");
+    session.answer("foam");
+    session.says("its level");
+    fs::write(own.join("008-foam.mcap"), "theirs").unwrap();
+    session.answer("2");
+    session.says("008-foam.mcap: File exists");
+    assert_eq!(session.process.exit_code(), Some(74));
+    for theirs in ["007-sponge.mcap", "008-foam.mcap"] {
+        assert_eq!(fs::read(own.join(theirs)).unwrap(), b"theirs");
+    }
+}
+
+#[test]
+fn a_recording_that_cannot_begin_leaves_no_file() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "no/such/directory/events.sock", "");
+    let out = bench.path("a.mcap");
+    let _sensor = bench.sensor(&[]);
+    let record = [
+        "record",
+        "--config",
+        config.to_str().unwrap(),
+        "--sockets",
+        "--out",
+    ];
+    let output = hardnessd(&[&record[..], &[out.to_str().unwrap()]].concat());
+    assert!(!output.status.success(), "{output:?}");
+    assert!(!out.exists());
 }
 
 /// `hrn-train` accepts the recordings unchanged.

@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use tokio::sync::{mpsc, watch};
 
-use super::{Error, check_level, clear, levels, record, said};
+use super::{Error, check_level, clear, create, levels, record, said};
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::record::Progress;
@@ -129,7 +129,7 @@ pub(super) async fn run(
     let mut list = List::open(directory)?;
     let mut user = User::at_terminal(shutdown);
     say("One recording for each object. `q` ends the session.\n");
-    while let Some(object) = ask_for_object(&mut user, list.next, &setup).await {
+    while let Some(object) = ask_for_object(&mut user, list.next()?, &setup).await {
         if !record_object(
             &mut user, &object, directory, labels, &setup, sockets, &mut list,
         )
@@ -184,8 +184,8 @@ async fn record_object(
     sockets: Sockets,
     list: &mut List,
 ) -> Result<bool, Error> {
-    let file = format!("{:03}-{}.mcap", object.number, slug(&object.name));
-    let path = directory.join(&file);
+    let name = format!("{:03}-{}.mcap", object.number, slug(&object.name));
+    let path = directory.join(&name);
     let mut labels = labels.clone();
     labels.extend([
         ("object".to_owned(), object.number.to_string()),
@@ -193,6 +193,8 @@ async fn record_object(
         ("level".to_owned(), object.level.clone()),
     ]);
     loop {
+        // From here on the file is this session's own, so it may be removed.
+        let file = create(&path)?;
         say("do not touch the sensor until the zero is taken\n");
         let mut next = Next::KeepAndQuit;
         let (progress, mut counted) = watch::channel(Progress::default());
@@ -200,7 +202,16 @@ async fn record_object(
             let end = async {
                 next = wait_for_user(user, &mut counted).await;
             };
-            record(setup.clone(), sockets, &path, labels.clone(), progress, end).await
+            record(
+                setup.clone(),
+                sockets,
+                &path,
+                file,
+                labels.clone(),
+                progress,
+                end,
+            )
+            .await
         };
         clear();
         let presses = counted.borrow().presses;
@@ -208,7 +219,7 @@ async fn record_object(
             // A recording without a press would stop `hrn-train collect`.
             let _ = fs::remove_file(&path);
         } else if recorded.is_err() {
-            list.add(object, presses, &file)?;
+            list.add(object, presses, &name)?;
         }
         recorded?;
         match next {
@@ -216,7 +227,7 @@ async fn record_object(
             Next::Keep if presses == 0 => say("no press was recorded: again\n"),
             Next::KeepAndQuit if presses == 0 => return Ok(false),
             Next::Keep | Next::KeepAndQuit => {
-                list.add(object, presses, &file)?;
+                list.add(object, presses, &name)?;
                 return Ok(matches!(next, Next::Keep));
             }
         }
@@ -275,8 +286,6 @@ fn slug(name: &str) -> String {
 /// `session.csv`: a line for each object.
 struct List {
     path: PathBuf,
-    /// The number of the next object. It continues the numbers of an earlier session.
-    next: u32,
     added: u32,
 }
 
@@ -294,15 +303,29 @@ impl List {
             let strange = io::Error::new(ErrorKind::InvalidData, "not the list of a session");
             return Err(listed(&path, strange));
         }
-        let numbers = text
-            .lines()
-            .filter_map(|line| line.split(',').next()?.parse().ok());
-        let last: u32 = numbers.max().unwrap_or_default();
-        Ok(Self {
-            path,
-            next: last.saturating_add(1),
-            added: 0,
-        })
+        Ok(Self { path, added: 0 })
+    }
+
+    /// The number of the next object: above those in the list and those of all recordings in the
+    /// directory. A session that was killed lists nothing, and another one may run beside this one.
+    fn next(&self) -> Result<u32, Error> {
+        let refused = |source| listed(&self.path, source);
+        let listed = fs::read_to_string(&self.path).map_err(refused)?;
+        let listed = listed.lines().filter_map(|line| line.split(',').next());
+        let directory = self.path.parent().unwrap_or(Path::new("."));
+        let files = fs::read_dir(directory).map_err(refused)?;
+        let files = files
+            .flatten()
+            .filter_map(|file| file.file_name().into_string().ok());
+        let files =
+            files.filter_map(|name| name.split_once('-').map(|(number, _)| number.to_owned()));
+        let files: Vec<String> = files.collect();
+        let numbers = listed.chain(files.iter().map(String::as_str));
+        let last: u32 = numbers
+            .filter_map(|number| number.parse().ok())
+            .max()
+            .unwrap_or_default();
+        Ok(last.saturating_add(1))
     }
 
     fn add(&mut self, object: &Object, presses: u64, file: &str) -> Result<(), Error> {
@@ -318,7 +341,6 @@ impl List {
             .open(&self.path)
             .and_then(|mut list| list.write_all(line.as_bytes()));
         written.map_err(|source| listed(&self.path, source))?;
-        self.next = number.saturating_add(1);
         self.added += 1;
         Ok(())
     }
@@ -351,14 +373,22 @@ mod tests {
     fn a_session_goes_on_with_the_numbers_of_the_one_before() {
         let directory = tempfile::tempdir().unwrap();
         let mut list = List::open(directory.path()).unwrap();
-        assert_eq!(list.next, 1);
+        assert_eq!(list.next().unwrap(), 1);
         let object = Object {
             number: 1,
             name: "a \"b\", c".to_owned(),
             level: "2".to_owned(),
         };
         list.add(&object, 20, "001-a.mcap").unwrap();
-        assert_eq!(List::open(directory.path()).unwrap().next, 2);
+        assert_eq!(list.next().unwrap(), 2);
+        // The list of a session that was killed lacks its last recording.
+        fs::write(directory.path().join("007-foam.mcap"), "").unwrap();
+        assert_eq!(list.next().unwrap(), 8);
+        fs::remove_file(directory.path().join(LIST)).unwrap();
+        let list = List::open(directory.path()).unwrap();
+        assert_eq!(list.next().unwrap(), 8);
+        let mut list = List::open(directory.path()).unwrap();
+        list.add(&object, 20, "001-a.mcap").unwrap();
         let text = fs::read_to_string(directory.path().join(LIST)).unwrap();
         assert_eq!(
             text,
