@@ -93,8 +93,17 @@ def installs(machine):
     conffiles = machine.run("dpkg-query -W -f '${Conffiles}' hardnessd").split()
     assert conffiles[::2] == ["/etc/hardnessd.toml"], conffiles
     assert machine.run("dpkg --verify hardnessd") == ""
+    # The rules touch no port that the user has not named.
+    assert adapter(machine) == ["0", "0", "hupcl"], adapter(machine)
+    machine.run(r"""
+        serial=$(udevadm info --query=property /dev/ttyUSB0 | sed -n s/^ID_SERIAL=//p)
+        echo "SUBSYSTEM==\"tty\", ENV{ID_SERIAL}==\"$serial\", ENV{HARDNESSD}=\"1\"" \
+            > /etc/udev/rules.d/98-hardnessd.rules
+        udevadm control --reload
+        udevadm trigger --settle --action=add /dev/ttyUSB0
+    """)
     assert adapter(machine) == ["1", "1", "-hupcl"], adapter(machine)
-    say("installed", f"{seconds:.1f} s; nothing started; the rules act on the adapter that is there")
+    say("installed", f"{seconds:.1f} s; nothing started; the rules act on the adapter once it is named")
 
 
 def config(palm):

@@ -239,37 +239,16 @@ fn subcommand(root: &Path, pid: u32) -> Option<Vec<u8>> {
     is_ours.then(|| words.next().unwrap_or_default().to_vec())
 }
 
-/// ModemManager writes to every new USB serial port, unless a udev rule tells it not to.
+/// ModemManager writes to every new USB serial port, unless udev's database says of this one that it
+/// must not.
 fn modem_manager(root: &Path, device: &Path) -> Option<Fault> {
-    let is_told = [
-        "etc/udev/rules.d",
-        "run/udev/rules.d",
-        "usr/lib/udev/rules.d",
-        "lib/udev/rules.d",
-    ]
-    .iter()
-    .flat_map(|rules| {
-        names(root, rules)
-            .into_iter()
-            .map(move |name| root.join(rules).join(name))
-    })
-    // ModemManager's own rules exempt devices of its list by the same variable.
-    .filter(|rule| {
-        rule.file_name()
-            .is_some_and(|name| !name.to_string_lossy().starts_with("77-mm-"))
-    })
-    .filter_map(|rule| fs::read_to_string(rule).ok())
-    .any(|rule| {
-        rule.lines()
-            .any(|line| !line.starts_with('#') && line.contains(r#"ID_MM_DEVICE_IGNORE}="1""#))
-    });
-    let runs = || processes(root).find(|&pid| command(root, pid) == "ModemManager");
-    if is_told || !is_usb(device) {
+    if !is_usb(device) || property(root, device, "ID_MM_DEVICE_IGNORE").as_deref() == Some("1") {
         return None;
     }
-    runs().map(|pid| Fault {
+    let pid = processes(root).find(|&pid| command(root, pid) == "ModemManager")?;
+    Some(Fault {
         what: format!("ModemManager (process {pid}) writes to it, and no udev rule forbids that"),
-        cure: UDEV_RULE.to_owned(),
+        cure: udev_rule(root, device),
     })
 }
 
@@ -286,16 +265,46 @@ fn latency(root: &Path, device: &Path) -> Option<Fault> {
     (ms > 1).then(|| Fault {
         what: format!("its latency timer holds bytes back for {ms} ms"),
         cure: format!(
-            "echo 1 | sudo tee /{}; to last: {UDEV_RULE}",
-            timer.display()
+            "echo 1 | sudo tee /{}; to last: {}",
+            timer.display(),
+            udev_rule(root, device)
         ),
     })
 }
 
-/// The commands that install the shipped udev rule. It keeps ModemManager away and sets the latency
-/// timer.
-const UDEV_RULE: &str = "sudo cp systemd/99-hardnessd.rules /etc/udev/rules.d/ && \
-    sudo udevadm control --reload && sudo udevadm trigger";
+/// What udev's database says of a device.
+fn property(root: &Path, device: &Path, key: &str) -> Option<String> {
+    let number = Path::new("sys/class/tty").join(device.file_name()?);
+    let number = fs::read_to_string(root.join(number).join("dev")).ok()?;
+    let entry = root
+        .join("run/udev/data")
+        .join(format!("c{}", number.trim()));
+    let text = fs::read_to_string(entry).ok()?;
+    let of_key = |line: &str| {
+        Some(
+            line.strip_prefix("E:")?
+                .strip_prefix(key)?
+                .strip_prefix('=')?
+                .to_owned(),
+        )
+    };
+    text.lines().find_map(of_key)
+}
+
+/// The commands that let the shipped udev rules act on this device.
+fn udev_rule(root: &Path, device: &Path) -> String {
+    let keys = ["ID_SERIAL", "ID_PATH"];
+    let known = keys
+        .iter()
+        .find_map(|key| Some((*key, property(root, device, key)?)));
+    let (key, value) = known.unwrap_or(("ID_SERIAL", "its serial number".to_owned()));
+    let shown = device.display();
+    format!(
+        "echo 'SUBSYSTEM==\"tty\", ENV{{{key}}}==\"{value}\", ENV{{HARDNESSD}}=\"1\"' | sudo tee -a \
+         /etc/udev/rules.d/98-hardnessd.rules && sudo udevadm control --reload && sudo udevadm trigger \
+         --action=add {shown} (99-hardnessd.rules of the package does the rest)"
+    )
+}
 
 fn is_usb(device: &Path) -> bool {
     let name = device.file_name().unwrap_or_default().to_string_lossy();

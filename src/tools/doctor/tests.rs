@@ -158,12 +158,19 @@ fn what_the_kernel_says_goes_before_mode_and_group() {
 fn modem_manager_matters_without_a_rule() {
     let machine = Machine::new();
     machine.put("proc/77/comm", "ModemManager\n");
-    one(
-        &machine.faults(PORT),
-        &["ModemManager (process 77)", "99-hardnessd.rules"],
+    let cure = "ENV{ID_SERIAL}==\"Film_A1\", ENV{HARDNESSD}=\"1\"";
+    machine.put("sys/class/tty/ttyUSB0/dev", "188:0\n");
+    machine.put("run/udev/data/c188:0", "E:ID_SERIAL=Film_A1\n");
+    one(&machine.faults(PORT), &["ModemManager (process 77)", cure]);
+    // A rule for another device does not help this one.
+    machine.put(
+        "etc/udev/rules.d/99-modem.rules",
+        "ENV{ID_MM_DEVICE_IGNORE}=\"1\"\n",
     );
-    let rule = include_str!("../../../systemd/99-hardnessd.rules");
-    machine.put("etc/udev/rules.d/99-hardnessd.rules", rule);
+    machine.put("run/udev/data/c188:1", "E:ID_MM_DEVICE_IGNORE=1\n");
+    one(&machine.faults(PORT), &["ModemManager (process 77)"]);
+    let database = "E:ID_SERIAL=Film_A1\nE:ID_MM_DEVICE_IGNORE=1\n";
+    machine.put("run/udev/data/c188:0", database);
     assert_eq!(machine.faults(PORT), Vec::<String>::new());
 }
 
