@@ -148,13 +148,6 @@ fn the_page_on_recordings_says_what_happens() {
     follow("recordings.md");
 }
 
-#[test]
-fn dots_match_anything_and_the_rest_must_come() {
-    assert!(occurs("a ... c\n...\ne", "x\na b c\nd\ne\n"));
-    assert!(!occurs("a ... d", "a b c"));
-    assert!(occurs("", "anything"));
-}
-
 /// Whether this build has the command: some come with a feature.
 fn is_built(call: &Call) -> bool {
     match call.words.get(1).map(String::as_str) {
@@ -194,47 +187,6 @@ fn every_option_of_the_daemon_in_a_sentence_exists() {
         });
     let wrong: Vec<_> = wrong.collect();
     assert!(wrong.is_empty(), "{wrong:#?}");
-}
-
-#[test]
-fn commands_are_read_as_a_shell_reads_them() {
-    let text = "```sh\nmore='--seed 3 --json'\nfor n in 1 2; do hardnessd demo $more --presses $n; done\n\
-                until [ -e x ]; do sleep 1; done; cargo run -- tail \\\n    --types 'a b' | head\n```\n\
-                ```console\n$ sudo hardnessd check \\\n>   --confg x\nhardnessd output\n```\n";
-    let words: Vec<Vec<String>> = calls("a page", text)
-        .into_iter()
-        .map(|call| call.words)
-        .collect();
-    assert_eq!(
-        words,
-        [
-            &[
-                "hardnessd",
-                "demo",
-                "--seed",
-                "3",
-                "--json",
-                "--presses",
-                "1"
-            ][..],
-            &[
-                "hardnessd",
-                "demo",
-                "--seed",
-                "3",
-                "--json",
-                "--presses",
-                "2"
-            ],
-            &["hardnessd", "tail", "--types", "a b"],
-            &["hardnessd", "check", "--confg", "x"],
-        ]
-    );
-    let is_valid: Vec<bool> = words
-        .iter()
-        .map(|words| Args::try_parse_from(words).is_ok())
-        .collect();
-    assert_eq!(is_valid, [true, true, false, false]);
 }
 
 #[test]

@@ -201,15 +201,3 @@ fn the_package_has_what_its_pages_link_to() {
         "not among the package's assets in Cargo.toml: {missing:#?}"
     );
 }
-
-#[test]
-fn anchors_are_those_of_the_headings() {
-    for (heading, expected) in [
-        ("`[[sensor]]`", "sensor"),
-        ("`gap`, `error` and `ok`", "gap-error-and-ok"),
-        ("ROS 2", "ros-2"),
-        ("A data set: `.npz`", "a-data-set-npz"),
-    ] {
-        assert_eq!(anchor(heading), expected);
-    }
-}

@@ -471,15 +471,4 @@ mod tests {
         let wrong: Vec<_> = wrong.collect();
         assert!(wrong.is_empty(), "{wrong:#?}");
     }
-
-    #[test]
-    fn an_unknown_option_or_a_missing_one_is_no_valid_command() {
-        let page = "```sh\nhrn-train export run --out m.onnx\nhrn-train export run --to m.onnx\n\
-                    hrn-train export run\n```\n";
-        let is_valid: Vec<bool> = pages::calls("a page", page)
-            .iter()
-            .map(|call| Arguments::try_parse_from(&call.words).is_ok())
-            .collect();
-        assert_eq!(is_valid, [true, false, false]);
-    }
 }
