@@ -1,5 +1,7 @@
 //! The checks of a port. They read the file trees under a root, which is `/` except in tests.
 
+mod service;
+
 use std::ffi::OsStr;
 use std::fmt;
 use std::fs;
@@ -106,6 +108,7 @@ fn device_of_another_kind(root: &Path, number: u64) -> Option<String> {
 pub(super) fn examine(root: &Path, port: &Path, user: &User) -> Vec<Fault> {
     let mut faults = in_the_way(root, port, user);
     if let Some(device) = device(root, port) {
+        faults.extend(service::faults(root, &device));
         faults.extend(modem_manager(root, &device));
         faults.extend(latency(root, &device));
     }
@@ -148,21 +151,11 @@ fn others(ports: &[PathBuf]) -> String {
 }
 
 fn denied(root: &Path, device: &Path, user: &User) -> Option<Fault> {
-    const READ_WRITE: u32 = 0o6;
     let path = under(root, device);
     let refusal = (user.access)(&path).err()?;
     let file = fs::metadata(path).ok()?;
     let (mode, gid) = (file.mode(), file.gid());
-    let allows = |shift: u32| (mode >> shift) & READ_WRITE == READ_WRITE;
-    let by_mode = if user.uid == 0 {
-        true
-    } else if user.uid == file.uid() {
-        allows(6)
-    } else if user.gids.contains(&gid) {
-        allows(3)
-    } else {
-        allows(0)
-    };
+    let by_mode = lets_in(&file, user.uid, &user.gids);
     let (line, name, shown) = (entry(root, "etc/group", gid), &user.name, device.display());
     if by_mode {
         return Some(Fault {
@@ -174,7 +167,7 @@ fn denied(root: &Path, device: &Path, user: &User) -> Option<Fault> {
     }
     let group = line.as_ref().map_or(gid.to_string(), |line| field(line, 0));
     let is_listed = line.is_some_and(|line| field(&line, 3).split(',').any(|one| one == name));
-    let cure = if gid == 0 || !allows(3) {
+    let cure = if gid == 0 || !allows(mode, 3) {
         format!(
             "sudo chgrp dialout {shown} && sudo chmod 660 {shown} && sudo usermod -aG dialout {name}"
         )
@@ -190,6 +183,25 @@ fn denied(root: &Path, device: &Path, user: &User) -> Option<Fault> {
         ),
         cure,
     })
+}
+
+/// Whether a file's mode lets a user read and write, by its owner, its group or everybody.
+fn lets_in(file: &fs::Metadata, uid: u32, gids: &[u32]) -> bool {
+    let mode = file.mode();
+    if uid == 0 {
+        true
+    } else if uid == file.uid() {
+        allows(mode, 6)
+    } else if gids.contains(&file.gid()) {
+        allows(mode, 3)
+    } else {
+        allows(mode, 0)
+    }
+}
+
+fn allows(mode: u32, shift: u32) -> bool {
+    const READ_WRITE: u32 = 0o6;
+    (mode >> shift) & READ_WRITE == READ_WRITE
 }
 
 /// A fault for each process other than `own` that has the device open. Only root can see this of
@@ -272,13 +284,17 @@ fn latency(root: &Path, device: &Path) -> Option<Fault> {
     })
 }
 
+/// The number of a serial port, MAJOR:MINOR.
+fn number(root: &Path, device: &Path) -> Option<String> {
+    let entry = Path::new("sys/class/tty").join(device.file_name()?);
+    let number = fs::read_to_string(root.join(entry).join("dev")).ok()?;
+    Some(number.trim().to_owned())
+}
+
 /// What udev's database says of a device.
 fn property(root: &Path, device: &Path, key: &str) -> Option<String> {
-    let number = Path::new("sys/class/tty").join(device.file_name()?);
-    let number = fs::read_to_string(root.join(number).join("dev")).ok()?;
-    let entry = root
-        .join("run/udev/data")
-        .join(format!("c{}", number.trim()));
+    let entry = format!("c{}", number(root, device)?);
+    let entry = root.join("run/udev/data").join(entry);
     let text = fs::read_to_string(entry).ok()?;
     let of_key = |line: &str| {
         Some(

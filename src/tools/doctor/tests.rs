@@ -175,6 +175,44 @@ fn modem_manager_matters_without_a_rule() {
 }
 
 #[test]
+fn the_service_may_open_every_kind_of_serial_port_and_is_told_of_another() {
+    let machine = Machine::new();
+    machine.put("sys/class/tty/ttyUSB0/dev", "188:0\n");
+    machine.put(
+        "proc/devices",
+        "Character devices:\n  4 ttyS\n188 ttyUSB\n\nBlock devices:\n188 sd\n",
+    );
+    let gid = fs::metadata(machine.path("dev/ttyUSB0")).unwrap().gid();
+    let unit = include_str!("../../../systemd/hardnessd.service");
+    machine.put("usr/lib/systemd/system/hardnessd.service", unit);
+    machine.put("etc/passwd", "hardnessd:x:993:993::/:/usr/sbin/nologin\n");
+    machine.put("etc/group", &format!("dialout:x:{gid}:\n"));
+    assert_eq!(machine.faults(PORT), Vec::<String>::new());
+    for kind in "ttyS ttyAMA ttyTHS ttymxc ttyLP ttyPS ttySTM ttyMSM ttyGS rfcomm".split(' ') {
+        machine.put("proc/devices", &format!("Character devices:\n188 {kind}\n"));
+        assert_eq!(machine.faults(PORT), Vec::<String>::new(), "{kind}");
+    }
+    machine.put("proc/devices", "Character devices:\n188 odd\n");
+    one(
+        &machine.faults(PORT),
+        &["Operation not permitted", "DeviceAllow=char-odd rw"],
+    );
+    machine.put(
+        "etc/systemd/system/hardnessd.service.d/override.conf",
+        "[Service]\nDeviceAllow=char-odd rw\n",
+    );
+    assert_eq!(machine.faults(PORT), Vec::<String>::new());
+    machine.put("etc/group", &format!("radio:x:{gid}:\n"));
+    one(
+        &machine.faults(PORT),
+        &[
+            "user hardnessd may not open it",
+            "SupplementaryGroups=radio",
+        ],
+    );
+}
+
+#[test]
 fn a_slow_latency_timer_is_a_fault() {
     let machine = Machine::new();
     machine.put("sys/class/tty/ttyUSB0/device/latency_timer", "16\n");
