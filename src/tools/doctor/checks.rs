@@ -118,7 +118,9 @@ pub(super) fn examine(root: &Path, port: &Path, user: &User) -> Vec<Fault> {
 /// The faults that keep `user` from opening `port`.
 pub(super) fn in_the_way(root: &Path, port: &Path, user: &User) -> Vec<Fault> {
     let Some(device) = device(root, port) else {
-        return vec![missing(&ports(root))];
+        let mut faults = vec![missing(&ports(root))];
+        faults.extend(braille(root));
+        return faults;
     };
     let denied = denied(root, &device, user).into_iter();
     denied
@@ -138,6 +140,26 @@ fn missing(ports: &[PathBuf]) -> Fault {
         what: "no such device".to_owned(),
         cure: others(ports),
     }
+}
+
+/// brltty takes adapters with the chips CH340 and CP210x for braille displays. Their port goes away at
+/// once then.
+fn braille(root: &Path) -> Option<Fault> {
+    let rules = [
+        "etc/udev/rules.d",
+        "usr/lib/udev/rules.d",
+        "lib/udev/rules.d",
+    ];
+    let mut rules = rules.iter().flat_map(|folder| names(root, folder));
+    let is_installed = rules.any(|name| name.ends_with("-brltty.rules"));
+    let runs = processes(root).any(|pid| command(root, pid) == "brltty");
+    (is_installed || runs).then(|| Fault {
+        what: "brltty is installed, which takes adapters with the chips CH340 and CP210x"
+            .to_owned(),
+        cure:
+            "if nobody here reads braille: `sudo apt remove brltty`, then plug the adapter in again"
+                .to_owned(),
+    })
 }
 
 /// Other ports that the user could mean.

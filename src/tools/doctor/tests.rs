@@ -213,6 +213,16 @@ fn the_service_may_open_every_kind_of_serial_port_and_is_told_of_another() {
 }
 
 #[test]
+fn brltty_is_named_where_a_port_is_missing() {
+    let machine = Machine::new();
+    machine.put("usr/lib/udev/rules.d/85-brltty.rules", "");
+    assert_eq!(machine.faults(PORT), Vec::<String>::new());
+    let faults = machine.faults("/dev/ttyUSB7");
+    assert_eq!(faults.len(), 2, "{faults:?}");
+    assert!(faults[1].contains("sudo apt remove brltty"), "{faults:?}");
+}
+
+#[test]
 fn a_slow_latency_timer_is_a_fault() {
     let machine = Machine::new();
     machine.put("sys/class/tty/ttyUSB0/device/latency_timer", "16\n");
