@@ -16,8 +16,6 @@ import intervals  # noqa: E402
 HERE = pathlib.Path(__file__).resolve().parent
 METHODS = {
     "hrn15-strong": "hrn15-strong (no GAN, a good recipe)",
-    "fixmatch": "fixmatch (no GAN, unlabelled too)",
-    "self-training": "self-training (no GAN, unlabelled too)",
     "features-1500": "features (18 hand-made features)",
     "sgan": "sgan (one GAN, Odena)",
     "igan": "igan (one GAN, Salimans)",
@@ -41,7 +39,7 @@ SETS = {
 
 
 def main():
-    figure, panels = plt.subplots(1, len(SETS), figsize=(12, 5.6), layout="constrained", sharey=True)
+    figure, panels = plt.subplots(1, len(SETS), figsize=(12, 5), layout="constrained", sharey=True)
     names = list(METHODS)[::-1]
     border = WITH_MORE_LABELS - 0.5
     for axes, (wanted, title) in zip(panels, SETS.items()):

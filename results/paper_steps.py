@@ -26,8 +26,6 @@ METHODS = {
     "hrn15-long": ("no GAN, the steps of ours", None),
     "hrn15-tuned": ("no GAN, Adam, stops early", None),
     "hrn15-strong": ("no GAN, a good recipe", None),
-    "self-training": ("unlabelled presses, no GAN", None),
-    "fixmatch": ("unlabelled presses, no GAN", None),
     "features": ("1,500 labels, 18 hand-made features", None),
     "frame": ("10,000 labels, default model's method", None),
 }

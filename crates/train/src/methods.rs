@@ -48,12 +48,6 @@ pub enum Method {
     /// Control: hrn15 with the default model's recipe: Adam, averaged weights, symmetries and shifts, a
     /// logarithmic image, mean pooling beside max pooling.
     Hrn15Strong,
-    /// hrn15-strong that also learns from unlabelled samples: it must judge them alike under changes
-    /// of the sensor (FixMatch with an averaged teacher).
-    #[value(name = "fixmatch")]
-    FixMatch,
-    /// hrn15-strong twice: the second time also on the unlabelled samples that the first one was sure of.
-    SelfTraining,
     /// Logistic regression on hand-made features of a frame.
     Features,
     /// Judges a frame and gives its Shore hardness: convolutions beside hand-made features, on all labels.
@@ -67,8 +61,8 @@ pub enum Method {
     Course,
 }
 
-/// Training steps of the strong methods without a GAN, whatever their number of labels: about as
-/// many as the default model takes.
+/// Training steps of `hrn15-strong`, whatever its number of labels: about as many as the default
+/// model takes.
 fn strong_steps(profile: Profile) -> u64 {
     match profile {
         Profile::Paper => 4_800,
@@ -98,21 +92,11 @@ impl Method {
             Self::Hrn15Long => "hrn15-long",
             Self::Hrn15Tuned => "hrn15-tuned",
             Self::Hrn15Strong => "hrn15-strong",
-            Self::FixMatch => "fixmatch",
-            Self::SelfTraining => "self-training",
             Self::Features => "features",
             Self::Frame => "frame",
             Self::Adapt => "adapt",
             Self::Course => "course",
         }
-    }
-
-    /// Whether the method takes [`strong_steps`] and the settings that go with them.
-    fn is_strong(self) -> bool {
-        matches!(
-            self,
-            Self::Hrn15Strong | Self::FixMatch | Self::SelfTraining
-        )
     }
 
     /// The method's settings, before a settings file or an option overrides them.
@@ -123,7 +107,7 @@ impl Method {
             Self::Frame => settings::frame(profile),
             Self::Adapt => settings::adapt(profile),
             Self::Course => settings::course(profile),
-            _ if self.is_strong() => settings::strong(profile),
+            Self::Hrn15Strong => settings::strong(profile),
             _ => Settings::of(profile),
         }
     }
@@ -219,8 +203,8 @@ pub struct Request {
 
 impl Request {
     /// The description of the run on `dataset`. `hrn15-long` gets the number of epochs that makes
-    /// as many steps as `ours` would take on the same labels under the same settings. A strong
-    /// method gets enough epochs for its steps.
+    /// as many steps as `ours` would take on the same labels under the same settings.
+    /// `hrn15-strong` gets enough epochs for its steps.
     ///
     /// # Errors
     ///
@@ -243,7 +227,7 @@ impl Request {
             description.settings.training.epochs =
                 epochs_as_long_as_ours(&self.settings, train.len());
         }
-        if self.method.is_strong() {
+        if self.method == Method::Hrn15Strong {
             let labelled = chosen(dataset, &description)?;
             let share = self.settings.validation.share;
             let (train, _) = dataset.hold_out(&labelled, share, self.seed);
@@ -266,13 +250,7 @@ pub fn check(method: Method, dataset: &Dataset, description: &Description) -> an
     let labelled = chosen(dataset, description)?;
     let needs_unlabelled = matches!(
         method,
-        Method::Ours
-            | Method::Nahrn
-            | Method::Nihrn
-            | Method::Sgan
-            | Method::Igan
-            | Method::FixMatch
-            | Method::SelfTraining
+        Method::Ours | Method::Nahrn | Method::Nihrn | Method::Sgan | Method::Igan
     );
     let Validation { share, .. } = description.settings.validation;
     let (_, held_out) = dataset.hold_out(&labelled, share, description.seed);
@@ -403,11 +381,6 @@ pub fn train(
             let generated = stages.generated(&stages.ustgan()?)?;
             let pretrained = stages.pretrained(&generated, stages.random())?;
             stages.trained("fine-tuning", pretrained)?
-        }
-        Method::FixMatch => stages.consistent("hrn", stages.random())?,
-        Method::SelfTraining => {
-            let teacher = stages.trained("teacher", stages.random())?;
-            stages.self_trained("student", &teacher, stages.random())?
         }
         Method::Sgan => stages.semi_supervised("sgan", Game::FakeLevel)?,
         Method::Igan => stages.semi_supervised("igan", Game::FeatureMatching)?,

@@ -238,15 +238,6 @@ impl Stages<'_> {
         fit::fit(&self.fit_task(stage), initial, self.run)
     }
 
-    /// Trains HRN on the labelled samples and, by consistency, on the unlabelled ones.
-    ///
-    /// # Errors
-    ///
-    /// Fails if the run's directory cannot be read or written, or the training diverges.
-    pub fn consistent(&self, stage: &'static str, initial: Weights) -> anyhow::Result<Trained> {
-        fit::fit(&self.consistent_task(stage), initial, self.run)
-    }
-
     fn consistent_task(&self, stage: &'static str) -> fit::Task<'_> {
         let has_unlabelled = !self.unlabelled.is_empty();
         let consistency = self.settings().consistency;
@@ -273,48 +264,6 @@ impl Stages<'_> {
     /// Fails if the run's directory cannot be read or written, or the training diverges.
     pub fn adapted(&self, stage: &'static str, start: &Start) -> anyhow::Result<Trained> {
         adapt::fit(&self.consistent_task(stage), start, self.run)
-    }
-
-    /// Trains HRN on the labelled samples and on the unlabelled ones that `teacher` judges with
-    /// enough confidence, each with the level that the teacher assigns to it.
-    ///
-    /// # Errors
-    ///
-    /// Fails if the run's directory cannot be read or written, or the training diverges.
-    pub fn self_trained(
-        &self,
-        stage: &'static str,
-        teacher: &Trained,
-        initial: Weights,
-    ) -> anyhow::Result<Trained> {
-        let mut dataset = self.dataset.clone();
-        let frames = (self.unlabelled.iter()).map(|&index| &self.dataset.samples[index].frame);
-        let logits = teacher.logits(frames, self.scale(), self.device);
-        let probabilities = temperature::probabilities(&logits, teacher.temperature, self.device);
-        let least = self.settings().consistency.confidence;
-        let mut train = self.train.to_vec();
-        for (&index, of_frame) in self.unlabelled.iter().zip(&probabilities) {
-            let (level, confidence) = argmax(of_frame);
-            if f64::from(confidence) >= least {
-                dataset.samples[index].level = level as u8 + 1;
-                train.push(index);
-            }
-        }
-        // The student takes as many steps as the teacher took.
-        let own = &self.settings().training;
-        let steps = u64::from(own.epochs) * self.train.len().div_ceil(own.batch) as u64;
-        let epochs = steps.div_ceil(train.len().div_ceil(own.batch) as u64);
-        let settings = Training {
-            epochs: u32::try_from(epochs).unwrap_or(u32::MAX),
-            ..*own
-        };
-        let task = fit::Task {
-            dataset: &dataset,
-            train: &train,
-            settings: &settings,
-            ..self.fit_task(stage)
-        };
-        fit::fit(&task, initial, self.run)
     }
 
     /// Trains a GAN whose discriminator also learns the levels and becomes the recogniser.

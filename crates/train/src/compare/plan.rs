@@ -215,8 +215,6 @@ impl Recipe {
             Method::Hrn15Long | Method::Nihrn => 93.0,
             Method::Hrn100 => 20.0,
             Method::Hrn15Tuned => 15.0,
-            Method::FixMatch => 20.0,
-            Method::SelfTraining => 10.0,
             Method::Hrn50 | Method::Frame => 10.0,
             Method::Hrn15 | Method::Nahrn => 3.0,
             Method::Hrn15Strong => 5.0,

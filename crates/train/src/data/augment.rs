@@ -1,11 +1,8 @@
 //! Augmentation that keeps the physics: the 8 symmetries of the square and integer shifts.
 //!
-//! Optionally also the changes of another sensor of the same kind (`disturb`).
-//!
 //! There is no zoom, no shear, no intensity jitter and no normalisation by a frame's own maximum,
 //! because hardness shows in the contact's width and force.
 
-use crate::data::disturb;
 use crate::settings::AugmentationSettings;
 use hardnessd_core::frame::{COLS, Frame, ROWS};
 use hardnessd_simulator::random::Stream;
@@ -23,11 +20,7 @@ pub fn vary(frame: &Frame, settings: AugmentationSettings, stream: &mut Stream) 
     let reach = isize::from(settings.shift_taxels);
     let mut shift = || stream.below(2 * settings.shift_taxels as usize + 1) as isize - reach;
     let (rows, columns) = (shift(), shift());
-    let moved = shifted(&turned(frame, symmetry), rows, columns);
-    if settings.other_sensors && stream.below(2) == 1 {
-        return disturb::disturbed(&moved, stream);
-    }
-    moved
+    shifted(&turned(frame, symmetry), rows, columns)
 }
 
 /// The image of `frame` under symmetry 0..8; 0 is the identity.

@@ -11,7 +11,6 @@ use crate::settings::{
 const SYMMETRIES_AND_SHIFTS: AugmentationSettings = AugmentationSettings {
     symmetries: true,
     shift_taxels: 3,
-    other_sensors: false,
 };
 
 /// The settings of `igan`. The rate is Salimans's. The average covers about a tenth of the steps.
@@ -39,7 +38,7 @@ pub(super) fn hrn15_tuned(profile: Profile) -> Settings {
     settings
 }
 
-/// The settings of `hrn15-strong`, `fixmatch` and `self-training`.
+/// The settings of `hrn15-strong`.
 pub(super) fn strong(profile: Profile) -> Settings {
     let mut settings = Settings::of(profile);
     settings.network = NetworkSettings {

@@ -11,6 +11,4 @@ pub struct AugmentationSettings {
     pub symmetries: bool,
     /// The largest shift along each axis, in taxels. The taxels that come in are background.
     pub shift_taxels: u8,
-    /// Whether half of the frames are changed to what another sensor of the same kind would give.
-    pub other_sensors: bool,
 }

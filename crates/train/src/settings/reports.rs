@@ -48,19 +48,6 @@ impl Default for ArmReports {
 }
 
 impl ArmReports {
-    /// A robot that always moves alike and reports nothing. Time then takes the place of the
-    /// approach.
-    pub const ONE_ROBOT: Self = Self {
-        unknown: 1.0,
-        unknown_arm: 0.0,
-        exact: 1.0,
-        position: 0.0,
-        arm: 0.0,
-        clock_frames: 0.0,
-        early: 0.25,
-        slower: 0.0,
-    };
-
     /// Returns an error if a value lies outside its range.
     pub(super) fn check(&self) -> Result<(), SettingsError> {
         let check = |key, found: f64, fits, expected| check("reports.", key, found, fits, expected);

@@ -518,8 +518,6 @@ fn every_method_leaves_a_model() {
         "hrn15-long",
         "hrn15-tuned",
         "hrn15-strong",
-        "fixmatch",
-        "self-training",
     ] {
         let trial = Trial::of(method, method, GAN_SETTINGS);
         trial.train("1", &["--label-choice", "random"]);

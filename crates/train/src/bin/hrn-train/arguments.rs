@@ -238,10 +238,6 @@ pub(super) struct Train {
     /// Which samples get their labels
     #[arg(long, default_value = "object")]
     pub(super) label_choice: LabelChoice,
-    /// With --method course: train for a robot that always moves in the same way and reports nothing of its
-    /// arm
-    #[arg(long)]
-    pub(super) one_robot: bool,
     /// Where to compute
     #[arg(long, default_value = "cpu")]
     pub(super) device: DeviceName,

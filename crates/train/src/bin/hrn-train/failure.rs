@@ -56,8 +56,6 @@ pub(super) enum WrongUsage {
          name a model of whole presses, such as models/course.onnx"
     )]
     NoStart,
-    #[error("--one-robot: works with `--method course` only")]
-    NotOneRobot,
     #[error("{0}: works with methods of single frames only")]
     OfFrames(&'static str),
     #[error("{}: {} is another file of this command: name a new one", .0, .1.display())]

@@ -14,7 +14,7 @@ use hrn_train::methods::{self, Method, Request};
 use hrn_train::model::evaluated::Evaluated;
 use hrn_train::model::{course, export};
 use hrn_train::run::{Description, Run};
-use hrn_train::settings::{ArmReports, Profile, Settings};
+use hrn_train::settings::{Profile, Settings};
 
 use super::account;
 use super::arguments::{Adapt, DeviceName, Train};
@@ -27,9 +27,6 @@ pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
     }
     if arguments.method == Method::Course {
         return train_course(arguments);
-    }
-    if arguments.one_robot {
-        return Err(WrongUsage::NotOneRobot.into());
     }
     let settings = settings(
         arguments.method,
@@ -90,14 +87,11 @@ fn train_course(arguments: &Train) -> anyhow::Result<String> {
     if let Some((option, _)) = of_frames.into_iter().find(|(_, is_given)| *is_given) {
         return Err(WrongUsage::OfFrames(option).into());
     }
-    let mut settings = settings(
+    let settings = settings(
         arguments.method,
         arguments.profile,
         arguments.config.as_deref(),
     )?;
-    if arguments.one_robot {
-        settings.reports = ArmReports::ONE_ROBOT;
-    }
     let (courses, sources) = Courses::read_all(&arguments.data)?;
     let choices = (arguments.profile, arguments.seed, settings);
     let description = methods::course::description(Method::Course, &courses, sources, choices)?;
