@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::data::dataset::{LabelChoice, Source};
 use crate::net::network::Weights;
-use crate::settings::{Profile, Settings, SettingsError, retired};
+use crate::settings::{Profile, Settings, SettingsError};
 use checkpoint::Checkpoint;
 use disk::{lock, refuse_foreign, write_whole};
 use hardnessd_core::wording;
@@ -42,7 +42,7 @@ pub struct Description {
     /// How the labelled samples are chosen.
     pub label_choice: LabelChoice,
     /// SHA-256 of the model file that the run started from, if it was one.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<String>,
     /// Settings of the method.
     pub settings: Settings,
@@ -51,20 +51,9 @@ pub struct Description {
 }
 
 impl Description {
-    /// Reads `settings.toml`, also of an earlier version, as long as the run used none of the
-    /// retired options.
+    /// Reads `settings.toml`.
     fn read(text: &str) -> Result<Self, SettingsError> {
-        let syntax = |error| SettingsError::Syntax(wording::of_toml(text, &error));
-        let mut table: toml::Table = toml::from_str(text).map_err(syntax)?;
-        let had_retired = match table.get_mut("settings") {
-            Some(toml::Value::Table(settings)) => retired::strip(settings)?,
-            _ => false,
-        };
-        if had_retired {
-            return table.try_into().map_err(syntax);
-        }
-        // Parse the text itself, so that an error can name the line.
-        toml::from_str(text).map_err(syntax)
+        toml::from_str(text).map_err(|error| SettingsError::Syntax(wording::of_toml(text, &error)))
     }
 
     /// The first key whose value differs from `expected`, with both values. `None` if there is

@@ -12,7 +12,6 @@ pub mod gan;
 pub mod network;
 pub mod optimiser;
 pub mod reports;
-pub(crate) mod retired;
 
 use hardnessd_core::wording;
 
@@ -165,8 +164,6 @@ pub struct Settings {
     /// Learning from unlabelled samples beside the labelled ones, without a GAN.
     pub consistency: ConsistencySettings,
     /// What a robot reports of its arm, and the errors in it, for networks of whole presses.
-    /// Older settings files call the table `told`.
-    #[serde(alias = "told")]
     pub reports: ArmReports,
     /// The labelled objects that are held out.
     pub validation: Validation,
@@ -244,11 +241,7 @@ impl Settings {
         let syntax = |error| SettingsError::Syntax(wording::of_toml(text, &error));
         let _: Self = toml::from_str(text).map_err(syntax)?;
         let own = toml::Table::try_from(self).expect("settings are plain tables of numbers");
-        let mut given: toml::Table = toml::from_str(text).map_err(syntax)?;
-        // These settings have the table under its present name.
-        if let Some(reports) = given.remove(reports::OLD_NAME) {
-            given.insert(reports::NAME.to_owned(), reports);
-        }
+        let given: toml::Table = toml::from_str(text).map_err(syntax)?;
         let merged: Self = merged(own, given).try_into().map_err(syntax)?;
         merged.checked()
     }
@@ -348,27 +341,6 @@ mod tests {
         expected.training.batch = 50;
         expected.training.optimiser.rule = optimiser::Rule::Adam;
         assert_eq!(settings, expected);
-    }
-
-    #[test]
-    fn an_older_file_names_the_reports_of_the_arm_told() {
-        let quick = Settings::of(Profile::Quick);
-        let text = "[told]\nunknown = 1.0\nclock_frames = 0.0";
-        let settings = quick.overridden(text).unwrap();
-        assert_eq!(
-            settings,
-            quick.overridden(&text.replace("told", "reports")).unwrap()
-        );
-        assert_eq!(settings.reports.unknown, 1.0);
-
-        let written = toml::to_string(&settings).unwrap();
-        assert!(written.contains("[reports]"), "{written}");
-        let older = written.replace("[reports]", "[told]");
-        assert_eq!(toml::from_str::<Settings>(&older).unwrap(), settings);
-
-        let both = "[told]\nexact = 0.0\n[reports]\nexact = 1.0";
-        let error = quick.overridden(both).unwrap_err().to_string();
-        assert!(error.contains("reports"), "{error}");
     }
 
     #[test]

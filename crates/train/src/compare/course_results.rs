@@ -31,7 +31,6 @@ pub struct OnSet {
     pub shore_rmse: Option<f64>,
     /// The 95 % interval of the accuracy, by a bootstrap over the geometries where all materials are
     /// pressed alike, otherwise over the objects. Null if it cannot be computed.
-    #[serde(default)]
     pub interval: Option<[f64; 2]>,
     /// Presses judged correctly, by object.
     pub objects: Vec<ObjectCount>,

@@ -89,8 +89,8 @@ pub struct Worth {
 }
 
 impl Worth {
-    /// Reads a run's `compared.json`. A file that is missing or unreadable, such as one of an older
-    /// version, counts as empty, because the results can be measured again.
+    /// Reads a run's `compared.json`. A file that is missing or unreadable counts as empty, because
+    /// the results can be measured again.
     fn read(run: &Path) -> Self {
         let worth = read_json(&run.join("compared.json"));
         worth.ok().flatten().unwrap_or_default()

@@ -314,8 +314,7 @@ fn described(sets: &[(&str, &str)]) -> String {
     sets.iter().map(one).collect::<Vec<_>>().join("; ")
 }
 
-/// Accuracy and calibration on a base set and on other sets. Runs of earlier versions lack some
-/// sets.
+/// Accuracy and calibration on a base set and on other sets.
 fn elsewhere(
     rows: &[Row],
     (title, note): (&str, &str),

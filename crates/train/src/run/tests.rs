@@ -40,18 +40,6 @@ fn a_run_goes_on_with_its_data_under_another_name_and_with_no_other() {
 }
 
 #[test]
-fn a_run_goes_on_whose_settings_name_the_reports_of_the_arm_told() {
-    let directory = tempfile::tempdir().unwrap();
-    let open = || Run::open(directory.path(), &description("a.npz", "12"), true);
-    drop(open().unwrap());
-    let path = directory.path().join("settings.toml");
-    let text = fs::read_to_string(&path).unwrap();
-    assert!(text.contains("[settings.reports]"), "{text}");
-    fs::write(&path, text.replace("[settings.reports]", "[settings.told]")).unwrap();
-    open().unwrap();
-}
-
-#[test]
 fn every_program_that_had_a_part_in_a_run_is_named() {
     let directory = tempfile::tempdir().unwrap();
     let path = |name: &str| directory.path().join(name);

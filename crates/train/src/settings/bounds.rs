@@ -22,14 +22,6 @@ pub enum SettingsError {
          only"
     )]
     Keep,
-    /// A run of an earlier version used an option that no longer exists.
-    #[error("the run used `{key}`, which is gone: read it with revision {last_revision}")]
-    Retired {
-        /// Path of the key.
-        key: String,
-        /// The last revision that knew the option.
-        last_revision: &'static str,
-    },
 }
 
 /// The most samples that a component generates at once. Fifty components make half a million, which

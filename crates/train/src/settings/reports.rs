@@ -4,11 +4,6 @@ use serde::{Deserialize, Serialize};
 
 use super::bounds::{SettingsError, check};
 
-/// The name of the table.
-pub(super) const NAME: &str = "reports";
-/// The name of the table in older settings files.
-pub(super) const OLD_NAME: &str = "told";
-
 /// Errors in the reports about the arm, and other changes to a press, drawn anew for each press. A
 /// network that has only learnt from correct reports trusts every report.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
