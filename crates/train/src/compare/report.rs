@@ -20,12 +20,17 @@ pub use self::courses::{Curve, courses};
 use self::plot::escaped;
 use crate::compare::digits;
 use crate::compare::results::{Comparison, Details, Measured, Row, ensure_square};
-use crate::compare::sets::{MATCHED, PAPER_SPLIT};
+use crate::compare::sets::MATCHED;
 use crate::compare::table::Table;
 use crate::compare::tables;
 use crate::judge::metrics::{Bin, Evaluation};
 
 const STYLE: &str = include_str!("report/style.css");
+
+/// How to read the curves of training.
+const CURVES: &str = "A line for each run. Blue: loss and accuracy on the training samples (of a GAN, \
+                      the discriminator's loss). Orange: on held-out objects, the generator's loss, or \
+                      within a component. Dashed: real frames.";
 
 /// The page of the comparison or run in `directory`.
 ///
@@ -46,82 +51,30 @@ pub fn of(directory: &Path) -> anyhow::Result<String> {
 ///
 /// Fails if a picture of a run cannot be read.
 pub fn comparison(comparison: &Comparison) -> anyhow::Result<String> {
-    let rows = comparison.rows();
     let mut page = Page::default();
-    page.section("summary", "Summary");
-    page.table(&tables::headline(&rows));
-    page.figure(
-        &figures::accuracies(
-            &rows,
-            MATCHED,
-            "accuracy on fresh objects of matched shapes",
-        ),
-        "Fresh objects, shapes alike for all materials: mean over seeds, its 95 % interval, \
-         and a tick for each seed.",
-    );
-
-    page.section("table-2", "Table 2");
-    page.table(&tables::table_2(&rows));
-    page.figure(
-        &figures::accuracies(&rows, PAPER_SPLIT, "accuracy on the test split"),
-        "The data set's own test split, of the paper's size. Rings: the paper's figures on its own \
-         data.",
-    );
-    for table in tables::fresh(&rows) {
+    page.section("tables", "Tables");
+    for table in tables::all(comparison) {
         page.subtitle(&table.title);
         page.table(&table);
     }
-
-    page.section("table-3", "Table 3");
-    page.table(&tables::table_3(&rows));
-    page.note("Samples of the test split, mean over seeds; in the paper 250 a level.");
-    page.panels(confusions(&rows));
-
-    page.section("steps", "Accuracy against steps");
-    page.figure(
-        &figures::price(&rows, MATCHED),
-        "Accuracy of every method on fresh objects of matched shapes, against the steps of all its \
-         stages.",
-    );
-    page.note(
-        "In training, a line for each seed: the share of the training samples that were judged \
-         correctly (blue), and of held-out objects if there are some (orange). Dashed lines separate \
-         the stages. Methods that do not measure this share are left out. The dot is the accuracy on \
-         fresh objects of matched shapes.",
-    );
-    page.panels(
-        rows.iter()
-            .filter_map(|row| figures::curve(row, MATCHED))
-            .collect(),
-    );
-
+    let rows = comparison.rows();
+    page.section("training", "Training");
+    page.note(CURVES);
+    for row in &rows {
+        let histories = row.runs.iter().map(|(_, details)| &details.history);
+        let pictures = figures::stages(&histories.collect::<Vec<_>>());
+        if !pictures.is_empty() {
+            page.folded(&row.title, |page| page.panels(pictures));
+        }
+    }
     page.section("samples", "Frames, real and generated");
     samples(&mut page, &rows)?;
-
     page.section("calibration", "Calibration");
-    page.table(&tables::calibration(&rows));
     page.note(
         "Share of right answers against stated confidence, fresh objects of matched shapes, all \
          seeds. Below the diagonal a model is too sure.",
     );
     page.panels(reliabilities(&rows));
-    page.subtitle("Another sensor");
-    page.table(&tables::shifts(&rows));
-    page.subtitle("Other shapes and materials");
-    page.table(&tables::worlds(&rows));
-
-    page.section("price", "Price");
-    page.table(&tables::price(&rows));
-
-    if !comparison.swaps.is_empty() {
-        page.section("swaps", "Materials swapped");
-        page.table(&tables::swaps(&comparison.swaps));
-        page.figure(
-            &figures::swaps(&tables::swap_groups(&comparison.swaps)),
-            "Each dot is a run: an assignment of the two materials of each level to training and test, \
-             and a seed. Rings are the paper's assignment.",
-        );
-    }
     let provenance = tables::provenance(comparison);
     Ok(page.finish("Hardness recognition: methods compared", &provenance))
 }
@@ -143,8 +96,7 @@ pub fn run(details: &Details) -> anyhow::Result<String> {
         ensure_square(&details.directory, std::iter::once(&evaluation))?;
         page.section("evaluation", "On the test split");
         page.table(&tables::evaluation(&evaluation));
-        let counts = tables::mean_confusion(&[&evaluation]);
-        page.panels(vec![figures::confusion(&counts, "counts")]);
+        page.table(&tables::confusion(&evaluation));
     }
     page.section("sets", "On other shapes and materials");
     if details.worth.sets.is_empty() {
@@ -158,12 +110,8 @@ pub fn run(details: &Details) -> anyhow::Result<String> {
     }
     page.section("steps", "Training");
     page.table(&tables::stages(&details.history));
-    page.note(
-        "Blue: loss and accuracy on the training samples (of a GAN, the discriminator's loss). \
-         Orange: on held-out objects, the generator's loss, or within a component. Dashed: real \
-         frames.",
-    );
-    page.panels(figures::stages(&details.history));
+    page.note(CURVES);
+    page.panels(figures::stages(&[&details.history]));
     if !details.worth.sets.is_empty() {
         page.section("calibration", "Calibration");
         let sets = details.worth.sets.iter();
@@ -190,26 +138,6 @@ pub fn run(details: &Details) -> anyhow::Result<String> {
         details.revisions.replace('\n', ", ")
     );
     Ok(page.finish(&title, &provenance))
-}
-
-fn confusions(rows: &[Row]) -> Vec<String> {
-    let mut pictures = Vec::new();
-    for row in rows {
-        let evaluations = tables::evaluations(row, PAPER_SPLIT);
-        if evaluations.is_empty() {
-            continue;
-        }
-        let counts = tables::mean_confusion(&evaluations);
-        let mut picture = figures::confusion(&counts, &row.title);
-        if let Some(paper) = tables::paper_row(row) {
-            let counts = paper
-                .confusion
-                .map(|row| row.map(|count| count as f64).to_vec());
-            picture += &figures::confusion(&counts, "in the paper");
-        }
-        pictures.push(picture);
-    }
-    pictures
 }
 
 fn reliabilities(rows: &[Row]) -> Vec<String> {
@@ -244,11 +172,10 @@ fn samples(page: &mut Page, rows: &[Row]) -> anyhow::Result<()> {
         if !tables::reference(rows).is_some_and(|reference| std::ptr::eq(row, reference)) {
             continue;
         }
-        page.body += "<details><summary>fixed noise at the end of each stage</summary>\n";
-        for picture in &pictures[1..] {
-            page.picture(picture)?;
-        }
-        page.body += "</details>\n";
+        page.folded("fixed noise at the end of each stage", |page| {
+            let mut later = pictures[1..].iter();
+            later.try_for_each(|picture| page.picture(picture))
+        })?;
     }
     if none {
         page.note("None of these runs has pictures.");
@@ -308,12 +235,13 @@ impl Page {
         let _ = writeln!(self.body, "<p>{}</p>", escaped(text));
     }
 
-    fn figure(&mut self, picture: &str, caption: &str) {
-        let caption = escaped(caption);
-        let _ = writeln!(
-            self.body,
-            "<figure>{picture}<figcaption>{caption}</figcaption></figure>"
-        );
+    /// Adds what `content` adds, folded under a title.
+    fn folded<T>(&mut self, title: &str, content: impl FnOnce(&mut Self) -> T) -> T {
+        let title = escaped(title);
+        let _ = writeln!(self.body, "<details><summary>{title}</summary>");
+        let result = content(self);
+        self.body += "</details>\n";
+        result
     }
 
     fn panels(&mut self, pictures: Vec<String>) {

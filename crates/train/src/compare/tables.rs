@@ -15,14 +15,12 @@ use crate::compare::sets::{FRESH, MATCHED, PAPER_SPLIT, SHIFTS, WORLDS, clusters
 use crate::judge::metrics::{self, Evaluation};
 use crate::run::history::{History, Stage};
 use cells::{
-    before_temperature, beside, by_assignment, deviation, interval, least, mean_over_seeds,
-    minus_features, minus_reference, most, of_entries, percent_of, with_spread,
+    before_temperature, beside, by_assignment, deviation, evaluations, interval, least, mean,
+    mean_confusion, mean_over_seeds, minus_features, minus_reference, most, of_entries, paper_row,
+    percent_of, swap_groups, with_spread,
 };
 
-pub use cells::{
-    accuracy, difference_text, evaluations, interval_text, mean, mean_confusion, paper_row,
-    reference, swap_groups,
-};
+pub use cells::{difference_text, interval_text, reference};
 
 /// The content of `tables.md`.
 pub fn markdown(comparison: &Comparison) -> String {
@@ -75,7 +73,7 @@ pub fn provenance(comparison: &Comparison) -> String {
 }
 
 /// Every table, in the order to read them.
-fn all(comparison: &Comparison) -> Vec<Table> {
+pub(super) fn all(comparison: &Comparison) -> Vec<Table> {
     let rows = comparison.rows();
     let mut tables = vec![headline(&rows), table_2(&rows)];
     tables.extend(fresh(&rows));
@@ -144,7 +142,7 @@ const ACCURACIES: [&str; 7] = [
 ];
 
 /// Table 2, with the paper's figures in brackets.
-pub fn table_2(rows: &[Row]) -> Table {
+fn table_2(rows: &[Row]) -> Table {
     let note = "Category accuracies and overall accuracy in per cent on the data set's own test \
                 split, of the paper's size; in brackets the paper's.";
     let head = [&["method", "labels"], &ACCURACIES[..]].concat();
@@ -167,7 +165,7 @@ pub fn table_2(rows: &[Row]) -> Table {
 }
 
 /// Accuracies on the fresh objects of `paper` and of `matched` shapes.
-pub fn fresh(rows: &[Row]) -> [Table; 2] {
+fn fresh(rows: &[Row]) -> [Table; 2] {
     [
         (FRESH, "Fresh objects, shapes as the paper's pictures"),
         (MATCHED, "Fresh objects, the same shapes for all materials"),
@@ -191,7 +189,7 @@ fn accuracies(rows: &[Row], set: &str, title: &str) -> Table {
 }
 
 /// Table 3's kappas, with the paper's in brackets.
-pub fn table_3(rows: &[Row]) -> Table {
+fn table_3(rows: &[Row]) -> Table {
     let note = "Cohen's kappa on the counts, and the same with quadratic weights, because levels \
                 are ordinal; in brackets what the paper's counts give.";
     let head = [
@@ -251,7 +249,7 @@ fn confusions(rows: &[Row]) -> Table {
 }
 
 /// Calibration errors and likelihoods of the models' probabilities.
-pub fn calibration(rows: &[Row]) -> Table {
+fn calibration(rows: &[Row]) -> Table {
     let note = "Expected calibration error (ECE) in per cent (15 bins of the largest probability) and mean \
                 negative log-likelihood in nats, on materials that no model has seen. \"Raw\": before the \
                 temperature that methods with held-out objects fit on them.";
@@ -282,7 +280,7 @@ pub fn calibration(rows: &[Row]) -> Table {
 }
 
 /// Results on the same objects under other sensors.
-pub fn shifts(rows: &[Row]) -> Table {
+fn shifts(rows: &[Row]) -> Table {
     let note = format!(
         "The fresh objects of the paper's shapes, pressed again on other sensors: accuracy and expected \
          calibration error (ECE) in per cent. {}.",
@@ -297,7 +295,7 @@ pub fn shifts(rows: &[Row]) -> Table {
 }
 
 /// Results on objects of other shapes and materials.
-pub fn worlds(rows: &[Row]) -> Table {
+fn worlds(rows: &[Row]) -> Table {
     let note = format!(
         "Fresh objects of other shapes and materials: accuracy and expected calibration error (ECE) \
          in per cent. One frame fixes only the ratio of radius and modulus, so varying shapes lower the accuracy \
@@ -348,7 +346,7 @@ fn elsewhere(
 }
 
 /// Labels, steps and seconds of each method, stage by stage.
-pub fn price(rows: &[Row]) -> Table {
+fn price(rows: &[Row]) -> Table {
     let note = "Mean over seeds. A step is a batch of 100 of either network; one of a GAN costs \
                 about six of HRN in seconds.";
     let head = [
@@ -435,6 +433,23 @@ pub fn evaluation(evaluation: &Evaluation) -> Table {
     table
 }
 
+/// The confusion matrix of one evaluation. Rows are the truth, columns are the verdicts.
+pub fn confusion(evaluation: &Evaluation) -> Table {
+    let mut table = Table::new(
+        "Confusion",
+        "Rows are the truth, columns are the verdicts.",
+        &[],
+    );
+    table.head = vec!["truth".to_owned()];
+    for (truth, counts) in (1..).zip(&evaluation.confusion) {
+        table.head.push(truth.to_string());
+        let mut cells = vec![format!("level {truth}")];
+        cells.extend(counts.iter().map(ToString::to_string));
+        table.rows.push(cells);
+    }
+    table
+}
+
 /// The table of a run's results on the test sets of a comparison.
 pub fn sets(worth: &Worth) -> Table {
     let sets = described(&[&SHIFTS[..], &WORLDS[..]].concat());
@@ -461,7 +476,7 @@ pub fn sets(worth: &Worth) -> Table {
 }
 
 /// The table of runs with swapped materials.
-pub fn swaps(swaps: &[SwapEntry]) -> Table {
+fn swaps(swaps: &[SwapEntry]) -> Table {
     let note = "The two materials of some levels in each other's roles, each time learnt anew and \
                 judged on 20 objects of each material, in the paper's shapes: accuracy in per cent. Each \
                 assignment counts with its mean over seeds. The choice of materials alone causes the \

@@ -2,9 +2,9 @@
 
 use super::Page;
 use super::figures;
-use super::plot::{Anchor, Scale, Svg, axes};
+use super::plot::{Axis, Chart};
 use crate::compare::course_results::{self, CourseRow, OnSet};
-use crate::compare::so_far::{After, AtForce, SoFar};
+use crate::compare::so_far::SoFar;
 
 /// The force of a press against the approach of the arm.
 #[derive(Debug, Clone, PartialEq)]
@@ -71,104 +71,56 @@ fn force_against_approach(curves: &[Curve]) -> Vec<String> {
     let points = || curves.iter().flat_map(|curve| &curve.points);
     let most_mm = points().fold(0.0_f64, |most, point| most.max(point.0));
     let most_n = points().fold(0.0_f64, |most, point| most.max(point.1));
-    let x = Scale::linear((0.0, most_mm), (38.0, 244.0));
-    let y = Scale::linear((0.0, most_n), (146.0, 40.0));
     let mut levels: Vec<u8> = curves.iter().map(|curve| curve.level).collect();
     levels.sort_unstable();
     levels.dedup();
     let panel = |level: u8| {
-        let mut svg = Svg::new(260.0, 181.0);
-        let title = format!("level {level}");
-        svg.text("name", (0.0, 12.0), Anchor::Start, &title);
-        axes(&mut svg, (&x, "approach, mm"), (&y, "force, N"), (4, 4));
-        for curve in curves.iter().filter(|curve| curve.level == level) {
-            let points = curve
-                .points
-                .iter()
-                .map(|point| (x.at(point.0), y.at(point.1)));
-            svg.path("train", &points.collect::<Vec<_>>());
-        }
-        svg.finish(&format!("force against approach, {title}"))
+        let title = format!("force against approach, level {level}");
+        let x = Axis::linear("approach, mm", 0.0, most_mm);
+        let y = Axis::linear("force, N", 0.0, most_n);
+        let of_level = curves.iter().filter(|curve| curve.level == level);
+        of_level
+            .fold(Chart::new(&title, x, y), |chart, curve| {
+                chart.line("train", &curve.points)
+            })
+            .svg()
     };
     levels.into_iter().map(panel).collect()
 }
 
 /// Accuracy against the time since a press began.
 fn against_time(so_far: &SoFar, set: &str) -> String {
-    let point = |after: &After| Point {
-        at: f64::from(after.seconds),
-        accuracy: after.accuracy,
-        presses: after.going_on,
-        tip: format!(
-            "after {} s: {:.1} % correct, {:.1} % still pressed",
-            after.seconds,
-            100.0 * after.accuracy,
-            100.0 * after.going_on
-        ),
-    };
-    let points: Vec<Point> = so_far.after.iter().map(point).collect();
-    shares(
-        &points,
-        "seconds",
-        &format!("accuracy against time, {set}"),
-        set,
-    )
+    let points = so_far.after.iter();
+    let points = points.map(|at| (f64::from(at.seconds), at.accuracy, at.going_on));
+    shares("time", "seconds", set, points.collect())
 }
 
 /// Accuracy against the force that a press has reached.
 fn against_force(so_far: &SoFar, set: &str) -> String {
-    let point = |at: &AtForce| {
-        let accuracy = at.accuracy?;
-        Some(Point {
-            at: at.newtons,
-            accuracy,
-            presses: at.reached,
-            tip: format!(
-                "from {} N: {:.1} % correct, {:.1} % reach it",
-                at.newtons,
-                100.0 * accuracy,
-                100.0 * at.reached
-            ),
-        })
-    };
-    let points: Vec<Point> = so_far.at_force.iter().filter_map(point).collect();
-    shares(
-        &points,
-        "newtons",
-        &format!("accuracy against force, {set}"),
-        set,
-    )
+    let points = so_far.at_force.iter();
+    let points = points.filter_map(|at| Some((at.newtons, at.accuracy?, at.reached)));
+    shares("force", "newtons", set, points.collect())
 }
 
-/// A point of [`shares`].
-struct Point {
-    at: f64,
-    accuracy: f64,
-    presses: f64,
-    tip: String,
-}
-
-/// Accuracy (a line with marks) and a share of presses (dashed) on a logarithmic axis.
-fn shares(points: &[Point], axis: &str, title: &str, set: &str) -> String {
-    let (least, most) = points
-        .iter()
-        .fold((1.0_f64, 1.0_f64), |(least, most), point| {
-            (least.min(point.at), most.max(point.at))
-        });
+/// Accuracy and the share of presses (dashed) on a logarithmic axis. Each of `points` has its place,
+/// the accuracy and the share.
+fn shares(of: &str, axis: &str, set: &str, points: Vec<(f64, f64, f64)>) -> String {
+    let places = points.iter().map(|point| point.0);
+    let (least, most) = places.fold((1.0_f64, 1.0_f64), |(least, most), at| {
+        (least.min(at), most.max(at))
+    });
+    let title = format!("accuracy against {of}, {set}");
     // With a margin, so that the ends of the axis show decades.
-    let x = Scale::logarithmic((0.8 * least, 1.6 * most), (38.0, 244.0));
-    let y = Scale::linear((0.0, 100.0), (146.0, 40.0));
-    let mut svg = Svg::new(260.0, 181.0);
-    svg.text("name", (0.0, 12.0), Anchor::Start, set);
-    axes(&mut svg, (&x, axis), (&y, "%"), (3, 4));
-    let place = |point: &Point, share: f64| (x.at(point.at), y.at(100.0 * share));
-    let path = |of: fn(&Point) -> f64| -> Vec<(f64, f64)> {
-        points.iter().map(|point| place(point, of(point))).collect()
-    };
-    svg.path("diagonal", &path(|point| point.presses));
-    svg.path("train", &path(|point| point.accuracy));
-    for point in points {
-        svg.dot("mark", place(point, point.accuracy), 3.0, &point.tip);
-    }
-    svg.finish(title)
+    let x = Axis::logarithmic(axis, 0.8 * least, 1.6 * most);
+    let y = Axis::linear("%", 0.0, 100.0);
+    let presses: Vec<_> = points
+        .iter()
+        .map(|point| (point.0, 100.0 * point.2))
+        .collect();
+    let right: Vec<_> = points
+        .iter()
+        .map(|point| (point.0, 100.0 * point.1))
+        .collect();
+    let lines = Chart::new(&title, x, y).line("diagonal", &presses);
+    lines.line("train", &right).svg()
 }

@@ -1,169 +1,66 @@
-//! Draws figures as SVG. Colours are classes of the page's style sheet, so that they follow its
-//! dark and light modes. The SVG loads nothing.
+//! Draws charts of lines and dots as SVG, all of one size. Colours are classes of the page's style
+//! sheet, so that they follow its dark and light modes. The SVG loads nothing.
 
 use std::fmt::Write as _;
 
-/// An SVG under construction. Lengths are in its own pixels.
-#[derive(Debug)]
-pub(super) struct Svg {
-    /// The style class of the whole picture; may be empty.
-    class: &'static str,
-    width: f64,
-    height: f64,
-    body: String,
-}
+/// Width and height of a chart, and the edges of its axes, in pixels.
+const SIZE: (f64, f64) = (260.0, 181.0);
+const LEFT: f64 = 48.0;
+const RIGHT: f64 = 244.0;
+const BOTTOM: f64 = 146.0;
+const TOP: f64 = 40.0;
 
-/// The anchor of a text.
+/// An axis: its name, and the values at its ends.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Anchor {
-    Start,
-    Middle,
-    End,
+pub(super) struct Axis<'a> {
+    name: &'a str,
+    low: f64,
+    high: f64,
+    is_logarithmic: bool,
 }
 
-impl Svg {
-    pub(super) fn new(width: f64, height: f64) -> Self {
+impl<'a> Axis<'a> {
+    pub(super) fn linear(name: &'a str, low: f64, high: f64) -> Self {
         Self {
-            class: "",
-            width,
-            height,
-            body: String::new(),
+            name,
+            low,
+            high,
+            is_logarithmic: false,
         }
     }
 
-    /// The same picture with a style class, which says how it fits on a narrow screen.
-    pub(super) fn of_class(self, class: &'static str) -> Self {
-        Self { class, ..self }
-    }
-
-    pub(super) fn line(&mut self, class: &str, from: (f64, f64), to: (f64, f64)) {
-        let ((x1, y1), (x2, y2)) = (from, to);
-        self.element(format_args!(
-            r#"<line class="{class}" x1="{x1:.1}" y1="{y1:.1}" x2="{x2:.1}" y2="{y2:.1}"/>"#
-        ));
-    }
-
-    pub(super) fn path(&mut self, class: &str, points: &[(f64, f64)]) {
-        let mut list = String::new();
-        for (x, y) in points {
-            let _ = write!(list, "{x:.1},{y:.1} ");
+    /// A logarithmic axis, for values above 0.
+    pub(super) fn logarithmic(name: &'a str, low: f64, high: f64) -> Self {
+        Self {
+            is_logarithmic: true,
+            ..Self::linear(name, low, high)
         }
-        let list = list.trim_end();
-        self.element(format_args!(
-            r#"<polyline class="{class}" points="{list}"/>"#
-        ));
     }
 
-    /// A dot that shows `tip` under the pointer.
-    pub(super) fn dot(&mut self, class: &str, (x, y): (f64, f64), radius: f64, tip: &str) {
-        let tip = escaped(tip);
-        self.element(format_args!(
-            r#"<circle class="{class}" cx="{x:.1}" cy="{y:.1}" r="{radius:.1}"><title>{tip}</title></circle>"#
-        ));
-    }
-
-    /// A rectangle of this opacity.
-    pub(super) fn rectangle(
-        &mut self,
-        class: &str,
-        (x, y): (f64, f64),
-        (width, height): (f64, f64),
-        opacity: f64,
-    ) {
-        self.element(format_args!(
-            r#"<rect class="{class}" x="{x:.1}" y="{y:.1}" width="{width:.1}" height="{height:.1}" fill-opacity="{opacity:.3}"/>"#
-        ));
-    }
-
-    pub(super) fn text(&mut self, class: &str, (x, y): (f64, f64), anchor: Anchor, text: &str) {
-        let anchor = match anchor {
-            Anchor::Start => "start",
-            Anchor::Middle => "middle",
-            Anchor::End => "end",
+    /// The place of a value between two pixels.
+    fn at(&self, value: f64, (first, last): (f64, f64)) -> f64 {
+        let place = |value: f64| match self.is_logarithmic {
+            true => value.ln(),
+            false => value,
         };
-        let text = escaped(text);
-        self.element(format_args!(
-            r#"<text class="{class}" x="{x:.1}" y="{y:.1}" text-anchor="{anchor}">{text}</text>"#
-        ));
-    }
-
-    fn element(&mut self, element: std::fmt::Arguments) {
-        let _ = self.body.write_fmt(element);
-        self.body.push('\n');
-    }
-
-    /// The complete element. `title` is its label for screen readers.
-    pub(super) fn finish(self, title: &str) -> String {
-        let Self {
-            class,
-            width,
-            height,
-            body,
-        } = self;
-        let title = escaped(title);
-        let class = if class.is_empty() {
-            String::new()
-        } else {
-            format!(r#" class="{class}""#)
-        };
-        format!(
-            r#"<svg{class} viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img" aria-label="{title}">
-{body}</svg>
-"#
-        )
-    }
-}
-
-/// A scale from values to pixels.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Scale {
-    values: (f64, f64),
-    pixels: (f64, f64),
-    logarithmic: bool,
-}
-
-impl Scale {
-    pub(super) fn linear(values: (f64, f64), pixels: (f64, f64)) -> Self {
-        Self {
-            values,
-            pixels,
-            logarithmic: false,
-        }
-    }
-
-    /// A logarithmic scale, for values above 0.
-    pub(super) fn logarithmic(values: (f64, f64), pixels: (f64, f64)) -> Self {
-        Self {
-            values,
-            pixels,
-            logarithmic: true,
-        }
-    }
-
-    pub(super) fn at(&self, value: f64) -> f64 {
-        let place = |value: f64| if self.logarithmic { value.ln() } else { value };
-        let (low, high) = (place(self.values.0), place(self.values.1));
+        let (low, high) = (place(self.low), place(self.high));
         let part = if high > low {
             (place(value) - low) / (high - low)
         } else {
             0.5
         };
-        self.pixels.0 + part * (self.pixels.1 - self.pixels.0)
+        first + part * (last - first)
     }
 
-    /// Round values within the scale, about `count` of them.
-    pub(super) fn ticks(&self, count: usize) -> Vec<f64> {
-        if count == 0 {
-            return Vec::new();
-        }
-        let (low, high) = self.values;
-        if self.logarithmic {
-            let decades = low.log10().ceil() as i32..=high.log10().floor() as i32;
+    /// Three to eight round values within the axis, or its decades.
+    fn ticks(&self) -> Vec<f64> {
+        if self.is_logarithmic {
+            let decades = self.low.log10().ceil() as i32..=self.high.log10().floor() as i32;
             return decades.map(|decade| 10_f64.powi(decade)).collect();
         }
-        let rough = (high - low) / count as f64;
+        let rough = (self.high - self.low) / 4.0;
         if rough <= 0.0 || !rough.is_finite() {
-            return vec![low];
+            return vec![self.low];
         }
         let decade = 10_f64.powf(rough.log10().floor());
         let step = [1.0, 2.0, 5.0, 10.0]
@@ -171,66 +68,117 @@ impl Scale {
             .into_iter()
             .find(|step| *step >= 0.999 * rough)
             .unwrap_or(10.0 * decade);
-        let first = (low / step - 1e-9).ceil() as i64;
-        let last = (high / step + 1e-9).floor() as i64;
+        let first = (self.low / step - 1e-9).ceil() as i64;
+        let last = (self.high / step + 1e-9).floor() as i64;
         (first..=last).map(|k| k as f64 * step).collect()
     }
 }
 
 /// The label of a tick.
-pub(super) fn label(value: f64) -> String {
-    if value == 0.0 {
-        return "0".to_owned();
-    }
-    let size = value.abs();
-    if size >= 1e6 {
-        format!("{}M", value / 1e6)
-    } else if size >= 1e3 {
-        format!("{}k", value / 1e3)
-    } else {
+fn label(value: f64) -> String {
+    match value.abs() {
+        0.0 => "0".to_owned(),
+        1e6.. => format!("{}M", value / 1e6),
+        1e3.. => format!("{}k", value / 1e3),
         // Round to 6 decimals, which removes the noise of binary fractions.
-        format!("{}", (value * 1e6).round() / 1e6)
+        _ => format!("{}", (value * 1e6).round() / 1e6),
     }
 }
 
-/// Draws two axes, each with its name and about `ticks` ticks, and a grid.
-pub(super) fn axes(
-    svg: &mut Svg,
-    (x, x_name): (&Scale, &str),
-    (y, y_name): (&Scale, &str),
-    ticks: (usize, usize),
-) {
-    let ((left, right), (bottom, top)) = (x.pixels, y.pixels);
-    for value in y.ticks(ticks.1) {
-        let at = y.at(value);
-        svg.line("grid", (left, at), (right, at));
-        svg.text("tick", (left - 5.0, at + 3.5), Anchor::End, &label(value));
+/// A chart under construction.
+#[derive(Debug)]
+pub(super) struct Chart<'a> {
+    title: &'a str,
+    x: Axis<'a>,
+    y: Axis<'a>,
+    body: String,
+}
+
+impl<'a> Chart<'a> {
+    pub(super) fn new(title: &'a str, x: Axis<'a>, y: Axis<'a>) -> Self {
+        let mut chart = Self {
+            title,
+            x,
+            y,
+            body: String::new(),
+        };
+        chart.text("name", (0.0, 12.0), "start", title);
+        for value in y.ticks() {
+            let at = chart.place((x.low, value)).1;
+            chart.path("grid", &[(LEFT, at), (RIGHT, at)]);
+            chart.text("tick", (LEFT - 5.0, at + 3.5), "end", &label(value));
+        }
+        for value in x.ticks() {
+            let at = chart.place((value, y.low)).0;
+            chart.path("grid", &[(at, BOTTOM), (at, TOP)]);
+            chart.text("tick", (at, BOTTOM + 14.0), "middle", &label(value));
+        }
+        chart.path("axis", &[(LEFT, TOP), (LEFT, BOTTOM), (RIGHT, BOTTOM)]);
+        let middle = 0.5 * (LEFT + RIGHT);
+        chart.text("tick", (middle, BOTTOM + 28.0), "middle", x.name);
+        chart.text("tick", (LEFT, TOP - 9.0), "start", y.name);
+        chart
     }
-    for value in x.ticks(ticks.0) {
-        let at = x.at(value);
-        svg.line("grid", (at, bottom), (at, top));
-        svg.text("tick", (at, bottom + 14.0), Anchor::Middle, &label(value));
+
+    /// Adds a line through `points`, thinned to a few hundred, because no more can be distinguished.
+    pub(super) fn line(mut self, class: &str, points: &[(f64, f64)]) -> Self {
+        let every = points.len().div_ceil(300).max(1);
+        let last = points.last().filter(|_| points.len() % every != 1);
+        let thinned = points.iter().step_by(every).chain(last);
+        let places: Vec<_> = thinned.map(|&point| self.place(point)).collect();
+        self.path(class, &places);
+        self
     }
-    svg.line("axis", (left, bottom), (right, bottom));
-    svg.line("axis", (left, bottom), (left, top));
-    let middle = 0.5 * (left + right);
-    svg.text("tick", (middle, bottom + 28.0), Anchor::Middle, x_name);
-    svg.text("tick", (left, top - 9.0), Anchor::Start, y_name);
+
+    /// Adds a dot that shows `tip` under the pointer.
+    pub(super) fn dot(mut self, point: (f64, f64), radius: f64, tip: &str) -> Self {
+        let (x, y) = self.place(point);
+        let tip = escaped(tip);
+        let _ = writeln!(
+            self.body,
+            r#"<circle class="mark" cx="{x:.1}" cy="{y:.1}" r="{radius:.1}"><title>{tip}</title></circle>"#
+        );
+        self
+    }
+
+    fn place(&self, (x, y): (f64, f64)) -> (f64, f64) {
+        (self.x.at(x, (LEFT, RIGHT)), self.y.at(y, (BOTTOM, TOP)))
+    }
+
+    fn path(&mut self, class: &str, places: &[(f64, f64)]) {
+        let places: Vec<String> = places
+            .iter()
+            .map(|(x, y)| format!("{x:.1},{y:.1}"))
+            .collect();
+        let list = places.join(" ");
+        let _ = writeln!(self.body, r#"<polyline class="{class}" points="{list}"/>"#);
+    }
+
+    fn text(&mut self, class: &str, (x, y): (f64, f64), anchor: &str, text: &str) {
+        let text = escaped(text);
+        let _ = writeln!(
+            self.body,
+            r#"<text class="{class}" x="{x:.1}" y="{y:.1}" text-anchor="{anchor}">{text}</text>"#
+        );
+    }
+
+    /// The complete element. The title is its label for screen readers, too.
+    pub(super) fn svg(self) -> String {
+        let (width, height) = SIZE;
+        let (title, body) = (escaped(self.title), self.body);
+        format!(
+            "<svg viewBox=\"0 0 {width} {height}\" width=\"{width}\" height=\"{height}\" role=\"img\" \
+             aria-label=\"{title}\">\n{body}</svg>\n"
+        )
+    }
 }
 
 /// Escapes text for elements and attributes of HTML and SVG.
 pub(super) fn escaped(text: &str) -> String {
-    let mut safe = String::with_capacity(text.len());
-    for letter in text.chars() {
-        match letter {
-            '<' => safe.push_str("&lt;"),
-            '>' => safe.push_str("&gt;"),
-            '&' => safe.push_str("&amp;"),
-            '"' => safe.push_str("&quot;"),
-            other => safe.push(other),
-        }
-    }
-    safe
+    text.replace('&', "&amp;")
+        .replace('<', "&lt;")
+        .replace('>', "&gt;")
+        .replace('"', "&quot;")
 }
 
 #[cfg(test)]
@@ -239,36 +187,29 @@ mod tests {
 
     #[test]
     fn ticks_are_round_and_inside() {
-        let scale = |low, high| Scale::linear((low, high), (0.0, 100.0));
-        assert_eq!(
-            scale(0.0, 100.0).ticks(5),
-            [0.0, 20.0, 40.0, 60.0, 80.0, 100.0]
-        );
-        assert_eq!(scale(0.32, 0.97).ticks(3), [0.5]);
-        assert_eq!(scale(3.0, 3.0).ticks(3), [3.0]);
-        let decades = Scale::logarithmic((30.0, 2e5), (0.0, 1.0)).ticks(3);
+        let ticks = |low, high| Axis::linear("", low, high).ticks();
+        assert_eq!(ticks(0.0, 100.0), [0.0, 50.0, 100.0]);
+        assert_eq!(ticks(0.32, 0.97), [0.4, 0.6000000000000001, 0.8]);
+        assert_eq!(ticks(3.0, 3.0), [3.0]);
+        let decades = Axis::logarithmic("", 30.0, 2e5).ticks();
         assert_eq!(decades, [100.0, 1e3, 1e4, 1e5]);
         assert_eq!([0.3, 42_500.0, 2e6].map(label), ["0.3", "42.5k", "2M"]);
     }
 
     #[test]
-    fn a_scale_puts_ends_on_ends() {
-        let scale = Scale::logarithmic((10.0, 1000.0), (200.0, 0.0));
+    fn an_axis_puts_ends_on_ends() {
+        let axis = Axis::logarithmic("", 10.0, 1000.0);
         for (value, pixel) in [(10.0, 200.0), (100.0, 100.0), (1000.0, 0.0)] {
-            assert!(
-                (scale.at(value) - pixel).abs() < 1e-9,
-                "{value}: {}",
-                scale.at(value)
-            );
+            let found = axis.at(value, (200.0, 0.0));
+            assert!((found - pixel).abs() < 1e-9, "{value}: {found}");
         }
-        assert_eq!(Scale::linear((1.0, 1.0), (0.0, 10.0)).at(1.0), 5.0);
+        assert_eq!(Axis::linear("", 1.0, 1.0).at(1.0, (0.0, 10.0)), 5.0);
     }
 
     #[test]
     fn text_cannot_become_markup() {
-        let mut svg = Svg::new(10.0, 10.0);
-        svg.text("name", (0.0, 0.0), Anchor::Start, "<script>\"&");
-        let text = svg.finish("a \"b\"");
+        let axis = Axis::linear("<script>\"&", 0.0, 1.0);
+        let text = Chart::new("a \"b\"", axis, axis).svg();
         assert!(text.contains("&lt;script&gt;&quot;&amp;"), "{text}");
         assert!(text.contains("a &quot;b&quot;"), "{text}");
     }

@@ -16,7 +16,7 @@ const REFERENCE: &str = "ours";
 const FEATURES: &str = "features";
 
 /// The mean confusion matrix of some evaluations.
-pub fn mean_confusion(evaluations: &[&Evaluation]) -> Vec<Vec<f64>> {
+pub(super) fn mean_confusion(evaluations: &[&Evaluation]) -> Vec<Vec<f64>> {
     let levels = evaluations.first().map_or(0, |first| first.confusion.len());
     let cell = |truth: usize, said: usize| {
         let counts = evaluations.iter().map(|e| e.confusion[truth][said] as f64);
@@ -28,7 +28,7 @@ pub fn mean_confusion(evaluations: &[&Evaluation]) -> Vec<Vec<f64>> {
 }
 
 /// The runs with swapped materials, grouped by method and number of labels.
-pub fn swap_groups(swaps: &[SwapEntry]) -> Vec<Vec<&SwapEntry>> {
+pub(super) fn swap_groups(swaps: &[SwapEntry]) -> Vec<Vec<&SwapEntry>> {
     let mut groups: Vec<Vec<&SwapEntry>> = Vec::new();
     for swap in swaps {
         let same = |group: &&mut Vec<&SwapEntry>| {
@@ -43,12 +43,12 @@ pub fn swap_groups(swaps: &[SwapEntry]) -> Vec<Vec<&SwapEntry>> {
 }
 
 /// The paper's figures for the method of a row, if it has any.
-pub fn paper_row(row: &Row) -> Option<&'static paper::Row> {
+pub(super) fn paper_row(row: &Row) -> Option<&'static paper::Row> {
     paper::row(&row.runs[0].0.method)
 }
 
 /// The evaluations of a row's runs on a set, where it was measured.
-pub fn evaluations<'a>(row: &Row<'a>, set: &str) -> Vec<&'a Evaluation> {
+pub(super) fn evaluations<'a>(row: &Row<'a>, set: &str) -> Vec<&'a Evaluation> {
     let of_entry = |(entry, _): &(&'a Entry, _)| match set {
         PAPER_SPLIT => entry.paper_split.as_ref(),
         FRESH => Some(&entry.fresh),
@@ -68,7 +68,7 @@ fn objects<'a>(row: &Row<'a>, set: &str) -> Vec<(u64, &'a [ObjectCount])> {
 }
 
 /// A row's accuracy over its seeds.
-pub fn accuracy(row: &Row, set: &str) -> Option<Estimate> {
+pub(super) fn accuracy(row: &Row, set: &str) -> Option<Estimate> {
     let objects = objects(row, set);
     let seeds: Vec<&[ObjectCount]> = objects.into_iter().map(|(_, objects)| objects).collect();
     metrics::accuracy_by_object(&seeds, sets::clusters(set))
@@ -220,7 +220,7 @@ pub(super) fn beside(here: String, there: Option<f64>, decimals: usize) -> Strin
 }
 
 /// The mean; 0 without values.
-pub fn mean(values: &[f64]) -> f64 {
+pub(super) fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len().max(1) as f64
 }
 
