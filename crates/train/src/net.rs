@@ -11,7 +11,6 @@ pub mod shore;
 pub mod start;
 pub mod sensed;
 pub mod hrn;
-pub mod unfolded;
 pub mod frame;
 pub mod course;
 pub mod generator;

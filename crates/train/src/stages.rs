@@ -16,11 +16,10 @@ use crate::learn::temperature;
 use crate::model::evaluated::Evaluated;
 use crate::model::export::{self, Recogniser};
 use crate::net::generator;
-use crate::net::hrn;
+use crate::net::hrn::{self, Start};
 use crate::net::image::Scale;
 use crate::net::losses::Game;
 use crate::net::network::Weights;
-use crate::net::unfolded::{Start, Unfolded};
 use crate::run::{Description, Run};
 use crate::settings::{AugmentationSettings, GanSettings, Settings, Training, Validation};
 use hardnessd_core::frame::Frame;
@@ -247,13 +246,13 @@ impl Stages<'_> {
         }
     }
 
-    /// The start with its factor of the forces corrected by the labelled samples.
+    /// The factor by which the forces of the labelled samples must be multiplied for the start.
     ///
     /// # Errors
     ///
-    /// Fails as [`adapt::with_force_factor`] does.
-    pub fn with_force_factor(&self, start: Start) -> anyhow::Result<Start> {
-        adapt::with_force_factor(start, &self.fit_task("adapt"))
+    /// Fails as [`adapt::force_factor`] does.
+    pub fn force_factor(&self, start: &Start) -> anyhow::Result<f32> {
+        adapt::force_factor(start, &self.fit_task("adapt"))
     }
 
     /// Continues to train an exported HRN on the labelled samples and, by consistency, on the
@@ -316,12 +315,6 @@ impl Stages<'_> {
             shore: None,
             temperature: trained.temperature,
             force_factor,
-            unfolded: Some(Unfolded::of(
-                &trained.weights,
-                &trained.statistics,
-                scale,
-                force_factor,
-            )),
         };
         let probabilities = |frames: &[&Frame]| {
             let logits = trained.logits(frames.iter().copied(), scale, self.device);

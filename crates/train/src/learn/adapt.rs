@@ -6,16 +6,16 @@
 use crate::learn::epochs::LEARNT_SHARE;
 use crate::learn::fit::{self, Task, Trained};
 use crate::learn::force::{self, Label};
-use crate::net::unfolded::Start;
+use crate::net::hrn::Start;
 use crate::run::Run;
 
-/// The start with its factor of the forces corrected by the labels of the training samples. The
-/// task's scale does not count.
+/// The factor of the forces that the labels of the training samples make most probable. The task's
+/// scale does not count.
 ///
 /// # Errors
 ///
 /// Fails as [`force::factor`] does; judging samples with HRN adds no error of its own.
-pub fn with_force_factor(mut start: Start, task: &Task) -> anyhow::Result<Start> {
+pub fn force_factor(start: &Start, task: &Task) -> anyhow::Result<f32> {
     let samples = || task.train.iter().map(|&index| &task.dataset.samples[index]);
     let levels = samples().map(|sample| sample.level);
     let labels: Vec<Label> = levels
@@ -26,13 +26,10 @@ pub fn with_force_factor(mut start: Start, task: &Task) -> anyhow::Result<Start>
         statistics: start.statistics.clone(),
         temperature: start.temperature,
     };
-    let factor = force::factor(&labels, start.temperature, task.device, |factor| {
+    force::factor(&labels, start.temperature, task.device, |factor| {
         let scale = start.scale.of_newtons_times(factor);
         Ok(known.logits(samples().map(|sample| &sample.frame), scale, task.device))
-    })?;
-    start.scale = start.scale.of_newtons_times(factor);
-    start.force_factor *= factor;
-    Ok(start)
+    })
 }
 
 /// Trains from the start's weights. Without held-out objects its temperature stays.

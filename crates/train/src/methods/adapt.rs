@@ -8,7 +8,7 @@ use crate::learn::force;
 use crate::model::evaluated::Evaluated;
 use crate::model::file;
 use crate::net::frame as network;
-use crate::net::{start, unfolded};
+use crate::net::{hrn, start};
 use crate::run::{Description, Run};
 use crate::settings::{NetworkSettings, Settings, SettingsError};
 use crate::stages::Stages;
@@ -36,13 +36,6 @@ pub enum NoStart {
         /// The number of levels of the data.
         expected: usize,
     },
-    /// The file's graph is the paper's network, and what folding loses is missing, or is not this
-    /// network's.
-    #[error(
-        "adapt needs the `hrn.unfolded` of this file, which is missing or wrong: train its model again with this \
-         version"
-    )]
-    Folded,
 }
 
 impl NoStart {
@@ -62,8 +55,8 @@ impl NoStart {
 pub enum Start {
     /// The network of `frame`.
     Frame(start::Start),
-    /// The paper's network.
-    Hrn(unfolded::Start),
+    /// The paper's network, and the factor of the forces that its scale includes.
+    Hrn(hrn::Start, f32),
 }
 
 impl Start {
@@ -71,24 +64,19 @@ impl Start {
     ///
     /// # Errors
     ///
-    /// Returns [`NoStart`] if it is another network than those above, or the file does not have what
-    /// further training needs.
-    pub fn read(hrn: &Hrn, bytes: &[u8], device: &Device) -> anyhow::Result<Self> {
+    /// Returns [`NoStart`] if it is another network than those above.
+    pub fn read(model: &Hrn, bytes: &[u8], device: &Device) -> anyhow::Result<Self> {
         let levels = dataset::levels().len();
         let constants = file::constants(bytes)?;
         let constant = |name: &str| constants.get(name);
-        let start = match file::unfolded(bytes)? {
-            None => network::start(constant, levels, device).map(Self::Frame),
-            Some(unfolded) => unfolded.start(levels, constant, device).map(Self::Hrn),
+        let frame = network::start(constant, levels, device).map(Self::Frame);
+        let paper = || {
+            let factor = model.card().metrics["force_factor"].as_f64();
+            let start = hrn::start(constant, levels, device)?;
+            Some(Self::Hrn(start, factor.map_or(1.0, |factor| factor as f32)))
         };
-        // The other networks also have the means of their features.
-        let is_folded = hrn.card().levels.len() == levels
-            && constants.contains_key("head.matrix")
-            && !constants.contains_key("column means");
-        Ok(start.ok_or_else(|| match is_folded {
-            true => NoStart::Folded,
-            false => NoStart::of(hrn, "single frames (any method but features)"),
-        })?)
+        let start = frame.or_else(paper);
+        Ok(start.ok_or_else(|| NoStart::of(model, "single frames (any method but features)"))?)
     }
 
     /// The settings of the run: the start's network and image instead of the given ones.
@@ -102,7 +90,7 @@ impl Start {
                 settings.validation.check_last()?;
                 settings
             }
-            Self::Hrn(start) => Settings {
+            Self::Hrn(start, _) => Settings {
                 full_scale_n: start.scale.full_scale_n,
                 network: NetworkSettings {
                     pooling: start.pooling,
@@ -132,7 +120,7 @@ pub fn train(
     let share = description.settings.validation.share;
     let (kept, held_out) = dataset.hold_out(&labelled, share, description.seed);
     let unlabelled = super::unlabelled(dataset, &labelled, &held_out);
-    let start = match start {
+    let (start, known_factor) = match start {
         Start::Frame(start) => {
             let samples = frame::Samples {
                 dataset,
@@ -142,7 +130,7 @@ pub fn train(
             };
             return frame::train(STAGE, &samples, Some(start), description, run, device);
         }
-        Start::Hrn(start) => start,
+        Start::Hrn(start, factor) => (start, factor),
     };
     let stages = |description| Stages {
         dataset,
@@ -153,15 +141,16 @@ pub fn train(
         run,
         device,
     };
-    let start = stages(description).with_force_factor(start)?;
-    if let Some(account) = force::account(start.force_factor) {
+    let correction = stages(description).force_factor(&start)?;
+    let force_factor = known_factor * correction;
+    if let Some(account) = force::account(force_factor) {
         hardnessd_core::say!("{account}");
     }
-    // The corrected scale of the image.
+    let corrected_scale = start.scale.of_newtons_times(correction);
     let mut corrected = description.clone();
-    corrected.settings.full_scale_n = start.scale.full_scale_n;
-    corrected.settings.network.log_above_n = start.scale.log_above_n;
+    corrected.settings.full_scale_n = corrected_scale.full_scale_n;
+    corrected.settings.network.log_above_n = corrected_scale.log_above_n;
     let stages = stages(&corrected);
     let trained = stages.adapted(STAGE, &start)?;
-    stages.finish(&trained, start.force_factor)
+    stages.finish(&trained, force_factor)
 }

@@ -52,7 +52,6 @@ pub fn train(
         shore: None,
         temperature: 1.0,
         force_factor: 1.0,
-        unfolded: None,
     };
     let probabilities = |frames: &[&Frame]| {
         let rows = features::features(frames.iter().copied())?;

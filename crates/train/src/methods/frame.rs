@@ -129,7 +129,6 @@ fn finish(
         shore: samples.has_shore().then_some(shore),
         temperature: calibration.temperature,
         force_factor: trained.standard.force_factor,
-        unfolded: None,
     };
     export::finish(
         run,

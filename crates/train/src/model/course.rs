@@ -92,7 +92,7 @@ pub fn finish(
             temperature,
             shore: Some(shore),
         };
-        file::write(graph, &outputs, card, &checks, None)
+        file::write(graph, &outputs, card, &checks)
     };
     let hrn = Hrn::load(&write(&card)?)?;
     let test = verdicts(&hrn, courses, Split::Test, |course| course)?;

@@ -12,7 +12,6 @@ use super::file;
 use crate::data::dataset::{self, Dataset, Kind, Source};
 use crate::judge::metrics::Judged;
 use crate::net::graph::Graph;
-use crate::net::unfolded::Unfolded;
 use crate::run::{Description, Run};
 use hardnessd_core::frame::Frame;
 use hardnessd_core::press;
@@ -35,8 +34,6 @@ pub struct Recogniser {
     pub temperature: f32,
     /// The factor by which the graph multiplies forces first; 1 if it does not.
     pub force_factor: f32,
-    /// What further training needs beside the graph, if it needs anything.
-    pub unfolded: Option<Unfolded>,
 }
 
 /// Writes the model and its evaluation on the test split to the run's directory. `train` are the
@@ -75,7 +72,6 @@ pub fn finish(
             raw_logits,
             shore,
             temperature,
-            unfolded,
             ..
         } = recogniser.clone();
         let outputs = file::Outputs {
@@ -83,7 +79,7 @@ pub fn finish(
             temperature,
             shore,
         };
-        file::write(graph, &outputs, card, &checks, unfolded.as_ref())
+        file::write(graph, &outputs, card, &checks)
     };
     // The metrics are measured on a file without them and then added; the graph does not change.
     let hrn = Hrn::load(&write(&card)?)?;

@@ -11,12 +11,8 @@ use prost::Message as _;
 use tract_onnx::pb;
 use tract_onnx::prelude::Framework as _;
 
-use crate::net::graph::{Graph, frame_input, integer, model, value_info};
-use crate::net::unfolded::Unfolded;
+use crate::net::graph::{self, Constant, Graph, frame_input, integer, model, value_info};
 use hardnessd_core::verdict::{COURSE_FRAMES, Card, Checks, Hrn, course_inputs};
-
-/// The metadata key of [`Unfolded`].
-const UNFOLDED: &str = "hrn.unfolded";
 
 /// The outputs of a graph.
 #[derive(Debug, Clone)]
@@ -30,8 +26,7 @@ pub struct Outputs {
     pub shore: Option<String>,
 }
 
-/// Writes the file: the logits over the temperature, their softmax, and the metadata. `unfolded` is
-/// what further training needs beside the graph.
+/// Writes the file: the logits over the temperature, their softmax, and the metadata.
 ///
 /// # Errors
 ///
@@ -41,7 +36,6 @@ pub fn write(
     outputs: &Outputs,
     card: &Card,
     checks: &Checks,
-    unfolded: Option<&Unfolded>,
 ) -> anyhow::Result<Vec<u8>> {
     let temperature = outputs.temperature;
     ensure!(
@@ -75,14 +69,7 @@ pub fn write(
             .map(|(name, dims)| value_info(name, dims))
             .collect(),
     };
-    let mut metadata = metadata(card, checks)?;
-    if let Some(unfolded) = unfolded {
-        metadata.push(pb::StringStringEntryProto {
-            key: UNFOLDED.to_owned(),
-            value: serde_json::to_string(unfolded)?,
-        });
-    }
-    let proto = model(graph, input, output, metadata);
+    let proto = model(graph, input, output, metadata(card, checks)?);
     let bytes = proto.encode_to_vec();
     let read_back = Hrn::load(&bytes).context("the exported model does not pass the daemon's")?;
     ensure!(
@@ -121,48 +108,14 @@ pub(super) fn metadata(
     Ok(entries.into_iter().map(entry).collect())
 }
 
-/// Constants by name: the shape and the numbers of each.
-pub type Constants = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
-
-fn parsed(bytes: &[u8]) -> anyhow::Result<pb::ModelProto> {
-    let mut reader = bytes;
-    tract_onnx::onnx().proto_model_for_read(&mut reader)
-}
-
-/// The metadata `hrn.unfolded` of a file are damaged.
-#[derive(Debug, thiserror::Error)]
-#[error("hrn.unfolded: {0}")]
-pub struct Damaged(serde_json::Error);
-
-/// What a file that [`write()`] wrote has for further training beside its graph, if it has it.
-///
-/// # Errors
-///
-/// Fails if the bytes are not an ONNX model. Returns [`Damaged`] if the metadata are.
-pub fn unfolded(bytes: &[u8]) -> anyhow::Result<Option<Unfolded>> {
-    let entries = parsed(bytes)?.metadata_props;
-    let entry = entries.iter().find(|entry| entry.key == UNFOLDED);
-    let unfolded = entry.map(|entry| serde_json::from_str(&entry.value).map_err(Damaged));
-    Ok(unfolded.transpose()?)
-}
-
-/// The f32 constants of a file that [`write()`] wrote.
+/// The f32 constants of a file that [`write()`] wrote, by name.
 ///
 /// # Errors
 ///
 /// Fails if the bytes are not an ONNX model.
-pub fn constants(bytes: &[u8]) -> anyhow::Result<Constants> {
-    let tensors = parsed(bytes)?
-        .graph
-        .into_iter()
-        .flat_map(|graph| graph.initializer);
-    let floats =
-        tensors.filter(|tensor| tensor.data_type == pb::tensor_proto::DataType::Float as i32);
-    let constant = |tensor: pb::TensorProto| {
-        let dims = tensor.dims.iter().map(|&length| length as usize).collect();
-        let (numbers, _) = tensor.raw_data.as_chunks();
-        let numbers = numbers.iter().map(|&bytes| f32::from_le_bytes(bytes));
-        (tensor.name, (dims, numbers.collect()))
-    };
-    Ok(floats.map(constant).collect())
+pub fn constants(bytes: &[u8]) -> anyhow::Result<BTreeMap<String, Constant>> {
+    let mut reader = bytes;
+    let proto = tract_onnx::onnx().proto_model_for_read(&mut reader)?;
+    let graph = proto.graph.unwrap_or_default();
+    Ok(graph::floats(&graph.initializer))
 }

@@ -8,9 +8,10 @@
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
 use crate::net::frames::FEATURES;
+use crate::net::graph::Constant;
 use crate::net::network::{Weights, dense};
 use crate::net::shore;
-use crate::net::start::{Constant, Start};
+use crate::net::start::Start;
 use hardnessd_core::verdict::COURSE_FRAMES;
 use hardnessd_simulator::random::Stream;
 

@@ -9,16 +9,14 @@ use burn::tensor::{Device, Tensor, TensorData, activation};
 
 use crate::net::builder::Builder;
 use crate::net::frames::{self, FEATURES, Features};
-use crate::net::graph::{Graph, INPUT, integer};
+use crate::net::graph::{Constant, Graph, INPUT, integer};
 use crate::net::hrn;
 use crate::net::image::Scale;
 use crate::net::layers::leaky_relu;
-use crate::net::network::{
-    self, Folded, LEAKY_SLOPE, TRUNK, Weights, as_images, dense, pooled, sums,
-};
+use crate::net::network::{self, LEAKY_SLOPE, TRUNK, Weights, as_images, dense, pooled, sums};
 use crate::net::shore;
 use crate::net::standard::Standard;
-use crate::net::start::{Constant, Start};
+use crate::net::start::Start;
 use hardnessd_core::frame::Frame;
 use hardnessd_simulator::random::Stream;
 
@@ -131,14 +129,9 @@ pub fn graph(
     levels: usize,
     widths: [f32; 2],
 ) -> (Graph, String, String) {
-    let layer = |name: &str| Folded {
-        kernel: weights.numbers(&format!("{name}.kernel")),
-        bias: weights.numbers(&format!("{name}.bias")),
-    };
-    let layers: Vec<Folded> = TRUNK.iter().map(|of| layer(of.name)).collect();
     let mut b = Builder(Graph::default());
     let newtons = standard.forces_node(&mut b, INPUT);
-    let pooled = hrn::trunk_nodes(&mut b.0, &newtons, &layers, SCALE, true);
+    let pooled = hrn::trunk_nodes(&mut b.0, &newtons, (weights, None), SCALE, true);
     let (columns, _) = frames::nodes(&mut b, &newtons, 1);
     let columns = standard.nodes(&mut b, &columns);
     let columns = b.reshaped(&columns, &[1, FEATURES], "columns");

@@ -5,13 +5,64 @@
 
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
-use crate::net::graph::{self, Graph};
+use crate::net::graph::{self, Constant, Graph};
 use crate::net::image::Scale;
 use crate::net::layers::STRIDE;
 use crate::net::network::{self, FEATURES, LEAKY_SLOPE, Normalisation, Statistics, TRUNK, Weights};
 use crate::settings::network::Pooling;
 use hardnessd_core::frame::ROWS;
 use hardnessd_simulator::random::Stream;
+
+/// An exported HRN to continue training from.
+#[derive(Debug, Clone)]
+pub struct Start {
+    /// Weights of all layers.
+    pub weights: Weights,
+    /// Mean and variance of each normalised layer over the samples that it learnt from.
+    pub statistics: Statistics,
+    /// The pooling before the head.
+    pub pooling: Pooling,
+    /// The scale of the image.
+    pub scale: Scale,
+    /// The temperature by which the logits are divided.
+    pub temperature: f32,
+}
+
+/// The start of further training, from an exported graph's constants. `None` if they are of another
+/// network.
+pub fn start<'a>(
+    constant: impl Fn(&str) -> Option<&'a Constant>,
+    levels: usize,
+    device: &Device,
+) -> Option<Start> {
+    let number = |name: &str| constant(name)?.1.first().copied();
+    let pooling = match *constant("head.matrix")?.0.first()? {
+        FEATURES => Pooling::Max,
+        features if features == 2 * FEATURES => Pooling::MaxMean,
+        _ => return None,
+    };
+    let values = |name: &str, dims: &[usize]| {
+        let (found, values) = constant(name)?;
+        let tensor = || Tensor::from_data(TensorData::new(values.clone(), [values.len()]), device);
+        (found == dims).then(tensor)
+    };
+    let mut weights = initial(levels, pooling, 0, device);
+    for weight in &mut weights.entries {
+        weight.values = values(&weight.name, &weight.dims)?;
+    }
+    let normalised = TRUNK.iter().filter(|layer| layer.normalised);
+    let statistics = normalised.map(|layer| {
+        let part = |part: &str| values(&format!("{}.{part}", layer.name), &[layer.outputs]);
+        Some((part("mean")?, part("variance")?))
+    });
+    Some(Start {
+        statistics: Statistics::of(statistics.collect::<Option<_>>()?),
+        weights,
+        pooling,
+        scale: Scale::of_constants(number("scale")?, number("log factor"))?,
+        temperature: number("temperature")?,
+    })
+}
 
 /// The number of features that a pooling makes.
 fn features(pooling: Pooling) -> usize {
@@ -119,13 +170,13 @@ pub fn targets(
     Tensor::from_data(TensorData::new(values, [batch, levels]), device)
 }
 
-/// The graph from newtons to logits, and the logits' name. Batch normalisation is folded into
-/// the convolutions.
+/// The graph from newtons to logits, and the logits' name. The inference library fuses batch
+/// normalisation with the convolution before it.
 pub fn graph(weights: &Weights, statistics: &Statistics, scale: Scale) -> (Graph, String) {
     let mut graph = Graph::default();
     let means = network::takes_means(weights);
-    let folded = network::fold(weights, statistics);
-    let flat = trunk_nodes(&mut graph, graph::INPUT, &folded, scale, means);
+    let trunk = (weights, Some(statistics));
+    let flat = trunk_nodes(&mut graph, graph::INPUT, trunk, scale, means);
     let features = weights.dims("head.matrix")[0];
     let bias = weights.numbers("head.bias");
     let matrix = weights.numbers("head.matrix");
@@ -136,21 +187,25 @@ pub fn graph(weights: &Weights, statistics: &Statistics, scale: Scale) -> (Graph
 }
 
 /// Adds the nodes from newtons to each channel's greatest value, `[1, 64]`, or with the means after
-/// them, `[1, 128]`. Returns the name of their output.
+/// them, `[1, 128]`. Without statistics, no layer is normalised. Returns the name of their output.
 pub(super) fn trunk_nodes(
     graph: &mut Graph,
     newtons: &str,
-    folded: &[network::Folded],
+    (weights, statistics): (&Weights, Option<&Statistics>),
     scale: Scale,
     with_means: bool,
 ) -> String {
     // `network::trunk` raises the image by 1, too.
     let mut x = scale.nodes(graph, newtons);
-    for (layer, folded) in TRUNK.iter().zip(folded) {
+    let mut normalised_index = 0;
+    for layer in &TRUNK {
         let name = layer.name;
-        let dims = [layer.outputs, layer.inputs, layer.kernel, layer.kernel];
-        let kernel = graph.constant(&format!("{name}.kernel"), &dims, &folded.kernel);
-        let bias = graph.constant(&format!("{name}.bias"), &[layer.outputs], &folded.bias);
+        let weight = |graph: &mut Graph, part: &str| {
+            let name = format!("{name}.{part}");
+            graph.constant(&name, weights.dims(&name), &weights.numbers(&name))
+        };
+        let kernel = weight(graph, "kernel");
+        let bias = weight(graph, "bias");
         let (before, after) = (layer.padding.0 as i64, layer.padding.1 as i64);
         let attributes = vec![
             graph::integers("kernel_shape", &[layer.kernel as i64; 2]),
@@ -159,6 +214,22 @@ pub(super) fn trunk_nodes(
         ];
         let sum = format!("{name}.sum");
         x = graph.node("Conv", &[&x, &kernel, &bias], &sum, attributes);
+        if let Some(statistics) = statistics.filter(|_| layer.normalised) {
+            let (mean, variance) = statistics.layer(normalised_index);
+            normalised_index += 1;
+            let [mean, variance] =
+                [("mean", mean), ("variance", variance)].map(|(part, values)| {
+                    let values = network::numbers(&values);
+                    graph.constant(&format!("{name}.{part}"), &[layer.outputs], &values)
+                });
+            let [gamma, beta] = ["gamma", "beta"].map(|part| weight(graph, part));
+            x = graph.node(
+                "BatchNormalization",
+                &[&x, &gamma, &beta, &mean, &variance],
+                &format!("{name}.normalised"),
+                vec![graph::number("epsilon", network::BATCH_NORM_EPSILON)],
+            );
+        }
         let slope = vec![graph::number("alpha", LEAKY_SLOPE)];
         x = graph.node("LeakyRelu", &[&x], &format!("{name}.out"), slope);
     }
@@ -308,17 +379,17 @@ mod tests {
     }
 
     #[test]
-    fn folding_keeps_what_the_layers_compute() {
-        check_folding(Pooling::Max, scale(10.2));
+    fn the_graph_computes_what_the_layers_do_and_gives_the_network_back() {
+        check_graph(Pooling::Max, scale(10.2));
         let log_above_n = 0.1;
         let scale = Scale {
             log_above_n,
             ..scale(10.2)
         };
-        check_folding(Pooling::MaxMean, scale);
+        check_graph(Pooling::MaxMean, scale);
     }
 
-    fn check_folding(pooling: Pooling, scale: Scale) {
+    fn check_graph(pooling: Pooling, scale: Scale) {
         let frames: Vec<Frame> = (0..5).map(|n| blob(9.0 + n as f32, 14.0, 2.0)).collect();
         let weights = initial(4, pooling, 9, &device()).moved(9, &device());
         let x = scale.images(frames.iter(), &device());
@@ -330,11 +401,38 @@ mod tests {
         );
         let fixed = logits(&weights, x, &mut Normalisation::Fixed(&statistics));
         let (graph, name) = graph(&weights, &statistics, scale);
+        let mut constants = graph.floats();
+        constants.insert("temperature".to_owned(), (vec![], vec![1.5]));
         let plan = graph::Plan::new(graph, &name, &[1, 4]).unwrap();
-        let folded = frames.iter().flat_map(|frame| plan.run(frame).unwrap());
-        let (folded, fixed) = (folded.collect::<Vec<_>>(), network::numbers(&fixed));
-        let largest = largest_difference(&folded, &fixed);
-        assert!(largest < 1e-4, "{largest}: {folded:?} {fixed:?}");
+        let computed = frames.iter().flat_map(|frame| plan.run(frame).unwrap());
+        let (computed, fixed) = (computed.collect::<Vec<_>>(), network::numbers(&fixed));
+        let largest = largest_difference(&computed, &fixed);
+        assert!(largest < 1e-4, "{largest}: {computed:?} {fixed:?}");
+
+        let found = start(|name| constants.get(name), 4, &device()).unwrap();
+        assert_eq!((found.pooling, found.temperature), (pooling, 1.5));
+        let near = |found: f64, expected: f64| (found - expected).abs() <= 1e-6 * expected;
+        assert!(
+            near(found.scale.full_scale_n, scale.full_scale_n),
+            "{found:?}"
+        );
+        assert!(
+            near(found.scale.log_above_n, scale.log_above_n),
+            "{found:?}"
+        );
+        for entry in &weights.entries {
+            let values = found.weights.numbers(&entry.name);
+            assert_eq!(values, network::numbers(&entry.values), "{}", entry.name);
+        }
+        for index in 0..2 {
+            let (was, is) = (statistics.layer(index), found.statistics.layer(index));
+            assert_eq!(network::numbers(&was.0), network::numbers(&is.0));
+            assert_eq!(network::numbers(&was.1), network::numbers(&is.1));
+        }
+        for missing in ["conv2.gamma", "conv3.variance", "head.bias", "scale"] {
+            let without = |name: &str| constants.get(name).filter(|_| name != missing);
+            assert!(start(without, 4, &device()).is_none(), "{missing}");
+        }
     }
 
     #[test]

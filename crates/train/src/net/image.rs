@@ -71,6 +71,25 @@ impl Scale {
         Tensor::from_data(TensorData::new(values, [batch, 1, ROWS, COLS]), device)
     }
 
+    /// The scale whose [`Self::nodes`] have these constants: `scale`, and of a logarithmic one its
+    /// `log factor`. `None` if no scale has them.
+    pub fn of_constants(scale: f32, log_factor: Option<f32>) -> Option<Self> {
+        let found = match (f64::from(scale), log_factor) {
+            (scale, None) => Self {
+                full_scale_n: 2.0 / scale,
+                log_above_n: 0.0,
+            },
+            (scale, Some(factor)) => Self {
+                full_scale_n: (2.0 / f64::from(factor)).exp_m1() / scale,
+                log_above_n: 1.0 / scale,
+            },
+        };
+        let is_sound = [found.full_scale_n, found.log_above_n + 1.0]
+            .iter()
+            .all(|number| number.is_finite() && *number > 0.0);
+        is_sound.then_some(found)
+    }
+
     /// Adds the nodes from `newtons` to the image raised by 1, so that the background is 0. Returns
     /// that value's name.
     pub fn nodes(self, graph: &mut Graph, newtons: &str) -> String {

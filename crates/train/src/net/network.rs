@@ -454,35 +454,3 @@ pub(super) fn dense(weights: &Weights, name: &str, x: Tensor<2>) -> Tensor<2> {
         .reshape([inputs, outputs]);
     x.matmul(matrix).add(bias.reshape([1, outputs]))
 }
-
-/// A convolution with batch normalisation folded into it, as it is exported.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Folded {
-    /// The kernel `[outputs, inputs, kernel, kernel]`.
-    pub kernel: Vec<f32>,
-    /// The bias `[outputs]`.
-    pub bias: Vec<f32>,
-}
-
-/// Folds `gamma (k * x + b - mean) / sqrt(variance + eps) + beta` into one kernel and bias.
-pub fn fold(weights: &Weights, statistics: &Statistics) -> Vec<Folded> {
-    let mut normalised_index = 0;
-    let fold_layer = |layer: &Convolution| {
-        let part = |part: &str| weights.numbers(&format!("{}.{part}", layer.name));
-        let (mut kernel, mut bias) = (part("kernel"), part("bias"));
-        if layer.normalised {
-            let (mean, variance) = statistics.layer(normalised_index);
-            let (mean, variance) = (numbers(&mean), numbers(&variance));
-            let (gamma, beta) = (part("gamma"), part("beta"));
-            normalised_index += 1;
-            let share = kernel.len() / layer.outputs;
-            for (channel, taps) in kernel.chunks_mut(share).enumerate() {
-                let scale = gamma[channel] / (variance[channel] + BATCH_NORM_EPSILON).sqrt();
-                taps.iter_mut().for_each(|tap| *tap *= scale);
-                bias[channel] = (bias[channel] - mean[channel]) * scale + beta[channel];
-            }
-        }
-        Folded { kernel, bias }
-    };
-    TRUNK.iter().map(fold_layer).collect()
-}

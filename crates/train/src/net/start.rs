@@ -2,12 +2,10 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 
+use crate::net::graph::Constant;
 use crate::net::network::Weights;
 use crate::net::shore;
 use crate::net::standard::{FORCE_FACTOR, Standard};
-
-/// Shape and numbers of a constant of an exported graph.
-pub type Constant = (Vec<usize>, Vec<f32>);
 
 /// The network of an exported file.
 #[derive(Debug, Clone)]

@@ -8,7 +8,6 @@ use hrn_train::data::dataset::DatasetError;
 use hrn_train::methods::LabelsError;
 use hrn_train::methods::adapt::NoStart;
 use hrn_train::model::adopt::Foreign;
-use hrn_train::model::file::Damaged;
 use hrn_train::settings::SettingsError;
 
 use super::configuration::ConfigurationError;
@@ -105,7 +104,6 @@ pub(super) fn exit_code(error: &anyhow::Error) -> u8 {
     } else if has(|e| {
         e.is::<ModelError>()
             || e.is::<NoStart>()
-            || e.is::<Damaged>()
             || e.is::<Foreign>()
             || e.is::<SettingsError>()
             || e.is::<ConfigurationError>()

@@ -5,11 +5,11 @@ use tract_onnx::pb;
 use super::{COLUMNS, DILATIONS, FRAMES, HIDDEN, KERNEL, LAST, POOLS};
 use crate::net::builder::Builder;
 use crate::net::frames;
+use crate::net::graph::Constant;
 use crate::net::graph::{Graph, integer, integers};
 use crate::net::network::Weights;
 use crate::net::shore;
 use crate::net::standard::Standard;
-use crate::net::start::Constant;
 
 /// Added before a logarithm to keep it finite: to mm, s, and s between frames.
 pub(super) const MM: f32 = 0.3;
