@@ -1,17 +1,20 @@
-//! The methods of the table, each a sequence of the same stages.
+//! The methods of the table, each a sequence of the same stages; `adapt`; and whole presses.
 
 pub mod adapt;
 pub mod course;
 pub mod features;
 pub mod frame;
 mod settings;
+pub mod task;
 
 use std::collections::BTreeSet;
 
 use anyhow::ensure;
 use burn::tensor::Device;
 
-use crate::data::dataset::{Dataset, DatasetError, LabelChoice, Sample, warn_of_other_levels};
+use crate::data::dataset::{
+    Dataset, DatasetError, LabelChoice, Sample, Source, warn_of_other_levels,
+};
 use crate::model::evaluated::Evaluated;
 use crate::net::generator::COMPONENTS;
 use crate::net::losses::Game;
@@ -20,7 +23,7 @@ use crate::settings::{Keep, Profile, Settings, SettingsError, Training, Validati
 use crate::stages::Stages;
 use hardnessd_simulator::Split;
 
-/// A row of the table.
+/// A method of single frames: a row of the table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum Method {
     /// The paper's whole method: USTGAN's start, pretraining on generated samples, fine-tuning.
@@ -53,12 +56,6 @@ pub enum Method {
     /// Judges a frame and gives its Shore hardness: convolutions beside hand-made features, on all labels.
     /// The default model is of this method.
     Frame,
-    /// `hrn-train adapt`: continues the model of a file.
-    #[value(skip)]
-    Adapt,
-    /// Judges the course of a press with the arm's motion, and gives its Shore hardness: a temporal
-    /// convolution. Takes data of `simulate --sequences`.
-    Course,
 }
 
 /// Training steps of `hrn15-strong`, whatever its number of labels: about as many as the default
@@ -72,10 +69,9 @@ fn strong_steps(profile: Profile) -> u64 {
 }
 
 impl Method {
-    /// The methods that judge a frame, in the order of the tables.
-    pub fn of_frames() -> impl Iterator<Item = Self> {
-        let all = <Self as clap::ValueEnum>::value_variants().iter().copied();
-        all.filter(|&method| method != Self::Course)
+    /// All methods, in the order of the tables.
+    pub fn all() -> &'static [Self] {
+        <Self as clap::ValueEnum>::value_variants()
     }
 
     /// The method's name in commands, files and tables.
@@ -94,8 +90,6 @@ impl Method {
             Self::Hrn15Strong => "hrn15-strong",
             Self::Features => "features",
             Self::Frame => "frame",
-            Self::Adapt => "adapt",
-            Self::Course => "course",
         }
     }
 
@@ -105,8 +99,6 @@ impl Method {
             Self::Igan => settings::igan(profile),
             Self::Hrn15Tuned => settings::hrn15_tuned(profile),
             Self::Frame => settings::frame(profile),
-            Self::Adapt => settings::adapt(profile),
-            Self::Course => settings::course(profile),
             Self::Hrn15Strong => settings::strong(profile),
             _ => Settings::of(profile),
         }
@@ -115,7 +107,7 @@ impl Method {
     /// The number of labels that the method uses of `labelled` samples by default.
     fn labels(self, labelled: usize) -> usize {
         let percent = match self {
-            Self::Hrn100 | Self::Features | Self::Frame | Self::Adapt | Self::Course => 100,
+            Self::Hrn100 | Self::Features | Self::Frame => 100,
             Self::Hrn50 => 50,
             _ => 15,
         };
@@ -185,10 +177,8 @@ fn chosen(dataset: &Dataset, description: &Description) -> Result<Vec<usize>, Da
 }
 
 /// A request for a run, before its data determines the labels and epochs.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct Request {
-    /// The method to train.
-    pub method: Method,
     /// The profile, which sets how long the run takes.
     pub profile: Profile,
     /// The seed of everything random.
@@ -197,37 +187,31 @@ pub struct Request {
     pub labels: Option<usize>,
     /// How the labels are chosen.
     pub label_choice: LabelChoice,
-    /// The method's settings with all overrides applied.
+    /// SHA-256 of the model file that the run starts from, if it is one.
+    pub start: Option<String>,
+    /// The settings with all overrides applied.
     pub settings: Settings,
 }
 
 impl Request {
-    /// The description of the run on `dataset`. `hrn15-long` gets the number of epochs that makes
+    /// The description of a run of `method` on `dataset`. `hrn15-long` gets the number of epochs that makes
     /// as many steps as `ours` would take on the same labels under the same settings.
     /// `hrn15-strong` gets enough epochs for its steps.
     ///
     /// # Errors
     ///
     /// Fails as [`labels`] does.
-    pub fn description(&self, dataset: &Dataset) -> Result<Description, LabelsError> {
-        let mut description = Description {
-            method: self.method.name().to_owned(),
-            profile: self.profile,
-            seed: self.seed,
-            labels: labels(self.method, dataset, self.labels)?,
-            label_choice: self.label_choice,
-            start: None,
-            settings: self.settings,
-            data: dataset.sources.clone(),
-        };
-        if self.method == Method::Hrn15Long {
+    pub fn of_method(&self, method: Method, dataset: &Dataset) -> Result<Description, LabelsError> {
+        let labels = labels(method, dataset, self.labels)?;
+        let mut description = self.of(method.name(), labels, dataset.sources.clone());
+        if method == Method::Hrn15Long {
             let labelled = chosen(dataset, &description)?;
             let share = self.settings.validation.share;
             let (train, _) = dataset.hold_out(&labelled, share, self.seed);
             description.settings.training.epochs =
                 epochs_as_long_as_ours(&self.settings, train.len());
         }
-        if self.method == Method::Hrn15Strong {
+        if method == Method::Hrn15Strong {
             let labelled = chosen(dataset, &description)?;
             let share = self.settings.validation.share;
             let (train, _) = dataset.hold_out(&labelled, share, self.seed);
@@ -237,6 +221,20 @@ impl Request {
         }
         Ok(description)
     }
+
+    /// The description of a run called `method` that uses `labels` labels of the data.
+    fn of(&self, method: &str, labels: usize, data: Vec<Source>) -> Description {
+        Description {
+            method: method.to_owned(),
+            profile: self.profile,
+            seed: self.seed,
+            labels,
+            label_choice: self.label_choice,
+            start: self.start.clone(),
+            settings: self.settings,
+            data,
+        }
+    }
 }
 
 /// Checks, before anything is written, that the data has what all stages of a method need.
@@ -245,12 +243,16 @@ impl Request {
 ///
 /// Fails if the data has no labelled training samples, if no unlabelled ones remain for a method
 /// that needs them, if an STGAN has none of its level, or if objects are to be held out without
-/// effect.
-pub fn check(method: Method, dataset: &Dataset, description: &Description) -> anyhow::Result<()> {
+/// effect. Without a method, the run adapts a model.
+fn check(
+    method: Option<Method>,
+    dataset: &Dataset,
+    description: &Description,
+) -> anyhow::Result<()> {
     let labelled = chosen(dataset, description)?;
     let needs_unlabelled = matches!(
         method,
-        Method::Ours | Method::Nahrn | Method::Nihrn | Method::Sgan | Method::Igan
+        Some(Method::Ours | Method::Nahrn | Method::Nihrn | Method::Sgan | Method::Igan)
     );
     let Validation { share, .. } = description.settings.validation;
     let (_, held_out) = dataset.hold_out(&labelled, share, description.seed);
@@ -258,10 +260,10 @@ pub fn check(method: Method, dataset: &Dataset, description: &Description) -> an
         !needs_unlabelled || !unlabelled(dataset, &labelled, &held_out).is_empty(),
         "no unlabelled training samples are left for {} beside its {} labelled ones and the held-out \
          objects: use fewer with --labels",
-        method.name(),
+        description.method,
         description.labels
     );
-    let has_stgans = matches!(method, Method::Ours | Method::Nihrn);
+    let has_stgans = matches!(method, Some(Method::Ours | Method::Nihrn));
     for level in crate::data::dataset::levels() {
         let of_level = |&index: &usize| dataset.samples[index].level == level.level;
         ensure!(
@@ -278,16 +280,16 @@ pub fn check(method: Method, dataset: &Dataset, description: &Description) -> an
 /// Checks that the method uses held-out objects. Prints a warning where the share rounds to no
 /// object.
 fn check_validation(
-    method: Method,
+    method: Option<Method>,
     dataset: &Dataset,
     description: &Description,
     labelled: &[usize],
 ) -> anyhow::Result<()> {
     let Validation { share, keep, .. } = description.settings.validation;
-    if method == Method::Frame {
+    if method == Some(Method::Frame) {
         description.settings.validation.check_last()?;
     }
-    if share == 0.0 || method == Method::Features {
+    if share == 0.0 || method == Some(Method::Features) {
         return Ok(());
     }
     let refused = |expected| SettingsError::Range {
@@ -295,7 +297,7 @@ fn check_validation(
         found: share,
         expected,
     };
-    if matches!(method, Method::Sgan | Method::Igan) {
+    if matches!(method, Some(Method::Sgan | Method::Igan)) {
         return Err(refused("0: sgan and igan have no use for held-out objects").into());
     }
     let (_, held_out) = dataset.hold_out(labelled, share, description.seed);
@@ -327,15 +329,8 @@ fn epochs_as_long_as_ours(settings: &Settings, samples: usize) -> u32 {
     u32::try_from(epochs).unwrap_or(u32::MAX)
 }
 
-/// Trains a method on data that passed [`check`] and writes its model and evaluation to the run's
-/// directory. A resumed run continues from the files there. Returns the evaluation on the test
-/// split, if the data has one.
-///
-/// # Errors
-///
-/// Fails if the data has no labelled training samples, the training diverges, or the directory
-/// cannot be read or written.
-pub fn train(
+/// Trains a method on data that passed [`check`]: [`task::Task::train`].
+fn train(
     method: Method,
     dataset: &Dataset,
     description: &Description,
@@ -343,20 +338,8 @@ pub fn train(
     device: &Device,
 ) -> anyhow::Result<Option<Evaluated>> {
     let labelled = chosen(dataset, description)?;
-    if method == Method::Features {
-        return features::train(dataset, &labelled, description, run);
-    }
     let Description { settings, seed, .. } = description;
     let (train, validation) = dataset.hold_out(&labelled, settings.validation.share, *seed);
-    if method == Method::Frame {
-        let samples = frame::Samples {
-            dataset,
-            train: &train,
-            held_out: &validation,
-            unlabelled: &[],
-        };
-        return frame::train("frame", &samples, None, description, run, device);
-    }
     let stages = Stages {
         dataset,
         train: &train,
@@ -367,6 +350,16 @@ pub fn train(
         device,
     };
     let trained = match method {
+        Method::Features => return features::train(dataset, &labelled, description, run),
+        Method::Frame => {
+            let samples = frame::Samples {
+                dataset,
+                train: &train,
+                held_out: &validation,
+                unlabelled: &[],
+            };
+            return frame::train("frame", &samples, None, description, run, device);
+        }
         Method::Ours => {
             let ustgan = stages.ustgan()?;
             let generated = stages.generated(&ustgan)?;
@@ -384,7 +377,12 @@ pub fn train(
         }
         Method::Sgan => stages.semi_supervised("sgan", Game::FakeLevel)?,
         Method::Igan => stages.semi_supervised("igan", Game::FeatureMatching)?,
-        _ => stages.trained("hrn", stages.random())?,
+        Method::Hrn15
+        | Method::Hrn50
+        | Method::Hrn100
+        | Method::Hrn15Long
+        | Method::Hrn15Tuned
+        | Method::Hrn15Strong => stages.trained("hrn", stages.random())?,
     };
     stages.finish(&trained, 1.0)
 }
@@ -483,14 +481,13 @@ mod tests {
     }
 
     #[test]
-    fn every_methods_settings_are_within_their_ranges() {
-        for &method in Method::value_variants() {
+    fn all_settings_are_within_their_ranges() {
+        for &method in Method::all() {
             for profile in [Profile::Paper, Profile::Quick, Profile::Smoke] {
-                assert!(
-                    method.settings(profile).checked().is_ok(),
-                    "{}",
-                    method.name()
-                );
+                let settings = [adapt::settings(profile), course::settings(profile)];
+                for settings in settings.into_iter().chain([method.settings(profile)]) {
+                    assert!(settings.checked().is_ok(), "{}", method.name());
+                }
             }
         }
     }

@@ -63,7 +63,7 @@ pub(super) struct Recipe {
 pub(super) fn recipes(plan: &Plan, dataset: &Dataset) -> anyhow::Result<Vec<Recipe>> {
     let few = methods::labels(Method::Hrn15, dataset, None)?;
     let mut methods = plan.methods.clone();
-    methods.extend(Method::of_frames());
+    methods.extend(Method::all());
     let mut recipes = Vec::new();
     for (number, &method) in methods.iter().enumerate() {
         if methods[..number].contains(&method) {
@@ -195,14 +195,14 @@ impl Recipe {
         dataset: &Dataset,
     ) -> Result<Description, LabelsError> {
         let request = Request {
-            method: self.method,
             profile,
             seed,
             labels: self.labels,
             label_choice: self.choice,
+            start: None,
             settings: self.method.settings(profile),
         };
-        request.description(dataset)
+        request.of_method(self.method, dataset)
     }
 
     /// The cost of a run, in thousands of HRN's steps in the `paper` profile. A step of a GAN
@@ -219,8 +219,6 @@ impl Recipe {
             Method::Hrn15 | Method::Nahrn => 3.0,
             Method::Hrn15Strong => 5.0,
             Method::Features => 0.5,
-            // These methods are not rows of a comparison.
-            Method::Course | Method::Adapt => 0.0,
         }
     }
 }

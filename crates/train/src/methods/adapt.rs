@@ -15,6 +15,8 @@ use crate::stages::Stages;
 use hardnessd_core::verdict::Hrn;
 use hardnessd_simulator::Split;
 
+pub use super::settings::adapt as settings;
+
 /// The name of the only stage.
 const STAGE: &str = "adapt";
 
@@ -51,7 +53,7 @@ impl NoStart {
 }
 
 /// The network of a model file.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub enum Start {
     /// The network of `frame`.
     Frame(start::Start),

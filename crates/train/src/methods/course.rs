@@ -6,10 +6,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use anyhow::ensure;
 use burn::tensor::Device;
 
-use super::Method;
+use super::Request;
 use super::adapt::NoStart;
 use crate::data::courses::Courses;
-use crate::data::dataset::{self, LabelChoice, Source};
+use crate::data::dataset::{self, Source};
 use crate::learn::conformal::Calibration;
 use crate::learn::course::{self, Task};
 use crate::learn::force;
@@ -19,23 +19,24 @@ use crate::model::file;
 use crate::net::course as network;
 use crate::net::start::Start;
 use crate::run::{Description, Run};
-use crate::settings::{Profile, Settings};
 use hardnessd_core::verdict::Hrn;
 use hardnessd_simulator::Split;
 use hardnessd_simulator::random::Stream;
 
-/// The description of a run of a method, which uses all labels.
+pub use super::settings::course as settings;
+
+/// The description of a run called `method`, which uses all labels.
 ///
 /// # Errors
 ///
 /// Fails if the data has no labelled training presses, or if `validation.keep` is not `last`.
 pub fn description(
-    method: Method,
+    method: &str,
     courses: &Courses,
     sources: Vec<Source>,
-    (profile, seed, settings): (Profile, u64, Settings),
+    request: &Request,
 ) -> anyhow::Result<Description> {
-    settings.validation.check_last()?;
+    request.settings.validation.check_last()?;
     dataset::warn_of_other_levels(&sources);
     let labels = courses.labelled(Split::Train).count();
     ensure!(
@@ -43,16 +44,7 @@ pub fn description(
         "{}: no press of the train split has a level: collect some with `--sequences --level L`",
         sources.first().map_or("", |source| &source.name)
     );
-    Ok(Description {
-        method: method.name().to_owned(),
-        profile,
-        seed,
-        labels,
-        label_choice: LabelChoice::Object,
-        start: None,
-        settings,
-        data: sources,
-    })
+    Ok(request.of(method, labels, sources))
 }
 
 /// Trains from random weights or from `start`, and writes the model and its evaluation to the run's
@@ -81,11 +73,9 @@ pub fn train(
         hardnessd_core::say!("{account}");
     }
     let presses = course::presses(courses, force_factor)?;
+    let is_adapted = start.is_some();
     let task = Task {
-        stage: match start {
-            Some(_) => "adapt",
-            None => "course",
-        },
+        stage: if is_adapted { "adapt" } else { "course" },
         presses: &presses,
         train: &train,
         held_out: &held_out,
@@ -100,7 +90,7 @@ pub fn train(
         hardnessd_core::say!("{missing}");
     }
     if !task.has_shore() {
-        let consequence = match description.method == Method::Adapt.name() {
+        let consequence = match is_adapted {
             true => "the Shore hardness stays as the start gives it",
             false => {
                 "the model's Shore hardness says nothing, and its interval is always the whole scale"

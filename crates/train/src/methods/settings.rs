@@ -79,7 +79,7 @@ pub(super) fn frame(profile: Profile) -> Settings {
 }
 
 /// The settings of `adapt`.
-pub(super) fn adapt(profile: Profile) -> Settings {
+pub fn adapt(profile: Profile) -> Settings {
     let mut settings = Settings::of(profile);
     settings.training = Training {
         batch: 50,
@@ -95,7 +95,7 @@ pub(super) fn adapt(profile: Profile) -> Settings {
 }
 
 /// The settings of `course`.
-pub(super) fn course(profile: Profile) -> Settings {
+pub fn course(profile: Profile) -> Settings {
     let mut settings = Settings::of(profile);
     settings.training = Training {
         batch: 128,

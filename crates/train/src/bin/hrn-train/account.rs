@@ -7,7 +7,7 @@ use std::path::Path;
 use hardnessd_core::verdict::Hrn;
 use hardnessd_simulator::Split;
 use hrn_train::compare::digits::{rounded, thousands};
-use hrn_train::data::dataset::{self, Dataset};
+use hrn_train::data::dataset;
 use hrn_train::judge::metrics::Evaluation;
 use hrn_train::model::evaluated::{Case, Evaluated, NEAR_BORDER};
 
@@ -169,17 +169,18 @@ fn of_evaluation(evaluation: &Evaluation) -> String {
     )
 }
 
-/// The number of presses of each level in each split of a data set, and a warning if the levels
+/// The number of presses of each level in each split, from the split, level and object of every press, and a warning if the levels
 /// were probably counted from 0.
-pub(super) fn of_data(dataset: &Dataset) -> String {
+pub(super) fn of_data(presses: &[(Split, u8, Option<u32>)]) -> String {
     let mut text = String::new();
     let levels = dataset::levels();
     for (split, name) in [(Split::Train, "training"), (Split::Test, "test")] {
-        let samples: Vec<_> = (dataset.samples.iter())
-            .filter(|sample| sample.split == split)
+        let of_split: Vec<u8> = (presses.iter())
+            .filter(|press| press.0 == split)
+            .map(|press| press.1)
             .collect();
-        let presses_of = |level: u8| samples.iter().filter(|s| s.level == level).count() as u64;
-        if samples.is_empty() {
+        let presses_of = |level: u8| of_split.iter().filter(|&&of| of == level).count() as u64;
+        if of_split.is_empty() {
             continue;
         }
         let mut counts: Vec<String> = (levels.iter())
@@ -194,7 +195,7 @@ pub(super) fn of_data(dataset: &Dataset) -> String {
         counts.push(format!("unlabelled (level 0) {}", thousands(presses_of(0))));
         let _ = writeln!(text, "{name} presses: {}", counts.join(", "));
     }
-    let has = |level: u8| dataset.samples.iter().any(|sample| sample.level == level);
+    let has = |level: u8| presses.iter().any(|press| press.1 == level);
     if let Some(highest) = levels.last().map(|level| level.level)
         && has(0)
         && !has(highest)
@@ -209,12 +210,13 @@ pub(super) fn of_data(dataset: &Dataset) -> String {
     text
 }
 
-/// Warnings about levels with few training presses, or none. `presses` has the level of each labelled
-/// training press, and its object where it is known.
-pub(super) fn of_levels(presses: impl Iterator<Item = (u8, Option<u32>)>) -> String {
+/// Warnings about levels with few labelled training presses, or none.
+pub(super) fn of_levels(presses: &[(Split, u8, Option<u32>)]) -> String {
     let mut objects: BTreeMap<u8, BTreeSet<Option<u32>>> = BTreeMap::new();
-    for (level, object) in presses {
-        objects.entry(level).or_default().insert(object);
+    for &(split, level, object) in presses {
+        if split == Split::Train && level > 0 {
+            objects.entry(level).or_default().insert(object);
+        }
     }
     let levels = dataset::levels();
     let all = || levels.iter().map(|level| level.level);

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::builder::RangedU64ValueParser;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Parser, Subcommand, ValueEnum};
 use hardnessd_simulator::{DatasetSettings, LawName, Materials, SensorProfile, Shapes, Split};
 use hrn_train::data::dataset::LabelChoice;
@@ -205,11 +206,34 @@ pub(super) struct Collect {
     pub(super) captures: Vec<PathBuf>,
 }
 
+/// A value of `train --method`.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Trained {
+    Frames(Method),
+    Courses,
+}
+
+/// The name of [`Trained::Courses`].
+const COURSE: &str = "course";
+
+fn trained() -> impl TypedValueParser<Value = Trained> {
+    let of_courses = PossibleValue::new(COURSE).help(
+        "Judges the course of a press with the arm's motion, and gives its Shore hardness: a temporal \
+         convolution. Takes data of `simulate --sequences`",
+    );
+    let methods = Method::all().iter();
+    let of_frames = methods.filter_map(ValueEnum::to_possible_value);
+    PossibleValuesParser::new(of_frames.chain([of_courses])).map(|name| {
+        let method = Method::all().iter().find(|method| method.name() == name);
+        method.map_or(Trained::Courses, |&method| Trained::Frames(method))
+    })
+}
+
 #[derive(Debug, clap::Args)]
 pub(super) struct Train {
     /// What to train
-    #[arg(long)]
-    pub(super) method: Method,
+    #[arg(long, value_parser = trained())]
+    pub(super) method: Trained,
     /// Data to learn from; several files may be named. The files are joined, and objects of different files stay
     /// different: all presses of an object must be in one file
     #[arg(long, value_name = "D.npz", required = true, num_args = 1..)]

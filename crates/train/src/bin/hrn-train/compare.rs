@@ -26,11 +26,8 @@ pub(super) fn compare(arguments: Compare) -> anyhow::Result<String> {
     }
     let [data] =
         <[PathBuf; 1]>::try_from(arguments.data).map_err(|all| WrongUsage::ManyFiles(all.len()))?;
-    if arguments.methods.contains(&Method::Course) {
-        return Err(WrongUsage::NotOfFrames.into());
-    }
     let methods = if arguments.methods.is_empty() {
-        Method::of_frames().collect()
+        Method::all().to_vec()
     } else {
         arguments.methods
     };

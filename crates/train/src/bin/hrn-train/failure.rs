@@ -46,8 +46,6 @@ pub(super) struct NoCuda;
 /// Options that do not go together.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum WrongUsage {
-    #[error("--methods: course judges whole presses: compare its models with --course")]
-    NotOfFrames,
     #[error("--data: found {0} files, expected 1 without --course")]
     ManyFiles(usize),
     #[error(

@@ -1,23 +1,22 @@
 //! `hrn-train train` and `hrn-train adapt`.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Instant;
 
 use anyhow::Context as _;
 use burn::tensor::Device;
 use hardnessd_core::verdict::{BUILT_IN, Hrn, sha256_hex};
 use hardnessd_core::wording;
-use hardnessd_simulator::Split;
-use hrn_train::data::courses::{self, Courses};
-use hrn_train::data::dataset::{Dataset, DatasetError, LabelChoice};
-use hrn_train::methods::{self, Method, Request};
+use hrn_train::data::courses::Courses;
+use hrn_train::data::dataset::LabelChoice;
+use hrn_train::methods::task::{Frames, Task};
+use hrn_train::methods::{self, Request};
 use hrn_train::model::evaluated::Evaluated;
-use hrn_train::model::{course, export};
-use hrn_train::run::{Description, Run};
+use hrn_train::run::Run;
 use hrn_train::settings::{Profile, Settings};
 
 use super::account;
-use super::arguments::{Adapt, DeviceName, Train};
+use super::arguments::{Adapt, DeviceName, Train, Trained};
 use super::failure::{NoCuda, Unreadable, WrongUsage};
 use super::files::{load_with_bytes, read};
 
@@ -25,15 +24,19 @@ pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
     if let Some(parent) = arguments.parent {
         end_with(parent)?;
     }
-    if arguments.method == Method::Course {
-        return train_course(arguments);
-    }
-    let settings = settings(
-        arguments.method,
-        arguments.profile,
-        arguments.config.as_deref(),
-    )?;
-    let dataset = dataset_of(&arguments.data)?;
+    let profile = arguments.profile;
+    let defaults = match arguments.method {
+        Trained::Frames(method) => method.settings(profile),
+        Trained::Courses => methods::course::settings(profile),
+    };
+    let settings = overridden(defaults, arguments.config.as_deref())?;
+    let task = match arguments.method {
+        Trained::Frames(method) => Task::frames(&arguments.data, Frames::Method(method))?,
+        Trained::Courses => {
+            check_options_of_courses(arguments)?;
+            Task::courses(&arguments.data, None)?
+        }
+    };
     for other in &arguments.from {
         let unreadable = |source| Unreadable {
             path: other.clone(),
@@ -42,40 +45,33 @@ pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
         std::fs::read_dir(other).map_err(unreadable)?;
     }
     let request = Request {
-        method: arguments.method,
-        profile: arguments.profile,
+        profile,
         seed: arguments.seed,
         labels: arguments.labels,
         label_choice: arguments.label_choice,
+        start: None,
         settings,
     };
-    let description = request.description(&dataset)?;
-    methods::check(arguments.method, &dataset, &description)?;
+    let description = task.description(&request)?;
     let device = device(arguments.device)?;
     let run = Run::open(&arguments.out, &description, arguments.resume)?
         .taking_from(arguments.from.clone());
-    hardnessd_core::say_part!("{}", wording::lines(&account::of_data(&dataset)));
-    let labelled = dataset
-        .samples
-        .iter()
-        .filter(|sample| sample.split == Split::Train && sample.level > 0);
-    let labelled = labelled.map(|sample| (sample.level, sample.object));
-    hardnessd_core::say_part!("{}", account::of_levels(labelled));
-    if arguments.profile == Profile::Smoke {
+    let presses = task.presses();
+    hardnessd_core::say_part!("{}", wording::lines(&account::of_data(&presses)));
+    hardnessd_core::say_part!("{}", account::of_levels(&presses));
+    if profile == Profile::Smoke {
         hardnessd_core::say!(
             "--profile smoke: tries the commands in seconds; too short to learn anything"
         );
     }
     let begun = Instant::now();
-    let evaluation = methods::train(arguments.method, &dataset, &description, &run, &device)?;
-    Ok(account_of_run(
-        begun,
-        &run,
-        evaluation.as_ref().map(account::of_evaluated),
-    ))
+    let evaluation = task.train(&description, &run, &device)?;
+    let figures = evaluation.as_ref().map(account::of_evaluated);
+    Ok(account_of_run(begun, &run, figures))
 }
 
-fn train_course(arguments: &Train) -> anyhow::Result<String> {
+/// Refuses options that mean nothing for whole presses.
+fn check_options_of_courses(arguments: &Train) -> Result<(), WrongUsage> {
     let of_frames = [
         ("--labels", arguments.labels.is_some()),
         (
@@ -84,117 +80,56 @@ fn train_course(arguments: &Train) -> anyhow::Result<String> {
         ),
         ("--from", !arguments.from.is_empty()),
     ];
-    if let Some((option, _)) = of_frames.into_iter().find(|(_, is_given)| *is_given) {
-        return Err(WrongUsage::OfFrames(option).into());
+    match of_frames.into_iter().find(|(_, is_given)| *is_given) {
+        Some((option, _)) => Err(WrongUsage::OfFrames(option)),
+        None => Ok(()),
     }
-    let settings = settings(
-        arguments.method,
-        arguments.profile,
-        arguments.config.as_deref(),
-    )?;
-    let (courses, sources) = Courses::read_all(&arguments.data)?;
-    let choices = (arguments.profile, arguments.seed, settings);
-    let description = methods::course::description(Method::Course, &courses, sources, choices)?;
-    let device = device(arguments.device)?;
-    let run = Run::open(&arguments.out, &description, arguments.resume)?;
-    let labelled = courses.labelled(Split::Train);
-    let labelled = labelled.map(|place| &courses.presses[place]);
-    let labelled = labelled.map(|press| (press.level, Some(press.object)));
-    hardnessd_core::say_part!("{}", account::of_levels(labelled));
-    let begun = Instant::now();
-    let evaluation = methods::course::train(&courses, None, &description, &run, &device)?;
-    Ok(account_of_run(
-        begun,
-        &run,
-        evaluation.as_ref().map(account::of_evaluated),
-    ))
 }
 
 pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
-    if Courses::is_at(&arguments.data[0])? {
-        return adapt_course(arguments);
-    }
-    let (method, profile) = (Method::Adapt, Profile::Paper);
-    let settings = settings(method, profile, arguments.config.as_deref())?;
+    let of_courses = Courses::is_at(&arguments.data[0])?;
+    let profile = Profile::Paper;
+    let defaults = methods::adapt::settings(profile);
+    let settings = overridden(defaults, arguments.config.as_deref())?;
     let device = device(arguments.device)?;
     let (model, bytes, name) = match &arguments.start {
         Some(path) => {
             let (model, bytes) = load_with_bytes(path)?;
             (model, bytes, path.display().to_string())
         }
+        None if of_courses => return Err(WrongUsage::NoStart.into()),
         None => {
             let name = "the built-in model".to_owned();
             (Hrn::load(BUILT_IN)?, BUILT_IN.to_vec(), name)
         }
     };
-    let start = methods::adapt::Start::read(&model, &bytes, &device).context(name)?;
-    let dataset = dataset_of(&arguments.data)?;
+    let task = if of_courses {
+        let start = methods::course::start(&model, &bytes, &device).context(name)?;
+        Task::courses(&arguments.data, Some(start))?
+    } else {
+        let start = methods::adapt::Start::read(&model, &bytes, &device).context(name)?;
+        Task::frames(&arguments.data, Frames::Adapt(start))?
+    };
     let request = Request {
-        method,
         profile,
         seed: arguments.seed,
         labels: None,
         label_choice: LabelChoice::Object,
-        settings: start.settings(settings)?,
-    };
-    let description = Description {
         start: Some(sha256_hex(&bytes)),
-        ..request.description(&dataset)?
+        settings,
     };
-    methods::check(method, &dataset, &description)?;
+    let description = task.description(&request)?;
     let run = Run::open(&arguments.out, &description, arguments.resume)?;
-    hardnessd_core::say_part!("{}", wording::lines(&account::of_data(&dataset)));
+    let presses = task.presses();
+    hardnessd_core::say_part!("{}", wording::lines(&account::of_data(&presses)));
     let begun = Instant::now();
-    let evaluation = methods::adapt::train(&dataset, start, &description, &run, &device)?;
+    let evaluation = task.train(&description, &run, &device)?;
     let beside_start = |evaluation: &Evaluated| {
-        let cases = export::cases(&model, &dataset, &dataset.labelled(Split::Test)?)?;
+        let cases = task.test_cases(&model)?;
         Ok(account::of_adapted(evaluation, &model, &cases))
     };
     let figures: anyhow::Result<Option<String>> = evaluation.as_ref().map(beside_start).transpose();
     Ok(account_of_run(begun, &run, figures?))
-}
-
-/// Continues to train a model of whole presses.
-fn adapt_course(arguments: &Adapt) -> anyhow::Result<String> {
-    let path = arguments.start.as_ref().ok_or(WrongUsage::NoStart)?;
-    let (method, profile) = (Method::Adapt, Profile::Paper);
-    let settings = settings(method, profile, arguments.config.as_deref())?;
-    let device = device(arguments.device)?;
-    let (model, bytes) = load_with_bytes(path)?;
-    let start = methods::course::start(&model, &bytes, &device)
-        .with_context(|| path.display().to_string())?;
-    let (courses, sources) = Courses::read_all(&arguments.data)?;
-    let choices = (profile, arguments.seed, settings);
-    let description = Description {
-        start: Some(sha256_hex(&bytes)),
-        ..methods::course::description(method, &courses, sources, choices)?
-    };
-    let run = Run::open(&arguments.out, &description, arguments.resume)?;
-    let begun = Instant::now();
-    let evaluation = methods::course::train(&courses, Some(start), &description, &run, &device)?;
-    let beside_start = |evaluation: &Evaluated| {
-        let verdicts = course::verdicts(&model, &courses, Split::Test, |course| course)?;
-        Ok(account::of_adapted(
-            evaluation,
-            &model,
-            &course::cases(&verdicts),
-        ))
-    };
-    let figures: anyhow::Result<Option<String>> = evaluation.as_ref().map(beside_start).transpose();
-    Ok(account_of_run(begun, &run, figures?))
-}
-
-/// The data of several files, joined.
-fn dataset_of(paths: &[PathBuf]) -> anyhow::Result<Dataset> {
-    let parts: Result<Vec<Dataset>, DatasetError> = paths
-        .iter()
-        .map(|path| courses::single_frames(path))
-        .collect();
-    let parts = parts?;
-    for part in &parts {
-        part.warn_of_object_in_both_splits();
-    }
-    Ok(Dataset::joined(parts)?)
 }
 
 /// The duration of the training, the path of the model, and its figures on the data's test presses,
@@ -210,9 +145,8 @@ fn account_of_run(begun: Instant, run: &Run, figures: Option<String>) -> String 
     )
 }
 
-/// The settings of the method, with the values that a file overrides.
-fn settings(method: Method, profile: Profile, file: Option<&Path>) -> anyhow::Result<Settings> {
-    let settings = method.settings(profile);
+/// The settings with the values that a file overrides.
+fn overridden(settings: Settings, file: Option<&Path>) -> anyhow::Result<Settings> {
     let Some(path) = file else {
         return Ok(settings);
     };
