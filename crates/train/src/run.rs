@@ -4,6 +4,7 @@
 //! row of `metrics.csv` may be broken; a resumed run drops it.
 
 pub mod checkpoint;
+pub mod checkpoints;
 pub mod disk;
 pub mod history;
 pub mod progress;
@@ -20,12 +21,10 @@ use crate::data::dataset::{LabelChoice, Source};
 use crate::net::network::Weights;
 use crate::settings::{Profile, Settings, SettingsError};
 use checkpoint::Checkpoint;
+use checkpoints::Checkpoints;
 use disk::{lock, refuse_foreign, write_whole};
 use hardnessd_core::wording;
-use history::Metrics;
-
-/// The number of checkpoints kept for a stage: the newest, and one before it.
-const CHECKPOINTS_KEPT: usize = 2;
+use history::MetricsFile;
 
 /// The description of a run, in `settings.toml`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -115,6 +114,10 @@ const OF_A_RUN: [&str; 4] = [
 pub struct Run {
     directory: PathBuf,
     _lock: File,
+    /// The checkpoints of its stages.
+    pub checkpoints: Checkpoints,
+    /// Its `metrics.csv`.
+    pub metrics: MetricsFile,
     /// Directories of other runs, from which finished stages may be taken.
     others: Vec<PathBuf>,
 }
@@ -152,6 +155,8 @@ impl Run {
         let run = Self {
             directory: directory.to_owned(),
             _lock: lock(directory)?,
+            checkpoints: Checkpoints::of(directory),
+            metrics: MetricsFile::of(directory),
             others: Vec::new(),
         };
         let before = Self::description_at(directory)?;
@@ -206,21 +211,6 @@ impl Run {
         write_whole(&self.path(name), bytes)
     }
 
-    /// Writes a stage's checkpoint and removes all but the last two.
-    ///
-    /// # Errors
-    ///
-    /// Returns the errors of writing.
-    pub fn save(&self, stage: &str, checkpoint: &Checkpoint) -> anyhow::Result<()> {
-        let name = format!("checkpoints/{stage}-{:010}.npz", checkpoint.progress.step);
-        self.write(&name, &checkpoint.to_bytes()?)?;
-        let all = checkpoints(&self.directory, stage)?;
-        for old in &all[..all.len().saturating_sub(CHECKPOINTS_KEPT)] {
-            fs::remove_file(old).with_context(|| old.display().to_string())?;
-        }
-        Ok(())
-    }
-
     /// A stage's newest checkpoint that can be read. Without any checkpoint, that of another run
     /// which did all `epochs` of a stage of the same `origin`; it then becomes this run's too. A
     /// checkpoint must have the lists of `fresh`, the stage before its first step.
@@ -237,31 +227,16 @@ impl Run {
         fresh: &[(String, Weights)],
         device: &Device,
     ) -> anyhow::Result<Option<Checkpoint>> {
-        let read = |path: &Path| {
-            let checkpoint = Checkpoint::read(path, device)?;
-            checkpoint.check_like(fresh)?;
-            Ok::<_, anyhow::Error>(checkpoint)
-        };
-        let mut failure = None;
-        for path in checkpoints(&self.directory, stage)?.iter().rev() {
-            match read(path) {
-                Ok(checkpoint) => return Ok(Some(checkpoint)),
-                Err(error) => failure = Some(error.context(path.display().to_string())),
-            }
-        }
-        if let Some(failure) = failure {
-            return Err(failure);
+        if let Some(own) = self.checkpoints.newest(stage, fresh, device)? {
+            return Ok(Some(own));
         }
         for other in &self.others {
             // A file of another run that cannot be read is no error, because this run can do the
             // stage itself.
-            let Some(path) = checkpoints(other, stage).unwrap_or_default().pop() else {
+            let Ok(Some(checkpoint)) = Checkpoints::of(other).newest(stage, fresh, device) else {
                 continue;
             };
-            let Ok(checkpoint) = read(&path) else {
-                continue;
-            };
-            let Ok(metrics) = metrics_of(other) else {
+            let Ok(metrics) = MetricsFile::of(other).read() else {
                 continue;
             };
             let Ok(revisions) = fs::read_to_string(other.join("revision")) else {
@@ -269,8 +244,8 @@ impl Run {
             };
             if checkpoint.origin == origin && checkpoint.progress.epoch == epochs {
                 self.add_revisions(&revisions)?;
-                self.take_metrics(stage, &metrics)?;
-                self.save(stage, &checkpoint)?;
+                self.metrics.take(stage, &metrics)?;
+                self.checkpoints.save(stage, &checkpoint)?;
                 return Ok(Some(checkpoint));
             }
         }
@@ -318,98 +293,6 @@ impl Run {
         }
         self.write("revision", all.as_bytes())
     }
-
-    /// Adds the rows of `stage` of another run's metrics to `metrics.csv`, because they are part of
-    /// the cost of this run's model.
-    fn take_metrics(&self, stage: &str, text: &str) -> anyhow::Result<()> {
-        let mut own = self.metrics_before()?;
-        if own.is_empty() {
-            own = history::columns() + "\n";
-        }
-        let of_stage = |row: &&str| row.split(',').next() == Some(stage);
-        own = own
-            .lines()
-            .filter(|row| !of_stage(row))
-            .fold(String::new(), |rows, row| rows + row + "\n");
-        for row in text.lines().filter(of_stage) {
-            own += row;
-            own.push('\n');
-        }
-        self.write("metrics.csv", own.as_bytes())
-    }
-
-    /// Opens `metrics.csv` and cuts off the rows of `stage` after `step`, because a resumed run
-    /// writes them again.
-    ///
-    /// # Errors
-    ///
-    /// Returns the errors of reading and writing, and an error if another version began the file
-    /// with other columns.
-    pub fn metrics(&self, stage: &'static str, step: u64) -> anyhow::Result<Metrics> {
-        let before = self.metrics_before()?;
-        let columns = history::columns();
-        let mut seconds_before = 0.0;
-        let mut text = columns.clone() + "\n";
-        for row in before.lines().skip(1) {
-            let cells: Vec<&str> = row.split(',').collect();
-            let row_step = cells.get(1).and_then(|cell| cell.parse::<u64>().ok());
-            let is_done = cells[0] != stage || row_step.is_some_and(|row_step| row_step <= step);
-            // A full disk may have broken a row off.
-            if !is_done || cells.len() != columns.split(',').count() {
-                continue;
-            }
-            text.push_str(row);
-            text.push('\n');
-            let seconds = cells.last().and_then(|cell| cell.parse().ok());
-            if let (true, Some(seconds)) = (cells[0] == stage, seconds) {
-                seconds_before = seconds;
-            }
-        }
-        self.write("metrics.csv", text.as_bytes())?;
-        let path = self.path("metrics.csv");
-        let file = File::options().append(true).open(&path);
-        let file = file.with_context(|| path.display().to_string())?;
-        Ok(Metrics::new(file, stage, seconds_before))
-    }
-
-    /// The text of `metrics.csv` so far. Empty if the file does not exist yet.
-    fn metrics_before(&self) -> anyhow::Result<String> {
-        let path = self.path("metrics.csv");
-        match fs::read_to_string(&path) {
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(String::new()),
-            Err(error) => Err(error).with_context(|| path.display().to_string()),
-            Ok(text) if text.is_empty() => Ok(text),
-            Ok(text) => history::check_columns(&text, &path).map(|()| text),
-        }
-    }
-}
-
-/// The text of a run's `metrics.csv`, if its columns are those of this version.
-fn metrics_of(run: &Path) -> anyhow::Result<String> {
-    let path = run.join("metrics.csv");
-    let text = fs::read_to_string(&path).with_context(|| path.display().to_string())?;
-    history::check_columns(&text, &path)?;
-    Ok(text)
-}
-
-/// Paths of a stage's checkpoints in a run's directory, oldest first.
-fn checkpoints(run: &Path, stage: &str) -> anyhow::Result<Vec<PathBuf>> {
-    let directory = run.join("checkpoints");
-    let prefix = format!("{stage}-");
-    let mut paths = Vec::new();
-    for entry in fs::read_dir(&directory).with_context(|| directory.display().to_string())? {
-        let path = entry?.path();
-        let name = path
-            .file_name()
-            .unwrap_or_default()
-            .to_string_lossy()
-            .into_owned();
-        if name.starts_with(&prefix) && name.ends_with(".npz") {
-            paths.push(path);
-        }
-    }
-    paths.sort();
-    Ok(paths)
 }
 
 /// This package's version, and the commit it was built from.

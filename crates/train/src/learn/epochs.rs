@@ -84,7 +84,7 @@ pub fn run(
     };
     let count = stage.train.len();
     let steps = u64::from(epochs) * count.div_ceil(batch) as u64;
-    let mut metrics = run.metrics(name, progress.step)?;
+    let mut metrics = run.metrics.open(name, progress.step)?;
     let bar = progress_bar(name, steps, progress.step);
     let begun = Instant::now();
     while progress.epoch < epochs {
@@ -128,7 +128,7 @@ pub fn run(
                 progress,
                 lists: learner.lists(""),
             };
-            run.save(name, &checkpoint)?;
+            run.checkpoints.save(name, &checkpoint)?;
         }
     }
     bar.finish_and_clear();

@@ -115,7 +115,7 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
         }
         None => fresh,
     };
-    let mut metrics = run.metrics(task.stage, state.progress.step)?;
+    let mut metrics = run.metrics.open(task.stage, state.progress.step)?;
     let bar = progress_bar(task.stage, steps, state.progress.step);
     let begun = Instant::now();
 
@@ -160,7 +160,8 @@ pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> 
         }
         report(&bar, task.stage, epoch, epochs, message);
         if due(task.settings.checkpoint_every_epochs) {
-            run.save(task.stage, &state.checkpoint(&origin))?;
+            run.checkpoints
+                .save(task.stage, &state.checkpoint(&origin))?;
         }
     }
     bar.finish_and_clear();

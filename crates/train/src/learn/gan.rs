@@ -96,7 +96,7 @@ pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
         }
         None => fresh,
     };
-    let mut metrics = run.metrics(task.stage, state.progress.step)?;
+    let mut metrics = run.metrics.open(task.stage, state.progress.step)?;
     let mut reference = None;
     let bar = progress_bar(task.stage, steps, state.progress.step);
     let begun = Instant::now();
@@ -157,7 +157,8 @@ pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
         }
         report(&bar, task.stage, epoch, epochs, message);
         if due(task.settings.checkpoint_every_epochs) {
-            run.save(task.stage, &state.checkpoint(&origin))?;
+            run.checkpoints
+                .save(task.stage, &state.checkpoint(&origin))?;
         }
     }
     bar.finish_and_clear();

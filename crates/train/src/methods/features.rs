@@ -33,7 +33,7 @@ pub fn train(
         .map(|&index| usize::from(dataset.samples[index].level) - 1)
         .collect();
     let baseline = Baseline::fit(&rows, &level_of, dataset::levels().len());
-    run.metrics("features", 0)?.add(&Row {
+    run.metrics.open("features", 0)?.add(&Row {
         step: baseline.steps.into(),
         epoch: baseline.steps,
         loss: baseline.loss,

@@ -7,11 +7,86 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{ErrorKind, Write as _};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, ensure};
 
+use super::disk::write_whole;
 use crate::judge::likeness::Likeness;
+
+/// A run's `metrics.csv`.
+#[derive(Debug)]
+pub struct MetricsFile {
+    path: PathBuf,
+}
+
+impl MetricsFile {
+    /// The file of the run in a directory.
+    pub(super) fn of(run: &Path) -> Self {
+        Self {
+            path: run.join("metrics.csv"),
+        }
+    }
+
+    /// Opens the file and cuts off the rows of `stage` after `step`, because a resumed run writes them
+    /// again.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of reading and writing, and an error if another version began the file
+    /// with other columns.
+    pub fn open(&self, stage: &'static str, step: u64) -> anyhow::Result<Metrics> {
+        let before = self.read()?;
+        let columns = columns();
+        let mut seconds_before = 0.0;
+        let mut text = columns.clone() + "\n";
+        for row in before.lines().skip(1) {
+            let cells: Vec<&str> = row.split(',').collect();
+            let row_step = cells.get(1).and_then(|cell| cell.parse::<u64>().ok());
+            let is_done = cells[0] != stage || row_step.is_some_and(|row_step| row_step <= step);
+            // A full disk may have broken a row off.
+            if !is_done || cells.len() != columns.split(',').count() {
+                continue;
+            }
+            text.push_str(row);
+            text.push('\n');
+            let seconds = cells.last().and_then(|cell| cell.parse().ok());
+            if let (true, Some(seconds)) = (cells[0] == stage, seconds) {
+                seconds_before = seconds;
+            }
+        }
+        write_whole(&self.path, text.as_bytes())?;
+        let file = File::options().append(true).open(&self.path);
+        Ok(Metrics {
+            file: file.with_context(|| self.path.display().to_string())?,
+            stage,
+            seconds_before,
+        })
+    }
+
+    /// Adds the rows of `stage` from the text of another run's file, because they are part of the
+    /// cost of this run's model.
+    pub(super) fn take(&self, stage: &str, text: &str) -> anyhow::Result<()> {
+        let mut own = self.read()?;
+        if own.is_empty() {
+            own = columns() + "\n";
+        }
+        let of_stage = |row: &&str| row.split(',').next() == Some(stage);
+        let own = own.lines().filter(|row| !of_stage(row));
+        let rows: Vec<&str> = own.chain(text.lines().filter(of_stage)).collect();
+        write_whole(&self.path, (rows.join("\n") + "\n").as_bytes())
+    }
+
+    /// The text so far. Empty if the file does not exist yet.
+    pub(super) fn read(&self) -> anyhow::Result<String> {
+        match std::fs::read_to_string(&self.path) {
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(String::new()),
+            Err(error) => Err(error).with_context(|| self.path.display().to_string()),
+            Ok(text) if text.is_empty() => Ok(text),
+            Ok(text) => check_columns(&text, &self.path).map(|()| text),
+        }
+    }
+}
 
 /// `metrics.csv`, open for one stage.
 #[derive(Debug)]
@@ -57,15 +132,6 @@ pub struct Adversarial {
 }
 
 impl Metrics {
-    /// Adds rows of `stage` to `file`, which already has its columns.
-    pub fn new(file: File, stage: &'static str, seconds_before: f64) -> Self {
-        Self {
-            file,
-            stage,
-            seconds_before,
-        }
-    }
-
     /// Adds a row.
     ///
     /// # Errors
@@ -136,16 +202,13 @@ impl Row {
 }
 
 /// The first line of `metrics.csv`.
-pub fn columns() -> String {
+fn columns() -> String {
     Row::default().cells("").map(|(column, _)| column).join(",")
 }
 
-/// Checks that an existing file has the columns of this version.
-///
-/// # Errors
-///
-/// Returns an error if it has others, because its rows and new ones would mix different columns.
-pub fn check_columns(text: &str, path: &Path) -> anyhow::Result<()> {
+/// Checks that an existing file has the columns of this version, because its rows and new ones would
+/// otherwise mix different columns.
+fn check_columns(text: &str, path: &Path) -> anyhow::Result<()> {
     let (found, expected) = (text.lines().next().unwrap_or_default(), columns());
     ensure!(
         found == expected,
@@ -284,11 +347,10 @@ mod tests {
                 feature_distance: 4.0,
             }),
         });
-        let file = tempfile::NamedTempFile::new().unwrap();
-        let again = file.reopen().unwrap();
-        Metrics::new(again, "ustgan", 1.0).add(&row).unwrap();
-        let text = columns() + "\n" + &std::fs::read_to_string(file.path()).unwrap();
-        let history = History::parse(&text);
+        let run = tempfile::tempdir().unwrap();
+        let file = MetricsFile::of(run.path());
+        file.open("ustgan", 0).unwrap().add(&row).unwrap();
+        let history = History::parse(&file.read().unwrap());
         let stage = &history.stages[0];
         assert_eq!(stage.name, "ustgan");
         let expected = [
@@ -297,7 +359,6 @@ mod tests {
             ("sigma_max", 0.3),
             ("pixel_std_component", 3.0),
             ("feature_distance", 4.0),
-            ("seconds", 1.0),
         ];
         for (column, value) in expected {
             assert_eq!(stage.rows[0].get(column), Some(&value), "{column}");

@@ -78,8 +78,8 @@ fn every_program_that_had_a_part_in_a_run_is_named() {
         lists: vec![("weights".to_owned(), weights)],
     };
     let other = open("other", true);
-    other.save("ustgan", &checkpoint).unwrap();
-    other.metrics("ustgan", 0).unwrap();
+    other.checkpoints.save("ustgan", &checkpoint).unwrap();
+    other.metrics.open("ustgan", 0).unwrap();
     let run = open("run", false).taking_from(vec![path("other")]);
     let taken = |origin| {
         run.latest("ustgan", origin, 3, &checkpoint.lists, &device)
@@ -94,11 +94,8 @@ fn every_program_that_had_a_part_in_a_run_is_named() {
 #[test]
 fn seconds_go_on_from_the_row_of_the_checkpoint() {
     let directory = tempfile::tempdir().unwrap();
-    let run = Run {
-        directory: directory.path().to_owned(),
-        _lock: lock(directory.path()).unwrap(),
-        others: Vec::new(),
-    };
+    let path = directory.path().join("metrics.csv");
+    let file = MetricsFile::of(directory.path());
     let row = |step, seconds| Row {
         step,
         epoch: 1,
@@ -109,15 +106,15 @@ fn seconds_go_on_from_the_row_of_the_checkpoint() {
         seconds,
         adversarial: None,
     };
-    let mut metrics = run.metrics("first", 0).unwrap();
+    let mut metrics = file.open("first", 0).unwrap();
     metrics.add(&row(10, 2.0)).unwrap();
     metrics.add(&row(20, 4.0)).unwrap();
     metrics.add(&row(30, 9.0)).unwrap();
-    run.metrics("second", 0).unwrap().add(&row(5, 1.0)).unwrap();
+    file.open("second", 0).unwrap().add(&row(5, 1.0)).unwrap();
     // The run was killed after step 30 and continues from the checkpoint of step 20.
-    let mut metrics = run.metrics("first", 20).unwrap();
+    let mut metrics = file.open("first", 20).unwrap();
     metrics.add(&row(30, 3.5)).unwrap();
-    let text = fs::read_to_string(run.path("metrics.csv")).unwrap();
+    let text = fs::read_to_string(&path).unwrap();
     let seconds: Vec<&str> = text
         .lines()
         .skip(1)
@@ -128,11 +125,11 @@ fn seconds_go_on_from_the_row_of_the_checkpoint() {
     assert!(text.contains("second,5,"), "{text}");
 
     // A row that a full disk broke off is dropped. A file that is not text stays unchanged.
-    fs::write(run.path("metrics.csv"), text.clone() + "sec").unwrap();
-    run.metrics("first", 30).unwrap();
-    assert_eq!(fs::read_to_string(run.path("metrics.csv")).unwrap(), text);
-    fs::write(run.path("metrics.csv"), b"\xff").unwrap();
-    let error = format!("{:#}", run.metrics("first", 30).unwrap_err());
+    fs::write(&path, text.clone() + "sec").unwrap();
+    file.open("first", 30).unwrap();
+    assert_eq!(fs::read_to_string(&path).unwrap(), text);
+    fs::write(&path, b"\xff").unwrap();
+    let error = format!("{:#}", file.open("first", 30).unwrap_err());
     assert!(error.contains("metrics.csv"), "{error}");
-    assert_eq!(fs::read(run.path("metrics.csv")).unwrap(), b"\xff");
+    assert_eq!(fs::read(&path).unwrap(), b"\xff");
 }
