@@ -245,7 +245,7 @@ fn compare(at: &Path, told: &Value) {
     for section in ["accuracy", "curves", "time", "calibration"] {
         assert!(page.contains(&format!("id=\"{section}\"")), "{section}");
     }
-    let count = |what: &str| page.matches(what).count();
+    let count = |title: &str| page.matches(&format!("aria-label=\"{title}")).count();
     assert!(count("force against approach, level ") >= 2, "{page}");
     assert_eq!(count("accuracy against time, d"), 1);
     assert_eq!(count("accuracy against force, d"), 1);

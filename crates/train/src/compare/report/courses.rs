@@ -92,19 +92,19 @@ fn force_against_approach(curves: &[Curve]) -> Vec<String> {
 fn against_time(so_far: &SoFar, set: &str) -> String {
     let points = so_far.after.iter();
     let points = points.map(|at| (f64::from(at.seconds), at.accuracy, at.going_on));
-    shares("time", "seconds", set, points.collect())
+    shares("time", "seconds", set, &points.collect::<Vec<_>>())
 }
 
 /// Accuracy against the force that a press has reached.
 fn against_force(so_far: &SoFar, set: &str) -> String {
     let points = so_far.at_force.iter();
     let points = points.filter_map(|at| Some((at.newtons, at.accuracy?, at.reached)));
-    shares("force", "newtons", set, points.collect())
+    shares("force", "newtons", set, &points.collect::<Vec<_>>())
 }
 
 /// Accuracy and the share of presses (dashed) on a logarithmic axis. Each of `points` has its place,
 /// the accuracy and the share.
-fn shares(of: &str, axis: &str, set: &str, points: Vec<(f64, f64, f64)>) -> String {
+fn shares(of: &str, axis: &str, set: &str, points: &[(f64, f64, f64)]) -> String {
     let places = points.iter().map(|point| point.0);
     let (least, most) = places.fold((1.0_f64, 1.0_f64), |(least, most), at| {
         (least.min(at), most.max(at))
