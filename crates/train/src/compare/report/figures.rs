@@ -79,7 +79,8 @@ pub(super) fn stages(runs: &[&History]) -> Vec<String> {
             let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
                 (low.min(v.1), high.max(v.1))
             });
-            if low > high {
+            // One point is no curve.
+            if curves.iter().all(|(_, curve)| curve.len() < 2) {
                 continue;
             }
             let room = (0.05 * (high - low)).max(0.02 * high.abs()).max(1e-3);
