@@ -1,13 +1,13 @@
 //! Bytes from strangers, at every input of the programs. Whatever the bytes are, the program
-//! answers, never panics, and takes a bounded time. `doors/properties.rs` has the properties.
-//! `fuzz/` searches for bytes that break them, guided by coverage. `crates/core/src/verdict/guard` also tries
-//! model files.
+//! answers, never panics, and takes a bounded time. `properties.rs` has the properties. `fuzz/`
+//! searches for bytes that break them, guided by coverage.
 
 use std::io::Cursor;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
 use hardnessd_core::recording::{Reader, recover};
+use hardnessd_core::trial;
 use proptest::prelude::*;
 use proptest::test_runner::TestRunner;
 
@@ -73,6 +73,7 @@ proptest! {
 
 #[test]
 fn every_property_holds_of_what_the_fuzzer_kept() {
+    trial::set_program(env!("CARGO_BIN_EXE_hardnessd").into());
     for (door, property) in crate::properties::ALL {
         for bytes in kept(door) {
             property(&bytes);
@@ -82,6 +83,7 @@ fn every_property_holds_of_what_the_fuzzer_kept() {
 
 #[test]
 fn every_property_holds_of_changes_to_what_the_fuzzer_kept() {
+    trial::set_program(env!("CARGO_BIN_EXE_hardnessd").into());
     let end = Instant::now() + Duration::from_secs(seconds());
     let mut tried = 0;
     while Instant::now() < end {

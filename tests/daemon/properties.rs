@@ -19,6 +19,7 @@ use hardnessd::daemon::config::{Config, Setup};
 use hardnessd::tools::replay::motion as table;
 use hardnessd_core::motion::{Point, Track};
 use hardnessd_core::recording::{Playback, Reader, recover};
+use hardnessd_core::trial;
 use hardnessd_core::verdict::{BUILT_IN, Hrn};
 use hardnessd_core::wire::{
     Cell, Checksum, Decoder, HexBytes, Layout, LengthField, Order, Preset, Settings,
@@ -316,9 +317,11 @@ pub fn recovered(bytes: &[u8]) {
     assert!(good.len() < 4 * bytes.len() + 65_536, "{}", good.len());
 }
 
-/// A model file is refused, or judges its check frames.
+/// A model file that completes its trial is refused, or judges its check frames.
 pub fn model(bytes: &[u8]) {
-    if let Ok(hrn) = Hrn::load(bytes) {
+    if trial::survives(bytes).is_ok()
+        && let Ok(hrn) = Hrn::load(bytes)
+    {
         hrn.judge_check(0).expect("a model that was loaded judges");
     }
 }

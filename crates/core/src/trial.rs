@@ -1,14 +1,15 @@
 //! The trial of a model file in a child process, before this process loads the file.
 //!
 //! In: the bytes of a model file, and how long a verdict may take. Out: the [`Hrn`], or the reason
-//! why the file is refused. [`verdict`] refuses all known dangers before the inference library sees
-//! them. A trial catches the unknown ones: the child may panic, fill its memory or never end. This
-//! process then reports it in one line and continues. The child is the same program, which calls
-//! [`entry`] first. If nobody has called [`entry`], as in a test of the library, there is no trial.
+//! why the file is refused. With some files the inference library panics, fills the memory or never
+//! ends. That happens to the child. This process then reports it in one line and continues. The
+//! child is the same program, which calls [`entry`] first. If nobody has called [`entry`], as in a
+//! test of the library, there is no trial.
 
 use std::io::{Read, Write};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::panic::{self, PanicHookInfo};
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitCode, ExitStatus, Stdio};
 use std::sync::OnceLock;
 use std::sync::mpsc;
@@ -41,8 +42,8 @@ const TIMED: Duration = Duration::from_secs(1);
 /// The longest answer of a trial.
 const ANSWER_BYTES: u64 = 64 << 10;
 
-/// Set if this program can run as a trial.
-static IS_TRIER: OnceLock<()> = OnceLock::new();
+/// The program that runs as a trial. Without it, there is no trial.
+static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
 
 /// The answer of a trial, as a line of JSON.
 #[derive(Debug, Serialize, Deserialize)]
@@ -68,8 +69,15 @@ pub fn entry() -> Option<ExitCode> {
     if std::env::args_os().next().is_some_and(|name| name == NAME) {
         return Some(trial());
     }
-    let _ = IS_TRIER.set(());
+    // This is still the same program if another one has been installed in its place.
+    set_program("/proc/self/exe".into());
     None
+}
+
+/// Tries models with another program, which calls [`entry`]. This is for tests, whose own program
+/// does not call it.
+pub fn set_program(program: PathBuf) {
+    let _ = PROGRAM.set(program);
 }
 
 /// Loads a model file after a trial. If `most` is given, a verdict may take no longer.
@@ -82,8 +90,8 @@ pub fn load(bytes: &[u8], most: Option<Duration>) -> Result<Hrn, ModelError> {
     if bytes.len() > verdict::MAX_FILE_BYTES {
         return Err(ModelError::TooLarge { found: bytes.len() });
     }
-    if IS_TRIER.get().is_some() {
-        let found = tried(child(), bytes, DEADLINE)?;
+    if let Some(program) = PROGRAM.get() {
+        let found = tried(child(program), bytes, DEADLINE)?;
         if let Some(expected) = most
             && found > expected
         {
@@ -104,15 +112,15 @@ pub fn survives(bytes: &[u8]) -> Result<(), ModelError> {
     if bytes.len() > verdict::MAX_FILE_BYTES {
         return Err(ModelError::TooLarge { found: bytes.len() });
     }
-    if IS_TRIER.get().is_some() {
-        let _ = answered(child(), bytes, DEADLINE)?;
+    if let Some(program) = PROGRAM.get() {
+        let _ = answered(child(program), bytes, DEADLINE)?;
     }
     Ok(())
 }
 
-/// The command that starts this program again, even if another one has been installed in its place.
-fn child() -> Command {
-    let mut command = Command::new("/proc/self/exe");
+/// The command that starts a trial.
+fn child(program: &Path) -> Command {
+    let mut command = Command::new(program);
     command.arg0(NAME);
     // At its start, the trainer's allocator takes a GiB of address space. That is all that a trial
     // may have, so good models sometimes failed.

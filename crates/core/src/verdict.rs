@@ -22,6 +22,7 @@ pub use self::course::{
     extents,
 };
 pub use self::file::check_levels;
+pub use self::guard::NodeProblem;
 use crate::frame::{COLS, Frame, ROWS};
 
 /// The default model, built into the binary; `models/README.md` is its card.
@@ -270,13 +271,13 @@ pub enum ModelError {
         /// The expected value.
         expected: String,
     },
-    /// The file has an operator, an attribute, a tensor or a size that no model may have.
-    #[error("model {place}: {problem}")]
-    Guard {
-        /// The node, tensor, input or output.
-        place: String,
+    /// The graph has a node that no model may have.
+    #[error("model node {node}: {problem}")]
+    Node {
+        /// The name and the operator of the node.
+        node: String,
         /// The problem with it.
-        problem: String,
+        problem: NodeProblem,
     },
     /// The graph cannot be run.
     #[error("model graph cannot be run: {0}")]
@@ -456,7 +457,7 @@ impl Hrn {
         file::check_tensors_inside(graph)?;
         let (card, checks) = file::read_metadata(&proto)?;
         let (format, inputs) = file::check_signature(graph, &card, &checks)?;
-        guard::check(&proto, graph)?;
+        guard::check_operators(graph)?;
         let position = |name: &str| graph.output.iter().position(|output| output.name == name);
         let shore_output = position("shore");
         let (Some(logits_output), Some(probabilities_output)) =
@@ -484,19 +485,25 @@ impl Hrn {
             .try_fold(inference, |model, (at, shape)| {
                 model.with_input_fact(at, f32::fact(shape).into())
             });
-        let optimized = inference
-            .and_then(InferenceModelExt::into_optimized)
-            .map_err(graph_error)?;
+        let typed = inference.and_then(InferenceModelExt::into_typed);
+        let typed = typed.and_then(TypedModel::into_decluttered);
+        let mut optimized = typed.map_err(graph_error)?;
+        guard::check_values(&optimized)?;
+        optimized.optimize().map_err(graph_error)?;
         // The inference library does not compare a graph with the shapes that it declares.
-        let of_levels = |output| (output, f32::fact([1, card.levels.len()]));
-        let agreed = [of_levels(logits_output), of_levels(probabilities_output)];
-        let of_shore = shore_output.map(|output| (output, f32::fact([1, 3])));
-        for (output, agreed) in agreed.into_iter().chain(of_shore) {
+        let levels = card.levels.len();
+        let mut agreed = vec![
+            ("logits", logits_output, levels),
+            ("probabilities", probabilities_output, levels),
+        ];
+        agreed.extend(shore_output.map(|output| ("shore", output, 3)));
+        for (name, output, length) in agreed {
+            let agreed = f32::fact([1, length]);
             let computed = optimized.output_fact(output).map_err(graph_error)?;
             if computed.without_value() != agreed {
                 return Err(ModelError::Signature {
                     what: "outputs",
-                    found: format!("computed as {computed:?}"),
+                    found: format!("{name} computed as {computed:?}"),
                     expected: format!("{agreed:?}"),
                 });
             }

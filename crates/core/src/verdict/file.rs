@@ -31,47 +31,16 @@ pub(super) fn check_opset(proto: &pb::ModelProto) -> Result<(), ModelError> {
     }
 }
 
-/// Refuses tensors whose data lies outside the file, including those in subgraphs and attributes.
+/// Refuses a graph whose weights lie in another file, as some exporters write them.
 pub(super) fn check_tensors_inside(graph: &pb::GraphProto) -> Result<(), ModelError> {
-    let inside = |tensor: &pb::TensorProto| {
-        let external = pb::tensor_proto::DataLocation::External as i32;
-        if tensor.data_location == Some(external) || !tensor.external_data.is_empty() {
-            return Err(ModelError::ExternalData {
-                tensor: tensor.name.clone(),
-            });
-        }
-        Ok(())
-    };
-    let sparse_inside = |sparse: &pb::SparseTensorProto| {
-        sparse
-            .values
-            .iter()
-            .chain(&sparse.indices)
-            .try_for_each(inside)
-    };
-    graph.initializer.iter().try_for_each(inside)?;
-    graph
-        .sparse_initializer
-        .iter()
-        .try_for_each(sparse_inside)?;
-    for attribute in graph.node.iter().flat_map(|node| &node.attribute) {
-        attribute
-            .t
-            .iter()
-            .chain(&attribute.tensors)
-            .try_for_each(inside)?;
-        attribute
-            .sparse_tensor
-            .iter()
-            .chain(&attribute.sparse_tensors)
-            .try_for_each(sparse_inside)?;
-        attribute
-            .g
-            .iter()
-            .chain(&attribute.graphs)
-            .try_for_each(check_tensors_inside)?;
+    let external = Some(pb::tensor_proto::DataLocation::External as i32);
+    let mut tensors = graph.initializer.iter();
+    match tensors.find(|tensor| tensor.data_location == external) {
+        Some(tensor) => Err(ModelError::ExternalData {
+            tensor: tensor.name.clone(),
+        }),
+        None => Ok(()),
     }
-    Ok(())
 }
 
 /// Refuses inputs and outputs that break the format. Returns the format, and for format 2 the

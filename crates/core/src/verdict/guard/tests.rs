@@ -1,86 +1,8 @@
-use std::panic::{AssertUnwindSafe, catch_unwind};
-
-use prost::Message as _;
 use tract_onnx::pb::attribute_proto::AttributeType;
 use tract_onnx::pb::tensor_proto::DataType;
-use tract_onnx::pb::{AttributeProto, GraphProto, ModelProto, NodeProto, TensorProto};
+use tract_onnx::pb::{AttributeProto, GraphProto, NodeProto, TensorProto};
 
-use super::table::OPERATORS;
 use super::*;
-use crate::verdict::{BUILT_IN, Hrn};
-
-/// Random numbers from a seed (SplitMix64).
-struct Dice(u64);
-
-impl Dice {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    fn below(&mut self, most: usize) -> usize {
-        (self.next() % most as u64) as usize
-    }
-
-    fn one<'a, T>(&mut self, of: &'a [T]) -> &'a T {
-        &of[self.below(of.len())]
-    }
-
-    fn often(&mut self) -> bool {
-        self.below(4) > 0
-    }
-}
-
-/// Whole numbers that often make programs fail.
-const WHOLE: [i64; 20] = [
-    0,
-    1,
-    2,
-    3,
-    4,
-    5,
-    7,
-    8,
-    28,
-    64,
-    -1,
-    -2,
-    -9,
-    784,
-    1 << 20,
-    1 << 31,
-    (1 << 31) - 1,
-    1 << 40,
-    i64::MAX,
-    i64::MIN,
-];
-
-fn model() -> ModelProto {
-    ModelProto::decode(BUILT_IN).unwrap()
-}
-
-fn floats(name: &str, dims: &[i64]) -> TensorProto {
-    let count = dims.iter().product::<i64>();
-    TensorProto {
-        name: name.to_owned(),
-        dims: dims.to_vec(),
-        data_type: DataType::Float as i32,
-        float_data: (0..count).map(|n| n as f32 * 0.01 - 0.3).collect(),
-        ..Default::default()
-    }
-}
-
-fn ints(name: &str, ints: &[i64]) -> TensorProto {
-    TensorProto {
-        name: name.to_owned(),
-        dims: vec![ints.len() as i64],
-        data_type: DataType::Int64 as i32,
-        int64_data: ints.to_vec(),
-        ..Default::default()
-    }
-}
 
 fn node(domain: &str, operator: &str, inputs: &[&str], outputs: &[&str]) -> NodeProto {
     let owned = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect();
@@ -93,281 +15,232 @@ fn node(domain: &str, operator: &str, inputs: &[&str], outputs: &[&str]) -> Node
     }
 }
 
-/// An attribute that the table allows, mostly near its bounds.
-fn attribute(name: &str, allowed: Allowed, dice: &mut Dice) -> AttributeProto {
-    let mut attribute = AttributeProto {
+fn int(name: &str, value: i64) -> AttributeProto {
+    AttributeProto {
         name: name.to_owned(),
-        r#type: allowed.kind() as i32,
-        ..Default::default()
-    };
-    let mut int = |low: i64, high: i64| {
-        let near = low.saturating_add(dice.below(4) as i64);
-        let (near, far) = (near.min(high), if dice.often() { near } else { high });
-        if dice.often() { near } else { far }
-    };
-    match allowed {
-        Allowed::Int(low, high) => attribute.i = int(low.max(-4), high),
-        Allowed::Ints(_, low, high) => {
-            let length = [1, 2, 2, 4][(int(0, 3)) as usize];
-            attribute.ints = (0..length).map(|_| int(low.max(-4), high)).collect();
-        }
-        Allowed::Float => attribute.f = [0.0, 1.0, 0.1, -1.0, f32::MAX, f32::NAN][dice.below(6)],
-        Allowed::Floats(_) => attribute.floats = vec![0.5; dice.below(5)],
-        Allowed::Text(texts) => attribute.s = dice.one(texts).as_bytes().to_vec(),
-        Allowed::Texts(_, texts) => {
-            attribute.strings = vec![dice.one(texts).as_bytes().to_vec(); 1 + dice.below(3)];
-        }
-        Allowed::Tensor => attribute.t = Some(ints("", &[1])),
-        Allowed::Graph => {}
-    }
-    attribute
-}
-
-/// A graph of nodes that the guard accepts one by one, from the frame to probabilities.
-fn accepted(seed: u64) -> GraphProto {
-    let mut dice = Dice(seed);
-    let mut graph = model().graph.unwrap();
-    graph.node.clear();
-    graph.initializer = vec![
-        floats("f0", &[]),
-        floats("f1", &[1]),
-        floats("f4", &[4]),
-        floats("f28", &[28]),
-        floats("f1111", &[1, 1, 1, 1]),
-        floats("frame-like", &[1, 1, 28, 28]),
-        floats("kernel1", &[2, 1, 3, 3]),
-        floats("kernel2", &[4, 2, 3, 3]),
-        floats("kernel4", &[4, 1, 2, 2]),
-        floats("square", &[28, 28]),
-        floats("wide", &[784, 4]),
-        floats("f2", &[2]),
-        floats("w", &[1, 84, 28]),
-        floats("r", &[1, 84, 28]),
-        floats("b", &[1, 168]),
-        ints("i0", &[0]),
-        ints("i1", &[1]),
-        ints("i2", &[2]),
-        ints("i3", &[3]),
-        ints("in1", &[-1]),
-        ints("i23", &[2, 3]),
-        ints("i01", &[0, 1]),
-        ints("i1n1", &[1, -1]),
-        ints("i14", &[14, 14]),
-        ints("imax", &[i64::MAX]),
-        ints("shape3", &[28, 1, 28]),
-        ints("shape4", &[1, 1, 28, 28]),
-        ints("pads", &[0, 0, 1, 1, 0, 0, 2, 1]),
-        ints("ones", &[1, 1, 1, 1]),
-        ints("none", &[]),
-    ];
-    // The values of the walk borrow the nodes, so the nodes are leaked.
-    let base: &'static GraphProto = Box::leak(Box::new(graph.clone()));
-    let mut walk = Walk::new(17 + dice.below(3) as i64);
-    walk.tensors(base).unwrap();
-    walk.bind("frame", tensor::declared(&base.input[0]).unwrap())
-        .unwrap();
-    let mut names: Vec<String> = base.initializer.iter().map(|t| t.name.clone()).collect();
-    let mut last = "frame".to_owned();
-    for number in 0..400 {
-        if graph.node.len() >= 8 {
-            break;
-        }
-        let operator = dice.one(OPERATORS);
-        let name = *dice.one(operator.names);
-        let (least, most) = operator.inputs;
-        let count = least + dice.below(most.min(5).max(least) - least + 1);
-        let inputs: Vec<&str> = (0..count)
-            .map(|index| match index {
-                0 if dice.often() => last.as_str(),
-                _ if operator.gaps && index >= least && dice.below(3) == 0 => "",
-                _ => dice.one(&names).as_str(),
-            })
-            .collect();
-        let output = format!("value {number}");
-        let mut outputs = vec![output.as_str()];
-        let second = format!("second {number}");
-        if operator.outputs.0 > 1 || (operator.outputs.1 > 1 && !dice.often()) {
-            outputs.push(&second);
-        }
-        let mut made = node(operator.domain, name, &inputs, &outputs);
-        for &(name, allowed) in operator.attributes {
-            if dice.below(3) > 0 {
-                made.attribute.push(attribute(name, allowed, &mut dice));
-            }
-        }
-        let kept: &'static NodeProto = Box::leak(Box::new(made));
-        let before = walk.cost;
-        if walk.node(kept).is_ok() {
-            graph.node.push(kept.clone());
-            names.push(output.clone());
-            if walk.values[output.as_str()].datum == Datum::F32 {
-                last = output;
-            }
-        } else {
-            walk.cost = before;
-        }
-    }
-    // Turn the last value, whatever it is, into four numbers.
-    graph.initializer.push(floats("four", &[1, 4]));
-    graph.initializer.push(ints("one by one", &[1, 1]));
-    let mut mean = node("", "ReduceSum", &[&last], &["mean"]);
-    mean.attribute.push(AttributeProto {
-        name: "keepdims".to_owned(),
         r#type: AttributeType::Int as i32,
+        i: value,
         ..Default::default()
-    });
-    graph.node.extend([
-        mean,
-        node("", "Reshape", &["mean", "one by one"], &["matrix"]),
-        node("", "MatMul", &["matrix", "four"], &["logits"]),
-        node("", "Softmax", &["logits"], &["probabilities"]),
-    ]);
-    graph
-}
-
-/// Loads a file as a trial does. An error is the message of a panic.
-fn load(bytes: &[u8]) -> Result<String, String> {
-    let loaded = catch_unwind(AssertUnwindSafe(|| match Hrn::load(bytes) {
-        Ok(_) => "good".to_owned(),
-        Err(ModelError::Guard { .. }) => "guard".to_owned(),
-        Err(ModelError::Graph(problem)) => format!("graph: {problem}"),
-        Err(other) => other.to_string(),
-    }));
-    loaded.map_err(|panic| {
-        let text = panic.downcast_ref::<String>().cloned();
-        text.or_else(|| panic.downcast_ref::<&str>().map(|&text| text.to_owned()))
-            .unwrap_or_default()
-    })
-}
-
-/// How many graphs a test tries. `HARDNESSD_GRAPHS` sets more, to search for gaps in the guard.
-fn tries(usual: u64) -> u64 {
-    let wanted = std::env::var("HARDNESSD_GRAPHS").ok();
-    wanted.map_or(usual, |wanted| wanted.parse().unwrap())
-}
-
-fn report(panics: &[(u64, String)], reached: u64, tries: u64) {
-    eprintln!("{reached} of {tries} graphs reached the inference library");
-    let seen: Vec<String> = panics
-        .iter()
-        .take(40)
-        .map(|(seed, panic)| format!("{seed}: {panic:.300}"))
-        .collect();
-    assert!(panics.is_empty(), "{} panics: {seen:#?}", panics.len());
-}
-
-#[test]
-fn no_graph_that_the_guard_accepts_makes_the_inference_library_panic() {
-    let (mut panics, mut reached) = (Vec::new(), 0);
-    let tries = tries(150);
-    for seed in 0..tries {
-        let mut model = model();
-        model.graph = Some(accepted(seed));
-        model.opset_import[0].version = 17 + Dice(seed).below(3) as i64;
-        match load(&model.encode_to_vec()) {
-            Ok(came) => reached += u64::from(came != "guard"),
-            Err(panic) => {
-                let operators: Vec<String> = model
-                    .graph
-                    .unwrap()
-                    .node
-                    .iter()
-                    .map(|node| node.op_type.clone())
-                    .collect();
-                panics.push((seed, format!("{} {panic}", operators.join(","))));
-            }
-        }
-    }
-    assert!(reached * 4 > tries, "only {reached} of {tries} were tried");
-    report(&panics, reached, tries);
-}
-
-#[test]
-fn no_damage_to_the_graph_makes_the_inference_library_panic() {
-    let (mut panics, mut reached) = (Vec::new(), 0);
-    let tries = tries(300);
-    for seed in 0..tries {
-        let mut dice = Dice(seed);
-        let mut model = model();
-        if seed % 2 == 1 {
-            model.graph = Some(accepted(seed));
-        }
-        for _ in 0..=dice.below(3) {
-            damage(model.graph.as_mut().unwrap(), &mut dice);
-        }
-        match load(&model.encode_to_vec()) {
-            Ok(came) => reached += u64::from(came != "guard"),
-            Err(panic) => panics.push((seed, panic)),
-        }
-    }
-    report(&panics, reached, tries);
-}
-
-/// Changes one field of a graph.
-fn damage(graph: &mut GraphProto, dice: &mut Dice) {
-    let (nodes, tensors) = (graph.node.len(), graph.initializer.len());
-    let names: Vec<String> = graph
-        .node
-        .iter()
-        .flat_map(|node| node.output.clone())
-        .chain(graph.initializer.iter().map(|t| t.name.clone()))
-        .collect();
-    let node = &mut graph.node[dice.below(nodes)];
-    let tensor = &mut graph.initializer[dice.below(tensors)];
-    match dice.below(12) {
-        0 => {
-            let names = dice_names(dice);
-            node.op_type = (*dice.one(names)).to_owned();
-        }
-        1 if !node.input.is_empty() => {
-            let place = dice.below(node.input.len());
-            node.input[place] = dice.one(&names).clone();
-        }
-        2 => node.input.push(dice.one(&names).clone()),
-        3 => drop(node.input.pop()),
-        4 => node.attribute.clear(),
-        5 if !node.attribute.is_empty() => {
-            let place = dice.below(node.attribute.len());
-            let attribute = &mut node.attribute[place];
-            attribute.i = *dice.one(&WHOLE);
-            for int in &mut attribute.ints {
-                *int = *dice.one(&WHOLE);
-            }
-        }
-        6 if !node.attribute.is_empty() => {
-            let place = dice.below(node.attribute.len());
-            node.attribute[place].ints.push(*dice.one(&WHOLE));
-        }
-        7 if !tensor.dims.is_empty() => {
-            let place = dice.below(tensor.dims.len());
-            tensor.dims[place] = *dice.one(&WHOLE);
-        }
-        8 => tensor.dims.reverse(),
-        9 => tensor.data_type = dice.below(24) as i32,
-        10 => {
-            for int in &mut tensor.int64_data {
-                *int = *dice.one(&WHOLE);
-            }
-            tensor.raw_data.truncate(dice.below(64));
-        }
-        _ => {
-            let places = (dice.below(nodes), dice.below(nodes));
-            graph.node.swap(places.0, places.1);
-        }
     }
 }
 
-/// The names of the operators in a random line of the table.
-fn dice_names(dice: &mut Dice) -> &'static [&'static str] {
-    dice.one(OPERATORS).names
+fn texts(name: &str, texts: &[&str]) -> AttributeProto {
+    AttributeProto {
+        name: name.to_owned(),
+        r#type: AttributeType::Strings as i32,
+        strings: texts.iter().map(|text| text.as_bytes().to_vec()).collect(),
+        ..Default::default()
+    }
+}
+
+fn cast(input: &str, to: DataType, output: &str) -> NodeProto {
+    let mut cast = node("", "Cast", &[input], &[output]);
+    cast.attribute.push(int("to", to as i64));
+    cast
+}
+
+fn value(name: &str) -> pb::ValueInfoProto {
+    use pb::tensor_shape_proto::{Dimension, dimension::Value};
+    let dim = |length| Dimension {
+        value: Some(Value::DimValue(length)),
+        ..Default::default()
+    };
+    let tensor = pb::type_proto::Tensor {
+        elem_type: DataType::Float as i32,
+        shape: Some(pb::TensorShapeProto {
+            dim: vec![dim(1), dim(4)],
+        }),
+    };
+    pb::ValueInfoProto {
+        name: name.to_owned(),
+        r#type: Some(pb::TypeProto {
+            value: Some(pb::type_proto::Value::TensorType(tensor)),
+            ..Default::default()
+        }),
+        ..Default::default()
+    }
+}
+
+/// A graph from `x`, f32 [1, 4], to `y`. `i0` and `i4` are the integers 0 and 4.
+fn graph(nodes: &[NodeProto]) -> GraphProto {
+    let ints = |name: &str, int: i64| TensorProto {
+        name: name.to_owned(),
+        dims: vec![1],
+        data_type: DataType::Int64 as i32,
+        int64_data: vec![int],
+        ..Default::default()
+    };
+    GraphProto {
+        node: nodes.to_vec(),
+        initializer: vec![ints("i0", 0), ints("i4", 4)],
+        input: vec![value("x")],
+        output: vec![pb::ValueInfoProto {
+            name: "y".to_owned(),
+            ..Default::default()
+        }],
+        ..Default::default()
+    }
+}
+
+/// Checks a graph as [`super::super::Hrn::read`] does.
+fn check(graph: GraphProto) -> Result<(), ModelError> {
+    check_operators(&graph)?;
+    let proto = pb::ModelProto {
+        ir_version: 8,
+        opset_import: vec![pb::OperatorSetIdProto {
+            version: 17,
+            ..Default::default()
+        }],
+        graph: Some(graph),
+        ..Default::default()
+    };
+    let onnx = tract_onnx::onnx().with_ignore_value_info(true);
+    let model = onnx.model_for_proto_model(&proto).unwrap();
+    check_values(&model.into_typed().unwrap().into_decluttered().unwrap())
 }
 
 #[test]
-fn the_built_in_model_costs_what_its_layers_do() {
-    let model = model();
-    let cost = check(&model, model.graph.as_ref().unwrap()).unwrap();
-    assert!((1_000_000..1_500_000).contains(&cost.work), "{cost:?}");
-    assert!(cost.nodes < 160 && cost.numbers < 50_000, "{cost:?}");
+fn every_operator_of_the_list_is_in_the_inference_library_and_on_the_page() {
+    let known = tract_onnx::onnx().op_register.0;
+    for (_, operator) in OPERATORS {
+        assert!(known.contains_key(*operator), "{operator}");
+    }
+    let page = include_str!("../../../../../docs/formats.md");
+    let (_, page) = page.split_once("that a graph may use:").unwrap();
+    let (page, _) = page.split_once("From PyTorch").unwrap();
+    let (of_onnx, of_learners) = page.split_once("and of `ai.onnx.ml`: `").unwrap();
+    let names = |text: &'static str| {
+        let is_between = |char: char| !char.is_ascii_alphanumeric();
+        text.split(is_between)
+            .filter(|name| !name.is_empty() && *name != "text")
+    };
+    let listed = names(of_onnx).map(|name| ("", name));
+    let listed = listed.chain(names(of_learners).map(|name| (LEARNERS, name)));
+    assert_eq!(listed.collect::<Vec<_>>(), OPERATORS);
+}
+
+#[test]
+fn integers_that_depend_on_an_input_are_no_indices_or_divisors() {
+    let divided = [
+        cast("x", DataType::Int64, "whole"),
+        node("", "Div", &["i4", "whole"], &["share"]),
+        cast("share", DataType::Float, "y"),
+    ];
+    let picked = [
+        node("", "ArgMax", &["x"], &["most"]),
+        node("", "Gather", &["x", "most"], &["y"]),
+    ];
+    let in_a_loop = {
+        let mut body = graph(&divided);
+        body.input[0].name = "x".to_owned();
+        body.output = vec![value("y")];
+        let mut scan = node("", "Scan", &["xs"], &["y"]);
+        scan.attribute = vec![
+            int("num_scan_inputs", 1),
+            AttributeProto {
+                name: "body".to_owned(),
+                r#type: AttributeType::Graph as i32,
+                g: Some(body),
+                ..Default::default()
+            },
+        ];
+        let mut stacked = node("", "Concat", &["first", "second"], &["xs"]);
+        stacked.attribute.push(int("axis", 0));
+        [
+            node("", "Unsqueeze", &["x", "i0"], &["first"]),
+            node("", "Exp", &["first"], &["second"]),
+            stacked,
+            scan,
+        ]
+    };
+    for nodes in [&divided[..], &picked, &in_a_loop] {
+        let error = check(graph(nodes)).unwrap_err().to_string();
+        let expected = "it takes integers that depend on an input of the model";
+        assert!(error.contains(expected), "{error}");
+    }
+    // Integers may be compared, and what depends on no input may be anything.
+    let compared = [
+        node("", "ArgMax", &["x"], &["most"]),
+        node("", "Equal", &["most", "i4"], &["is"]),
+        cast("is", DataType::Float, "y"),
+    ];
+    let of_a_shape = [
+        node("", "Shape", &["x"], &["shape"]),
+        node("", "Div", &["shape", "i4"], &["indices"]),
+        node("", "Gather", &["x", "i0"], &["first"]),
+        node("", "Reshape", &["first", "shape"], &["y"]),
+    ];
+    for nodes in [&compared[..], &of_a_shape] {
+        check(graph(nodes)).unwrap();
+    }
+}
+
+#[test]
+fn a_shape_that_is_open_is_refused() {
+    let mut model = TypedModel::default();
+    let length = model.symbols.sym("n");
+    let fact = f32::fact([TDim::from(length)]);
+    model.add_source("x", fact).unwrap();
+    let error = check_values(&model).unwrap_err().to_string();
+    let expected = "the shape of its output depends on an input of the model";
+    assert!(error.contains(expected), "{error}");
+}
+
+#[test]
+fn a_graph_of_too_many_numbers_is_refused() {
+    let twice = |number: usize| {
+        let [from, to] = [number, number + 1].map(|number| match number {
+            0 => "x".to_owned(),
+            24 => "y".to_owned(),
+            number => format!("value {number}"),
+        });
+        let mut concat = node("", "Concat", &[&from, &from], &[&to]);
+        concat.attribute.push(int("axis", 0));
+        concat
+    };
+    let nodes: Vec<NodeProto> = (0..24).map(twice).collect();
+    let error = check(graph(&nodes)).unwrap_err().to_string();
+    assert!(error.contains("more than 64000000 numbers"), "{error}");
+}
+
+#[test]
+fn what_the_inference_library_would_ignore_is_refused() {
+    let check = |operator: &str, attribute: AttributeProto| {
+        let mut node = node("", operator, &[], &["y"]);
+        node.attribute.push(attribute);
+        check_operator(&node)
+    };
+    let usual = ["Sigmoid", "Tanh"];
+    for activations in [&usual[..], &["Sigmoid", "Tanh", "Sigmoid", "Tanh"]] {
+        check("GRU", texts("activations", activations)).unwrap();
+    }
+    check("LSTM", int("input_forget", 0)).unwrap();
+    for (operator, attribute) in [
+        ("LSTM", texts("activations", &usual)),
+        ("GRU", texts("activations", &["HardSigmoid", "Tanh"])),
+        ("RNN", texts("activations", &["Tanh", "Relu"])),
+        ("GRU", int("clip", 1)),
+        ("LSTM", int("input_forget", 1)),
+        ("BatchNormalization", int("training_mode", 1)),
+    ] {
+        let name = attribute.name.clone();
+        let problem = check(operator, attribute).unwrap_err().to_string();
+        assert!(problem.contains(&name), "{operator}: {problem}");
+    }
+}
+
+#[test]
+fn an_operator_of_another_domain_is_named_with_it() {
+    for (domain, operator, expected) in [
+        ("", "Loop", "model node \"y\" (Loop): this operator is not"),
+        ("com.microsoft", "Relu", "\"y\" (com.microsoft.Relu): this"),
+        ("", "Normalizer", "\"y\" (Normalizer): this operator"),
+    ] {
+        let nodes = [node(domain, operator, &["x"], &["y"])];
+        let error = check(graph(&nodes)).unwrap_err().to_string();
+        assert!(error.contains(expected), "{error}");
+    }
+    check(graph(&[node("ai.onnx", "Relu", &["x"], &["y"])])).unwrap();
 }
 
 /// A node of two trees over three features and two classes.
@@ -384,18 +257,7 @@ fn forest() -> NodeProto {
         floats: vec![0.5; count],
         ..Default::default()
     };
-    let texts = |name: &str, texts: &[&str]| AttributeProto {
-        name: name.to_owned(),
-        r#type: AttributeType::Strings as i32,
-        strings: texts.iter().map(|text| text.as_bytes().to_vec()).collect(),
-        ..Default::default()
-    };
-    let mut trees = node(
-        "ai.onnx.ml",
-        "TreeEnsembleClassifier",
-        &["features"],
-        &["label", "scores"],
-    );
+    let mut trees = node(LEARNERS, "TreeEnsembleClassifier", &["x"], &["label", "y"]);
     let branch = ["BRANCH_LEQ", "LEAF", "LEAF"];
     trees.attribute = vec![
         list("nodes_treeids", &[0, 0, 0, 1, 1, 1]),
@@ -416,40 +278,40 @@ fn forest() -> NodeProto {
 
 #[test]
 fn every_place_that_a_tree_names_exists() {
-    let check = |change: &dyn Fn(&mut NodeProto)| {
+    check(graph(&[forest()])).unwrap();
+    let refused = |change: &dyn Fn(&mut AttributeProto), name: &str| {
         let mut trees = forest();
-        change(&mut trees);
-        let mut walk = Walk::new(17);
-        let features = Value::new(Datum::F32, vec![1, 3]);
-        walk.bind("features", features).unwrap();
-        walk.node(Box::leak(Box::new(trees)))
-    };
-    check(&|_| {}).unwrap();
-    let set = |name: &'static str, place: usize, value: i64| {
-        move |trees: &mut NodeProto| {
-            let mut attributes = trees.attribute.iter_mut();
-            let list = attributes.find(|list| list.name == name).unwrap();
-            list.ints[place] = value;
-        }
+        let mut attributes = trees.attribute.iter_mut();
+        change(attributes.find(|list| list.name == name).unwrap());
+        check_operator(&trees).unwrap_err().to_string()
     };
     for (name, place, value, expected) in [
-        ("nodes_featureids", 3, 3, "asks for feature 3 of 3"),
         ("nodes_truenodeids", 0, 0, "leads nowhere"),
         ("nodes_falsenodeids", 3, 3, "leads nowhere"),
         ("nodes_nodeids", 1, 5, "node 5 of tree 0 is out of order"),
-        ("nodes_treeids", 3, 2, "node 0 of tree 2 is out of order"),
+        ("nodes_treeids", 3, 2, "node 1 of tree 1 is out of order"),
         ("class_ids", 3, 2, "a vote for class 2"),
+        ("class_ids", 3, -1, "a vote for class -1"),
         ("class_nodeids", 0, 0, "at node 0 of tree 0"),
         ("class_treeids", 3, 7, "at node 2 of tree 7"),
     ] {
-        let problem = check(&set(name, place, value)).unwrap_err().to_string();
+        let problem = refused(&|list| list.ints[place] = value, name);
         assert!(problem.contains(expected), "{name}: {problem}");
     }
-    let without = |name: &'static str| {
-        move |trees: &mut NodeProto| trees.attribute.retain(|list| list.name != name)
-    };
-    for list in forest().attribute {
-        let name: &'static str = list.name.leak();
-        assert!(check(&without(name)).is_err(), "{name}");
+    for name in [
+        "nodes_treeids",
+        "nodes_nodeids",
+        "nodes_truenodeids",
+        "nodes_falsenodeids",
+        "nodes_modes",
+        "class_treeids",
+        "class_nodeids",
+        "class_ids",
+    ] {
+        let problem = refused(&|list| list.name.clear(), name);
+        assert!(problem.contains("differ in length"), "{name}: {problem}");
     }
+    let taken_for_a_leaf = |list: &mut AttributeProto| list.strings[0] = b"BRANCH_GTE".to_vec();
+    let problem = refused(&taken_for_a_leaf, "nodes_modes");
+    assert!(problem.contains("`nodes_modes`"), "{problem}");
 }
