@@ -16,7 +16,8 @@ use super::file;
 use crate::data::dataset::{self, Dataset};
 use crate::net::graph::{INPUT, frame_input, integer, value_info};
 use hardnessd_core::frame::{COLS, Frame, ROWS};
-use hardnessd_core::verdict::{COURSE_FRAMES, Card, Check, Checks, Hrn, ModelError, course_inputs};
+use hardnessd_core::trial;
+use hardnessd_core::verdict::{COURSE_FRAMES, Card, Check, Checks, Hrn, course_inputs};
 use hardnessd_simulator::Split;
 
 /// The least probability before a logarithm, because the file's probabilities may round to 0.
@@ -251,8 +252,7 @@ pub(super) fn set(proto: &mut pb::ModelProto, card: &Card, checks: &Checks) -> a
 
 /// Adopts a file. Returns the file with its metadata, the changes in its graph, and its evaluation
 /// on the test split if the data set has one. The daemon's own inference library computes the
-/// probabilities of the check frames here. `attempt` tries the file before it is loaded, and
-/// returns an error if loading it would end this process.
+/// probabilities of the check frames here, after a child process has tried the file.
 ///
 /// # Errors
 ///
@@ -263,7 +263,6 @@ pub fn adopt(
     bytes: &[u8],
     dataset: &Dataset,
     stated: &Stated,
-    attempt: impl FnOnce(&[u8]) -> Result<(), ModelError>,
 ) -> anyhow::Result<(Vec<u8>, Vec<String>, Option<Evaluated>)> {
     let mut proto = decode(bytes)?;
     let (done, found) = mend(&mut proto)?;
@@ -296,7 +295,7 @@ pub fn adopt(
     };
     set(&mut proto, &card, &Checks::Frames(check.clone()))?;
     let unchecked = proto.encode_to_vec();
-    attempt(&unchecked)?;
+    trial::survives(&unchecked)?;
     let hrn = Hrn::read(&unchecked)?;
     let computed = |frame: &&Frame| Ok(hrn.judge(frame)?.probabilities);
     let computed: anyhow::Result<Vec<Vec<f32>>> = frames.iter().map(computed).collect();

@@ -15,6 +15,7 @@ use tract_onnx::pb;
 use super::adopt::{decode, has_course_inputs, mend_input, mend_outputs, set};
 use crate::data::dataset;
 use hardnessd_core::frame::{Frame, TAXELS};
+use hardnessd_core::trial;
 use hardnessd_core::verdict::{
     Card, Check, CheckedCourse, Checks, Course, CourseCheck, CourseMoment, Hrn, Level, MIN_OPSET,
     ModelError, Range,
@@ -88,9 +89,9 @@ impl fmt::Display for Finding {
     }
 }
 
-/// Reviews a file. The file passes if no finding has a problem. `attempt` tries a file before it is
-/// loaded here, and returns an error if loading it would end this process.
-pub fn review(bytes: &[u8], mut attempt: impl FnMut(&[u8]) -> Result<(), ModelError>) -> Review {
+/// Reviews a file. The file passes if no finding has a problem. A child process tries the file before
+/// it is loaded here.
+pub fn review(bytes: &[u8]) -> Review {
     let mut problems: Vec<(&'static str, String, bool)> = Vec::new();
     let (mut format, mut stopped_at) = (Format::Frame, None);
     match decode(bytes) {
@@ -107,7 +108,7 @@ pub fn review(bytes: &[u8], mut attempt: impl FnMut(&[u8]) -> Result<(), ModelEr
             // Each turn mends one part, so there is at most one turn more than there are parts.
             for _ in 0..=format.parts().len() {
                 let bytes = proto.encode_to_vec();
-                let error = match attempt(&bytes).and_then(|()| Hrn::load(&bytes)) {
+                let error = match trial::survives(&bytes).and_then(|()| Hrn::load(&bytes)) {
                     Ok(_) => break,
                     Err(ModelError::CheckDiffers { .. } | ModelError::ShoreDiffers { .. })
                         if !has_own_check =>
@@ -326,7 +327,7 @@ mod tests {
 
     /// The parts of a file that have a problem, with the problem.
     fn problems(bytes: &[u8]) -> Vec<(&'static str, String)> {
-        let findings = review(bytes, |_| Ok(())).findings;
+        let findings = review(bytes).findings;
         let with_problem = findings.into_iter().filter(|finding| {
             assert!(finding.problem.is_some() || !finding.is_mended);
             finding.problem.is_some()
@@ -343,7 +344,7 @@ mod tests {
             (course_model(8, &[]), Format::Course, 16),
         ] {
             assert_eq!(problems(&bytes), []);
-            let review = review(&bytes, |_| Ok(()));
+            let review = review(&bytes);
             assert_eq!((review.format, review.findings.len()), (format, parts));
         }
         assert!(Format::Course.wanted().contains("course of a press"));
@@ -352,7 +353,7 @@ mod tests {
     #[test]
     fn a_graph_of_presses_without_metadata_lacks_the_keys_of_its_format_alone() {
         let bare = encoded(8, &[], |proto| proto.metadata_props.clear());
-        let review = review(&bare, |_| Ok(()));
+        let review = review(&bare);
         assert_eq!(review.format, Format::Course);
         for Finding {
             part,
@@ -400,18 +401,5 @@ mod tests {
         let problems = problems(&one_input_less);
         assert_eq!(problems[0].0, "input");
         assert!(problems[0].1.contains("T 3 to 48"), "{problems:?}");
-    }
-
-    #[test]
-    fn a_file_that_fails_its_trial_is_not_loaded() {
-        let mut tried = 0;
-        let review = review(BUILT_IN, |bytes| {
-            assert!(!bytes.is_empty());
-            tried += 1;
-            Err(ModelError::Trial("model: it ended the process".to_owned()))
-        });
-        let of_graph = review.findings.iter().find(|f| f.part == "graph").unwrap();
-        let problem = of_graph.problem.as_deref();
-        assert_eq!((problem, tried), (Some("model: it ended the process"), 1));
     }
 }

@@ -98,7 +98,7 @@ const SLOWEST_HZ: f64 = 5.0;
 /// even if the model does not pass.
 pub(super) fn check_model(path: &Path) -> ExitCode {
     let checked = read(path).map_err(anyhow::Error::from).and_then(|bytes| {
-        let Review { format, findings } = review::review(&bytes, trial::survives);
+        let Review { format, findings } = review::review(&bytes);
         let mut lines = format!("{}: {}\n", path.display(), format.wanted());
         for finding in &findings {
             lines += &format!("{finding}\n");
@@ -148,7 +148,7 @@ pub(super) fn adopt_model(arguments: &Adopt) -> anyhow::Result<String> {
             .unwrap_or_else(|| format!("adopted from {}", name.display())),
         validation: arguments.validation.clone(),
     };
-    let adopted = adopt::adopt(&bytes, &dataset, &stated, trial::survives);
+    let adopted = adopt::adopt(&bytes, &dataset, &stated);
     let (model, done, evaluation) =
         adopted.with_context(|| arguments.model.display().to_string())?;
     let hrn = trial::load(&model, None).with_context(|| arguments.model.display().to_string())?;
