@@ -21,7 +21,7 @@ pub use self::course::{
     COURSE_FRAMES, CheckedCourse, Course, CourseCheck, CourseMoment, Extents, Shore, course_inputs,
     extents,
 };
-pub use self::file::check_levels;
+pub use self::file::{check_levels, describe};
 pub use self::guard::NodeProblem;
 use crate::frame::{COLS, Frame, ROWS};
 

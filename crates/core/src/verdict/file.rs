@@ -16,6 +16,8 @@ use crate::wording::is_plain;
 
 /// The longest `label` and `shore` of a level: every event carries a label.
 const LONGEST_LABEL_BYTES: usize = 255;
+/// The longest part of a name in a message.
+const NAME_CHARS: usize = 60;
 /// The longest text of another key.
 const LONGEST_LINE_BYTES: usize = 16_384;
 
@@ -51,13 +53,6 @@ pub(super) fn check_signature(
     checks: &Checks,
 ) -> Result<(Format, Vec<Input>), ModelError> {
     let levels = card.levels.len();
-    let describe = |values: &[&pb::ValueInfoProto]| {
-        values
-            .iter()
-            .map(|value| describe_value(value))
-            .collect::<Vec<_>>()
-            .join(", ")
-    };
     // Before ONNX IR 4, every initialiser is also listed among the inputs.
     let inputs: Vec<&pb::ValueInfoProto> = graph
         .input
@@ -167,13 +162,23 @@ fn check_lengths(check: &CourseCheck, most: usize) -> Result<(), ModelError> {
     }
 }
 
-/// A graph input or output as `name type [shape]`.
+/// Inputs or outputs of a graph, each as `name type [shape]`.
+pub fn describe(values: &[&pb::ValueInfoProto]) -> String {
+    let all: Vec<String> = values.iter().map(|value| describe_value(value)).collect();
+    match all.is_empty() {
+        true => "none".to_owned(),
+        false => all.join(", "),
+    }
+}
+
 fn describe_value(value: &pb::ValueInfoProto) -> String {
     use pb::tensor_shape_proto::dimension::Value as Dimension;
     use pb::type_proto::Value;
+    let short = |name: &str| name.chars().take(NAME_CHARS).collect::<String>();
+    let name = short(&value.name);
     let Some(Value::TensorType(tensor)) = value.r#type.as_ref().and_then(|t| t.value.as_ref())
     else {
-        return format!("{} of no tensor type", value.name);
+        return format!("{name} of no tensor type");
     };
     let datum = match pb::tensor_proto::DataType::try_from(tensor.elem_type) {
         Ok(pb::tensor_proto::DataType::Float) => "f32".to_owned(),
@@ -186,11 +191,11 @@ fn describe_value(value: &pb::ValueInfoProto) -> String {
         .flat_map(|shape| &shape.dim)
         .map(|dimension| match &dimension.value {
             Some(Dimension::DimValue(length)) => length.to_string(),
-            Some(Dimension::DimParam(name)) => name.clone(),
+            Some(Dimension::DimParam(name)) => short(name),
             None => "?".to_owned(),
         })
         .collect();
-    format!("{} {datum} [{}]", value.name, dimensions.join(","))
+    format!("{name} {datum} [{}]", dimensions.join(","))
 }
 
 /// Reads and checks all `hrn.*` keys.

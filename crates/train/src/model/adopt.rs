@@ -17,7 +17,7 @@ use crate::data::dataset::{self, Dataset};
 use crate::net::graph::{INPUT, frame_input, integer, value_info};
 use hardnessd_core::frame::{COLS, Frame, ROWS};
 use hardnessd_core::trial;
-use hardnessd_core::verdict::{COURSE_FRAMES, Card, Check, Checks, Hrn, course_inputs};
+use hardnessd_core::verdict::{COURSE_FRAMES, Card, Check, Checks, Hrn, course_inputs, describe};
 use hardnessd_simulator::Split;
 
 /// The least probability before a logarithm, because the file's probabilities may round to 0.
@@ -219,26 +219,6 @@ fn dims(value: &pb::ValueInfoProto) -> Option<Vec<Option<usize>>> {
         })
         .collect(),
     )
-}
-
-fn describe(values: &[&pb::ValueInfoProto]) -> String {
-    let one = |value: &&pb::ValueInfoProto| {
-        let name: String = value.name.chars().take(60).collect();
-        match dims(value) {
-            Some(dims) => {
-                let text = |dim: &Option<usize>| dim.map_or("?".to_owned(), |dim| dim.to_string());
-                let dims: Vec<String> = dims.iter().map(text).collect();
-                format!("{name:?} f32 [{}]", dims.join(","))
-            }
-            None => format!("{name:?} of another type"),
-        }
-    };
-    let all: Vec<String> = values.iter().map(one).collect();
-    if all.is_empty() {
-        "none".to_owned()
-    } else {
-        all.join(", ")
-    }
 }
 
 /// Sets the metadata of a file, replacing all its `hrn.` keys.

@@ -336,17 +336,17 @@ fn what_cannot_be_adopted_is_refused_in_a_line() {
     for (model, expected) in [
         (
             model("y", 4, 17),
-            "outputs: found \"y\" f32 [?,4], expected `logits`",
+            "outputs: found y f32 [N,4], expected `logits`",
         ),
         (model("logits", 3, 17), "found 3 levels, expected 4"),
         (model("logits", 4, 9), "ONNX opset 9: expected 17 or newer"),
         (
             two_inputs,
-            "inputs: found \"x\" f32 [?,1,28,28], \"y\" f32 [1], expected one",
+            "inputs: found x f32 [N,1,28,28], y f32 [1], expected one",
         ),
         (
             of_another_shape,
-            "inputs: found \"x\" f32 [1,784], expected one",
+            "inputs: found x f32 [1,784], expected one",
         ),
     ] {
         let path = write(directory.path(), "foreign.onnx", &model);
