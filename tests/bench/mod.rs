@@ -19,10 +19,7 @@ use std::time::{Duration, Instant};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-pub const BINARY: &str = match option_env!("CARGO_BIN_EXE_hardnessd") {
-    Some(path) => path,
-    None => concat!(env!("CARGO_TARGET_TMPDIR"), "/../debug/hardnessd"),
-};
+pub const BINARY: &str = env!("CARGO_BIN_EXE_hardnessd");
 
 /// The trainer, which `cargo test --workspace` builds beside the daemon.
 pub fn hrn_train() -> PathBuf {

@@ -67,6 +67,16 @@ pub fn of_a_press(
     context: Option<Value>,
     sends: bool,
 ) -> (Vec<u8>, Sensor) {
+    of_a_labelled_press(&labels(), change, context, sends)
+}
+
+/// Like [`of_a_press`], with these labels of the recording.
+pub fn of_a_labelled_press(
+    labels: &Labels,
+    change: impl FnOnce(&mut Description),
+    context: Option<Value>,
+    sends: bool,
+) -> (Vec<u8>, Sensor) {
     let mut described = Description {
         name: "forearm".to_owned(),
         ..Description::default()
@@ -78,7 +88,7 @@ pub fn of_a_press(
         run: "r".to_owned(),
         boot_id: "b".to_owned(),
         reason: None,
-        labels: labels(),
+        labels: labels.clone(),
         sensors: vec![RecordedSensor::new(&sensor, &hrn)],
     };
     let mut writer = Writer::new(Vec::new(), &about).unwrap();
@@ -104,7 +114,7 @@ pub fn of_a_press(
         pipeline.tell(&points).unwrap();
     }
     pipeline.set_context(context);
-    let state = State::of(&pipeline, labels());
+    let state = State::of(&pipeline, labels.clone());
     let came = at(begin_ms);
     writer
         .entry(0, came, &Entry::State(Box::new(state)))

@@ -1,199 +1,292 @@
 //! Recordings of known objects as samples of a data set.
 //!
-//! In: captures, `.mcap` or `.bin`. Out: the chosen frame of every press that was judged, or all
-//! its frames with the arm's approach. The daemon's own pipeline decodes, tares and selects, so a
-//! model learns from the same frames that it will judge.
+//! In: recordings (`.mcap` or `.bin`), and data sets that are put together. Out: the chosen frame of
+//! every press that was judged, or all its frames with the arm's approach. The daemon's own pipeline
+//! decodes, tares and selects, so a model learns from the same frames that it will judge.
 //!
-//! The presses of each capture are a file of their own first ([`Parts`]), found in parallel. The
-//! data set is put together from these files, so that the frames of only a few captures are in
-//! memory.
+//! All presses of a call are in memory.
 
 mod capture;
-mod collection;
 mod error;
-mod file;
-mod parts;
+mod part;
 mod selection;
 mod walk;
 
-use std::num::NonZeroUsize;
-use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::thread;
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::{Seek, Write};
+use std::path::PathBuf;
+use std::sync::Arc;
 
-use anyhow::Context as _;
 use indicatif::{ProgressBar, ProgressStyle};
+use serde_json::{Map, Value, json};
 
-pub use self::collection::{Collection, Earlier};
-pub use self::error::CollectError;
-pub use self::parts::Parts;
+pub use self::error::{CollectError, Problem};
+pub use self::part::Part;
+use self::part::{Object, Presses, Shape};
 pub use self::walk::captures;
+use crate::data::courses::Courses;
+use crate::data::dataset;
+use hardnessd_core::sensor::Sensor;
+use hardnessd_core::verdict::Hrn;
 use hardnessd_simulator::Split;
 
-use self::collection::Shape;
-
-/// The labels of the samples. A field that is `None` is taken from the capture's labels.
+/// The labels of the samples. A field that is `None` is taken from the recording's labels.
 #[derive(Debug, Clone, Copy)]
 pub struct Labelling {
     /// The hardness level 1..=4, or 0 for unlabelled.
     pub level: Option<u8>,
     /// The number of the pressed object. The same number in another data set is another object. If
-    /// neither this field nor a label gives a number, all captures of one call are one new object.
+    /// neither this field nor a label gives a number, all recordings of one call are one new object.
     pub object: Option<u32>,
     /// The split: training or test.
     pub split: Split,
 }
 
-/// What to do with captures that cannot be used.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Unusable {
-    /// The first one ends the collection.
-    Ends,
-    /// They are left out and listed.
-    LeftOut,
-}
-
-/// A capture whose part is there.
+/// How recordings become samples.
 #[derive(Debug)]
-struct Ready {
-    part: PathBuf,
-    shape: Shape,
-    /// The number of its label `object`.
-    object: Option<u32>,
+pub struct Settings {
+    /// The sensor of recordings that do not describe their own.
+    pub sensor: Sensor,
+    /// The model that judges the presses.
+    pub hrn: Arc<Hrn>,
+    /// The labels of the samples.
+    pub labelling: Labelling,
+    /// Whether all frames of a press are wanted, not only the chosen one.
+    pub sequences: bool,
+    /// Whether files that cannot be used are left out and listed. Otherwise the first one ends the
+    /// collection.
+    pub skip_unusable: bool,
 }
 
-/// Collects `captures`, after the samples of `earlier` if there are any, `jobs` at a time. The
-/// samples are in the order of the captures. The data set has the array `material`, and the array
-/// `shore`, if the captures have that label.
+/// Collects `paths`, recordings and data sets, after the samples of `earlier` if there are any. The
+/// samples are in the order of the paths. The data set has the array `material`, and the array
+/// `shore`, if the recordings have that label.
 ///
 /// Presses over time whose begin is not in the recording are left out. They may lack a material or
 /// a measured hardness.
 ///
 /// # Errors
 ///
-/// Returns the [`CollectError`] of the first capture that cannot be used, unless such captures are
-/// left out. Returns another error if a part cannot be written or read, or no number is left for a
-/// new object.
+/// Returns the [`CollectError`] of the first file that cannot be used, unless such files are left
+/// out.
 pub fn collect(
-    captures: &[PathBuf],
-    parts: &Parts,
-    labelling: Labelling,
-    earlier: Option<Earlier>,
-    jobs: NonZeroUsize,
-    unusable: Unusable,
-) -> anyhow::Result<Collection> {
-    let ready = all_ready(captures, parts, labelling, jobs, unusable)?;
-    let first = first_of_most(&ready);
-    let begin = match first.and_then(|first| Some((first, ready[first].as_ref().ok()?))) {
-        Some((first, ready)) => (captures[first].as_path(), ready.shape),
-        // Nothing is added then.
-        None => (Path::new(""), Shape::default()),
-    };
-    let sequences = parts.are_sequences();
-    let mut collection = Collection::begun(earlier, begin, labelling.split, sequences);
-    let labelled = ready.iter().flatten().filter_map(|ready| ready.object);
-    collection.keep_free(labelled.max());
-    for (path, ready) in captures.iter().zip(ready) {
-        let added = ready.map_err(anyhow::Error::from).and_then(|ready| {
-            let head = parts::head(&ready.part, path);
-            let head = head.with_context(|| format!("{}: is gone", ready.part.display()))?;
-            collection.add(&head, ready.part, labelling)
-        });
-        match added.map_err(anyhow::Error::downcast::<CollectError>) {
-            Ok(()) => {}
-            Err(Ok(error)) if unusable == Unusable::LeftOut => {
-                let reason = error.reason(path);
-                collection.left_out.push((path.clone(), reason));
+    paths: &[PathBuf],
+    mut earlier: Option<Part>,
+    settings: &Settings,
+) -> Result<Collection, CollectError> {
+    if let Some(earlier) = &mut earlier {
+        // The objects of the data set keep their numbers.
+        earlier.new_objects.clear();
+    }
+    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} recordings, {eta} left");
+    let bar = ProgressBar::new(paths.len() as u64);
+    let bar = bar.with_style(style.expect("the template is right"));
+    let mut parts = Vec::new();
+    for path in paths {
+        let part = Part::read(path, settings);
+        bar.inc(1);
+        match part {
+            Err(error) if !settings.skip_unusable => return Err(error),
+            part => parts.push(part),
+        }
+    }
+    bar.finish_and_clear();
+
+    let read = || parts.iter().flatten();
+    // The most frequent shape, so that a stray recording does not decide what the data set has.
+    let frequency = |part: &&Part| read().filter(|other| other.shape() == part.shape()).count();
+    let first = read().rev().max_by_key(frequency);
+    let first = earlier.as_ref().or(first);
+    let (first, shape) =
+        first.map_or_else(Default::default, |part| (part.path.clone(), part.shape()));
+    let mut collection = Collection::new(settings.sequences, first, shape);
+    // A recording without a label must not share the number of one with a label.
+    let parts_and_earlier = read().chain(&earlier);
+    let last = parts_and_earlier.flat_map(Part::numbered_objects).max();
+    collection.free_object = last.map_or(Some(0), |last| last.checked_add(1));
+    if let Some(earlier) = earlier {
+        collection.meta = earlier.meta.clone();
+        collection.add(earlier)?;
+        (collection.added, collection.known) = (0, 0);
+    }
+    for (path, part) in paths.iter().zip(parts) {
+        match part.and_then(|part| collection.add(part)) {
+            Err(error) if settings.skip_unusable => {
+                collection.left_out.push((path.clone(), error.reason(path)));
             }
-            Err(Ok(error)) => return Err(error.into()),
-            Err(Err(error)) => return Err(error),
+            added => added?,
         }
     }
     Ok(collection)
 }
 
-/// Makes the parts of all captures that are not there yet, and checks the labels of each capture.
-/// The result is in the order of the captures.
-fn all_ready(
-    captures: &[PathBuf],
-    parts: &Parts,
-    labelling: Labelling,
-    jobs: NonZeroUsize,
-    unusable: Unusable,
-) -> anyhow::Result<Vec<Result<Ready, CollectError>>> {
-    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} recordings, {eta} left");
-    let bar = ProgressBar::new(captures.len() as u64);
-    let bar = bar.with_style(style.expect("the template is right"));
-    let (next, stops) = (AtomicUsize::new(0), AtomicBool::new(false));
-    // Captures are taken in order. So when one fails, all before it were taken too, and the error
-    // of the first one is known however many threads there are.
-    let work = || {
-        let mut done = Vec::new();
-        while !stops.load(Ordering::Relaxed) {
-            let number = next.fetch_add(1, Ordering::Relaxed);
-            let Some(path) = captures.get(number) else {
-                break;
-            };
-            let ready = ready(path, parts, labelling, number).map_err(anyhow::Error::downcast);
-            let ready = match ready {
-                Ok(ready) => Ok(Ok(ready)),
-                Err(Ok(unusable)) => Ok(Err(unusable)),
-                Err(Err(error)) => Err(error),
-            };
-            let ends = match &ready {
-                Ok(ready) => ready.is_err() && unusable == Unusable::Ends,
-                Err(_) => true,
-            };
-            stops.fetch_or(ends, Ordering::Relaxed);
-            done.push((number, ready));
-            bar.inc(1);
-        }
-        done
-    };
-    let mut done: Vec<_> = thread::scope(|scope| {
-        let threads = jobs.get().min(captures.len());
-        let threads: Vec<_> = (0..threads).map(|_| scope.spawn(work)).collect();
-        let joined = threads.into_iter().map(thread::ScopedJoinHandle::join);
-        let joined =
-            joined.map(|done| done.unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
-        joined.flatten().collect()
-    });
-    bar.finish_and_clear();
-    done.sort_by_key(|(number, _)| *number);
-    done.into_iter().map(|(_, ready)| ready).collect()
+/// A data set under construction.
+#[derive(Debug)]
+pub struct Collection {
+    presses: Presses,
+    /// What all samples have in common.
+    shape: Shape,
+    /// The file that first had this shape.
+    first: PathBuf,
+    /// What an earlier data set says of itself.
+    meta: Map<String, Value>,
+    materials: Vec<String>,
+    captures: Vec<Value>,
+    generators: Vec<String>,
+    /// The names of recordings by what makes two of them the same presses of the same object.
+    names: BTreeMap<String, String>,
+    objects: BTreeSet<Object>,
+    /// The least number that no object has. `None` if all numbers are taken.
+    free_object: Option<u32>,
+    /// The number of the object of this call's recordings without a number, once there is one.
+    new_object: Option<u32>,
+    /// The files that give no samples, with the reason.
+    pub left_out: Vec<(PathBuf, String)>,
+    /// The number of presses that were added.
+    pub added: usize,
+    /// The number of these whose approach is known.
+    pub known: usize,
+    /// The number of presses that were left out because their begin is not in the recording.
+    pub partial: usize,
 }
 
-fn ready(path: &Path, parts: &Parts, labelling: Labelling, number: usize) -> anyhow::Result<Ready> {
-    let (part, head) = parts.of(path, number)?;
-    // Wrong labels are found here and not after hours of work on the others.
-    head.level(labelling.level)?;
-    head.shore()?;
-    let object = match labelling.object {
-        Some(_) => None,
-        None => head.number("object", "a number")?,
-    };
-    let shape = Shape::of(&head, parts.are_sequences());
-    Ok(Ready {
-        part,
-        shape,
-        object,
-    })
-}
-
-/// The first capture of the most frequent shape, so that a stray capture does not decide what the
-/// data set has.
-fn first_of_most(ready: &[Result<Ready, CollectError>]) -> Option<usize> {
-    let mut shapes: Vec<(Shape, usize, usize)> = Vec::new();
-    for (number, ready) in ready.iter().enumerate() {
-        let Ok(Ready { shape, .. }) = ready else {
-            continue;
-        };
-        match shapes.iter_mut().find(|(known, ..)| known == shape) {
-            Some((_, _, count)) => *count += 1,
-            None => shapes.push((*shape, number, 1)),
+impl Collection {
+    fn new(sequences: bool, first: PathBuf, shape: Shape) -> Self {
+        Self {
+            presses: match sequences {
+                true => Presses::Courses(Courses::default()),
+                false => Presses::Frames(Vec::new()),
+            },
+            shape,
+            first,
+            meta: Map::from_iter([("seed".to_owned(), Value::Null)]),
+            materials: Vec::new(),
+            captures: Vec::new(),
+            generators: Vec::new(),
+            names: BTreeMap::new(),
+            objects: BTreeSet::new(),
+            free_object: None,
+            new_object: None,
+            left_out: Vec::new(),
+            added: 0,
+            known: 0,
+            partial: 0,
         }
     }
-    let most = shapes.iter().map(|(.., count)| *count).max()?;
-    let first = shapes.iter().find(|(.., count)| *count == most);
-    first.map(|(_, first, _)| *first)
+
+    /// The number of presses.
+    pub fn presses(&self) -> usize {
+        self.presses.len()
+    }
+
+    fn add(&mut self, mut part: Part) -> Result<(), CollectError> {
+        let fits = self.fit(&mut part);
+        fits.map_err(|problem| problem.of(&part.path))?;
+        self.objects.extend(part.presses.objects());
+        self.names.extend(part.captures.iter().filter_map(identity));
+        self.captures.extend(part.captures);
+        for generator in part.generators {
+            if !self.generators.contains(&generator) {
+                self.generators.push(generator);
+            }
+        }
+        self.added += part.presses.len();
+        self.known += part.presses.known();
+        self.partial += part.partial;
+        self.presses.append(part.presses);
+        Ok(())
+    }
+
+    /// Gives the objects and the materials of a part their numbers in this data set, and returns an
+    /// error if the part does not go with the rest.
+    fn fit(&mut self, part: &mut Part) -> Result<(), Problem> {
+        part.shape().check(&self.shape, &self.first)?;
+        let mut materials = Vec::new();
+        for name in &part.materials {
+            let known = self.materials.iter().position(|material| material == name);
+            let number = known.unwrap_or(self.materials.len());
+            let number = u8::try_from(number);
+            materials.push(number.map_err(|_| Problem::Materials(name.clone()))?);
+            if known.is_none() {
+                self.materials.push(name.clone());
+            }
+        }
+        let mut objects = BTreeMap::new();
+        for &number in &part.new_objects {
+            objects.insert(number, self.new_object(part.is_recording)?);
+        }
+        let renumbered = |number: u32| objects.get(&number).copied().unwrap_or(number);
+        part.presses.renumber(renumbered, &materials);
+        for capture in &mut part.captures {
+            let number = capture["object"].as_u64();
+            let number = number.and_then(|number| u32::try_from(number).ok());
+            if let Some(number) = number.filter(|_| capture["new_object"] == true) {
+                capture["object"] = json!(renumbered(number));
+            }
+        }
+        for (identity, _) in part.captures.iter().filter_map(identity) {
+            if let Some(name) = self.names.get(&identity) {
+                return Err(Problem::Twice(name.clone()));
+            }
+        }
+        for added in part.presses.objects() {
+            let other =
+                |object: &&Object| object.is_same_as(&added) && object.split() != added.split();
+            if let Some(object) = self.objects.iter().find(other) {
+                return Err(Problem::Splits {
+                    object: object.number,
+                    found: added.split().name(),
+                    expected: object.split().name(),
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// A number for an object that has none. All recordings of a call without a number are one object.
+    fn new_object(&mut self, is_recording: bool) -> Result<u32, Problem> {
+        if is_recording && let Some(number) = self.new_object {
+            return Ok(number);
+        }
+        let number = self.free_object.ok_or(Problem::NoNumber)?;
+        self.free_object = number.checked_add(1);
+        if is_recording {
+            self.new_object = Some(number);
+        }
+        Ok(number)
+    }
+
+    /// Writes the data set.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of writing to `out`.
+    pub fn write<W: Write + Seek>(&self, out: W) -> anyhow::Result<W> {
+        let mut meta = self.meta.clone();
+        for (key, value) in [
+            ("captures", json!(self.captures)),
+            ("generator", json!(self.generators.join(", "))),
+            ("levels", json!(dataset::levels())),
+            ("materials", json!(self.materials)),
+            ("pitch_mm", json!(self.shape.pitch_mm)),
+        ] {
+            meta.insert(key.to_owned(), value);
+        }
+        Ok(match &self.presses {
+            Presses::Frames(samples) => dataset::write(out, samples, &meta.into())?,
+            Presses::Courses(courses) => courses.write(out, &meta.into())?,
+        })
+    }
+}
+
+/// What makes two recordings the same presses of the same object, and the name of this one. `None` if
+/// another program described the recording in another way.
+fn identity(capture: &Value) -> Option<(String, String)> {
+    let sha256 = capture["sha256"].as_str()?;
+    let [level, object, split] = ["level", "object", "split"].map(|key| &capture[key]);
+    let name = capture["name"].as_str().unwrap_or_default();
+    Some((
+        format!("{sha256} {level} {object} {split}"),
+        name.to_owned(),
+    ))
 }

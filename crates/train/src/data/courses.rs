@@ -238,7 +238,7 @@ impl Courses {
     }
 
     /// Adds the presses of another file. `objects` is added to their numbers of objects.
-    fn append(&mut self, other: Self, objects: u32) {
+    pub(super) fn append(&mut self, other: Self, objects: u32) {
         let (rows, presses) = (self.press.len() as u32, self.presses.len() as u32);
         self.frames_mn.extend(other.frames_mn);
         self.press

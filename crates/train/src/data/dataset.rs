@@ -5,7 +5,6 @@
 //! object's frames has practically seen the others.
 
 pub(super) mod file;
-pub(super) mod stream;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

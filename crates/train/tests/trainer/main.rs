@@ -4,9 +4,6 @@
     reason = "clippy knows no helper of a test as a test"
 )]
 
-#[path = "../../../../tests/bench/mod.rs"]
-mod bench;
-
 mod adapt;
 mod adopt;
 mod collect;

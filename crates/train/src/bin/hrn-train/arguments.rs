@@ -193,15 +193,9 @@ pub(super) struct Collect {
     /// Leave out recordings that cannot be used. D.npz.left-out.tsv names each with the reason
     #[arg(long)]
     pub(super) skip_unusable: bool,
-    /// Keep the presses of each recording in this directory, and take them from there next time. A call
-    /// that was stopped continues
-    #[arg(long, value_name = "DIR")]
-    pub(super) parts: Option<PathBuf>,
-    /// Recordings at a time [default: as many as there are cores]
-    #[arg(long, value_name = "J")]
-    pub(super) jobs: Option<std::num::NonZeroUsize>,
-    /// Recordings of `record`, directories with recordings, or raw bytes back to back. If all have a
-    /// label "material" or "shore", the data set has that array; all or none must have it
+    /// Recordings of `record`, directories with recordings, raw bytes back to back, or data sets of
+    /// `collect` to put together, which keep their labels. If all have a label "material" or "shore", the
+    /// data set has that array; all or none must have it
     #[arg(value_name = "CAPTURE", required = true)]
     pub(super) captures: Vec<PathBuf>,
 }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use hardnessd_core::exit;
-use hrn_train::data::collect::CollectError;
+use hrn_train::data::collect::{CollectError, Problem};
 use hrn_train::data::dataset::DatasetError;
 use hrn_train::methods::LabelsError;
 use hrn_train::methods::adapt::NoStart;
@@ -59,7 +59,7 @@ pub(super) enum WrongUsage {
     Overwritten(&'static str, PathBuf),
 }
 
-/// One of several captures cannot be collected.
+/// One of several files cannot be collected.
 #[derive(Debug, thiserror::Error)]
 #[error("{0} (to leave out such recordings: --skip-unusable)")]
 pub(super) struct NotCollected(#[source] pub(super) CollectError);
@@ -74,6 +74,13 @@ pub(super) struct NoObjects;
 #[error("{0}: works with `--materials {1}` only")]
 pub(super) struct OtherMaterials(pub(super) &'static str, pub(super) &'static str);
 
+fn problem<'e>(error: &'e (dyn std::error::Error + 'static)) -> Option<&'e Problem> {
+    match error.downcast_ref()? {
+        CollectError::File { problem, .. } => Some(problem),
+        CollectError::Dataset(_) => None,
+    }
+}
+
 /// The exit code: 2 wrong usage, 66 unreadable input, 69 no such device, 78 bad configuration or
 /// model, 74 other I/O error, 1 any other error.
 pub(super) fn exit_code(error: &anyhow::Error) -> u8 {
@@ -83,14 +90,14 @@ pub(super) fn exit_code(error: &anyhow::Error) -> u8 {
             || e.is::<OtherMaterials>()
             || e.is::<WrongUsage>()
             || matches!(e.downcast_ref(), Some(LabelsError::Range { .. }))
-            || matches!(e.downcast_ref(), Some(CollectError::NoLevel { .. }))
+            || matches!(problem(e), Some(Problem::NoLevel))
     }) {
         exit::USAGE
     } else if has(|e| {
         e.is::<Unreadable>()
             || e.is::<NoRun>()
             || matches!(e.downcast_ref(), Some(DatasetError::Unreadable { .. }))
-            || matches!(e.downcast_ref(), Some(CollectError::Unreadable { .. }))
+            || matches!(problem(e), Some(Problem::Unreadable(_)))
             || matches!(
                 e.downcast_ref(),
                 Some(ConfigurationError::Unreadable { .. })

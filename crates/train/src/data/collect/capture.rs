@@ -1,117 +1,169 @@
 //! The presses in one recording, and what its labels say of them.
 
-use std::path::{Path, PathBuf};
+use std::collections::BTreeSet;
+use std::path::Path;
 use std::sync::Arc;
 
-use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value, json};
 
-use super::CollectError;
+use super::part::{Part, Presses};
 use super::selection::{Judged, Selection};
-use crate::data::dataset::{self, file::SHORE};
+use super::{Problem, Settings};
+use crate::data::courses::{Courses, Press};
+use crate::data::dataset::{self, COLLECTOR, Sample, file::SHORE};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::motion::Track;
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::recording::{Entry, FileKind, Found, Labels, Playback, Reader};
 use hardnessd_core::sensor::Sensor;
-use hardnessd_core::verdict::Hrn;
+use hardnessd_core::verdict::{Hrn, sha256_hex};
 
-/// A capture without its frames.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) struct Head {
-    #[serde(skip)]
-    pub(super) path: PathBuf,
-    pub(super) sha256: String,
-    pub(super) labels: Labels,
-    /// Distance between the sensor's taxels.
-    pub(super) pitch_mm: f64,
-    /// The number of presses that were judged.
-    pub(super) judged: usize,
-    /// The number of presses for the data set: all, or those that are recorded from their begin.
-    pub(super) presses: usize,
-    /// The number of these whose approach is known.
-    pub(super) known: usize,
-    /// The number of frames of these presses.
-    pub(super) frames: usize,
+/// The material of presses over time whose recording does not name one.
+const NO_MATERIAL: &str = "unknown";
+
+/// The presses of `bytes`, the content of `path`.
+///
+/// # Errors
+///
+/// Returns an error if the recording is damaged, describes an impossible sensor or sensors of
+/// different pitches, has no press that was judged, or lacks a label that is needed.
+pub(super) fn part(path: &Path, bytes: &[u8], settings: &Settings) -> Result<Part, Problem> {
+    let Pressed {
+        judged,
+        labels,
+        pitch_mm,
+    } = Pressed::of(bytes, &settings.sensor, &settings.hrn)?;
+    let (given, sequences) = (settings.labelling, settings.sequences);
+    let level = level(&labels, given.level)?;
+    let shore = shore(&labels)?;
+    let number = match given.object {
+        None => number(&labels, "object", "a number")?,
+        given => given,
+    };
+    let object = number.unwrap_or_default();
+    let material = labels.get("material").cloned();
+    let material = material.or_else(|| sequences.then(|| NO_MATERIAL.to_owned()));
+    let count = judged.len();
+    let presses = if sequences {
+        let mut courses = Courses::default();
+        for judged in judged.iter().filter(|press| press.is_whole()) {
+            let press = Press {
+                level,
+                object,
+                material: 0,
+                split: given.split,
+                shore: shore.unwrap_or(f32::NAN),
+                force_n: judged.force_n,
+                arm_n_per_mm: judged.arm_n_per_mm,
+                best: judged.best as u32,
+            };
+            let moments = judged.moments.iter();
+            courses.push(
+                press,
+                moments.map(|moment| (moment.time_s, moment.approach_mm, &moment.frame)),
+            );
+        }
+        Presses::Courses(courses)
+    } else {
+        let sample = |judged: Judged| Sample {
+            frame: judged.frame,
+            level,
+            object: Some(object),
+            material: material.as_ref().map(|_| 0),
+            force_n: Some(judged.force_n),
+            split: given.split,
+            shore,
+            source: 0,
+        };
+        Presses::Frames(judged.into_iter().map(sample).collect())
+    };
+    let mut capture = json!({
+        "name": path.file_name().unwrap_or_default().to_string_lossy(),
+        "sha256": sha256_hex(bytes),
+        "level": level,
+        "object": object,
+        "presses": presses.len(),
+        "split": given.split.name(),
+        "labels": labels,
+    });
+    let mut new_objects = BTreeSet::new();
+    if number.is_none() {
+        capture["new_object"] = Value::Bool(true);
+        new_objects.insert(object);
+    }
+    Ok(Part {
+        path: path.to_owned(),
+        is_recording: true,
+        pitch_mm,
+        materials: material.into_iter().collect(),
+        captures: vec![capture],
+        new_objects,
+        generators: vec![format!("{COLLECTOR} {}", env!("CARGO_PKG_VERSION"))],
+        partial: count - presses.len(),
+        presses,
+        meta: Map::new(),
+    })
 }
 
-impl Head {
-    /// The label `key` as a number, if there is one.
-    pub(super) fn number(
-        &self,
-        key: &'static str,
-        expected: &'static str,
-    ) -> Result<Option<u32>, CollectError> {
-        let Some(label) = self.labels.get(key) else {
-            return Ok(None);
-        };
-        let wrong = |_| CollectError::Label {
-            path: self.path.clone(),
-            key,
-            found: format!("{label:?}"),
-            expected,
-        };
-        label.parse().map(Some).map_err(wrong)
-    }
-
-    pub(super) fn shore(&self) -> Result<Option<f32>, CollectError> {
-        let Some(label) = self.labels.get("shore") else {
-            return Ok(None);
-        };
-        let shore = label.parse().ok().filter(|shore| SHORE.contains(shore));
-        let wrong = || CollectError::Label {
-            path: self.path.clone(),
-            key: "shore",
-            found: format!("{label:?}"),
-            expected: "a number from 0 to 100",
-        };
-        shore.ok_or_else(wrong).map(Some)
-    }
-
-    pub(super) fn level(&self, given: Option<u8>) -> Result<u8, CollectError> {
-        const EXPECTED: &str = "a level from 0 (unlabelled) to 4";
-        let level = match given {
-            Some(level) => u32::from(level),
-            None => self
-                .number("level", EXPECTED)?
-                .ok_or_else(|| CollectError::NoLevel {
-                    path: self.path.clone(),
-                })?,
-        };
-        let known = u8::try_from(level).ok();
-        let known = known.filter(|level| usize::from(*level) <= dataset::levels().len());
-        known.ok_or_else(|| CollectError::Label {
-            path: self.path.clone(),
-            key: "level",
-            found: level.to_string(),
-            expected: EXPECTED,
-        })
-    }
+/// The label `key` as a number, if there is one.
+fn number(
+    labels: &Labels,
+    key: &'static str,
+    expected: &'static str,
+) -> Result<Option<u32>, Problem> {
+    let Some(label) = labels.get(key) else {
+        return Ok(None);
+    };
+    let wrong = |_| Problem::Label {
+        key,
+        found: format!("{label:?}"),
+        expected,
+    };
+    label.parse().map(Some).map_err(wrong)
 }
 
-/// The presses of a capture, with its labels and its pitch.
-pub(super) struct Presses {
-    pub(super) labels: Labels,
-    pub(super) pitch_mm: f64,
-    pub(super) judged: Vec<Judged>,
+fn shore(labels: &Labels) -> Result<Option<f32>, Problem> {
+    let Some(label) = labels.get("shore") else {
+        return Ok(None);
+    };
+    let shore = label.parse().ok().filter(|shore| SHORE.contains(shore));
+    let wrong = || Problem::Label {
+        key: "shore",
+        found: format!("{label:?}"),
+        expected: "a number from 0 to 100",
+    };
+    shore.ok_or_else(wrong).map(Some)
 }
 
-impl Presses {
-    /// Finds the presses in `bytes`, the content of `path`. `sensor` is the sensor of a capture
-    /// that does not describe its own, and `hrn` judges the presses.
-    ///
-    /// # Errors
-    ///
-    /// Returns an error if the capture is damaged, describes an impossible sensor or sensors of
-    /// different pitches, or has no press that was judged.
-    pub(super) fn of(
-        bytes: &[u8],
-        path: &Path,
-        sensor: &Sensor,
-        hrn: &Arc<Hrn>,
-    ) -> Result<Self, CollectError> {
+fn level(labels: &Labels, given: Option<u8>) -> Result<u8, Problem> {
+    const EXPECTED: &str = "a level from 0 (unlabelled) to 4";
+    if let Some(level) = given {
+        return Ok(level);
+    }
+    let level = number(labels, "level", EXPECTED)?.ok_or(Problem::NoLevel)?;
+    let known = u8::try_from(level).ok();
+    let known = known.filter(|level| usize::from(*level) <= dataset::levels().len());
+    known.ok_or_else(|| Problem::Label {
+        key: "level",
+        found: level.to_string(),
+        expected: EXPECTED,
+    })
+}
+
+/// What is in a recording: its presses, labels and pitch.
+struct Pressed {
+    judged: Vec<Judged>,
+    labels: Labels,
+    pitch_mm: f64,
+}
+
+impl Pressed {
+    /// Finds the presses. `sensor` is the sensor of a recording that does not describe its own, and
+    /// `hrn` judges the presses.
+    fn of(bytes: &[u8], sensor: &Sensor, hrn: &Arc<Hrn>) -> Result<Self, Problem> {
         let mut selection = Selection::default();
         let (labels, pitch_mm) = if FileKind::of(bytes) == FileKind::Recording {
-            play(bytes, hrn, path, &mut selection)?
+            play(bytes, hrn, &mut selection)?
         } else {
             let mut pipeline = Pipeline::new(sensor.clone(), hrn.clone(), Clock::FrameRate);
             selection.describe(sensor.name(), sensor.description());
@@ -121,13 +173,12 @@ impl Presses {
             (Labels::new(), sensor.description().calibration.pitch_mm)
         };
         if selection.presses.is_empty() {
-            let path = path.to_owned();
-            return Err(CollectError::NoPress { path });
+            return Err(Problem::NoPress);
         }
         Ok(Self {
+            judged: selection.presses,
             labels,
             pitch_mm,
-            judged: selection.presses,
         })
     }
 }
@@ -138,30 +189,21 @@ const NOT_LOOKED_AT: Stamp = Stamp {
     wall: jiff::Timestamp::UNIX_EPOCH,
 };
 
-fn play(
-    bytes: &[u8],
-    hrn: &Arc<Hrn>,
-    path: &Path,
-    selection: &mut Selection,
-) -> Result<(Labels, f64), CollectError> {
+fn play(bytes: &[u8], hrn: &Arc<Hrn>, selection: &mut Selection) -> Result<(Labels, f64), Problem> {
     let mut playback = Playback::new(hrn.clone());
     let (mut pitch_mm, none) = (None, Track::default());
     for found in Reader::new(bytes) {
-        let found = found.map_err(|source| CollectError::Recording {
-            path: path.to_owned(),
-            source,
-        })?;
+        let found = found.map_err(Problem::Recording)?;
         if let Some(found) = pitch_of(&found) {
             let expected = *pitch_mm.get_or_insert(found);
-            check_pitch(path, found, expected, path)?;
+            if found != expected {
+                return Err(Problem::Pitches { found, expected });
+            }
         }
         let (at, sensor) = (found.at, found.sensor.clone());
         selection.note(&found);
         let events = playback.feed(found);
-        let events = events.map_err(|source| CollectError::Sensor {
-            path: path.to_owned(),
-            source,
-        })?;
+        let events = events.map_err(Problem::Sensor)?;
         selection.take(events, at, playback.track(&sensor).unwrap_or(&none));
     }
     // A press that is still under way gets no verdict.
@@ -179,23 +221,6 @@ fn pitch_of(found: &Found) -> Option<f64> {
     }
 }
 
-pub(super) fn check_pitch(
-    path: &Path,
-    found: f64,
-    expected: f64,
-    first: &Path,
-) -> Result<(), CollectError> {
-    if found == expected {
-        return Ok(());
-    }
-    Err(CollectError::Pitch {
-        path: path.to_owned(),
-        found,
-        expected,
-        first: first.to_owned(),
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use serde_json::json;
@@ -205,8 +230,8 @@ mod tests {
 
     /// The approach at each frame of the press of a recording, and the stiffness of the arm.
     fn approach((bytes, sensor): &(Vec<u8>, Sensor)) -> (Vec<Option<f32>>, f32) {
-        let presses = Presses::of(bytes, Path::new("a.mcap"), sensor, &hrn()).unwrap();
-        let [press] = &presses.judged[..] else {
+        let pressed = Pressed::of(bytes, sensor, &hrn()).unwrap();
+        let [press] = &pressed.judged[..] else {
             panic!("one press");
         };
         let rounded = press.moments.iter().map(|moment| {

@@ -1,50 +1,44 @@
-//! The reasons that captures cannot be collected.
+//! The reasons that files cannot be collected.
 
 use std::path::{Path, PathBuf};
 
+use crate::data::dataset::DatasetError;
 use hardnessd_core::recording::{self, PlaybackError};
 
-/// The reason that a capture gives no samples.
+/// The reason that a file gives no samples.
 #[derive(Debug, thiserror::Error)]
 pub enum CollectError {
-    /// The capture is missing or unreadable.
-    #[error("{path}: {source}")]
-    Unreadable {
-        /// The capture.
+    /// A recording, or something between files.
+    #[error("{}: {problem}", path.display())]
+    File {
+        /// The file.
         path: PathBuf,
-        /// The system's error.
-        source: std::io::Error,
+        /// The reason.
+        problem: Problem,
     },
-    /// The capture is damaged, or is not a recording of hardnessd.
-    #[error("{path}: {source}")]
-    Recording {
-        /// The capture.
-        path: PathBuf,
-        /// The reader's error.
-        source: recording::Error,
-    },
-    /// The capture describes an impossible sensor.
-    #[error("{path}: {source}")]
-    Sensor {
-        /// The capture.
-        path: PathBuf,
-        /// The error of the playback.
-        source: PlaybackError,
-    },
+    /// The file is an `.npz` file, but not the data set that is needed.
+    #[error(transparent)]
+    Dataset(#[from] DatasetError),
+}
+
+/// The reason, without the file's path.
+#[derive(Debug, thiserror::Error)]
+pub enum Problem {
+    /// The file is missing or unreadable.
+    #[error("{0}")]
+    Unreadable(std::io::Error),
+    /// The recording is damaged, or is not one of hardnessd.
+    #[error("{0}")]
+    Recording(recording::Error),
+    /// The recording describes an impossible sensor.
+    #[error("{0}")]
+    Sensor(PlaybackError),
     /// The level is neither given nor a label.
-    #[error("{path}: the recording has no label `level`: give its level with --level")]
-    NoLevel {
-        /// The capture.
-        path: PathBuf,
-    },
+    #[error("the recording has no label `level`: give its level with --level")]
+    NoLevel,
     /// A label is not a number in its range.
-    #[error(
-        "{path}: label {key}: found {found}, expected {expected}{}",
-        said_too(key)
-    )]
+    #[error("label {key}: found {found}, expected {expected}{}", option(key))]
     Label {
-        /// The capture.
-        path: PathBuf,
         /// The label's key.
         key: &'static str,
         /// The value found.
@@ -52,89 +46,94 @@ pub enum CollectError {
         /// The accepted values.
         expected: &'static str,
     },
-    /// The capture has another taxel pitch than the others.
-    #[error("{path}: taxel pitch: found {found} mm, expected {expected} mm, that of {first}")]
+    /// The file has another taxel pitch than the others.
+    #[error("taxel pitch: found {found} mm, expected {expected} mm, that of {}", first.display())]
     Pitch {
-        /// The capture.
-        path: PathBuf,
-        /// The capture's pitch, in mm.
+        /// The file's pitch, in mm.
         found: f64,
         /// The pitch of the others, in mm.
         expected: f64,
-        /// One of the others, or the data set to which the captures are added.
+        /// One of the others, or the data set to which the file is added.
         first: PathBuf,
     },
-    /// An array has values for some samples only. The data set would lose it, because an array has
-    /// a value for every sample or is missing.
+    /// The sensors of one recording have different taxel pitches.
+    #[error("taxel pitch: found {found} mm, expected {expected} mm, that of its first sensor")]
+    Pitches {
+        /// The pitch of a sensor, in mm.
+        found: f64,
+        /// The pitch of the first one, in mm.
+        expected: f64,
+    },
+    /// An array has values in this file only, or everywhere but in this file. The data set would lose
+    /// it, because an array has a value for every sample or is missing.
     #[error(
-        "{path}: has no {array}, and {first} has: {}make it a data set of its own (train takes \
-         several --data)",
-        remedy(array)
+        "has {no}{array}, and {first} has{not}: {}make it a data set of its own (train takes several \
+         --data)",
+        remedy(array),
+        no = if *is_there { "" } else { "no " },
+        first = first.display(),
+        not = if *is_there { " not" } else { "" },
     )]
-    Lost {
-        /// The file without values.
-        path: PathBuf,
+    Arrays {
         /// The array's name.
         array: &'static str,
-        /// The file with values.
+        /// Whether this file has it.
+        is_there: bool,
+        /// The other file.
         first: PathBuf,
     },
     /// The same object is in the training split and in the test split.
     #[error(
-        "{path}: object {object} is in the {found} split here, and in the {expected} split in \
-         {first}: give it the same --split, because presses of one object are near-copies"
+        "object {object} is in the {found} split here, and in the {expected} split before: give it the \
+         same --split, because presses of one object are near-copies"
     )]
     Splits {
-        /// The capture.
-        path: PathBuf,
         /// The object's number.
         object: u32,
-        /// The split of the object's presses in this capture.
+        /// The split of the object's presses in this file.
         found: &'static str,
         /// The split of the object's earlier presses.
         expected: &'static str,
-        /// The data set to which the capture is added.
-        first: PathBuf,
     },
     /// The same recording was collected before, with the same labels.
     #[error(
-        "{path}: the same recording as {first}, whose presses are in the data set already: leave it out, because \
+        "the same recording as {0}, whose presses are in the data set already: leave it out, because \
          presses that are there twice count twice"
     )]
-    Twice {
-        /// The capture.
-        path: PathBuf,
-        /// The name of the earlier capture.
-        first: String,
-    },
-    /// The capture names a material for which no number is left.
+    Twice(String),
+    /// The file names a material for which no number is left.
+    #[error("material {0:?} is one too many: a data set has at most 256 materials")]
+    Materials(String),
+    /// No number is left for a new object.
     #[error(
-        "{path}: label material: {name:?} is one too many: a data set has at most 256 materials"
+        "no number is left for a new object, because object {} is in the data set: give its number with \
+         --object",
+        u32::MAX
     )]
-    Materials {
-        /// The capture.
-        path: PathBuf,
-        /// The material.
-        name: String,
-    },
+    NoNumber,
     /// The sensor was not pressed, or no press was judged.
     #[error(
-        "{path}: no press found: was the sensor pressed, and is this its layout? (`hardnessd replay {path}`)"
+        "no press found: was the sensor pressed, and is this its layout? `hardnessd replay` shows what \
+         is in a recording"
     )]
-    NoPress {
-        /// The capture.
-        path: PathBuf,
-    },
+    NoPress,
     /// A directory has no recording in it.
-    #[error("{path}: no recording is in this directory")]
-    Empty {
-        /// The directory.
-        path: PathBuf,
-    },
+    #[error("no recording is in this directory")]
+    Empty,
+}
+
+impl Problem {
+    /// The error of the file with this problem.
+    pub(super) fn of(self, path: &Path) -> CollectError {
+        CollectError::File {
+            path: path.to_owned(),
+            problem: self,
+        }
+    }
 }
 
 impl CollectError {
-    /// The error without the capture's path, for a list that has the path elsewhere.
+    /// The error without the file's path, for a list that has the path elsewhere.
     pub(super) fn reason(&self, path: &Path) -> String {
         let text = self.to_string();
         let reason = text.strip_prefix(&format!("{}: ", path.display()));
@@ -142,7 +141,7 @@ impl CollectError {
     }
 }
 
-fn said_too(key: &str) -> String {
+fn option(key: &str) -> String {
     match key {
         "level" | "object" => format!(": --{key} gives another one"),
         _ => String::new(),

@@ -44,7 +44,7 @@ impl Judged {
         !self.moments.is_empty()
     }
 
-    pub(super) fn is_known(&self) -> bool {
+    fn is_known(&self) -> bool {
         self.moments
             .iter()
             .any(|moment| moment.approach_mm.is_some())

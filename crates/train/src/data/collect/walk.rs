@@ -4,10 +4,10 @@ use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
-use super::CollectError;
+use super::{CollectError, Problem};
 use hardnessd_core::recording::MAGIC;
 
-/// The captures that `paths` name. In place of a directory come all recordings below it, sorted by
+/// The files that `paths` name. In place of a directory come all recordings below it, sorted by
 /// their paths. A recording is known by its first bytes. Links to directories are not followed.
 ///
 /// # Errors
@@ -22,7 +22,7 @@ pub fn captures(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CollectError> {
         }
         let mut found = below(path)?;
         if found.is_empty() {
-            return Err(CollectError::Empty { path: path.clone() });
+            return Err(Problem::Empty.of(path));
         }
         found.sort();
         all.append(&mut found);
@@ -33,10 +33,7 @@ pub fn captures(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CollectError> {
 fn below(directory: &Path) -> Result<Vec<PathBuf>, CollectError> {
     let (mut found, mut directories) = (Vec::new(), vec![directory.to_owned()]);
     while let Some(directory) = directories.pop() {
-        let unreadable = |source| CollectError::Unreadable {
-            path: directory.clone(),
-            source,
-        };
+        let unreadable = |error| Problem::Unreadable(error).of(&directory);
         for entry in fs::read_dir(&directory).map_err(unreadable)? {
             let entry = entry.map_err(unreadable)?;
             let path = entry.path();
