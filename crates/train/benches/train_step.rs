@@ -10,6 +10,7 @@ use std::path::Path;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use hardnessd_simulator::random::Stream;
+use hrn_train::data::npz::Writer;
 use hrn_train::learn::learner::Learner;
 use hrn_train::learn::{fit, gan};
 use hrn_train::net::losses::Game;
@@ -17,8 +18,6 @@ use hrn_train::net::network::numbers;
 use hrn_train::net::{generator, hrn};
 use hrn_train::settings::network::Pooling;
 use hrn_train::settings::{GanSettings, OptimiserSettings};
-use ndarray::{ArrayD, IxDyn};
-use ndarray_npy::NpzWriter;
 use rustix::time::{ClockId, clock_gettime};
 
 /// The same allocator as in `hrn-train`.
@@ -125,11 +124,9 @@ impl Networks {
 
     fn write(&self, path: &Path) {
         let file = std::fs::File::create(path).expect("a file that can be written");
-        let mut npz = NpzWriter::new(file);
+        let mut npz = Writer::plain(file);
         let mut add = |name: &str, dims: &[usize], values: Vec<f32>| {
-            let array =
-                ArrayD::from_shape_vec(IxDyn(dims), values).expect("as many as the axes say");
-            npz.add_array(name, &array).expect("room on the disk");
+            npz.add(name, dims, &values).expect("room on the disk");
         };
         let sides = [
             ("hrn", &self.hrn),

@@ -4,18 +4,16 @@
 //! press. `docs/formats.md` has the arrays.
 
 use std::collections::BTreeSet;
-use std::io::{Seek, Write};
+use std::io::{self, Seek, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
-
-use ndarray::{ArrayView1, ArrayView3};
-use ndarray_npy::{NpzWriter, WriteNpzError};
 
 use super::dataset::file::{self, FORCES_N, File, SHORE};
 use super::dataset::{
     Dataset, DatasetError, Sample, Source, levels, objects_after, pitch_mm,
     warn_of_object_in_both_splits,
 };
+use super::npz::Writer;
 use hardnessd_core::frame::{COLS, Frame, ROWS, TAXELS};
 use hardnessd_core::verdict::COURSE_FRAMES;
 use hardnessd_simulator::{LabelledCourse, NEWTONS_PER_COUNT, Split};
@@ -366,20 +364,14 @@ impl Courses {
     /// # Errors
     ///
     /// Returns the errors of writing to `out`.
-    pub fn write<W: Write + Seek>(
-        &self,
-        out: W,
-        meta: &serde_json::Value,
-    ) -> Result<W, WriteNpzError> {
-        let mut npz = NpzWriter::new_compressed(out);
-        let shape = (self.press.len(), ROWS, COLS);
-        let frames = ArrayView3::from_shape(shape, &self.frames_mn)
-            .expect("as many values as the shape asks for");
-        npz.add_array("frames_mn", &frames)?;
-        npz.add_array("press", &ArrayView1::from(&self.press))?;
-        npz.add_array("time_s", &ArrayView1::from(&self.time_s))?;
-        npz.add_array("approach_mm", &ArrayView1::from(&self.approach_mm))?;
-        npz.add_array("known", &ArrayView1::from(&self.known))?;
+    pub fn write<W: Write + Seek>(&self, out: W, meta: &serde_json::Value) -> io::Result<W> {
+        let mut npz = Writer::compressed(out);
+        let shape = [self.press.len(), ROWS, COLS];
+        npz.add("frames_mn", &shape, &self.frames_mn)?;
+        npz.add_list("press", &self.press)?;
+        npz.add_list("time_s", &self.time_s)?;
+        npz.add_list("approach_mm", &self.approach_mm)?;
+        npz.add_list("known", &self.known)?;
         let bytes: [Column<u8>; 3] = [
             ("level", |press| press.level),
             ("material", |press| press.material),
@@ -387,7 +379,7 @@ impl Courses {
         ];
         for (name, of) in bytes {
             let values: Vec<u8> = self.presses.iter().map(of).collect();
-            npz.add_array(name, &ArrayView1::from(&values))?;
+            npz.add_list(name, &values)?;
         }
         let numbers: [Column<u32>; 2] = [
             ("object", |press| press.object),
@@ -395,7 +387,7 @@ impl Courses {
         ];
         for (name, of) in numbers {
             let values: Vec<u32> = self.presses.iter().map(of).collect();
-            npz.add_array(name, &ArrayView1::from(&values))?;
+            npz.add_list(name, &values)?;
         }
         let reals: [Column<f32>; 3] = [
             ("shore", |press| press.shore),
@@ -404,9 +396,9 @@ impl Courses {
         ];
         for (name, of) in reals {
             let values: Vec<f32> = self.presses.iter().map(of).collect();
-            npz.add_array(name, &ArrayView1::from(&values))?;
+            npz.add_list(name, &values)?;
         }
-        npz.add_array("meta", &ArrayView1::from(meta.to_string().as_bytes()))?;
+        npz.add_list("meta", meta.to_string().as_bytes())?;
         npz.finish()
     }
 }

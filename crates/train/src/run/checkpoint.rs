@@ -9,15 +9,14 @@ use std::path::Path;
 
 use anyhow::{Context as _, bail, ensure};
 use burn::tensor::{Device, Tensor, TensorData};
-use ndarray::{ArrayD, ArrayView1, IxDyn};
-use ndarray_npy::NpzWriter;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 use zip::ZipArchive;
 
 use crate::data::dataset::Dataset;
+use crate::data::npz::{Element as _, Writer};
 use crate::net::network::{Weight, Weights, numbers};
-use hardnessd_core::npy::{self, Header};
+use hardnessd_core::npy::Header;
 
 /// The state from which a stage continues, beside its settings and data.
 #[derive(Debug, Clone)]
@@ -123,14 +122,13 @@ impl Checkpoint {
     ///
     /// Returns an error if the archive cannot be built.
     pub fn to_bytes(&self) -> anyhow::Result<Vec<u8>> {
-        let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
-        let progress = serde_json::to_vec(&self.progress)?;
-        npz.add_array("progress", &ArrayView1::from(&progress))?;
-        npz.add_array("origin", &ArrayView1::from(self.origin.as_bytes()))?;
+        let mut npz = Writer::plain(Cursor::new(Vec::new()));
+        npz.add_list("progress", &serde_json::to_vec(&self.progress)?)?;
+        npz.add_list("origin", self.origin.as_bytes())?;
         for (list, weights) in &self.lists {
             for weight in &weights.entries {
-                let array = ArrayD::from_shape_vec(IxDyn(&weight.dims), numbers(&weight.values))?;
-                npz.add_array(format!("{list}/{}", weight.name), &array)?;
+                let name = format!("{list}/{}", weight.name);
+                npz.add(&name, &weight.dims, &numbers(&weight.values))?;
             }
         }
         Ok(npz.finish()?.into_inner())
@@ -149,39 +147,31 @@ impl Checkpoint {
         for place in 0..zip.len() {
             let mut packed = zip.by_index(place)?;
             let name = packed.name().trim_end_matches(".npy").to_owned();
-            let Header {
-                descr,
-                shape,
-                fortran_order,
-            } = npy::header(&mut packed)?;
-            let count = shape
-                .iter()
-                .try_fold(1_usize, |count, &axis| count.checked_mul(axis));
-            let count = count.with_context(|| format!("array `{name}`: found shape {shape:?}"))?;
+            let header = Header::read(&mut packed)?;
             let text = match name.as_str() {
                 "progress" => Some(&mut progress),
                 "origin" => Some(&mut origin),
                 _ => None,
             };
             if let Some(text) = text {
-                *text = Some(npy::elements(&mut packed, count, |[byte]: [u8; 1]| byte)?);
+                *text = Some(header.elements(&mut packed, u8::of)?);
                 continue;
             }
             let Some((list, weight)) = name.split_once('/') else {
                 bail!("array `{name}` is no part of a checkpoint");
             };
             ensure!(
-                descr == "<f4" && !fortran_order,
-                "array `{name}`: found {descr}, expected <f4 in C order"
+                !header.fortran_order,
+                "array `{name}`: found Fortran order, expected C order"
             );
-            let values = npy::elements(&mut packed, count, f32::from_le_bytes)?;
+            let values = header.elements(&mut packed, f32::of)?;
             if lists.last().is_none_or(|(last, _)| last != list) {
                 lists.push((list.to_owned(), Weights::default()));
             }
             let entries = &mut lists.last_mut().expect("pushed just now").1.entries;
             entries.push(Weight {
                 name: weight.to_owned(),
-                dims: shape,
+                dims: header.shape,
                 values: flat(values, device),
             });
         }

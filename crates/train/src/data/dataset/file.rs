@@ -1,18 +1,17 @@
 //! Data sets as `.npz` files: arrays with the names, types and shapes of `docs/formats.md`.
 
-use std::io::{Cursor, Read, Seek, Write};
+use std::io::{self, Cursor, Read, Seek, Write};
 use std::ops::RangeInclusive;
 use std::os::unix::fs::FileTypeExt as _;
 use std::path::Path;
 
-use ndarray::{ArrayView, ArrayView1, ArrayView3};
-use ndarray_npy::{NpzWriter, WritableElement, WriteNpzError};
 use zip::ZipArchive;
 use zip::result::ZipError;
 
 use super::{Dataset, DatasetError, Sample, Source, levels};
+use crate::data::npz::{Element, Writer};
 use hardnessd_core::frame::{COLS, Frame, ROWS, TAXELS};
-use hardnessd_core::npy::{self, Header, NpyError};
+use hardnessd_core::npy::{Header, NpyError};
 use hardnessd_core::verdict::{Level, check_levels, sha256_hex};
 use hardnessd_simulator::Split;
 
@@ -180,102 +179,33 @@ pub fn write<W: Write + Seek>(
     out: W,
     samples: &[Sample],
     meta: &serde_json::Value,
-) -> Result<W, WriteNpzError> {
-    let mut npz = NpzWriter::new_compressed(out);
-    let n = samples.len();
-    let frames: Vec<f32> = samples
-        .iter()
-        .flat_map(|sample| sample.frame.newtons)
-        .collect();
-    let shape = "as many values as the shape asks for";
-    let frames = ArrayView3::from_shape((n, ROWS, COLS), &frames).expect(shape);
-    npz.add_array("frames", &frames)?;
-    let level: Vec<u8> = samples.iter().map(|sample| sample.level).collect();
-    npz.add_array("level", &ArrayView1::from(&level))?;
+) -> io::Result<W> {
+    let mut npz = Writer::compressed(out);
+    let newtons = samples.iter().flat_map(|sample| sample.frame.newtons);
+    let frames: Vec<f32> = newtons.collect();
+    npz.add("frames", &[samples.len(), ROWS, COLS], &frames)?;
+    let levels: Vec<u8> = samples.iter().map(|sample| sample.level).collect();
+    npz.add_list("level", &levels)?;
     add_optional(&mut npz, "object", samples, |sample| sample.object)?;
     add_optional(&mut npz, "material", samples, |sample| sample.material)?;
     add_optional(&mut npz, "force", samples, |sample| sample.force_n)?;
-    let split: Vec<u8> = samples.iter().map(|sample| sample.split as u8).collect();
-    npz.add_array("split", &ArrayView1::from(&split))?;
+    let splits: Vec<u8> = samples.iter().map(|sample| sample.split as u8).collect();
+    npz.add_list("split", &splits)?;
     add_optional(&mut npz, "shore", samples, |sample| sample.shore)?;
-    npz.add_array("meta", &ArrayView1::from(meta.to_string().as_bytes()))?;
+    npz.add_list("meta", meta.to_string().as_bytes())?;
     npz.finish()
 }
 
 /// Adds an array if every sample has a value for it.
-fn add_optional<W: Write + Seek, T: WritableElement>(
-    npz: &mut NpzWriter<W>,
+fn add_optional<W: Write + Seek, T: Element>(
+    npz: &mut Writer<W>,
     name: &str,
     samples: &[Sample],
     value: impl Fn(&Sample) -> Option<T>,
-) -> Result<(), WriteNpzError> {
+) -> io::Result<()> {
     match samples.iter().map(value).collect::<Option<Vec<T>>>() {
-        Some(values) => npz.add_array(name, &ArrayView::from(&values)),
+        Some(values) => npz.add_list(name, &values),
         None => Ok(()),
-    }
-}
-
-/// An element type that our files may hold.
-pub(in crate::data) trait Element: Copy {
-    /// The type's name in errors.
-    const NAME: &'static str;
-    /// The type's names in numpy's headers.
-    const DESCRIPTIONS: &'static [&'static str];
-    /// Reads `count` elements.
-    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, NpyError>;
-    /// The bytes of elements, as the first of [`Self::DESCRIPTIONS`] says.
-    fn bytes(values: &[Self]) -> Vec<u8>;
-}
-impl Element for f32 {
-    const NAME: &'static str = "f32";
-    const DESCRIPTIONS: &'static [&'static str] = &["<f4"];
-    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, NpyError> {
-        npy::elements(reader, count, Self::from_le_bytes)
-    }
-    fn bytes(values: &[Self]) -> Vec<u8> {
-        values
-            .iter()
-            .flat_map(|value| value.to_le_bytes())
-            .collect()
-    }
-}
-impl Element for u32 {
-    const NAME: &'static str = "u32";
-    const DESCRIPTIONS: &'static [&'static str] = &["<u4"];
-    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, NpyError> {
-        npy::elements(reader, count, Self::from_le_bytes)
-    }
-    fn bytes(values: &[Self]) -> Vec<u8> {
-        values
-            .iter()
-            .flat_map(|value| value.to_le_bytes())
-            .collect()
-    }
-}
-impl Element for u16 {
-    const NAME: &'static str = "u16";
-    const DESCRIPTIONS: &'static [&'static str] = &["<u2"];
-    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, NpyError> {
-        npy::elements(reader, count, Self::from_le_bytes)
-    }
-    fn bytes(values: &[Self]) -> Vec<u8> {
-        values
-            .iter()
-            .flat_map(|value| value.to_le_bytes())
-            .collect()
-    }
-}
-impl Element for u8 {
-    const NAME: &'static str = "u8";
-    const DESCRIPTIONS: &'static [&'static str] = &["|u1", "<u1", ">u1"];
-    fn read(reader: &mut impl Read, count: usize) -> Result<Vec<Self>, NpyError> {
-        npy::elements(reader, count, Self::from_le_bytes)
-    }
-    fn bytes(values: &[Self]) -> Vec<u8> {
-        values
-            .iter()
-            .flat_map(|value| value.to_le_bytes())
-            .collect()
     }
 }
 
@@ -444,38 +374,28 @@ fn array_of<T: Element>(
     n: Option<usize>,
     free: u64,
 ) -> Result<Vec<T>, ArrayError> {
-    let Header {
-        descr,
-        fortran_order,
-        shape,
-    } = npy::header(reader)?;
-    if !T::DESCRIPTIONS.contains(&descr.as_str()) {
-        return Err(NpyError::Type(descr).into());
-    }
-    let fits = match shape.split_first() {
+    let header = Header::read(reader)?;
+    let fits = match header.shape.split_first() {
         Some((first, rest)) => rest == inner && n.is_none_or(|n| *first == n),
         None => false,
     };
-    let count = shape
-        .iter()
-        .try_fold(1_usize, |product, &length| product.checked_mul(length));
-    let Some(count) = count.filter(|_| fits) else {
-        let name = T::NAME;
+    let Some(count) = header.count().filter(|_| fits) else {
+        let (name, shape) = (T::NAME, header.shape);
         return Err(ArrayError::Shape { name, shape });
     };
     let bytes = count.saturating_mul(size_of::<T>()) as u64;
     if bytes > free.max(packed.saturating_mul(MOST_PACKED)) {
         return Err(ArrayError::Packed { bytes, packed });
     }
-    let values = T::read(reader, count)?;
-    if !fortran_order {
+    let values = header.elements(reader, T::of)?;
+    if !header.fortran_order {
         return Ok(values);
     }
     // In Fortran order the first axis changes fastest; in our order the last one does.
     let place = |mut index: usize| {
         let mut steps = count;
         let (mut place, mut stride) = (0, 1);
-        for &length in &shape {
+        for &length in &header.shape {
             steps /= length;
             place += index / steps * stride;
             index %= steps;
@@ -492,9 +412,12 @@ mod tests {
 
     #[test]
     fn an_array_as_large_as_another_may_be_all_zeros() {
-        let zeros = ndarray::Array1::<u8>::zeros(20 << 20);
-        let mut bytes = Vec::new();
-        ndarray_npy::WriteNpyExt::write_npy(&zeros, &mut bytes).unwrap();
+        let header = Header {
+            descr: "|u1".to_owned(),
+            fortran_order: false,
+            shape: vec![20 << 20],
+        };
+        let bytes = [header.to_bytes(), vec![0; 20 << 20]].concat();
         let read = |free| array_of::<u8>(&mut &*bytes, 100, &[], Some(20 << 20), free);
         assert!(matches!(read(FREE_BYTES), Err(ArrayError::Packed { .. })));
         assert!(read(20 << 20).is_ok_and(|values| values.len() == 20 << 20));

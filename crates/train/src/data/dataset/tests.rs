@@ -2,11 +2,10 @@
 
 use std::io::Cursor;
 
-use ndarray::{Array1, Array3};
-use ndarray_npy::NpzWriter;
-
 use super::*;
-use hardnessd_core::frame::{COLS, ROWS};
+use crate::data::npz::{Element, Writer};
+use hardnessd_core::frame::{COLS, ROWS, TAXELS};
+use hardnessd_core::npy::Header;
 use hardnessd_core::verdict::sha256_hex;
 
 fn sample(level: u8, object: u32, split: Split) -> Sample {
@@ -54,14 +53,28 @@ fn a_file_reads_back_what_was_written() {
     assert_eq!(bytes, bytes_of(&samples));
 }
 
+type Npz = Writer<Cursor<Vec<u8>>>;
+
+/// The bytes of a file with the arrays that `fill` adds.
+fn npz(fill: impl FnOnce(&mut Npz)) -> Vec<u8> {
+    let mut npz = Writer::plain(Cursor::new(Vec::new()));
+    fill(&mut npz);
+    npz.finish().unwrap().into_inner()
+}
+
+/// Adds `n` frames whose taxels are all `newtons`.
+fn add_frames(npz: &mut Npz, n: usize, newtons: f32) {
+    let frames = vec![newtons; n * TAXELS];
+    npz.add("frames", &[n, ROWS, COLS], &frames).unwrap();
+}
+
 #[test]
 fn optional_arrays_may_be_missing() {
-    let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
-    npz.add_array("frames", &Array3::<f32>::zeros((3, ROWS, COLS)))
-        .unwrap();
-    npz.add_array("level", &Array1::from(vec![0_u8, 1, 4]))
-        .unwrap();
-    let read = parse(npz.finish().unwrap().get_ref()).unwrap();
+    let read = parse(&npz(|npz| {
+        add_frames(npz, 3, 0.0);
+        npz.add_list("level", &[0_u8, 1, 4]).unwrap();
+    }));
+    let read = read.unwrap();
     assert!(
         read.samples
             .iter()
@@ -76,32 +89,32 @@ fn optional_arrays_may_be_missing() {
     );
 }
 
+/// Adds an array of a type or an order that our own writer does not use.
+fn add_as(npz: &mut Npz, name: &str, descr: &str, is_fortran: bool, shape: &[usize], bytes: &[u8]) {
+    let header = Header {
+        descr: descr.to_owned(),
+        fortran_order: is_fortran,
+        shape: shape.to_vec(),
+    };
+    npz.add_npy(name, &[&header.to_bytes(), bytes].concat())
+        .unwrap();
+}
+
 #[test]
 fn more_frames_than_fit_in_memory_are_an_error() {
-    let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
-    npz.add_array("frames", &Array3::<f32>::zeros((2, ROWS, COLS)))
-        .unwrap();
-    let mut bytes = npz.finish().unwrap().into_inner();
-    // The header is padded with spaces, so there is room for a longer number.
-    let shape = b"(2, 28, 28)";
-    let place = bytes.windows(shape.len()).position(|part| part == shape);
-    let line = bytes[place.unwrap()..].split_mut(|&byte| byte == b'\n');
-    let line = line.into_iter().next().unwrap();
-    line.copy_within(..line.len() - 12, 12);
-    line[..12 + shape.len()].copy_from_slice(b"(9999999999999, 28, 28)");
+    let shape = [9_999_999_999_999, ROWS, COLS];
+    let bytes = npz(|npz| add_as(npz, "frames", "<f4", false, &shape, &[0; 4 * TAXELS]));
     let error = parse(&bytes).unwrap_err().to_string();
     assert!(error.contains("array `frames`: found"), "{error}");
 }
 
 #[test]
 fn a_file_that_unpacks_to_far_more_than_it_has_is_an_error() {
-    let mut npz = NpzWriter::new_compressed(Cursor::new(Vec::new()));
-    npz.add_array("frames", &Array3::<f32>::zeros((1, ROWS, COLS)))
-        .unwrap();
-    npz.add_array("level", &Array1::from(vec![1_u8])).unwrap();
+    let mut npz = Writer::compressed(Cursor::new(Vec::new()));
+    add_frames(&mut npz, 1, 0.0);
+    npz.add_list("level", &[1_u8]).unwrap();
     // 32 MB of spaces around a null are JSON too.
-    let meta = vec![b' '; 32 << 20];
-    npz.add_array("meta", &Array1::from(meta)).unwrap();
+    npz.add_list("meta", &vec![b' '; 32 << 20]).unwrap();
     let bytes = npz.finish().unwrap().into_inner();
     assert!(bytes.len() < 64 << 10, "{}", bytes.len());
     let error = parse(&bytes).unwrap_err().to_string();
@@ -113,132 +126,115 @@ fn a_file_that_unpacks_to_far_more_than_it_has_is_an_error() {
 
 #[test]
 fn an_array_in_fortran_order_is_the_same_array() {
-    let frames = Array3::from_shape_fn((3, ROWS, COLS), |(n, row, col)| {
-        (n * 1000 + row * COLS + col) as f32
-    });
-    let mut other = frames.clone().reversed_axes();
-    other = other.as_standard_layout().into_owned();
-    let of = |frames: ndarray::ArrayView3<'_, f32>| {
-        let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
-        npz.add_array("frames", &frames).unwrap();
-        npz.add_array("level", &Array1::from(vec![1_u8, 2, 3]))
-            .unwrap();
-        npz.finish().unwrap().into_inner()
+    const N: usize = 3;
+    let taxel = |n: usize, row: usize, col: usize| (n * 1000 + row * COLS + col) as f32;
+    let in_c = (0..N * TAXELS).map(|k| taxel(k / TAXELS, k / COLS % ROWS, k % COLS));
+    let in_fortran = (0..N * TAXELS).map(|k| taxel(k % N, k / N % ROWS, k / N / ROWS));
+    let parse = |is_fortran, taxels: Vec<f32>| {
+        let bytes: Vec<u8> = taxels
+            .iter()
+            .flat_map(|newtons| newtons.to_le_bytes())
+            .collect();
+        let file = npz(|npz| {
+            add_as(npz, "frames", "<f4", is_fortran, &[N, ROWS, COLS], &bytes);
+            npz.add_list("level", &[1_u8, 2, 3]).unwrap();
+        });
+        parse(&file).unwrap().samples
     };
-    let (c, fortran) = (of(frames.view()), of(other.view().reversed_axes()));
-    let is_fortran = |bytes: &[u8]| bytes.windows(4).any(|word| word == b"True");
-    assert!(!is_fortran(&c) && is_fortran(&fortran));
-    let samples = |bytes: &[u8]| parse(bytes).unwrap().samples;
-    for (one, other) in samples(&c).iter().zip(&samples(&fortran)) {
-        assert_eq!(one.frame, other.frame);
-    }
+    assert_eq!(
+        parse(true, in_fortran.collect()),
+        parse(false, in_c.collect())
+    );
+}
+
+#[test]
+fn numbers_of_the_types_that_numpy_makes_by_default_are_converted() {
+    let frames = 0.5_f64.to_le_bytes().repeat(2 * TAXELS);
+    let numbers = [1_i64.to_le_bytes(), 4_i64.to_le_bytes()].concat();
+    let file = npz(|npz| {
+        add_as(npz, "frames", "<f8", false, &[2, ROWS, COLS], &frames);
+        add_as(npz, "level", "<i8", false, &[2], &numbers);
+        add_as(npz, "force", "<i8", false, &[2], &numbers);
+    });
+    let samples = parse(&file).unwrap().samples;
+    assert_eq!(samples[0].frame.newtons, [0.5; TAXELS]);
+    let labels = samples.iter().map(|sample| (sample.level, sample.force_n));
+    assert_eq!(labels.collect::<Vec<_>>(), [(1, Some(1.0)), (4, Some(4.0))]);
 }
 
 #[test]
 fn what_is_not_as_agreed_is_named_with_what_was_found_and_expected() {
-    fn check(fill: impl FnOnce(&mut NpzWriter<Cursor<Vec<u8>>>), expected: &str) {
-        let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
-        fill(&mut npz);
-        let error = parse(npz.finish().unwrap().get_ref())
-            .unwrap_err()
-            .to_string();
+    fn check(fill: impl FnOnce(&mut Npz), expected: &str) {
+        let error = parse(&npz(fill)).unwrap_err().to_string();
         assert!(error.starts_with("D.npz: "), "{error}");
         assert!(
             error.contains(expected),
             "{error}\nshould contain\n{expected}"
         );
     }
-    let frames = |n: usize| Array3::<f32>::zeros((n, ROWS, COLS));
+    /// Two frames of level 1, and one more array.
+    fn check_with<T: Element>(name: &str, elements: &[T], expected: &str) {
+        let fill = |npz: &mut Npz| {
+            add_frames(npz, 2, 0.0);
+            if name != "level" {
+                npz.add_list("level", &[1_u8, 1]).unwrap();
+            }
+            npz.add_list(name, elements).unwrap();
+        };
+        check(fill, expected);
+    }
     check(|_| {}, "array `frames`: found none, expected f32 [N,28,28]");
     check(
         |npz| {
-            npz.add_array("frames", &Array3::<f64>::zeros((2, ROWS, COLS)))
+            npz.add("frames", &[1, 27, COLS], &[0.0_f32; 27 * COLS])
                 .unwrap();
         },
-        "array `frames`: found dtype '<f8', expected f32 [N,28,28]",
+        "array `frames`: found f32 [1, 27, 28], expected f32 [N,28,28]",
     );
     check(
-        |npz| {
-            npz.add_array("frames", &Array3::<f32>::zeros((2, 27, COLS)))
-                .unwrap();
-        },
-        "array `frames`: found f32 [2, 27, 28], expected f32 [N,28,28]",
-    );
-    check(
-        |npz| npz.add_array("frames", &frames(0)).unwrap(),
+        |npz| add_frames(npz, 0, 0.0),
         "array `frames`: found no frame, expected at least one",
     );
     check(
-        |npz| {
-            npz.add_array("frames", &frames(2).mapv(|_| f32::NAN))
-                .unwrap();
-        },
+        |npz| add_frames(npz, 2, f32::NAN),
         "array `frames`: found NaN at [0,0,0], expected newtons from 0 to 1e6",
     );
     check(
         |npz| {
-            let mut frames = frames(2);
-            frames[[1, 3, 4]] = 1e38;
-            npz.add_array("frames", &frames).unwrap();
+            let mut frames = [0.0_f32; 2 * TAXELS];
+            frames[TAXELS + 3 * COLS + 4] = 1e38;
+            npz.add("frames", &[2, ROWS, COLS], &frames).unwrap();
         },
         "array `frames`: found 1e38 at [1,3,4], expected newtons from 0 to 1e6",
     );
-    for (array, expected) in [("force", "-1000000 to 1000000"), ("shore", "0 to 100")] {
-        check(
-            |npz| {
-                npz.add_array("frames", &frames(2)).unwrap();
-                npz.add_array("level", &Array1::from(vec![1_u8, 2]))
-                    .unwrap();
-                npz.add_array(array, &Array1::from(vec![1.0, f32::INFINITY]))
-                    .unwrap();
-            },
-            &format!("array `{array}`: found inf at 1, expected {expected}"),
-        );
-    }
     check(
-        |npz| npz.add_array("frames", &frames(2)).unwrap(),
+        |npz| add_frames(npz, 2, 0.0),
         "array `level`: found none, expected u8 [2]",
     );
-    check(
-        |npz| {
-            npz.add_array("frames", &frames(2)).unwrap();
-            npz.add_array("level", &Array1::from(vec![1_i64, 2]))
-                .unwrap();
-        },
-        "array `level`: found dtype '<i8', expected u8 [2]",
-    );
-    check(
-        |npz| {
-            npz.add_array("frames", &frames(2)).unwrap();
-            npz.add_array("level", &Array1::from(vec![1_u8, 5]))
-                .unwrap();
-        },
-        "array `level`: found 5 at 1, expected 0 (unlabelled) to 4",
-    );
-    check(
-        |npz| {
-            npz.add_array("frames", &frames(2)).unwrap();
-            npz.add_array("level", &Array1::from(vec![1_u8, 4]))
-                .unwrap();
-            npz.add_array("object", &Array1::from(vec![1_u32])).unwrap();
-        },
+    for (array, expected) in [("force", "-1000000 to 1000000"), ("shore", "0 to 100")] {
+        let expected = format!("array `{array}`: found inf at 1, expected {expected}");
+        check_with(array, &[1.0, f32::INFINITY], &expected);
+    }
+    for (level, expected) in [
+        (0.5, "found 0.5 at 1, expected u8 [2]"),
+        (-1.0, "found -1.0 at 1, expected u8 [2]"),
+        (5.0, "found 5 at 1, expected 0 (unlabelled) to 4"),
+    ] {
+        check_with(
+            "level",
+            &[1.0_f32, level],
+            &format!("array `level`: {expected}"),
+        );
+    }
+    check_with(
+        "object",
+        &[1_u32],
         "array `object`: found u32 [1], expected u32 [2]",
     );
-    check(
-        |npz| {
-            npz.add_array("frames", &frames(1)).unwrap();
-            npz.add_array("level", &Array1::from(vec![1_u8])).unwrap();
-            npz.add_array("meta", &Array1::from(b"{".to_vec())).unwrap();
-        },
-        "array `meta`: found EOF",
-    );
-    check(
-        |npz| {
-            npz.add_array("frames", &frames(1)).unwrap();
-            npz.add_array("level", &Array1::from(vec![1_u8])).unwrap();
-            let meta = br#"{"pitch_mm":-1}"#.to_vec();
-            npz.add_array("meta", &Array1::from(meta)).unwrap();
-        },
+    check_with("meta", b"{", "array `meta`: found EOF");
+    check_with(
+        "meta",
+        br#"{"pitch_mm":-1}"#,
         "array `meta`: found pitch_mm -1, expected millimetres from 0.01 to 1000",
     );
     let error = parse(b"PK no zip").unwrap_err().to_string();
