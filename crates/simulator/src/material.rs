@@ -31,7 +31,7 @@ pub enum Material {
 }
 
 /// The part of a data set that a sample belongs to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[repr(u8)]
 pub enum Split {
     /// Training; 0 in the data set's file.

@@ -22,10 +22,10 @@ use serde_json::{Map, Value, json};
 
 pub use self::error::{CollectError, Problem};
 pub use self::part::Part;
-use self::part::{Object, Presses, Shape};
+use self::part::{Presses, Shape};
 pub use self::walk::captures;
 use crate::data::courses::Courses;
-use crate::data::dataset;
+use crate::data::dataset::{self, Object};
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::verdict::Hrn;
 use hardnessd_simulator::Split;
@@ -135,7 +135,7 @@ pub struct Collection {
     generators: Vec<String>,
     /// The names of recordings by what makes two of them the same presses of the same object.
     names: BTreeMap<String, String>,
-    objects: BTreeSet<Object>,
+    objects: BTreeSet<(Object, Split)>,
     /// The least number that no object has. `None` if all numbers are taken.
     free_object: Option<u32>,
     /// The number of the object of this call's recordings without a number, once there is one.
@@ -229,14 +229,13 @@ impl Collection {
                 return Err(Problem::Twice(name.clone()));
             }
         }
-        for added in part.presses.objects() {
-            let other =
-                |object: &&Object| object.is_same_as(&added) && object.split() != added.split();
-            if let Some(object) = self.objects.iter().find(other) {
+        for (added, split) in part.presses.objects() {
+            let other = |(object, of): &&(Object, Split)| object.is_same_as(&added) && *of != split;
+            if let Some((object, expected)) = self.objects.iter().find(other) {
                 return Err(Problem::Splits {
                     object: object.number,
-                    found: added.split().name(),
-                    expected: object.split().name(),
+                    found: split.name(),
+                    expected: expected.name(),
                 });
             }
         }

@@ -3,15 +3,14 @@
 //! In: files, or the simulator's courses. Out: [`Courses`], with a row per kept frame and a row per
 //! press. `docs/formats.md` has the arrays.
 
-use std::collections::BTreeSet;
 use std::io::{self, Seek, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use super::dataset::file::{self, FORCES_N, File, SHORE};
 use super::dataset::{
-    Dataset, DatasetError, Sample, Source, levels, objects_after, pitch_mm,
-    warn_of_object_in_both_splits,
+    Dataset, DatasetError, Object, Sample, Source, levels, object_in_both_splits, objects_after,
+    pitch_mm, warn_of_object_in_both_splits,
 };
 use super::npz::Writer;
 use hardnessd_core::frame::{COLS, Frame, ROWS, TAXELS};
@@ -58,6 +57,17 @@ pub struct Press {
     pub arm_n_per_mm: f32,
     /// The row of the frame that a model of single frames judges.
     pub best: u32,
+}
+
+impl Press {
+    /// The pressed object.
+    pub(super) fn pressed(&self) -> Object {
+        Object {
+            number: self.object,
+            material: Some(self.material),
+            level: self.level,
+        }
+    }
 }
 
 /// Reads a file of single frames, or of whole presses. A press gives the frame with its largest contact
@@ -193,7 +203,9 @@ impl Courses {
         let mut first_object = 0;
         for path in paths {
             let (part, source) = Self::read_with_source(path)?;
-            if let Some(object) = part.object_in_both_splits() {
+            let presses = part.presses.iter();
+            let presses = presses.map(|press| (press.pressed(), press.split));
+            if let Some(object) = object_in_both_splits(presses) {
                 warn_of_object_in_both_splits(path, object);
             }
             sources.push(source);
@@ -221,18 +233,6 @@ impl Courses {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         let source = file::source(&bytes, &file, name.into_owned(), &meta)?;
         Ok((Self::parse(&bytes, path)?, source))
-    }
-
-    /// An object that has presses in both splits.
-    fn object_in_both_splits(&self) -> Option<u32> {
-        let of = |split| {
-            let presses = self.presses.iter();
-            presses
-                .filter(move |press| press.split == split)
-                .map(|press| press.object)
-        };
-        let trained: BTreeSet<u32> = of(Split::Train).collect();
-        of(Split::Test).find(|object| trained.contains(object))
     }
 
     /// Adds the presses of another file. `objects` is added to their numbers of objects.

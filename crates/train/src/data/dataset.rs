@@ -6,7 +6,7 @@
 
 pub(super) mod file;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 pub use self::file::{meta, write};
@@ -142,13 +142,50 @@ impl From<LabelledSample> for Sample {
 }
 
 impl Sample {
-    /// Whether both samples are of one object: they have the same number and material, and not two
-    /// different levels. An unlabelled sample agrees with every level.
-    pub fn shares_object_with(&self, other: &Self) -> bool {
-        let same_level = self.level == other.level || self.level == 0 || other.level == 0;
-        let same_number = self.object.is_some() && self.object == other.object;
-        same_number && self.material == other.material && same_level
+    /// The pressed object, if the data set says which one it is.
+    pub(super) fn pressed(&self) -> Option<Object> {
+        Some(Object {
+            number: self.object?,
+            material: self.material,
+            level: self.level,
+        })
     }
+
+    /// Whether both samples are of one object.
+    pub fn shares_object_with(&self, other: &Self) -> bool {
+        let both = self.pressed().zip(other.pressed());
+        both.is_some_and(|(one, other)| one.is_same_as(&other))
+    }
+}
+
+/// A pressed object. Numbers of objects may begin anew for each level, or for each material.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Object {
+    pub(super) number: u32,
+    pub(super) material: Option<u8>,
+    pub(super) level: u8,
+}
+
+impl Object {
+    /// Whether both are one object: they have the same number and material, and not two different
+    /// levels. An unlabelled one agrees with every level.
+    pub(super) fn is_same_as(&self, other: &Self) -> bool {
+        let same_level = self.level == other.level || self.level == 0 || other.level == 0;
+        self.number == other.number && self.material == other.material && same_level
+    }
+}
+
+/// The number of an object that has presses in both splits, if there is one.
+pub(super) fn object_in_both_splits(presses: impl Iterator<Item = (Object, Split)>) -> Option<u32> {
+    let (mut trained, mut tested) = (BTreeSet::new(), BTreeSet::new());
+    for (object, split) in presses {
+        match split {
+            Split::Train => trained.insert(object),
+            Split::Test => tested.insert(object),
+        };
+    }
+    let is_tested = |object: &&Object| tested.iter().any(|other| other.is_same_as(object));
+    trained.iter().find(is_tested).map(|object| object.number)
 }
 
 /// Prints the warning that `object` of a file has presses in both splits.
@@ -388,18 +425,9 @@ impl Dataset {
     }
 
     /// An object that has samples in both splits, if there is one.
-    pub fn object_in_both_splits(&self) -> Option<u32> {
-        let mut tests: BTreeMap<Option<u32>, Vec<&Sample>> = BTreeMap::new();
-        for sample in &self.samples {
-            if sample.split == Split::Test {
-                tests.entry(sample.object).or_default().push(sample);
-            }
-        }
-        let is_tested = |sample: &&Sample| {
-            let mut tests = tests.get(&sample.object).into_iter().flatten();
-            sample.split == Split::Train && tests.any(|test| test.shares_object_with(sample))
-        };
-        self.samples.iter().find(is_tested)?.object
+    fn object_in_both_splits(&self) -> Option<u32> {
+        let samples = self.samples.iter();
+        object_in_both_splits(samples.filter_map(|sample| Some((sample.pressed()?, sample.split))))
     }
 
     /// Prints a warning if an object has samples in both splits.

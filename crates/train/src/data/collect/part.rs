@@ -7,7 +7,7 @@ use serde_json::{Map, Value};
 
 use super::{CollectError, Problem, Settings, capture};
 use crate::data::courses::Courses;
-use crate::data::dataset::{self, Dataset, Sample, file};
+use crate::data::dataset::{self, Dataset, Object, Sample, file};
 use hardnessd_simulator::Split;
 
 /// The generator of a data set that names none.
@@ -80,8 +80,8 @@ impl Part {
             })
             .collect();
         let materials_used = presses.objects().into_iter();
-        let last = materials_used.filter_map(|object| object.material).max();
-        let all = last.map_or(0, |last| usize::from(last) + 1);
+        let last = materials_used.filter_map(|(object, _)| object.material);
+        let all = last.max().map_or(0, |last| usize::from(last) + 1);
         materials.extend((materials.len()..all).map(nameless));
         let generators = meta.get("generator").and_then(Value::as_str);
         let generators = generators.unwrap_or(UNKNOWN).split(", ");
@@ -107,7 +107,7 @@ impl Part {
     /// The numbers of objects that a label or an option gave.
     pub(super) fn numbered_objects(&self) -> impl Iterator<Item = u32> {
         let objects = self.presses.objects().into_iter();
-        let numbers = objects.map(|object| object.number);
+        let numbers = objects.map(|(object, _)| object.number);
         numbers.filter(|number| !self.new_objects.contains(number))
     }
 
@@ -159,28 +159,17 @@ impl Presses {
             .count()
     }
 
-    pub(super) fn objects(&self) -> BTreeSet<Object> {
+    /// The objects, each with its split.
+    pub(super) fn objects(&self) -> BTreeSet<(Object, Split)> {
         match self {
             Self::Frames(samples) => samples
                 .iter()
-                .filter_map(|sample| {
-                    Some(Object {
-                        number: sample.object?,
-                        material: sample.material,
-                        level: sample.level,
-                        is_test: sample.split == Split::Test,
-                    })
-                })
+                .filter_map(|sample| Some((sample.pressed()?, sample.split)))
                 .collect(),
             Self::Courses(courses) => courses
                 .presses
                 .iter()
-                .map(|press| Object {
-                    number: press.object,
-                    material: Some(press.material),
-                    level: press.level,
-                    is_test: press.split == Split::Test,
-                })
+                .map(|press| (press.pressed(), press.split))
                 .collect(),
         }
     }
@@ -210,30 +199,6 @@ impl Presses {
             (Self::Frames(all), Self::Frames(samples)) => all.extend(samples),
             (Self::Courses(all), Self::Courses(courses)) => all.append(courses, 0),
             _ => unreachable!("all files of a call are read as one kind"),
-        }
-    }
-}
-
-/// An object in a data set, with what distinguishes two of the same number.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct Object {
-    pub(super) number: u32,
-    material: Option<u8>,
-    level: u8,
-    is_test: bool,
-}
-
-impl Object {
-    /// Whether both are one object, by the rule of [`Sample::shares_object_with`].
-    pub(super) fn is_same_as(&self, other: &Self) -> bool {
-        let same_level = self.level == other.level || self.level == 0 || other.level == 0;
-        self.number == other.number && self.material == other.material && same_level
-    }
-
-    pub(super) fn split(&self) -> Split {
-        match self.is_test {
-            true => Split::Test,
-            false => Split::Train,
         }
     }
 }
