@@ -67,7 +67,8 @@ pub struct SensorTable {
     /// The sensor's name: unique, and `[a-z][a-z0-9_]*`.
     #[serde(default = "default_name")]
     pub name: String,
-    /// The sensor's device file.
+    /// The sensor's device file. It has no default: [`Config::load`] refuses an empty path.
+    #[serde(default)]
     pub port: PathBuf,
     /// The baud rate of the serial line, in bits per second. A pty and USB CDC ignore it.
     #[serde(default = "default_baud", deserialize_with = "above_zero")]

@@ -6,11 +6,11 @@
 
 pub(crate) mod motion;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use self::motion::Positions;
-use hardnessd_core::event::{CONTEXT_BYTES, Kind};
+use hardnessd_core::event::{self, ContextError, Kind};
 
 /// A request that can be used.
 #[derive(Debug, Clone, PartialEq)]
@@ -54,9 +54,12 @@ impl Change {
 }
 
 /// The events that a subscriber wants, and the policy if it is slow.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub(crate) struct Subscription {
+    #[serde(rename = "subscribe")]
     pub(crate) kinds: Kinds,
+    #[serde(default)]
     pub(crate) policy: Policy,
     /// The last event that the subscriber had in an earlier connection.
     pub(crate) since: Option<Since>,
@@ -76,19 +79,23 @@ impl Default for Subscription {
 }
 
 /// The events that are kept for a subscriber that is slow.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub(crate) enum Policy {
     /// Every event. When the queue is full, the oldest is dropped.
+    #[default]
     Queue,
     /// The newest event of each kind and sensor.
     Latest,
     /// The newest frame of each sensor, and every other event. This is for viewers, as on
     /// `/events`.
+    #[serde(skip)]
     LatestFrames,
 }
 
 /// A place in a run: `RUN:SEQ`.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(try_from = "String")]
 pub(crate) struct Since {
     pub(crate) run: String,
     pub(crate) seq: u64,
@@ -105,9 +112,28 @@ impl Since {
     }
 }
 
+impl TryFrom<String> for Since {
+    type Error = Unusable;
+
+    fn try_from(token: String) -> Result<Self, Unusable> {
+        Self::parse(&token).ok_or_else(|| Unusable::Value {
+            key: "since",
+            found: short(&token),
+            expected: "\"RUN:SEQ\"",
+        })
+    }
+}
+
 /// A set of event kinds.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(from = "Vec<Kind>")]
 pub(crate) struct Kinds(u8);
+
+impl From<Vec<Kind>> for Kinds {
+    fn from(kinds: Vec<Kind>) -> Self {
+        kinds.into_iter().collect()
+    }
+}
 
 impl Kinds {
     /// The kinds that carry a `seq`.
@@ -133,13 +159,82 @@ impl FromIterator<Kind> for Kinds {
     }
 }
 
+/// A request as it is written. The first key names it.
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum Written {
+    Subscribe(Subscription),
+    Get(Queried),
+    Tare(String),
+    Context(Context),
+    Motion(Positions),
+    Blackbox(String),
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum Queried {
+    Status,
+    Last,
+}
+
+impl From<Written> for Request {
+    fn from(written: Written) -> Self {
+        match written {
+            Written::Subscribe(subscription) => Request::Subscribe(subscription),
+            Written::Get(Queried::Status) => Request::Status,
+            Written::Get(Queried::Last) => Request::Last,
+            Written::Tare(sensor) => Request::Change(Change::Tare { sensor }),
+            Written::Context(Context { sensor, context }) => {
+                Request::Change(Change::Context { sensor, context })
+            }
+            Written::Motion(positions) => Request::Change(Change::Motion(positions)),
+            Written::Blackbox(sensor) => Request::Change(Change::Blackbox { sensor }),
+        }
+    }
+}
+
+/// A context as it came. It includes the key `sensor`, and without any other it is none.
+#[derive(Debug, Deserialize)]
+#[serde(try_from = "Map<String, Value>")]
+struct Context {
+    sensor: String,
+    context: Option<Value>,
+}
+
+impl TryFrom<Map<String, Value>> for Context {
+    type Error = ContextProblem;
+
+    fn try_from(fields: Map<String, Value>) -> Result<Self, ContextProblem> {
+        let Some(Value::String(sensor)) = fields.get("sensor") else {
+            return Err(ContextProblem::NoSensor);
+        };
+        let (sensor, is_empty) = (sensor.clone(), fields.len() == 1);
+        let context = Value::Object(fields);
+        event::check_context(&context)?;
+        Ok(Self {
+            sensor,
+            context: (!is_empty).then_some(context),
+        })
+    }
+}
+
+#[derive(Debug, thiserror::Error)]
+enum ContextProblem {
+    #[error("context.sensor: expected a sensor's name")]
+    NoSensor,
+    #[error(transparent)]
+    Unfit(#[from] ContextError),
+}
+
 /// The reason a line cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum Unusable {
-    #[error("found no JSON ({0}), expected an object")]
-    NoJson(String),
-    #[error("found JSON of another type, expected an object")]
-    NoObject,
+    #[error("found no JSON object ({0})")]
+    NoObject(String),
+    /// The request's key, and the reader's message.
+    #[error("{key}: {problem}")]
+    Request { key: String, problem: String },
     #[error("found {found}, expected {expected}")]
     Key {
         found: String,
@@ -151,24 +246,6 @@ pub(crate) enum Unusable {
         found: String,
         expected: &'static str,
     },
-    #[error("found {0}, which this request does not take")]
-    Extra(String),
-    #[error("context: found {0} bytes, expected fewer than {CONTEXT_BYTES}")]
-    LongContext(usize),
-    #[error("{0}")]
-    Motion(#[from] motion::Unusable),
-}
-
-impl Unusable {
-    /// The error of a value in JSON.
-    fn value(key: &'static str, found: &Value, expected: &'static str) -> Self {
-        let found = short(found);
-        Self::Value {
-            key,
-            found,
-            expected,
-        }
-    }
 }
 
 /// A line that was read.
@@ -182,14 +259,14 @@ pub(crate) struct Line {
 
 /// Reads one line, without its newline.
 pub(crate) fn parse(line: &[u8]) -> Line {
-    let unusable = |reason| Line {
-        id: None,
-        request: Err(reason),
-    };
     let mut fields: Map<String, Value> = match serde_json::from_slice(line) {
-        Ok(Value::Object(fields)) => fields,
-        Ok(_) => return unusable(Unusable::NoObject),
-        Err(error) => return unusable(Unusable::NoJson(error.to_string())),
+        Ok(fields) => fields,
+        Err(error) => {
+            return Line {
+                id: None,
+                request: Err(Unusable::NoObject(error.to_string())),
+            };
+        }
     };
     let id = fields.remove("id");
     Line {
@@ -199,95 +276,17 @@ pub(crate) fn parse(line: &[u8]) -> Line {
 }
 
 fn request(mut fields: Map<String, Value>) -> Result<Request, Unusable> {
-    let request = if let Some(kinds) = fields.remove("subscribe") {
-        Request::Subscribe(Subscription {
-            kinds: self::kinds(&kinds)?,
-            policy: fields
-                .remove("policy")
-                .map_or(Ok(Policy::Queue), |value| policy(&value))?,
-            since: fields
-                .remove("since")
-                .map(|value| since(&value))
-                .transpose()?,
-        })
-    } else if let Some(what) = fields.remove("get") {
-        match what.as_str() {
-            Some("status") => Request::Status,
-            Some("last") => Request::Last,
-            _ => return Err(Unusable::value("get", &what, "\"status\" or \"last\"")),
-        }
-    } else if let Some(sensor) = fields.remove("tare") {
-        let sensor = name("tare", &sensor)?;
-        Request::Change(Change::Tare { sensor })
-    } else if let Some(context) = fields.remove("context") {
-        Request::Change(self::context(context)?)
-    } else if let Some(motion) = fields.remove("motion") {
-        Request::Change(self::motion(&motion)?)
-    } else if let Some(sensor) = fields.remove("blackbox") {
-        let sensor = name("blackbox", &sensor)?;
-        Request::Change(Change::Blackbox { sensor })
-    } else {
-        let found = fields.keys().next().map_or("no key".to_owned(), short);
-        let expected = "\"subscribe\" or \"get\", or on the control socket \"tare\", \"context\", \
-                        \"motion\" or \"blackbox\"";
-        return Err(Unusable::Key { found, expected });
-    };
-    match fields.keys().next() {
-        Some(key) => Err(Unusable::Extra(short(key))),
-        None => Ok(request),
+    let mut key = fields.keys().next().cloned().unwrap_or_default();
+    // A subscription has its other keys beside `subscribe`, not within it.
+    if fields.contains_key("subscribe") {
+        key = "subscribe".to_owned();
+        fields = Map::from_iter([(key.clone(), Value::Object(fields))]);
     }
-}
-
-fn name(key: &'static str, value: &Value) -> Result<String, Unusable> {
-    let name = value.as_str().map(str::to_owned);
-    name.ok_or_else(|| Unusable::value(key, value, NAME))
-}
-
-/// The expected value of a key that names a sensor.
-const NAME: &str = "a sensor's name";
-
-/// The sensor in the object of a command.
-fn sensor(key: &'static str, fields: &Map<String, Value>) -> Result<String, Unusable> {
-    fields.get("sensor").map_or_else(
-        || {
-            Err(Unusable::Value {
-                key,
-                found: "none".to_owned(),
-                expected: NAME,
-            })
-        },
-        |sensor| name(key, sensor),
-    )
-}
-
-fn motion(value: &Value) -> Result<Change, Unusable> {
-    let Value::Object(fields) = value else {
-        return Err(Unusable::value("motion", value, "an object"));
-    };
-    let sensor = sensor("motion.sensor", fields)?;
-    let mut others = fields
-        .keys()
-        .filter(|key| !["sensor", "at"].contains(&key.as_str()));
-    if let Some(other) = others.next() {
-        return Err(Unusable::Extra(short(&format!("motion.{other}"))));
-    }
-    let points = motion::points(fields.get("at").unwrap_or(&Value::Null))?;
-    Ok(Change::Motion(Positions { sensor, points }))
-}
-
-fn context(value: Value) -> Result<Change, Unusable> {
-    let Value::Object(fields) = &value else {
-        return Err(Unusable::value("context", &value, "an object"));
-    };
-    let sensor = sensor("context.sensor", fields)?;
-    let bytes = value.to_string().len();
-    if bytes >= CONTEXT_BYTES {
-        return Err(Unusable::LongContext(bytes));
-    }
-    let says_something = fields.len() > 1;
-    Ok(Change::Context {
-        sensor,
-        context: says_something.then_some(value),
+    let written = serde_json::from_value::<Written>(Value::Object(fields));
+    let request = written.map(Request::from);
+    request.map_err(|error| Unusable::Request {
+        key,
+        problem: error.to_string(),
     })
 }
 
@@ -299,34 +298,6 @@ pub(crate) fn short(found: &(impl Serialize + ?Sized)) -> String {
         Some((end, _)) => format!("{}...", &text[..end]),
         None => text,
     }
-}
-
-fn kinds(value: &Value) -> Result<Kinds, Unusable> {
-    let unusable = |found| {
-        let expected = "a list of \"hardness\", \"press\", \"status\", \"frame\"";
-        Unusable::value("subscribe", found, expected)
-    };
-    let Value::Array(names) = value else {
-        return Err(unusable(value));
-    };
-    let kind = |name: &Value| name.as_str().and_then(Kind::named);
-    names
-        .iter()
-        .map(|name| kind(name).ok_or_else(|| unusable(name)))
-        .collect()
-}
-
-fn policy(value: &Value) -> Result<Policy, Unusable> {
-    match value.as_str() {
-        Some("queue") => Ok(Policy::Queue),
-        Some("latest") => Ok(Policy::Latest),
-        _ => Err(Unusable::value("policy", value, "\"queue\" or \"latest\"")),
-    }
-}
-
-fn since(value: &Value) -> Result<Since, Unusable> {
-    let since = value.as_str().and_then(Since::parse);
-    since.ok_or_else(|| Unusable::value("since", value, "\"RUN:SEQ\""))
 }
 
 #[cfg(test)]
@@ -365,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn a_context_is_kept_as_it_came_and_below_a_kibibyte() {
+    fn a_context_is_kept_as_it_came_and_neither_long_nor_deep() {
         let context = |more: &str| {
             let line = format!(r#"{{"context":{{"sensor":"forearm"{more}}}}}"#);
             match parse(line.as_bytes()).request {
@@ -381,37 +352,78 @@ mod tests {
             context(&format!(r#","tag":"{}""#, "x".repeat(bytes - around)))
         };
         assert!(long(1023).is_ok());
-        assert_eq!(long(1024), Err(Unusable::LongContext(1024)));
+        let error = long(1024).unwrap_err().to_string();
+        assert!(
+            error.ends_with("found 1024 bytes, expected fewer than 1024"),
+            "{error}"
+        );
+        // The context itself is a level.
+        let deep = |lists: usize| {
+            context(&format!(
+                r#","at":{}{}"#,
+                "[".repeat(lists),
+                "]".repeat(lists)
+            ))
+        };
+        assert!(deep(15).is_ok());
+        let error = deep(16).unwrap_err().to_string();
+        assert!(
+            error.ends_with("found 17 levels, expected at most 16"),
+            "{error}"
+        );
     }
 
     #[test]
     fn an_unusable_line_says_what_was_found_and_echoes_its_id() {
         for (line, found) in [
-            (&br#"{"subscribe":["touch"],"id":"a"}"#[..], "\"touch\""),
-            (br#"{"subscribe":"press","id":"a"}"#, "\"press\""),
-            (br#"{"subscribe":[],"policy":"all","id":"a"}"#, "\"all\""),
-            (br#"{"subscribe":[],"since":"7","id":"a"}"#, "\"7\""),
+            (
+                &br#"{"subscribe":["touch"],"id":"a"}"#[..],
+                "subscribe: unknown variant `touch`",
+            ),
+            (br#"{"subscribe":"press","id":"a"}"#, "string \"press\""),
+            (
+                br#"{"subscribe":[],"policy":"all","id":"a"}"#,
+                "`all`, expected `queue` or `latest`",
+            ),
+            (
+                br#"{"subscribe":[],"since":"7","id":"a"}"#,
+                "since: found \"7\", expected \"RUN:SEQ\"",
+            ),
             (br#"{"subscribe":[],"since":"ab:-7","id":"a"}"#, "\"ab:-7\""),
-            (br#"{"subscribe":[],"sinse":"ab:7","id":"a"}"#, "\"sinse\""),
-            (br#"{"get":"frames","id":"a"}"#, "\"frames\""),
-            (br#"{"tare":7,"id":"a"}"#, "tare"),
-            (br#"{"tare":"a","context":{},"id":"a"}"#, "\"context\""),
-            (br#"{"context":"pick","id":"a"}"#, "\"pick\""),
+            (
+                br#"{"subscribe":[],"sinse":"ab:7","id":"a"}"#,
+                "unknown field `sinse`",
+            ),
+            (
+                br#"{"get":"frames","id":"a"}"#,
+                "get: unknown variant `frames`",
+            ),
+            (br#"{"tare":7,"id":"a"}"#, "tare: invalid type: integer `7`"),
+            (
+                br#"{"tare":"a","context":{},"id":"a"}"#,
+                "expected map with a single key",
+            ),
+            (
+                br#"{"context":"pick","id":"a"}"#,
+                "context: invalid type: string \"pick\"",
+            ),
             (br#"{"context":{"tag":"x"},"id":"a"}"#, "context.sensor"),
-            (br#"{"id":"a"}"#, "no key"),
+            (br#"{"id":"a"}"#, "expected map with a single key"),
             (
                 br#"{"retare":"a","id":"a"}"#,
-                "\"tare\", \"context\", \"motion\" or \"blackbox\"",
+                "retare: unknown variant `retare`, expected one of `subscribe`",
             ),
-            (br#"{"motion":[],"id":"a"}"#, "motion: found []"),
-            (br#"{"motion":{"at":[]},"id":"a"}"#, "motion.sensor"),
+            (
+                br#"{"motion":{"at":[]},"id":"a"}"#,
+                "motion: missing field `sensor`",
+            ),
             (
                 br#"{"motion":{"sensor":"a"},"id":"a"}"#,
-                "motion.at: found null",
+                "motion: missing field `at`",
             ),
             (
                 br#"{"motion":{"sensor":"a","at":[],"mm":1},"id":"a"}"#,
-                "\"motion.mm\"",
+                "unknown field `mm`",
             ),
         ] {
             let read = parse(line);

@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use serde::{Serialize, Serializer};
+use serde_json::Value;
 
 pub use self::reply::{Hello, ModelCard, Reply, SensorCard, Tared};
 use crate::frame::{COLS, ROWS};
@@ -20,6 +21,53 @@ pub const PROTOCOL: u32 = 1;
 
 /// A context, written as JSON without spaces, is shorter than this.
 pub const CONTEXT_BYTES: usize = 1024;
+
+/// The most levels of objects and lists in a context. A recording holds a context within a state,
+/// and JSON is read only up to 128 levels.
+pub const CONTEXT_LEVELS: usize = 16;
+
+/// The reason why a value cannot be a controller's context.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum ContextError {
+    /// The value is a number, a text or a list.
+    #[error("context: expected an object")]
+    NoObject,
+    /// The context is too long.
+    #[error("context: found {0} bytes, expected fewer than {CONTEXT_BYTES}")]
+    Long(usize),
+    /// The context has too many levels.
+    #[error("context: found {0} levels, expected at most {CONTEXT_LEVELS}")]
+    Deep(usize),
+}
+
+/// Checks that a value can be a controller's context.
+///
+/// # Errors
+///
+/// Returns an error if the value is no object, has [`CONTEXT_BYTES`] or more, or has more than
+/// [`CONTEXT_LEVELS`].
+pub fn check_context(context: &Value) -> Result<(), ContextError> {
+    if !context.is_object() {
+        return Err(ContextError::NoObject);
+    }
+    let bytes = context.to_string().len();
+    if bytes >= CONTEXT_BYTES {
+        return Err(ContextError::Long(bytes));
+    }
+    match levels(context) {
+        0..=CONTEXT_LEVELS => Ok(()),
+        deeper => Err(ContextError::Deep(deeper)),
+    }
+}
+
+/// The levels of objects and lists in a value. A number or a text has none.
+fn levels(value: &Value) -> usize {
+    match value {
+        Value::Array(items) => 1 + items.iter().map(levels).max().unwrap_or(0),
+        Value::Object(fields) => 1 + fields.values().map(levels).max().unwrap_or(0),
+        _ => 0,
+    }
+}
 
 /// A numbered or live event of one sensor.
 ///

@@ -27,7 +27,7 @@ pub use self::reader::{Found, Reader};
 pub use self::recover::{RecoverError, Recovered, recover};
 pub use self::ring::Ring;
 pub use self::writer::{About, Writer};
-use crate::event::Event;
+use crate::event::{ContextError, Event};
 use crate::frame::Stamp;
 use crate::motion::Point;
 use crate::pipeline::{self, Pipeline};
@@ -332,6 +332,9 @@ pub enum Error {
         /// The expected content.
         expected: &'static str,
     },
+    /// A controller's context in the recording cannot be one.
+    #[error(transparent)]
+    Context(#[from] ContextError),
 }
 
 impl From<mcap::McapError> for Error {

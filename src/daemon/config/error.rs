@@ -1,6 +1,5 @@
 //! The errors of a configuration. Each error names the file, and the line or the key.
 
-use std::fmt;
 use std::path::{Path, PathBuf};
 
 use hardnessd_core::npy::NpyError;
@@ -30,14 +29,28 @@ pub enum Error {
         path: PathBuf,
     },
     /// The file is not TOML, or has an unknown key or a value of the wrong type.
-    #[error("{path}:{place}: {problem}")]
+    #[error("{path}: {problem}")]
     Syntax {
         /// The path of the configuration.
         path: PathBuf,
-        /// The line and the column.
-        place: Place,
-        /// The problem: what was found and what was expected.
+        /// The place in the file, and the parser's message.
         problem: String,
+    },
+    /// The file has `[sensor]` in place of `[[sensor]]`.
+    #[error("{path}: write [[sensor]], not [sensor]: there may be several")]
+    SingleBrackets {
+        /// The path of the configuration.
+        path: PathBuf,
+    },
+    /// A `[[sensor]]` has no port.
+    #[error(
+        "{path}: sensor.port of {sensor:?} is missing: set it to a path under /dev/serial/by-id/"
+    )]
+    NoPort {
+        /// The path of the configuration.
+        path: PathBuf,
+        /// The sensor's name.
+        sensor: String,
     },
     /// A value cannot be used.
     #[error("{path}: {key}: found {found}, expected {expected}")]
@@ -155,29 +168,5 @@ fn table_of(sensor: &str, problem: &SensorError) -> String {
         // The name cannot be used, so it cannot identify the table.
         SensorError::Name(_) | SensorError::LongName { .. } => "sensor.".to_owned(),
         _ => format!("sensor[{sensor:?}]."),
-    }
-}
-
-/// A line and a column, both counted from 1.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Place {
-    line: usize,
-    column: usize,
-}
-
-impl fmt::Display for Place {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(out, "{}:{}", self.line, self.column)
-    }
-}
-
-impl Place {
-    pub(super) fn of(text: &str, byte: usize) -> Self {
-        let before = &text[..byte.min(text.len())];
-        let line_start = before.rfind('\n').map_or(0, |newline| newline + 1);
-        Self {
-            line: before.matches('\n').count() + 1,
-            column: before[line_start..].chars().count() + 1,
-        }
     }
 }

@@ -3,9 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use toml::de::DeTable;
-
-use super::error::{Error, MAX_BYTES, Place};
+use super::error::{Error, MAX_BYTES};
 use super::read::{Until, read};
 use super::{Config, Model};
 use hardnessd_core::npy::{self, NpyError};
@@ -23,10 +21,19 @@ pub(super) fn load(path: &Path, until: Until) -> Result<Config, Error> {
             path: path.to_owned(),
         });
     }
-    let text = text(&bytes, path)?;
+    let text = std::str::from_utf8(&bytes).map_err(|error| Error::Syntax {
+        path: path.to_owned(),
+        problem: error.to_string(),
+    })?;
     let mut config: Config = toml::from_str(text).map_err(|error| syntax(path, text, &error))?;
     let directory = path.parent().unwrap_or(Path::new(""));
     for sensor in &mut config.sensors {
+        if sensor.port.as_os_str().is_empty() {
+            return Err(Error::NoPort {
+                path: path.to_owned(),
+                sensor: sensor.name.clone(),
+            });
+        }
         let key = format!("sensor.port of {:?}", sensor.name);
         resolve(
             &mut sensor.port,
@@ -110,84 +117,17 @@ fn resolve(
     Ok(())
 }
 
-fn text<'a>(bytes: &'a [u8], path: &Path) -> Result<&'a str, Error> {
-    std::str::from_utf8(bytes).map_err(|error| {
-        let (before, after) = bytes.split_at(error.valid_up_to());
-        let before = String::from_utf8_lossy(before);
-        Error::Syntax {
-            path: path.to_owned(),
-            place: Place::of(&before, before.len()),
-            problem: format!("found byte {:#04x}, expected UTF-8", after[0]),
-        }
-    })
-}
-
+/// The parser's error, or the better words for a file that has `[sensor]` in place of `[[sensor]]`.
 fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Error {
-    if let Some(start) = error
-        .message()
-        .starts_with("missing field")
-        .then(|| sensor_without_port(text))
-        .flatten()
-    {
-        return Error::Syntax {
-            path: path.to_owned(),
-            place: Place::of(text, start),
-            problem: "sensor.port is missing: set it to a path under /dev/serial/by-id/".to_owned(),
-        };
+    let path = path.to_owned();
+    let table = text.parse::<toml::Table>().unwrap_or_default();
+    if table.get("sensor").is_some_and(toml::Value::is_table) {
+        return Error::SingleBrackets { path };
     }
-    if let Some(start) = single_brackets(text, error.message()) {
-        return Error::Syntax {
-            path: path.to_owned(),
-            place: Place::of(text, start),
-            problem: "write [[sensor]], not [sensor]: there may be several".to_owned(),
-        };
-    }
-    let start = error.span().map_or(0, |span| span.start);
-    // The parser reports what was found and expected. The key is earlier on the same line.
-    let line_start = text[..start].rfind('\n').map_or(0, |newline| newline + 1);
-    let line = text[line_start..].lines().next().unwrap_or_default();
-    let key = line
-        .split_once('=')
-        .map(|(key, _)| key.trim())
-        .filter(|key| !key.is_empty());
-    let message = match wording::plain(error.message()) {
-        twice if error.message() == "duplicate key" && key.is_none() => {
-            format!("{}: {twice}: put its keys below the first one", line.trim())
-        }
-        message => message,
-    };
     Error::Syntax {
-        path: path.to_owned(),
-        place: Place::of(text, start),
-        problem: wording::brief(&match key {
-            Some(key) if !message.contains(&format!("`{key}`")) => format!("{key}: {message}"),
-            _ => message,
-        }),
+        path,
+        problem: wording::of_toml(text, error),
     }
-}
-
-/// The offset at which the file has `[sensor]` in place of `[[sensor]]`, if that caused the
-/// parser's error.
-fn single_brackets(text: &str, message: &str) -> Option<usize> {
-    let start = text
-        .lines()
-        .position(|line| line.trim_start().starts_with("[sensor]"))?;
-    let before = text.split_inclusive('\n').take(start);
-    message
-        .contains("expected a sequence")
-        .then(|| before.map(str::len).sum())
-}
-
-/// The offset of the first `[[sensor]]` without a port. The parser gives no place for a missing
-/// key, and only a port can be missing.
-fn sensor_without_port(text: &str) -> Option<usize> {
-    let file = DeTable::parse(text).ok()?;
-    let mut sensors = file.get_ref().get("sensor")?.get_ref().as_array()?.iter();
-    let found = sensors.find(|sensor| {
-        let sensor = sensor.get_ref().as_table();
-        sensor.is_some_and(|keys| keys.get("port").is_none())
-    })?;
-    Some(found.span().start)
 }
 
 /// Loads the model. If it is a file, another process tries it first. `most` is the longest time

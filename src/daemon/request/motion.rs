@@ -2,9 +2,8 @@
 //! the clock of the frames.
 
 use jiff::Timestamp;
-use serde_json::Value;
+use serde::Deserialize;
 
-use super::short;
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::motion::{FURTHEST_MM, HELD, Point};
 
@@ -15,17 +14,26 @@ const MOST_POINTS: usize = 256;
 const AHEAD_NS: i128 = 1_000_000_000;
 
 /// Positions of the arm of a sensor, as they were reported.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub(crate) struct Positions {
     pub(crate) sensor: String,
+    #[serde(rename = "at")]
     pub(crate) points: Vec<Told>,
 }
 
 /// A point as it was reported.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(from = "(Moment, f64)")]
 pub(crate) struct Told {
     at: Moment,
     mm: f64,
+}
+
+impl From<(Moment, f64)> for Told {
+    fn from((at, mm): (Moment, f64)) -> Self {
+        Self { at, mm }
+    }
 }
 
 impl Told {
@@ -38,25 +46,27 @@ impl Told {
 }
 
 /// The time of a point, by one of two clocks.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(
+    untagged,
+    expecting = "expected nanoseconds of CLOCK_MONOTONIC, or an RFC 3339 time"
+)]
 enum Moment {
     /// CLOCK_MONOTONIC of this machine, in nanoseconds.
-    Mono(u64),
+    Mono(i64),
+    /// The same from a language that writes large numbers as 1.2e15.
+    Rounded(f64),
     /// Calendar time.
     Wall(Timestamp),
 }
 
 /// The reason points cannot be used.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub(crate) enum Unusable {
-    #[error("motion.at: found {0}, expected a list of 1 to {MOST_POINTS} points [MONO_NS, MM]")]
-    NoList(String),
-    #[error("motion.at[{index}]: found {found}, expected {expected}")]
-    Point {
-        index: usize,
-        found: String,
-        expected: &'static str,
-    },
+    #[error("motion.at: found {0} points, expected 1 to {MOST_POINTS}")]
+    Count(usize),
+    #[error("motion.at[{index}]: found {mm:?} mm, expected at most {FURTHEST_MM} from zero")]
+    Far { index: usize, mm: f64 },
     #[error(
         "motion.at[{index}]: found a moment {} s {}, expected one of the last {} s by this \
          machine's CLOCK_MONOTONIC, or an RFC 3339 time",
@@ -65,47 +75,6 @@ pub(crate) enum Unusable {
         HELD.as_secs()
     )]
     Clock { index: usize, away_ms: i64 },
-}
-
-/// Reads the points of a line.
-pub(super) fn points(at: &Value) -> Result<Vec<Told>, Unusable> {
-    let points = match at.as_array() {
-        Some(points) if (1..=MOST_POINTS).contains(&points.len()) => points,
-        Some(points) => return Err(Unusable::NoList(format!("{} points", points.len()))),
-        None => return Err(Unusable::NoList(short(at))),
-    };
-    let point = |(index, point): (usize, &Value)| {
-        let unusable = |found: &Value, expected| Unusable::Point {
-            index,
-            found: short(found),
-            expected,
-        };
-        let [at, mm] = point.as_array().map_or(&[][..], Vec::as_slice) else {
-            return Err(unusable(point, "[MONO_NS, MM] or [\"RFC 3339\", MM]"));
-        };
-        let moment = match at {
-            Value::String(text) => text.parse().ok().map(Moment::Wall),
-            number => nanoseconds(number).map(Moment::Mono),
-        };
-        let moment = moment.ok_or_else(|| {
-            let expected = "nanoseconds of CLOCK_MONOTONIC, or an RFC 3339 time";
-            unusable(at, expected)
-        })?;
-        match mm.as_f64() {
-            Some(mm) if mm.abs() <= FURTHEST_MM => Ok(Told { at: moment, mm }),
-            _ => Err(unusable(mm, "millimetres, at most 1000000 from zero")),
-        }
-    };
-    points.iter().enumerate().map(point).collect()
-}
-
-/// A whole number of nanoseconds. Some languages write large numbers as 1.2e15.
-fn nanoseconds(number: &Value) -> Option<u64> {
-    let rounded = || {
-        let number = number.as_f64()?;
-        (0.0..=1e18).contains(&number).then_some(number as u64)
-    };
-    number.as_u64().or_else(rounded)
 }
 
 /// Positions on CLOCK_MONOTONIC.
@@ -121,18 +90,28 @@ pub(crate) struct Placed {
 ///
 /// # Errors
 ///
-/// Fails if a point is more than [`AHEAD_NS`] ahead of `now`, or older than [`HELD`].
+/// Fails if there are no points or more than [`MOST_POINTS`], or if a point is too far from zero,
+/// more than [`AHEAD_NS`] ahead of `now`, or older than [`HELD`].
 pub(crate) fn placed(told: &[Told], now: Stamp) -> Result<Placed, Unusable> {
+    if !(1..=MOST_POINTS).contains(&told.len()) {
+        return Err(Unusable::Count(told.len()));
+    }
     let is_converted = told.iter().any(|told| matches!(told.at, Moment::Wall(_)));
     let mono_now = now.mono.as_nanos() as i128;
     let point = |(index, told): (usize, &Told)| {
-        let away = match told.at {
+        let Told { at, mm } = *told;
+        if mm.is_nan() || mm.abs() > FURTHEST_MM {
+            return Err(Unusable::Far { index, mm });
+        }
+        let away = match at {
+            // The conversion ends at the bounds of `i64`, which are away from any moment.
+            Moment::Rounded(at) => i128::from(at as i64) - mono_now,
             Moment::Mono(at) => i128::from(at) - mono_now,
             Moment::Wall(at) => at.as_nanosecond() - now.wall.as_nanosecond(),
         };
         let is_near = (-(HELD.as_nanos() as i128)..=AHEAD_NS).contains(&away);
         match i64::try_from(mono_now + away) {
-            Ok(at_ns) if is_near => Ok(Point { at_ns, mm: told.mm }),
+            Ok(at_ns) if is_near => Ok(Point { at_ns, mm }),
             _ => Err(Unusable::Clock {
                 index,
                 away_ms: i64::try_from(away / 1_000_000).unwrap_or(i64::MAX),
@@ -195,7 +174,7 @@ impl Calendar {
 mod tests {
     use std::time::Duration;
 
-    use serde_json::json;
+    use serde_json::{Value, json};
 
     use super::*;
 
@@ -206,16 +185,19 @@ mod tests {
         }
     }
 
-    fn place(at: &Value) -> Result<Vec<(i64, f64)>, String> {
-        let told = points(at).map_err(|error| error.to_string())?;
-        let placed = placed(&told, now()).map_err(|error| error.to_string())?;
+    fn points(at: Value) -> Result<Vec<Told>, String> {
+        serde_json::from_value(at).map_err(|error| error.to_string())
+    }
+
+    fn place(at: Value) -> Result<Vec<(i64, f64)>, String> {
+        let placed = placed(&points(at)?, now()).map_err(|error| error.to_string())?;
         Ok(placed.points.into_iter().map(Into::into).collect())
     }
 
     #[test]
     fn points_by_both_clocks_become_moments_of_this_machine() {
         let ns = 499_999_000_000_u64;
-        let placed = place(&json!([
+        let placed = place(json!([
             [ns, 3.5],
             [5e11, -1],
             ["2026-11-21T11:00:00.25+01:00", 4]
@@ -227,7 +209,7 @@ mod tests {
 
     #[test]
     fn the_clocks_are_kept_only_of_calendar_times() {
-        let converted = |at: Value| placed(&points(&at).unwrap(), now()).unwrap().converted;
+        let converted = |at: Value| placed(&points(at).unwrap(), now()).unwrap().converted;
         assert_eq!(converted(json!([[5e11, 1]])), None);
         let mixed = json!([[5e11, 1], ["2026-11-21T10:00:00.1Z", 2]]);
         assert_eq!(converted(mixed), Some(now()));
@@ -270,34 +252,36 @@ mod tests {
     #[test]
     fn what_is_no_point_says_which_and_why() {
         let check = |at: Value, expected: &str| {
-            let error = place(&at).unwrap_err();
+            let error = place(at).unwrap_err();
             assert!(error.starts_with(expected), "{error}\n{expected}");
         };
         check(
             json!("here"),
-            "motion.at: found \"here\", expected a list of 1 to 256",
+            "invalid type: string \"here\", expected a sequence",
         );
         check(json!([]), "motion.at: found 0 points");
-        check(json!(vec![[1, 2]; 257]), "motion.at: found 257 points");
-        check(json!([7]), "motion.at[0]: found 7, expected [MONO_NS, MM]");
-        check(json!([[7]]), "motion.at[0]: found [7], expected");
-        let good = [json!(5e11), json!(1.0)];
+        let many = vec![json!([now().mono.as_nanos() as u64, 2]); 257];
+        check(json!(many), "motion.at: found 257 points");
         check(
-            json!([good, ["soon", 1]]),
-            "motion.at[1]: found \"soon\", expected nanoseconds",
+            json!([7]),
+            "invalid type: integer `7`, expected a tuple of size 2",
         );
+        check(json!([[7]]), "invalid length 1, expected a tuple of size 2");
+        let good = [json!(5e11), json!(1.0)];
+        let moment = "expected nanoseconds of CLOCK_MONOTONIC, or an RFC 3339 time";
+        check(json!([good, ["soon", 1]]), moment);
+        check(json!([good, [null, 1]]), moment);
         check(
             json!([good, [-7, 1]]),
-            "motion.at[1]: found -7, expected nanoseconds",
+            "motion.at[1]: found a moment 500 s ago",
         );
-        check(json!([good, [null, 1]]), "motion.at[1]: found null");
         check(
             json!([good, [5e11, "1"]]),
-            "motion.at[1]: found \"1\", expected millimetres",
+            "invalid type: string \"1\", expected f64",
         );
         check(
             json!([good, [5e11, 2e6]]),
-            "motion.at[1]: found 2000000.0, expected millimetres",
+            "motion.at[1]: found 2000000.0 mm, expected at most 1000000",
         );
         let ahead = "motion.at[1]: found a moment 1.5 s ahead, expected one of the last 60 s by";
         check(json!([good, [501_500_000_000_u64, 1]]), ahead);

@@ -472,11 +472,11 @@ mod tests {
             ),
             (
                 "[[fault]]\nat_s = 1.0\nkind = \"flip\"\nbits = -1",
-                "expected a whole number from 0",
+                "invalid value: integer `-1`",
             ),
             (
                 "[[fault]]\nat_s = \"soon\"\nkind = \"flip\"",
-                "expected a number",
+                "invalid type: string \"soon\"",
             ),
             (
                 "[[fault]]\nat_s = 1.0\nkind = \"half\"",
@@ -508,7 +508,7 @@ mod tests {
             ),
             (
                 "[[fault]]\nat_s = 1.0\nkind = \"stuck\"\nrows = [0, 0]\ncounts = 70000",
-                "expected a whole number from 0 to 65535",
+                "invalid value: integer `70000`",
             ),
             (
                 "[[fault]]\nat_s = 1.0\nkind = \"dead\"\nrows = [13, 28]",
@@ -524,7 +524,7 @@ mod tests {
             ),
             (
                 "[[fault]]\nat_s = 1.0\nkind = \"dead\"\nrows = 13",
-                "expected a list",
+                "invalid type: integer `13`",
             ),
             (
                 "[[fault]]\nat_s = 1.0\nkind = \"contact\"\nrows = [1, 2]",

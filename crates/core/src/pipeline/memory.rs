@@ -43,9 +43,7 @@ impl Memory {
             context,
             ..
         } = &self.pipeline.seen;
-        let is_context = |context: &serde_json::Value| {
-            context.is_object() && context.to_string().len() < event::CONTEXT_BYTES
-        };
+        let is_context = |context| event::check_context(context).is_ok();
         self.decoder
             .is_possible(frames.saturating_add(*frames_damaged))
             && self.tare.is_possible()

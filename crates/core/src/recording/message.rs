@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::{Entry, Error, Input, RecordedSensor, State};
+use crate::event;
 use crate::frame::Stamp;
 use crate::motion::Point;
 use crate::ros::{self, Blob, Header, Topic};
@@ -157,6 +158,7 @@ pub(super) fn decode_entry(bytes: &[u8]) -> Result<(String, Stamp, Entry), Error
         5 => Entry::Input(Input::Tare),
         6 => {
             let context: Option<Value> = serde_json::from_slice(&data).map_err(unreadable)?;
+            context.as_ref().map_or(Ok(()), event::check_context)?;
             Entry::Input(Input::Context(context))
         }
         7 => Entry::Input(Input::Shutdown),
@@ -166,6 +168,10 @@ pub(super) fn decode_entry(bytes: &[u8]) -> Result<(String, Stamp, Entry), Error
         }
         9 => {
             let state: State = serde_json::from_slice(&data).map_err(unreadable)?;
+            state
+                .memory
+                .context()
+                .map_or(Ok(()), event::check_context)?;
             Entry::State(Box::new(state))
         }
         10 => {

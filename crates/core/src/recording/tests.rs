@@ -3,7 +3,7 @@ use std::io::Cursor;
 use serde_json::json;
 
 use super::*;
-use crate::event::Rejection;
+use crate::event::{self, Rejection};
 use crate::frame::RawFrame;
 use crate::pipeline::Clock;
 use crate::test_support::{at, hrn, labels, sensor};
@@ -285,6 +285,30 @@ fn a_memory_that_no_pipeline_came_to_is_refused() {
     for wrong in [-1.0, 1e39] {
         let told = fed(&pressed, Some((&newtons, json!(wrong)))).unwrap_err();
         assert!(told.contains("N at a taxel, expected 0 or more"), "{told}");
+    }
+}
+
+#[test]
+fn a_context_that_is_too_deep_is_refused_in_an_input_and_in_a_state() {
+    let nested = |levels: usize| (1..levels).fold(json!({}), |inner, _| json!({"a": inner}));
+    let read = |entry: Entry| {
+        let message = message::encode_entry("forearm", at(0), &entry);
+        let read = message::decode_entry(&message);
+        read.map(drop).map_err(|error| error.to_string())
+    };
+    for (levels, expected) in [
+        (event::CONTEXT_LEVELS, Ok(())),
+        (
+            event::CONTEXT_LEVELS + 1,
+            Err("context: found 17 levels, expected at most 16".to_owned()),
+        ),
+    ] {
+        let context = Some(nested(levels));
+        let mut pipeline = Pipeline::new(sensor(), hrn(), Clock::Arrival);
+        pipeline.set_context(context.clone());
+        let state = State::of(&pipeline, labels());
+        assert_eq!(read(Entry::Input(Input::Context(context))), expected);
+        assert_eq!(read(Entry::State(Box::new(state))), expected);
     }
 }
 

@@ -1,10 +1,8 @@
 //! The settings that turn counts into newtons.
 
-use std::fmt;
 use std::path::PathBuf;
 
-use serde::de::value::SeqAccessDeserializer;
-use serde::de::{Error as _, SeqAccess, Visitor};
+use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::frame::Array;
@@ -60,38 +58,14 @@ pub struct Settings {
 /// The factor of each taxel's newtons.
 ///
 /// [`Settings`] has an example.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-#[serde(untagged)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(untagged, expecting = "expected the path of an .npy file")]
 pub enum Gains {
     /// The path of a numpy file, as a configuration gives it. The reader of the configuration
     /// replaces the path by the numbers, so a sensor never holds a path.
     File(PathBuf),
     /// `[rows][cols]`, in the sensor's own rows and columns. Recordings hold these.
     Taxels(Vec<Vec<f32>>),
-}
-
-impl<'de> Deserialize<'de> for Gains {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        struct Either;
-
-        impl<'de> Visitor<'de> for Either {
-            type Value = Gains;
-
-            fn expecting(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-                out.write_str("the path of an .npy file")
-            }
-
-            fn visit_str<E>(self, path: &str) -> Result<Gains, E> {
-                Ok(Gains::File(path.into()))
-            }
-
-            fn visit_seq<A: SeqAccess<'de>>(self, rows: A) -> Result<Gains, A::Error> {
-                Vec::deserialize(SeqAccessDeserializer::new(rows)).map(Gains::Taxels)
-            }
-        }
-
-        deserializer.deserialize_any(Either)
-    }
 }
 
 /// Reads lists of exactly two numbers. The TOML parser would silently drop the rest of a longer

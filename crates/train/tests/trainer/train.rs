@@ -906,7 +906,7 @@ fn bad_input_has_its_exit_code_and_one_line() {
         (
             train(&["--data", &data, "--config", &text]),
             78,
-            "line 1: unknown key `epoch`",
+            "line 1, column 1, `epoch = 3`: unknown field `epoch`",
         ),
         (train(&["--data", &data, "--from", &missing]), 66, "missing"),
         (
