@@ -1,8 +1,10 @@
 #!/usr/bin/env python3
-"""Writes the first bytes that each target begins with, from fixtures/, config/ and models/.
+"""Writes the first bytes that each target begins with, from fixtures/, config/, models/ and a recording.
 
     pip install mcap mcap-ros2-support numpy onnx
-    python3 fuzz/seeds.py
+    python3 fuzz/seeds.py RECORDING
+
+RECORDING is one of `hardnessd record`.
 
 They are small, because a fuzzer tries small changes fastest. `fuzz/corpus` holds them, with what the fuzzer
 found to reach more code.
@@ -96,8 +98,8 @@ def configuration():
     )
 
 
-def recording():
-    """The first messages of a recording, without chunks, compression or checksums."""
+def recording(whole):
+    """The beginning of a recording, and its first messages without chunks, compression or checksums."""
     out = io.BytesIO()
     writer = mcap.writer.Writer(
         out, use_chunking=False, enable_crcs=False, enable_data_crcs=False, index_types=mcap.writer.IndexType.NONE
@@ -105,7 +107,7 @@ def recording():
     writer.start(profile="", library="")
     channels = {}
     counts = {}
-    with open(TOP / "fixtures/earlier.mcap", "rb") as source:
+    with io.BytesIO(whole) as source:
         for schema, channel, message in mcap.reader.make_reader(source).iter_messages():
             if channel.topic not in channels:
                 number = writer.register_schema(schema.name, schema.encoding, schema.data if len(schema.data) < 64 else b"")
@@ -115,7 +117,6 @@ def recording():
                 writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
     writer.finish()
     plain = out.getvalue()
-    whole = (TOP / "fixtures/earlier.mcap").read_bytes()
     for target in ("recording", "recover"):
         keep(target, "plain", plain)
         keep(target, "cut", plain[: len(plain) * 2 // 3])
@@ -187,9 +188,11 @@ def motion():
 
 
 def main():
+    whole = pathlib.Path(sys.argv[1]).read_bytes()
     os.chdir(TOP)
-    for make in (wire, lines, http, configuration, recording, model, npz, motion):
+    for make in (wire, lines, http, configuration, model, npz, motion):
         make()
+    recording(whole)
     total = sum(path.stat().st_size for path in CORPUS.rglob("*") if path.is_file())
     print(f"{total} bytes in {CORPUS}", file=sys.stderr)
 

@@ -4,6 +4,7 @@ use std::fs;
 use std::process::{Command, Stdio};
 
 use crate::bench::{Bench, Process, by_terminal, hardnessd};
+use hardnessd_core::test_support::of_a_press;
 use rustix::process::Signal;
 
 fn calibrate(bench: &Bench, more: &[&str]) -> Command {
@@ -260,13 +261,15 @@ fn the_other_sensors_neither_count_nor_have_to_be_there() {
 #[test]
 fn weights_of_a_recording_are_read_with_its_own_settings() {
     let bench = Bench::new();
-    // Four presses, of a daemon with another configuration.
-    let recording = concat!(env!("CARGO_MANIFEST_DIR"), "/fixtures/earlier.mcap");
+    // A press of a daemon with another configuration: 80 counts on each of nine taxels.
+    let recording = bench.path("press.mcap");
+    fs::write(&recording, of_a_press(|_| {}, None, false).0).unwrap();
+    let recording = recording.to_str().unwrap();
     let weigh = |calibration: &str| {
         let path = bench.path("hardnessd.toml");
         let sensor = "[[sensor]]\nname = \"forearm\"\nport = \"port\"\n[sensor.calibration]\n";
         fs::write(&path, format!("{sensor}{calibration}")).unwrap();
-        let weights = ["--newtons", "12.7", "12.6", "9", "9.9", "--from", recording];
+        let weights = ["--newtons", "28.8", "--from", recording];
         let config = ["calibrate", "force", "--config", path.to_str().unwrap()];
         let output = hardnessd(&[&config[..], &weights[..]].concat());
         assert!(output.status.success(), "{output:?}");
@@ -275,7 +278,7 @@ fn weights_of_a_recording_are_read_with_its_own_settings() {
             "newtons_per_count",
         )
     };
-    // The weights are what the recorded events say, with the recorded 0.04.
+    // The weight is what the recorded frames say, with the recorded 0.04.
     let then = weigh("");
     assert!((0.038..0.043).contains(&then), "{then}");
     let now = weigh("newtons_per_count = 0.01\nexponent = 1.3\n");

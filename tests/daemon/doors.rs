@@ -7,12 +7,16 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use hardnessd_core::recording::{Reader, recover};
+use hardnessd_core::test_support::of_a_press;
 use hardnessd_core::trial;
 use proptest::prelude::*;
 use proptest::test_runner::TestRunner;
+use serde_json::json;
 
-/// A recording from a daemon.
-const RECORDING: &[u8] = include_bytes!("../../fixtures/earlier.mcap");
+/// A recording of a press, with positions of the arm and a context.
+fn recording() -> Vec<u8> {
+    of_a_press(|_| {}, Some(json!({"tag": "x"})), true).0
+}
 
 /// Changes to bytes: the place, the new bytes, and the number of bytes that they replace.
 type Damage = Vec<(prop::sample::Index, Vec<u8>, usize)>;
@@ -54,7 +58,7 @@ fn kept(door: &str) -> Vec<Vec<u8>> {
         .collect();
     assert!(!kept.is_empty(), "{door}");
     if ["recording", "recover"].contains(&door) {
-        kept.push(RECORDING.to_vec());
+        kept.push(recording());
     }
     kept
 }
@@ -63,7 +67,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
     #[test]
     fn of_a_damaged_recording_what_could_be_read_is_saved(damage in damage()) {
-        let bytes = damaged(RECORDING, damage);
+        let bytes = damaged(&recording(), damage);
         // The reader ends with the first error.
         let read = Reader::new(bytes.as_slice()).filter(Result::is_ok).count();
         let (_, good) = recover(Cursor::new(&bytes), Vec::new()).unwrap();

@@ -85,11 +85,9 @@ struct Seen {
     link: Link,
     context: Option<serde_json::Value>,
     /// The speed of the approach when the press under way, or the last one, began.
-    #[serde(default)]
     speed_mm_s: Option<f64>,
     /// The number of frames in contact at which a model of the course next judges the press under
     /// way. It is the greatest number once the early verdict has come.
-    #[serde(default)]
     next_look: u64,
     frames: u64,
     frames_damaged: u64,

@@ -49,7 +49,6 @@ pub struct Peak {
     /// The frame itself.
     pub frame: Frame,
     /// The frame's marks.
-    #[serde(default)]
     pub marks: Marks,
     /// The contact area of the frame.
     pub contact_area_taxels: u32,
@@ -265,8 +264,6 @@ struct Pressed {
     frames: u64,
     released_frames: u32,
     peak: Peak,
-    /// The course of the press. Recordings from before models of courses do not have it.
-    #[serde(default)]
     course: Course,
     /// `None` once the early verdict has come.
     settling: Option<Settling>,

@@ -21,7 +21,7 @@ pub struct Description {
     pub frame_rate_hz: f64,
     /// The silence after which a live sensor is stale. `None` means the larger of 2.5 periods and
     /// 50 ms.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub stale_after_ms: Option<f64>,
     /// How the sensor writes a frame.
     pub frame: wire::Settings,
@@ -30,19 +30,13 @@ pub struct Description {
     /// The thresholds that begin and end a press.
     pub press: press::Settings,
     /// The arm that presses with this sensor.
-    #[serde(default)]
     pub arm: motion::Settings,
     /// A verdict below this confidence is rejected.
     pub min_confidence: f32,
     /// A verdict on a frame with less total force is rejected.
     pub min_force_n: f64,
     /// A model of the course gives an early verdict when its confidence reaches this value.
-    #[serde(default = "early_confidence")]
     pub early_confidence: f32,
-}
-
-fn early_confidence() -> f32 {
-    Description::default().early_confidence
 }
 
 impl Default for Description {
@@ -81,20 +75,6 @@ impl Description {
         Self {
             stale_after_ms: Some(stale_after.as_nanos() as f64 / 1e6),
             ..self.clone()
-        }
-    }
-
-    /// The description that a recording means. Old recordings do not hold the stale time. It was
-    /// 2.5 periods then.
-    pub fn of_recording(&self) -> Self {
-        let late = || {
-            (FRAME_RATES_HZ.0..=FRAME_RATES_HZ.1)
-                .contains(&self.frame_rate_hz)
-                .then(|| late(self.frame_rate_hz))
-        };
-        match self.stale_after_ms {
-            Some(_) => self.clone(),
-            None => late().map_or_else(|| self.clone(), |late| self.for_recording(late)),
         }
     }
 }
@@ -374,7 +354,7 @@ mod tests {
     }
 
     #[test]
-    fn a_recording_holds_how_long_a_silence_is_stale_and_an_old_one_means_2_5_periods() {
+    fn a_recording_holds_how_long_a_silence_is_stale() {
         for (hz, ms) in [(5.0, None), (100.0, None), (3.0, None), (100.0, Some(33.3))] {
             let described = Description {
                 frame_rate_hz: hz,
@@ -383,18 +363,13 @@ mod tests {
             };
             let sensor = Sensor::new(described).unwrap();
             let recorded = sensor.description().for_recording(sensor.stale_after());
-            let played = Sensor::new(recorded.of_recording()).unwrap();
+            assert!(recorded.stale_after_ms.is_some());
+            let played = Sensor::new(recorded).unwrap();
             assert_eq!(
                 played.stale_after(),
                 sensor.stale_after(),
                 "{hz} Hz, {ms:?}"
             );
-            let old = Description {
-                stale_after_ms: None,
-                ..recorded
-            };
-            let played = Sensor::new(old.of_recording()).unwrap();
-            assert_eq!(played.stale_after(), sensor.late_after());
         }
     }
 }

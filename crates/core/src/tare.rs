@@ -83,7 +83,7 @@ pub struct Retaken {
 }
 
 /// The purpose of a tare under way.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Aim {
     /// The first baseline. It is tried again until nothing touches the sensor.
     First {
@@ -198,12 +198,12 @@ impl Stage {
     }
 }
 
-/// The state of a [`Tare`], without its settings and without the purpose of the tare under way.
+/// The state of a [`Tare`], without its settings.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Memory {
     #[serde(with = "taxels")]
     baseline: Box<[f32; TAXELS]>,
-    taking: Option<Sums>,
+    taking: Option<(Aim, Sums)>,
 }
 
 impl Memory {
@@ -211,7 +211,7 @@ impl Memory {
     pub(crate) fn is_possible(&self) -> bool {
         // The mean of counts, with room for rounding.
         let is_count = |mean: &f32| (0.0..=65_536.0).contains(mean);
-        let are_sums = |sums: &Sums| {
+        let are_sums = |(_, sums): &(Aim, Sums)| {
             let most = u64::from(sums.seen) * u64::from(u16::MAX);
             sums.seen < sums.wanted
                 && sums.wanted <= MOST_TARE_FRAMES
@@ -298,16 +298,17 @@ impl Tare {
         Memory {
             baseline: self.baseline.clone(),
             taking: match &self.stage {
-                Stage::Taking { sums, .. } => Some(sums.clone()),
+                Stage::Taking { aim, sums } => Some((*aim, sums.clone())),
                 Stage::Idle | Stage::Ended(_) => None,
             },
         }
     }
 
-    /// Continues from the state of another tare. If a tare was under way, its purpose is `aim`.
-    pub fn recall(&mut self, memory: Memory, aim: Aim) {
+    /// Continues from the state of another tare.
+    pub fn recall(&mut self, memory: Memory) {
         self.baseline = memory.baseline;
-        let taking = memory.taking.map(|sums| Stage::Taking { aim, sums });
+        let taking = memory.taking;
+        let taking = taking.map(|(aim, sums)| Stage::Taking { aim, sums });
         self.stage = taking.unwrap_or(Stage::Idle);
     }
 

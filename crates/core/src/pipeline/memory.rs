@@ -4,8 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Pipeline, RATE_FRAMES, Seen};
 use crate::motion::Track;
-use crate::tare::{self, Aim, Offsets};
-use crate::{event, press, wire};
+use crate::{event, press, tare, wire};
 
 /// The whole state of a pipeline. A pipeline of the same sensor that recalls it returns the same
 /// events from there on. Recordings begin with it.
@@ -14,23 +13,9 @@ pub struct Memory {
     decoder: wire::Memory,
     tare: tare::Memory,
     tracker: press::Memory,
-    /// The positions that a press under way, or the next one, may need. Older recordings have none.
-    #[serde(default)]
+    /// The positions that a press under way, or the next one, may need.
     track: Track,
-    pipeline: Noted,
-}
-
-/// The pipeline's own state, as recordings hold it. For compatibility, it also has the purpose of
-/// the tare under way.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct Noted {
-    /// Whether the tare under way is the first, and something touched the sensor during an earlier
-    /// try.
-    tare_met_contact: bool,
-    /// If the tare under way was requested: the offsets in force at the request.
-    retaring: Option<Offsets>,
-    #[serde(flatten)]
-    seen: Seen,
+    pipeline: Seen,
 }
 
 impl Memory {
@@ -42,7 +27,7 @@ impl Memory {
             recent,
             context,
             ..
-        } = &self.pipeline.seen;
+        } = &self.pipeline;
         let is_context = |context| event::check_context(context).is_ok();
         self.decoder
             .is_possible(frames.saturating_add(*frames_damaged))
@@ -55,14 +40,13 @@ impl Memory {
 
     /// The controller's context.
     pub(crate) fn context(&self) -> Option<&serde_json::Value> {
-        self.pipeline.seen.context.as_ref()
+        self.pipeline.context.as_ref()
     }
 }
 
 impl Pipeline {
     /// The pipeline's state.
     pub fn memory(&self) -> Memory {
-        let aim = self.tare.aim();
         let last_frame = self.seen.last_frame.map(|frame| frame.mono);
         let since = self.tracker.began().or(last_frame).unwrap_or_default();
         Memory {
@@ -70,29 +54,16 @@ impl Pipeline {
             decoder: self.decoder.memory(),
             tare: self.tare.memory(),
             tracker: self.tracker.memory(),
-            pipeline: Noted {
-                tare_met_contact: aim == Some(Aim::First { met_contact: true }),
-                retaring: (aim == Some(Aim::Request)).then(|| self.tare.offsets()),
-                seen: self.seen.clone(),
-            },
+            pipeline: self.seen.clone(),
         }
     }
 
     /// Continues from the state of another pipeline of the same sensor.
     pub fn recall(&mut self, memory: Memory) {
-        let Noted {
-            tare_met_contact: met_contact,
-            retaring,
-            seen,
-        } = memory.pipeline;
-        let aim = match retaring {
-            Some(_) => Aim::Request,
-            None => Aim::First { met_contact },
-        };
         self.decoder.recall(memory.decoder);
-        self.tare.recall(memory.tare, aim);
+        self.tare.recall(memory.tare);
         self.tracker.recall(memory.tracker);
         self.track = memory.track;
-        self.seen = seen;
+        self.seen = memory.pipeline;
     }
 }

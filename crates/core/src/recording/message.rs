@@ -11,17 +11,17 @@ use crate::frame::Stamp;
 use crate::motion::Point;
 use crate::ros::{self, Blob, Header, Topic};
 
-/// The channels of a sensor, in the order of their numbers. The order never changes, because
-/// `recover` numbers the channels of a damaged file by it. Later channels have numbers of their own
-/// ([`LATER`]).
-pub(super) const TOPICS: [Topic; 5] = [INPUT, ros::FRAME, ros::HARDNESS, ros::PRESS, ros::STATUS];
-
-/// The later channels, each with the number of the first sensor's channel. These never change
-/// either.
-pub(super) const LATER: [(Topic, u16); 3] = [
-    (MOTION, 50_000),
-    (ros::CONTACT, 55_000),
-    (ros::GRID, 60_000),
+/// The channels of a sensor, in the order of their numbers. `recover` numbers the channels of a
+/// damaged file by this order.
+pub(super) const TOPICS: [Topic; 8] = [
+    INPUT,
+    MOTION,
+    ros::FRAME,
+    ros::GRID,
+    ros::CONTACT,
+    ros::PRESS,
+    ros::HARDNESS,
+    ros::STATUS,
 ];
 
 pub(super) const INPUT: Topic = Topic {

@@ -14,20 +14,19 @@ use crate::verdict::Hrn;
 ///
 /// # Example
 ///
-/// ```
+/// ```no_run
 /// use std::sync::Arc;
 ///
-/// use hardnessd_core::event::Kind;
 /// use hardnessd_core::recording::{Playback, Reader};
 /// use hardnessd_core::verdict::{BUILT_IN, Hrn};
 ///
 /// let mut playback = Playback::new(Arc::new(Hrn::load(BUILT_IN)?));
 /// let mut events = Vec::new();
-/// for found in Reader::new(std::fs::File::open("../../fixtures/earlier.mcap")?) {
+/// for found in Reader::new(std::fs::File::open("press.mcap")?) {
 ///     events.extend(playback.feed(found?)?);
 /// }
 /// events.extend(playback.end());
-/// assert!(events.iter().any(|event| event.kind() == Kind::Hardness));
+/// events.iter().for_each(|event| print!("{}", event.to_line()));
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Debug)]

@@ -261,9 +261,9 @@ fn a_memory_that_no_pipeline_came_to_is_refused() {
         (&taring, "/memory/decoder/anchor", json!(1_u64 << 40)),
         (&taring, "/memory/tare/baseline/7", json!(-1.0)),
         (&taring, "/memory/tare/baseline/7", json!(1e39)),
-        (&taring, "/memory/tare/taking/seen", json!(5)),
-        (&taring, "/memory/tare/taking/wanted", json!(u32::MAX)),
-        (&taring, "/memory/tare/taking/sum/7", json!(u32::MAX)),
+        (&taring, "/memory/tare/taking/1/seen", json!(5)),
+        (&taring, "/memory/tare/taking/1/wanted", json!(u32::MAX)),
+        (&taring, "/memory/tare/taking/1/sum/7", json!(u32::MAX)),
         (&taring, "/memory/pipeline/frames", json!(u64::MAX)),
         (
             &taring,

@@ -7,7 +7,7 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::write::NoSeek;
 use mcap::{Compression, WriteOptions};
 
-use super::message::{self, INPUT, LATER, TOPICS};
+use super::message::{self, INPUT, TOPICS};
 use super::{Entry, Error, Labels, RecordedSensor};
 use crate::event::Event;
 use crate::frame::Stamp;
@@ -81,37 +81,22 @@ pub(super) fn options() -> WriteOptions {
         .disable_seeking(true)
 }
 
-/// The topics of a sensor.
-fn topics() -> impl Iterator<Item = Topic> + Clone {
-    TOPICS.into_iter().chain(LATER.map(|(topic, _)| topic))
-}
-
 /// The number of a channel. It follows from the sensor's index and the topic, so `recover` knows it
 /// even if the record of the channel is lost.
 pub(super) fn channel_id(sensor: usize, topic: Topic) -> u16 {
-    let id = match LATER.iter().find(|(later, _)| *later == topic) {
-        Some((_, first)) => usize::from(*first) + sensor,
-        None => {
-            let place = TOPICS.iter().position(|known| *known == topic);
-            sensor * TOPICS.len() + place.expect("every other topic stands in TOPICS") + 1
-        }
-    };
+    let id = sensor * TOPICS.len() + usize::from(schema_id(topic));
     u16::try_from(id).expect("a daemon has few sensors")
 }
 
 /// The topic of the channel with this number.
 pub(super) fn topic_of(channel_id: u16) -> Topic {
-    let later = LATER.iter().rfind(|(_, first)| channel_id >= *first);
-    later.map_or_else(
-        || TOPICS[usize::from(channel_id.wrapping_sub(1)) % TOPICS.len()],
-        |(topic, _)| *topic,
-    )
+    TOPICS[usize::from(channel_id.wrapping_sub(1)) % TOPICS.len()]
 }
 
 /// The number of a topic's schema.
 pub(super) fn schema_id(topic: Topic) -> u16 {
-    let place = topics().position(|known| known == topic);
-    place.expect("every topic stands in one of the lists") as u16 + 1
+    let place = TOPICS.iter().position(|known| *known == topic);
+    place.expect("every topic of a sensor is in TOPICS") as u16 + 1
 }
 
 /// The name of a channel.
@@ -124,7 +109,7 @@ pub(super) fn is_topic_of_ours(name: &str) -> bool {
     let parts = name
         .strip_prefix("/tactile/")
         .and_then(|rest| rest.split_once('/'));
-    parts.is_some_and(|(_, name)| topics().any(|topic| topic.name == name))
+    parts.is_some_and(|(_, name)| TOPICS.iter().any(|topic| topic.name == name))
 }
 
 /// Whether a channel of this name holds a sensor's entries.
@@ -166,12 +151,12 @@ impl<W: Write> Writer<W> {
             let name = name.to_owned();
             out.write_metadata(&Metadata { name, metadata })?;
         }
-        for topic in topics() {
+        for topic in TOPICS {
             let text = topic.text();
             out.add_schema_with_id(schema_id(topic), topic.schema, "ros2msg", text.as_bytes())?;
         }
         for (index, sensor) in about.sensors.iter().enumerate() {
-            for topic in topics() {
+            for topic in TOPICS {
                 let name = topic_name(sensor.name(), topic);
                 let id = channel_id(index, topic);
                 out.add_channel_with_id(id, schema_id(topic), &name, "cdr", &BTreeMap::new())?;
