@@ -56,6 +56,7 @@ use self::running::Running;
 use self::sensor::{SensorHandle, Sensors};
 use self::serial::Link;
 use hardnessd_core::event::{Hello, ModelCard, PROTOCOL, SensorCard, Status};
+use hardnessd_core::exit::{CONFIG, Coded, FAILED, IO};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::recording::{About, Found, Labels, RecordedSensor};
@@ -81,6 +82,24 @@ pub enum Error {
     /// A task ended by itself, which is a fault of this program.
     #[error("{0} stopped by itself")]
     Stopped(&'static str),
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::Publish(error) => error.exit_code(),
+            Error::Random(_) => IO,
+            Error::Record(error) => error.exit_code(),
+            Error::Log(error) => error.exit_code(),
+            Error::Stopped(_) => FAILED,
+        }
+    }
+}
+
+impl Coded for log::Error {
+    fn exit_code(&self) -> u8 {
+        CONFIG
+    }
 }
 
 /// The sockets of a daemon that records into one file.

@@ -67,7 +67,7 @@ fn main() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            hardnessd_core::say!("hardnessd: {}", tools::line(&error));
+            hardnessd_core::say!("hardnessd: {}", error.line());
             ExitCode::from(error.code())
         }
     }
@@ -115,7 +115,7 @@ async fn calibrate(args: calibrate::Args, signals: Signals) -> Result<(), Failur
     let mut end = pin!(signals.end());
     let setup = tokio::select! {
         loaded = load(path.clone(), std::future::pending()) => loaded?,
-        stop = &mut end => return Err(Failure::Stopped(stop)),
+        stop = &mut end => return Err(stop.into()),
     };
     let Some(setup) = setup else {
         return Ok(());
@@ -124,7 +124,7 @@ async fn calibrate(args: calibrate::Args, signals: Signals) -> Result<(), Failur
     let mut stopped = None;
     let shutdown = async { stopped = Some(end.await) };
     calibrate::run(args, setup, &path, shutdown).await?;
-    stopped.map_or(Ok(()), |stop| Err(Failure::Stopped(stop)))
+    stopped.map_or(Ok(()), |stop| Err(stop.into()))
 }
 
 /// Waits until `work` ends. A signal before its end is a failure.
@@ -134,7 +134,7 @@ async fn finish<E: Into<Failure>>(
 ) -> Result<(), Failure> {
     tokio::select! {
         done = work => done.map_err(Into::into),
-        stop = signals.end() => Err(Failure::Stopped(stop)),
+        stop = signals.end() => Err(stop.into()),
     }
 }
 

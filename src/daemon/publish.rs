@@ -28,6 +28,7 @@ use super::systemd;
 use super::tcp::{self, Tcp};
 #[cfg(feature = "zenoh")]
 use super::zenoh;
+use hardnessd_core::exit::{CONFIG, Coded, IO};
 use hardnessd_core::recording::Found;
 
 /// The mode of the control socket's file: only the daemon's own user may connect.
@@ -79,6 +80,23 @@ pub enum Error {
     /// The service manager passed something other than Unix sockets.
     #[error("socket activation: {0}")]
     Passed(#[source] io::Error),
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            // The configuration names a path that the daemon cannot use.
+            Error::Socket(
+                socket::Error::NoSocket { .. }
+                | socket::Error::NoDirectory { .. }
+                | socket::Error::TooLong { .. },
+            )
+            | Error::Unasked { .. }
+            | Error::Passed(_) => CONFIG,
+            // The address is in use, or the system refused. A later try may succeed.
+            _ => IO,
+        }
+    }
 }
 
 /// The publishers. Connections wait until [`Publishers::serve`] is called.

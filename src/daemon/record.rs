@@ -23,6 +23,7 @@ use tracing::warn;
 use self::worker::Worker;
 use super::config;
 use hardnessd_core::event::{Event, Kind};
+use hardnessd_core::exit::{CONFIG, Coded, IO, UNAVAILABLE};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::Pipeline;
 use hardnessd_core::recording::{About, Entry, Found, Input, Labels, RecordedSensor, State};
@@ -106,6 +107,16 @@ pub enum Error {
     /// The thread could not be started.
     #[error("no thread for the recording: {0}")]
     Thread(#[source] std::io::Error),
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::Directory { .. } => CONFIG,
+            Error::Unavailable { .. } | Error::Lost { .. } => UNAVAILABLE,
+            Error::Write { .. } | Error::Thread(_) => IO,
+        }
+    }
 }
 
 /// The reason a black box was not written.

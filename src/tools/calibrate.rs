@@ -29,6 +29,7 @@ use super::simulate::{OutOfRange, within};
 use crate::daemon::config::Setup;
 use crate::daemon::record::Progress;
 use crate::daemon::{self, Daemon, Sockets};
+use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
 use hardnessd_core::frame::Array;
 use hardnessd_core::npy;
 use hardnessd_core::recording::Labels;
@@ -152,6 +153,25 @@ pub enum Error {
     /// Stdout cannot be written to.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::Daemon(error) => error.exit_code(),
+            Error::NoSensor { .. } | Error::Unasked | Error::NoFile => USAGE,
+            Error::Missing { .. } => NO_INPUT,
+            Error::Recording { source, .. } if source.is_io() => IO,
+            Error::Arm(_)
+            | Error::Force(_)
+            | Error::Taxels(_)
+            | Error::Count { .. }
+            | Error::Recording { .. } => FAILED,
+            Error::Temporary { .. } | Error::Taken { .. } | Error::Out { .. } | Error::Print(_) => {
+                IO
+            }
+        }
+    }
 }
 
 /// How long to wait for positions after the last press.

@@ -11,6 +11,7 @@ use super::configuration::{self, Configuration};
 use super::player::BITS_A_BYTE;
 use crate::daemon;
 use crate::daemon::config::{self, Endpoint, SensorTable, Setup};
+use hardnessd_core::exit::{CONFIG, Coded, IO};
 use hardnessd_core::frame::{Array, COLS, ROWS};
 use hardnessd_core::tare::{self, Gains};
 use hardnessd_core::wire::Layout;
@@ -62,6 +63,18 @@ pub enum Error {
     /// Stdout cannot be written to.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::Config(error) => error.exit_code(),
+            Error::Daemon { source, .. } => source.exit_code(),
+            Error::Missing(error) => error.exit_code(),
+            Error::FrameRate { .. } => CONFIG,
+            Error::Print(_) => IO,
+        }
+    }
 }
 
 /// Prints what the daemon would run. Warnings go to stderr.

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
+use hardnessd_core::exit::{Coded, NO_INPUT};
 
 /// The argument `--config`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -20,6 +21,12 @@ pub struct Configuration {
     PLACES[1]
 )]
 pub struct Missing;
+
+impl Coded for Missing {
+    fn exit_code(&self) -> u8 {
+        NO_INPUT
+    }
+}
 
 /// The paths at which a configuration is looked for, in this order.
 const PLACES: [&str; 2] = ["./hardnessd.toml", "/etc/hardnessd.toml"];

@@ -30,6 +30,7 @@ use super::player::{BITS_A_BYTE, Pace, Player};
 use super::simulate::{OutOfRange, within};
 use crate::daemon::config::{Config, Http, SensorTable, Setup};
 use crate::daemon::{self, Daemon};
+use hardnessd_core::exit::{CONFIG, Coded, FAILED, IO};
 use hardnessd_core::motion;
 use hardnessd_core::wire::{Layout, LayoutError};
 use hardnessd_simulator::{ARM_N_PER_MM, SequenceSettings};
@@ -85,6 +86,18 @@ pub enum Error {
     /// The daemon closed the connection.
     #[error("the daemon closed the connection")]
     Closed,
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::Config(error) => error.exit_code(),
+            Error::Daemon(error) => error.exit_code(),
+            Error::Missed { .. } | Error::Closed => FAILED,
+            Error::Io { .. } => IO,
+            Error::Layout(_) => CONFIG,
+        }
+    }
 }
 
 /// The longest time from the last byte to the last verdict.

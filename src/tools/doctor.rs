@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 use clap::Args as ClapArgs;
 
 use self::checks::{User, examine, in_the_way, ports, refused};
+use hardnessd_core::exit::{Coded, FAILED, IO};
 use hardnessd_core::wording::escaped;
 
 /// Arguments of `doctor`.
@@ -35,6 +36,15 @@ pub enum Error {
     /// Stdout cannot be written to.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::Faults { .. } => FAILED,
+            Error::Print(_) => IO,
+        }
+    }
 }
 
 /// The fault that keeps this process from opening `port`, with the remedy. `None` if no fault is

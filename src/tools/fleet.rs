@@ -21,6 +21,7 @@ use self::session::{PATIENCE, Session, WAITING};
 use super::simulate::positive;
 use crate::daemon::config::Endpoint;
 use crate::daemon::now;
+use hardnessd_core::exit::{Coded, IO, UNAVAILABLE};
 
 /// Arguments of `fleet`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -55,6 +56,15 @@ pub enum Error {
     /// Stdout cannot be written to.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::Unavailable { .. } => UNAVAILABLE,
+            Error::Thread(_) | Error::Print(_) => IO,
+        }
+    }
 }
 
 fn listed(endpoints: &[Endpoint]) -> String {

@@ -25,6 +25,7 @@ use super::simulate::positive;
 use crate::daemon::config::Setup;
 use crate::daemon::record::{Error as RecordError, Progress};
 use crate::daemon::{self, Daemon, Sockets};
+use hardnessd_core::exit::{Coded, IO, UNAVAILABLE, USAGE};
 use hardnessd_core::recording::{LabelError, Labels, check_label};
 use hardnessd_core::verdict::Level;
 use hardnessd_core::wording::escaped;
@@ -112,6 +113,19 @@ pub enum Error {
     /// Recording failed, or all sensors were lost.
     #[error(transparent)]
     Daemon(#[from] daemon::Error),
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::Level { .. } | Error::Twice { .. } | Error::Asked { .. } | Error::NoTerminal => {
+                USAGE
+            }
+            Error::Session { .. } | Error::Create { .. } => IO,
+            Error::Unavailable { .. } => UNAVAILABLE,
+            Error::Daemon(error) => error.exit_code(),
+        }
+    }
 }
 
 /// Records until `shutdown` comes, the time has passed or no sensor is left.

@@ -9,6 +9,7 @@ use clap::Args as ClapArgs;
 use jiff::Timestamp;
 use tempfile::NamedTempFile;
 
+use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT};
 use hardnessd_core::recording::{self, RecoverError, Recovered};
 
 /// Arguments of `recover`.
@@ -64,6 +65,16 @@ pub enum Error {
         /// The error of the new recording.
         source: recording::Error,
     },
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::Unreadable { .. } => NO_INPUT,
+            Error::Nothing { .. } | Error::Foreign { .. } => FAILED,
+            Error::Broken { .. } | Error::Write { .. } => IO,
+        }
+    }
 }
 
 /// Saves the whole parts. Stderr says what was saved and what was lost.

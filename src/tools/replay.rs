@@ -18,6 +18,7 @@ use super::simulate::positive;
 use crate::daemon::config::{self, Config, SensorTable, Setup};
 use crate::daemon::now;
 use hardnessd_core::event::{Event, Kind};
+use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
 use hardnessd_core::motion::Point;
 use hardnessd_core::pipeline::{Clock, Pipeline, Unjudged};
 use hardnessd_core::recording::{self, FileKind, Playback, Reader};
@@ -108,6 +109,22 @@ pub enum Error {
     /// Stdout cannot be written to.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::Config(error) => error.exit_code(),
+            Error::Unreadable { .. } => NO_INPUT,
+            Error::Motion { source, .. } if source.is_unreadable() => NO_INPUT,
+            Error::Motion { .. }
+            | Error::Recording { .. }
+            | Error::Sensor { .. }
+            | Error::NoFrame { .. } => FAILED,
+            Error::OwnMotion { .. } => USAGE,
+            Error::Broken { .. } | Error::Print(_) => IO,
+        }
+    }
 }
 
 /// The number of bytes that are read at once if neither a speed nor positions pace them.

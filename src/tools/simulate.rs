@@ -15,6 +15,7 @@ use serde::de::value::Error as NameError;
 
 use super::faults::{self, Faults, Line};
 use super::player::{BITS_A_BYTE, Pace, Player};
+use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::wire::{Layout, LayoutError, Preset, Settings as Frame};
 use hardnessd_simulator::{Material, REST_S, SensorProfile, Sequence, SequenceSettings};
@@ -110,6 +111,17 @@ pub enum Error {
         /// The system's error.
         source: std::io::Error,
     },
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::Faults(error) if error.is_unreadable() => NO_INPUT,
+            Error::Faults(_) => FAILED,
+            Error::Layout(_) | Error::Baud { .. } => USAGE,
+            Error::Recording { .. } | Error::Pty { .. } => IO,
+        }
+    }
 }
 
 /// Plays until the presses are over or `shutdown` comes.

@@ -21,6 +21,7 @@ use self::proposal::{Proposal, propose};
 use super::doctor;
 use super::simulate::positive;
 use crate::daemon::serial::{Link, Turn};
+use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, UNAVAILABLE};
 use hardnessd_core::recording::{self, Entry, FileKind, Input, Reader};
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::wire::Settings;
@@ -97,6 +98,17 @@ pub enum Error {
     /// Stdout cannot be written to.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::Unreadable { .. } => NO_INPUT,
+            Error::Recording { .. } | Error::Unexplained { .. } => FAILED,
+            Error::Unavailable { .. } => UNAVAILABLE,
+            Error::Print(_) | Error::Write { .. } => IO,
+        }
+    }
 }
 
 /// The most bytes that are examined, from the beginning: 20,000 frames of the JX255N.

@@ -16,6 +16,7 @@ use serde_json::{Value, json};
 use super::connect::{self, Address, Connection, Source};
 use super::simulate::positive;
 use hardnessd_core::event::{Kind, PROTOCOL};
+use hardnessd_core::exit::{Coded, FAILED, IO, UNAVAILABLE};
 use hardnessd_core::wording;
 
 /// Arguments of `tail`.
@@ -87,6 +88,19 @@ pub enum Error {
     /// Stdout cannot be written to.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::Connect(_)
+            | Error::Mute { .. }
+            | Error::Foreign { .. }
+            | Error::Refused { .. } => UNAVAILABLE,
+            Error::Timeout { .. } => FAILED,
+            Error::Print(_) => IO,
+        }
+    }
 }
 
 /// How long a daemon may take to send `hello`: a hundred times the 50 ms that a running one takes

@@ -25,6 +25,7 @@ use self::screen::{Screen, keys};
 use self::view::{Clock, Key, Loss, QUESTION, View};
 use super::connect::{self, Address, Connection, Source};
 use crate::daemon::now;
+use hardnessd_core::exit::{Coded, IO, USAGE};
 
 /// Arguments of `watch`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -46,6 +47,15 @@ pub enum Error {
     /// The terminal cannot be read from or written to.
     #[error("terminal: {0}")]
     Terminal(#[source] io::Error),
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::NoTerminal => USAGE,
+            Error::Terminal(_) => IO,
+        }
+    }
 }
 
 /// Time between two pictures: as fast as eyes can follow.

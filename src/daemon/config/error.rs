@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use hardnessd_core::exit::{CONFIG, Coded, NO_INPUT};
 use hardnessd_core::npy::NpyError;
 use hardnessd_core::sensor::SensorError;
 use hardnessd_core::verdict::ModelError;
@@ -147,6 +148,15 @@ pub enum Error {
         /// The reason the model is refused.
         source: Box<ModelError>,
     },
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::Unreadable { .. } => NO_INPUT,
+            _ => CONFIG,
+        }
+    }
 }
 
 /// The message about an unusable file of gains.
