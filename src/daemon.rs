@@ -294,7 +294,7 @@ fn start_sensors(
     for (index, (port, sensor)) in ports.zip(&setup.sensors).enumerate() {
         let (commands, inbox) = mpsc::channel(QUESTIONS);
         let pipeline = Pipeline::new(sensor.clone(), setup.hrn.clone(), Clock::Arrival);
-        let link = Link::new(&port.port, port.baud);
+        let link = Link::new(&port.port, port.baud.get());
         let recorder = recorder.map_or(SensorRecorder::default(), |recorder| {
             recorder.of_sensor(index)
         });

@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Serialize};
 
 pub use self::error::Error;
 pub use self::publish::{
@@ -60,65 +60,60 @@ pub struct Config {
     pub log: log::Settings,
 }
 
-/// A `[[sensor]]` table.
+/// A `[[sensor]]` table. [`Description`] has the defaults of the keys that both have.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, default)]
 pub struct SensorTable {
     /// The sensor's name: unique, and `[a-z][a-z0-9_]*`.
-    #[serde(default = "default_name")]
     pub name: String,
     /// The sensor's device file. It has no default: [`Config::load`] refuses an empty path.
-    #[serde(default)]
     pub port: PathBuf,
     /// The baud rate of the serial line, in bits per second. A pty and USB CDC ignore it.
-    #[serde(default = "default_baud", deserialize_with = "above_zero")]
-    pub baud: u32,
+    pub baud: NonZeroU32,
     /// The number of frames that the sensor is expected to send in a second.
-    #[serde(default = "default_frame_rate_hz")]
     pub frame_rate_hz: f64,
     /// The silence after which a live sensor is stale, in milliseconds. The default is the larger
     /// of 2.5 periods and 50 ms.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub stale_after_ms: Option<f64>,
     /// The layout of a frame in bytes.
-    #[serde(default)]
     pub frame: wire::Settings,
     /// The calibration, which converts counts to newtons.
-    #[serde(default)]
     pub calibration: tare::Settings,
     /// The arm that presses with the sensor.
-    #[serde(default)]
     pub arm: motion::Settings,
 }
 
-fn default_name() -> String {
-    Description::default().name
-}
-
-fn default_baud() -> u32 {
-    115_200
-}
-
-fn above_zero<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u32, D::Error> {
-    NonZeroU32::deserialize(deserializer).map(NonZeroU32::get)
-}
-
-fn default_frame_rate_hz() -> f64 {
-    Description::default().frame_rate_hz
+impl Default for SensorTable {
+    fn default() -> Self {
+        let Description {
+            name,
+            frame_rate_hz,
+            stale_after_ms,
+            frame,
+            calibration,
+            arm,
+            ..
+        } = Description::default();
+        Self {
+            name,
+            port: PathBuf::new(),
+            baud: const { NonZeroU32::new(115_200).unwrap() },
+            frame_rate_hz,
+            stale_after_ms,
+            frame,
+            calibration,
+            arm,
+        }
+    }
 }
 
 impl SensorTable {
     /// A sensor at `port`, with the defaults of all other keys.
     pub fn new(port: PathBuf) -> Self {
         Self {
-            name: default_name(),
             port,
-            baud: default_baud(),
-            frame_rate_hz: default_frame_rate_hz(),
-            stale_after_ms: None,
-            frame: wire::Settings::default(),
-            calibration: tare::Settings::default(),
-            arm: motion::Settings::default(),
+            ..Self::default()
         }
     }
 }

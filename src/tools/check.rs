@@ -249,7 +249,7 @@ const PITCH_TOLERANCE_MM: f64 = 0.005;
 fn line_of(sensor: &SensorTable, layout: &Layout, path: &Path) -> Result<String, Error> {
     let (shortest, longest) = (layout.min_frame_bytes(), layout.max_frame_bytes());
     let bytes_per_s = sensor.frame_rate_hz * longest as f64;
-    let capacity = f64::from(sensor.baud) / BITS_A_BYTE;
+    let capacity = f64::from(sensor.baud.get()) / BITS_A_BYTE;
     let paced = is_paced(&sensor.port);
     let error = |frame_bytes: usize| Error::FrameRate {
         path: path.to_owned(),
@@ -257,7 +257,7 @@ fn line_of(sensor: &SensorTable, layout: &Layout, path: &Path) -> Result<String,
         frame_rate_hz: sensor.frame_rate_hz,
         frame_bytes,
         most: capacity / frame_bytes as f64,
-        baud: sensor.baud,
+        baud: sensor.baud.get(),
     };
     if paced && sensor.frame_rate_hz * shortest as f64 > capacity {
         return Err(error(shortest));

@@ -118,7 +118,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         ..SensorTable::new(port.clone())
     };
     let layout = Layout::new(&sensor.frame)?;
-    let line_s = layout.max_frame_bytes() as f64 * BITS_A_BYTE / f64::from(sensor.baud);
+    let line_s = layout.max_frame_bytes() as f64 * BITS_A_BYTE / f64::from(sensor.baud.get());
     sensor.arm = motion::Settings {
         stiffness_n_per_mm: Some(ARM_N_PER_MM),
         // A frame's stamp is the time of its last byte. The arm's stamp is the time of its
@@ -126,7 +126,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         delay_ms: (1e3 * line_s / args.speed).min(1e3),
         ..motion::Settings::default()
     };
-    let pace = Pace::new(sensor.frame_rate_hz, sensor.baud, args.speed);
+    let pace = Pace::new(sensor.frame_rate_hz, sensor.baud.get(), args.speed);
     let sequence = SequenceSettings {
         seed: args.seed,
         frame_rate_hz: sensor.frame_rate_hz,
