@@ -25,8 +25,8 @@ use super::config;
 use hardnessd_core::event::{Event, Kind};
 use hardnessd_core::exit::{CONFIG, Coded, IO, UNAVAILABLE};
 use hardnessd_core::frame::Stamp;
-use hardnessd_core::pipeline::Pipeline;
-use hardnessd_core::recording::{About, Entry, Found, Input, Labels, RecordedSensor, State};
+use hardnessd_core::pipeline::{Input, Pipeline};
+use hardnessd_core::recording::{About, Entry, Found, Labels, RecordedSensor, State};
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::verdict::Hrn;
 
@@ -297,18 +297,7 @@ impl SensorRecorder {
         Self { viewers, ..self }
     }
 
-    /// Records `input` and feeds it to `pipeline`.
-    pub(crate) fn feed(
-        &mut self,
-        pipeline: &mut Pipeline,
-        input: Input<'_>,
-        at: Stamp,
-    ) -> Vec<Event> {
-        self.note(pipeline, &input, at);
-        input.feed(pipeline, at)
-    }
-
-    /// Records `input`, which is about to be fed to `pipeline`.
+    /// Records `input`, which `pipeline` is about to take.
     pub(crate) fn note(&mut self, pipeline: &Pipeline, input: &Input<'_>, at: Stamp) {
         if let Some(active) = &mut self.active {
             active.follow(pipeline, at, Entry::Input(input.to_owned()));

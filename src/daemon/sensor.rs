@@ -19,9 +19,9 @@ use super::record::{NoBlackbox, SensorRecorder};
 use super::request::motion::{Calendar, Placed};
 use super::serial::{Link, Turn};
 use hardnessd_core::event::{Event, Kind, Status, Tared};
+use hardnessd_core::frame::Stamp;
 use hardnessd_core::motion::StepBack;
-use hardnessd_core::pipeline::Pipeline;
-use hardnessd_core::recording::Input;
+use hardnessd_core::pipeline::{Input, Pipeline};
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::tare::RetareError;
 use hardnessd_core::verdict::Hrn;
@@ -131,7 +131,7 @@ pub(crate) async fn serve(
                 }
                 Some(Command::Context(context, reply)) => {
                     log::context(pipeline.sensor().name(), context.as_ref());
-                    recorder.feed(&mut pipeline, Input::Context(context), super::now());
+                    take(&mut pipeline, &mut recorder, Input::Context(context), super::now());
                     let _ = reply.send(());
                     continue;
                 }
@@ -154,7 +154,7 @@ pub(crate) async fn serve(
                     continue;
                 }
                 Some(Command::Finish) | None => {
-                    let events = recorder.feed(&mut pipeline, Input::Shutdown, super::now());
+                    let events = take(&mut pipeline, &mut recorder, Input::Shutdown, super::now());
                     return hub.publish(events).await;
                 }
             },
@@ -166,9 +166,9 @@ pub(crate) async fn serve(
                     Turn::Unavailable(reason) => Input::Unavailable(reason.into()),
                     Turn::Lost(reason) => Input::Lost(reason.into()),
                 };
-                recorder.feed(&mut pipeline, input, at)
+                take(&mut pipeline, &mut recorder, input, at)
             }
-            () = until(deadline) => recorder.feed(&mut pipeline, Input::Tick, super::now()),
+            () = until(deadline) => take(&mut pipeline, &mut recorder, Input::Tick, super::now()),
         };
         let kinds = events.iter().map(Event::kind);
         let frames = kinds.filter(|&kind| kind == Kind::Frame).count();
@@ -189,6 +189,17 @@ pub(crate) async fn serve(
     }
 }
 
+/// Records an input, then passes it on to the pipeline.
+fn take(
+    pipeline: &mut Pipeline,
+    recorder: &mut SensorRecorder,
+    input: Input<'_>,
+    at: Stamp,
+) -> Vec<Event> {
+    recorder.note(pipeline, &input, at);
+    pipeline.take(input, at)
+}
+
 /// Records positions of the arm and passes them on to the pipeline. If this machine's calendar
 /// clock was set since the last positions with calendar times, the pipeline learns that first.
 fn hear(
@@ -199,7 +210,12 @@ fn hear(
 ) -> Result<(), StepBack> {
     if let Some(set) = placed.converted.and_then(|now| calendar.set(now)) {
         log::clock_set(pipeline.sensor().name(), set.by_ms);
-        recorder.feed(pipeline, Input::ClockSet(set.until_ns), super::now());
+        take(
+            pipeline,
+            recorder,
+            Input::ClockSet(set.until_ns),
+            super::now(),
+        );
     }
     let input = Input::Motion(placed.points.as_slice().into());
     recorder.note(pipeline, &input, super::now());
@@ -252,7 +268,7 @@ mod tests {
 
     use super::*;
     use crate::daemon::request::{Change, Request, motion, parse};
-    use hardnessd_core::frame::{RawFrame, Stamp};
+    use hardnessd_core::frame::RawFrame;
     use hardnessd_core::pipeline::Clock;
     use hardnessd_core::test_support as tests;
 

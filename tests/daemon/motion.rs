@@ -7,7 +7,8 @@ use std::path::Path;
 use std::time::Duration;
 
 use crate::bench::{Bench, Daemon, Subscriber, hardnessd};
-use hardnessd_core::recording::{Entry, Input, Reader};
+use hardnessd_core::pipeline::Input;
+use hardnessd_core::recording::{Entry, Reader};
 use serde_json::{Value, json};
 
 fn mono_ns() -> u64 {

@@ -8,7 +8,8 @@ use std::time::Duration;
 use crate::bench::{
     BINARY, Bench, Daemon, PATIENCE, Process, Subscriber, by_terminal, hardnessd, wait_for,
 };
-use hardnessd_core::recording::{Entry, Found, Input, Reader};
+use hardnessd_core::pipeline::Input;
+use hardnessd_core::recording::{Entry, Found, Reader};
 use hardnessd_simulator::random::Stream;
 use rustix::process::Signal;
 use serde_json::{Value, json};

@@ -6,6 +6,7 @@
 
 mod course;
 mod events;
+mod input;
 mod link;
 mod memory;
 
@@ -18,9 +19,10 @@ use serde::{Deserialize, Serialize};
 
 pub use self::course::{approach_by_speed, approach_speed_mm_s, says_something};
 pub use self::events::{FIRST_LOOK, look_after};
+pub use self::input::Input;
 use self::link::Link;
 pub use self::memory::Memory;
-use crate::event::{Event, FrameEvent, LinkState, Phase, Tared};
+use crate::event::{Event, FrameEvent, Phase, Tared};
 use crate::frame::{RawFrame, Stamp};
 use crate::motion::{Point, StepBack, Track};
 use crate::press::{self, Abort, Moment, PressTracker};
@@ -59,9 +61,6 @@ pub struct Unjudged {
     pub error: ModelError,
 }
 
-/// The number of frames over which the frame rate is measured.
-const RATE_FRAMES: usize = 32;
-
 /// The state of one sensor.
 #[derive(Debug)]
 pub struct Pipeline {
@@ -93,12 +92,6 @@ struct Seen {
     frames_damaged: u64,
     /// The ends of recent chunks in the stream, and when they came.
     chunks: VecDeque<(u64, Stamp)>,
-    /// The arrival times of the latest frames.
-    recent: VecDeque<Duration>,
-    last_bytes: Option<Duration>,
-    last_frame: Option<Stamp>,
-    /// State and reason of the last published status.
-    told: (LinkState, Option<String>),
 }
 
 impl Pipeline {
@@ -145,17 +138,13 @@ impl Pipeline {
             track: Track::default(),
             decoder: Decoder::new(layout.clone()),
             seen: Seen {
-                link: Link::Closed { reason: None },
+                link: Link::new(),
                 context: None,
                 speed_mm_s: None,
                 next_look: 0,
                 frames: 0,
                 frames_damaged: 0,
                 chunks: VecDeque::new(),
-                recent: VecDeque::with_capacity(RATE_FRAMES),
-                last_bytes: None,
-                last_frame: None,
-                told: (LinkState::Connecting, None),
             },
             sensor,
             hrn,
@@ -201,7 +190,7 @@ impl Pipeline {
         if self.tracker.is_pressed() {
             return Err(RetareError::Pressed);
         }
-        if !matches!(self.seen.link, Link::Live { .. }) {
+        if !self.seen.link.is_live() {
             return Err(RetareError::NotLive);
         }
         self.tare.retake()
@@ -265,26 +254,21 @@ impl Pipeline {
 
     /// The arrival time of the last whole frame.
     pub fn last_frame(&self) -> Option<Stamp> {
-        self.seen.last_frame
+        self.seen.link.last_frame
     }
 
     /// Call this when the port is open. The next bytes do not continue the earlier bytes.
     pub fn opened(&mut self, at: Stamp) -> Vec<Event> {
         self.decoder.restart();
         self.seen.chunks.clear();
-        self.seen.last_bytes = None;
-        if matches!(self.seen.link, Link::Closed { .. }) {
-            self.seen.link = Link::Opened { since: at.mono };
-        }
+        self.seen.link.opened(at.mono);
         self.status_if_changed(at)
     }
 
     /// Call this when the port could not be opened. If the port was open before, the sensor is
     /// already lost, and its reason stays.
     pub fn unavailable(&mut self, reason: String, at: Stamp) -> Vec<Event> {
-        if let Link::Closed { reason: known } = &mut self.seen.link {
-            *known = Some(reason);
-        }
+        self.seen.link.unavailable(reason);
         self.status_if_changed(at)
     }
 
@@ -292,7 +276,7 @@ impl Pipeline {
     pub fn push(&mut self, bytes: &[u8], at: Stamp) -> Vec<Event> {
         let mut events = self.tick(at);
         self.decoder.push(bytes);
-        self.seen.last_bytes = Some(at.mono);
+        self.seen.link.last_bytes = Some(at.mono);
         if self.clock == Clock::Arrival {
             self.seen.chunks.push_back((self.decoder.received(), at));
         }
@@ -316,13 +300,10 @@ impl Pipeline {
         if let Some(deadline) = self.stale_deadline()
             && at.mono >= deadline
         {
-            self.seen.link = match self.seen.link {
-                Link::Opened { .. } => Link::Silent,
-                _ => Link::Stale,
-            };
+            self.seen.link.silent();
             self.tare.give_up(RetareError::NotLive);
             // Count from the last frame, so that both times come from one clock reading.
-            let since = self.seen.last_frame.unwrap_or(at);
+            let since = self.seen.link.last_frame.unwrap_or(at);
             let wait = deadline.saturating_sub(since.mono);
             let wall = since.wall.checked_add(wait).unwrap_or(at.wall);
             events.extend(self.status_if_changed(Stamp {
@@ -338,8 +319,7 @@ impl Pipeline {
         let mut events = Vec::new();
         self.settle(at, &mut events);
         self.decoder.restart();
-        self.seen.recent.clear();
-        self.seen.link = Link::Lost { reason };
+        self.seen.link.lost(reason);
         self.tare.give_up(RetareError::NotLive);
         events.extend(self.status_if_changed(at));
         self.abort(Abort::Lost, &mut events);
@@ -359,10 +339,9 @@ impl Pipeline {
         let mut events = Vec::new();
         self.settle(at.unwrap_or(EPOCH), &mut events);
         self.abort(Abort::EndOfRecording, &mut events);
-        self.seen.link = Link::Lost {
-            reason: Abort::EndOfRecording.reason().to_owned(),
-        };
-        let at = at.or(self.seen.last_frame).unwrap_or(EPOCH);
+        let reason = Abort::EndOfRecording.reason().to_owned();
+        self.seen.link.ended(reason);
+        let at = at.or(self.seen.link.last_frame).unwrap_or(EPOCH);
         // The rest of the bytes never became a frame, so count them as skipped.
         self.decoder.restart();
         events.push(Event::Status(self.status(at)));
@@ -373,7 +352,7 @@ impl Pipeline {
     /// bytes was whole when the last byte came.
     fn settle(&mut self, at: Stamp, events: &mut Vec<Event>) {
         self.decoder.settle();
-        let arrival = self.seen.last_bytes.take().unwrap_or(at.mono);
+        let arrival = self.seen.link.last_bytes.take().unwrap_or(at.mono);
         self.drain(arrival, events);
     }
 
@@ -384,7 +363,7 @@ impl Pipeline {
             match found {
                 Ok(Decoded { frame, end }) => {
                     let stamp = self.stamp_of(end);
-                    self.take(&frame, stamp, events);
+                    self.take_frame(&frame, stamp, events);
                 }
                 Err(_damage) => self.seen.frames_damaged += 1,
             }
@@ -421,22 +400,13 @@ impl Pipeline {
     }
 
     /// Takes in a whole frame.
-    fn take(&mut self, raw: &RawFrame, stamp: Stamp, events: &mut Vec<Event>) {
+    fn take_frame(&mut self, raw: &RawFrame, stamp: Stamp, events: &mut Vec<Event>) {
         let at = Moment {
             frame: self.seen.frames,
             stamp,
         };
         self.seen.frames += 1;
-        let before = self.seen.last_frame.replace(stamp);
-        // A rate measured across a silence would be meaningless.
-        if matches!(self.seen.link, Link::Silent | Link::Stale) {
-            self.seen.recent.clear();
-        }
-        if self.seen.recent.len() == RATE_FRAMES {
-            self.seen.recent.pop_front();
-        }
-        self.seen.recent.push_back(stamp.mono);
-        self.seen.link = Link::Live { since: stamp.mono };
+        let before = self.seen.link.frame(stamp);
 
         let frame = self.tare.apply(raw);
         // During a tare on request, presses are tracked with the old baseline.

@@ -135,18 +135,14 @@ pub enum Change {
     },
     /// The press ended and is to be judged.
     End {
-        /// The press's number.
-        press: u64,
+        /// The whole press.
+        press: Box<SoFar>,
         /// The last frame in contact.
         last: Moment,
         /// The number of frames in contact.
         frames: u64,
         /// Whether the press was released or timed out.
         end: End,
-        /// The best frame.
-        peak: Box<Peak>,
-        /// The frames in contact.
-        course: Box<SoFar>,
     },
     /// The press ended without a verdict.
     Aborted {
@@ -173,6 +169,11 @@ impl SoFar {
     /// The press's number.
     pub fn press(&self) -> u64 {
         self.press
+    }
+
+    /// The best frame.
+    pub fn peak(&self) -> &Peak {
+        &self.peak
     }
 
     /// The frames up to `until`, and the place of the best frame among them. They are evenly spread
@@ -209,7 +210,7 @@ impl SoFar {
 /// }
 /// assert!(matches!(changes[0], Change::Begin { press: 1, .. }));
 /// assert!(matches!(changes[1], Change::Settled { press: 1, .. }));
-/// assert!(matches!(changes[2], Change::End { press: 1, frames: 3, .. }));
+/// assert!(matches!(changes[2], Change::End { frames: 3, .. }));
 /// ```
 #[derive(Debug)]
 pub struct PressTracker {
@@ -483,16 +484,14 @@ impl Pressed {
             };
         }
         Change::End {
-            press,
+            press: Box::new(SoFar {
+                press,
+                peak,
+                course,
+            }),
             last,
             frames,
             end,
-            course: Box::new(SoFar {
-                press,
-                peak: peak.clone(),
-                course,
-            }),
-            peak: Box::new(peak),
         }
     }
 }

@@ -1,6 +1,6 @@
 //! Recordings: the bytes of sensors and when they came, as MCAP files that ROS tools open.
 //!
-//! In: what happens to a sensor's pipeline ([`Input`]), and the events that follow. Out: the bytes
+//! In: what happens to a sensor's pipeline ([`pipeline::Input`]), and the events that follow. Out: the bytes
 //! of a file. A [`Reader`] returns the inputs, and a [`Playback`] turns them into the same events.
 //! A file can be played from the first [`State`] of a sensor on. It has one every few seconds, so
 //! damage costs only the damaged stretch. Nothing here opens a file or asks the time. No other
@@ -14,7 +14,6 @@ mod recover;
 mod ring;
 mod writer;
 
-use std::borrow::Cow;
 use std::io::{self, Read};
 
 use serde::{Deserialize, Serialize};
@@ -27,116 +26,12 @@ pub use self::reader::{Found, Reader};
 pub use self::recover::{RecoverError, Recovered, recover};
 pub use self::ring::Ring;
 pub use self::writer::{About, Writer};
-use crate::event::{ContextError, Event};
+use crate::event::ContextError;
 use crate::frame::Stamp;
 use crate::motion::Point;
-use crate::pipeline::{self, Pipeline};
+use crate::pipeline::{self, Input, Pipeline};
 use crate::sensor::{Description, Sensor, SensorError};
 use crate::verdict::Hrn;
-
-/// One thing that happens to a pipeline. Only a change of the sensor's description is an entry of
-/// its own ([`Entry::Settings`]).
-///
-/// # Example
-///
-/// A recorded input goes into a pipeline as it did live.
-///
-/// ```
-/// use std::sync::Arc;
-/// use std::time::Duration;
-///
-/// use hardnessd_core::event::{Event, LinkState};
-/// use hardnessd_core::frame::Stamp;
-/// use hardnessd_core::pipeline::{Clock, Pipeline};
-/// use hardnessd_core::recording::Input;
-/// use hardnessd_core::sensor::{Description, Sensor};
-/// use hardnessd_core::verdict::{BUILT_IN, Hrn};
-///
-/// let sensor = Sensor::new(Description::default())?;
-/// let mut pipeline = Pipeline::new(sensor, Arc::new(Hrn::load(BUILT_IN)?), Clock::Arrival);
-/// let at = Stamp {
-///     mono: Duration::from_secs(1),
-///     wall: jiff::Timestamp::UNIX_EPOCH,
-/// };
-/// assert!(Input::Opened.feed(&mut pipeline, at).is_empty());
-/// let events = Input::Lost("unplugged".into()).feed(&mut pipeline, at);
-/// assert!(matches!(&events[..], [Event::Status(status)] if status.state == LinkState::Lost));
-/// # Ok::<(), Box<dyn std::error::Error>>(())
-/// ```
-#[derive(Debug, Clone, PartialEq)]
-pub enum Input<'a> {
-    /// The port is open.
-    Opened,
-    /// The port could not be opened, for this reason.
-    Unavailable(Cow<'a, str>),
-    /// Bytes came.
-    Bytes(Cow<'a, [u8]>),
-    /// Time has passed.
-    Tick,
-    /// The device is gone, for this reason.
-    Lost(Cow<'a, str>),
-    /// A tare was requested.
-    Tare,
-    /// The controller's context.
-    Context(Option<Value>),
-    /// Positions of the arm from the robot.
-    Motion(Cow<'a, [Point]>),
-    /// This machine's calendar clock was set. Moments from calendar times are uncertain up to this
-    /// moment of CLOCK_MONOTONIC, in nanoseconds.
-    ClockSet(i64),
-    /// The daemon stops.
-    Shutdown,
-}
-
-impl Input<'_> {
-    /// Passes the input to `pipeline`. A refused tare and a step back in time are not reported: see
-    /// [`Pipeline::retare`] and [`Pipeline::tell`].
-    pub fn feed(self, pipeline: &mut Pipeline, at: Stamp) -> Vec<Event> {
-        match self {
-            Input::Opened => pipeline.opened(at),
-            Input::Unavailable(reason) => pipeline.unavailable(reason.into_owned(), at),
-            Input::Bytes(bytes) => pipeline.push(&bytes, at),
-            Input::Tick => pipeline.tick(at),
-            Input::Lost(reason) => pipeline.lost(reason.into_owned(), at),
-            Input::Tare => {
-                // A refused tare changes nothing and publishes nothing.
-                let _ = pipeline.retare();
-                Vec::new()
-            }
-            Input::Context(context) => {
-                pipeline.set_context(context);
-                Vec::new()
-            }
-            Input::Motion(points) => {
-                // Points after a step back are taken in too.
-                let _ = pipeline.tell(&points);
-                Vec::new()
-            }
-            Input::ClockSet(until_ns) => {
-                pipeline.clock_set(until_ns);
-                Vec::new()
-            }
-            Input::Shutdown => pipeline.shutdown(),
-        }
-    }
-
-    /// A copy that borrows nothing.
-    pub fn to_owned(&self) -> Input<'static> {
-        let text = |text: &Cow<'_, str>| Cow::Owned(text.clone().into_owned());
-        match self {
-            Input::Opened => Input::Opened,
-            Input::Unavailable(reason) => Input::Unavailable(text(reason)),
-            Input::Bytes(bytes) => Input::Bytes(Cow::Owned(bytes.clone().into_owned())),
-            Input::Tick => Input::Tick,
-            Input::Lost(reason) => Input::Lost(text(reason)),
-            Input::Tare => Input::Tare,
-            Input::Context(context) => Input::Context(context.clone()),
-            Input::Motion(points) => Input::Motion(Cow::Owned(points.to_vec())),
-            Input::ClockSet(until_ns) => Input::ClockSet(*until_ns),
-            Input::Shutdown => Input::Shutdown,
-        }
-    }
-}
 
 /// An entry of a recording for one sensor. Entries are in order of time.
 ///
@@ -145,7 +40,8 @@ impl Input<'_> {
 /// This counts the bytes of a sensor in a recording, and how often the configuration was read again.
 ///
 /// ```no_run
-/// use hardnessd_core::recording::{Entry, Input, Reader};
+/// use hardnessd_core::pipeline::Input;
+/// use hardnessd_core::recording::{Entry, Reader};
 ///
 /// let file = std::fs::File::open("press.mcap")?;
 /// let (mut bytes, mut reloads) = (0, 0);

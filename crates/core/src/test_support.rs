@@ -14,8 +14,8 @@ use serde_json::Value;
 
 use crate::frame::{COLS, ROWS, RawFrame, Stamp};
 use crate::motion::Point;
-use crate::pipeline::{Clock, Pipeline};
-use crate::recording::{About, Entry, Input, Labels, RecordedSensor, State, Writer};
+use crate::pipeline::{Clock, Input, Pipeline};
+use crate::recording::{About, Entry, Labels, RecordedSensor, State, Writer};
 use crate::sensor::{Description, Sensor};
 use crate::tare::{self, Gains};
 use crate::verdict::{BUILT_IN, Hrn};

@@ -61,9 +61,9 @@ pub(super) fn one_press<'a>(
                 Change::Begin { .. } | Change::Settled { .. } => {}
                 Change::End {
                     end: End::Release,
-                    peak,
+                    press,
                     ..
-                } => best = Some(peak.moment.frame as usize),
+                } => best = Some(press.peak().moment.frame as usize),
                 Change::End { .. } | Change::Aborted { .. } => return None,
             }
         }

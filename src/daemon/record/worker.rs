@@ -16,7 +16,8 @@ use super::{Error, Job, NoBlackbox, Progress, Target};
 use crate::daemon::config;
 use hardnessd_core::event::{Event, LinkState, PressState};
 use hardnessd_core::frame::Stamp;
-use hardnessd_core::recording::{self, About, Entry, Input, Ring};
+use hardnessd_core::pipeline::Input;
+use hardnessd_core::recording::{self, About, Entry, Ring};
 
 /// How often written entries are passed to the system. `kill -9` loses no more than this time.
 const FLUSH_EVERY: Duration = Duration::from_millis(500);

@@ -56,15 +56,14 @@ impl Pipeline {
                 last,
                 frames,
                 end,
-                peak,
-                course,
             } => {
                 let reason = match end {
                     End::Release => None,
                     End::Timeout => Some("timeout"),
                 };
-                events.push(self.press(press, PressState::End, last, frames, reason));
-                events.extend(self.judge(Phase::Final, &course, &peak));
+                let number = press.press();
+                events.push(self.press(number, PressState::End, last, frames, reason));
+                events.extend(self.judge(Phase::Final, &press, press.peak()));
                 let delay_ms = self.sensor.description().arm.delay_ms;
                 self.track.judged(last.stamp.mono, delay_ms);
             }

@@ -1,5 +1,6 @@
 //! The link of a sensor: its state, its measured rate, and the silences that change it.
 
+use std::collections::VecDeque;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
@@ -7,15 +8,32 @@ use serde::{Deserialize, Serialize};
 use super::{Clock, Pipeline};
 use crate::event::{Event, LinkState, Status};
 use crate::frame::Stamp;
+use crate::sensor::Sensor;
 use crate::tare::Aim;
 
 /// After a silence of this many periods, the pending bytes are settled: a frame that only waited for
 /// the header of the next one is then whole.
 const PAUSE_PERIODS: f64 = 0.5;
 
+/// The number of frames over which the frame rate is measured.
+pub(super) const RATE_FRAMES: usize = 32;
+
+/// The link of a sensor: its port, and when bytes and frames came over it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct Link {
+    port: Port,
+    /// The arrival times of the latest frames.
+    recent: VecDeque<Duration>,
+    /// When the last bytes came that are not settled.
+    pub(super) last_bytes: Option<Duration>,
+    pub(super) last_frame: Option<Stamp>,
+    /// State and reason of the last published status.
+    published: (LinkState, Option<String>),
+}
+
 /// The state of the port.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) enum Link {
+enum Port {
     /// The port was never opened. The reason is that of the last try.
     Closed { reason: Option<String> },
     /// The port has been open since then, and no frame has come yet.
@@ -28,6 +46,91 @@ pub(super) enum Link {
     Stale,
     /// The port was open and is gone, or it is open again and no frame has come.
     Lost { reason: String },
+}
+
+impl Link {
+    /// The link of a port that was never opened.
+    pub(super) fn new() -> Self {
+        Self {
+            port: Port::Closed { reason: None },
+            recent: VecDeque::with_capacity(RATE_FRAMES),
+            last_bytes: None,
+            last_frame: None,
+            published: (LinkState::Connecting, None),
+        }
+    }
+
+    /// Whether a link can have this state. A recording may hold anything.
+    pub(super) fn is_possible(&self) -> bool {
+        self.recent.len() <= RATE_FRAMES
+    }
+
+    pub(super) fn is_live(&self) -> bool {
+        matches!(self.port, Port::Live { .. })
+    }
+
+    /// The port is open.
+    pub(super) fn opened(&mut self, at: Duration) {
+        self.last_bytes = None;
+        if matches!(self.port, Port::Closed { .. }) {
+            self.port = Port::Opened { since: at };
+        }
+    }
+
+    /// The port could not be opened. If it was open before, its reason stays.
+    pub(super) fn unavailable(&mut self, reason: String) {
+        if let Port::Closed { reason: known } = &mut self.port {
+            *known = Some(reason);
+        }
+    }
+
+    /// A frame came. Returns when the one before it came.
+    pub(super) fn frame(&mut self, stamp: Stamp) -> Option<Stamp> {
+        // A rate measured across a silence would be meaningless.
+        if matches!(self.port, Port::Silent | Port::Stale) {
+            self.recent.clear();
+        }
+        if self.recent.len() == RATE_FRAMES {
+            self.recent.pop_front();
+        }
+        self.recent.push_back(stamp.mono);
+        self.port = Port::Live { since: stamp.mono };
+        self.last_frame.replace(stamp)
+    }
+
+    /// The silence has lasted until [`Self::stale_deadline`].
+    pub(super) fn silent(&mut self) {
+        self.port = match self.port {
+            Port::Opened { .. } => Port::Silent,
+            _ => Port::Stale,
+        };
+    }
+
+    /// The device is gone.
+    pub(super) fn lost(&mut self, reason: String) {
+        self.recent.clear();
+        self.ended(reason);
+    }
+
+    /// No more bytes will come. The measured rate stays.
+    pub(super) fn ended(&mut self, reason: String) {
+        self.port = Port::Lost { reason };
+    }
+
+    /// When a silence makes the link stale.
+    fn stale_deadline(&self, sensor: &Sensor) -> Option<Duration> {
+        match self.port {
+            Port::Opened { since } => Some(since.saturating_add(sensor.late_after())),
+            Port::Live { since } => Some(since.saturating_add(sensor.stale_after())),
+            _ => None,
+        }
+    }
+
+    /// The span of the latest frames and their number. `None` before two frames.
+    fn measured(&self) -> Option<(Duration, usize)> {
+        let span = self.recent.back()?.checked_sub(*self.recent.front()?)?;
+        (self.recent.len() >= 2).then_some((span, self.recent.len()))
+    }
 }
 
 impl Pipeline {
@@ -65,11 +168,11 @@ impl Pipeline {
             let ms = (silence.as_nanos() as f64 / 1e5).round() / 10.0;
             Some(format!("no frame for {ms} ms"))
         };
-        match &self.seen.link {
-            Link::Closed { reason } => (LinkState::Connecting, reason.clone()),
-            Link::Opened { .. } => (LinkState::Connecting, None),
-            Link::Live { .. } => (LinkState::Live, tare()),
-            Link::Silent => {
+        match &self.seen.link.port {
+            Port::Closed { reason } => (LinkState::Connecting, reason.clone()),
+            Port::Opened { .. } => (LinkState::Connecting, None),
+            Port::Live { .. } => (LinkState::Live, tare()),
+            Port::Silent => {
                 let mut reason = no_frame_for(self.sensor.late_after());
                 if self.decoder.received() > 0
                     && let Some(reason) = &mut reason
@@ -78,32 +181,27 @@ impl Pipeline {
                 }
                 (LinkState::Stale, reason)
             }
-            Link::Stale => (LinkState::Stale, no_frame_for(self.sensor.stale_after())),
-            Link::Lost { reason } => (LinkState::Lost, Some(reason.clone())),
+            Port::Stale => (LinkState::Stale, no_frame_for(self.sensor.stale_after())),
+            Port::Lost { reason } => (LinkState::Lost, Some(reason.clone())),
         }
     }
 
     /// A status, if the state or its reason have changed since the last one.
     pub(super) fn status_if_changed(&mut self, at: Stamp) -> Vec<Event> {
         let state = self.state();
-        if self.seen.told == state {
+        if self.seen.link.published == state {
             return Vec::new();
         }
-        self.seen.told = state;
+        self.seen.link.published = state;
         vec![Event::Status(self.status(at))]
     }
 
     fn measured_rate_hz(&self) -> Option<f64> {
-        let span = self
-            .seen
-            .recent
-            .back()?
-            .checked_sub(*self.seen.recent.front()?)?
-            .as_secs_f64();
+        let (span, frames) = self.seen.link.measured()?;
+        let span = span.as_secs_f64();
         match self.clock {
-            _ if self.seen.recent.len() < 2 => None,
             Clock::FrameRate => Some(self.sensor.description().frame_rate_hz),
-            Clock::Arrival => (span > 0.0).then(|| (self.seen.recent.len() - 1) as f64 / span),
+            Clock::Arrival => (span > 0.0).then(|| (frames - 1) as f64 / span),
         }
     }
 
@@ -111,6 +209,7 @@ impl Pipeline {
     pub(super) fn pause_deadline(&self) -> Option<Duration> {
         let last_bytes = self
             .seen
+            .link
             .last_bytes
             .filter(|_| self.decoder.pending() > 0)?;
         Some(last_bytes.saturating_add(self.sensor.period().mul_f64(PAUSE_PERIODS)))
@@ -121,10 +220,6 @@ impl Pipeline {
         if self.clock == Clock::FrameRate {
             return None;
         }
-        match self.seen.link {
-            Link::Opened { since } => Some(since.saturating_add(self.sensor.late_after())),
-            Link::Live { since } => Some(since.saturating_add(self.sensor.stale_after())),
-            _ => None,
-        }
+        self.seen.link.stale_deadline(&self.sensor)
     }
 }

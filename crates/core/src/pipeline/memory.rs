@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Pipeline, RATE_FRAMES, Seen};
+use super::{Pipeline, Seen};
 use crate::motion::Track;
 use crate::{event, press, tare, wire};
 
@@ -24,7 +24,7 @@ impl Memory {
         let Seen {
             frames,
             frames_damaged,
-            recent,
+            link,
             context,
             ..
         } = &self.pipeline;
@@ -34,7 +34,7 @@ impl Memory {
             && self.tare.is_possible()
             && self.tracker.is_possible(*frames)
             && self.track.is_possible()
-            && recent.len() <= RATE_FRAMES
+            && link.is_possible()
             && context.as_ref().is_none_or(is_context)
     }
 
@@ -47,7 +47,7 @@ impl Memory {
 impl Pipeline {
     /// The pipeline's state.
     pub fn memory(&self) -> Memory {
-        let last_frame = self.seen.last_frame.map(|frame| frame.mono);
+        let last_frame = self.seen.link.last_frame.map(|frame| frame.mono);
         let since = self.tracker.began().or(last_frame).unwrap_or_default();
         Memory {
             track: self.track.since(since),

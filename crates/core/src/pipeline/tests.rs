@@ -180,10 +180,11 @@ fn moments_beyond_all_time_are_no_panic() {
     let mut pipeline = pipeline(Preset::Jx255n);
     play(&mut pipeline, 0, &[raw(0, 0)]);
     pipeline.decoder.push(&[0xBB, 0xAA]);
-    pipeline.seen.last_bytes = Some(Duration::MAX);
-    pipeline.seen.link = Link::Live {
-        since: Duration::MAX,
-    };
+    pipeline.seen.link.frame(Stamp {
+        mono: Duration::MAX,
+        ..at(0)
+    });
+    pipeline.seen.link.last_bytes = Some(Duration::MAX);
     assert_eq!(pipeline.deadline(), Some(Duration::MAX));
 }
 
@@ -665,7 +666,7 @@ fn the_rate_is_measured_over_the_last_frames() {
     assert_eq!(rates, [None, None, Some(5.0)]);
     // The rate doubles. After 32 frames, the first rate has no more effect.
     let bytes = bytes(&pipeline, &raw(0, 0));
-    for number in 0..RATE_FRAMES as u64 {
+    for number in 0..link::RATE_FRAMES as u64 {
         pipeline.push(&bytes, at(300 + 100 * number));
     }
     assert_eq!(pipeline.status(at(0)).frame_rate_hz, Some(10.0));

@@ -36,13 +36,12 @@ fn track(settings: &Settings, loads: &[(usize, f32)], rate_hz: u64) -> String {
                     last,
                     frames,
                     end,
-                    peak,
-                    ..
+                    press,
                 } => format!(
                     "{}@{number}:last{} n{frames} peak{}",
                     if end == End::Release { 'e' } else { 't' },
                     last.frame,
-                    peak.moment.frame
+                    press.peak().moment.frame
                 ),
                 Change::Aborted {
                     last,
@@ -119,11 +118,11 @@ fn equal_counts_are_a_tie_however_their_newtons_are_rounded() {
         }
         changes.extend(tracker.push(&frame, Marks::default(), moment(number, 5)));
     }
-    let peak = changes.into_iter().find_map(|change| match change {
-        Change::End { peak, .. } => Some(peak),
+    let ended = changes.into_iter().find_map(|change| match change {
+        Change::End { press, .. } => Some(press),
         _ => None,
     });
-    assert_eq!(peak.unwrap().moment.frame, 0);
+    assert_eq!(ended.unwrap().peak().moment.frame, 0);
 }
 
 #[test]

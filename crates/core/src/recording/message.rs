@@ -5,10 +5,11 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::{Entry, Error, Input, RecordedSensor, State};
+use super::{Entry, Error, RecordedSensor, State};
 use crate::event;
 use crate::frame::Stamp;
 use crate::motion::Point;
+use crate::pipeline::Input;
 use crate::ros::{self, Blob, Header, Topic};
 
 /// The channels of a sensor, in the order of their numbers. `recover` numbers the channels of a

@@ -126,7 +126,7 @@ impl Playback {
             }
             (Entry::Input(input), Some(known)) => {
                 known.last = at;
-                input.feed(&mut known.pipeline, at)
+                known.pipeline.take(input, at)
             }
             (_, None) => Vec::new(),
         };

@@ -24,8 +24,8 @@ const KEPT_BYTES: usize = 32 << 20;
 /// use std::time::Duration;
 ///
 /// use hardnessd_core::frame::Stamp;
-/// use hardnessd_core::pipeline::{Clock, Pipeline};
-/// use hardnessd_core::recording::{Entry, Input, Labels, Ring, State};
+/// use hardnessd_core::pipeline::{Clock, Input, Pipeline};
+/// use hardnessd_core::recording::{Entry, Labels, Ring, State};
 /// use hardnessd_core::sensor::{Description, Sensor};
 /// use hardnessd_core::verdict::{BUILT_IN, Hrn};
 ///
@@ -96,8 +96,8 @@ impl Ring {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pipeline::{Clock, Pipeline};
-    use crate::recording::{Input, Labels, State};
+    use crate::pipeline::{Clock, Input, Pipeline};
+    use crate::recording::{Labels, State};
     use crate::test_support;
 
     fn at(seconds: u64) -> Stamp {

@@ -3,7 +3,7 @@ use std::io::Cursor;
 use serde_json::json;
 
 use super::*;
-use crate::event::{self, Rejection};
+use crate::event::{self, Event, Rejection};
 use crate::frame::RawFrame;
 use crate::pipeline::Clock;
 use crate::test_support::{at, hrn, labels, sensor};
@@ -100,7 +100,7 @@ fn recorded(states: usize, chunk: usize) -> (Vec<u8>, Vec<Event>) {
             pipeline.reload(changed, hrn.clone()).unwrap();
         }
         writer.entry(0, at, &Entry::Input(input.clone())).unwrap();
-        let mut came = input.feed(&mut pipeline, at);
+        let mut came = pipeline.take(input, at);
         for event in &mut came {
             writer.event(event).unwrap();
             if let Event::Hardness(verdict) = event {
@@ -221,7 +221,7 @@ fn a_memory_that_no_pipeline_came_to_is_refused() {
     // Take one state during the first tare, and one during a press.
     let (mut taring, mut pressed) = (None, None);
     for (moment, input) in story() {
-        input.feed(&mut pipeline, moment);
+        pipeline.take(input, moment);
         let state = State::of(&pipeline, labels());
         let kept = match pipeline.frame_counts().0 {
             3 => &mut taring,

@@ -38,7 +38,8 @@ pub struct About {
 /// use std::time::Duration;
 ///
 /// use hardnessd_core::frame::Stamp;
-/// use hardnessd_core::recording::{About, Entry, Input, Labels, Reader, RecordedSensor, Writer};
+/// use hardnessd_core::pipeline::Input;
+/// use hardnessd_core::recording::{About, Entry, Labels, Reader, RecordedSensor, Writer};
 /// use hardnessd_core::sensor::{Description, Sensor};
 /// use hardnessd_core::verdict::{BUILT_IN, Hrn};
 ///

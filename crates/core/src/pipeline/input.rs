@@ -1,0 +1,108 @@
+//! All that happens to a pipeline: the alphabet of live operation, of recordings and of replays.
+
+use std::borrow::Cow;
+
+use serde_json::Value;
+
+use super::Pipeline;
+use crate::event::Event;
+use crate::frame::Stamp;
+use crate::motion::Point;
+
+/// One thing that happens to a pipeline. Beside inputs, only [`Pipeline::reload`] changes what a
+/// pipeline does.
+///
+/// # Example
+///
+/// The port is opened, and then lost.
+///
+/// ```
+/// use std::sync::Arc;
+/// use std::time::Duration;
+///
+/// use hardnessd_core::event::{Event, LinkState};
+/// use hardnessd_core::frame::Stamp;
+/// use hardnessd_core::pipeline::{Clock, Input, Pipeline};
+/// use hardnessd_core::sensor::{Description, Sensor};
+/// use hardnessd_core::verdict::{BUILT_IN, Hrn};
+///
+/// let sensor = Sensor::new(Description::default())?;
+/// let mut pipeline = Pipeline::new(sensor, Arc::new(Hrn::load(BUILT_IN)?), Clock::Arrival);
+/// let at = Stamp {
+///     mono: Duration::from_secs(1),
+///     wall: jiff::Timestamp::UNIX_EPOCH,
+/// };
+/// assert!(pipeline.take(Input::Opened, at).is_empty());
+/// let events = pipeline.take(Input::Lost("unplugged".into()), at);
+/// assert!(matches!(&events[..], [Event::Status(status)] if status.state == LinkState::Lost));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Debug, Clone, PartialEq)]
+pub enum Input<'a> {
+    /// The port is open.
+    Opened,
+    /// The port could not be opened, for this reason.
+    Unavailable(Cow<'a, str>),
+    /// Bytes came.
+    Bytes(Cow<'a, [u8]>),
+    /// Time has passed.
+    Tick,
+    /// The device is gone, for this reason.
+    Lost(Cow<'a, str>),
+    /// A tare was requested.
+    Tare,
+    /// The controller's context.
+    Context(Option<Value>),
+    /// Positions of the arm from the robot.
+    Motion(Cow<'a, [Point]>),
+    /// This machine's calendar clock was set. Moments from calendar times are uncertain up to this
+    /// moment of CLOCK_MONOTONIC, in nanoseconds.
+    ClockSet(i64),
+    /// The daemon stops.
+    Shutdown,
+}
+
+impl Input<'_> {
+    /// A copy that borrows nothing.
+    pub fn to_owned(&self) -> Input<'static> {
+        let text = |text: &Cow<'_, str>| Cow::Owned(text.clone().into_owned());
+        match self {
+            Input::Opened => Input::Opened,
+            Input::Unavailable(reason) => Input::Unavailable(text(reason)),
+            Input::Bytes(bytes) => Input::Bytes(Cow::Owned(bytes.clone().into_owned())),
+            Input::Tick => Input::Tick,
+            Input::Lost(reason) => Input::Lost(text(reason)),
+            Input::Tare => Input::Tare,
+            Input::Context(context) => Input::Context(context.clone()),
+            Input::Motion(points) => Input::Motion(Cow::Owned(points.to_vec())),
+            Input::ClockSet(until_ns) => Input::ClockSet(*until_ns),
+            Input::Shutdown => Input::Shutdown,
+        }
+    }
+}
+
+impl Pipeline {
+    /// Takes an input that came at `at`, and returns its events. A refused tare and a step back in
+    /// time are not reported: see [`Pipeline::retare`] and [`Pipeline::tell`].
+    pub fn take(&mut self, input: Input<'_>, at: Stamp) -> Vec<Event> {
+        match input {
+            Input::Opened => return self.opened(at),
+            Input::Unavailable(reason) => return self.unavailable(reason.into_owned(), at),
+            Input::Bytes(bytes) => return self.push(&bytes, at),
+            Input::Tick => return self.tick(at),
+            Input::Lost(reason) => return self.lost(reason.into_owned(), at),
+            Input::Shutdown => return self.shutdown(),
+            // A refused tare changes nothing and publishes nothing.
+            Input::Tare => {
+                let _ = self.retare();
+            }
+            Input::Context(context) => self.set_context(context),
+            // Points after a step back are taken in too.
+            Input::Motion(points) => {
+                let _ = self.tell(&points);
+            }
+            Input::ClockSet(until_ns) => self.clock_set(until_ns),
+        }
+        Vec::new()
+    }
+}
