@@ -19,6 +19,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 pub use self::error::Error;
 pub use self::publish::{
@@ -273,51 +274,51 @@ impl Config {
         }
     }
 
-    /// The first key that differs between `self` and `other` and that only a restart can change.
+    /// The first key that differs between `self` and `other` and that only a restart can change. This
+    /// is any key but those that are named here as taken over by a running daemon.
     pub fn fixed_difference(&self, other: &Self) -> Option<String> {
-        if self.robot != other.robot {
-            return Some("robot".to_owned());
-        }
+        let fixed = |config: &Self, others: &Self| Self {
+            press: others.press.clone(),
+            model: others.model.clone(),
+            log: others.log,
+            sensors: Vec::new(),
+            ..config.clone()
+        };
+        let fixed_of_sensor = |sensor: &SensorTable, others: &SensorTable| SensorTable {
+            stale_after_ms: others.stale_after_ms,
+            calibration: others.calibration.clone(),
+            arm: others.arm.clone(),
+            ..sensor.clone()
+        };
         if self.sensors.len() != other.sensors.len() {
             return Some("sensor".to_owned());
         }
-        for (ours, theirs) in self.sensors.iter().zip(&other.sensors) {
-            let key = if ours.port != theirs.port {
-                Some("port")
-            } else if ours.baud != theirs.baud {
-                Some("baud")
-            } else {
-                let described = self.describe(ours);
-                described.fixed_difference(&other.describe(theirs))
-            };
-            if let Some(key) = key {
-                return Some(format!("sensor.{key} of \"{}\"", ours.name));
-            }
-        }
-        let (ours, theirs) = (&self.publish, &other.publish);
-        let (unix, their_unix) = (&ours.unix, &theirs.unix);
-        let control_differs = unix.control_path() != their_unix.control_path();
-        let differs = [
-            ("publish.unix.enabled", unix.enabled != their_unix.enabled),
-            ("publish.unix.path", unix.path() != their_unix.path()),
-            ("publish.unix.mode", unix.mode != their_unix.mode),
-            ("publish.unix.control_path", control_differs),
-            (
-                "publish.unix.max_clients",
-                unix.max_clients != their_unix.max_clients,
-            ),
-            ("publish.tcp.listen", ours.tcp != theirs.tcp),
-            ("publish.foxglove.listen", ours.foxglove != theirs.foxglove),
-            ("publish.zenoh", ours.zenoh != theirs.zenoh),
-            ("publish.ros2", ours.ros2 != theirs.ros2),
-            ("http.listen", self.http != other.http),
-            ("record", self.record != other.record),
-        ];
-        differs
-            .iter()
-            .find(|(_, differs)| *differs)
-            .map(|(key, _)| (*key).to_owned())
+        let sensors = self.sensors.iter().zip(&other.sensors);
+        let mut of_sensors = sensors.filter_map(|(ours, theirs)| {
+            let key = difference(ours, &fixed_of_sensor(theirs, ours))?;
+            Some(format!("sensor.{key} of {:?}", ours.name))
+        });
+        let of_tables = difference(&fixed(self, self), &fixed(other, self));
+        of_sensors.next().or(of_tables)
     }
+}
+
+/// The first key that differs, with the keys of its tables before it.
+fn difference<T: PartialEq + Serialize>(ours: &T, theirs: &T) -> Option<String> {
+    fn first(ours: &Value, theirs: &Value) -> Option<String> {
+        let (Value::Object(ours), Value::Object(theirs)) = (ours, theirs) else {
+            return None;
+        };
+        let mut keys = ours.keys().chain(theirs.keys());
+        let key = keys.find(|key| ours.get(*key) != theirs.get(*key))?;
+        let [ours, theirs] = [ours, theirs].map(|table| table.get(key).unwrap_or(&Value::Null));
+        let below = first(ours, theirs).map(|below| format!(".{below}"));
+        Some(format!("{key}{}", below.unwrap_or_default()))
+    }
+    // A path that is not UTF-8 has no JSON, so its key cannot be named.
+    let json = |table: &T| serde_json::to_value(table).unwrap_or_default();
+    let named = || first(&json(ours), &json(theirs)).unwrap_or_else(|| "a path".to_owned());
+    (ours != theirs).then(named)
 }
 
 /// A configuration whose values have all been checked, with its sensors and its model.

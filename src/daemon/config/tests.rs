@@ -468,12 +468,9 @@ fn only_what_a_sensor_can_change_while_it_runs_may_differ_in_a_reload() {
         ),
         (
             "[[sensor]]\nport = \"/dev/ttyUSB0\"\n[publish.tcp]",
-            Some("publish.tcp.listen"),
+            Some("publish.tcp"),
         ),
-        (
-            "[[sensor]]\nport = \"/dev/ttyUSB0\"\n[http]",
-            Some("http.listen"),
-        ),
+        ("[[sensor]]\nport = \"/dev/ttyUSB0\"\n[http]", Some("http")),
         (
             "[[sensor]]\nport = \"/dev/ttyUSB0\"\nstale_after_ms = 900\n\
              [sensor.calibration]\npitch_mm = 2.0\n\
