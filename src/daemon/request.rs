@@ -203,13 +203,18 @@ struct Context {
 }
 
 impl TryFrom<Map<String, Value>> for Context {
-    type Error = ContextProblem;
+    type Error = Unusable;
 
-    fn try_from(fields: Map<String, Value>) -> Result<Self, ContextProblem> {
-        let Some(Value::String(sensor)) = fields.get("sensor") else {
-            return Err(ContextProblem::NoSensor);
+    fn try_from(fields: Map<String, Value>) -> Result<Self, Unusable> {
+        let sensor = fields.get("sensor");
+        let Some(Value::String(name)) = sensor else {
+            return Err(Unusable::Value {
+                key: "sensor",
+                found: short(&sensor),
+                expected: "a sensor's name",
+            });
         };
-        let (sensor, is_empty) = (sensor.clone(), fields.len() == 1);
+        let (sensor, is_empty) = (name.clone(), fields.len() == 1);
         let context = Value::Object(fields);
         event::check_context(&context)?;
         Ok(Self {
@@ -217,14 +222,6 @@ impl TryFrom<Map<String, Value>> for Context {
             context: (!is_empty).then_some(context),
         })
     }
-}
-
-#[derive(Debug, thiserror::Error)]
-enum ContextProblem {
-    #[error("context.sensor: expected a sensor's name")]
-    NoSensor,
-    #[error(transparent)]
-    Unfit(#[from] ContextError),
 }
 
 /// The reason a line cannot be used.
@@ -246,6 +243,8 @@ pub(crate) enum Unusable {
         found: String,
         expected: &'static str,
     },
+    #[error(transparent)]
+    Context(#[from] ContextError),
 }
 
 /// A line that was read.
@@ -276,7 +275,11 @@ pub(crate) fn parse(line: &[u8]) -> Line {
 }
 
 fn request(mut fields: Map<String, Value>) -> Result<Request, Unusable> {
-    let mut key = fields.keys().next().cloned().unwrap_or_default();
+    let mut key = fields
+        .keys()
+        .next()
+        .map_or("request", String::as_str)
+        .to_owned();
     // A subscription has its other keys beside `subscribe`, not within it.
     if fields.contains_key("subscribe") {
         key = "subscribe".to_owned();
@@ -407,7 +410,10 @@ mod tests {
                 br#"{"context":"pick","id":"a"}"#,
                 "context: invalid type: string \"pick\"",
             ),
-            (br#"{"context":{"tag":"x"},"id":"a"}"#, "context.sensor"),
+            (
+                br#"{"context":{"tag":"x"},"id":"a"}"#,
+                "context: sensor: found null, expected a sensor's name",
+            ),
             (br#"{"id":"a"}"#, "expected map with a single key"),
             (
                 br#"{"retare":"a","id":"a"}"#,

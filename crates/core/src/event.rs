@@ -30,13 +30,13 @@ pub const CONTEXT_LEVELS: usize = 16;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum ContextError {
     /// The value is a number, a text or a list.
-    #[error("context: expected an object")]
+    #[error("found no object, expected one")]
     NoObject,
     /// The context is too long.
-    #[error("context: found {0} bytes, expected fewer than {CONTEXT_BYTES}")]
+    #[error("found {0} bytes, expected fewer than {CONTEXT_BYTES}")]
     Long(usize),
     /// The context has too many levels.
-    #[error("context: found {0} levels, expected at most {CONTEXT_LEVELS}")]
+    #[error("found {0} levels, expected at most {CONTEXT_LEVELS}")]
     Deep(usize),
 }
 

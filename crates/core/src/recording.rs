@@ -229,7 +229,7 @@ pub enum Error {
         expected: &'static str,
     },
     /// A controller's context in the recording cannot be one.
-    #[error(transparent)]
+    #[error("context: {0}")]
     Context(#[from] ContextError),
 }
 
