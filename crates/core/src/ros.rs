@@ -89,8 +89,10 @@ impl Time {
         // In ROS, nanoseconds always count up from the second. Before 1970, jiff's nanoseconds do
         // not.
         let ns = time.as_nanosecond();
+        let seconds = ns.div_euclid(1_000_000_000);
         Self {
-            sec: ns.div_euclid(1_000_000_000) as i32,
+            // A ROS header ends on 19 January 2038. A later time is that moment.
+            sec: seconds.clamp(i32::MIN.into(), i32::MAX.into()) as i32,
             nanosec: ns.rem_euclid(1_000_000_000) as u32,
         }
     }

@@ -120,8 +120,13 @@ fn foreign(found: String) -> Error {
     }
 }
 
-fn stamp(header: &Header, mono_ns: u64) -> Result<Stamp, Error> {
-    let wall = header.time();
+/// The moment of a message. MCAP's own time reaches further than that of a ROS header, but does not
+/// know the time before 1970.
+fn stamp(header: &Header, mono_ns: u64, log_time_ns: u64) -> Result<Stamp, Error> {
+    let wall = match log_time_ns {
+        0 => header.time(),
+        ns => jiff::Timestamp::from_nanosecond(ns.into()).ok(),
+    };
     Ok(Stamp {
         mono: std::time::Duration::from_nanos(mono_ns),
         wall: wall.ok_or_else(|| foreign("a time that is none".to_owned()))?,
@@ -129,9 +134,12 @@ fn stamp(header: &Header, mono_ns: u64) -> Result<Stamp, Error> {
 }
 
 /// Reads the sensor, the moment and the positions of the arm from a message on [`MOTION`].
-pub(super) fn decode_motion(bytes: &[u8]) -> Result<(String, Stamp, Entry), Error> {
+pub(super) fn decode_motion(
+    bytes: &[u8],
+    log_time_ns: u64,
+) -> Result<(String, Stamp, Entry), Error> {
     let message: MotionMessage = from_cdr(bytes)?;
-    let at = stamp(&message.header, message.mono_ns)?;
+    let at = stamp(&message.header, message.mono_ns, log_time_ns)?;
     let (moments, positions) = (message.at_ns, message.approach_mm);
     let same = moments.len() == positions.len();
     let points = moments.into_iter().zip(positions);
@@ -144,9 +152,12 @@ pub(super) fn decode_motion(bytes: &[u8]) -> Result<(String, Stamp, Entry), Erro
 }
 
 /// Reads the sensor, the moment and the entry from a message on [`INPUT`].
-pub(super) fn decode_entry(bytes: &[u8]) -> Result<(String, Stamp, Entry), Error> {
+pub(super) fn decode_entry(
+    bytes: &[u8],
+    log_time_ns: u64,
+) -> Result<(String, Stamp, Entry), Error> {
     let message: InputMessage = from_cdr(bytes)?;
-    let at = stamp(&message.header, message.mono_ns)?;
+    let at = stamp(&message.header, message.mono_ns, log_time_ns)?;
     let data = message.data.0;
     let text = |data: Vec<u8>| String::from_utf8_lossy(&data).into_owned().into();
     let unreadable = |error: serde_json::Error| foreign(format!("other JSON ({error})"));

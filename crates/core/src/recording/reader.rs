@@ -144,8 +144,8 @@ pub(super) fn decoder(schema: &str) -> Option<Decode> {
     }
 }
 
-/// A function that reads a message.
-pub(super) type Decode = fn(&[u8]) -> Result<(String, Stamp, Entry), Error>;
+/// A function that reads a message and the time at which it was logged, in nanoseconds since 1970.
+pub(super) type Decode = fn(&[u8], u64) -> Result<(String, Stamp, Entry), Error>;
 
 /// Reads a recording from its beginning. It yields the entries in order, and ends after the first
 /// error.
@@ -260,7 +260,7 @@ impl<R: Read> Reader<R> {
             }
             Record::Message { header, data } => {
                 if let Some(decode) = self.channels.get(&header.channel_id) {
-                    let (sensor, at, entry) = decode(&data)?;
+                    let (sensor, at, entry) = decode(&data, header.log_time)?;
                     return Ok(Some(Found { sensor, at, entry }));
                 }
             }

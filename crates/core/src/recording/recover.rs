@@ -327,7 +327,7 @@ impl<W: Write> Copy<W> {
                     } = &self.channels[&header.channel_id];
                     let schema = self.schemas.get(schema_id);
                     let decode = schema.and_then(|(name, ..)| decoder(name));
-                    match decode.map(|decode| decode(&data)) {
+                    match decode.map(|decode| decode(&data, header.log_time)) {
                         Some(Err(_)) => {
                             self.done.messages_damaged += 1;
                             continue;

@@ -293,7 +293,7 @@ fn a_context_that_is_too_deep_is_refused_in_an_input_and_in_a_state() {
     let nested = |levels: usize| (1..levels).fold(json!({}), |inner, _| json!({"a": inner}));
     let read = |entry: Entry| {
         let message = message::encode_entry("forearm", at(0), &entry);
-        let read = message::decode_entry(&message);
+        let read = message::decode_entry(&message, 1);
         read.map(drop).map_err(|error| error.to_string())
     };
     for (levels, expected) in [
@@ -580,4 +580,17 @@ fn the_worst_file_is_read_a_few_times_and_no_more() {
         );
         assert!(messages * 10 >= whole * 9, "{what}: {messages} of {whole}");
     }
+}
+
+#[test]
+fn a_replay_knows_the_time_after_2038() {
+    let wall: jiff::Timestamp = "2041-03-01T12:00:00.25Z".parse().unwrap();
+    let late = Stamp { wall, ..at(0) };
+    let message = message::encode_entry("forearm", late, &Entry::Input(Input::Tick));
+    let log_time_ns = u64::try_from(wall.as_nanosecond()).unwrap();
+    let (_, read, _) = message::decode_entry(&message, log_time_ns).unwrap();
+    assert_eq!(read, late);
+    // The header of the message, which other programs read, ends in 2038.
+    let (_, by_header, _) = message::decode_entry(&message, 0).unwrap();
+    assert_eq!(by_header.wall.to_string(), "2038-01-19T03:14:07.25Z");
 }
