@@ -1,8 +1,7 @@
 //! Unix sockets and their files.
 //!
-//! A socket's file has its mode and accepts connections from its first moment on. A file that a
-//! dead daemon left behind is replaced. A file whose socket answers is not. A file that is deleted
-//! is made again.
+//! A socket accepts connections only once its file has its mode. A file that a dead daemon left
+//! behind is replaced. A file whose socket answers is not. A file that is deleted is made again.
 
 mod place;
 
@@ -19,9 +18,6 @@ use tracing::warn;
 pub(crate) use self::place::check;
 use self::place::{Identity, Place, identity};
 use super::accept::{Listener, Stop};
-
-/// How long another daemon may take to put its socket in its place.
-const BIND_PATIENCE: Duration = Duration::from_secs(1);
 
 /// How often a socket checks that its file is still there.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
@@ -107,12 +103,12 @@ pub(crate) struct Socket {
 }
 
 impl Socket {
-    /// Listens at `path`. The file has `mode` from its first moment. `key` is the key of the path
+    /// Listens at `path`. The file has `mode` before anybody can connect. `key` is the key of the path
     /// in the configuration. If the directory is missing, it is made, but no directory above it.
     pub(crate) fn bind(key: &'static str, path: &Path, mode: u32) -> Result<Self, Error> {
         let path = path.to_owned();
         let place = Place { key, path, mode };
-        let (listener, identity) = place.listen(BIND_PATIENCE)?;
+        let (listener, identity) = place.listen()?;
         Ok(Self::new(listener, place, Some(identity)))
     }
 
@@ -174,8 +170,7 @@ impl Socket {
             (Ok(_), None) => None,
             (Ok(_), Some(_)) => Some("another file is in its place".to_owned()),
             (Err(error), Some(_)) if error.kind() == ErrorKind::NotFound => {
-                // Do not wait for another daemon, because the sensors wait meanwhile.
-                match self.place.listen(Duration::ZERO) {
+                match self.place.listen() {
                     Ok((listener, identity)) => {
                         self.listener = listener;
                         self.identity = Some(identity);

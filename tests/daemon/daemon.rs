@@ -275,21 +275,6 @@ fn a_reload_from_what_does_not_end_is_given_up_and_the_next_one_works() {
 }
 
 #[test]
-fn nobody_keeps_a_daemon_from_starting_by_a_lock_on_the_directory() {
-    let bench = Bench::new();
-    let directory = fs::File::open(bench.path("")).unwrap();
-    directory.lock().unwrap();
-    let _daemon = bench.daemon();
-    assert_eq!(bench.subscriber().next().unwrap()["type"], "hello");
-    let mut left: Vec<String> = fs::read_dir(bench.path(""))
-        .unwrap()
-        .map(|file| file.unwrap().file_name().into_string().unwrap())
-        .collect();
-    left.sort();
-    assert_eq!(left, ["control.sock", "events.sock", "hardnessd.toml"]);
-}
-
-#[test]
 fn a_socket_whose_file_was_deleted_is_there_again() {
     let bench = Bench::new();
     let mut daemon = bench.daemon();
