@@ -2,7 +2,8 @@
 //!
 //! A program that sends commands can make the daemon log as fast as that program can write. So of
 //! the lines from one place in the source about one sensor, at most [`MOST`] are written within
-//! [`WINDOW`]. The others are counted, and when the window ends, one line gives their number.
+//! [`WINDOW`]. The others are counted. Before the next line after the window, or at the end of the
+//! program, one line gives their number.
 //!
 //! Two kinds of line are always written: numbered events (they have a `seq`), which only a sensor
 //! can cause, and lines below `info`, which the operator requested with `RUST_LOG`.
@@ -31,9 +32,8 @@ const LEFT_OUT: &str = "left_out";
 pub(super) struct Limit(Arc<Mutex<Windows>>);
 
 impl Limit {
-    /// Logs the number of lines left out in every window that has ended by `now`. Returns the time
-    /// until the next window ends, or `None` if no line is being counted.
-    pub(super) fn report(&self, now: Instant) -> Option<Duration> {
+    /// Logs the number of lines left out in every window that has ended by `now`.
+    pub(super) fn report(&self, now: Instant) {
         let over = self.windows().close(now);
         for LeftOut { what, lines } in over {
             let About { message, sensor } = what;
@@ -46,7 +46,6 @@ impl Limit {
                 "lines left out"
             );
         }
-        self.windows().next_end(now)
     }
 
     /// Logs the number of lines left out so far, because no more lines follow.
@@ -139,12 +138,6 @@ impl Windows {
             })
             .collect()
     }
-
-    /// The time until the next window ends.
-    fn next_end(&self, now: Instant) -> Option<Duration> {
-        let first = self.0.values().map(|window| window.since).min()?;
-        Some((first + WINDOW).saturating_duration_since(now))
-    }
 }
 
 #[cfg(test)]
@@ -174,13 +167,11 @@ mod tests {
         assert!(windows.admit(id(place), about(Some("wrist")), start));
         assert!(windows.admit(id(other), about(Some("forearm")), start));
         assert_eq!(windows.close(start + WINDOW / 2), []);
-        assert_eq!(windows.next_end(start + WINDOW / 2), Some(WINDOW / 2));
         let expected = LeftOut {
             what: about(Some("forearm")),
             lines: 86_000 - MOST,
         };
         assert_eq!(windows.close(start + WINDOW), [expected]);
-        assert_eq!(windows.next_end(start + WINDOW), None);
         // In a new window the line is written again.
         assert!(windows.admit(id(place), about(Some("forearm")), start + WINDOW));
     }

@@ -8,7 +8,7 @@ use std::io::{self, Write};
 use std::os::unix::net::UnixDatagram;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{self, Receiver, RecvTimeoutError, SyncSender, TrySendError};
+use std::sync::mpsc::{self, Receiver, SyncSender, TrySendError};
 use std::time::{Duration, Instant};
 
 use tracing_subscriber::fmt::MakeWriter;
@@ -83,23 +83,10 @@ impl Lines {
     }
 }
 
-/// Waits for the next message. Meanwhile, when a window ends, this logs the number of lines left
-/// out.
-fn next(messages: &Receiver<Message>, limit: &Limit) -> Option<Message> {
-    loop {
-        let Some(wait) = limit.report(Instant::now()) else {
-            return messages.recv().ok();
-        };
-        match messages.recv_timeout(wait) {
-            Err(RecvTimeoutError::Timeout) => {}
-            received => return received.ok(),
-        }
-    }
-}
-
 fn write(messages: &Receiver<Message>, journal: &UnixDatagram, lost: &AtomicU64, limit: &Limit) {
     let mut before: &[u8] = b"";
-    while let Some(message) = next(messages, limit) {
+    while let Ok(message) = messages.recv() {
+        limit.report(Instant::now());
         // A write that fails cannot be logged: stderr is closed, or the journal is gone.
         match message {
             Message::Line(line) => {
