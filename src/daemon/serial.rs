@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use serialport::{ClearBuffer, ErrorKind, SerialPort, TTYPort};
 use tokio::io::AsyncReadExt;
-use tokio::task::JoinHandle;
+use tokio::sync::oneshot;
 use tokio::time::Instant;
 use tokio_serial::SerialStream;
 
@@ -51,7 +51,7 @@ enum State {
     /// The port will be opened at this time.
     Waiting(Instant),
     /// A separate thread is opening the port, because a driver may be slow.
-    Opening(JoinHandle<Result<TTYPort, serialport::Error>>),
+    Opening(oneshot::Receiver<Result<TTYPort, serialport::Error>>),
     Open(SerialStream),
 }
 
@@ -73,14 +73,18 @@ impl Link {
             match &mut self.state {
                 State::Waiting(until) => {
                     tokio::time::sleep_until(*until).await;
-                    let (path, baud) = (self.path.clone(), self.baud);
-                    self.state =
-                        State::Opening(tokio::task::spawn_blocking(move || open(&path, baud)));
+                    match start_opening(self.path.clone(), self.baud) {
+                        Ok(opening) => self.state = State::Opening(opening),
+                        Err(error) => {
+                            self.wait();
+                            return Turn::Unavailable(format!("no thread to open it: {error}"));
+                        }
+                    }
                 }
                 State::Opening(opening) => {
                     let opened = match opening.await {
                         Ok(opened) => opened.and_then(SerialStream::try_from),
-                        Err(stopped) => Err(std::io::Error::other(stopped).into()),
+                        Err(ended) => Err(std::io::Error::other(ended).into()),
                     };
                     match opened {
                         Ok(port) => {
@@ -118,6 +122,24 @@ impl Link {
         self.state = State::Waiting(Instant::now() + self.pause);
         self.pause = (self.pause * 2).min(LONGEST_PAUSE);
     }
+}
+
+/// Opens the port in a thread of its own.
+///
+/// # Errors
+///
+/// Fails if the system has no thread to spare. The runtime's own threads would panic then.
+fn start_opening(
+    path: PathBuf,
+    baud: u32,
+) -> std::io::Result<oneshot::Receiver<Result<TTYPort, serialport::Error>>> {
+    let (opened, opening) = oneshot::channel();
+    let thread = std::thread::Builder::new().name("port".to_owned());
+    thread.spawn(move || {
+        // The daemon may have ended meanwhile.
+        let _ = opened.send(open(&path, baud));
+    })?;
+    Ok(opening)
 }
 
 fn open(path: &Path, baud: u32) -> Result<TTYPort, serialport::Error> {
