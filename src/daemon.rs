@@ -1,21 +1,21 @@
 //! The daemon, which connects sensors to subscribers and runs the core between them.
 //!
 //! In: a checked [`Setup`], a future that ends when the daemon must end, and requests to read the
-//! configuration again. Out: events on the sockets. One thread runs everything: one task for each
-//! sensor, one for the hub and one for each connection. The tasks share nothing but lines that are
-//! ready to be sent. The daemon starts without its sensors and waits for them.
+//! configuration again. Out: events on the sockets. The sensors' thread runs one task for each
+//! sensor, one for the hub, and one for each connection that writes its lines. The clients' thread
+//! reads requests and runs HTTP. The tasks share nothing but lines that are ready to be sent. The
+//! daemon starts without its sensors and waits for them.
 
 mod accept;
 pub mod busy;
 mod client;
+mod clients;
 pub mod config;
-pub mod descriptors;
 #[cfg(feature = "foxglove")]
 pub mod foxglove;
 mod frame_rate;
 mod http;
 mod hub;
-mod lane;
 pub(crate) mod lines;
 pub mod log;
 pub mod publish;
@@ -30,6 +30,7 @@ pub mod ros2;
 mod running;
 mod sensor;
 pub(crate) mod serial;
+mod snapshot;
 pub mod socket;
 mod systemd;
 pub mod tcp;
@@ -43,10 +44,12 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
-use tracing::{info, warn};
+use tracing::{debug, info};
 
+use self::clients::Clients;
 use self::config::{Config, Publish, Setup};
 use self::publish::Publishers;
 use self::realtime::Standing;
@@ -76,6 +79,9 @@ pub enum Error {
     /// A sensor to record is missing or lost, or the recording cannot be written.
     #[error(transparent)]
     Record(#[from] record::Error),
+    /// The thread for the clients cannot be started.
+    #[error("cannot start a thread for the clients: {0}")]
+    Clients(#[source] std::io::Error),
     /// The log cannot be written as configured.
     #[error(transparent)]
     Log(#[from] log::Error),
@@ -88,7 +94,7 @@ impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
             Error::Publish(error) => error.exit_code(),
-            Error::Random(_) => IO,
+            Error::Random(_) | Error::Clients(_) => IO,
             Error::Record(error) => error.exit_code(),
             Error::Log(error) => error.exit_code(),
             Error::Stopped(_) => FAILED,
@@ -115,6 +121,7 @@ pub enum Sockets {
 pub struct Daemon {
     setup: Setup,
     hello: Hello,
+    clients: Clients,
     publishers: Publishers,
     /// The target of the recording, if there is one.
     target: Option<Target>,
@@ -171,8 +178,10 @@ impl Daemon {
     /// address is in use, the path holds another file, or the system refuses.
     pub fn bind(setup: Setup) -> Result<Self, Error> {
         let hello = hello(&setup, run_token().map_err(Error::Random)?);
-        let publishers = Publishers::bind(&setup.config)?;
+        let clients = Clients::start().map_err(Error::Clients)?;
+        let publishers = Publishers::bind(&setup.config, &clients)?;
         Ok(Self {
+            clients,
             target: setup.config.record.clone().map(Target::Directory),
             setup,
             hello,
@@ -244,14 +253,12 @@ impl Daemon {
         let Self {
             setup,
             hello,
+            clients,
             publishers,
             target,
         } = self;
-        descriptors::raise();
+        raise_descriptors();
         realtime::lock_memory();
-        if let Some(shortage) = descriptors::shortage(&setup.config) {
-            warn!("{shortage}");
-        }
         let run = hello.run.clone();
         let recorder = target
             .map(|target| Recorder::start(target, about(&setup, &hello)))
@@ -264,7 +271,7 @@ impl Daemon {
         let (sensors, tasks) = start_sensors(&setup, recorder.as_ref(), viewers.as_ref(), &hub);
         let (orders, receiver) = watch::channel(());
         publishers.announce();
-        let publishers = publishers.serve(&hub, &sensors, &receiver);
+        let publishers = publishers.serve(&hub, &sensors, &receiver, &clients);
         announce(&setup, &run);
         systemd::ready();
         busy::forget();
@@ -275,9 +282,25 @@ impl Daemon {
             sensors,
             tasks,
             publishers,
+            clients,
             recorder,
             orders,
         })
+    }
+}
+
+/// Raises the soft limit of file descriptors to the hard limit, because every subscriber takes one.
+/// Nothing in this process fails on descriptors above 1,023.
+fn raise_descriptors() {
+    let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
+    let raised = Rlimit {
+        current: maximum,
+        maximum,
+    };
+    if current != maximum
+        && let Err(error) = setrlimit(Resource::Nofile, raised)
+    {
+        debug!(%error, "the limit of file descriptors stays as it is");
     }
 }
 
@@ -311,7 +334,7 @@ fn start_sensors(
 async fn alive(hub: &hub::Handle, sensors: &Sensors) -> Option<Vec<Status>> {
     let statuses = sensors.statuses().await;
     let all = statuses.len() == sensors.0.len();
-    (all && hub.finals().await.is_ok()).then_some(statuses)
+    (all && hub.survey().await.is_ok()).then_some(statuses)
 }
 
 fn announce(setup: &Setup, run: &str) {

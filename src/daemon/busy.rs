@@ -1,8 +1,8 @@
-//! The longest time that the daemon's thread worked without a wait.
+//! The longest time that the sensors' thread worked without a wait.
 //!
-//! One thread runs every task, so while it works on one thing, everything else waits: a frame of
-//! another sensor, a new subscriber. The time is the thread's processor time. Other programs that
-//! take the core away do not count.
+//! While this thread works on one thing, everything else in it waits: a frame of another sensor, an
+//! event for another subscriber. The time is the thread's processor time. Other programs that take
+//! the core away do not count.
 
 use std::cell::Cell;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -45,8 +45,8 @@ const MOST: Duration = Duration::from_millis(20);
 const PAUSE: Duration = Duration::from_micros(100);
 
 /// Pauses this thread for a moment if it has worked for long without a wait. In real-time scheduling the
-/// system kills a process whose thread never waits, and clients that ask without end leave it no wait of
-/// its own. Call it after the work for a client.
+/// system kills a process whose thread never waits. Clients that subscribe again and again, each time
+/// since the start, could leave it no wait of its own. Call it after the work for a client.
 pub(super) fn rest() {
     let worked = match (BEGUN.get(), used()) {
         (Some(begun), Some(now)) => now.saturating_sub(begun),

@@ -1,32 +1,35 @@
 //! One subscriber's connection: events out, requests in.
 //!
-//! This is the protocol of lines, over both Unix sockets and TCP. A task fetches lines from the hub
-//! and writes them, and reads requests in between. Only a connection with [`Access::Control`] can
-//! change anything. While the daemon carries out a command, events are still sent and the next
-//! request waits.
-
-mod pace;
+//! This is the protocol of lines, over both Unix sockets and TCP. A connection has two tasks. The
+//! reader reads requests, and prepares or carries out what they ask for. The writer fetches lines
+//! from the hub and writes them, with the answers in between. While the daemon carries out a
+//! command, events are still sent and the next request waits. Only a connection with
+//! [`Access::Control`] can change anything.
+//!
+//! The writer runs on the sensors' thread, so that real-time scheduling holds from a sensor's bytes
+//! to its event in the socket. The reader of a connection that can change nothing runs on the
+//! clients' thread, where requests without end delay no sensor.
 
 use std::io;
-use std::pin::Pin;
+use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt, Interest};
 use tokio::net::{TcpStream, UnixStream, tcp, unix};
-use tokio::sync::oneshot;
+use tokio::runtime::Handle;
 use tokio::sync::oneshot::error::TryRecvError;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 use tracing::debug;
 
-use self::pace::Pace;
 use super::accept::Serve;
 use super::busy;
 use super::hub::{self, Closed, Line};
-use super::lane::Lane;
 use super::lines::{Heard, Lines};
 use super::record::NoBlackbox;
 use super::request::motion::{Positions, Told};
-use super::request::{self, Change, Request, motion};
+use super::request::{self, Change, Request, Subscription, motion};
 use super::sensor::{Command, Sensors};
+use super::snapshot::Snapshots;
 use hardnessd_core::event::{Reply, Tared};
 use hardnessd_core::motion::StepBack;
 use hardnessd_core::tare::RetareError;
@@ -55,8 +58,8 @@ pub(crate) trait Stream: Send + 'static {
     /// The writing direction.
     type Output: Output;
 
-    /// Splits the connection into its two directions.
-    fn split(self) -> (Self::Input, Self::Output);
+    /// Splits the connection into its two directions. `runtime` learns when either is ready.
+    fn split(self, runtime: &Handle) -> io::Result<(Self::Input, Self::Output)>;
 
     /// Sends a line if there is room for it, without waiting.
     fn say(self, line: &[u8]) -> io::Result<()>;
@@ -72,8 +75,10 @@ impl Stream for UnixStream {
     type Input = unix::OwnedReadHalf;
     type Output = unix::OwnedWriteHalf;
 
-    fn split(self) -> (Self::Input, Self::Output) {
-        self.into_split()
+    fn split(self, runtime: &Handle) -> io::Result<(Self::Input, Self::Output)> {
+        let stream = self.into_std()?;
+        let _inside = runtime.enter();
+        Ok(UnixStream::from_std(stream)?.into_split())
     }
 
     fn say(self, line: &[u8]) -> io::Result<()> {
@@ -86,8 +91,10 @@ impl Stream for TcpStream {
     type Input = tcp::OwnedReadHalf;
     type Output = tcp::OwnedWriteHalf;
 
-    fn split(self) -> (Self::Input, Self::Output) {
-        self.into_split()
+    fn split(self, runtime: &Handle) -> io::Result<(Self::Input, Self::Output)> {
+        let stream = self.into_std()?;
+        let _inside = runtime.enter();
+        Ok(TcpStream::from_std(stream)?.into_split())
     }
 
     fn say(self, line: &[u8]) -> io::Result<()> {
@@ -114,11 +121,23 @@ pub(crate) struct Service {
     pub(crate) max_clients: usize,
     pub(crate) hub: hub::Handle,
     pub(crate) sensors: Sensors,
-    /// The turns of the connections that ask much.
-    pub(crate) lane: Lane,
+    pub(crate) snapshots: Snapshots,
+    /// The turns of the connections that can change nothing.
+    pub(crate) turns: Arc<Semaphore>,
+    /// The runtime of the writers.
+    pub(crate) writers: Handle,
 }
 
 impl Service {
+    /// Waits for a turn to ask the sensors' thread for something. Only the daemon's own user can
+    /// connect to the control socket, and its robot must not wait.
+    async fn turn(&self) -> Option<OwnedSemaphorePermit> {
+        match self.access {
+            Access::ReadOnly => Arc::clone(&self.turns).acquire_owned().await.ok(),
+            Access::Control => None,
+        }
+    }
+
     /// Carries out a command.
     async fn change(&self, change: Change) -> Result<Done, Refused> {
         let key = change.key();
@@ -163,9 +182,9 @@ impl Service {
 
 impl<S: Stream> Serve<S> for Service {
     fn serve(&self, stream: S) -> impl Future<Output = ()> + Send + 'static {
-        let client = Client::new(stream, self.clone());
+        let service = self.clone();
         async move {
-            if let Err(end) = client.serve().await {
+            if let Err(end) = serve(stream, service).await {
                 debug!(%end, "subscriber gone");
             }
         }
@@ -226,15 +245,6 @@ enum End {
     TooLong,
 }
 
-/// One connection.
-struct Client<S: Stream> {
-    input: Lines<S::Input>,
-    output: S::Output,
-    /// The bytes being written. One call writes a whole batch.
-    outgoing: Vec<u8>,
-    service: Service,
-}
-
 /// The content of the answer to a command.
 #[derive(Default)]
 struct Done {
@@ -242,80 +252,156 @@ struct Done {
     blackbox: Option<String>,
 }
 
-/// A command that is being carried out. Its result is the answer.
-type Doing = Pin<Box<dyn Future<Output = Line> + Send>>;
+/// What the reader has for the writer.
+enum Asked {
+    /// A subscription, and the `id` of its request. The writer makes it, because its answer comes
+    /// between the lines of the old and of the new one.
+    Subscribe(Subscription, Option<serde_json::Value>),
+    /// The lines of an answer.
+    Answer(Vec<Line>),
+    /// The other end sent a line that is too long.
+    TooLong,
+}
 
-impl<S: Stream> Client<S> {
-    fn new(stream: S, service: Service) -> Self {
-        let (input, output) = stream.split();
-        Self {
-            input: Lines::new(input, LONGEST_LINE_BYTES),
-            output,
-            outgoing: Vec::new(),
-            service,
-        }
+/// Serves a connection until it ends.
+async fn serve<S: Stream>(stream: S, service: Service) -> Result<(), End> {
+    let turn = service.turn().await;
+    // A writer that waits for room in the socket must not wait for the clients' thread too.
+    let (input, output) = stream.split(&service.writers)?;
+    let (id, hello) = service.hub.join().await?;
+    let mut lines = vec![hello];
+    lines.extend(service.snapshots.current().await?.statuses.clone());
+    let (asked, inbox) = mpsc::channel(1);
+    let mut writer = Writer {
+        id,
+        hub: service.hub.clone(),
+        output,
+        outgoing: Vec::new(),
+        inbox,
+    };
+    let written = service.writers.spawn(async move {
+        let written = writer.write(lines, turn).await;
+        writer.hub.leave(id).await;
+        written
+    });
+    let lines = Lines::new(input, LONGEST_LINE_BYTES);
+    let read = read(lines, asked, &service).await;
+    // The writer ends soon after the reader, unless the other end only stopped sending.
+    let written = written.await.map_err(io::Error::other)?;
+    written.and(read)
+}
+
+/// Reads requests until the writer has ended or the other end sends no more.
+async fn read<I: AsyncRead + Unpin>(
+    mut lines: Lines<I>,
+    asked: mpsc::Sender<(Asked, Option<OwnedSemaphorePermit>)>,
+    service: &Service,
+) -> Result<(), End> {
+    loop {
+        // The place is taken before the request is read: the writer waits for its answer, even
+        // when the hub has closed.
+        let Ok(place) = asked.reserve().await else {
+            return Ok(());
+        };
+        let line = tokio::select! {
+            heard = lines.next() => match heard? {
+                Heard::Line(line) => line,
+                Heard::TooLong => {
+                    place.send((Asked::TooLong, None));
+                    return Ok(());
+                }
+                Heard::End => return Ok(()),
+            },
+            () = asked.closed() => return Ok(()),
+        };
+        let turn = service.turn().await;
+        let line = request::parse(&line);
+        let id = line.id;
+        let request = match line.request {
+            Ok(Request::Subscribe(subscription)) => Asked::Subscribe(subscription, id),
+            Ok(Request::Status) => {
+                let mut lines = service.snapshots.current().await?.statuses.clone();
+                lines.push(answer(Ok(Done::default()), id));
+                Asked::Answer(lines)
+            }
+            Ok(Request::Last) => {
+                let finals = service.hub.survey().await?.finals;
+                let mut lines: Vec<Line> = finals.into_values().collect();
+                lines.push(answer(Ok(Done::default()), id));
+                Asked::Answer(lines)
+            }
+            // A command may take long, because it may wait for frames or for a file to be written.
+            Ok(Request::Change(change)) => {
+                Asked::Answer(vec![answer(service.change(change).await, id)])
+            }
+            Err(unusable) => Asked::Answer(vec![answer(Err(unusable.into()), id)]),
+        };
+        place.send((request, turn));
     }
+}
 
-    async fn serve(mut self) -> Result<(), End> {
-        let (id, hello) = self.service.hub.join().await?;
-        let served = self.converse(id, hello).await;
-        self.service.hub.leave(id).await;
-        served
-    }
+/// The writing half of a connection.
+struct Writer<O> {
+    /// The number of the subscriber.
+    id: u64,
+    hub: hub::Handle,
+    output: O,
+    /// The bytes being written. One call writes a whole batch.
+    outgoing: Vec<u8>,
+    inbox: mpsc::Receiver<(Asked, Option<OwnedSemaphorePermit>)>,
+}
 
-    async fn converse(&mut self, id: u64, hello: Line) -> Result<(), End> {
-        let hub = self.service.hub.clone();
-        let mut lines = vec![hello];
-        lines.extend(statuses(&self.service.sensors).await);
+impl<O: Output> Writer<O> {
+    /// Writes `lines`, then what the hub and the reader have, until the hub has closed or the other
+    /// end is gone. The turn of a request ends when there is no more to do for it but to write.
+    async fn write(
+        &mut self,
+        lines: Vec<Line>,
+        turn: Option<OwnedSemaphorePermit>,
+    ) -> Result<(), End> {
+        drop(turn);
         self.send(&lines).await?;
-        let mut next = hub.take(id).await?;
-        let mut hearing = true;
-        let mut doing: Option<Doing> = None;
+        let mut next = self.hub.take(self.id).await?;
+        let mut reading = true;
         let mut pause = HALF_CLOSED_CHECKS.0;
-        let mut pace = Pace::new(self.service.lane.clone());
         loop {
             tokio::select! {
                 biased;
                 lines = &mut next => {
                     let Ok(lines) = lines else {
-                        // The hub has closed. Only the answer to a command still has to be sent.
-                        if let Some(doing) = doing {
-                            self.send(&[doing.await]).await?;
-                        }
-                        return Ok(());
+                        return self.finish().await;
                     };
                     self.send(&lines).await?;
-                    next = hub.take(id).await?;
+                    next = self.hub.take(self.id).await?;
                 }
-                answer = done(&mut doing) => {
-                    doing = None;
-                    self.send(&[answer]).await?;
-                }
-                heard = hear(&mut self.input, &pace), if hearing && doing.is_none() => match heard? {
-                    Heard::Line(line) => {
-                        pace.count(line.len());
-                        doing = self.heed(id, &line, &mut next).await?;
+                asked = self.inbox.recv(), if reading => match asked {
+                    Some((asked, turn)) => {
+                        self.answer(asked, turn, &mut next).await?;
                         busy::rest();
                     }
-                    Heard::TooLong => {
-                        let message = format!(
-                            "found a line over {LONGEST_LINE_BYTES} bytes, expected a shorter one"
-                        );
-                        self.send(&[error(message, None)]).await?;
-                        return Err(End::TooLong);
-                    }
                     // The other end sends no more, but it may still read.
-                    Heard::End => {
-                        hearing = false;
+                    None => {
+                        reading = false;
                         self.stay().await?;
                     }
                 },
-                () = tokio::time::sleep(pause), if !hearing => {
+                () = tokio::time::sleep(pause), if !reading => {
                     pause = HALF_CLOSED_CHECKS.1.min(2 * pause);
                     self.stay().await?;
                 }
             }
         }
+    }
+
+    /// The hub has closed. Only the answer to a command that is being carried out is still sent.
+    async fn finish(&mut self) -> Result<(), End> {
+        self.inbox.close();
+        while let Some((asked, _)) = self.inbox.recv().await {
+            if let Asked::Answer(lines) = asked {
+                self.send(&lines).await?;
+            }
+        }
+        Ok(())
     }
 
     /// Fails if the other end is closed.
@@ -327,49 +413,39 @@ impl<S: Stream> Client<S> {
         }
     }
 
-    /// Answers a request, or begins to carry out a command. `next` is the pending `take` of the
-    /// hub.
-    async fn heed(
+    /// Answers a request. `next` is the pending `take` of the hub.
+    async fn answer(
         &mut self,
-        id: u64,
-        line: &[u8],
+        asked: Asked,
+        turn: Option<OwnedSemaphorePermit>,
         next: &mut oneshot::Receiver<Vec<Line>>,
-    ) -> Result<Option<Doing>, End> {
-        let Service { hub, sensors, .. } = self.service.clone();
-        let line = request::parse(line);
-        let answered = match line.request {
-            Ok(Request::Subscribe(subscription)) => {
-                let subscribed = hub.subscribe(id, subscription).await?;
-                subscribed.map(|()| Vec::new()).map_err(Refused::from)
+    ) -> Result<(), End> {
+        let answer = match asked {
+            Asked::Subscribe(subscription, id) => {
+                let subscribed = self.hub.subscribe(self.id, subscription).await?;
+                let done = subscribed.map(|()| Done::default());
+                vec![answer(done.map_err(Refused::from), id)]
             }
-            Ok(Request::Status) => Ok(statuses(&sensors).await),
-            Ok(Request::Last) => Ok(hub.finals().await?),
-            Ok(Request::Change(change)) => {
-                // A command may take long, because it may wait for frames or for a file to be
-                // written.
-                let service = self.service.clone();
-                return Ok(Some(Box::pin(async move {
-                    answer(service.change(change).await, line.id)
-                })));
+            Asked::Answer(lines) => lines,
+            Asked::TooLong => {
+                let message =
+                    format!("found a line over {LONGEST_LINE_BYTES} bytes, expected a shorter one");
+                self.send(&[error(message, None)]).await?;
+                return Err(End::TooLong);
             }
-            Err(unusable) => Err(unusable.into()),
         };
+        drop(turn);
         // Lines that the hub gave before it answered are sent before the answer.
         let given = next.try_recv();
         if let Ok(lines) = &given {
             self.send(lines).await?;
         }
-        let (mut lines, answered) = match answered {
-            Ok(lines) => (lines, Ok(Done::default())),
-            Err(refused) => (Vec::new(), Err(refused)),
-        };
-        lines.push(answer(answered, line.id));
-        self.send(&lines).await?;
+        self.send(&answer).await?;
         // Either the pending `take` gave its lines, or another subscription ended it.
         if given != Err(TryRecvError::Empty) {
-            *next = hub.take(id).await?;
+            *next = self.hub.take(self.id).await?;
         }
-        Ok(None)
+        Ok(())
     }
 
     async fn send(&mut self, lines: &[Line]) -> Result<(), End> {
@@ -379,12 +455,6 @@ impl<S: Stream> Client<S> {
         }
         Ok(self.output.write_all(&self.outgoing).await?)
     }
-}
-
-/// Waits until another line may be read, and reads it.
-async fn hear<I: AsyncRead + Unpin>(lines: &mut Lines<I>, pace: &Pace) -> io::Result<Heard> {
-    pace.wait().await;
-    lines.next().await
 }
 
 /// Passes a command on to the sensor called `name`. `key` is the request's key for that name.
@@ -419,20 +489,6 @@ pub(super) async fn move_arm(
     tell(sensors, "motion.sensor", sensor, command).await?;
     taken.await.map_err(|_| Refused::Stopping("motion"))??;
     Ok(())
-}
-
-/// Every sensor's current status.
-pub(super) async fn statuses(sensors: &Sensors) -> Vec<Line> {
-    let statuses = sensors.statuses().await;
-    statuses.into_iter().map(Line::from).collect()
-}
-
-/// Waits for the answer to a command. If no command is being carried out, this waits forever.
-async fn done(doing: &mut Option<Doing>) -> Line {
-    match doing {
-        Some(doing) => doing.await,
-        None => std::future::pending().await,
-    }
 }
 
 fn answer(answered: Result<Done, Refused>, id: Option<serde_json::Value>) -> Line {

@@ -15,6 +15,7 @@ use std::fmt::Display;
 use std::io::Write as _;
 use std::net::SocketAddr;
 use std::pin::pin;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use axum::Router;
@@ -22,6 +23,7 @@ use axum::extract::State;
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
 use base64::prelude::{BASE64_STANDARD, Engine};
+use bytes::Bytes;
 use hyper::body::Incoming;
 use hyper::header::{self, HeaderName, HeaderValue};
 use hyper::server::conn::http1;
@@ -32,13 +34,13 @@ use hyper_util::service::TowerToHyperService;
 use rustix::net::sockopt;
 use sha2::{Digest, Sha256};
 use tokio::net::TcpStream;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tracing::debug;
 
 use super::accept::{Serve, Stop, stopped};
-use super::busy;
 use super::hub::{self, Closed};
-use super::lane::Lane;
-use super::sensor::Sensors;
+use super::sensor::{Sensors, Vitals};
+use super::snapshot::{Snapshot, Snapshots};
 use hardnessd_core::event::LinkState;
 
 /// The live page: one file, which loads nothing from elsewhere.
@@ -55,10 +57,9 @@ const BUFFER_BYTES: usize = 64 * 1024;
 /// section 3).
 const LONGEST_TARGET: usize = 8_000;
 
-/// The time of a request in the lane, and the time of the requests that do not wait: 50 at once, and after
-/// that 500 a second over all connections.
-const REQUEST_TIME: Duration = Duration::from_millis(2);
-const FREE_TIME: Duration = Duration::from_millis(100);
+/// The most bytes of texts that connections may keep waiting together. All who ask at about the same
+/// time share one text, so a client that reads never needs much of this.
+const MOST_TEXT_BYTES: usize = 16 << 20;
 
 /// A connection whose other end takes nothing for this long is closed.
 const UNREAD_PATIENCE: Duration = Duration::from_secs(30);
@@ -89,8 +90,6 @@ pub(crate) struct Http {
     listen: SocketAddr,
     routes: TowerToHyperService<Router>,
     stop: Stop,
-    /// The turns of all requests.
-    lane: Lane,
 }
 
 /// The sources of the answers.
@@ -98,13 +97,26 @@ pub(crate) struct Http {
 struct Sources {
     hub: hub::Handle,
     sensors: Sensors,
+    snapshots: Snapshots,
+    turns: Arc<Semaphore>,
+    /// The snapshots of `/metrics` and `/api/status`.
+    texts: Snapshots,
+    /// One permit for each byte of the texts that exist.
+    text_bytes: Arc<Semaphore>,
 }
 
 impl Http {
     /// The most connections at a time. A page has two or three.
     pub(crate) const MOST_CONNECTIONS: usize = 128;
 
-    pub(crate) fn new(listen: SocketAddr, hub: hub::Handle, sensors: Sensors, stop: Stop) -> Self {
+    pub(crate) fn new(
+        listen: SocketAddr,
+        hub: hub::Handle,
+        sensors: Sensors,
+        snapshots: Snapshots,
+        turns: Arc<Semaphore>,
+        stop: Stop,
+    ) -> Self {
         let policy = HeaderValue::try_from(page_policy(PAGE)).expect("base64 is ASCII");
         let page = ([(header::CONTENT_SECURITY_POLICY, policy)], Html(PAGE));
         let routes = Router::new()
@@ -120,19 +132,23 @@ impl Http {
                     "not found: the paths are /, /events, /api/status, /metrics, /livez and /readyz",
                 )
             })
-            .with_state(Sources { hub, sensors });
+            .with_state(Sources {
+                texts: Snapshots::new(hub.clone(), sensors.clone()),
+                hub,
+                sensors,
+                snapshots,
+                turns,
+                text_bytes: Arc::new(Semaphore::new(MOST_TEXT_BYTES)),
+            });
         Self {
             listen,
             routes: TowerToHyperService::new(routes),
             stop,
-            lane: Lane::new(),
         }
     }
 
     /// Answers a request. `local` is this machine's address of the connection.
     async fn respond(&self, request: Request<Incoming>, local: SocketAddr) -> Response {
-        self.lane.take(REQUEST_TIME, FREE_TIME).await;
-        busy::rest();
         let mut response = if !host::is_ours(&request, self.listen, local) {
             let message = "the Host header is not an address of this machine: use localhost or \
                            the address in [http] listen";
@@ -174,20 +190,80 @@ impl IntoResponse for Closed {
     }
 }
 
-async fn status(State(of): State<Sources>) -> Result<impl IntoResponse, Closed> {
-    let json = status::json(&of.hub.survey().await?, &of.sensors.vitals().await);
-    Ok(([(header::CONTENT_TYPE, "application/json")], json))
+/// A text that all who asked for it at about the same time share.
+#[derive(Debug)]
+pub(super) struct Text {
+    text: String,
+    /// The text's share of [`MOST_TEXT_BYTES`].
+    _bytes: OwnedSemaphorePermit,
 }
 
-async fn metrics(State(of): State<Sources>) -> Result<impl IntoResponse, Closed> {
-    let text = metrics::encode(&of.hub.survey().await?, &of.sensors.vitals().await);
-    Ok(([(header::CONTENT_TYPE, metrics::CONTENT_TYPE)], text))
+impl Text {
+    /// Returns `None` if the connections keep too many texts waiting.
+    fn new(text: String, text_bytes: &Arc<Semaphore>) -> Option<Self> {
+        let bytes = u32::try_from(text.len()).ok()?;
+        let bytes = Arc::clone(text_bytes).try_acquire_many_owned(bytes).ok()?;
+        Some(Self {
+            text,
+            _bytes: bytes,
+        })
+    }
+}
+
+impl AsRef<[u8]> for Text {
+    fn as_ref(&self) -> &[u8] {
+        self.text.as_bytes()
+    }
+}
+
+/// An answer with the text in `place`, which `encode` makes of the snapshot once.
+fn shared(
+    content_type: &'static str,
+    snapshot: &Snapshot,
+    place: &OnceLock<Option<Bytes>>,
+    encode: fn(&Snapshot) -> String,
+    text_bytes: &Arc<Semaphore>,
+) -> Response {
+    let made = place.get_or_init(|| Text::new(encode(snapshot), text_bytes).map(Bytes::from_owner));
+    match made {
+        Some(text) => ([(header::CONTENT_TYPE, content_type)], text.clone()).into_response(),
+        None => refusal(
+            StatusCode::SERVICE_UNAVAILABLE,
+            "too many answers wait to be read: try later",
+        ),
+    }
+}
+
+async fn status(State(of): State<Sources>) -> Result<Response, Closed> {
+    let now = of.texts.recent().await?;
+    let encode = |now: &Snapshot| status::json(&now.survey, &now.vitals);
+    Ok(shared(
+        "application/json",
+        &now,
+        &now.status,
+        encode,
+        &of.text_bytes,
+    ))
+}
+
+async fn metrics(State(of): State<Sources>) -> Result<Response, Closed> {
+    let now = of.texts.recent().await?;
+    let encode = |now: &Snapshot| metrics::encode(&now.survey, &now.vitals);
+    Ok(shared(
+        metrics::CONTENT_TYPE,
+        &now,
+        &now.metrics,
+        encode,
+        &of.text_bytes,
+    ))
 }
 
 /// Makes the same check as the watchdog.
 async fn live(State(of): State<Sources>) -> Response {
-    match tokio::time::timeout(PATIENCE, super::alive(&of.hub, &of.sensors)).await {
-        Ok(Some(_)) => "ok: every pipeline answers\n".into_response(),
+    match tokio::time::timeout(PATIENCE, of.snapshots.current()).await {
+        Ok(Ok(now)) if now.vitals.len() == of.sensors.0.len() => {
+            "ok: every pipeline answers\n".into_response()
+        }
         _ => refusal(
             StatusCode::SERVICE_UNAVAILABLE,
             "a pipeline does not answer",
@@ -195,11 +271,11 @@ async fn live(State(of): State<Sources>) -> Response {
     }
 }
 
-async fn ready(State(of): State<Sources>) -> impl IntoResponse {
-    let statuses = of.sensors.statuses().await;
+async fn ready(State(of): State<Sources>) -> Result<impl IntoResponse, Closed> {
+    let now = of.snapshots.current().await?;
     let mut lines = String::new();
-    let mut ready = statuses.len() == of.sensors.0.len();
-    for status in &statuses {
+    let mut ready = now.vitals.len() == of.sensors.0.len();
+    for Vitals { status, .. } in &now.vitals {
         ready &= status.state == LinkState::Live;
         let state = hardnessd_core::event::name(&status.state);
         lines += &format!("{} {state}\n", status.sensor);
@@ -209,7 +285,7 @@ async fn ready(State(of): State<Sources>) -> impl IntoResponse {
     } else {
         StatusCode::SERVICE_UNAVAILABLE
     };
-    (code, lines)
+    Ok((code, lines))
 }
 
 impl Serve<TcpStream> for Http {

@@ -4,12 +4,14 @@ use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
+use tokio::runtime::Handle;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tracing::info;
 
 use super::accept::{Stop, accept};
 use super::client::{Access, Service};
+use super::clients::Clients;
 use super::config::{Config, Unix};
 #[cfg(feature = "foxglove")]
 use super::foxglove;
@@ -17,12 +19,12 @@ use super::http::Http;
 use super::hub;
 #[cfg(feature = "foxglove")]
 use super::hub::Line;
-use super::lane::Lane;
 #[cfg(any(feature = "foxglove", feature = "ros2", feature = "zenoh"))]
 use super::relay::Worker;
 #[cfg(feature = "ros2")]
 use super::ros2;
 use super::sensor::Sensors;
+use super::snapshot::Snapshots;
 use super::socket::{self, Socket};
 use super::systemd;
 use super::tcp::{self, Tcp};
@@ -115,8 +117,9 @@ pub(crate) struct Publishers {
 }
 
 impl Publishers {
-    /// Opens all publishers of the configuration, or none.
-    pub(crate) fn bind(config: &Config) -> Result<Self, Error> {
+    /// Opens all publishers of the configuration, or none. Call it on the sensors' thread, which
+    /// serves the control socket itself. All others belong to the thread for `clients`.
+    pub(crate) fn bind(config: &Config, clients: &Clients) -> Result<Self, Error> {
         let publish = &config.publish;
         let unix = &publish.unix;
         let mut passed = systemd::sockets().map_err(Error::Passed)?;
@@ -127,8 +130,11 @@ impl Publishers {
             });
             made.transpose()
         };
+        let on_their_thread = clients.runtime.enter();
         let events = socket(EVENTS_KEY, &unix.path(), unix.mode.0)?;
+        drop(on_their_thread);
         let control = socket(CONTROL_KEY, &unix.control_path(), CONTROL_MODE)?;
+        let _on_their_thread = clients.runtime.enter();
         if let Some(left) = passed.first() {
             let address = left.local_addr().map_err(Error::Passed)?;
             let found = address.as_pathname().unwrap_or(Path::new("(no path)"));
@@ -204,7 +210,13 @@ impl Publishers {
 
     /// Serves each publisher in a task, until the order to stop and until the publisher's
     /// subscribers have their last lines.
-    pub(crate) fn serve(self, hub: &hub::Handle, sensors: &Sensors, stop: &Stop) -> JoinSet<()> {
+    pub(crate) fn serve(
+        self,
+        hub: &hub::Handle,
+        sensors: &Sensors,
+        stop: &Stop,
+        clients: &Clients,
+    ) -> JoinSet<()> {
         let Self {
             max_clients,
             socket,
@@ -218,18 +230,22 @@ impl Publishers {
             #[cfg(feature = "zenoh")]
             zenoh,
         } = self;
+        let snapshots = Snapshots::new(hub.clone(), sensors.clone());
         let service = |access| Service {
-            lane: Lane::new(),
             access,
             max_clients,
             hub: hub.clone(),
             sensors: sensors.clone(),
+            snapshots: snapshots.clone(),
+            turns: clients.turns.clone(),
+            writers: Handle::current(),
         };
+        let on = &clients.runtime;
         let mut tasks = JoinSet::new();
         if let Some(socket) = socket {
             let service = service(Access::ReadOnly);
             let socket = socket.obey(stop.clone());
-            tasks.spawn(accept(socket, max_clients, service, stop.clone()));
+            tasks.spawn_on(accept(socket, max_clients, service, stop.clone()), on);
         }
         if let Some(control) = control {
             let service = service(Access::Control);
@@ -238,28 +254,33 @@ impl Publishers {
         }
         if let Some(tcp) = tcp {
             let service = service(Access::ReadOnly);
-            tasks.spawn(accept(tcp, max_clients, service, stop.clone()));
+            tasks.spawn_on(accept(tcp, max_clients, service, stop.clone()), on);
         }
         if let Some(listener) = http {
             let http = Http::new(
                 listener.address(),
                 hub.clone(),
                 sensors.clone(),
+                snapshots.clone(),
+                clients.turns.clone(),
                 stop.clone(),
             );
-            tasks.spawn(accept(listener, Http::MOST_CONNECTIONS, http, stop.clone()));
+            tasks.spawn_on(
+                accept(listener, Http::MOST_CONNECTIONS, http, stop.clone()),
+                on,
+            );
         }
         #[cfg(feature = "foxglove")]
         if let Some((foxglove, _)) = foxglove {
-            tasks.spawn(foxglove.serve(hub.clone(), sensors.clone()));
+            tasks.spawn_on(foxglove.serve(hub.clone(), sensors.clone()), on);
         }
         #[cfg(feature = "ros2")]
         if let Some(ros2) = ros2 {
-            tasks.spawn(ros2.serve(hub.clone(), sensors.clone()));
+            tasks.spawn_on(ros2.serve(hub.clone(), sensors.clone()), on);
         }
         #[cfg(feature = "zenoh")]
         if let Some(zenoh) = zenoh {
-            tasks.spawn(zenoh.serve(hub.clone(), sensors.clone()));
+            tasks.spawn_on(zenoh.serve(hub.clone(), sensors.clone()), on);
         }
         tasks
     }

@@ -2,8 +2,8 @@
 //!
 //! The daemon does not ask for real-time scheduling. systemd sets it before it starts the daemon
 //! (`CPUSchedulingPolicy=` of the unit), and the sandbox then refuses any change. Threads that the
-//! daemon starts are scheduled as ordinary ones (`CPUSchedulingResetOnFork=`): they log, record and
-//! load models. The daemon locks its memory itself, because systemd cannot. It does so where the
+//! daemon starts are scheduled as ordinary ones (`CPUSchedulingResetOnFork=`): they serve clients,
+//! log, record and load models. The daemon locks its memory itself, because systemd cannot. It does so where the
 //! unit has removed the limit (`LimitMEMLOCK=`), or where the daemon may ignore the limit.
 
 use std::path::Path;

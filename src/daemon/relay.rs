@@ -167,7 +167,14 @@ async fn relay<J: From<Vec<Line>>>(
     };
     // Only a subscription with `since` can be refused.
     let _ = hub.subscribe(id, wanted).await?;
-    let mut job = J::from(client::statuses(sensors).await);
+    let mut job = J::from(
+        sensors
+            .statuses()
+            .await
+            .into_iter()
+            .map(Line::from)
+            .collect(),
+    );
     let mut next = hub.take(id).await?;
     let mut tick = tokio::time::interval(VITALS);
     tick.set_missed_tick_behavior(MissedTickBehavior::Delay);

@@ -8,6 +8,7 @@ use tokio::task::JoinSet;
 use tokio::time::MissedTickBehavior;
 use tracing::{error, info, warn};
 
+use super::clients::Clients;
 use super::config::Setup;
 use super::record::Recorder;
 use super::reload::{self, Readers, Refusal, Reload};
@@ -29,6 +30,8 @@ pub(super) struct Running {
     pub(super) tasks: JoinSet<()>,
     /// The tasks of the publishers.
     pub(super) publishers: JoinSet<()>,
+    /// The thread of those tasks.
+    pub(super) clients: Clients,
     pub(super) recorder: Option<Recorder>,
     /// Sends orders to the listeners.
     pub(super) orders: watch::Sender<()>,
@@ -110,6 +113,7 @@ impl Running {
         if tokio::time::timeout(FAREWELL, farewell).await.is_err() {
             warn!("a subscriber did not fetch its last lines");
         }
+        drop(self.clients);
         let recorded = match self.recorder {
             // Wait as long as necessary for a recording into one file, because a user asked for it.
             Some(recorder) if self.setup.config.record.is_none() => recorder.finish().await,

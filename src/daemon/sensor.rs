@@ -26,6 +26,10 @@ use hardnessd_core::sensor::Sensor;
 use hardnessd_core::tare::RetareError;
 use hardnessd_core::verdict::Hrn;
 
+/// So many sensors are asked for their state at once: few switches between threads, and yet a frame
+/// that comes meanwhile does not wait for all sensors.
+const AT_ONCE: usize = 32;
+
 /// A command to a sensor's task.
 #[derive(Debug)]
 pub(crate) enum Command {
@@ -76,12 +80,16 @@ impl Sensors {
     /// The current state of every sensor. A sensor whose task has ended is left out.
     pub(crate) async fn vitals(&self) -> Vec<Vitals> {
         let mut all = Vec::with_capacity(self.0.len());
-        for sensor in &self.0 {
-            let (reply, vitals) = oneshot::channel();
-            if sensor.commands.send(Command::Status(reply)).await.is_ok()
-                && let Ok(vitals) = vitals.await
-            {
-                all.push(vitals);
+        for some in self.0.chunks(AT_ONCE) {
+            let mut asked = Vec::with_capacity(AT_ONCE);
+            for sensor in some {
+                let (reply, vitals) = oneshot::channel();
+                if sensor.commands.send(Command::Status(reply)).await.is_ok() {
+                    asked.push(vitals);
+                }
+            }
+            for vitals in asked {
+                all.extend(vitals.await.ok());
             }
         }
         all

@@ -154,9 +154,6 @@ pub fn run(args: &Args) -> Result<(), Error> {
         }
     }
     lines += &networks(&setup, path);
-    if let Some(shortage) = daemon::descriptors::shortage(&setup.config) {
-        hardnessd_core::say!("warning: {}: {shortage}", path.display());
-    }
     super::print(lines.as_bytes())
         .map(drop)
         .map_err(Error::Print)

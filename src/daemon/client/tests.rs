@@ -1,6 +1,5 @@
 use serde_json::Value;
 use tokio::io::{AsyncBufReadExt, BufReader};
-use tokio::sync::mpsc;
 
 use super::*;
 use crate::daemon::hub::tests::{hello, press};
@@ -15,12 +14,15 @@ async fn events_go_on_and_requests_wait_while_a_command_is_carried_out() {
     let hub = hub::start(hello(), EventRecorder::default());
     let (commands, mut inbox) = mpsc::channel(1);
     let name = "a".to_owned();
+    let sensors = Sensors(vec![SensorHandle { name, commands }]);
     let service = Service {
-        lane: Lane::new(),
         access: Access::Control,
         max_clients: 1,
         hub: hub.clone(),
-        sensors: Sensors(vec![SensorHandle { name, commands }]),
+        snapshots: Snapshots::new(hub.clone(), sensors.clone()),
+        sensors,
+        turns: Arc::new(Semaphore::new(1)),
+        writers: Handle::current(),
     };
     let (ours, theirs) = UnixStream::pair().unwrap();
     tokio::spawn(service.serve(theirs));

@@ -12,7 +12,7 @@ use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use futures_util::stream::{self, StreamExt};
 use hyper::StatusCode;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{SemaphorePermit, mpsc, oneshot};
 
 use super::{Sources, refusal};
 use crate::daemon::hub::{Ahead, Closed, Line};
@@ -113,9 +113,10 @@ async fn open(
 ) -> Result<Result<mpsc::Receiver<Batch>, Ahead>, Closed> {
     let (reply, opened) = oneshot::channel();
     tokio::spawn(async move {
+        let turn = sources.turns.acquire().await;
         if let Ok((id, hello)) = sources.hub.join().await {
             // The client, the hub and the connection may each end the subscription.
-            let _ = serve(&sources, id, hello, wanted, reply).await;
+            let _ = serve(&sources, id, hello, wanted, reply, turn.ok()).await;
             sources.hub.leave(id).await;
         }
     });
@@ -125,13 +126,15 @@ async fn open(
 /// Answers the request of a subscriber that has joined, and serves the subscriber until its
 /// connection or the hub has ended.
 async fn serve(
-    Sources { hub, sensors }: &Sources,
+    Sources { hub, snapshots, .. }: &Sources,
     id: u64,
     hello: Line,
     wanted: Subscription,
     opened: oneshot::Sender<Result<mpsc::Receiver<Batch>, Ahead>>,
+    turn: Option<SemaphorePermit<'_>>,
 ) -> Option<()> {
-    let run = hub.survey().await.ok()?.hello.run;
+    let now = snapshots.current().await.ok()?;
+    let run = now.survey.hello.run.clone();
     // If the connection breaks before its first event, the browser resumes from here.
     let from = match &wanted.since {
         None => hello.seq,
@@ -142,9 +145,11 @@ async fn serve(
         return opened.send(Err(ahead)).ok();
     }
     let hello = event(&run, &Line { seq: from, ..hello }).retry(RETRY);
-    let statuses = sensors.statuses().await.into_iter().map(Line::from);
+    drop(turn);
     let mut batch = vec![hello];
-    batch.extend(statuses.map(|line| event(&run, &line)));
+    batch.extend(now.statuses.iter().map(|line| event(&run, line)));
+    // The snapshot may hold long texts, and a connection may be open for days.
+    drop(now);
     let (connection, batches) = mpsc::channel(1);
     opened.send(Ok(batches)).ok()?;
     let mut next = hub.take(id).await.ok()?;

@@ -33,9 +33,6 @@ enum Command {
         subscription: Subscription,
         reply: oneshot::Sender<Result<(), Ahead>>,
     },
-    Finals {
-        reply: oneshot::Sender<Vec<Line>>,
-    },
     Survey {
         reply: oneshot::Sender<Survey>,
     },
@@ -105,11 +102,6 @@ impl Handle {
             reply,
         })
         .await
-    }
-
-    /// The last final verdict of each sensor, as it was sent.
-    pub(crate) async fn finals(&self) -> Result<Vec<Line>, Closed> {
-        self.ask(|reply| Command::Finals { reply }).await
     }
 
     /// The state of the hub.
@@ -208,9 +200,6 @@ async fn serve(mut hub: Hub, mut inbox: mpsc::Receiver<Command>) {
                 // takes again after its answer.
                 waiting.remove(&id);
                 let _ = reply.send(hub.subscribe(id, &subscription));
-            }
-            Command::Finals { reply } => {
-                let _ = reply.send(hub.finals.values().cloned().collect());
             }
             Command::Survey { reply } => {
                 let _ = reply.send(Survey {

@@ -1,0 +1,58 @@
+//! The thread that serves everything that clients do, with a runtime of its own.
+//!
+//! The sensors' thread has real-time scheduling under systemd, and this thread has not. So clients
+//! that ask without end delay other clients, and no sensor.
+
+use std::io;
+use std::sync::Arc;
+use std::thread;
+
+use tokio::runtime::{Builder, Handle};
+use tokio::sync::{Semaphore, oneshot};
+
+/// The thread. When this is dropped, its tasks are dropped, and the thread ends.
+#[derive(Debug)]
+pub(crate) struct Clients {
+    pub(super) runtime: Handle,
+    /// A client that asks the sensors' thread for something needs the one permit. So that thread
+    /// has one request at a time to answer, and between two requests it waits for this thread.
+    pub(super) turns: Arc<Semaphore>,
+    /// Ends the thread when it is dropped.
+    ending: Option<oneshot::Sender<()>>,
+    thread: Option<thread::JoinHandle<()>>,
+}
+
+impl Clients {
+    /// Starts the thread.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the system has no thread or descriptors for it.
+    pub(super) fn start() -> io::Result<Self> {
+        let runtime = Builder::new_current_thread().enable_all().build()?;
+        let handle = runtime.handle().clone();
+        let (ending, ended) = oneshot::channel::<()>();
+        let thread = thread::Builder::new()
+            .name("clients".to_owned())
+            .spawn(move || {
+                // The wait always ends with an error, because the sender is only dropped.
+                let _ = runtime.block_on(ended);
+            })?;
+        Ok(Self {
+            runtime: handle,
+            turns: Arc::new(Semaphore::new(1)),
+            ending: Some(ending),
+            thread: Some(thread),
+        })
+    }
+}
+
+impl Drop for Clients {
+    fn drop(&mut self) {
+        drop(self.ending.take());
+        if let Some(thread) = self.thread.take() {
+            // A panic on that thread has been reported by itself.
+            let _ = thread.join();
+        }
+    }
+}
