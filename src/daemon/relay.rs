@@ -167,14 +167,8 @@ async fn relay<J: From<Vec<Line>>>(
     };
     // Only a subscription with `since` can be refused.
     let _ = hub.subscribe(id, wanted).await?;
-    let mut job = J::from(
-        sensors
-            .statuses()
-            .await
-            .into_iter()
-            .map(Line::from)
-            .collect(),
-    );
+    let statuses = sensors.statuses().await.into_iter().map(Line::from);
+    let mut job = J::from(statuses.collect::<Vec<Line>>());
     let mut next = hub.take(id).await?;
     let mut tick = tokio::time::interval(VITALS);
     tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
