@@ -21,7 +21,8 @@ fn run(arguments: &[&str]) -> (i32, String, String) {
 }
 
 fn recorded(bench: &Bench, preset: &str) -> String {
-    let path = bench.path("sensor.bin").to_str().unwrap().to_owned();
+    let name = format!("{preset}.bin");
+    let path = bench.path(&name).to_str().unwrap().to_owned();
     let played = ["--presses", "4", "--fps", "20", "--seed", "5"];
     let arguments = [
         &["simulate", "--to", &path, "--preset", preset],

@@ -77,10 +77,12 @@ impl Link {
         }
     }
 
-    /// The port could not be opened. If it was open before, its reason stays.
+    /// The port could not be opened.
     pub(super) fn unavailable(&mut self, reason: String) {
-        if let Port::Closed { reason: known } = &mut self.port {
-            *known = Some(reason);
+        match &mut self.port {
+            Port::Closed { reason: known } => *known = Some(reason),
+            Port::Lost { reason: known } => *known = reason,
+            _ => {}
         }
     }
 

@@ -358,11 +358,18 @@ fn a_lost_device_aborts_the_press_and_numbers_go_on() {
     play(&mut pipeline, 5, &[raw(5, 50); 2]);
     let lost = pipeline.lost("end of file".to_owned(), at(1300));
     assert_eq!(words(&lost), ["Lost (end of file)", "Aborted 1 (lost)"]);
-    assert!(
-        pipeline
-            .unavailable("no such device".to_owned(), at(1400))
-            .is_empty()
-    );
+    // A device that stays lost says why, once.
+    for (reason, expected) in [
+        ("no such device", &["Lost (no such device)"][..]),
+        ("no such device", &[]),
+        (
+            "held by another process",
+            &["Lost (held by another process)"],
+        ),
+    ] {
+        let said = pipeline.unavailable(reason.to_owned(), at(1400));
+        assert_eq!(words(&said), expected);
+    }
     assert!(
         pipeline.opened(at(2000)).is_empty(),
         "lost until a frame arrives"
