@@ -28,7 +28,7 @@ use hyper::body::Incoming;
 use hyper::header::{self, HeaderName, HeaderValue};
 use hyper::server::conn::http1;
 use hyper::service::{Service, service_fn};
-use hyper::{Method, Request, StatusCode, Uri};
+use hyper::{Method, Request, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use rustix::net::sockopt;
@@ -53,10 +53,6 @@ const HEAD_PATIENCE: Duration = Duration::from_secs(15);
 /// The most bytes that wait in a connection, in each direction.
 const BUFFER_BYTES: usize = 64 * 1024;
 
-/// The longest target of a request in bytes: as many as every server should accept (RFC 9112,
-/// section 3).
-const LONGEST_TARGET: usize = 8_000;
-
 /// The most bytes of texts that connections may keep waiting together. All who ask at about the same
 /// time share one text, so a client that reads never needs much of this.
 const MOST_TEXT_BYTES: usize = 16 << 20;
@@ -69,11 +65,10 @@ const PATIENCE: Duration = Duration::from_secs(1);
 
 /// The headers of every answer. A browser must not guess the answer's type, store the answer, or
 /// let a page from elsewhere use it.
-const HEADERS: [(HeaderName, &str); 5] = [
+const HEADERS: [(HeaderName, &str); 4] = [
     (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
     (header::REFERRER_POLICY, "no-referrer"),
     (header::CACHE_CONTROL, "no-store"),
-    (header::X_FRAME_OPTIONS, "DENY"),
     (
         HeaderName::from_static("cross-origin-resource-policy"),
         "same-origin",
@@ -153,9 +148,9 @@ impl Http {
             let message = "the Host header is not an address of this machine: use localhost or \
                            the address in [http] listen";
             refusal(StatusCode::MISDIRECTED_REQUEST, message)
-        } else if target_bytes(request.uri()) > LONGEST_TARGET {
-            let message = format!("the target is longer than {LONGEST_TARGET} bytes");
-            refusal(StatusCode::URI_TOO_LONG, message)
+        } else if head_bytes(&request) > BUFFER_BYTES {
+            let message = format!("the head is longer than {BUFFER_BYTES} bytes");
+            refusal(StatusCode::REQUEST_HEADER_FIELDS_TOO_LARGE, message)
         } else if ![Method::GET, Method::HEAD].contains(request.method()) {
             let message = "method not allowed: this server is read-only: use GET or HEAD";
             let allow = [(header::ALLOW, "GET, HEAD")];
@@ -175,8 +170,15 @@ impl Http {
     }
 }
 
-fn target_bytes(target: &Uri) -> usize {
-    target.path().len() + target.query().map_or(0, str::len)
+/// The bytes of a request's head. hyper's own bound holds for what it has not parsed yet, so a head
+/// that comes in one piece may be a little longer.
+fn head_bytes(request: &Request<Incoming>) -> usize {
+    let target = request.uri();
+    let target = target.path().len() + target.query().map_or(0, str::len);
+    let headers = request.headers().iter();
+    // `: ` and the end of the line.
+    let headers = headers.map(|(name, value)| name.as_str().len() + value.len() + 4);
+    target + headers.sum::<usize>()
 }
 
 /// An answer with an error code and one line with the reason.
@@ -305,6 +307,8 @@ impl Serve<TcpStream> for Http {
                     .timer(TokioTimer::new())
                     .header_read_timeout(HEAD_PATIENCE)
                     .max_buf_size(BUFFER_BYTES)
+                    // hyper panics while it writes a date before 1970.
+                    .auto_date_header(false)
                     .serve_connection(TokioIo::new(stream), service)
             );
             let served = tokio::select! {

@@ -46,7 +46,9 @@ pub(super) async fn answer(
             let batches = stream::poll_fn(move |context| batches.poll_recv(context));
             let events = batches.flat_map(stream::iter).map(Ok::<_, Infallible>);
             let beat = KeepAlive::new().interval(HEARTBEAT);
-            Sse::new(events).keep_alive(beat).into_response()
+            // Without it, nginx and its like hold events back.
+            let unbuffered = [("x-accel-buffering", "no")];
+            (unbuffered, Sse::new(events).keep_alive(beat)).into_response()
         }
         Err(ahead) => refusal(StatusCode::BAD_REQUEST, ahead),
     })
