@@ -202,4 +202,4 @@ if __name__ == "__main__":
         full(binary)
         print("a full disk: the recording stops and goes on")
     else:
-        print("a full disk: skipped, no mount namespaces here")
+        print("skipped: a full disk: no mount namespaces here")
