@@ -246,7 +246,8 @@ fn no_route_changes_anything() {
         assert_eq!(get(address, path).code, 404, "{path}");
     }
     let target = |bytes: usize| get(address, &format!("/{}", "a".repeat(bytes - 1))).code;
-    assert_eq!((target(60_000), target(66_000)), (404, 431));
+    // hyper itself refuses a target that is so long.
+    assert_eq!((target(60_000), target(66_000)), (404, 414));
     let header = |bytes: usize| {
         let header = format!("X-Long: {}", "a".repeat(bytes));
         ask(address, "GET /livez", &[&header]).code

@@ -55,7 +55,8 @@ fn a_recording_of_an_unknown_layout_is_named_and_the_proposal_runs() {
         "ff-tail",
         "zero-run",
     ] {
-        let (code, toml, stderr) = run(&["sniff", &recorded(&bench, preset)]);
+        let recording = recorded(&bench, preset);
+        let (code, toml, stderr) = run(&["sniff", &recording]);
         assert_eq!(code, 0, "{preset}: {stderr}");
         assert!(toml.contains("[sensor.frame]"), "{toml}");
         // Without a checksum, a header and a tail look the same in the middle of a stream.
@@ -65,12 +66,8 @@ fn a_recording_of_an_unknown_layout_is_named_and_the_proposal_runs() {
         // A capture decodes with the proposed layout.
         let config = bench.path("proposed.toml");
         checked(&bench, &toml);
-        let (code, events, stderr) = run(&[
-            "replay",
-            bench.path("sensor.bin").to_str().unwrap(),
-            "--config",
-            config.to_str().unwrap(),
-        ]);
+        let (code, events, stderr) =
+            run(&["replay", &recording, "--config", config.to_str().unwrap()]);
         assert_eq!(code, 0, "{stderr}");
         let presses = events.matches("\"state\":\"begin\"").count();
         assert_eq!(presses, 4, "{preset}: {toml}");
