@@ -41,13 +41,14 @@ use std::fs::File;
 use std::future::Future;
 use std::io::Read;
 use std::net::SocketAddr;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
-use tracing::{debug, info};
+use tracing::{debug, info, warn};
 
 use self::clients::Clients;
 use self::config::{Config, Publish, Setup};
@@ -351,7 +352,18 @@ fn announce(setup: &Setup, run: &str) {
     for sensor in &setup.config.sensors {
         info!(sensor = sensor.name.as_str(), port = %sensor.port.display(), "sensor");
     }
+    let clock = now().wall;
+    if !ROS_SECONDS.contains(&clock.as_second()) {
+        warn!(
+            %clock,
+            "the header of a ROS 2 message cannot hold the time of this machine's clock: it has the nearest \
+             that it can"
+        );
+    }
 }
+
+/// A ROS 2 header counts seconds in 32 bits (builtin_interfaces/msg/Time).
+const ROS_SECONDS: RangeInclusive<i64> = -(1 << 31)..=(1 << 31) - 1;
 
 /// The model's name in events.
 fn short(setup: &Setup) -> &str {

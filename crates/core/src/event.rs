@@ -441,7 +441,7 @@ pub struct FrameEvent {
     pub tared: bool,
     /// During a press: how far the arm went since the press began, by the positions up to now. This
     /// is for views; the verdict has a more exact value.
-    #[serde(serialize_with = "rounded")]
+    #[serde(serialize_with = "rounded_or_null")]
     pub approach_mm: Option<f64>,
 }
 
@@ -488,11 +488,6 @@ pub fn name(state: &impl Serialize) -> String {
 /// The time by RFC 3339 in UTC with microseconds, so that every time has the same width.
 pub fn time_text(time: Timestamp) -> String {
     format!("{time:.6}")
-}
-
-/// Rounds to a micrometre.
-fn rounded<S: Serializer>(mm: &Option<f64>, serializer: S) -> Result<S::Ok, S::Error> {
-    mm.map(|mm| (mm * 1e3).round() / 1e3).serialize(serializer)
 }
 
 fn rfc3339<S: Serializer>(time: &Timestamp, serializer: S) -> Result<S::Ok, S::Error> {

@@ -22,7 +22,6 @@ use super::tracked::{Seen, begins_press, ideal_tare, one_press};
 use crate::random::Stream;
 use hardnessd_core::frame::{RawFrame, TAXELS};
 use hardnessd_core::press::thinned;
-use hardnessd_core::tare::NEWTONS_PER_COUNT;
 
 /// The settings of a simulated data set of presses.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -107,7 +106,7 @@ pub struct LabelledCourse {
 /// One frame of a press.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CourseMoment {
-    /// Counts after an ideal tare, at [`NEWTONS_PER_COUNT`] each.
+    /// Counts after an ideal tare, at [`NEWTONS_PER_COUNT`](hardnessd_core::tare::NEWTONS_PER_COUNT) each.
     pub counts: Box<[u16; TAXELS]>,
     /// Time since the frame that began the press; negative before it.
     pub time_s: f32,
@@ -397,14 +396,6 @@ impl Bench {
     }
 }
 
-impl LabelledCourse {
-    /// The total force that frame `place` reads, in newtons.
-    pub fn force_read_n(&self, place: usize) -> f64 {
-        let counts = self.moments[place].counts.iter();
-        counts.map(|&counts| f64::from(counts)).sum::<f64>() * f64::from(NEWTONS_PER_COUNT)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::super::object::Shapes;
@@ -424,6 +415,13 @@ mod tests {
             },
             ..CourseSettings::default()
         }
+    }
+
+    /// The total force that the best frame reads, in newtons.
+    fn force_read_n(course: &LabelledCourse) -> f64 {
+        let counts = course.moments[course.best].counts.iter();
+        counts.map(|&counts| f64::from(counts)).sum::<f64>()
+            * f64::from(hardnessd_core::tare::NEWTONS_PER_COUNT)
     }
 
     #[test]
@@ -454,7 +452,7 @@ mod tests {
             let most = approach.iter().copied().fold(0.0, f32::max);
             assert!(most <= course.speed_mm_s * times.last().unwrap() + 1e-3);
             assert!((3.0..=30.0).contains(&course.arm_n_per_mm));
-            let ratio = course.force_read_n(course.best) / f64::from(course.force_n);
+            let ratio = force_read_n(course) / f64::from(course.force_n);
             assert!((0.1..1.6).contains(&ratio), "reads {ratio} of the force");
         }
         // Test presses of the same number are paired over the objects, except those that never
