@@ -24,9 +24,9 @@ use tracing::debug;
 use super::accept::Serve;
 use super::busy;
 use super::hub::{self, Closed, Line};
-use super::lines::{Heard, Lines};
+use super::lines::{LineRead, Lines};
 use super::record::NoBlackbox;
-use super::request::motion::{Positions, Told};
+use super::request::motion::{Positions, ReportedPoint};
 use super::request::{self, Change, Request, Subscription, motion};
 use super::sensor::{Command, Sensors};
 use super::snapshot::Snapshots;
@@ -305,12 +305,12 @@ async fn read<I: AsyncRead + Unpin>(
         };
         let line = tokio::select! {
             heard = lines.next() => match heard? {
-                Heard::Line(line) => line,
-                Heard::TooLong => {
+                LineRead::Line(line) => line,
+                LineRead::TooLong => {
                     place.send((Asked::TooLong, None));
                     return Ok(());
                 }
-                Heard::End => return Ok(()),
+                LineRead::End => return Ok(()),
             },
             () = asked.closed() => return Ok(()),
         };
@@ -480,7 +480,7 @@ async fn tell(
 pub(super) async fn move_arm(
     sensors: &Sensors,
     sensor: &str,
-    points: &[Told],
+    points: &[ReportedPoint],
 ) -> Result<(), Refused> {
     // Read the clocks now, because the sensor's task may have other work to do first.
     let placed = motion::placed(points, crate::daemon::now())?;

@@ -19,7 +19,7 @@ pub(crate) struct Lines<R> {
 
 /// The outcome of reading a line.
 #[derive(Debug)]
-pub(crate) enum Heard {
+pub(crate) enum LineRead {
     /// A line, without its newline.
     Line(BytesMut),
     /// The line is longer than the bound. Nothing after it can be read.
@@ -39,25 +39,25 @@ impl<R: AsyncRead + Unpin> Lines<R> {
     }
 
     /// Waits for a whole line. Cancelling the wait loses nothing.
-    pub(crate) async fn next(&mut self) -> io::Result<Heard> {
+    pub(crate) async fn next(&mut self) -> io::Result<LineRead> {
         loop {
             let rest = &self.unread[self.searched..];
             if let Some(length) = rest.iter().position(|&byte| byte == b'\n') {
                 let length = self.searched + length;
                 if length > self.longest_bytes {
-                    return Ok(Heard::TooLong);
+                    return Ok(LineRead::TooLong);
                 }
                 self.searched = 0;
                 let line = self.unread.split_to(length);
                 self.unread.advance(1);
-                return Ok(Heard::Line(line));
+                return Ok(LineRead::Line(line));
             }
             self.searched = self.unread.len();
             if self.searched > self.longest_bytes {
-                return Ok(Heard::TooLong);
+                return Ok(LineRead::TooLong);
             }
             if self.input.read_buf(&mut self.unread).await? == 0 {
-                return Ok(Heard::End);
+                return Ok(LineRead::End);
             }
         }
     }
@@ -68,7 +68,7 @@ mod tests {
     use super::*;
 
     /// The lines read from `text`, whose bytes come in pieces, and the outcome that ended them.
-    async fn read(text: &[u8], piece: usize, longest: usize) -> (Vec<String>, Heard) {
+    async fn read(text: &[u8], piece: usize, longest: usize) -> (Vec<String>, LineRead) {
         let (mut here, there) = tokio::io::duplex(piece);
         let text = text.to_vec();
         tokio::spawn(async move {
@@ -79,7 +79,7 @@ mod tests {
         let mut found = Vec::new();
         loop {
             match lines.next().await.unwrap() {
-                Heard::Line(line) => found.push(String::from_utf8(line.to_vec()).unwrap()),
+                LineRead::Line(line) => found.push(String::from_utf8(line.to_vec()).unwrap()),
                 stopped => return (found, stopped),
             }
         }
@@ -90,7 +90,7 @@ mod tests {
         for piece in [1, 3, 64] {
             let (found, stopped) = read(b"one\n\nthree\nno end", piece, 8).await;
             assert_eq!(found, ["one", "", "three"]);
-            assert!(matches!(stopped, Heard::End), "{stopped:?}");
+            assert!(matches!(stopped, LineRead::End), "{stopped:?}");
         }
     }
 
@@ -99,11 +99,11 @@ mod tests {
         for piece in [1, 64] {
             let (found, stopped) = read(b"12345678\n123456789\n", piece, 8).await;
             assert_eq!(found, ["12345678"]);
-            assert!(matches!(stopped, Heard::TooLong), "{stopped:?}");
+            assert!(matches!(stopped, LineRead::TooLong), "{stopped:?}");
         }
         let endless = Lines::new(tokio::io::repeat(b'x'), 1 << 16);
         let mut endless = endless;
-        assert!(matches!(endless.next().await.unwrap(), Heard::TooLong));
+        assert!(matches!(endless.next().await.unwrap(), LineRead::TooLong));
         assert!(endless.unread.capacity() <= 4 << 16);
     }
 }

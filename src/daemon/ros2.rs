@@ -24,7 +24,7 @@ use tracing::{info, warn};
 use super::config;
 use super::hub::Line;
 use super::relay::{Door, Worker};
-use super::request::motion::{Positions, Told};
+use super::request::motion::{Positions, ReportedPoint};
 use hardnessd_core::event::{Event, FrameEvent, Status};
 use hardnessd_core::ros::{self, Topic, tools};
 
@@ -231,7 +231,7 @@ async fn hear(sensor: String, positions: Subscription<tools::PointStamped>, door
                 continue;
             }
         };
-        match told.and_then(|(at, mm)| Told::at_time(at, mm)) {
+        match told.and_then(|(at, mm)| ReportedPoint::at_time(at, mm)) {
             Some(told) => door.put(Positions {
                 sensor: sensor.clone(),
                 points: vec![told],

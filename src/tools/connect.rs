@@ -18,7 +18,7 @@ use tokio::net::{TcpStream, UnixStream, tcp, unix};
 
 use super::demo;
 use crate::daemon::config::Unix;
-use crate::daemon::lines::{Heard, Lines};
+use crate::daemon::lines::{LineRead, Lines};
 
 /// Options that name a daemon.
 #[derive(Debug, Clone, Default, ClapArgs)]
@@ -218,9 +218,9 @@ impl Connection {
     pub(super) async fn next(&mut self) -> Result<String, Error> {
         let address = || self.address.clone();
         match self.lines.next().await {
-            Ok(Heard::Line(line)) => Ok(String::from_utf8_lossy(&line).into_owned()),
-            Ok(Heard::End) => Err(Error::Closed { address: address() }),
-            Ok(Heard::TooLong) => Err(Error::TooLong { address: address() }),
+            Ok(LineRead::Line(line)) => Ok(String::from_utf8_lossy(&line).into_owned()),
+            Ok(LineRead::End) => Err(Error::Closed { address: address() }),
+            Ok(LineRead::TooLong) => Err(Error::TooLong { address: address() }),
             Err(source) => Err(Error::Broken {
                 address: address(),
                 source,

@@ -109,11 +109,11 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
             }
             _ = questions.tick() => daemon.say(r#"{"get":"status"}"#),
             heard = daemon.next() => match heard {
-                Ok(Heard::Connection(address)) => {
+                Ok(FromDaemon::Connection(address)) => {
                     let clock = Clock::of(&address);
                     view.wait(address.to_string(), clock, now().mono);
                 }
-                Ok(Heard::Line(line)) => {
+                Ok(FromDaemon::Line(line)) => {
                     if let Some(request) = view.hear(&line, now()) {
                         daemon.say(&request);
                     }
@@ -152,7 +152,7 @@ enum State {
 type Connecting = Pin<Box<dyn Future<Output = Result<Connection, connect::Error>> + Send>>;
 
 /// A connection to the daemon, or a line from it.
-enum Heard {
+enum FromDaemon {
     /// The daemon accepted the connection at this address.
     Connection(Address),
     Line(String),
@@ -168,7 +168,7 @@ impl Daemon {
 
     /// The next connection or line, or the reason why there is no daemon. Cancelling the call loses
     /// nothing.
-    async fn next(&mut self) -> Result<Heard, Loss> {
+    async fn next(&mut self) -> Result<FromDaemon, Loss> {
         loop {
             match &mut self.state {
                 State::Waiting(until) => {
@@ -181,7 +181,7 @@ impl Daemon {
                     Ok(connection) => {
                         let address = connection.address().clone();
                         self.state = State::Connected(connection);
-                        return Ok(Heard::Connection(address));
+                        return Ok(FromDaemon::Connection(address));
                     }
                     Err(error) => {
                         self.pause();
@@ -189,7 +189,7 @@ impl Daemon {
                     }
                 },
                 State::Connected(connection) => match connection.next().await {
-                    Ok(line) => return Ok(Heard::Line(line)),
+                    Ok(line) => return Ok(FromDaemon::Line(line)),
                     Err(error) => {
                         self.pause();
                         return Err(match error {

@@ -300,7 +300,7 @@ pub enum Rejection {
 /// The source of the arm's approach.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Course {
+pub enum ApproachSource {
     /// The robot sent positions.
     Positions,
     /// A constant speed was assumed while the contact was loaded.
@@ -408,7 +408,7 @@ pub struct Hardness {
     /// The levels that the model cannot tell apart; null without a conformal threshold.
     pub levels: Option<Vec<u8>>,
     /// The source of the approach; null unless the model judges courses.
-    pub course: Option<Course>,
+    pub course: Option<ApproachSource>,
     /// The slope of force against indentation at the end of loading; null if unknown.
     #[serde(serialize_with = "rounded_or_null")]
     pub stiffness_n_per_mm: Option<f64>,

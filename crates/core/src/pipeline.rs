@@ -25,7 +25,7 @@ pub use self::memory::Memory;
 use crate::event::{Event, FrameEvent, Phase, Tared};
 use crate::frame::{RawFrame, Stamp};
 use crate::motion::{Point, StepBack, Track};
-use crate::press::{self, Abort, Moment, PressTracker};
+use crate::press::{self, Abort, FrameAt, PressTracker};
 use crate::sensor::Sensor;
 use crate::tare::{self, Aim, Contact, RetareError, Tare};
 use crate::verdict::{Hrn, ModelError};
@@ -401,7 +401,7 @@ impl Pipeline {
 
     /// Takes in a whole frame.
     fn take_frame(&mut self, raw: &RawFrame, stamp: Stamp, events: &mut Vec<Event>) {
-        let at = Moment {
+        let at = FrameAt {
             frame: self.seen.frames,
             stamp,
         };

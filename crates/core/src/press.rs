@@ -14,7 +14,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use self::course::Course;
+use self::course::HeldFrames;
 pub use self::settings::{Settings, SettingsError};
 pub use self::settling::first_settled;
 use self::settling::{Load, Settling};
@@ -23,7 +23,7 @@ use crate::frame::{Frame, Stamp, TAXELS};
 
 /// The number of a frame in a press, and when its last byte came.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Moment {
+pub struct FrameAt {
     /// The number of the frame, per sensor.
     pub frame: u64,
     /// When the frame's last byte came.
@@ -43,9 +43,9 @@ pub struct Marks {
 /// A frame of a press, in contact. The best frame has the maximal contact area. Of equal areas the
 /// greater force wins, then the earlier frame.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Peak {
+pub struct ContactFrame {
     /// The frame's number and arrival.
-    pub moment: Moment,
+    pub moment: FrameAt,
     /// The frame itself.
     pub frame: Frame,
     /// The frame's marks.
@@ -124,21 +124,21 @@ pub enum Change {
         /// The press's number.
         press: u64,
         /// The frame.
-        at: Moment,
+        at: FrameAt,
     },
     /// The contact has settled.
     Settled {
         /// The press's number.
         press: u64,
         /// The best frame so far.
-        peak: Box<Peak>,
+        peak: Box<ContactFrame>,
     },
     /// The press ended and is to be judged.
     End {
         /// The whole press.
         press: Box<SoFar>,
         /// The last frame in contact.
-        last: Moment,
+        last: FrameAt,
         /// The number of frames in contact.
         frames: u64,
         /// Whether the press was released or timed out.
@@ -149,7 +149,7 @@ pub enum Change {
         /// The press's number.
         press: u64,
         /// The last frame in contact.
-        last: Moment,
+        last: FrameAt,
         /// The number of frames in contact.
         frames: u64,
         /// The reason why there is no verdict.
@@ -161,8 +161,8 @@ pub enum Change {
 #[derive(Debug, Clone, PartialEq)]
 pub struct SoFar {
     press: u64,
-    peak: Peak,
-    course: Course,
+    peak: ContactFrame,
+    course: HeldFrames,
 }
 
 impl SoFar {
@@ -172,13 +172,13 @@ impl SoFar {
     }
 
     /// The best frame.
-    pub fn peak(&self) -> &Peak {
+    pub fn peak(&self) -> &ContactFrame {
         &self.peak
     }
 
     /// The frames up to `until`, and the place of the best frame among them. They are evenly spread
     /// over the press, some hundred at most. A short press has all its frames.
-    pub fn until(&self, until: Duration) -> (Vec<&Peak>, usize) {
+    pub fn until(&self, until: Duration) -> (Vec<&ContactFrame>, usize) {
         self.course.until(until, &self.peak)
     }
 }
@@ -261,11 +261,11 @@ enum State {
 struct Pressed {
     press: u64,
     began: Duration,
-    last: Moment,
+    last: FrameAt,
     frames: u64,
     released_frames: u32,
-    peak: Peak,
-    course: Course,
+    peak: ContactFrame,
+    course: HeldFrames,
     /// `None` once the early verdict has come.
     settling: Option<Settling>,
 }
@@ -334,7 +334,7 @@ impl PressTracker {
     }
 
     /// Takes the next frame in. Returns its changes, in order.
-    pub fn push(&mut self, frame: &Frame, marks: Marks, at: Moment) -> Vec<Change> {
+    pub fn push(&mut self, frame: &Frame, marks: Marks, at: FrameAt) -> Vec<Change> {
         let area = frame.contact_area_taxels(self.settings.contact_threshold_n);
         let touched = area >= self.settings.end_area_taxels;
         let mut changes = Vec::new();
@@ -342,7 +342,7 @@ impl PressTracker {
             State::Idle if area < self.settings.begin_area_taxels => return changes,
             State::Idle => {
                 self.presses += 1;
-                let peak = Peak {
+                let peak = ContactFrame {
                     moment: at,
                     frame: *frame,
                     marks,
@@ -353,7 +353,7 @@ impl PressTracker {
                     press: self.presses,
                     at,
                 });
-                let mut course = Course::default();
+                let mut course = HeldFrames::default();
                 course.push(peak.clone());
                 self.state = State::Pressed(Box::new(Pressed {
                     press: self.presses,
@@ -397,7 +397,7 @@ impl PressTracker {
     }
 
     /// Adds the changes of this frame to the press: settled, released or timed out.
-    fn conclude(&mut self, frame: &Frame, at: Moment, area: u32, changes: &mut Vec<Change>) {
+    fn conclude(&mut self, frame: &Frame, at: FrameAt, area: u32, changes: &mut Vec<Change>) {
         let State::Pressed(pressed) = &mut self.state else {
             return;
         };
@@ -441,11 +441,11 @@ impl PressTracker {
 const ROUNDING: f64 = 2.0 * f32::EPSILON as f64;
 
 impl Pressed {
-    fn touch(&mut self, frame: &Frame, marks: Marks, at: Moment, area: u32) {
+    fn touch(&mut self, frame: &Frame, marks: Marks, at: FrameAt, area: u32) {
         self.last = at;
         self.frames += 1;
         self.released_frames = 0;
-        let touched = Peak {
+        let touched = ContactFrame {
             moment: at,
             frame: *frame,
             marks,
@@ -497,7 +497,7 @@ impl Pressed {
 }
 
 /// Whether `one` is better than `other`, which came before it.
-fn is_greater(one: &Peak, other: &Peak) -> bool {
+fn is_greater(one: &ContactFrame, other: &ContactFrame) -> bool {
     match one.contact_area_taxels.cmp(&other.contact_area_taxels) {
         Ordering::Less => false,
         Ordering::Equal => one.force_n > other.force_n * (1.0 + ROUNDING),

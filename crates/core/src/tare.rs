@@ -116,7 +116,7 @@ pub enum Aim {
 /// ```
 #[derive(Debug, Clone)]
 pub struct Tare {
-    scale: Scale,
+    scale: ForceCurve,
     /// The number of frames of a tare.
     frames: u32,
     /// `[ROWS, COLS]` in counts. All zeros until a tare is taken.
@@ -133,14 +133,14 @@ pub struct Tare {
 
 /// The conversion from counts to newtons.
 #[derive(Debug, Clone)]
-struct Scale {
+struct ForceCurve {
     newtons_per_count: f32,
     exponent: f32,
     /// The gain of each taxel.
     gains: Box<[f32; TAXELS]>,
 }
 
-impl Scale {
+impl ForceCurve {
     fn new(settings: &Settings, array: Array) -> Self {
         let mut gains = Box::new([1.0; TAXELS]);
         if let Some(Gains::Taxels(rows)) = &settings.gains {
@@ -262,7 +262,7 @@ impl Tare {
     pub fn new(settings: &Settings, array: Array, contact: Contact) -> Self {
         let first = Aim::First { met_contact: false };
         Self {
-            scale: Scale::new(settings, array),
+            scale: ForceCurve::new(settings, array),
             frames: settings.tare_frames,
             baseline: Box::new([0.0; TAXELS]),
             stage: Stage::begin(first, settings.tare_frames),
@@ -285,7 +285,7 @@ impl Tare {
             Stage::Taking { aim, .. } if frames != self.frames => Stage::begin(aim, frames),
             stage => stage,
         };
-        self.scale = Scale::new(settings, self.array);
+        self.scale = ForceCurve::new(settings, self.array);
         self.frames = frames;
         self.max_n = settings.tare_max_n;
         self.follows = settings.auto_tare;

@@ -119,7 +119,7 @@ mod tests {
     use super::*;
 
     #[derive(Debug, thiserror::Error)]
-    enum Told {
+    enum Wrapped {
         #[error("x: cannot read: {0}")]
         Whole(#[source] io::Error),
         #[error("x: cannot read")]
@@ -131,10 +131,10 @@ mod tests {
     #[test]
     fn a_cause_is_told_once() {
         let cause = || io::Error::other("no such file");
-        for told in [Told::Whole(cause()), Told::Bare(cause())] {
+        for told in [Wrapped::Whole(cause()), Wrapped::Bare(cause())] {
             assert_eq!(line(&told), "x: cannot read: no such file");
         }
-        let told = Told::Within(cause());
+        let told = Wrapped::Within(cause());
         assert_eq!(line(&told), "x: no such file, expected a new file");
     }
 
@@ -142,7 +142,7 @@ mod tests {
     fn the_number_of_an_error_is_not_told() {
         let cause = |errno| io::Error::from_raw_os_error(errno);
         assert_eq!(
-            line(&Told::Bare(cause(2))),
+            line(&Wrapped::Bare(cause(2))),
             "x: cannot read: No such file or directory"
         );
         let two = format!("{}, then {}", cause(2), cause(13));

@@ -12,15 +12,15 @@ use super::substance::Law;
 use hardnessd_core::frame::TAXELS;
 
 /// A press from touch to separation.
-pub(super) struct Course {
+pub(super) struct SolvedPress {
     /// The solved moments, ascending in time from the touch. Forces are linear between them.
-    moments: Vec<Moment>,
+    moments: Vec<SolvedStep>,
     /// The arm's motion during the press.
     pub(super) motion: Motion,
 }
 
 #[derive(Clone)]
-struct Moment {
+struct SolvedStep {
     time_s: f64,
     force_n: f64,
     taxels_n: [f32; TAXELS],
@@ -36,7 +36,7 @@ const HOLD_S: [f64; 9] = [0.03, 0.07, 0.14, 0.25, 0.4, 0.6, 0.85, 1.15, 1.5];
 /// Tolerance of the position in the hold, as a part of the force.
 const HOLD_TOLERANCE: f64 = 1e-3;
 
-impl Course {
+impl SolvedPress {
     /// Presses to `force_n`, holds the position for `hold_s` and withdraws.
     pub(super) fn new(
         bench: &mut Bench,
@@ -115,7 +115,7 @@ struct Run<'a> {
     /// Position z of the sensor's carrier, mm.
     travel_mm: f64,
     time_s: f64,
-    moments: Vec<Moment>,
+    moments: Vec<SolvedStep>,
     fits: bool,
 }
 
@@ -131,7 +131,7 @@ struct Trial {
 impl<'a> Run<'a> {
     fn new(bench: &'a mut Bench, specimen: &'a Specimen, arm: Arm, window: Window) -> Self {
         let cells = window.width * window.width;
-        let touch = Moment {
+        let touch = SolvedStep {
             time_s: 0.0,
             force_n: 0.0,
             taxels_n: [0.0; TAXELS],
@@ -183,7 +183,7 @@ impl<'a> Run<'a> {
         let (gap, _) = self.effective_gap(0.0);
         let end_mm = f64::from(gap.iter().copied().fold(f32::INFINITY, f32::min));
         let last_s = ((self.travel_mm - end_mm) / self.arm.speed_mm_s).max(LEAST_STEP_S);
-        self.moments.push(Moment {
+        self.moments.push(SolvedStep {
             time_s: self.time_s + last_s,
             force_n: 0.0,
             taxels_n: [0.0; TAXELS],
@@ -319,7 +319,7 @@ impl<'a> Run<'a> {
         self.force_n = trial.force_n;
         self.travel_mm = trial.travel_mm;
         self.time_s += trial.time_s;
-        self.moments.push(Moment {
+        self.moments.push(SolvedStep {
             time_s: self.time_s,
             force_n: self.force_n,
             taxels_n: taxel_forces(&self.pressure, self.window.width, self.window.corner),
@@ -401,13 +401,13 @@ mod tests {
     fn force_relaxes_in_the_hold_as_creep_and_arm_say() {
         // Soft candy's compliance grows by up to 60 %, which the arm and the growing contact share.
         let specimen = specimen(Material::SoftCandy, &Face::ball(27.0));
-        let course = Course::new(&mut Bench::default(), &specimen, Arm::default(), 12.0, 1.5);
+        let course = SolvedPress::new(&mut Bench::default(), &specimen, Arm::default(), 12.0, 1.5);
         let top = course
             .moments
             .iter()
             .map(|moment| moment.force_n)
             .fold(0.0, f64::max);
-        let hold: Vec<&Moment> = course
+        let hold: Vec<&SolvedStep> = course
             .moments
             .iter()
             .skip_while(|moment| moment.force_n < top)
@@ -426,7 +426,8 @@ mod tests {
     fn carriage_moves_at_5_mm_a_second_and_taxels_carry_the_force() {
         for material in [Material::Rubber, Material::Plasticine, Material::YogaMat] {
             let specimen = specimen(material, &Face::ball(27.0));
-            let course = Course::new(&mut Bench::default(), &specimen, Arm::default(), 15.0, 1.0);
+            let course =
+                SolvedPress::new(&mut Bench::default(), &specimen, Arm::default(), 15.0, 1.0);
             let mut last = -1.0;
             for moment in &course.moments {
                 assert!(moment.time_s > last, "{material}: time stands still");
@@ -463,7 +464,7 @@ mod tests {
             let specimen = specimen(material, &Face::ball(27.0));
             let mut bench = Bench::default();
             let [coarse, fine] = [LEVELS, 2 * LEVELS].map(|levels| {
-                Course::in_levels(&mut bench, &specimen, Arm::default(), 15.0, 1.0, levels)
+                SolvedPress::in_levels(&mut bench, &specimen, Arm::default(), 15.0, 1.0, levels)
             });
             let (mut off, mut sum) = (0.0, 0.0);
             for frame in 0..200 {

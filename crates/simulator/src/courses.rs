@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use serde::{Deserialize, Serialize};
 
 use super::body::{Body, draw_patch};
-use super::course::Course;
+use super::course::SolvedPress;
 use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
 use super::material::Split;
 use super::motion::Arm;
@@ -143,12 +143,12 @@ struct Plan {
     period_s: f64,
     /// Offset between the frames and the touch, as a part of a period.
     phase: f64,
-    told: Told,
+    told: ReportErrors,
 }
 
 /// The errors of the robot's reports.
 #[derive(Clone, Copy)]
-struct Told {
+struct ReportErrors {
     is_known: bool,
     position_factor: f64,
     arm_factor: f64,
@@ -173,7 +173,7 @@ impl Plan {
         let [least, most] = settings.hold_s;
         let period_s = 1.0 / log_even(settings.frame_rate_hz, stream);
         let mut off = |most: f64| stream.range(-most, most);
-        let told = Told {
+        let told = ReportErrors {
             position_factor: 1.0 + off(settings.position_error),
             arm_factor: 1.0 + off(settings.arm_error),
             late_s: off(settings.clock_error_frames) * period_s,
@@ -248,7 +248,7 @@ impl Subject {
             let mut noise = noise.child(attempt);
             // One solve shows whether the press is worth the forty solves of a course.
             if self.is_felt(bench, &specimen, plan, force_n, &mut noise) {
-                let course = Course::new(bench, &specimen, plan.arm, force_n, plan.hold_s);
+                let course = SolvedPress::new(bench, &specimen, plan.arm, force_n, plan.hold_s);
                 // A material that flows faster than the arm follows never bears the force, and its
                 // press would last minutes.
                 if course.duration_s() > LONGEST_S {
@@ -282,7 +282,7 @@ impl Subject {
 
     /// The sensor's frames from a few before the touch to the release, with their times after the
     /// touch.
-    fn read(&self, course: &Course, plan: &Plan, noise: &mut Stream) -> Vec<(f64, RawFrame)> {
+    fn read(&self, course: &SolvedPress, plan: &Plan, noise: &mut Stream) -> Vec<(f64, RawFrame)> {
         let gain = self.sensor.press_gain(noise);
         let mut film = Film::new();
         let first_s = -(BEFORE as f64 + plan.phase) * plan.period_s;
@@ -331,7 +331,7 @@ impl Subject {
 fn kept(
     frames: &[(f64, RawFrame)],
     seen: &Seen,
-    course: &Course,
+    course: &SolvedPress,
     plan: &Plan,
 ) -> (Vec<CourseMoment>, usize) {
     let begin = seen.contact[0];
@@ -344,7 +344,7 @@ fn kept(
         .chain(thin.iter().map(|&place| seen.contact[place]))
         .collect();
     let begin_s = frames[begin].0;
-    let Told {
+    let ReportErrors {
         is_known,
         position_factor,
         late_s,

@@ -6,7 +6,7 @@
 use std::collections::VecDeque;
 
 use super::body::{Body, draw_patch};
-use super::course::Course;
+use super::course::SolvedPress;
 use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
 use super::material::Material;
 use super::motion::{Approach, Arm, Motion};
@@ -200,7 +200,8 @@ impl Sequence {
         let hold_s = draws.range(0.8, 1.5).max(HOLD_FRAMES / rate);
         let specimen = Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch);
         for attempt in 1.. {
-            let course = Course::new(&mut self.bench, &specimen, Arm::default(), force_n, hold_s);
+            let course =
+                SolvedPress::new(&mut self.bench, &specimen, Arm::default(), force_n, hold_s);
             let mut noise = draws.child(4).child(attempt);
             let mut film = self.film.clone();
             let (frames, next) = self.play(&course, touch_s, &mut film, &mut noise);
@@ -232,7 +233,7 @@ impl Sequence {
     /// The frames from now until the end of `course`, and the number of the frame after them.
     fn play(
         &self,
-        course: &Course,
+        course: &SolvedPress,
         touch_s: f64,
         film: &mut Film,
         noise: &mut Stream,
@@ -275,7 +276,7 @@ mod tests {
 
     use super::*;
     use hardnessd_core::frame::{Array, Stamp};
-    use hardnessd_core::press::{self, Change, End, Marks, Moment, PressTracker};
+    use hardnessd_core::press::{self, Change, End, FrameAt, Marks, PressTracker};
     use hardnessd_core::tare::{self, Tare};
 
     /// The presses that the daemon sees with its default settings, each with its number of frames
@@ -296,7 +297,7 @@ mod tests {
         for (number, frame) in (0_u32..).zip(frames) {
             let mono = Duration::from_secs_f64(f64::from(number) / rate_hz);
             let wall = jiff::Timestamp::UNIX_EPOCH;
-            let at = Moment {
+            let at = FrameAt {
                 frame: number.into(),
                 stamp: Stamp { mono, wall },
             };

@@ -6,7 +6,7 @@
 use std::time::Duration;
 
 use hardnessd_core::frame::{Frame, RawFrame, Stamp};
-use hardnessd_core::press::{Change, End, Marks, Moment, PressTracker, Settings};
+use hardnessd_core::press::{Change, End, FrameAt, Marks, PressTracker, Settings};
 use hardnessd_core::tare::NEWTONS_PER_COUNT;
 
 /// The frame after a tare with baseline 0.
@@ -47,7 +47,7 @@ pub(super) fn one_press<'a>(
     let mut tracker = PressTracker::new(settings.clone());
     let (mut contact, mut best) = (Vec::new(), None);
     for (number, raw) in (0_u32..).zip(frames.into_iter().copied().chain(rest)) {
-        let at = Moment {
+        let at = FrameAt {
             frame: number.into(),
             stamp: Stamp {
                 mono: Duration::from_secs_f64(period_s * f64::from(number)),

@@ -16,8 +16,8 @@ use crate::learn::temperature;
 use crate::model::evaluated::Evaluated;
 use crate::model::export::{self, Recogniser};
 use crate::net::generator;
-use crate::net::hrn::{self, Start};
-use crate::net::image::Scale;
+use crate::net::hrn::{self, ExportedHrn};
+use crate::net::image::PixelScale;
 use crate::net::losses::Game;
 use crate::net::network::Weights;
 use crate::run::{Description, Run};
@@ -58,9 +58,9 @@ impl Stages<'_> {
         &self.description.settings
     }
 
-    fn scale(&self) -> Scale {
+    fn scale(&self) -> PixelScale {
         let settings = self.settings();
-        Scale {
+        PixelScale {
             full_scale_n: settings.full_scale_n,
             log_above_n: settings.network.log_above_n,
         }
@@ -251,7 +251,7 @@ impl Stages<'_> {
     /// # Errors
     ///
     /// Fails as [`adapt::force_factor`] does.
-    pub fn force_factor(&self, start: &Start) -> anyhow::Result<f32> {
+    pub fn force_factor(&self, start: &ExportedHrn) -> anyhow::Result<f32> {
         adapt::force_factor(start, &self.fit_task("adapt"))
     }
 
@@ -261,7 +261,7 @@ impl Stages<'_> {
     /// # Errors
     ///
     /// Fails if the run's directory cannot be read or written, or the training diverges.
-    pub fn adapted(&self, stage: &'static str, start: &Start) -> anyhow::Result<Trained> {
+    pub fn adapted(&self, stage: &'static str, start: &ExportedHrn) -> anyhow::Result<Trained> {
         adapt::fit(&self.consistent_task(stage), start, self.run)
     }
 

@@ -19,28 +19,28 @@ const AHEAD_NS: i128 = 1_000_000_000;
 pub(crate) struct Positions {
     pub(crate) sensor: String,
     #[serde(rename = "at")]
-    pub(crate) points: Vec<Told>,
+    pub(crate) points: Vec<ReportedPoint>,
 }
 
 /// A point as it was reported.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
-#[serde(from = "(Moment, f64)")]
-pub(crate) struct Told {
-    at: Moment,
+#[serde(from = "(ReportedTime, f64)")]
+pub(crate) struct ReportedPoint {
+    at: ReportedTime,
     mm: f64,
 }
 
-impl From<(Moment, f64)> for Told {
-    fn from((at, mm): (Moment, f64)) -> Self {
+impl From<(ReportedTime, f64)> for ReportedPoint {
+    fn from((at, mm): (ReportedTime, f64)) -> Self {
         Self { at, mm }
     }
 }
 
-impl Told {
+impl ReportedPoint {
     /// A point at a calendar time. `None` if the position is too far from its zero.
     #[cfg(feature = "ros2")]
     pub(crate) fn at_time(at: Timestamp, mm: f64) -> Option<Self> {
-        let at = Moment::Wall(at);
+        let at = ReportedTime::Wall(at);
         (mm.abs() <= FURTHEST_MM).then_some(Self { at, mm })
     }
 }
@@ -51,7 +51,7 @@ impl Told {
     untagged,
     expecting = "expected nanoseconds of CLOCK_MONOTONIC, or an RFC 3339 time"
 )]
-enum Moment {
+enum ReportedTime {
     /// CLOCK_MONOTONIC of this machine, in nanoseconds.
     Mono(i64),
     /// The same from a language that writes large numbers as 1.2e15.
@@ -92,22 +92,24 @@ pub(crate) struct Placed {
 ///
 /// Fails if there are no points or more than [`MOST_POINTS`], or if a point is too far from zero,
 /// more than [`AHEAD_NS`] ahead of `now`, or older than [`HELD`].
-pub(crate) fn placed(told: &[Told], now: Stamp) -> Result<Placed, Unusable> {
+pub(crate) fn placed(told: &[ReportedPoint], now: Stamp) -> Result<Placed, Unusable> {
     if !(1..=MOST_POINTS).contains(&told.len()) {
         return Err(Unusable::Count(told.len()));
     }
-    let is_converted = told.iter().any(|told| matches!(told.at, Moment::Wall(_)));
+    let is_converted = told
+        .iter()
+        .any(|told| matches!(told.at, ReportedTime::Wall(_)));
     let mono_now = now.mono.as_nanos() as i128;
-    let point = |(index, told): (usize, &Told)| {
-        let Told { at, mm } = *told;
+    let point = |(index, told): (usize, &ReportedPoint)| {
+        let ReportedPoint { at, mm } = *told;
         if mm.is_nan() || mm.abs() > FURTHEST_MM {
             return Err(Unusable::Far { index, mm });
         }
         let away = match at {
             // The conversion ends at the bounds of `i64`, which are away from any moment.
-            Moment::Rounded(at) => i128::from(at as i64) - mono_now,
-            Moment::Mono(at) => i128::from(at) - mono_now,
-            Moment::Wall(at) => at.as_nanosecond() - now.wall.as_nanosecond(),
+            ReportedTime::Rounded(at) => i128::from(at as i64) - mono_now,
+            ReportedTime::Mono(at) => i128::from(at) - mono_now,
+            ReportedTime::Wall(at) => at.as_nanosecond() - now.wall.as_nanosecond(),
         };
         let is_near = (-(HELD.as_nanos() as i128)..=AHEAD_NS).contains(&away);
         match i64::try_from(mono_now + away) {
@@ -185,7 +187,7 @@ mod tests {
         }
     }
 
-    fn points(at: Value) -> Result<Vec<Told>, String> {
+    fn points(at: Value) -> Result<Vec<ReportedPoint>, String> {
         serde_json::from_value(at).map_err(|error| error.to_string())
     }
 

@@ -10,7 +10,7 @@ use jiff::Timestamp;
 use serde_json::Value;
 
 use super::numbers::Numbers;
-use super::session::{Heard, Hello, News, What};
+use super::session::{FleetEvent, Hello, News, What};
 use hardnessd_core::event::Kind;
 use hardnessd_core::frame::Stamp;
 
@@ -246,7 +246,7 @@ impl Robot {
         self.received += u64::from(numbers.come(number));
     }
 
-    fn count(&mut self, heard: &Heard) {
+    fn count(&mut self, heard: &FleetEvent) {
         let Some(number) = heard.seq else {
             return;
         };
@@ -269,7 +269,7 @@ impl Robot {
         }
     }
 
-    fn hear(&mut self, heard: Heard, at: Stamp) {
+    fn hear(&mut self, heard: FleetEvent, at: Stamp) {
         let sensor = self.sensors.entry(heard.sensor).or_insert_with(|| Sensor {
             heard: at,
             status: String::new(),

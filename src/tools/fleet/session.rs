@@ -51,7 +51,7 @@ pub(super) enum What {
     /// Its token was there when it was asked.
     There,
     /// It sent an event, or answered with one.
-    Event(Heard),
+    Event(FleetEvent),
     /// It answered with its `hello`.
     Hello(Hello),
     /// No more answers come to the last question.
@@ -60,7 +60,7 @@ pub(super) enum What {
 
 /// An event.
 #[derive(Debug)]
-pub(super) struct Heard {
+pub(super) struct FleetEvent {
     pub(super) kind: Kind,
     pub(super) sensor: String,
     pub(super) seq: Option<u64>,
@@ -358,7 +358,7 @@ fn take(sample: &Sample, outlet: &Outlet, is_answer: bool) {
 }
 
 /// The event in a value at `tactile/SITE/SENSOR/KIND`.
-fn event<'a>(key: &'a str, bytes: &[u8], is_answer: bool) -> Option<(&'a str, Heard)> {
+fn event<'a>(key: &'a str, bytes: &[u8], is_answer: bool) -> Option<(&'a str, FleetEvent)> {
     #[derive(Deserialize)]
     struct Said<'a> {
         #[serde(borrow, rename = "type")]
@@ -386,7 +386,7 @@ fn event<'a>(key: &'a str, bytes: &[u8], is_answer: bool) -> Option<(&'a str, He
         true => serde_json::from_slice::<Value>(bytes).ok()?.to_string(),
         false => String::new(),
     };
-    let heard = Heard {
+    let heard = FleetEvent {
         kind,
         sensor: sensor.to_owned(),
         seq: said.seq,

@@ -208,7 +208,7 @@ fn aligned<const N: usize>(rows: &[[String; N]]) -> String {
 mod tests {
     use std::time::Duration;
 
-    use super::super::session::{Heard, Hello, Model, News, What};
+    use super::super::session::{FleetEvent, Hello, Model, News, What};
     use super::*;
     use hardnessd_core::event::Kind;
 
@@ -226,7 +226,7 @@ mod tests {
     }
 
     fn event(json: &Value) -> What {
-        What::Event(Heard {
+        What::Event(FleetEvent {
             kind: Kind::named(json["type"].as_str().unwrap()).unwrap(),
             sensor: json["sensor"].as_str().unwrap().to_owned(),
             seq: json["seq"].as_u64(),

@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::Pipeline;
 use crate::event::{self, Phase};
 use crate::motion::{self, SPEEDS_MM_S};
-use crate::press::{Peak, SoFar, thinned};
+use crate::press::{ContactFrame, SoFar, thinned};
 use crate::verdict;
 
 /// Loading ends at the first frame that has this share of the greatest force. A steady approach may
@@ -25,17 +25,17 @@ const END_FRAMES: usize = 3;
 const LEAST_SPREAD_MM: f64 = 0.005;
 
 /// A press, with the approach at each of its frames.
-pub(super) struct Known<'a> {
-    pub(super) frames: Vec<&'a Peak>,
+pub(super) struct PressWithApproach<'a> {
+    pub(super) frames: Vec<&'a ContactFrame>,
     /// The place of the best frame.
     pub(super) best: usize,
     /// The approach at each frame where it is known.
     approach_mm: Vec<Option<f64>>,
     /// The source of the approach.
-    pub(super) rests_on: event::Course,
+    pub(super) rests_on: event::ApproachSource,
 }
 
-impl<'a> Known<'a> {
+impl<'a> PressWithApproach<'a> {
     fn moments(&self) -> Vec<Duration> {
         let moments = self.frames.iter().map(|frame| frame.moment.stamp.mono);
         moments.collect()
@@ -49,7 +49,7 @@ impl<'a> Known<'a> {
     fn or_nothing(mut self) -> Self {
         if !says_something(&self.approach_mm, self.best) {
             self.approach_mm.fill(None);
-            self.rests_on = event::Course::None;
+            self.rests_on = event::ApproachSource::None;
         }
         self
     }
@@ -83,7 +83,7 @@ impl<'a> Known<'a> {
             }
         };
         let places = thinned(self.frames.len(), self.best, most);
-        let is_known = self.rests_on != event::Course::None;
+        let is_known = self.rests_on != event::ApproachSource::None;
         verdict::Course {
             moments: places.into_iter().map(moment).collect(),
             arm_n_per_mm: arm_n_per_mm.filter(|_| is_known).unwrap_or(0.0) as f32,
@@ -176,13 +176,13 @@ fn slope(points: &[(f64, f64)]) -> Option<f64> {
 
 impl Pipeline {
     /// The course of a press up to now.
-    pub(super) fn known<'a>(&self, so_far: &'a SoFar, phase: Phase) -> Known<'a> {
+    pub(super) fn known<'a>(&self, so_far: &'a SoFar, phase: Phase) -> PressWithApproach<'a> {
         let (frames, best) = so_far.until(Duration::MAX);
-        let mut known = Known {
+        let mut known = PressWithApproach {
             approach_mm: vec![None; frames.len()],
             frames,
             best,
-            rests_on: event::Course::None,
+            rests_on: event::ApproachSource::None,
         };
         let moments = known.moments();
         let (begin, last) = (moments[0], moments[moments.len() - 1]);
@@ -190,7 +190,7 @@ impl Pipeline {
         if self.track.is_told(last, delay_ms) {
             if let Some(approach_mm) = self.track.approach(begin, &moments, delay_ms) {
                 known.approach_mm = approach_mm;
-                known.rests_on = event::Course::Positions;
+                known.rests_on = event::ApproachSource::Positions;
             }
             // The latest positions may still be on their way. The final verdict does not wait for
             // them.
@@ -201,7 +201,7 @@ impl Pipeline {
         }
         if let Some(speed_mm_s) = self.seen.speed_mm_s {
             known.approach_mm = approach_by_speed(speed_mm_s, &moments, &known.forces_n());
-            known.rests_on = event::Course::Speed;
+            known.rests_on = event::ApproachSource::Speed;
         }
         known.or_nothing()
     }

@@ -3,7 +3,7 @@
 use super::{Clock, Pipeline, Unjudged};
 use crate::event::{self, Event, Hardness, Note, Phase, Press, PressState, Rejection};
 use crate::frame::{Frame, RawFrame};
-use crate::press::{Change, End, Marks, Moment, Peak, SoFar};
+use crate::press::{Change, ContactFrame, End, FrameAt, Marks, SoFar};
 use crate::sensor::Description;
 use crate::verdict::{Format, ModelError, Verdict};
 
@@ -22,9 +22,9 @@ pub fn look_after(frames: u64) -> u64 {
 
 /// What a verdict says of the arm.
 #[derive(Clone, Copy)]
-struct Told {
+struct ArmKnowledge {
     /// Only for a model of the course.
-    course: Option<event::Course>,
+    course: Option<event::ApproachSource>,
     stiffness_n_per_mm: Option<f64>,
     /// Whether the model was trained on presses like this one. Always so for a model of a frame.
     is_trained: bool,
@@ -43,7 +43,7 @@ impl Pipeline {
                 if self.hrn.format() == Format::Frame && self.seen.next_look != NO_LOOK {
                     self.seen.next_look = NO_LOOK;
                     let verdict = self.hrn.judge(&peak.frame);
-                    let told = Told {
+                    let told = ArmKnowledge {
                         course: None,
                         stiffness_n_per_mm: self.stiffness_so_far(),
                         is_trained: true,
@@ -83,7 +83,7 @@ impl Pipeline {
         &self,
         press: u64,
         state: PressState,
-        at: Moment,
+        at: FrameAt,
         frames: u64,
         reason: Option<&'static str>,
     ) -> Event {
@@ -140,7 +140,7 @@ impl Pipeline {
     }
 
     /// The verdict on a press up to now. `peak` is its best frame.
-    fn judge(&mut self, phase: Phase, so_far: &SoFar, peak: &Peak) -> Option<Event> {
+    fn judge(&mut self, phase: Phase, so_far: &SoFar, peak: &ContactFrame) -> Option<Event> {
         let known = self.known(so_far, phase);
         let arm_n_per_mm = self.sensor.description().arm.stiffness_n_per_mm;
         let stiffness_n_per_mm = known.stiffness_n_per_mm(arm_n_per_mm);
@@ -156,7 +156,7 @@ impl Pipeline {
                 )
             }
         };
-        let told = Told {
+        let told = ArmKnowledge {
             course,
             stiffness_n_per_mm,
             is_trained,
@@ -171,9 +171,9 @@ impl Pipeline {
         &mut self,
         press: u64,
         phase: Phase,
-        peak: &Peak,
+        peak: &ContactFrame,
         verdict: Result<Verdict, ModelError>,
-        told: Told,
+        told: ArmKnowledge,
     ) -> Option<Event> {
         let Description {
             min_confidence,
@@ -213,7 +213,7 @@ impl Pipeline {
             Some(known.label.clone())
         });
         let pitch_mm = calibration.pitch_mm;
-        let Moment { frame, stamp } = peak.moment;
+        let FrameAt { frame, stamp } = peak.moment;
         Some(Event::Hardness(Hardness {
             seq: None,
             sensor: self.sensor.name().to_owned(),
@@ -244,7 +244,7 @@ impl Pipeline {
         }))
     }
 
-    fn notes(&self, peak: &Peak, is_trained: bool) -> Vec<Note> {
+    fn notes(&self, peak: &ContactFrame, is_trained: bool) -> Vec<Note> {
         let range = &self.hrn.card().range;
         let [least_n, most_n] = range.force_n.map(f64::from);
         let [least_taxels, most_taxels] = range.contact_area_taxels;

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Peak, is_greater, packed};
+use super::{ContactFrame, is_greater, packed};
 
 /// The largest number of frames that are held. When there are more, every second one is dropped,
 /// and from then on only every second, fourth, ... frame is held.
@@ -12,19 +12,19 @@ const MOST_HELD: usize = 512;
 
 /// The frames in contact so far.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct Course {
+pub(super) struct HeldFrames {
     /// Frames 0, `stride`, 2 `stride`, ... of the frames in contact.
     #[serde(with = "packed")]
-    held: Vec<Peak>,
+    held: Vec<ContactFrame>,
     stride: u64,
     /// The last frame in contact.
     #[serde(with = "packed")]
-    newest: Vec<Peak>,
+    newest: Vec<ContactFrame>,
     count: u64,
 }
 
-impl Course {
-    pub(super) fn push(&mut self, frame: Peak) {
+impl HeldFrames {
+    pub(super) fn push(&mut self, frame: ContactFrame) {
         self.stride = self.stride.max(1);
         if self.count.is_multiple_of(self.stride) {
             if self.held.len() == MOST_HELD {
@@ -45,12 +45,16 @@ impl Course {
 
     /// The frames up to `until`, by their times, and the place of the best frame among them. `peak`
     /// is the best frame of the whole press.
-    pub(super) fn until<'a>(&'a self, until: Duration, peak: &'a Peak) -> (Vec<&'a Peak>, usize) {
+    pub(super) fn until<'a>(
+        &'a self,
+        until: Duration,
+        peak: &'a ContactFrame,
+    ) -> (Vec<&'a ContactFrame>, usize) {
         let all = self.held.iter().chain(&self.newest).chain([peak]);
-        let mut frames: Vec<&Peak> = all.filter(|f| f.moment.stamp.mono <= until).collect();
+        let mut frames: Vec<&ContactFrame> = all.filter(|f| f.moment.stamp.mono <= until).collect();
         frames.sort_by_key(|frame| frame.moment.frame);
         frames.dedup_by_key(|frame| frame.moment.frame);
-        let peak = |frame: &&Peak| frame.moment.frame == peak.moment.frame;
+        let peak = |frame: &&ContactFrame| frame.moment.frame == peak.moment.frame;
         let best = frames.iter().position(peak).unwrap_or_else(|| {
             (1..frames.len()).fold(0, |best, place| {
                 if is_greater(frames[place], frames[best]) {
@@ -76,13 +80,13 @@ impl Course {
 mod tests {
     use super::*;
     use crate::frame::{Frame, Stamp};
-    use crate::press::{Marks, Moment};
+    use crate::press::{FrameAt, Marks};
 
-    fn frame(number: u64, area: u32) -> Peak {
+    fn frame(number: u64, area: u32) -> ContactFrame {
         let mut frame = Frame::default();
         frame.newtons[(number % 784) as usize] = 0.5 + number as f32;
-        Peak {
-            moment: Moment {
+        ContactFrame {
+            moment: FrameAt {
                 frame: number,
                 stamp: Stamp {
                     mono: Duration::from_millis(10 * number),
@@ -101,7 +105,7 @@ mod tests {
         for count in [1, 2, 511, 512, 513, 1024, 1025, 5000] {
             let best = count / 3;
             let area = |number| if number == best { 9 } else { 5 };
-            let mut course = Course::default();
+            let mut course = HeldFrames::default();
             (0..count).for_each(|number| course.push(frame(number, area(number))));
             let peak = frame(best, 9);
             let (frames, found) = course.until(Duration::MAX, &peak);
@@ -120,7 +124,7 @@ mod tests {
 
     #[test]
     fn the_best_frame_of_a_part_is_the_best_until_then() {
-        let mut course = Course::default();
+        let mut course = HeldFrames::default();
         let areas = [3, 5, 5, 4, 8, 8, 2];
         for (number, area) in (0..).zip(areas) {
             course.push(frame(number, area));
@@ -135,11 +139,11 @@ mod tests {
 
     #[test]
     fn a_recording_holds_every_bit_of_it() {
-        let mut course = Course::default();
+        let mut course = HeldFrames::default();
         (0..700).for_each(|number| course.push(frame(number, 3)));
         let text = serde_json::to_string(&course).unwrap();
         // Without packing, the text is 4 times as long.
         assert!(text.len() < 200 * 352, "{}", text.len());
-        assert_eq!(serde_json::from_str::<Course>(&text).unwrap(), course);
+        assert_eq!(serde_json::from_str::<HeldFrames>(&text).unwrap(), course);
     }
 }

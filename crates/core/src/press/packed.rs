@@ -2,20 +2,23 @@
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-use super::{Marks, Moment, Peak};
+use super::{ContactFrame, FrameAt, Marks};
 use crate::frame::{Frame, sparse};
 
-/// The form of a [`Peak`] in a recording.
+/// The form of a [`ContactFrame`] in a recording.
 #[derive(Serialize, Deserialize)]
 struct Packed {
-    moment: Moment,
+    moment: FrameAt,
     #[serde(with = "sparse")]
     frame: Frame,
     marks: Marks,
     area: u32,
 }
 
-pub(super) fn serialize<S: Serializer>(frames: &[Peak], serializer: S) -> Result<S::Ok, S::Error> {
+pub(super) fn serialize<S: Serializer>(
+    frames: &[ContactFrame],
+    serializer: S,
+) -> Result<S::Ok, S::Error> {
     serializer.collect_seq(frames.iter().map(|held| Packed {
         moment: held.moment,
         frame: held.frame,
@@ -26,9 +29,9 @@ pub(super) fn serialize<S: Serializer>(frames: &[Peak], serializer: S) -> Result
 
 pub(super) fn deserialize<'de, D: Deserializer<'de>>(
     deserializer: D,
-) -> Result<Vec<Peak>, D::Error> {
+) -> Result<Vec<ContactFrame>, D::Error> {
     let packed: Vec<Packed> = Vec::deserialize(deserializer)?;
-    let unpack = |packed: Packed| Peak {
+    let unpack = |packed: Packed| ContactFrame {
         moment: packed.moment,
         force_n: packed.frame.force_n(),
         frame: packed.frame,

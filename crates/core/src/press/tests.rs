@@ -9,10 +9,10 @@ fn frame(area: usize, force_n: f32) -> Frame {
     frame
 }
 
-fn moment(frame: u64, rate_hz: u64) -> Moment {
+fn moment(frame: u64, rate_hz: u64) -> FrameAt {
     let mono = Duration::from_nanos(frame * 1_000_000_000 / rate_hz);
     let wall = jiff::Timestamp::UNIX_EPOCH + mono;
-    Moment {
+    FrameAt {
         frame,
         stamp: Stamp { mono, wall },
     }

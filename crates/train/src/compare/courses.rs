@@ -23,7 +23,7 @@ use crate::judge::press_features::{self, PressOf};
 use crate::learn::course::{self, Press};
 use crate::model::course as model;
 use crate::model::evaluated;
-use crate::net::course::Moment;
+use crate::net::course::PressMoment;
 use crate::net::frames::FEATURES;
 use crate::run::disk::{refuse_foreign, write_whole};
 use hardnessd_core::verdict::{Course, Format, Hrn, argmax};
@@ -162,7 +162,7 @@ fn curves(sets: &[TestSet]) -> Option<(&str, Vec<Curve>)> {
         if objects.len() == CURVES_A_LEVEL || !objects.insert(press.object) {
             continue;
         }
-        let point = |moment: &Moment| {
+        let point = |moment: &PressMoment| {
             let approach_mm = moment.approach_mm.unwrap_or_default();
             (f64::from(approach_mm), f64::from(moment.force_n))
         };

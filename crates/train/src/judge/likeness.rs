@@ -5,7 +5,7 @@
 //! size, force and roughness.
 
 use crate::judge::features;
-use crate::net::image::Scale;
+use crate::net::image::PixelScale;
 use hardnessd_core::frame::{Frame, TAXELS};
 
 /// A comparison of generated frames with real ones.
@@ -33,7 +33,7 @@ pub struct Reference {
     /// Standardised features, a row per frame.
     rows: Vec<Vec<f64>>,
     pixel_std: f64,
-    scale: Scale,
+    scale: PixelScale,
 }
 
 impl Reference {
@@ -42,7 +42,7 @@ impl Reference {
     /// # Errors
     ///
     /// Returns an error if the features cannot be computed.
-    pub fn of(frames: &[&Frame], scale: Scale) -> anyhow::Result<Self> {
+    pub fn of(frames: &[&Frame], scale: PixelScale) -> anyhow::Result<Self> {
         let rows = features::features(frames.iter().copied())?;
         let (mean, deviation) = features::moments(&rows);
         let mut reference = Self {
@@ -110,7 +110,7 @@ fn mean_distance_within(rows: &[Vec<f64>]) -> f64 {
     mean_distance(rows, rows) * n / (n - 1.0).max(1.0)
 }
 
-fn pixel_std<'a>(frames: impl ExactSizeIterator<Item = &'a Frame>, scale: Scale) -> f64 {
+fn pixel_std<'a>(frames: impl ExactSizeIterator<Item = &'a Frame>, scale: PixelScale) -> f64 {
     let n = frames.len() as f64;
     let mut sums = vec![(0.0_f64, 0.0_f64); TAXELS];
     for frame in frames {
@@ -132,7 +132,7 @@ mod tests {
     use super::*;
     use hardnessd_simulator::{DatasetSettings, dataset};
 
-    const SCALE: Scale = Scale {
+    const SCALE: PixelScale = PixelScale {
         full_scale_n: 10.2,
         log_above_n: 0.0,
     };

@@ -4,7 +4,7 @@
 //! In: the features of a press's frames, their times, the arm's approach. Out: a row of numbers per
 //! press.
 
-use crate::net::course::Moment;
+use crate::net::course::PressMoment;
 use crate::net::frames::FEATURES;
 use hardnessd_core::tare::PITCH_MM;
 
@@ -32,7 +32,7 @@ pub struct PressOf<'a> {
     /// Features of each frame (`net::frames`), `[frames, FEATURES]`.
     pub frames: &'a [f32],
     /// Time, approach and force of each frame.
-    pub moments: &'a [Moment],
+    pub moments: &'a [PressMoment],
     /// Stiffness of the arm. 0 if unknown.
     pub arm_n_per_mm: f32,
 }
@@ -72,7 +72,7 @@ impl PressOf<'_> {
 
     /// The indentation of object and cover in a frame: the approach minus the arm's deflection.
     fn indentation_mm(&self, frame: usize) -> Option<f32> {
-        let Moment {
+        let PressMoment {
             approach_mm,
             force_n,
             ..
@@ -211,7 +211,7 @@ mod tests {
     use super::*;
 
     /// A ball of `radius_mm` on an elastic half space, on an arm of 10 N/mm, with its contact area.
-    fn press(young_mpa: f32, radius_mm: f32) -> (Vec<f32>, Vec<Moment>) {
+    fn press(young_mpa: f32, radius_mm: f32) -> (Vec<f32>, Vec<PressMoment>) {
         let (mut frames, mut moments) = (Vec::new(), Vec::new());
         for step in 1..=20_u8 {
             let depth_mm = 0.1 * f32::from(step);
@@ -219,7 +219,7 @@ mod tests {
             let taxels = std::f32::consts::PI * radius_mm * depth_mm / (3.5 * 3.5);
             frames.push((taxels + 1.0).ln());
             frames.extend([0.0; FEATURES - 1]);
-            moments.push(Moment {
+            moments.push(PressMoment {
                 time_s: 0.05 * f32::from(step),
                 approach_mm: Some(depth_mm + force_n / 10.0),
                 force_n,

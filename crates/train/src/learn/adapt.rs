@@ -6,7 +6,7 @@
 use crate::learn::epochs::LEARNT_SHARE;
 use crate::learn::fit::{self, Task, Trained};
 use crate::learn::force::{self, Label};
-use crate::net::hrn::Start;
+use crate::net::hrn::ExportedHrn;
 use crate::run::Run;
 
 /// The factor of the forces that the labels of the training samples make most probable. The task's
@@ -15,7 +15,7 @@ use crate::run::Run;
 /// # Errors
 ///
 /// Fails as [`force::factor`] does; judging samples with HRN adds no error of its own.
-pub fn force_factor(start: &Start, task: &Task) -> anyhow::Result<f32> {
+pub fn force_factor(start: &ExportedHrn, task: &Task) -> anyhow::Result<f32> {
     let samples = || task.train.iter().map(|&index| &task.dataset.samples[index]);
     let levels = samples().map(|sample| sample.level);
     let labels: Vec<Label> = levels
@@ -37,7 +37,7 @@ pub fn force_factor(start: &Start, task: &Task) -> anyhow::Result<f32> {
 /// # Errors
 ///
 /// Fails if the run's directory cannot be read or written, or the training diverges.
-pub fn fit(task: &Task, start: &Start, run: &Run) -> anyhow::Result<Trained> {
+pub fn fit(task: &Task, start: &ExportedHrn, run: &Run) -> anyhow::Result<Trained> {
     let learnt = fit::fit(task, start.weights.clone(), run)?;
     let weights = learnt.weights.between(&start.weights, LEARNT_SHARE);
     let mut trained = task.finished(weights, task.settings.epochs)?;

@@ -12,13 +12,13 @@ use crate::learn::conformal::{Calibration, Judged};
 use crate::learn::epochs::{self, Batch};
 use crate::learn::force::{self, Label};
 use crate::learn::learner::Learner;
-use crate::net::course::{self, COLUMNS, FRAMES, Moment};
+use crate::net::course::{self, COLUMNS, FRAMES, PressMoment};
 use crate::net::frames::{self, FEATURES, Features};
 use crate::net::hrn;
 use crate::net::network::{Weights, numbers};
 use crate::net::shore;
 use crate::net::standard::Standard;
-use crate::net::start::Start;
+use crate::net::start::ExportedNetwork;
 use crate::run::Run;
 use crate::run::checkpoint::Origin;
 use crate::run::progress::ensure_finite_logits;
@@ -48,7 +48,7 @@ pub struct Press {
     /// Features of each frame, `[frames, FEATURES]`.
     pub features: Vec<f32>,
     /// Time, approach and force of each frame.
-    pub moments: Vec<Moment>,
+    pub moments: Vec<PressMoment>,
     /// Stiffness of the arm in N/mm; 0 if unknown.
     pub arm_n_per_mm: f32,
     /// The hardness level, 1..=L, or 0 if unlabelled.
@@ -82,7 +82,7 @@ fn prepared(courses: &Courses, numbers: &[usize], force_factor: f32) -> anyhow::
         let frame = |&row: &usize| courses.frame(row).times(force_factor);
         let frames: Vec<Frame> = rows.iter().map(frame).collect();
         let features = plan.of(&frames)?;
-        let moment = |(&row, of_frame): (&usize, &[f32])| Moment {
+        let moment = |(&row, of_frame): (&usize, &[f32])| PressMoment {
             time_s: courses.time_s[row],
             approach_mm: (courses.known[row] == 1).then_some(courses.approach_mm[row]),
             force_n: frames::force_n(of_frame),
@@ -187,11 +187,11 @@ impl Trained {
 ///
 /// Fails if features cannot be computed.
 pub fn with_force_factor(
-    mut start: Start,
+    mut start: ExportedNetwork,
     courses: &Courses,
     train: &[usize],
     device: &Device,
-) -> anyhow::Result<Start> {
+) -> anyhow::Result<ExportedNetwork> {
     let presses = train.iter().map(|&place| &courses.presses[place]);
     let labels: Vec<Label> = presses.map(|press| (press.level, press.object)).collect();
     let trained = Trained {
@@ -216,7 +216,11 @@ pub fn with_force_factor(
 ///
 /// Fails if the run's directory cannot be read or written, its checkpoint is of another stage than
 /// this, or the loss or a weight is no longer finite.
-pub fn fit(task: &Task, start: Option<(Start, Calibration)>, run: &Run) -> anyhow::Result<Trained> {
+pub fn fit(
+    task: &Task,
+    start: Option<(ExportedNetwork, Calibration)>,
+    run: &Run,
+) -> anyhow::Result<Trained> {
     let Some((start, calibration)) = start else {
         let initial = course::initial(task.levels, task.seed, task.device);
         let (weights, standard) = task.learnt(initial, task.standard(), run)?;

@@ -16,7 +16,7 @@ use crate::learn::consistency::{self, Views};
 use crate::learn::learner::Learner;
 use crate::learn::temperature::{self, LevelAndLogits};
 use crate::net::hrn;
-use crate::net::image::Scale;
+use crate::net::image::PixelScale;
 use crate::net::network::{Normalisation, Statistics, Weights, numbers};
 use crate::run::Run;
 use crate::run::checkpoint::{Checkpoint, Origin, Progress};
@@ -48,7 +48,7 @@ pub struct Task<'a> {
     /// Unlabelled samples to learn from by consistency, and its settings; `None` for most methods.
     pub unlabelled: Option<(&'a [usize], ConsistencySettings)>,
     /// The scale from newtons to images.
-    pub scale: Scale,
+    pub scale: PixelScale,
     /// Settings of the training.
     pub settings: &'a Training,
     /// Seed of the order of the samples and of their augmentation.
@@ -74,7 +74,7 @@ impl Trained {
     pub fn logits<'a>(
         &self,
         frames: impl Iterator<Item = &'a Frame>,
-        scale: Scale,
+        scale: PixelScale,
         device: &Device,
     ) -> Vec<Vec<f32>> {
         let frames: Vec<&Frame> = frames.collect();

@@ -20,7 +20,7 @@ use crate::net::hrn;
 use crate::net::network::{Weights, numbers};
 use crate::net::shore;
 use crate::net::standard::Standard;
-use crate::net::start::Start;
+use crate::net::start::ExportedNetwork;
 use crate::run::Run;
 use crate::run::checkpoint::Origin;
 use crate::run::progress::ensure_finite_logits;
@@ -100,14 +100,14 @@ impl Trained {
 ///
 /// Fails if the run's directory cannot be read or written, its checkpoint is of another stage than
 /// this, features cannot be computed, or the loss or a weight is no longer finite.
-pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Trained> {
+pub fn fit(task: &Task, start: Option<ExportedNetwork>, run: &Run) -> anyhow::Result<Trained> {
     let plan = Features::new()?;
     let kept = start.as_ref().map(|start| start.weights.clone());
     let start = match start {
         Some(start) => start,
         None => {
             let rows = plan.of(&task.frames(task.train))?;
-            Start {
+            ExportedNetwork {
                 weights: frame::initial(task.levels, task.seed, task.device),
                 standard: Standard::of(FEATURES, rows.chunks(FEATURES)),
                 temperature: 1.0,
@@ -120,7 +120,7 @@ pub fn fit(task: &Task, start: Option<Start>, run: &Run) -> anyhow::Result<Train
         widths: start.widths,
         ..Calibration::NONE
     };
-    let Start {
+    let ExportedNetwork {
         weights: initial,
         standard,
         ..
@@ -176,7 +176,7 @@ impl Task<'_> {
     /// # Errors
     ///
     /// Fails if features cannot be computed.
-    pub fn with_force_factor(&self, mut start: Start) -> anyhow::Result<Start> {
+    pub fn with_force_factor(&self, mut start: ExportedNetwork) -> anyhow::Result<ExportedNetwork> {
         let plan = Features::new()?;
         let levels = self
             .train

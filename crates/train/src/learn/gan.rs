@@ -13,7 +13,7 @@ use crate::data::dataset::Dataset;
 use crate::learn::learner::Learner;
 use crate::net::generator;
 use crate::net::hrn;
-use crate::net::image::Scale;
+use crate::net::image::PixelScale;
 use crate::net::losses::Game;
 use crate::net::network::{self, FEATURES, Weights};
 use crate::net::sensed::Sensor;
@@ -68,7 +68,7 @@ pub struct Task<'a> {
     /// Samples whose levels the discriminator learns; empty where the game has no levels.
     pub labelled: &'a [usize],
     /// The scale from newtons to images.
-    pub scale: Scale,
+    pub scale: PixelScale,
     /// Settings of the training.
     pub settings: &'a GanSettings,
     /// Seed of the noise and of the order of the samples.

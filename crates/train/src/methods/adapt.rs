@@ -54,14 +54,14 @@ impl NoStart {
 
 /// The network of a model file.
 #[derive(Debug, Clone)]
-pub enum Start {
+pub enum AdaptBase {
     /// The network of `frame`.
-    Frame(start::Start),
+    Frame(start::ExportedNetwork),
     /// The paper's network, and the factor of the forces that its scale includes.
-    Hrn(hrn::Start, f32),
+    Hrn(hrn::ExportedHrn, f32),
 }
 
-impl Start {
+impl AdaptBase {
     /// Reads the network of a file that the daemon's loader has accepted.
     ///
     /// # Errors
@@ -85,7 +85,7 @@ impl Start {
     ///
     /// # Errors
     ///
-    /// Fails if the start is of [`Start::Frame`] and `validation.keep` is not `last`.
+    /// Fails if the start is of [`AdaptBase::Frame`] and `validation.keep` is not `last`.
     pub fn settings(&self, settings: Settings) -> Result<Settings, SettingsError> {
         Ok(match self {
             Self::Frame(_) => {
@@ -113,7 +113,7 @@ impl Start {
 /// cannot be read or written.
 pub fn train(
     dataset: &Dataset,
-    start: Start,
+    start: AdaptBase,
     description: &Description,
     run: &Run,
     device: &Device,
@@ -123,7 +123,7 @@ pub fn train(
     let (kept, held_out) = dataset.hold_out(&labelled, share, description.seed);
     let unlabelled = super::unlabelled(dataset, &labelled, &held_out);
     let (start, known_factor) = match start {
-        Start::Frame(start) => {
+        AdaptBase::Frame(start) => {
             let samples = frame::Samples {
                 dataset,
                 train: &kept,
@@ -132,7 +132,7 @@ pub fn train(
             };
             return frame::train(STAGE, &samples, Some(start), description, run, device);
         }
-        Start::Hrn(start, factor) => (start, factor),
+        AdaptBase::Hrn(start, factor) => (start, factor),
     };
     let stages = |description| Stages {
         dataset,

@@ -17,7 +17,7 @@ use crate::model::course::finish;
 use crate::model::evaluated::Evaluated;
 use crate::model::file;
 use crate::net::course as network;
-use crate::net::start::Start;
+use crate::net::start::ExportedNetwork;
 use crate::run::{Description, Run};
 use hardnessd_core::verdict::Hrn;
 use hardnessd_simulator::Split;
@@ -55,7 +55,7 @@ pub fn description(
 /// Fails if the training diverges, or the directory cannot be read or written.
 pub fn train(
     courses: &Courses,
-    start: Option<(Start, Calibration)>,
+    start: Option<(ExportedNetwork, Calibration)>,
     description: &Description,
     run: &Run,
     device: &Device,
@@ -116,7 +116,11 @@ pub fn train(
 /// # Errors
 ///
 /// Returns [`NoStart`] if the file holds another network.
-pub fn start(hrn: &Hrn, bytes: &[u8], device: &Device) -> anyhow::Result<(Start, Calibration)> {
+pub fn start(
+    hrn: &Hrn,
+    bytes: &[u8],
+    device: &Device,
+) -> anyhow::Result<(ExportedNetwork, Calibration)> {
     let constants = file::constants(bytes)?;
     let start = network::start(|name| constants.get(name), dataset::levels().len(), device);
     let start = start.ok_or_else(|| NoStart::of(hrn, "presses: course, or adapt of one"))?;

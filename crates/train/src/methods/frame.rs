@@ -11,7 +11,7 @@ use crate::model::evaluated::Evaluated;
 use crate::model::export::{self, Recogniser};
 use crate::net::frame as network;
 use crate::net::frames::Features;
-use crate::net::start::Start;
+use crate::net::start::ExportedNetwork;
 use crate::run::{Description, Run};
 use crate::stages;
 use hardnessd_core::frame::Frame;
@@ -46,7 +46,7 @@ impl Samples<'_> {
 pub fn train(
     stage: &'static str,
     samples: &Samples,
-    start: Option<Start>,
+    start: Option<ExportedNetwork>,
     description: &Description,
     run: &Run,
     device: &Device,

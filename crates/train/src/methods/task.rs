@@ -22,7 +22,11 @@ pub enum Task {
     /// Single frames.
     Frames(Dataset, Frames),
     /// Whole presses and the files that they are from. With a start, the run adapts its model.
-    Courses(Courses, Vec<Source>, Option<(start::Start, Calibration)>),
+    Courses(
+        Courses,
+        Vec<Source>,
+        Option<(start::ExportedNetwork, Calibration)>,
+    ),
 }
 
 /// What is done with single frames.
@@ -31,7 +35,7 @@ pub enum Frames {
     /// A method trains a network from random weights.
     Method(Method),
     /// The model of a file is adapted.
-    Adapt(adapt::Start),
+    Adapt(adapt::AdaptBase),
 }
 
 impl Task {
@@ -56,7 +60,7 @@ impl Task {
     /// Fails if a file cannot be read, or the files do not go together.
     pub fn courses(
         data: &[PathBuf],
-        start: Option<(start::Start, Calibration)>,
+        start: Option<(start::ExportedNetwork, Calibration)>,
     ) -> Result<Self, DatasetError> {
         let (courses, sources) = Courses::read_all(data)?;
         Ok(Self::Courses(courses, sources, start))

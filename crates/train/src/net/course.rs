@@ -11,7 +11,7 @@ use crate::net::frames::FEATURES;
 use crate::net::graph::Constant;
 use crate::net::network::{Weights, dense};
 use crate::net::shore;
-use crate::net::start::Start;
+use crate::net::start::ExportedNetwork;
 use hardnessd_core::verdict::COURSE_FRAMES;
 use hardnessd_simulator::random::Stream;
 
@@ -38,7 +38,7 @@ const PRESSES_AT_ONCE: usize = 32;
 
 /// The measurements of a press at one moment, beside the frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Moment {
+pub struct PressMoment {
     /// Seconds since the frame that began the press.
     pub time_s: f32,
     /// Approach of the arm since that frame, in mm. `None` if unknown.
@@ -51,11 +51,11 @@ pub struct Moment {
 ///
 /// With d the approach and k the arm's stiffness, d - F/k is the indentation of object and cover.
 /// By Hertz F = 4/3 E* R^(1/2) (d - F/k)^(3/2), so logarithms turn the power law into a sum.
-pub fn motion(moments: &[Moment], arm_n_per_mm: f32) -> Vec<[f32; MOTION]> {
+pub fn motion(moments: &[PressMoment], arm_n_per_mm: f32) -> Vec<[f32; MOTION]> {
     let is_arm_known = if arm_n_per_mm > 0.0 { 1.0 } else { 0.0 };
     let arm = arm_n_per_mm.max(graph::LEAST_ARM);
     let mut before_s = moments.first().map_or(0.0, |moment| moment.time_s);
-    let row = |moment: &Moment| {
+    let row = |moment: &PressMoment| {
         let known = if moment.approach_mm.is_some() {
             1.0
         } else {
@@ -157,9 +157,9 @@ pub fn start<'a>(
     constant: impl Fn(&str) -> Option<&'a Constant>,
     levels: usize,
     device: &Device,
-) -> Option<Start> {
+) -> Option<ExportedNetwork> {
     let weight = |name: &str| graph::weight(name, &constant);
-    Start::of_constants(initial(levels, 0, device), COLUMNS, weight, device)
+    ExportedNetwork::of_constants(initial(levels, 0, device), COLUMNS, weight, device)
 }
 
 /// Logits and Shore outputs `[presses, L + 3]`. Presses with similar numbers of frames should follow each
@@ -206,7 +206,7 @@ mod tests {
 
     #[test]
     fn motion_is_0_where_nothing_is_known() {
-        let moment = |time_s, approach_mm| Moment {
+        let moment = |time_s, approach_mm| PressMoment {
             time_s,
             approach_mm,
             force_n: 5.0,

@@ -11,18 +11,18 @@ use crate::net::builder::Builder;
 use crate::net::frames::{self, FEATURES, Features};
 use crate::net::graph::{Constant, Graph, INPUT, integer};
 use crate::net::hrn;
-use crate::net::image::Scale;
+use crate::net::image::PixelScale;
 use crate::net::layers::leaky_relu;
 use crate::net::network::{self, LEAKY_SLOPE, TRUNK, Weights, as_images, dense, pooled, sums};
 use crate::net::shore;
 use crate::net::standard::Standard;
-use crate::net::start::Start;
+use crate::net::start::ExportedNetwork;
 use hardnessd_core::frame::Frame;
 use hardnessd_simulator::random::Stream;
 
 /// The scale from newtons to an image. It is logarithmic, so that the light taxels of a contact's
 /// edge count as much as the heavy ones.
-pub const SCALE: Scale = Scale {
+pub const SCALE: PixelScale = PixelScale {
     full_scale_n: 10.2,
     log_above_n: 0.1,
 };
@@ -116,9 +116,9 @@ pub fn start<'a>(
     constant: impl Fn(&str) -> Option<&'a Constant>,
     levels: usize,
     device: &Device,
-) -> Option<Start> {
+) -> Option<ExportedNetwork> {
     let constant = |name: &str| constant(name).cloned();
-    Start::of_constants(initial(levels, 0, device), FEATURES, constant, device)
+    ExportedNetwork::of_constants(initial(levels, 0, device), FEATURES, constant, device)
 }
 
 /// The graph from newtons to raw logits `[1, levels]` and Shore OO `[1, 3]`, and the names of both.

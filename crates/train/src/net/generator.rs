@@ -6,7 +6,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 
-use crate::net::image::Scale;
+use crate::net::image::PixelScale;
 use crate::net::layers::{Geometry, STRIDE, transposed_convolution};
 use crate::net::network::{
     FEATURES, Normalisation, Statistics, Weights, batch_norm, numbers, truncated_normal,
@@ -235,7 +235,7 @@ pub struct Making<'a> {
     /// Statistics of its normalised layers.
     pub statistics: &'a Statistics,
     /// The scale from images to newtons.
-    pub scale: Scale,
+    pub scale: PixelScale,
     /// The sensor that turns a force into a reading.
     pub sensor: Sensor,
     /// The device to compute on.
@@ -286,7 +286,7 @@ fn is_press(frame: &Frame) -> bool {
 }
 
 /// Images `[batch, 1, 28, 28]` in [-1, 1] as the frames that the sensor would give.
-pub fn frames(images: &Tensor<4>, scale: Scale, sensor: Sensor) -> Vec<Frame> {
+pub fn frames(images: &Tensor<4>, scale: PixelScale, sensor: Sensor) -> Vec<Frame> {
     let frame = |values: &[f32]| {
         let mut frame = Frame::default();
         for (newtons, value) in frame.newtons.iter_mut().zip(values) {
@@ -315,7 +315,7 @@ mod tests {
         Making {
             weights,
             statistics,
-            scale: Scale {
+            scale: PixelScale {
                 full_scale_n: 10.2,
                 log_above_n: 0.0,
             },

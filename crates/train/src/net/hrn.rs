@@ -6,7 +6,7 @@
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
 use crate::net::graph::{self, Constant, Graph};
-use crate::net::image::Scale;
+use crate::net::image::PixelScale;
 use crate::net::layers::STRIDE;
 use crate::net::network::{self, FEATURES, LEAKY_SLOPE, Normalisation, Statistics, TRUNK, Weights};
 use crate::settings::network::Pooling;
@@ -15,7 +15,7 @@ use hardnessd_simulator::random::Stream;
 
 /// An exported HRN to continue training from.
 #[derive(Debug, Clone)]
-pub struct Start {
+pub struct ExportedHrn {
     /// Weights of all layers.
     pub weights: Weights,
     /// Mean and variance of each normalised layer over the samples that it learnt from.
@@ -23,7 +23,7 @@ pub struct Start {
     /// The pooling before the head.
     pub pooling: Pooling,
     /// The scale of the image.
-    pub scale: Scale,
+    pub scale: PixelScale,
     /// The temperature by which the logits are divided.
     pub temperature: f32,
 }
@@ -34,7 +34,7 @@ pub fn start<'a>(
     constant: impl Fn(&str) -> Option<&'a Constant>,
     levels: usize,
     device: &Device,
-) -> Option<Start> {
+) -> Option<ExportedHrn> {
     let number = |name: &str| constant(name)?.1.first().copied();
     let pooling = match *constant("head.matrix")?.0.first()? {
         FEATURES => Pooling::Max,
@@ -55,11 +55,11 @@ pub fn start<'a>(
         let part = |part: &str| values(&format!("{}.{part}", layer.name), &[layer.outputs]);
         Some((part("mean")?, part("variance")?))
     });
-    Some(Start {
+    Some(ExportedHrn {
         statistics: Statistics::of(statistics.collect::<Option<_>>()?),
         weights,
         pooling,
-        scale: Scale::of_constants(number("scale")?, number("log factor"))?,
+        scale: PixelScale::of_constants(number("scale")?, number("log factor"))?,
         temperature: number("temperature")?,
     })
 }
@@ -172,7 +172,7 @@ pub fn targets(
 
 /// The graph from newtons to logits, and the logits' name. The inference library fuses batch
 /// normalisation with the convolution before it.
-pub fn graph(weights: &Weights, statistics: &Statistics, scale: Scale) -> (Graph, String) {
+pub fn graph(weights: &Weights, statistics: &Statistics, scale: PixelScale) -> (Graph, String) {
     let mut graph = Graph::default();
     let means = network::takes_means(weights);
     let trunk = (weights, Some(statistics));
@@ -192,7 +192,7 @@ pub(super) fn trunk_nodes(
     graph: &mut Graph,
     newtons: &str,
     (weights, statistics): (&Weights, Option<&Statistics>),
-    scale: Scale,
+    scale: PixelScale,
     with_means: bool,
 ) -> String {
     // `network::trunk` raises the image by 1, too.
@@ -276,8 +276,8 @@ mod tests {
         Device::flex()
     }
 
-    fn scale(full_scale_n: f64) -> Scale {
-        Scale {
+    fn scale(full_scale_n: f64) -> PixelScale {
+        PixelScale {
             full_scale_n,
             log_above_n: 0.0,
         }
@@ -382,14 +382,14 @@ mod tests {
     fn the_graph_computes_what_the_layers_do_and_gives_the_network_back() {
         check_graph(Pooling::Max, scale(10.2));
         let log_above_n = 0.1;
-        let scale = Scale {
+        let scale = PixelScale {
             log_above_n,
             ..scale(10.2)
         };
         check_graph(Pooling::MaxMean, scale);
     }
 
-    fn check_graph(pooling: Pooling, scale: Scale) {
+    fn check_graph(pooling: Pooling, scale: PixelScale) {
         let frames: Vec<Frame> = (0..5).map(|n| blob(9.0 + n as f32, 14.0, 2.0)).collect();
         let weights = initial(4, pooling, 9, &device()).moved(9, &device());
         let x = scale.images(frames.iter(), &device());
@@ -452,7 +452,7 @@ mod tests {
         );
         let weights = initial(4, Pooling::Max, 1, &device());
         for log_above_n in [0.0, 0.1] {
-            let scale = Scale {
+            let scale = PixelScale {
                 log_above_n,
                 ..scale(10.2)
             };

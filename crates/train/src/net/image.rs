@@ -8,7 +8,7 @@ use hardnessd_core::frame::{COLS, Frame, ROWS, TAXELS};
 
 /// One scale for all frames, because force carries hardness: 0 N is -1, the full scale is 1.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Scale {
+pub struct PixelScale {
     /// The force on a taxel, in newtons, that becomes 1.
     pub full_scale_n: f64,
     /// Above 0, the image is linear in log(1 + newtons / this value), so that light taxels differ
@@ -16,7 +16,7 @@ pub struct Scale {
     pub log_above_n: f64,
 }
 
-impl Scale {
+impl PixelScale {
     /// The image's value for a taxel of `newtons`.
     pub fn pixel(self, newtons: f32) -> f32 {
         let Self {
@@ -30,7 +30,7 @@ impl Scale {
         part * self.log_factor() - 1.0
     }
 
-    /// The force on a taxel for a value of the image: the inverse of [`Scale::pixel`].
+    /// The force on a taxel for a value of the image: the inverse of [`PixelScale::pixel`].
     pub fn newtons(self, pixel: f32) -> f32 {
         let Self {
             full_scale_n,
@@ -114,7 +114,7 @@ mod tests {
     #[test]
     fn both_scales_put_the_ends_on_the_ends_and_come_back() {
         for log_above_n in [0.0, 0.1] {
-            let scale = Scale {
+            let scale = PixelScale {
                 full_scale_n: 10.2,
                 log_above_n,
             };

@@ -8,7 +8,7 @@ use std::collections::BTreeSet;
 
 use burn::tensor::{Tensor, TensorData};
 
-use crate::net::image::Scale;
+use crate::net::image::PixelScale;
 use crate::net::network::numbers;
 use hardnessd_core::frame::Frame;
 
@@ -84,7 +84,7 @@ impl Sensor {
 
     /// Generated images as the sensor would give them. Gradients pass unchanged (the
     /// straight-through estimate), because a step has no gradient of its own.
-    pub fn images(self, images: Tensor<4>, scale: Scale) -> Tensor<4> {
+    pub fn images(self, images: Tensor<4>, scale: PixelScale) -> Tensor<4> {
         let dims = images.dims();
         let device = images.device();
         let given = images.clone().inner();

@@ -9,7 +9,7 @@ use crate::net::standard::{FORCE_FACTOR, Standard};
 
 /// The network of an exported file.
 #[derive(Debug, Clone)]
-pub struct Start {
+pub struct ExportedNetwork {
     /// Weights of all layers.
     pub weights: Weights,
     /// The factor of the forces, and mean and deviation of the columns.
@@ -20,7 +20,7 @@ pub struct Start {
     pub widths: [f32; 2],
 }
 
-impl Start {
+impl ExportedNetwork {
     /// Reads the network from an exported graph's constants. `initial` has the expected layers with
     /// any weights, and `columns` is the expected number of columns. `None` if the constants are of
     /// another network. `constant` gives a constant by its name, laid out like the weights.

@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 
 use super::*;
-use crate::event::{Course as RestsOn, Hardness};
+use crate::event::{ApproachSource, Hardness};
 use crate::test_support::course_model::course_model;
 
 /// A tared pipeline with an arm of 10 N/mm. Its model returns its own input.
@@ -79,7 +79,7 @@ fn positions_reach_the_model_and_the_slope_is_the_objects() {
     };
     // This is the sum of 0, 1, 2, 3 and again 3 mm.
     assert_eq!(given(last), [9.0, 5.0, 10.0]);
-    assert_eq!(last.course, Some(RestsOn::Positions));
+    assert_eq!(last.course, Some(ApproachSource::Positions));
     // From 14.4 to 28.8 N the arm goes 2 mm, of which 1.44 mm are its own bending.
     let slope = last.stiffness_n_per_mm.unwrap();
     assert!((slope - 14.4 / 0.56).abs() < 1e-3, "{slope}");
@@ -125,14 +125,14 @@ fn without_positions_the_arm_moves_at_its_speed_and_then_holds() {
         let found = judged(&mut pipeline, |_| Vec::new());
         // At 5 mm/s, this is the sum of 0, 1, 2, 3 and again 3 mm.
         assert_eq!(given(&found[1]), [value, 5.0, 10.0]);
-        assert_eq!(found[1].course, Some(RestsOn::Speed));
+        assert_eq!(found[1].course, Some(ApproachSource::Speed));
         assert!(found[1].stiffness_n_per_mm.is_some());
     }
     // A context may be any JSON.
     let mut pipeline = tared(&[], |_| {});
     pipeline.set_context(Some(json!({"speed_mm_s": "fast"})));
     let found = judged(&mut pipeline, |_| Vec::new());
-    assert_eq!(found[1].course, Some(RestsOn::None));
+    assert_eq!(found[1].course, Some(ApproachSource::None));
 }
 
 #[test]
@@ -168,7 +168,7 @@ fn where_the_approach_is_unknown_nothing_is_said_of_the_arm() {
         assert_eq!(given(last), [0.0, 5.0, 0.0]);
         assert_eq!(
             (last.course, last.stiffness_n_per_mm),
-            (Some(RestsOn::None), None)
+            (Some(ApproachSource::None), None)
         );
     }
 }
@@ -196,10 +196,10 @@ fn positions_that_say_nothing_of_the_press_are_no_course() {
         let last = verdicts(events).pop().unwrap();
         (last.frame, last.course, given(&last))
     };
-    let known = Some(RestsOn::Positions);
+    let known = Some(ApproachSource::Positions);
     assert_eq!(found(raw(9, 20), 2400), (6, known, [1.0, 2.0, 10.0]));
     // The approach is known at the first frame only.
-    let unknown = Some(RestsOn::None);
+    let unknown = Some(ApproachSource::None);
     assert_eq!(found(raw(9, 20), 2350), (6, unknown, [0.0, 2.0, 0.0]));
     // If the first frame is the best one, the second one counts too.
     assert_eq!(found(raw(12, 80), 2400), (5, known, [1.0, 2.0, 10.0]));

@@ -107,7 +107,7 @@ pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
         let start = methods::course::start(&model, &bytes, &device).context(name)?;
         Task::courses(&arguments.data, Some(start))?
     } else {
-        let start = methods::adapt::Start::read(&model, &bytes, &device).context(name)?;
+        let start = methods::adapt::AdaptBase::read(&model, &bytes, &device).context(name)?;
         Task::frames(&arguments.data, Frames::Adapt(start))?
     };
     let request = Request {

@@ -22,7 +22,7 @@ pub(super) struct Judged {
     /// Total force of the chosen frame.
     pub(super) force_n: f32,
     /// The press's frames in contact, thinned. Empty if the recording does not have all of them.
-    pub(super) moments: Vec<Moment>,
+    pub(super) moments: Vec<KeptFrame>,
     /// Index of the chosen frame in `moments`.
     pub(super) best: usize,
     /// Stiffness of the arm. 0 if the stiffness or the approach is unknown.
@@ -31,7 +31,7 @@ pub(super) struct Judged {
 
 /// A frame of a press.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Moment {
+pub(super) struct KeptFrame {
     /// Seconds since the press began.
     pub(super) time_s: f32,
     /// The approach since the press began, where it is known.
@@ -185,7 +185,7 @@ impl Held {
             if place == best {
                 judged.best = judged.moments.len();
             }
-            judged.moments.push(Moment {
+            judged.moments.push(KeptFrame {
                 time_s: before_s,
                 approach_mm: way[place].map(|mm| mm as f32),
                 frame: Frame::try_from(pressed[place].1.newtons.clone()).ok()?,

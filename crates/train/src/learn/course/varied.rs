@@ -194,10 +194,10 @@ fn at(reported: &[(f32, f32)], time_s: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::net::course::Moment;
+    use crate::net::course::PressMoment;
 
     fn press() -> Press {
-        let moment = |n: u8| Moment {
+        let moment = |n: u8| PressMoment {
             time_s: 0.1 * f32::from(n),
             approach_mm: Some(0.5 * f32::from(n)),
             force_n: 1.0,

@@ -7,7 +7,7 @@ use burn::tensor::Tensor;
 
 use crate::learn::learner::Learner;
 use crate::net::generator;
-use crate::net::image::Scale;
+use crate::net::image::PixelScale;
 use crate::net::losses::{self, Game, Judged};
 use crate::net::network::{self, Normalisation, Weights, numbers};
 use crate::net::sensed::Sensor;
@@ -23,7 +23,7 @@ pub struct Rules {
     pub rate: f64,
     /// The sensor applied to generated images before the discriminator judges them. `None` applies
     /// no sensor.
-    pub sensing: Option<(Sensor, Scale)>,
+    pub sensing: Option<(Sensor, PixelScale)>,
 }
 
 /// The discriminator's inputs in a step, besides generated images.
@@ -63,7 +63,7 @@ struct Generated {
 }
 
 impl Generated {
-    fn of(generator: &Learner, eta: Tensor<2>, sensing: Option<(Sensor, Scale)>) -> Self {
+    fn of(generator: &Learner, eta: Tensor<2>, sensing: Option<(Sensor, PixelScale)>) -> Self {
         let tracked = generator.weights.tracked();
         let images = generator::images(&tracked, eta, &mut Normalisation::Batch);
         let images = match sensing {
