@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 
 use super::robots::{Fleet, Robot, Sensor, read, time};
 use hardnessd_core::frame::Stamp;
-use hardnessd_core::wording;
+use hardnessd_core::wording::{self, escaped};
 
 /// Clears the terminal, so that a table takes the place of the last one.
 pub(super) const CLEAR: &str = "\u{1b}[2J\u{1b}[H";
@@ -182,7 +182,7 @@ fn age(seconds: f64) -> String {
 
 /// Text from elsewhere, which must not speak to the terminal.
 fn shown(text: &str) -> String {
-    let text = super::super::shown(text);
+    let text = escaped(text);
     match text.char_indices().nth(WIDEST) {
         Some((end, _)) => format!("{}...", &text[..end]),
         None => text,
