@@ -62,9 +62,10 @@ pub fn lines(text: &str) -> String {
 pub fn of_usage(rendered: &str) -> String {
     let error = rendered.split("\n\nUsage:").next().unwrap_or_default();
     let error = error.split("\n\nFor more").next().unwrap_or_default();
-    let words: Vec<&str> = error.split_whitespace().collect();
-    let words = words.join(" ");
-    escaped(words.trim_start_matches("error: "))
+    let on_one_line = |part: &str| part.split_whitespace().collect::<Vec<_>>().join(" ");
+    // A tip is a part of its own.
+    let parts: Vec<String> = error.split("\n\n").map(on_one_line).collect();
+    escaped(parts.join("; ").trim_start_matches("error: "))
 }
 
 /// The error of a TOML text on one line: its place, the text's line there, and the parser's message.
@@ -153,6 +154,22 @@ mod tests {
         for other in ["a (os error x) b", "a (os error 2"] {
             assert_eq!(without_numbers(other), other);
         }
+    }
+
+    #[test]
+    fn the_error_of_a_command_line_is_one_line_with_its_tip() {
+        let rendered = "error: unrecognized subcommand 'replya'\n\n  tip: a similar subcommand exists: \
+                        'replay'\n\nUsage: hardnessd <COMMAND>\n\nFor more information, try '--help'.\n";
+        assert_eq!(
+            of_usage(rendered),
+            "unrecognized subcommand 'replya'; tip: a similar subcommand exists: 'replay'"
+        );
+        let missing =
+            "error: the following required arguments were not provided:\n  <FILE>\n\nUsage: x";
+        assert_eq!(
+            of_usage(missing),
+            "the following required arguments were not provided: <FILE>"
+        );
     }
 
     #[test]
