@@ -264,7 +264,7 @@ def program(bench):
         for code, arguments, said in [
             (1, [events, "--types", "hardness", "--timeout", "0.01"], "timed out after 0.01 s (0 events)"),
             (1, [bench.path("nobody.sock"), "--timeout", "0.5"], "timed out after 0.5 s (0 events)"),
-            (1, [events, "--since", "7"], "the daemon refused: since"),
+            (1, [events, "--since", "7"], "the daemon refused: subscribe: since"),
             (2, ["127.0.0.1:99999"], "127.0.0.1:99999: no address: "),
             (2, [events, "--types", "touch"], "found 'touch'"),
             (2, [events, "--count", "0"], "found '0', expected a whole number above 0"),
