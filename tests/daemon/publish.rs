@@ -426,7 +426,7 @@ fn a_lost_sensor_disturbs_no_other_and_every_word_names_its_sensor() {
         if event["sensor"] == "forearm" {
             // The rest of the sensor's press, and why the sensor stays lost.
             let is_rest = event["type"] == "press" && event["reason"] == "lost";
-            let is_reason = event["type"] == "status" && event["reason"] == "no such device";
+            let is_reason = event["type"] == "status" && event["state"] == "lost";
             assert!(is_rest || is_reason, "{event}");
             continue;
         }

@@ -100,7 +100,7 @@ impl Abort {
 /// use std::time::Duration;
 ///
 /// use hardnessd_core::frame::{Frame, Stamp};
-/// use hardnessd_core::press::{Abort, Change, Marks, Moment, PressTracker, Settings};
+/// use hardnessd_core::press::{Abort, Change, Marks, FrameAt, PressTracker, Settings};
 ///
 /// let mut tracker = PressTracker::new(Settings::default());
 /// let mut touched = Frame::default();
@@ -111,7 +111,7 @@ impl Abort {
 ///         mono: Duration::from_millis(200 * number),
 ///         wall: jiff::Timestamp::UNIX_EPOCH,
 ///     };
-///     let at = Moment { frame: number, stamp };
+///     let at = FrameAt { frame: number, stamp };
 ///     changes.extend(tracker.push(&frame, Marks::default(), at));
 /// }
 /// assert!(matches!(changes[0], Change::Begin { press: 1, .. }));
@@ -193,7 +193,7 @@ impl SoFar {
 /// use std::time::Duration;
 ///
 /// use hardnessd_core::frame::{Frame, Stamp};
-/// use hardnessd_core::press::{Change, Marks, Moment, PressTracker, Settings};
+/// use hardnessd_core::press::{Change, Marks, FrameAt, PressTracker, Settings};
 ///
 /// let mut tracker = PressTracker::new(Settings::default());
 /// let free = Frame::default();
@@ -205,7 +205,7 @@ impl SoFar {
 ///         mono: Duration::from_millis(200 * number),
 ///         wall: jiff::Timestamp::UNIX_EPOCH,
 ///     };
-///     let at = Moment { frame: number, stamp };
+///     let at = FrameAt { frame: number, stamp };
 ///     changes.extend(tracker.push(&frame, Marks::default(), at));
 /// }
 /// assert!(matches!(changes[0], Change::Begin { press: 1, .. }));
