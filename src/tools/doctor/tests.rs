@@ -199,8 +199,11 @@ fn the_service_may_open_every_kind_of_serial_port_and_is_told_of_another() {
     );
     machine.put(
         "etc/systemd/system/hardnessd.service.d/override.conf",
-        "[Service]\nDeviceAllow=char-odd rw\n",
+        "[Service]\nDeviceAllow=char-odd rw\nSupplementaryGroups=audio plugdev\n",
     );
+    assert_eq!(machine.faults(PORT), Vec::<String>::new());
+    // The second of two groups on a line counts too.
+    machine.put("etc/group", &format!("plugdev:x:{gid}:\n"));
     assert_eq!(machine.faults(PORT), Vec::<String>::new());
     machine.put("etc/group", &format!("radio:x:{gid}:\n"));
     one(

@@ -69,7 +69,7 @@ fn values<'a>(unit: &'a str, key: &str) -> Vec<&'a str> {
             .and_then(|rest| rest.strip_prefix('='))
         {
             Some("") => values.clear(),
-            Some(value) => values.extend(value.split_whitespace().next()),
+            Some(value) => values.push(value),
             None => {}
         }
     }
@@ -83,6 +83,7 @@ fn of_user(root: &Path, device: &Path, unit: &str) -> Option<(String, String)> {
     let line = passwd.lines().find(|line| field(line, 0) == user)?;
     let uid: u32 = field(line, 2).parse().ok()?;
     let listed = values(unit, "SupplementaryGroups");
+    let listed: Vec<&str> = listed.into_iter().flat_map(str::split_whitespace).collect();
     let groups = fs::read_to_string(root.join("etc/group")).ok()?;
     let is_member = |group: &&str| {
         listed.contains(&field(group, 0).as_str())
@@ -99,7 +100,11 @@ fn of_user(root: &Path, device: &Path, unit: &str) -> Option<(String, String)> {
 
 /// The kernel's name for the kind of `device`, if the unit's list of devices lacks it.
 fn of_policy(root: &Path, device: &Path, unit: &str) -> Option<String> {
-    let allowed = values(unit, "DeviceAllow");
+    // The rights come after the name.
+    let allowed = values(unit, "DeviceAllow").into_iter();
+    let allowed: Vec<&str> = allowed
+        .filter_map(|value| value.split_whitespace().next())
+        .collect();
     if allowed.is_empty() {
         return None;
     }
