@@ -1,4 +1,4 @@
-//! The properties of `tests/doors`, for the fuzz targets.
+//! The properties of `tests/daemon` and of the trainer's tests, for the fuzz targets.
 
 #[path = "../../tests/daemon/properties.rs"]
 mod properties;
