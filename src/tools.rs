@@ -29,13 +29,20 @@ use std::io::{self, Write};
 use std::path::Path;
 use std::process::ExitCode;
 
+use clap::error::ErrorKind;
 use tokio::time::Instant;
 
 use hardnessd_core::wording;
 pub use hardnessd_core::wording::{line, lines};
 
-/// Prints clap's error on one line, or the help or the version if the command line asks for it.
+/// Prints clap's error on one line, or the help or the version if the command line asks for it. A
+/// command line without a command gets the help too.
 pub fn usage(error: &clap::Error) -> ExitCode {
+    if error.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand {
+        // If stderr has gone, nobody reads the help.
+        let _ = error.print();
+        return ExitCode::from(exit::USAGE);
+    }
     if error.use_stderr() {
         hardnessd_core::say!("hardnessd: {}", wording::of_usage(&error.to_string()));
         return ExitCode::from(exit::USAGE);

@@ -590,6 +590,13 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         2,
         &["--baud", "158000"],
     );
+    let helped = hardnessd(&[]);
+    let help = String::from_utf8(helped.stderr).unwrap();
+    assert_eq!(helped.status.code(), Some(2), "{help}");
+    assert!(
+        help.contains("Usage: hardnessd <COMMAND>") && help.contains("replay"),
+        "{help}"
+    );
     fails(&["run", "x.toml"], 2, &["unexpected argument 'x.toml'"]);
     fails(&["frobnicate"], 2, &["'frobnicate'"]);
     fails(&["replya"], 2, &["'replya'", "'replay'"]);

@@ -16,6 +16,7 @@ use std::io::{self, Write as _};
 use std::process::ExitCode;
 
 use clap::Parser as _;
+use clap::error::ErrorKind;
 use hardnessd_core::trial;
 use hardnessd_core::{exit, wording};
 
@@ -69,8 +70,14 @@ fn main() -> ExitCode {
     }
 }
 
-/// Prints clap's error on one line, or the help or the version if the command line asks for it.
+/// Prints clap's error on one line, or the help or the version if the command line asks for it. A
+/// command line without a command gets the help too.
 fn usage(error: &clap::Error) -> ExitCode {
+    if error.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand {
+        // If stderr has gone, nobody reads the help.
+        let _ = error.print();
+        return ExitCode::from(exit::USAGE);
+    }
     if error.use_stderr() {
         hardnessd_core::say!("hrn-train: {}", wording::of_usage(&error.to_string()));
         return ExitCode::from(exit::USAGE);
