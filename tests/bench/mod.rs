@@ -97,6 +97,15 @@ impl Bench {
         });
         sensor
     }
+
+    /// Pulls the cable of the sensor at the first port.
+    ///
+    /// The link goes first. The kernel gives the number of a closed pseudo-terminal to the next one
+    /// that a test beside this opens, and a daemon that follows a left link would read that.
+    pub fn unplug(&self, sensor: &mut Process) {
+        fs::remove_file(self.path("port")).unwrap();
+        sensor.0.kill().unwrap();
+    }
 }
 
 /// The program with SIGHUP as a terminal starts it. Tests may run under `nohup`, whose setting is

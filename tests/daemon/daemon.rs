@@ -99,7 +99,7 @@ fn an_unplugged_sensor_is_lost_at_once_and_goes_on_counting_when_it_is_back() {
         assert_eq!(press["press"], presses + 1);
         assert!(press["frame"].as_u64().unwrap() > frames);
         let unplugged = SystemTime::now();
-        sensor.0.kill().unwrap();
+        bench.unplug(&mut sensor);
         let lost = subscriber.until(&json!({"type": "status", "state": "lost"}));
         subscriber.until(&json!({"type": "press", "state": "aborted", "reason": "lost"}));
         delays.push(

@@ -319,7 +319,7 @@ fn metrics_say_what_was_published() {
     for _ in 0..2 {
         last = subscriber.until(&json!({"phase": "final"}));
     }
-    sensor.0.kill().unwrap();
+    bench.unplug(&mut sensor);
     let lost = subscriber.until(&json!({"type": "status", "state": "lost"}));
     assert_eq!(of("frames_total", ""), lost["frames"].as_f64());
     assert_eq!(of("frames_damaged_total", ""), Some(0.0));
@@ -366,7 +366,7 @@ fn readiness_follows_the_sensors_and_liveness_does_not() {
     let mut sensor = bench.sensor(&[]);
     wait_for("readiness", || get(address, "/readyz").code == 200);
     bench.subscriber().until(&json!({"phase": "final"}));
-    sensor.0.kill().unwrap();
+    bench.unplug(&mut sensor);
     wait_for("the loss", || get(address, "/readyz").code == 503);
     assert_eq!(codes(), (200, 503), "absent hardware is healthy");
     assert_eq!(get(address, "/readyz").body, "forearm lost\n");

@@ -417,7 +417,7 @@ fn a_lost_sensor_disturbs_no_other_and_every_word_names_its_sensor() {
     for sensor in ["forearm", "wrist"] {
         subscriber.until(&json!({"type": "hardness", "phase": "final", "sensor": sensor}));
     }
-    forearm.0.kill().unwrap();
+    bench.unplug(&mut forearm);
     subscriber.until(&json!({"type": "status", "state": "lost", "sensor": "forearm"}));
     let mut frame = None;
     let mut finals = 0;

@@ -147,7 +147,7 @@ fn it_shows_presses_loss_and_a_daemon_that_goes_and_comes_back() {
     });
     let text = terminal.shows("LIVE");
     assert_eq!(text.lines().count(), 24, "{text}");
-    sensor.0.kill().unwrap();
+    bench.unplug(&mut sensor);
     let text = terminal.shows("LOST");
     assert!(text.contains("force not known"), "{text}");
     daemon.process.signal(Signal::TERM);
