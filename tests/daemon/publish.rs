@@ -573,7 +573,9 @@ fn fifty_subscribers_miss_nothing_beside_one_that_never_reads() {
     assert!(seqs.len() > 10 && seqs.windows(2).all(|pair| pair[1] == pair[0] + 1));
 
     let read: Vec<_> = reading.into_iter().map(|r| r.join().unwrap()).collect();
-    let reference = &read[0].0;
+    // Readers end at moments of their own.
+    let longest = read.iter().max_by_key(|(marks, _)| marks.len());
+    let reference = &longest.unwrap().0;
     let frames = reference.iter().filter(|(kind, _)| *kind == 'f').count();
     for (marks, gaps) in &read {
         assert_eq!(gaps, &[], "a reader missed something");
@@ -585,7 +587,11 @@ fn fifty_subscribers_miss_nothing_beside_one_that_never_reads() {
     }
     let mut told = Vec::new();
     for woken in woken {
-        let (marks, gaps) = woken.join().unwrap();
+        let (mut marks, gaps) = woken.join().unwrap();
+        let is_newer = |mark: &Mark| !reference.contains(mark);
+        while marks.last().is_some_and(is_newer) {
+            marks.pop();
+        }
         assert_eq!(gaps.len(), 1, "one gap, before what is left");
         let (at, lost) = gaps[0];
         let place = |mark: &Mark| reference.iter().position(|other| other == mark).unwrap();
