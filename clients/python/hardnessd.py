@@ -186,7 +186,7 @@ class Status(_Numbered):
 
 
 class Frame(TypedDict):
-    """One frame: 784 newtons, row by row. `tared` is false until the first tare is taken."""
+    """One frame: `rows` x `cols` newtons, row by row. `tared` is false until the first tare is taken."""
 
     type: Literal["frame"]
     sensor: str

@@ -251,7 +251,7 @@ fn vitals(pipeline: &Pipeline, unjudged: u64) -> Vitals {
         last_frame_age: pipeline
             .last_frame()
             .map(|frame| now.mono.saturating_sub(frame.mono)),
-        contact_threshold_n: pipeline.sensor().description().press.contact_threshold_n,
+        contact_threshold_n: pipeline.sensor().thresholds().contact_threshold_n,
         unjudged,
         motion: pipeline.motion_counts(),
     }

@@ -391,7 +391,7 @@ fn plain(press: &Press) -> taxels::Plain {
             cols: rows.first().map_or(0, Vec::len),
         };
         for frame in &mut frames {
-            for (place, gain) in array.places().zip(rows.iter().flatten()) {
+            for (place, gain) in (0..array.taxels()).zip(rows.iter().flatten()) {
                 frame[place] /= gain;
             }
         }

@@ -12,8 +12,9 @@ use super::player::BITS_A_BYTE;
 use crate::daemon;
 use crate::daemon::config::{self, Endpoint, SensorTable, Setup};
 use hardnessd_core::exit::{CONFIG, Coded, IO};
-use hardnessd_core::frame::{Array, COLS, ROWS};
+use hardnessd_core::frame::Pitch;
 use hardnessd_core::tare::{self, Gains};
+use hardnessd_core::verdict::Card;
 use hardnessd_core::wire::Layout;
 
 /// Arguments of `check`.
@@ -93,16 +94,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
     let mut lines = format!("robot {}\n", setup.config.robot);
     for (sensor, checked) in setup.config.sensors.iter().zip(&setup.sensors) {
         lines += &line_of(sensor, checked.layout(), path)?;
-        warn_of_array(sensor, checked.layout().array(), path);
-        let (ours, models) = (sensor.calibration.pitch_mm, setup.hrn.card().pitch_mm);
-        if (ours - f64::from(models)).abs() > PITCH_TOLERANCE_MM {
-            hardnessd_core::say!(
-                "warning: {}: sensor.calibration.pitch_mm of {:?}: found {ours:?}, \
-                 expected the model's {models:?}",
-                path.display(),
-                sensor.name
-            );
-        }
+        warn_of_pitch(sensor, setup.hrn.card(), path);
     }
     lines += &model(&setup);
     let unix = &setup.config.publish.unix;
@@ -182,21 +174,25 @@ fn warn_of_permissions(key: &str, socket: &Path, path: &Path) {
     }
 }
 
-/// Warns if the array is smaller than the model's frame, and says where its taxels are in that
-/// frame.
-fn warn_of_array(sensor: &SensorTable, array: Array, path: &Path) {
-    let Array { rows, cols } = array;
-    if (rows, cols) == (ROWS, COLS) {
+/// Warns if the taxels have another pitch than the model's.
+fn warn_of_pitch(sensor: &SensorTable, card: &Card, path: &Path) {
+    let Pitch { rows_mm, cols_mm } = sensor.calibration.pitch_mm;
+    let is_models = |mm: f64| (mm - f64::from(card.pitch_mm)).abs() <= PITCH_TOLERANCE_MM;
+    if is_models(rows_mm) && is_models(cols_mm) {
         return;
     }
-    let place = array.place(0, 0);
+    let effect = if card.holds(sensor.calibration.pitch_mm) {
+        "forces are shared out over the model's taxels"
+    } else {
+        "forces are shared out over the model's taxels, and the model was not trained on such a pitch"
+    };
     hardnessd_core::say!(
-        "warning: {}: sensor.frame of {:?}: the array of {rows}x{cols} taxels begins at row {}, column {} \
-         of the model's {ROWS}x{COLS}; the model was not trained on such arrays",
+        "warning: {}: sensor.calibration.pitch_mm of {:?}: found {}, expected the model's {:?}: \
+         {effect}",
         path.display(),
         sensor.name,
-        place / COLS,
-        place % COLS
+        sensor.calibration.pitch_mm,
+        card.pitch_mm
     );
 }
 

@@ -18,7 +18,7 @@ use self::cable::Cable;
 pub(crate) use self::cable::Line;
 pub(crate) use self::script::{Error, FORMAT};
 use self::taxels::OfTaxels;
-use hardnessd_core::frame::RawFrame;
+use hardnessd_core::frame::{Array, RawFrame};
 use hardnessd_core::wire::Layout;
 use hardnessd_simulator::random::Stream;
 
@@ -71,7 +71,7 @@ impl Faults {
             fault.strike(time_s, &mut raw);
         }
         bytes.clear();
-        layout.encode(&raw, bytes);
+        layout.encode(&middle(&raw, layout.array()), bytes);
         for fault in &mut self.bytes {
             fault.strike(time_s, &mut self.stream, bytes);
         }
@@ -79,10 +79,31 @@ impl Faults {
     }
 }
 
+/// The middle of a frame of the simulated array, as another array has it. Taxels that the simulated
+/// one lacks read 0.
+pub(super) fn middle(raw: &RawFrame, array: Array) -> RawFrame {
+    let mut cut = RawFrame::zero(array);
+    let place = |own: usize, side: usize, other: usize| {
+        (own + other / 2)
+            .checked_sub(side / 2)
+            .filter(|&at| at < other)
+    };
+    for row in 0..array.rows {
+        for col in 0..array.cols {
+            let from_row = place(row, array.rows, raw.array.rows);
+            let from_col = place(col, array.cols, raw.array.cols);
+            if let (Some(from_row), Some(from_col)) = (from_row, from_col) {
+                let count = raw.counts[raw.array.place(from_row, from_col)];
+                cut.counts[array.place(row, col)] = count;
+            }
+        }
+    }
+    cut
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hardnessd_core::frame::TAXELS;
     use hardnessd_core::wire::{Decoder, Settings};
 
     /// A script at work on frames whose taxels all read `rest`.
@@ -103,15 +124,15 @@ mod tests {
 
         fn whole(&self) -> Vec<u8> {
             let mut whole = Vec::new();
-            let counts = [self.rest; TAXELS];
-            self.layout.encode(&RawFrame { counts }, &mut whole);
+            let mut raw = RawFrame::default();
+            raw.counts.fill(self.rest);
+            self.layout.encode(&raw, &mut whole);
             whole
         }
 
         fn at(&mut self, time_s: f64) -> (Line, Vec<u8>) {
-            let raw = RawFrame {
-                counts: [self.rest; TAXELS],
-            };
+            let mut raw = RawFrame::default();
+            raw.counts.fill(self.rest);
             let mut bytes = vec![1, 2, 3];
             let line = self.faults.encode(time_s, raw, &self.layout, &mut bytes);
             (line, bytes)
@@ -275,7 +296,7 @@ mod tests {
         // The taxels that read another number than at rest, and that number.
         let mut other = |time_s| {
             let raw = played.frame(time_s);
-            let places = (0..TAXELS).filter(|&place| raw.counts[place] != 7);
+            let places = (0..784).filter(|&place| raw.counts[place] != 7);
             let places: Vec<usize> = places.collect();
             (
                 places.len(),
@@ -291,12 +312,12 @@ mod tests {
         assert_eq!(other(4.0), (0, None));
         // A count is 0.04 N, which 0.5 N an hour reach in 288 s.
         assert_eq!(other(10.0 + 140.0), (0, None));
-        assert_eq!(other(10.0 + 150.0), (TAXELS, Some((0, 8))));
-        assert_eq!(other(10.0 + 3500.0), (TAXELS, Some((0, 19))));
+        assert_eq!(other(10.0 + 150.0), (784, Some((0, 8))));
+        assert_eq!(other(10.0 + 3500.0), (784, Some((0, 19))));
         // After its hour it stays.
-        assert_eq!(other(4999.0), (TAXELS, Some((0, 20))));
+        assert_eq!(other(4999.0), (784, Some((0, 20))));
         // No taxel reads less than nothing.
-        assert_eq!(other(9000.0), (TAXELS, Some((0, 0))));
+        assert_eq!(other(9000.0), (784, Some((0, 0))));
         assert_eq!(played.frame(9000.0).counts[28], 20);
     }
 

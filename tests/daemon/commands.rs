@@ -66,16 +66,17 @@ fn whoever_holds_the_port_is_named_and_what_to_do() {
 }
 
 #[test]
-fn check_says_where_a_small_array_lies() {
+fn check_warns_of_a_pitch_that_the_model_does_not_know() {
     let bench = Bench::new();
-    let config = bench.path("small.toml");
-    let small = "[[sensor]]\nport = \"port\"\n[sensor.frame]\nrows = 16\ncols = 10\n";
+    let config = bench.path("coarse.toml");
+    let small = "[[sensor]]\nport = \"port\"\n[sensor.calibration]\npitch_mm = [3.5, 7.0]\n";
     fs::write(&config, small).unwrap();
     let Output { status, stderr, .. } = hardnessd(&["check", "--config", config.to_str().unwrap()]);
     let said = text(&stderr);
     assert_eq!(status.code(), Some(0), "{said}");
     assert!(
-        said.contains("16x10 taxels begins at row 6, column 9"),
+        said.contains("found [3.5, 7.0], expected the model's 3.5")
+            && said.contains("was not trained on such a pitch"),
         "{said}"
     );
     assert!(said.contains("not trained"), "{said}");

@@ -7,7 +7,7 @@
         for event in take.events():
             if event["type"] == "hardness":
                 print(event["press"], event["label"])
-        for sensor, time_ns, newtons in take.frames():
+        for frame in take.frames():
             ...
 
 It needs mcap and mcap-ros2-support: pip install './clients/python[recording]'
@@ -61,7 +61,9 @@ class Frame(NamedTuple):
     time_ns: int
     """Nanoseconds since 1970, UTC."""
     newtons: "array.array[float]"
-    """784 newtons, row by row. numpy.asarray(newtons).reshape(28, 28) makes an image of it."""
+    """rows x cols newtons, row by row. numpy.asarray(newtons).reshape(rows, cols) makes an image of it."""
+    rows: int
+    cols: int
 
 
 class Chunk(NamedTuple):
@@ -134,7 +136,7 @@ class Recording:
             newtons = array.array("f", bytes(message.data))
             if sys.byteorder == "big":
                 newtons.byteswap()
-            yield Frame(sensor, _time_ns(message), newtons)
+            yield Frame(sensor, _time_ns(message), newtons, message.height, message.width)
 
     def chunks(self) -> Iterator[Chunk]:
         """The bytes that came from the sensors, as they were read, in the order of time."""

@@ -13,7 +13,7 @@ use serde::{Serialize, Serializer};
 use serde_json::Value;
 
 pub use self::reply::{Hello, ModelCard, Reply, SensorCard, Tared};
-use crate::frame::{COLS, ROWS};
+use crate::frame::Frame;
 use crate::verdict::Shore;
 
 /// The version of the format, as announced in `hello`.
@@ -317,9 +317,12 @@ pub enum Note {
     AtEdge,
     /// A taxel reads full scale.
     Saturated,
-    /// The force or the area is outside the range of the model's training. With a model of format 2,
-    /// also the duration, the frame rate, the speed, the depth or the arm.
+    /// The force or the area is outside the range of the model's training. So is the pitch. With a
+    /// model of format 2, also the duration, the frame rate, the speed, the depth or the arm.
     OutsideTraining,
+    /// The sensor's taxels have another pitch than the model's, so their forces were shared out
+    /// over the model's.
+    Resampled,
 }
 
 /// A verdict.
@@ -427,9 +430,9 @@ pub struct FrameEvent {
     pub time: Timestamp,
     /// The number of the frame, from 0, per sensor.
     pub frame: u64,
-    /// Always 28.
+    /// The rows of the sensor's array.
     pub rows: usize,
-    /// Always 28.
+    /// The columns of the sensor's array.
     pub cols: usize,
     /// `[rows, cols]` flattened, row-major, rounded to 0.001 N.
     #[serde(serialize_with = "millinewtons")]
@@ -450,18 +453,18 @@ impl FrameEvent {
     pub fn new(
         sensor: String,
         time: Timestamp,
-        frame: u64,
-        newtons: Vec<f32>,
+        number: u64,
+        frame: &Frame,
         contact_area_taxels: u32,
         tared: bool,
     ) -> Self {
         Self {
             sensor,
             time,
-            frame,
-            rows: ROWS,
-            cols: COLS,
-            newtons,
+            frame: number,
+            rows: frame.array.rows,
+            cols: frame.array.cols,
+            newtons: frame.newtons.to_vec(),
             contact_area_taxels,
             tared,
             approach_mm: None,

@@ -1,22 +1,166 @@
-//! One instant of the sensor: 28x28 taxels, row-major.
+//! One instant of the sensor: the taxels of its array, row-major.
 //!
 //! A [`RawFrame`] is in counts, as the sensor sent them. A [`Frame`] is in newtons, after tare and
 //! with dead taxels replaced. Only `tare` makes a [`Frame`] from a [`RawFrame`], so raw counts
-//! cannot
-//! reach the press tracker.
+//! cannot reach the press tracker.
 
 pub mod sparse;
 
-use serde::{Deserialize, Serialize};
+use serde::de::{SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// Rows of a frame, and of the network's input (paper, "Tactile sensor").
-pub const ROWS: usize = 28;
-/// Columns of a frame, and of the network's input.
-pub const COLS: usize = 28;
-/// Taxels in a frame.
-pub const TAXELS: usize = ROWS * COLS;
+/// The most rows, and the most columns, of an array.
+pub const MOST_SIDE: usize = 64;
 
-/// A frame in sensor counts. Taxels outside a smaller array are 0.
+/// The size of a sensor's array.
+///
+/// # Example
+///
+/// ```
+/// use hardnessd_core::frame::Array;
+///
+/// let array = Array { rows: 10, cols: 12 };
+/// let place = array.place(1, 2);
+/// assert_eq!(place, 14);
+/// assert_eq!(array.position(place), (1, 2));
+/// assert_eq!(array.taxels(), 120);
+/// ```
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Array {
+    /// Rows of the array, 1 to [`MOST_SIDE`].
+    pub rows: usize,
+    /// Columns of the array, 1 to [`MOST_SIDE`].
+    pub cols: usize,
+}
+
+impl Array {
+    /// The array of the JX255N (paper, "Tactile sensor").
+    pub const JX255N: Array = Array { rows: 28, cols: 28 };
+
+    /// The number of taxels.
+    pub const fn taxels(self) -> usize {
+        self.rows * self.cols
+    }
+
+    /// The place in a frame of `row` and `col`.
+    pub fn place(self, row: usize, col: usize) -> usize {
+        row * self.cols + col
+    }
+
+    /// The row and the column of a place in a frame.
+    pub fn position(self, place: usize) -> (usize, usize) {
+        (place / self.cols, place % self.cols)
+    }
+}
+
+/// The distances between the centres of neighbouring taxels, in mm: from row to row, and from
+/// column to column. A configuration gives one number if both are equal.
+///
+/// # Example
+///
+/// ```
+/// use hardnessd_core::frame::Pitch;
+///
+/// let pitch: Pitch = serde_json::from_str("[7.0, 3.5]")?;
+/// assert_eq!(pitch.area_mm2(), 24.5);
+/// assert_eq!(serde_json::to_string(&Pitch::square(3.5))?, "3.5");
+/// # Ok::<(), serde_json::Error>(())
+/// ```
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pitch {
+    /// The distance from row to row.
+    pub rows_mm: f64,
+    /// The distance from column to column.
+    pub cols_mm: f64,
+}
+
+impl Serialize for Pitch {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let Self { rows_mm, cols_mm } = self;
+        if rows_mm == cols_mm {
+            rows_mm.serialize(serializer)
+        } else {
+            [rows_mm, cols_mm].serialize(serializer)
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for Pitch {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_any(PitchVisitor)
+    }
+}
+
+/// Reads a number or a list of two. A derived reader of either would not say what it found.
+struct PitchVisitor;
+
+impl<'de> Visitor<'de> for PitchVisitor {
+    type Value = Pitch;
+
+    fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("a number, or [rows, columns]")
+    }
+
+    fn visit_f64<E: serde::de::Error>(self, mm: f64) -> Result<Pitch, E> {
+        Ok(Pitch::square(mm))
+    }
+
+    fn visit_i64<E: serde::de::Error>(self, mm: i64) -> Result<Pitch, E> {
+        Ok(Pitch::square(mm as f64))
+    }
+
+    fn visit_u64<E: serde::de::Error>(self, mm: u64) -> Result<Pitch, E> {
+        Ok(Pitch::square(mm as f64))
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Pitch, A::Error> {
+        let mut mm = Vec::new();
+        while let Some(next) = list.next_element()? {
+            mm.push(next);
+        }
+        match mm[..] {
+            [rows_mm, cols_mm] => Ok(Pitch { rows_mm, cols_mm }),
+            _ => Err(serde::de::Error::invalid_length(mm.len(), &self)),
+        }
+    }
+}
+
+impl std::fmt::Display for Pitch {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { rows_mm, cols_mm } = self;
+        if rows_mm == cols_mm {
+            write!(f, "{rows_mm:?}")
+        } else {
+            write!(f, "[{rows_mm:?}, {cols_mm:?}]")
+        }
+    }
+}
+
+impl Pitch {
+    /// The pitch of the JX255N (paper, "Tactile sensor").
+    pub const JX255N: Pitch = Pitch::square(3.5);
+
+    /// The same distance both ways.
+    pub const fn square(mm: f64) -> Self {
+        Self {
+            rows_mm: mm,
+            cols_mm: mm,
+        }
+    }
+
+    /// The area of a taxel with its share of the gaps.
+    pub fn area_mm2(self) -> f64 {
+        self.rows_mm * self.cols_mm
+    }
+}
+
+impl Default for Pitch {
+    fn default() -> Self {
+        Self::JX255N
+    }
+}
+
+/// A frame in sensor counts.
 ///
 /// # Example
 ///
@@ -24,33 +168,52 @@ pub const TAXELS: usize = ROWS * COLS;
 /// use hardnessd_core::frame::{Array, RawFrame};
 ///
 /// let array = Array { rows: 10, cols: 12 };
-/// let mut raw = RawFrame::default();
+/// let mut raw = RawFrame::zero(array);
 /// raw.counts[array.place(0, 0)] = 200;
-/// assert_eq!(format!("{raw:?}"), "RawFrame { sum: 200, peak: Some(200) }");
+/// assert_eq!(format!("{raw:?}"), "RawFrame { array: 10x12, sum: 200, peak: Some(200) }");
 /// ```
-#[derive(Clone, Copy, PartialEq, Eq)]
+#[derive(Clone, PartialEq, Eq)]
 pub struct RawFrame {
-    /// `[ROWS, COLS]` flattened, row-major, in counts.
-    pub counts: [u16; TAXELS],
+    /// The size of the array.
+    pub array: Array,
+    /// A count for each taxel, row-major.
+    pub counts: Box<[u16]>,
 }
 
-impl Default for RawFrame {
-    fn default() -> Self {
+impl RawFrame {
+    /// A frame of zeros.
+    pub fn zero(array: Array) -> Self {
         Self {
-            counts: [0; TAXELS],
+            array,
+            counts: vec![0; array.taxels()].into(),
         }
     }
 }
 
-/// Prints the sum and the peak, because 784 numbers are unreadable in a log or a failed assertion.
+impl Default for RawFrame {
+    /// A frame of zeros of the JX255N.
+    fn default() -> Self {
+        Self::zero(Array::JX255N)
+    }
+}
+
+/// Prints the sum and the peak, because hundreds of numbers are unreadable in a log or a failed
+/// assertion.
 impl std::fmt::Debug for RawFrame {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let sum: u32 = self.counts.iter().map(|&count| u32::from(count)).sum();
         let peak = self.counts.iter().max();
         f.debug_struct("RawFrame")
+            .field("array", &format_args!("{}", self.array))
             .field("sum", &sum)
             .field("peak", &peak)
             .finish()
+    }
+}
+
+impl std::fmt::Display for Array {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}x{}", self.rows, self.cols)
     }
 }
 
@@ -59,29 +222,25 @@ impl std::fmt::Debug for RawFrame {
 /// # Example
 ///
 /// ```
-/// use hardnessd_core::frame::{Frame, TAXELS};
+/// use hardnessd_core::frame::{Array, Frame};
 ///
-/// let mut newtons = vec![0.0; TAXELS];
-/// newtons[100..104].fill(0.5);
-/// let frame = Frame::try_from(newtons)?;
+/// let mut frame = Frame::zero(Array { rows: 12, cols: 32 });
+/// frame.newtons[100..104].fill(0.5);
 /// assert_eq!(frame.contact_area_taxels(0.07), 4);
 /// assert_eq!(frame.force_n(), 2.0);
-///
-/// assert!(Frame::try_from(vec![0.0; 100]).is_err());
-/// # Ok::<(), hardnessd_core::frame::FrameError>(())
 /// ```
-#[derive(Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(try_from = "Vec<f32>", into = "Vec<f32>")]
+#[derive(Clone, PartialEq)]
 pub struct Frame {
-    /// `[ROWS, COLS]` flattened, row-major, in newtons a taxel; finite and not negative.
-    pub newtons: [f32; TAXELS],
+    /// The size of the array.
+    pub array: Array,
+    /// The force on each taxel, row-major, in newtons; finite and not negative.
+    pub newtons: Box<[f32]>,
 }
 
 impl Default for Frame {
+    /// A frame of zeros of the JX255N.
     fn default() -> Self {
-        Self {
-            newtons: [0.0; TAXELS],
-        }
+        Self::zero(Array::JX255N)
     }
 }
 
@@ -89,136 +248,41 @@ impl std::fmt::Debug for Frame {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let peak = self.newtons.iter().copied().fold(0.0, f32::max);
         f.debug_struct("Frame")
+            .field("array", &format_args!("{}", self.array))
             .field("force_n", &self.force_n())
             .field("peak_n", &peak)
             .finish()
     }
 }
 
-impl From<Frame> for Vec<f32> {
-    fn from(frame: Frame) -> Self {
-        frame.newtons.to_vec()
-    }
-}
-
-/// The reason why numbers are not a frame.
-#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-pub enum FrameError {
-    /// The force is negative or not finite.
-    #[error("found {0} N at a taxel, expected 0 or more")]
-    Newtons(f32),
-    /// There are too many or too few taxels.
-    #[error("found {0} taxels, expected {TAXELS}")]
-    Length(usize),
-}
-
-impl TryFrom<Vec<f32>> for Frame {
-    type Error = FrameError;
-
-    fn try_from(newtons: Vec<f32>) -> Result<Self, FrameError> {
-        if let Some(&found) = newtons.iter().find(|&&n| !n.is_finite() || n < 0.0) {
-            return Err(FrameError::Newtons(found));
-        }
-        match newtons.try_into() {
-            Ok(newtons) => Ok(Self { newtons }),
-            Err(found) => Err(FrameError::Length(Vec::len(&found))),
-        }
-    }
-}
-
-/// Writes one value for each taxel as a list, for `#[serde(with)]`. Serde itself supports no arrays
-/// of this length.
-pub(crate) mod taxels {
-    use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error};
-
-    use super::TAXELS;
-
-    pub(crate) fn serialize<T: Serialize, S: Serializer>(
-        taxels: &[T; TAXELS],
-        serializer: S,
-    ) -> Result<S::Ok, S::Error> {
-        serializer.collect_seq(taxels)
-    }
-
-    pub(crate) fn deserialize<'de, T: Deserialize<'de>, D: Deserializer<'de>>(
-        deserializer: D,
-    ) -> Result<Box<[T; TAXELS]>, D::Error> {
-        let taxels = Vec::deserialize(deserializer)?;
-        let found = taxels.len();
-        taxels
-            .try_into()
-            .map_err(|_| D::Error::invalid_length(found, &"784 taxels"))
-    }
-}
-
 impl Frame {
+    /// A frame without contact.
+    pub fn zero(array: Array) -> Self {
+        Self {
+            array,
+            newtons: vec![0.0; array.taxels()].into(),
+        }
+    }
+
     /// The contact area: the number of taxels at or above `threshold_n`.
     pub fn contact_area_taxels(&self, threshold_n: f32) -> u32 {
-        self.newtons
-            .iter()
-            .map(|&n| u32::from(n >= threshold_n))
-            .sum()
-    }
-
-    /// The frame with all forces times `factor`, which is finite and not negative.
-    pub fn times(&self, factor: f32) -> Self {
-        Self {
-            newtons: self.newtons.map(|newtons| newtons * factor),
-        }
+        contact_area_taxels(&self.newtons, threshold_n)
     }
 
     /// The total force in newtons. It is summed in f64, so the order of taxels makes no difference.
     pub fn force_n(&self) -> f64 {
-        self.newtons.iter().map(|&n| f64::from(n)).sum()
+        force_n(&self.newtons)
     }
 }
 
-/// The size of the sensor's own array. The array is centred in a frame: at offset floor((28 - n) /
-/// 2).
-///
-/// # Example
-///
-/// ```
-/// use hardnessd_core::frame::{Array, COLS};
-///
-/// let array = Array { rows: 10, cols: 12 };
-/// let place = array.place(0, 0);
-/// assert_eq!((place / COLS, place % COLS), (9, 8));
-/// assert_eq!(array.position(place), Some((0, 0)));
-/// assert_eq!(array.position(0), None);
-/// ```
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Array {
-    /// Rows of the array, 1 to [`ROWS`].
-    pub rows: usize,
-    /// Columns of the array, 1 to [`COLS`].
-    pub cols: usize,
+/// The number of taxels at or above `threshold_n`.
+pub(crate) fn contact_area_taxels(newtons: &[f32], threshold_n: f32) -> u32 {
+    newtons.iter().map(|&n| u32::from(n >= threshold_n)).sum()
 }
 
-impl Array {
-    /// The array that fills a frame.
-    pub const FULL: Array = Array {
-        rows: ROWS,
-        cols: COLS,
-    };
-
-    /// The place in the frame of the array's own `row` and `col`.
-    pub fn place(self, row: usize, col: usize) -> usize {
-        (row + (ROWS - self.rows) / 2) * COLS + col + (COLS - self.cols) / 2
-    }
-
-    /// The array's own row and column of a place in the frame, or `None` outside the array.
-    pub fn position(self, place: usize) -> Option<(usize, usize)> {
-        let row = (place / COLS).checked_sub((ROWS - self.rows) / 2)?;
-        let col = (place % COLS).checked_sub((COLS - self.cols) / 2)?;
-        (row < self.rows && col < self.cols).then_some((row, col))
-    }
-
-    /// The places of the array, row-major.
-    pub fn places(self) -> impl Iterator<Item = usize> {
-        (0..self.rows * self.cols)
-            .map(move |index| self.place(index / self.cols, index % self.cols))
-    }
+/// The sum of forces, in f64.
+pub(crate) fn force_n(newtons: &[f32]) -> f64 {
+    newtons.iter().map(|&n| f64::from(n)).sum()
 }
 
 /// The arrival time on two clocks: one that never jumps, for durations, and the calendar, for

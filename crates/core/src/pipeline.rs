@@ -25,7 +25,7 @@ pub use self::memory::Memory;
 use crate::event::{Event, FrameEvent, Phase, Tared};
 use crate::frame::{RawFrame, Stamp};
 use crate::motion::{Point, StepBack, Track};
-use crate::press::{self, Abort, FrameAt, PressTracker};
+use crate::press::{Abort, FrameAt, PressTracker, Thresholds};
 use crate::sensor::Sensor;
 use crate::tare::{self, Aim, Contact, RetareError, Tare};
 use crate::verdict::{Hrn, ModelError};
@@ -132,9 +132,9 @@ impl Pipeline {
             tare: Tare::new(
                 &described.calibration,
                 layout.array(),
-                contact(&described.press),
+                contact(sensor.thresholds()),
             ),
-            tracker: PressTracker::new(described.press.clone()),
+            tracker: PressTracker::new(sensor.thresholds().clone()),
             track: Track::default(),
             decoder: Decoder::new(layout.clone()),
             seen: Seen {
@@ -172,8 +172,8 @@ impl Pipeline {
             return Err(FixedError { key });
         }
         self.tare
-            .reload(&described.calibration, contact(&described.press));
-        self.tracker.reload(described.press.clone());
+            .reload(&described.calibration, contact(sensor.thresholds()));
+        self.tracker.reload(sensor.thresholds().clone());
         self.sensor = sensor;
         self.hrn = hrn;
         Ok(())
@@ -435,8 +435,8 @@ impl Pipeline {
             self.sensor.name().to_owned(),
             stamp.wall,
             at.frame,
-            frame.newtons.to_vec(),
-            frame.contact_area_taxels(self.sensor.description().press.contact_threshold_n),
+            &frame,
+            frame.contact_area_taxels(self.sensor.thresholds().contact_threshold_n),
             tared,
         );
         events.push(Event::Frame(FrameEvent {
@@ -462,7 +462,7 @@ const EPOCH: Stamp = Stamp {
     wall: Timestamp::UNIX_EPOCH,
 };
 
-fn contact(press: &press::Settings) -> Contact {
+fn contact(press: &Thresholds) -> Contact {
     Contact {
         threshold_n: press.contact_threshold_n,
         area_taxels: press.begin_area_taxels,

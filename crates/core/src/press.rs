@@ -10,16 +10,17 @@ mod settling;
 mod thin;
 
 use std::cmp::Ordering;
+use std::sync::Arc;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
 use self::course::HeldFrames;
-pub use self::settings::{Settings, SettingsError};
+pub use self::settings::{Settings, SettingsError, Thresholds};
 pub use self::settling::first_settled;
 use self::settling::{Load, Settling};
 pub use self::thin::thinned;
-use crate::frame::{Frame, Stamp, TAXELS};
+use crate::frame::{Array, Frame, Stamp};
 
 /// The number of a frame in a press, and when its last byte came.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -43,11 +44,12 @@ pub struct Marks {
 /// A frame of a press, in contact. The best frame has the maximal contact area. Of equal areas the
 /// greater force wins, then the earlier frame.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(into = "packed::Packed", try_from = "packed::Packed")]
 pub struct ContactFrame {
     /// The frame's number and arrival.
     pub moment: FrameAt,
     /// The frame itself.
-    pub frame: Frame,
+    pub frame: Arc<Frame>,
     /// The frame's marks.
     pub marks: Marks,
     /// The contact area of the frame.
@@ -100,9 +102,9 @@ impl Abort {
 /// use std::time::Duration;
 ///
 /// use hardnessd_core::frame::{Frame, Stamp};
-/// use hardnessd_core::press::{Abort, Change, Marks, FrameAt, PressTracker, Settings};
+/// use hardnessd_core::press::{Abort, Change, Marks, FrameAt, PressTracker, Thresholds};
 ///
-/// let mut tracker = PressTracker::new(Settings::default());
+/// let mut tracker = PressTracker::new(Thresholds::default());
 /// let mut touched = Frame::default();
 /// touched.newtons[400..409].fill(0.5);
 /// let mut changes = Vec::new();
@@ -193,20 +195,20 @@ impl SoFar {
 /// use std::time::Duration;
 ///
 /// use hardnessd_core::frame::{Frame, Stamp};
-/// use hardnessd_core::press::{Change, Marks, FrameAt, PressTracker, Settings};
+/// use hardnessd_core::press::{Change, Marks, FrameAt, PressTracker, Thresholds};
 ///
-/// let mut tracker = PressTracker::new(Settings::default());
+/// let mut tracker = PressTracker::new(Thresholds::default());
 /// let free = Frame::default();
-/// let mut touched = free;
+/// let mut touched = free.clone();
 /// touched.newtons[400..409].fill(0.5);
 /// let mut changes = Vec::new();
-/// for (number, frame) in (0..).zip([touched, touched, touched, free, free]) {
+/// for (number, frame) in (0..).zip([&touched, &touched, &touched, &free, &free]) {
 ///     let stamp = Stamp {
 ///         mono: Duration::from_millis(200 * number),
 ///         wall: jiff::Timestamp::UNIX_EPOCH,
 ///     };
 ///     let at = FrameAt { frame: number, stamp };
-///     changes.extend(tracker.push(&frame, Marks::default(), at));
+///     changes.extend(tracker.push(frame, Marks::default(), at));
 /// }
 /// assert!(matches!(changes[0], Change::Begin { press: 1, .. }));
 /// assert!(matches!(changes[1], Change::Settled { press: 1, .. }));
@@ -214,12 +216,12 @@ impl SoFar {
 /// ```
 #[derive(Debug)]
 pub struct PressTracker {
-    settings: Settings,
+    thresholds: Thresholds,
     state: State,
     presses: u64,
 }
 
-/// The state of a [`PressTracker`], without its settings.
+/// The state of a [`PressTracker`], without its thresholds.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Memory {
     state: State,
@@ -227,16 +229,16 @@ pub struct Memory {
 }
 
 impl Memory {
-    /// Whether a tracker can have this state after this many frames.
-    pub(crate) fn is_possible(&self, frames: u64) -> bool {
+    /// Whether a tracker of `array` can have this state after this many frames.
+    pub(crate) fn is_possible(&self, frames: u64, array: Array) -> bool {
         let is_press = |pressed: &Pressed| {
             let peak = &pressed.peak;
             pressed.press == self.presses
                 && pressed.frames <= frames
                 && peak.moment.frame < frames
-                && peak.contact_area_taxels as usize <= TAXELS
-                && peak.force_n == peak.frame.force_n()
-                && pressed.course.is_possible(frames)
+                && peak.frame.array == array
+                && peak.contact_area_taxels as usize <= array.taxels()
+                && pressed.course.is_possible(frames, array)
                 && pressed.settling.as_ref().is_none_or(Settling::is_possible)
         };
         self.presses <= frames
@@ -271,18 +273,18 @@ struct Pressed {
 }
 
 impl PressTracker {
-    /// A tracker without a press. `settings` have passed [`Settings::check`].
-    pub fn new(settings: Settings) -> Self {
+    /// A tracker without a press.
+    pub fn new(thresholds: Thresholds) -> Self {
         Self {
-            settings,
+            thresholds,
             state: State::Idle,
             presses: 0,
         }
     }
 
-    /// Takes over changed settings. They also apply to a press under way.
-    pub fn reload(&mut self, settings: Settings) {
-        self.settings = settings;
+    /// Takes over changed thresholds. They also apply to a press under way.
+    pub fn reload(&mut self, thresholds: Thresholds) {
+        self.thresholds = thresholds;
     }
 
     /// The tracker's state.
@@ -335,16 +337,16 @@ impl PressTracker {
 
     /// Takes the next frame in. Returns its changes, in order.
     pub fn push(&mut self, frame: &Frame, marks: Marks, at: FrameAt) -> Vec<Change> {
-        let area = frame.contact_area_taxels(self.settings.contact_threshold_n);
-        let touched = area >= self.settings.end_area_taxels;
+        let area = frame.contact_area_taxels(self.thresholds.contact_threshold_n);
+        let touched = area >= self.thresholds.end_area_taxels;
         let mut changes = Vec::new();
         match &mut self.state {
-            State::Idle if area < self.settings.begin_area_taxels => return changes,
+            State::Idle if area < self.thresholds.begin_area_taxels => return changes,
             State::Idle => {
                 self.presses += 1;
                 let peak = ContactFrame {
                     moment: at,
-                    frame: *frame,
+                    frame: Arc::new(frame.clone()),
                     marks,
                     contact_area_taxels: area,
                     force_n: frame.force_n(),
@@ -370,7 +372,7 @@ impl PressTracker {
             State::Pressed(pressed) => pressed.released_frames += 1,
             State::AwaitingRelease { released_frames } => {
                 *released_frames = if touched { 0 } else { *released_frames + 1 };
-                if *released_frames >= self.settings.end_frames {
+                if *released_frames >= self.thresholds.end_frames {
                     self.state = State::Idle;
                 }
                 return changes;
@@ -407,7 +409,7 @@ impl PressTracker {
                 contact_area_taxels: area,
                 force_n: frame.force_n(),
             };
-            if settling.push(load, &self.settings) {
+            if settling.push(load, &self.thresholds) {
                 pressed.settling = None;
                 changes.push(Change::Settled {
                     press: pressed.press,
@@ -416,9 +418,9 @@ impl PressTracker {
             }
         }
         let held = at.stamp.mono.saturating_sub(pressed.began).as_secs_f64();
-        let end = if pressed.released_frames >= self.settings.end_frames {
+        let end = if pressed.released_frames >= self.thresholds.end_frames {
             End::Release
-        } else if held >= self.settings.max_seconds {
+        } else if held >= self.thresholds.max_seconds {
             End::Timeout
         } else {
             return;
@@ -430,7 +432,7 @@ impl PressTracker {
             },
         };
         if let State::Pressed(pressed) = std::mem::replace(&mut self.state, next) {
-            changes.push(pressed.finish(end, self.settings.min_frames));
+            changes.push(pressed.finish(end, self.thresholds.min_frames));
         }
     }
 }
@@ -447,7 +449,7 @@ impl Pressed {
         self.released_frames = 0;
         let touched = ContactFrame {
             moment: at,
-            frame: *frame,
+            frame: Arc::new(frame.clone()),
             marks,
             contact_area_taxels: area,
             force_n: frame.force_n(),

@@ -120,7 +120,7 @@ impl RecordedSensor {
     /// The recorded description of `sensor` with the model `hrn`.
     pub fn new(sensor: &Sensor, hrn: &Hrn) -> Self {
         Self {
-            description: sensor.description().for_recording(sensor.stale_after()),
+            description: sensor.for_recording(),
             model: hrn.sha256().to_owned(),
         }
     }

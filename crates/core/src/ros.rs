@@ -16,6 +16,7 @@ use serde_json::Value;
 pub use self::frame::contact;
 pub use self::frame::{CONTACT, FRAME, GRID};
 use crate::event::{self, Event, name};
+use crate::frame::Pitch;
 
 /// The bytes before every message: CDR, little-endian, no options (DDS-XTYPES 1.3, 7.6.3.1.2).
 pub const ENCAPSULATION: [u8; 4] = [0, 1, 0, 0];
@@ -215,11 +216,11 @@ fn context(context: Option<&Value>) -> String {
 }
 
 /// Every message that a recording or a viewer such as Foxglove holds of an event. A frame has three
-/// messages. `pitch_mm` is the distance between the sensor's taxels.
-pub fn encode_all(event: &Event, pitch_mm: f64) -> Vec<(Topic, Timestamp, Vec<u8>)> {
+/// messages. `pitch` is that of the sensor's taxels.
+pub fn encode_all(event: &Event, pitch: Pitch) -> Vec<(Topic, Timestamp, Vec<u8>)> {
     let mut messages = vec![encode(event)];
     if let Event::Frame(frame) = event {
-        messages.extend([frame::contact(frame), frame::grid(frame, pitch_mm)]);
+        messages.extend([frame::contact(frame), frame::grid(frame, pitch)]);
     }
     messages
 }

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use crate::press::Thresholds;
 use crate::wire::{self, Layout};
 use crate::{motion, press, tare};
 
@@ -67,15 +68,6 @@ impl Description {
         ];
         let first = differs.iter().find(|(_, differs)| *differs);
         first.map(|(key, _)| *key)
-    }
-
-    /// The description as a recording holds it. The stale time is always written, so a later
-    /// default does not change what a recording says.
-    pub fn for_recording(&self, stale_after: Duration) -> Self {
-        Self {
-            stale_after_ms: Some(stale_after.as_nanos() as f64 / 1e6),
-            ..self.clone()
-        }
     }
 }
 
@@ -155,6 +147,7 @@ const LEAST_STALE_AFTER: Duration = Duration::from_millis(50);
 pub struct Sensor {
     description: Description,
     layout: Layout,
+    thresholds: Thresholds,
     stale_after: Duration,
 }
 
@@ -215,7 +208,7 @@ impl Sensor {
         };
         let layout = Layout::new(frame)?;
         calibration.check(layout.array())?;
-        press.check()?;
+        let thresholds = press.check(layout.array(), calibration.pitch_mm)?;
         arm.check()?;
         if !(0.0..=1.0).contains(min_confidence) {
             return Err(SensorError::MinConfidence(*min_confidence));
@@ -228,6 +221,7 @@ impl Sensor {
         }
         Ok(Self {
             layout,
+            thresholds,
             stale_after,
             description,
         })
@@ -241,6 +235,27 @@ impl Sensor {
     /// The sensor's name.
     pub fn name(&self) -> &str {
         &self.description.name
+    }
+
+    /// The thresholds of presses, for the size of the sensor's taxels.
+    pub fn thresholds(&self) -> &Thresholds {
+        &self.thresholds
+    }
+
+    /// The description as a recording holds it. Values whose default is computed are written, so a
+    /// later default does not change what a recording says.
+    pub fn for_recording(&self) -> Description {
+        let press = press::Settings {
+            contact_threshold_n: Some(self.thresholds.contact_threshold_n),
+            begin_area_taxels: Some(self.thresholds.begin_area_taxels),
+            end_area_taxels: Some(self.thresholds.end_area_taxels),
+            ..self.description.press.clone()
+        };
+        Description {
+            stale_after_ms: Some(self.stale_after.as_nanos() as f64 / 1e6),
+            press,
+            ..self.description.clone()
+        }
     }
 
     /// How the sensor writes a frame.
@@ -306,7 +321,7 @@ mod tests {
         for ms in [0.0, -1.0, 3.7e6, f64::NAN] {
             check(&|d| d.stale_after_ms = Some(ms), "stale_after_ms: found");
         }
-        check(&|d| d.frame.rows = Some(29), "frame.rows: found 29");
+        check(&|d| d.frame.rows = Some(65), "frame.rows: found 65");
         let dead = "calibration.dead_taxels: found [5, 0]";
         check(
             &|d| {
@@ -362,8 +377,9 @@ mod tests {
                 ..Description::default()
             };
             let sensor = Sensor::new(described).unwrap();
-            let recorded = sensor.description().for_recording(sensor.stale_after());
+            let recorded = sensor.for_recording();
             assert!(recorded.stale_after_ms.is_some());
+            assert_eq!(recorded.press.contact_threshold_n, Some(0.07));
             let played = Sensor::new(recorded).unwrap();
             assert_eq!(
                 played.stale_after(),

@@ -9,10 +9,8 @@ mod settings;
 use serde::{Deserialize, Serialize};
 
 use self::settings::MOST_TARE_FRAMES;
-pub use self::settings::{
-    EXPONENTS, GAINS, Gains, NEWTONS_PER_COUNT, PITCH_MM, Settings, SettingsError,
-};
-use crate::frame::{Array, COLS, Frame, ROWS, RawFrame, TAXELS, taxels};
+pub use self::settings::{EXPONENTS, GAINS, Gains, NEWTONS_PER_COUNT, Settings, SettingsError};
+use crate::frame::{Array, Frame, RawFrame};
 
 /// The thresholds at which frames of a tare count as touched.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -100,13 +98,14 @@ pub enum Aim {
 /// # Example
 ///
 /// ```
-/// use hardnessd_core::frame::{Array, RawFrame, TAXELS};
+/// use hardnessd_core::frame::{Array, RawFrame};
 /// use hardnessd_core::tare::{Contact, Progress, Settings, Tare};
 ///
 /// let contact = Contact { threshold_n: 0.07, area_taxels: 3 };
 /// let settings = Settings { tare_frames: 1, ..Settings::default() };
-/// let mut tare = Tare::new(&settings, Array::FULL, contact);
-/// let mut raw = RawFrame { counts: [2; TAXELS] };
+/// let mut tare = Tare::new(&settings, Array::JX255N, contact);
+/// let mut raw = RawFrame::zero(Array::JX255N);
+/// raw.counts.fill(2);
 /// assert_eq!(tare.observe(&raw), Progress::Taken);
 ///
 /// raw.counts[0] = 27;
@@ -119,8 +118,8 @@ pub struct Tare {
     scale: ForceCurve,
     /// The number of frames of a tare.
     frames: u32,
-    /// `[ROWS, COLS]` in counts. All zeros until a tare is taken.
-    baseline: Box<[f32; TAXELS]>,
+    /// The counts of each unloaded taxel. All zeros until a tare is taken.
+    baseline: Vec<f32>,
     stage: Stage,
     contact: Contact,
     max_n: f32,
@@ -137,17 +136,15 @@ struct ForceCurve {
     newtons_per_count: f32,
     exponent: f32,
     /// The gain of each taxel.
-    gains: Box<[f32; TAXELS]>,
+    gains: Vec<f32>,
 }
 
 impl ForceCurve {
     fn new(settings: &Settings, array: Array) -> Self {
-        let mut gains = Box::new([1.0; TAXELS]);
-        if let Some(Gains::Taxels(rows)) = &settings.gains {
-            for (place, &gain) in array.places().zip(rows.iter().flatten()) {
-                gains[place] = gain;
-            }
-        }
+        let gains = match &settings.gains {
+            Some(Gains::Taxels(rows)) => rows.concat(),
+            Some(Gains::File(_)) | None => vec![1.0; array.taxels()],
+        };
         Self {
             newtons_per_count: settings.newtons_per_count,
             exponent: settings.exponent,
@@ -189,11 +186,11 @@ enum Stage {
 
 impl Stage {
     /// Begins a tare over `frames` frames. With 0 frames, no tare begins.
-    fn begin(aim: Aim, frames: u32) -> Self {
+    fn begin(aim: Aim, frames: u32, array: Array) -> Self {
         if frames == 0 {
             return Self::Idle;
         }
-        let sums = Sums::new(frames);
+        let sums = Sums::new(frames, array);
         Self::Taking { aim, sums }
     }
 }
@@ -201,23 +198,27 @@ impl Stage {
 /// The state of a [`Tare`], without its settings.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Memory {
-    #[serde(with = "taxels")]
-    baseline: Box<[f32; TAXELS]>,
+    baseline: Vec<f32>,
     taking: Option<(Aim, Sums)>,
 }
 
 impl Memory {
-    /// Whether a tare can have this state. A recording may hold anything.
-    pub(crate) fn is_possible(&self) -> bool {
+    /// Whether a tare of `array` can have this state. A recording may hold anything.
+    pub(crate) fn is_possible(&self, array: Array) -> bool {
         // The mean of counts, with room for rounding.
         let is_count = |mean: &f32| (0.0..=65_536.0).contains(mean);
         let are_sums = |(_, sums): &(Aim, Sums)| {
             let most = u64::from(sums.seen) * u64::from(u16::MAX);
             sums.seen < sums.wanted
+                && sums.sum.len() == array.taxels()
+                && sums.least.len() == array.taxels()
+                && sums.most.len() == array.taxels()
                 && sums.wanted <= MOST_TARE_FRAMES
                 && sums.sum.iter().all(|&sum| u64::from(sum) <= most)
         };
-        self.baseline.iter().all(is_count) && self.taking.as_ref().is_none_or(are_sums)
+        self.baseline.len() == array.taxels()
+            && self.baseline.iter().all(is_count)
+            && self.taking.as_ref().is_none_or(are_sums)
     }
 }
 
@@ -226,22 +227,19 @@ impl Memory {
 struct Sums {
     wanted: u32,
     seen: u32,
-    #[serde(with = "taxels")]
-    sum: Box<[u32; TAXELS]>,
-    #[serde(with = "taxels")]
-    least: Box<[u16; TAXELS]>,
-    #[serde(with = "taxels")]
-    most: Box<[u16; TAXELS]>,
+    sum: Vec<u32>,
+    least: Vec<u16>,
+    most: Vec<u16>,
 }
 
 impl Sums {
-    fn new(wanted: u32) -> Self {
+    fn new(wanted: u32, array: Array) -> Self {
         Self {
             wanted,
             seen: 0,
-            sum: Box::new([0; TAXELS]),
-            least: Box::new([u16::MAX; TAXELS]),
-            most: Box::new([0; TAXELS]),
+            sum: vec![0; array.taxels()],
+            least: vec![u16::MAX; array.taxels()],
+            most: vec![0; array.taxels()],
         }
     }
 
@@ -264,8 +262,8 @@ impl Tare {
         Self {
             scale: ForceCurve::new(settings, array),
             frames: settings.tare_frames,
-            baseline: Box::new([0.0; TAXELS]),
-            stage: Stage::begin(first, settings.tare_frames),
+            baseline: vec![0.0; array.taxels()],
+            stage: Stage::begin(first, settings.tare_frames, array),
             contact,
             max_n: settings.tare_max_n,
             follows: settings.auto_tare,
@@ -282,7 +280,9 @@ impl Tare {
             Stage::Taking {
                 aim: Aim::Request, ..
             } if frames == 0 => Stage::Ended(Err(RetareError::NoFrames)),
-            Stage::Taking { aim, .. } if frames != self.frames => Stage::begin(aim, frames),
+            Stage::Taking { aim, .. } if frames != self.frames => {
+                Stage::begin(aim, frames, self.array)
+            }
             stage => stage,
         };
         self.scale = ForceCurve::new(settings, self.array);
@@ -333,7 +333,7 @@ impl Tare {
         if self.frames == 0 {
             return Err(RetareError::NoFrames);
         }
-        self.stage = Stage::begin(Aim::Request, self.frames);
+        self.stage = Stage::begin(Aim::Request, self.frames, self.array);
         Ok(())
     }
 
@@ -369,7 +369,7 @@ impl Tare {
     /// Converts counts to newtons: `newtons_per_count x max(0, counts - baseline)^exponent x gain`.
     /// A dead taxel is replaced by the mean of its live neighbours.
     pub fn apply(&self, raw: &RawFrame) -> Frame {
-        let mut frame = Frame::default();
+        let mut frame = Frame::zero(self.array);
         for (place, newtons) in frame.newtons.iter_mut().enumerate() {
             let counts = f32::from(raw.counts[place]) - self.baseline[place];
             *newtons = self.scale.newtons(counts, place);
@@ -405,8 +405,8 @@ impl Tare {
 
     /// Whether a live taxel reads `full_scale` counts.
     pub fn is_saturated(&self, raw: &RawFrame, full_scale: u16) -> bool {
-        self.array.places().any(|place| {
-            raw.counts[place] >= full_scale && !self.dead.iter().any(|(dead, _)| *dead == place)
+        raw.counts.iter().enumerate().any(|(place, &count)| {
+            count >= full_scale && !self.dead.iter().any(|(dead, _)| *dead == place)
         })
     }
 
@@ -420,12 +420,13 @@ impl Tare {
             return Progress::Taking;
         }
         let (aim, sums) = (*aim, sums.clone());
-        let mean = Box::new(std::array::from_fn(|place| {
-            sums.sum[place] as f32 / sums.seen as f32
-        }));
+        let means = sums.sum.iter().map(|&sum| sum as f32 / sums.seen as f32);
+        let mean: Vec<f32> = means.collect();
         if self.is_touched(&sums, &mean) {
             self.stage = match aim {
-                Aim::First { .. } => Stage::begin(Aim::First { met_contact: true }, sums.wanted),
+                Aim::First { .. } => {
+                    Stage::begin(Aim::First { met_contact: true }, sums.wanted, self.array)
+                }
                 Aim::Request => Stage::Ended(Err(RetareError::Touched)),
             };
             return Progress::Contact;
@@ -442,7 +443,7 @@ impl Tare {
         Progress::Taken
     }
 
-    fn is_touched(&self, sums: &Sums, mean: &[f32; TAXELS]) -> bool {
+    fn is_touched(&self, sums: &Sums, mean: &[f32]) -> bool {
         let live = self.live();
         let mut sorted: Vec<f32> = live.iter().map(|&place| mean[place]).collect();
         sorted.sort_by(f32::total_cmp);
@@ -460,28 +461,27 @@ impl Tare {
 
     /// The places of the array's live taxels.
     fn live(&self) -> Vec<usize> {
-        self.array
-            .places()
+        (0..self.array.taxels())
             .filter(|place| !self.dead.iter().any(|(dead, _)| dead == place))
             .collect()
     }
 }
 
 fn dead(settings: &Settings, array: Array) -> Vec<(usize, Vec<usize>)> {
-    let mut is_dead = [false; TAXELS];
+    let mut is_dead = vec![false; array.taxels()];
     for &[row, col] in &settings.dead_taxels {
         is_dead[array.place(row, col)] = true;
     }
     let live_neighbours = |place: usize| {
-        let (row, col) = (place / COLS, place % COLS);
-        let rows = row.saturating_sub(1)..=(row + 1).min(ROWS - 1);
+        let (row, col) = array.position(place);
+        let rows = row.saturating_sub(1)..=(row + 1).min(array.rows - 1);
         rows.flat_map(|r| {
-            (col.saturating_sub(1)..=(col + 1).min(COLS - 1)).map(move |c| r * COLS + c)
+            (col.saturating_sub(1)..=(col + 1).min(array.cols - 1)).map(move |c| array.place(r, c))
         })
-        .filter(|&at| at != place && !is_dead[at] && array.position(at).is_some())
+        .filter(|&at| at != place && !is_dead[at])
         .collect()
     };
-    (0..TAXELS)
+    (0..array.taxels())
         .filter(|&place| is_dead[place])
         .map(|place| (place, live_neighbours(place)))
         .collect()

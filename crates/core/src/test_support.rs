@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-use crate::frame::{COLS, ROWS, RawFrame, Stamp};
+use crate::frame::{Array, RawFrame, Stamp};
 use crate::motion::Point;
 use crate::pipeline::{Clock, Input, Pipeline};
 use crate::recording::{About, Entry, Labels, RecordedSensor, State, Writer};
@@ -35,10 +35,10 @@ fn described() -> Description {
         name: "forearm".to_owned(),
         calibration: tare::Settings {
             gains: Some(Gains::Taxels(vec![
-                (1..=COLS)
+                (1..=Array::JX255N.cols)
                     .map(|n| n as f32 / 14.3)
                     .collect();
-                ROWS
+                Array::JX255N.rows
             ])),
             auto_tare: true,
             ..tare::Settings::default()

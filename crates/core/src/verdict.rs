@@ -8,6 +8,7 @@
 
 mod course;
 mod file;
+mod grid;
 mod guard;
 
 use std::time::Duration;
@@ -22,8 +23,11 @@ pub use self::course::{
     extents,
 };
 pub use self::file::{check_levels, describe};
+pub use self::grid::{
+    COLS, CONTACT_THRESHOLD_N, Laying, ModelFrame, ModelFrameError, ROWS, TAXELS,
+};
 pub use self::guard::NodeProblem;
-use crate::frame::{COLS, Frame, ROWS};
+use crate::frame::Pitch;
 
 /// The default model, built into the binary; `models/README.md` is its card.
 pub const BUILT_IN: &[u8] = include_bytes!("../../../models/hrn.onnx");
@@ -75,6 +79,10 @@ pub struct Range {
     /// The least and the greatest stiffness of the arm, in N/mm.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub arm_n_per_mm: Option<[f32; 2]>,
+    /// The least and the greatest distance between the taxels of the training sensors, in mm.
+    /// `None` means that of the model's grid.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pitch_mm: Option<[f32; 2]>,
 }
 
 impl Range {
@@ -87,6 +95,7 @@ impl Range {
         speed_mm_s: None,
         approach_mm: None,
         arm_n_per_mm: None,
+        pitch_mm: Some([0.0, f32::MAX]),
     };
 
     /// The ranges of the presses, in the order of [`Extents`].
@@ -152,6 +161,23 @@ pub struct Card {
     /// `hrn.conformal`: only a file of format 2 may have it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub conformal: Option<Conformal>,
+}
+
+impl Card {
+    /// A taxel of the model's grid is in contact at or above this force.
+    pub fn contact_threshold_n(&self) -> f32 {
+        let share = f64::from(self.pitch_mm) / Pitch::JX255N.rows_mm;
+        (f64::from(CONTACT_THRESHOLD_N) * share * share) as f32
+    }
+
+    /// Whether the model was trained on sensors of this pitch. Taxels that are finer than the
+    /// model's add up to what the model's would read, so only coarser ones are foreign to a model
+    /// that knows one pitch.
+    pub fn holds(&self, pitch: Pitch) -> bool {
+        let [least, most] = self.range.pitch_mm.unwrap_or([0.0, self.pitch_mm]);
+        let known = f64::from(least) * 0.98..=f64::from(most) * 1.02;
+        known.contains(&pitch.rows_mm) && known.contains(&pitch.cols_mm)
+    }
 }
 
 /// `hrn.conformal`: the threshold for the set of levels that a verdict cannot tell apart.
@@ -349,11 +375,10 @@ pub enum ModelError {
 /// The card of a model has the labels of its levels.
 ///
 /// ```
-/// use hardnessd_core::frame::Frame;
-/// use hardnessd_core::verdict::{BUILT_IN, Hrn};
+/// use hardnessd_core::verdict::{BUILT_IN, Hrn, ModelFrame};
 ///
 /// let hrn = Hrn::load(BUILT_IN)?;
-/// let mut frame = Frame::default();
+/// let mut frame = ModelFrame::default();
 /// frame.newtons[400..404].fill(2.0);
 /// let verdict = hrn.judge(&frame)?;
 /// let level = &hrn.card().levels[usize::from(verdict.level) - 1];
@@ -550,7 +575,7 @@ impl Hrn {
     ///
     /// Returns [`ModelError::NotFinite`] if an output is NaN or infinite, and
     /// [`ModelError::Inference`] if the inference library fails.
-    pub fn judge(&self, frame: &Frame) -> Result<Verdict, ModelError> {
+    pub fn judge(&self, frame: &ModelFrame) -> Result<Verdict, ModelError> {
         match self.format {
             Format::Frame => {
                 let input = Tensor::from_shape(&[1, 1, ROWS, COLS], &frame.newtons);
@@ -596,7 +621,7 @@ impl Hrn {
     pub fn judge_check(&self, index: usize) -> Result<Verdict, ModelError> {
         match &self.checks {
             Checks::Frames(check) => {
-                let mut frame = Frame::default();
+                let mut frame = ModelFrame::default();
                 frame.newtons.copy_from_slice(&check.frames[index]);
                 self.judge(&frame)
             }

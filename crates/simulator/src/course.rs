@@ -7,9 +7,8 @@
 
 use super::motion::{Arm, Motion};
 use super::press::{Bench, Specimen, Step, Window, touches_border};
-use super::sensor::taxel_forces;
+use super::sensor::{TAXELS, taxel_forces};
 use super::substance::Law;
-use hardnessd_core::frame::TAXELS;
 
 /// A press from touch to separation.
 pub(super) struct SolvedPress {

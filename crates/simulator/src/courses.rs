@@ -20,7 +20,7 @@ use super::settings::DatasetSettings;
 use super::subject::{Subject, shared_out, units};
 use super::tracked::{Seen, begins_press, ideal_tare, one_press};
 use crate::random::Stream;
-use hardnessd_core::frame::{RawFrame, TAXELS};
+use hardnessd_core::frame::RawFrame;
 use hardnessd_core::press::thinned;
 
 /// The settings of a simulated data set of presses.
@@ -107,7 +107,7 @@ pub struct LabelledCourse {
 #[derive(Debug, Clone, PartialEq)]
 pub struct CourseMoment {
     /// Counts after an ideal tare, at [`NEWTONS_PER_COUNT`](hardnessd_core::tare::NEWTONS_PER_COUNT) each.
-    pub counts: Box<[u16; TAXELS]>,
+    pub counts: Box<[u16]>,
     /// Time since the frame that began the press; negative before it.
     pub time_s: f32,
     /// How far the arm went since the begin, as reported; 0 if it is not reported.
@@ -355,7 +355,7 @@ fn kept(
         let (time_s, raw) = &frames[place];
         let approach_mm = told_mm(*time_s) - told_mm(begin_s);
         CourseMoment {
-            counts: Box::new(raw.counts),
+            counts: raw.counts.clone(),
             time_s: (time_s - begin_s) as f32,
             approach_mm: if is_known { approach_mm as f32 } else { 0.0 },
             known: is_known,

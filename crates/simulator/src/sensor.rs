@@ -10,8 +10,19 @@ use std::sync::OnceLock;
 use serde::{Deserialize, Serialize};
 
 use crate::random::Stream;
-use hardnessd_core::frame::{COLS, ROWS, RawFrame, TAXELS};
-use hardnessd_core::tare::{NEWTONS_PER_COUNT, PITCH_MM};
+use hardnessd_core::frame::{Array, Pitch, RawFrame};
+use hardnessd_core::tare::NEWTONS_PER_COUNT;
+
+/// The simulated array.
+pub(super) const ARRAY: Array = Array::JX255N;
+/// Rows of the array.
+const ROWS: usize = ARRAY.rows;
+/// Columns of the array.
+const COLS: usize = ARRAY.cols;
+/// Taxels of the array.
+pub(super) const TAXELS: usize = ARRAY.taxels();
+/// The distance between taxels.
+const PITCH_MM: f64 = Pitch::JX255N.rows_mm;
 
 /// Cells along a taxel.
 const CELLS_PER_TAXEL: usize = 4;
@@ -157,7 +168,7 @@ impl Sensor {
             rows[k / COLS] += force;
             columns[k % COLS] += force;
         }
-        let mut raw = RawFrame::default();
+        let mut raw = RawFrame::zero(ARRAY);
         for (k, counts) in raw.counts.iter_mut().enumerate() {
             let (row, column) = (k / COLS, k % COLS);
             let own = forces_n[k];
@@ -389,7 +400,7 @@ mod tests {
             1.0,
             &mut Stream::new(2, "noise"),
         );
-        assert_eq!(raw, RawFrame::default());
+        assert_eq!(raw, RawFrame::zero(ARRAY));
     }
 
     #[test]

@@ -12,10 +12,10 @@ use super::material::Material;
 use super::motion::{Approach, Arm, Motion};
 use super::object::{Object, POSTURES, Pose, Shapes};
 use super::press::{Bench, Specimen};
-use super::sensor::{Film, Sensor, SensorProfile};
+use super::sensor::{ARRAY, Film, Sensor, SensorProfile, TAXELS};
 use super::tracked::one_press;
 use crate::random::Stream;
-use hardnessd_core::frame::{RawFrame, TAXELS};
+use hardnessd_core::frame::RawFrame;
 
 /// The settings of a sequence: what to press, how often and how hard.
 #[derive(Debug, Clone, PartialEq)]
@@ -174,7 +174,7 @@ impl Sequence {
         let materials = &self.settings.materials;
         let pressed = self.made.checked_sub(1);
         SequenceFrame {
-            raw: RawFrame::default(),
+            raw: RawFrame::zero(ARRAY),
             press: self.made,
             material: pressed.map(|press| materials[press as usize % materials.len()]),
             loaded: false,
@@ -286,12 +286,12 @@ mod tests {
             tare_frames: 0,
             ..tare::Settings::default()
         };
-        let settings = press::Settings::default();
+        let settings = press::Thresholds::default();
         let contact = tare::Contact {
             threshold_n: settings.contact_threshold_n,
             area_taxels: settings.begin_area_taxels,
         };
-        let tare = Tare::new(&calibration, Array::FULL, contact);
+        let tare = Tare::new(&calibration, Array::JX255N, contact);
         let mut tracker = PressTracker::new(settings);
         let mut seen = Vec::new();
         for (number, frame) in (0_u32..).zip(frames) {

@@ -5,26 +5,29 @@
 
 use std::time::Duration;
 
+use super::sensor::ARRAY;
 use hardnessd_core::frame::{Frame, RawFrame, Stamp};
-use hardnessd_core::press::{Change, End, FrameAt, Marks, PressTracker, Settings};
+use hardnessd_core::press::{Change, End, FrameAt, Marks, PressTracker, Thresholds};
 use hardnessd_core::tare::NEWTONS_PER_COUNT;
 
 /// The frame after a tare with baseline 0.
 pub(super) fn ideal_tare(raw: &RawFrame) -> Frame {
+    let newtons = raw.counts.iter();
     Frame {
-        newtons: raw
-            .counts
-            .map(|counts| f32::from(counts) * NEWTONS_PER_COUNT),
+        array: raw.array,
+        newtons: newtons
+            .map(|&counts| f32::from(counts) * NEWTONS_PER_COUNT)
+            .collect(),
     }
 }
 
 /// Whether a press tracker with default settings begins a press with this frame.
 pub(super) fn begins_press(frame: &Frame) -> bool {
-    let Settings {
+    let Thresholds {
         contact_threshold_n,
         begin_area_taxels,
         ..
-    } = Settings::default();
+    } = Thresholds::default();
     frame.contact_area_taxels(contact_threshold_n) >= begin_area_taxels
 }
 
@@ -42,11 +45,12 @@ pub(super) fn one_press<'a>(
     frames: impl IntoIterator<Item = &'a RawFrame>,
     period_s: f64,
 ) -> Option<Seen> {
-    let settings = Settings::default();
-    let rest = std::iter::repeat_n(RawFrame::default(), settings.end_frames as usize);
+    let settings = Thresholds::default();
+    let rest = std::iter::repeat_n(Frame::zero(ARRAY), settings.end_frames as usize);
+    let frames = frames.into_iter().map(ideal_tare).chain(rest);
     let mut tracker = PressTracker::new(settings.clone());
     let (mut contact, mut best) = (Vec::new(), None);
-    for (number, raw) in (0_u32..).zip(frames.into_iter().copied().chain(rest)) {
+    for (number, frame) in (0_u32..).zip(frames) {
         let at = FrameAt {
             frame: number.into(),
             stamp: Stamp {
@@ -54,7 +58,6 @@ pub(super) fn one_press<'a>(
                 wall: jiff::Timestamp::UNIX_EPOCH,
             },
         };
-        let frame = ideal_tare(&raw);
         for change in tracker.push(&frame, Marks::default(), at) {
             match change {
                 Change::Begin { .. } if best.is_some() => return None,

@@ -22,8 +22,7 @@ use crate::net::losses::Game;
 use crate::net::network::Weights;
 use crate::run::{Description, Run};
 use crate::settings::{AugmentationSettings, GanSettings, Settings, Training, Validation};
-use hardnessd_core::frame::Frame;
-use hardnessd_core::verdict::argmax;
+use hardnessd_core::verdict::{ModelFrame, argmax};
 use hardnessd_simulator::Split;
 use hardnessd_simulator::random::Stream;
 
@@ -156,7 +155,7 @@ impl Stages<'_> {
             let real = real.map(|&index| &self.dataset.samples[index].frame);
             rows.push(Strip::of(&format!("{level} real"), real));
             let frames = generated.iter().filter(|sample| sample.level == level);
-            let frames: Vec<&Frame> = frames.map(|sample| &sample.frame).collect();
+            let frames: Vec<&ModelFrame> = frames.map(|sample| &sample.frame).collect();
             for part in frames.chunks(sheet::TILES).take(2) {
                 let name = format!("{level} generated");
                 rows.push(Strip::of(&name, part.iter().copied()));
@@ -173,7 +172,7 @@ impl Stages<'_> {
         stage: &'static str,
         real: &[usize],
         ustgan: &Gan,
-    ) -> anyhow::Result<Vec<Frame>> {
+    ) -> anyhow::Result<Vec<ModelFrame>> {
         let settings = self.settings();
         let seed = self.description.seed;
         let task = gan::Task {
@@ -316,7 +315,7 @@ impl Stages<'_> {
             temperature: trained.temperature,
             force_factor,
         };
-        let probabilities = |frames: &[&Frame]| {
+        let probabilities = |frames: &[&ModelFrame]| {
             let logits = trained.logits(frames.iter().copied(), scale, self.device);
             Ok(temperature::probabilities(
                 &logits,

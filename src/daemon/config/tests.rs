@@ -119,8 +119,8 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
             &["stale_after_ms: found 0.0, expected 0.1 to 3600000 milli"],
         ),
         (
-            "[[sensor]]\nport = \"p\"\n[sensor.frame]\nrows = 29",
-            &["sensor[\"sensor\"].frame.rows", "29", "28"],
+            "[[sensor]]\nport = \"p\"\n[sensor.frame]\nrows = 65",
+            &["sensor[\"sensor\"].frame.rows", "65", "64"],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[sensor.frame]\nsync = \"xyz\"",

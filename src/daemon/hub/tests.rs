@@ -59,12 +59,12 @@ pub(in crate::daemon) fn press(sensor: &str) -> Event {
 }
 
 fn frame(sensor: &str, number: u64) -> Event {
-    let newtons = vec![0.0; hardnessd_core::frame::TAXELS];
+    let newtons = hardnessd_core::frame::Frame::default();
     Event::Frame(FrameEvent::new(
         sensor.to_owned(),
         jiff::Timestamp::UNIX_EPOCH,
         number,
-        newtons,
+        &newtons,
         0,
         true,
     ))

@@ -1,6 +1,7 @@
 use std::sync::mpsc::Receiver;
 
 use super::*;
+use hardnessd_core::frame::Pitch;
 use hardnessd_core::pipeline::Clock;
 use hardnessd_core::recording::Ring;
 use hardnessd_core::test_support;
@@ -132,11 +133,14 @@ fn viewers_get_the_settings_after_a_reload() {
     let (viewers, mut shown) = mpsc::channel(1);
     let mut recorder = SensorRecorder::default().with_viewers(Some(viewers));
     let mut description = test_support::sensor().description().clone();
-    description.calibration.pitch_mm = 2.0;
+    description.calibration.pitch_mm = Pitch::square(2.0);
     let changed = Sensor::new(description).unwrap();
     recorder.reload(&pipeline, &changed, &test_support::hrn(), at(7));
     let Entry::Settings(settings) = shown.try_recv().unwrap().entry else {
         panic!("no settings");
     };
-    assert_eq!(settings.description.calibration.pitch_mm, 2.0);
+    assert_eq!(
+        settings.description.calibration.pitch_mm,
+        Pitch::square(2.0)
+    );
 }

@@ -5,7 +5,7 @@
 //! arrays are often nearer to another power.
 
 use super::gather::Press;
-use hardnessd_core::frame::{Array, RawFrame, TAXELS};
+use hardnessd_core::frame::{Array, RawFrame};
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::tare::{self, Tare};
 
@@ -187,12 +187,10 @@ fn rest(press: &Press, sensor: &Sensor) -> Vec<Count> {
 /// in the recording has no counts, so it counts as dead here too.
 fn shares(sensor: &Sensor, recorded: &Sensor) -> Vec<f64> {
     let mut settings = sensor.description().calibration.clone();
-    let (array, of_recording) = (sensor.layout().array(), recorded.layout().array());
+    let array = sensor.layout().array();
     let dead = recorded.description().calibration.dead_taxels.iter();
-    settings.dead_taxels.extend(dead.filter_map(|&[row, col]| {
-        let (row, col) = array.position(of_recording.place(row, col))?;
-        Some([row, col])
-    }));
+    let is_here = |&&[row, col]: &&[usize; 2]| row < array.rows && col < array.cols;
+    settings.dead_taxels.extend(dead.filter(is_here));
     let effects = effects(&settings, array);
     effects.into_iter().map(|[_, share]| share).collect()
 }
@@ -212,14 +210,14 @@ fn effects(settings: &tare::Settings, array: Array) -> Vec<[f64; 2]> {
         area_taxels: 1,
     };
     let tare = Tare::new(&settings, array, contact);
-    let mut raw = RawFrame::default();
+    let mut raw = RawFrame::zero(array);
     let of_place = |place: usize| {
         raw.counts[place] = 1;
         let newtons = tare.apply(&raw).newtons;
         raw.counts[place] = 0;
         [newtons[place], newtons.iter().sum()].map(f64::from)
     };
-    (0..TAXELS).map(of_place).collect()
+    (0..array.taxels()).map(of_place).collect()
 }
 
 fn raised(counts: &[Count], exponent: f64) -> f64 {
@@ -278,8 +276,8 @@ mod tests {
         let total = loaded.iter().zip(&shape);
         let total: f64 = total.map(|(&at, c)| own[at][1] * c.powf(e)).sum();
         let scale = (newtons / (a * total)).powf(1.0 / e);
-        let read = effects(settings, Array::FULL);
-        let mut frame = vec![0.0_f32; TAXELS];
+        let read = effects(settings, Array::JX255N);
+        let mut frame = vec![0.0_f32; Array::JX255N.taxels()];
         for (&at, shape) in loaded.iter().zip(&shape) {
             let raised = (scale * shape).powf(f64::from(settings.exponent));
             frame[at] = (f64::from(settings.newtons_per_count) * read[at][0] * raised) as f32;

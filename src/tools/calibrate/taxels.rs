@@ -6,7 +6,7 @@
 //! taxel is also compared with the array's median. The gains that fit all comparisons best are
 //! found by least squares, and drawn towards 1 where there are few presses.
 
-use hardnessd_core::frame::{Array, TAXELS};
+use hardnessd_core::frame::Array;
 
 /// A press without gains.
 pub(super) struct Plain {
@@ -95,13 +95,13 @@ impl Fit {
     /// Computes the gains from presses on `array`. `dead` are the taxels whose newtons are no
     /// measurement.
     pub(super) fn of(presses: &[Plain], array: Array, dead: &[[usize; 2]]) -> Result<Self, Unfit> {
-        let mut is_dead = vec![false; TAXELS];
+        let mut is_dead = vec![false; array.taxels()];
         for &[row, col] in dead {
             is_dead[array.place(row, col)] = true;
         }
         let all: Vec<&Plain> = presses.iter().collect();
         let (logs, reached) = solve(&all, array, &is_dead);
-        let places: Vec<usize> = array.places().collect();
+        let places: Vec<usize> = (0..array.taxels()).collect();
         let taxels = places.iter().filter(|&&place| !is_dead[place]).count();
         let measured: Vec<usize> = places.iter().copied().filter(|&p| reached[p] > 1).collect();
         if measured.len() < LEAST_TAXELS {
@@ -120,10 +120,7 @@ impl Fit {
         let dead = places
             .iter()
             .filter(|&&p| !is_dead[p] && looks_dead(presses, array, &is_dead, p));
-        let position = |&place: &usize| {
-            let (row, col) = array.position(place)?;
-            Some([row, col])
-        };
+        let position = |&place: &usize| <[usize; 2]>::from(array.position(place));
         Ok(Self {
             gains: places.iter().map(|&p| (-logs[p]).exp() as f32).collect(),
             presses: places.iter().map(|&p| reached[p]).collect(),
@@ -133,7 +130,7 @@ impl Fit {
                 .count(),
             spread: deviation(own),
             error: 0.5 * deviation(apart),
-            dead: dead.filter_map(position).collect(),
+            dead: dead.map(position).collect(),
         })
     }
 }
@@ -142,7 +139,7 @@ impl Fit {
 /// each taxel was compared.
 fn solve(presses: &[&Plain], array: Array, is_dead: &[bool]) -> (Vec<f64>, Vec<usize>) {
     let (rows, noise) = compare(presses, array, is_dead);
-    let mut reached = vec![0; TAXELS];
+    let mut reached = vec![0; array.taxels()];
     for row in &rows {
         let (Compared::Trio(place, _) | Compared::Array(place)) = row.compared;
         reached[place] = reached[place].max(row.presses);
@@ -179,13 +176,15 @@ fn solve(presses: &[&Plain], array: Array, is_dead: &[bool]) -> (Vec<f64>, Vec<u
         }
         applied
     };
-    let mut wanted = vec![0.0; TAXELS];
+    let mut wanted = vec![0.0; array.taxels()];
     for row in &rows {
         back(&mut wanted, row.compared, weight(row) * row.value);
     }
     let mut logs = conjugate_gradients(apply, &wanted);
     // The common scale of all taxels belongs to `newtons_per_count`, so remove the mean.
-    let measured: Vec<usize> = (0..TAXELS).filter(|&place| reached[place] > 0).collect();
+    let measured: Vec<usize> = (0..array.taxels())
+        .filter(|&place| reached[place] > 0)
+        .collect();
     let mean = measured.iter().map(|&p| logs[p]).sum::<f64>() / measured.len().max(1) as f64;
     measured.iter().for_each(|&place| logs[place] -= mean);
     (logs, reached)
@@ -195,7 +194,7 @@ fn solve(presses: &[&Plain], array: Array, is_dead: &[bool]) -> (Vec<f64>, Vec<u
 fn compare(presses: &[&Plain], array: Array, is_dead: &[bool]) -> (Vec<Row>, f64) {
     let trios = trios(array, is_dead);
     let mut values: Vec<Vec<f64>> = vec![Vec::new(); trios.len()];
-    let mut evens: Vec<Vec<f64>> = vec![Vec::new(); TAXELS];
+    let mut evens: Vec<Vec<f64>> = vec![Vec::new(); array.taxels()];
     for press in presses {
         let even = is_even(press, array, is_dead);
         let frames = press.frames.iter();
@@ -215,12 +214,12 @@ fn compare(presses: &[&Plain], array: Array, is_dead: &[bool]) -> (Vec<Row>, f64
         let middles: Vec<f64> = loaded
             .iter()
             .map(|logs| {
-                let mut well: Vec<f64> = array.places().map(|p| logs[p]).collect();
+                let mut well: Vec<f64> = (0..array.taxels()).map(|p| logs[p]).collect();
                 well.retain(|log| log.is_finite());
                 median(&mut well).unwrap_or(f64::NAN)
             })
             .collect();
-        for place in array.places().filter(|&place| !is_dead[place]) {
+        for place in (0..array.taxels()).filter(|&place| !is_dead[place]) {
             let values = loaded
                 .iter()
                 .zip(&middles)
@@ -297,7 +296,7 @@ fn trios(array: Array, is_dead: &[bool]) -> Vec<(usize, [usize; 2])> {
 
 /// Whether a press loads the whole array.
 fn is_even(press: &Plain, array: Array, is_dead: &[bool]) -> bool {
-    let live = || array.places().filter(|&place| !is_dead[place]);
+    let live = || (0..array.taxels()).filter(|&place| !is_dead[place]);
     press.frames.iter().any(|frame| {
         let well = live().filter(|&place| frame[place] >= LEAST_N).count();
         well as f64 >= EVEN_SHARE * live().count() as f64
@@ -307,9 +306,7 @@ fn is_even(press: &Plain, array: Array, is_dead: &[bool]) -> bool {
 /// Whether a taxel reads nothing while all its live neighbours along its row and column are loaded
 /// well.
 fn looks_dead(presses: &[Plain], array: Array, is_dead: &[bool], place: usize) -> bool {
-    let Some((row, col)) = array.position(place) else {
-        return false;
-    };
+    let (row, col) = array.position(place);
     let beside = [
         (row.wrapping_sub(1), col),
         (row + 1, col),

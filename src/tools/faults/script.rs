@@ -8,7 +8,7 @@ use super::bytes::{Damage, OfBytes};
 use super::cable::{self, OfCable};
 use super::taxels::{Change, OfTaxels, Region};
 use super::times::{Frames, Span};
-use hardnessd_core::frame::{COLS, ROWS};
+use hardnessd_core::frame::Array;
 use hardnessd_core::wording;
 use hardnessd_simulator::FULL_SCALE_COUNTS;
 
@@ -397,8 +397,8 @@ impl Table {
         Ok(OfTaxels {
             span: self.span()?,
             region: Region {
-                rows: side("rows", self.rows.as_deref(), ROWS)?,
-                cols: side("cols", self.cols.as_deref(), COLS)?,
+                rows: side("rows", self.rows.as_deref(), Array::JX255N.rows)?,
+                cols: side("cols", self.cols.as_deref(), Array::JX255N.cols)?,
             },
             change,
         })

@@ -1,7 +1,7 @@
 //! Faults of taxels: the frame is whole, and what its taxels read is wrong.
 
 use super::times::Span;
-use hardnessd_core::frame::{COLS, RawFrame};
+use hardnessd_core::frame::RawFrame;
 use hardnessd_simulator::{FULL_SCALE_COUNTS, NEWTONS_PER_COUNT};
 
 /// A fault of some taxels.
@@ -60,9 +60,8 @@ impl Region {
     fn each(&self, raw: &mut RawFrame, change: impl Fn(&mut u16)) {
         let [first, last] = self.cols;
         for row in self.rows[0]..=self.rows[1] {
-            raw.counts[row * COLS + first..=row * COLS + last]
-                .iter_mut()
-                .for_each(&change);
+            let places = raw.array.place(row, first)..=raw.array.place(row, last);
+            raw.counts[places].iter_mut().for_each(&change);
         }
     }
 }

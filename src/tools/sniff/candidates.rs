@@ -16,12 +16,14 @@
 
 use std::collections::BTreeMap;
 
-use hardnessd_core::frame::{Array, COLS, ROWS};
+use hardnessd_core::frame::Array;
 use hardnessd_core::wire::{Cell, Checksum, HexBytes, LengthField, Preset, Settings};
 
 /// The smallest side of an array that is looked for. Any short repetition would fit a smaller
 /// array.
 const SMALLEST_SIDE: usize = 4;
+/// The longest side that is looked for.
+const LARGEST_SIDE: usize = 28;
 /// The most bytes of a frame beside its cells: `jq-u16` has 8.
 const MOST_OVERHEAD_BYTES: usize = 12;
 /// The number of distances that are examined. Rows of a press recur too, so the distance of frames
@@ -81,7 +83,7 @@ pub(super) fn candidates(bytes: &[u8]) -> Vec<(Settings, u32)> {
 
 /// Distances at which a pair of bytes recurs, most frequent first, each with that pair.
 fn periods(bytes: &[u8]) -> Vec<(usize, u16)> {
-    let longest = 2 * ROWS * ROWS + MOST_OVERHEAD_BYTES;
+    let longest = 2 * LARGEST_SIDE * LARGEST_SIDE + MOST_OVERHEAD_BYTES;
     let mut last = vec![None; 1 << 16];
     let mut gaps: Vec<(usize, u16)> = Vec::new();
     for (at, pair) in bytes.array_windows().enumerate() {
@@ -113,7 +115,7 @@ fn periods(bytes: &[u8]) -> Vec<(usize, u16)> {
 /// Square arrays that fit a frame of `period` bytes: side, cell, bytes beside the cells.
 fn payloads(period: usize) -> Vec<(usize, Cell, usize)> {
     let mut payloads = Vec::new();
-    for side in (SMALLEST_SIDE..=ROWS).rev() {
+    for side in (SMALLEST_SIDE..=LARGEST_SIDE).rev() {
         for (cell, cell_bytes) in [(Cell::U8, 1), (Cell::U16le, 2)] {
             let overhead = period.saturating_sub(side * side * cell_bytes);
             if (1..=MOST_OVERHEAD_BYTES).contains(&overhead) {
@@ -270,7 +272,9 @@ fn square(cells: usize) -> Option<(usize, usize)> {
 fn most_frequent(arrays: impl Iterator<Item = (usize, usize)>) -> Option<Array> {
     let mut counts: BTreeMap<(usize, usize), usize> = BTreeMap::new();
     for (rows, cols) in arrays {
-        if (SMALLEST_SIDE..=ROWS).contains(&rows) && (SMALLEST_SIDE..=COLS).contains(&cols) {
+        if (SMALLEST_SIDE..=LARGEST_SIDE).contains(&rows)
+            && (SMALLEST_SIDE..=LARGEST_SIDE).contains(&cols)
+        {
             *counts.entry((rows, cols)).or_default() += 1;
         }
     }

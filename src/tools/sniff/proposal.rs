@@ -6,7 +6,7 @@
 use std::cmp::Reverse;
 
 use super::candidates::{candidates, marked_array, packed_array, text_array};
-use hardnessd_core::frame::{Array, COLS, ROWS, RawFrame};
+use hardnessd_core::frame::{Array, RawFrame};
 use hardnessd_core::wire::{Cell, Checksum, Decoder, Layout, LengthField, Preset, Settings};
 
 /// The number of pieces that candidates are first tried on. The pieces come from all over the
@@ -93,8 +93,8 @@ pub(super) fn propose(bytes: &[u8]) -> Vec<Proposal> {
         let Array { rows, cols } = array?;
         let settings = Settings {
             preset,
-            rows: (rows != ROWS).then_some(rows),
-            cols: (cols != COLS).then_some(cols),
+            rows: (rows != Array::JX255N.rows).then_some(rows),
+            cols: (cols != Array::JX255N.cols).then_some(cols),
             ..Settings::default()
         };
         Some((settings, bits))
@@ -174,12 +174,12 @@ impl Proposal {
     /// Whether the two layouts write the same stream, except for its first and last bytes. One then
     /// has a header where the other has a tail.
     pub(super) fn is_same_but_for_the_ends(&self, other: &Self) -> bool {
-        let frame = RawFrame {
-            counts: std::array::from_fn(|taxel| taxel as u16),
-        };
         let encoded = |proposal: &Self| {
             let mut bytes = Vec::new();
             let layout = Layout::new(&proposal.settings).ok()?;
+            let mut frame = RawFrame::zero(layout.array());
+            let counts = frame.counts.iter_mut().zip(0..);
+            counts.for_each(|(count, taxel)| *count = taxel);
             layout.encode(&frame, &mut bytes);
             Some(bytes)
         };
@@ -214,7 +214,11 @@ impl Tally {
             };
             let counts = &decoded.frame.counts;
             self.frames += 1;
-            self.changed += u64::from(self.last.is_some_and(|last| last.counts != *counts));
+            self.changed += u64::from(
+                self.last
+                    .as_ref()
+                    .is_some_and(|last| last.counts != *counts),
+            );
             self.roughness += counts
                 .array_windows()
                 .map(|[a, b]| u64::from(a.abs_diff(*b)))

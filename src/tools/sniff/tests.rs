@@ -2,6 +2,7 @@
 
 use super::proposal::propose;
 use super::toml;
+use crate::tools::faults::middle;
 use hardnessd_core::frame::RawFrame;
 use hardnessd_core::wire::{
     Cell, Checksum, Decoder, HexBytes, Layout, LengthField, Preset, Settings,
@@ -9,15 +10,18 @@ use hardnessd_core::wire::{
 use hardnessd_simulator::random::Stream;
 use hardnessd_simulator::{Material, Sequence, SequenceSettings};
 
-/// Rest, a press and rest: 20 to 50 frames.
-fn frames(seed: u64) -> Vec<RawFrame> {
+/// Rest, a press and rest on the array of `layout`: 20 to 50 frames.
+fn frames(layout: &Layout, seed: u64) -> Vec<RawFrame> {
     let settings = SequenceSettings {
         seed,
         materials: vec![Material::ALL[4 + seed as usize % 4]],
         presses: Some(1),
         ..SequenceSettings::default()
     };
-    let frames: Vec<RawFrame> = Sequence::new(settings).map(|frame| frame.raw).collect();
+    let sequence = Sequence::new(settings);
+    let frames: Vec<RawFrame> = sequence
+        .map(|frame| middle(&frame.raw, layout.array()))
+        .collect();
     assert!((20..=50).contains(&frames.len()), "{} frames", frames.len());
     frames
 }
@@ -76,7 +80,7 @@ fn missing(of: &[RawFrame], among: &[RawFrame]) -> usize {
 fn check(settings: &Settings, seed: u64) -> Result<(), String> {
     let layout = Layout::new(settings).unwrap();
     let mut stream = Stream::new(seed, "line");
-    let bytes = line(&layout, &frames(seed), &mut stream);
+    let bytes = line(&layout, &frames(&layout, seed), &mut stream);
     let proposals = propose(&bytes);
     let Some(best) = proposals.first() else {
         return Err(format!("no proposal for {settings:?}, seed {seed}"));
@@ -157,7 +161,7 @@ fn frames_without_a_zero_are_not_taken_for_packed_ones() {
         ..Settings::default()
     })
     .unwrap();
-    let mut frames = frames(1);
+    let mut frames = frames(&layout, 1);
     for frame in &mut frames {
         for count in &mut frame.counts {
             *count += 1;
@@ -248,7 +252,7 @@ fn presets_of_small_arrays_are_found() {
             ..Settings::default()
         };
         let layout = Layout::new(&settings).unwrap();
-        let bytes = line(&layout, &frames(1), &mut Stream::new(1, "line"));
+        let bytes = line(&layout, &frames(&layout, 1), &mut Stream::new(1, "line"));
         let proposals = propose(&bytes);
         assert_eq!(proposals[0].settings, settings, "{preset:?} {side}");
     }
@@ -261,7 +265,11 @@ fn the_simplest_settings_are_proposed() {
         sync: Some(HexBytes(vec![0xA5, 0x5A])),
         ..Settings::default()
     };
-    let bytes = line(&layout(&settings), &frames(1), &mut Stream::new(1, "line"));
+    let bytes = line(
+        &layout(&settings),
+        &frames(&layout(&settings), 1),
+        &mut Stream::new(1, "line"),
+    );
     let proposals = propose(&bytes);
     assert_eq!(proposals[0].settings, settings);
     let words = toml(
@@ -303,7 +311,7 @@ fn a_header_that_the_bytes_begin_with_is_no_tail() {
         };
         let layout = Layout::new(&settings).unwrap();
         let mut bytes = Vec::new();
-        for frame in frames(seed) {
+        for frame in frames(&layout, seed) {
             layout.encode(&frame, &mut bytes);
         }
         // A stream that was cut off makes a tail more likely, because its last frame has none.
@@ -321,7 +329,7 @@ fn a_header_that_the_bytes_begin_with_is_no_tail() {
 #[test]
 fn why_one_is_preferred_is_said_without_a_negative_lead() {
     let layout = Layout::new(&Settings::default()).unwrap();
-    let bytes = line(&layout, &frames(1), &mut Stream::new(1, "line"));
+    let bytes = line(&layout, &frames(&layout, 1), &mut Stream::new(1, "line"));
     let proposals = propose(&bytes);
     assert!(proposals.len() > 1);
     for pair in proposals.windows(2) {
@@ -348,11 +356,15 @@ fn a_layout_without_a_checksum_is_not_preferred_for_one() {
             ..Settings::default()
         };
         let layout = Layout::new(&settings(16)).unwrap();
-        let bytes = line(&layout, &frames(1), &mut Stream::new(1, "line"));
+        let bytes = line(&layout, &frames(&layout, 1), &mut Stream::new(1, "line"));
         let best = &propose(&bytes)[0];
         assert_eq!(best.settings, settings(16));
         let plain = Layout::new(&Settings::default()).unwrap();
-        let other = &propose(&line(&plain, &frames(1), &mut Stream::new(1, "line")))[1];
+        let other = &propose(&line(
+            &plain,
+            &frames(&plain, 1),
+            &mut Stream::new(1, "line"),
+        ))[1];
         let reason = "every byte of its frames is in order";
         assert_eq!(best.reason(other), Some(reason));
     }
@@ -366,7 +378,7 @@ fn a_tail_in_the_middle_of_a_stream_cannot_be_told_from_a_header() {
     })
     .unwrap();
     let mut bytes = Vec::new();
-    for frame in frames(1) {
+    for frame in frames(&layout, 1) {
         layout.encode(&frame, &mut bytes);
     }
     let said = |bytes: &[u8]| {

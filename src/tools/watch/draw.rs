@@ -15,6 +15,7 @@ use ratatui_core::layout::Rect;
 use ratatui_core::style::{Color, Modifier, Style};
 use ratatui_core::terminal::Frame;
 
+use self::map::MapSize;
 use super::look::Look;
 use super::view::{Link, Sensor, Verdict, View, age};
 
@@ -57,7 +58,7 @@ pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
     let side_by_side = body.width > NARROW && body.height > 10;
     if side_by_side {
         let map = page.map_size(sensor, body.width / 2, body.height.saturating_sub(5));
-        let width = map.0.max(30);
+        let width = map.cols.max(30);
         let left = Rect { width, ..body };
         let right = Rect {
             x: body.x + width + GAP,
@@ -204,7 +205,11 @@ impl Page<'_> {
         }
         let spare = rows.0.height.saturating_sub(4);
         let map = self.map_size(sensor, body.width, spare.saturating_sub(1));
-        let verdicts = if map.1 == 0 { 4 } else { spare - map.1 + 3 };
+        let verdicts = if map.rows == 0 {
+            4
+        } else {
+            spare - map.rows + 3
+        };
         let curves = verdicts >= 14;
         if let Some(area) = rows.take(if curves {
             5
@@ -213,8 +218,8 @@ impl Page<'_> {
         }) {
             self.verdicts(area, view, sensor, link);
         }
-        if map.1 > 0
-            && let Some(area) = rows.take(map.1 + 1)
+        if map.rows > 0
+            && let Some(area) = rows.take(map.rows + 1)
         {
             self.map(area, map, sensor, link);
         }
@@ -226,14 +231,14 @@ impl Page<'_> {
     fn map_and_counters(
         &mut self,
         area: Rect,
-        map: (u16, u16),
+        map: MapSize,
         view: &View,
         sensor: &Sensor,
         link: Link,
     ) {
         let mut rows = Rows(area);
-        if map.1 > 0
-            && let Some(area) = rows.take(map.1 + 1)
+        if map.rows > 0
+            && let Some(area) = rows.take(map.rows + 1)
         {
             self.map(area, map, sensor, link);
         }

@@ -16,7 +16,7 @@ use super::look::Look;
 use super::screen::{Screen, key};
 use super::view::{Clock, Key, Link, Loss, View};
 use crate::tools::pty::pair::Pair;
-use hardnessd_core::frame::{COLS, Stamp, TAXELS};
+use hardnessd_core::frame::Stamp;
 
 const COLOURS: Look = Look {
     colours: true,
@@ -72,9 +72,9 @@ fn status(sensor: &str, state: &str) -> Value {
 }
 
 fn frame(sensor: &str, newtons: f32, taxels: usize) -> Value {
-    let mut all = vec![0.0; TAXELS];
+    let mut all = vec![0.0; 784];
     for taxel in 0..taxels {
-        all[14 * COLS + 10 + taxel] = newtons;
+        all[14 * 28 + 10 + taxel] = newtons;
     }
     json!({"type": "frame", "sensor": sensor, "frame": 7, "newtons": all,
         "contact_area_taxels": taxels})
@@ -425,9 +425,8 @@ fn a_small_array_is_drawn_alone() {
     let mut hello = hello("a", &["forearm"]);
     hello["sensors"][0]["rows"] = json!(4);
     hello["sensors"][0]["cols"] = json!(6);
-    let mut newtons = vec![0.0; TAXELS];
-    // The last row and column of the array: 12 + 3 and 11 + 5 in the 28x28 frame.
-    newtons[15 * COLS + 16] = 1.0;
+    let mut newtons = vec![0.0; 24];
+    newtons[23] = 1.0;
     let view = told(&[
         (0, hello),
         (0, status("forearm", "live")),

@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use super::line;
+use crate::frame::Pitch;
 use crate::tare::Offsets;
 
 /// A line that is not an event of a sensor: `hello`, `gap`, `error` or `ok`.
@@ -122,7 +123,7 @@ pub struct SensorCard {
     /// The number of columns of the sensor's own array.
     pub cols: usize,
     /// The distance between taxel centres.
-    pub pitch_mm: f64,
+    pub pitch_mm: Pitch,
 }
 
 /// The model, as announced in `hello`.

@@ -1,21 +1,18 @@
-//! A frame as short text: its taxels that are not 0, in base64.
+//! The newtons of a frame as short text: the taxels that are not 0, in base64.
 //!
 //! Each such taxel has six bytes: its place in the frame (u16) and its newtons (f32), both
 //! little-endian. The places ascend. `docs/formats.md` shows how numpy reads and writes the text.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use serde::{Deserialize, Deserializer, Serializer, de::Error};
-
-use super::{Frame, TAXELS};
 
 /// The bytes of one taxel.
 const BYTES: usize = 6;
 
-/// The frame as text.
-pub fn write(frame: &Frame) -> String {
+/// The newtons of a frame as text.
+pub fn write(newtons: &[f32]) -> String {
     let mut bytes = Vec::new();
-    for (place, newtons) in (0_u16..).zip(frame.newtons) {
+    for (place, newtons) in (0_u16..).zip(newtons) {
         // A negative zero is kept, so that a frame is read back bit for bit.
         if newtons.to_bits() != 0 {
             bytes.extend(place.to_le_bytes());
@@ -35,50 +32,39 @@ pub enum SparseError {
     #[error("found {0} bytes, expected {BYTES} a taxel")]
     Length(usize),
     /// The place is outside the frame, or does not follow the place before it.
-    #[error("found place {0}, expected ascending places below {TAXELS}")]
-    Place(u16),
+    #[error("found place {0}, expected ascending places below {1}")]
+    Place(u16, usize),
     /// The force is negative or not finite.
     #[error("found {0} N at a taxel, expected 0 or more")]
     Newtons(f32),
 }
 
-/// Reads the frame that a text holds.
+/// Reads the newtons of a frame of `taxels` taxels.
 ///
 /// # Errors
 ///
-/// Returns a [`SparseError`] if the text holds no frame.
-pub fn read(text: &str) -> Result<Frame, SparseError> {
+/// Returns a [`SparseError`] if the text holds no such frame.
+pub fn read(text: &str, taxels: usize) -> Result<Vec<f32>, SparseError> {
     let bytes = STANDARD.decode(text)?;
-    let (taxels, rest) = bytes.as_chunks::<BYTES>();
+    let (written, rest) = bytes.as_chunks::<BYTES>();
     if !rest.is_empty() {
         return Err(SparseError::Length(bytes.len()));
     }
-    let mut frame = Frame::default();
+    let mut all = vec![0.0; taxels];
     let mut least = 0;
-    for &[low, high, newtons @ ..] in taxels {
+    for &[low, high, newtons @ ..] in written {
         let place = u16::from_le_bytes([low, high]);
         let newtons = f32::from_le_bytes(newtons);
-        if usize::from(place) >= TAXELS || place < least {
-            return Err(SparseError::Place(place));
+        if usize::from(place) >= taxels || place < least {
+            return Err(SparseError::Place(place, taxels));
         }
         if !newtons.is_finite() || newtons < 0.0 {
             return Err(SparseError::Newtons(newtons));
         }
-        frame.newtons[usize::from(place)] = newtons;
+        all[usize::from(place)] = newtons;
         least = place + 1;
     }
-    Ok(frame)
-}
-
-/// Used by `#[serde(with)]`.
-pub(crate) fn serialize<S: Serializer>(frame: &Frame, serializer: S) -> Result<S::Ok, S::Error> {
-    serializer.serialize_str(&write(frame))
-}
-
-/// Used by `#[serde(with)]`.
-pub(crate) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Frame, D::Error> {
-    let text = String::deserialize(deserializer)?;
-    read(&text).map_err(D::Error::custom)
+    Ok(all)
 }
 
 #[cfg(test)]
@@ -87,13 +73,13 @@ mod tests {
 
     #[test]
     fn a_frame_is_read_as_it_was_written() {
-        let mut frame = Frame::default();
-        assert_eq!(write(&frame), "");
-        for (place, newtons) in [(0, 0.5), (3, 1e-30), (783, 10.2), (400, 0.04)] {
-            frame.newtons[place] = newtons;
+        let mut newtons = vec![0.0; 784];
+        assert_eq!(write(&newtons), "");
+        for (place, force_n) in [(0, 0.5), (3, 1e-30), (783, 10.2), (400, 0.04)] {
+            newtons[place] = force_n;
         }
-        assert_eq!(read(&write(&frame)), Ok(frame));
-        assert_eq!(&write(&frame)[..8], "AAAAAAA/");
+        assert_eq!(&write(&newtons)[..8], "AAAAAAA/");
+        assert_eq!(read(&write(&newtons), 784), Ok(newtons));
     }
 
     #[test]
@@ -104,11 +90,15 @@ mod tests {
             });
             STANDARD.encode(bytes.collect::<Vec<u8>>())
         };
+        let read = |text: &str| read(text, 784);
         assert!(matches!(read("*"), Err(SparseError::Text(_))));
         assert_eq!(read("AAAA"), Err(SparseError::Length(3)));
-        assert_eq!(read(&text(&[(784, 1.0)])), Err(SparseError::Place(784)));
+        assert_eq!(
+            read(&text(&[(784, 1.0)])),
+            Err(SparseError::Place(784, 784))
+        );
         let twice = text(&[(7, 1.0), (7, 1.0)]);
-        assert_eq!(read(&twice), Err(SparseError::Place(7)));
+        assert_eq!(read(&twice), Err(SparseError::Place(7, 784)));
         assert_eq!(read(&text(&[(7, -1.0)])), Err(SparseError::Newtons(-1.0)));
         assert!(read(&text(&[(7, f32::NAN)])).is_err());
     }

@@ -6,7 +6,7 @@ use super::Pipeline;
 use crate::event::{self, Phase};
 use crate::motion::{self, SPEEDS_MM_S};
 use crate::press::{ContactFrame, SoFar, thinned};
-use crate::verdict;
+use crate::verdict::{self, Laying};
 
 /// Loading ends at the first frame that has this share of the greatest force. A steady approach may
 /// end there.
@@ -71,7 +71,12 @@ impl<'a> PressWithApproach<'a> {
     }
 
     /// The course for a model of `most` frames.
-    pub(super) fn course(&self, arm_n_per_mm: Option<f64>, most: usize) -> verdict::Course {
+    pub(super) fn course(
+        &self,
+        arm_n_per_mm: Option<f64>,
+        most: usize,
+        laying: &Laying,
+    ) -> verdict::Course {
         let begin = self.frames[0].moment.stamp.mono;
         let moment = |place: usize| {
             let frame = self.frames[place];
@@ -79,7 +84,7 @@ impl<'a> PressWithApproach<'a> {
             verdict::CourseMoment {
                 time_s: since.as_secs_f32(),
                 approach_mm: self.approach_mm[place].map(|mm| mm as f32),
-                frame: frame.frame,
+                frame: laying.lay(&frame.frame),
             }
         };
         let places = thinned(self.frames.len(), self.best, most);

@@ -5,7 +5,7 @@ use crate::event::{self, Event, Hardness, Note, Phase, Press, PressState, Reject
 use crate::frame::{Frame, RawFrame};
 use crate::press::{Change, ContactFrame, End, FrameAt, Marks, SoFar};
 use crate::sensor::Description;
-use crate::verdict::{Format, ModelError, Verdict};
+use crate::verdict::{Format, Laying, ModelError, Verdict};
 
 /// The number of frames in contact that an early verdict on the course needs.
 pub const FIRST_LOOK: u64 = 3;
@@ -42,7 +42,8 @@ impl Pipeline {
             Change::Settled { press, peak } => {
                 if self.hrn.format() == Format::Frame && self.seen.next_look != NO_LOOK {
                     self.seen.next_look = NO_LOOK;
-                    let verdict = self.hrn.judge(&peak.frame);
+                    let laying = self.laying(&peak);
+                    let verdict = self.hrn.judge(&laying.lay(&peak.frame));
                     let told = ArmKnowledge {
                         course: None,
                         stiffness_n_per_mm: self.stiffness_so_far(),
@@ -144,10 +145,11 @@ impl Pipeline {
         let known = self.known(so_far, phase);
         let arm_n_per_mm = self.sensor.description().arm.stiffness_n_per_mm;
         let stiffness_n_per_mm = known.stiffness_n_per_mm(arm_n_per_mm);
+        let laying = self.laying(peak);
         let (verdict, course, is_trained) = match self.hrn.format() {
-            Format::Frame => (self.hrn.judge(&peak.frame), None, true),
+            Format::Frame => (self.hrn.judge(&laying.lay(&peak.frame)), None, true),
             Format::Course { most_frames } => {
-                let course = known.course(arm_n_per_mm, most_frames);
+                let course = known.course(arm_n_per_mm, most_frames, &laying);
                 let is_trained = self.hrn.card().range.holds(&course);
                 (
                     self.hrn.judge_course(&course),
@@ -212,7 +214,6 @@ impl Pipeline {
                 .find(|known| known.level == level)?;
             Some(known.label.clone())
         });
-        let pitch_mm = calibration.pitch_mm;
         let FrameAt { frame, stamp } = peak.moment;
         Some(Event::Hardness(Hardness {
             seq: None,
@@ -228,7 +229,7 @@ impl Pipeline {
             confidence: verdict.confidence,
             frame,
             contact_area_taxels: peak.contact_area_taxels,
-            contact_area_mm2: f64::from(peak.contact_area_taxels) * pitch_mm * pitch_mm,
+            contact_area_mm2: f64::from(peak.contact_area_taxels) * calibration.pitch_mm.area_mm2(),
             force_n: peak.force_n,
             model: hrn.sha256()[..12].to_owned(),
             state: self.state().0,
@@ -245,16 +246,28 @@ impl Pipeline {
     }
 
     fn notes(&self, peak: &ContactFrame, is_trained: bool) -> Vec<Note> {
-        let range = &self.hrn.card().range;
+        let card = self.hrn.card();
+        let range = &card.range;
+        let laying = self.laying(peak);
+        // The range of areas is in taxels of the model's grid.
+        let area = if laying.is_resampled() {
+            laying
+                .lay(&peak.frame)
+                .contact_area_taxels(card.contact_threshold_n())
+        } else {
+            peak.contact_area_taxels
+        };
         let [least_n, most_n] = range.force_n.map(f64::from);
         let [least_taxels, most_taxels] = range.contact_area_taxels;
         let trained = (least_n..=most_n).contains(&peak.force_n)
-            && (least_taxels..=most_taxels).contains(&peak.contact_area_taxels)
+            && (least_taxels..=most_taxels).contains(&area)
+            && card.holds(self.sensor.description().calibration.pitch_mm)
             && is_trained;
         [
             (Note::AtEdge, peak.marks.at_edge),
             (Note::Saturated, peak.marks.saturated),
             (Note::OutsideTraining, !trained),
+            (Note::Resampled, laying.is_resampled()),
         ]
         .into_iter()
         .filter_map(|(note, applies)| applies.then_some(note))
@@ -272,12 +285,17 @@ impl Pipeline {
 
     fn is_at_edge(&self, frame: &Frame) -> bool {
         let array = self.sensor.layout().array();
-        let threshold_n = self.sensor.description().press.contact_threshold_n;
-        array.places().any(|place| {
-            frame.newtons[place] >= threshold_n
-                && array.position(place).is_some_and(|(row, col)| {
-                    row == 0 || col == 0 || row + 1 == array.rows || col + 1 == array.cols
-                })
+        let threshold_n = self.sensor.thresholds().contact_threshold_n;
+        frame.newtons.iter().enumerate().any(|(place, &newtons)| {
+            let (row, col) = array.position(place);
+            let is_edge = row == 0 || col == 0 || row + 1 == array.rows || col + 1 == array.cols;
+            is_edge && newtons >= threshold_n
         })
+    }
+
+    /// How the frames of a press whose best frame is `peak` are laid onto the model's grid.
+    fn laying(&self, peak: &ContactFrame) -> Laying {
+        let pitch = self.sensor.description().calibration.pitch_mm;
+        Laying::new(&peak.frame, pitch, f64::from(self.hrn.card().pitch_mm))
     }
 }

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Pipeline, Seen};
+use crate::frame::Array;
 use crate::motion::Track;
 use crate::{event, press, tare, wire};
 
@@ -19,8 +20,8 @@ pub struct Memory {
 }
 
 impl Memory {
-    /// Whether a pipeline can have this state. A recording may hold anything.
-    pub(crate) fn is_possible(&self) -> bool {
+    /// Whether a pipeline of `array` can have this state. A recording may hold anything.
+    pub(crate) fn is_possible(&self, array: Array) -> bool {
         let Seen {
             frames,
             frames_damaged,
@@ -31,8 +32,8 @@ impl Memory {
         let is_context = |context| event::check_context(context).is_ok();
         self.decoder
             .is_possible(frames.saturating_add(*frames_damaged))
-            && self.tare.is_possible()
-            && self.tracker.is_possible(*frames)
+            && self.tare.is_possible(array)
+            && self.tracker.is_possible(*frames, array)
             && self.track.is_possible()
             && link.is_possible()
             && context.as_ref().is_none_or(is_context)

@@ -2,32 +2,38 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::frame::TAXELS;
+use crate::frame::{Array, Pitch};
 use crate::wording::as_written;
 
-/// The `[press]` table.
+/// The `[press]` table. A key that is `None` depends on the size of a taxel: see [`Thresholds`].
 ///
 /// # Example
 ///
 /// ```
+/// use hardnessd_core::frame::{Array, Pitch};
 /// use hardnessd_core::press::Settings;
 ///
 /// let settings = Settings { max_seconds: 5.0, ..Settings::default() };
-/// assert!(settings.check().is_ok());
+/// let thresholds = settings.check(Array::JX255N, Pitch::square(7.0))?;
+/// assert_eq!(thresholds.contact_threshold_n, 0.28);
 ///
-/// let settings = Settings { begin_area_taxels: 3, end_area_taxels: 4, ..Settings::default() };
-/// let error = settings.check().unwrap_err();
+/// let settings = Settings { begin_area_taxels: Some(3), end_area_taxels: Some(4), ..Settings::default() };
+/// let error = settings.check(Array::JX255N, Pitch::JX255N).unwrap_err();
 /// assert_eq!(error.to_string(), "end_area_taxels: found 4, expected 1 to 3");
+/// # Ok::<(), hardnessd_core::press::SettingsError>(())
 /// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
     /// A taxel is in contact at or above this force.
-    pub contact_threshold_n: f32,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub contact_threshold_n: Option<f32>,
     /// A press begins with the first frame of at least this contact area.
-    pub begin_area_taxels: u32,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub begin_area_taxels: Option<u32>,
     /// Frames below this contact area release the press.
-    pub end_area_taxels: u32,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub end_area_taxels: Option<u32>,
     /// The number of such frames in a row that releases it.
     pub end_frames: u32,
     /// A press with fewer frames in contact gets no verdict.
@@ -43,9 +49,9 @@ pub struct Settings {
 impl Default for Settings {
     fn default() -> Self {
         Self {
-            contact_threshold_n: 0.07,
-            begin_area_taxels: 3,
-            end_area_taxels: 1,
+            contact_threshold_n: None,
+            begin_area_taxels: None,
+            end_area_taxels: None,
             end_frames: 2,
             min_frames: 2,
             max_seconds: 30.0,
@@ -96,15 +102,19 @@ pub enum SettingsError {
 const LARGEST: f64 = 1e6;
 
 impl Settings {
-    /// Checks every value.
+    /// Checks every value. Returns the thresholds for an array of taxels `pitch` apart.
     ///
     /// # Errors
     ///
     /// Returns an error if a force or duration is not finite or out of range, an area is 0 or above
-    /// 784, the end area is above the begin area, or a count of frames is 0.
-    pub fn check(&self) -> Result<(), SettingsError> {
+    /// the number of taxels, the end area is above the begin area, or a count of frames is 0.
+    pub fn check(&self, array: Array, pitch: Pitch) -> Result<Thresholds, SettingsError> {
+        let thresholds = self.thresholds(array, pitch);
         for (key, found) in [
-            ("contact_threshold_n", as_written(self.contact_threshold_n)),
+            (
+                "contact_threshold_n",
+                as_written(thresholds.contact_threshold_n),
+            ),
             ("max_seconds", self.max_seconds),
         ] {
             if !(found > 0.0 && found <= LARGEST) {
@@ -130,13 +140,13 @@ impl Settings {
         for (key, found, most) in [
             (
                 "begin_area_taxels",
-                u64::from(self.begin_area_taxels),
-                TAXELS as u64,
+                u64::from(thresholds.begin_area_taxels),
+                array.taxels() as u64,
             ),
             (
                 "end_area_taxels",
-                u64::from(self.end_area_taxels),
-                self.begin_area_taxels.into(),
+                u64::from(thresholds.end_area_taxels),
+                thresholds.begin_area_taxels.into(),
             ),
             (
                 "end_frames",
@@ -154,6 +164,100 @@ impl Settings {
                 });
             }
         }
-        Ok(())
+        Ok(thresholds)
+    }
+
+    /// The unchecked thresholds for an array of taxels `pitch` apart.
+    fn thresholds(&self, array: Array, pitch: Pitch) -> Thresholds {
+        let taxel = pitch.area_mm2() / Pitch::JX255N.area_mm2();
+        // A finer array sees the same contact with more taxels. A coarser one keeps the number: a
+        // single taxel may be noise.
+        let finer = (1.0 / taxel).max(1.0);
+        let most = array.taxels() as u32;
+        let area = |given: Option<u32>, usual: f64, most: u32| {
+            given.unwrap_or_else(|| ((usual * finer).round() as u32).min(most))
+        };
+        let begin_area_taxels = area(self.begin_area_taxels, 3.0, most);
+        Thresholds {
+            contact_threshold_n: self
+                .contact_threshold_n
+                .unwrap_or((CONTACT_THRESHOLD_N * taxel) as f32),
+            begin_area_taxels,
+            end_area_taxels: area(self.end_area_taxels, 1.0, begin_area_taxels),
+            end_frames: self.end_frames,
+            min_frames: self.min_frames,
+            max_seconds: self.max_seconds,
+            early_settle_s: self.early_settle_s,
+            early_min_force_n: self.early_min_force_n,
+        }
+    }
+}
+
+/// The contact threshold of a taxel of the JX255N. It means a pressure, so it grows with the area of
+/// a taxel.
+const CONTACT_THRESHOLD_N: f64 = 0.07;
+
+/// Checked [`Settings`], for the taxels of one sensor. By default they are those of the JX255N.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Thresholds {
+    /// A taxel is in contact at or above this force.
+    pub contact_threshold_n: f32,
+    /// A press begins with the first frame of at least this contact area.
+    pub begin_area_taxels: u32,
+    /// Frames below this contact area release the press.
+    pub end_area_taxels: u32,
+    /// The number of such frames in a row that releases it.
+    pub end_frames: u32,
+    /// A press with fewer frames in contact gets no verdict.
+    pub min_frames: u64,
+    /// A press that is held for this long ends.
+    pub max_seconds: f64,
+    /// How long the contact must have settled for an early verdict.
+    pub early_settle_s: f64,
+    /// The least total force for an early verdict.
+    pub early_min_force_n: f64,
+}
+
+impl Default for Thresholds {
+    fn default() -> Self {
+        Settings::default().thresholds(Array::JX255N, Pitch::JX255N)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn thresholds_mean_the_same_pressure_and_area_on_every_array() {
+        let array = Array { rows: 64, cols: 64 };
+        for (pitch, threshold_n, begin, end) in [
+            (Pitch::JX255N, 0.07, 3, 1),
+            (Pitch::square(1.75), 0.0175, 12, 4),
+            (Pitch::square(1.5), 0.012_857, 16, 5),
+            (Pitch::square(7.0), 0.28, 3, 1),
+            (
+                Pitch {
+                    rows_mm: 7.0,
+                    cols_mm: 1.75,
+                },
+                0.07,
+                3,
+                1,
+            ),
+        ] {
+            let found = Settings::default().check(array, pitch).unwrap();
+            assert!(
+                (found.contact_threshold_n - threshold_n).abs() < 1e-6,
+                "{found:?}"
+            );
+            assert_eq!(
+                (found.begin_area_taxels, found.end_area_taxels),
+                (begin, end)
+            );
+        }
+        // A press can begin on an array of two taxels.
+        let two = Settings::default().check(Array { rows: 1, cols: 2 }, Pitch::JX255N);
+        assert_eq!(two.unwrap().begin_area_taxels, 2);
     }
 }

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::Settings;
-use crate::frame::Frame;
+use super::Thresholds;
+use crate::frame::{contact_area_taxels, force_n};
 
 /// The latest frames whose area and force are all near the largest ones so far.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -34,7 +34,7 @@ impl Settling {
     /// Adds a frame. Returns true if area and force have stayed near their largest values so far,
     /// over at least `early_settle_s` and [`SETTLED_FRAMES`] frames, and the force is enough for a
     /// verdict.
-    pub(super) fn push(&mut self, load: Load, settings: &Settings) -> bool {
+    pub(super) fn push(&mut self, load: Load, thresholds: &Thresholds) -> bool {
         self.most_area = self.most_area.max(load.contact_area_taxels);
         self.most_force_n = self.most_force_n.max(load.force_n);
         self.near.push_back(load);
@@ -48,31 +48,32 @@ impl Settling {
         if let Some(last_far) = self.near.iter().rposition(|load| !is_near(load)) {
             self.near.drain(..=last_far);
         }
-        let settle = Duration::from_secs_f64(settings.early_settle_s);
+        let settle = Duration::from_secs_f64(thresholds.early_settle_s);
         let covers = |first: &Load| load.at.saturating_sub(first.at) >= settle;
         while self.near.len() > SETTLED_FRAMES && self.near.get(1).is_some_and(covers) {
             self.near.pop_front();
         }
-        load.force_n >= settings.early_min_force_n
+        load.force_n >= thresholds.early_min_force_n
             && self.near.len() >= SETTLED_FRAMES
             && self.near.front().is_some_and(covers)
     }
 }
 
 /// The place of the first of `frames` of a press with which its contact has settled, or `None` if it
-/// never settles. Each frame comes with the time since the press began.
+/// never settles. The newtons of each frame come
+/// with the time since the press began.
 pub fn first_settled<'a>(
-    frames: impl Iterator<Item = (Duration, &'a Frame)>,
-    settings: &Settings,
+    frames: impl Iterator<Item = (Duration, &'a [f32])>,
+    thresholds: &Thresholds,
 ) -> Option<usize> {
     let mut settling = Settling::default();
-    let is_settled = |(at, frame): (Duration, &Frame)| {
+    let is_settled = |(at, newtons): (Duration, &[f32])| {
         let load = Load {
             at,
-            contact_area_taxels: frame.contact_area_taxels(settings.contact_threshold_n),
-            force_n: frame.force_n(),
+            contact_area_taxels: contact_area_taxels(newtons, thresholds.contact_threshold_n),
+            force_n: force_n(newtons),
         };
-        settling.push(load, settings)
+        settling.push(load, thresholds)
     };
     frames.map(is_settled).position(|settled| settled)
 }

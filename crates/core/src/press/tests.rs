@@ -1,4 +1,5 @@
 use super::*;
+use crate::frame::Pitch;
 
 /// A frame of `area` taxels sharing `force_n`.
 fn frame(area: usize, force_n: f32) -> Frame {
@@ -20,7 +21,7 @@ fn moment(frame: u64, rate_hz: u64) -> FrameAt {
 
 /// Tracks `loads` and writes each change as a letter with its frame: b begin, s settled, e end, t
 /// timeout, x aborted.
-fn track(settings: &Settings, loads: &[(usize, f32)], rate_hz: u64) -> String {
+fn track(settings: &Thresholds, loads: &[(usize, f32)], rate_hz: u64) -> String {
     let mut tracker = PressTracker::new(settings.clone());
     let mut text = Vec::new();
     for (number, &(area, force_n)) in (0..).zip(loads) {
@@ -62,7 +63,7 @@ fn track(settings: &Settings, loads: &[(usize, f32)], rate_hz: u64) -> String {
 }
 
 fn check(loads: &[(usize, f32)], expected: &str) {
-    assert_eq!(track(&Settings::default(), loads, 5), expected);
+    assert_eq!(track(&Thresholds::default(), loads, 5), expected);
 }
 
 #[test]
@@ -107,7 +108,7 @@ fn ties_of_area_go_to_force_then_to_the_earlier_frame() {
 
 #[test]
 fn equal_counts_are_a_tie_however_their_newtons_are_rounded() {
-    let mut tracker = PressTracker::new(Settings::default());
+    let mut tracker = PressTracker::new(Thresholds::default());
     let mut changes = Vec::new();
     // In f32, the second force is greater by 7e-9 N.
     let counts = [[2_u8, 5, 6], [3, 4, 6], [0; 3], [0; 3]];
@@ -127,10 +128,10 @@ fn equal_counts_are_a_tie_however_their_newtons_are_rounded() {
 
 #[test]
 fn a_held_press_times_out_once_and_waits_for_release() {
-    let settings = Settings {
+    let settings = Thresholds {
         max_seconds: 1.0,
         early_settle_s: 9.0,
-        ..Settings::default()
+        ..Thresholds::default()
     };
     let mut loads = vec![(5, 2.0); 8];
     loads.extend([(0, 0.0), (5, 2.0), (0, 0.0), (0, 0.0), (5, 2.0)]);
@@ -139,10 +140,10 @@ fn a_held_press_times_out_once_and_waits_for_release() {
 
 #[test]
 fn a_press_held_at_its_limit_counts_the_release_it_has_begun() {
-    let settings = Settings {
+    let settings = Thresholds {
         max_seconds: 1.0,
         early_settle_s: 9.0,
-        ..Settings::default()
+        ..Thresholds::default()
     };
     let mut loads = vec![(5, 2.0); 5];
     loads.extend([(0, 0.0), (0, 0.0), (5, 2.0)]);
@@ -151,10 +152,10 @@ fn a_press_held_at_its_limit_counts_the_release_it_has_begun() {
 
 #[test]
 fn a_press_too_short_for_a_verdict_at_its_limit_is_aborted() {
-    let settings = Settings {
+    let settings = Thresholds {
         max_seconds: 0.4,
         min_frames: 9,
-        ..Settings::default()
+        ..Thresholds::default()
     };
     assert_eq!(
         track(&settings, &[(5, 2.0); 4], 5),
@@ -164,11 +165,11 @@ fn a_press_too_short_for_a_verdict_at_its_limit_is_aborted() {
 
 #[test]
 fn frames_below_the_end_area_release_though_something_is_touched() {
-    let settings = Settings {
+    let settings = Thresholds {
         begin_area_taxels: 5,
         end_area_taxels: 3,
         early_settle_s: 9.0,
-        ..Settings::default()
+        ..Thresholds::default()
     };
     let loads = [
         (4, 9.),
@@ -181,7 +182,7 @@ fn frames_below_the_end_area_release_though_something_is_touched() {
     ];
     assert_eq!(track(&settings, &loads, 5), "b1@1 e@4:last2 n2 peak1 b2@6");
     // The same holds after a timeout.
-    let settings = Settings {
+    let settings = Thresholds {
         max_seconds: 0.2,
         ..settings
     };
@@ -191,13 +192,13 @@ fn frames_below_the_end_area_release_though_something_is_touched() {
 
 #[test]
 fn what_was_reloaded_holds_for_the_press_under_way() {
-    let mut tracker = PressTracker::new(Settings::default());
+    let mut tracker = PressTracker::new(Thresholds::default());
     for number in 0..3 {
         let _ = tracker.push(&frame(5, 2.0), Marks::default(), moment(number, 5));
     }
-    tracker.reload(Settings {
+    tracker.reload(Thresholds {
         end_frames: 1,
-        ..Settings::default()
+        ..Thresholds::default()
     });
     assert!(matches!(
         tracker.push(&frame(0, 0.0), Marks::default(), moment(3, 5))[..],
@@ -207,7 +208,7 @@ fn what_was_reloaded_holds_for_the_press_under_way() {
 
 #[test]
 fn a_contact_settles_within_a_taxel_or_5_percent_of_its_largest_area_and_force() {
-    let settles = |loads: &[(usize, f32)]| track(&Settings::default(), loads, 5).contains(" s@");
+    let settles = |loads: &[(usize, f32)]| track(&Thresholds::default(), loads, 5).contains(" s@");
     for (loads, expected) in [
         (&[(100, 8.), (95, 8.), (95, 8.)][..], true),
         (&[(100, 8.), (94, 8.), (94, 8.)], false),
@@ -245,7 +246,7 @@ fn settled_contact_is_reported_once_and_never_while_the_load_rises() {
 
 #[test]
 fn settling_needs_its_time_at_high_rates() {
-    let settings = Settings::default();
+    let settings = Thresholds::default();
     let text = track(&settings, &[(10, 5.0); 40], 100);
     assert_eq!(text, "b1@0 s@30:0");
 }
@@ -255,8 +256,9 @@ fn the_frame_that_settles_a_recorded_press_is_the_trackers() {
     let settled_at = |loads: &[(usize, f32)]| {
         let frames: Vec<Frame> = loads.iter().map(|&(area, n)| frame(area, n)).collect();
         let stamped = frames.iter().zip(0..);
-        let stamped = stamped.map(|(frame, number)| (moment(number, 5).stamp.mono, frame));
-        first_settled(stamped, &Settings::default())
+        let stamped =
+            stamped.map(|(frame, number)| (moment(number, 5).stamp.mono, &frame.newtons[..]));
+        first_settled(stamped, &Thresholds::default())
     };
     let loads = [(5, 2.), (9, 6.), (12, 10.), (12, 9.9), (12, 9.8), (12, 9.8)];
     check(&loads, "b1@0 s@4:2");
@@ -266,7 +268,7 @@ fn the_frame_that_settles_a_recorded_press_is_the_trackers() {
 
 #[test]
 fn an_aborted_press_leaves_the_tracker_idle() {
-    let mut tracker = PressTracker::new(Settings::default());
+    let mut tracker = PressTracker::new(Thresholds::default());
     assert_eq!(tracker.abort(Abort::Lost), None);
     let _ = tracker.push(&frame(5, 2.0), Marks::default(), moment(0, 5));
     assert!(matches!(
@@ -283,9 +285,9 @@ fn an_aborted_press_leaves_the_tracker_idle() {
 
 #[test]
 fn a_loss_does_not_release_what_timed_out() {
-    let mut tracker = PressTracker::new(Settings {
+    let mut tracker = PressTracker::new(Thresholds {
         max_seconds: 0.2,
-        ..Settings::default()
+        ..Thresholds::default()
     });
     for number in 0..2 {
         let _ = tracker.push(&frame(5, 2.0), Marks::default(), moment(number, 5));
@@ -300,10 +302,11 @@ fn a_loss_does_not_release_what_timed_out() {
 #[test]
 fn what_is_out_of_range_is_told_as_it_was_written() {
     let settings = Settings {
-        contact_threshold_n: -0.07,
+        contact_threshold_n: Some(-0.07),
         ..Settings::default()
     };
-    let told = settings.check().unwrap_err().to_string();
+    let told = settings.check(Array::JX255N, Pitch::JX255N);
+    let told = told.unwrap_err().to_string();
     assert!(
         told.starts_with("contact_threshold_n: found -0.07, expected"),
         "{told}"

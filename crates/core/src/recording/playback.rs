@@ -99,11 +99,11 @@ impl Playback {
         let known = players.find(|player| player.pipeline.sensor().name() == sensor);
         let events = match (entry, known) {
             (Entry::State(state), known) => {
-                if !state.memory.is_possible() {
+                let described = state.sensor.check()?;
+                if !state.memory.is_possible(described.layout().array()) {
                     return Err(PlaybackProblem::Memory);
                 }
                 // If no entry is missing, the pipeline already has this state.
-                let described = state.sensor.check()?;
                 let mut pipeline = Pipeline::new(described, self.hrn.clone(), Clock::Arrival);
                 pipeline.recall(state.memory);
                 let player = Player {

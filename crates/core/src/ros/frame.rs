@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::{Blob, Header, Time, Topic, to_cdr};
 use crate::event::FrameEvent;
-use crate::frame::{COLS, ROWS};
+use crate::frame::Pitch;
 
 /// The frame as an image, in newtons.
 pub const FRAME: Topic = Topic {
@@ -139,11 +139,11 @@ pub(super) fn image(frame: &FrameEvent) -> (Topic, Timestamp, Vec<u8>) {
     let bytes = frame.newtons.iter().flat_map(|n| n.to_le_bytes()).collect();
     let message = ImageMessage {
         header: Header::new(frame.time, &frame.sensor),
-        height: ROWS as u32,
-        width: COLS as u32,
+        height: frame.rows as u32,
+        width: frame.cols as u32,
         encoding: "32FC1",
         is_bigendian: 0,
-        step: COLS as u32 * NEWTONS_BYTES,
+        step: frame.cols as u32 * NEWTONS_BYTES,
         data: Blob(bytes),
     };
     (FRAME, frame.time, to_cdr(&message))
@@ -164,24 +164,28 @@ pub fn contact(frame: &FrameEvent) -> (Topic, Timestamp, Vec<u8>) {
 
 /// The frame as a grid in metres around the sensor's middle. Its y axis points up, so the frame's
 /// last row comes first.
-pub(super) fn grid(frame: &FrameEvent, pitch_mm: f64) -> (Topic, Timestamp, Vec<u8>) {
-    let pitch_m = pitch_mm / 1e3;
-    let rows = frame.newtons.chunks(COLS).rev();
+pub(super) fn grid(frame: &FrameEvent, pitch: Pitch) -> (Topic, Timestamp, Vec<u8>) {
+    let cell_size = Vector2 {
+        x: pitch.cols_mm / 1e3,
+        y: pitch.rows_mm / 1e3,
+    };
+    let rows = frame.newtons.chunks(frame.cols).rev();
     let bytes = rows.flatten().flat_map(|n| n.to_le_bytes()).collect();
-    let corner = |taxels: usize| -0.5 * taxels as f64 * pitch_m;
+    let corner = |taxels: usize, size_m: f64| -0.5 * taxels as f64 * size_m;
     let message = GridMessage {
         timestamp: Time::new(frame.time),
         frame_id: &frame.sensor,
         pose: Pose {
-            position: [corner(COLS), corner(ROWS), 0.0],
+            position: [
+                corner(frame.cols, cell_size.x),
+                corner(frame.rows, cell_size.y),
+                0.0,
+            ],
             orientation: [0.0, 0.0, 0.0, 1.0],
         },
-        column_count: COLS as u32,
-        cell_size: Vector2 {
-            x: pitch_m,
-            y: pitch_m,
-        },
-        row_stride: COLS as u32 * NEWTONS_BYTES,
+        column_count: frame.cols as u32,
+        cell_size,
+        row_stride: frame.cols as u32 * NEWTONS_BYTES,
         cell_stride: NEWTONS_BYTES,
         fields: vec![Field {
             name: "newtons",

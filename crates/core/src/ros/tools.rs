@@ -11,7 +11,6 @@ use super::frame::ImageMessage;
 use super::{Blob, Header, Topic, to_cdr};
 use crate::colour::viridis;
 use crate::event::{FrameEvent, LinkState, Status, name};
-use crate::frame::{COLS, ROWS};
 
 /// The state of every sensor, for tools such as `rqt_robot_monitor`.
 pub const DIAGNOSTICS: Topic = on_a_wire("diagnostics", "diagnostic_msgs/msg/DiagnosticArray");
@@ -132,11 +131,11 @@ pub fn picture(frame: &FrameEvent, most_n: f32) -> Vec<u8> {
     let pixels = frame.newtons.iter().flat_map(|n| viridis(n / most_n));
     to_cdr(&ImageMessage {
         header: Header::new(frame.time, &frame.sensor),
-        height: ROWS as u32,
-        width: COLS as u32,
+        height: frame.rows as u32,
+        width: frame.cols as u32,
         encoding: "rgb8",
         is_bigendian: 0,
-        step: 3 * COLS as u32,
+        step: 3 * frame.cols as u32,
         data: Blob(pixels.collect()),
     })
 }

@@ -5,13 +5,11 @@ use std::path::PathBuf;
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::frame::Array;
+use crate::frame::{Array, Pitch};
 use crate::wording::as_written;
 
 /// The force of one count of the JX255N: 8 bits are 10.2 N.
 pub const NEWTONS_PER_COUNT: f32 = 0.04;
-/// The distance between taxel centres of the JX255N (paper, "Tactile sensor").
-pub const PITCH_MM: f64 = 3.5;
 
 /// The `[sensor.calibration]` table.
 ///
@@ -29,7 +27,7 @@ pub const PITCH_MM: f64 = 3.5;
 ///     ..Settings::default()
 /// };
 /// assert!(settings.check(Array { rows: 2, cols: 2 }).is_ok());
-/// let error = settings.check(Array::FULL).unwrap_err();
+/// let error = settings.check(Array::JX255N).unwrap_err();
 /// assert_eq!(error.to_string(), "gains: found 2 rows of 2, expected 28 of 28");
 /// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -42,8 +40,8 @@ pub struct Settings {
     /// The factor of each taxel's newtons. `None` means 1 for all.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gains: Option<Gains>,
-    /// The distance between taxel centres.
-    pub pitch_mm: f64,
+    /// The distance between taxel centres: a number, or `[rows, columns]`.
+    pub pitch_mm: Pitch,
     /// The number of frames that are averaged at start. With 0 there is no tare.
     pub tare_frames: u32,
     /// How far above the array's median an unloaded taxel may read.
@@ -86,7 +84,7 @@ impl Default for Settings {
             newtons_per_count: NEWTONS_PER_COUNT,
             exponent: 1.0,
             gains: None,
-            pitch_mm: PITCH_MM,
+            pitch_mm: Pitch::JX255N,
             tare_frames: 5,
             tare_max_n: 0.5,
             auto_tare: false,
@@ -194,7 +192,8 @@ impl Settings {
                 as_written(self.newtons_per_count),
                 MOST_NEWTONS_PER_COUNT,
             ),
-            ("pitch_mm", self.pitch_mm, MOST_PITCH_MM),
+            ("pitch_mm", self.pitch_mm.rows_mm, MOST_PITCH_MM),
+            ("pitch_mm", self.pitch_mm.cols_mm, MOST_PITCH_MM),
             ("tare_max_n", as_written(self.tare_max_n), MOST_TARE_N),
         ] {
             if !(found > 0.0 && found <= max) {

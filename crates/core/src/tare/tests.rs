@@ -5,10 +5,18 @@ const CONTACT: Contact = Contact {
     area_taxels: 3,
 };
 
+fn even(array: Array, count: u16) -> RawFrame {
+    let mut frame = RawFrame::zero(array);
+    frame.counts.fill(count);
+    frame
+}
+
 fn raw(counts: &[(usize, u16)]) -> RawFrame {
-    let mut frame = RawFrame {
-        counts: [2; TAXELS],
-    };
+    raw_of(Array::JX255N, counts)
+}
+
+fn raw_of(array: Array, counts: &[(usize, u16)]) -> RawFrame {
+    let mut frame = even(array, 2);
     for &(place, count) in counts {
         frame.counts[place] = count;
     }
@@ -34,10 +42,8 @@ fn force_grows_with_a_power_of_the_counts() {
             threshold_n: 0.07,
             area_taxels: 3,
         };
-        let mut tare = Tare::new(&settings, Array::FULL, contact);
-        let mut raw = RawFrame {
-            counts: [2; TAXELS],
-        };
+        let mut tare = Tare::new(&settings, Array::JX255N, contact);
+        let mut raw = raw(&[]);
         tare.observe(&raw);
         raw.counts[7] = counts;
         tare.apply(&raw).newtons[7]
@@ -64,10 +70,10 @@ fn a_gain_multiplies_the_newtons_of_its_own_taxel() {
     };
     settings.check(array).unwrap();
     let mut tare = Tare::new(&settings, array, CONTACT);
-    tare.observe(&raw(&[]));
-    for place in array.places() {
-        let (row, col) = array.position(place).unwrap();
-        let newtons = tare.apply(&raw(&[(place, 27)])).newtons;
+    tare.observe(&raw_of(array, &[]));
+    for place in 0..array.taxels() {
+        let (row, col) = array.position(place);
+        let newtons = tare.apply(&raw_of(array, &[(place, 27)])).newtons;
         assert_eq!(
             newtons[place],
             gain(row, col),
@@ -123,17 +129,15 @@ fn gains_of_another_array_or_beyond_any_film_are_refused() {
 fn a_baseline_follows_by_its_bound_while_no_live_taxel_is_in_contact() {
     // The taxels read one count more, 0.04 N, but the gain of column 1 makes it 0.08 N there, which
     // is a contact.
-    let drifted = RawFrame {
-        counts: [3; TAXELS],
-    };
+    let drifted = even(Array::JX255N, 3);
     let newtons = |auto_tare, gain: f32, dead_taxels: &[[usize; 2]], seconds| {
         let settings = Settings {
             auto_tare,
             tare_frames: 1,
-            gains: gains(ROWS, COLS, |_, col| if col == 1 { gain } else { 1.0 }),
+            gains: gains(28, 28, |_, col| if col == 1 { gain } else { 1.0 }),
             ..settings(dead_taxels)
         };
-        let mut tare = Tare::new(&settings, Array::FULL, CONTACT);
+        let mut tare = Tare::new(&settings, Array::JX255N, CONTACT);
         tare.observe(&raw(&[]));
         (0..seconds).for_each(|_| tare.follow(&drifted));
         tare.apply(&drifted).newtons
@@ -146,13 +150,13 @@ fn a_baseline_follows_by_its_bound_while_no_live_taxel_is_in_contact() {
     let touched = newtons(true, 2.0, &[], 36_000);
     assert_eq!((touched[0], touched[1]), (0.04, 0.08));
     // A dead taxel is no contact.
-    let column: Vec<[usize; 2]> = (0..ROWS).map(|row| [row, 1]).collect();
+    let column: Vec<[usize; 2]> = (0..28).map(|row| [row, 1]).collect();
     assert_eq!(newtons(true, 2.0, &column, 150)[0], 0.0);
 }
 
 #[test]
 fn baseline_is_the_mean_and_frames_before_it_are_untared() {
-    let mut tare = Tare::new(&settings(&[]), Array::FULL, CONTACT);
+    let mut tare = Tare::new(&settings(&[]), Array::JX255N, CONTACT);
     for count in [2, 3, 2, 3] {
         assert_eq!(tare.observe(&raw(&[(0, count)])), Progress::Taking);
     }
@@ -168,7 +172,7 @@ fn baseline_is_the_mean_and_frames_before_it_are_untared() {
 fn a_moving_or_a_resting_load_is_contact() {
     let moving = [[2, 4], [2, 4], [2, 4]];
     let check = |touch: &dyn Fn(usize) -> Vec<(usize, u16)>, expected| {
-        let mut tare = Tare::new(&settings(&[]), Array::FULL, CONTACT);
+        let mut tare = Tare::new(&settings(&[]), Array::JX255N, CONTACT);
         let last = (0..5).map(|frame| tare.observe(&raw(&touch(frame)))).last();
         assert_eq!(last, Some(expected));
         let again = Aim::First { met_contact: true };
@@ -207,24 +211,14 @@ fn what_a_tare_compares_is_the_array_and_its_live_taxels() {
         (&row[..2], Progress::Taken),
         (&[], Progress::Contact),
     ] {
-        let found = check(&settings(dead), Array::FULL, CONTACT, flicker);
+        let found = check(&settings(dead), Array::JX255N, CONTACT, flicker.clone());
         assert_eq!(found, expected, "{dead:?}");
     }
-    // Only values above the median count as high: some taxels may rest low, and places outside a
-    // small array read 0.
-    let low = raw(&[(0, 0), (1, 0), (2, 0), (3, 0)]);
-    let high = RawFrame {
-        counts: low.counts.map(|count| 15 * count),
-    };
+    // Only values above the median count as high: some taxels may rest low.
+    let mut high = even(Array::JX255N, 30);
+    high.counts[..4].fill(0);
     assert_eq!(
-        check(&settings(&[]), Array::FULL, CONTACT, [high; 2]),
-        Progress::Taken
-    );
-    let array = Array { rows: 5, cols: 4 };
-    let mut small = RawFrame::default();
-    array.places().for_each(|place| small.counts[place] = 30);
-    assert_eq!(
-        check(&settings(&[]), array, CONTACT, [small; 2]),
+        check(&settings(&[]), Array::JX255N, CONTACT, [high.clone(), high]),
         Progress::Taken
     );
     // A variation equal to the threshold counts: two counts are 0.08 N.
@@ -234,14 +228,14 @@ fn what_a_tare_compares_is_the_array_and_its_live_taxels() {
             threshold_n,
             ..CONTACT
         };
-        let found = check(&settings(&[]), Array::FULL, contact, two);
+        let found = check(&settings(&[]), Array::JX255N, contact, two.clone());
         assert_eq!(found, expected, "{threshold_n} N");
     }
 }
 
 #[test]
 fn full_scale_is_read_by_live_taxels_alone() {
-    let tare = Tare::new(&settings(&[[0, 0]]), Array::FULL, CONTACT);
+    let tare = Tare::new(&settings(&[[0, 0]]), Array::JX255N, CONTACT);
     let is_saturated = |at, count| tare.is_saturated(&raw(&[(at, count)]), 255);
     assert!(is_saturated(1, 255) && !is_saturated(1, 254));
     assert!(!is_saturated(0, 255), "a dead one says nothing");
@@ -251,7 +245,7 @@ fn full_scale_is_read_by_live_taxels_alone() {
 fn another_tare_leaves_the_baseline_until_it_is_taken_or_given_up() {
     let mut settings = settings(&[[0, 1]]);
     settings.tare_frames = 2;
-    let mut tare = Tare::new(&settings, Array::FULL, CONTACT);
+    let mut tare = Tare::new(&settings, Array::JX255N, CONTACT);
     let frames = |tare: &mut Tare, count| -> Vec<Progress> {
         let drifted = raw(&[(0, count), (1, 900)]);
         (0..2).map(|_| tare.observe(&drifted)).collect()
@@ -288,19 +282,19 @@ fn another_tare_leaves_the_baseline_until_it_is_taken_or_given_up() {
 fn a_dead_taxel_is_the_mean_of_its_live_neighbours() {
     let mut settings = settings(&[[0, 0], [0, 1]]);
     settings.tare_frames = 0;
-    let tare = Tare::new(&settings, Array::FULL, CONTACT);
-    let frame = tare.apply(&raw(&[(0, 255), (1, 255), (COLS, 10), (COLS + 1, 20)]));
+    let tare = Tare::new(&settings, Array::JX255N, CONTACT);
+    let frame = tare.apply(&raw(&[(0, 255), (1, 255), (28, 10), (29, 20)]));
     assert!((frame.newtons[0] - 15.0 * 0.04).abs() < 1e-6);
     let expected = (2.0 + 10.0 + 20.0 + 2.0) / 4.0 * 0.04;
     assert!((frame.newtons[1] - expected).abs() < 1e-6);
 }
 
 #[test]
-fn a_small_array_ignores_what_lies_outside_it() {
+fn the_border_of_an_array_has_fewer_neighbours() {
     let array = Array { rows: 1, cols: 2 };
     let mut settings = settings(&[[0, 0]]);
     settings.tare_frames = 0;
     let tare = Tare::new(&settings, array, CONTACT);
-    let frame = tare.apply(&raw(&[(array.place(0, 1), 50)]));
-    assert_eq!(frame.newtons[array.place(0, 0)], 50.0 * 0.04);
+    let frame = tare.apply(&raw_of(array, &[(1, 50)]));
+    assert_eq!(frame.newtons[0], 50.0 * 0.04);
 }

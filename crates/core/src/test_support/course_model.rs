@@ -8,7 +8,7 @@ use prost::Message as _;
 use serde_json::{Value, json};
 use tract_onnx::pb;
 
-use crate::frame::Frame;
+use crate::verdict::ModelFrame;
 use crate::verdict::{CheckedCourse, Course, CourseCheck, CourseMoment};
 
 /// The file for presses of `most` frames. `more` adds or replaces metadata.
@@ -210,7 +210,7 @@ fn check(most: usize) -> CourseCheck {
     let press = |number: usize| {
         let length = 1 + number * (most - 1) / 7;
         let moments = (0..length).map(|place| {
-            let mut frame = Frame::default();
+            let mut frame = ModelFrame::default();
             frame.newtons[300..300 + number].fill(0.1 + 0.05 * place as f32);
             CourseMoment {
                 time_s: 0.05 * place as f32,

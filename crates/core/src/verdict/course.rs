@@ -6,8 +6,8 @@
 use serde::{Deserialize, Serialize};
 use tract_onnx::prelude::*;
 
+use super::grid::{COLS, ModelFrame, ModelFrameError, ROWS, TAXELS};
 use crate::frame::sparse::{self, SparseError};
-use crate::frame::{COLS, Frame, ROWS, TAXELS};
 
 /// The fewest and the most frames that a model of format 2 may take.
 pub const COURSE_FRAMES: (usize, usize) = (3, 48);
@@ -20,7 +20,7 @@ pub struct CourseMoment {
     /// How far the arm went since the frame that began the press. `None` if it is unknown.
     pub approach_mm: Option<f32>,
     /// The taxels of the frame.
-    pub frame: Frame,
+    pub frame: ModelFrame,
 }
 
 /// A press over time.
@@ -30,11 +30,10 @@ pub struct CourseMoment {
 /// A model of format 2 judges a whole press, here one of two frames.
 ///
 /// ```
-/// use hardnessd_core::frame::Frame;
-/// use hardnessd_core::verdict::{Course, CourseMoment, Hrn};
+/// use hardnessd_core::verdict::{Course, CourseMoment, Hrn, ModelFrame};
 ///
 /// let moment = |time_s, approach_mm, newtons| {
-///     let mut frame = Frame::default();
+///     let mut frame = ModelFrame::default();
 ///     frame.newtons[400..404].fill(newtons);
 ///     CourseMoment { time_s, approach_mm: Some(approach_mm), frame }
 /// };
@@ -247,7 +246,10 @@ impl From<CheckedCourse> for Written {
             time_s: moments.iter().map(|moment| moment.time_s).collect(),
             approach_mm: moments.iter().map(|moment| moment.approach_mm).collect(),
             arm_n_per_mm: *arm_n_per_mm,
-            frames: moments.iter().map(|m| sparse::write(&m.frame)).collect(),
+            frames: moments
+                .iter()
+                .map(|m| sparse::write(&m.frame.newtons))
+                .collect(),
             probabilities: checked.probabilities,
             shore: checked.shore,
         }
@@ -268,6 +270,8 @@ enum Unwritten {
     },
     #[error("frame {0} of a press: {1}")]
     Frame(usize, #[source] SparseError),
+    #[error(transparent)]
+    Newtons(#[from] ModelFrameError),
 }
 
 impl TryFrom<Written> for CheckedCourse {
@@ -286,8 +290,10 @@ impl TryFrom<Written> for CheckedCourse {
         let rows = written.time_s.iter().zip(&written.approach_mm);
         let moments = rows.zip(&written.frames).enumerate();
         let moment = |(place, ((&time_s, &approach_mm), frame)): (usize, ((&f32, _), &String))| {
-            let frame = sparse::read(frame).map_err(|error| Unwritten::Frame(place, error))?;
-            Ok(CourseMoment {
+            let newtons = sparse::read(frame, TAXELS);
+            let newtons = newtons.map_err(|error| Unwritten::Frame(place, error))?;
+            let frame = ModelFrame::try_from(newtons)?;
+            Ok::<_, Unwritten>(CourseMoment {
                 time_s,
                 approach_mm,
                 frame,

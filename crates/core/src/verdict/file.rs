@@ -7,11 +7,11 @@ use serde::Deserialize;
 use tract_onnx::pb;
 
 use super::course::Input;
+use super::grid::{COLS, ROWS, TAXELS};
 use super::{
     COURSE_FRAMES, Card, Check, CheckedCourse, Checks, Conformal, CourseCheck, Format, Level,
     MIN_OPSET, ModelError, Range,
 };
-use crate::frame::{COLS, ROWS, TAXELS};
 use crate::wording::is_plain;
 
 /// The longest `label` and `shore` of a level: every event carries a label.

@@ -38,7 +38,7 @@ fn the_built_in_model_loads_and_judges() {
         panic!("the model judges frames");
     };
     for (newtons, expected) in check.frames.iter().zip(&check.probabilities) {
-        let mut frame = Frame::default();
+        let mut frame = ModelFrame::default();
         frame.newtons.copy_from_slice(newtons);
         let verdict = hrn.judge(&frame).unwrap();
         let (best, confidence) = argmax(&verdict.probabilities);

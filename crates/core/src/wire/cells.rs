@@ -66,7 +66,7 @@ fn places(array: Array, order: Order) -> Vec<u16> {
                 }
                 Order::Serpentine => (index / cols, cols - 1 - index % cols),
             };
-            u16::try_from(array.place(row, col)).expect("a frame has 784 places")
+            u16::try_from(array.place(row, col)).expect("a frame has at most 4096 places")
         })
         .collect()
 }

@@ -148,7 +148,7 @@ impl Fixed {
     }
 
     fn whole(&self, cells: &Cells, bytes: &[u8]) -> Scan {
-        let mut frame = RawFrame::default();
+        let mut frame = RawFrame::zero(cells.array);
         let payload = &bytes[self.header.len()..self.header.len() + self.payload_bytes];
         match self.cell {
             Cell::U8 => {

@@ -5,7 +5,7 @@ use super::checksum::Checksum;
 use super::scan::{Context, Scan};
 use super::settings::{Cell, HexBytes, LayoutError, LengthField, Order, Preset, Settings};
 use super::{fixed, text, zero_run};
-use crate::frame::{Array, COLS, ROWS, RawFrame};
+use crate::frame::{Array, MOST_SIDE, RawFrame};
 
 /// The way to find counts in bytes.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -29,10 +29,10 @@ enum Framing {
 /// let layout = Layout::new(&settings)?;
 /// assert_eq!(layout.array(), Array { rows: 10, cols: 28 });
 /// let mut bytes = Vec::new();
-/// layout.encode(&RawFrame::default(), &mut bytes);
+/// layout.encode(&RawFrame::zero(layout.array()), &mut bytes);
 /// assert_eq!(bytes.len(), layout.max_frame_bytes());
 ///
-/// let settings = Settings { rows: Some(29), ..Settings::default() };
+/// let settings = Settings { rows: Some(65), ..Settings::default() };
 /// assert!(matches!(Layout::new(&settings), Err(LayoutError::Size { key: "rows", .. })));
 /// # Ok::<(), LayoutError>(())
 /// ```
@@ -48,14 +48,15 @@ impl Layout {
     ///
     /// # Errors
     ///
-    /// Returns a [`LayoutError`] that names the key: a side outside 1..=28, no mark to find frames
+    /// Returns a [`LayoutError`] that names the key: a side outside 1..=64, no mark to find frames
     /// by, a length field that cannot hold the payload, a mask wider than the cell, or a key that a
     /// preset fixes.
     pub fn new(settings: &Settings) -> Result<Self, LayoutError> {
-        let rows = settings.rows.unwrap_or(ROWS);
-        let cols = settings.cols.unwrap_or(COLS);
-        for (key, found, max) in [("rows", rows, ROWS), ("cols", cols, COLS)] {
-            if !(1..=max).contains(&found) {
+        let rows = settings.rows.unwrap_or(Array::JX255N.rows);
+        let cols = settings.cols.unwrap_or(Array::JX255N.cols);
+        for (key, found) in [("rows", rows), ("cols", cols)] {
+            if !(1..=MOST_SIDE).contains(&found) {
+                let max = MOST_SIDE;
                 return Err(LayoutError::Size { key, found, max });
             }
         }
@@ -110,7 +111,7 @@ impl Layout {
     }
 
     /// Appends `frame` as the sensor would send it. Counts beyond a cell's largest value are
-    /// clipped to it. Taxels outside the array are left out.
+    /// clipped to it.
     pub fn encode(&self, frame: &RawFrame, out: &mut Vec<u8>) {
         let cells = self.cells.of(frame);
         match &self.framing {

@@ -3,10 +3,6 @@
 use crate::frame::RawFrame;
 
 /// The answer of a search.
-#[expect(
-    clippy::large_enum_variant,
-    reason = "a frame is handed on by value: boxing it would allocate each one"
-)]
 pub(super) enum Scan {
     /// More bytes are needed.
     Wait,

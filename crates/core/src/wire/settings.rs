@@ -78,10 +78,10 @@ pub struct Settings {
     /// The checksum over all bytes before it, little-endian.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub checksum: Option<Checksum>,
-    /// The number of rows of the array, 1 to 28.
+    /// The number of rows of the array, 1 to 64.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rows: Option<usize>,
-    /// The number of columns of the array, 1 to 28.
+    /// The number of columns of the array, 1 to 64.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cols: Option<usize>,
     /// The order in which the taxels are sent.
@@ -161,14 +161,14 @@ pub enum Order {
 /// The reason why a `[sensor.frame]` table is unusable. Each message names its key.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum LayoutError {
-    /// The array is larger than a frame, or empty.
+    /// The array is too large, or empty.
     #[error("{key}: found {found}, expected 1 to {max}")]
     Size {
         /// `rows` or `cols`.
         key: &'static str,
         /// The configured value.
         found: usize,
-        /// The side of a frame.
+        /// The longest side.
         max: usize,
     },
     /// The layout has neither `sync` nor `tail`.

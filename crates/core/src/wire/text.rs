@@ -35,7 +35,7 @@ pub(super) fn scan(cells: &Cells, bytes: &[u8], context: Context) -> Scan {
     let Array { rows, cols } = cells.array;
     let mut lines = Lines { bytes, at: 0 };
     // The places where the last `rows` lines began.
-    let mut starts = [0; crate::frame::ROWS];
+    let mut starts = [0; crate::frame::MOST_SIDE];
     let mut count = 0;
     loop {
         let start = lines.at;
@@ -110,7 +110,7 @@ fn row_start(text: &[u8], cols: usize) -> usize {
 }
 
 fn parse(cells: &Cells, text: &[u8], rows: usize, cols: usize) -> Option<RawFrame> {
-    let mut frame = RawFrame::default();
+    let mut frame = RawFrame::zero(cells.array);
     let mut index = 0;
     for line in (Lines { bytes: text, at: 0 }) {
         let row_end = index + cols;

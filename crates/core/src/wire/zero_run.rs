@@ -75,7 +75,7 @@ pub(super) fn scan(cells: &Cells, bytes: &[u8], context: Context) -> Scan {
 
 fn unpack(cells: &Cells, packed: &[u8]) -> Option<RawFrame> {
     let count = cells.count();
-    let mut frame = RawFrame::default();
+    let mut frame = RawFrame::zero(cells.array);
     let mut index = 0;
     let mut bytes = packed.iter();
     while let Some(&byte) = bytes.next() {

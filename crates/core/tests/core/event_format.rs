@@ -5,6 +5,7 @@
 use std::time::Duration;
 
 use hardnessd_core::event::*;
+use hardnessd_core::frame::{Array, Frame, Pitch};
 use hardnessd_core::tare::Offsets;
 use hardnessd_core::verdict::Level;
 use jiff::Timestamp;
@@ -140,18 +141,20 @@ fn a_probability_has_at_most_six_digits_after_the_point() {
 
 #[test]
 fn frame_is_frozen_and_never_numbered() {
+    let mut shown = Frame::zero(Array { rows: 1, cols: 3 });
+    shown.newtons.copy_from_slice(&[0.0, 0.123_456, 10.2]);
     let mut frame = Event::Frame(FrameEvent::new(
         "forearm".to_owned(),
         time(),
         5,
-        vec![0.0, 0.123_456, 10.2],
+        &shown,
         2,
         true,
     ));
     frame.number(9);
     check(
         &frame.to_line(),
-        r#"{"type":"frame","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","frame":5,"rows":28,"cols":28,"newtons":[0.0,0.123,10.2],"contact_area_taxels":2,"tared":true,"approach_mm":null}"#,
+        r#"{"type":"frame","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","frame":5,"rows":1,"cols":3,"newtons":[0.0,0.123,10.2],"contact_area_taxels":2,"tared":true,"approach_mm":null}"#,
     );
 }
 
@@ -221,7 +224,7 @@ fn replies_are_frozen() {
             name: "forearm".to_owned(),
             rows: 28,
             cols: 28,
-            pitch_mm: 3.5,
+            pitch_mm: Pitch::JX255N,
         }],
         model: ModelCard {
             sha256: "00".to_owned(),

@@ -175,8 +175,8 @@ fn settled(course: &Course) -> Option<usize> {
     let frames = course
         .moments
         .iter()
-        .map(|moment| (time(moment), &moment.frame));
-    press::first_settled(frames, &press::Settings::default())
+        .map(|moment| (time(moment), &moment.frame.newtons[..]));
+    press::first_settled(frames, &press::Thresholds::default())
 }
 
 /// The upper median.

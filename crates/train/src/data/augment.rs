@@ -4,14 +4,14 @@
 //! because hardness shows in the contact's width and force.
 
 use crate::settings::AugmentationSettings;
-use hardnessd_core::frame::{COLS, Frame, ROWS};
+use hardnessd_core::verdict::{COLS, ModelFrame, ROWS};
 use hardnessd_simulator::random::Stream;
 
 /// Symmetries of the square: mirror rows, mirror columns, transpose.
 const SYMMETRIES: usize = 8;
 
 /// Draws one variant of `frame`.
-pub fn vary(frame: &Frame, settings: AugmentationSettings, stream: &mut Stream) -> Frame {
+pub fn vary(frame: &ModelFrame, settings: AugmentationSettings, stream: &mut Stream) -> ModelFrame {
     let symmetry = if settings.symmetries {
         stream.below(SYMMETRIES)
     } else {
@@ -24,9 +24,9 @@ pub fn vary(frame: &Frame, settings: AugmentationSettings, stream: &mut Stream) 
 }
 
 /// The image of `frame` under symmetry 0..8; 0 is the identity.
-fn turned(frame: &Frame, symmetry: usize) -> Frame {
+fn turned(frame: &ModelFrame, symmetry: usize) -> ModelFrame {
     const { assert!(ROWS == COLS, "a transposed frame must fit") };
-    let mut image = Frame::default();
+    let mut image = ModelFrame::default();
     for row in 0..ROWS {
         for column in 0..COLS {
             let (r, c) = if symmetry & 4 == 0 {
@@ -43,8 +43,8 @@ fn turned(frame: &Frame, symmetry: usize) -> Frame {
 }
 
 /// `frame` moved down by `rows` and right by `columns`.
-fn shifted(frame: &Frame, rows: isize, columns: isize) -> Frame {
-    let mut image = Frame::default();
+fn shifted(frame: &ModelFrame, rows: isize, columns: isize) -> ModelFrame {
+    let mut image = ModelFrame::default();
     for row in 0..ROWS {
         for column in 0..COLS {
             let from = (
@@ -63,15 +63,15 @@ fn shifted(frame: &Frame, rows: isize, columns: isize) -> Frame {
 mod tests {
     use super::*;
 
-    fn corner() -> Frame {
-        let mut frame = Frame::default();
+    fn corner() -> ModelFrame {
+        let mut frame = ModelFrame::default();
         frame.newtons[COLS + 2] = 1.0; // row 1, column 2
         frame
     }
 
     #[test]
     fn the_symmetries_are_eight_different_ones_that_keep_force_and_area() {
-        let images: Vec<Frame> = (0..SYMMETRIES).map(|s| turned(&corner(), s)).collect();
+        let images: Vec<ModelFrame> = (0..SYMMETRIES).map(|s| turned(&corner(), s)).collect();
         assert_eq!(images[0], corner());
         for (index, image) in images.iter().enumerate() {
             assert_eq!(image.force_n(), 1.0);

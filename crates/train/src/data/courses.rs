@@ -13,8 +13,7 @@ use super::dataset::{
     pitch_mm, warn_of_object_in_both_splits,
 };
 use super::npz::Writer;
-use hardnessd_core::frame::{COLS, Frame, ROWS, TAXELS};
-use hardnessd_core::verdict::COURSE_FRAMES;
+use hardnessd_core::verdict::{COLS, COURSE_FRAMES, ModelFrame, ROWS, TAXELS};
 use hardnessd_simulator::{LabelledCourse, NEWTONS_PER_COUNT, Split};
 
 /// Newtons per unit of [`Courses::frames_mn`].
@@ -122,7 +121,7 @@ impl Courses {
     pub fn push<'a>(
         &mut self,
         press: Press,
-        moments: impl Iterator<Item = (f32, Option<f32>, &'a Frame)>,
+        moments: impl Iterator<Item = (f32, Option<f32>, &'a ModelFrame)>,
     ) {
         let (first, number) = (self.press.len() as u32, self.presses.len() as u32);
         for (time_s, approach_mm, frame) in moments {
@@ -174,9 +173,9 @@ impl Courses {
     }
 
     /// A kept frame in newtons.
-    pub fn frame(&self, row: usize) -> Frame {
+    pub fn frame(&self, row: usize) -> ModelFrame {
         let taxels = &self.frames_mn[row * TAXELS..][..TAXELS];
-        Frame {
+        ModelFrame {
             newtons: std::array::from_fn(|k| f32::from(taxels[k]) * NEWTONS),
         }
     }
@@ -463,7 +462,7 @@ mod tests {
                 arm_n_per_mm: 0.0,
                 best: 0,
             };
-            courses.push(press, [(0.0, None, &Frame::default())].into_iter());
+            courses.push(press, [(0.0, None, &ModelFrame::default())].into_iter());
         }
         let path = directory.join(name);
         let bytes = courses.write(Cursor::new(Vec::new()), &json!({"pitch_mm": pitch_mm}));

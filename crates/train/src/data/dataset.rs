@@ -10,13 +10,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 pub use self::file::{meta, write};
-use hardnessd_core::frame::Frame;
-use hardnessd_core::verdict::Level;
+use hardnessd_core::frame::{Frame, Pitch};
+use hardnessd_core::verdict::{Laying, Level, ModelFrame};
 use hardnessd_simulator::random::Stream;
 use hardnessd_simulator::{LEVELS, LabelledSample, LevelRange, Split};
 
 /// The distance between taxels, unless a file names another one.
-pub use hardnessd_core::tare::PITCH_MM;
+pub const PITCH_MM: f64 = Pitch::JX255N.rows_mm;
 
 /// The four hardness levels of the paper's Table 1.
 pub fn levels() -> Vec<Level> {
@@ -108,7 +108,7 @@ pub enum LabelChoice {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
     /// The frame in newtons, after tare.
-    pub frame: Frame,
+    pub frame: ModelFrame,
     /// The hardness level 1..=4, or 0 for unlabelled.
     pub level: u8,
     /// The number of the pressed object, unique in the data set.
@@ -126,10 +126,15 @@ pub struct Sample {
     pub source: usize,
 }
 
+/// A frame of the simulated sensor, on the model's grid.
+pub fn laid(frame: &Frame) -> ModelFrame {
+    Laying::new(frame, Pitch::JX255N, PITCH_MM).lay(frame)
+}
+
 impl From<LabelledSample> for Sample {
     fn from(sample: LabelledSample) -> Self {
         Self {
-            frame: sample.frame,
+            frame: laid(&sample.frame),
             level: sample.level,
             object: Some(sample.object),
             material: Some(sample.material),

@@ -4,7 +4,7 @@
 //! for each frame, so that the frames are of many sensors. Forces are rounded to counts. The press
 //! stays: total force changes by about ten per cent, and the contact keeps its place.
 
-use hardnessd_core::frame::{COLS, Frame, ROWS, TAXELS};
+use hardnessd_core::verdict::{COLS, ModelFrame, ROWS, TAXELS};
 use hardnessd_simulator::NEWTONS_PER_COUNT;
 use hardnessd_simulator::random::Stream;
 
@@ -22,7 +22,7 @@ const THRESHOLD_N: (f64, f64) = (0.03, 0.2);
 const DEAD: f64 = 0.01;
 
 /// Draws one disturbed variant of `frame`.
-pub fn disturbed(frame: &Frame, stream: &mut Stream) -> Frame {
+pub fn disturbed(frame: &ModelFrame, stream: &mut Stream) -> ModelFrame {
     let mut spread = |most: f64| most * stream.uniform();
     let (taxel, line, whole) = (spread(GAIN_TAXEL), spread(GAIN_LINE), spread(GAIN_FRAME));
     let (crosstalk, dead) = (spread(CROSSTALK), spread(DEAD));
@@ -48,7 +48,7 @@ pub fn disturbed(frame: &Frame, stream: &mut Stream) -> Frame {
 }
 
 /// Each taxel after it gave `share` of its force to each of its neighbours.
-fn mixed(frame: &Frame, share: f32) -> Frame {
+fn mixed(frame: &ModelFrame, share: f32) -> ModelFrame {
     let mut image = *frame;
     for place in 0..TAXELS {
         let given: f32 = neighbours(place).map(|other| frame.newtons[other]).sum();
@@ -59,7 +59,7 @@ fn mixed(frame: &Frame, share: f32) -> Frame {
 
 /// The frame with each dead taxel replaced by the mean of the live taxels beside it. `tare` takes the
 /// diagonal ones too.
-fn filled(frame: &Frame, is_dead: &[bool]) -> Frame {
+fn filled(frame: &ModelFrame, is_dead: &[bool]) -> ModelFrame {
     let mut image = *frame;
     for place in (0..TAXELS).filter(|&place| is_dead[place]) {
         let live: Vec<f32> = neighbours(place)
@@ -88,8 +88,8 @@ fn neighbours(place: usize) -> impl Iterator<Item = usize> {
 mod tests {
     use super::*;
 
-    fn pressed() -> Frame {
-        let mut frame = Frame::default();
+    fn pressed() -> ModelFrame {
+        let mut frame = ModelFrame::default();
         for row in 10..16 {
             for column in 8..14 {
                 frame.newtons[row * COLS + column] = 0.6;

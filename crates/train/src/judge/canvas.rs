@@ -12,7 +12,7 @@ use embedded_graphics::mono_font::ascii::FONT_7X14;
 use embedded_graphics::pixelcolor::{Rgb888, RgbColor as _};
 use embedded_graphics::text::{Baseline, Text};
 use hardnessd_core::colour::viridis;
-use hardnessd_core::frame::{COLS, Frame, ROWS};
+use hardnessd_core::verdict::{COLS, ModelFrame, ROWS};
 
 /// Pixels per taxel along each axis.
 const ZOOM: usize = 4;
@@ -60,7 +60,7 @@ impl Canvas {
         let Ok(_) = Text::with_baseline(text, place, style, Baseline::Top).draw(self);
     }
 
-    pub(super) fn tile(&mut self, tile: usize, top: usize, frame: &Frame, caption: &str) {
+    pub(super) fn tile(&mut self, tile: usize, top: usize, frame: &ModelFrame, caption: &str) {
         let left = MARGIN + tile * (TILE + GAP);
         for (k, &newtons) in frame.newtons.iter().enumerate() {
             let (x, y) = (left + k % COLS * ZOOM, top + k / COLS * ZOOM);

@@ -8,8 +8,8 @@ use tract_onnx::pb;
 
 use crate::net::frames::AREA_THRESHOLDS_N;
 use crate::net::graph::{self, Graph};
-use hardnessd_core::frame::{COLS, Frame, ROWS, TAXELS};
 use hardnessd_core::press;
+use hardnessd_core::verdict::{COLS, ModelFrame, ROWS, TAXELS};
 
 /// The number of features of a frame.
 pub const FEATURES: usize = 18;
@@ -226,7 +226,7 @@ pub(super) fn feature_graph() -> (Graph, String) {
         columns: Vec::new(),
     };
     b.constants();
-    let contact = b.mask(press::Settings::default().contact_threshold_n);
+    let contact = b.mask(press::Thresholds::default().contact_threshold_n);
     let area = b.areas(&contact);
     let pressed = b.node("Mul", &[graph::INPUT, &contact], "pressed");
     let force = b.forces(&pressed, &area);
@@ -253,7 +253,7 @@ pub(super) fn feature_graph() -> (Graph, String) {
 /// # Errors
 ///
 /// Returns an error if the graph cannot be run.
-pub fn features<'a>(frames: impl Iterator<Item = &'a Frame>) -> anyhow::Result<Vec<Vec<f32>>> {
+pub fn features<'a>(frames: impl Iterator<Item = &'a ModelFrame>) -> anyhow::Result<Vec<Vec<f32>>> {
     let (graph, features) = feature_graph();
     let plan = graph::Plan::new(graph, &features, &[1, FEATURES]).context("features")?;
     frames.map(|frame| plan.run(frame)).collect()
@@ -283,7 +283,7 @@ mod tests {
     #[test]
     fn features_follow_their_names() {
         // Two taxels of 1 N and 3 N, side by side in row 4.
-        let mut frame = Frame::default();
+        let mut frame = ModelFrame::default();
         frame.newtons[4 * COLS + 10] = 1.0;
         frame.newtons[4 * COLS + 11] = 3.0;
         let row = &features([&frame].into_iter()).unwrap()[0];
@@ -317,7 +317,7 @@ mod tests {
 
     #[test]
     fn an_empty_frame_has_finite_features() {
-        let row = &features([&Frame::default()].into_iter()).unwrap()[0];
+        let row = &features([&ModelFrame::default()].into_iter()).unwrap()[0];
         assert!(row.iter().all(|x| x.is_finite()), "{row:?}");
     }
 }

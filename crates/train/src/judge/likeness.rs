@@ -6,7 +6,7 @@
 
 use crate::judge::features;
 use crate::net::image::PixelScale;
-use hardnessd_core::frame::{Frame, TAXELS};
+use hardnessd_core::verdict::{ModelFrame, TAXELS};
 
 /// A comparison of generated frames with real ones.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -42,7 +42,7 @@ impl Reference {
     /// # Errors
     ///
     /// Returns an error if the features cannot be computed.
-    pub fn of(frames: &[&Frame], scale: PixelScale) -> anyhow::Result<Self> {
+    pub fn of(frames: &[&ModelFrame], scale: PixelScale) -> anyhow::Result<Self> {
         let rows = features::features(frames.iter().copied())?;
         let (mean, deviation) = features::moments(&rows);
         let mut reference = Self {
@@ -61,7 +61,7 @@ impl Reference {
     /// # Errors
     ///
     /// Returns an error if the features cannot be computed.
-    pub fn compare(&self, frames: &[Frame], components: usize) -> anyhow::Result<Likeness> {
+    pub fn compare(&self, frames: &[ModelFrame], components: usize) -> anyhow::Result<Likeness> {
         let rows = self.standardised(&features::features(frames.iter())?);
         let across = 2.0 * mean_distance(&self.rows, &rows);
         let within = mean_distance_within(&self.rows) + mean_distance_within(&rows);
@@ -110,7 +110,7 @@ fn mean_distance_within(rows: &[Vec<f64>]) -> f64 {
     mean_distance(rows, rows) * n / (n - 1.0).max(1.0)
 }
 
-fn pixel_std<'a>(frames: impl ExactSizeIterator<Item = &'a Frame>, scale: PixelScale) -> f64 {
+fn pixel_std<'a>(frames: impl ExactSizeIterator<Item = &'a ModelFrame>, scale: PixelScale) -> f64 {
     let n = frames.len() as f64;
     let mut sums = vec![(0.0_f64, 0.0_f64); TAXELS];
     for frame in frames {
@@ -130,6 +130,7 @@ fn pixel_std<'a>(frames: impl ExactSizeIterator<Item = &'a Frame>, scale: PixelS
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::data::dataset::laid;
     use hardnessd_simulator::{DatasetSettings, dataset};
 
     const SCALE: PixelScale = PixelScale {
@@ -137,7 +138,7 @@ mod tests {
         log_above_n: 0.0,
     };
 
-    fn frames(seed: u64, level: u8) -> Vec<Frame> {
+    fn frames(seed: u64, level: u8) -> Vec<ModelFrame> {
         let settings = DatasetSettings {
             seed,
             objects: 8,
@@ -148,7 +149,7 @@ mod tests {
         dataset(&settings, 1, |_| ())
             .into_iter()
             .filter(|sample| sample.level == level)
-            .map(|sample| sample.frame)
+            .map(|sample| laid(&sample.frame))
             .collect()
     }
 
@@ -172,7 +173,7 @@ mod tests {
         assert!(likeness.pixel_std < 1e-6, "{likeness:?}");
         assert!(likeness.feature_distance > 0.3, "{likeness:?}");
         // The 20 frames are five components, each of which gives one frame only.
-        let components: Vec<Frame> = (0..20).map(|n| real[10 * (n % 5) + 9]).collect();
+        let components: Vec<ModelFrame> = (0..20).map(|n| real[10 * (n % 5) + 9]).collect();
         let likeness = reference.compare(&components, 5).unwrap();
         assert!(likeness.pixel_std > 1e-4, "{likeness:?}");
         assert!(likeness.pixel_std_component < 1e-6, "{likeness:?}");

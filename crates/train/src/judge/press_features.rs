@@ -4,9 +4,9 @@
 //! In: the features of a press's frames, their times, the arm's approach. Out: a row of numbers per
 //! press.
 
+use crate::data::dataset::PITCH_MM;
 use crate::net::course::PressMoment;
 use crate::net::frames::FEATURES;
-use hardnessd_core::tare::PITCH_MM;
 
 /// Shares of the greatest force at which area and indentation are read off while the force rises.
 const SHARES: [f32; 3] = [0.25, 0.5, 0.75];

@@ -6,8 +6,10 @@
 use std::collections::BTreeMap;
 
 use super::canvas::{Canvas, GAP, MARGIN, TEXT, TILE};
-use hardnessd_core::frame::{Frame, RawFrame};
+use crate::data::dataset::laid;
+use hardnessd_core::frame::{Array, Frame, RawFrame};
 use hardnessd_core::press;
+use hardnessd_core::verdict::ModelFrame;
 use hardnessd_simulator::{
     CourseMoment, LabelledCourse, LabelledSample, Material, Materials, NEWTONS_PER_COUNT,
     material_names,
@@ -51,7 +53,7 @@ pub fn sheet(
         for (tile, sample) in spread(&of_material).enumerate() {
             let area = sample.frame.contact_area_taxels(threshold_n);
             let caption = format!("{:.0} N, {:.0}, {area}", sample.force_n, sample.shore);
-            canvas.tile(tile, top, &sample.frame, &caption);
+            canvas.tile(tile, top, &laid(&sample.frame), &caption);
         }
         top += ROW;
     }
@@ -67,10 +69,7 @@ pub fn sheet(
         name(&mut canvas, top, usize::from(material.index()));
         let press = first_press(frames);
         for (tile, &(number, raw)) in spread(&press).enumerate() {
-            let newtons = raw
-                .counts
-                .map(|counts| f32::from(counts) * NEWTONS_PER_COUNT);
-            let frame = Frame { newtons };
+            let frame = of_counts(&raw.counts);
             canvas.tile(
                 tile,
                 top,
@@ -84,19 +83,30 @@ pub fn sheet(
     canvas.png()
 }
 
+/// The frame with these counts of the simulated sensor.
+fn of_counts(counts: &[u16]) -> ModelFrame {
+    let newtons = counts.iter();
+    laid(&Frame {
+        array: Array::JX255N,
+        newtons: newtons
+            .map(|&counts| f32::from(counts) * NEWTONS_PER_COUNT)
+            .collect(),
+    })
+}
+
 /// A named row of frames, each with a caption.
 #[derive(Debug)]
 pub struct Strip<'a> {
     /// The row's name, drawn to the left of the frames.
     pub name: String,
     /// The frames with their captions. At most twelve are drawn.
-    pub tiles: Vec<(&'a Frame, String)>,
+    pub tiles: Vec<(&'a ModelFrame, String)>,
 }
 
 impl<'a> Strip<'a> {
     /// A row of frames whose captions give contact area, force and greatest taxel.
-    pub fn of(name: &str, frames: impl Iterator<Item = &'a Frame>) -> Self {
-        let tile = |frame: &'a Frame| {
+    pub fn of(name: &str, frames: impl Iterator<Item = &'a ModelFrame>) -> Self {
+        let tile = |frame: &'a ModelFrame| {
             let peak = frame.newtons.iter().copied().fold(0.0, f32::max);
             let area = frame.contact_area_taxels(contact_threshold_n());
             let force = frame.force_n();
@@ -110,7 +120,7 @@ impl<'a> Strip<'a> {
 }
 
 fn contact_threshold_n() -> f32 {
-    press::Settings::default().contact_threshold_n
+    press::Thresholds::default().contact_threshold_n
 }
 
 /// The meaning of the captions of [`Strip::of`], for titles.
@@ -163,19 +173,16 @@ pub fn courses(courses: &[LabelledCourse]) -> anyhow::Result<Vec<u8>> {
         let key = (course.material, course.level);
         shown.entry(key).or_insert(course);
     }
-    let newtons = |moment: &CourseMoment| Frame {
-        newtons: moment
-            .counts
-            .map(|counts| f32::from(counts) * NEWTONS_PER_COUNT),
-    };
-    let frames: Vec<(&LabelledCourse, Vec<Frame>)> = shown
+    let newtons = |moment: &CourseMoment| of_counts(&moment.counts);
+    let frames: Vec<(&LabelledCourse, Vec<ModelFrame>)> = shown
         .into_values()
         .map(|course| (course, course.moments.iter().map(newtons).collect()))
         .collect();
     let rows: Vec<Strip> = frames
         .iter()
         .map(|(course, frames)| {
-            let pairs: Vec<(&CourseMoment, &Frame)> = course.moments.iter().zip(frames).collect();
+            let pairs: Vec<(&CourseMoment, &ModelFrame)> =
+                course.moments.iter().zip(frames).collect();
             let name = material_names(Materials::Broad)[usize::from(course.material)];
             Strip {
                 name: format!("{} {:.0}", name.trim_start_matches("broad-"), course.shore),

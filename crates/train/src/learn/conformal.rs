@@ -56,7 +56,8 @@ impl Calibration {
 
     /// The calibration of a network that learnt no Shore hardness: its interval is the whole scale.
     pub const WITHOUT_SHORE: Self = Self {
-        widths: [100.0; 2],
+        // An untrained output may lie outside the scale.
+        widths: [1000.0; 2],
         ..Self::NONE
     };
 

@@ -23,8 +23,7 @@ use crate::run::Run;
 use crate::run::checkpoint::Origin;
 use crate::run::progress::ensure_finite_logits;
 use crate::settings::{ArmReports, Training};
-use hardnessd_core::frame::Frame;
-use hardnessd_core::verdict::argmax;
+use hardnessd_core::verdict::{ModelFrame, argmax};
 use hardnessd_simulator::random::Stream;
 
 mod varied;
@@ -80,7 +79,7 @@ fn prepared(courses: &Courses, numbers: &[usize], force_factor: f32) -> anyhow::
             .filter(|&row| courses.time_s[row] >= 0.0);
         let rows: Vec<usize> = rows.take(FRAMES).collect();
         let frame = |&row: &usize| courses.frame(row).times(force_factor);
-        let frames: Vec<Frame> = rows.iter().map(frame).collect();
+        let frames: Vec<ModelFrame> = rows.iter().map(frame).collect();
         let features = plan.of(&frames)?;
         let moment = |(&row, of_frame): (&usize, &[f32])| PressMoment {
             time_s: courses.time_s[row],

@@ -23,8 +23,7 @@ use crate::run::checkpoint::{Checkpoint, Origin, Progress};
 use crate::run::history::Row;
 use crate::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
 use crate::settings::{ConsistencySettings, Keep, Training, Validation};
-use hardnessd_core::frame::Frame;
-use hardnessd_core::verdict::argmax;
+use hardnessd_core::verdict::{ModelFrame, argmax};
 use hardnessd_simulator::random::Stream;
 
 /// Samples per pass without gradients.
@@ -73,11 +72,11 @@ impl Trained {
     /// Logits of `frames`, a row each, before temperature.
     pub fn logits<'a>(
         &self,
-        frames: impl Iterator<Item = &'a Frame>,
+        frames: impl Iterator<Item = &'a ModelFrame>,
         scale: PixelScale,
         device: &Device,
     ) -> Vec<Vec<f32>> {
-        let frames: Vec<&Frame> = frames.collect();
+        let frames: Vec<&ModelFrame> = frames.collect();
         let mut rows = Vec::with_capacity(frames.len());
         for part in frames.chunks(JUDGED_AT_ONCE) {
             let images = scale.images(part.iter().copied(), device);
@@ -319,7 +318,7 @@ impl Task<'_> {
     /// Images of one batch, augmented for step `step`.
     fn images(&self, indices: &[usize], step: u64) -> Tensor<4> {
         let mut stream = self.stream("augmentation").child(step);
-        let frames: Vec<Frame> = indices
+        let frames: Vec<ModelFrame> = indices
             .iter()
             .map(|&index| {
                 let frame = &self.dataset.samples[index].frame;
@@ -350,7 +349,7 @@ impl Task<'_> {
 
         let weak = self.images(indices, step | UNLABELLED);
         let mut stream = self.stream("disturbance").child(step);
-        let frames: Vec<Frame> = indices
+        let frames: Vec<ModelFrame> = indices
             .iter()
             .map(|&index| {
                 let frame = &self.dataset.samples[index].frame;

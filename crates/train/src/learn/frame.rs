@@ -25,8 +25,7 @@ use crate::run::Run;
 use crate::run::checkpoint::Origin;
 use crate::run::progress::ensure_finite_logits;
 use crate::settings::{ConsistencySettings, Training};
-use hardnessd_core::frame::Frame;
-use hardnessd_core::verdict::argmax;
+use hardnessd_core::verdict::{ModelFrame, argmax};
 use hardnessd_simulator::random::Stream;
 
 /// How far the weights of levels with few samples are raised towards equal levels, unless the
@@ -78,7 +77,7 @@ impl Trained {
     /// Fails if features cannot be computed.
     pub fn judge(
         &self,
-        frames: &[Frame],
+        frames: &[ModelFrame],
         plan: &Features,
         levels: usize,
         device: &Device,
@@ -213,13 +212,13 @@ impl Task<'_> {
         Stream::new(self.seed, &format!("{} {name}", self.stage))
     }
 
-    fn frames(&self, samples: &[usize]) -> Vec<Frame> {
+    fn frames(&self, samples: &[usize]) -> Vec<ModelFrame> {
         let frame = |&sample: &usize| self.dataset.samples[sample].frame;
         samples.iter().map(frame).collect()
     }
 
     /// The frames of `samples`, each augmented as the settings say.
-    fn varied(&self, samples: &[usize], stream: &mut Stream) -> Vec<Frame> {
+    fn varied(&self, samples: &[usize], stream: &mut Stream) -> Vec<ModelFrame> {
         let vary = |frame| augment::vary(&frame, self.settings.augmentation, stream);
         self.frames(samples).into_iter().map(vary).collect()
     }
@@ -233,7 +232,7 @@ impl Task<'_> {
         (standard, weights): (&Standard, &Tensor<2>),
         batch: Batch,
     ) -> anyhow::Result<(f64, usize)> {
-        let of = |frames: &[Frame]| frame::Batch::new(frames, plan, standard, self.device);
+        let of = |frames: &[ModelFrame]| frame::Batch::new(frames, plan, standard, self.device);
         let mut stream = self.stream("augmentation").child(batch.step);
         let images = of(&self.varied(batch.samples, &mut stream))?;
         let pseudo = self.unlabelled_views(batch, &mut stream);
@@ -276,7 +275,7 @@ impl Task<'_> {
         &self,
         batch: Batch,
         stream: &mut Stream,
-    ) -> Option<(Vec<Frame>, Vec<Frame>)> {
+    ) -> Option<(Vec<ModelFrame>, Vec<ModelFrame>)> {
         let (all, settings) = self.unlabelled;
         if all.is_empty() || batch.step == 0 {
             return None;

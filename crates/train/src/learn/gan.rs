@@ -22,7 +22,7 @@ use crate::run::checkpoint::{Checkpoint, Origin, Progress};
 use crate::run::history::{Adversarial, Row};
 use crate::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
 use crate::settings::GanSettings;
-use hardnessd_core::frame::Frame;
+use hardnessd_core::verdict::ModelFrame;
 use hardnessd_simulator::random::Stream;
 
 mod samples;
@@ -288,7 +288,7 @@ impl Task<'_> {
         order
     }
 
-    fn frames(&self, indices: &[usize]) -> Vec<&Frame> {
+    fn frames(&self, indices: &[usize]) -> Vec<&ModelFrame> {
         let frame = |&index: &usize| &self.dataset.samples[index].frame;
         indices.iter().map(frame).collect()
     }

@@ -12,7 +12,7 @@ use crate::model::export::{self, Recogniser};
 use crate::run::history::Row;
 use crate::run::{Description, Run};
 use crate::stages;
-use hardnessd_core::frame::Frame;
+use hardnessd_core::verdict::ModelFrame;
 
 /// Fits the regression and writes the model and its evaluation to the run's directory.
 ///
@@ -53,7 +53,7 @@ pub fn train(
         temperature: 1.0,
         force_factor: 1.0,
     };
-    let probabilities = |frames: &[&Frame]| {
+    let probabilities = |frames: &[&ModelFrame]| {
         let rows = features::features(frames.iter().copied())?;
         Ok(rows.iter().map(|row| baseline.probabilities(row)).collect())
     };

@@ -14,7 +14,7 @@ use crate::net::frames::Features;
 use crate::net::start::ExportedNetwork;
 use crate::run::{Description, Run};
 use crate::stages;
-use hardnessd_core::frame::Frame;
+use hardnessd_core::verdict::ModelFrame;
 
 /// The samples of a run, by their use.
 #[derive(Debug)]
@@ -94,8 +94,8 @@ fn finish(
     let levels = dataset::levels().len();
     let plan = Features::new().context("features")?;
     let calibration = trained.calibration;
-    let probabilities = |frames: &[&Frame]| {
-        let frames: Vec<Frame> = frames.iter().copied().copied().collect();
+    let probabilities = |frames: &[&ModelFrame]| {
+        let frames: Vec<ModelFrame> = frames.iter().copied().copied().collect();
         let judged = trained.judge(&frames, &plan, levels, device)?;
         let logits: Vec<Vec<f32>> = judged.into_iter().map(|(logits, _)| logits).collect();
         Ok(temperature::probabilities(
@@ -109,7 +109,7 @@ fn finish(
     } else {
         ("held-out", samples.held_out)
     };
-    let frames: Vec<&Frame> = shown
+    let frames: Vec<&ModelFrame> = shown
         .iter()
         .map(|&index| &samples.dataset.samples[index].frame)
         .collect();

@@ -15,9 +15,10 @@ use super::export;
 use super::file;
 use crate::data::dataset::{self, Dataset};
 use crate::net::graph::{INPUT, frame_input, integer, value_info};
-use hardnessd_core::frame::{COLS, Frame, ROWS};
 use hardnessd_core::trial;
-use hardnessd_core::verdict::{COURSE_FRAMES, Card, Check, Checks, Hrn, course_inputs, describe};
+use hardnessd_core::verdict::{
+    COLS, COURSE_FRAMES, Card, Check, Checks, Hrn, ModelFrame, ROWS, course_inputs, describe,
+};
 use hardnessd_simulator::Split;
 
 /// The least probability before a logarithm, because the file's probabilities may round to 0.
@@ -277,7 +278,7 @@ pub fn adopt(
     let unchecked = proto.encode_to_vec();
     trial::survives(&unchecked)?;
     let hrn = Hrn::read(&unchecked)?;
-    let computed = |frame: &&Frame| Ok(hrn.judge(frame)?.probabilities);
+    let computed = |frame: &&ModelFrame| Ok(hrn.judge(frame)?.probabilities);
     let computed: anyhow::Result<Vec<Vec<f32>>> = frames.iter().map(computed).collect();
     check.probabilities = computed?;
     let evaluation = match dataset.labelled(Split::Test) {

@@ -13,9 +13,8 @@ use crate::data::dataset::{self, Dataset, Kind, Source};
 use crate::judge::metrics::Judged;
 use crate::net::graph::Graph;
 use crate::run::{Description, Run};
-use hardnessd_core::frame::Frame;
 use hardnessd_core::press;
-use hardnessd_core::verdict::{Card, Check, Checks, Hrn, Range};
+use hardnessd_core::verdict::{Card, Check, Checks, Hrn, ModelFrame, Range};
 use hardnessd_simulator::Split;
 
 /// Check frames per level (`docs/formats.md`).
@@ -48,7 +47,7 @@ pub fn finish(
     dataset: &Dataset,
     train: &[usize],
     recogniser: &Recogniser,
-    probabilities: impl Fn(&[&Frame]) -> anyhow::Result<Vec<Vec<f32>>>,
+    probabilities: impl Fn(&[&ModelFrame]) -> anyhow::Result<Vec<Vec<f32>>>,
 ) -> anyhow::Result<Option<Evaluated>> {
     let frames = check_frames(dataset, train);
     let checks = Checks::Frames(Check {
@@ -173,7 +172,7 @@ fn evaluations_by_source(hrn: &Hrn, dataset: &Dataset) -> anyhow::Result<serde_j
 }
 
 /// Two frames of each level: those one third and two thirds through its samples.
-pub(super) fn check_frames<'a>(dataset: &'a Dataset, train: &[usize]) -> Vec<&'a Frame> {
+pub(super) fn check_frames<'a>(dataset: &'a Dataset, train: &[usize]) -> Vec<&'a ModelFrame> {
     let mut frames = Vec::new();
     for level in dataset::levels() {
         let of_level = |index: &usize| dataset.samples[*index].level == level.level;
@@ -216,8 +215,8 @@ pub(super) fn validation(sources: &[Source]) -> &'static str {
 }
 
 /// The range of total force and contact area of the training frames.
-pub(super) fn range(frames: impl Iterator<Item = Frame>) -> Range {
-    let threshold_n = press::Settings::default().contact_threshold_n;
+pub(super) fn range(frames: impl Iterator<Item = ModelFrame>) -> Range {
+    let threshold_n = press::Thresholds::default().contact_threshold_n;
     let mut range = Range {
         force_n: [f32::INFINITY, 0.0],
         contact_area_taxels: [u32::MAX, 0],

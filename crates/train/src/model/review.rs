@@ -14,11 +14,10 @@ use tract_onnx::pb;
 
 use super::adopt::{decode, has_course_inputs, mend_input, mend_outputs, set};
 use crate::data::dataset;
-use hardnessd_core::frame::{Frame, TAXELS};
 use hardnessd_core::trial;
 use hardnessd_core::verdict::{
     Card, Check, CheckedCourse, Checks, Course, CourseCheck, CourseMoment, Hrn, Level, MIN_OPSET,
-    ModelError, Range,
+    ModelError, ModelFrame, Range, TAXELS,
 };
 
 /// The parts of the file and of its graph.
@@ -267,7 +266,7 @@ impl Format {
                 let moment = CourseMoment {
                     time_s: 0.0,
                     approach_mm: None,
-                    frame: Frame {
+                    frame: ModelFrame {
                         newtons: [1.0; TAXELS],
                     },
                 };

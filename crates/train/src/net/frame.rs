@@ -17,7 +17,7 @@ use crate::net::network::{self, LEAKY_SLOPE, TRUNK, Weights, as_images, dense, p
 use crate::net::shore;
 use crate::net::standard::Standard;
 use crate::net::start::ExportedNetwork;
-use hardnessd_core::frame::Frame;
+use hardnessd_core::verdict::ModelFrame;
 use hardnessd_simulator::random::Stream;
 
 /// The scale from newtons to an image. It is logarithmic, so that the light taxels of a contact's
@@ -77,13 +77,13 @@ impl Batch {
     ///
     /// Returns an error if the features cannot be computed.
     pub fn new(
-        frames: &[Frame],
+        frames: &[ModelFrame],
         plan: &Features,
         standard: &Standard,
         device: &Device,
     ) -> anyhow::Result<Self> {
-        let times = |frame: &Frame| frame.times(standard.force_factor);
-        let frames: Vec<Frame> = frames.iter().map(times).collect();
+        let times = |frame: &ModelFrame| frame.times(standard.force_factor);
+        let frames: Vec<ModelFrame> = frames.iter().map(times).collect();
         let rows = plan.of(&frames)?;
         let rows = rows.iter().enumerate();
         let rows: Vec<f32> = rows
@@ -147,11 +147,12 @@ pub fn graph(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::data::dataset::laid;
     use crate::net::graph::Plan;
     use crate::net::network::numbers;
     use hardnessd_simulator::{self, DatasetSettings};
 
-    fn frames() -> Vec<Frame> {
+    fn frames() -> Vec<ModelFrame> {
         let settings = DatasetSettings {
             objects: 1,
             test_objects: 0,
@@ -159,10 +160,10 @@ mod tests {
             ..DatasetSettings::default()
         };
         let samples = hardnessd_simulator::dataset(&settings, 1, |_| ());
-        samples.iter().map(|sample| sample.frame).collect()
+        samples.iter().map(|sample| laid(&sample.frame)).collect()
     }
 
-    fn prepared(frames: &[Frame], device: &Device) -> (Batch, Standard) {
+    fn prepared(frames: &[ModelFrame], device: &Device) -> (Batch, Standard) {
         let plan = Features::new().unwrap();
         let rows = plan.of(frames).unwrap();
         let standard = Standard::of(FEATURES, rows.chunks(FEATURES));

@@ -8,8 +8,8 @@
 
 use crate::net::builder::Builder;
 use crate::net::graph::{Graph, Plan, integer, integers};
-use hardnessd_core::frame::{COLS, Frame, ROWS, TAXELS};
 use hardnessd_core::press;
+use hardnessd_core::verdict::{COLS, ModelFrame, ROWS, TAXELS};
 
 /// The number of frames that are computed in one pass.
 const FRAMES_AT_ONCE: usize = 48;
@@ -48,7 +48,7 @@ pub(super) fn nodes(b: &mut Builder, input: &str, frames: usize) -> (String, Str
     b.0.constant("sums", &[TAXELS, SUMS], &sums);
     b.0.indices("taxel axes", &[2, 3]);
 
-    let contact = contact(b, input, press::Settings::default().contact_threshold_n);
+    let contact = contact(b, input, press::Thresholds::default().contact_threshold_n);
     let pressed = b.node("Mul", &[input, &contact], "pressed");
     let counts: Vec<String> = AREA_THRESHOLDS_N
         .iter()
@@ -261,7 +261,7 @@ impl Features {
     /// # Errors
     ///
     /// Returns an error if the inference library fails.
-    pub fn of(&self, frames: &[Frame]) -> anyhow::Result<Vec<f32>> {
+    pub fn of(&self, frames: &[ModelFrame]) -> anyhow::Result<Vec<f32>> {
         let mut features = Vec::with_capacity(frames.len() * FEATURES);
         for part in frames.chunks(FRAMES_AT_ONCE) {
             let mut newtons = vec![0.0; FRAMES_AT_ONCE * TAXELS];
@@ -287,11 +287,11 @@ mod tests {
     fn a_taxel_counts_from_its_threshold_on() {
         let plan = Features::new().unwrap();
         let of = |newtons: f32| {
-            let mut frame = Frame::default();
+            let mut frame = ModelFrame::default();
             frame.newtons[300..310].fill(newtons);
             plan.of(&[frame]).unwrap()
         };
-        let contact_n = press::Settings::default().contact_threshold_n;
+        let contact_n = press::Thresholds::default().contact_threshold_n;
         let thresholds = [&[contact_n], AREA_THRESHOLDS_N.as_slice()].concat();
         for (place, &threshold_n) in thresholds.iter().enumerate() {
             let ends = [threshold_n.next_down(), threshold_n, threshold_n.next_up()];
@@ -305,14 +305,14 @@ mod tests {
 
     #[test]
     fn features_are_those_of_a_frame_by_hand() {
-        let mut frame = Frame::default();
+        let mut frame = ModelFrame::default();
         // Two taxels of one row with a taxel between them, and one that is too light to count.
         frame.newtons[10 * COLS + 4] = 1.0;
         frame.newtons[10 * COLS + 6] = 3.0;
         frame.newtons[20 * COLS + 20] = 0.01;
         let found = Features::new()
             .unwrap()
-            .of(&[Frame::default(), frame])
+            .of(&[ModelFrame::default(), frame])
             .unwrap();
         let ln = f32::ln;
         // The columns' variance is 0.75 with the forces as weights, and 1 with all taxels alike.

@@ -12,8 +12,8 @@ use crate::net::network::{
     FEATURES, Normalisation, Statistics, Weights, batch_norm, numbers, truncated_normal,
 };
 use crate::net::sensed::Sensor;
-use hardnessd_core::frame::{COLS, Frame, ROWS, TAXELS};
 use hardnessd_core::press;
+use hardnessd_core::verdict::{COLS, ModelFrame, ROWS, TAXELS};
 use hardnessd_simulator::random::Stream;
 
 /// n: noise values per image (paper, "Training of STGAN and USTGAN").
@@ -246,8 +246,12 @@ pub struct Making<'a> {
 ///
 /// A frame that is not a press is drawn again, because recorded samples are all presses. A
 /// component that still has too few after eight rounds keeps whatever it makes.
-pub fn generate(making: &Making, samples_a_component: usize, stream: &mut Stream) -> Vec<Frame> {
-    let mut of_component: Vec<Vec<Frame>> = vec![Vec::new(); COMPONENTS];
+pub fn generate(
+    making: &Making,
+    samples_a_component: usize,
+    stream: &mut Stream,
+) -> Vec<ModelFrame> {
+    let mut of_component: Vec<Vec<ModelFrame>> = vec![Vec::new(); COMPONENTS];
     for round in 0..=DRAWN_AGAIN {
         let missing = of_component
             .iter()
@@ -280,15 +284,15 @@ pub fn generate(making: &Making, samples_a_component: usize, stream: &mut Stream
 }
 
 /// Whether a press would begin with the frame, by the default settings.
-fn is_press(frame: &Frame) -> bool {
-    let settings = press::Settings::default();
+fn is_press(frame: &ModelFrame) -> bool {
+    let settings = press::Thresholds::default();
     frame.contact_area_taxels(settings.contact_threshold_n) >= settings.begin_area_taxels
 }
 
 /// Images `[batch, 1, 28, 28]` in [-1, 1] as the frames that the sensor would give.
-pub fn frames(images: &Tensor<4>, scale: PixelScale, sensor: Sensor) -> Vec<Frame> {
+pub fn frames(images: &Tensor<4>, scale: PixelScale, sensor: Sensor) -> Vec<ModelFrame> {
     let frame = |values: &[f32]| {
-        let mut frame = Frame::default();
+        let mut frame = ModelFrame::default();
         for (newtons, value) in frame.newtons.iter_mut().zip(values) {
             *newtons = sensor.newtons(scale.newtons(*value));
         }
@@ -371,7 +375,7 @@ mod tests {
         for component in 0..COMPONENTS {
             for sample in 1..samples {
                 let frame = &frames[sample * COMPONENTS + component];
-                let distance = |other: &Frame| -> f32 {
+                let distance = |other: &ModelFrame| -> f32 {
                     let pairs = frame.newtons.iter().zip(&other.newtons);
                     pairs.map(|(a, b)| (a - b).abs()).sum()
                 };
@@ -416,7 +420,7 @@ mod tests {
             making.scale,
             making.sensor,
         );
-        let presses = |frames: &[Frame]| frames.iter().filter(|frame| is_press(frame)).count();
+        let presses = |frames: &[ModelFrame]| frames.iter().filter(|frame| is_press(frame)).count();
         let drawn = generate(&making, 4, &mut Stream::new(1, "drawn"));
         let (before, after) = (presses(&once), presses(&drawn));
         assert_eq!((once.len(), drawn.len()), (4 * COMPONENTS, 4 * COMPONENTS));

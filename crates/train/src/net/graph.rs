@@ -9,8 +9,7 @@ use std::collections::BTreeMap;
 use tract_onnx::pb;
 use tract_onnx::prelude::*;
 
-use hardnessd_core::frame::{COLS, Frame, ROWS};
-use hardnessd_core::verdict::MIN_OPSET;
+use hardnessd_core::verdict::{COLS, MIN_OPSET, ModelFrame, ROWS};
 
 /// Shape and numbers of a constant of a graph.
 pub type Constant = (Vec<usize>, Vec<f32>);
@@ -181,7 +180,7 @@ impl Plan {
     /// # Errors
     ///
     /// Returns an error if the inference library fails.
-    pub fn run(&self, frame: &Frame) -> anyhow::Result<Vec<f32>> {
+    pub fn run(&self, frame: &ModelFrame) -> anyhow::Result<Vec<f32>> {
         self.run_on(&frame.newtons)
     }
 

@@ -10,7 +10,7 @@ use crate::net::image::PixelScale;
 use crate::net::layers::STRIDE;
 use crate::net::network::{self, FEATURES, LEAKY_SLOPE, Normalisation, Statistics, TRUNK, Weights};
 use crate::settings::network::Pooling;
-use hardnessd_core::frame::ROWS;
+use hardnessd_core::verdict::ROWS;
 use hardnessd_simulator::random::Stream;
 
 /// An exported HRN to continue training from.
@@ -269,7 +269,8 @@ fn pool_nodes(graph: &mut Graph, x: &str, with_means: bool) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hardnessd_core::frame::{COLS, Frame};
+    use crate::data::dataset::laid;
+    use hardnessd_core::verdict::{COLS, ModelFrame};
     use hardnessd_simulator::{self, DatasetSettings};
 
     fn device() -> Device {
@@ -284,8 +285,8 @@ mod tests {
     }
 
     /// A frame with a Gaussian blob of `width` taxels at (row, column).
-    fn blob(row: f32, column: f32, width: f32) -> Frame {
-        let mut frame = Frame::default();
+    fn blob(row: f32, column: f32, width: f32) -> ModelFrame {
+        let mut frame = ModelFrame::default();
         for (index, newtons) in frame.newtons.iter_mut().enumerate() {
             let (r, c) = ((index / COLS) as f32 - row, (index % COLS) as f32 - column);
             *newtons = 2.0 * (-(r * r + c * c) / (2.0 * width * width)).exp();
@@ -300,7 +301,7 @@ mod tests {
 
     #[test]
     fn every_parameter_receives_a_gradient() {
-        let frames: Vec<Frame> = (0..8).map(|n| blob(9.0 + n as f32, 14.0, 2.0)).collect();
+        let frames: Vec<ModelFrame> = (0..8).map(|n| blob(9.0 + n as f32, 14.0, 2.0)).collect();
         let weights = initial(4, Pooling::MaxMean, 3, &device()).tracked();
         let x = scale(10.2).images(frames.iter(), &device());
         let y = targets((0..8).map(|n| n % 4 + 1), 4, &device());
@@ -324,7 +325,7 @@ mod tests {
 
     #[test]
     fn gradients_agree_with_finite_differences() {
-        let frames: Vec<Frame> = (0..6)
+        let frames: Vec<ModelFrame> = (0..6)
             .map(|n| blob(8.0 + 2.0 * n as f32, 13.0, 2.5))
             .collect();
         let mut weights = initial(4, Pooling::MaxMean, 5, &device());
@@ -363,7 +364,7 @@ mod tests {
 
     #[test]
     fn statistics_of_a_batch_give_its_own_logits() {
-        let frames: Vec<Frame> = (0..5).map(|n| blob(9.0 + n as f32, 14.0, 2.0)).collect();
+        let frames: Vec<ModelFrame> = (0..5).map(|n| blob(9.0 + n as f32, 14.0, 2.0)).collect();
         let weights = initial(4, Pooling::Max, 9, &device());
         let x = scale(10.2).images(frames.iter(), &device());
         let mut statistics = Statistics::default();
@@ -390,7 +391,7 @@ mod tests {
     }
 
     fn check_graph(pooling: Pooling, scale: PixelScale) {
-        let frames: Vec<Frame> = (0..5).map(|n| blob(9.0 + n as f32, 14.0, 2.0)).collect();
+        let frames: Vec<ModelFrame> = (0..5).map(|n| blob(9.0 + n as f32, 14.0, 2.0)).collect();
         let weights = initial(4, pooling, 9, &device()).moved(9, &device());
         let x = scale.images(frames.iter(), &device());
         let mut statistics = Statistics::default();
@@ -450,13 +451,14 @@ mod tests {
             1,
             |_| (),
         );
+        let frames: Vec<_> = samples.iter().map(|sample| laid(&sample.frame)).collect();
         let weights = initial(4, Pooling::Max, 1, &device());
         for log_above_n in [0.0, 0.1] {
             let scale = PixelScale {
                 log_above_n,
                 ..scale(10.2)
             };
-            let images = scale.images(samples.iter().map(|sample| &sample.frame), &device());
+            let images = scale.images(frames.iter(), &device());
             let mut statistics = Statistics::default();
             logits(
                 &weights,

@@ -4,7 +4,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 
 use crate::net::graph::Graph;
-use hardnessd_core::frame::{COLS, Frame, ROWS, TAXELS};
+use hardnessd_core::verdict::{COLS, ModelFrame, ROWS, TAXELS};
 
 /// One scale for all frames, because force carries hardness: 0 N is -1, the full scale is 1.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -60,7 +60,7 @@ impl PixelScale {
     /// Frames as images `[batch, 1, 28, 28]` in [-1, 1].
     pub fn images<'a>(
         self,
-        frames: impl ExactSizeIterator<Item = &'a Frame>,
+        frames: impl ExactSizeIterator<Item = &'a ModelFrame>,
         device: &Device,
     ) -> Tensor<4> {
         let batch = frames.len();

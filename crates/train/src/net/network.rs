@@ -10,7 +10,7 @@
 use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::net::layers::{Geometry, convolution, leaky_relu, normalised};
-use hardnessd_core::frame::{COLS, ROWS};
+use hardnessd_core::verdict::{COLS, ROWS};
 use hardnessd_simulator::random::Stream;
 
 /// Batch normalisation's epsilon in the discriminator. It must lie far below the variances that it

@@ -10,7 +10,7 @@ use burn::tensor::{Tensor, TensorData};
 
 use crate::net::image::PixelScale;
 use crate::net::network::numbers;
-use hardnessd_core::frame::Frame;
+use hardnessd_core::verdict::ModelFrame;
 
 /// The number of frames, spread over all of them, from which the step is read.
 const FRAMES: usize = 200;
@@ -28,8 +28,9 @@ pub struct Sensor {
 
 impl Sensor {
     /// Reads step, threshold and greatest force off the frames of a sensor.
-    pub fn of(frames: &[&Frame]) -> Self {
-        let pressed = |frame: &&Frame| frame.newtons.into_iter().filter(|newtons| *newtons > 0.0);
+    pub fn of(frames: &[&ModelFrame]) -> Self {
+        let pressed =
+            |frame: &&ModelFrame| frame.newtons.into_iter().filter(|newtons| *newtons > 0.0);
         let all = || frames.iter().flat_map(pressed);
         let (Some(threshold_n), Some(most_n)) = (all().reduce(f32::min), all().reduce(f32::max))
         else {
@@ -101,8 +102,8 @@ impl Sensor {
 mod tests {
     use super::*;
 
-    fn frame(newtons: &[f32]) -> Frame {
-        let mut frame = Frame::default();
+    fn frame(newtons: &[f32]) -> ModelFrame {
+        let mut frame = ModelFrame::default();
         frame.newtons[..newtons.len()].copy_from_slice(newtons);
         frame
     }
@@ -126,7 +127,7 @@ mod tests {
     fn soft_objects_at_the_beginning_do_not_limit_the_force() {
         let soft = frame(&[0.08, 0.12, 0.4]);
         let hard = frame(&[0.04, 0.4, 10.2]);
-        let frames: Vec<&Frame> = std::iter::repeat_n(&soft, 1000).chain([&hard]).collect();
+        let frames: Vec<&ModelFrame> = std::iter::repeat_n(&soft, 1000).chain([&hard]).collect();
         let sensor = Sensor::of(&frames);
         assert_eq!(sensor.newtons(8.0), 8.0);
         assert_eq!(sensor.newtons(20.0), 10.2);
@@ -135,7 +136,7 @@ mod tests {
 
     #[test]
     fn an_empty_data_set_changes_nothing() {
-        let sensor = Sensor::of(&[&Frame::default()]);
+        let sensor = Sensor::of(&[&ModelFrame::default()]);
         assert_eq!(sensor.newtons(0.3), 0.3);
     }
 }

@@ -4,8 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use hardnessd_core::frame::Frame;
-use hardnessd_core::verdict::Hrn;
+use hardnessd_core::verdict::{Hrn, ModelFrame};
 use hardnessd_simulator::Split;
 use hrn_train::data::dataset::{self, Dataset, Sample};
 use prost::Message;
@@ -226,7 +225,7 @@ fn three_levels(path: &Path, levels: &serde_json::Value) {
 /// The same with this `meta`.
 fn three_levels_of(path: &Path, meta: &serde_json::Value) {
     let sample = |level: u8| Sample {
-        frame: Frame {
+        frame: ModelFrame {
             newtons: [0.1 * f32::from(level); 784],
         },
         level,

@@ -4,6 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+use hardnessd_core::frame::Pitch;
 use hardnessd_core::recording::Labels;
 use hardnessd_core::sensor::Description;
 use hardnessd_core::test_support::of_a_labelled_press;
@@ -343,7 +344,7 @@ fn a_model_is_of_the_pitch_of_its_recordings_and_pitches_do_not_mix() {
     let desk = Desk::new();
     let config = narrow(&desk);
     let capture = desk.recording_of("narrow.mcap", &[], |described| {
-        described.calibration.pitch_mm = 2.0;
+        described.calibration.pitch_mm = Pitch::square(2.0);
     });
     let capture = text(&capture);
     let out = desk.path("narrow.npz");
@@ -592,7 +593,7 @@ fn what_cannot_be_used_is_left_out_with_its_reason() {
 fn the_most_recordings_decide_what_a_data_set_has() {
     let desk = Desk::new();
     let stray = desk.recording_of("stray.mcap", &[], |described| {
-        described.calibration.pitch_mm = 2.0;
+        described.calibration.pitch_mm = Pitch::square(2.0);
     });
     let named = desk.recording("named.mcap", &["material=oak"]);
     let usual = ["1", "2", "3"].map(|n| desk.recording(&format!("{n}.mcap"), &[&format!("n={n}")]));

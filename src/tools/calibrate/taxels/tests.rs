@@ -16,15 +16,15 @@ use hardnessd_simulator::{ARM_N_PER_MM, Material, SensorProfile, Sequence, Seque
 fn domes(array: Array, gains: impl Fn(usize, usize) -> f32) -> Vec<Plain> {
     let mut noise = Stream::new(4, "noise");
     let mut presses = Vec::new();
-    for centre in array.places() {
-        let (row, col) = array.position(centre).unwrap();
-        let mut frame = vec![0.0; TAXELS];
-        for place in array.places() {
-            let (r, c) = array.position(place).unwrap();
+    for centre in 0..array.taxels() {
+        let (row, col) = array.position(centre);
+        let mut frame = vec![0.0; array.taxels()];
+        for (place, newtons) in frame.iter_mut().enumerate() {
+            let (r, c) = array.position(place);
             let square = r.abs_diff(row).pow(2) + c.abs_diff(col).pow(2);
-            let newtons =
+            let pressed_n =
                 4.0 * (-(square as f32) / 12.0).exp() * (1.0 + 0.01 * noise.normal() as f32);
-            frame[place] = newtons * gains(r, c);
+            *newtons = pressed_n * gains(r, c);
         }
         presses.push(Plain {
             frames: vec![frame.clone(), frame],
@@ -63,10 +63,10 @@ fn an_even_pressure_says_all_gains_and_the_dead_taxels() {
     let array = Array { rows: 12, cols: 10 };
     let dead = [[3, 4], [7, 7]];
     let frame = |level: f32| {
-        let mut frame = vec![0.0; TAXELS];
-        for place in array.places() {
-            let (row, col) = array.position(place).unwrap();
-            frame[place] = if dead.contains(&[row, col]) {
+        let mut frame = vec![0.0; array.taxels()];
+        for (place, newtons) in frame.iter_mut().enumerate() {
+            let (row, col) = array.position(place);
+            *newtons = if dead.contains(&[row, col]) {
                 0.0
             } else {
                 level * uneven(row, col)
@@ -197,7 +197,7 @@ fn right(played: &Played, sensor: Sensor, hrn: &Arc<Hrn>) -> f64 {
 
 /// Correlation of the gains found with the true ones, over the taxels that were measured.
 fn correlation(fit: &Fit, truth: &[f32]) -> f64 {
-    let pairs: Vec<(f64, f64)> = (0..TAXELS)
+    let pairs: Vec<(f64, f64)> = (0..784)
         .filter(|&k| fit.presses[k] > 1 && truth[k] > 0.0)
         .map(|k| (-f64::from(fit.gains[k]).ln(), f64::from(truth[k]).ln()))
         .collect();
@@ -214,7 +214,7 @@ fn fitted(played: &Played, hrn: &Arc<Hrn>) -> Fit {
     let presses =
         gather::presses(played.first.as_slice(), &plain_sensor, hrn.clone(), false).unwrap();
     let plain: Vec<Plain> = presses.iter().map(plain).collect();
-    Fit::of(&plain, Array::FULL, &[]).unwrap()
+    Fit::of(&plain, Array::JX255N, &[]).unwrap()
 }
 
 #[test]
@@ -253,7 +253,7 @@ fn print_the_worth_of_gains() {
                 .iter()
                 .map(|g| if *g > 0.1 { 1.0 / g } else { 1.0 })
                 .collect();
-            let dead = (0..TAXELS)
+            let dead = (0..784)
                 .filter(|&k| played.gains[k] < 0.1)
                 .map(|k| [k / 28, k % 28]);
             let sensors = [

@@ -6,35 +6,61 @@ use ratatui_core::style::Color;
 use super::super::view::{Link, Sensor};
 use super::Page;
 
+/// The size of a pressure map on the terminal.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct MapSize {
+    pub(super) cols: u16,
+    /// 0 if no map fits.
+    pub(super) rows: u16,
+    /// Columns of a taxel.
+    scale: usize,
+    /// Taxels of a column, if the terminal is too small to show each.
+    taxels: usize,
+}
+
 impl Page<'_> {
-    /// Columns and rows of the largest pressure map that fits. A taxel takes half as many rows as
-    /// columns, because a cell is twice as high as it is wide. Returns `(0, 0)` if no map fits.
-    pub(super) fn map_size(&self, sensor: &Sensor, width: u16, height: u16) -> (u16, u16) {
-        let cols = u16::try_from(sensor.cols).unwrap_or(u16::MAX);
-        let rows = u16::try_from(sensor.rows).unwrap_or(u16::MAX);
-        let scale = (width / cols).min(height.saturating_mul(2) / rows);
-        (scale * cols, (scale * rows).div_ceil(2))
+    /// The largest pressure map that fits. A taxel takes half as many rows as columns, because a
+    /// cell is twice as high as it is wide.
+    pub(super) fn map_size(&self, sensor: &Sensor, width: u16, height: u16) -> MapSize {
+        let (width, height) = (usize::from(width), 2 * usize::from(height));
+        let scale = (width / sensor.cols).min(height / sensor.rows);
+        let each = |taxels: usize, places: usize| taxels.div_ceil(places.max(1));
+        let taxels = each(sensor.cols, width).max(each(sensor.rows, height));
+        if (2..=MOST_SHARED).contains(&taxels) {
+            return MapSize {
+                cols: sensor.cols.div_ceil(taxels) as u16,
+                rows: sensor.rows.div_ceil(2 * taxels) as u16,
+                scale: 1,
+                taxels,
+            };
+        }
+        MapSize {
+            cols: (scale * sensor.cols) as u16,
+            rows: (scale * sensor.rows).div_ceil(2) as u16,
+            scale,
+            taxels: 1,
+        }
     }
 
-    pub(super) fn map(
-        &mut self,
-        area: Rect,
-        (cols, rows): (u16, u16),
-        sensor: &Sensor,
-        link: Link,
-    ) {
+    pub(super) fn map(&mut self, area: Rect, size: MapSize, sensor: &Sensor, link: Link) {
         let top = sensor.highest_n().max(LEAST_SCALE_N);
         let rest = self.text(area, "pressure ", self.look.heading());
         self.text(rest, &format!("0 to {top:.2} N a taxel"), self.look.aside());
         let area = Rect {
             y: area.y + 1,
-            width: cols.min(area.width),
-            height: rows.min(area.height - 1),
+            width: size.cols.min(area.width),
+            height: size.rows.min(area.height - 1),
             ..area
         };
-        let scale = (usize::from(cols) / sensor.cols).max(1);
-        // The square root keeps a soft touch visible beside a hard one.
-        let shade = |row, col| sensor.newtons(row, col).map(|n| (n / top).min(1.0).sqrt());
+        let MapSize { scale, taxels, .. } = size;
+        // The greatest of the taxels that share a place, so that no touch vanishes. The square root
+        // keeps a soft touch visible beside a hard one.
+        let shade = |row: usize, col: usize| {
+            let rows = row * taxels..(row + 1) * taxels;
+            let places = rows.flat_map(|row| (0..taxels).map(move |n| (row, col * taxels + n)));
+            let newtons = places.filter_map(|(row, col)| sensor.newtons(row, col));
+            newtons.reduce(f32::max).map(|n| (n / top).min(1.0).sqrt())
+        };
         for y in 0..area.height {
             for x in 0..area.width {
                 let (x_of, y_of) = (usize::from(x), usize::from(y));
@@ -95,6 +121,9 @@ fn max(one: Option<f32>, other: Option<f32>) -> Option<f32> {
 fn step(share: f32, steps: usize) -> usize {
     ((share * steps as f32) as usize).min(steps - 1)
 }
+
+/// The most taxels along each side that share a place of the map. With more, the map shows no form.
+const MOST_SHARED: usize = 3;
 
 /// The least full scale of the map, in newtons a taxel: noise must not look like a touch.
 const LEAST_SCALE_N: f32 = 1.0;

@@ -6,7 +6,7 @@ use std::time::Duration;
 use serde_json::Value;
 
 use super::{items, number, plain, text};
-use hardnessd_core::frame::{Array, COLS, ROWS, TAXELS};
+use hardnessd_core::frame::{Array, MOST_SIDE};
 use hardnessd_core::sensor::LATE_PERIODS;
 
 /// How far back the curves go.
@@ -53,7 +53,7 @@ pub(in crate::tools::watch) struct Status {
 #[derive(Debug, Clone, PartialEq)]
 pub(in crate::tools::watch) struct Frame {
     pub(in crate::tools::watch) at: Duration,
-    /// `[28, 28]`, newtons a taxel.
+    /// `[rows, cols]`, newtons a taxel.
     newtons: Vec<f32>,
     pub(in crate::tools::watch) force_n: f32,
     pub(in crate::tools::watch) contact_area_taxels: u32,
@@ -91,16 +91,16 @@ pub(in crate::tools::watch) struct Verdict {
 
 impl Sensor {
     pub(super) fn new(card: &Value) -> Self {
-        let size = |key, most: usize| {
+        let size = |key| {
             let size = card[key]
                 .as_u64()
                 .and_then(|size| usize::try_from(size).ok());
-            size.unwrap_or(most).clamp(1, most)
+            size.unwrap_or(1).clamp(1, MOST_SIDE)
         };
         Self {
             name: text(card, "name"),
-            rows: size("rows", ROWS),
-            cols: size("cols", COLS),
+            rows: size("rows"),
+            cols: size("cols"),
             ..Self::default()
         }
     }
@@ -180,7 +180,7 @@ impl Sensor {
             .filter_map(Value::as_f64)
             .map(|newtons| newtons as f32)
             .collect();
-        if newtons.len() != TAXELS {
+        if newtons.len() != self.rows * self.cols {
             return;
         }
         let load = Load {
@@ -209,8 +209,7 @@ impl Sensor {
         });
     }
 
-    /// Newtons of the taxel at a row and column of the sensor's own array in the last frame. A
-    /// smaller array is in the middle of the 28x28 frame (`docs/configuration.md`).
+    /// Newtons of the taxel at a row and column in the last frame.
     pub(in crate::tools::watch) fn newtons(&self, row: usize, col: usize) -> Option<f32> {
         let (rows, cols) = (self.rows, self.cols);
         let frame = self.frame.as_ref()?;

@@ -8,7 +8,7 @@ use crate::test_support::course_model::{course_model, encoded, judged};
 
 fn course(length: usize, approach: bool) -> Course {
     let moments = (0..length).map(|place| {
-        let mut frame = Frame::default();
+        let mut frame = ModelFrame::default();
         frame.newtons[500..510].fill(0.3 * (1 + place) as f32);
         CourseMoment {
             time_s: 0.2 * place as f32,

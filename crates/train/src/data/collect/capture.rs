@@ -7,14 +7,14 @@ use std::sync::Arc;
 use serde_json::{Map, Value, json};
 
 use super::part::{Part, Presses};
-use super::selection::{Judged, Selection};
+use super::selection::{Judged, Selection, grid_mm};
 use super::{Problem, Settings};
 use crate::data::courses::{Courses, Press};
 use crate::data::dataset::{self, COLLECTOR, Sample, file::SHORE};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::motion::Track;
 use hardnessd_core::pipeline::{Clock, Pipeline};
-use hardnessd_core::recording::{Entry, FileKind, Found, Labels, Playback, Reader};
+use hardnessd_core::recording::{Entry, FileKind, Found, Labels, Playback, Reader, RecordedSensor};
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::verdict::{Hrn, sha256_hex};
 
@@ -170,7 +170,7 @@ impl Pressed {
             let none = Track::default();
             selection.take(pipeline.push(bytes, NOT_LOOKED_AT), NOT_LOOKED_AT, &none);
             selection.take(pipeline.end_of_recording(None), NOT_LOOKED_AT, &none);
-            (Labels::new(), sensor.description().calibration.pitch_mm)
+            (Labels::new(), grid_mm(sensor))
         };
         if selection.presses.is_empty() {
             return Err(Problem::NoPress);
@@ -194,7 +194,9 @@ fn play(bytes: &[u8], hrn: &Arc<Hrn>, selection: &mut Selection) -> Result<(Labe
     let (mut pitch_mm, none) = (None, Track::default());
     for found in Reader::new(bytes) {
         let found = found.map_err(Problem::Recording)?;
-        if let Some(found) = pitch_of(&found) {
+        // A wrong description is an error of the playback.
+        if let Some(Ok(sensor)) = sensor_of(&found).map(RecordedSensor::check) {
+            let found = grid_mm(&sensor);
             let expected = *pitch_mm.get_or_insert(found);
             if found != expected {
                 return Err(Problem::Pitches { found, expected });
@@ -212,11 +214,11 @@ fn play(bytes: &[u8], hrn: &Arc<Hrn>, selection: &mut Selection) -> Result<(Labe
     Ok((playback.labels(), pitch_mm.unwrap_or(dataset::PITCH_MM)))
 }
 
-/// The taxel pitch of the sensor that an entry describes.
-fn pitch_of(found: &Found) -> Option<f64> {
+/// The sensor that an entry describes.
+fn sensor_of(found: &Found) -> Option<&RecordedSensor> {
     match &found.entry {
-        Entry::State(state) => Some(state.sensor.description.calibration.pitch_mm),
-        Entry::Settings(sensor) => Some(sensor.description.calibration.pitch_mm),
+        Entry::State(state) => Some(&state.sensor),
+        Entry::Settings(sensor) => Some(sensor),
         Entry::Input(_) => None,
     }
 }

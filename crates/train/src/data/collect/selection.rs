@@ -6,19 +6,22 @@ use std::time::Duration;
 use jiff::Timestamp;
 
 use hardnessd_core::event::{Event, Hardness, Phase, PressState};
-use hardnessd_core::frame::{Frame, Stamp};
+use hardnessd_core::frame::{Array, Frame, Stamp};
 use hardnessd_core::motion::Track;
 use hardnessd_core::pipeline::{approach_by_speed, approach_speed_mm_s, says_something};
 use hardnessd_core::press::thinned;
 use hardnessd_core::recording::{Entry, Found};
-use hardnessd_core::sensor::Description;
+use hardnessd_core::sensor::{Description, Sensor};
+use hardnessd_core::verdict::{COLS, Laying, ModelFrame, ROWS};
 use hardnessd_simulator::MOST_FRAMES;
+
+use crate::data::dataset::PITCH_MM;
 
 /// A press that was judged.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Judged {
     /// The chosen frame.
-    pub(super) frame: Frame,
+    pub(super) frame: ModelFrame,
     /// Total force of the chosen frame.
     pub(super) force_n: f32,
     /// The press's frames in contact, thinned. Empty if the recording does not have all of them.
@@ -36,7 +39,7 @@ pub(super) struct KeptFrame {
     pub(super) time_s: f32,
     /// The approach since the press began, where it is known.
     pub(super) approach_mm: Option<f32>,
-    pub(super) frame: Frame,
+    pub(super) frame: ModelFrame,
 }
 
 impl Judged {
@@ -59,7 +62,7 @@ pub(super) struct Selection {
 }
 
 /// The frames and the press of one sensor.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Held {
     /// The frames of the press under way. Without a press, the newest frame.
     frames: BTreeMap<u64, Shown>,
@@ -69,14 +72,27 @@ struct Held {
     last: u64,
     /// The speed of the approach when the press under way began, if it is known.
     speed_mm_s: Option<f64>,
-    described: Description,
+    sensor: Sensor,
+}
+
+impl Default for Held {
+    fn default() -> Self {
+        Self {
+            frames: BTreeMap::new(),
+            is_pressed: false,
+            began: None,
+            last: 0,
+            speed_mm_s: None,
+            sensor: Sensor::new(Description::default()).expect("the default is a sensor"),
+        }
+    }
 }
 
 #[derive(Debug)]
 struct Shown {
     mono: Duration,
     area: u32,
-    newtons: Vec<f32>,
+    frame: Frame,
 }
 
 impl Selection {
@@ -91,8 +107,11 @@ impl Selection {
 
     pub(super) fn describe(&mut self, sensor: &str, description: &Description) {
         let held = self.held.entry(sensor.to_owned()).or_default();
-        if held.described != *description {
-            held.described = description.clone();
+        // A wrong description is an error of the playback.
+        if held.sensor.description() != description
+            && let Ok(sensor) = Sensor::new(description.clone())
+        {
+            held.sensor = sensor;
         }
     }
 
@@ -109,7 +128,13 @@ impl Selection {
                     let shown = Shown {
                         mono: moment(at, frame.time),
                         area: frame.contact_area_taxels,
-                        newtons: frame.newtons,
+                        frame: Frame {
+                            array: Array {
+                                rows: frame.rows,
+                                cols: frame.cols,
+                            },
+                            newtons: frame.newtons.into(),
+                        },
                     };
                     held.frames.insert(frame.frame, shown);
                 }
@@ -119,7 +144,8 @@ impl Selection {
                     match press.state {
                         PressState::Begin => {
                             held.began = Some(press.frame);
-                            let (context, arm) = (press.context.as_ref(), &held.described.arm);
+                            let (context, arm) =
+                                (press.context.as_ref(), &held.sensor.description().arm);
                             held.speed_mm_s = approach_speed_mm_s(context, arm);
                         }
                         PressState::End | PressState::Aborted => held.last = press.frame,
@@ -139,8 +165,10 @@ impl Held {
     fn judged(&mut self, verdict: &Hardness, track: &Track) -> Option<Judged> {
         // The chosen frame of a press that began before the recording may be missing from it.
         let chosen = self.frames.get(&verdict.frame)?;
+        let pitch = self.sensor.description().calibration.pitch_mm;
+        let laying = Laying::new(&chosen.frame, pitch, grid_mm(&self.sensor));
         let mut judged = Judged {
-            frame: Frame::try_from(chosen.newtons.clone()).ok()?,
+            frame: laying.lay(&chosen.frame),
             force_n: verdict.force_n as f32,
             moments: Vec::new(),
             best: 0,
@@ -149,7 +177,7 @@ impl Held {
         let Some(first) = self.began.take() else {
             return Some(judged);
         };
-        let least = self.described.press.end_area_taxels;
+        let least = self.sensor.thresholds().end_area_taxels;
         let pressed = self.frames.range(first..=self.last.max(first));
         let pressed: Vec<(u64, &Shown)> = pressed
             .filter(|(_, shown)| shown.area >= least)
@@ -162,16 +190,15 @@ impl Held {
             return Some(judged);
         };
         let moments: Vec<Duration> = pressed.iter().map(|(_, shown)| shown.mono).collect();
-        let arm = &self.described.arm;
+        let arm = &self.sensor.description().arm;
         let (begin, end) = (moments[0], moments[moments.len() - 1]);
         // The approach is what the daemon would give a model: from positions, or else from the speed.
         let way = if track.is_told(end, arm.delay_ms) {
             track.approach(begin, &moments, arm.delay_ms)
         } else {
             self.speed_mm_s.map(|speed_mm_s| {
-                let shown = pressed.iter().map(|(_, shown)| &shown.newtons);
-                let force_n = |newtons: &Vec<f32>| newtons.iter().map(|&n| f64::from(n)).sum();
-                let forces_n: Vec<f64> = shown.map(force_n).collect();
+                let shown = pressed.iter().map(|(_, shown)| shown.frame.force_n());
+                let forces_n: Vec<f64> = shown.collect();
                 approach_by_speed(speed_mm_s, &moments, &forces_n)
             })
         };
@@ -188,13 +215,25 @@ impl Held {
             judged.moments.push(KeptFrame {
                 time_s: before_s,
                 approach_mm: way[place].map(|mm| mm as f32),
-                frame: Frame::try_from(pressed[place].1.newtons.clone()).ok()?,
+                frame: laying.lay(&pressed[place].1.frame),
             });
         }
         if judged.is_known() {
             judged.arm_n_per_mm = arm.stiffness_n_per_mm.unwrap_or(0.0) as f32;
         }
         Some(judged)
+    }
+}
+
+/// The distance between the taxels of the grid on which a data set holds the frames of `sensor`. An
+/// array that fits into a data set is kept as it is.
+pub(super) fn grid_mm(sensor: &Sensor) -> f64 {
+    let pitch = sensor.description().calibration.pitch_mm;
+    let Array { rows, cols } = sensor.layout().array();
+    if rows <= ROWS && cols <= COLS && pitch.rows_mm == pitch.cols_mm {
+        pitch.rows_mm
+    } else {
+        PITCH_MM
     }
 }
 

@@ -10,9 +10,8 @@ use zip::result::ZipError;
 
 use super::{Dataset, DatasetError, Sample, Source, levels};
 use crate::data::npz::{Element, Writer};
-use hardnessd_core::frame::{COLS, Frame, ROWS, TAXELS};
 use hardnessd_core::npy::{Header, NpyError};
-use hardnessd_core::verdict::{Level, check_levels, sha256_hex};
+use hardnessd_core::verdict::{COLS, Level, ModelFrame, ROWS, TAXELS, check_levels, sha256_hex};
 use hardnessd_simulator::Split;
 
 /// A force above any sensor's, and low enough that sums of squares stay finite.
@@ -80,7 +79,7 @@ pub(super) fn parse(bytes: &[u8], path: &Path, name: String) -> Result<Dataset, 
     )?;
     let meta = file.meta()?;
     let sample = |index: usize| {
-        let mut frame = Frame::default();
+        let mut frame = ModelFrame::default();
         frame
             .newtons
             .copy_from_slice(&frames[index * TAXELS..][..TAXELS]);

@@ -4,12 +4,11 @@ use std::io::Cursor;
 
 use super::*;
 use crate::data::npz::{Element, Writer};
-use hardnessd_core::frame::{COLS, ROWS, TAXELS};
 use hardnessd_core::npy::Header;
-use hardnessd_core::verdict::sha256_hex;
+use hardnessd_core::verdict::{COLS, ROWS, TAXELS, sha256_hex};
 
 fn sample(level: u8, object: u32, split: Split) -> Sample {
-    let mut frame = Frame::default();
+    let mut frame = ModelFrame::default();
     frame.newtons[usize::from(level)] = object as f32;
     Sample {
         frame,
@@ -344,7 +343,7 @@ fn labels_are_chosen_by_object_and_equally_from_each_level() {
 #[test]
 fn objects_of_one_number_are_several_if_their_levels_differ() {
     let sample = |level, object| Sample {
-        frame: Frame::default(),
+        frame: ModelFrame::default(),
         level,
         object,
         material: None,

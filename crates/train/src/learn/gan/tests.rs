@@ -4,7 +4,7 @@ use super::step::{discriminator_loss, generator_loss, penalty};
 use super::*;
 use crate::net::network::{Normalisation, numbers};
 use burn::tensor::{DType, FloatDType, Tensor, TensorData};
-use hardnessd_core::frame::{COLS, ROWS};
+use hardnessd_core::verdict::{COLS, ROWS};
 
 const GAMES: [Game; 3] = [Game::RealOrFake, Game::FakeLevel, Game::FeatureMatching];
 const LEVELS: usize = 4;

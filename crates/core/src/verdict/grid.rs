@@ -1,0 +1,309 @@
+//! The model's own grid, and how frames of other arrays are laid onto it.
+//!
+//! In: the [`Frame`]s of a press, in the sensor's grid. Out: [`ModelFrame`]s, in the model's. Each
+//! taxel's force is shared out over the model's taxels by area, so the force stays the same.
+
+use serde::{Deserialize, Serialize};
+
+use crate::frame::{self, Array, Frame, Pitch};
+
+/// Rows of the model's input (paper, "Tactile sensor").
+pub const ROWS: usize = 28;
+/// Columns of the model's input.
+pub const COLS: usize = 28;
+/// Taxels in the model's input.
+pub const TAXELS: usize = ROWS * COLS;
+
+/// A taxel of the model's grid is in contact at or above this force, where the grid has the pitch of
+/// the JX255N.
+pub const CONTACT_THRESHOLD_N: f32 = 0.07;
+
+/// Two distances that differ by less than this share are the same.
+const SAME_PITCH: f64 = 0.02;
+
+/// A frame in newtons, on the model's grid.
+///
+/// # Example
+///
+/// ```
+/// use hardnessd_core::verdict::{ModelFrame, TAXELS};
+///
+/// let mut newtons = vec![0.0; TAXELS];
+/// newtons[100..104].fill(0.5);
+/// let frame = ModelFrame::try_from(newtons)?;
+/// assert_eq!(frame.contact_area_taxels(0.07), 4);
+/// assert_eq!(frame.force_n(), 2.0);
+///
+/// assert!(ModelFrame::try_from(vec![0.0; 100]).is_err());
+/// # Ok::<(), hardnessd_core::verdict::ModelFrameError>(())
+/// ```
+#[derive(Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "Vec<f32>", into = "Vec<f32>")]
+pub struct ModelFrame {
+    /// `[ROWS, COLS]` flattened, row-major, in newtons a taxel; finite and not negative.
+    pub newtons: [f32; TAXELS],
+}
+
+impl Default for ModelFrame {
+    fn default() -> Self {
+        Self {
+            newtons: [0.0; TAXELS],
+        }
+    }
+}
+
+impl std::fmt::Debug for ModelFrame {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let peak = self.newtons.iter().copied().fold(0.0, f32::max);
+        f.debug_struct("ModelFrame")
+            .field("force_n", &self.force_n())
+            .field("peak_n", &peak)
+            .finish()
+    }
+}
+
+impl From<ModelFrame> for Vec<f32> {
+    fn from(frame: ModelFrame) -> Self {
+        frame.newtons.to_vec()
+    }
+}
+
+/// The reason why numbers are not a frame of the model's grid.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum ModelFrameError {
+    /// The force is negative or not finite.
+    #[error("found {0} N at a taxel, expected 0 or more")]
+    Newtons(f32),
+    /// There are too many or too few taxels.
+    #[error("found {0} taxels, expected {TAXELS}")]
+    Length(usize),
+}
+
+impl TryFrom<Vec<f32>> for ModelFrame {
+    type Error = ModelFrameError;
+
+    fn try_from(newtons: Vec<f32>) -> Result<Self, ModelFrameError> {
+        if let Some(&found) = newtons.iter().find(|&&n| !n.is_finite() || n < 0.0) {
+            return Err(ModelFrameError::Newtons(found));
+        }
+        match newtons.try_into() {
+            Ok(newtons) => Ok(Self { newtons }),
+            Err(found) => Err(ModelFrameError::Length(Vec::len(&found))),
+        }
+    }
+}
+
+impl ModelFrame {
+    /// The contact area: the number of taxels at or above `threshold_n`.
+    pub fn contact_area_taxels(&self, threshold_n: f32) -> u32 {
+        frame::contact_area_taxels(&self.newtons, threshold_n)
+    }
+
+    /// The frame with all forces times `factor`, which is finite and not negative.
+    pub fn times(&self, factor: f32) -> Self {
+        Self {
+            newtons: self.newtons.map(|newtons| newtons * factor),
+        }
+    }
+
+    /// The total force in newtons. It is summed in f64, so the order of taxels makes no difference.
+    pub fn force_n(&self) -> f64 {
+        frame::force_n(&self.newtons)
+    }
+}
+
+/// How the frames of one press are laid onto the model's grid.
+///
+/// An array that is no longer than the grid lies in its middle, along each side. Of a longer array,
+/// the grid covers the part around the contact. Between grids of the same pitch taxels move as they
+/// are; otherwise each model taxel gets the share of a taxel's force by which it covers its area.
+///
+/// # Example
+///
+/// Four taxels of 1.75 mm are one of 3.5 mm.
+///
+/// ```
+/// use hardnessd_core::frame::{Array, Frame, Pitch};
+/// use hardnessd_core::verdict::Laying;
+///
+/// let mut fine = Frame::zero(Array { rows: 56, cols: 56 });
+/// for (row, col) in [(20, 30), (20, 31), (21, 30), (21, 31)] {
+///     fine.newtons[fine.array.place(row, col)] = 0.5;
+/// }
+/// let laying = Laying::new(&fine, Pitch::square(1.75), 3.5);
+/// let laid = laying.lay(&fine);
+/// assert_eq!(laid.newtons[10 * 28 + 15], 2.0);
+/// assert_eq!(laid.force_n(), 2.0);
+/// ```
+#[derive(Debug, Clone)]
+pub struct Laying {
+    rows: Side,
+    cols: Side,
+    is_resampled: bool,
+}
+
+impl Laying {
+    /// The laying of a press whose best frame is `best`, of taxels `pitch` apart, onto a grid of
+    /// taxels `model_mm` apart.
+    pub fn new(best: &Frame, pitch: Pitch, model_mm: f64) -> Self {
+        let Array { rows, cols } = best.array;
+        let (row, col) = centre(best);
+        let is_same = |mm: f64| (mm / model_mm - 1.0).abs() <= SAME_PITCH;
+        Self {
+            rows: Side::new(rows, pitch.rows_mm / model_mm, ROWS, row),
+            cols: Side::new(cols, pitch.cols_mm / model_mm, COLS, col),
+            is_resampled: !(is_same(pitch.rows_mm) && is_same(pitch.cols_mm)),
+        }
+    }
+
+    /// Whether taxels of another pitch are shared out.
+    pub fn is_resampled(&self) -> bool {
+        self.is_resampled
+    }
+
+    /// The frame on the model's grid.
+    pub fn lay(&self, frame: &Frame) -> ModelFrame {
+        let mut laid = ModelFrame::default();
+        for (row, newtons) in frame.newtons.chunks_exact(frame.array.cols).enumerate() {
+            for &(model_row, row_share) in self.rows.shares(row) {
+                for (col, &newtons) in newtons.iter().enumerate() {
+                    if newtons == 0.0 {
+                        continue;
+                    }
+                    for &(model_col, col_share) in self.cols.shares(col) {
+                        laid.newtons[model_row * COLS + model_col] +=
+                            newtons * row_share * col_share;
+                    }
+                }
+            }
+        }
+        laid
+    }
+}
+
+/// The centre of a frame's force, as a row and a column. The middle of the array if there is no
+/// force.
+fn centre(frame: &Frame) -> (f64, f64) {
+    let force_n = frame.force_n();
+    let Array { rows, cols } = frame.array;
+    if force_n <= 0.0 {
+        return ((rows - 1) as f64 / 2.0, (cols - 1) as f64 / 2.0);
+    }
+    let (mut row_sum, mut col_sum) = (0.0, 0.0);
+    for (place, &newtons) in frame.newtons.iter().enumerate() {
+        let (row, col) = frame.array.position(place);
+        row_sum += f64::from(newtons) * row as f64;
+        col_sum += f64::from(newtons) * col as f64;
+    }
+    (row_sum / force_n, col_sum / force_n)
+}
+
+/// How the taxels along one side of an array lie on the model's.
+#[derive(Debug, Clone)]
+struct Side {
+    /// For each row or column of the array, the model's that it covers, and the share on each.
+    shares: Vec<Vec<(usize, f32)>>,
+}
+
+impl Side {
+    /// A side of `count` taxels, each as long as `length` model taxels, on a side of `grid` model
+    /// taxels. The contact's centre is at taxel `centre`.
+    fn new(count: usize, length: f64, grid: usize, centre: f64) -> Self {
+        // Taxels of the same pitch move as they are.
+        let length = if (length - 1.0).abs() <= SAME_PITCH {
+            1.0
+        } else {
+            length
+        };
+        let whole = count as f64 * length;
+        // The place of the array's border on the grid, negative if the array begins before it. It
+        // is a whole number, so that taxels half or a third as long share no border.
+        let free = grid as f64 - whole;
+        let first = if free >= 0.0 {
+            (free / 2.0).floor()
+        } else {
+            let around = (grid as f64 / 2.0 - (centre + 0.5) * length).round();
+            around.clamp(free.floor(), 0.0)
+        };
+        let shares = |taxel: usize| {
+            let from = first + taxel as f64 * length;
+            let to = from + length;
+            let first_cell = from.floor().max(0.0) as usize;
+            let cells = first_cell..(to.ceil().max(0.0) as usize).min(grid);
+            let share = |cell: usize| {
+                let covered = to.min(cell as f64 + 1.0) - from.max(cell as f64);
+                (cell, (covered / length) as f32)
+            };
+            // What is left of a border after rounding is no share.
+            cells.map(share).filter(|&(_, s)| s > 1e-6).collect()
+        };
+        Self {
+            shares: (0..count).map(shares).collect(),
+        }
+    }
+
+    fn shares(&self, taxel: usize) -> &[(usize, f32)] {
+        &self.shares[taxel]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// A frame with one square contact.
+    fn touched(array: Array, row: usize, col: usize, side: usize) -> Frame {
+        let mut frame = Frame::zero(array);
+        for r in row..(row + side).min(array.rows) {
+            for c in col..(col + side).min(array.cols) {
+                frame.newtons[array.place(r, c)] = 0.25;
+            }
+        }
+        frame
+    }
+
+    #[test]
+    fn the_models_own_array_is_laid_as_it_is() {
+        let mut frame = touched(Array::JX255N, 3, 20, 6);
+        frame.newtons[783] = 1e-7;
+        let laying = Laying::new(&frame, Pitch::JX255N, 3.5);
+        assert!(!laying.is_resampled());
+        assert_eq!(laying.lay(&frame).newtons[..], frame.newtons[..]);
+    }
+
+    #[test]
+    fn a_small_array_lies_in_the_middle_and_a_large_one_around_the_contact() {
+        let small = touched(Array { rows: 10, cols: 13 }, 0, 0, 1);
+        let laid = Laying::new(&small, Pitch::JX255N, 3.5).lay(&small);
+        assert_eq!(laid.newtons[9 * COLS + 7], 0.25);
+
+        // The middle of the contact is at row 42, column 60.5, too near the end to be in the middle.
+        let large = touched(Array { rows: 64, cols: 64 }, 40, 59, 4);
+        let laid = Laying::new(&large, Pitch::JX255N, 3.5).lay(&large);
+        assert_eq!(laid.force_n(), large.force_n());
+        assert_eq!(laid.newtons[12 * COLS + 59 - 36], 0.25);
+        assert_eq!(laid.newtons[12 * COLS + 59 - 37], 0.0);
+    }
+
+    proptest! {
+        #[test]
+        fn the_force_stays_the_same_whatever_the_pitch(
+            rows in 1_usize..=64,
+            cols in 1_usize..=64,
+            row_share in 0.0..1.0_f64,
+            col_share in 0.0..1.0_f64,
+            mm in [1.0..12.0_f64, 1.0..12.0_f64],
+        ) {
+            let array = Array { rows, cols };
+            let row = (row_share * rows as f64) as usize;
+            let col = (col_share * cols as f64) as usize;
+            let frame = touched(array, row, col, 2);
+            let pitch = Pitch { rows_mm: mm[0], cols_mm: mm[1] };
+            let laying = Laying::new(&frame, pitch, 3.5);
+            let laid = laying.lay(&frame);
+            prop_assert!((laid.force_n() / frame.force_n() - 1.0).abs() < 1e-5);
+        }
+    }
+}
