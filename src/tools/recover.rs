@@ -57,6 +57,14 @@ pub enum Error {
         /// The number of whole messages.
         messages: u64,
     },
+    /// Chunks that are not damaged were left out. The new file has all others.
+    #[error("{path}: left out {chunks} chunks that are not damaged: `mcap recover` rewrites them")]
+    Unread {
+        /// The path of the damaged file.
+        path: PathBuf,
+        /// The number of these chunks.
+        chunks: usize,
+    },
     /// The new file cannot be written.
     #[error("--out {path}: {source}")]
     Write {
@@ -71,7 +79,7 @@ impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
             Error::Unreadable { .. } => NO_INPUT,
-            Error::Nothing { .. } | Error::Foreign { .. } => FAILED,
+            Error::Nothing { .. } | Error::Foreign { .. } | Error::Unread { .. } => FAILED,
             Error::Broken { .. } | Error::Write { .. } => IO,
         }
     }
@@ -82,7 +90,7 @@ impl Coded for Error {
 /// # Errors
 ///
 /// Returns [`Error`] if there is nothing to save, or a file cannot be read or written. The new file
-/// does not exist then.
+/// does not exist then, except after [`Error::Unread`].
 pub fn run(args: &Args) -> Result<(), Error> {
     let unreadable = |source| Error::Unreadable {
         path: args.broken.clone(),
@@ -115,7 +123,13 @@ pub fn run(args: &Args) -> Result<(), Error> {
         .and_then(|_| sync_directory(&args.out))
         .map_err(|error| unwritten(error.into()))?;
     hardnessd_core::say!("{}", account(&recovered));
-    Ok(())
+    match recovered.unread.len() {
+        0 => Ok(()),
+        chunks => Err(Error::Unread {
+            path: args.broken.clone(),
+            chunks,
+        }),
+    }
 }
 
 /// Makes a file beside `out`, so that a file at `out` is always whole. Unless the process is killed,
@@ -172,6 +186,7 @@ fn account(recovered: &Recovered) -> String {
         chunks,
         span_ns,
         lost,
+        unread,
         messages_unknown,
         messages_damaged,
         complete,
@@ -186,6 +201,9 @@ fn account(recovered: &Recovered) -> String {
     let mut text = format!("saved {messages} messages in {chunks} chunks, {first} to {last}");
     for (place, bytes) in lost {
         text += &format!("\nlost {bytes} damaged bytes at byte {place}");
+    }
+    for (place, problem) in unread {
+        text += &format!("\nleft out the chunk at byte {place}: {problem}");
     }
     if *messages_unknown > 0 {
         text += &format!("\nlost {messages_unknown} messages of channels that nothing describes");

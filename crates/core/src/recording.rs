@@ -220,6 +220,9 @@ pub enum Error {
     /// The recording is damaged or cut off.
     #[error("{0}: `hardnessd recover` saves what is whole")]
     Damaged(String),
+    /// The recording has a chunk that is too long, or packed in a way that is not read.
+    #[error("{0}: `mcap recover` rewrites the recording with chunks that are read")]
+    Unread(String),
     /// The file is MCAP of another program or of a later version, or not MCAP.
     #[error("found {found}, expected {expected}")]
     Foreign {
@@ -241,6 +244,13 @@ impl From<mcap::McapError> for Error {
                 found: "no MCAP file".to_owned(),
                 expected: "a recording",
             },
+            mcap::McapError::ChunkTooLarge(bytes) => Error::Unread(format!(
+                "found a chunk of {bytes} bytes, expected at most {}",
+                reader::LONGEST_CHUNK_BYTES
+            )),
+            mcap::McapError::UnsupportedCompression(name) => Error::Unread(format!(
+                "found a chunk packed with {name:?}, expected zstd, lz4 or none"
+            )),
             other => Error::Damaged(format!("the recording is damaged ({other})")),
         }
     }

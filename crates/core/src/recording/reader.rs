@@ -31,10 +31,12 @@ impl Found {
     }
 }
 
-/// The longest record that is read, and the longest chunk once it is unpacked. A chunk of ours ends
-/// with the first message after 1 MiB. The longest message is a state in the middle of a long press
-/// that loads every taxel. It has less than 6 MiB.
-pub(super) const LONGEST_RECORD_BYTES: usize = 8 << 20;
+/// The longest record in a chunk. The longest message is a state in the middle of a long press that
+/// loads every taxel of a large array. It has less than 24 MiB.
+pub(super) const LONGEST_RECORD_BYTES: usize = 32 << 20;
+/// The longest chunk that is read, packed and unpacked. A chunk of ours ends with the first message
+/// after 1 MiB. Those of other programs may be longer.
+pub(super) const LONGEST_CHUNK_BYTES: usize = 64 << 20;
 
 /// The bytes of a chunk's record before its data, without the name of the compression: two times, the
 /// unpacked length, the checksum, the name's length, and the data's length.
@@ -64,7 +66,7 @@ impl Chunks {
         read: u64,
     ) -> Result<Vec<Record<'static>>, Error> {
         let length = header.uncompressed_size;
-        if length > LONGEST_RECORD_BYTES as u64 {
+        if length > LONGEST_CHUNK_BYTES as u64 {
             return Err(mcap::McapError::ChunkTooLarge(length).into());
         }
         if self.unpacked + length > most_unpacked(read) {
@@ -183,7 +185,7 @@ impl<R: Read> Reader<R> {
     pub fn new(source: R) -> Self {
         let options = LinearReaderOptions::default()
             .with_emit_chunks(true)
-            .with_record_length_limit(LONGEST_RECORD_BYTES);
+            .with_record_length_limit(LONGEST_CHUNK_BYTES);
         Self {
             source,
             linear: LinearReader::new_with_options(options),

@@ -2,7 +2,7 @@
 //!
 //! One scan goes from front to back and trusts no index. It takes each chunk whose checksum fits.
 //! If a record does not fill its length, the next record's place is unknown. The scan then searches
-//! for the bytes that every compressed chunk has at the same place. Whatever the file holds, the
+//! for the bytes that every chunk has at the same place. Whatever the file holds, the
 //! scan reads no more than a few times its length, unpacks a bounded length ([`Chunks`]), and
 //! holds one chunk of bounded size.
 
@@ -14,7 +14,7 @@ use mcap::records::{Channel, Record, op};
 use mcap::write::NoSeek;
 
 use super::message;
-use super::reader::{Chunks, LONGEST_RECORD_BYTES, decoder, parse};
+use super::reader::{Chunks, LONGEST_CHUNK_BYTES, decoder, parse};
 use super::{Entry, Error, writer};
 
 /// The result of recovering a damaged recording.
@@ -33,6 +33,8 @@ pub struct Recovered {
     pub span_ns: Option<(u64, u64)>,
     /// The beginning and the length of each damaged stretch, in bytes of the file.
     pub lost: Vec<(u64, u64)>,
+    /// The place of each chunk that is not damaged and yet not read, and the reason.
+    pub unread: Vec<(u64, String)>,
     /// The number of messages in whole chunks whose channel is unknown.
     pub messages_unknown: u64,
     /// The number of messages in whole chunks that cannot be read. A chunk without a checksum may
@@ -60,10 +62,10 @@ const RECORD_HEAD_BYTES: u64 = 9;
 const UNPACKED_AT: usize = RECORD_HEAD_BYTES as usize + 16;
 /// The place of the name of a chunk's compression: after the unpacked length and the checksum.
 const COMPRESSION_AT: usize = UNPACKED_AT + 12;
-/// The name of the compression, with its length.
-const COMPRESSION: [u8; 8] = *b"\x04\0\0\0zstd";
-/// The place of a compressed chunk's data: after the name and the data's length.
-const DATA_AT: usize = COMPRESSION_AT + COMPRESSION.len() + 8;
+/// The names of the compressions, with their lengths.
+const COMPRESSIONS: [&[u8]; 3] = [b"\x04\0\0\0zstd", b"\x03\0\0\0lz4", b"\0\0\0\0"];
+/// The bytes before a chunk's data: after the longest name and the data's length.
+const HEAD_BYTES: usize = COMPRESSION_AT + COMPRESSIONS[0].len() + 8;
 /// The number of bytes that are searched at once.
 const BLOCK_BYTES: usize = 1 << 20;
 
@@ -82,6 +84,7 @@ pub fn recover<R: Read + Seek, W: Write>(
         copy.take(records)?;
     }
     copy.done.lost = scan.lost;
+    copy.done.unread = scan.unread;
     copy.done.chunks = scan.whole;
     copy.done.complete = scan.complete;
     Ok(copy.finish()?)
@@ -97,6 +100,9 @@ struct Scan<R> {
     whole: u64,
     chunks: Chunks,
     lost: Vec<(u64, u64)>,
+    unread: Vec<(u64, String)>,
+    /// The numbers of the channels so far.
+    channels: BTreeSet<u16>,
     complete: bool,
     /// The number of bytes read as records that turned out not to be records.
     wasted: u64,
@@ -118,6 +124,8 @@ impl<R: Read + Seek> Scan<R> {
             whole: 0,
             chunks: Chunks::default(),
             lost: Vec::new(),
+            unread: Vec::new(),
+            channels: BTreeSet::new(),
             complete: false,
             wasted: 0,
             block: (0, Vec::new()),
@@ -145,7 +153,7 @@ impl<R: Read + Seek> Scan<R> {
                 }
                 _ => {}
             }
-            let Some(record) = exact(opcode, &body) else {
+            let Some(record) = self.exact(opcode, &body) else {
                 self.wasted += end - place;
                 self.place = self.skip(place)?;
                 continue;
@@ -155,14 +163,45 @@ impl<R: Read + Seek> Scan<R> {
                 Record::Chunk { header, .. } => match self.chunks.records(&header, &body, end) {
                     Ok(records) => {
                         self.whole += 1;
+                        self.note(&records);
                         return Ok(Some(records));
                     }
+                    Err(Error::Unread(problem)) => self.unread.push((place, problem)),
                     Err(_) => self.lost.push((place, end - place)),
                 },
-                record => return Ok(Some(vec![record.into_owned()])),
+                record => {
+                    let records = vec![record.into_owned()];
+                    self.note(&records);
+                    return Ok(Some(records));
+                }
             }
         }
         Ok(None)
+    }
+
+    /// Takes in the channels among `records`.
+    fn note(&mut self, records: &[Record<'_>]) {
+        let channels = records.iter().filter_map(|record| match record {
+            Record::Channel(channel) => Some(channel.id),
+            _ => None,
+        });
+        self.channels.extend(channels);
+    }
+
+    /// Parses a record if it fills its bytes to the last one. If it does not, its length is
+    /// damaged, and its end is unknown.
+    ///
+    /// A message outside a chunk fills any length, and has no checksum. So its channel must be known,
+    /// and in a file with chunks it is another record whose first byte is damaged.
+    fn exact<'a>(&self, opcode: u8, body: &'a [u8]) -> Option<Record<'a>> {
+        let record = parse(opcode, body).ok()?;
+        let is_exact = match &record {
+            Record::Message { header, .. } => {
+                self.whole == 0 && self.channels.contains(&header.channel_id)
+            }
+            record => length(record, body) == Some(body.len()),
+        };
+        is_exact.then_some(record)
     }
 
     /// The opcode and the end of the record at `place`, if there can be a record.
@@ -175,7 +214,7 @@ impl<R: Read + Seek> Scan<R> {
         let length = u64::from_le_bytes(length);
         let end = place + RECORD_HEAD_BYTES + length.min(self.length);
         let known = (op::HEADER..=op::DATA_END).contains(&opcode);
-        let fits = length <= LONGEST_RECORD_BYTES as u64 && end <= self.length;
+        let fits = length <= LONGEST_CHUNK_BYTES as u64 && end <= self.length;
         // After that many wasted bytes, only chunks are tried as records.
         let hopeless = opcode != op::CHUNK && self.wasted > self.length;
         Ok((known && fits && !hopeless).then_some((opcode, end)))
@@ -191,27 +230,27 @@ impl<R: Read + Seek> Scan<R> {
     /// The place of the next chunk from `place` on, whether the chunk is whole or not.
     fn next_chunk(&mut self, place: u64) -> io::Result<Option<u64>> {
         let mut from = place;
-        while from + DATA_AT as u64 <= self.length {
+        while from + HEAD_BYTES as u64 <= self.length {
             let (start, block) = &self.block;
             let inside = from
                 .checked_sub(*start)
                 .and_then(|at| block.get(at as usize..));
-            let Some(block) = inside.filter(|block| block.len() >= DATA_AT) else {
+            let Some(block) = inside.filter(|block| block.len() >= HEAD_BYTES) else {
                 // The next search continues in the same block.
                 self.block = (from, self.bytes(from, from + BLOCK_BYTES as u64)?);
-                if self.block.1.len() < DATA_AT {
+                if self.block.1.len() < HEAD_BYTES {
                     // The file has become shorter during the scan.
                     return Ok(None);
                 }
                 continue;
             };
-            let mut heads = block.windows(DATA_AT).enumerate();
+            let mut heads = block.windows(HEAD_BYTES).enumerate();
             let left = self.length - from;
             if let Some((at, _)) = heads.find(|(at, head)| is_chunk_head(head, left - *at as u64)) {
                 return Ok(Some(from + at as u64));
             }
             // A chunk's head may lie across the border of two blocks.
-            from += (block.len() - DATA_AT + 1) as u64;
+            from += (block.len() - HEAD_BYTES + 1) as u64;
         }
         Ok(None)
     }
@@ -232,29 +271,33 @@ impl<R: Read + Seek> Scan<R> {
     }
 }
 
-/// Whether these [`DATA_AT`] bytes begin a chunk of ours that ends within `left` bytes. The check
-/// compares its lengths with each other, so the rest of the chunk need not be read.
+/// Whether these [`HEAD_BYTES`] bytes begin a chunk that ends within `left` bytes. The check compares
+/// its lengths with each other, so the rest of the chunk need not be read.
 fn is_chunk_head(head: &[u8], left: u64) -> bool {
-    let length = |at: usize| {
+    let number = |at: usize| {
         let bytes = head.get(at..at + 8).and_then(|bytes| bytes.try_into().ok());
         bytes.map_or(u64::MAX, u64::from_le_bytes)
     };
-    head[COMPRESSION_AT..].starts_with(&COMPRESSION)
-        && head[0] == op::CHUNK
-        && length(1) <= (LONGEST_RECORD_BYTES as u64).min(left - RECORD_HEAD_BYTES)
-        && length(1).checked_sub(length(DATA_AT - 8)) == Some(DATA_AT as u64 - RECORD_HEAD_BYTES)
-        && length(UNPACKED_AT) <= LONGEST_RECORD_BYTES as u64
+    let is_of = |compression: &&[u8]| {
+        let length_at = COMPRESSION_AT + compression.len();
+        let data_at = (length_at + 8) as u64;
+        head[COMPRESSION_AT..].starts_with(compression)
+            && number(1).checked_sub(number(length_at)) == Some(data_at - RECORD_HEAD_BYTES)
+    };
+    head[0] == op::CHUNK
+        && number(1) <= (LONGEST_CHUNK_BYTES as u64).min(left - RECORD_HEAD_BYTES)
+        && number(UNPACKED_AT) <= LONGEST_CHUNK_BYTES as u64
+        && COMPRESSIONS.iter().any(is_of)
 }
 
-/// Parses a record if it fills its bytes to the last one. If it does not, its length is damaged,
-/// and its end is unknown.
-fn exact(opcode: u8, body: &[u8]) -> Option<Record<'_>> {
-    let record = parse(opcode, body).ok()?;
+/// The number of bytes that a record fills by its own lengths. `None` for a record that does not
+/// come before the end of the data.
+fn length(record: &Record<'_>, body: &[u8]) -> Option<usize> {
     let text = |text: &str| 4 + text.len();
     let map = |map: &BTreeMap<String, String>| {
         4 + map.iter().map(|(k, v)| text(k) + text(v)).sum::<usize>()
     };
-    let bytes = match &record {
+    Some(match record {
         Record::Header(header) => text(&header.profile) + text(&header.library),
         Record::Schema { header, data } => {
             2 + text(&header.name) + text(&header.encoding) + 4 + data.len()
@@ -267,10 +310,8 @@ fn exact(opcode: u8, body: &[u8]) -> Option<Record<'_>> {
         Record::Metadata(metadata) => text(&metadata.name) + map(&metadata.metadata),
         // An attachment has a checksum of its own.
         Record::Attachment { .. } => body.len(),
-        // Messages are inside chunks, and the other records come after the end of the data.
         _ => return None,
-    };
-    (bytes == body.len()).then_some(record)
+    })
 }
 
 /// The new file.
@@ -415,6 +456,7 @@ impl Recovered {
     pub fn is_whole(&self) -> bool {
         self.complete
             && self.lost.is_empty()
+            && self.unread.is_empty()
             && self.messages_unknown == 0
             && self.messages_damaged == 0
     }
