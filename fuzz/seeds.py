@@ -47,6 +47,9 @@ def wire():
     keep("wire", "ff-tail-2x2", bytes([1, 9, 2, 5 | 8, 12]) + (b"\1\2\3\4\xff") * 3)
     keep("wire", "ascii-2x2", bytes([1, 9, 2, 6 | 8, 12]) + b"1 2\n30 4\n\n" * 3)
     keep("wire", "zero-run-2x2", bytes([1, 9, 2, 7 | 8, 12]) + b"\1\0\3\xff" * 3)
+    keep("wire", "csv-2x2", bytes([1, 9, 2, 32 | 8, 3, 12]) + b"t 5: 1,2;30 [4]\nready\n" * 3)
+    packets = bytes([32 | 64 | 8, 0, 1, 0, 0, 2, 0, 1, 12])
+    keep("wire", "packets-2x2", bytes([1, 9, 2]) + packets + b"\xaa\x55\1\1\2\xaa\x55\2\3\4" * 3)
     free = bytes([8 | 16, 12, 2, 0xBB, 0xAA, 1, 0xEE, 1, 0, 2, 0, 0xFF, 0xFF, 0])
     keep("wire", "free", bytes([3, 1, 4]) + free + b"\xbb\xaa\4\1\2\3\4\0\xee" * 2)
 

@@ -22,7 +22,8 @@ use hardnessd_core::recording::{Playback, Reader, recover};
 use hardnessd_core::trial;
 use hardnessd_core::verdict::{BUILT_IN, Hrn};
 use hardnessd_core::wire::{
-    Cell, Checksum, Decoder, HexBytes, Layout, LengthField, Order, Preset, Settings,
+    Cell, Checksum, ChecksumOver, Decoder, FooterBytes, HexBytes, Layout, LengthField, Order,
+    Packets, Preset, Settings,
 };
 
 /// How long the daemon may take to answer.
@@ -89,6 +90,24 @@ fn layout(choices: &mut Choices) -> Option<Layout> {
         preset: presets[usize::from(how % 8)],
         ..Settings::default()
     };
+    if how & 32 != 0 {
+        settings.preset = choices.of(&[
+            Preset::Flexitac,
+            Preset::JqGlove,
+            Preset::M1616,
+            Preset::Csv,
+        ]);
+    }
+    if how & 64 != 0 {
+        settings.header_bytes = Some(usize::from(choices.byte() % 5));
+        settings.footer_bytes = Some(FooterBytes::Each(usize::from(choices.byte() % 5)));
+        settings.checksum_over = Some(choices.of(&[ChecksumOver::All, ChecksumOver::Cells]));
+        settings.packets = Some(Packets {
+            count: usize::from(choices.byte() % 5),
+            number_at: usize::from(choices.byte() % 5),
+            first: choices.byte(),
+        });
+    }
     if how & 8 != 0 {
         let size = choices.byte();
         settings.rows = Some(usize::from(size % 5));
@@ -110,6 +129,9 @@ fn layout(choices: &mut Choices) -> Option<Layout> {
             Checksum::Xor8,
             Checksum::Crc16Modbus,
             Checksum::Crc16Ccitt,
+            Checksum::Crc16CcittBe,
+            Checksum::Crc32,
+            Checksum::Crc32Be,
         ]));
         settings.order =
             Some(choices.of(&[Order::RowMajor, Order::ColumnMajor, Order::Serpentine]));

@@ -174,7 +174,7 @@ fn the_pace_of_a_replay_does_not_show() {
 #[test]
 fn a_frame_comes_no_earlier_than_its_time_however_long_frames_are() {
     let directory = tempfile::tempdir().unwrap();
-    for preset in ["ascii", "zero-run", "jx255n"] {
+    for preset in ["ascii", "csv", "zero-run", "jx255n", "jq-glove", "m1616"] {
         let path = |extension| directory.path().join(preset).with_extension(extension);
         let simulated = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
             .args(["simulate", "--presses", "1", "--preset", preset, "--to"])

@@ -4,9 +4,10 @@
 //! [`Damage`]. A [`Layout`] says where the parts of a frame are. A [`Decoder`] finds frames by it.
 //! Nothing here reads a port, waits or asks the time.
 //!
-//! A frame of a free layout is `sync, length, cells, checksum, tail`. Each part but the cells is
-//! optional, but a layout needs a `sync` or a `tail`. The vendor of the JX255N publishes no
-//! protocol: these layouts are those of comparable film arrays.
+//! A frame of a free layout is `sync, length, header bytes, cells, footer bytes, checksum, tail`, or
+//! several packets of these parts. Each part but the cells is optional, but a layout needs a `sync`
+//! or a `tail`. The vendor of the JX255N publishes no protocol: these layouts are those of
+//! comparable film arrays.
 //!
 //! The files below are in reading order. Each uses only those above it.
 //!
@@ -16,15 +17,17 @@ mod checksum;
 mod settings;
 mod cells;
 mod scan;
-mod fixed;
 mod text;
+mod preset;
+mod fixed;
 mod zero_run;
 mod layout;
 mod decoder;
 
-pub use self::checksum::Checksum;
+pub use self::checksum::{Checksum, ChecksumOver};
 pub use self::decoder::{Damage, Decoded, Decoder, Memory};
 pub use self::layout::Layout;
 pub use self::settings::{
-    Cell, HexBytes, HexError, LayoutError, LengthField, Order, Preset, Settings,
+    Cell, FooterBytes, HexBytes, HexError, LayoutError, LengthField, Order, Packets, Preset,
+    Settings,
 };

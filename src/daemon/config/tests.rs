@@ -127,8 +127,8 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
             &["line 4, ", "sync", "xyz", "hex"],
         ),
         (
-            "[[sensor]]\nport = \"p\"\n[sensor.frame]\npreset = \"ff-tail\"\nsync = \"AA\"",
-            &["frame.sync", "preset ff-tail fixes it"],
+            "[[sensor]]\nport = \"p\"\n[sensor.frame]\npreset = \"ascii\"\nsync = \"AA\"",
+            &["frame.sync", "frames of preset ascii have no such part"],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[sensor.calibration]\ndead_taxels = [[28, 0]]",

@@ -17,7 +17,7 @@
 use std::collections::BTreeMap;
 
 use hardnessd_core::frame::Array;
-use hardnessd_core::wire::{Cell, Checksum, HexBytes, LengthField, Preset, Settings};
+use hardnessd_core::wire::{Cell, Checksum, HexBytes, LengthField, Settings};
 
 /// The smallest side of an array that is looked for. Any short repetition would fit a smaller
 /// array.
@@ -209,17 +209,14 @@ fn free(block: &[u8], tail: usize, side: usize, cell: Cell, checksum: Checksum) 
         })
         .unwrap_or((LengthField::None, header));
     Settings {
-        preset: Preset::default(),
         sync: Some(HexBytes(sync.to_vec())),
         tail: Some(HexBytes(tail.to_vec())),
         length: Some(length),
         cell: Some(cell),
-        mask: None,
-        invert: None,
         checksum: Some(checksum),
         rows: Some(side),
         cols: Some(side),
-        order: None,
+        ..Settings::default()
     }
 }
 

@@ -398,36 +398,11 @@ fn is_preset(settings: &Settings) -> bool {
     *settings == sized
 }
 
-/// The number of keys beside the preset.
+/// The number of keys, the preset included.
 fn keys(settings: &Settings) -> usize {
-    let Settings {
-        preset: _,
-        sync,
-        tail,
-        length,
-        cell,
-        mask,
-        invert,
-        checksum,
-        rows,
-        cols,
-        order,
-    } = settings;
-    [
-        sync.is_some(),
-        tail.is_some(),
-        length.is_some(),
-        cell.is_some(),
-        mask.is_some(),
-        invert.is_some(),
-        checksum.is_some(),
-        rows.is_some(),
-        cols.is_some(),
-        order.is_some(),
-    ]
-    .into_iter()
-    .filter(|&is_given| is_given)
-    .count()
+    toml::Table::try_from(settings)
+        .expect("settings are a table")
+        .len()
 }
 
 /// Pieces from all over `bytes`, or all of `bytes` if they are few.

@@ -30,14 +30,24 @@ impl Cells {
         self.places.len()
     }
 
-    /// Writes the `index`-th cell on the wire to the place of its taxel.
-    pub(super) fn place(&self, frame: &mut RawFrame, index: usize, cell: u16) {
-        let masked = cell & self.mask;
-        frame.counts[usize::from(self.places[index])] = if self.invert {
-            self.mask - masked
-        } else {
-            masked
-        };
+    /// The frame of all cells of all `parts`, which are in the order of the wire.
+    pub(super) fn frame<P>(&self, parts: impl IntoIterator<Item = P>) -> RawFrame
+    where
+        P: IntoIterator<Item = u16>,
+    {
+        let mut frame = RawFrame::zero(self.array);
+        let mut places = self.places.iter();
+        for part in parts {
+            for (cell, &place) in part.into_iter().zip(&mut places) {
+                let masked = cell & self.mask;
+                frame.counts[usize::from(place)] = if self.invert {
+                    self.mask - masked
+                } else {
+                    masked
+                };
+            }
+        }
+        frame
     }
 
     /// The cells of `frame` in the order of the wire.

@@ -1,17 +1,18 @@
 //! A checked layout: where the parts of a frame are.
 
 use super::cells::Cells;
-use super::checksum::Checksum;
+use super::preset::{Keys, Kind};
 use super::scan::{Context, Scan};
-use super::settings::{Cell, HexBytes, LayoutError, LengthField, Order, Preset, Settings};
-use super::{fixed, text, zero_run};
+use super::settings::{LayoutError, Order, Settings};
+use super::text::FrameEnd;
+use super::{fixed, zero_run};
 use crate::frame::{Array, MOST_SIDE, RawFrame};
 
 /// The way to find counts in bytes.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Framing {
     Fixed(fixed::Fixed),
-    Text,
+    Text(FrameEnd),
     ZeroRun,
 }
 
@@ -49,19 +50,38 @@ impl Layout {
     /// # Errors
     ///
     /// Returns a [`LayoutError`] that names the key: a side outside 1..=64, no mark to find frames
-    /// by, a length field that cannot hold the payload, a mask wider than the cell, or a key that a
-    /// preset fixes.
+    /// by, a length field that cannot hold the payload, packets that do not fit, a mask wider than
+    /// the cell, or a part that frames of the preset do not have.
     pub fn new(settings: &Settings) -> Result<Self, LayoutError> {
-        let rows = settings.rows.unwrap_or(Array::JX255N.rows);
-        let cols = settings.cols.unwrap_or(Array::JX255N.cols);
-        for (key, found) in [("rows", rows), ("cols", cols)] {
-            if !(1..=MOST_SIDE).contains(&found) {
-                let max = MOST_SIDE;
+        let keys = Keys::with(settings);
+        for (key, found) in [("rows", keys.rows), ("cols", keys.cols)] {
+            let max = MOST_SIDE;
+            if !(1..=max).contains(&found) {
                 return Err(LayoutError::Size { key, found, max });
             }
         }
-        let array = Array { rows, cols };
-        let (framing, all_ones, largest) = framing(settings, rows * cols)?;
+        let array = Array {
+            rows: keys.rows,
+            cols: keys.cols,
+        };
+        if keys.kind != Kind::Fixed
+            && let Some(key) = key_of_parts(settings)
+        {
+            return Err(LayoutError::Unused {
+                key,
+                preset: settings.preset,
+            });
+        }
+        // The value of a cell with all ones, and the largest cell value if it is known.
+        let (framing, all_ones, largest) = match keys.kind {
+            Kind::Text(end) => (Framing::Text(end), u16::MAX, None),
+            Kind::ZeroRun => (Framing::ZeroRun, 0xFF, Some(0xFE)),
+            Kind::Fixed => {
+                let fixed = fixed::Fixed::new(keys)?;
+                let (all_ones, largest) = (fixed.all_ones(), fixed.largest_cell());
+                (Framing::Fixed(fixed), all_ones, Some(largest))
+            }
+        };
         let mask = settings.mask.unwrap_or(all_ones);
         if mask == 0 || mask > all_ones {
             return Err(LayoutError::Mask {
@@ -92,31 +112,29 @@ impl Layout {
 
     /// The number of bytes in a frame. If frames vary, of the longest one.
     pub fn max_frame_bytes(&self) -> usize {
-        let cells = self.cells.count();
         match &self.framing {
-            Framing::Fixed(fixed) => fixed.frame_bytes(cells),
-            Framing::Text => text::max_frame_bytes(&self.cells),
-            Framing::ZeroRun => zero_run::max_frame_bytes(cells),
+            Framing::Fixed(fixed) => fixed.frame_bytes(),
+            Framing::Text(end) => end.max_frame_bytes(&self.cells),
+            Framing::ZeroRun => zero_run::max_frame_bytes(self.cells.count()),
         }
     }
 
     /// The number of bytes in a frame. If frames vary, of the shortest one.
     pub fn min_frame_bytes(&self) -> usize {
-        let cells = self.cells.count();
         match &self.framing {
-            Framing::Fixed(fixed) => fixed.frame_bytes(cells),
-            Framing::Text => text::min_frame_bytes(self.cells.array),
-            Framing::ZeroRun => zero_run::min_frame_bytes(cells),
+            Framing::Fixed(fixed) => fixed.frame_bytes(),
+            Framing::Text(end) => end.min_frame_bytes(&self.cells),
+            Framing::ZeroRun => zero_run::min_frame_bytes(self.cells.count()),
         }
     }
 
     /// Appends `frame` as the sensor would send it. Counts beyond a cell's largest value are
-    /// clipped to it.
+    /// clipped to it. Skipped bytes are zeros.
     pub fn encode(&self, frame: &RawFrame, out: &mut Vec<u8>) {
         let cells = self.cells.of(frame);
         match &self.framing {
-            Framing::Fixed(fixed) => fixed.encode(cells, self.cells.count(), out),
-            Framing::Text => text::encode(cells, self.cells.array.cols, out),
+            Framing::Fixed(fixed) => fixed.encode(cells, out),
+            Framing::Text(end) => end.encode(cells, self.cells.array, out),
             Framing::ZeroRun => zero_run::encode(cells, out),
         }
     }
@@ -125,7 +143,7 @@ impl Layout {
     pub(super) fn scan(&self, bytes: &[u8], context: Context) -> Scan {
         match &self.framing {
             Framing::Fixed(fixed) => fixed.scan(&self.cells, bytes, context),
-            Framing::Text => text::scan(&self.cells, bytes, context),
+            Framing::Text(end) => end.scan(&self.cells, bytes, context),
             Framing::ZeroRun => zero_run::scan(&self.cells, bytes, context),
         }
     }
@@ -139,104 +157,23 @@ impl Layout {
     /// Whether the next frame begins where a dropped candidate ended. This holds for text and for
     /// runs, whose candidates end with the mark of a frame's end.
     pub(super) fn ends_with_dropped(&self) -> bool {
-        matches!(&self.framing, Framing::Text | Framing::ZeroRun)
+        matches!(&self.framing, Framing::Text(_) | Framing::ZeroRun)
     }
 }
 
-/// The framing of a preset with its overrides, the value of a cell with all ones, and the largest
-/// cell value if it is known.
-fn framing(settings: &Settings, cells: usize) -> Result<(Framing, u16, Option<u16>), LayoutError> {
-    let hex = |bytes: &[u8]| bytes.to_vec();
-    let (sync, tail, length, cell, checksum) = match settings.preset {
-        Preset::Jx255n => (
-            hex(&[0xBB, 0xAA]),
-            hex(&[]),
-            LengthField::U16le,
-            Cell::U8,
-            Checksum::Crc16Modbus,
-        ),
-        Preset::Jx255nU16 => (
-            hex(&[0xBB, 0xAA]),
-            hex(&[]),
-            LengthField::U16le,
-            Cell::U16le,
-            Checksum::Crc16Modbus,
-        ),
-        Preset::Jq => (
-            hex(&JQ_MARK),
-            hex(&[]),
-            LengthField::None,
-            Cell::U8,
-            Checksum::None,
-        ),
-        Preset::JqTail => (
-            hex(&[]),
-            hex(&JQ_MARK),
-            LengthField::None,
-            Cell::U8,
-            Checksum::None,
-        ),
-        Preset::JqU16 => (
-            hex(&[]),
-            JQ_MARK.iter().flat_map(|&byte| [byte, 0]).collect(),
-            LengthField::None,
-            Cell::U16le,
-            Checksum::None,
-        ),
-        Preset::FfTail => (
-            hex(&[]),
-            hex(&[0xFF]),
-            LengthField::None,
-            Cell::U8,
-            Checksum::None,
-        ),
-        Preset::Ascii => {
-            only_preset(settings)?;
-            return Ok((Framing::Text, u16::MAX, None));
-        }
-        Preset::ZeroRun => {
-            only_preset(settings)?;
-            return Ok((Framing::ZeroRun, 0xFF, Some(0xFE)));
-        }
-    };
-    let closed = settings.preset == Preset::FfTail;
-    if closed {
-        only_preset(settings)?;
-    }
-    let owned = |given: &Option<HexBytes>, preset| given.clone().map_or(preset, |bytes| bytes.0);
-    let fixed = fixed::Fixed::new(
-        fixed::Parts {
-            sync: owned(&settings.sync, sync),
-            tail: owned(&settings.tail, tail),
-            length: settings.length.unwrap_or(length),
-            cell: settings.cell.unwrap_or(cell),
-            checksum: settings.checksum.unwrap_or(checksum),
-            tail_not_in_cells: closed,
-        },
-        cells,
-    )?;
-    let all_ones = fixed.largest_cell();
-    let full_scale = if closed { 0xFE } else { all_ones };
-    Ok((Framing::Fixed(fixed), all_ones, Some(full_scale)))
-}
-
-/// The header or tail of the JQ arrays.
-const JQ_MARK: [u8; 4] = [0xAA, 0x55, 0x03, 0x99];
-
-/// Refuses overrides of `ff-tail`, `ascii` and `zero-run`, whose marks and cells belong together.
-fn only_preset(settings: &Settings) -> Result<(), LayoutError> {
+/// The first key that is given of those that only frames of one length have.
+fn key_of_parts(settings: &Settings) -> Option<&'static str> {
     let given = [
         ("sync", settings.sync.is_some()),
         ("tail", settings.tail.is_some()),
         ("length", settings.length.is_some()),
+        ("header_bytes", settings.header_bytes.is_some()),
         ("cell", settings.cell.is_some()),
+        ("footer_bytes", settings.footer_bytes.is_some()),
         ("checksum", settings.checksum.is_some()),
+        ("checksum_over", settings.checksum_over.is_some()),
+        ("packets", settings.packets.is_some()),
     ];
-    match given.into_iter().find(|&(_, is_given)| is_given) {
-        Some((key, _)) => Err(LayoutError::Fixed {
-            key,
-            preset: settings.preset,
-        }),
-        None => Ok(()),
-    }
+    let key = given.into_iter().find(|&(_, is_given)| is_given);
+    key.map(|(key, _)| key)
 }

@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use super::checksum::Checksum;
+use super::checksum::{Checksum, ChecksumOver};
 
 /// Ready-made layouts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -27,6 +27,14 @@ pub enum Preset {
     Ascii,
     /// 1..254 is a value, `00 n` is a run of n zeros, `FF` ends the frame.
     ZeroRun,
+    /// `AA 55`, 16x32 cells u8.
+    Flexitac,
+    /// Two packets: `AA 55 03 99`, packet number, type, 128 cells u8; 16 more bytes end the second.
+    JqGlove,
+    /// `AA AB AC`, 16x16 cells u16 BE, four more bytes.
+    M1616,
+    /// All decimals of a frame on one line.
+    Csv,
 }
 
 impl fmt::Display for Preset {
@@ -66,6 +74,9 @@ pub struct Settings {
     /// The field after `sync` that holds the number of bytes of the cells.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub length: Option<LengthField>,
+    /// The number of bytes that are skipped before the cells.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub header_bytes: Option<usize>,
     /// How a taxel is written.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cell: Option<Cell>,
@@ -75,9 +86,15 @@ pub struct Settings {
     /// Whether the count is `mask` minus the cell.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub invert: Option<bool>,
-    /// The checksum over all bytes before it, little-endian.
+    /// The number of bytes that are skipped after the cells.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub footer_bytes: Option<FooterBytes>,
+    /// The checksum.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub checksum: Option<Checksum>,
+    /// The bytes that the checksum covers.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub checksum_over: Option<ChecksumOver>,
     /// The number of rows of the array, 1 to 64.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rows: Option<usize>,
@@ -87,6 +104,41 @@ pub struct Settings {
     /// The order in which the taxels are sent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub order: Option<Order>,
+    /// The packets of a frame, if a frame is sent in several.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub packets: Option<Packets>,
+}
+
+/// The number of bytes that are skipped after the cells.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(
+    untagged,
+    expecting = "expected a number of bytes, or a list with a number for each packet"
+)]
+pub enum FooterBytes {
+    /// The same number in each packet.
+    Each(usize),
+    /// A number for each packet.
+    Of(Vec<usize>),
+}
+
+/// The `[sensor.frame.packets]` table: a frame that is sent in several packets. Each packet has the
+/// parts of a frame, and an equal share of the cells.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Packets {
+    /// The number of packets of a frame.
+    pub count: usize,
+    /// The byte that holds the packet's number, counted from 0 in the header bytes.
+    #[serde(default)]
+    pub number_at: usize,
+    /// The number of the first packet. The others follow in steps of one.
+    #[serde(default = "one")]
+    pub first: u8,
+}
+
+fn one() -> u8 {
+    1
 }
 
 /// Bytes written as hex pairs, such as `BB AA`.
@@ -193,12 +245,61 @@ pub enum LayoutError {
         /// The value of a cell with all ones.
         max: u16,
     },
-    /// The preset fixes this key.
-    #[error("{key}: found a value, expected none: preset {preset} fixes it")]
-    Fixed {
+    /// The frames of the preset have no such part.
+    #[error("{key}: found a value, expected none: frames of preset {preset} have no such part")]
+    Unused {
         /// The key.
         key: &'static str,
         /// The preset.
         preset: Preset,
+    },
+    /// Too many bytes are skipped.
+    #[error("{key}: found {found} bytes, expected 0 to {max}")]
+    Skipped {
+        /// `header_bytes` or `footer_bytes`.
+        key: &'static str,
+        /// The configured value.
+        found: usize,
+        /// The most bytes that can be skipped.
+        max: usize,
+    },
+    /// The list of `footer_bytes` is longer or shorter than the packets of a frame.
+    #[error("footer_bytes: found {found} numbers, expected one for each packet ({packets})")]
+    FooterBytes {
+        /// The number of configured values.
+        found: usize,
+        /// The number of packets.
+        packets: usize,
+    },
+    /// The packets cannot be found, because they have no `sync`.
+    #[error("packets: found no sync, expected the one that each packet begins with")]
+    PacketsWithoutSync,
+    /// The cells are not an equal share for each packet.
+    #[error(
+        "packets.count: found {found}, expected 1 to 255 that divides the {cells} cells evenly"
+    )]
+    PacketCount {
+        /// The configured value.
+        found: usize,
+        /// The number of cells.
+        cells: usize,
+    },
+    /// The packet's number is not in the header.
+    #[error(
+        "packets.number_at: found {found}, expected a byte of the header (header_bytes: {header_bytes})"
+    )]
+    PacketNumberAt {
+        /// The configured value.
+        found: usize,
+        /// The configured number of header bytes.
+        header_bytes: usize,
+    },
+    /// The last packet's number does not fit into a byte.
+    #[error("packets.first: found {found}, expected at most {max}: a packet's number is one byte")]
+    PacketFirst {
+        /// The configured value.
+        found: u8,
+        /// The largest value at which the last packet's number fits.
+        max: usize,
     },
 }

@@ -75,8 +75,7 @@ pub(super) fn scan(cells: &Cells, bytes: &[u8], context: Context) -> Scan {
 
 fn unpack(cells: &Cells, packed: &[u8]) -> Option<RawFrame> {
     let count = cells.count();
-    let mut frame = RawFrame::zero(cells.array);
-    let mut index = 0;
+    let mut unpacked = Vec::with_capacity(count);
     let mut bytes = packed.iter();
     while let Some(&byte) = bytes.next() {
         let run = if byte == 0 {
@@ -84,13 +83,10 @@ fn unpack(cells: &Cells, packed: &[u8]) -> Option<RawFrame> {
         } else {
             1
         };
-        if run == 0 || index + run > count {
+        if run == 0 || unpacked.len() + run > count {
             return None;
         }
-        for _ in 0..run {
-            cells.place(&mut frame, index, u16::from(byte));
-            index += 1;
-        }
+        unpacked.resize(unpacked.len() + run, u16::from(byte));
     }
-    (index == count).then_some(frame)
+    (unpacked.len() == count).then(|| cells.frame([unpacked]))
 }
