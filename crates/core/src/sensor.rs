@@ -4,6 +4,7 @@
 //! In: a [`Description`] from a configuration or a recording. Out: a [`Sensor`]. Every value of a
 //! [`Sensor`] is in its range, and the values fit each other, so no other module checks them again.
 
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
@@ -100,6 +101,12 @@ pub enum SensorError {
     /// The layout of a frame is unusable.
     #[error("frame.{0}")]
     Frame(#[from] wire::LayoutError),
+    /// The time between requests is too short or too long for any sensor.
+    #[error("frame.request_ms: found {0}, expected 1 to 3600000 milliseconds")]
+    RequestTime(u32),
+    /// A time between requests, and no request.
+    #[error("frame.request_ms: found a value, expected none without frame.request")]
+    NoRequest,
     /// The calibration is unusable.
     #[error("calibration.{0}")]
     Calibration(#[from] tare::SettingsError),
@@ -130,6 +137,9 @@ pub const FRAME_RATES_HZ: (f64, f64) = (0.01, 10_000.0);
 /// The accepted stale times: from a period of the highest rate to an hour. Nobody waits longer for
 /// a frame.
 const STALE_AFTER_MS: (f64, f64) = (0.1, 3_600_000.0);
+
+/// The accepted times between requests, up to an hour.
+const REQUEST_MS: RangeInclusive<u32> = 1..=3_600_000;
 
 /// The longest name. A name is part of topics, of file names and of each line of the log.
 const MOST_NAME_CHARS: usize = 64;
@@ -207,6 +217,11 @@ impl Sensor {
             Some(ms) => return Err(SensorError::StaleAfter(ms)),
         };
         let layout = Layout::new(frame)?;
+        match frame.request_ms {
+            Some(_) if frame.request.is_none() => return Err(SensorError::NoRequest),
+            Some(ms) if !REQUEST_MS.contains(&ms) => return Err(SensorError::RequestTime(ms)),
+            _ => {}
+        }
         calibration.check(layout.array())?;
         let thresholds = press.check(layout.array(), calibration.pitch_mm)?;
         arm.check()?;
@@ -295,6 +310,7 @@ fn of_ms(ms: f64) -> Duration {
 mod tests {
     use super::*;
     use crate::motion::Settings as Arm;
+    use crate::wire::HexBytes;
 
     #[test]
     fn a_value_that_no_sensor_has_is_refused_with_its_key() {
@@ -322,6 +338,19 @@ mod tests {
             check(&|d| d.stale_after_ms = Some(ms), "stale_after_ms: found");
         }
         check(&|d| d.frame.rows = Some(65), "frame.rows: found 65");
+        check(
+            &|d| d.frame.request_ms = Some(5),
+            "frame.request_ms: found a value",
+        );
+        for ms in [0, 3_600_001] {
+            check(
+                &|d| {
+                    d.frame.request = Some(HexBytes(vec![0x52]));
+                    d.frame.request_ms = Some(ms);
+                },
+                &format!("frame.request_ms: found {ms}, expected 1 to 3600000"),
+            );
+        }
         let dead = "calibration.dead_taxels: found [5, 0]";
         check(
             &|d| {

@@ -104,6 +104,15 @@ pub struct Settings {
     /// The order in which the taxels are sent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub order: Option<Order>,
+    /// Bytes that ask the sensor for a frame, in hex. They are sent again and again.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub request: Option<HexBytes>,
+    /// The time from one request to the next, in milliseconds. The default is the frame period.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub request_ms: Option<u32>,
+    /// Bytes that are sent once after each opening of the port, in hex.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub start: Option<HexBytes>,
     /// The packets of a frame, if a frame is sent in several.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub packets: Option<Packets>,
