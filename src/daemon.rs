@@ -7,6 +7,7 @@
 //! daemon starts without its sensors and waits for them.
 
 mod accept;
+pub(crate) mod baud;
 pub mod busy;
 mod client;
 mod clients;
@@ -18,6 +19,7 @@ mod http;
 mod hub;
 pub(crate) mod lines;
 pub mod log;
+pub mod port;
 pub mod publish;
 pub mod realtime;
 pub mod record;
@@ -51,7 +53,8 @@ use tokio::task::JoinSet;
 use tracing::{debug, info, warn};
 
 use self::clients::Clients;
-use self::config::{Config, Publish, Setup};
+use self::baud::Load;
+use self::config::{Config, Publish, SensorTable, Setup};
 use self::publish::Publishers;
 use self::realtime::Standing;
 use self::record::{EventRecorder, Progress, Recorder, SensorRecorder, Target};
@@ -64,6 +67,7 @@ use hardnessd_core::exit::{CONFIG, Coded, FAILED, IO};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::recording::{About, Found, Labels, RecordedSensor};
+use hardnessd_core::sensor::Sensor;
 
 /// The most commands that wait for a sensor. When the queue is full, the tasks that send wait.
 const QUESTIONS: usize = 16;
@@ -318,7 +322,7 @@ fn start_sensors(
     for (index, (port, sensor)) in ports.zip(&setup.sensors).enumerate() {
         let (commands, inbox) = mpsc::channel(QUESTIONS);
         let pipeline = Pipeline::new(sensor.clone(), setup.hrn.clone(), Clock::Arrival);
-        let link = Link::new(&port.port, port.baud.get());
+        let link = Link::new(&port.port, port.baud.get(), serial::Settings::of(sensor));
         let recorder = recorder.map_or(SensorRecorder::default(), |recorder| {
             recorder.of_sensor(index)
         });
@@ -349,8 +353,8 @@ fn announce(setup: &Setup, run: &str) {
         scheduling = standing,
         "started"
     );
-    for sensor in &setup.config.sensors {
-        info!(sensor = sensor.name.as_str(), port = %sensor.port.display(), "sensor");
+    for (sensor, checked) in setup.config.sensors.iter().zip(&setup.sensors) {
+        announce_sensor(sensor, checked);
     }
     let clock = now().wall;
     if !ROS_SECONDS.contains(&clock.as_second()) {
@@ -359,6 +363,14 @@ fn announce(setup: &Setup, run: &str) {
             "the header of a ROS 2 message cannot hold the time of this machine's clock: it has the nearest \
              that it can"
         );
+    }
+}
+
+fn announce_sensor(sensor: &SensorTable, checked: &Sensor) {
+    let name = sensor.name.as_str();
+    info!(sensor = name, port = %sensor.port, "sensor");
+    if let Some(excess) = Load::of(sensor, checked.layout()).excess {
+        warn!(sensor = name, %excess, "the line cannot carry frame_rate_hz");
     }
 }
 

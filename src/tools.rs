@@ -13,7 +13,7 @@ mod faults;
 #[cfg(feature = "zenoh")]
 pub mod fleet;
 mod player;
-mod pty;
+pub(crate) mod pty;
 pub mod record;
 pub mod recover;
 pub mod replay;

@@ -27,6 +27,7 @@ pub use self::publish::{
 };
 use self::read::Until;
 use super::log;
+use super::port::Port;
 use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::verdict::Hrn;
 use hardnessd_core::{motion, press, tare, trial, wire};
@@ -67,8 +68,8 @@ pub struct Config {
 pub struct SensorTable {
     /// The sensor's name: unique, and `[a-z][a-z0-9_]*`.
     pub name: String,
-    /// The sensor's device file. It has no default: [`Config::load`] refuses an empty path.
-    pub port: PathBuf,
+    /// The sensor's port. It has no default: [`Config::load`] refuses an empty path.
+    pub port: Port,
     /// The baud rate of the serial line, in bits per second. A pty and USB CDC ignore it.
     pub baud: NonZeroU32,
     /// The number of frames that the sensor is expected to send in a second.
@@ -98,7 +99,7 @@ impl Default for SensorTable {
         } = Description::default();
         Self {
             name,
-            port: PathBuf::new(),
+            port: PathBuf::new().into(),
             baud: const { NonZeroU32::new(115_200).unwrap() },
             frame_rate_hz,
             stale_after_ms,
@@ -111,9 +112,9 @@ impl Default for SensorTable {
 
 impl SensorTable {
     /// A sensor at `port`, with the defaults of all other keys.
-    pub fn new(port: PathBuf) -> Self {
+    pub fn new(port: impl Into<Port>) -> Self {
         Self {
-            port,
+            port: port.into(),
             ..Self::default()
         }
     }

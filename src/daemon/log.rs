@@ -9,6 +9,7 @@ mod limit;
 mod lines;
 
 use std::io::IsTerminal;
+use std::net::SocketAddr;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
@@ -21,6 +22,7 @@ use tracing_subscriber::{Registry, reload};
 use self::journal::Journal;
 use self::limit::Limit;
 use self::lines::Lines;
+use super::serial::tty::Changed;
 use hardnessd_core::event::{Event, LinkState, PressState, Tared, name};
 use hardnessd_core::pipeline::Unjudged;
 use hardnessd_core::tare::RetareError;
@@ -304,6 +306,25 @@ pub(crate) fn frame_rate(sensor: &str, frame_rate_hz: f64, measured_hz: f64) {
         frame_rate_hz,
         measured_hz,
         "the sensor sends frames at another rate: set frame_rate_hz to it"
+    );
+}
+
+/// Logs that another program had changed the settings of a serial line.
+pub(crate) fn line_settings(sensor: &str, changed: &Changed) {
+    warn!(
+        sensor,
+        found = changed.found,
+        expected = changed.expected,
+        "another program changed the settings of the line: they are set again"
+    );
+}
+
+/// Logs that a second sender sends datagrams for a sensor.
+pub(crate) fn stranger(sensor: &str, address: SocketAddr) {
+    warn!(
+        sensor,
+        %address,
+        "ignored: another sender sends for this sensor, and one at a time may"
     );
 }
 

@@ -17,7 +17,7 @@ use super::hub;
 use super::log;
 use super::record::{NoBlackbox, SensorRecorder};
 use super::request::motion::{Calendar, Placed};
-use super::serial::{Link, Turn};
+use super::serial::{self, Link, Turn};
 use hardnessd_core::event::{Event, Kind, Status, Tared};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::motion::StepBack;
@@ -155,6 +155,7 @@ pub(crate) async fn serve(
                 }
                 Some(Command::Reload(sensor, hrn)) => {
                     recorder.reload(&pipeline, &sensor, &hrn, super::now());
+                    link.reload(serial::Settings::of(&sensor));
                     let reloaded = pipeline.reload(*sensor, hrn);
                     reloaded.expect("a configuration that differs in what is fixed was refused");
                     answer(&mut pipeline, &mut taring);
@@ -173,6 +174,14 @@ pub(crate) async fn serve(
                     Turn::Opened => Input::Opened,
                     Turn::Unavailable(reason) => Input::Unavailable(reason.into()),
                     Turn::Lost(reason) => Input::Lost(reason.into()),
+                    Turn::Restored(changed) => {
+                        log::line_settings(pipeline.sensor().name(), &changed);
+                        continue;
+                    }
+                    Turn::Stranger(address) => {
+                        log::stranger(pipeline.sensor().name(), address);
+                        continue;
+                    }
                 };
                 take(&mut pipeline, &mut recorder, input, at)
             }

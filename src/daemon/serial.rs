@@ -1,19 +1,31 @@
-//! One serial port, which is opened, read, and opened again when it is lost.
+//! One port, which is opened, read, and opened again when it is lost.
 //!
-//! In: the configured path and baud rate. Out: one [`Turn`] at a time: bytes, or what happened to
-//! the port. This module tries to open the port for as long as it runs, and never interprets the
-//! bytes. The port is opened exclusively (by TIOCEXCL and flock; only flock keeps root out), and
-//! stale input is flushed. A read of no bytes means that the port is lost, because every read of an
-//! unplugged tty gives no bytes.
+//! In: the configured port, and what the sensor expects to be sent. Out: one [`Turn`] at a time:
+//! bytes, or what happened to the port. This module tries to open the port for as long as it runs,
+//! and never interprets the bytes. A read of no bytes means that the port is lost: every read of an
+//! unplugged tty gives no bytes, and so does a read of a connection that the other end has closed.
 
-use std::path::{Path, PathBuf};
+mod network;
+pub(crate) mod tty;
+
+use std::io;
+use std::net::SocketAddr;
+use std::os::unix::fs::{FileTypeExt, MetadataExt};
+use std::path::Path;
 use std::time::Duration;
 
-use serialport::{ClearBuffer, ErrorKind, SerialPort, TTYPort};
+use rustix::io::Errno;
 use tokio::io::AsyncReadExt;
+use tokio::io::unix::AsyncFd;
+use tokio::net::TcpStream;
 use tokio::sync::oneshot;
 use tokio::time::Instant;
-use tokio_serial::SerialStream;
+
+use self::network::{Datagram, Udp};
+use self::tty::{Changed, Tty};
+use super::port::Port;
+use hardnessd_core::sensor::Sensor;
+use hardnessd_core::wording;
 
 /// The pause before the first try to reopen. It doubles with each try that fails.
 const FIRST_PAUSE: Duration = Duration::from_millis(50);
@@ -22,6 +34,11 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 
 /// The most bytes read at once: 20 frames of the JX255N.
 const BUFFER_BYTES: usize = 16 * 1024;
+/// The longest datagram.
+const DATAGRAM_BYTES: usize = 64 * 1024;
+
+/// How often the settings of a serial line are compared while its sensor is stale.
+const COMPARE_EVERY: Duration = Duration::from_secs(1);
 
 /// A change of the port, or bytes from it.
 #[derive(Debug)]
@@ -34,13 +51,49 @@ pub(crate) enum Turn<'a> {
     Bytes(&'a [u8]),
     /// The port was open and is lost, for this reason.
     Lost(String),
+    /// Another program had changed the settings of the line. They are set again.
+    Restored(Changed),
+    /// Datagrams of this sender are ignored, because another one sends.
+    Stranger(SocketAddr),
+}
+
+/// What a link must know of its sensor.
+#[derive(Debug, Clone)]
+pub(crate) struct Settings {
+    /// The silence after which the sensor is stale.
+    pub(crate) stale_after: Duration,
+    /// Sent once after each opening.
+    pub(crate) start: Vec<u8>,
+    /// Sent again and again, after this time.
+    pub(crate) request: Option<(Vec<u8>, Duration)>,
+}
+
+impl Settings {
+    /// The settings for `sensor`.
+    pub(crate) fn of(sensor: &Sensor) -> Self {
+        let frame = &sensor.description().frame;
+        let every = frame.request_ms.map(|ms| Duration::from_millis(ms.into()));
+        let request = frame.request.as_ref();
+        Self {
+            stale_after: sensor.stale_after(),
+            start: frame.start.clone().unwrap_or_default().0,
+            request: request.map(|bytes| (bytes.0.clone(), every.unwrap_or(sensor.period()))),
+        }
+    }
+
+    /// The bytes to send at the opening.
+    fn opening(&self) -> Vec<u8> {
+        let request = self.request.iter().flat_map(|(bytes, _)| bytes);
+        self.start.iter().chain(request).copied().collect()
+    }
 }
 
 /// A port and its state.
 #[derive(Debug)]
 pub(crate) struct Link {
-    path: PathBuf,
+    port: Port,
     baud: u32,
+    settings: Settings,
     state: State,
     pause: Duration,
     buffer: Box<[u8]>,
@@ -50,20 +103,56 @@ pub(crate) struct Link {
 enum State {
     /// The port will be opened at this time.
     Waiting(Instant),
-    /// A separate thread is opening the port, because a driver may be slow.
-    Opening(oneshot::Receiver<Result<TTYPort, serialport::Error>>),
-    Open(SerialStream),
+    /// A separate thread is opening the port, because a driver or a network may be slow.
+    Opening(oneshot::Receiver<io::Result<Opened>>),
+    Open(Open),
+}
+
+/// A port that is open, but not known to the runtime yet.
+#[derive(Debug)]
+enum Opened {
+    Tty(Tty),
+    Tcp(std::net::TcpStream),
+    Udp(std::net::UdpSocket),
+}
+
+#[derive(Debug)]
+struct Open {
+    line: Line,
+    /// When the next request is due, if the sensor wants any.
+    request_at: Option<Instant>,
+    /// When the settings of a serial line are compared next.
+    compare_at: Option<Instant>,
+}
+
+#[derive(Debug)]
+enum Line {
+    Tty(AsyncFd<Tty>),
+    Tcp(TcpStream),
+    Udp(Udp),
+}
+
+/// What happened to an open port.
+enum Happened {
+    Read(io::Result<Datagram>),
+    RequestIsDue,
+    CompareIsDue,
 }
 
 impl Link {
-    /// A link to `path`. The first turn opens it.
-    pub(crate) fn new(path: &Path, baud: u32) -> Self {
+    /// A link to `port`. The first turn opens it.
+    pub(crate) fn new(port: &Port, baud: u32, settings: Settings) -> Self {
+        let bytes = match port {
+            Port::Device(_) | Port::Tcp(_) => BUFFER_BYTES,
+            Port::Udp(_) => DATAGRAM_BYTES,
+        };
         Self {
-            path: path.to_owned(),
+            port: port.clone(),
             baud,
+            settings,
             state: State::Waiting(Instant::now()),
             pause: FIRST_PAUSE,
-            buffer: vec![0; BUFFER_BYTES].into(),
+            buffer: vec![0; bytes].into(),
         }
     }
 
@@ -73,7 +162,8 @@ impl Link {
             match &mut self.state {
                 State::Waiting(until) => {
                     tokio::time::sleep_until(*until).await;
-                    match start_opening(self.path.clone(), self.baud) {
+                    let opening = start_opening(&self.port, self.baud, self.settings.opening());
+                    match opening {
                         Ok(opening) => self.state = State::Opening(opening),
                         Err(error) => {
                             self.wait();
@@ -83,27 +173,54 @@ impl Link {
                 }
                 State::Opening(opening) => {
                     let opened = match opening.await {
-                        Ok(opened) => opened.and_then(SerialStream::try_from),
-                        Err(ended) => Err(std::io::Error::other(ended).into()),
+                        Ok(opened) => opened.and_then(|opened| Open::new(opened, &self.settings)),
+                        Err(ended) => Err(io::Error::other(ended)),
                     };
                     match opened {
-                        Ok(port) => {
-                            self.state = State::Open(port);
+                        Ok(open) => {
+                            self.state = State::Open(open);
                             return Turn::Opened;
                         }
                         Err(error) => {
                             self.wait();
-                            return Turn::Unavailable(reason(&error));
+                            return Turn::Unavailable(reason(&self.port, &error));
                         }
                     }
                 }
-                State::Open(port) => {
-                    // A read that is cancelled has read nothing, because a read is one system call,
-                    // made when bytes are there.
-                    let lost = match AsyncReadExt::read(port, &mut self.buffer).await {
-                        Ok(0) => "end of file".to_owned(),
-                        Ok(read) => return Turn::Bytes(&self.buffer[..read]),
-                        Err(error) => error.to_string(),
+                State::Open(open) => {
+                    let happened = open.wait(&mut self.buffer, self.settings.stale_after).await;
+                    let now = Instant::now();
+                    let lost = match happened {
+                        Happened::Read(Ok(Datagram::Bytes(0))) => open.line.end().to_owned(),
+                        Happened::Read(Ok(Datagram::Bytes(read))) => {
+                            return Turn::Bytes(&self.buffer[..read]);
+                        }
+                        Happened::Read(Ok(Datagram::First(read))) => {
+                            open.line.send(&self.settings.opening());
+                            if read == 0 {
+                                continue;
+                            }
+                            return Turn::Bytes(&self.buffer[..read]);
+                        }
+                        Happened::Read(Ok(Datagram::Stranger(address))) => {
+                            return Turn::Stranger(address);
+                        }
+                        Happened::Read(Err(error)) => error.to_string(),
+                        Happened::RequestIsDue => {
+                            if let Some((request, every)) = &self.settings.request {
+                                open.line.send(request);
+                                let next = open.request_at.map(|at| (at + *every).max(now));
+                                open.request_at = next;
+                            }
+                            continue;
+                        }
+                        Happened::CompareIsDue => {
+                            open.compare_at = Some(now + COMPARE_EVERY);
+                            match open.line.restore() {
+                                Some(changed) => return Turn::Restored(changed),
+                                None => continue,
+                            }
+                        }
                     };
                     self.wait();
                     return Turn::Lost(lost);
@@ -112,10 +229,22 @@ impl Link {
         }
     }
 
-    /// Records that the port works, so that it is opened again quickly after the next loss. A port
-    /// that fails as soon as it is opened never gets so far.
+    /// Records that the port works: frames come. So it is opened again quickly after the next loss,
+    /// and its settings are right. A port that fails as soon as it is opened never gets so far.
     pub(crate) fn proven(&mut self) {
         self.pause = FIRST_PAUSE;
+        if let State::Open(Open {
+            compare_at: Some(at),
+            ..
+        }) = &mut self.state
+        {
+            *at = Instant::now() + self.settings.stale_after;
+        }
+    }
+
+    /// Takes over the changed settings of the sensor.
+    pub(crate) fn reload(&mut self, settings: Settings) {
+        self.settings = settings;
     }
 
     fn wait(&mut self) {
@@ -124,31 +253,136 @@ impl Link {
     }
 }
 
-/// Opens the port in a thread of its own.
+impl Open {
+    fn new(opened: Opened, settings: &Settings) -> io::Result<Self> {
+        let now = Instant::now();
+        let line = match opened {
+            Opened::Tty(tty) => Line::Tty(watched(tty)?),
+            Opened::Tcp(stream) => Line::Tcp(TcpStream::from_std(stream)?),
+            Opened::Udp(socket) => Line::Udp(Udp::new(socket)?),
+        };
+        let is_tty = matches!(line, Line::Tty(_));
+        Ok(Self {
+            line,
+            request_at: settings.request.as_ref().map(|(_, every)| now + *every),
+            compare_at: is_tty.then_some(now + COMPARE_EVERY),
+        })
+    }
+
+    async fn wait(&mut self, buffer: &mut [u8], stale_after: Duration) -> Happened {
+        // A read that is cancelled has read nothing, because a read is one system call, made when
+        // bytes are there.
+        tokio::select! {
+            read = self.line.read(buffer, stale_after) => Happened::Read(read),
+            () = until(self.request_at) => Happened::RequestIsDue,
+            () = until(self.compare_at) => Happened::CompareIsDue,
+        }
+    }
+}
+
+impl Line {
+    async fn read(&mut self, buffer: &mut [u8], stale_after: Duration) -> io::Result<Datagram> {
+        match self {
+            Self::Tty(tty) => loop {
+                let mut ready = tty.readable().await?;
+                if let Ok(read) = ready.try_io(|tty| Ok(rustix::io::read(tty, &mut *buffer)?)) {
+                    return read.map(Datagram::Bytes);
+                }
+            },
+            Self::Tcp(stream) => stream.read(buffer).await.map(Datagram::Bytes),
+            Self::Udp(udp) => udp.read(buffer, stale_after).await,
+        }
+    }
+
+    /// Sends bytes, if there is room for them. What is not sent is sent with the next request, and
+    /// the next read finds out why.
+    fn send(&self, bytes: &[u8]) {
+        match self {
+            Self::Tty(tty) => drop(rustix::io::write(tty, bytes)),
+            Self::Tcp(stream) => drop(rustix::io::write(stream, bytes)),
+            Self::Udp(udp) => udp.send(bytes),
+        }
+    }
+
+    /// Sets the settings of a serial line again, if they differ.
+    fn restore(&self) -> Option<Changed> {
+        match self {
+            // Where this fails, the next read finds out why.
+            Self::Tty(tty) => tty.get_ref().restore().ok().flatten(),
+            Self::Tcp(_) | Self::Udp(_) => None,
+        }
+    }
+
+    /// The reason of a loss by a read of no bytes.
+    fn end(&self) -> &'static str {
+        match self {
+            Self::Tty(_) | Self::Udp(_) => "end of file",
+            Self::Tcp(_) => "closed by the other end",
+        }
+    }
+}
+
+/// Lets the runtime learn when `tty` has bytes.
+#[expect(
+    deprecated,
+    reason = "the other constructor is unsafe, for a type whose descriptor may change: this one owns its own"
+)]
+fn watched(tty: Tty) -> io::Result<AsyncFd<Tty>> {
+    AsyncFd::new(tty)
+}
+
+/// Waits until a time. Without one, this waits forever.
+async fn until(time: Option<Instant>) {
+    match time {
+        Some(time) => tokio::time::sleep_until(time).await,
+        None => std::future::pending().await,
+    }
+}
+
+/// Opens the port in a thread of its own, and sends `first` there.
 ///
 /// # Errors
 ///
 /// Fails if the system has no thread to spare. The runtime's own threads would panic then.
 fn start_opening(
-    path: PathBuf,
+    port: &Port,
     baud: u32,
-) -> std::io::Result<oneshot::Receiver<Result<TTYPort, serialport::Error>>> {
-    let (opened, opening) = oneshot::channel();
+    first: Vec<u8>,
+) -> io::Result<oneshot::Receiver<io::Result<Opened>>> {
+    let (sender, opening) = oneshot::channel();
+    let port = port.clone();
     let thread = std::thread::Builder::new().name("port".to_owned());
     thread.spawn(move || {
         // The daemon may have ended meanwhile.
-        let _ = opened.send(open(&path, baud));
+        let _ = sender.send(open(&port, baud, &first));
     })?;
     Ok(opening)
 }
 
-fn open(path: &Path, baud: u32) -> Result<TTYPort, serialport::Error> {
-    // The builder's defaults are 8N1 without flow control, and exclusive access.
-    let port = TTYPort::open(&serialport::new(path.to_string_lossy(), baud))?;
-    // Bytes from before the port had its settings are of unknown age, and may be garbled.
-    port.clear(ClearBuffer::Input)?;
-    lower_latency(path);
-    Ok(port)
+fn open(port: &Port, baud: u32, first: &[u8]) -> io::Result<Opened> {
+    match port {
+        Port::Device(path) => {
+            let tty = Tty::open(path, baud)?;
+            lower_latency(path);
+            if !first.is_empty() {
+                rustix::io::write(&tty, first)?;
+            }
+            Ok(Opened::Tty(tty))
+        }
+        Port::Tcp(address) => {
+            let stream = network::connect(address)?;
+            if !first.is_empty() {
+                rustix::io::write(&stream, first)?;
+            }
+            Ok(Opened::Tcp(stream))
+        }
+        // The first bytes go to the first sender.
+        Port::Udp(address) => {
+            let socket = std::net::UdpSocket::bind(address)?;
+            socket.set_nonblocking(true)?;
+            Ok(Opened::Udp(socket))
+        }
+    }
 }
 
 /// Asks an FTDI adapter to pass bytes on after 1 ms instead of 16. Failure is no error: most ports
@@ -173,21 +407,38 @@ fn lower_latency(path: &Path) {
     }
 }
 
-fn reason(error: &serialport::Error) -> String {
-    match error.kind() {
-        // This is EBUSY or a lock that is taken: serialport has one kind for both.
-        ErrorKind::NoDevice => "port held by another process".to_owned(),
-        ErrorKind::Io(std::io::ErrorKind::NotFound) => "no such device".to_owned(),
-        ErrorKind::Io(std::io::ErrorKind::PermissionDenied) => "permission denied".to_owned(),
-        _ => of_system(&error.to_string()),
+/// Whether a port that is no device can be opened now.
+pub(crate) fn probe(port: &Port) -> io::Result<()> {
+    open(port, 0, &[]).map(drop)
+}
+
+/// Why `port` cannot be opened, in plain words.
+pub(crate) fn reason(port: &Port, error: &io::Error) -> String {
+    let Some(path) = port.device() else {
+        return wording::line(error);
+    };
+    match Errno::from_io_error(error) {
+        Some(Errno::BUSY | Errno::WOULDBLOCK) if is_held_here(path) => {
+            "this daemon reads that port already, for another sensor".to_owned()
+        }
+        Some(Errno::BUSY | Errno::WOULDBLOCK) => "port held by another process".to_owned(),
+        Some(Errno::NOENT) => "no such device".to_owned(),
+        Some(Errno::ACCESS) => "permission denied".to_owned(),
+        Some(Errno::NOTTY) => "not a serial port".to_owned(),
+        _ => wording::line(error),
     }
 }
 
-/// The system's error of a port, in plain words where the system's own are not plain.
-fn of_system(text: &str) -> String {
-    match text {
-        // These are the texts of ENOTTY.
-        "Not a typewriter" | "Inappropriate ioctl for device" => "not a serial port".to_owned(),
-        text => text.to_owned(),
-    }
+/// Whether this process has the device of `path` open, perhaps under another name.
+fn is_held_here(path: &Path) -> bool {
+    let device = |path: &Path| {
+        let file = std::fs::metadata(path).ok()?;
+        file.file_type().is_char_device().then(|| file.rdev())
+    };
+    let Some(wanted) = device(path) else {
+        return false;
+    };
+    let files = std::fs::read_dir("/proc/self/fd").into_iter().flatten();
+    let mut files = files.flatten();
+    files.any(|file| device(&file.path()) == Some(wanted))
 }

@@ -8,8 +8,8 @@ use clap::Args as ClapArgs;
 use rustix::fs::Access;
 
 use super::configuration::{self, Configuration};
-use super::player::BITS_A_BYTE;
 use crate::daemon;
+use crate::daemon::baud::{Excess, Load, Pace};
 use crate::daemon::config::{self, Endpoint, SensorTable, Setup};
 use hardnessd_core::exit::{CONFIG, Coded, IO};
 use hardnessd_core::frame::Pitch;
@@ -42,24 +42,14 @@ pub enum Error {
         source: daemon::Error,
     },
     /// The line cannot carry that many frames.
-    #[error(
-        "{path}: sensor.frame_rate_hz of {sensor:?}: found {frame_rate_hz} frames/s of \
-         {frame_bytes} bytes, expected at most {most:.2} over {baud} baud at 10 bits a byte \
-         (a pty or USB CDC port has no such limit)"
-    )]
+    #[error("{path}: sensor.frame_rate_hz of {sensor:?}: {excess}")]
     FrameRate {
         /// Path of the configuration.
         path: PathBuf,
         /// The sensor's name.
         sensor: String,
-        /// The configured frame rate in frames/s.
-        frame_rate_hz: f64,
-        /// The number of bytes in a frame of the sensor's layout.
-        frame_bytes: usize,
-        /// The highest frame rate that the line can carry.
-        most: f64,
-        /// The configured baud rate.
-        baud: u32,
+        /// What the line cannot carry.
+        excess: Excess,
     },
     /// Stdout cannot be written to.
     #[error("stdout: {0}")]
@@ -241,23 +231,24 @@ const PITCH_TOLERANCE_MM: f64 = 0.005;
 
 fn line_of(sensor: &SensorTable, layout: &Layout, path: &Path) -> Result<String, Error> {
     let (shortest, longest) = (layout.min_frame_bytes(), layout.max_frame_bytes());
-    let bytes_per_s = sensor.frame_rate_hz * longest as f64;
-    let capacity = f64::from(sensor.baud.get()) / BITS_A_BYTE;
-    let paced = is_paced(&sensor.port);
-    let error = |frame_bytes: usize| Error::FrameRate {
-        path: path.to_owned(),
-        sensor: sensor.name.clone(),
-        frame_rate_hz: sensor.frame_rate_hz,
-        frame_bytes,
-        most: capacity / frame_bytes as f64,
-        baud: sensor.baud.get(),
-    };
-    if paced && sensor.frame_rate_hz * shortest as f64 > capacity {
-        return Err(error(shortest));
-    }
-    // Frames of these layouts vary in length, so this is only a warning.
-    if paced && bytes_per_s > capacity {
-        hardnessd_core::say!("warning: {}", error(longest));
+    let Load {
+        pace,
+        capacity,
+        bytes_per_s,
+        excess,
+    } = Load::of(sensor, layout);
+    if let Some(excess) = excess {
+        let is_certain = excess.is_certain;
+        let error = Error::FrameRate {
+            path: path.to_owned(),
+            sensor: sensor.name.clone(),
+            excess,
+        };
+        if is_certain {
+            return Err(error);
+        }
+        // Frames of some layouts vary in length, and a port that is not there may turn out to be USB CDC.
+        hardnessd_core::say!("warning: {error}");
     }
     let array = layout.array();
     let frame_bytes = if shortest == longest {
@@ -265,18 +256,18 @@ fn line_of(sensor: &SensorTable, layout: &Layout, path: &Path) -> Result<String,
     } else {
         format!("{shortest} to {longest}")
     };
-    let load = if paced {
+    let load = if pace == Pace::Free {
+        format!("{bytes_per_s:.0} bytes/s, whatever the baud rate")
+    } else {
         format!(
             "{bytes_per_s:.0} of {capacity:.0} bytes/s at {} baud",
             sensor.baud
         )
-    } else {
-        format!("{bytes_per_s:.0} bytes/s, whatever the baud rate")
     };
     Ok(format!(
         "sensor {}: {}, {}x{} taxels in {frame_bytes} bytes, {} frames/s: {load}{}\n",
         sensor.name,
-        sensor.port.display(),
+        sensor.port,
         array.rows,
         array.cols,
         sensor.frame_rate_hz,
@@ -293,14 +284,6 @@ fn gains(calibration: &tare::Settings) -> String {
     let least = gains.clone().fold(f32::INFINITY, f32::min);
     let most = gains.fold(0.0, f32::max);
     format!(", gains {least:.2} to {most:.2}")
-}
-
-/// Whether the baud rate limits what the port carries. On a pty and on USB CDC, the baud rate has
-/// no effect. If the port does not exist, its name decides.
-fn is_paced(port: &Path) -> bool {
-    let device = port.canonicalize().unwrap_or_else(|_| port.to_owned());
-    let name = device.file_name().unwrap_or_default().to_string_lossy();
-    !(device.starts_with("/dev/pts") || name.starts_with("ttyACM"))
 }
 
 fn model(setup: &Setup) -> String {

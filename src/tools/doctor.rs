@@ -1,7 +1,8 @@
 //! `hardnessd doctor`: finds why a port does not work. It prints each fault on one line, with the
 //! remedy.
 //!
-//! It opens no device, because opening one resets boards like an Arduino.
+//! It opens no device, because opening one resets boards like an Arduino. The exception is a port that the
+//! daemon has open already.
 
 mod checks;
 #[cfg(test)]
@@ -12,7 +13,8 @@ use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
 
-use self::checks::{User, examine, in_the_way, ports, refused};
+use self::checks::{User, examine, in_the_way, network, ports, refused};
+use crate::daemon::port::Port;
 use hardnessd_core::exit::{Coded, FAILED, IO};
 use hardnessd_core::wording::escaped;
 
@@ -21,7 +23,7 @@ use hardnessd_core::wording::escaped;
 pub struct Args {
     /// Port to examine [default: every USB serial port]
     #[arg(long, value_name = "P")]
-    port: Option<PathBuf>,
+    port: Option<Port>,
 }
 
 /// An error of `doctor`.
@@ -49,12 +51,16 @@ impl Coded for Error {
 
 /// The fault that keeps this process from opening `port`, with the remedy. `None` if no fault is
 /// visible. For example, only root can see that a process of another user holds the port.
-pub(super) fn obstacle(port: &Path) -> Option<String> {
+pub(super) fn obstacle(port: &Port) -> Option<String> {
     let root = Path::new("/");
-    let port = std::path::absolute(port).unwrap_or_else(|_| port.to_owned());
+    let port = absolute(port.device()?);
     let user = User::of_this_process(root);
     let fault = refused(root, &port).or_else(|| in_the_way(root, &port, &user).into_iter().next());
     fault.map(|fault| fault.to_string())
+}
+
+fn absolute(path: &Path) -> PathBuf {
+    std::path::absolute(path).unwrap_or_else(|_| path.to_owned())
 }
 
 /// Prints the faults, each with its remedy.
@@ -66,10 +72,10 @@ pub(super) fn obstacle(port: &Path) -> Option<String> {
 pub fn run(args: &Args) -> Result<(), Error> {
     let root = Path::new("/");
     let user = User::of_this_process(root);
-    let ports = args
-        .port
-        .as_ref()
-        .map_or_else(|| ports(root), |port| vec![port.clone()]);
+    let ports = match &args.port {
+        Some(port) => vec![port.clone()],
+        None => ports(root).into_iter().map(Port::Device).collect(),
+    };
     let mut lines = Vec::new();
     let mut found = 0;
     if ports.is_empty() {
@@ -78,17 +84,25 @@ pub fn run(args: &Args) -> Result<(), Error> {
         lines.push(line.to_owned());
     }
     for port in ports {
-        let port = std::path::absolute(&port).unwrap_or(port);
-        let faults = match refused(root, &port) {
-            Some(fault) => vec![fault],
-            None => examine(root, &port, &user),
+        let (port, faults) = match port.device().map(absolute) {
+            Some(path) => {
+                let faults = match refused(root, &path) {
+                    Some(fault) => vec![fault],
+                    None => examine(root, &path, &user),
+                };
+                (Port::Device(path), faults)
+            }
+            None => {
+                let faults = network::faults(root, &port);
+                (port, faults)
+            }
         };
         found += faults.len();
         if faults.is_empty() {
-            lines.push(format!("{}: no fault found", port.display()));
+            lines.push(format!("{port}: no fault found"));
         }
         for fault in faults {
-            lines.push(format!("{}: {fault}", port.display()));
+            lines.push(format!("{port}: {fault}"));
         }
     }
     let told: String = lines.iter().map(|line| escaped(line) + "\n").collect();

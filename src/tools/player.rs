@@ -14,11 +14,9 @@ use tokio::time::Instant;
 use super::faults::{Faults, Line};
 use super::pty::Pty;
 use super::robot::{Moving, Robot};
+use crate::daemon::baud::BITS_A_BYTE;
 use hardnessd_core::wire::Layout;
 use hardnessd_simulator::{Approach, Sequence, SequenceFrame, SequenceSettings};
-
-/// Bits on the line for a byte: a start bit, eight data bits, a stop bit.
-pub(crate) const BITS_A_BYTE: f64 = 10.0;
 
 /// The time between two writes: shorter than the time in which a UART's FIFO is emptied, yet long
 /// enough to be cheap.

@@ -23,6 +23,7 @@ use super::configuration::Configuration;
 use super::doctor;
 use super::simulate::positive;
 use crate::daemon::config::Setup;
+use crate::daemon::port::Port;
 use crate::daemon::record::{Error as RecordError, Progress};
 use crate::daemon::{self, Daemon, Sockets};
 use hardnessd_core::exit::{Coded, IO, UNAVAILABLE, USAGE};
@@ -101,12 +102,12 @@ pub enum Error {
         source: io::Error,
     },
     /// A sensor is missing at the start.
-    #[error("sensor {sensor:?}: {}: {obstacle}", port.display())]
+    #[error("sensor {sensor:?}: {port}: {obstacle}")]
     Unavailable {
         /// The sensor's name.
         sensor: String,
         /// The sensor's port, as the configuration gives it.
-        port: PathBuf,
+        port: Port,
         /// The fault, and the remedy.
         obstacle: String,
     },
@@ -243,7 +244,7 @@ async fn record(
     progress: watch::Sender<Progress>,
     end: impl Future<Output = ()>,
 ) -> Result<(), Error> {
-    let ports: BTreeMap<String, PathBuf> = setup.config.sensors.iter().map(port_of).collect();
+    let ports: BTreeMap<String, Port> = setup.config.sensors.iter().map(port_of).collect();
     let begun = Daemon::recording(setup, path.to_owned(), file, labels, progress, sockets);
     let daemon = begun.inspect_err(|_| {
         // The file holds nothing, and its path must be free for the next try.
@@ -252,7 +253,7 @@ async fn record(
     match daemon.run(end, None).await {
         Err(daemon::Error::Record(RecordError::Unavailable { sensor, reason })) => {
             let _ = fs::remove_file(path);
-            let port = ports.get(&sensor).cloned().unwrap_or_default();
+            let port = ports[&sensor].clone();
             let obstacle = doctor::obstacle(&port).unwrap_or(reason);
             Err(Error::Unavailable {
                 sensor,
@@ -264,7 +265,7 @@ async fn record(
     }
 }
 
-fn port_of(sensor: &crate::daemon::config::SensorTable) -> (String, PathBuf) {
+fn port_of(sensor: &crate::daemon::config::SensorTable) -> (String, Port) {
     (sensor.name.clone(), sensor.port.clone())
 }
 

@@ -14,7 +14,8 @@ use serde::de::IntoDeserializer;
 use serde::de::value::Error as NameError;
 
 use super::faults::{self, Faults, Line};
-use super::player::{BITS_A_BYTE, Pace, Player};
+use super::player::{Pace, Player};
+use crate::daemon::baud::BITS_A_BYTE;
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::wire::{Layout, LayoutError, Preset, Settings as Frame};

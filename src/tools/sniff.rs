@@ -20,7 +20,8 @@ use clap::{ArgGroup, Args as ClapArgs};
 use self::proposal::{Proposal, propose};
 use super::doctor;
 use super::simulate::positive;
-use crate::daemon::serial::{Link, Turn};
+use crate::daemon::port::Port;
+use crate::daemon::serial::{self, Link, Turn};
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, UNAVAILABLE};
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{self, Entry, FileKind, Reader};
@@ -36,7 +37,7 @@ pub struct Args {
     file: Option<PathBuf>,
     /// Listen to this port instead; press the sensor meanwhile
     #[arg(long, value_name = "P")]
-    port: Option<PathBuf>,
+    port: Option<Port>,
     /// Speed of the port in bits per second
     #[arg(long, value_name = "B", default_value_t = 115_200, conflicts_with = "file",
         value_parser = clap::value_parser!(u32).range(1..))]
@@ -128,22 +129,23 @@ pub async fn run(args: Args) -> Result<(), Error> {
     // This runs on another thread, because the file may be a pipe and many bytes take long.
     let told = tokio::task::spawn_blocking(move || match listened {
         Some(bytes) => tell(&args, &bytes),
-        None => read(args.source()).and_then(|bytes| tell(&args, &bytes)),
+        None => read(&args.source()).and_then(|bytes| tell(&args, &bytes)),
     });
     told.await.expect("a proposal is made without a panic")
 }
 
 impl Args {
     /// The file or the port.
-    fn source(&self) -> &Path {
-        let source = self.file.as_ref().or(self.port.as_ref());
+    fn source(&self) -> PathBuf {
+        let port = self.port.as_ref().map(|port| port.to_string().into());
+        let source = self.file.clone().or(port);
         source.expect("clap asks for a port where there is no file")
     }
 }
 
 /// Prints or writes the layout that explains `bytes`.
 fn tell(args: &Args, bytes: &[u8]) -> Result<(), Error> {
-    let path = args.source();
+    let path = &args.source();
     let proposals = propose(bytes);
     let Some((best, others)) = proposals.split_first() else {
         return Err(Error::Unexplained {
@@ -175,13 +177,15 @@ fn tell(args: &Args, bytes: &[u8]) -> Result<(), Error> {
 
 /// The part of a configuration above `[sensor.frame]`.
 fn configuration(args: &Args, frame_rate_hz: Option<f64>) -> String {
-    let port = args
-        .port
-        .as_deref()
-        .unwrap_or(Path::new("/dev/serial/by-id/..."));
-    // The configuration may be in another directory.
-    let port = std::path::absolute(port).unwrap_or_else(|_| port.to_owned());
-    let port = toml::Value::String(port.display().to_string());
+    let port = match &args.port {
+        // The configuration may be in another directory.
+        Some(Port::Device(path)) => std::path::absolute(path)
+            .map_or(path.clone(), |path| path)
+            .into(),
+        Some(port) => port.clone(),
+        None => Port::Device("/dev/serial/by-id/...".into()),
+    };
+    let port = toml::Value::String(port.to_string());
     let baud = args.baud;
     let mut text = format!("[[sensor]]\nname = \"sensor\"\nport = {port}\nbaud = {baud}\n");
     match frame_rate_hz {
@@ -232,9 +236,17 @@ fn read(path: &Path) -> Result<Vec<u8>, Error> {
     Ok(bytes)
 }
 
+/// After this silence another sender of datagrams is taken.
+const STALE_AFTER: Duration = Duration::from_secs(1);
+
 /// The bytes that come from the port in `seconds`. Fewer if the port is lost.
-async fn listen(path: &Path, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> {
-    let mut link = Link::new(path, baud);
+async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> {
+    let settings = serial::Settings {
+        stale_after: STALE_AFTER,
+        start: Vec::new(),
+        request: None,
+    };
+    let mut link = Link::new(port, baud, settings);
     let mut bytes = Vec::new();
     let mut lost = None;
     // If the duration is too long to count, listening ends when the port is lost or enough bytes
@@ -244,10 +256,11 @@ async fn listen(path: &Path, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> 
         while bytes.len() < MOST_BYTES {
             match link.turn().await {
                 Turn::Opened => {
-                    let path = escaped(&path.display().to_string());
-                    hardnessd_core::say!("listening at {path} for {seconds} s: press the sensor");
+                    let port = escaped(&port.to_string());
+                    hardnessd_core::say!("listening at {port} for {seconds} s: press the sensor");
                 }
                 Turn::Bytes(read) => bytes.extend_from_slice(read),
+                Turn::Restored(_) | Turn::Stranger(_) => {}
                 Turn::Unavailable(reason) | Turn::Lost(reason) => {
                     lost = Some(reason);
                     return;
@@ -258,8 +271,8 @@ async fn listen(path: &Path, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> 
     .await;
     match lost {
         Some(reason) if bytes.is_empty() => Err(Error::Unavailable {
-            path: path.to_owned(),
-            reason: doctor::obstacle(path).unwrap_or(reason),
+            path: port.to_string().into(),
+            reason: doctor::obstacle(port).unwrap_or(reason),
         }),
         _ => Ok(bytes),
     }

@@ -17,6 +17,7 @@ mod demo;
 mod doors;
 mod faults;
 mod http;
+mod lines;
 mod model;
 mod motion;
 mod port;

@@ -2,10 +2,11 @@
 
 use std::collections::{HashMap, HashSet};
 use std::net::{IpAddr, SocketAddr};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use super::error::Error;
 use super::{Config, Model, Publish, Record, Ros2, SensorTable, Unix, Zenoh};
+use crate::daemon::port::Port;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::wording;
 
@@ -295,8 +296,8 @@ const MOST: u64 = 1_000_000_000;
 #[derive(Default)]
 struct Taken<'a> {
     names: HashSet<&'a str>,
-    /// The sensor of each device. A device that exists may have several names.
-    devices: HashMap<PathBuf, &'a str>,
+    /// The sensor of each port. A device that exists may have several names.
+    ports: HashMap<Port, &'a str>,
 }
 
 impl<'a> Taken<'a> {
@@ -309,12 +310,11 @@ impl<'a> Taken<'a> {
             return Err(clash(path, key("name"), problem));
         }
         let port = &sensor.port;
-        let device = port.canonicalize().unwrap_or_else(|_| port.clone());
-        if let Some(other) = self.devices.insert(device, name) {
-            let problem = format!(
-                "{} is the port of {other:?} too: give each sensor a port of its own",
-                port.display()
-            );
+        let device = port.device().and_then(|path| path.canonicalize().ok());
+        let one = device.map_or_else(|| port.clone(), Port::Device);
+        if let Some(other) = self.ports.insert(one, name) {
+            let problem =
+                format!("{port} is the port of {other:?} too: give each sensor a port of its own");
             return Err(clash(path, key("port"), problem));
         }
         Ok(())

@@ -6,6 +6,7 @@ use std::time::Duration;
 use super::error::{Error, MAX_BYTES};
 use super::read::{Until, read};
 use super::{Config, Model};
+use crate::daemon::port::Port;
 use hardnessd_core::npy::{self, NpyError};
 use hardnessd_core::tare::Gains;
 use hardnessd_core::verdict::{self, Hrn};
@@ -28,20 +29,16 @@ pub(super) fn load(path: &Path, until: Until) -> Result<Config, Error> {
     let mut config: Config = toml::from_str(text).map_err(|error| syntax(path, text, &error))?;
     let directory = path.parent().unwrap_or(Path::new(""));
     for sensor in &mut config.sensors {
-        if sensor.port.as_os_str().is_empty() {
-            return Err(Error::NoPort {
-                path: path.to_owned(),
-                sensor: sensor.name.clone(),
-            });
+        if let Port::Device(device) = &mut sensor.port {
+            if device.as_os_str().is_empty() {
+                return Err(Error::NoPort {
+                    path: path.to_owned(),
+                    sensor: sensor.name.clone(),
+                });
+            }
+            let key = format!("sensor.port of {:?}", sensor.name);
+            resolve(device, directory, key, "the path of a device", path)?;
         }
-        let key = format!("sensor.port of {:?}", sensor.name);
-        resolve(
-            &mut sensor.port,
-            directory,
-            key,
-            "the path of a device",
-            path,
-        )?;
         if let Some(given) = &mut sensor.calibration.gains {
             *given = gains(given, directory, &sensor.name, path, until)?;
         }

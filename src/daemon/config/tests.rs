@@ -361,7 +361,7 @@ fn paths_are_relative_to_the_file() {
                 [publish.unix]\npath = \"/run/events.sock\"\ncontrol_path = \"c\"";
     std::fs::write(&path, text).unwrap();
     let config = Config::load(&path).unwrap();
-    assert_eq!(config.sensors[0].port, directory.path().join("port"));
+    assert_eq!(config.sensors[0].port, directory.path().join("port").into());
     assert_eq!(config.model.path, Some(directory.path().join("hrn.onnx")));
     let unix = &config.publish.unix;
     assert_eq!(unix.path(), Path::new("/run/events.sock"));

@@ -1,5 +1,7 @@
 //! The checks of a port. They read the file trees under a root, which is `/` except in tests.
 
+mod daemon;
+pub(super) mod network;
 mod service;
 
 use std::ffi::OsStr;
@@ -230,25 +232,35 @@ fn allows(mode: u32, shift: u32) -> bool {
 /// other users' processes.
 fn held(root: &Path, device: &Path, own: u32) -> Vec<Fault> {
     let mut faults = Vec::new();
+    // Another file may lead to the same device.
+    let wanted = number_of(&under(root, device));
     for pid in processes(root).filter(|&pid| pid != own) {
         let files = root.join("proc").join(pid.to_string()).join("fd");
         let Ok(files) = fs::read_dir(files) else {
             continue;
         };
-        let is_device =
-            |file: fs::DirEntry| fs::read_link(file.path()).is_ok_and(|target| target == device);
+        let is_device = |file: fs::DirEntry| {
+            fs::read_link(file.path()).is_ok_and(|target| target == device)
+                || number_of(&file.path()).is_some_and(|number| Some(number) == wanted)
+        };
         if files.flatten().any(is_device) {
             let tool = subcommand(root, pid);
             // A simulator made the port and does not keep others from opening it.
             if matches!(tool.as_deref(), Some(b"simulate" | b"demo")) {
                 continue;
             }
-            faults.push(if tool.as_deref() == Some(b"run") {
+            let mut line = None;
+            let fault = if tool.as_deref() == Some(b"run") {
                 let standing = Standing::of(&root.join("proc").join(pid.to_string()));
                 let how =
                     standing.map_or(String::new(), |how| format!("; its scheduling is {how}"));
+                let sensor = daemon::sensor(root, pid, device);
+                line = daemon::line(root, device, sensor.as_ref());
+                let reads = sensor.map_or(String::new(), |sensor| {
+                    format!(", which reads it as {} for {:?}", sensor.port, sensor.name)
+                });
                 Fault {
-                    what: format!("held by process {pid}, the daemon (hardnessd run{how})"),
+                    what: format!("held by process {pid}, the daemon (hardnessd run{how}){reads}"),
                     cure: format!(
                         "sudo systemctl stop hardnessd; where it is no service, kill {pid}"
                     ),
@@ -258,10 +270,18 @@ fn held(root: &Path, device: &Path, own: u32) -> Vec<Fault> {
                     what: format!("held by process {pid} ({})", command(root, pid)),
                     cure: format!("kill {pid}"),
                 }
-            });
+            };
+            faults.push(fault);
+            faults.extend(line);
         }
     }
     faults
+}
+
+/// The number of the character device that a file is.
+fn number_of(path: &Path) -> Option<u64> {
+    let file = fs::metadata(path).ok()?;
+    file.file_type().is_char_device().then(|| file.rdev())
 }
 
 /// The subcommand of `hardnessd` that a process runs.

@@ -42,6 +42,15 @@ pub(super) fn faults(root: &Path, device: &Path) -> Vec<Fault> {
     refused.chain(forbidden).collect()
 }
 
+/// Whether the service may reach no other machine.
+pub(super) fn forbids_network(root: &Path) -> bool {
+    unit(root).is_some_and(|unit| {
+        let allowed = values(&unit, "IPAddressAllow");
+        values(&unit, "IPAddressDeny").contains(&"any")
+            && allowed.iter().all(|allowed| *allowed == "localhost")
+    })
+}
+
 /// The unit, and the files that change it, as one text.
 fn unit(root: &Path) -> Option<String> {
     let mut places = UNITS.iter().map(|place| root.join(place));

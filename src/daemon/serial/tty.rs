@@ -1,0 +1,192 @@
+//! A serial line: how it is opened for this process alone, and its settings.
+//!
+//! The settings are 8 data bits, no parity, 1 stop bit, no flow control, and no processing of the
+//! bytes. Another program may change them while the port is open, so they can be compared and set
+//! again.
+
+use std::collections::BTreeSet;
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
+use std::path::Path;
+
+use rustix::fs::{FlockOperation, Mode, OFlags, flock};
+use rustix::io::Errno;
+use rustix::termios::{
+    ControlModes, InputModes, LocalModes, OptionalActions, OutputModes, QueueSelector,
+    SpecialCodeIndex, Termios, ioctl_tiocexcl, ioctl_tiocnxcl, tcflush, tcgetattr, tcsetattr,
+};
+
+/// An open serial port. No other process can open it until it is dropped.
+#[derive(Debug)]
+pub(super) struct Tty {
+    file: OwnedFd,
+    /// The settings, as the driver took them.
+    settings: Termios,
+}
+
+impl Tty {
+    /// Opens the port at `path`.
+    pub(super) fn open(path: &Path, baud: u32) -> Result<Self, Errno> {
+        let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
+        let file = rustix::fs::open(path, flags, Mode::empty())?;
+        // TIOCEXCL keeps others out, and the lock also keeps root out.
+        flock(&file, FlockOperation::NonBlockingLockExclusive)?;
+        ioctl_tiocexcl(&file)?;
+        let mut tty = Self {
+            settings: tcgetattr(&file)?,
+            file,
+        };
+        make_plain(&mut tty.settings, baud)?;
+        tcsetattr(&tty.file, OptionalActions::Now, &tty.settings)?;
+        tty.settings = tcgetattr(&tty.file)?;
+        // Bytes from before the port had its settings are of unknown age, and may be garbled.
+        tcflush(&tty.file, QueueSelector::IFlush)?;
+        Ok(tty)
+    }
+
+    /// Sets the settings again if another program has changed them. Returns what it found.
+    pub(super) fn restore(&self) -> Result<Option<Changed>, Errno> {
+        let changed = Changed::between(&tcgetattr(&self.file)?, &self.settings);
+        if changed.is_some() {
+            tcsetattr(&self.file, OptionalActions::Now, &self.settings)?;
+        }
+        Ok(changed)
+    }
+}
+
+impl AsFd for Tty {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.file.as_fd()
+    }
+}
+
+impl AsRawFd for Tty {
+    fn as_raw_fd(&self) -> RawFd {
+        self.file.as_raw_fd()
+    }
+}
+
+impl Drop for Tty {
+    fn drop(&mut self) {
+        // On a pty the kernel keeps TIOCEXCL as long as the other end is open. Where this fails, the
+        // device is gone.
+        let _ = ioctl_tiocnxcl(&self.file);
+    }
+}
+
+/// Sets 8N1 at `baud`, without flow control and without processing of the bytes.
+pub(crate) fn make_plain(settings: &mut Termios, baud: u32) -> Result<(), Errno> {
+    settings.make_raw();
+    settings.input_modes -= InputModes::INPCK | InputModes::IXOFF;
+    settings.input_modes |= InputModes::IGNPAR;
+    settings.control_modes -= ControlModes::CSTOPB | ControlModes::PARODD | ControlModes::CRTSCTS;
+    settings.control_modes |= ControlModes::CREAD | ControlModes::CLOCAL;
+    settings.set_speed(baud)
+}
+
+/// The settings of a line that are not as expected, in the words of stty(1).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Changed {
+    pub(crate) found: String,
+    pub(crate) expected: String,
+}
+
+impl Changed {
+    /// The settings that differ, if any do.
+    pub(crate) fn between(found: &Termios, expected: &Termios) -> Option<Self> {
+        let (found, expected) = (named(found), named(expected));
+        let only = |one: &BTreeSet<String>, other| {
+            let names: Vec<String> = one.difference(other).cloned().collect();
+            names.join(" ")
+        };
+        (found != expected).then(|| Self {
+            found: only(&found, &expected),
+            expected: only(&expected, &found),
+        })
+    }
+}
+
+/// The settings that change what is read or written.
+fn named(settings: &Termios) -> BTreeSet<String> {
+    let input = settings.input_modes;
+    let output = settings.output_modes;
+    let local = settings.local_modes;
+    let control = settings.control_modes;
+    let flags = [
+        ("brkint", input.contains(InputModes::BRKINT)),
+        ("icrnl", input.contains(InputModes::ICRNL)),
+        ("igncr", input.contains(InputModes::IGNCR)),
+        ("inlcr", input.contains(InputModes::INLCR)),
+        ("inpck", input.contains(InputModes::INPCK)),
+        ("istrip", input.contains(InputModes::ISTRIP)),
+        ("ixoff", input.contains(InputModes::IXOFF)),
+        ("ixon", input.contains(InputModes::IXON)),
+        ("parmrk", input.contains(InputModes::PARMRK)),
+        ("opost", output.contains(OutputModes::OPOST)),
+        ("echo", local.contains(LocalModes::ECHO)),
+        ("icanon", local.contains(LocalModes::ICANON)),
+        ("iexten", local.contains(LocalModes::IEXTEN)),
+        ("isig", local.contains(LocalModes::ISIG)),
+        ("cread", control.contains(ControlModes::CREAD)),
+        ("crtscts", control.contains(ControlModes::CRTSCTS)),
+        ("cstopb", control.contains(ControlModes::CSTOPB)),
+        ("parenb", control.contains(ControlModes::PARENB)),
+        ("parodd", control.contains(ControlModes::PARODD)),
+    ];
+    let size = match control & ControlModes::CSIZE {
+        ControlModes::CS5 => "cs5",
+        ControlModes::CS6 => "cs6",
+        ControlModes::CS7 => "cs7",
+        _ => "cs8",
+    };
+    let code = |index| settings.special_codes[index];
+    let sign = |is_set| if is_set { "" } else { "-" };
+    let mut names: BTreeSet<String> = flags
+        .iter()
+        .map(|(name, is_set)| format!("{}{name}", sign(*is_set)))
+        .collect();
+    names.insert(size.to_owned());
+    names.insert(format!("ispeed {}", settings.input_speed()));
+    names.insert(format!("ospeed {}", settings.output_speed()));
+    names.insert(format!("min {}", code(SpecialCodeIndex::VMIN)));
+    names.insert(format!("time {}", code(SpecialCodeIndex::VTIME)));
+    names
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tools::pty::Pty;
+
+    #[test]
+    fn settings_that_another_program_changed_are_named_and_set_again() {
+        let pty = Pty::open(None).unwrap();
+        let tty = Tty::open(pty.path(), 57_600).unwrap();
+        assert_eq!(tty.restore(), Ok(None));
+        // What a getty sets.
+        let mut cooked = tty.settings.clone();
+        cooked.local_modes |= LocalModes::ICANON | LocalModes::ECHO;
+        cooked.input_modes |= InputModes::ICRNL;
+        cooked.set_speed(9_600).unwrap();
+        tcsetattr(&tty.file, OptionalActions::Now, &cooked).unwrap();
+        let changed = Changed {
+            found: "echo icanon icrnl ispeed 9600 ospeed 9600".to_owned(),
+            expected: "-echo -icanon -icrnl ispeed 57600 ospeed 57600".to_owned(),
+        };
+        assert_eq!(tty.restore(), Ok(Some(changed)));
+        assert_eq!(tty.restore(), Ok(None));
+    }
+
+    #[test]
+    fn a_port_is_held_by_one_until_it_is_dropped_and_takes_any_speed() {
+        let pty = Pty::open(None).unwrap();
+        let tty = Tty::open(pty.path(), 250_000).unwrap();
+        assert_eq!(tty.settings.input_speed(), 250_000);
+        // The lock keeps root out, TIOCEXCL all others.
+        let held = Tty::open(pty.path(), 250_000).unwrap_err();
+        assert!([Errno::WOULDBLOCK, Errno::BUSY].contains(&held), "{held}");
+        drop(tty);
+        Tty::open(pty.path(), 250_000).unwrap();
+        let file = tempfile::NamedTempFile::new().unwrap();
+        assert_eq!(Tty::open(file.path(), 9_600).unwrap_err(), Errno::NOTTY);
+    }
+}
