@@ -192,7 +192,9 @@ pub(crate) async fn serve(
         if frames > 0 {
             link.proven();
             let configured_hz = pipeline.sensor().description().frame_rate_hz;
-            let differs = frame_rate.differs(frames as u32, super::now().mono, configured_hz);
+            let slow_hz = pipeline.slow_rate_hz();
+            let now = super::now().mono;
+            let differs = frame_rate.differs(frames as u32, now, configured_hz, slow_hz);
             if let Some(measured_hz) = differs {
                 log::frame_rate(pipeline.sensor().name(), configured_hz, measured_hz);
             }

@@ -406,7 +406,7 @@ impl Pipeline {
             stamp,
         };
         self.seen.frames += 1;
-        let before = self.seen.link.frame(stamp);
+        let before = self.seen.link.frame(stamp, &self.sensor);
 
         let frame = self.tare.apply(raw);
         // During a tare on request, presses are tracked with the old baseline.

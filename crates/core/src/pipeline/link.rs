@@ -8,12 +8,22 @@ use serde::{Deserialize, Serialize};
 use super::{Clock, Pipeline};
 use crate::event::{Event, LinkState, Status};
 use crate::frame::Stamp;
-use crate::sensor::Sensor;
+use crate::sensor::{LATE_PERIODS, Sensor};
 use crate::tare::Aim;
 
 /// After a silence of this many periods, the pending bytes are settled: a frame that only waited for
 /// the header of the next one is then whole.
 const PAUSE_PERIODS: f64 = 0.5;
+
+/// After so many silences of about the same length, the sensor is known to send more slowly than expected.
+const STEADY_SILENCES: usize = 3;
+/// The longest of them is no longer than this many times the shortest.
+const STEADY_FACTOR: f64 = 1.25;
+/// They are at least this many periods long.
+const SLOW_FACTOR: f64 = 1.5;
+
+/// A longer silence is no period of any sensor.
+const LONGEST_PERIOD: Duration = Duration::from_secs(3600);
 
 /// The number of frames over which the frame rate is measured.
 pub(super) const RATE_FRAMES: usize = 32;
@@ -24,6 +34,9 @@ pub(super) struct Link {
     port: Port,
     /// The arrival times of the latest frames.
     recent: VecDeque<Duration>,
+    /// The latest silences that were longer than the sensor's stale time, one after the other. Frames
+    /// ended them.
+    silences: VecDeque<Duration>,
     /// When the last bytes came that are not settled.
     pub(super) last_bytes: Option<Duration>,
     pub(super) last_frame: Option<Stamp>,
@@ -54,6 +67,7 @@ impl Link {
         Self {
             port: Port::Closed { reason: None },
             recent: VecDeque::with_capacity(RATE_FRAMES),
+            silences: VecDeque::with_capacity(STEADY_SILENCES),
             last_bytes: None,
             last_frame: None,
             published: (LinkState::Connecting, None),
@@ -62,7 +76,10 @@ impl Link {
 
     /// Whether a link can have this state. A recording may hold anything.
     pub(super) fn is_possible(&self) -> bool {
+        let are_silences = |silence: &Duration| *silence <= LONGEST_PERIOD;
         self.recent.len() <= RATE_FRAMES
+            && self.silences.len() <= STEADY_SILENCES
+            && self.silences.iter().all(are_silences)
     }
 
     pub(super) fn is_live(&self) -> bool {
@@ -87,7 +104,10 @@ impl Link {
     }
 
     /// A frame came. Returns when the one before it came.
-    pub(super) fn frame(&mut self, stamp: Stamp) -> Option<Stamp> {
+    pub(super) fn frame(&mut self, stamp: Stamp, sensor: &Sensor) -> Option<Stamp> {
+        if let (Port::Live { .. } | Port::Stale, Some(last)) = (&self.port, self.last_frame) {
+            self.silence(stamp.mono.saturating_sub(last.mono), sensor);
+        }
         // A rate measured across a silence would be meaningless.
         if matches!(self.port, Port::Silent | Port::Stale) {
             self.recent.clear();
@@ -98,6 +118,40 @@ impl Link {
         self.recent.push_back(stamp.mono);
         self.port = Port::Live { since: stamp.mono };
         self.last_frame.replace(stamp)
+    }
+
+    /// A silence of a live sensor has ended with a frame.
+    fn silence(&mut self, silence: Duration, sensor: &Sensor) {
+        if silence <= sensor.stale_after() {
+            // The sensor sends as often as expected.
+            self.silences.clear();
+        } else if silence <= LONGEST_PERIOD
+            && (silence <= self.stale_after(sensor) || self.slow_period(sensor).is_none())
+        {
+            if self.silences.len() == STEADY_SILENCES {
+                self.silences.pop_front();
+            }
+            self.silences.push_back(silence);
+        }
+    }
+
+    /// The period of a sensor that steadily sends more slowly than expected. The latest silences are
+    /// then about equal.
+    pub(super) fn slow_period(&self, sensor: &Sensor) -> Option<Duration> {
+        let longest = *self.silences.iter().max()?;
+        let shortest = *self.silences.iter().min()?;
+        let is_steady = self.silences.len() == STEADY_SILENCES
+            && longest <= shortest.mul_f64(STEADY_FACTOR)
+            && shortest >= sensor.period().mul_f64(SLOW_FACTOR);
+        let sum: Duration = self.silences.iter().sum();
+        is_steady.then(|| sum / STEADY_SILENCES as u32)
+    }
+
+    /// How long the sensor may be silent before it is stale. One that steadily sends more slowly than
+    /// expected is late only by its own period: it would be stale and live with every frame.
+    pub(super) fn stale_after(&self, sensor: &Sensor) -> Duration {
+        let own = self.slow_period(sensor).unwrap_or_default();
+        sensor.stale_after().max(own.mul_f64(LATE_PERIODS))
     }
 
     /// The silence has lasted until [`Self::stale_deadline`].
@@ -123,7 +177,7 @@ impl Link {
     fn stale_deadline(&self, sensor: &Sensor) -> Option<Duration> {
         match self.port {
             Port::Opened { since } => Some(since.saturating_add(sensor.late_after())),
-            Port::Live { since } => Some(since.saturating_add(sensor.stale_after())),
+            Port::Live { since } => Some(since.saturating_add(self.stale_after(sensor))),
             _ => None,
         }
     }
@@ -183,7 +237,10 @@ impl Pipeline {
                 }
                 (LinkState::Stale, reason)
             }
-            Port::Stale => (LinkState::Stale, no_frame_for(self.sensor.stale_after())),
+            Port::Stale => (
+                LinkState::Stale,
+                no_frame_for(self.seen.link.stale_after(&self.sensor)),
+            ),
             Port::Lost { reason } => (LinkState::Lost, Some(reason.clone())),
         }
     }
@@ -196,6 +253,12 @@ impl Pipeline {
         }
         self.seen.link.published = state;
         vec![Event::Status(self.status(at))]
+    }
+
+    /// The rate of a sensor that steadily sends more slowly than its description says, in frames/s.
+    pub fn slow_rate_hz(&self) -> Option<f64> {
+        let period = self.seen.link.slow_period(&self.sensor)?;
+        Some(1.0 / period.as_secs_f64())
     }
 
     fn measured_rate_hz(&self) -> Option<f64> {

@@ -181,10 +181,11 @@ fn moments_beyond_all_time_are_no_panic() {
     let mut pipeline = pipeline(Preset::Jx255n);
     play(&mut pipeline, 0, &[raw(0, 0)]);
     pipeline.decoder.push(&[0xBB, 0xAA]);
-    pipeline.seen.link.frame(Stamp {
+    let never = Stamp {
         mono: Duration::MAX,
         ..at(0)
-    });
+    };
+    pipeline.seen.link.frame(never, &pipeline.sensor);
     pipeline.seen.link.last_bytes = Some(Duration::MAX);
     assert_eq!(pipeline.deadline(), Some(Duration::MAX));
 }
@@ -270,6 +271,43 @@ fn silence_is_stale_after_two_and_a_half_periods_and_ends_no_press() {
         play(&mut pipeline, 20, &back),
         ["Live", "End 1", "Final of 5"]
     );
+}
+
+#[test]
+fn a_sensor_that_is_steadily_slow_is_late_by_its_own_period() {
+    // 100 frames/s are configured: a silence of 50 ms is stale.
+    let mut pipeline = pipeline_of(|described| described.frame_rate_hz = 100.0);
+    pipeline.opened(at(0));
+    let mut clock = 0;
+    let mut play = |pipeline: &mut Pipeline, periods_ms: &[u64]| {
+        let mut events = Vec::new();
+        for ms in periods_ms {
+            // Time passes in steps, as the deadlines of the daemon.
+            for _ in 0..ms / 10 {
+                clock += 10;
+                events.extend(pipeline.tick(at(clock)));
+            }
+            let bytes = bytes(pipeline, &raw(0, 0));
+            events.extend(pipeline.push(&bytes, at(clock)));
+        }
+        words(&events)
+    };
+    // Ten frames/s come, for three seconds.
+    let told = play(&mut pipeline, &[[10; 1].as_slice(), &[100; 30]].concat());
+    let (stale, live) = ("Stale (no frame for 50 ms)", "Live");
+    assert_eq!(told, [live, stale, live, stale, live, stale, live]);
+    assert_eq!(pipeline.slow_rate_hz(), Some(10.0));
+    // A silence of two and a half of its own periods is stale, and the sensor is still known after it.
+    let own = "Stale (no frame for 250 ms)";
+    assert_eq!(play(&mut pipeline, &[1000, 100, 100]), [own, live]);
+    assert_eq!(pipeline.slow_rate_hz(), Some(10.0));
+    // A sensor that sends as expected is late as expected.
+    assert_eq!(play(&mut pipeline, &[10, 100]), [stale, live]);
+    assert_eq!(pipeline.slow_rate_hz(), None);
+    // Pauses of different lengths are no rate.
+    let told = play(&mut pipeline, &[100, 200, 100, 300, 100, 200, 400, 100]);
+    assert_eq!(told.len(), 16, "{told:?}");
+    assert_eq!(pipeline.slow_rate_hz(), None);
 }
 
 #[test]
