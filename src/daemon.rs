@@ -52,8 +52,8 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tracing::{debug, info, warn};
 
-use self::clients::Clients;
 use self::baud::Load;
+use self::clients::Clients;
 use self::config::{Config, Publish, SensorTable, Setup};
 use self::publish::Publishers;
 use self::realtime::Standing;
@@ -66,7 +66,7 @@ use hardnessd_core::event::{Hello, ModelCard, PROTOCOL, SensorCard, Status};
 use hardnessd_core::exit::{CONFIG, Coded, FAILED, IO};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Clock, Pipeline};
-use hardnessd_core::recording::{About, Found, Labels, RecordedSensor};
+use hardnessd_core::recording::{About, Labels, RecordedSensor};
 use hardnessd_core::sensor::Sensor;
 
 /// The most commands that wait for a sensor. When the queue is full, the tasks that send wait.
@@ -273,7 +273,13 @@ impl Daemon {
             .map_or(EventRecorder::default(), Recorder::of_hub);
         let hub = hub::start(hello, events);
         let viewers = publishers.viewers();
-        let (sensors, tasks) = start_sensors(&setup, recorder.as_ref(), viewers.as_ref(), &hub);
+        let mut tasks = JoinSet::new();
+        let started = (0..setup.sensors.len()).map(|index| {
+            let recorder = recorder.as_ref().map(|recorder| recorder.of_sensor(index));
+            let recorder = recorder.unwrap_or_default().with_viewers(viewers.clone());
+            start_sensor(&setup, index, recorder, &hub, &mut tasks)
+        });
+        let (changed_sensors, sensors) = Sensors::new(started.collect());
         let (orders, receiver) = watch::channel(());
         publishers.announce();
         let publishers = publishers.serve(&hub, &sensors, &receiver, &clients);
@@ -285,6 +291,7 @@ impl Daemon {
             run,
             hub,
             sensors,
+            changed_sensors,
             tasks,
             publishers,
             clients,
@@ -309,37 +316,32 @@ fn raise_descriptors() {
     }
 }
 
-/// Starts a task for each sensor.
-fn start_sensors(
+/// Starts the task of the sensor with this `index`. The task's result is the sensor's name.
+fn start_sensor(
     setup: &Setup,
-    recorder: Option<&Recorder>,
-    viewers: Option<&mpsc::Sender<Found>>,
+    index: usize,
+    recorder: SensorRecorder,
     hub: &hub::Handle,
-) -> (Sensors, JoinSet<()>) {
-    let mut tasks = JoinSet::new();
-    let mut sensors = Vec::new();
-    let ports = setup.config.sensors.iter();
-    for (index, (port, sensor)) in ports.zip(&setup.sensors).enumerate() {
-        let (commands, inbox) = mpsc::channel(QUESTIONS);
-        let pipeline = Pipeline::new(sensor.clone(), setup.hrn.clone(), Clock::Arrival);
-        let link = Link::new(&port.port, port.baud.get(), serial::Settings::of(sensor));
-        let recorder = recorder.map_or(SensorRecorder::default(), |recorder| {
-            recorder.of_sensor(index)
-        });
-        let recorder = recorder.with_viewers(viewers.cloned());
-        tasks.spawn(sensor::serve(pipeline, link, recorder, hub.clone(), inbox));
-        let name = port.name.clone();
-        sensors.push(SensorHandle { name, commands });
-    }
-    (Sensors(sensors), tasks)
+    tasks: &mut JoinSet<String>,
+) -> SensorHandle {
+    let (port, sensor) = (&setup.config.sensors[index], &setup.sensors[index]);
+    let (commands, inbox) = mpsc::channel(QUESTIONS);
+    let pipeline = Pipeline::new(sensor.clone(), setup.hrn.clone(), Clock::Arrival);
+    let link = Link::new(&port.port, port.baud.get(), serial::Settings::of(sensor));
+    let (name, hub) = (port.name.clone(), hub.clone());
+    let ended = name.clone();
+    tasks.spawn(async move {
+        sensor::serve(pipeline, link, recorder, hub, inbox).await;
+        ended
+    });
+    SensorHandle { name, commands }
 }
 
 /// The status of every sensor, if every sensor's task and the hub answer. The answer feeds the
 /// watchdog.
 async fn alive(hub: &hub::Handle, sensors: &Sensors) -> Option<Vec<Status>> {
-    let statuses = sensors.statuses().await;
-    let all = statuses.len() == sensors.0.len();
-    (all && hub.survey().await.is_ok()).then_some(statuses)
+    let (statuses, is_whole) = sensors.statuses().await;
+    (is_whole && hub.survey().await.is_ok()).then_some(statuses)
 }
 
 fn announce(setup: &Setup, run: &str) {

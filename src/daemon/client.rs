@@ -464,11 +464,12 @@ async fn tell(
     name: &str,
     command: Command,
 ) -> Result<(), Refused> {
-    let Some(sensor) = sensors.0.iter().find(|sensor| sensor.name == name) else {
+    let sensors = sensors.current();
+    let Some(sensor) = sensors.iter().find(|sensor| sensor.name == name) else {
         return Err(Refused::NoSensor {
             key,
             found: request::short(name),
-            names: sensors.0.iter().map(|s| s.name.clone()).collect(),
+            names: sensors.iter().map(|s| s.name.clone()).collect(),
         });
     };
     let stopping = |_| Refused::Stopping(key);

@@ -11,6 +11,7 @@ mod check;
 mod parse;
 mod read;
 
+use std::collections::BTreeSet;
 use std::env;
 use std::net::SocketAddr;
 use std::num::NonZeroU32;
@@ -291,16 +292,38 @@ impl Config {
             arm: others.arm.clone(),
             ..sensor.clone()
         };
-        if self.sensors.len() != other.sensors.len() {
-            return Some("sensor".to_owned());
-        }
-        let sensors = self.sensors.iter().zip(&other.sensors);
-        let mut of_sensors = sensors.filter_map(|(ours, theirs)| {
+        let mut of_sensors = self.sensors.iter().filter_map(|ours| {
+            let theirs = other
+                .sensors
+                .iter()
+                .find(|theirs| theirs.name == ours.name)?;
             let key = difference(ours, &fixed_of_sensor(theirs, ours))?;
             Some(format!("sensor.{key} of {:?}", ours.name))
         });
         let of_tables = difference(&fixed(self, self), &fixed(other, self));
-        of_sensors.next().or(of_tables)
+        of_sensors
+            .next()
+            .or(of_tables)
+            .or_else(|| self.fixed_names(other))
+    }
+
+    /// The key of a publisher that announces the names of the sensors once, if they differ.
+    fn fixed_names(&self, other: &Self) -> Option<String> {
+        let names = |config: &Self| -> BTreeSet<String> {
+            config
+                .sensors
+                .iter()
+                .map(|sensor| sensor.name.clone())
+                .collect()
+        };
+        let publish = &self.publish;
+        let announcing = [
+            ("publish.zenoh", publish.zenoh.is_some()),
+            ("publish.ros2", publish.ros2.is_some()),
+            ("publish.foxglove", publish.foxglove.is_some()),
+        ];
+        let (key, _) = announcing.into_iter().find(|(_, is_on)| *is_on)?;
+        (names(self) != names(other)).then(|| format!("sensor.name (beside {key})"))
     }
 }
 

@@ -91,7 +91,6 @@ pub(crate) struct Http {
 #[derive(Debug, Clone)]
 struct Sources {
     hub: hub::Handle,
-    sensors: Sensors,
     snapshots: Snapshots,
     turns: Arc<Semaphore>,
     /// The snapshots of `/metrics` and `/api/status`.
@@ -128,9 +127,8 @@ impl Http {
                 )
             })
             .with_state(Sources {
-                texts: Snapshots::new(hub.clone(), sensors.clone()),
+                texts: Snapshots::new(hub.clone(), sensors),
                 hub,
-                sensors,
                 snapshots,
                 turns,
                 text_bytes: Arc::new(Semaphore::new(MOST_TEXT_BYTES)),
@@ -263,9 +261,7 @@ async fn metrics(State(of): State<Sources>) -> Result<Response, Closed> {
 /// Makes the same check as the watchdog.
 async fn live(State(of): State<Sources>) -> Response {
     match tokio::time::timeout(PATIENCE, of.snapshots.current()).await {
-        Ok(Ok(now)) if now.vitals.len() == of.sensors.0.len() => {
-            "ok: every pipeline answers\n".into_response()
-        }
+        Ok(Ok(now)) if now.is_whole => "ok: every pipeline answers\n".into_response(),
         _ => refusal(
             StatusCode::SERVICE_UNAVAILABLE,
             "a pipeline does not answer",
@@ -276,7 +272,7 @@ async fn live(State(of): State<Sources>) -> Response {
 async fn ready(State(of): State<Sources>) -> Result<impl IntoResponse, Closed> {
     let now = of.snapshots.current().await?;
     let mut lines = String::new();
-    let mut ready = now.vitals.len() == of.sensors.0.len();
+    let mut ready = now.is_whole;
     for Vitals { status, .. } in &now.vitals {
         ready &= status.state == LinkState::Live;
         let state = hardnessd_core::event::name(&status.state);

@@ -158,6 +158,20 @@ impl Hub {
         true
     }
 
+    /// Describes the daemon with `hello` from now on. The run and the numbers stay. What was counted and
+    /// kept of sensors that `hello` lacks is forgotten.
+    fn describe(&mut self, hello: Hello) {
+        self.hello = Hello {
+            seq: self.hello.seq,
+            run: std::mem::take(&mut self.hello.run),
+            ..hello
+        };
+        let sensors = &self.hello.sensors;
+        let is_there = |name: &str| sensors.iter().any(|sensor| sensor.name == name);
+        self.finals.retain(|name, _| is_there(name));
+        self.tally.sensors.retain(|name, _| is_there(name));
+    }
+
     fn keep(&mut self, held: Held) {
         if self.held.len() == HELD {
             let oldest = self.held.pop_front().expect("HELD is not 0");

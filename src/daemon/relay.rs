@@ -167,7 +167,8 @@ async fn relay<J: From<Vec<Line>>>(
     };
     // Only a subscription with `since` can be refused.
     let _ = hub.subscribe(id, wanted).await?;
-    let statuses = sensors.statuses().await.into_iter().map(Line::from);
+    let (statuses, _) = sensors.statuses().await;
+    let statuses = statuses.into_iter().map(Line::from);
     let mut job = J::from(statuses.collect::<Vec<Line>>());
     let mut next = hub.take(id).await?;
     let mut tick = tokio::time::interval(VITALS);
@@ -183,7 +184,7 @@ async fn relay<J: From<Vec<Line>>>(
                 Err(_) => break,
             },
             make = each_second(&mut tick, vitals) => {
-                make(hub.survey().await?.hello, sensors.statuses().await)
+                make(hub.survey().await?.hello, sensors.statuses().await.0)
             }
         };
     }

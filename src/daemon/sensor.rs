@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use serde_json::Value;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
 
 use super::frame_rate::FrameRate;
@@ -45,8 +45,8 @@ pub(crate) enum Command {
     /// Write the last minute to a file. The answer is the path of the file.
     Blackbox(oneshot::Sender<Result<PathBuf, NoBlackbox>>),
     /// Use another description and model from now on. Values that only a restart can change must
-    /// not differ.
-    Reload(Box<Sensor>, Arc<Hrn>),
+    /// not differ. If there is another recorder, use that one too.
+    Reload(Box<Sensor>, Arc<Hrn>, Option<SensorRecorder>),
     /// End the task. A press under way is aborted, and no further event follows.
     Finish,
 }
@@ -72,15 +72,29 @@ pub(crate) struct SensorHandle {
     pub(crate) commands: mpsc::Sender<Command>,
 }
 
-/// Sends commands to the tasks of all sensors, in the order of the configuration.
+/// Sends commands to the tasks of all sensors, in the order of the configuration. A reload may add and
+/// remove sensors.
 #[derive(Debug, Clone)]
-pub(crate) struct Sensors(pub(crate) Vec<SensorHandle>);
+pub(crate) struct Sensors(watch::Receiver<Arc<[SensorHandle]>>);
 
 impl Sensors {
-    /// The current state of every sensor. A sensor whose task has ended is left out.
-    pub(crate) async fn vitals(&self) -> Vec<Vitals> {
-        let mut all = Vec::with_capacity(self.0.len());
-        for some in self.0.chunks(AT_ONCE) {
+    /// These sensors, until the sender sends others.
+    pub(crate) fn new(sensors: Vec<SensorHandle>) -> (watch::Sender<Arc<[SensorHandle]>>, Self) {
+        let (sender, current) = watch::channel(sensors.into());
+        (sender, Self(current))
+    }
+
+    /// The sensors that there are now.
+    pub(crate) fn current(&self) -> Arc<[SensorHandle]> {
+        Arc::clone(&self.0.borrow())
+    }
+
+    /// The current state of every sensor, and whether every sensor answered. A sensor whose task has
+    /// ended is left out.
+    pub(crate) async fn vitals(&self) -> (Vec<Vitals>, bool) {
+        let sensors = self.current();
+        let mut all = Vec::with_capacity(sensors.len());
+        for some in sensors.chunks(AT_ONCE) {
             let mut asked = Vec::with_capacity(AT_ONCE);
             for sensor in some {
                 let (reply, vitals) = oneshot::channel();
@@ -92,13 +106,15 @@ impl Sensors {
                 all.extend(vitals.await.ok());
             }
         }
-        all
+        let is_whole = all.len() == sensors.len();
+        (all, is_whole)
     }
 
-    /// Every sensor's current status.
-    pub(crate) async fn statuses(&self) -> Vec<Status> {
-        let vitals = self.vitals().await;
-        vitals.into_iter().map(|vitals| vitals.status).collect()
+    /// Every sensor's current status, and whether every sensor answered.
+    pub(crate) async fn statuses(&self) -> (Vec<Status>, bool) {
+        let (vitals, is_whole) = self.vitals().await;
+        let statuses = vitals.into_iter().map(|vitals| vitals.status);
+        (statuses.collect(), is_whole)
     }
 }
 
@@ -153,11 +169,12 @@ pub(crate) async fn serve(
                     recorder.blackbox(reply);
                     continue;
                 }
-                Some(Command::Reload(sensor, hrn)) => {
+                Some(Command::Reload(sensor, hrn, next)) => {
                     recorder.reload(&pipeline, &sensor, &hrn, super::now());
                     link.reload(serial::Settings::of(&sensor));
                     let reloaded = pipeline.reload(*sensor, hrn);
                     reloaded.expect("a configuration that differs in what is fixed was refused");
+                    recorder = next.unwrap_or(recorder);
                     answer(&mut pipeline, &mut taring);
                     frame_rate = FrameRate::default();
                     continue;

@@ -22,6 +22,8 @@ pub(crate) struct Snapshot {
     pub(crate) survey: Survey,
     /// The state of every sensor. A sensor whose task has ended is left out.
     pub(crate) vitals: Vec<Vitals>,
+    /// Whether every sensor answered.
+    pub(crate) is_whole: bool,
     /// The status of every sensor, as a line.
     pub(crate) statuses: Vec<Line>,
     /// The text of `/metrics`, once somebody has asked for it. `None`: there was no room for it.
@@ -68,12 +70,13 @@ impl Snapshots {
         }
         let begun = Instant::now();
         let survey = self.hub.survey().await?;
-        let vitals = self.sensors.vitals().await;
+        let (vitals, is_whole) = self.sensors.vitals().await;
         let statuses = vitals.iter().map(|vitals| vitals.status.clone().into());
         let snapshot = Arc::new(Snapshot {
             statuses: statuses.collect(),
             survey,
             vitals,
+            is_whole,
             metrics: OnceLock::new(),
             status: OnceLock::new(),
             begun,
@@ -99,7 +102,8 @@ mod tests {
         let hub = hub::start(hello(), EventRecorder::default());
         let (commands, mut inbox) = mpsc::channel(16);
         let name = "a".to_owned();
-        let snapshots = Snapshots::new(hub, Sensors(vec![SensorHandle { name, commands }]));
+        let (_, sensors) = Sensors::new(vec![SensorHandle { name, commands }]);
+        let snapshots = Snapshots::new(hub, sensors);
         let asked = Arc::new(AtomicUsize::new(0));
         let counted = Arc::clone(&asked);
         tokio::spawn(async move {

@@ -22,6 +22,7 @@ mod model;
 mod motion;
 mod port;
 mod publish;
+mod sensors;
 mod service;
 mod shipped;
 mod stdout;

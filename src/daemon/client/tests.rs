@@ -14,7 +14,7 @@ async fn events_go_on_and_requests_wait_while_a_command_is_carried_out() {
     let hub = hub::start(hello(), EventRecorder::default());
     let (commands, mut inbox) = mpsc::channel(1);
     let name = "a".to_owned();
-    let sensors = Sensors(vec![SensorHandle { name, commands }]);
+    let (_, sensors) = Sensors::new(vec![SensorHandle { name, commands }]);
     let service = Service {
         access: Access::Control,
         max_clients: 1,

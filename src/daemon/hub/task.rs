@@ -20,6 +20,7 @@ enum Command {
     },
     Describe {
         hello: Box<Hello>,
+        recorder: Option<EventRecorder>,
     },
     Join {
         reply: oneshot::Sender<(u64, Line)>,
@@ -61,13 +62,13 @@ impl Handle {
         }
     }
 
-    /// Changes the `hello` of new subscribers. The run and the numbers stay.
-    pub(crate) async fn describe(&self, hello: Hello) {
+    /// Changes the `hello` of new subscribers. The run and the numbers stay. From now on events are
+    /// passed on to `recorder`, if there is another one.
+    pub(crate) async fn describe(&self, hello: Hello, recorder: Option<EventRecorder>) {
+        let hello = Box::new(hello);
         let _ = self
             .commands
-            .send(Command::Describe {
-                hello: Box::new(hello),
-            })
+            .send(Command::Describe { hello, recorder })
             .await;
     }
 
@@ -170,12 +171,9 @@ async fn serve(mut hub: Hub, mut inbox: mpsc::Receiver<Command>) {
                     }
                 }
             }
-            Command::Describe { hello } => {
-                hub.hello = Hello {
-                    seq: hub.hello.seq,
-                    run: hub.hello.run,
-                    ..*hello
-                };
+            Command::Describe { hello, recorder } => {
+                hub.describe(*hello);
+                hub.recorder = recorder.unwrap_or(hub.recorder);
             }
             Command::Join { reply } => {
                 let (id, hello) = hub.join();
