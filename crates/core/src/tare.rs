@@ -36,7 +36,7 @@ pub enum Progress {
     /// The frame was the last of the tare. The new baseline holds from the next frame on.
     Taken,
     /// Something touches the sensor, and the frames of the tare were discarded. A first tare begins
-    /// again. A tare on request has ended.
+    /// again, with this frame if it differs from those before it. A tare on request has ended.
     Contact,
 }
 
@@ -191,6 +191,16 @@ impl Stage {
             return Self::Idle;
         }
         let sums = Sums::new(frames, array);
+        Self::Taking { aim, sums }
+    }
+
+    /// Begins the first tare again, after a touch. `first` is the first of its frames, if that is known.
+    fn again(frames: u32, array: Array, first: Option<&RawFrame>) -> Self {
+        let mut sums = Sums::new(frames, array);
+        if let Some(raw) = first {
+            sums.add(raw);
+        }
+        let aim = Aim::First { met_contact: true };
         Self::Taking { aim, sums }
     }
 }
@@ -416,20 +426,23 @@ impl Tare {
             return Progress::Ready;
         };
         sums.add(raw);
-        if sums.seen < sums.wanted {
-            return Progress::Taking;
-        }
         let (aim, sums) = (*aim, sums.clone());
         let means = sums.sum.iter().map(|&sum| sum as f32 / sums.seen as f32);
         let mean: Vec<f32> = means.collect();
-        if self.is_touched(&sums, &mean) {
+        let moves = self.is_moving(&sums);
+        let is_whole = sums.seen == sums.wanted;
+        if moves || (is_whole && self.is_loaded(&mean)) {
             self.stage = match aim {
+                // A frame unlike those before it may be the first one without a touch.
                 Aim::First { .. } => {
-                    Stage::begin(Aim::First { met_contact: true }, sums.wanted, self.array)
+                    Stage::again(sums.wanted, self.array, moves.then_some(raw))
                 }
                 Aim::Request => Stage::Ended(Err(RetareError::Touched)),
             };
             return Progress::Contact;
+        }
+        if !is_whole {
+            return Progress::Taking;
         }
         let old = self.offsets();
         self.baseline = mean;
@@ -443,20 +456,26 @@ impl Tare {
         Progress::Taken
     }
 
-    fn is_touched(&self, sums: &Sums, mean: &[f32]) -> bool {
+    /// Whether the frames of a tare differ as under a touch that moves.
+    fn is_moving(&self, sums: &Sums) -> bool {
         let live = self.live();
-        let mut sorted: Vec<f32> = live.iter().map(|&place| mean[place]).collect();
-        sorted.sort_by(f32::total_cmp);
-        let median = sorted.get(sorted.len() / 2).copied().unwrap_or(0.0);
         let varying = live.iter().filter(|&&place| {
             let spread = f32::from(sums.most[place] - sums.least[place]);
             self.scale.newtons(spread, place) >= self.contact.threshold_n
         });
+        varying.count() >= self.contact.area_taxels as usize
+    }
+
+    /// Whether the mean of the frames is that of a sensor on which something rests.
+    fn is_loaded(&self, mean: &[f32]) -> bool {
+        let live = self.live();
+        let mut sorted: Vec<f32> = live.iter().map(|&place| mean[place]).collect();
+        sorted.sort_by(f32::total_cmp);
+        let median = sorted.get(sorted.len() / 2).copied().unwrap_or(0.0);
         let high = live
             .iter()
             .filter(|&&place| self.scale.newtons(mean[place] - median, place) > self.max_n);
-        let limit = self.contact.area_taxels as usize;
-        varying.count() >= limit || high.count() >= limit
+        high.count() >= self.contact.area_taxels as usize
     }
 
     /// The places of the array's live taxels.

@@ -194,6 +194,43 @@ fn a_moving_or_a_resting_load_is_contact() {
     check(&|_| (0..3).map(|i| (i, 2 + 12)).collect(), Progress::Taken);
 }
 
+/// The counts of 40 taxels in each frame of a robot that presses again and again. `unloaded` of `cycle`
+/// frames are without a load, and flicker by a count.
+fn pressing(cycle: usize, unloaded: usize) -> Vec<RawFrame> {
+    let frame = |number: usize| {
+        let (loaded, place) = (cycle - unloaded, number.saturating_sub(unloaded));
+        let count = if number < unloaded {
+            2 + (number % 2) as u16
+        } else {
+            2 + 25 * (place + 1).min(loaded - place) as u16
+        };
+        let counts: Vec<(usize, u16)> = (300..340).map(|place| (place, count)).collect();
+        raw(&counts)
+    };
+    (0..cycle).map(frame).collect()
+}
+
+#[test]
+fn the_first_tare_takes_the_first_quiet_frames_wherever_a_robot_begins() {
+    for (cycle, unloaded) in [(15, 8), (20, 6), (20, 5)] {
+        let frames = pressing(cycle, unloaded);
+        for begin in 0..cycle {
+            let mut tare = Tare::new(&settings(&[]), Array::FULL, CONTACT);
+            let mut frames = frames.iter().cycle().skip(begin).take(2 * cycle);
+            let taken = frames.position(|raw| tare.observe(raw) == Progress::Taken);
+            // The next five quiet frames in a row.
+            let wait = if begin + 5 <= unloaded {
+                0
+            } else {
+                cycle - begin
+            };
+            assert_eq!(taken, Some(wait + 4), "{unloaded} of {cycle} from {begin}");
+            let offsets = tare.offsets();
+            assert!(offsets.most_counts < 3.0, "{offsets:?}");
+        }
+    }
+}
+
 #[test]
 fn what_a_tare_compares_is_the_array_and_its_live_taxels() {
     let check = |settings: &Settings, array: Array, contact, frames: [RawFrame; 2]| {
