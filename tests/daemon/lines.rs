@@ -281,3 +281,45 @@ fn a_second_name_of_a_port_that_the_daemon_reads_is_said_to_be_its_own() {
     let reason = "this daemon reads that port already, for another sensor";
     subscriber.until(&json!({"type": "status", "state": "connecting", "reason": reason}));
 }
+
+#[test]
+fn the_tools_take_an_address_in_place_of_a_port() {
+    let bench = Bench::new();
+    let frames = frames(&bench);
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = format!("tcp://{}", listener.local_addr().unwrap());
+    let sensor = std::thread::spawn(move || {
+        let mut peer = accept(&listener);
+        peer.write_all(&frames.concat()).unwrap();
+    });
+    let sniffed = hardnessd(&["sniff", "--port", &port, "--seconds", "20"]);
+    sensor.join().unwrap();
+    let stdout = String::from_utf8(sniffed.stdout).unwrap();
+    assert!(stdout.contains("preset = \"jx255n\""), "{stdout}");
+    // Nobody listens any more.
+    let config = configure(&bench, &port, "");
+    let out = bench.path("out.mcap");
+    let recorded = hardnessd(&[
+        "record",
+        "--config",
+        config.to_str().unwrap(),
+        "--out",
+        out.to_str().unwrap(),
+    ]);
+    assert_eq!(recorded.status.code(), Some(69));
+    let stderr = String::from_utf8(recorded.stderr).unwrap();
+    let error = format!("sensor \"forearm\": {port}: Connection refused");
+    assert!(stderr.contains(&error), "{stderr}");
+    let held = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let port = format!("udp://{}", held.local_addr().unwrap());
+    let doctor = hardnessd(&["doctor", "--port", &port]);
+    let stdout = String::from_utf8(doctor.stdout).unwrap();
+    let fault = format!("{port}: Address already in use: another program receives there");
+    assert!(stdout.starts_with(&fault), "{stdout}");
+    drop(held);
+    let doctor = hardnessd(&["doctor", "--port", &port]);
+    assert_eq!(doctor.status.code(), Some(0), "{doctor:?}");
+    // A name that is neither is wrong usage.
+    let doctor = hardnessd(&["doctor", "--port", "serial://x"]);
+    assert_eq!(doctor.status.code(), Some(2), "{doctor:?}");
+}

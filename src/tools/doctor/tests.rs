@@ -8,7 +8,7 @@ use std::process::{Child, Command};
 
 use tempfile::TempDir;
 
-use super::checks::{User, examine, ports, refused};
+use super::checks::{User, examine, network, ports, refused};
 use crate::tools::pty::Pty;
 
 const PORT: &str = "/dev/serial/by-id/usb-film-if00";
@@ -310,4 +310,45 @@ fn a_real_port_held_by_a_real_process_is_found() {
     let faults = examine(root, pty.path(), &user);
     let faults: Vec<String> = faults.iter().map(ToString::to_string).collect();
     one(&faults, &[&format!("held by process {} (", holder.0.id())]);
+}
+
+#[test]
+fn a_unit_that_forbids_the_network_is_a_fault_of_a_sensor_elsewhere() {
+    let machine = Machine::new();
+    let unit = include_str!("../../../systemd/hardnessd.service");
+    machine.put("usr/lib/systemd/system/hardnessd.service", unit);
+    let forbidden = |port: &str| {
+        let faults = network::faults(machine.0.path(), &port.parse().unwrap());
+        let faults: Vec<String> = faults.iter().map(ToString::to_string).collect();
+        faults
+            .iter()
+            .any(|fault| fault.contains("add `[Service]` and `IPAddressAllow="))
+    };
+    assert!(!forbidden("udp://127.0.0.1:40917"));
+    assert!(forbidden("udp://0.0.0.0:40917"));
+    machine.put(
+        "etc/systemd/system/hardnessd.service.d/override.conf",
+        "[Service]\nIPAddressAllow=192.168.7.9\n",
+    );
+    assert!(!forbidden("udp://0.0.0.0:40917"));
+}
+
+#[test]
+fn a_daemon_is_named_with_its_sensor_under_every_name_of_the_port() {
+    let machine = Machine::new();
+    machine.put("proc/88/comm", "hardnessd\n");
+    machine.put(
+        "proc/88/cmdline",
+        "hardnessd\0run\0--config\0/etc/arm.toml\0",
+    );
+    machine.put(
+        "etc/arm.toml",
+        &format!("[[sensor]]\nname = \"palm\"\nport = {PORT:?}\n"),
+    );
+    fs::create_dir_all(machine.path("proc/88/fd")).unwrap();
+    symlink("/dev/ttyUSB0", machine.path("proc/88/fd/3")).unwrap();
+    let reads = format!("which reads it as {PORT} for \"palm\"");
+    for name in [PORT, "/dev/ttyUSB0"] {
+        one(&machine.faults(name), &["process 88, the daemon", &reads]);
+    }
 }

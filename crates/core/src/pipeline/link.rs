@@ -18,7 +18,7 @@ const PAUSE_PERIODS: f64 = 0.5;
 /// After so many silences of about the same length, the sensor is known to send more slowly than expected.
 const STEADY_SILENCES: usize = 3;
 /// The longest of them is no longer than this many times the shortest.
-const STEADY_FACTOR: f64 = 1.25;
+const STEADY_FACTOR: f64 = 1.5;
 /// They are at least this many periods long.
 const SLOW_FACTOR: f64 = 1.5;
 
