@@ -104,7 +104,7 @@ enum State {
     /// The port will be opened at this time.
     Waiting(Instant),
     /// A separate thread is opening the port, because a driver or a network may be slow.
-    Opening(oneshot::Receiver<io::Result<Opened>>),
+    Opening(oneshot::Receiver<Result<Opened, String>>),
     Open(Open),
 }
 
@@ -173,17 +173,19 @@ impl Link {
                 }
                 State::Opening(opening) => {
                     let opened = match opening.await {
-                        Ok(opened) => opened.and_then(|opened| Open::new(opened, &self.settings)),
-                        Err(ended) => Err(io::Error::other(ended)),
+                        Ok(opened) => opened.and_then(|opened| {
+                            Open::new(opened, &self.settings).map_err(|error| wording::line(&error))
+                        }),
+                        Err(ended) => Err(ended.to_string()),
                     };
                     match opened {
                         Ok(open) => {
                             self.state = State::Open(open);
                             return Turn::Opened;
                         }
-                        Err(error) => {
+                        Err(reason) => {
                             self.wait();
-                            return Turn::Unavailable(reason(&self.port, &error));
+                            return Turn::Unavailable(reason);
                         }
                     }
                 }
@@ -348,13 +350,14 @@ fn start_opening(
     port: &Port,
     baud: u32,
     first: Vec<u8>,
-) -> io::Result<oneshot::Receiver<io::Result<Opened>>> {
+) -> io::Result<oneshot::Receiver<Result<Opened, String>>> {
     let (sender, opening) = oneshot::channel();
     let port = port.clone();
     let thread = std::thread::Builder::new().name("port".to_owned());
     thread.spawn(move || {
         // The daemon may have ended meanwhile.
-        let _ = sender.send(open(&port, baud, &first));
+        let opened = open(&port, baud, &first);
+        let _ = sender.send(opened.map_err(|error| reason(&port, &error)));
     })?;
     Ok(opening)
 }

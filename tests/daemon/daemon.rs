@@ -557,9 +557,15 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         74,
         &["http.listen", &address.to_string(), "in use"],
     );
-    // 20 frames/s of 790 bytes need more than 115,200 baud, and the real rate of this port is
-    // unknown.
+    // 20 frames/s of 790 bytes need more than 115,200 baud. An adapter that is not there follows its
+    // baud rate. A port of which nothing is known may be a pty: that is a warning.
     let config = written("");
+    let checked = hardnessd(&["check", "--config", &config]);
+    let warning = String::from_utf8(checked.stderr).unwrap();
+    assert_eq!(checked.status.code(), Some(0), "{warning}");
+    assert!(warning.contains("14.58 over 115200 baud"), "{warning}");
+    let text = fs::read_to_string(&config).unwrap();
+    fs::write(&config, text.replace("\"port\"", "\"/dev/ttyUSB99\"")).unwrap();
     fails(
         &["check", "--config", &config],
         78,

@@ -8,9 +8,9 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use rustix::termios::{InputModes, LocalModes, OptionalActions, tcgetattr, tcsetattr};
-use serde_json::json;
+use serde_json::{Value, json};
 
-use crate::bench::{Bench, Daemon, PATIENCE, hardnessd, wait_for};
+use crate::bench::{Bench, Daemon, PATIENCE, Subscriber, hardnessd, wait_for};
 use crate::pair::Pair;
 
 /// The bytes of a frame of the JX255N.
@@ -48,6 +48,21 @@ fn configure(bench: &Bench, port: &str, more: &str) -> PathBuf {
     );
     fs::write(&path, text).unwrap();
     path
+}
+
+/// The current status of the sensor.
+fn status(subscriber: &mut Subscriber) -> Value {
+    subscriber.say("{\"get\":\"status\"}");
+    let mut status = Value::Null;
+    loop {
+        let line = subscriber.next().unwrap();
+        // Published events come between. They have a number.
+        if line["type"] == "status" && line["seq"].is_null() {
+            status = line;
+        } else if line["type"] == "ok" {
+            return status;
+        }
+    }
 }
 
 fn accept(listener: &TcpListener) -> TcpStream {
@@ -96,8 +111,7 @@ fn a_press_over_tcp_is_judged_silence_is_stale_and_the_end_of_the_peer_is_loss()
     drop(peer);
     subscriber.until(&json!({"type": "status", "state": "lost"}));
     wait_for("the reason", || {
-        subscriber.say("{\"get\":\"status\"}");
-        subscriber.until(&json!({"type": "status"}))["reason"] == "Connection refused"
+        status(&mut subscriber)["reason"] == "Connection refused"
     });
     let doctor = hardnessd(&["doctor", "--port", &format!("tcp://{address}")]);
     let stdout = String::from_utf8(doctor.stdout).unwrap();
@@ -122,10 +136,6 @@ fn datagrams_are_taken_from_one_sender_until_it_is_silent() {
     );
     let mut daemon = Daemon::start(&config);
     let mut subscriber = bench.subscriber();
-    let status = |subscriber: &mut crate::bench::Subscriber| {
-        subscriber.say("{\"get\":\"status\"}");
-        subscriber.until(&json!({"type": "status"}))
-    };
     wait_for("the first frame", || {
         first.send_to(&frames[0], address).unwrap();
         status(&mut subscriber)["state"] == "live"
@@ -232,8 +242,7 @@ fn settings_of_the_line_that_somebody_changed_are_shown_and_set_again() {
     };
     wait_for("a live sensor", || {
         send();
-        subscriber.say("{\"get\":\"status\"}");
-        subscriber.until(&json!({"type": "status"}))["state"] == "live"
+        status(&mut subscriber)["state"] == "live"
     });
     // As a getty does. The line then waits for the end of a line of text.
     let mut cooked = tcgetattr(&pair.device).unwrap();
@@ -256,8 +265,7 @@ fn settings_of_the_line_that_somebody_changed_are_shown_and_set_again() {
     assert!(line.contains("found=\"echo icanon"), "{line}");
     wait_for("a live sensor", || {
         send();
-        subscriber.say("{\"get\":\"status\"}");
-        subscriber.until(&json!({"type": "status"}))["state"] == "live"
+        status(&mut subscriber)["state"] == "live"
     });
     daemon.process.signal(rustix::process::Signal::TERM);
     let log = daemon.whole_log();

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use rustix::process::Signal;
 use serde_json::json;
 
-use crate::bench::{Bench, Daemon, Subscriber, hardnessd, wait_for};
+use crate::bench::{Bench, Daemon, hardnessd, wait_for};
 
 /// A configuration with these sensors, each at the port of its name.
 fn configure(bench: &Bench, names: &[&str], more: &str) -> PathBuf {
@@ -36,9 +36,11 @@ fn names(hello: &serde_json::Value) -> Vec<&str> {
         .collect()
 }
 
-fn frames(subscriber: &mut Subscriber, sensor: &str) -> u64 {
-    subscriber.say("{\"get\":\"status\"}");
-    let status = subscriber.until(&json!({"type": "status", "sensor": sensor}));
+/// The number of frames of a sensor, by a connection of its own: this begins with the statuses.
+fn frames(bench: &Bench, sensor: &str) -> u64 {
+    let status = bench
+        .subscriber()
+        .until(&json!({"type": "status", "sensor": sensor}));
     status["frames"].as_u64().unwrap()
 }
 
@@ -62,7 +64,7 @@ fn a_reload_adds_and_removes_sensors_and_the_others_run_on() {
     // A press of the sensor that goes is under way.
     subscriber.until(&json!({"type": "press", "sensor": "wrist", "state": "begin"}));
     let press = subscriber.until(&json!({"type": "press", "sensor": "elbow", "state": "begin"}));
-    let before = frames(&mut subscriber, "wrist");
+    let before = frames(&bench, "wrist");
     configure(&bench, &["palm", "wrist"], "");
     reload(&mut daemon, "reloaded");
     let end = subscriber.until(&json!({"type": "press", "sensor": "elbow"}));
@@ -72,7 +74,7 @@ fn a_reload_adds_and_removes_sensors_and_the_others_run_on() {
         (&json!("aborted"), &json!("shutdown"))
     );
     subscriber.until(&json!({"type": "status", "sensor": "palm", "state": "live"}));
-    assert!(frames(&mut subscriber, "wrist") > before);
+    assert!(frames(&bench, "wrist") > before);
     // The next press of the kept sensor goes on with its numbers.
     let next = subscriber.until(&json!({"type": "press", "sensor": "wrist", "state": "begin"}));
     assert!(next["press"].as_u64() >= Some(2), "{next}");

@@ -40,7 +40,7 @@ fn the_shipped_configuration_names_every_key() {
     let defaults = Config::new(vec![SensorTable::new(PathBuf::from("/dev/ttyUSB0"))]);
     collect(&toml::Value::try_from(defaults).unwrap(), &mut keys);
     // Keys without a default value are not in the defaults.
-    let silent = "gains stale_after_ms sync tail length cell mask invert checksum rows cols order path sha256 control_path listen connect site domain_id namespace networks dir continuous rotate_mb rotate_s keep_free_mb";
+    let silent = "gains stale_after_ms sync tail length cell mask invert checksum rows cols order request request_ms start path sha256 control_path listen connect site domain_id namespace networks dir continuous rotate_mb rotate_s keep_free_mb";
     keys.extend(silent.split(' ').map(str::to_owned));
     for key in keys {
         assert!(
