@@ -160,7 +160,9 @@ fn datagrams_are_taken_from_one_sender_until_it_is_silent() {
     for key in ["frames", "frames_damaged", "bytes_skipped"] {
         assert_eq!(after[key], before[key], "{key}");
     }
-    subscriber.until(&json!({"type": "status", "state": "stale"}));
+    wait_for("a stale sensor", || {
+        status(&mut subscriber)["state"] == "stale"
+    });
     wait_for("the second sender", || {
         second.send_to(&frames[0], address).unwrap();
         std::thread::sleep(PERIOD);
@@ -260,7 +262,6 @@ fn settings_of_the_line_that_somebody_changed_are_shown_and_set_again() {
         let reads = format!(", which reads it as {port} for \"forearm\"");
         assert!(stdout.contains(&reads), "{stdout}");
     }
-    subscriber.until(&json!({"type": "status", "state": "stale"}));
     let line = daemon.logged("another program changed the settings of the line");
     assert!(line.contains("found=\"echo icanon"), "{line}");
     wait_for("a live sensor", || {
@@ -296,14 +297,16 @@ fn the_tools_take_an_address_in_place_of_a_port() {
     let frames = frames(&bench);
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = format!("tcp://{}", listener.local_addr().unwrap());
+    let bytes = frames.concat();
+    let heard = format!("# {port}: {} bytes\n", bytes.len());
     let sensor = std::thread::spawn(move || {
         let mut peer = accept(&listener);
-        peer.write_all(&frames.concat()).unwrap();
+        peer.write_all(&bytes).unwrap();
     });
     let sniffed = hardnessd(&["sniff", "--port", &port, "--seconds", "20"]);
     sensor.join().unwrap();
     let stdout = String::from_utf8(sniffed.stdout).unwrap();
-    assert!(stdout.contains("preset = \"jx255n\""), "{stdout}");
+    assert!(stdout.starts_with(&heard), "{stdout}");
     // Nobody listens any more.
     let config = configure(&bench, &port, "");
     let out = bench.path("out.mcap");
