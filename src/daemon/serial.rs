@@ -15,14 +15,15 @@ use std::path::Path;
 use std::time::Duration;
 
 use rustix::io::Errno;
+use serialport::TTYPort;
 use tokio::io::AsyncReadExt;
-use tokio::io::unix::AsyncFd;
 use tokio::net::TcpStream;
 use tokio::sync::oneshot;
 use tokio::time::Instant;
+use tokio_serial::SerialStream;
 
 use self::network::{Datagram, Udp};
-use self::tty::{Changed, Tty};
+use self::tty::{Changed, LineSettings};
 use super::port::Port;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::wording;
@@ -111,7 +112,7 @@ enum State {
 /// A port that is open, but not known to the runtime yet.
 #[derive(Debug)]
 enum Opened {
-    Tty(Tty),
+    Tty(TTYPort, LineSettings),
     Tcp(std::net::TcpStream),
     Udp(std::net::UdpSocket),
 }
@@ -127,7 +128,7 @@ struct Open {
 
 #[derive(Debug)]
 enum Line {
-    Tty(AsyncFd<Tty>),
+    Tty(SerialStream, LineSettings),
     Tcp(TcpStream),
     Udp(Udp),
 }
@@ -259,11 +260,11 @@ impl Open {
     fn new(opened: Opened, settings: &Settings) -> io::Result<Self> {
         let now = Instant::now();
         let line = match opened {
-            Opened::Tty(tty) => Line::Tty(watched(tty)?),
+            Opened::Tty(port, settings) => Line::Tty(SerialStream::try_from(port)?, settings),
             Opened::Tcp(stream) => Line::Tcp(TcpStream::from_std(stream)?),
             Opened::Udp(socket) => Line::Udp(Udp::new(socket)?),
         };
-        let is_tty = matches!(line, Line::Tty(_));
+        let is_tty = matches!(line, Line::Tty(..));
         Ok(Self {
             line,
             request_at: settings.request.as_ref().map(|(_, every)| now + *every),
@@ -285,12 +286,7 @@ impl Open {
 impl Line {
     async fn read(&mut self, buffer: &mut [u8], stale_after: Duration) -> io::Result<Datagram> {
         match self {
-            Self::Tty(tty) => loop {
-                let mut ready = tty.readable().await?;
-                if let Ok(read) = ready.try_io(|tty| Ok(rustix::io::read(tty, &mut *buffer)?)) {
-                    return read.map(Datagram::Bytes);
-                }
-            },
+            Self::Tty(port, _) => AsyncReadExt::read(port, buffer).await.map(Datagram::Bytes),
             Self::Tcp(stream) => stream.read(buffer).await.map(Datagram::Bytes),
             Self::Udp(udp) => udp.read(buffer, stale_after).await,
         }
@@ -300,7 +296,7 @@ impl Line {
     /// the next read finds out why.
     fn send(&self, bytes: &[u8]) {
         match self {
-            Self::Tty(tty) => drop(rustix::io::write(tty, bytes)),
+            Self::Tty(_, settings) => drop(settings.send(bytes)),
             Self::Tcp(stream) => drop(rustix::io::write(stream, bytes)),
             Self::Udp(udp) => udp.send(bytes),
         }
@@ -310,7 +306,7 @@ impl Line {
     fn restore(&self) -> Option<Changed> {
         match self {
             // Where this fails, the next read finds out why.
-            Self::Tty(tty) => tty.get_ref().restore().ok().flatten(),
+            Self::Tty(_, settings) => settings.restore().ok().flatten(),
             Self::Tcp(_) | Self::Udp(_) => None,
         }
     }
@@ -318,19 +314,10 @@ impl Line {
     /// The reason of a loss by a read of no bytes.
     fn end(&self) -> &'static str {
         match self {
-            Self::Tty(_) | Self::Udp(_) => "end of file",
+            Self::Tty(..) | Self::Udp(_) => "end of file",
             Self::Tcp(_) => "closed by the other end",
         }
     }
-}
-
-/// Lets the runtime learn when `tty` has bytes.
-#[expect(
-    deprecated,
-    reason = "the other constructor is unsafe, for a type whose descriptor may change: this one owns its own"
-)]
-fn watched(tty: Tty) -> io::Result<AsyncFd<Tty>> {
-    AsyncFd::new(tty)
 }
 
 /// Waits until a time. Without one, this waits forever.
@@ -365,12 +352,12 @@ fn start_opening(
 fn open(port: &Port, baud: u32, first: &[u8]) -> io::Result<Opened> {
     match port {
         Port::Device(path) => {
-            let tty = Tty::open(path, baud)?;
+            let (port, settings) = tty::open(path, baud)?;
             lower_latency(path);
             if !first.is_empty() {
-                rustix::io::write(&tty, first)?;
+                settings.send(first)?;
             }
-            Ok(Opened::Tty(tty))
+            Ok(Opened::Tty(port, settings))
         }
         Port::Tcp(address) => {
             let stream = network::connect(address)?;

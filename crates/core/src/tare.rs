@@ -434,9 +434,7 @@ impl Tare {
         if moves || (is_whole && self.is_loaded(&mean)) {
             self.stage = match aim {
                 // A frame unlike those before it may be the first one without a touch.
-                Aim::First { .. } => {
-                    Stage::again(sums.wanted, self.array, moves.then_some(raw))
-                }
+                Aim::First { .. } => Stage::again(sums.wanted, self.array, moves.then_some(raw)),
                 Aim::Request => Stage::Ended(Err(RetareError::Touched)),
             };
             return Progress::Contact;

@@ -5,42 +5,52 @@
 //! again.
 
 use std::collections::BTreeSet;
-use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
+use std::io;
+use std::os::fd::OwnedFd;
 use std::path::Path;
 
-use rustix::fs::{FlockOperation, Mode, OFlags, flock};
+use rustix::fs::{Mode, OFlags};
 use rustix::io::Errno;
 use rustix::termios::{
-    ControlModes, InputModes, LocalModes, OptionalActions, OutputModes, QueueSelector,
-    SpecialCodeIndex, Termios, ioctl_tiocexcl, ioctl_tiocnxcl, tcflush, tcgetattr, tcsetattr,
+    ControlModes, InputModes, LocalModes, OptionalActions, OutputModes, SpecialCodeIndex, Termios,
+    tcgetattr, tcsetattr,
 };
+use serialport::{ClearBuffer, ErrorKind, SerialPort, TTYPort};
 
-/// An open serial port. No other process can open it until it is dropped.
+/// Opens the port at `path`. No other process can open it until it is dropped: TIOCEXCL keeps others
+/// out, and a lock also keeps root out.
+pub(super) fn open(path: &Path, baud: u32) -> io::Result<(TTYPort, LineSettings)> {
+    let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
+    // From TIOCEXCL on, not even this process can open the port again.
+    let file = rustix::fs::open(path, flags, Mode::empty())?;
+    tcgetattr(&file)?;
+    // The builder's defaults are 8N1 without flow control, and exclusive access.
+    let opened = TTYPort::open(&serialport::new(path.to_string_lossy(), baud));
+    let port = opened.map_err(|error| match error.kind() {
+        // The port is locked.
+        ErrorKind::NoDevice => Errno::BUSY.into(),
+        _ => io::Error::from(error),
+    })?;
+    // Bytes from before the port had its settings are of unknown age, and may be garbled.
+    port.clear(ClearBuffer::Input)?;
+    let settings = tcgetattr(&file)?;
+    Ok((port, LineSettings { file, settings }))
+}
+
+/// The settings of an open serial line, on a descriptor of their own: that of the port is not
+/// reachable.
 #[derive(Debug)]
-pub(super) struct Tty {
+pub(super) struct LineSettings {
     file: OwnedFd,
     /// The settings, as the driver took them.
     settings: Termios,
 }
 
-impl Tty {
-    /// Opens the port at `path`.
-    pub(super) fn open(path: &Path, baud: u32) -> Result<Self, Errno> {
-        let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
-        let file = rustix::fs::open(path, flags, Mode::empty())?;
-        // TIOCEXCL keeps others out, and the lock also keeps root out.
-        flock(&file, FlockOperation::NonBlockingLockExclusive)?;
-        ioctl_tiocexcl(&file)?;
-        let mut tty = Self {
-            settings: tcgetattr(&file)?,
-            file,
-        };
-        make_plain(&mut tty.settings, baud)?;
-        tcsetattr(&tty.file, OptionalActions::Now, &tty.settings)?;
-        tty.settings = tcgetattr(&tty.file)?;
-        // Bytes from before the port had its settings are of unknown age, and may be garbled.
-        tcflush(&tty.file, QueueSelector::IFlush)?;
-        Ok(tty)
+impl LineSettings {
+    /// Sends bytes, if there is room for them.
+    pub(super) fn send(&self, bytes: &[u8]) -> io::Result<()> {
+        rustix::io::write(&self.file, bytes)?;
+        Ok(())
     }
 
     /// Sets the settings again if another program has changed them. Returns what it found.
@@ -50,26 +60,6 @@ impl Tty {
             tcsetattr(&self.file, OptionalActions::Now, &self.settings)?;
         }
         Ok(changed)
-    }
-}
-
-impl AsFd for Tty {
-    fn as_fd(&self) -> BorrowedFd<'_> {
-        self.file.as_fd()
-    }
-}
-
-impl AsRawFd for Tty {
-    fn as_raw_fd(&self) -> RawFd {
-        self.file.as_raw_fd()
-    }
-}
-
-impl Drop for Tty {
-    fn drop(&mut self) {
-        // On a pty the kernel keeps TIOCEXCL as long as the other end is open. Where this fails, the
-        // device is gone.
-        let _ = ioctl_tiocnxcl(&self.file);
     }
 }
 
@@ -160,33 +150,32 @@ mod tests {
     #[test]
     fn settings_that_another_program_changed_are_named_and_set_again() {
         let pty = Pty::open(None).unwrap();
-        let tty = Tty::open(pty.path(), 57_600).unwrap();
-        assert_eq!(tty.restore(), Ok(None));
+        let (_port, line) = open(pty.path(), 57_600).unwrap();
+        assert_eq!(line.restore(), Ok(None));
         // What a getty sets.
-        let mut cooked = tty.settings.clone();
+        let mut cooked = line.settings.clone();
         cooked.local_modes |= LocalModes::ICANON | LocalModes::ECHO;
         cooked.input_modes |= InputModes::ICRNL;
         cooked.set_speed(9_600).unwrap();
-        tcsetattr(&tty.file, OptionalActions::Now, &cooked).unwrap();
+        tcsetattr(&line.file, OptionalActions::Now, &cooked).unwrap();
         let changed = Changed {
             found: "echo icanon icrnl ispeed 9600 ospeed 9600".to_owned(),
             expected: "-echo -icanon -icrnl ispeed 57600 ospeed 57600".to_owned(),
         };
-        assert_eq!(tty.restore(), Ok(Some(changed)));
-        assert_eq!(tty.restore(), Ok(None));
+        assert_eq!(line.restore(), Ok(Some(changed)));
+        assert_eq!(line.restore(), Ok(None));
     }
 
     #[test]
     fn a_port_is_held_by_one_until_it_is_dropped_and_takes_any_speed() {
         let pty = Pty::open(None).unwrap();
-        let tty = Tty::open(pty.path(), 250_000).unwrap();
-        assert_eq!(tty.settings.input_speed(), 250_000);
-        // The lock keeps root out, TIOCEXCL all others.
-        let held = Tty::open(pty.path(), 250_000).unwrap_err();
-        assert!([Errno::WOULDBLOCK, Errno::BUSY].contains(&held), "{held}");
-        drop(tty);
-        Tty::open(pty.path(), 250_000).unwrap();
+        let opened = open(pty.path(), 250_000).unwrap();
+        assert_eq!(opened.1.settings.input_speed(), 250_000);
+        let errno = |path: &Path| Errno::from_io_error(&open(path, 250_000).unwrap_err());
+        assert_eq!(errno(pty.path()), Some(Errno::BUSY));
+        drop(opened);
+        open(pty.path(), 250_000).unwrap();
         let file = tempfile::NamedTempFile::new().unwrap();
-        assert_eq!(Tty::open(file.path(), 9_600).unwrap_err(), Errno::NOTTY);
+        assert_eq!(errno(file.path()), Some(Errno::NOTTY));
     }
 }

@@ -215,7 +215,7 @@ fn the_first_tare_takes_the_first_quiet_frames_wherever_a_robot_begins() {
     for (cycle, unloaded) in [(15, 8), (20, 6), (20, 5)] {
         let frames = pressing(cycle, unloaded);
         for begin in 0..cycle {
-            let mut tare = Tare::new(&settings(&[]), Array::FULL, CONTACT);
+            let mut tare = Tare::new(&settings(&[]), Array::JX255N, CONTACT);
             let mut frames = frames.iter().cycle().skip(begin).take(2 * cycle);
             let taken = frames.position(|raw| tare.observe(raw) == Progress::Taken);
             // The next five quiet frames in a row.
