@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
-"""The Python client against servers that are not hardnessd.
+"""The Python client, `tail` and `watch` against servers that are not hardnessd.
 
     python3 -m venv venv && venv/bin/pip install ./clients/python
-    venv/bin/python tests/peers/hostile.py
+    venv/bin/python tests/peers/hostile.py target/debug/hardnessd
 
 Claims, for Client and AsyncClient alike: whatever a server sends, the client says in one `disconnected`
 event what is wrong with it, and tries again. It never holds much more than the longest line, and a time limit
-holds for a whole answer. Control and Connection raise an exception with the same words.
+holds for a whole answer. Control and Connection raise an exception with the same words. `tail` ends with one line
+and an exit code, in its time; `watch` goes on, and ends at a key. Neither takes much memory.
 """
 
 import asyncio
@@ -122,6 +123,61 @@ def by_control(sent, raised, said, **more):
             raise AssertionError(f"{said!r} is not raised")
 
 
+# What `tail` says to each server: the first bytes, what follows without end, the exit code and the words.
+def for_tail(hello, endless):
+    not_json, closed = "a line that is no JSON, expected", "the daemon closed the connection"
+    frame = line({"type": "frame", "sensor": "a", "rows": 64, "cols": 64, "newtons": [0.0] * 4096})
+    yield b"", {"endless": endless}, 69, "longer than 1048576 bytes"
+    yield hello, {"endless": endless}, 69, "longer than 1048576 bytes"
+    yield b"HTTP/1.1 400 Bad Request\r\n\r\n", {}, 69, not_json
+    yield b"\xff\xfe\x00\n", {}, 69, not_json
+    yield hello + b"[" * 500_000 + b"\n", {}, 69, not_json
+    yield hello + b'{"type":"status","x":' + b"9" * 500_000 + b"}\n", {}, 69, not_json
+    yield line(STATUS), {}, 69, 'found "status", expected the hello'
+    yield line({**HELLO, "protocol": 2}), {}, 69, "found protocol 2"
+    yield line({"type": "error", "message": "full"}), {}, 69, "the daemon says: full"
+    yield hello + b"5\n" + b'{"type":["status"]}\n' + b'{"type":"press","seq":"8"}\n', {}, 69, closed
+    yield hello + line(STATUS)[:-1], {}, 69, closed
+    yield b"", {"stays": True}, 1, "timed out after 2 s"
+    yield b"", {"endless": b"x", "slowly": 0.05}, 1, "timed out after 2 s"
+    yield hello, {"endless": line({"type": "hail"}), "slowly": 0.005}, 1, "timed out after 2 s"
+    yield hello, {"endless": frame}, 69, closed
+
+
+def by_tail(binary, servers):
+    for sent, more, code, said in servers:
+        with Server(sent, **more) as server:
+            command = [binary, "tail", "--json", "--timeout", "2", "--socket", server.path]
+            shown = subprocess.run(command, capture_output=True, text=True, timeout=20)
+            assert shown.returncode == code, shown
+            assert said in shown.stderr and shown.stderr.count("\n") == 1, (said, shown.stderr)
+
+
+def by_watch(binary, servers):
+    for sent, more, *_ in servers:
+        with Server(sent, **more) as server:
+            ours, theirs = os.openpty()
+            watch = subprocess.Popen([binary, "watch", "--socket", server.path], stdin=theirs, stdout=theirs, stderr=theirs)
+            os.close(theirs)
+            drawn = []
+            threading.Thread(target=drain, args=(ours, drawn), daemon=True).start()
+            time.sleep(1)
+            with open(f"/proc/{watch.pid}/status") as status:
+                (most_kb,) = [int(line.split()[1]) for line in status if line.startswith("VmHWM")]
+            assert most_kb < 64 * 1024, (sent[:60], most_kb)
+            assert watch.poll() is None, (sent[:60], b"".join(drawn)[-300:])
+            os.write(ours, b"q")
+            assert watch.wait(timeout=10) == 0, (sent[:60], b"".join(drawn)[-300:])
+
+
+def drain(terminal, drawn):
+    try:
+        while bytes_drawn := os.read(terminal, 1 << 16):
+            drawn.append(bytes_drawn)
+    except OSError:
+        pass  # The other end is closed.
+
+
 def main():
     hello = line(HELLO)
     endless = b"x" * (1 << 16)
@@ -187,6 +243,9 @@ def main():
         shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
         # Half of the fields are missing.
         assert shown.returncode == 0 and json.loads(shown.stdout) == STATUS, shown
+    if len(sys.argv) > 1:
+        by_tail(sys.argv[1], for_tail(hello, endless))
+        by_watch(sys.argv[1], for_tail(hello, endless))
     print("servers that are not hardnessd: each is named, none harms")
 
 
