@@ -18,7 +18,7 @@ use hardnessd::tools::fleet;
 #[cfg(feature = "watch")]
 use hardnessd::tools::watch;
 use hardnessd::tools::{
-    self, calibrate, check, demo, doctor, record, recover, replay, simulate, sniff, tail,
+    self, calibrate, check, control, demo, doctor, record, recover, replay, simulate, sniff, tail,
 };
 use hardnessd_core::trial;
 use tokio::signal::unix::{Signal, SignalKind, signal};
@@ -75,7 +75,7 @@ fn main() -> ExitCode {
 
 async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
     match command {
-        Command::Run(config) => run(config.path()?, signals).await,
+        Command::Run(args) => run(args.config.path()?, args.model.path()?, signals).await,
         Command::Demo(args) => {
             // The events are the output. The log would repeat each of them.
             let _log = Log::start(LogSettings::default(), "error")?;
@@ -84,7 +84,7 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
         Command::Simulate(args) => Ok(simulate::run(args, signals.received()).await?),
         Command::Record(args) => {
             let mut end = pin!(signals.received());
-            let Some(setup) = load(args.config.path()?, end.as_mut()).await? else {
+            let Some(setup) = load(args.config.path()?, None, end.as_mut()).await? else {
                 return Ok(());
             };
             // On a terminal the progress line replaces the log.
@@ -102,6 +102,15 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
         Command::Watch(args) => Ok(watch::run(args, signals.received()).await?),
         #[cfg(feature = "zenoh")]
         Command::Fleet(args) => Ok(fleet::run(args, signals.received()).await?),
+        Command::Tare(target) => {
+            finish(signals, control::run(control::Command::Tare(target))).await
+        }
+        Command::Context(context) => {
+            finish(signals, control::run(control::Command::Context(context))).await
+        }
+        Command::Blackbox(target) => {
+            finish(signals, control::run(control::Command::Blackbox(target))).await
+        }
         Command::Check(args) => finish_blocking(signals, move || check::run(&args)).await,
         Command::Calibrate(args) => calibrate(args, signals).await,
         Command::Doctor(args) => finish_blocking(signals, move || doctor::run(&args)).await,
@@ -114,7 +123,7 @@ async fn calibrate(args: calibrate::Args, signals: Signals) -> Result<(), Failur
     let path = args.config.path()?;
     let mut end = pin!(signals.end());
     let setup = tokio::select! {
-        loaded = load(path.clone(), std::future::pending()) => loaded?,
+        loaded = load(path.clone(), None, std::future::pending()) => loaded?,
         stop = &mut end => return Err(stop.into()),
     };
     let Some(setup) = setup else {
@@ -152,21 +161,25 @@ async fn finish_blocking<E: Into<Failure> + Send + 'static>(
 
 /// Loads the configuration and its model. Returns `None` if `end` comes first. This runs on a
 /// thread of its own, because a file may be a pipe that sends nothing.
-async fn load(path: PathBuf, end: impl Future<Output = ()>) -> Result<Option<Setup>, ConfigError> {
+async fn load(
+    path: PathBuf,
+    model: Option<PathBuf>,
+    end: impl Future<Output = ()>,
+) -> Result<Option<Setup>, ConfigError> {
     tokio::select! {
-        loaded = tokio::task::spawn_blocking(move || Setup::load(&path)) => {
+        loaded = tokio::task::spawn_blocking(move || Setup::load(&path, model.as_deref())) => {
             loaded.expect("a configuration is read without a panic").map(Some)
         }
         () = end => Ok(None),
     }
 }
 
-async fn run(path: PathBuf, signals: Signals) -> Result<(), Failure> {
+async fn run(path: PathBuf, model: Option<PathBuf>, signals: Signals) -> Result<(), Failure> {
     let (shutdown, mut hangup) = signals.apart();
     let mut shutdown = pin!(async {
         shutdown.await;
     });
-    let Some(setup) = load(path.clone(), shutdown.as_mut()).await? else {
+    let Some(setup) = load(path.clone(), model.clone(), shutdown.as_mut()).await? else {
         return Ok(());
     };
     let log = Log::start(setup.config.log, "info")?;
@@ -184,6 +197,7 @@ async fn run(path: PathBuf, signals: Signals) -> Result<(), Failure> {
             Some(Reload {
                 requests,
                 path,
+                model,
                 log,
             }),
         )

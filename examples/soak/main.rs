@@ -87,7 +87,7 @@ fn serve(config: &Path) -> Result<(), Failure> {
     runtime.block_on(async {
         let mut hangup = signal(SignalKind::hangup())?;
         let mut terminate = signal(SignalKind::terminate())?;
-        let setup = Setup::load(config)?;
+        let setup = Setup::load(config, None)?;
         let log = Log::start(setup.config.log, "warn")?;
         let daemon = Daemon::bind(setup)?;
         let (request, requests) = tokio::sync::mpsc::channel(1);
@@ -100,6 +100,7 @@ fn serve(config: &Path) -> Result<(), Failure> {
         let reload = Reload {
             requests,
             path,
+            model: None,
             log,
         };
         let shutdown = async move {

@@ -240,6 +240,16 @@ impl Config {
         }
     }
 
+    /// The same configuration with the model at `path`, if there is one.
+    #[must_use]
+    pub fn with_model(mut self, path: Option<&Path>) -> Self {
+        if let Some(path) = path {
+            self.model.path = Some(path.to_owned());
+            self.model.sha256 = None;
+        }
+        self
+    }
+
     /// Reads a file, but does not check its values. [`Self::check`] does.
     ///
     /// # Errors
@@ -357,21 +367,25 @@ pub struct Setup {
 }
 
 impl Setup {
-    /// Reads a configuration and its model.
+    /// Reads a configuration and its model. `model` replaces the configuration's own.
     ///
     /// # Errors
     ///
     /// Returns the errors of [`Config::load`] and [`Self::of`].
-    pub fn load(path: &Path) -> Result<Self, Error> {
+    pub fn load(path: &Path, model: Option<&Path>) -> Result<Self, Error> {
         let config = Config::load(path)?;
-        Self::of(config, path)
+        Self::of(config.with_model(model), path)
     }
 
     /// Reads a configuration and its model, but does not wait longer than `until` for a program that
     /// writes a file of them.
-    pub(super) fn load_until(path: &Path, until: Instant) -> Result<Self, Error> {
+    pub(super) fn load_until(
+        path: &Path,
+        model: Option<&Path>,
+        until: Instant,
+    ) -> Result<Self, Error> {
         let config = parse::load(path, Some(until))?;
-        Self::of_until(config, path, Some(until))
+        Self::of_until(config.with_model(model), path, Some(until))
     }
 
     /// Checks `config` and loads its model. `path` is only for messages.

@@ -32,6 +32,8 @@ pub struct Reload {
     pub requests: mpsc::Receiver<()>,
     /// The path of the configuration.
     pub path: PathBuf,
+    /// The model that replaces the configuration's own, if there is one.
+    pub model: Option<PathBuf>,
     /// The log, whose format may change.
     pub log: Log,
 }
@@ -68,13 +70,14 @@ impl Default for Readers {
 }
 
 impl Readers {
-    /// Reads the configuration at `path` and its model.
+    /// Reads the configuration at `path` and its model, or `model` in its place.
     pub(super) fn read(
         &self,
-        path: PathBuf,
+        (path, model): (PathBuf, Option<PathBuf>),
     ) -> impl Future<Output = Result<Setup, Refusal>> + use<> {
         let readers = Arc::clone(&self.0);
-        let read = |path: &Path| Setup::load_until(path, Instant::now() + PATIENCE);
+        let read =
+            move |path: &Path| Setup::load_until(path, model.as_deref(), Instant::now() + PATIENCE);
         async move { load(readers, path, PATIENCE + MARGIN, read).await }
     }
 }
@@ -113,13 +116,13 @@ async fn load<T: Send + 'static>(
     }
 }
 
-/// Waits for the next request to reload, and returns the path to read. If no request can come, this
-/// waits forever.
-pub(super) async fn requested(reload: &mut Option<Reload>) -> PathBuf {
+/// Waits for the next request to reload, and returns the path to read, and that of the model in the
+/// place of the configuration's own. If no request can come, this waits forever.
+pub(super) async fn requested(reload: &mut Option<Reload>) -> (PathBuf, Option<PathBuf>) {
     if let Some(reload) = reload
         && reload.requests.recv().await.is_some()
     {
-        return reload.path.clone();
+        return (reload.path.clone(), reload.model.clone());
     }
     std::future::pending().await
 }

@@ -1,13 +1,15 @@
 //! The command line of `hardnessd`: the one definition for the program, its help and its man pages.
 
-use clap::{Parser, Subcommand};
+use clap::{Args as ClapArgs, Parser, Subcommand};
 
-use super::configuration::Configuration;
+use super::configuration::{Configuration, ModelFile};
 #[cfg(feature = "zenoh")]
 use super::fleet;
 #[cfg(feature = "watch")]
 use super::watch;
-use super::{calibrate, check, demo, doctor, record, recover, replay, simulate, sniff, tail};
+use super::{
+    calibrate, check, control, demo, doctor, record, recover, replay, simulate, sniff, tail,
+};
 
 /// Hardness events from a tactile array on a serial port
 #[derive(Debug, Parser)]
@@ -22,7 +24,7 @@ pub struct Args {
 #[derive(Debug, Subcommand)]
 pub enum Command {
     /// Run the daemon until SIGINT or SIGTERM; SIGHUP reloads the configuration
-    Run(Configuration),
+    Run(Run),
     /// Run the whole daemon on a simulated sensor and print each press beside its verdict
     Demo(demo::Args),
     /// Simulate a sensor on a pty
@@ -31,7 +33,7 @@ pub enum Command {
     Record(record::Args),
     /// Save what is whole in a damaged recording
     Recover(recover::Args),
-    /// Replay a recording through the daemon's pipeline; print events as JSON lines
+    /// Replay a recording through the daemon's pipeline and print its events
     Replay(replay::Args),
     /// Print events of a running daemon
     Tail(tail::Args),
@@ -41,6 +43,12 @@ pub enum Command {
     /// Show the sensors of every robot behind a zenoh router
     #[cfg(feature = "zenoh")]
     Fleet(fleet::Args),
+    /// Take another tare of a sensor of a running daemon
+    Tare(control::Target),
+    /// Set what presses and verdicts of a sensor repeat, or remove it
+    Context(control::Context),
+    /// Write the last minutes of a sensor to a file
+    Blackbox(control::Target),
     /// Check a configuration and print what would run
     Check(check::Args),
     /// Measure values for the configuration: the arm, newtons, gains of taxels
@@ -49,6 +57,17 @@ pub enum Command {
     Doctor(doctor::Args),
     /// Propose a [sensor.frame] for raw bytes, as TOML on stdout
     Sniff(sniff::Args),
+}
+
+/// Arguments of `run`.
+#[derive(Debug, ClapArgs)]
+pub struct Run {
+    /// `--config`.
+    #[command(flatten)]
+    pub config: Configuration,
+    /// `--model`.
+    #[command(flatten)]
+    pub model: ModelFile,
 }
 
 const EXIT_CODES: &str = "Exit codes: 0 done; 1 failed or bad data; 2 wrong usage; 66 a file named \

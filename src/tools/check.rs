@@ -76,7 +76,7 @@ impl Coded for Error {
 /// frames, or a path for sockets, the log or recordings cannot be written to.
 pub fn run(args: &Args) -> Result<(), Error> {
     let path = &args.config.path()?;
-    let setup = Setup::load(path)?;
+    let setup = Setup::load(path, None)?;
     daemon::check(&setup.config).map_err(|source| Error::Daemon {
         path: path.clone(),
         source,

@@ -28,6 +28,48 @@ impl Coded for Missing {
     }
 }
 
+/// The argument `--model`.
+#[derive(Debug, Clone, ClapArgs)]
+pub struct ModelFile {
+    /// Model that judges, in place of the configuration's or the built-in one
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+}
+
+/// The file of `--model` cannot be read.
+#[derive(Debug, thiserror::Error)]
+#[error("--model {path}: cannot read: {source}")]
+pub struct NoModel {
+    path: PathBuf,
+    source: std::io::Error,
+}
+
+impl Coded for NoModel {
+    fn exit_code(&self) -> u8 {
+        NO_INPUT
+    }
+}
+
+impl ModelFile {
+    /// The path of the model, if the command line names one.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`NoModel`] if the file cannot be opened.
+    pub fn path(&self) -> Result<Option<PathBuf>, NoModel> {
+        let Some(path) = &self.model else {
+            return Ok(None);
+        };
+        match super::open(path) {
+            Ok(_) => Ok(Some(path.clone())),
+            Err(source) => Err(NoModel {
+                path: path.clone(),
+                source,
+            }),
+        }
+    }
+}
+
 /// The paths at which a configuration is looked for, in this order.
 const PLACES: [&str; 2] = ["./hardnessd.toml", "/etc/hardnessd.toml"];
 

@@ -142,7 +142,28 @@ impl Source {
     pub(super) async fn connect(&self) -> Result<Connection, Error> {
         match self.given() {
             Some(address) => Connection::open(address).await,
-            None => find().await,
+            None => find("events.sock").await,
+        }
+    }
+
+    /// The control socket at `path`, or that of the first daemon found.
+    pub(super) fn control(path: Option<PathBuf>) -> Self {
+        Self {
+            socket: path,
+            connect: None,
+        }
+    }
+
+    /// Connects to the control socket that the command line names, or else to that of the first
+    /// daemon found, which is beside its other one.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Error`] if no daemon answers.
+    pub(super) async fn connect_control(&self) -> Result<Connection, Error> {
+        match self.given() {
+            Some(address) => Connection::open(address).await,
+            None => find("control.sock").await,
         }
     }
 
@@ -153,11 +174,13 @@ impl Source {
     }
 }
 
-/// The first daemon that answers at one of the usual places.
-async fn find() -> Result<Connection, Error> {
-    let places = Unix::places();
+/// The first daemon that answers at one of the usual places, at its socket of this name.
+async fn find(name: &str) -> Result<Connection, Error> {
+    let place = |path: PathBuf| path.with_file_name(name);
+    let places: Vec<PathBuf> = Unix::places().into_iter().map(place).collect();
+    let demos = demo::sockets().into_iter().map(place);
     let mut denied = None;
-    for path in places.iter().cloned().chain(demo::sockets()) {
+    for path in places.iter().cloned().chain(demos) {
         match Connection::open(Address::Unix(path)).await {
             Ok(connection) => return Ok(connection),
             Err(error @ Error::Denied { .. }) => denied = denied.or(Some(error)),

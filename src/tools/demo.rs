@@ -25,6 +25,7 @@ use tokio::time::Instant;
 use self::account::Account;
 use self::place::Place;
 pub(super) use self::place::sockets;
+use super::configuration::{ModelFile, NoModel};
 use super::faults::Faults;
 use super::player::{Pace, Player};
 use super::simulate::{OutOfRange, within};
@@ -54,6 +55,8 @@ pub struct Args {
     /// Print events as JSON lines on a terminal too
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    model: ModelFile,
 }
 
 /// The reason why the demonstration failed.
@@ -62,6 +65,9 @@ pub enum Error {
     /// The daemon's configuration or model cannot be used.
     #[error(transparent)]
     Config(#[from] daemon::config::Error),
+    /// The file of `--model` cannot be read.
+    #[error(transparent)]
+    Model(#[from] NoModel),
     /// The daemon failed.
     #[error(transparent)]
     Daemon(#[from] daemon::Error),
@@ -93,6 +99,7 @@ impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
             Error::Config(error) => error.exit_code(),
+            Error::Model(error) => error.exit_code(),
             Error::Daemon(error) => error.exit_code(),
             Error::Missed { .. } | Error::Closed => FAILED,
             Error::Io { .. } => IO,
@@ -145,7 +152,10 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let mut config = hastened(sensor, &socket, args.speed);
     config.http = Some(Http { listen: args.http });
     let robot = player.robot(config.publish.unix.control_path(), None);
-    let daemon = Daemon::bind(Setup::of(config, Path::new("demo"))?)?;
+    let daemon = Daemon::bind(Setup::of(
+        config.with_model(args.model.path()?.as_deref()),
+        Path::new("demo"),
+    )?)?;
     if let Some(address) = daemon.http_address() {
         hardnessd_core::say!("live page: http://{address}/");
     }

@@ -7,14 +7,16 @@
 pub mod motion;
 
 use std::collections::VecDeque;
-use std::io::{self, BufReader, Read};
+use std::io::{self, BufReader, IsTerminal, Read};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use clap::Args as ClapArgs;
 
+use super::configuration::{ModelFile, NoModel};
 use super::simulate::positive;
+use super::{json_escaped, readable};
 use crate::daemon::config::{self, Config, SensorTable, Setup};
 use crate::daemon::now;
 use hardnessd_core::event::{Event, Kind};
@@ -39,6 +41,11 @@ pub struct Args {
     /// frame, and approach_mm [default: none]
     #[arg(long, value_name = "M.csv")]
     motion: Option<PathBuf>,
+    #[command(flatten)]
+    model: ModelFile,
+    /// Print events as JSON lines on a terminal too
+    #[arg(long)]
+    json: bool,
 }
 
 /// The reason why a recording cannot be played.
@@ -47,6 +54,9 @@ pub enum Error {
     /// The configuration or its model cannot be used.
     #[error(transparent)]
     Config(#[from] config::Error),
+    /// The file of `--model` cannot be read.
+    #[error(transparent)]
+    Model(#[from] NoModel),
     /// The recording cannot be read.
     #[error("{path}: cannot read: {source}")]
     Unreadable {
@@ -115,6 +125,7 @@ impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
             Error::Config(error) => error.exit_code(),
+            Error::Model(error) => error.exit_code(),
             Error::Unreadable { .. } => NO_INPUT,
             Error::Motion { source, .. } if source.is_unreadable() => NO_INPUT,
             Error::Motion { .. }
@@ -146,11 +157,12 @@ pub async fn run(args: Args) -> Result<(), Error> {
 
 /// Plays to the end, or until the other end of `stopped` is dropped.
 fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Error> {
+    let model = args.model.path()?;
     let setup = match &args.config {
-        Some(config) => Setup::load(config)?,
+        Some(config) => Setup::load(config, model.as_deref())?,
         None => {
             let config = Config::new(vec![SensorTable::new(args.file.clone())]);
-            Setup::of(config, Path::new("defaults"))?
+            Setup::of(config.with_model(model.as_deref()), Path::new("defaults"))?
         }
     };
     let path = &args.file;
@@ -162,6 +174,7 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Error> {
         speed: args.speed,
         start: None,
         stopped,
+        form: Form::of(args),
     };
     let (kind, recording) = FileKind::read(recording).map_err(|source| Error::Broken {
         path: path.clone(),
@@ -189,6 +202,7 @@ struct Pace<'a> {
     /// When the first entry was played.
     start: Option<Instant>,
     stopped: &'a Receiver<()>,
+    form: Form,
 }
 
 impl Pace<'_> {
@@ -211,6 +225,7 @@ impl Pace<'_> {
 fn play_recording(path: &Path, file: impl Read, setup: Setup, pace: Pace) -> Result<(), Error> {
     let mut playback = Playback::new(setup.hrn);
     let mut seq = 0;
+    let form = pace.form;
     let played = play_entries(path, file, pace, &mut playback, &mut seq);
     if let Ok(false) = played {
         return Ok(());
@@ -224,7 +239,7 @@ fn play_recording(path: &Path, file: impl Read, setup: Setup, pace: Pace) -> Res
     }
     let end = playback.end();
     warn(playback.unjudged());
-    print(end, &mut seq)?;
+    print(end, &mut seq, form)?;
     played.map(drop)
 }
 
@@ -260,7 +275,7 @@ fn play_entries(
             source,
         })?;
         warn(playback.unjudged());
-        if !print(events, seq)? {
+        if !print(events, seq, pace.form)? {
             return Ok(false);
         }
     }
@@ -318,7 +333,7 @@ fn play_bytes(
                 }),
                 _ => None,
             });
-            print(end, &mut seq)?;
+            print(end, &mut seq, pace.form)?;
             return none.map_or(Ok(()), Err);
         }
         let (frames, _) = pipeline.frame_counts();
@@ -337,8 +352,40 @@ fn play_bytes(
         warn(pipeline.unjudged());
         let (frames, _) = pipeline.frame_counts();
         let since = time_of(frames.saturating_sub(1), frame_rate_hz);
-        if !pace.wait(since) || !print(events, &mut seq)? {
+        if !pace.wait(since) || !print(events, &mut seq, pace.form)? {
             return Ok(());
+        }
+    }
+}
+
+/// How events are printed.
+#[derive(Debug, Clone, Copy)]
+enum Form {
+    Json,
+    /// JSON without characters that move the cursor.
+    JsonOnTerminal,
+    Readable,
+}
+
+impl Form {
+    fn of(args: &Args) -> Self {
+        match (io::stdout().is_terminal(), args.json) {
+            (false, _) => Self::Json,
+            (true, true) => Self::JsonOnTerminal,
+            (true, false) => Self::Readable,
+        }
+    }
+
+    /// The event's line, newline included.
+    fn line(self, event: &Event) -> String {
+        let line = event.to_line();
+        match self {
+            Self::Json => line,
+            Self::JsonOnTerminal => json_escaped(line.trim_end()) + "\n",
+            Self::Readable => match serde_json::from_str(&line) {
+                Ok(event) => readable::line(&event) + "\n",
+                Err(_) => line,
+            },
         }
     }
 }
@@ -366,13 +413,13 @@ fn warn(unjudged: Vec<Unjudged>) {
 
 /// Prints the events that a subscriber would receive, without frames. Returns `false` if nobody
 /// reads stdout.
-fn print(events: Vec<Event>, seq: &mut u64) -> Result<bool, Error> {
+fn print(events: Vec<Event>, seq: &mut u64, form: Form) -> Result<bool, Error> {
     let mut lines = String::new();
     for mut event in events {
         if event.kind() != Kind::Frame {
             *seq += 1;
             event.number(*seq);
-            lines.push_str(&event.to_line());
+            lines += &form.line(&event);
         }
     }
     super::print(lines.as_bytes()).map_err(Error::Print)

@@ -4,8 +4,6 @@
 //! statuses that a connection begins with. A `gap` is printed where it happened, but not counted.
 //! `hello` is not printed.
 
-mod readable;
-
 use std::future::Future;
 use std::io::{self, IsTerminal};
 use std::time::Duration;
@@ -15,6 +13,7 @@ use serde_json::{Value, json};
 
 use super::connect::{self, Address, Connection, Source};
 use super::simulate::positive;
+use super::{json_escaped, readable};
 use hardnessd_core::event::{Kind, PROTOCOL};
 use hardnessd_core::exit::{Coded, FAILED, IO, UNAVAILABLE};
 use hardnessd_core::wording;
@@ -187,19 +186,6 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
     }
 }
 
-/// The same JSON without hidden characters, for a terminal. They are inside strings only.
-fn json_escaped(line: &str) -> String {
-    let mut escaped = String::with_capacity(line.len());
-    for c in line.chars() {
-        if wording::is_hidden(c) {
-            escaped += &format!("\\u{:04x}", u32::from(c));
-        } else {
-            escaped.push(c);
-        }
-    }
-    escaped
-}
-
 /// Fails unless this is a daemon's first line.
 fn meet(hello: &Value, address: Address) -> Result<(), Error> {
     let kind = hello["type"].as_str().unwrap_or_default();
@@ -224,19 +210,5 @@ async fn next(daemon: &mut Connection) -> Result<(String, Value), Error> {
             address: daemon.address().clone(),
             found: "a line that is no JSON".to_owned(),
         }),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn on_a_terminal_the_same_json_has_no_hidden_characters() {
-        let line = "{\"label\":\"a\u{202e}b\u{9b}é\"}";
-        let safe = json_escaped(line);
-        assert_eq!(safe, r#"{"label":"a\u202eb\u009bé"}"#);
-        let [same, of] = [&safe, line].map(|text| serde_json::from_str::<Value>(text).unwrap());
-        assert_eq!(same, of);
     }
 }

@@ -1,11 +1,14 @@
 //! The messages of the commands around the daemon.
 
 use std::fs;
+use std::io::Read;
 use std::os::unix::fs::symlink;
 use std::process::{Command, Output, Stdio};
 
 use crate::bench::{BINARY, Bench, Process, hardnessd};
+use crate::pair::Pair;
 use rustix::process::Signal;
+use serde_json::{Value, json};
 
 fn text(bytes: &[u8]) -> String {
     String::from_utf8(bytes.to_vec()).unwrap()
@@ -161,4 +164,106 @@ fn sniff_at_a_port_that_is_interrupted_has_not_finished() {
         sniff.signal(signal);
         assert_eq!(sniff.exit_code(), Some(code));
     }
+}
+
+#[test]
+fn the_control_socket_has_commands_of_its_own() {
+    let bench = Bench::new();
+    let _daemon = bench.daemon();
+    let socket = bench.path("control.sock");
+    let control = |arguments: &[&str]| {
+        let mut command = Command::new(BINARY);
+        command.args(arguments).arg("--socket").arg(&socket);
+        let Output {
+            status,
+            stdout,
+            stderr,
+        } = command.output().unwrap();
+        (status.code().unwrap(), text(&stdout), text(&stderr))
+    };
+    let (code, _, said) = control(&["tare", "forearm"]);
+    assert_eq!((code, said.lines().count()), (1, 1), "{said}");
+    assert!(said.contains("not live"), "{said}");
+    let (code, _, said) = control(&["tare", "wrist"]);
+    assert!(code == 1 && said.contains("forearm"), "{said}");
+
+    let sets = ["context", "forearm", "tag=pick-17", "speed_mm_s=5.5"];
+    assert_eq!(control(&sets), (0, "done\n".to_owned(), String::new()));
+    let _sensor = bench.sensor(&[]);
+    let mut subscriber = bench.subscriber();
+    let begun = subscriber.until(&json!({"type": "press", "state": "begin"}));
+    assert_eq!(
+        begun["context"],
+        json!({"sensor": "forearm", "tag": "pick-17", "speed_mm_s": 5.5})
+    );
+    assert_eq!(control(&["context", "forearm"]).0, 0);
+    let judged = subscriber.until(&json!({"phase": "final"}));
+    assert_eq!(judged["context"], Value::Null);
+    let (code, tared, said) = control(&["tare", "forearm"]);
+    assert!(
+        code == 0 && tared.starts_with("tared: the mean offset was 0.00"),
+        "{said}"
+    );
+    let (code, _, said) = control(&["blackbox", "forearm"]);
+    assert!(code == 1 && said.contains("[record]"), "{said}");
+
+    // The socket of events changes nothing.
+    let mut command = Command::new(BINARY);
+    command
+        .args(["tare", "forearm", "--socket"])
+        .arg(bench.path("events.sock"));
+    let Output { status, stderr, .. } = command.output().unwrap();
+    assert_eq!(status.code(), Some(1));
+    assert!(text(&stderr).contains("send it to the control socket"));
+}
+
+#[test]
+fn a_model_of_the_command_line_judges_in_place_of_the_others() {
+    let course = concat!(env!("CARGO_MANIFEST_DIR"), "/models/course.onnx");
+    let fixture = concat!(env!("CARGO_MANIFEST_DIR"), "/fixtures/foam.5hz.bin");
+    let verdict = |arguments: &[&str]| {
+        let Output { stdout, stderr, .. } = hardnessd(arguments);
+        let events = text(&stdout);
+        let mut lines = events
+            .lines()
+            .map(|line| serde_json::from_str::<Value>(line).unwrap());
+        let found = lines.find(|event| event["phase"] == "final");
+        found.unwrap_or_else(|| panic!("{}", text(&stderr)))
+    };
+    assert_eq!(verdict(&["replay", fixture])["course"], Value::Null);
+    assert_eq!(
+        verdict(&["replay", fixture, "--model", course])["course"],
+        "none"
+    );
+    let demo = ["demo", "--presses", "1", "--speed", "4", "--model", course];
+    assert_eq!(verdict(&demo)["course"], "positions");
+    for command in [&["demo"][..], &["replay", fixture], &["run"]] {
+        let Output { status, stderr, .. } = hardnessd(&[command, &["--model", "no.onnx"]].concat());
+        assert_eq!(status.code(), Some(66), "{}", text(&stderr));
+    }
+    let Output { status, stderr, .. } = hardnessd(&["replay", fixture, "--model", fixture]);
+    assert_eq!(status.code(), Some(78), "{}", text(&stderr));
+}
+
+#[test]
+fn replay_prints_readable_lines_on_a_terminal_and_json_if_asked() {
+    let fixture = concat!(env!("CARGO_MANIFEST_DIR"), "/fixtures/foam.5hz.bin");
+    let shown = |more: &[&str]| {
+        let Pair { master, device, .. } = Pair::open().unwrap();
+        let mut command = Command::new(BINARY);
+        command
+            .args(["replay", fixture])
+            .args(more)
+            .stdout(Stdio::from(device));
+        let mut replay = command.stderr(Stdio::null()).spawn().unwrap();
+        drop(command);
+        let mut shown = Vec::new();
+        // The end of a terminal is an error.
+        let _ = std::fs::File::from(master).read_to_end(&mut shown);
+        assert!(replay.wait().unwrap().success());
+        text(&shown)
+    };
+    let lines = shown(&[]);
+    assert!(lines.contains("press     #1    begin"), "{lines}");
+    assert!(shown(&["--json"]).starts_with("{\"type\":\"status\""));
 }

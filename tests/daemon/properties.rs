@@ -199,7 +199,7 @@ fn served() -> &'static Served {
                 .build()
                 .expect("a runtime");
             runtime.block_on(async {
-                let setup = Setup::load(&path).expect("a configuration that is good");
+                let setup = Setup::load(&path, None).expect("a configuration that is good");
                 let daemon = Daemon::bind(setup).expect("sockets");
                 bound.send(daemon.http_address()).expect("who waits");
                 let ended = daemon.run(std::future::pending(), None).await;

@@ -366,7 +366,7 @@ fn paths_are_relative_to_the_file() {
     let unix = &config.publish.unix;
     assert_eq!(unix.path(), Path::new("/run/events.sock"));
     assert_eq!(unix.control_path(), directory.path().join("c"));
-    let error = Setup::load(&path).unwrap_err().to_string();
+    let error = Setup::load(&path, None).unwrap_err().to_string();
     assert!(error.contains("model.path: cannot read"), "{error}");
 }
 
@@ -417,7 +417,7 @@ fn a_reload_gives_a_pipe_up_and_a_pipe_that_a_program_writes_is_read() {
         std::fs::write(place(name), bytes).unwrap();
     }
     let load = |wait: Duration| {
-        let loaded = Setup::load_until(&config, Instant::now() + wait);
+        let loaded = Setup::load_until(&config, None, Instant::now() + wait);
         loaded.map(drop).map_err(|error| error.to_string())
     };
     let patience = Duration::from_secs(60);

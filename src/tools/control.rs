@@ -1,0 +1,168 @@
+//! `hardnessd tare`, `context` and `blackbox`: one command to the control socket of a running daemon,
+//! and its answer.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::Args as ClapArgs;
+use serde_json::{Map, Value, json};
+
+use super::connect::{self, Connection, Source};
+use hardnessd_core::exit::{Coded, FAILED, IO, UNAVAILABLE};
+use hardnessd_core::wording;
+
+/// The sensor and the socket of a command.
+#[derive(Debug, Clone, ClapArgs)]
+pub struct Target {
+    /// Name of the sensor
+    #[arg(value_name = "SENSOR")]
+    sensor: String,
+    /// Control socket of the daemon [default: beside the events of the first daemon that answers]
+    #[arg(long, value_name = "P")]
+    socket: Option<PathBuf>,
+}
+
+/// Arguments of `context`.
+#[derive(Debug, Clone, ClapArgs)]
+pub struct Context {
+    /// Sensor and socket.
+    #[command(flatten)]
+    target: Target,
+    /// What presses and verdicts repeat from now on, such as tag=pick-17 or speed_mm_s=5; without
+    /// any, the context is removed
+    #[arg(value_name = "KEY=VALUE", value_parser = pair)]
+    pairs: Vec<(String, Value)>,
+}
+
+/// A command to a daemon.
+#[derive(Debug, Clone)]
+pub enum Command {
+    /// Take another tare.
+    Tare(Target),
+    /// Set the context.
+    Context(Context),
+    /// Write the black box.
+    Blackbox(Target),
+}
+
+/// Reads `KEY=VALUE`. A value that is JSON is taken as JSON, any other as text.
+fn pair(text: &str) -> Result<(String, Value), &'static str> {
+    match text.split_once('=') {
+        Some((key, value)) if !key.is_empty() => {
+            let value = serde_json::from_str(value).unwrap_or_else(|_| value.into());
+            Ok((key.to_owned(), value))
+        }
+        _ => Err("expected KEY=VALUE, such as tag=pick-17"),
+    }
+}
+
+/// The reason why a command was not carried out.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// There is no connection to a daemon.
+    #[error(transparent)]
+    Connect(#[from] connect::Error),
+    /// The daemon refused the command.
+    #[error("{0}")]
+    Refused(String),
+    /// The daemon did not answer in time.
+    #[error("no answer within {} s", ANSWER.as_secs())]
+    Mute,
+    /// Stdout cannot be written to.
+    #[error("stdout: {0}")]
+    Print(#[source] std::io::Error),
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::Connect(_) => UNAVAILABLE,
+            Error::Refused(_) | Error::Mute => FAILED,
+            Error::Print(_) => IO,
+        }
+    }
+}
+
+/// The longest wait for an answer. The frames of a tare may take as long.
+const ANSWER: Duration = Duration::from_secs(60);
+
+/// Sends a command, and prints what the daemon did.
+///
+/// # Errors
+///
+/// Returns [`Error`] if no daemon answers, or the daemon refuses.
+pub async fn run(command: Command) -> Result<(), Error> {
+    let (target, request) = match command {
+        Command::Tare(target) => {
+            let request = json!({"tare": target.sensor, "id": 1});
+            (target, request)
+        }
+        Command::Blackbox(target) => {
+            let request = json!({"blackbox": target.sensor, "id": 1});
+            (target, request)
+        }
+        Command::Context(Context { target, pairs }) => {
+            let mut context: Map<String, Value> = pairs.into_iter().collect();
+            context.insert("sensor".to_owned(), target.sensor.clone().into());
+            (target, json!({"context": context, "id": 1}))
+        }
+    };
+    let mut daemon = Source::control(target.socket).connect_control().await?;
+    daemon.send(&request.to_string()).await?;
+    let answer = tokio::time::timeout(ANSWER, answer(&mut daemon)).await;
+    let answer = answer.map_err(|_| Error::Mute)??;
+    if answer["type"] == "error" {
+        let message = answer["message"].as_str().unwrap_or_default();
+        return Err(Error::Refused(wording::escaped(message)));
+    }
+    let line = said(&answer) + "\n";
+    super::print(line.as_bytes()).map_err(Error::Print)?;
+    Ok(())
+}
+
+/// The answer to the command. Other lines come before it.
+async fn answer(daemon: &mut Connection) -> Result<Value, Error> {
+    loop {
+        let line = daemon.next().await?;
+        let answer: Value = serde_json::from_str(&line).unwrap_or_default();
+        let is_refusal = answer["type"] == "error" && answer["id"].is_null();
+        if answer["id"] == 1 || is_refusal {
+            return Ok(answer);
+        }
+    }
+}
+
+/// The answer in plain words.
+fn said(answer: &Value) -> String {
+    if let Some(path) = answer["blackbox"].as_str() {
+        return format!("written to {}", wording::escaped(path));
+    }
+    let tare = &answer["tare"];
+    let mean = |of: &str| tare[of]["mean_counts"].as_f64();
+    match (mean("old"), mean("new")) {
+        (Some(old), Some(new)) => {
+            format!("tared: the mean offset was {old:.2} counts and is {new:.2} counts")
+        }
+        _ => "done".to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_value_is_json_or_text() {
+        for (text, value) in [
+            ("tag=pick-17", json!("pick-17")),
+            ("speed_mm_s=5.5", json!(5.5)),
+            ("is_new=true", json!(true)),
+            ("at=[1,2]", json!([1, 2])),
+            ("formula=a=b", json!("a=b")),
+            ("empty=", json!("")),
+        ] {
+            assert_eq!(pair(text).unwrap().1, value, "{text}");
+        }
+        assert!(pair("=5").is_err() && pair("tag").is_err());
+    }
+}
