@@ -171,10 +171,21 @@ impl Fit {
             (delay_ms, slope(&alone, delay_ms).unwrap_or(n_per_mm))
         };
         let alone: Vec<(f64, f64)> = known.iter().map(one).collect();
-        let spread = |value, of: fn(&(f64, f64)) -> f64| Spread {
-            value,
-            least: alone.iter().map(of).fold(f64::INFINITY, f64::min),
-            most: alone.iter().map(of).fold(f64::NEG_INFINITY, f64::max),
+        let spread = |value: f64, of: fn(&(f64, f64)) -> f64| {
+            let mut alone: Vec<f64> = alone.iter().map(of).collect();
+            alone.sort_by(f64::total_cmp);
+            let (least, most) = (alone[0], alone[alone.len() - 1]);
+            // All presses together may give a value that none of them gives.
+            let is_inside = (least..=most).contains(&value);
+            Spread {
+                value: if is_inside {
+                    value
+                } else {
+                    alone[alone.len() / 2]
+                },
+                least,
+                most,
+            }
         };
         let forces = known.iter().map(|press| press.force_n());
         Ok(Self {

@@ -35,6 +35,28 @@ pub enum Unfit {
         /// The weight in newtons.
         newtons: f64,
     },
+    /// A heavier weight gives fewer counts.
+    #[error(
+        "the weight of {heavy} N gives fewer counts than that of {light} N: was each weight on the \
+         sensor when its turn was?"
+    )]
+    Falling {
+        /// The heavier weight in newtons.
+        heavy: f64,
+        /// The lighter one.
+        light: f64,
+    },
+    /// No law fits all weights.
+    #[error(
+        "the weights do not fit one law: that of {newtons} N would read {read:.1} N. Put all weights on \
+         the same foot and repeat it; with four weights or more, a curve is tried too"
+    )]
+    Scattered {
+        /// The weight that fits worst, in newtons.
+        newtons: f64,
+        /// Its reading with the values that fit best.
+        read: f64,
+    },
     /// A taxel reads full scale, so the weight may be larger than the sum of the taxels.
     #[error(
         "press {press}, of {newtons} N, reaches full scale on a taxel: put the weight on more taxels, \
@@ -66,6 +88,8 @@ const LEAST_RATIO: f64 = 2.0;
 const LEAST_ERROR: f64 = 0.02;
 /// The exponent must leave less than this share of the line's error.
 const MOST_LEFT: f64 = 0.5;
+/// With a larger error of a weight, the values would be worth nothing.
+const MOST_ERROR: f64 = 0.2;
 /// The step between the exponents that are tried.
 const STEP: f64 = 0.01;
 
@@ -116,8 +140,10 @@ impl Fit {
         let read = |(newtons, counts): &(f64, Vec<Count>)| {
             (*newtons, newtons_per_count * raised(counts, exponent))
         };
+        let weights: Vec<(f64, f64)> = resting.iter().map(read).collect();
+        check(weights.clone())?;
         Ok(Self {
-            weights: resting.iter().map(read).collect(),
+            weights,
             newtons_per_count,
             alone: [
                 alone.clone().fold(f64::INFINITY, f64::min),
@@ -137,6 +163,27 @@ impl Fit {
             Some((exponent, error)) if exponent == self.exponent => error,
             _ => self.line_error,
         }
+    }
+}
+
+/// Checks that readings grow with their weights, and that each is near its weight.
+fn check(mut weights: Vec<(f64, f64)>) -> Result<(), Unfit> {
+    weights.sort_by(|one, other| one.0.total_cmp(&other.0));
+    for pair in weights.windows(2) {
+        let [(light, less), (heavy, more)] = [pair[0], pair[1]];
+        if heavy > light && more < less {
+            return Err(Unfit::Falling { heavy, light });
+        }
+    }
+    let error = |&(newtons, read): &(f64, f64)| (read / newtons - 1.0).abs();
+    let worst = weights
+        .iter()
+        .max_by(|one, other| error(one).total_cmp(&error(other)));
+    match worst {
+        Some(&(newtons, read)) if error(&(newtons, read)) > MOST_ERROR => {
+            Err(Unfit::Scattered { newtons, read })
+        }
+        _ => Ok(()),
     }
 }
 
@@ -332,7 +379,7 @@ mod tests {
                 assert!((read / newtons - 1.0).abs() < 0.01, "{found:?}");
             }
             // Two different weights cannot determine an exponent.
-            let two = fit((0.01, 1.4), &[2.0, 20.0, 20.0], &settings);
+            let two = fit((0.01, 1.2), &[10.0, 20.0, 20.0], &settings);
             assert_eq!(two.exponent, 1.0);
         }
     }
@@ -398,5 +445,27 @@ mod tests {
             ..press(newtons, (0.04, 1.0), &sensor, &settings)
         };
         assert_eq!(of(&full), Err(Unfit::Saturated { press: 2, newtons }));
+    }
+
+    #[test]
+    fn weights_that_do_not_fit_one_law_give_no_values() {
+        let sensor = Sensor::new(Description::default()).unwrap();
+        let settings = sensor.description().calibration.clone();
+        let fit = |weights: &[(f64, f64)]| {
+            let presses: Vec<(f64, Press)> = weights
+                .iter()
+                .map(|&(newtons, on_it)| (newtons, press(on_it, (0.04, 1.0), &sensor, &settings)))
+                .collect();
+            let named: Vec<(f64, &Press)> = presses.iter().map(|(n, press)| (*n, press)).collect();
+            Fit::of(&named, &sensor)
+        };
+        assert!(fit(&[(5.0, 5.0), (10.0, 10.5), (20.0, 19.0)]).is_ok());
+        // Two weights were swapped.
+        let (heavy, light) = (20.0, 10.0);
+        let swapped = fit(&[(5.0, 5.0), (light, heavy), (heavy, light)]);
+        assert_eq!(swapped, Err(Unfit::Falling { heavy, light }));
+        // One weight was not the named one.
+        let wrong = fit(&[(5.0, 5.0), (10.0, 10.0), (20.0, 11.0)]);
+        assert!(matches!(wrong, Err(Unfit::Scattered { .. })), "{wrong:?}");
     }
 }

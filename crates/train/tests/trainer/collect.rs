@@ -422,6 +422,20 @@ fn a_model_of_presses_is_of_the_pitch_of_its_recordings() {
         assert_eq!(errors.is_empty(), expected.is_empty(), "{errors}");
         assert!(errors.ends_with(expected), "{errors}");
     }
+    // Single frames are no presses.
+    let frames = desk.path("frames.npz");
+    assert!(
+        collect(&frames, &["--level", "1", FIXTURE])
+            .status
+            .success()
+    );
+    let of = ["evaluate", "--model", text(&model), "--data", text(&frames)];
+    let output = hrn_train(&of);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(
+        errors(&output).contains("found single frames"),
+        "{output:?}"
+    );
 }
 
 #[test]

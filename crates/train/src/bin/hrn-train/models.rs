@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use anyhow::Context as _;
 use hardnessd_core::trial;
-use hardnessd_core::verdict::Hrn;
+use hardnessd_core::verdict::{Format as ModelFormat, Hrn};
 use hardnessd_core::{exit, wording};
 use hrn_train::data::courses::{self, Courses};
 use hrn_train::data::dataset::{self, Dataset};
@@ -29,6 +29,11 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     if Courses::is_at(&arguments.data)? {
         return evaluate_courses(arguments, &hrn);
     }
+    anyhow::ensure!(
+        hrn.format() == ModelFormat::Frame,
+        "{}: found single frames, expected presses over time, which the model judges (`--sequences`)",
+        arguments.data.display()
+    );
     let dataset = Dataset::read(&arguments.data)?;
     warn_of_pitch(&arguments.data, dataset.pitch_mm(), &hrn);
     dataset.warn_of_object_in_both_splits();
