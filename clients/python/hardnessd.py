@@ -127,6 +127,16 @@ class Shore(TypedDict):
     high: float
 
 
+class ObjectVerdict(TypedDict):
+    """The verdict over all presses so far of the object that the context names."""
+
+    name: str
+    presses: int
+    level: int
+    probabilities: List[float]
+    shore: Optional[Shore]
+
+
 class Hardness(_Numbered):
     """A verdict on a press."""
 
@@ -155,6 +165,7 @@ class Hardness(_Numbered):
     levels: Optional[List[int]]
     course: Optional[Literal["positions", "speed", "none"]]
     stiffness_n_per_mm: Optional[float]
+    object: Optional[ObjectVerdict]
 
 
 class Press(_Numbered):
@@ -831,6 +842,10 @@ def _verdict(event: Hardness) -> str:
     shore = event.get("shore")
     if shore is not None:
         text += f"  Shore {shore['value']:.0f} ({shore['low']:.0f} to {shore['high']:.0f})"
+    of_object = event.get("object")
+    if of_object is not None and of_object["presses"] > 1:
+        most = max(of_object["probabilities"])
+        text += f"  {of_object['name']}: {of_object['level']} by {of_object['presses']} presses, {100 * most:.0f} %"
     if event["age_at_publish_ms"] is not None:
         text += f"  frame {event['frame']} at {event['time'][11:23]}"
     return text + _reason(", ".join(event["notes"])) + _context(event["context"])

@@ -119,6 +119,21 @@ fn hardness(line: &mut String, event: &Value) {
             format_args!("  Shore {value:.0} ({low:.0} to {high:.0})"),
         );
     }
+    let object = &event["object"];
+    if let (Some(name), Some(presses @ 2..)) = (object["name"].as_str(), object["presses"].as_u64())
+    {
+        let level = number(object, "level");
+        let probabilities = object["probabilities"].as_array().into_iter().flatten();
+        let probabilities: Vec<f64> = probabilities.filter_map(Value::as_f64).collect();
+        let most = probabilities.iter().copied().fold(0.0, f64::max);
+        write(
+            line,
+            format_args!(
+                "  {name}: {level} by {presses} presses, {:.0} %",
+                100.0 * most
+            ),
+        );
+    }
     if let (Some(_), Some(time)) = (published(event), event["time"].as_str()) {
         let frame = number(event, "frame");
         write(line, format_args!("  frame {frame} at {}", clock(time)));

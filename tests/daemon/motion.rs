@@ -192,7 +192,7 @@ fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_rep
         // 15 N bend the arm by 1.5 mm, and the pressed object gives way too.
         let frames = shore("value") - shore("low");
         let mean_mm = shore("value") / frames;
-        assert!((0.8..8.0).contains(&mean_mm), "{verdict}");
+        assert!((0.5..8.0).contains(&mean_mm), "{verdict}");
         finals.push(timeless(verdict));
     }
     assert!(earlies >= 1);

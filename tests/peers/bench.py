@@ -30,6 +30,8 @@ NULL = {"level": 0, "label": "", "rejected": "", "context": "", "mono_ns": 0, "r
 
 def same(found, expected, key):
     """A field of a ROS message is that of the JSON event."""
+    if key == "object":
+        return found == (expected["name"] if expected else "")
     if key == "age_at_publish_ms":
         return math.isclose(found, expected)
     if key == "levels":

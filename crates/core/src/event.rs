@@ -415,9 +415,29 @@ pub struct Hardness {
     /// The slope of force against indentation at the end of loading; null if unknown.
     #[serde(serialize_with = "rounded_or_null")]
     pub stiffness_n_per_mm: Option<f64>,
+    /// The verdict on the object that the context names, over all its presses so far; null if it
+    /// names none.
+    pub object: Option<ObjectVerdict>,
     /// The arrival of the byte that made the verdict possible, on CLOCK_MONOTONIC. Not published.
     #[serde(skip)]
     pub arrival: Duration,
+}
+
+/// The verdict over all presses of an object so far.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ObjectVerdict {
+    /// The name in the context.
+    pub name: String,
+    /// The number of presses, with this one.
+    pub presses: u64,
+    /// The most probable level.
+    pub level: u8,
+    /// One probability for each level. Published with six digits after the point.
+    #[serde(serialize_with = "millionths")]
+    pub probabilities: Vec<f32>,
+    /// The Shore hardness with its 90 % interval; null if the model has no such output.
+    #[serde(serialize_with = "shore")]
+    pub shore: Option<Shore>,
 }
 
 /// One frame in newtons, tared if the first tare has been taken.

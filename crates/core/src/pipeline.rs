@@ -9,6 +9,7 @@ mod events;
 mod input;
 mod link;
 mod memory;
+mod objects;
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -22,6 +23,7 @@ pub use self::events::{FIRST_LOOK, look_after};
 pub use self::input::Input;
 use self::link::Link;
 pub use self::memory::Memory;
+use self::objects::Objects;
 use crate::event::{Event, FrameEvent, Phase, Tared};
 use crate::frame::{RawFrame, Stamp};
 use crate::motion::{Point, StepBack, Track};
@@ -83,6 +85,7 @@ pub struct Pipeline {
 struct Seen {
     link: Link,
     context: Option<serde_json::Value>,
+    objects: Objects,
     /// The speed of the approach when the press under way, or the last one, began.
     speed_mm_s: Option<f64>,
     /// The number of frames in contact at which a model of the course next judges the press under
@@ -140,6 +143,7 @@ impl Pipeline {
             seen: Seen {
                 link: Link::new(),
                 context: None,
+                objects: Objects::default(),
                 speed_mm_s: None,
                 next_look: 0,
                 frames: 0,
@@ -175,6 +179,10 @@ impl Pipeline {
             .reload(&described.calibration, contact(sensor.thresholds()));
         self.tracker.reload(sensor.thresholds().clone());
         self.sensor = sensor;
+        if hrn.sha256() != self.hrn.sha256() {
+            // Another model errs in other ways.
+            self.seen.objects = Objects::default();
+        }
         self.hrn = hrn;
         Ok(())
     }

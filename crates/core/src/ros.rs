@@ -173,6 +173,13 @@ struct HardnessMessage<'a> {
     levels: Blob,
     course: String,
     stiffness_n_per_mm: f64,
+    object: &'a str,
+    object_presses: u64,
+    object_level: u8,
+    object_probabilities: &'a [f32],
+    object_shore: f64,
+    object_shore_low: f64,
+    object_shore_high: f64,
 }
 
 #[derive(Debug, Serialize)]
@@ -231,6 +238,8 @@ pub fn encode(event: &Event) -> (Topic, Timestamp, Vec<u8>) {
         Event::Frame(frame) => frame::image(frame),
         Event::Hardness(verdict) => {
             let shore = verdict.shore;
+            let object = verdict.object.as_ref();
+            let of_object = object.and_then(|object| object.shore);
             let message = HardnessMessage {
                 header: Header::new(verdict.time, &verdict.sensor),
                 seq: verdict.seq.unwrap_or(0),
@@ -260,6 +269,13 @@ pub fn encode(event: &Event) -> (Topic, Timestamp, Vec<u8>) {
                 levels: Blob(verdict.levels.clone().unwrap_or_default()),
                 course: verdict.course.as_ref().map_or_else(String::new, name),
                 stiffness_n_per_mm: verdict.stiffness_n_per_mm.unwrap_or(f64::NAN),
+                object: object.map_or("", |object| &object.name),
+                object_presses: object.map_or(0, |object| object.presses),
+                object_level: object.map_or(0, |object| object.level),
+                object_probabilities: object.map_or(&[], |object| &object.probabilities),
+                object_shore: of_object.map_or(f64::NAN, |shore| shore.value.into()),
+                object_shore_low: of_object.map_or(f64::NAN, |shore| shore.low.into()),
+                object_shore_high: of_object.map_or(f64::NAN, |shore| shore.high.into()),
             };
             (HARDNESS, verdict.time, to_cdr(&message))
         }

@@ -1,5 +1,6 @@
 //! The press and hardness events of a pipeline.
 
+use super::objects::object_of;
 use super::{Clock, Pipeline, Unjudged};
 use crate::event::{self, Event, Hardness, Note, Phase, Press, PressState, Rejection};
 use crate::frame::{Frame, RawFrame};
@@ -196,6 +197,13 @@ impl Pipeline {
                 return None;
             }
         };
+        let object = object_of(self.seen.context.as_ref()).map(|name| {
+            let object = self.seen.objects.with(&name, &verdict);
+            if phase == Phase::Final {
+                self.seen.objects.add(&name, &verdict);
+            }
+            object
+        });
         let rejected = if peak.force_n < *min_force_n {
             Some(Rejection::LowForce)
         } else if verdict.confidence < *min_confidence {
@@ -241,6 +249,7 @@ impl Pipeline {
             levels: verdict.levels,
             course: told.course,
             stiffness_n_per_mm: told.stiffness_n_per_mm,
+            object,
             arrival: self.arrival,
         }))
     }

@@ -27,6 +27,7 @@ impl Memory {
             frames_damaged,
             link,
             context,
+            objects,
             ..
         } = &self.pipeline;
         let is_context = |context| event::check_context(context).is_ok();
@@ -36,6 +37,7 @@ impl Memory {
             && self.tracker.is_possible(*frames, array)
             && self.track.is_possible()
             && link.is_possible()
+            && objects.is_possible(*frames)
             && context.as_ref().is_none_or(is_context)
     }
 

@@ -726,3 +726,34 @@ fn the_rate_is_measured_over_the_last_frames() {
     pipeline.lost("end of file".to_owned(), at(9000));
     assert_eq!(pipeline.status(at(9000)).frame_rate_hz, None);
 }
+
+#[test]
+fn presses_of_one_object_are_judged_together_also_by_a_pipeline_that_goes_on() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
+    let press = [raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)];
+    let judged = |pipeline: &mut Pipeline, first: u64| {
+        let mut found = None;
+        for (number, raw) in (first..).zip(&press) {
+            let bytes = bytes(pipeline, raw);
+            for event in pipeline.push(&bytes, at(number * 200)) {
+                if let Event::Hardness(verdict) = event {
+                    found = verdict.object.map(|object| (object.name, object.presses));
+                }
+            }
+        }
+        found
+    };
+    assert_eq!(judged(&mut pipeline, 5), None, "no object is named");
+    pipeline.set_context(Some(serde_json::json!({"object": "cup"})));
+    assert_eq!(judged(&mut pipeline, 9), Some(("cup".to_owned(), 1)));
+    pipeline.set_context(Some(serde_json::json!({"object": 7})));
+    assert_eq!(judged(&mut pipeline, 13), Some(("7".to_owned(), 1)));
+    let mut next = pipeline_of(|_| {});
+    next.recall(pipeline.memory());
+    next.set_context(Some(serde_json::json!({"object": "cup"})));
+    assert_eq!(judged(&mut next, 17), Some(("cup".to_owned(), 2)));
+    // The same model goes on with its objects.
+    reload(&mut next, |described| described.press.min_frames = 1);
+    assert_eq!(judged(&mut next, 21), Some(("cup".to_owned(), 3)));
+}
