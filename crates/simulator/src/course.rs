@@ -7,13 +7,15 @@
 
 use super::motion::{Arm, Motion};
 use super::press::{Bench, Specimen, Step, Window, touches_border};
-use super::sensor::{TAXELS, taxel_forces};
+use super::sensor::Grid;
 use super::substance::Law;
 
-/// A press from touch to separation.
+/// A press from touch to separation, as pressure under the cover. Sensors under the same cover may
+/// feel the same press.
 pub(super) struct SolvedPress {
-    /// The solved moments, ascending in time from the touch. Forces are linear between them.
+    /// The solved moments, ascending in time from the touch.
     moments: Vec<SolvedStep>,
+    window: Window,
     /// The arm's motion during the press.
     pub(super) motion: Motion,
 }
@@ -22,7 +24,14 @@ pub(super) struct SolvedPress {
 struct SolvedStep {
     time_s: f64,
     force_n: f64,
-    taxels_n: [f32; TAXELS],
+    /// Pressure on the window, MPa; empty without contact.
+    pressure: Vec<f32>,
+}
+
+/// A press as the taxels of a grid feel it.
+pub(super) struct FeltPress {
+    /// Times and taxel forces in newtons. Forces are linear between them.
+    moments: Vec<(f64, Vec<f32>)>,
 }
 
 /// The number of forces solved while loading, and while unloading.
@@ -73,7 +82,11 @@ impl SolvedPress {
                         hold_s,
                         speed_mm_s: arm.speed_mm_s,
                     };
-                    return Self { moments, motion };
+                    return Self {
+                        moments,
+                        window,
+                        motion,
+                    };
                 }
             }
         }
@@ -84,17 +97,29 @@ impl SolvedPress {
         self.moments.last().map_or(0.0, |moment| moment.time_s)
     }
 
-    /// The taxel forces in newtons `time_s` after the touch; zero before and after the press.
-    pub(super) fn taxels_n(&self, time_s: f64) -> [f32; TAXELS] {
-        let after = self
-            .moments
-            .partition_point(|moment| moment.time_s <= time_s);
-        if after == 0 || after == self.moments.len() {
-            return [0.0; TAXELS];
+    /// The press on the taxels of `grid`.
+    pub(super) fn felt(&self, grid: &Grid) -> FeltPress {
+        let moment = |step: &SolvedStep| {
+            let taxels_n = grid.taxel_forces(&step.pressure, self.window);
+            (step.time_s, taxels_n)
+        };
+        FeltPress {
+            moments: self.moments.iter().map(moment).collect(),
         }
-        let (a, b) = (&self.moments[after - 1], &self.moments[after]);
-        let part = ((time_s - a.time_s) / (b.time_s - a.time_s)) as f32;
-        std::array::from_fn(|k| a.taxels_n[k] + part * (b.taxels_n[k] - a.taxels_n[k]))
+    }
+}
+
+impl FeltPress {
+    /// The taxel forces in newtons `time_s` after the touch; zero before and after the press.
+    pub(super) fn taxels_n(&self, time_s: f64) -> Vec<f32> {
+        let after = self.moments.partition_point(|&(at_s, _)| at_s <= time_s);
+        if after == 0 || after == self.moments.len() {
+            let taxels = self.moments.first().map_or(0, |(_, taxels)| taxels.len());
+            return vec![0.0; taxels];
+        }
+        let ((a_s, a), (b_s, b)) = (&self.moments[after - 1], &self.moments[after]);
+        let part = ((time_s - a_s) / (b_s - a_s)) as f32;
+        a.iter().zip(b).map(|(a, b)| a + part * (b - a)).collect()
     }
 }
 
@@ -133,7 +158,7 @@ impl<'a> Run<'a> {
         let touch = SolvedStep {
             time_s: 0.0,
             force_n: 0.0,
-            taxels_n: [0.0; TAXELS],
+            pressure: Vec::new(),
         };
         Self {
             bench,
@@ -185,7 +210,7 @@ impl<'a> Run<'a> {
         self.moments.push(SolvedStep {
             time_s: self.time_s + last_s,
             force_n: 0.0,
-            taxels_n: [0.0; TAXELS],
+            pressure: Vec::new(),
         });
     }
 
@@ -321,7 +346,7 @@ impl<'a> Run<'a> {
         self.moments.push(SolvedStep {
             time_s: self.time_s,
             force_n: self.force_n,
-            taxels_n: taxel_forces(&self.pressure, self.window.width, self.window.corner),
+            pressure: self.pressure.clone(),
         });
     }
 }
@@ -368,7 +393,7 @@ mod tests {
         )
     }
 
-    fn total(taxels: &[f32; TAXELS]) -> f64 {
+    fn total(taxels: &[f32]) -> f64 {
         taxels.iter().map(|&force| f64::from(force)).sum()
     }
 
@@ -428,10 +453,11 @@ mod tests {
             let course =
                 SolvedPress::new(&mut Bench::default(), &specimen, Arm::default(), 15.0, 1.0);
             let mut last = -1.0;
-            for moment in &course.moments {
+            let felt = course.felt(&Grid::jx255n());
+            for (moment, (_, taxels_n)) in course.moments.iter().zip(&felt.moments) {
                 assert!(moment.time_s > last, "{material}: time stands still");
                 last = moment.time_s;
-                let sum = total(&moment.taxels_n);
+                let sum = total(taxels_n);
                 assert!(
                     (sum - moment.force_n).abs() < 0.03 * moment.force_n + 1e-6,
                     "{material}: taxels carry {sum} N of {} N",
@@ -464,6 +490,7 @@ mod tests {
             let mut bench = Bench::default();
             let [coarse, fine] = [LEVELS, 2 * LEVELS].map(|levels| {
                 SolvedPress::in_levels(&mut bench, &specimen, Arm::default(), 15.0, 1.0, levels)
+                    .felt(&Grid::jx255n())
             });
             let (mut off, mut sum) = (0.0, 0.0);
             for frame in 0..200 {

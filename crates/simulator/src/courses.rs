@@ -14,14 +14,16 @@ use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
 use super::material::Split;
 use super::motion::Arm;
 use super::object::{POSTURES, Pose};
-use super::press::{Bench, Specimen};
-use super::sensor::{Film, taxel_forces};
+use super::press::{Bench, Cover, Specimen};
+use super::sensor::{Film, Sensor};
 use super::settings::DatasetSettings;
-use super::subject::{Subject, shared_out, units};
-use super::tracked::{Seen, begins_press, ideal_tare, one_press};
-use crate::random::Stream;
-use hardnessd_core::frame::RawFrame;
+use super::subject::{Subject, shared_out, units, weights};
+use super::tracked::{Seen, begins_press, one_press};
+use super::world::{self, BroadSensors};
+use crate::random::{Stream, log_even};
+use hardnessd_core::frame::{Frame, Pitch};
 use hardnessd_core::press::thinned;
+use hardnessd_core::verdict::Laying;
 
 /// The settings of a simulated data set of presses.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -46,6 +48,9 @@ pub struct CourseSettings {
     pub clock_error_frames: f64,
     /// Share of the presses for which the robot reports nothing.
     pub unknown_share: f64,
+    /// The sensors, if each is another one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sensors: Option<BroadSensors>,
 }
 
 impl Default for CourseSettings {
@@ -65,6 +70,7 @@ impl Default for CourseSettings {
             arm_error: 0.0,
             clock_error_frames: 0.0,
             unknown_share: 0.0,
+            sensors: None,
         }
     }
 }
@@ -83,7 +89,7 @@ pub struct LabelledCourse {
     pub best: usize,
     /// The arm's stiffness as reported; 0 if it is not reported.
     pub arm_n_per_mm: f32,
-    /// Hardness level, 1 to 4.
+    /// Hardness level, 1 to 4; 0 for a reference.
     pub level: u8,
     /// Number of the object, unique in the data set.
     pub object: u32,
@@ -95,6 +101,10 @@ pub struct LabelledCourse {
     pub split: Split,
     /// The object's Shore hardness.
     pub shore: f32,
+    /// Number of the sensor, unique in the data set. 0 if the sensors have no numbers.
+    pub sensor: u32,
+    /// The rigid piece that was pressed. Its level is 0 and its Shore hardness NaN.
+    pub reference: Option<Reference>,
     /// The object's Young's modulus, MPa.
     pub young_mpa: f32,
     /// Frames per second.
@@ -103,11 +113,26 @@ pub struct LabelledCourse {
     pub speed_mm_s: f32,
 }
 
+/// A rigid piece whose form is known.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Reference {
+    /// A flat round face of this width across.
+    Flat {
+        /// The width.
+        width_mm: f32,
+    },
+    /// A ball of this radius.
+    Ball {
+        /// The radius.
+        radius_mm: f32,
+    },
+}
+
 /// One frame of a press.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CourseMoment {
-    /// Counts after an ideal tare, at [`NEWTONS_PER_COUNT`](hardnessd_core::tare::NEWTONS_PER_COUNT) each.
-    pub counts: Box<[u16]>,
+    /// Millinewtons after an ideal tare, on the grid of a model whose taxels are 3.5 mm apart.
+    pub millinewtons: Box<[u16]>,
     /// Time since the frame that began the press; negative before it.
     pub time_s: f32,
     /// How far the arm went since the begin, as reported; 0 if it is not reported.
@@ -118,7 +143,7 @@ pub struct CourseMoment {
 
 /// The condition that stops the arm.
 #[derive(Clone, Copy)]
-enum Stop {
+pub(super) enum Stop {
     Force(f64),
     /// The arm stops at this distance in mm beyond the touch, or at 25 N.
     Position(f64),
@@ -134,29 +159,35 @@ const LONGEST_S: f64 = 30.0;
 const HOLD_FRAMES: f64 = 3.0;
 
 /// The plan of one press, the same in every material.
-struct Plan {
+pub(super) struct Plan {
     posture: usize,
     pose: Stream,
     stop: Stop,
-    arm: Arm,
-    hold_s: f64,
-    period_s: f64,
+    pub(super) arm: Arm,
+    pub(super) hold_s: f64,
+    pub(super) reading: Reading,
+}
+
+/// How a press is read.
+#[derive(Clone, Copy)]
+pub(super) struct Reading {
+    pub(super) period_s: f64,
     /// Offset between the frames and the touch, as a part of a period.
-    phase: f64,
-    told: ReportErrors,
+    pub(super) phase: f64,
+    pub(super) errors: ReportErrors,
 }
 
 /// The errors of the robot's reports.
 #[derive(Clone, Copy)]
-struct ReportErrors {
+pub(super) struct ReportErrors {
     is_known: bool,
     position_factor: f64,
-    arm_factor: f64,
-    late_s: f64,
+    pub(super) arm_factor: f64,
+    late_frames: f64,
 }
 
 impl Plan {
-    fn draw(settings: &CourseSettings, stream: &mut Stream) -> Self {
+    pub(super) fn draw(settings: &CourseSettings, stream: &mut Stream) -> Self {
         let posture = stream.below(POSTURES);
         let lowest = f64::from(settings.objects.lowest_force_n);
         let force = Stop::Force(stream.range(lowest, HIGHEST_FORCE_N));
@@ -173,10 +204,10 @@ impl Plan {
         let [least, most] = settings.hold_s;
         let period_s = 1.0 / log_even(settings.frame_rate_hz, stream);
         let mut off = |most: f64| stream.range(-most, most);
-        let told = ReportErrors {
+        let errors = ReportErrors {
             position_factor: 1.0 + off(settings.position_error),
             arm_factor: 1.0 + off(settings.arm_error),
-            late_s: off(settings.clock_error_frames) * period_s,
+            late_frames: off(settings.clock_error_frames),
             is_known: stream.uniform() >= settings.unknown_share,
         };
         Self {
@@ -185,15 +216,13 @@ impl Plan {
             stop,
             arm,
             hold_s: stream.range(least, most).max(HOLD_FRAMES * period_s),
-            period_s,
-            phase: stream.uniform(),
-            told,
+            reading: Reading {
+                period_s,
+                phase: stream.uniform(),
+                errors,
+            },
         }
     }
-}
-
-fn log_even([low, high]: [f64; 2], stream: &mut Stream) -> f64 {
-    stream.range(low.ln(), high.ln()).exp()
 }
 
 /// Simulates the presses on `threads` threads, and calls `progress` with the number done. The
@@ -204,11 +233,15 @@ pub fn courses(
     threads: usize,
     progress: impl Fn(usize) + Sync,
 ) -> Vec<LabelledCourse> {
+    if let Some(sensors) = &settings.sensors {
+        return world::courses(settings, sensors, threads, progress);
+    }
     let done = AtomicUsize::new(0);
     let of = &settings.objects;
-    let bench = || Bench::under(of.cover_young_mpa);
+    let weights = weights(of);
+    let bench = || Bench::under(Cover::of(of.cover_young_mpa));
     shared_out(&units(of), threads, bench, |bench, object, unit| {
-        let subject = Subject::draw(of, unit);
+        let subject = Subject::draw(of, unit, &weights);
         let mut made = Vec::with_capacity(of.presses as usize);
         for press in 0..u64::from(of.presses) {
             let mut paired = subject.draws.geometry.child(3).child(press);
@@ -229,6 +262,21 @@ impl Subject {
         object: u32,
         press: u64,
     ) -> Option<LabelledCourse> {
+        self.pressed(bench, plan, press, |solved, force_n, noise| {
+            let read = read_press(&self.sensor, solved, &plan.reading, noise)?;
+            Some(self.labelled(plan, &plan.reading, object, force_n, read))
+        })
+    }
+
+    /// Presses, harder each time until the object's sensor feels it and `read` gives something.
+    /// `None` if that never happens, or the press lasts too long.
+    pub(super) fn pressed<T>(
+        &self,
+        bench: &mut Bench,
+        plan: &Plan,
+        press: u64,
+        read: impl Fn(&SolvedPress, f64, &mut Stream) -> Option<T>,
+    ) -> Option<T> {
         let Body {
             substance,
             young_mpa,
@@ -248,17 +296,14 @@ impl Subject {
             let mut noise = noise.child(attempt);
             // One solve shows whether the press is worth the forty solves of a course.
             if self.is_felt(bench, &specimen, plan, force_n, &mut noise) {
-                let course = SolvedPress::new(bench, &specimen, plan.arm, force_n, plan.hold_s);
+                let solved = SolvedPress::new(bench, &specimen, plan.arm, force_n, plan.hold_s);
                 // A material that flows faster than the arm follows never bears the force, and its
                 // press would last minutes.
-                if course.duration_s() > LONGEST_S {
+                if solved.duration_s() > LONGEST_S {
                     return None;
                 }
-                let frames = self.read(&course, plan, &mut noise);
-                let raws = frames.iter().map(|(_, raw)| raw);
-                if let Some(seen) = one_press(raws, plan.period_s) {
-                    let (moments, best) = kept(&frames, &seen, &course, plan);
-                    return Some(self.labelled(plan, object, force_n, moments, best));
+                if let Some(read) = read(&solved, force_n, &mut noise) {
+                    return Some(read);
                 }
             }
             force_n *= HARDER;
@@ -276,64 +321,108 @@ impl Subject {
     ) -> bool {
         let ramp_s = force_n / plan.arm.n_per_mm / plan.arm.speed_mm_s;
         let (window, pressure, _) = bench.press(specimen, force_n, ramp_s, 0.0);
-        let forces = taxel_forces(&pressure, window.width, window.corner);
-        begins_press(&ideal_tare(&self.sensor.read(&forces, 1.0, noise)))
+        let forces = self.sensor.grid.taxel_forces(&pressure, window);
+        begins_press(&self.sensor.tared(&self.sensor.read(&forces, 1.0, noise)))
     }
 
-    /// The sensor's frames from a few before the touch to the release, with their times after the
-    /// touch.
-    fn read(&self, course: &SolvedPress, plan: &Plan, noise: &mut Stream) -> Vec<(f64, RawFrame)> {
-        let gain = self.sensor.press_gain(noise);
-        let mut film = Film::new();
-        let first_s = -(BEFORE as f64 + plan.phase) * plan.period_s;
-        (0_u32..)
-            .map(|number| first_s + f64::from(number) * plan.period_s)
-            .take_while(|&time_s| time_s < course.duration_s())
-            .map(|time_s| {
-                let forces = course.taxels_n(time_s);
-                let crept = film.advance(&forces, plan.period_s);
-                (time_s, self.sensor.read(&crept, gain, noise))
-            })
-            .collect()
-    }
-
-    fn labelled(
+    pub(super) fn labelled(
         &self,
         plan: &Plan,
+        reading: &Reading,
         object: u32,
         force_n: f64,
-        moments: Vec<CourseMoment>,
-        best: usize,
+        read: ReadPress,
     ) -> LabelledCourse {
-        let told_n_per_mm = plan.arm.n_per_mm * plan.told.arm_factor;
         LabelledCourse {
-            moments,
-            best,
-            arm_n_per_mm: if plan.told.is_known {
-                told_n_per_mm as f32
-            } else {
-                0.0
-            },
+            moments: read.moments,
+            best: read.best,
+            arm_n_per_mm: plan.reported_n_per_mm(reading),
             level: self.body.level,
             object,
             material: self.body.material,
             force_n: force_n as f32,
             split: self.split,
             shore: self.body.shore as f32,
+            sensor: 0,
+            reference: None,
             young_mpa: self.body.young_mpa as f32,
-            frame_rate_hz: (1.0 / plan.period_s) as f32,
+            frame_rate_hz: (1.0 / reading.period_s) as f32,
             speed_mm_s: plan.arm.speed_mm_s as f32,
         }
     }
 }
 
-/// The frames to keep, and the index of the best frame among them.
+impl Plan {
+    /// The arm's stiffness as the robot reports it; 0 if it reports none.
+    pub(super) fn reported_n_per_mm(&self, reading: &Reading) -> f32 {
+        let ReportErrors {
+            is_known,
+            arm_factor,
+            ..
+        } = reading.errors;
+        if is_known {
+            (self.arm.n_per_mm * arm_factor) as f32
+        } else {
+            0.0
+        }
+    }
+}
+
+/// A press as a data set holds it.
+pub(super) struct ReadPress {
+    pub(super) moments: Vec<CourseMoment>,
+    /// Index of the best frame.
+    pub(super) best: usize,
+}
+
+/// A press as a sensor reads it. `None` unless the daemon sees one press in it.
+pub(super) fn read_press(
+    sensor: &Sensor,
+    solved: &SolvedPress,
+    reading: &Reading,
+    noise: &mut Stream,
+) -> Option<ReadPress> {
+    let frames = frames(sensor, solved, reading, noise);
+    let seen = one_press(
+        frames.iter().map(|(_, frame)| frame),
+        &sensor.thresholds(),
+        reading.period_s,
+    )?;
+    Some(kept(&frames, &seen, sensor.grid.pitch, solved, reading))
+}
+
+/// The sensor's frames from a few before the touch to the release, with their times after the
+/// touch.
+fn frames(
+    sensor: &Sensor,
+    solved: &SolvedPress,
+    reading: &Reading,
+    noise: &mut Stream,
+) -> Vec<(f64, Frame)> {
+    let gain = sensor.press_gain(noise);
+    let felt = solved.felt(&sensor.grid);
+    let mut film = Film::new(&sensor.design);
+    let first_s = -(BEFORE as f64 + reading.phase) * reading.period_s;
+    let last_s = solved.duration_s() + sensor.design.settled_s();
+    (0_u32..)
+        .map(|number| first_s + f64::from(number) * reading.period_s)
+        .take_while(|&time_s| time_s < last_s)
+        .map(|time_s| {
+            let forces = felt.taxels_n(time_s);
+            let film_n = film.advance(&sensor.design, &forces, reading.period_s);
+            (time_s, sensor.tared(&sensor.read(&film_n, gain, noise)))
+        })
+        .collect()
+}
+
+/// The frames to keep, on the model's grid, and the best frame among them.
 fn kept(
-    frames: &[(f64, RawFrame)],
+    frames: &[(f64, Frame)],
     seen: &Seen,
-    course: &SolvedPress,
-    plan: &Plan,
-) -> (Vec<CourseMoment>, usize) {
+    pitch: Pitch,
+    solved: &SolvedPress,
+    reading: &Reading,
+) -> ReadPress {
     let begin = seen.contact[0];
     let best = seen
         .contact
@@ -347,24 +436,36 @@ fn kept(
     let ReportErrors {
         is_known,
         position_factor,
-        late_s,
+        late_frames,
         ..
-    } = plan.told;
-    let told_mm = |time_s: f64| position_factor * course.motion.approach_mm(time_s - late_s);
+    } = reading.errors;
+    let late_s = late_frames * reading.period_s;
+    let reported_mm = |time_s: f64| position_factor * solved.motion.approach_mm(time_s - late_s);
+    let laying = Laying::new(&frames[seen.best].1, pitch, Pitch::JX255N.rows_mm);
     let moment = |&place: &usize| {
-        let (time_s, raw) = &frames[place];
-        let approach_mm = told_mm(*time_s) - told_mm(begin_s);
+        let (time_s, frame) = &frames[place];
+        let approach_mm = reported_mm(*time_s) - reported_mm(begin_s);
         CourseMoment {
-            counts: raw.counts.clone(),
+            millinewtons: millinewtons(&laying.lay(frame).newtons),
             time_s: (time_s - begin_s) as f32,
             approach_mm: if is_known { approach_mm as f32 } else { 0.0 },
             known: is_known,
         }
     };
-    let best = places
-        .binary_search(&seen.best)
-        .expect("thinning keeps the best frame");
-    (places.iter().map(moment).collect(), best)
+    ReadPress {
+        moments: places.iter().map(moment).collect(),
+        best: places
+            .binary_search(&seen.best)
+            .expect("thinning keeps the best frame"),
+    }
+}
+
+/// Newtons as a data set holds them. A u16 holds up to 65 N on a taxel.
+fn millinewtons(newtons: &[f32]) -> Box<[u16]> {
+    let rounded = newtons
+        .iter()
+        .map(|newtons| (newtons / 1e-3).round() as u16);
+    rounded.collect()
 }
 
 impl Bench {
@@ -399,8 +500,10 @@ impl Bench {
 #[cfg(test)]
 mod tests {
     use super::super::object::Shapes;
+    use super::super::sensor::Design;
     use super::super::settings::Materials;
     use super::*;
+    use hardnessd_core::verdict::{self, Course, Hrn, ModelFrame};
 
     fn small() -> CourseSettings {
         CourseSettings {
@@ -419,9 +522,8 @@ mod tests {
 
     /// The total force that the best frame reads, in newtons.
     fn force_read_n(course: &LabelledCourse) -> f64 {
-        let counts = course.moments[course.best].counts.iter();
-        counts.map(|&counts| f64::from(counts)).sum::<f64>()
-            * f64::from(hardnessd_core::tare::NEWTONS_PER_COUNT)
+        let taxels = course.moments[course.best].millinewtons.iter();
+        1e-3 * taxels.map(|&taxel| f64::from(taxel)).sum::<f64>()
     }
 
     #[test]
@@ -436,7 +538,8 @@ mod tests {
             let begin = times.iter().position(|&time_s| time_s == 0.0).unwrap();
             assert!(begin <= BEFORE && times.len() - begin <= MOST_FRAMES);
             let area = |place: usize| {
-                let contact = course.moments[place].counts.iter().filter(|&&c| c >= 2);
+                let taxels = course.moments[place].millinewtons.iter();
+                let contact = taxels.filter(|&&taxel| taxel >= 70);
                 contact.count()
             };
             assert!(area(begin) >= 3 && (0..begin).all(|place| area(place) < 3));
@@ -512,7 +615,7 @@ mod tests {
             let frames = |course: &LabelledCourse| {
                 let moments = course.moments.iter();
                 moments
-                    .map(|m| (m.counts.clone(), m.time_s))
+                    .map(|m| (m.millinewtons.clone(), m.time_s))
                     .collect::<Vec<_>>()
             };
             assert!(frames(truth) == frames(wrong));
@@ -539,6 +642,99 @@ mod tests {
             assert!((most(wrong) - most(truth)).abs() <= slack);
         }
         assert!((2..20).contains(&unknown), "{unknown} of {}", wrong.len());
+    }
+
+    #[test]
+    #[ignore = "judges some hundred presses four times, half a minute: run it after a change of laying or models"]
+    fn arrays_of_other_pitches_give_the_same_levels() {
+        let frame_model = Hrn::load(hardnessd_core::verdict::BUILT_IN).unwrap();
+        let course_model = std::fs::read("../../models/course.onnx").unwrap();
+        let course_model = Hrn::load(&course_model).unwrap();
+        // The second is what another sensor of the same design gives.
+        let pitches = [3.5, 3.5, 1.75, 7.0];
+        for (materials, shapes) in [
+            (Materials::Named, Shapes::Matched),
+            (Materials::Broad, Shapes::Matched),
+            (Materials::Broad, Shapes::Wide),
+        ] {
+            let settings = CourseSettings {
+                objects: DatasetSettings {
+                    seed: 411,
+                    materials,
+                    shapes,
+                    objects: 0,
+                    test_objects: 10,
+                    presses: 6,
+                    ..DatasetSettings::default()
+                },
+                ..CourseSettings::default()
+            };
+            let of = &settings.objects;
+            let sensors: Vec<Sensor> = (0_u64..)
+                .zip(pitches)
+                .map(|(k, pitch_mm)| {
+                    let design = Design::jx255n(of.profile).at_pitch(pitch_mm);
+                    Sensor::draw(design, &Stream::new(of.seed, "pitches").child(k))
+                })
+                .collect();
+            let mut bench = Bench::default();
+            let (mut alike, mut count) = ([[0; 4]; 2], 0);
+            for unit in units(of) {
+                let subject = Subject::draw(of, unit, &[]);
+                for press in 0..of.presses.into() {
+                    let mut paired = subject.draws.geometry.child(3).child(press);
+                    let plan = Plan::draw(&settings, &mut paired);
+                    let read = subject.pressed(&mut bench, &plan, press, |solved, _, noise| {
+                        let read = |sensor| read_press(sensor, solved, &plan.reading, noise);
+                        sensors.iter().map(read).collect::<Option<Vec<_>>>()
+                    });
+                    let Some(read) = read else { continue };
+                    count += 1;
+                    let levels = |press: &ReadPress| {
+                        let course = course_of(press, plan.reported_n_per_mm(&plan.reading));
+                        let best = frame_of(&press.moments[press.best]);
+                        [
+                            frame_model.judge(&best).unwrap().level,
+                            course_model.judge_course(&course).unwrap().level,
+                        ]
+                    };
+                    let expected = levels(&read[0]);
+                    for (sensor, press) in read.iter().enumerate() {
+                        for (model, level) in levels(press).into_iter().enumerate() {
+                            alike[model][sensor] += i32::from(level == expected[model]);
+                        }
+                    }
+                }
+            }
+            for (model, alike) in ["built-in", "course"].into_iter().zip(alike) {
+                let [_, again, fine, coarse] =
+                    alike.map(|n| 100.0 * f64::from(n) / f64::from(count));
+                println!(
+                    "{materials:?} {shapes:?}, {model} model, {count} presses: the level of a 3.5 mm \
+                     array again {again:.0} %, at 1.75 mm {fine:.0} %, at 7 mm {coarse:.0} %"
+                );
+            }
+        }
+    }
+
+    fn frame_of(moment: &CourseMoment) -> ModelFrame {
+        ModelFrame {
+            newtons: std::array::from_fn(|k| 1e-3 * f32::from(moment.millinewtons[k])),
+        }
+    }
+
+    fn course_of(press: &ReadPress, arm_n_per_mm: f32) -> Course {
+        let moments = press.moments.iter().filter(|moment| moment.time_s >= 0.0);
+        Course {
+            moments: moments
+                .map(|moment| verdict::CourseMoment {
+                    time_s: moment.time_s,
+                    approach_mm: Some(moment.approach_mm),
+                    frame: frame_of(moment),
+                })
+                .collect(),
+            arm_n_per_mm,
+        }
     }
 
     #[test]

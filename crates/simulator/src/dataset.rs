@@ -9,11 +9,11 @@ use super::body::draw_patch;
 use super::material::Split;
 use super::motion::Arm;
 use super::object::{POSTURES, Pose};
-use super::press::{Bench, Specimen};
-use super::sensor::{Film, taxel_forces};
+use super::press::{Bench, Cover, Specimen};
+use super::sensor::Film;
 use super::settings::DatasetSettings;
-use super::subject::{Subject, shared_out, units};
-use super::tracked::{begins_press, ideal_tare};
+use super::subject::{Subject, shared_out, units, weights};
+use super::tracked::begins_press;
 use crate::random::Stream;
 use hardnessd_core::frame::Frame;
 
@@ -62,10 +62,11 @@ pub fn dataset(
     progress: impl Fn(usize) + Sync,
 ) -> Vec<LabelledSample> {
     let done = AtomicUsize::new(0);
-    let bench = || Bench::under(settings.cover_young_mpa);
+    let weights = weights(settings);
+    let bench = || Bench::under(Cover::of(settings.cover_young_mpa));
     shared_out(&units(settings), threads, bench, |bench, object, unit| {
         let mut samples = Vec::with_capacity(settings.presses as usize);
-        Subject::draw(settings, unit).press_all(settings, bench, |sample| {
+        Subject::draw(settings, unit, &weights).press_all(settings, bench, |sample| {
             samples.push(LabelledSample { object, ..sample });
             progress(done.fetch_add(1, Ordering::Relaxed) + 1);
         });
@@ -127,9 +128,10 @@ impl Subject {
         loop {
             let ramp_s = (force_n / arm.n_per_mm + TYPICAL_DEPTH_MM) / arm.speed_mm_s;
             let (window, pressure, _) = bench.press(specimen, force_n, ramp_s, hold_s);
-            let forces = taxel_forces(&pressure, window.width, window.corner);
-            let crept = Film::new().advance(&forces, hold_s + 0.5 * ramp_s);
-            let frame = ideal_tare(&self.sensor.read(&crept, gain, noise));
+            let forces = self.sensor.grid.taxel_forces(&pressure, window);
+            let design = &self.sensor.design;
+            let crept = Film::new(design).advance(design, &forces, hold_s + 0.5 * ramp_s);
+            let frame = self.sensor.tared(&self.sensor.read(&crept, gain, noise));
             tries += 1;
             if begins_press(&frame) || tries == TRIES {
                 return (force_n, frame);

@@ -25,6 +25,7 @@ mod material;
 mod motion;
 mod object;
 mod press;
+mod rigid;
 mod sensor;
 mod settings;
 mod sequence;
@@ -32,9 +33,10 @@ mod subject;
 mod substance;
 mod texture;
 mod tracked;
+mod world;
 
 pub use broad::{LawName, Laws, NoLaw, UnknownLaw};
-pub use courses::{CourseMoment, CourseSettings, LabelledCourse, MOST_FRAMES, courses};
+pub use courses::{CourseMoment, CourseSettings, LabelledCourse, MOST_FRAMES, Reference, courses};
 pub use dataset::{LabelledSample, dataset};
 pub use level::{Borders, LEVELS, LevelRange, borders, level_of};
 pub use material::{Material, Split, UnknownMaterial};
@@ -44,6 +46,7 @@ pub use sensor::FULL_SCALE_COUNTS;
 pub use sensor::{SensorProfile, UnknownProfile};
 pub use sequence::{REST_S, Sequence, SequenceFrame, SequenceSettings};
 pub use settings::{DatasetSettings, Materials, UnknownMaterials};
+pub use world::{BroadSensors, REFERENCES};
 
 pub use hardnessd_core::tare::NEWTONS_PER_COUNT;
 

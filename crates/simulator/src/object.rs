@@ -357,8 +357,21 @@ fn log_even((low, high): (f64, f64), stream: &mut Stream) -> f64 {
 const WEDGE_HEIGHT_MM: f64 = 30.0;
 
 impl Face {
+    /// A flat disc with a small edge.
+    pub(super) fn flat(radius: f64) -> Self {
+        Face {
+            outline: Outline::Disc {
+                radius,
+                edge: 0.5,
+                crown: 1e6,
+            },
+            height_mm: 20.0,
+            tilt_sd_deg: 0.1,
+            roughness: 1.0,
+        }
+    }
+
     /// The top of a ball.
-    #[cfg(test)]
     pub(super) fn ball(radius: f64) -> Self {
         let outline = Outline::Ellipsoid {
             x: radius,

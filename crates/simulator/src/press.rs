@@ -17,10 +17,28 @@ use super::texture::Patch;
 /// Window widths in cells. FFTs of twice these sizes are fast.
 const WIDTHS: [usize; 6] = [24, 32, 48, 64, 96, CELLS];
 
-/// The sensor's cover: E in MPa, Poisson's ratio, thickness in mm (assumed: soft silicone).
+/// The JX255N's cover: E in MPa and thickness in mm (assumed: soft silicone).
 pub(super) const COVER_YOUNG_MPA: f64 = 3.0;
-const COVER_NU: f64 = 0.45;
 const COVER_MM: f64 = 1.0;
+/// Poisson's ratio of every cover.
+const COVER_NU: f64 = 0.45;
+
+/// The cover of a sensor.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Cover {
+    pub(super) young_mpa: f64,
+    pub(super) thickness_mm: f64,
+}
+
+impl Cover {
+    /// A cover as thick as that of the JX255N.
+    pub(super) fn of(young_mpa: f64) -> Self {
+        Self {
+            young_mpa,
+            thickness_mm: COVER_MM,
+        }
+    }
+}
 
 /// An object's face in its pose.
 pub(super) struct Specimen {
@@ -41,7 +59,7 @@ pub(super) struct Window {
 
 /// Plans, kernels and fields, kept between presses.
 pub(super) struct Bench {
-    cover_young_mpa: f64,
+    cover: Cover,
     widths: BTreeMap<usize, Width>,
     layers: Vec<((f64, Base), Layer)>,
     fields: Fields,
@@ -232,15 +250,15 @@ pub(super) struct Step<'a> {
 impl Default for Bench {
     /// A bench for the default cover.
     fn default() -> Self {
-        Self::under(COVER_YOUNG_MPA)
+        Self::under(Cover::of(COVER_YOUNG_MPA))
     }
 }
 
 impl Bench {
-    /// A bench for a sensor whose cover has this Young's modulus.
-    pub(super) fn under(cover_young_mpa: f64) -> Self {
+    /// A bench for a sensor with this cover.
+    pub(super) fn under(cover: Cover) -> Self {
         Self {
-            cover_young_mpa,
+            cover,
             widths: BTreeMap::new(),
             layers: Vec::new(),
             fields: Fields::default(),
@@ -342,9 +360,8 @@ impl Bench {
     /// The object's spectrum for E* = 1 and lengths in cells.
     fn object_spectrum(&mut self, specimen: &Specimen, width: usize) -> Rc<Vec<f32>> {
         if !self.widths.contains_key(&width) {
-            let cover_young_mpa = self.cover_young_mpa;
-            let cover = self.layer(COVER_NU, Base::Rigid);
-            let made = Width::new(width, &self.layers[cover].1, cover_young_mpa);
+            let layer = self.layer(COVER_NU, Base::Rigid);
+            let made = Width::new(width, &self.layers[layer].1, self.cover);
             self.widths.insert(width, made);
         }
         let Some((base, height_mm)) = specimen.substance.layer(specimen.height_mm) else {
@@ -390,12 +407,12 @@ fn keep<T>(list: &mut Vec<T>, item: T, most: usize) {
 }
 
 impl Width {
-    fn new(width: usize, cover: &Layer, cover_young_mpa: f64) -> Self {
+    fn new(width: usize, layer: &Layer, cover: Cover) -> Self {
         let mut convolver = Convolver::new(width);
         let half_space = Rc::new(convolver.spectrum(|i, j| kernel::half_space(i as f64, j as f64)));
-        let unit = CELL_MM * (1.0 - COVER_NU * COVER_NU) / cover_young_mpa;
-        let height = COVER_MM / CELL_MM;
-        let cover = convolver.spectrum(|i, j| unit * cover.influence(i as f64, j as f64, height));
+        let unit = CELL_MM * (1.0 - COVER_NU * COVER_NU) / cover.young_mpa;
+        let height = cover.thickness_mm / CELL_MM;
+        let cover = convolver.spectrum(|i, j| unit * layer.influence(i as f64, j as f64, height));
         Self {
             convolver,
             half_space,
@@ -418,7 +435,7 @@ pub(super) fn touches_border(pressure_mpa: &[f32], width: usize) -> bool {
 mod tests {
     use super::super::material::Material;
     use super::super::object::{Face, Pose};
-    use super::super::sensor::taxel_forces;
+    use super::super::sensor::Grid;
     use super::*;
     use crate::random::Stream;
 
@@ -444,7 +461,7 @@ mod tests {
         // A smooth solid ball under a cover that hardly yields obeys a^3 = 3 F R / (4 E*), with the
         // compliance after creep. A sphere is steeper than Hertz's paraboloid, which changes a by
         // 1 % where a is a quarter of R.
-        let mut bench = Bench::under(1e4);
+        let mut bench = Bench::under(Cover::of(1e4));
         let rubber = Material::Rubber.properties().substance;
         for (radius, young_mpa, force_n) in [
             (12.0, 2.0, 10.0),
@@ -485,7 +502,7 @@ mod tests {
                     (cells / force_n - 1.0).abs() < 1e-4,
                     "{material}: cells carry {cells} N"
                 );
-                let taxels = taxel_forces(&pressure, window.width, window.corner);
+                let taxels = Grid::jx255n().taxel_forces(&pressure, window);
                 let sum: f64 = taxels.iter().map(|&force| f64::from(force)).sum();
                 // A taxel senses 3.0 of 3.5 mm, so sharp contacts can fall between taxels or upon
                 // them.

@@ -82,6 +82,11 @@ impl Stream {
     }
 }
 
+/// Draws a number between two, whose logarithm is uniform.
+pub(crate) fn log_even([low, high]: [f64; 2], stream: &mut Stream) -> f64 {
+    stream.range(low.ln(), high.ln()).exp()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

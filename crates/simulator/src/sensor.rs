@@ -1,53 +1,34 @@
-//! The film array, which turns the pressure under its cover into taxel forces, and those into
+//! A tactile array, which turns the pressure under its cover into taxel forces, and those into
 //! counts.
 //!
-//! A [`Sensor`] is one instance, whose gains, activation thresholds and dead taxels are drawn once.
-//! There is no noise without load: below its activation threshold a taxel's layers do not touch,
-//! and the taxel reads exactly 0, as film arrays do.
+//! A [`Design`] is what sensors of one make have in common. A [`Sensor`] is one instance, whose
+//! gains, activation thresholds and dead taxels are drawn once. There is no noise without load:
+//! below its activation threshold a taxel's layers do not touch, and the taxel reads exactly 0, as
+//! film arrays do.
 
-use std::sync::OnceLock;
+mod design;
+mod grid;
+
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
+pub(super) use self::design::Design;
+pub(super) use self::grid::Grid;
 use crate::random::Stream;
-use hardnessd_core::frame::{Array, Pitch, RawFrame};
-use hardnessd_core::tare::NEWTONS_PER_COUNT;
+use hardnessd_core::frame::{Array, Frame, RawFrame};
+use hardnessd_core::press::{Settings, Thresholds};
 
-/// The simulated array.
+/// The array of a sequence.
 pub(super) const ARRAY: Array = Array::JX255N;
-/// Rows of the array.
-const ROWS: usize = ARRAY.rows;
-/// Columns of the array.
-const COLS: usize = ARRAY.cols;
-/// Taxels of the array.
-pub(super) const TAXELS: usize = ARRAY.taxels();
-/// The distance between taxels.
-const PITCH_MM: f64 = Pitch::JX255N.rows_mm;
-
-/// Cells along a taxel.
-const CELLS_PER_TAXEL: usize = 4;
-/// Width of a cell, mm.
-pub(super) const CELL_MM: f64 = PITCH_MM / CELLS_PER_TAXEL as f64;
+/// Width of a cell, mm: a quarter of a taxel of the JX255N.
+pub(super) const CELL_MM: f64 = 0.875;
 /// Width of the sensor in cells.
-pub(super) const CELLS: usize = ROWS * CELLS_PER_TAXEL;
-
-/// Width of a taxel's sensitive area, mm.
-const ACTIVE_MM: f64 = 3.0;
-/// Depth of the film under the cover's surface, mm.
-const DEPTH_MM: f64 = 1.0;
-/// Film creep, as share and time constant in s: 3 % with 0.4 s, and 4 % with 8 s.
-const FILM_CREEP: [(f32, f32); 2] = [(0.03, 0.4), (0.04, 8.0)];
-const CROSSTALK_NEIGHBOUR: f32 = 0.015;
-const CROSSTALK_LINE: f32 = 0.004;
-const NOISE_RATIO: f64 = 0.015;
-const NOISE_N: f64 = 0.012;
-const DEAD_SHARE: f64 = 0.003;
-/// The largest count of the simulated sensor, which has 8 bits.
+pub(super) const CELLS: usize = 112;
+/// The largest count of the simulated JX255N, which has 8 bits.
 pub const FULL_SCALE_COUNTS: u16 = 255;
-/// Median of the lognormal activation thresholds. Their +3 sigma is the paper's "minimum
-/// discrimination" of 0.2 N, read as a bound that holds for every taxel.
-const THRESHOLD_MEDIAN_N: f64 = 0.05;
-const THRESHOLD_BOUND_N: f64 = 0.2;
+/// A force on a taxel that is no longer felt, N. The film's delay alone would never end a press.
+const NOTHING_N: f32 = 1e-4;
 
 /// The spread between the taxels of a sensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -76,72 +57,60 @@ impl std::str::FromStr for SensorProfile {
 #[error("no sensor profile \"{0}\"; there are clean, raw")]
 pub struct UnknownProfile(pub String);
 
-/// Relative spreads of a profile, per taxel, row, column and press.
-struct Spread {
-    taxel: f64,
-    row: f64,
-    column: f64,
-    press: f64,
-}
-
-impl SensorProfile {
-    fn spread(self) -> Spread {
-        match self {
-            SensorProfile::Clean => Spread {
-                taxel: 0.06,
-                row: 0.03,
-                column: 0.03,
-                press: 0.0,
-            },
-            SensorProfile::Raw => Spread {
-                taxel: 0.16,
-                row: 0.03,
-                column: 0.055,
-                press: 0.10,
-            },
-        }
-    }
-}
-
 /// One instance of a sensor.
 #[derive(Debug, Clone)]
 pub(super) struct Sensor {
+    pub(super) design: Design,
+    pub(super) grid: Arc<Grid>,
     gain: Vec<f32>,
     threshold_n: Vec<f32>,
-    press_spread: f64,
+    /// What its user takes a count for.
+    pub(super) newtons_per_count: f32,
 }
 
 impl Sensor {
-    /// Draws a sensor.
+    /// Draws a JX255N.
     pub(super) fn new(profile: SensorProfile, stream: &Stream) -> Self {
-        let spread = profile.spread();
+        Self::of(Design::jx255n(profile), Grid::jx255n(), stream)
+    }
+
+    /// Draws a sensor of a design.
+    pub(super) fn draw(design: Design, stream: &Stream) -> Self {
+        let grid = Arc::new(Grid::new(&design));
+        Self::of(design, grid, stream)
+    }
+
+    fn of(design: Design, grid: Arc<Grid>, stream: &Stream) -> Self {
+        let Array { rows, cols } = design.array;
+        let count = design.array.taxels();
+        let spread = design.spread;
         let lines = |sd: f64, name: u64, count: usize| -> Vec<f64> {
             let mut stream = stream.child(name);
             (0..count).map(|_| 1.0 + sd * stream.normal()).collect()
         };
-        let taxels = lines(spread.taxel, 0, TAXELS);
-        let rows = lines(spread.row, 1, ROWS);
-        let columns = lines(spread.column, 2, COLS);
+        let taxels = lines(spread.taxel, 0, count);
+        let of_rows = lines(spread.row, 1, rows);
+        let of_columns = lines(spread.column, 2, cols);
         let mut dead = stream.child(3);
-        let gain = (0..TAXELS)
+        let gain = (0..count)
             .map(|k| {
-                let alive = dead.uniform() >= DEAD_SHARE;
-                let gain = taxels[k] * rows[k / COLS] * columns[k % COLS];
+                let alive = dead.uniform() >= design.dead_share;
+                let gain = taxels[k] * of_rows[k / cols] * of_columns[k % cols];
                 if alive { gain.max(0.0) as f32 } else { 0.0 }
             })
             .collect();
         let mut draws = stream.child(4);
-        let sigma = (THRESHOLD_BOUND_N / THRESHOLD_MEDIAN_N).ln() / 3.0;
-        let threshold_n = (0..TAXELS)
-            .map(|_| {
-                let drawn = THRESHOLD_MEDIAN_N * (sigma * draws.normal()).exp();
-                drawn.min(THRESHOLD_BOUND_N) as f32
-            })
+        let (median_n, bound_n) = (design.threshold_median_n, design.threshold_bound_n);
+        let sigma = (bound_n / median_n).ln() / 3.0;
+        let threshold_n = (0..count)
+            .map(|_| (median_n * (sigma * draws.normal()).exp()).min(bound_n) as f32)
             .collect();
         Self {
+            newtons_per_count: design.count_n,
+            design,
+            grid,
             gain,
             threshold_n,
-            press_spread: spread.press,
         }
     }
 
@@ -152,89 +121,135 @@ impl Sensor {
 
     /// Draws the factor common to all taxels in one press.
     pub(super) fn press_gain(&self, stream: &mut Stream) -> f32 {
-        (1.0 + self.press_spread * stream.normal()).max(0.3) as f32
+        (1.0 + self.design.spread.press * stream.normal()).max(0.3) as f32
     }
 
-    /// Converts taxel forces in newtons, with film creep, into counts.
-    pub(super) fn read(
-        &self,
-        forces_n: &[f32; TAXELS],
-        press_gain: f32,
-        noise: &mut Stream,
-    ) -> RawFrame {
-        let mut rows = [0.0_f32; ROWS];
-        let mut columns = [0.0_f32; COLS];
+    /// The daemon's default thresholds for this array.
+    pub(super) fn thresholds(&self) -> Thresholds {
+        let settings = Settings::default();
+        settings
+            .check(self.grid.array, self.grid.pitch)
+            .expect("the default settings fit every array")
+    }
+
+    /// Converts taxel forces in newtons, as the film gives them, into counts.
+    pub(super) fn read(&self, forces_n: &[f32], press_gain: f32, noise: &mut Stream) -> RawFrame {
+        let design = &self.design;
+        let array = design.array;
+        let mut rows = vec![0.0_f32; array.rows];
+        let mut columns = vec![0.0_f32; array.cols];
         for (k, &force) in forces_n.iter().enumerate() {
-            rows[k / COLS] += force;
-            columns[k % COLS] += force;
+            rows[k / array.cols] += force;
+            columns[k % array.cols] += force;
         }
-        let mut raw = RawFrame::zero(ARRAY);
+        let mut raw = RawFrame::zero(array);
         for (k, counts) in raw.counts.iter_mut().enumerate() {
-            let (row, column) = (k / COLS, k % COLS);
+            let (row, column) = array.position(k);
             let own = forces_n[k];
             let mut near = 0.0;
             if row > 0 {
-                near += forces_n[k - COLS];
+                near += forces_n[k - array.cols];
             }
-            if row + 1 < ROWS {
-                near += forces_n[k + COLS];
+            if row + 1 < array.rows {
+                near += forces_n[k + array.cols];
             }
             if column > 0 {
                 near += forces_n[k - 1];
             }
-            if column + 1 < COLS {
+            if column + 1 < array.cols {
                 near += forces_n[k + 1];
             }
             // Force through the cover can close a taxel. Crosstalk along the lines cannot, and an
             // open taxel reads nothing. Otherwise 25 N on one point would draw a cross.
-            let pressed = own + CROSSTALK_NEIGHBOUR * near;
+            let pressed = own + design.crosstalk_neighbour * near;
             if pressed <= self.threshold_n[k] {
                 continue;
             }
             let line = rows[row] + columns[column] - 2.0 * own;
-            let felt = pressed + CROSSTALK_LINE * line;
-            let ratio = 1.0 + (NOISE_RATIO * noise.normal()) as f32;
+            let felt = design.response.of(pressed + design.crosstalk_line * line);
+            let ratio = 1.0 + (design.noise_ratio * noise.normal()) as f32;
             let read = felt * self.gain[k] * press_gain * ratio
                 + if self.gain[k] > 0.0 {
-                    (NOISE_N * noise.normal()) as f32
+                    (design.noise_n * noise.normal()) as f32
                 } else {
                     0.0
                 };
-            let rounded = (read / NEWTONS_PER_COUNT)
+            let rounded = (read / design.count_n)
                 .round()
-                .clamp(0.0, f32::from(FULL_SCALE_COUNTS));
-            // A reading of one count becomes 0.
-            *counts = if rounded < 2.0 { 0 } else { rounded as u16 };
+                .clamp(0.0, f32::from(design.full_scale_counts));
+            *counts = if rounded < design.least_counts {
+                0
+            } else {
+                rounded as u16
+            };
         }
         raw
     }
+
+    /// The frame after a tare with baseline 0.
+    pub(super) fn tared(&self, raw: &RawFrame) -> Frame {
+        let newtons = raw.counts.iter();
+        Frame {
+            array: raw.array,
+            newtons: newtons
+                .map(|&counts| f32::from(counts) * self.newtons_per_count)
+                .collect(),
+        }
+    }
 }
 
-/// The state of the film's creep under each taxel.
+/// The state of the film under each taxel.
 #[derive(Debug, Clone)]
 pub(super) struct Film {
     crept: Vec<[f32; 2]>,
+    /// The delayed forces, and the greatest of them since a taxel was touched.
+    delayed_n: Vec<f32>,
+    greatest_n: Vec<f32>,
 }
 
 impl Film {
     /// A film at rest.
-    pub(super) fn new() -> Self {
+    pub(super) fn new(design: &Design) -> Self {
+        let taxels = design.array.taxels();
         Self {
-            crept: vec![[0.0; 2]; TAXELS],
+            crept: vec![[0.0; 2]; taxels],
+            delayed_n: vec![0.0; taxels],
+            greatest_n: vec![0.0; taxels],
         }
     }
 
-    /// Advances by `time_s` under `forces_n` and returns the forces with the film's creep. Creep
-    /// multiplies the load, so an unloaded taxel reads nothing, however long it was loaded.
-    pub(super) fn advance(&mut self, forces_n: &[f32; TAXELS], time_s: f64) -> [f32; TAXELS] {
-        let step = FILM_CREEP.map(|(_, tau)| -(-(time_s as f32) / tau).exp_m1());
-        let mut read = [0.0; TAXELS];
-        for ((read, &force), crept) in read.iter_mut().zip(forces_n).zip(&mut self.crept) {
+    /// Advances by `time_s` under `forces_n` and returns the forces with delay, hysteresis and
+    /// creep. Creep and hysteresis multiply the load, so an unloaded taxel reads nothing, however
+    /// long it was loaded.
+    pub(super) fn advance(&mut self, design: &Design, forces_n: &[f32], time_s: f64) -> Vec<f32> {
+        let creep = design.creep;
+        let step = creep.map(|(_, tau)| -(-(time_s as f32) / tau).exp_m1());
+        let follow = -(-(time_s as f32) / design.lag_s).exp_m1();
+        let mut read = vec![0.0; forces_n.len()];
+        for (k, (read, &force)) in read.iter_mut().zip(forces_n).enumerate() {
+            let mut force = force;
+            if design.lag_s > 0.0 {
+                let delayed = &mut self.delayed_n[k];
+                *delayed += follow * (force - *delayed);
+                if *delayed < NOTHING_N {
+                    *delayed = 0.0;
+                }
+                force = *delayed;
+            }
             let goal = if force > 0.0 { 1.0 } else { 0.0 };
             let mut factor = 1.0;
-            for ((crept, step), (ratio, _)) in crept.iter_mut().zip(step).zip(FILM_CREEP) {
+            for ((crept, step), (ratio, _)) in self.crept[k].iter_mut().zip(step).zip(creep) {
                 *crept += step * (goal - *crept);
                 factor += ratio * *crept;
+            }
+            let greatest = &mut self.greatest_n[k];
+            *greatest = if force > 0.0 {
+                greatest.max(force)
+            } else {
+                0.0
+            };
+            if force < *greatest {
+                factor *= 1.0 + design.hysteresis * (1.0 - force / *greatest);
             }
             *read = force * factor;
         }
@@ -242,85 +257,13 @@ impl Film {
     }
 }
 
-/// The number of taxels on each side that feel a load.
-const REACH: usize = 2;
-const SPAN: usize = 2 * REACH + 1;
-
-/// The taxel forces (N) from the pressure (MPa) on a window of cells. `corner` is the window's
-/// first row and column in cells of the sensor. Force beyond the sensor's border is lost, as on a
-/// real sensor.
-pub(super) fn taxel_forces(
-    pressure_mpa: &[f32],
-    width: usize,
-    corner: (usize, usize),
-) -> [f32; TAXELS] {
-    let table = spreading();
-    let mut forces = [0.0_f32; TAXELS];
-    let area = (CELL_MM * CELL_MM) as f32;
-    for (k, &pressure) in pressure_mpa.iter().enumerate() {
-        if pressure == 0.0 {
-            continue;
-        }
-        let (i, j) = (corner.0 + k / width, corner.1 + k % width);
-        let cell = i % CELLS_PER_TAXEL * CELLS_PER_TAXEL + j % CELLS_PER_TAXEL;
-        let (row, column) = (i / CELLS_PER_TAXEL, j / CELLS_PER_TAXEL);
-        for (n, &share) in table[cell].iter().enumerate() {
-            let (row, column) = (row + n / SPAN, column + n % SPAN);
-            if (REACH..ROWS + REACH).contains(&row) && (REACH..COLS + REACH).contains(&column) {
-                forces[(row - REACH) * COLS + column - REACH] += pressure * area * share;
-            }
-        }
-    }
-    forces
-}
-
-/// The shares of a load on each cell of a taxel that the taxel and its neighbours feel.
-///
-/// Normal stress at depth z under a point load is `3 F z^3 / (2 pi (r^2 + z^2)^(5/2))`, whose
-/// transform is `(1 + q z) exp(-q z)`. A taxel integrates its active square and is calibrated
-/// under uniform pressure, so that over a taxel's cells the shares add up to 1 on average.
-fn spreading() -> &'static [[f32; SPAN * SPAN]; CELLS_PER_TAXEL * CELLS_PER_TAXEL] {
-    static TABLE: OnceLock<[[f32; SPAN * SPAN]; CELLS_PER_TAXEL * CELLS_PER_TAXEL]> =
-        OnceLock::new();
-    TABLE.get_or_init(|| {
-        // The number of points along a taxel's active width and along a cell (midpoint rule).
-        const FINE: usize = 12;
-        const PARTS: usize = 3;
-        let mut table = [[0.0_f32; SPAN * SPAN]; CELLS_PER_TAXEL * CELLS_PER_TAXEL];
-        let mut sum = 0.0;
-        let along = |cell: usize, part: usize| {
-            (cell as f64 + (part as f64 + 0.5) / PARTS as f64) * CELL_MM - 0.5 * PITCH_MM
-        };
-        let active = |taxel: usize, point: usize| {
-            (taxel as f64 - REACH as f64) * PITCH_MM
-                + ((point as f64 + 0.5) / FINE as f64 - 0.5) * ACTIVE_MM
-        };
-        for (cell, shares) in table.iter_mut().enumerate() {
-            for (n, share) in shares.iter_mut().enumerate() {
-                let mut value = 0.0;
-                for part in 0..PARTS * PARTS {
-                    let y = along(cell / CELLS_PER_TAXEL, part / PARTS);
-                    let x = along(cell % CELLS_PER_TAXEL, part % PARTS);
-                    for point in 0..FINE * FINE {
-                        let dy = active(n / SPAN, point / FINE) - y;
-                        let dx = active(n % SPAN, point % FINE) - x;
-                        let square = dx * dx + dy * dy + DEPTH_MM * DEPTH_MM;
-                        value += DEPTH_MM.powi(3) / (square * square * square.sqrt());
-                    }
-                }
-                *share = value as f32;
-                sum += value;
-            }
-        }
-        let scale = ((CELLS_PER_TAXEL * CELLS_PER_TAXEL) as f64 / sum) as f32;
-        table.iter_mut().flatten().for_each(|share| *share *= scale);
-        table
-    })
-}
-
 #[cfg(test)]
 mod tests {
+    use super::design::{FOIL_MM, Response, ranges};
     use super::*;
+    use crate::press::Window;
+
+    const TAXELS: usize = ARRAY.taxels();
 
     fn smooth_load() -> (Vec<f32>, f64) {
         let width = 48_usize;
@@ -344,24 +287,187 @@ mod tests {
         sensor
     }
 
+    /// The smooth load's place on the sensor.
+    const WINDOW: Window = Window {
+        corner: (30, 33),
+        width: 48,
+    };
+
     #[test]
-    fn taxel_forces_add_up_to_the_force() {
+    fn taxel_forces_add_up_to_the_force_at_every_pitch() {
         let (pressure, force) = smooth_load();
-        let taxels = taxel_forces(&pressure, 48, (30, 33));
-        let sum: f64 = taxels.iter().map(|&f| f64::from(f)).sum();
-        assert!((sum / force - 1.0).abs() < 2e-3, "{sum} N of {force} N");
+        for pitch_mm in [1.75, 2.0, 2.9, 3.5, 4.4, 5.0, 7.0] {
+            let design = Design::jx255n(SensorProfile::Clean).at_pitch(pitch_mm);
+            let taxels = Grid::new(&design).taxel_forces(&pressure, WINDOW);
+            let sum: f64 = taxels.iter().map(|&f| f64::from(f)).sum();
+            // Cells have rounded places where they do not fit into the taxels.
+            let slack = if pitch_mm == 3.5 { 2e-3 } else { 0.02 };
+            assert!(
+                (sum / force - 1.0).abs() < slack,
+                "{pitch_mm} mm: {sum} N of {force} N"
+            );
+        }
+    }
+
+    #[test]
+    fn a_load_stays_at_its_place_at_every_pitch() {
+        let (pressure, _) = smooth_load();
+        for pitch_mm in [1.75, 2.3, 3.5, 5.5, 7.0] {
+            let grid = Grid::new(&Design::jx255n(SensorProfile::Clean).at_pitch(pitch_mm));
+            let taxels = grid.taxel_forces(&pressure, WINDOW);
+            let (mut moment, mut sum) = (0.0, 0.0);
+            for (k, &force) in taxels.iter().enumerate() {
+                let row = k / grid.array.cols;
+                let from_middle = row as f64 - 0.5 * (grid.array.rows - 1) as f64;
+                moment += f64::from(force) * from_middle * pitch_mm;
+                sum += f64::from(force);
+            }
+            // The load's middle is cell 24 of the window.
+            let expected = (30.0 + 24.5) * CELL_MM - 49.0;
+            let found = moment / sum;
+            assert!(
+                (found - expected).abs() < 0.2,
+                "{pitch_mm} mm: at {found}, not {expected}"
+            );
+        }
+    }
+
+    #[test]
+    fn responses_are_as_they_are_named() {
+        let read = |response: Response, forces: [f32; 4]| forces.map(|force| response.of(force));
+        assert_eq!(
+            read(Response::Linear, [0.0, 1.0, 3.0, 9.0]),
+            [0.0, 1.0, 3.0, 9.0]
+        );
+        let power = Response::Power {
+            exponent: 0.5,
+            unit_n: 4.0,
+        };
+        assert_eq!(read(power, [0.0, 1.0, 4.0, 16.0]), [0.0, 2.0, 4.0, 8.0]);
+        let levels = read(Response::Levels { most_n: 3.0 }, [0.0, 3.0, 30.0, 3e6]);
+        assert!(levels.is_sorted() && levels[1] == 1.5 && (2.99..=3.0).contains(&levels[3]));
+        let falls = read(Response::Falls { most_n: 3.0 }, [0.3, 3.0, 6.0, 12.0]);
+        assert!(
+            falls[..3].is_sorted() && falls[2] == 3.0 && falls[3] < 2.5,
+            "{falls:?}"
+        );
+    }
+
+    #[test]
+    fn an_unloading_taxel_reads_late_and_too_much() {
+        let mut design = Design::jx255n(SensorProfile::Clean);
+        design.creep = [(0.0, 1.0); 2];
+        let read = |design: &Design, course: &[f32]| {
+            let mut film = Film::new(design);
+            let steps = course
+                .iter()
+                .map(|&force| film.advance(design, &[force; TAXELS], 0.02)[0]);
+            steps.collect::<Vec<_>>()
+        };
+        let course = [1.0, 2.0, 2.0, 1.0, 0.0, 1.0];
+        assert_eq!(read(&design, &course), course);
+        design.hysteresis = 0.2;
+        assert_eq!(read(&design, &course), [1.0, 2.0, 2.0, 1.1, 0.0, 1.0]);
+        design.lag_s = 0.02;
+        let late = read(&design, &course);
+        assert!(late[0] < 0.7 && late[4] > 0.3, "{late:?}");
+        let free = read(&design, &[&course[..], &[0.0; 10]].concat());
+        assert_eq!(free[15], 0.0);
+    }
+
+    #[test]
+    fn broad_designs_draw_every_property_within_its_range() {
+        let cover_mm = 2.0;
+        let designs: Vec<Design> = (0..2000)
+            .map(|k| Design::broad(cover_mm, &mut Stream::new(3, "designs").child(k)))
+            .collect();
+        type Property = (&'static str, [f64; 2], fn(&Design) -> Option<f64>);
+        let properties: [Property; 21] = [
+            ("pitch", ranges::PITCH_MM, |d| Some(d.pitch_mm)),
+            ("active", ranges::ACTIVE_SHARE, |d| {
+                Some(d.active_mm / d.pitch_mm)
+            }),
+            ("depth", ranges::DEPTH, |d| {
+                Some((d.depth_mm - FOIL_MM) / 2.0)
+            }),
+            ("exponent", ranges::EXPONENT, |d| match d.response {
+                Response::Power { exponent, .. } => Some(exponent.into()),
+                _ => None,
+            }),
+            ("levels", ranges::MOST_N, |d| match d.response {
+                Response::Levels { most_n } => Some(of_area(d, most_n.into())),
+                _ => None,
+            }),
+            ("falls", ranges::MOST_N, |d| match d.response {
+                Response::Falls { most_n } => Some(of_area(d, most_n.into())),
+                _ => None,
+            }),
+            ("threshold", ranges::THRESHOLD_N, |d| {
+                Some(of_area(d, d.threshold_median_n))
+            }),
+            ("count", ranges::COUNT_N, |d| {
+                Some(of_area(d, d.count_n.into()))
+            }),
+            ("lag", ranges::LAG_S, |d| Some(d.lag_s.into())),
+            ("hysteresis", ranges::HYSTERESIS, |d| {
+                Some(d.hysteresis.into())
+            }),
+            ("neighbour", ranges::NEIGHBOUR, |d| {
+                Some(d.crosstalk_neighbour.into())
+            }),
+            ("line", ranges::LINE, |d| Some(d.crosstalk_line.into())),
+            ("creep", ranges::CREEP[0], |d| Some(d.creep[0].0.into())),
+            ("slow creep", ranges::CREEP[1], |d| {
+                Some(d.creep[1].0.into())
+            }),
+            ("noise", ranges::NOISE, |d| Some(d.noise_ratio)),
+            ("noise in N", ranges::NOISE_N, |d| {
+                Some(of_area(d, d.noise_n))
+            }),
+            ("dead", ranges::DEAD, |d| Some(d.dead_share)),
+            ("taxel", ranges::TAXEL, |d| Some(d.spread.taxel)),
+            ("row", ranges::ROW, |d| Some(d.spread.row)),
+            ("column", ranges::ROW, |d| Some(d.spread.column)),
+            ("press", ranges::PRESS, |d| Some(d.spread.press)),
+        ];
+        for (name, [low, high], of) in properties {
+            let found: Vec<f64> = designs.iter().filter_map(of).collect();
+            let least = found.iter().copied().fold(f64::INFINITY, f64::min);
+            let most = found.iter().copied().fold(0.0, f64::max);
+            let slack = 1e-4 * high;
+            assert!(
+                least >= low - slack && most <= high + slack,
+                "{name}: {least} to {most}"
+            );
+            let near = 0.1 * (high - low);
+            assert!(
+                least < low + near && most > high - near,
+                "{name}: {least} to {most}"
+            );
+        }
+        for design in &designs {
+            let side = design.array.rows;
+            let width_mm = side as f64 * design.pitch_mm;
+            assert!((7..=49).contains(&side) && (45.0..=102.0).contains(&width_mm));
+        }
+    }
+
+    /// A force on a taxel as on one of 3.5 mm.
+    fn of_area(design: &Design, newtons: f64) -> f64 {
+        newtons / (design.pitch_mm / 3.5).powi(2)
     }
 
     #[test]
     fn readings_follow_the_force_within_the_sensors_spread() {
         let (pressure, force) = smooth_load();
-        let taxels = taxel_forces(&pressure, 48, (30, 33)).map(|f| f * 0.1);
+        let taxels = Grid::jx255n().taxel_forces(&pressure, WINDOW);
+        let taxels: Vec<f32> = taxels.iter().map(|f| f * 0.1).collect();
         let sensor = Sensor::new(SensorProfile::Clean, &Stream::new(5, "sensor"));
         let raw = sensor.read(&taxels, 1.0, &mut Stream::new(5, "noise"));
         let read: f64 = raw
             .counts
             .iter()
-            .map(|&c| f64::from(c) * f64::from(NEWTONS_PER_COUNT))
+            .map(|&c| f64::from(c) * f64::from(sensor.newtons_per_count))
             .sum();
         // Where a taxel is above its threshold, crosstalk adds up to 4 x 1.5 % + 54 x 0.4 %.
         assert!(
@@ -374,7 +480,7 @@ mod tests {
     #[test]
     fn a_point_load_draws_no_cross() {
         let mut forces = [0.0; TAXELS];
-        forces[14 * COLS + 14] = 25.0;
+        forces[ARRAY.place(14, 14)] = 25.0;
         let sensor = without_thresholds(6);
         let raw = sensor.read(&forces, 1.0, &mut Stream::new(6, "noise"));
         assert_eq!(
@@ -386,17 +492,17 @@ mod tests {
 
     #[test]
     fn an_unloaded_sensor_reads_zero_even_after_long_load() {
-        let mut film = Film::new();
+        let sensor = without_thresholds(1);
+        let mut film = Film::new(&sensor.design);
         let mut forces = [3.0; TAXELS];
         for _ in 0..100 {
-            film.advance(&forces, 0.1);
+            film.advance(&sensor.design, &forces, 0.1);
         }
-        let crept = film.advance(&forces, 0.1)[0] / 3.0;
+        let crept = film.advance(&sensor.design, &forces, 0.1)[0] / 3.0;
         assert!((1.05..1.07).contains(&crept), "film creep {crept}");
         forces = [0.0; TAXELS];
-        let sensor = without_thresholds(1);
         let raw = sensor.read(
-            &film.advance(&forces, 0.01),
+            &film.advance(&sensor.design, &forces, 0.01),
             1.0,
             &mut Stream::new(2, "noise"),
         );

@@ -12,7 +12,7 @@ use super::material::Material;
 use super::motion::{Approach, Arm, Motion};
 use super::object::{Object, POSTURES, Pose, Shapes};
 use super::press::{Bench, Specimen};
-use super::sensor::{ARRAY, Film, Sensor, SensorProfile, TAXELS};
+use super::sensor::{ARRAY, Film, Sensor, SensorProfile};
 use super::tracked::one_press;
 use crate::random::Stream;
 use hardnessd_core::frame::RawFrame;
@@ -128,9 +128,9 @@ impl Sequence {
             free_s: FIRST_REST.0.max(FIRST_REST.1 / rate).max(settings.rest_s),
             settings,
             root,
-            sensor,
             bench: Bench::default(),
-            film: Film::new(),
+            film: Film::new(&sensor.design),
+            sensor,
             ready: VecDeque::new(),
             made: 0,
             frames: 0,
@@ -168,8 +168,11 @@ impl Sequence {
             last: self.last,
             next: next_s.map(|touch_s| (touch_s, Arm::default().speed_mm_s)),
         };
-        self.film
-            .advance(&[0.0; TAXELS], 1.0 / self.settings.frame_rate_hz);
+        self.film.advance(
+            &self.sensor.design,
+            &vec![0.0; ARRAY.taxels()],
+            1.0 / self.settings.frame_rate_hz,
+        );
         self.frames += 1;
         let materials = &self.settings.materials;
         let pressed = self.made.checked_sub(1);
@@ -205,9 +208,12 @@ impl Sequence {
             let mut noise = draws.child(4).child(attempt);
             let mut film = self.film.clone();
             let (frames, next) = self.play(&course, touch_s, &mut film, &mut noise);
-            if attempt as usize == TRIES
-                || one_press(frames.iter().map(|(raw, _)| raw), 1.0 / rate).is_some()
-            {
+            let seen: Vec<_> = frames
+                .iter()
+                .map(|(raw, _)| self.sensor.tared(raw))
+                .collect();
+            let is_seen = one_press(&seen, &self.sensor.thresholds(), 1.0 / rate).is_some();
+            if attempt as usize == TRIES || is_seen {
                 self.last = Some((touch_s, course.motion));
                 let approach = Approach {
                     last: self.last,
@@ -240,14 +246,15 @@ impl Sequence {
     ) -> (Vec<(RawFrame, bool)>, u64) {
         let period_s = 1.0 / self.settings.frame_rate_hz;
         let gain = self.sensor.press_gain(noise);
+        let felt = course.felt(&self.sensor.grid);
         let mut frames = Vec::new();
         for number in self.frames.. {
             let time_s = number as f64 * period_s - touch_s;
             if time_s >= course.duration_s() {
                 return (frames, number);
             }
-            let forces = course.taxels_n(time_s);
-            let crept = film.advance(&forces, period_s);
+            let forces = felt.taxels_n(time_s);
+            let crept = film.advance(&self.sensor.design, &forces, period_s);
             frames.push((self.sensor.read(&crept, gain, noise), time_s > 0.0));
         }
         unreachable!("frame numbers do not run out before a press of seconds ends")

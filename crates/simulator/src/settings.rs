@@ -73,6 +73,10 @@ pub struct DatasetSettings {
     pub one_sensor: bool,
     /// Young's modulus of the sensors' cover, MPa.
     pub cover_young_mpa: f64,
+    /// Whether the sensors are calibrated with weights: a count is then worth what makes the mean sum
+    /// the force, and not 0.04 N.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub calibrated: bool,
     /// Whether the two materials of each level swap roles, from level 1. The paper's test material
     /// then trains.
     pub swapped_levels: [bool; 4],
@@ -96,6 +100,7 @@ impl Default for DatasetSettings {
             sensor_seed: None,
             one_sensor: false,
             cover_young_mpa: COVER_YOUNG_MPA,
+            calibrated: false,
             swapped_levels: [false; 4],
         }
     }

@@ -12,7 +12,8 @@ use super::broad;
 use super::level::LEVELS;
 use super::material::{Material, Split};
 use super::object::{Object, Shapes};
-use super::press::Bench;
+use super::press::{Bench, Cover};
+use super::rigid::{self, Weight};
 use super::sensor::Sensor;
 use super::settings::{DatasetSettings, Materials};
 use crate::random::Stream;
@@ -35,8 +36,8 @@ enum Origin {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Unit {
     origin: Origin,
-    split: Split,
-    number: u32,
+    pub(super) split: Split,
+    pub(super) number: u32,
 }
 
 /// The objects of a data set, in the order of materials (as in [`Material::ALL`]) or of split and
@@ -68,11 +69,11 @@ pub(super) fn units(settings: &DatasetSettings) -> Vec<Unit> {
 
 /// Runs `work` on each unit and its index, on `threads` threads. The results are in the order of
 /// the units, whichever thread makes them.
-pub(super) fn shared_out<T: Send>(
-    units: &[Unit],
+pub(super) fn shared_out<U: Copy + Sync, B, T: Send>(
+    units: &[U],
     threads: usize,
-    bench: impl Fn() -> Bench + Sync,
-    work: impl Fn(&mut Bench, u32, Unit) -> Vec<T> + Sync,
+    bench: impl Fn() -> B + Sync,
+    work: impl Fn(&mut B, u32, U) -> Vec<T> + Sync,
 ) -> Vec<T> {
     let next = AtomicUsize::new(0);
     let parts: Mutex<Vec<Vec<T>>> = Mutex::new(units.iter().map(|_| Vec::new()).collect());
@@ -131,6 +132,15 @@ impl Draws {
     }
 }
 
+/// The weights that the sensors of these settings are calibrated with.
+pub(super) fn weights(settings: &DatasetSettings) -> Vec<Weight> {
+    if settings.calibrated {
+        rigid::weights(&mut Bench::under(Cover::of(settings.cover_young_mpa)))
+    } else {
+        Vec::new()
+    }
+}
+
 /// An object with its material and the sensor it is pressed on.
 pub(super) struct Subject {
     pub(super) split: Split,
@@ -141,7 +151,7 @@ pub(super) struct Subject {
 }
 
 impl Subject {
-    pub(super) fn draw(settings: &DatasetSettings, unit: Unit) -> Self {
+    pub(super) fn draw(settings: &DatasetSettings, unit: Unit, weights: &[Weight]) -> Self {
         let draws = Draws::new(settings, unit);
         let mut hardness = draws.body.child(0);
         let body = match unit.origin {
@@ -157,11 +167,15 @@ impl Subject {
         };
         let sensor_seed = settings.sensor_seed.unwrap_or(settings.seed);
         let of_sensor = Stream::new(sensor_seed, sensors).child(u64::from(number));
+        let mut sensor = Sensor::new(settings.profile, &of_sensor);
+        if settings.calibrated {
+            sensor.calibrate(weights);
+        }
         Self {
             split: unit.split,
             object: Object::draw(settings.shapes, body.level, &mut draws.geometry.child(0)),
             body,
-            sensor: Sensor::new(settings.profile, &of_sensor),
+            sensor,
             draws,
         }
     }

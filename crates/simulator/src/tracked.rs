@@ -1,27 +1,14 @@
-//! Simulated frames as the daemon sees them: after tare, and through its press tracker.
+//! Simulated frames as the daemon's press tracker sees them.
 //!
-//! In: raw frames at a steady rate, with the sensor unloaded before the first. Out: the frames in
-//! newtons, and the frames of the single press among them.
+//! In: frames at a steady rate, with the sensor unloaded before the first. Out: the frames of the
+//! single press among them.
 
 use std::time::Duration;
 
-use super::sensor::ARRAY;
-use hardnessd_core::frame::{Frame, RawFrame, Stamp};
+use hardnessd_core::frame::{Frame, Stamp};
 use hardnessd_core::press::{Change, End, FrameAt, Marks, PressTracker, Thresholds};
-use hardnessd_core::tare::NEWTONS_PER_COUNT;
 
-/// The frame after a tare with baseline 0.
-pub(super) fn ideal_tare(raw: &RawFrame) -> Frame {
-    let newtons = raw.counts.iter();
-    Frame {
-        array: raw.array,
-        newtons: newtons
-            .map(|&counts| f32::from(counts) * NEWTONS_PER_COUNT)
-            .collect(),
-    }
-}
-
-/// Whether a press tracker with default settings begins a press with this frame.
+/// Whether a press tracker of a JX255N begins a press with this frame.
 pub(super) fn begins_press(frame: &Frame) -> bool {
     let Thresholds {
         contact_threshold_n,
@@ -39,18 +26,19 @@ pub(super) struct Seen {
     pub(super) best: usize,
 }
 
-/// The press that a press tracker with default settings sees in these frames, when frames without
-/// load follow. `None` unless there is exactly one press and it ends with a release.
+/// The press that a press tracker sees in these frames, when frames without load follow. `None`
+/// unless there is exactly one press and it ends with a release.
 pub(super) fn one_press<'a>(
-    frames: impl IntoIterator<Item = &'a RawFrame>,
+    frames: impl IntoIterator<Item = &'a Frame>,
+    settings: &Thresholds,
     period_s: f64,
 ) -> Option<Seen> {
-    let settings = Thresholds::default();
-    let rest = std::iter::repeat_n(Frame::zero(ARRAY), settings.end_frames as usize);
-    let frames = frames.into_iter().map(ideal_tare).chain(rest);
+    let frames: Vec<&Frame> = frames.into_iter().collect();
+    let free = Frame::zero(frames.first()?.array);
+    let rest = std::iter::repeat_n(&free, settings.end_frames as usize);
     let mut tracker = PressTracker::new(settings.clone());
     let (mut contact, mut best) = (Vec::new(), None);
-    for (number, frame) in (0_u32..).zip(frames) {
+    for (number, frame) in (0_u32..).zip(frames.iter().copied().chain(rest)) {
         let at = FrameAt {
             frame: number.into(),
             stamp: Stamp {
@@ -58,7 +46,7 @@ pub(super) fn one_press<'a>(
                 wall: jiff::Timestamp::UNIX_EPOCH,
             },
         };
-        for change in tracker.push(&frame, Marks::default(), at) {
+        for change in tracker.push(frame, Marks::default(), at) {
             match change {
                 Change::Begin { .. } if best.is_some() => return None,
                 Change::Begin { .. } | Change::Settled { .. } => {}

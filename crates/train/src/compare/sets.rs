@@ -220,7 +220,7 @@ fn simulated(directory: &Path, name: &str, settings: &DatasetSettings) -> anyhow
     let path = file_of(directory, name, settings)?;
     if !path.exists() {
         hardnessd_core::say!("simulating {}", path.display());
-        let samples = simulated::simulate(settings);
+        let samples = simulated::simulate(settings, simulated::all_cores());
         write_whole(&path, &simulated::to_bytes(settings, samples)?)?;
     }
     Ok(path)

@@ -186,7 +186,8 @@ fn file(
     let path = sets::file_of(&plan.out.join("data"), &label, &own)?;
     if !path.exists() {
         let parts = parts.get_or_insert_with(|| {
-            [false, true].map(|swapped| simulated::simulate(&under([swapped; 4])))
+            [false, true]
+                .map(|swapped| simulated::simulate(&under([swapped; 4]), simulated::all_cores()))
         });
         write_whole(
             &path,

@@ -14,7 +14,7 @@ use super::dataset::{
 };
 use super::npz::Writer;
 use hardnessd_core::verdict::{COLS, COURSE_FRAMES, ModelFrame, ROWS, TAXELS};
-use hardnessd_simulator::{LabelledCourse, NEWTONS_PER_COUNT, Split};
+use hardnessd_simulator::{LabelledCourse, Reference, Split};
 
 /// Newtons per unit of [`Courses::frames_mn`].
 const NEWTONS: f32 = 1e-3;
@@ -54,6 +54,10 @@ pub struct Press {
     pub force_n: f32,
     /// Stiffness of the arm. 0 if unknown.
     pub arm_n_per_mm: f32,
+    /// The number of the sensor. 0 if the file has one sensor, or does not name them.
+    pub sensor: u32,
+    /// The rigid piece that was pressed to show what the sensor reads. Such a press has no level.
+    pub reference: Option<Reference>,
     /// The row of the frame that a model of single frames judges.
     pub best: u32,
 }
@@ -93,10 +97,7 @@ impl Courses {
         for (number, course) in (0_u32..).zip(courses) {
             let first = all.press.len();
             for moment in &course.moments {
-                let millinewtons = |&counts: &u16| {
-                    (f32::from(counts) * NEWTONS_PER_COUNT / NEWTONS).round() as u16
-                };
-                all.frames_mn.extend(moment.counts.iter().map(millinewtons));
+                all.frames_mn.extend(&moment.millinewtons);
                 all.press.push(number);
                 all.time_s.push(moment.time_s);
                 all.approach_mm.push(moment.approach_mm);
@@ -110,6 +111,8 @@ impl Courses {
                 shore: course.shore,
                 force_n: course.force_n,
                 arm_n_per_mm: course.arm_n_per_mm,
+                sensor: course.sensor,
+                reference: course.reference,
                 best: (first + course.best) as u32,
             });
         }
@@ -140,7 +143,8 @@ impl Courses {
         });
     }
 
-    /// The frame of each press with the largest contact area, as a data set of single frames.
+    /// The frame of each press with the largest contact area, as a data set of single frames. Presses
+    /// of rigid pieces are left out.
     fn best_frames(&self, path: &Path, source: Source) -> Dataset {
         let sample = |press: &Press| Sample {
             frame: self.frame(press.best as usize),
@@ -153,7 +157,12 @@ impl Courses {
             source: 0,
         };
         Dataset {
-            samples: self.presses.iter().map(sample).collect(),
+            samples: self
+                .presses
+                .iter()
+                .filter(|press| press.reference.is_none())
+                .map(sample)
+                .collect(),
             sources: vec![source],
             paths: vec![path.to_owned()],
         }
@@ -199,9 +208,9 @@ impl Courses {
     /// have different pitches, or the files have more objects than a u32 can number.
     pub fn read_all(paths: &[PathBuf]) -> Result<(Self, Vec<Source>), DatasetError> {
         let (mut all, mut sources) = (Self::default(), Vec::new());
-        let mut first_object = 0;
+        let (mut first_object, mut first_sensor) = (0, 0);
         for path in paths {
-            let (part, source) = Self::read_with_source(path)?;
+            let (mut part, source) = Self::read_with_source(path)?;
             let presses = part.presses.iter();
             let presses = presses.map(|press| (press.pressed(), press.split));
             if let Some(object) = object_in_both_splits(presses) {
@@ -220,6 +229,12 @@ impl Courses {
             let last = part.presses.iter().map(|press| press.object).max();
             let before;
             (before, first_object) = objects_after(first_object, last, path.clone())?;
+            // Sensors of different files are different ones.
+            let sensors = part.presses.iter().map(|press| press.sensor).max();
+            for press in &mut part.presses {
+                press.sensor = press.sensor.saturating_add(first_sensor);
+            }
+            first_sensor = sensors.map_or(0, |last| last.saturating_add(first_sensor + 1));
             all.append(part, before);
         }
         Ok((all, sources))
@@ -283,7 +298,17 @@ impl Courses {
         let force_n: Vec<f32> = file.required("force", &[], count)?;
         let arm_n_per_mm: Vec<f32> = file.required("arm_n_per_mm", &[], count)?;
         let best: Vec<u32> = file.required("best", &[], count)?;
+        let sensor: Option<Vec<u32>> = file.read("sensor", &[], count)?;
+        let reference: Option<Vec<u8>> = file.read("reference", &[], count)?;
+        let reference_mm: Vec<f32> = match reference {
+            Some(_) => file.required("reference_mm", &[], count)?,
+            None => Vec::new(),
+        };
+        let reference = reference.unwrap_or_default();
+        let kinds = "0 (no reference), 1 (flat) or 2 (ball)";
+        file.within("reference", &reference, 2, kinds)?;
         for (array, values, range) in [
+            ("reference_mm", &reference_mm, 0.0..=1e6),
             ("time_s", &time_s, -1e5..=1e5),
             ("approach_mm", &approach_mm, -1e6..=1e6),
             ("force", &force_n, FORCES_N),
@@ -314,6 +339,20 @@ impl Courses {
             let expected = format!("0 to {}, each at least once", level.len() - 1);
             return Err(file.error("press", found, expected));
         }
+        let labelled = |k: &usize| reference[*k] > 0 && level[*k] > 0;
+        if let Some(k) = (0..reference.len()).find(labelled) {
+            let found = format!("{} of press {k}, a reference", level[k]);
+            return Err(file.error("level", found, "0".to_owned()));
+        }
+        let reference = |k: usize| match reference.get(k) {
+            Some(1) => Some(Reference::Flat {
+                width_mm: reference_mm[k],
+            }),
+            Some(2) => Some(Reference::Ball {
+                radius_mm: reference_mm[k],
+            }),
+            _ => None,
+        };
         let presses = (0..level.len()).map(|k| Press {
             level: level[k],
             object: object[k],
@@ -326,6 +365,8 @@ impl Courses {
             shore: shore[k],
             force_n: force_n[k],
             arm_n_per_mm: arm_n_per_mm[k],
+            sensor: sensor.as_ref().map_or(0, |sensor| sensor[k]),
+            reference: reference(k),
             best: best[k],
         });
         let courses = Self {
@@ -397,8 +438,28 @@ impl Courses {
             let values: Vec<f32> = self.presses.iter().map(of).collect();
             npz.add_list(name, &values)?;
         }
+        let names_sensors = |press: &Press| press.sensor > 0 || press.reference.is_some();
+        if self.presses.iter().any(names_sensors) {
+            self.write_sensors(&mut npz)?;
+        }
         npz.add_list("meta", meta.to_string().as_bytes())?;
         npz.finish()
+    }
+}
+
+impl Courses {
+    /// The arrays of a file that has several sensors, or references.
+    fn write_sensors<W: Write + Seek>(&self, npz: &mut Writer<W>) -> io::Result<()> {
+        let sensor: Vec<u32> = self.presses.iter().map(|press| press.sensor).collect();
+        let references = self.presses.iter().map(|press| match press.reference {
+            None => (0, 0.0),
+            Some(Reference::Flat { width_mm }) => (1, width_mm),
+            Some(Reference::Ball { radius_mm }) => (2, radius_mm),
+        });
+        let (reference, reference_mm): (Vec<u8>, Vec<f32>) = references.unzip();
+        npz.add_list("sensor", &sensor)?;
+        npz.add_list("reference", &reference)?;
+        npz.add_list("reference_mm", &reference_mm)
     }
 }
 
@@ -448,6 +509,38 @@ mod tests {
         }
     }
 
+    #[test]
+    fn sensors_and_references_are_kept_and_checked() {
+        let mut courses = simulated();
+        let [flat, ball] = [
+            Reference::Flat { width_mm: 20.0 },
+            Reference::Ball { radius_mm: 7.5 },
+        ];
+        for (place, reference) in [(1, flat), (3, ball)] {
+            let press = &mut courses.presses[place];
+            (press.level, press.reference) = (0, Some(reference));
+            (press.shore, press.sensor) = (50.0, place as u32);
+        }
+        assert!(round_trip(&courses).unwrap() == courses);
+        let frames = courses.best_frames(Path::new("a"), Source::default());
+        assert_eq!(frames.samples.len(), courses.presses.len() - 2);
+        courses.presses[3].level = 2;
+        let error = round_trip(&courses).unwrap_err().to_string();
+        assert!(
+            error.contains("`level`: found 2 of press 3, a reference, expected 0"),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn sensors_of_different_files_stay_apart() {
+        let directory = tempfile::tempdir().unwrap();
+        let one = written(directory.path(), "one", &[0, 4], 3.5);
+        let (all, _) = Courses::read_all(&[one.clone(), one]).unwrap();
+        let sensors: Vec<u32> = all.presses.iter().map(|press| press.sensor).collect();
+        assert_eq!(sensors, [0, 0, 1, 1]);
+    }
+
     /// Writes a file with these objects and this pitch into a directory.
     fn written(directory: &Path, name: &str, objects: &[u32], pitch_mm: f64) -> PathBuf {
         let mut courses = Courses::default();
@@ -460,6 +553,8 @@ mod tests {
                 shore: 80.0,
                 force_n: 1.0,
                 arm_n_per_mm: 0.0,
+                sensor: 0,
+                reference: None,
                 best: 0,
             };
             courses.push(press, [(0.0, None, &ModelFrame::default())].into_iter());

@@ -18,32 +18,30 @@ use hardnessd_simulator::{
     LevelRange, Materials,
 };
 
-/// Simulates samples on all cores, with a progress bar on a terminal.
-pub fn simulate(settings: &DatasetSettings) -> Vec<LabelledSample> {
-    with_bar(settings.samples(), "samples", |threads, progress| {
-        hardnessd_simulator::dataset(settings, threads, progress)
+/// Simulates samples on `jobs` threads, with a progress bar on a terminal.
+pub fn simulate(settings: &DatasetSettings, jobs: usize) -> Vec<LabelledSample> {
+    with_bar(settings.samples(), "samples", |progress| {
+        hardnessd_simulator::dataset(settings, jobs, progress)
     })
 }
 
 /// Like [`simulate`], for whole presses.
-pub fn simulate_courses(settings: &CourseSettings) -> Vec<LabelledCourse> {
-    with_bar(
-        settings.objects.samples(),
-        "presses",
-        |threads, progress| hardnessd_simulator::courses(settings, threads, progress),
-    )
+pub fn simulate_courses(settings: &CourseSettings, jobs: usize) -> Vec<LabelledCourse> {
+    with_bar(settings.presses(), "presses", |progress| {
+        hardnessd_simulator::courses(settings, jobs, progress)
+    })
 }
 
-fn with_bar<T>(
-    total: u64,
-    what: &str,
-    make: impl FnOnce(usize, &(dyn Fn(usize) + Sync)) -> T,
-) -> T {
-    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+/// The number of cores.
+pub fn all_cores() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
+}
+
+fn with_bar<T>(total: u64, what: &str, make: impl FnOnce(&(dyn Fn(usize) + Sync)) -> T) -> T {
     let style = format!("{{bar:30}} {{pos}}/{{len}} {what}, {{per_sec}}, {{eta}} left");
     let style = ProgressStyle::with_template(&style).expect("the template is right");
     let bar = ProgressBar::new(total).with_style(style);
-    let made = make(threads, &|done| bar.set_position(done as u64));
+    let made = make(&|done| bar.set_position(done as u64));
     bar.finish_and_clear();
     made
 }
@@ -66,7 +64,8 @@ pub fn to_bytes(
     settings: &DatasetSettings,
     samples: Vec<LabelledSample>,
 ) -> anyhow::Result<Vec<u8>> {
-    let meta = meta(settings, &json!(settings));
+    let names = hardnessd_simulator::material_names(settings.materials);
+    let meta = meta(settings, &names, &json!(settings));
     let samples: Vec<Sample> = samples.into_iter().map(Sample::from).collect();
     Ok(dataset::write(Cursor::new(Vec::new()), &samples, &meta)?.into_inner())
 }
@@ -80,14 +79,19 @@ pub fn courses_to_bytes(
     settings: &CourseSettings,
     courses: &[LabelledCourse],
 ) -> anyhow::Result<Vec<u8>> {
-    let meta = meta(&settings.objects, &json!(settings));
+    let names = settings.material_names();
+    let meta = meta(&settings.objects, &names, &json!(settings));
     let out = Cursor::new(Vec::new());
     Ok(Courses::of(courses).write(out, &meta)?.into_inner())
 }
 
-fn meta(objects: &DatasetSettings, settings: &serde_json::Value) -> serde_json::Value {
+fn meta(
+    objects: &DatasetSettings,
+    materials: &[&str],
+    settings: &serde_json::Value,
+) -> serde_json::Value {
     json!({
-        "materials": hardnessd_simulator::material_names(objects.materials),
+        "materials": materials,
         "levels": levels(objects),
         "seed": objects.seed,
         "generator": format!("{SIMULATOR} {}", env!("CARGO_PKG_VERSION")),

@@ -12,7 +12,7 @@ use hardnessd_core::press;
 use hardnessd_core::verdict::ModelFrame;
 use hardnessd_simulator::{
     CourseMoment, LabelledCourse, LabelledSample, Material, Materials, NEWTONS_PER_COUNT,
-    material_names,
+    Reference, material_names,
 };
 
 /// Frames in a row of the sheet.
@@ -173,19 +173,73 @@ pub fn courses(courses: &[LabelledCourse]) -> anyhow::Result<Vec<u8>> {
         let key = (course.material, course.level);
         shown.entry(key).or_insert(course);
     }
-    let newtons = |moment: &CourseMoment| of_counts(&moment.counts);
-    let frames: Vec<(&LabelledCourse, Vec<ModelFrame>)> = shown
-        .into_values()
-        .map(|course| (course, course.moments.iter().map(newtons).collect()))
+    let named = shown.into_values().map(|course| {
+        let name = material_names(Materials::Broad)[usize::from(course.material)];
+        let name = format!("{} {:.0}", name.trim_start_matches("broad-"), course.shore);
+        (name, course)
+    });
+    over_time("names with Shore hardness", named)
+}
+
+/// The number of presses of [`sensors`], and of sensors that read each.
+const SHOWN: (usize, usize) = (3, 5);
+
+/// Draws what several sensors read of the same press of an object, a flat piece and a ball. The
+/// captions are those of [`courses`].
+///
+/// # Errors
+///
+/// Returns an error if the PNG encoder fails.
+pub fn sensors(courses: &[LabelledCourse]) -> anyhow::Result<Vec<u8>> {
+    // The sensors that read a press have its object and its force in common.
+    let mut presses: BTreeMap<(u32, u32), Vec<&LabelledCourse>> = BTreeMap::new();
+    for course in courses {
+        let key = (course.object, course.force_n.to_bits());
+        presses.entry(key).or_default().push(course);
+    }
+    let of = |wanted: fn(&LabelledCourse) -> bool| {
+        let presses = presses.values().filter(|press| wanted(press[0]));
+        presses.max_by_key(|press| press.len())
+    };
+    let kinds: [fn(&LabelledCourse) -> bool; SHOWN.0] = [
+        |course| course.reference.is_none(),
+        |course| matches!(course.reference, Some(Reference::Flat { .. })),
+        |course| matches!(course.reference, Some(Reference::Ball { .. })),
+    ];
+    let named = kinds.into_iter().filter_map(of).flat_map(|press| {
+        press.iter().take(SHOWN.1).map(|course| {
+            let what = match course.reference {
+                None => format!("{:.0}", course.shore),
+                Some(Reference::Flat { .. }) => "flat".to_owned(),
+                Some(Reference::Ball { radius_mm }) => format!("r {radius_mm:.0}"),
+            };
+            let (sensor, force_n) = (course.sensor, course.force_n);
+            (format!("{sensor}: {what}, {force_n:.0} N"), *course)
+        })
+    });
+    over_time(
+        "names with sensor, Shore hardness and greatest force",
+        named,
+    )
+}
+
+fn over_time<'a>(
+    names: &str,
+    named: impl Iterator<Item = (String, &'a LabelledCourse)>,
+) -> anyhow::Result<Vec<u8>> {
+    let newtons = |moment: &CourseMoment| ModelFrame {
+        newtons: std::array::from_fn(|k| 1e-3 * f32::from(moment.millinewtons[k])),
+    };
+    let frames: Vec<(String, &LabelledCourse, Vec<ModelFrame>)> = named
+        .map(|(name, course)| (name, course, course.moments.iter().map(newtons).collect()))
         .collect();
     let rows: Vec<Strip> = frames
         .iter()
-        .map(|(course, frames)| {
+        .map(|(name, course, frames)| {
             let pairs: Vec<(&CourseMoment, &ModelFrame)> =
                 course.moments.iter().zip(frames).collect();
-            let name = material_names(Materials::Broad)[usize::from(course.material)];
             Strip {
-                name: format!("{} {:.0}", name.trim_start_matches("broad-"), course.shore),
+                name: name.clone(),
                 tiles: spread(&pairs)
                     .map(|&(moment, frame)| {
                         let (time_s, mm) = (moment.time_s, moment.approach_mm);
@@ -195,9 +249,8 @@ pub fn courses(courses: &[LabelledCourse]) -> anyhow::Result<Vec<u8>> {
             }
         })
         .collect();
-    let title =
-        "presses over time: seconds, approach in mm, newtons read; names with Shore hardness";
-    strips(title, &rows)
+    let title = format!("presses over time: seconds, approach in mm, newtons read; {names}");
+    strips(&title, &rows)
 }
 
 /// Up to [`TILES`] of `items`, from the first to the last at even distances.

@@ -178,6 +178,8 @@ mod tests {
                     shore: f32::NAN,
                     force_n: 1.0,
                     arm_n_per_mm: 0.0,
+                    sensor: 0,
+                    reference: None,
                     best: 0,
                 });
             }

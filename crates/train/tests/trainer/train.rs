@@ -841,6 +841,39 @@ fn presses_over_time_are_data_too() {
 }
 
 #[test]
+fn presses_on_many_sensors_are_files_of_whole_sensors() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name);
+    let (out, sheet) = (path("w.npz"), path("w.png"));
+    let options = "simulate --sequences --sensors broad --materials broad --objects 2 --test-objects 1 \
+                   --presses 1 --covers 2 --test-covers 1 --electronics 2 --shards 2 --jobs 2";
+    let files = [
+        "--out",
+        out.to_str().unwrap(),
+        "--sheet",
+        sheet.to_str().unwrap(),
+    ];
+    let arguments: Vec<&str> = options.split_whitespace().chain(files).collect();
+    let said = succeed(&arguments);
+    assert_eq!(said.lines().count(), 2, "{said}");
+    assert!(std::fs::read(&sheet).unwrap().starts_with(b"\x89PNG"));
+    let (first, second) = (path("w-0.npz"), path("w-1.npz"));
+    let bytes = [&first, &second].map(|path| std::fs::read(path).unwrap());
+    succeed(&arguments);
+    assert!(bytes == [&first, &second].map(|path| std::fs::read(path).unwrap()));
+    // Covers 0 and 2 are in the first file: sensors 0, 1, 4 and 5.
+    let courses = Courses::read(&first).unwrap();
+    let mut sensors: Vec<u32> = courses.presses.iter().map(|press| press.sensor).collect();
+    sensors.dedup();
+    sensors.sort_unstable();
+    sensors.dedup();
+    assert_eq!(sensors, [0, 1, 4, 5]);
+    let (all, _) = Courses::read_all(&[first, second]).unwrap();
+    let references = all.presses.iter().filter(|press| press.reference.is_some());
+    assert!((40..=60).contains(&references.count()), "{said}");
+}
+
+#[test]
 fn bad_input_has_its_exit_code_and_one_line() {
     let path = |name: &str| data().0.path().join(name).to_str().unwrap().to_owned();
     let (data, missing, text, out) = (

@@ -119,6 +119,10 @@ pub(super) struct Simulate {
     #[arg(long, value_name = "MPA", default_value_t = DatasetSettings::default().cover_young_mpa,
           value_parser = cover_mpa)]
     pub(super) cover: f64,
+    /// Calibrate each sensor with weights: the mean sum of its taxels is then the force of the press,
+    /// and not a tenth more
+    #[arg(long)]
+    pub(super) calibrated: bool,
     /// Levels whose two materials change roles, such as 24: the paper's test material trains
     #[arg(long, value_name = "LEVELS", value_parser = swapped_levels)]
     pub(super) swapped_levels: Option<[bool; 4]>,
@@ -131,8 +135,18 @@ pub(super) struct Simulate {
     /// Whole presses over time, with the arm's positions, in place of one frame a press
     #[arg(long)]
     pub(super) sequences: bool,
+    /// Threads that simulate [default: as many as cores]
+    #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=1024))]
+    pub(super) jobs: Option<usize>,
     #[command(flatten)]
     pub(super) courses: Courses,
+}
+
+/// Sensors of `simulate --sequences` other than the usual ones.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(super) enum Sensors {
+    /// Many sensors, each of a design of its own, with presses of rigid pieces on each
+    Broad,
 }
 
 /// Options of `--sequences`. Each press draws its own value between two numbers, or takes the one number.
@@ -163,6 +177,28 @@ pub(super) struct Courses {
     /// Share of the presses in which the arm reports nothing, 0 to 1 [default: 0]
     #[arg(long, value_name = "SHARE", value_parser = part::<100>)]
     pub(super) unknown: Option<f64>,
+    /// Sensors: broad (each has a design of its own, and presses of rigid pieces that show what it
+    /// reads) [default: eight instances of one design in each split]
+    #[arg(long, value_enum, hide_possible_values = true,
+          conflicts_with_all = ["sensor_profile", "one_sensor", "cover", "calibrated"])]
+    pub(super) sensors: Option<Sensors>,
+    /// Covers of broad sensors that training objects are pressed on, each with an arm of its own; at most
+    /// one for each object of a material [default: 200]
+    #[arg(long, value_name = "N", requires = "sensors",
+          value_parser = clap::value_parser!(u32).range(1..=MOST))]
+    pub(super) covers: Option<u32>,
+    /// The same for test objects [default: 20]
+    #[arg(long, value_name = "N", requires = "sensors",
+          value_parser = clap::value_parser!(u32).range(1..=MOST))]
+    pub(super) test_covers: Option<u32>,
+    /// Sensors under each of these covers. All of them read each press on it [default: 8]
+    #[arg(long, value_name = "N", requires = "sensors",
+          value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub(super) electronics: Option<u32>,
+    /// Write this many files in place of one, each with other covers: D-0.npz, D-1.npz, ... [default: 1]
+    #[arg(long, value_name = "N", requires = "sensors",
+          value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub(super) shards: Option<u32>,
 }
 
 #[derive(Debug, clap::Args)]

@@ -1,15 +1,17 @@
 //! `hrn-train simulate`.
 
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use hardnessd_core::frame::RawFrame;
 use hardnessd_simulator::{
-    Borders, CourseSettings, DatasetSettings, Laws, Material, Materials, Sequence, SequenceSettings,
+    Borders, BroadSensors, CourseSettings, DatasetSettings, Laws, Material, Materials, Sequence,
+    SequenceSettings,
 };
 use hrn_train::data::simulated;
 use hrn_train::judge::sheet;
 
-use super::arguments::Simulate;
+use super::arguments::{Sensors, Simulate};
 use super::failure::{NoObjects, OtherMaterials};
 use super::files::{apart, write};
 
@@ -55,6 +57,7 @@ fn simulated_settings(arguments: &Simulate) -> Result<DatasetSettings, OtherMate
         sensor_seed: arguments.one_sensor,
         one_sensor: arguments.one_sensor.is_some(),
         cover_young_mpa: arguments.cover,
+        calibrated: arguments.calibrated,
         swapped_levels: arguments.swapped_levels.unwrap_or_default(),
     })
 }
@@ -71,7 +74,7 @@ pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
         return simulate_courses(arguments, settings);
     }
     let begun = Instant::now();
-    let samples = simulated::simulate(&settings);
+    let samples = simulated::simulate(&settings, jobs(arguments));
     let seconds = begun.elapsed().as_secs_f64();
 
     let count = samples.len();
@@ -99,6 +102,15 @@ pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
 
 fn simulate_courses(arguments: &Simulate, objects: DatasetSettings) -> anyhow::Result<String> {
     let (asked, usual) = (&arguments.courses, CourseSettings::default());
+    let is_broad = matches!(asked.sensors, Some(Sensors::Broad));
+    let usual = CourseSettings {
+        arm_error: if is_broad {
+            BROAD_ARM_ERROR
+        } else {
+            usual.arm_error
+        },
+        ..usual
+    };
     let settings = CourseSettings {
         objects,
         frame_rate_hz: asked.fps.unwrap_or(usual.frame_rate_hz),
@@ -109,30 +121,87 @@ fn simulate_courses(arguments: &Simulate, objects: DatasetSettings) -> anyhow::R
         arm_error: asked.arm_error.unwrap_or(usual.arm_error),
         clock_error_frames: asked.clock_error.unwrap_or(usual.clock_error_frames),
         unknown_share: asked.unknown.unwrap_or(usual.unknown_share),
+        sensors: None,
     };
+    if !is_broad {
+        return write_courses(arguments, &settings, &arguments.out);
+    }
+    let usual = BroadSensors::default();
+    let shards = asked.shards.unwrap_or(usual.shards);
+    let mut said = String::new();
+    for shard in 0..shards {
+        let sensors = BroadSensors {
+            covers: asked.covers.unwrap_or(usual.covers),
+            test_covers: asked.test_covers.unwrap_or(usual.test_covers),
+            electronics: asked.electronics.unwrap_or(usual.electronics),
+            shard,
+            shards,
+        };
+        let settings = CourseSettings {
+            sensors: Some(sensors),
+            ..settings
+        };
+        let out = if shards > 1 {
+            numbered(&arguments.out, shard)
+        } else {
+            arguments.out.clone()
+        };
+        said += &write_courses(arguments, &settings, &out)?;
+    }
+    Ok(said)
+}
+
+/// Error of the stiffness that the robot of a broad sensor reports.
+const BROAD_ARM_ERROR: f64 = 0.15;
+
+/// `D-3.npz` for part 3 of `D.npz`.
+fn numbered(path: &Path, part: u32) -> PathBuf {
+    let mut name = path.file_stem().unwrap_or_default().to_owned();
+    name.push(format!("-{part}"));
+    if let Some(extension) = path.extension() {
+        name.push(".");
+        name.push(extension);
+    }
+    path.with_file_name(name)
+}
+
+/// Simulates and writes one file of whole presses. The first of several files makes the sheet.
+fn write_courses(
+    arguments: &Simulate,
+    settings: &CourseSettings,
+    out: &Path,
+) -> anyhow::Result<String> {
     let begun = Instant::now();
-    let courses = simulated::simulate_courses(&settings);
+    let courses = simulated::simulate_courses(settings, jobs(arguments));
     let seconds = begun.elapsed().as_secs_f64();
-    let sheet = match &arguments.sheet {
-        Some(path) => Some((path, sheet::courses(&courses)?)),
-        None => None,
+    let shard = settings.sensors.map(|sensors| sensors.shard);
+    let sheet = match (&arguments.sheet, shard) {
+        (Some(path), None) => Some((path, sheet::courses(&courses)?)),
+        (Some(path), Some(0)) => Some((path, sheet::sensors(&courses)?)),
+        (Some(_), Some(_)) | (None, _) => None,
     };
-    write(
-        &arguments.out,
-        &simulated::courses_to_bytes(&settings, &courses)?,
-    )?;
+    write(out, &simulated::courses_to_bytes(settings, &courses)?)?;
     if let Some((path, picture)) = sheet {
         write(path, &picture)?;
     }
-    let (count, wanted) = (courses.len() as u64, settings.objects.samples());
+    let (count, wanted) = (courses.len() as u64, settings.presses());
     let frames: usize = courses.iter().map(|course| course.moments.len()).sum();
+    let unseen = if shard.is_some() {
+        "their sensor did not see one press, or they lasted over 30 s"
+    } else {
+        "they never began, or lasted over 30 s"
+    };
     Ok(format!(
         "{}: {count} presses, {frames} frames in {seconds:.1} s, {:.0} presses a minute; {} left out: \
-         they never began, or lasted over 30 s\n",
-        arguments.out.display(),
+         {unseen}\n",
+        out.display(),
         60.0 * count as f64 / seconds,
         wanted - count
     ))
+}
+
+fn jobs(arguments: &Simulate) -> usize {
+    arguments.jobs.unwrap_or_else(simulated::all_cores)
 }
 
 /// One press of each training material, as the frames that the sensor sends over time.

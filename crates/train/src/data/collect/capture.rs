@@ -55,6 +55,8 @@ pub(super) fn part(path: &Path, bytes: &[u8], settings: &Settings) -> Result<Par
                 shore: shore.unwrap_or(f32::NAN),
                 force_n: judged.force_n,
                 arm_n_per_mm: judged.arm_n_per_mm,
+                sensor: 0,
+                reference: None,
                 best: judged.best as u32,
             };
             let moments = judged.moments.iter();

@@ -244,7 +244,7 @@ impl<'a> File<'a> {
 
     /// Reads an array of `n` (or any number of) elements of shape `inner`, row-major. `None` if it
     /// is missing. If its header is not as expected, the rest is not unpacked.
-    fn read<T: Element>(
+    pub(in crate::data) fn read<T: Element>(
         &mut self,
         array: &'static str,
         inner: &[usize],

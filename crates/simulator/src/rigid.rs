@@ -1,0 +1,158 @@
+//! The rigid pieces that a user presses on a sensor: weights, which calibrate it, and references,
+//! which show what it reads of a known form.
+
+use super::object::{Face, Pose};
+use super::press::{Bench, Specimen, Window};
+use super::sensor::{Film, Sensor};
+use super::substance::{Creep, Law, Substance, Texture};
+use super::texture::Patch;
+use crate::random::Stream;
+
+/// Width of the flat piece, mm.
+pub(super) const FLAT_MM: f64 = 20.0;
+/// Modulus of steel and of hard plastics alike, beside which every cover is soft, MPa.
+const YOUNG_MPA: f64 = 3000.0;
+
+/// The weights in N, from 0.2 to 2 kg, each put down in some places.
+const WEIGHTS_N: [f64; 4] = [2.0, 5.0, 10.0, 20.0];
+const PLACES: u64 = 3;
+/// How long a weight lies before it is read, s.
+const WEIGHT_S: f64 = 2.0;
+
+/// A face of a rigid piece in a pose that is drawn.
+pub(super) fn specimen(face: &Face, stream: &mut Stream) -> Specimen {
+    let texture = Texture {
+        rms_um: 1.0,
+        shortest_mm: 4.0,
+        longest_mm: 20.0,
+        hurst: 0.8,
+        anisotropy: 1.0,
+    };
+    let substance = Substance {
+        nu: 0.3,
+        law: Law::Solid,
+        creep: [Creep::NONE; 2],
+        texture,
+    };
+    let pose = Pose::draw(face, stream);
+    let patch = Patch::new(&texture, 1.0, super::sensor::CELL_MM, stream);
+    Specimen::new(substance, YOUNG_MPA, face, &pose, &patch)
+}
+
+/// A weight on the sensor: the pressure under its flat face.
+#[derive(Debug)]
+pub(super) struct Weight {
+    force_n: f64,
+    window: Window,
+    pressure: Vec<f32>,
+}
+
+/// The weights on sensors under one cover.
+pub(super) fn weights(bench: &mut Bench) -> Vec<Weight> {
+    let face = Face::flat(0.5 * FLAT_MM);
+    let stream = Stream::new(0, "places of weights");
+    let mut weights = Vec::new();
+    for place in 0..PLACES {
+        let specimen = specimen(&face, &mut stream.child(place));
+        for force_n in WEIGHTS_N {
+            let (window, pressure, _) = bench.press(&specimen, force_n, 0.0, WEIGHT_S);
+            weights.push(Weight {
+                force_n,
+                window,
+                pressure,
+            });
+        }
+    }
+    weights
+}
+
+impl Sensor {
+    /// The newtons that the sensor reads under a weight.
+    fn weighs(&self, weight: &Weight, noise: &mut Stream) -> f64 {
+        let forces = self.grid.taxel_forces(&weight.pressure, weight.window);
+        let felt = Film::new(&self.design).advance(&self.design, &forces, WEIGHT_S);
+        self.tared(&self.read(&felt, 1.0, noise)).force_n()
+    }
+
+    /// Sets the newtons of a count so that the sums under the weights are right on average. A user
+    /// who weighs a sensor finds its scale, and takes its response for linear.
+    pub(super) fn calibrate(&mut self, weights: &[Weight]) {
+        let mut noise = Stream::new(0, "weights");
+        let read_n: f64 = weights.iter().map(|w| self.weighs(w, &mut noise)).sum();
+        let force_n: f64 = weights.iter().map(|weight| weight.force_n).sum();
+        if read_n > 0.0 {
+            self.newtons_per_count *= (force_n / read_n) as f32;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::press::Cover;
+    use super::super::sensor::{Design, SensorProfile};
+    use super::*;
+
+    /// The mean sum over the force, on pieces that are no weights.
+    fn reads(sensor: &Sensor, bench: &mut Bench) -> f64 {
+        let (mut read, mut force) = (0.0, 0.0);
+        let mut noise = Stream::new(8, "noise");
+        for (face, place) in [
+            (Face::flat(12.0), 1),
+            (Face::ball(30.0), 2),
+            (Face::flat(8.0), 3),
+        ] {
+            let specimen = specimen(&face, &mut Stream::new(9, "pieces").child(place));
+            for force_n in [3.0, 7.0, 15.0] {
+                let (window, pressure, _) = bench.press(&specimen, force_n, 0.0, 1.0);
+                let weight = Weight {
+                    force_n,
+                    window,
+                    pressure,
+                };
+                read += sensor.weighs(&weight, &mut noise);
+                force += force_n;
+            }
+        }
+        read / force
+    }
+
+    #[test]
+    fn the_mean_sum_of_a_calibrated_sensor_is_the_force() {
+        let mut bench = Bench::under(Cover::of(1.0));
+        let weights = weights(&mut bench);
+        let mut off = Vec::new();
+        for pitch_mm in [1.75, 2.5, 3.5, 5.0] {
+            let design = Design::jx255n(SensorProfile::Clean).at_pitch(pitch_mm);
+            let mut sensor = Sensor::draw(design, &Stream::new(7, "sensor"));
+            off.push(reads(&sensor, &mut bench) - 1.0);
+            sensor.calibrate(&weights);
+            let ratio = reads(&sensor, &mut bench);
+            assert!(
+                (ratio - 1.0).abs() < 0.03,
+                "{pitch_mm} mm: {ratio} of the force"
+            );
+        }
+        // Without weights, the sums are a tenth above the force.
+        assert!(off.iter().all(|off| (0.03..0.2).contains(off)), "{off:?}");
+    }
+
+    #[test]
+    fn the_mean_sum_of_many_calibrated_broad_sensors_is_the_force() {
+        let mut bench = Bench::under(Cover::of(1.0));
+        let weights = weights(&mut bench);
+        let ratios = (0..40).map(|k| {
+            let draws = Stream::new(5, "broad").child(k);
+            let design = Design::broad(1.0, &mut draws.child(0));
+            let mut sensor = Sensor::draw(design, &draws.child(1));
+            sensor.calibrate(&weights);
+            reads(&sensor, &mut bench)
+        });
+        let ratios: Vec<f64> = ratios.collect();
+        let mean = ratios.iter().sum::<f64>() / 40.0;
+        assert!((mean - 1.0).abs() < 0.05, "{mean}: {ratios:?}");
+        assert!(
+            ratios.iter().all(|ratio| (0.5..2.0).contains(ratio)),
+            "{ratios:?}"
+        );
+    }
+}

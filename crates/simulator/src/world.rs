@@ -1,0 +1,472 @@
+//! A world of sensors: presses on many sensors, each of a design of its own, with presses of rigid
+//! pieces that show what each sensor reads.
+//!
+//! The cover and the arm belong to a contact, which is costly to solve. So a number of covers is
+//! drawn, objects are pressed on each, and several electronics read each of these presses: a
+//! sensor is one electronics under one cover. Train and test sensors share nothing.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use serde::{Deserialize, Serialize};
+
+use super::course::SolvedPress;
+use super::courses::{CourseSettings, LabelledCourse, Plan, Reading, Reference, read_press};
+use super::material::Split;
+use super::object::Face;
+use super::press::{Bench, Cover};
+use super::rigid::{self, FLAT_MM, Weight};
+use super::sensor::{Design, Sensor};
+use super::settings::DatasetSettings;
+use super::subject::{Subject, Unit, shared_out, units};
+use crate::random::{Stream, log_even};
+
+/// The sensors of a broad data set.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct BroadSensors {
+    /// The number of covers that training objects are pressed on, at most one for each object of a
+    /// material.
+    pub covers: u32,
+    /// The number of covers for test objects.
+    pub test_covers: u32,
+    /// The number of electronics that read the presses on each cover.
+    pub electronics: u32,
+    /// The part of the covers that is made, from 0, of `shards` parts.
+    pub shard: u32,
+    /// The number of parts.
+    pub shards: u32,
+}
+
+impl Default for BroadSensors {
+    /// 1,600 + 160 sensors.
+    fn default() -> Self {
+        Self {
+            covers: 200,
+            test_covers: 20,
+            electronics: 8,
+            shard: 0,
+            shards: 1,
+        }
+    }
+}
+
+/// Presses of each rigid piece on each sensor.
+pub const REFERENCES: u32 = 5;
+/// Their forces, N: log-uniform, one in each fifth of this range.
+const REFERENCE_N: [f64; 2] = [3.0, 25.0];
+/// Radius of the rigid ball of a cover, mm.
+const BALL_MM: [f64; 2] = [5.0, 20.0];
+/// The covers: Young's modulus in MPa, and thickness.
+const COVER_MPA: [f64; 2] = [0.3, 20.0];
+const COVER_MM: [f64; 2] = [0.5, 4.0];
+/// The factor on the newtons of the sensors whose users state wrong ones, and how many these are.
+const WRONG: [f64; 2] = [0.5, 2.0];
+const WRONG_SHARE: f64 = 0.5;
+
+/// One cover with the objects that are pressed on it.
+#[derive(Clone, Copy)]
+struct Place {
+    split: Split,
+    number: u32,
+    /// Number of the cover over both splits.
+    index: u32,
+}
+
+impl BroadSensors {
+    /// The covers of this shard that objects are pressed on, and the number of all covers.
+    fn places(&self, of: &DatasetSettings) -> Vec<Place> {
+        let train = self.covers.min(of.objects);
+        let test = self.test_covers.min(of.test_objects);
+        let of_split = |split, first, count| {
+            (0..count).map(move |number| Place {
+                split,
+                number,
+                index: first + number,
+            })
+        };
+        of_split(Split::Train, 0, train)
+            .chain(of_split(Split::Test, train, test))
+            .filter(|place| place.index % self.shards == self.shard)
+            .collect()
+    }
+
+    /// Whether a unit's object is pressed on this cover.
+    fn is_on(&self, place: Place, unit: Unit) -> bool {
+        let covers = match place.split {
+            Split::Train => self.covers,
+            Split::Test => self.test_covers,
+        };
+        unit.split == place.split && unit.number % covers == place.number
+    }
+}
+
+impl CourseSettings {
+    /// The number of presses that the settings make, if all begin.
+    pub fn presses(&self) -> u64 {
+        let of = &self.objects;
+        let Some(sensors) = &self.sensors else {
+            return of.samples();
+        };
+        let units = units(of);
+        let places = sensors.places(of);
+        let objects = |place: &Place| {
+            let own = units.iter().filter(|&&unit| sensors.is_on(*place, unit));
+            own.count() as u64
+        };
+        let contacts = |place| objects(place) * u64::from(of.presses) + 2 * u64::from(REFERENCES);
+        places.iter().map(contacts).sum::<u64>() * u64::from(sensors.electronics)
+    }
+
+    /// The names that a press's `material` indexes.
+    pub fn material_names(&self) -> Vec<&'static str> {
+        let mut names = super::material_names(self.objects.materials);
+        names.extend(self.sensors.map(|_| "rigid"));
+        names
+    }
+}
+
+/// Simulates the presses of one shard; see [`super::courses()`].
+pub(super) fn courses(
+    settings: &CourseSettings,
+    sensors: &BroadSensors,
+    threads: usize,
+    progress: impl Fn(usize) + Sync,
+) -> Vec<LabelledCourse> {
+    let units = units(&settings.objects);
+    let places = sensors.places(&settings.objects);
+    let done = AtomicUsize::new(0);
+    let progress = || progress(done.fetch_add(1, Ordering::Relaxed) + 1);
+    shared_out(
+        &places,
+        threads,
+        || (),
+        |(), _, place| {
+            let mut station = Station::draw(settings, sensors, place);
+            let mut made = station.references(units.len() as u32, &progress);
+            for (object, &unit) in (0_u32..).zip(&units) {
+                if sensors.is_on(place, unit) {
+                    made.extend(station.object(object, unit, &progress));
+                }
+            }
+            made
+        },
+    )
+}
+
+/// One cover on its arm, with the electronics under it.
+struct Station {
+    settings: CourseSettings,
+    place: Place,
+    draws: Stream,
+    bench: Bench,
+    ball_mm: f64,
+    electronics: Vec<Electronics>,
+}
+
+/// What reads the presses on a cover.
+struct Electronics {
+    number: u32,
+    sensor: Sensor,
+    period_s: f64,
+    arm_factor: f64,
+}
+
+impl Electronics {
+    fn draw(
+        settings: &CourseSettings,
+        number: u32,
+        cover: Cover,
+        weights: &[Weight],
+        draws: &Stream,
+    ) -> Self {
+        let design = Design::broad(cover.thickness_mm, &mut draws.child(0));
+        let mut sensor = Sensor::draw(design, &draws.child(1));
+        sensor.calibrate(weights);
+        let mut own = draws.child(2);
+        let wrong = log_even(WRONG, &mut own);
+        if own.uniform() < WRONG_SHARE {
+            sensor.newtons_per_count *= wrong as f32;
+        }
+        Self {
+            number,
+            sensor,
+            period_s: 1.0 / log_even(settings.frame_rate_hz, &mut own),
+            arm_factor: 1.0 + own.range(-settings.arm_error, settings.arm_error),
+        }
+    }
+
+    /// How these electronics read a press of this plan.
+    fn reading(&self, plan: &Plan, noise: &mut Stream) -> Reading {
+        let mut reading = plan.reading;
+        reading.period_s = self.period_s;
+        reading.phase = noise.uniform();
+        reading.errors.arm_factor = self.arm_factor;
+        reading
+    }
+}
+
+impl Station {
+    fn draw(settings: &CourseSettings, sensors: &BroadSensors, place: Place) -> Self {
+        let of = &settings.objects;
+        let name = match place.split {
+            Split::Train => "train covers",
+            Split::Test => "test covers",
+        };
+        let seed = of.sensor_seed.unwrap_or(of.seed);
+        let draws = Stream::new(seed, name).child(u64::from(place.number));
+        let mut own = draws.child(0);
+        let cover = Cover {
+            young_mpa: log_even(COVER_MPA, &mut own),
+            thickness_mm: log_even(COVER_MM, &mut own),
+        };
+        let arm_n_per_mm = log_even(settings.arm_n_per_mm, &mut own);
+        let mut bench = Bench::under(cover);
+        let weights = rigid::weights(&mut bench);
+        let electronics = |k: u32| {
+            let draws = draws.child(1).child(u64::from(k));
+            let number = place.index * sensors.electronics + k;
+            Electronics::draw(settings, number, cover, &weights, &draws)
+        };
+        Self {
+            settings: CourseSettings {
+                arm_n_per_mm: [arm_n_per_mm; 2],
+                ..*settings
+            },
+            place,
+            ball_mm: log_even(BALL_MM, &mut own),
+            electronics: (0..sensors.electronics).map(electronics).collect(),
+            draws,
+            bench,
+        }
+    }
+
+    /// The presses of the rigid pieces. `objects` is the number of the data set's other objects.
+    fn references(&mut self, objects: u32, progress: &impl Fn()) -> Vec<LabelledCourse> {
+        let (width_mm, radius_mm) = (FLAT_MM as f32, self.ball_mm as f32);
+        let pieces = [
+            (Reference::Flat { width_mm }, Face::flat(0.5 * FLAT_MM)),
+            (Reference::Ball { radius_mm }, Face::ball(self.ball_mm)),
+        ];
+        let material = self.settings.material_names().len() as u8 - 1;
+        let mut made = Vec::new();
+        for (piece, (reference, face)) in (0_u32..).zip(pieces) {
+            for press in 0..REFERENCES {
+                let draws = self
+                    .draws
+                    .child(2)
+                    .child((piece * REFERENCES + press).into());
+                let mut own = draws.child(0);
+                let plan = Plan::draw(&self.settings, &mut own);
+                let part = (f64::from(press) + own.uniform()) / f64::from(REFERENCES);
+                let [least, most] = REFERENCE_N;
+                let force_n = least * (most / least).powf(part);
+                let specimen = rigid::specimen(&face, &mut draws.child(1));
+                let (arm, hold_s) = (plan.arm, plan.hold_s);
+                let solved = SolvedPress::new(&mut self.bench, &specimen, arm, force_n, hold_s);
+                for electronics in &self.electronics {
+                    let mut noise = draws.child(2).child(u64::from(electronics.number));
+                    let reading = electronics.reading(&plan, &mut noise);
+                    progress();
+                    let read = read_press(&electronics.sensor, &solved, &reading, &mut noise);
+                    made.extend(read.map(|read| LabelledCourse {
+                        moments: read.moments,
+                        best: read.best,
+                        arm_n_per_mm: plan.reported_n_per_mm(&reading),
+                        level: 0,
+                        object: objects + 2 * self.place.index + piece,
+                        material,
+                        force_n: force_n as f32,
+                        split: self.place.split,
+                        shore: f32::NAN,
+                        sensor: electronics.number,
+                        reference: Some(reference),
+                        young_mpa: f32::INFINITY,
+                        frame_rate_hz: (1.0 / reading.period_s) as f32,
+                        speed_mm_s: plan.arm.speed_mm_s as f32,
+                    }));
+                }
+            }
+        }
+        made
+    }
+
+    /// The presses of one object. A press that only some of the electronics see is in the data set
+    /// for these.
+    fn object(&mut self, object: u32, unit: Unit, progress: &impl Fn()) -> Vec<LabelledCourse> {
+        let subject = Subject::draw(&self.settings.objects, unit, &[]);
+        let mut made = Vec::new();
+        for press in 0..u64::from(self.settings.objects.presses) {
+            let mut paired = subject.draws.geometry.child(3).child(press);
+            let plan = Plan::draw(&self.settings, &mut paired);
+            let electronics = &self.electronics;
+            let read = subject.pressed(&mut self.bench, &plan, press, |solved, force_n, noise| {
+                let of = |electronics: &Electronics| {
+                    let mut noise = noise.child(u64::from(electronics.number));
+                    let reading = electronics.reading(&plan, &mut noise);
+                    let read = read_press(&electronics.sensor, solved, &reading, &mut noise)?;
+                    Some(LabelledCourse {
+                        sensor: electronics.number,
+                        ..subject.labelled(&plan, &reading, object, force_n, read)
+                    })
+                };
+                Some(electronics.iter().filter_map(of).collect::<Vec<_>>())
+            });
+            made.extend(read.into_iter().flatten());
+            electronics.iter().for_each(|_| progress());
+        }
+        made
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::{BTreeMap, BTreeSet};
+
+    use super::super::courses::courses;
+    use super::super::settings::Materials;
+    use super::*;
+
+    fn small(shard: u32) -> CourseSettings {
+        CourseSettings {
+            objects: DatasetSettings {
+                seed: 6,
+                materials: Materials::Broad,
+                objects: 3,
+                test_objects: 2,
+                presses: 2,
+                ..DatasetSettings::default()
+            },
+            arm_error: 0.15,
+            sensors: Some(BroadSensors {
+                covers: 2,
+                test_covers: 9,
+                electronics: 3,
+                shard,
+                shards: 2,
+            }),
+            ..CourseSettings::default()
+        }
+    }
+
+    #[test]
+    fn shards_have_whole_sensors_with_their_references_and_threads_do_not_show() {
+        let shards = [small(0), small(1)];
+        let mut sensors = BTreeSet::new();
+        let mut total = 0;
+        for settings in &shards {
+            let most = AtomicUsize::new(0);
+            let made = courses(settings, 2, |done| {
+                most.fetch_max(done, Ordering::Relaxed);
+            });
+            assert_eq!(most.into_inner() as u64, settings.presses());
+            // Shore hardness of a reference is NaN, which is not equal to itself.
+            let labels = |course: &LabelledCourse| (course.sensor, course.object, course.best);
+            let again = courses(settings, 1, |_| ());
+            assert!(
+                made.iter().map(labels).eq(again.iter().map(labels)),
+                "threads show"
+            );
+            let moments = |course: &LabelledCourse| course.moments.clone();
+            assert!(
+                made.iter().map(moments).eq(again.iter().map(moments)),
+                "threads show"
+            );
+            total += made.len();
+            let mut own: BTreeMap<u32, Vec<&LabelledCourse>> = BTreeMap::new();
+            for course in &made {
+                own.entry(course.sensor).or_default().push(course);
+            }
+            // A cover of each split, under three electronics each.
+            assert_eq!(own.len(), 6);
+            let split = |presses: &[&LabelledCourse]| presses[0].split as u8;
+            assert_eq!(
+                own.values().map(|own| u32::from(split(own))).sum::<u32>(),
+                3
+            );
+            for (sensor, presses) in own {
+                assert!(sensors.insert(sensor), "sensor {sensor} is in both");
+                assert!(presses.iter().all(|press| press.split == presses[0].split));
+                for is_ball in [false, true] {
+                    let kind = |press: &&&LabelledCourse| match press.reference {
+                        Some(Reference::Ball { .. }) => is_ball,
+                        Some(Reference::Flat { .. }) => !is_ball,
+                        None => false,
+                    };
+                    let references: Vec<_> = presses.iter().filter(kind).collect();
+                    assert!(
+                        references.len() >= 2,
+                        "sensor {sensor}: {}",
+                        references.len()
+                    );
+                    let unlabelled = |r: &&&&LabelledCourse| r.level == 0 && r.shore.is_nan();
+                    assert_eq!(
+                        references.iter().filter(unlabelled).count(),
+                        references.len()
+                    );
+                }
+                assert!(
+                    presses.iter().any(|press| press.level > 0),
+                    "sensor {sensor}"
+                );
+                let arms: BTreeSet<u32> =
+                    presses.iter().map(|p| p.arm_n_per_mm.to_bits()).collect();
+                assert_eq!(arms.len(), 1, "one arm a sensor");
+                let rates: BTreeSet<u32> =
+                    presses.iter().map(|p| p.frame_rate_hz.to_bits()).collect();
+                assert_eq!(rates.len(), 1, "one rate a sensor");
+            }
+        }
+        let wanted: u64 = shards.iter().map(CourseSettings::presses).sum();
+        assert_eq!(wanted, 4 * 3 * 10 + 4 * (3 + 2) * 2 * 3);
+        assert!(total as u64 > wanted * 7 / 10, "{total} of {wanted}");
+        let materials = shards[0].material_names();
+        assert_eq!(materials.last(), Some(&"rigid"));
+    }
+
+    #[test]
+    fn objects_and_sensors_of_a_split_are_its_own() {
+        let made = courses(&small(0), 2, |_| ());
+        let of = |split: Split, number: fn(&LabelledCourse) -> u32| -> BTreeSet<u32> {
+            let own = made.iter().filter(|course| course.split == split);
+            own.map(number).collect()
+        };
+        for number in [
+            (|course| course.object) as fn(&LabelledCourse) -> u32,
+            |course| course.sensor,
+        ] {
+            let (train, test) = (of(Split::Train, number), of(Split::Test, number));
+            assert!(!train.is_empty() && !test.is_empty() && train.is_disjoint(&test));
+        }
+    }
+
+    #[test]
+    #[ignore = "measures speed: cargo test --release"]
+    fn print_costs() {
+        let cost = |electronics| {
+            let mut settings = small(0);
+            settings.objects.objects = 8;
+            settings.objects.presses = 6;
+            settings.sensors = Some(BroadSensors {
+                covers: 8,
+                electronics,
+                ..BroadSensors::default()
+            });
+            let begun = std::time::Instant::now();
+            let made = courses(&settings, 1, |_| ());
+            let frames: usize = made.iter().map(|course| course.moments.len()).sum();
+            let presses = settings.presses() as f64;
+            (begun.elapsed().as_secs_f64(), presses, frames, made.len())
+        };
+        let (one, many) = (cost(1), cost(9));
+        let reading = (many.0 - one.0) / (many.1 - one.1);
+        let contact = one.0 / one.1 - reading;
+        println!(
+            "{:.1} ms a contact, {:.1} ms a reading, sensors included; {} presses of {}, {} frames",
+            1e3 * contact,
+            1e3 * reading,
+            many.3,
+            many.1,
+            many.2
+        );
+    }
+}
