@@ -143,7 +143,7 @@ pub struct CourseMoment {
 
 /// The condition that stops the arm.
 #[derive(Clone, Copy)]
-pub(super) enum Stop {
+enum Stop {
     Force(f64),
     /// The arm stops at this distance in mm beyond the touch, or at 25 N.
     Position(f64),

@@ -357,8 +357,8 @@ fn log_even((low, high): (f64, f64), stream: &mut Stream) -> f64 {
 const WEDGE_HEIGHT_MM: f64 = 30.0;
 
 impl Face {
-    /// A flat disc with a small edge.
-    pub(super) fn flat(radius: f64) -> Self {
+    /// A flat disc with a small edge, held to within this tilt.
+    pub(super) fn flat(radius: f64, tilt_sd_deg: f64) -> Self {
         Face {
             outline: Outline::Disc {
                 radius,
@@ -366,7 +366,7 @@ impl Face {
                 crown: 1e6,
             },
             height_mm: 20.0,
-            tilt_sd_deg: 0.1,
+            tilt_sd_deg,
             roughness: 1.0,
         }
     }

@@ -49,7 +49,8 @@ pub(super) struct Weight {
 
 /// The weights on sensors under one cover.
 pub(super) fn weights(bench: &mut Bench) -> Vec<Weight> {
-    let face = Face::flat(0.5 * FLAT_MM);
+    // A weight lies by itself, so it does not tilt.
+    let face = Face::flat(0.5 * FLAT_MM, 0.0);
     let stream = Stream::new(0, "places of weights");
     let mut weights = Vec::new();
     for place in 0..PLACES {
@@ -97,9 +98,9 @@ mod tests {
         let (mut read, mut force) = (0.0, 0.0);
         let mut noise = Stream::new(8, "noise");
         for (face, place) in [
-            (Face::flat(12.0), 1),
+            (Face::flat(12.0, 0.0), 1),
             (Face::ball(30.0), 2),
-            (Face::flat(8.0), 3),
+            (Face::flat(8.0, 0.1), 3),
         ] {
             let specimen = specimen(&face, &mut Stream::new(9, "pieces").child(place));
             for force_n in [3.0, 7.0, 15.0] {

@@ -54,6 +54,8 @@ impl Default for BroadSensors {
 pub const REFERENCES: u32 = 5;
 /// Their forces, N: log-uniform, one in each fifth of this range.
 const REFERENCE_N: [f64; 2] = [3.0, 25.0];
+/// Standard deviation of the flat piece's tilt under an arm, degrees.
+const TILT_DEG: f64 = 0.1;
 /// Radius of the rigid ball of a cover, mm.
 const BALL_MM: [f64; 2] = [5.0, 20.0];
 /// The covers: Young's modulus in MPa, and thickness.
@@ -244,7 +246,10 @@ impl Station {
     fn references(&mut self, objects: u32, progress: &impl Fn()) -> Vec<LabelledCourse> {
         let (width_mm, radius_mm) = (FLAT_MM as f32, self.ball_mm as f32);
         let pieces = [
-            (Reference::Flat { width_mm }, Face::flat(0.5 * FLAT_MM)),
+            (
+                Reference::Flat { width_mm },
+                Face::flat(0.5 * FLAT_MM, TILT_DEG),
+            ),
             (Reference::Ball { radius_mm }, Face::ball(self.ball_mm)),
         ];
         let material = self.settings.material_names().len() as u8 - 1;

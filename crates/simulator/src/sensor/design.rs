@@ -108,8 +108,9 @@ impl SensorProfile {
 pub(super) mod ranges {
     pub(crate) const PITCH_MM: [f64; 2] = [2.0, 7.0];
     pub(crate) const ACTIVE_SHARE: [f64; 2] = [0.6, 1.0];
-    /// Depth under the film's foil, over the cover's thickness.
-    pub(crate) const DEPTH: [f64; 2] = [0.6, 1.4];
+    /// Depth of stress in the cover, over the cover's thickness. The stiff base of a thin cover keeps
+    /// stress from spreading as far as in a thick one.
+    pub(crate) const DEPTH: [f64; 2] = [0.3, 1.0];
     pub(crate) const EXPONENT: [f64; 2] = [0.6, 1.7];
     pub(crate) const MOST_N: [f64; 2] = [1.5, 30.0];
     pub(crate) const THRESHOLD_N: [f64; 2] = [0.01, 0.25];

@@ -522,7 +522,11 @@ mod tests {
             (press.shore, press.sensor) = (50.0, place as u32);
         }
         assert!(round_trip(&courses).unwrap() == courses);
-        let frames = courses.best_frames(Path::new("a"), Source::default());
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("courses.npz");
+        let bytes = courses.write(Cursor::new(Vec::new()), &json!({}));
+        std::fs::write(&path, bytes.unwrap().into_inner()).unwrap();
+        let frames = single_frames(&path).unwrap();
         assert_eq!(frames.samples.len(), courses.presses.len() - 2);
         courses.presses[3].level = 2;
         let error = round_trip(&courses).unwrap_err().to_string();
