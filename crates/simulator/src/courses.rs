@@ -646,7 +646,7 @@ mod tests {
 
     #[test]
     #[ignore = "judges some hundred presses four times, half a minute: run it after a change of laying or models"]
-    fn arrays_of_other_pitches_give_the_same_levels() {
+    fn print_levels_by_pitch() {
         let frame_model = Hrn::load(hardnessd_core::verdict::BUILT_IN).unwrap();
         let course_model = std::fs::read("../../models/course.onnx").unwrap();
         let course_model = Hrn::load(&course_model).unwrap();
