@@ -88,7 +88,6 @@ const OPERATORS: &[(&str, &str)] = &[
     ("", "ReduceL1"),
     ("", "ReduceL2"),
     ("", "ReduceLogSum"),
-    ("", "ReduceLogSumExp"),
     ("", "ReduceMax"),
     ("", "ReduceMean"),
     ("", "ReduceMin"),
