@@ -5,5 +5,7 @@ pub mod file;
 pub mod evaluated;
 pub mod export;
 pub mod course;
+pub mod learners;
+pub mod foreign;
 pub mod adopt;
 pub mod review;

@@ -12,7 +12,11 @@ use prost::Message as _;
 use serde_json::json;
 use tract_onnx::pb;
 
-use super::adopt::{decode, has_course_inputs, mend_input, mend_outputs, set};
+use super::adopt::set;
+use super::foreign::{
+    Foreign, check_sums, decode, has_course_inputs, mend_input, mend_nodes, mend_opset,
+    mend_outputs,
+};
 use crate::data::dataset;
 use hardnessd_core::trial;
 use hardnessd_core::verdict::{
@@ -112,19 +116,33 @@ pub fn review(bytes: &[u8]) -> Review {
                     Err(ModelError::CheckDiffers { .. } | ModelError::ShoreDiffers { .. })
                         if !has_own_check =>
                     {
+                        if let Some(reason) = scores(&bytes) {
+                            problems.retain(|(part, ..)| *part != "outputs");
+                            problems.push(("outputs", reason, false));
+                        }
                         break;
                     }
                     Err(error) => error,
                 };
                 let part = part(&error);
-                let is_known = problems.iter().any(|(known, ..)| *known == part);
-                let is_mended = !is_known && format.mend_part(&mut proto, part);
-                if !is_known {
-                    let is_adopted = is_mended && format == Format::Frame && part != "opset";
-                    problems.push((part, error.to_string(), is_adopted));
-                }
+                let known = problems.iter_mut().find(|(known, ..)| *known == part);
+                let mended = match known {
+                    // Mending did not suffice, so `adopt` does not either.
+                    Some(problem) => {
+                        *problem = (part, error.to_string(), false);
+                        Mended::No(None)
+                    }
+                    None => {
+                        let mended = format.mend_part(&mut proto, part);
+                        let is_adopted =
+                            matches!(mended, Mended::AsByAdopt) && format == Format::Frame;
+                        let reason = mended.reason();
+                        problems.push((part, reason.unwrap_or(error.to_string()), is_adopted));
+                        mended
+                    }
+                };
                 has_own_check &= part != "hrn.check";
-                if !is_mended {
+                if matches!(mended, Mended::No(_)) {
                     stopped_at = Some(part);
                     break;
                 }
@@ -152,6 +170,28 @@ pub fn review(bytes: &[u8]) -> Review {
     Review {
         format,
         findings: format.shown().into_iter().map(finding).collect(),
+    }
+}
+
+/// Whether a part was mended in the copy of the file, and else why not.
+enum Mended {
+    /// As `adopt` does it.
+    AsByAdopt,
+    /// Only so that the parts after it can be looked at.
+    ToLookFurther(Option<Foreign>),
+    No(Option<Foreign>),
+}
+
+impl Mended {
+    /// Why `adopt` does not mend it, without the name of the part.
+    fn reason(&self) -> Option<String> {
+        let (Self::ToLookFurther(Some(reason)) | Self::No(Some(reason))) = self else {
+            return None;
+        };
+        let text = reason.to_string();
+        let without = ["inputs: ", "outputs: "].map(|part| text.strip_prefix(part));
+        let found = without.into_iter().flatten().next().map(str::to_owned);
+        Some(found.unwrap_or(text))
     }
 }
 
@@ -197,6 +237,13 @@ impl Format {
     }
 }
 
+/// Why the probabilities of a file are none, without the name of the part.
+fn scores(bytes: &[u8]) -> Option<String> {
+    let verdict = Hrn::read(bytes).and_then(|hrn| hrn.judge_check(0)).ok()?;
+    let refused = check_sums(&[verdict.probabilities]).err();
+    Mended::No(refused).reason()
+}
+
 /// The part that an error concerns.
 fn part(error: &ModelError) -> &'static str {
     match error {
@@ -212,18 +259,39 @@ fn part(error: &ModelError) -> &'static str {
 }
 
 impl Format {
-    /// Mends a part, and returns whether it did. The values only have to be right in form. Of format
-    /// 1, it mends what `adopt` would mend. It also claims a newer opset, so that the parts after it
-    /// can be looked at.
-    fn mend_part(self, proto: &mut pb::ModelProto, part: &str) -> bool {
+    /// Mends a part. The values only have to be right in form. Of format 1, it mends what `adopt` would
+    /// mend. It also claims a newer opset, so that the parts after it can be looked at.
+    fn mend_part(self, proto: &mut pb::ModelProto, part: &str) -> Mended {
+        let mut done = Vec::new();
+        let by_adopt = |result: Result<(), Foreign>| match result {
+            Ok(()) => Mended::AsByAdopt,
+            Err(reason) => Mended::No(Some(reason)),
+        };
         match part {
             "opset" => {
+                let result = match self {
+                    Self::Frame => mend_opset(proto, &mut done).map_err(Some),
+                    Self::Course => Err(None),
+                };
                 let mut sets = proto.opset_import.iter_mut();
                 let of_onnx = sets.find(|set| ["", "ai.onnx"].contains(&set.domain.as_str()));
-                of_onnx.map(|set| set.version = MIN_OPSET).is_some()
+                match (result, of_onnx) {
+                    (Ok(()), Some(_)) => Mended::AsByAdopt,
+                    (result, Some(set)) => {
+                        set.version = MIN_OPSET;
+                        Mended::ToLookFurther(result.err().flatten())
+                    }
+                    (result, None) => Mended::No(result.err().flatten()),
+                }
             }
-            "input" if self == Self::Frame => mend_input(proto, &mut Vec::new()).is_ok(),
-            "outputs" if self == Self::Frame => mend_outputs(proto, &mut Vec::new()).is_ok(),
+            "input" if self == Self::Frame => by_adopt(mend_input(proto, &mut done)),
+            "outputs" if self == Self::Frame => {
+                by_adopt(mend_outputs(proto, None, &mut done).map(|_| ()))
+            }
+            "graph" if self == Self::Frame => match mend_nodes(proto, &mut done) {
+                Ok(()) if done.is_empty() => Mended::No(None),
+                result => by_adopt(result),
+            },
             part if part.starts_with("hrn.") => {
                 let mut mended = proto.clone();
                 let levels = levels(proto);
@@ -240,7 +308,7 @@ impl Format {
                     levels,
                 };
                 if set(&mut mended, &card, &self.checks(count)).is_err() {
-                    return false;
+                    return Mended::No(None);
                 }
                 // Replace only the refused key.
                 proto.metadata_props.retain(|entry| entry.key != part);
@@ -248,9 +316,9 @@ impl Format {
                 proto
                     .metadata_props
                     .extend(props.find(|entry| entry.key == part));
-                true
+                Mended::AsByAdopt
             }
-            _ => false,
+            _ => Mended::No(None),
         }
     }
 
@@ -303,7 +371,7 @@ impl Format {
 
 /// A list of as many levels as the outputs have.
 fn levels(proto: &pb::ModelProto) -> Vec<Level> {
-    let count = mend_outputs(&mut proto.clone(), &mut Vec::new()).unwrap_or(4);
+    let count = mend_outputs(&mut proto.clone(), None, &mut Vec::new()).unwrap_or(4);
     let agreed = dataset::levels();
     if count == agreed.len() {
         return agreed;

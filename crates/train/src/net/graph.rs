@@ -52,6 +52,18 @@ impl Graph {
         )
     }
 
+    /// Adds a node as it is and returns its first output's name.
+    pub(crate) fn push(&mut self, node: pb::NodeProto) -> String {
+        let output = node.output[0].clone();
+        self.nodes.push(node);
+        output
+    }
+
+    /// The nodes and constants, to add them to another graph.
+    pub(crate) fn into_parts(self) -> (Vec<pb::NodeProto>, Vec<pb::TensorProto>) {
+        (self.nodes, self.constants)
+    }
+
     fn raw(
         &mut self,
         name: &str,

@@ -7,7 +7,7 @@ use hrn_train::data::collect::{CollectError, Problem};
 use hrn_train::data::dataset::DatasetError;
 use hrn_train::methods::LabelsError;
 use hrn_train::methods::adapt::NoStart;
-use hrn_train::model::adopt::Foreign;
+use hrn_train::model::foreign::Foreign;
 use hrn_train::settings::SettingsError;
 
 use super::configuration::ConfigurationError;
