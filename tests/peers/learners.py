@@ -1,0 +1,281 @@
+#!/usr/bin/env python3
+"""Classifiers of scikit-learn and networks as other programs export them, in onnxruntime and adopted by hrn-train.
+
+    python tests/peers/learners.py target/debug
+
+It needs numpy, onnx, onnxruntime, scikit-learn and skl2onnx, and skips all without the last two. Claims: `hrn-train adopt` takes each file as skl2onnx writes it by default; its probabilities differ from onnxruntime's by less than 1e-5 on 288
+frames; the same holds with classes that are texts, for two levels, and for graphs as PyTorch and Keras write them with
+any batch. What cannot be adopted is refused in one line that says what to change.
+"""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import warnings
+
+import numpy as np
+import onnx
+import onnxruntime
+from onnx import TensorProto, helper, numpy_helper
+
+try:
+    import sklearn  # noqa: F401
+    import skl2onnx
+except ImportError as missing:
+    sys.exit(print(f"skipped: {missing} (pip install scikit-learn skl2onnx)"))
+
+from sklearn.calibration import CalibratedClassifierCV
+from sklearn.decomposition import PCA
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis, QuadraticDiscriminantAnalysis
+from sklearn.ensemble import (
+    AdaBoostClassifier, BaggingClassifier, ExtraTreesClassifier, GradientBoostingClassifier, RandomForestClassifier,
+    StackingClassifier,
+)
+from sklearn.linear_model import LogisticRegression, RidgeClassifier, SGDClassifier
+from sklearn.multiclass import OneVsRestClassifier
+from sklearn.naive_bayes import BernoulliNB, ComplementNB, GaussianNB, MultinomialNB
+from sklearn.neighbors import KNeighborsClassifier
+from sklearn.neural_network import MLPClassifier
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import (
+    Binarizer, MaxAbsScaler, MinMaxScaler, Normalizer, RobustScaler, StandardScaler,
+)
+from sklearn.svm import SVC, LinearSVC
+from sklearn.tree import DecisionTreeClassifier
+
+LABELS = np.array(["hard", "firm", "soft", "very-soft"])
+TOLERANCE = 1e-5
+# Naive Bayes adds the logarithms of 784 densities in f32. onnxruntime itself differs by 3e-5 from scikit-learn.
+ROUNDED = 1e-4
+
+
+def logistic():
+    return LogisticRegression(max_iter=200)
+
+
+def kinds():
+    """Each kind of classifier by name, with its tolerance."""
+    scaled = StandardScaler
+    return {
+        "logistic regression": logistic(),
+        "StandardScaler": make_pipeline(scaled(), logistic()),
+        "MinMaxScaler": make_pipeline(MinMaxScaler(), logistic()),
+        "MaxAbsScaler": make_pipeline(MaxAbsScaler(), logistic()),
+        "RobustScaler": make_pipeline(RobustScaler(), logistic()),
+        "Normalizer": make_pipeline(Normalizer(), logistic()),
+        "Normalizer max": make_pipeline(scaled(), Normalizer("max"), logistic()),
+        "Binarizer": make_pipeline(Binarizer(threshold=0.07), logistic()),
+        "PCA": make_pipeline(scaled(), PCA(20), logistic()),
+        "one against the rest": OneVsRestClassifier(logistic()),
+        "SGD": SGDClassifier(loss="log_loss"),
+        "LDA": LinearDiscriminantAnalysis(),
+        "QDA": make_pipeline(PCA(10), QuadraticDiscriminantAnalysis()),
+        "tree": DecisionTreeClassifier(max_depth=6),
+        "forest": RandomForestClassifier(30, max_depth=8),
+        "extra trees": make_pipeline(scaled(), ExtraTreesClassifier(30, max_depth=8)),
+        "gradient boosting": GradientBoostingClassifier(n_estimators=10, max_features=50),
+        "AdaBoost": AdaBoostClassifier(n_estimators=10),
+        "bagging": BaggingClassifier(n_estimators=4),
+        "SVC": make_pipeline(scaled(), SVC(probability=True)),
+        "SVC linear": SVC(kernel="linear", probability=True),
+        "SVC poly": SVC(kernel="poly", coef0=1, probability=True),
+        "SVC sigmoid": SVC(kernel="sigmoid", probability=True),
+        "MLP": make_pipeline(scaled(), MLPClassifier((32,), max_iter=60)),
+        "MLP tanh": MLPClassifier((16, 8), activation="tanh", max_iter=60),
+        "Gaussian naive Bayes": GaussianNB(var_smoothing=1e-2),
+        "multinomial naive Bayes": MultinomialNB(),
+        "complement naive Bayes": ComplementNB(),
+        "Bernoulli naive Bayes": BernoulliNB(binarize=0.07),
+        "calibrated": CalibratedClassifierCV(LinearSVC(), cv=3),
+        "calibrated isotonic": CalibratedClassifierCV(logistic(), method="isotonic", cv=3),
+        "calibrated forest": CalibratedClassifierCV(RandomForestClassifier(10, max_depth=5), cv=3),
+        "calibrated SVC": make_pipeline(scaled(), CalibratedClassifierCV(SVC(), ensemble=False, cv=3)),
+        "stacking": StackingClassifier([("a", logistic()), ("b", DecisionTreeClassifier(max_depth=4))], cv=3),
+    }
+
+
+def hrn_train(*arguments):
+    return subprocess.run(["hrn-train", *arguments], capture_output=True, text=True, timeout=120)
+
+
+def adopted(path, data):
+    """What `adopt` makes of the file: for each frame of the data set its probabilities."""
+    done = hrn_train("adopt", path, "--data", data, "--out", "adopted.onnx")
+    assert done.returncode == 0, done.stderr
+    found = []
+    for split in ("train", "test"):
+        options = ["--model", "adopted.onnx", "--data", data, "--split", split, "--verdicts", "verdicts.csv"]
+        done = hrn_train("evaluate", *options)
+        assert done.returncode == 0, done.stderr
+        with open("verdicts.csv") as lines:
+            rows = csv.DictReader(lines)
+            found += [[float(value) for key, value in row.items() if key.startswith("prob")] for row in rows]
+    return np.array(found)
+
+
+def expected(path, frames, order=None):
+    """The same of onnxruntime with the original file."""
+    session = onnxruntime.InferenceSession(path)
+    given = session.get_inputs()[0]
+    shape = [length if isinstance(length, int) else 1 for length in given.shape]
+    found = []
+    for frame in frames:
+        last = session.run(None, {given.name: frame.reshape(shape)})[-1]
+        if isinstance(last, list):
+            last = [[last[0][column] for column in (order or sorted(last[0]))]]
+        if session.get_outputs()[-1].name == "logits":
+            powers = np.exp(last - np.max(last))
+            last = powers / powers.sum()
+        found.append(last[0])
+    return np.array(found)
+
+
+def compare(name, path, data, order=None, tolerance=TOLERANCE):
+    arrays = np.load(data)
+    by_split = np.argsort(arrays["split"], kind="stable")
+    difference = np.abs(adopted(path, data) - expected(path, arrays["frames"][by_split], order)).max()
+    print(f"{name:28} {len(by_split)} frames, {difference:.1e}")
+    assert difference < tolerance, (name, difference)
+
+
+def refuse(path, data, wanted):
+    done = hrn_train("adopt", path, "--data", data, "--out", "refused.onnx")
+    assert done.returncode != 0 and wanted in done.stderr, (wanted, done)
+    assert done.stderr.count("\n") == 1 and not os.path.exists("refused.onnx"), done.stderr
+    print(f"refused: {done.stderr.strip()}")
+
+
+def export(classifier, inputs, classes, options=None, **more):
+    """The file of a fitted classifier, as skl2onnx writes it by default or with an option of the classifier."""
+    classifier.fit(inputs, classes)
+    given = {} if options is None else {"options": {id(classifier): options}}
+    model = skl2onnx.to_onnx(classifier, inputs[:1], **given, **more)
+    onnx.save(model, "classifier.onnx")
+    return "classifier.onnx"
+
+
+def classifiers(data):
+    arrays = np.load(data)
+    train = arrays["split"] == 0
+    inputs = arrays["frames"].reshape(-1, 784)[train]
+    level = arrays["level"][train].astype(np.int64)
+    for name, classifier in kinds().items():
+        tolerance = ROUNDED if "Bayes" in name else TOLERANCE
+        compare(name, export(classifier, inputs, level), data, tolerance=tolerance)
+    compare("levels from 0", export(logistic(), inputs, level - 1), data)
+    compare("without ZipMap", export(logistic(), inputs, level, {"zipmap": False}), data)
+    for name, classifier in {"texts": logistic(), "texts, trees": DecisionTreeClassifier(max_depth=4)}.items():
+        compare(name, export(classifier, inputs, LABELS[level - 1]), data, list(LABELS))
+
+    def refused(wanted, classifier, classes=level, options=None, values=inputs, **more):
+        refuse(export(classifier, values, classes, options, **more), data, wanted)
+
+    refused("without the option `zipmap`", logistic(), LABELS[level - 1], {"zipmap": False})
+    refused("found the classes 10, 20, 30, 40", logistic(), 10 * level)
+    refused("no options for the outputs", logistic(), options={"zipmap": "columns"})
+    refused("expected f32 (skl2onnx: `to_onnx(", logistic(), values=inputs.astype(np.float64))
+    refused("`target_opset=17`", MLPClassifier((8,), max_iter=20), target_opset=12)
+    for scores in (LinearSVC(), RidgeClassifier(), SVC()):
+        refused("`CalibratedClassifierCV`", scores)
+    refused("(TopK): this operator is not supported", KNeighborsClassifier())
+
+
+def two_levels(data):
+    """The same data with two levels, and the classifiers whose files differ then."""
+    arrays = dict(np.load(data))
+    arrays["level"] = (arrays["level"] + 1) // 2
+    meta = json.loads(arrays["meta"].tobytes())
+    meta["levels"] = [{"level": 1, "label": "hard", "shore": ">60"}, {"level": 2, "label": "soft", "shore": "<=60"}]
+    arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
+    np.savez("two.npz", **arrays)
+    train = arrays["split"] == 0
+    inputs, level = arrays["frames"].reshape(-1, 784)[train], arrays["level"][train].astype(np.int64)
+    chosen = "logistic regression, forest, gradient boosting, AdaBoost, SVC, MLP, calibrated, calibrated SVC"
+    for name in chosen.split(", "):
+        compare(f"two levels, {name}", export(kinds()[name], inputs, level), "two.npz")
+
+
+def networks(data):
+    """Graphs as exporters write them: PyTorch's for a batch that may change, with and without `dynamo`, and Keras's
+    through tf2onnx."""
+    random = np.random.default_rng(1)
+
+    def weight(name, *shape):
+        spread = np.sqrt(np.prod(shape) / 4)
+        return numpy_helper.from_array((random.normal(size=shape) / spread).astype(np.float32), name)
+
+    def indices(name, *values):
+        return numpy_helper.from_array(np.array(values, np.int64), name)
+
+    weights = [
+        weight("conv.weight", 8, 1, 5, 5), weight("conv.bias", 8), weight("fc.weight", 4, 8 * 14 * 14),
+        weight("fc.bias", 4), weight("w", 8 * 14 * 14, 4), indices("rest", 8 * 14 * 14), indices("first", 0),
+        indices("image", -1, 1, 28, 28), indices("flat", -1, 8 * 14 * 14),
+    ]
+
+    def convolved(source):
+        return [
+            helper.make_node("Conv", [source, "conv.weight", "conv.bias"], ["conv"], pads=[2] * 4),
+            helper.make_node("Relu", ["conv"], ["relu"]),
+            helper.make_node("MaxPool", ["relu"], ["pool"], kernel_shape=[2, 2], strides=[2, 2]),
+        ]
+
+    def gemm(output):
+        return helper.make_node("Gemm", ["view", "fc.weight", "fc.bias"], [output], transB=1)
+
+    flat = helper.make_node("Concat", ["batch", "rest"], ["shape"], axis=0)
+    view = helper.make_node("Reshape", ["pool", "shape"], ["view"])
+    newer = [helper.make_node("Shape", ["x"], ["batch"], start=0, end=1), *convolved("x"), flat, view]
+    older = [
+        *convolved("x"), helper.make_node("Shape", ["pool"], ["lengths"]),
+        helper.make_node("Gather", ["lengths", "first"], ["batch"]), flat, view,
+    ]
+    keras = [
+        helper.make_node("Reshape", ["x", "image"], ["nchw"]), *convolved("nchw"),
+        helper.make_node("Reshape", ["pool", "flat"], ["view"]),
+        helper.make_node("MatMul", ["view", "w"], ["dense"]), helper.make_node("Add", ["dense", "fc.bias"], ["sum"]),
+        helper.make_node("Softmax", ["sum"], ["Identity:0"]),
+    ]
+    softmax = [gemm("linear"), helper.make_node("Softmax", ["linear"], ["softmax"], axis=-1)]
+
+    def save(nodes, shape, output, opset):
+        graph = helper.make_graph(
+            nodes,
+            "main_graph",
+            [helper.make_tensor_value_info("x", TensorProto.FLOAT, ["batch", *shape])],
+            [helper.make_tensor_value_info(output, TensorProto.FLOAT, ["batch", 4])],
+            weights,
+        )
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8)
+        onnx.checker.check_model(model, full_check=True)
+        onnx.save(model, "network.onnx")
+        return "network.onnx"
+
+    compare("PyTorch", save([*newer, gemm("logits")], [1, 28, 28], "logits", 18), data)
+    compare("PyTorch, softmax", save([*newer, *softmax], [1, 28, 28], "softmax", 20), data)
+    compare("PyTorch, older", save([*older, gemm("logits")], [1, 28, 28], "logits", 14), data)
+    compare("Keras", save(keras, [28, 28, 1], "Identity:0", 15), data)
+    refuse(save([*newer, gemm("linear_1")], [1, 28, 28], "linear_1", 18), data, '`output_names=["logits"]`')
+
+
+def main(binaries):
+    warnings.filterwarnings("ignore")
+    # scikit-learn takes its random numbers from here.
+    np.random.seed(1)
+    onnxruntime.set_default_logger_severity(3)
+    os.environ["PATH"] = f"{os.path.abspath(binaries)}:{os.environ['PATH']}"
+    with tempfile.TemporaryDirectory() as directory:
+        os.chdir(directory)
+        few = "--objects 4 --test-objects 2 --presses 12".split()
+        assert hrn_train("simulate", "--out", "data.npz", *few).returncode == 0
+        classifiers("data.npz")
+        two_levels("data.npz")
+        networks("data.npz")
+        os.chdir("/")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
