@@ -1,11 +1,22 @@
 //! `hardnessd sniff`: raw bytes in, a proposed `[sensor.frame]` out.
 //!
 //! It prints TOML on stdout, to be appended below a `[[sensor]]`. The comments in the TOML say how
-//! sure the proposal is and why it was preferred. With `--out`, it writes a whole configuration to
-//! a file instead.
+//! sure the proposal is. With `--out`, it writes a whole configuration to a file instead. If two
+//! arrays are likely, it shows both as pictures on stderr, and the user chooses.
+//!
+//! The files below are in reading order: the length of a frame, what each byte is, which arrays
+//! there may be, and which of them makes the likeliest picture of a press.
 
-mod candidates;
+mod period;
+mod columns;
+mod checks;
+mod picture;
+mod hypotheses;
 mod proposal;
+mod text;
+mod find;
+#[cfg(test)]
+mod generator;
 #[cfg(test)]
 mod tests;
 
@@ -17,16 +28,20 @@ use std::time::Duration;
 
 use clap::{ArgGroup, Args as ClapArgs};
 
-use self::proposal::{Proposal, propose};
+pub use self::find::Failure;
+use self::find::{Found, Shown, find};
+use self::hypotheses::Known;
+use self::picture::draw;
 use super::doctor;
 use super::simulate::positive;
 use crate::daemon::port::Port;
 use crate::daemon::serial::{self, Link, Turn};
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, UNAVAILABLE};
+use hardnessd_core::frame::MOST_SIDE;
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{self, Entry, FileKind, Reader};
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
-use hardnessd_core::wire::Settings;
+use hardnessd_core::wire::Cell;
 use hardnessd_core::wording::escaped;
 
 /// Arguments of `sniff`.
@@ -46,6 +61,15 @@ pub struct Args {
     #[arg(long, value_name = "S", default_value_t = 10.0, conflicts_with = "file",
         value_parser = positive)]
     seconds: f64,
+    /// Rows of the array, if you know them
+    #[arg(long, value_name = "R", value_parser = side)]
+    rows: Option<usize>,
+    /// Columns of the array, if you know them
+    #[arg(long, value_name = "C", value_parser = side)]
+    cols: Option<usize>,
+    /// Type of a cell, if you know it: `u8`, `u16le` or `u16be`
+    #[arg(long, value_name = "T", value_parser = cell)]
+    cell: Option<Cell>,
     /// Write a whole configuration to this new file, instead of a [sensor.frame] on stdout
     #[arg(long, value_name = "TOML")]
     out: Option<PathBuf>,
@@ -78,16 +102,24 @@ pub enum Error {
         /// The fault that was found, or the system's reason.
         reason: String,
     },
-    /// No layout explains the bytes.
-    #[error(
-        "{path}: no layout explains half of the {bytes} bytes with at most a tenth of its frames damaged: \
-         press the sensor meanwhile, give it 20 frames or more, and try another --baud"
-    )]
+    /// There is no layout for the bytes.
+    #[error("{path}: {failure}")]
     Unexplained {
         /// Path of the recording or the port.
         path: PathBuf,
-        /// The number of bytes.
-        bytes: usize,
+        /// What the bytes are instead.
+        failure: Failure,
+    },
+    /// Two arrays are likely.
+    #[error(
+        "{path}: not sure: choose with `{options}` or as the pictures say, or press with one finger at several \
+         places and at the edges"
+    )]
+    Unsure {
+        /// Path of the recording or the port.
+        path: PathBuf,
+        /// The options for the likelier array.
+        options: String,
     },
     /// The configuration cannot be written.
     #[error("--out {path}: {source}")]
@@ -106,7 +138,7 @@ impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
             Error::Unreadable { .. } => NO_INPUT,
-            Error::Recording { .. } | Error::Unexplained { .. } => FAILED,
+            Error::Recording { .. } | Error::Unexplained { .. } | Error::Unsure { .. } => FAILED,
             Error::Unavailable { .. } => UNAVAILABLE,
             Error::Print(_) | Error::Write { .. } => IO,
         }
@@ -120,7 +152,8 @@ const MOST_BYTES: usize = 16 << 20;
 ///
 /// # Errors
 ///
-/// Returns [`Error`] if the bytes cannot be read, no layout explains them, or the output fails.
+/// Returns [`Error`] if the bytes cannot be read, there is no layout or more than one for them, or the
+/// output fails.
 pub async fn run(args: Args) -> Result<(), Error> {
     let listened = match &args.port {
         Some(port) => Some(listen(port, args.baud, args.seconds).await?),
@@ -146,21 +179,33 @@ impl Args {
 /// Prints or writes the layout that explains `bytes`.
 fn tell(args: &Args, bytes: &[u8]) -> Result<(), Error> {
     let path = &args.source();
-    let proposals = propose(bytes);
-    let Some((best, others)) = proposals.split_first() else {
-        return Err(Error::Unexplained {
+    let Args {
+        rows, cols, cell, ..
+    } = *args;
+    let found = find(bytes, Known { rows, cols, cell }).map_err(|failure| Error::Unexplained {
+        path: path.to_owned(),
+        failure,
+    })?;
+    if !found.is_sure() {
+        for shown in [&found.best].into_iter().chain(&found.next) {
+            show(shown);
+        }
+        return Err(Error::Unsure {
             path: path.to_owned(),
-            bytes: bytes.len(),
+            options: options(&found.best),
         });
-    };
-    let frame = toml(path, bytes.len(), best, others.first());
+    }
+    let frame = toml(path, bytes.len(), &found);
     let Some(out) = &args.out else {
         return super::print(frame.as_bytes())
             .map(drop)
             .map_err(Error::Print);
     };
     let listened_s = args.port.as_ref().map(|_| args.seconds);
-    let text = configuration(args, listened_s.map(|s| best.frames as f64 / s)) + &frame;
+    let text = configuration(
+        args,
+        listened_s.map(|s| found.best.proposal.frames as f64 / s),
+    ) + &frame;
     let written = File::create_new(out).and_then(|mut file| file.write_all(text.as_bytes()));
     written.map_err(|source| Error::Write {
         path: out.clone(),
@@ -278,53 +323,79 @@ async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> 
     }
 }
 
-fn toml(path: &Path, bytes: usize, best: &Proposal, next: Option<&Proposal>) -> String {
+/// The options that choose an array.
+fn options(shown: &Shown) -> String {
+    let array = format!("--rows {} --cols {}", shown.array.rows, shown.array.cols);
+    match shown.cell {
+        Some(cell) => format!("{array} --cell {}", name(cell)),
+        None => array,
+    }
+}
+
+/// Shows the strongest press as an array would have it.
+fn show(shown: &Shown) {
+    hardnessd_core::say!("{}:", options(shown));
+    for line in draw(&shown.picture, shown.array.cols) {
+        hardnessd_core::say!("    |{line}|");
+    }
+}
+
+fn toml(path: &Path, bytes: usize, found: &Found) -> String {
     let mut toml = String::new();
     let mut remark =
-        |words: String| writeln!(toml, "# {}", escaped(&words)).expect("a string takes it all");
-    remark(format!("{}: {bytes} bytes", path.display()));
-    remark(format!("explained: {}", said(best)));
-    match next {
-        Some(next) => {
-            let keys = keys(&next.settings).trim_end().replace('\n', ", ");
-            remark(comparison(best, next));
-            remark(format!("next: {}", said(next)));
-            remark(format!("    {keys}"));
-        }
-        None => remark("no other layout explains half of them".to_owned()),
-    }
-    if best.frames_changed == 0 {
-        remark("all frames are the same: sniff again with presses to be sure".to_owned());
-    }
-    remark(
-        "bytes do not show order, mask and invert, nor which side of the sensor is up".to_owned(),
-    );
-    toml + "[sensor.frame]\n" + &keys(&best.settings)
-}
-
-/// Why `best` is preferred to `next`, or what would tell them apart.
-fn comparison(best: &Proposal, next: &Proposal) -> String {
-    match best.reason(next) {
-        Some(reason) => format!("preferred to the next because {reason}"),
-        None if best.is_same_but_for_the_ends(next) => {
-            "cannot be told from the next, because a header and a tail look the same here: record \
-             from the moment the sensor is switched on, or read its data sheet"
-                .to_owned()
-        }
-        None => "nothing tells it from the next: read the sensor's data sheet".to_owned(),
-    }
-}
-
-fn said(proposal: &Proposal) -> String {
-    format!(
-        "{:.1} % of the bytes, {} whole frames ({} unlike the one before), {} damaged",
+        |words: &str| writeln!(toml, "# {}", escaped(words)).expect("a string takes it all");
+    let Found { best, next, .. } = found;
+    let proposal = &best.proposal;
+    remark(&format!("{}: {bytes} bytes", path.display()));
+    remark(&format!(
+        "explained: {:.1} % of the bytes, {} whole frames, {} damaged",
         100.0 * proposal.share,
         proposal.frames,
-        proposal.frames_changed,
         proposal.frames_damaged
-    )
+    ));
+    remark(&match (next, found.lead()) {
+        (Some(next), Some(lead)) => format!(
+            "{}: its picture is {} times as likely as the next, {}",
+            said(best),
+            lead.min(1e6).round(),
+            said(next)
+        ),
+        _ => format!("{}: no other array makes a picture", said(best)),
+    });
+    for words in proposal.remarks.iter().chain(&proposal.doubt) {
+        remark(words);
+    }
+    remark("bytes do not show order, mask and invert, nor which side of the sensor is up");
+    toml + "[sensor.frame]\n"
+        + &toml::to_string(&proposal.settings).expect("settings are keys and plain values")
 }
 
-fn keys(settings: &Settings) -> String {
-    toml::to_string(settings).expect("settings are keys and plain values")
+fn said(shown: &Shown) -> String {
+    match shown.cell {
+        Some(cell) => format!("{} {}", shown.array, name(cell)),
+        None => shown.array.to_string(),
+    }
+}
+
+/// The name of a type of cells in a configuration.
+fn name(cell: Cell) -> &'static str {
+    match cell {
+        Cell::U8 => "u8",
+        Cell::U16le => "u16le",
+        Cell::U16be => "u16be",
+    }
+}
+
+fn cell(text: &str) -> Result<Cell, String> {
+    let cells = [Cell::U8, Cell::U16le, Cell::U16be];
+    let found = cells.into_iter().find(|&cell| name(cell) == text);
+    found.ok_or_else(|| "expected u8, u16le or u16be".to_owned())
+}
+
+fn side(text: &str) -> Result<usize, String> {
+    let found = text
+        .parse()
+        .ok()
+        .filter(|side| (1..=MOST_SIDE).contains(side));
+    found.ok_or_else(|| format!("expected 1 to {MOST_SIDE}"))
 }

@@ -1,0 +1,275 @@
+//! Frames whose length varies: decimals as text, and packed zeros.
+//!
+//! In: raw bytes. Out: the layout, or what the text lacks.
+
+use std::collections::BTreeMap;
+
+use hardnessd_core::frame::Array;
+use hardnessd_core::wire::Preset;
+
+use super::find::{Failure, Found, Shown, sized};
+use super::hypotheses::{ELONGATED, Known, pressed};
+use super::picture::{Pictures, Score};
+
+/// The share of the lines, or packed frames, that must have the same number of cells.
+const SAME_SHARE: f64 = 0.6;
+/// The least number of frames.
+const LEAST_FRAMES: usize = 8;
+/// The most frames that are examined.
+const MOST_FRAMES: usize = 2000;
+/// The fewest cells of an array.
+const FEWEST_CELLS: usize = 4;
+
+/// Whether the bytes are lines of text. Cells may all be printable too, but then they are much alike.
+pub(super) fn is_text(bytes: &[u8]) -> bool {
+    let share = |is: fn(&u8) -> bool| {
+        bytes.iter().filter(|&byte| is(byte)).count() as f64 / bytes.len() as f64
+    };
+    let is_printable = |byte: &u8| matches!(byte, b' '..=b'~' | b'\t' | b'\r' | b'\n');
+    let lines = bytes.iter().filter(|&&byte| byte == b'\n').count();
+    lines > 2 && share(is_printable) > 0.97 && share(u8::is_ascii_whitespace) < 0.6
+}
+
+/// The array of a text.
+pub(super) fn find(bytes: &[u8], known: Known) -> Result<Found, Failure> {
+    let lines: Vec<Option<Vec<f32>>> = bytes.split(|&byte| byte == b'\n').map(numbers).collect();
+    // A frame in rows ends with a blank line.
+    let blocks: Vec<Vec<&Vec<f32>>> = lines
+        .split(|line| line.as_ref().is_some_and(Vec::is_empty))
+        .map(|block| block.iter().flatten().collect())
+        .collect();
+    let shape = |block: &Vec<&Vec<f32>>| Some((block.len(), block.last()?.len()));
+    if let Some(((rows, cols), times)) = most_frequent(blocks.iter().filter_map(shape))
+        && rows > 1
+        && times >= LEAST_FRAMES
+    {
+        return in_rows(Array { rows, cols }, bytes, known);
+    }
+    let no_array = |words: &str| Failure::Text(words.to_owned());
+    let of_line = lines
+        .iter()
+        .flatten()
+        .map(Vec::len)
+        .filter(|&count| count > 0);
+    let Some((count, times)) = most_frequent(of_line) else {
+        return Err(no_array(
+            "no line has only whole numbers of 0 to 65535 at its end",
+        ));
+    };
+    let frames: Vec<&Vec<f32>> = lines
+        .iter()
+        .flatten()
+        .filter(|line| line.len() == count)
+        .collect();
+    let filled = lines
+        .iter()
+        .filter(|line| line.as_ref().is_none_or(|line| !line.is_empty()))
+        .count();
+    if times < LEAST_FRAMES || (times as f64) < SAME_SHARE * filled as f64 || count < FEWEST_CELLS {
+        return Err(no_array("lines have different numbers of numbers"));
+    }
+    if let Some(rows) = rows_without_blank(&frames) {
+        return Err(no_array(&format!(
+            "a frame seems to be {rows} lines of {count} numbers; let the sensor print an empty line after each frame"
+        )));
+    }
+    // Numbers that count are no cells.
+    let leading = (0..count).take_while(|&at| is_growing(&frames, at)).count();
+    let frames: Vec<Vec<f32>> = frames
+        .iter()
+        .map(|frame| frame[leading..].to_vec())
+        .collect();
+    let mut found = in_order(Preset::Csv, &frames, bytes, known)?;
+    if leading > 0 {
+        let remark = format!(
+            "the first {leading} numbers of each line grow steadily: a counter or a clock; they are skipped"
+        );
+        found.best.proposal.remarks.push(remark);
+    }
+    Ok(found)
+}
+
+/// The array of packed zeros, if the bytes are that.
+pub(super) fn packed(bytes: &[u8], known: Known) -> Option<Found> {
+    let stretches = bytes.split(|&byte| byte == 0xFF);
+    let frames: Vec<Vec<f32>> = stretches
+        .filter(|packed| packed.contains(&0))
+        .filter_map(unpacked)
+        .collect();
+    let (count, times) = most_frequent(frames.iter().map(Vec::len))?;
+    // Without this, cells with zeros between two marks of FF would be unpacked too.
+    if count < 9 || times < LEAST_FRAMES || (times as f64) < SAME_SHARE * frames.len() as f64 {
+        return None;
+    }
+    let frames: Vec<_> = frames
+        .into_iter()
+        .filter(|frame| frame.len() == count)
+        .collect();
+    in_order(Preset::ZeroRun, &frames, bytes, known).ok()
+}
+
+fn unpacked(packed: &[u8]) -> Option<Vec<f32>> {
+    let mut cells = Vec::new();
+    let mut bytes = packed.iter();
+    while let Some(&byte) = bytes.next() {
+        let run = if byte == 0 {
+            usize::from(*bytes.next()?)
+        } else {
+            1
+        };
+        cells.resize(cells.len() + run, f32::from(byte));
+    }
+    Some(cells)
+}
+
+/// The numbers that end a line. `None` if the line ends with something else.
+fn numbers(line: &[u8]) -> Option<Vec<f32>> {
+    let is_separator = |byte: &u8| {
+        matches!(
+            byte,
+            b' ' | b'\t' | b',' | b';' | b'\r' | b'[' | b']' | b'(' | b')' | b'{' | b'}'
+        )
+    };
+    let words = line.split(is_separator).filter(|word| !word.is_empty());
+    let number = |word: &[u8]| -> Option<u16> { std::str::from_utf8(word).ok()?.parse().ok() };
+    let words: Vec<Option<f32>> = words.map(|word| number(word).map(f32::from)).collect();
+    let from = words
+        .iter()
+        .rposition(Option::is_none)
+        .map_or(0, |at| at + 1);
+    (words.is_empty() || from < words.len())
+        .then(|| words[from..].iter().copied().flatten().collect())
+}
+
+fn most_frequent<T: Ord + Copy>(of: impl Iterator<Item = T>) -> Option<(T, usize)> {
+    let mut counts: BTreeMap<T, usize> = BTreeMap::new();
+    for one in of {
+        *counts.entry(one).or_default() += 1;
+    }
+    counts.into_iter().max_by_key(|&(_, count)| count)
+}
+
+/// The text says the array itself.
+fn in_rows(array: Array, bytes: &[u8], known: Known) -> Result<Found, Failure> {
+    if array.rows.max(array.cols) > hardnessd_core::frame::MOST_SIDE {
+        return Err(Failure::TooLarge(array));
+    }
+    let no_array = || Failure::Text("its blocks of lines are not frames of one array".to_owned());
+    let allowed = known
+        .allows(array, None)
+        .then_some(array)
+        .ok_or_else(no_array)?;
+    let proposal = sized(Preset::Ascii, allowed, bytes).ok_or_else(no_array)?;
+    let (score, picture) = (Score::default(), Vec::new());
+    Ok(Found {
+        best: Shown {
+            array,
+            cell: None,
+            score,
+            picture,
+            proposal,
+        },
+        next: None,
+        is_given: true,
+    })
+}
+
+/// The number of lines after which a line is like this one, if that is more than one.
+fn rows_without_blank(lines: &[&Vec<f32>]) -> Option<usize> {
+    let lines = &lines[..lines.len().min(MOST_FRAMES)];
+    let difference = |apart: usize| {
+        let pairs = lines.iter().zip(&lines[apart..]);
+        let of_pair = |(a, b): (&&Vec<f32>, &&Vec<f32>)| {
+            a.iter()
+                .zip(b.iter())
+                .map(|(a, b)| (a - b).abs())
+                .sum::<f32>()
+        };
+        pairs.map(of_pair).sum::<f32>() / (lines.len() - apart) as f32
+    };
+    let most = hardnessd_core::frame::MOST_SIDE.min(lines.len() / 3);
+    let (apart, least) = (1..=most)
+        .map(|apart| (apart, difference(apart)))
+        .min_by(|a, b| a.1.total_cmp(&b.1))?;
+    (apart > 1 && 2.0 * least < difference(1)).then_some(apart)
+}
+
+fn is_growing(frames: &[&Vec<f32>], at: usize) -> bool {
+    let steps: Vec<f32> = frames
+        .windows(2)
+        .map(|pair| pair[1][at] - pair[0][at])
+        .collect();
+    10 * steps.iter().filter(|&&step| step > 0.0).count() >= 9 * steps.len()
+}
+
+/// The array of frames whose cells are known, but not its sides.
+fn in_order(
+    preset: Preset,
+    frames: &[Vec<f32>],
+    bytes: &[u8],
+    known: Known,
+) -> Result<Found, Failure> {
+    let frames = &frames[..frames.len().min(MOST_FRAMES)];
+    let cells = frames.first().map_or(0, Vec::len);
+    let mut rest = Vec::new();
+    for at in 0..cells {
+        let mut values: Vec<f32> = frames.iter().map(|frame| frame[at]).collect();
+        values.sort_by(f32::total_cmp);
+        rest.push(values[values.len() / 4]);
+    }
+    let change = |frame: &Vec<f32>| -> Vec<f32> {
+        frame
+            .iter()
+            .zip(&rest)
+            .map(|(value, rest)| value - rest)
+            .collect()
+    };
+    let changes: Vec<Vec<f32>> = frames.iter().map(change).collect();
+    let activity: Vec<u32> = changes
+        .iter()
+        .map(|frame| frame.iter().map(|value| value.abs() as u32).sum())
+        .collect();
+    let (presses, _) = pressed(&activity).ok_or(Failure::NoPress(cells))?;
+    let of_press = |press: &Vec<usize>| press.iter().map(|&index| changes[index].clone()).collect();
+    let pictures = Pictures(presses.iter().map(of_press).collect());
+    let mut shown: Vec<Shown> = Vec::new();
+    let mut too_large = None;
+    for cols in (1..=cells).filter(|&cols| cells.is_multiple_of(cols)) {
+        let array = Array {
+            rows: cells / cols,
+            cols,
+        };
+        if (cols == 1 && cells > 1) || !known.allows(array, None) {
+            continue;
+        }
+        if array.rows.max(array.cols) > hardnessd_core::frame::MOST_SIDE {
+            too_large = Some(array);
+            continue;
+        }
+        let elongated = (array.rows as f64 / array.cols as f64).ln().abs();
+        let score = pictures.score(0, cells, cols, -ELONGATED * elongated);
+        let Some(proposal) = sized(preset, array, bytes) else {
+            continue;
+        };
+        shown.push(Shown {
+            array,
+            cell: None,
+            score,
+            picture: pictures.strongest().to_vec(),
+            proposal,
+        });
+    }
+    shown.sort_by(|a, b| b.score.total().total_cmp(&a.score.total()));
+    let mut shown = shown.into_iter();
+    match (shown.next(), too_large) {
+        (Some(best), _) => Ok(Found {
+            best,
+            next: shown.next(),
+            is_given: known.rows.is_some() && known.cols.is_some(),
+        }),
+        (None, Some(array)) => Err(Failure::TooLarge(array)),
+        (None, None) => Err(Failure::Text(format!(
+            "{cells} numbers on each line make no array"
+        ))),
+    }
+}
