@@ -104,7 +104,7 @@ fn sniff_says_why_it_has_no_proposal() {
         state as u8
     };
     fs::write(&noise, (0..40_000).map(|_| random()).collect::<Vec<u8>>()).unwrap();
-    check(&[noise.to_str().unwrap()], 1, "no layout");
+    check(&[noise.to_str().unwrap()], 1, "nothing recurs");
     check(&["/no/such.bin"], 66, "/no/such.bin");
     // A port in place of a file would be read for ever.
     let _sensor = bench.sensor(&[]);
@@ -122,8 +122,7 @@ fn sniff_says_why_it_has_no_proposal() {
     let (_, _, stderr) = run(&["sniff", "/no/such.bin"]);
     assert_eq!(stderr.matches("No such file").count(), 1, "{stderr}");
     assert!(!stderr.contains("os error"), "{stderr}");
-    // This text has lines of many lengths: 60 % of it fit a layout, with 18 of 39 frames damaged.
-    check(&["/etc/passwd"], 1, "no layout");
+    check(&["/etc/passwd"], 1, "text, but no array");
     check(
         &["--port", "/dev/no-such"],
         69,
@@ -315,6 +314,34 @@ fn a_link_that_became_anothers_is_left() {
     sensor.signal(Signal::HUP);
     assert_eq!(sensor.exit_code(), Some(0));
     assert_eq!(fs::read_link(&link).unwrap(), Path::new("/dev/null"));
+}
+
+#[test]
+fn the_user_chooses_between_two_pictures() {
+    let bench = Bench::new();
+    let path = bench.path("open.bin").to_str().unwrap().to_owned();
+    // 12x8 u8. One press on a part of one row shows how long that part is, not how long a row is.
+    let frames = (0..60_u8).flat_map(|time| {
+        let mut frame = [&[0xAA, 0x55][..], &[0; 96]].concat();
+        if time / 20 == 1 {
+            frame[42..46].copy_from_slice(&[60, 90, 90, 60].map(|value| value + time));
+        }
+        frame
+    });
+    fs::write(&path, frames.collect::<Vec<u8>>()).unwrap();
+    let (code, toml, stderr) = run(&["sniff", &path]);
+    assert_eq!((code, toml.as_str()), (1, ""), "{stderr}");
+    let drawn = stderr.lines().filter(|line| line.trim().starts_with('|'));
+    assert!(drawn.clone().any(|line| line.contains('@')), "{stderr}");
+    let said = stderr.lines().last().unwrap();
+    assert!(said.contains("not sure: choose with `--rows "), "{stderr}");
+    let known = ["--rows", "12", "--cols", "8", "--cell", "u8"];
+    let (code, toml, stderr) = run(&[&["sniff", &path], &known[..]].concat());
+    assert_eq!(code, 0, "{stderr}");
+    assert!(toml.ends_with("rows = 12\ncols = 8\n"), "{toml}");
+    let (code, _, stderr) = run(&["sniff", &path, "--rows", "65"]);
+    assert_eq!(code, 2, "{stderr}");
+    assert!(stderr.contains("expected 1 to 64"), "{stderr}");
 }
 
 /// Sniffing takes half a second. The test fails after ten, which are enough for a busy machine.

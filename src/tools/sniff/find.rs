@@ -121,6 +121,10 @@ fn rank(failure: &Failure) -> usize {
     }
 }
 
+/// The most bytes that are skipped without a reason, if there is no array otherwise.
+const MOST_UNKNOWN: usize = 4;
+/// The most arrays of a mark that are examined further.
+const MOST_ARRAYS: usize = 40;
 /// The number of marks that are examined. Stuck taxels look like another one.
 const MARKS: usize = 2;
 
@@ -137,17 +141,22 @@ fn in_frames(frames: &Frames, bytes: &[u8], known: Known) -> Result<Found, Failu
         return Err(Failure::NoPress(period));
     }
     for mark in columns.marks().into_iter().take(MARKS) {
-        let Some(framed) = framed(frames, mark) else {
+        let Some(mut framed) = framed(frames, mark) else {
             continue;
         };
-        match framed.hypotheses(known) {
-            None => failure = Failure::NoPress(period),
-            Some(found) => {
-                let found = found
-                    .into_iter()
-                    .take(40)
-                    .map(|hypothesis| (hypothesis, framed.clone()));
-                arrays.extend(found);
+        for most_unknown in [0, MOST_UNKNOWN] {
+            framed.most_unknown = most_unknown;
+            let Some(found) = framed.hypotheses(known) else {
+                failure = Failure::NoPress(period);
+                break;
+            };
+            let is_likely = found
+                .first()
+                .is_some_and(|best| best.score.total() >= LEAST_SCORE);
+            let found = found.into_iter().take(MOST_ARRAYS);
+            arrays.extend(found.map(|hypothesis| (hypothesis, framed.clone())));
+            if is_likely {
+                break;
             }
         }
     }
@@ -218,7 +227,7 @@ fn in_frames(frames: &Frames, bytes: &[u8], known: Known) -> Result<Found, Failu
         .collect();
     if let Some((before, after)) = places.iter().find(|&&other| other != places[0]) {
         best.proposal.doubt = Some(format!(
-            "not sure where the cells begin: {} bytes that never change are skipped before them and {} after \
+            "not sure where the cells begin: {} bytes beside the mark are skipped before them and {} after \
              them, but it may be {before} and {after}; press the first taxels and the last to see",
             places[0].0, places[0].1
         ));
@@ -280,6 +289,7 @@ fn framed<'a>(frames: &Frames<'a>, mark: Stretch) -> Option<Framed<'a>> {
         columns,
         overhead,
         holds,
+        most_unknown: 0,
     })
 }
 

@@ -21,6 +21,8 @@ pub(super) struct Framed<'a> {
     /// The number of bytes at the end that are no cells.
     pub(super) overhead: usize,
     pub(super) holds: Option<Holds>,
+    /// The most bytes beside the mark that change in an unknown way and still are no cells.
+    pub(super) most_unknown: usize,
 }
 
 /// An array, and where its cells are.
@@ -56,6 +58,7 @@ const MOST_SKIPPED: usize = 8;
 /// What skipped bytes cost, as a score. They are less likely if nothing explains them.
 const SKIPPED: f64 = 0.3;
 const UNEXPLAINED: f64 = 1.5;
+const UNKNOWN: f64 = 0.3;
 const LENGTH_FIELD: f64 = 2.0;
 /// A field with the length of the cells is at most this far before them.
 const WITHIN_HEADER: usize = 12;
@@ -275,9 +278,11 @@ impl Framed<'_> {
         let end = kinds.len() - self.overhead;
         let is_constant = |at: usize| matches!(kinds[at], Kind::Constant(_));
         let is_number = |at: usize| kinds[at] == Kind::Number;
-        if !(0..before).chain(end - after..end).all(is_constant)
-            || (before..end - after).any(is_number)
-        {
+        let changing = (0..before)
+            .chain(end - after..end)
+            .filter(|&at| !is_constant(at))
+            .count();
+        if changing > self.most_unknown || (before..end - after).any(is_number) {
             return None;
         }
         let length = array.taxels() * width;
@@ -291,21 +296,22 @@ impl Framed<'_> {
         {
             return None;
         }
-        let mut score = if self.length_field(before, length).is_some() {
-            LENGTH_FIELD
-        } else {
-            0.0
+        let field_end = self.length_field(before, length);
+        let mut score = match field_end {
+            Some(end) if end <= self.overhead => LENGTH_FIELD,
+            _ => 0.0,
         };
         score -= ELONGATED * (array.rows as f64 / array.cols as f64).ln().abs();
-        if before + after > 0 {
+        if before + after > changing {
             score -= SKIPPED;
         }
+        score -= UNKNOWN * changing as f64;
         let is_explained =
             self.completes_number(before) || self.completes_mark(before, length, width);
-        if before > 0 && !is_explained {
+        if before > 0 && changing == 0 && !is_explained {
             score -= UNEXPLAINED + SKIPPED * before as f64;
         }
-        if after > 0 && !self.is_number_at_cells(after) {
+        if after > 0 && changing == 0 && !self.is_number_at_cells(after) {
             score -= UNEXPLAINED + SKIPPED * after as f64;
         }
         Some(score)
