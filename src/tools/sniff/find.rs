@@ -11,7 +11,7 @@ use super::columns::{Columns, Kind, Stretch};
 use super::hypotheses::{Framed, Hypothesis, Known};
 use super::period::{Frames, periods};
 use super::picture::Score;
-use super::proposal::{Proposal, shortened};
+use super::proposal::{Proposal, keys, shortened};
 use super::text;
 
 /// A layout was found.
@@ -65,7 +65,9 @@ pub enum Failure {
 }
 
 /// The least score of an array. Cells in any other order have about 0.
-const LEAST_SCORE: f64 = 0.7;
+const LEAST_SCORE: f64 = 0.5;
+/// What it adds to the score of an array that it is the one of a preset.
+const PRESET: f64 = 1.0;
 /// The least score of an array that is sure.
 const SMOOTH_SCORE: f64 = 1.0;
 /// The number of frames that are needed.
@@ -213,6 +215,13 @@ fn in_frames(frames: &Frames, bytes: &[u8], known: Known) -> Result<Found, Failu
             break;
         }
     }
+    // Boards with the layout of a preset have its array.
+    for one in &mut shown {
+        if keys(&one.proposal.settings) == 1 {
+            one.score.prior += PRESET;
+        }
+    }
+    shown.sort_by(|a, b| b.score.total().total_cmp(&a.score.total()));
     let mut shown = shown.into_iter();
     let mut best = shown.next().ok_or(failure)?;
     let is_same = |(other, _): &&(Hypothesis, Framed)| {

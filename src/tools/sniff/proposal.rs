@@ -353,7 +353,7 @@ pub(super) fn shortened(mut settings: Settings, layout: &Layout) -> Settings {
 }
 
 /// The number of keys, the preset included.
-fn keys(settings: &Settings) -> usize {
+pub(super) fn keys(settings: &Settings) -> usize {
     toml::Table::try_from(settings)
         .expect("settings are a table")
         .len()
