@@ -287,6 +287,13 @@ impl Parts<'_> {
             )
         };
         let mut remarks: Vec<String> = self.framed.columns.numbers.iter().map(number).collect();
+        let kinds = (0..self.between()).map(|at| self.framed.columns.kinds[self.column(at)]);
+        let unknown = kinds.filter(|&kind| kind == Kind::Active).count();
+        if unknown > 0 {
+            remarks.push(format!(
+                "{unknown} bytes beside the cells change in an unknown way; they are skipped"
+            ));
+        }
         let is_checked_from_mark = matches!(&self.framed.holds, Some(Holds::Checksum(check)) if matches!(check.over, Over::All(_)));
         if let Some(Holds::Sum(sum)) = &self.framed.holds {
             remarks.push(format!(
