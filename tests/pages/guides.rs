@@ -135,7 +135,7 @@ fn the_controllers_guide_says_what_happens() {
 
 #[test]
 fn the_guide_to_a_new_sensor_says_what_happens() {
-    follow("new-sensor.md");
+    follow("your-array.md");
 }
 
 #[test]
