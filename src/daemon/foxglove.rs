@@ -26,6 +26,7 @@ use super::config;
 use super::hub::Line;
 use super::relay::Worker;
 use hardnessd_core::event::{Event, Phase};
+use hardnessd_core::frame::Pitch;
 use hardnessd_core::recording::{Entry, Found, MOTION};
 use hardnessd_core::ros::{self, Topic};
 
@@ -71,7 +72,7 @@ const FAREWELL: Duration = Duration::from_millis(200);
 /// The name and the taxel distance of a sensor, which its topics need.
 pub(super) struct Sensor {
     pub(super) name: String,
-    pub(super) pitch_mm: f64,
+    pub(super) pitch: Pitch,
 }
 
 /// Listens as `settings` say and announces the topics of `sensors`. Also returns the queue for the
@@ -108,7 +109,7 @@ struct Topics {
     /// The last message of each topic that a late viewer gets at once.
     last: BTreeMap<String, Message>,
     /// The distance between taxels of each sensor, by the sensor's name.
-    pitches_mm: BTreeMap<String, f64>,
+    pitches: BTreeMap<String, Pitch>,
 }
 
 /// A listening server.
@@ -207,11 +208,11 @@ impl Topics {
                 channels.insert(name, channel);
             }
         }
-        let pitches = sensors.iter().map(|s| (s.name.clone(), s.pitch_mm));
+        let pitches = sensors.iter().map(|s| (s.name.clone(), s.pitch));
         Ok(Self {
             channels,
             last: BTreeMap::new(),
-            pitches_mm: pitches.collect(),
+            pitches: pitches.collect(),
         })
     }
 
@@ -220,10 +221,10 @@ impl Topics {
             warn!(gap = line.json.trim_end(), "foxglove is too slow");
             return;
         };
-        let Some(&pitch_mm) = self.pitches_mm.get(event.sensor()) else {
+        let Some(&pitch) = self.pitches.get(event.sensor()) else {
             return;
         };
-        for (topic, time, bytes) in ros::encode_all(event, pitch_mm) {
+        for (topic, time, bytes) in ros::encode_all(event, pitch) {
             let name = full_name(event.sensor(), topic);
             let at_ns = u64::try_from(time.as_nanosecond()).unwrap_or(0);
             let message = Message { at_ns, bytes };
@@ -239,8 +240,8 @@ impl Topics {
     /// Sends positions of the arm, or uses the taxel distance of new settings from now on.
     fn follow(&mut self, found: &Found) {
         if let Entry::Settings(settings) = &found.entry {
-            let pitch_mm = settings.description.calibration.pitch_mm;
-            self.pitches_mm.insert(found.sensor.clone(), pitch_mm);
+            let pitch = settings.description.calibration.pitch_mm;
+            self.pitches.insert(found.sensor.clone(), pitch);
             return;
         }
         let (topic, bytes) = found.message();

@@ -293,7 +293,7 @@ fn arrays(config: &Config) -> Vec<foxglove::Sensor> {
     sensors
         .map(|sensor| foxglove::Sensor {
             name: sensor.name.clone(),
-            pitch_mm: sensor.calibration.pitch_mm,
+            pitch: sensor.calibration.pitch_mm,
         })
         .collect()
 }
