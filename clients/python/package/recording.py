@@ -44,6 +44,7 @@ _NULL: Dict[str, Union[int, str, bytes]] = {
     "mono_ns": 0,
     "levels": b"",
     "course": "",
+    "object": "",
 }
 
 
@@ -192,6 +193,16 @@ def _value(key: str, message: Any) -> Any:
         return None
     if key == "context":
         return json.loads(value)
+    if key == "object":
+        low, high = message.object_shore_low, message.object_shore_high
+        shore = {"value": message.object_shore, "low": low, "high": high}
+        return {
+            "name": value,
+            "presses": message.object_presses,
+            "level": message.object_level,
+            "probabilities": list(message.object_probabilities),
+            "shore": None if math.isnan(message.object_shore) else shore,
+        }
     if key == "shore":
         return {"value": value, "low": message.shore_low, "high": message.shore_high}
     return list(value) if key in ("notes", "probabilities", "levels") else value
