@@ -163,29 +163,6 @@ fn in_frames(frames: &Frames, bytes: &[u8], known: Known) -> Result<Found, Failu
         }
     }
     arrays.sort_by(|(a, _), (b, _)| b.score.total().total_cmp(&a.score.total()));
-    if std::env::var("SNIFF_DEBUG").is_ok() {
-        for (h, f) in arrays.iter().take(12) {
-            eprintln!(
-                "   {}x{} {:?} skipped {:?} score {:.2} overhead {} {:?}",
-                h.array.rows,
-                h.array.cols,
-                h.cell,
-                h.skipped,
-                h.score.total(),
-                f.overhead,
-                f.holds
-            );
-        }
-        if let Some((_, f)) = arrays.first() {
-            let p = f.columns.kinds.len();
-            for k in (p - f.overhead - 6..p).chain(0..6) {
-                eprintln!("  {k} {:?}", f.columns.kinds[k]);
-            }
-            eprintln!("{:?}", f.columns.numbers);
-        } else {
-            eprintln!("marks {:?}", Columns::new(frames).marks());
-        }
-    }
     let mut shown: Vec<Shown> = Vec::new();
     for (hypothesis, framed) in &arrays {
         let Hypothesis { array, cell, .. } = *hypothesis;

@@ -27,6 +27,12 @@ pub(super) struct Proposal {
     pub(super) doubt: Option<String>,
 }
 
+/// A number of bytes in words.
+fn bytes(number: usize) -> String {
+    let plural = if number == 1 { "" } else { "s" };
+    format!("{number} byte{plural}")
+}
+
 /// The bytes that are decoded at once.
 const CHUNK_BYTES: usize = 8 * 1024;
 /// The least share of the bytes that a layout must explain.
@@ -273,7 +279,7 @@ impl Parts<'_> {
         let end = self.framed.columns.kinds.len() - self.framed.overhead;
         let number = |number: &Number| {
             let place = match number.at.checked_sub(end) {
-                Some(offset) => format!("{} bytes after the last cell", offset + after),
+                Some(offset) => format!("{} after the last cell", bytes(offset + after)),
                 None => "before the cells".to_owned(),
             };
             let kind = if number.step == 1 {
@@ -282,8 +288,9 @@ impl Parts<'_> {
                 "a clock, or a counter"
             };
             format!(
-                "{} bytes {place} grow by about {} a frame: {kind}; they are skipped",
-                number.bytes, number.step
+                "a number of {}, {place}, grows by about {} a frame: {kind}; it is skipped",
+                bytes(number.bytes),
+                number.step
             )
         };
         let mut remarks: Vec<String> = self.framed.columns.numbers.iter().map(number).collect();
@@ -291,14 +298,15 @@ impl Parts<'_> {
         let unknown = kinds.filter(|&kind| kind == Kind::Active).count();
         if unknown > 0 {
             remarks.push(format!(
-                "{unknown} bytes beside the cells change in an unknown way; they are skipped"
+                "the meaning of {} beside the cells is unknown: skipped",
+                bytes(unknown)
             ));
         }
         let is_checked_from_mark = matches!(&self.framed.holds, Some(Holds::Checksum(check)) if matches!(check.over, Over::All(_)));
         if let Some(Holds::Sum(sum)) = &self.framed.holds {
             remarks.push(format!(
-                "{} bytes are a sum of the cells that no key describes; they are skipped",
-                sum.len()
+                "a sum of the cells takes {}: no key describes it, so it is skipped",
+                bytes(sum.len())
             ));
         }
         if !is_checked_from_mark && self.beginning().is_none() {

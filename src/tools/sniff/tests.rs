@@ -159,7 +159,7 @@ fn a_clock_after_the_cells_is_said_and_skipped() {
     }
     let said = words(&find(&bytes, Known::default()).unwrap());
     assert!(
-        said.contains(" grow by about 32 a frame: a clock"),
+        said.contains(" grows by about 32 a frame: a clock"),
         "{said}"
     );
     assert!(
