@@ -21,9 +21,10 @@ pub fn look_after(frames: u64) -> u64 {
     frames + (frames / LOOK_SHARE).max(1)
 }
 
-/// What a verdict says of the arm.
-#[derive(Clone, Copy)]
-struct ArmKnowledge {
+/// What the event of a verdict says of the press beside the model's own words.
+struct Beside {
+    /// How the frames of the press lie on the model's grid.
+    laying: Laying,
     /// Only for a model of the course.
     course: Option<event::ApproachSource>,
     stiffness_n_per_mm: Option<f64>,
@@ -45,12 +46,13 @@ impl Pipeline {
                     self.seen.next_look = NO_LOOK;
                     let laying = self.laying(&peak);
                     let verdict = self.hrn.judge(&laying.lay(&peak.frame));
-                    let told = ArmKnowledge {
+                    let beside = Beside {
+                        laying,
                         course: None,
                         stiffness_n_per_mm: self.stiffness_so_far(),
                         is_trained: true,
                     };
-                    events.extend(self.judged(press, Phase::Early, &peak, verdict, told));
+                    events.extend(self.judged(press, Phase::Early, &peak, verdict, &beside));
                 }
             }
             Change::End {
@@ -159,12 +161,13 @@ impl Pipeline {
                 )
             }
         };
-        let told = ArmKnowledge {
+        let beside = Beside {
+            laying,
             course,
             stiffness_n_per_mm,
             is_trained,
         };
-        self.judged(so_far.press(), phase, peak, verdict, told)
+        self.judged(so_far.press(), phase, peak, verdict, &beside)
     }
 
     /// The event of a verdict. A model that fails on its own check frames was already refused at
@@ -176,7 +179,7 @@ impl Pipeline {
         phase: Phase,
         peak: &ContactFrame,
         verdict: Result<Verdict, ModelError>,
-        told: ArmKnowledge,
+        beside: &Beside,
     ) -> Option<Event> {
         let Description {
             min_confidence,
@@ -232,7 +235,7 @@ impl Pipeline {
             level,
             label,
             rejected,
-            notes: self.notes(peak, told.is_trained),
+            notes: self.notes(peak, beside),
             probabilities: verdict.probabilities,
             confidence: verdict.confidence,
             frame,
@@ -247,17 +250,17 @@ impl Pipeline {
             latency_us: None,
             shore: verdict.shore,
             levels: verdict.levels,
-            course: told.course,
-            stiffness_n_per_mm: told.stiffness_n_per_mm,
+            course: beside.course,
+            stiffness_n_per_mm: beside.stiffness_n_per_mm,
             object,
             arrival: self.arrival,
         }))
     }
 
-    fn notes(&self, peak: &ContactFrame, is_trained: bool) -> Vec<Note> {
+    fn notes(&self, peak: &ContactFrame, beside: &Beside) -> Vec<Note> {
         let card = self.hrn.card();
         let range = &card.range;
-        let laying = self.laying(peak);
+        let laying = &beside.laying;
         // The range of areas is in taxels of the model's grid.
         let area = if laying.is_resampled() {
             laying
@@ -271,7 +274,7 @@ impl Pipeline {
         let trained = (least_n..=most_n).contains(&peak.force_n)
             && (least_taxels..=most_taxels).contains(&area)
             && card.holds(self.sensor.description().calibration.pitch_mm)
-            && is_trained;
+            && beside.is_trained;
         [
             (Note::AtEdge, peak.marks.at_edge),
             (Note::Saturated, peak.marks.saturated),
