@@ -152,6 +152,12 @@ impl Pitch {
     pub fn area_mm2(self) -> f64 {
         self.rows_mm * self.cols_mm
     }
+
+    /// A taxel is in contact at or above this force, unless the settings give another. The
+    /// threshold means a pressure, so it grows with the area of a taxel.
+    pub fn contact_threshold_n(self) -> f32 {
+        (0.07 * self.area_mm2() / Self::JX255N.area_mm2()) as f32
+    }
 }
 
 impl Default for Pitch {

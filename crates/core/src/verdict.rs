@@ -23,9 +23,7 @@ pub use self::course::{
     extents,
 };
 pub use self::file::{check_levels, describe};
-pub use self::grid::{
-    COLS, CONTACT_THRESHOLD_N, Laying, ModelFrame, ModelFrameError, ROWS, TAXELS,
-};
+pub use self::grid::{COLS, Laying, ModelFrame, ModelFrameError, ROWS, TAXELS};
 pub use self::guard::NodeProblem;
 use crate::frame::Pitch;
 
@@ -166,8 +164,7 @@ pub struct Card {
 impl Card {
     /// A taxel of the model's grid is in contact at or above this force.
     pub fn contact_threshold_n(&self) -> f32 {
-        let share = f64::from(self.pitch_mm) / Pitch::JX255N.rows_mm;
-        (f64::from(CONTACT_THRESHOLD_N) * share * share) as f32
+        Pitch::square(f64::from(self.pitch_mm)).contact_threshold_n()
     }
 
     /// Whether the model was trained on sensors of this pitch. Taxels that are finer than the

@@ -181,7 +181,7 @@ impl Settings {
         Thresholds {
             contact_threshold_n: self
                 .contact_threshold_n
-                .unwrap_or((CONTACT_THRESHOLD_N * taxel) as f32),
+                .unwrap_or(pitch.contact_threshold_n()),
             begin_area_taxels,
             end_area_taxels: area(self.end_area_taxels, 1.0, begin_area_taxels),
             end_frames: self.end_frames,
@@ -192,10 +192,6 @@ impl Settings {
         }
     }
 }
-
-/// The contact threshold of a taxel of the JX255N. It means a pressure, so it grows with the area of
-/// a taxel.
-const CONTACT_THRESHOLD_N: f64 = 0.07;
 
 /// Checked [`Settings`], for the taxels of one sensor. By default they are those of the JX255N.
 #[derive(Debug, Clone, PartialEq)]

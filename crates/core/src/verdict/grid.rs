@@ -14,10 +14,6 @@ pub const COLS: usize = 28;
 /// Taxels in the model's input.
 pub const TAXELS: usize = ROWS * COLS;
 
-/// A taxel of the model's grid is in contact at or above this force, where the grid has the pitch of
-/// the JX255N.
-pub const CONTACT_THRESHOLD_N: f32 = 0.07;
-
 /// Two distances that differ by less than this share are the same.
 const SAME_PITCH: f64 = 0.02;
 
