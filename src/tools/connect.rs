@@ -1,4 +1,4 @@
-//! The connection to a running daemon, for `tail` and `watch`.
+//! The connection to a running daemon, for `tail`, `watch` and the commands of its control socket.
 //!
 //! In: the socket or address from the command line. Without one, the default paths of a daemon's
 //! socket are tried, then the sockets of running demonstrations. Out: a connection whose lines have
@@ -146,31 +146,23 @@ impl Source {
         }
     }
 
-    /// The control socket at `path`, or that of the first daemon found.
-    pub(super) fn control(path: Option<PathBuf>) -> Self {
-        Self {
-            socket: path,
-            connect: None,
-        }
-    }
-
-    /// Connects to the control socket that the command line names, or else to that of the first
-    /// daemon found, which is beside its other one.
-    ///
-    /// # Errors
-    ///
-    /// Returns [`Error`] if no daemon answers.
-    pub(super) async fn connect_control(&self) -> Result<Connection, Error> {
-        match self.given() {
-            Some(address) => Connection::open(address).await,
-            None => find("control.sock").await,
-        }
-    }
-
     /// The address that the command line names.
     pub(super) fn given(&self) -> Option<Address> {
         let tcp = self.connect.clone().map(Address::Tcp);
         tcp.or_else(|| self.socket.clone().map(Address::Unix))
+    }
+}
+
+/// Connects to the control socket at `path`, or else to that of the first daemon found, which is
+/// beside its other one.
+///
+/// # Errors
+///
+/// Returns [`Error`] if no daemon answers.
+pub(super) async fn control(path: Option<PathBuf>) -> Result<Connection, Error> {
+    match path {
+        Some(path) => Connection::open(Address::Unix(path)).await,
+        None => find("control.sock").await,
     }
 }
 

@@ -7,7 +7,7 @@ use std::time::Duration;
 use clap::Args as ClapArgs;
 use serde_json::{Map, Value, json};
 
-use super::connect::{self, Connection, Source};
+use super::connect::{self, Connection};
 use hardnessd_core::exit::{Coded, FAILED, IO, UNAVAILABLE};
 use hardnessd_core::wording;
 
@@ -107,7 +107,7 @@ pub async fn run(command: Command) -> Result<(), Error> {
             (target, json!({"context": context, "id": 1}))
         }
     };
-    let mut daemon = Source::control(target.socket).connect_control().await?;
+    let mut daemon = connect::control(target.socket).await?;
     daemon.send(&request.to_string()).await?;
     let answer = tokio::time::timeout(ANSWER, answer(&mut daemon)).await;
     let answer = answer.map_err(|_| Error::Mute)??;
