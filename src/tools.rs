@@ -108,33 +108,9 @@ async fn print_apart(lines: Vec<u8>) -> io::Result<bool> {
     tokio::task::spawn_blocking(move || print(&lines)).await?
 }
 
-/// The same JSON without hidden characters, for a terminal. They are inside strings only.
-fn json_escaped(line: &str) -> String {
-    let mut escaped = String::with_capacity(line.len());
-    for c in line.chars() {
-        if wording::is_hidden(c) {
-            escaped += &format!("\\u{:04x}", u32::from(c));
-        } else {
-            escaped.push(c);
-        }
-    }
-    escaped
-}
-
 #[cfg(test)]
 mod tests {
-    use serde_json::Value;
-
     use super::*;
-
-    #[test]
-    fn on_a_terminal_the_same_json_has_no_hidden_characters() {
-        let line = "{\"label\":\"a\u{202e}b\u{9b}é\"}";
-        let safe = json_escaped(line);
-        assert_eq!(safe, r#"{"label":"a\u202eb\u009bé"}"#);
-        let [same, of] = [&safe, line].map(|text| serde_json::from_str::<Value>(text).unwrap());
-        assert_eq!(same, of);
-    }
 
     #[test]
     fn a_directory_is_refused_in_the_system_s_words() {

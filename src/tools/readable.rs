@@ -1,6 +1,8 @@
-//! An event as an aligned line for people. The line holds nothing that is not in the event.
+//! An event as a line: JSON, or aligned text for people. The line holds nothing that is not in the
+//! event.
 
 use std::fmt::Write;
+use std::io::{self, IsTerminal};
 use std::time::Duration;
 
 use jiff::Timestamp;
@@ -8,8 +10,51 @@ use serde_json::Value;
 
 use hardnessd_core::wording;
 
+/// How events are printed on stdout.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Form {
+    Json,
+    /// JSON without characters that move the cursor.
+    JsonOnTerminal,
+    Readable,
+}
+
+impl Form {
+    /// The form for stdout as it is.
+    pub(super) fn of(is_json: bool) -> Self {
+        match (is_json, io::stdout().is_terminal()) {
+            (false, _) => Self::Readable,
+            (true, false) => Self::Json,
+            (true, true) => Self::JsonOnTerminal,
+        }
+    }
+
+    /// The line of an event, newline included. `json` is its line on the wire, and `event` reads it.
+    pub(super) fn line(self, json: String, event: impl FnOnce() -> Value) -> String {
+        let text = match self {
+            Self::Json => json,
+            Self::JsonOnTerminal => json_escaped(&json),
+            Self::Readable => line(&event()),
+        };
+        text + "\n"
+    }
+}
+
+/// The same JSON without hidden characters, for a terminal. They are inside strings only.
+fn json_escaped(line: &str) -> String {
+    let mut escaped = String::with_capacity(line.len());
+    for c in line.chars() {
+        if wording::is_hidden(c) {
+            escaped += &format!("\\u{:04x}", u32::from(c));
+        } else {
+            escaped.push(c);
+        }
+    }
+    escaped
+}
+
 /// The line of one event, without its newline.
-pub(super) fn line(event: &Value) -> String {
+fn line(event: &Value) -> String {
     let text = |key: &str| event[key].as_str().unwrap_or_default();
     let kind = text("type");
     if kind == "gap" {
@@ -179,6 +224,15 @@ fn context(line: &mut String, event: &Value) {
 mod tests {
     use super::*;
     use serde_json::json;
+
+    #[test]
+    fn on_a_terminal_the_same_json_has_no_hidden_characters() {
+        let line = "{\"label\":\"a\u{202e}b\u{9b}é\"}";
+        let safe = json_escaped(line);
+        assert_eq!(safe, r#"{"label":"a\u202eb\u009bé"}"#);
+        let [same, of] = [&safe, line].map(|text| serde_json::from_str::<Value>(text).unwrap());
+        assert_eq!(same, of);
+    }
 
     #[test]
     fn events_are_one_aligned_line_each() {

@@ -15,8 +15,8 @@ use std::time::{Duration, Instant};
 use clap::Args as ClapArgs;
 
 use super::configuration::{ModelFile, NoModel};
+use super::readable::Form;
 use super::simulate::positive;
-use super::{json_escaped, readable};
 use crate::daemon::config::{self, Config, SensorTable, Setup};
 use crate::daemon::now;
 use hardnessd_core::event::{Event, Kind};
@@ -174,7 +174,7 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Error> {
         speed: args.speed,
         start: None,
         stopped,
-        form: Form::of(args),
+        form: Form::of(args.json || !io::stdout().is_terminal()),
     };
     let (kind, recording) = FileKind::read(recording).map_err(|source| Error::Broken {
         path: path.clone(),
@@ -358,38 +358,6 @@ fn play_bytes(
     }
 }
 
-/// How events are printed.
-#[derive(Debug, Clone, Copy)]
-enum Form {
-    Json,
-    /// JSON without characters that move the cursor.
-    JsonOnTerminal,
-    Readable,
-}
-
-impl Form {
-    fn of(args: &Args) -> Self {
-        match (io::stdout().is_terminal(), args.json) {
-            (false, _) => Self::Json,
-            (true, true) => Self::JsonOnTerminal,
-            (true, false) => Self::Readable,
-        }
-    }
-
-    /// The event's line, newline included.
-    fn line(self, event: &Event) -> String {
-        let line = event.to_line();
-        match self {
-            Self::Json => line,
-            Self::JsonOnTerminal => json_escaped(line.trim_end()) + "\n",
-            Self::Readable => match serde_json::from_str(&line) {
-                Ok(event) => readable::line(&event) + "\n",
-                Err(_) => line,
-            },
-        }
-    }
-}
-
 /// The time of whole frame `number` after the first one, in bytes without times.
 fn time_of(number: u64, frame_rate_hz: f64) -> Duration {
     Duration::try_from_secs_f64(number as f64 / frame_rate_hz).unwrap_or(Duration::MAX)
@@ -419,7 +387,11 @@ fn print(events: Vec<Event>, seq: &mut u64, form: Form) -> Result<bool, Error> {
         if event.kind() != Kind::Frame {
             *seq += 1;
             event.number(*seq);
-            lines += &form.line(&event);
+            let line = event.to_line();
+            let json = line.trim_end();
+            lines += &form.line(json.to_owned(), || {
+                serde_json::from_str(json).expect("an event is JSON")
+            });
         }
     }
     super::print(lines.as_bytes()).map_err(Error::Print)

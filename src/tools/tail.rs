@@ -5,15 +5,15 @@
 //! `hello` is not printed.
 
 use std::future::Future;
-use std::io::{self, IsTerminal};
+use std::io;
 use std::time::Duration;
 
 use clap::Args as ClapArgs;
 use serde_json::{Value, json};
 
 use super::connect::{self, Address, Connection, Source};
+use super::readable::Form;
 use super::simulate::positive;
-use super::{json_escaped, readable};
 use hardnessd_core::event::{Kind, PROTOCOL};
 use hardnessd_core::exit::{Coded, FAILED, IO, UNAVAILABLE};
 use hardnessd_core::wording;
@@ -160,6 +160,7 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
             wording::escaped(&address.to_string())
         );
     }
+    let form = Form::of(args.json);
     loop {
         let (line, event) = next(&mut daemon).await?;
         let kind = event["type"].as_str().unwrap_or_default();
@@ -168,14 +169,8 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
         if !counts && kind != "gap" {
             continue;
         }
-        let text = if args.json && io::stdout().is_terminal() {
-            json_escaped(&line)
-        } else if args.json {
-            line
-        } else {
-            readable::line(&event)
-        };
-        let printed = super::print_apart((text + "\n").into_bytes()).await;
+        let line = form.line(line, || event);
+        let printed = super::print_apart(line.into_bytes()).await;
         if !printed.map_err(Error::Print)? {
             return Ok(());
         }
