@@ -17,6 +17,18 @@ fn hrn_train(arguments: &[&str]) -> Output {
         .unwrap()
 }
 
+/// What `adopt` says of a foreign model.
+fn adopt(foreign: &str, data: &str, out: &Path) -> Output {
+    hrn_train(&[
+        "adopt",
+        foreign,
+        "--data",
+        data,
+        "--out",
+        out.to_str().unwrap(),
+    ])
+}
+
 fn stdout(output: &Output) -> String {
     String::from_utf8(output.stdout.clone()).unwrap()
 }
@@ -342,14 +354,7 @@ fn a_classifier_of_skl2onnx_is_adopted_as_it_is_written_by_default() {
             lines.contains("hrn-train adopt") && !lines.contains("missing  "),
             "{lines}"
         );
-        let adopted = hrn_train(&[
-            "adopt",
-            &foreign,
-            "--data",
-            data,
-            "--out",
-            out.to_str().unwrap(),
-        ]);
+        let adopted = adopt(&foreign, data, &out);
         assert!(adopted.status.success(), "{}", stderr(&adopted));
         assert_linear(&out, data, columns, |n| (f64::from(n) - 0.01) * 2.0);
     }
@@ -403,14 +408,7 @@ fn a_network_with_any_batch_and_shape_of_frames_is_adopted() {
         &[1, 1, 28, 28],
     ] {
         let foreign = write(directory.path(), "foreign.onnx", &network(dims));
-        let adopted = hrn_train(&[
-            "adopt",
-            &foreign,
-            "--data",
-            data,
-            "--out",
-            out.to_str().unwrap(),
-        ]);
+        let adopted = adopt(&foreign, data, &out);
         assert!(adopted.status.success(), "{dims:?}: {}", stderr(&adopted));
         assert_linear(&out, data, [0, 1, 2, 3], f64::from);
     }
@@ -577,14 +575,7 @@ fn what_cannot_be_adopted_is_refused_in_a_line() {
         ),
     ] {
         let path = write(directory.path(), "foreign.onnx", &model);
-        let output = hrn_train(&[
-            "adopt",
-            &path,
-            "--data",
-            data,
-            "--out",
-            out.to_str().unwrap(),
-        ]);
+        let output = adopt(&path, data, &out);
         let message = stderr(&output);
         assert!(message.contains(expected), "{message}");
         assert_eq!(message.lines().count(), 1, "{message}");
