@@ -176,31 +176,6 @@ impl Columns {
         Some(number)
     }
 
-    /// Takes the byte below a number into it, if that byte changes at random from frame to frame.
-    pub(super) fn complete_numbers(&mut self, frames: &Frames) {
-        let pairs: Vec<_> = frames
-            .pairs()
-            .map(|(a, b)| (frames.get(a), frames.get(b)))
-            .collect();
-        for number in &mut self.numbers {
-            let lower = match number.is_big_endian {
-                Some(true) => Some(number.at + number.bytes),
-                Some(false) => number.at.checked_sub(1),
-                None => None,
-            };
-            let is_free =
-                |at: &usize| matches!(self.kinds.get(*at), Some(Kind::Active | Kind::Restless));
-            if let Some(lower) = lower.filter(is_free)
-                && difference(pairs.iter().copied(), lower) > RESTLESS_DIFFERENCE
-            {
-                self.kinds[lower] = Kind::Number;
-                number.at = number.at.min(lower);
-                number.bytes += 1;
-                number.step *= 256;
-            }
-        }
-    }
-
     fn find_restless(&mut self, pairs: &[(&[u8], &[u8])]) {
         let active: Vec<usize> = self.of_kind(|kind| kind == Kind::Active);
         let change = |(a, b): &(&[u8], &[u8])| -> u32 {

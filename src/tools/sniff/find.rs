@@ -260,9 +260,6 @@ fn framed<'a>(frames: &Frames<'a>, mark: Stretch) -> Option<Framed<'a>> {
         None => period - overhead..period - overhead,
     };
     overhead = overhead.max(period - skipped.start);
-    // These bytes are known, and the next one may belong to a clock.
-    columns.kinds[skipped.clone()].fill(Kind::Number);
-    columns.complete_numbers(&frames);
     columns.kinds[skipped].fill(Kind::Restless);
     // A number may stand before the checksum.
     let mark = columns.grown(Stretch {
