@@ -1,4 +1,5 @@
 //! `hardnessd`: the daemon and the tools around it, the two ends of the core that touch the world.
 
 pub mod daemon;
+mod maybe;
 pub mod tools;

@@ -32,7 +32,6 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use clap::error::ErrorKind;
-use tokio::time::Instant;
 
 use hardnessd_core::wording;
 pub use hardnessd_core::wording::{line, lines};
@@ -88,19 +87,6 @@ pub fn print(lines: &[u8]) -> io::Result<bool> {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
         written => written.map(|()| true),
     }
-}
-
-/// The output of the future. Without a future, this never completes.
-async fn wait<T: Future>(one: Option<T>) -> T::Output {
-    match one {
-        Some(one) => one.await,
-        None => std::future::pending().await,
-    }
-}
-
-/// Waits until the moment. Without a moment, this never completes.
-async fn until(moment: Option<Instant>) {
-    wait(moment.map(tokio::time::sleep_until)).await;
 }
 
 /// Like [`print`], but on a thread of its own, because the reader of stdout may be slow.

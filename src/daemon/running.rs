@@ -15,6 +15,7 @@ use super::record::{Recorder, Target};
 use super::reload::{self, Readers, Refusal, Reload};
 use super::sensor::{Command, SensorHandle, Sensors};
 use super::{Error, about, alive, announce_sensor, hello, hub, short, start_sensor, systemd};
+use crate::maybe;
 use hardnessd_core::event::Hello;
 
 /// How long subscribers may take to fetch their last lines. This is short, because the daemon must
@@ -61,7 +62,7 @@ impl Running {
                 () = &mut shutdown => return Ok(()),
                 Some(_) = self.tasks.join_next() => return Err(Error::Stopped("a sensor")),
                 Some(_) = self.publishers.join_next() => return Err(Error::Stopped("a listener")),
-                () = record_ended(&mut self.recorder) => return Ok(()),
+                () = maybe::wait(self.recorder.as_mut().map(Recorder::stopped)) => return Ok(()),
                 _ = heartbeat.tick() => {
                     if let Some(statuses) = alive(&self.hub, &self.sensors).await {
                         systemd::alive(&statuses);
@@ -73,7 +74,7 @@ impl Running {
                     let _ = self.orders.send(());
                     loading = Some(Box::pin(readers.read(path)));
                 }
-                loaded = finished(&mut loading) => {
+                loaded = maybe::wait(loading.as_mut()) => {
                     loading = None;
                     let log = reload.as_ref().map(|reload| &reload.log);
                     match loaded.and_then(|changed| reload::change(&self.setup, changed, log)) {
@@ -193,21 +194,5 @@ impl Running {
             None => Ok(()),
         };
         recorded.map_err(Error::Record)
-    }
-}
-
-/// Waits until there is no more to record. Without a recorder, this waits forever.
-async fn record_ended(recorder: &mut Option<Recorder>) {
-    match recorder {
-        Some(recorder) => recorder.stopped().await,
-        None => std::future::pending().await,
-    }
-}
-
-/// Waits for the configuration that is being read. If none is being read, this waits forever.
-async fn finished(loading: &mut Option<Loading>) -> Result<Setup, Refusal> {
-    match loading {
-        Some(loading) => loading.await,
-        None => std::future::pending().await,
     }
 }

@@ -18,6 +18,7 @@ use super::log;
 use super::record::{NoBlackbox, SensorRecorder};
 use super::request::motion::{Calendar, Placed};
 use super::serial::{self, Link, Turn};
+use crate::maybe;
 use hardnessd_core::event::{Event, Kind, Status, Tared};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::motion::StepBack;
@@ -202,7 +203,7 @@ pub(crate) async fn serve(
                 };
                 take(&mut pipeline, &mut recorder, input, at)
             }
-            () = until(deadline) => take(&mut pipeline, &mut recorder, Input::Tick, super::now()),
+            () = maybe::until(deadline.map(moment)) => take(&mut pipeline, &mut recorder, Input::Tick, super::now()),
         };
         let kinds = events.iter().map(Event::kind);
         let frames = kinds.filter(|&kind| kind == Kind::Frame).count();
@@ -285,16 +286,9 @@ fn vitals(pipeline: &Pipeline, unjudged: u64) -> Vitals {
     }
 }
 
-/// Waits for a time of CLOCK_MONOTONIC, which is also the runtime's clock. Without a deadline, this
-/// waits forever.
-async fn until(deadline: Option<Duration>) {
-    match deadline {
-        Some(deadline) => {
-            let left = deadline.saturating_sub(super::now().mono);
-            tokio::time::sleep_until(Instant::now() + left).await;
-        }
-        None => std::future::pending().await,
-    }
+/// The moment of a time of CLOCK_MONOTONIC, which is also the runtime's clock.
+fn moment(mono: Duration) -> Instant {
+    Instant::now() + mono.saturating_sub(super::now().mono)
 }
 
 #[cfg(test)]

@@ -10,8 +10,6 @@ pub(crate) mod tty;
 
 use std::io;
 use std::net::SocketAddr;
-use std::os::unix::fs::{FileTypeExt, MetadataExt};
-use std::path::Path;
 use std::time::Duration;
 
 use rustix::io::Errno;
@@ -25,6 +23,7 @@ use tokio_serial::SerialStream;
 use self::network::{Datagram, Udp};
 use self::tty::{Changed, LineSettings};
 use super::port::Port;
+use crate::maybe;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::wording;
 
@@ -277,8 +276,8 @@ impl Open {
         // bytes are there.
         tokio::select! {
             read = self.line.read(buffer, stale_after) => Happened::Read(read),
-            () = until(self.request_at) => Happened::RequestIsDue,
-            () = until(self.compare_at) => Happened::CompareIsDue,
+            () = maybe::until(self.request_at) => Happened::RequestIsDue,
+            () = maybe::until(self.compare_at) => Happened::CompareIsDue,
         }
     }
 }
@@ -320,14 +319,6 @@ impl Line {
     }
 }
 
-/// Waits until a time. Without one, this waits forever.
-async fn until(time: Option<Instant>) {
-    match time {
-        Some(time) => tokio::time::sleep_until(time).await,
-        None => std::future::pending().await,
-    }
-}
-
 /// Opens the port in a thread of its own, and sends `first` there.
 ///
 /// # Errors
@@ -353,7 +344,6 @@ fn open(port: &Port, baud: u32, first: &[u8]) -> io::Result<Opened> {
     match port {
         Port::Device(path) => {
             let (port, settings) = tty::open(path, baud)?;
-            lower_latency(path);
             if !first.is_empty() {
                 settings.send(first)?;
             }
@@ -375,28 +365,6 @@ fn open(port: &Port, baud: u32, first: &[u8]) -> io::Result<Opened> {
     }
 }
 
-/// Asks an FTDI adapter to pass bytes on after 1 ms instead of 16. Failure is no error: most ports
-/// have no such timer, and a daemon that is not root leaves it to the udev rule.
-fn lower_latency(path: &Path) {
-    let Ok(device) = path.canonicalize() else {
-        return;
-    };
-    let Some(name) = device.file_name() else {
-        return;
-    };
-    let timer = Path::new("/sys/bus/usb-serial/devices")
-        .join(name)
-        .join("latency_timer");
-    match std::fs::read_to_string(&timer) {
-        Ok(ms) if ms.trim() != "1" => {
-            if let Err(error) = std::fs::write(&timer, "1") {
-                tracing::debug!(timer = %timer.display(), ms = ms.trim(), %error, "latency timer");
-            }
-        }
-        _ => {}
-    }
-}
-
 /// Whether a port that is no device can be opened now.
 pub(crate) fn probe(port: &Port) -> io::Result<()> {
     open(port, 0, &[]).map(drop)
@@ -408,7 +376,7 @@ pub(crate) fn reason(port: &Port, error: &io::Error) -> String {
         return wording::line(error);
     };
     match Errno::from_io_error(error) {
-        Some(Errno::BUSY | Errno::WOULDBLOCK) if is_held_here(path) => {
+        Some(Errno::BUSY | Errno::WOULDBLOCK) if tty::is_held_here(path) => {
             "this daemon reads that port already, for another sensor".to_owned()
         }
         Some(Errno::BUSY | Errno::WOULDBLOCK) => "port held by another process".to_owned(),
@@ -417,18 +385,4 @@ pub(crate) fn reason(port: &Port, error: &io::Error) -> String {
         Some(Errno::NOTTY) => "not a serial port".to_owned(),
         _ => wording::line(error),
     }
-}
-
-/// Whether this process has the device of `path` open, perhaps under another name.
-fn is_held_here(path: &Path) -> bool {
-    let device = |path: &Path| {
-        let file = std::fs::metadata(path).ok()?;
-        file.file_type().is_char_device().then(|| file.rdev())
-    };
-    let Some(wanted) = device(path) else {
-        return false;
-    };
-    let files = std::fs::read_dir("/proc/self/fd").into_iter().flatten();
-    let mut files = files.flatten();
-    files.any(|file| device(&file.path()) == Some(wanted))
 }

@@ -32,6 +32,7 @@ use super::simulate::{OutOfRange, within};
 use crate::daemon::baud::BITS_A_BYTE;
 use crate::daemon::config::{Config, Http, SensorTable, Setup};
 use crate::daemon::{self, Daemon};
+use crate::maybe;
 use hardnessd_core::exit::{CONFIG, Coded, FAILED, IO};
 use hardnessd_core::motion;
 use hardnessd_core::wire::{Layout, LayoutError};
@@ -270,7 +271,7 @@ async fn print_events(
             // Read the lines that have arrived before checking for a timeout.
             biased;
             () = &mut shutdown => return Ok(()),
-            printed = super::wait(printing.as_mut().as_pin_mut()) => {
+            printed = maybe::wait(printing.as_mut().as_pin_mut()) => {
                 printing.set(None);
                 let printed: io::Result<bool> = printed;
                 if !printed.map_err(io("stdout"))? || Some(finals) == presses {
@@ -293,7 +294,7 @@ async fn print_events(
                 ended.map_err(io("pty"))?;
                 last_byte = Some(Instant::now());
             }
-            () = super::until(patience), if printing.is_none() => {
+            () = maybe::until(patience), if printing.is_none() => {
                 if missed {
                     return Ok(());
                 }

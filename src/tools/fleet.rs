@@ -21,6 +21,7 @@ use self::session::{PATIENCE, Session, WAITING};
 use super::simulate::positive;
 use crate::daemon::config::Endpoint;
 use crate::daemon::now;
+use crate::maybe;
 use hardnessd_core::exit::{Coded, IO, UNAVAILABLE};
 
 /// Arguments of `fleet`.
@@ -98,10 +99,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let mut fleet = Fleet::default();
     let mut tick = tokio::time::interval_at(Instant::now() + TICK, TICK);
     tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    let end = args
-        .seconds
-        .and_then(|s| Duration::try_from_secs_f64(s).ok());
-    let end = end.and_then(|end| Instant::now().checked_add(end));
+    let end = maybe::after(args.seconds);
     let mut asked = now().mono;
     let mut dropped = 0;
     // While a slow reader takes what is printed, news are still taken in.
@@ -110,7 +108,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     loop {
         tokio::select! {
             () = &mut shutdown => return Ok(()),
-            printed = super::wait(printing.as_mut().as_pin_mut()) => {
+            printed = maybe::wait(printing.as_mut().as_pin_mut()) => {
                 printing.set(None);
                 let printed: io::Result<bool> = printed;
                 if !printed.map_err(Error::Print)? || is_over {
@@ -122,7 +120,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
                 fleet.learn(news);
                 continue;
             }
-            () = super::until(end), if printing.is_none() => is_over = true,
+            () = maybe::until(end), if printing.is_none() => is_over = true,
             _ = tick.tick() => {}
         }
         let now = now();

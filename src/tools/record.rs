@@ -26,6 +26,7 @@ use crate::daemon::config::Setup;
 use crate::daemon::port::Port;
 use crate::daemon::record::{Error as RecordError, Progress};
 use crate::daemon::{self, Daemon, Sockets};
+use crate::maybe;
 use hardnessd_core::exit::{Coded, IO, UNAVAILABLE, USAGE};
 use hardnessd_core::recording::{LabelError, Labels, check_label};
 use hardnessd_core::verdict::Level;
@@ -165,16 +166,8 @@ pub async fn run(
         .expect("clap asks for it where there is no session");
     let file = create(&path)?;
     let (progress, counted) = watch::channel(Progress::default());
-    let over = async {
-        match args.seconds {
-            // A duration that is too long to count is no limit.
-            Some(seconds) => {
-                let time = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
-                tokio::time::sleep(time).await;
-            }
-            None => std::future::pending().await,
-        }
-    };
+    // The time begins with the first wait.
+    let over = async { maybe::until(maybe::after(args.seconds)).await };
     let is_ending = Cell::new(false);
     let end = async {
         tokio::select! {

@@ -15,7 +15,9 @@ use serde::de::value::Error as NameError;
 
 use super::faults::{self, Faults, Line};
 use super::player::{Pace, Player};
+use super::robot::Robot;
 use crate::daemon::baud::BITS_A_BYTE;
+use crate::maybe;
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::wire::{Layout, LayoutError, Preset, Settings as Frame};
@@ -187,12 +189,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let robot = args
         .motion
         .map(|socket| player.robot(socket, args.motion_sensor));
-    let robot = async {
-        match robot {
-            Some(robot) => robot.run().await,
-            None => std::future::pending().await,
-        }
-    };
+    let robot = maybe::wait(robot.map(Robot::run));
     let play = async {
         // It is no error if nobody reads the path, because the link shows it too.
         let told = super::print_apart(line.into_bytes());

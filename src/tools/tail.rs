@@ -14,6 +14,7 @@ use serde_json::{Value, json};
 use super::connect::{self, Address, Connection, Source};
 use super::readable::Form;
 use super::simulate::positive;
+use crate::maybe;
 use hardnessd_core::event::{Kind, PROTOCOL};
 use hardnessd_core::exit::{Coded, FAILED, IO, UNAVAILABLE};
 use hardnessd_core::wording;
@@ -126,21 +127,13 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     tokio::select! {
         printed = print(&args, &mut found) => return printed,
         () = shutdown => return Ok(()),
-        () = over(args.timeout) => {}
+        () = maybe::until(maybe::after(args.timeout)) => {}
     }
     Err(Error::Timeout {
         found,
         seconds: args.timeout.unwrap_or_default(),
         count: args.count,
     })
-}
-
-async fn over(timeout_s: Option<f64>) {
-    match timeout_s.map(Duration::try_from_secs_f64) {
-        Some(Ok(timeout)) => tokio::time::sleep(timeout).await,
-        // A duration that is too long to count never ends.
-        Some(Err(_)) | None => std::future::pending().await,
-    }
 }
 
 async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {

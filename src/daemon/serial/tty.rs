@@ -7,6 +7,7 @@
 use std::collections::BTreeSet;
 use std::io;
 use std::os::fd::OwnedFd;
+use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::Path;
 
 use rustix::fs::{Mode, OFlags};
@@ -34,7 +35,44 @@ pub(super) fn open(path: &Path, baud: u32) -> io::Result<(TTYPort, LineSettings)
     // Bytes from before the port had its settings are of unknown age, and may be garbled.
     port.clear(ClearBuffer::Input)?;
     let settings = tcgetattr(&file)?;
+    lower_latency(path);
     Ok((port, LineSettings { file, settings }))
+}
+
+/// Asks an FTDI adapter to pass bytes on after 1 ms instead of 16. Failure is no error: most ports
+/// have no such timer, and a daemon that is not root leaves it to the udev rule.
+fn lower_latency(path: &Path) {
+    let Ok(device) = path.canonicalize() else {
+        return;
+    };
+    let Some(name) = device.file_name() else {
+        return;
+    };
+    let timer = Path::new("/sys/bus/usb-serial/devices")
+        .join(name)
+        .join("latency_timer");
+    match std::fs::read_to_string(&timer) {
+        Ok(ms) if ms.trim() != "1" => {
+            if let Err(error) = std::fs::write(&timer, "1") {
+                tracing::debug!(timer = %timer.display(), ms = ms.trim(), %error, "latency timer");
+            }
+        }
+        _ => {}
+    }
+}
+
+/// Whether this process has the device of `path` open, perhaps under another name.
+pub(super) fn is_held_here(path: &Path) -> bool {
+    let device = |path: &Path| {
+        let file = std::fs::metadata(path).ok()?;
+        file.file_type().is_char_device().then(|| file.rdev())
+    };
+    let Some(wanted) = device(path) else {
+        return false;
+    };
+    let files = std::fs::read_dir("/proc/self/fd").into_iter().flatten();
+    let mut files = files.flatten();
+    files.any(|file| device(&file.path()) == Some(wanted))
 }
 
 /// The settings of an open serial line, on a descriptor of their own: that of the port is not

@@ -27,6 +27,7 @@ use ratatui_crossterm::crossterm::terminal::{
 use tokio::sync::mpsc;
 
 use super::view::Key;
+use crate::maybe;
 
 /// How long the terminal may take for the last bytes.
 const LAST_BYTES: Duration = Duration::from_millis(200);
@@ -114,10 +115,7 @@ impl Screen {
 
     /// Waits until the terminal has gone.
     pub(super) async fn gone(&self) {
-        match &self.out {
-            Some(out) => out.closed().await,
-            None => std::future::pending().await,
-        }
+        maybe::wait(self.out.as_ref().map(mpsc::Sender::closed)).await;
     }
 }
 
