@@ -1,6 +1,7 @@
 //! The tools around the daemon: a simulated sensor, recording and replay, views of a running
 //! daemon, calibration and diagnosis.
 
+mod answer;
 pub mod args;
 pub mod calibrate;
 pub mod check;

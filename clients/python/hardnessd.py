@@ -5,9 +5,10 @@ beside your program, or install it with `pip install ./clients/python`.
 
     import hardnessd
 
-    for event in hardnessd.Client():
+    client = hardnessd.Client()
+    for event in client:
         if event["type"] == "hardness" and event["phase"] == "final":
-            print(event["sensor"], event["label"], event["confidence"])
+            print(event["sensor"], hardnessd.answer(event, client.hello), event["confidence"])
 
 `Client` connects when you iterate over it. When the connection breaks, it connects again and
 continues where it stopped. It gives each numbered event once, as long as the daemon still holds the
@@ -86,6 +87,7 @@ __all__ = [
     "Status",
     "TYPES",
     "Tare",
+    "answer",
     "default_address",
 ]
 
@@ -97,6 +99,9 @@ TYPES = ("hardness", "press", "status", "frame")
 
 LONGEST_LINE_BYTES = 1 << 20
 """No line of the daemon comes near this. What is longer does not come from hardnessd."""
+
+CONFIDENT = 0.7
+"""[`answer`][hardnessd.answer] marks a level with less confidence as weak."""
 
 FIRST_PAUSE_S = 0.1
 LONGEST_PAUSE_S = 2.0
@@ -798,7 +803,31 @@ class Control:
         self.connection.close()
 
 
-def _readable(event: Event) -> str:
+def answer(event: Hardness, hello: Optional[Message] = None) -> str:
+    """What a verdict says: its level, such as "firm", or "firm?" if its confidence is below 0.7. For a
+    rejected verdict: the levels that it lies between, such as "firm or soft". Their labels are in the
+    client's `hello`."""
+    levels = hello["model"]["levels"] if hello else []
+
+    def named(level: int) -> str:
+        return levels[level - 1]["label"] if level <= len(levels) else f"level {level}"
+
+    if event["level"] is not None:
+        weak = "?" if event["confidence"] < CONFIDENT else ""
+        return (event["label"] or named(event["level"])) + weak
+    if event["rejected"] == "low_force":
+        return "low force"
+    between = event["levels"] or []
+    if len(between) < 2:
+        shares = event["probabilities"]
+        likely = sorted(range(len(shares)), key=lambda index: -shares[index])
+        between = sorted(index + 1 for index in likely[:2])
+    if len(between) < 2:
+        return "".join(f"{named(level)}?" for level in between) or "no level"
+    return f"{named(between[0])} {'or' if len(between) == 2 else 'to'} {named(between[-1])}"
+
+
+def _readable(event: Event, hello: Optional[Message]) -> str:
     """An event as one line of text, the same as that of `hardnessd tail`."""
     if event["type"] == "disconnected":
         return f"-- disconnected: {event['reason']} --"
@@ -806,7 +835,7 @@ def _readable(event: Event) -> str:
         lost = "an unknown number of" if event["lost"] is None else event["lost"]
         return f"-- gap: {lost} events lost --"
     if event["type"] == "hardness":
-        clock, text = _published(event), _verdict(event)
+        clock, text = _published(event), _verdict(event, hello)
     elif event["type"] == "press":
         clock = event["time"][11:23]
         text = f"#{event['press']:<4} {event['state']:<8}  frame {event['frame']}"
@@ -833,10 +862,9 @@ def _published(event: Hardness) -> str:
     return f"{published:%H:%M:%S.%f}"[:12]
 
 
-def _verdict(event: Hardness) -> str:
-    label = f"{event['level']} {event['label']}" if event["level"] else f"rejected: {event['rejected']}"
+def _verdict(event: Hardness, hello: Optional[Message]) -> str:
     probabilities = " ".join(f"{100 * p:.0f}" for p in event["probabilities"])
-    text = f"#{event['press']:<4} {event['phase']:<8}  {label:<24} {100 * event['confidence']:>3.0f} %"
+    text = f"#{event['press']:<4} {event['phase']:<8}  {answer(event, hello):<20} {100 * event['confidence']:>3.0f} %"
     text += f" [{probabilities}]  {event['contact_area_taxels']:>3} taxels  {event['force_n']:>6.2f} N"
     # An older daemon sends no Shore hardness.
     shore = event.get("shore")
@@ -935,7 +963,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
             else:
                 reason = event["reason"]
             try:
-                text = json.dumps(event) if args.json else _readable(event)
+                text = json.dumps(event) if args.json else _readable(event, client.hello)
             except (AttributeError, KeyError, OverflowError, TypeError, ValueError):
                 # No event of hardnessd.
                 text = json.dumps(event)

@@ -8,33 +8,42 @@ use std::time::Duration;
 use jiff::Timestamp;
 use serde_json::Value;
 
+use super::answer::Answer;
 use hardnessd_core::wording;
 
 /// How events are printed on stdout.
-#[derive(Debug, Clone, Copy)]
-pub(super) enum Form {
+#[derive(Debug)]
+pub(super) struct Printer {
+    form: Form,
+    /// The labels of the model's levels.
+    labels: Vec<String>,
+}
+
+#[derive(Debug)]
+enum Form {
     Json,
     /// JSON without characters that move the cursor.
     JsonOnTerminal,
     Readable,
 }
 
-impl Form {
-    /// The form for stdout as it is.
-    pub(super) fn of(is_json: bool) -> Self {
-        match (is_json, io::stdout().is_terminal()) {
-            (false, _) => Self::Readable,
-            (true, false) => Self::Json,
-            (true, true) => Self::JsonOnTerminal,
-        }
+impl Printer {
+    /// A printer for stdout as it is.
+    pub(super) fn new(is_json: bool, labels: Vec<String>) -> Self {
+        let form = match (is_json, io::stdout().is_terminal()) {
+            (false, _) => Form::Readable,
+            (true, false) => Form::Json,
+            (true, true) => Form::JsonOnTerminal,
+        };
+        Self { form, labels }
     }
 
     /// The line of an event, newline included. `json` is its line on the wire, and `event` reads it.
-    pub(super) fn line(self, json: String, event: impl FnOnce() -> Value) -> String {
-        let text = match self {
-            Self::Json => json,
-            Self::JsonOnTerminal => json_escaped(&json),
-            Self::Readable => line(&event()),
+    pub(super) fn line(&self, json: String, event: impl FnOnce() -> Value) -> String {
+        let text = match self.form {
+            Form::Json => json,
+            Form::JsonOnTerminal => json_escaped(&json),
+            Form::Readable => line(&event(), &self.labels),
         };
         text + "\n"
     }
@@ -54,7 +63,7 @@ fn json_escaped(line: &str) -> String {
 }
 
 /// The line of one event, without its newline.
-fn line(event: &Value) -> String {
+fn line(event: &Value, labels: &[String]) -> String {
     let text = |key: &str| event[key].as_str().unwrap_or_default();
     let kind = text("type");
     if kind == "gap" {
@@ -67,7 +76,7 @@ fn line(event: &Value) -> String {
     match kind {
         "status" => status(&mut line, event),
         "press" => press(&mut line, event),
-        "hardness" => hardness(&mut line, event),
+        "hardness" => hardness(&mut line, event, labels),
         "frame" => frame(&mut line, event),
         _ => line += &event.to_string(),
     }
@@ -133,12 +142,9 @@ fn press(line: &mut String, event: &Value) {
     context(line, event);
 }
 
-fn hardness(line: &mut String, event: &Value) {
+fn hardness(line: &mut String, event: &Value, labels: &[String]) {
     let (press, phase) = (number(event, "press"), event["phase"].as_str());
-    let verdict = match (event["level"].as_u64(), event["rejected"].as_str()) {
-        (Some(level), _) => format!("{level} {}", event["label"].as_str().unwrap_or_default()),
-        (None, rejected) => format!("rejected: {}", rejected.unwrap_or_default()),
-    };
+    let answer = Answer::of(event, labels).text;
     let percent = |value: &Value| format!("{:.0}", 100.0 * value.as_f64().unwrap_or_default());
     let probabilities: Vec<String> = event["probabilities"]
         .as_array()
@@ -149,7 +155,7 @@ fn hardness(line: &mut String, event: &Value) {
     write(
         line,
         format_args!(
-            "#{press:<4} {:<8}  {verdict:<24} {:>3} % [{}]  {:>3} taxels  {:>6.2} N",
+            "#{press:<4} {:<8}  {answer:<20} {:>3} % [{}]  {:>3} taxels  {:>6.2} N",
             phase.unwrap_or_default(),
             percent(&event["confidence"]),
             probabilities.join(" "),
@@ -236,7 +242,8 @@ mod tests {
 
     #[test]
     fn events_are_one_aligned_line_each() {
-        let check = |event: Value, expected: &str| assert_eq!(line(&event), expected);
+        let labels = ["hard", "firm"].map(str::to_owned);
+        let check = |event: Value, expected: &str| assert_eq!(line(&event, &labels), expected);
         let time = "2026-11-21T10:00:00.123456Z";
         check(
             json!({"type": "status", "sensor": "forearm", "time": time, "state": "lost",
@@ -256,7 +263,7 @@ mod tests {
                    "notes": ["at_edge"], "probabilities": [0.01, 0.93, 0.05, 0.01],
                    "confidence": 0.93, "contact_area_taxels": 52, "force_n": 12.345,
                    "frame": 41, "age_at_publish_ms": 1400.5, "context": {"tag": "pick-17"}}),
-            "10:00:01.523  wrist         hardness  #3    final     2 firm                    \
+            "10:00:01.523  wrist         hardness  #3    final     firm                  \
              93 % [1 93 5 1]   52 taxels   12.35 N  frame 41 at 10:00:00.123  (at_edge)  \
              {\"tag\":\"pick-17\"}",
         );
@@ -266,7 +273,7 @@ mod tests {
                    "notes": [], "probabilities": [0.1, 0.9], "confidence": 0.9,
                    "contact_area_taxels": 52, "force_n": 12.345, "context": null,
                    "shore": {"value": 63.6, "low": 58.2, "high": 70.0}}),
-            "10:00:00.123  wrist         hardness  #3    final     2 firm                    \
+            "10:00:00.123  wrist         hardness  #3    final     firm                  \
              90 % [10 90]   52 taxels   12.35 N  Shore 64 (58 to 70)",
         );
         check(
@@ -274,7 +281,7 @@ mod tests {
                    "phase": "early", "level": null, "rejected": "low_force", "notes": [],
                    "probabilities": [1.0], "confidence": 1.0, "contact_area_taxels": 5,
                    "force_n": 0.5, "context": null}),
-            "10:00:00.123  wrist         hardness  #3    early     rejected: low_force      \
+            "10:00:00.123  wrist         hardness  #3    early     low force            \
              100 % [100]    5 taxels    0.50 N",
         );
         check(

@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use clap::Args as ClapArgs;
 
 use super::configuration::{ModelFile, NoModel};
-use super::readable::Form;
+use super::readable::Printer;
 use super::simulate::positive;
 use crate::daemon::config::{self, Config, SensorTable, Setup};
 use crate::daemon::now;
@@ -170,11 +170,14 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Error> {
         path: path.clone(),
         source,
     })?;
+    let levels = &setup.hrn.card().levels;
+    let labels = levels.iter().map(|level| level.label.clone()).collect();
+    let printer = Printer::new(args.json || !io::stdout().is_terminal(), labels);
     let pace = Pace {
         speed: args.speed,
         start: None,
         stopped,
-        form: Form::of(args.json || !io::stdout().is_terminal()),
+        printer: &printer,
     };
     let (kind, recording) = FileKind::read(recording).map_err(|source| Error::Broken {
         path: path.clone(),
@@ -202,7 +205,7 @@ struct Pace<'a> {
     /// When the first entry was played.
     start: Option<Instant>,
     stopped: &'a Receiver<()>,
-    form: Form,
+    printer: &'a Printer,
 }
 
 impl Pace<'_> {
@@ -225,7 +228,7 @@ impl Pace<'_> {
 fn play_recording(path: &Path, file: impl Read, setup: Setup, pace: Pace) -> Result<(), Error> {
     let mut playback = Playback::new(setup.hrn);
     let mut seq = 0;
-    let form = pace.form;
+    let printer = pace.printer;
     let played = play_entries(path, file, pace, &mut playback, &mut seq);
     if let Ok(false) = played {
         return Ok(());
@@ -239,7 +242,7 @@ fn play_recording(path: &Path, file: impl Read, setup: Setup, pace: Pace) -> Res
     }
     let end = playback.end();
     warn(playback.unjudged());
-    print(end, &mut seq, form)?;
+    print(end, &mut seq, printer)?;
     played.map(drop)
 }
 
@@ -275,7 +278,7 @@ fn play_entries(
             source,
         })?;
         warn(playback.unjudged());
-        if !print(events, seq, pace.form)? {
+        if !print(events, seq, pace.printer)? {
             return Ok(false);
         }
     }
@@ -333,7 +336,7 @@ fn play_bytes(
                 }),
                 _ => None,
             });
-            print(end, &mut seq, pace.form)?;
+            print(end, &mut seq, pace.printer)?;
             return none.map_or(Ok(()), Err);
         }
         let (frames, _) = pipeline.frame_counts();
@@ -352,7 +355,7 @@ fn play_bytes(
         warn(pipeline.unjudged());
         let (frames, _) = pipeline.frame_counts();
         let since = time_of(frames.saturating_sub(1), frame_rate_hz);
-        if !pace.wait(since) || !print(events, &mut seq, pace.form)? {
+        if !pace.wait(since) || !print(events, &mut seq, pace.printer)? {
             return Ok(());
         }
     }
@@ -381,7 +384,7 @@ fn warn(unjudged: Vec<Unjudged>) {
 
 /// Prints the events that a subscriber would receive, without frames. Returns `false` if nobody
 /// reads stdout.
-fn print(events: Vec<Event>, seq: &mut u64, form: Form) -> Result<bool, Error> {
+fn print(events: Vec<Event>, seq: &mut u64, printer: &Printer) -> Result<bool, Error> {
     let mut lines = String::new();
     for mut event in events {
         if event.kind() != Kind::Frame {
@@ -389,7 +392,7 @@ fn print(events: Vec<Event>, seq: &mut u64, form: Form) -> Result<bool, Error> {
             event.number(*seq);
             let line = event.to_line();
             let json = line.trim_end();
-            lines += &form.line(json.to_owned(), || {
+            lines += &printer.line(json.to_owned(), || {
                 serde_json::from_str(json).expect("an event is JSON")
             });
         }

@@ -11,8 +11,9 @@ use std::time::Duration;
 use clap::Args as ClapArgs;
 use serde_json::{Value, json};
 
+use super::answer;
 use super::connect::{self, Address, Connection, Source};
-use super::readable::Form;
+use super::readable::Printer;
 use super::simulate::positive;
 use crate::maybe;
 use hardnessd_core::event::{Kind, PROTOCOL};
@@ -141,10 +142,14 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
     let address = daemon.address().clone();
     let request = json!({"subscribe": args.types}).to_string();
     daemon.send(&request).await?;
-    match tokio::time::timeout(HELLO, next(&mut daemon)).await {
-        Ok(hello) => meet(&hello?.1, address.clone())?,
+    let labels = match tokio::time::timeout(HELLO, next(&mut daemon)).await {
+        Ok(hello) => {
+            let (_, hello) = hello?;
+            meet(&hello, address.clone())?;
+            answer::labels(&hello)
+        }
         Err(_) => return Err(Error::Mute { address }),
-    }
+    };
     // This comes after the connection is made: if no daemon answers, the error must be the only
     // line.
     if args.source.given().is_none() {
@@ -153,7 +158,7 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
             wording::escaped(&address.to_string())
         );
     }
-    let form = Form::of(args.json);
+    let printer = Printer::new(args.json, labels);
     loop {
         let (line, event) = next(&mut daemon).await?;
         let kind = event["type"].as_str().unwrap_or_default();
@@ -162,7 +167,7 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
         if !counts && kind != "gap" {
             continue;
         }
-        let line = form.line(line, || event);
+        let line = printer.line(line, || event);
         let printed = super::print_apart(line.into_bytes()).await;
         if !printed.map_err(Error::Print)? {
             return Ok(());

@@ -234,6 +234,15 @@ def commands(bench):
     print("commands are carried out or refused with a reason")
 
 
+def a_verdict_in_words():
+    """The same words as the daemon's tools."""
+    table = json.loads((ROOT / "fixtures/answers.json").read_text())
+    for case in table["cases"]:
+        said = hardnessd.answer(case["verdict"], table["hello"])
+        assert said == case["text"], (said, case)
+    assert hardnessd.answer(table["cases"][2]["verdict"]) == "level 3 or level 4"
+
+
 def program(bench):
     """`python3 -m hardnessd`, and the one file by itself."""
     events = bench.path("events.sock")
@@ -367,6 +376,7 @@ def main(binary):
             ends_when_closed(bench)
             notices_a_restart(bench, daemon)
             commands(bench)
+            a_verdict_in_words()
             program(bench)
             finds_the_socket(bench)
             readme(bench)

@@ -29,6 +29,7 @@ from bench import Bench, wait_for
 from selenium import webdriver
 from selenium.webdriver.common.by import By
 
+ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 SHOWS_WITHIN_S = 1.0
 
 # Writes down when a text first matched, on the page's own clock: no question of ours delays it.
@@ -161,7 +162,7 @@ def events_arrive(page, bench, sensors):
     assert not page.shown("veil") and not page.shown("alarm")
     assert (page.tab("forearm"), page.tab("wrist")) == ("live", "live")
     wait_for("a verdict", lambda: page.text("label") not in ("", "none yet"))
-    assert page.colour("label") != page.colour("facts")
+    wait_for("a verdict that is sure", lambda: page.colour("label") != page.colour("facts"))
     assert re.match(r"Shore \d+ \(\d+ to \d+\), \d+ taxels", page.text("facts")), page.text("facts")
     wait_for("several verdicts", lambda: len(page.driver.find_elements(By.CSS_SELECTOR, "#rows tr")) > 1)
     before = int(page.text("frames").replace("\u202f", ""))
@@ -170,6 +171,18 @@ def events_arrive(page, bench, sensors):
     for scheme in ["light", "dark"]:
         page.look(scheme=scheme)
         page.picture(f"live-{scheme}")
+
+
+def a_verdict_in_words(page):
+    """The same words as the tools of the terminal."""
+    with open(os.path.join(ROOT, "fixtures/answers.json")) as table:
+        table = json.load(table)
+    script = """
+        const before = hello;
+        try { hello = arguments[0].hello; return arguments[0].cases.map((c) => [answer(c.verdict), isWeak(c.verdict)]); }
+        finally { hello = before; }"""
+    said = page.driver.execute_script(script, table)
+    assert said == [[case["text"], case["is_weak"]] for case in table["cases"]], said
 
 
 def force_against_approach_is_drawn(page):
@@ -303,6 +316,7 @@ def main(binary, pictures):
             page.look()
             page.driver.get(f"http://{bench.address('http')}/")
             events_arrive(page, bench, sensors)
+            a_verdict_in_words(page)
             force_against_approach_is_drawn(page)
             fits_a_phone(page)
             what_comes_late_is_as_old_as_it_is(page, bench, sensors)

@@ -4,6 +4,7 @@
 
 use serde_json::Value;
 
+use crate::tools::answer::{self, Answer};
 use hardnessd_simulator::Material;
 
 /// The counts of the presses so far.
@@ -11,8 +12,8 @@ use hardnessd_simulator::Material;
 pub(super) struct Account {
     /// The materials in the order of the presses. After the last one, the first one follows again.
     materials: Vec<Material>,
-    /// Columns that the longest label of a level takes.
-    label_columns: usize,
+    /// The labels of the model's levels.
+    labels: Vec<String>,
     presses: u32,
     right: u32,
     wrong: u32,
@@ -31,9 +32,7 @@ impl Account {
         let text = |key: &str| event[key].as_str().unwrap_or_default();
         match (text("type"), text("phase"), text("state")) {
             ("hello", ..) => {
-                let levels = event["model"]["levels"].as_array().into_iter().flatten();
-                let columns = |level: &Value| level["label"].as_str().map(|l| l.chars().count());
-                self.label_columns = levels.filter_map(columns).max().unwrap_or_default();
+                self.labels = answer::labels(event);
                 None
             }
             ("hardness", "final", _) => Some(self.verdict(event)),
@@ -61,12 +60,12 @@ impl Account {
             return String::new();
         };
         self.presses += 1;
-        let text = |key: &str| event[key].as_str().unwrap_or_default();
+        let answer = Answer::of(event, &self.labels).text;
         let percent = 100.0 * event["confidence"].as_f64().unwrap_or_default();
         let force_n = event["force_n"].as_f64().unwrap_or_default();
         let level = event["level"].as_u64();
         let (said, mark) = match level {
-            None => (text("rejected").replace('_', " "), "-"),
+            None => (answer, "-"),
             Some(level) => {
                 let is_right = self
                     .material(event)
@@ -77,13 +76,21 @@ impl Account {
                     &mut self.wrong
                 };
                 *count += 1;
-                let said = format!("{} {percent:.0} %", text("label"));
+                let said = format!("{answer} {percent:.0} %");
                 (said, if is_right { "ok" } else { "wrong" })
             }
         };
-        // Room for a label, a blank and `100 %`.
-        let columns = self.label_columns + 6;
+        let columns = self.answer_columns();
         format!("press {number:<2} {pressed}  ->  {said:<columns$}  {mark:<5}  {force_n:4.1} N")
+    }
+
+    /// The columns of the longest answer of one or two neighbouring levels.
+    fn answer_columns(&self) -> usize {
+        let columns = |label: &String| label.chars().count();
+        let single = self.labels.iter().map(|one| columns(one) + " 100 %".len());
+        let pairs = self.labels.windows(2);
+        let pairs = pairs.map(|pair| columns(&pair[0]) + " or ".len() + columns(&pair[1]));
+        single.chain(pairs).max().unwrap_or_default()
     }
 
     /// Number of a press, and the material that was pressed.
@@ -139,20 +146,20 @@ mod tests {
         let verdict = |press: u64, level: Option<u8>, label: &str, confidence: f64| {
             json!({"type": "hardness", "phase": "final", "press": press, "level": level,
                 "label": label, "confidence": confidence, "force_n": 7.41,
-                "rejected": level.is_none().then_some("low_force")})
+                "rejected": level.is_none().then_some("ambiguous"), "levels": [1, 2]})
         };
         for (event, expected) in [
             (
                 verdict(1, Some(1), "hard", 1.0),
-                "press 1  hard-plastic (level 1)  ->  hard 100 %    ok      7.4 N",
+                "press 1  hard-plastic (level 1)  ->  hard 100 %      ok      7.4 N",
             ),
             (
                 verdict(2, Some(1), "hard", 0.61),
-                "press 2  foam (level 2)          ->  hard 61 %     wrong   7.4 N",
+                "press 2  foam (level 2)          ->  hard? 61 %      wrong   7.4 N",
             ),
             (
                 verdict(3, None, "", 0.3),
-                "press 3  hard-plastic (level 1)  ->  low force     -       7.4 N",
+                "press 3  hard-plastic (level 1)  ->  hard or medium  -       7.4 N",
             ),
             (
                 json!({"type": "press", "state": "aborted", "press": 10, "reason": "short"}),

@@ -85,6 +85,14 @@ pub(super) struct Hello {
 #[derive(Debug, Default, Deserialize)]
 pub(super) struct Model {
     pub(super) sha256: String,
+    #[serde(default)]
+    pub(super) levels: Vec<Level>,
+}
+
+/// A level that a model knows.
+#[derive(Debug, Default, Deserialize)]
+pub(super) struct Level {
+    pub(super) label: String,
 }
 
 /// News that wait to be taken. One more is dropped and counted.

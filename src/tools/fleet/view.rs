@@ -8,6 +8,7 @@ use jiff::Timestamp;
 use serde_json::{Value, json};
 
 use super::robots::{Fleet, Robot, Sensor, read, time};
+use crate::tools::answer::Answer;
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::wording::{self, escaped};
 
@@ -131,7 +132,7 @@ fn row(site: &str, robot: &Robot, name: &str, sensor: &Sensor, now: Stamp) -> [S
         age(since(now, sensor.heard)),
         rate.map_or_else(String::new, |hz| format!("{hz:.1}")),
         damaged.map_or_else(String::new, |damaged| damaged.to_string()),
-        judged(&verdict),
+        judged(&verdict, robot),
         time(&verdict).map_or_else(String::new, |then| age(aged(now, then))),
         missed(robot),
     ]
@@ -146,16 +147,15 @@ fn missed(robot: &Robot) -> String {
     }
 }
 
-fn judged(verdict: &Value) -> String {
+fn judged(verdict: &Value, robot: &Robot) -> String {
     let Some(press) = verdict["press"].as_u64() else {
         return String::new();
     };
     let sure = verdict["confidence"].as_f64().unwrap_or_default() * 100.0;
-    let what = match (verdict["label"].as_str(), verdict["rejected"].as_str()) {
-        (Some(label), _) => shown(label),
-        (None, rejected) => format!("rejected: {}", shown(rejected.unwrap_or_default())),
-    };
-    format!("#{press} {what} {sure:.0} %")
+    let levels = robot.hello.iter().flat_map(|hello| &hello.model.levels);
+    let labels: Vec<String> = levels.map(|level| level.label.clone()).collect();
+    let answer = Answer::of(verdict, &labels);
+    format!("#{press} {} {sure:.0} %", shown(&answer.text))
 }
 
 /// Seconds since `then`, by the clock of this machine that nobody sets.
@@ -243,6 +243,7 @@ mod tests {
             seq,
             model: Model {
                 sha256: "0123456789abcdef".to_owned(),
+                levels: Vec::new(),
             },
         })
     }
@@ -257,7 +258,7 @@ mod tests {
         learn(&mut fleet, What::Came, 0);
         learn(&mut fleet, hello("a", 5), 0);
         let verdict = json!({"type": "hardness", "phase": "final", "sensor": "palm", "press": 7,
-            "label": "fi\u{1b}r\u{202e}m", "confidence": 0.934, "time": (at(0).wall - Duration::from_secs(10)).to_string(), "seq": 7});
+            "level": 2, "label": "fi\u{1b}r\u{202e}m", "confidence": 0.934, "time": (at(0).wall - Duration::from_secs(10)).to_string(), "seq": 7});
         let early = json!({"type": "hardness", "phase": "early", "sensor": "palm", "press": 8,
             "label": "soft", "seq": 8});
         for json in [&status(Some(6)), &verdict, &early] {

@@ -331,7 +331,9 @@ impl Page<'_> {
         }
         for (index, verdict) in sensor.verdicts.iter().enumerate() {
             let Some(row) = rows.take(1) else { return };
-            let style = if index == 0 && link == Link::Live {
+            let style = if verdict.is_weak {
+                self.look.aside()
+            } else if index == 0 && link == Link::Live {
                 self.look.strong()
             } else {
                 Style::new()
@@ -377,18 +379,14 @@ fn is_unplugged(reason: &str) -> bool {
 /// Press, phase, verdict, probabilities in per cent and age. Force and notes follow if there is
 /// room.
 fn verdict_line(verdict: &Verdict, old: &str, width: usize) -> String {
-    let level = match &verdict.level {
-        Ok((level, label)) => format!("{level} {label}"),
-        Err(why) => format!("- {why}"),
-    };
     let shares = verdict
         .probabilities
         .iter()
         .map(|share| format!("{:>3.0}", 100.0 * share));
     let shares = shares.collect::<Vec<_>>().join(" ");
     let mut line = format!(
-        "{:>3} {:<5} {level:<11} {shares} {old:>6}",
-        verdict.press, verdict.phase
+        "{:>3} {:<5} {:<12} {shares} {old:>6}",
+        verdict.press, verdict.phase, verdict.answer
     );
     let force = format!("  {:>5.1} N", verdict.force_n);
     let notes = verdict.notes.iter().map(|note| format!("  {note}"));

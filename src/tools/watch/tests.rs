@@ -83,6 +83,7 @@ fn frame(sensor: &str, newtons: f32, taxels: usize) -> Value {
 fn verdict(press: u64, level: Option<u8>, rejected: Option<&str>) -> Value {
     json!({"type": "hardness", "sensor": "forearm", "press": press, "phase": "final",
         "level": level, "label": "firm", "rejected": rejected, "probabilities": [0.07, 0.93],
+        "confidence": 0.93,
         "force_n": 12.34, "notes": []})
 }
 
@@ -299,11 +300,11 @@ fn verdicts_stand_with_their_probabilities_newest_first_and_none_twice() {
     assert_eq!(lines[first], "verdicts % of hard, firm");
     assert_eq!(
         lines[first + 1],
-        "  4 final - low force   7  93  1.2 s   12.3 N"
+        "  4 final low force      7  93  1.2 s   12.3 N"
     );
     assert_eq!(
         lines[first + 2],
-        "  3 final 2 firm        7  93   10 s   12.3 N"
+        "  3 final firm           7  93   10 s   12.3 N"
     );
     assert_eq!(lines[first + 3], "");
 }

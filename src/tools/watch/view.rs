@@ -167,8 +167,9 @@ impl View {
                 }
                 let name = text(&event, "sensor");
                 let at = self.moment(&event, kind, now);
+                let labels = self.hello.as_ref().map_or(&[][..], |hello| &hello.labels);
                 if let Some(sensor) = self.sensors.iter_mut().find(|one| one.name == name) {
-                    sensor.hear(kind, &event, at);
+                    sensor.hear(kind, &event, at, labels);
                 }
             }
         }

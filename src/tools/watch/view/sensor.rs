@@ -6,6 +6,7 @@ use std::time::Duration;
 use serde_json::Value;
 
 use super::{items, number, plain, text};
+use crate::tools::answer::Answer;
 use hardnessd_core::frame::{Array, MOST_SIDE};
 use hardnessd_core::sensor::LATE_PERIODS;
 
@@ -82,8 +83,9 @@ pub(in crate::tools::watch) struct Verdict {
     pub(in crate::tools::watch) at: Duration,
     pub(in crate::tools::watch) press: u64,
     pub(in crate::tools::watch) phase: String,
-    /// Level and label, or the reason why there is no level.
-    pub(in crate::tools::watch) level: Result<(u64, String), String>,
+    pub(in crate::tools::watch) answer: String,
+    /// Whether the answer must not look like a sure level.
+    pub(in crate::tools::watch) is_weak: bool,
     pub(in crate::tools::watch) probabilities: Vec<f64>,
     pub(in crate::tools::watch) force_n: f64,
     pub(in crate::tools::watch) notes: Vec<String>,
@@ -105,7 +107,8 @@ impl Sensor {
         }
     }
 
-    pub(super) fn hear(&mut self, kind: &str, event: &Value, at: Duration) {
+    /// Takes in an event. `labels` are those of the model's levels.
+    pub(super) fn hear(&mut self, kind: &str, event: &Value, at: Duration, labels: &[String]) {
         match kind {
             "status" => {
                 self.status = Some(Status {
@@ -137,22 +140,23 @@ impl Sensor {
                     self.press = Some(press);
                 }
             }
-            "hardness" => self.judge(event, at),
+            "hardness" => self.judge(event, at, labels),
             "frame" => self.show(event, at),
             _ => {}
         }
     }
 
-    fn judge(&mut self, event: &Value, at: Duration) {
-        let level = match event["level"].as_u64() {
-            Some(level) => Ok((level, text(event, "label"))),
-            None => Err(text(event, "rejected").replace('_', " ")),
-        };
+    fn judge(&mut self, event: &Value, at: Duration, labels: &[String]) {
+        let Answer {
+            text: answer,
+            is_weak,
+        } = Answer::of(event, labels);
         let verdict = Verdict {
             at,
             press: number(event, "press"),
             phase: text(event, "phase"),
-            level,
+            answer: plain(&answer),
+            is_weak,
             probabilities: items(event, "probabilities")
                 .filter_map(Value::as_f64)
                 .collect(),
