@@ -93,7 +93,7 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
             if is_shown {
                 log.clear_progress();
             }
-            Ok(record::run(args, setup, end).await?)
+            Ok(record::run(args, setup, &log, end).await?)
         }
         Command::Recover(args) => finish_blocking(signals, move || recover::run(&args)).await,
         Command::Replay(args) => finish(signals, replay::run(args)).await,

@@ -23,6 +23,7 @@ use super::configuration::Configuration;
 use super::doctor;
 use super::simulate::positive;
 use crate::daemon::config::Setup;
+use crate::daemon::log::Log;
 use crate::daemon::port::Port;
 use crate::daemon::record::{Error as RecordError, Progress};
 use crate::daemon::{self, Daemon, Sockets};
@@ -139,6 +140,7 @@ impl Coded for Error {
 pub async fn run(
     args: Args,
     setup: Setup,
+    log: &Log,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
     check_level(&args.labels, &setup.hrn.card().levels)?;
@@ -154,12 +156,12 @@ pub async fn run(
         Sockets::None
     };
     if let Some(directory) = &args.session {
-        let asked = ["level", "object", "name"];
+        let asked = ["level", "object", "name", "shore"];
         if let Some(key) = asked.into_iter().find(|&key| labels.contains_key(key)) {
             let key = key.to_owned();
             return Err(Error::Asked { key });
         }
-        return session::run(directory, &labels, setup, sockets, pin!(shutdown)).await;
+        return session::run(directory, &labels, setup, sockets, log, pin!(shutdown)).await;
     }
     let path = args
         .out

@@ -58,13 +58,15 @@ impl Session {
         }
     }
 
-    /// Waits for `part` in the output that was not looked at before.
-    fn says(&mut self, part: &str) {
+    /// Waits for `part` in the output that was not looked at before. Returns what comes before it.
+    fn says(&mut self, part: &str) -> String {
         let start = Instant::now();
         loop {
             if let Some(at) = self.written.find(part) {
-                self.written.drain(..at + part.len());
-                return;
+                let rest = self.written.split_off(at + part.len());
+                let mut before = std::mem::replace(&mut self.written, rest);
+                before.truncate(at);
+                return before;
             }
             let left = PATIENCE.saturating_sub(start.elapsed());
             assert!(left > Duration::ZERO, "{part:?} not in {:?}", self.written);
@@ -84,7 +86,11 @@ impl Session {
     }
 
     fn answer(&self, line: &str) {
-        rustix::io::write(&self.master, format!("{line}\n").as_bytes()).unwrap();
+        self.press(&format!("{line}\n"));
+    }
+
+    fn press(&self, keys: &str) {
+        rustix::io::write(&self.master, keys.as_bytes()).unwrap();
     }
 }
 
@@ -96,6 +102,8 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
     let _sensor = bench.sensor(&[]);
 
     let mut session = Session::start(&config, &own);
+    session.says("n: it asks for levels");
+    session.press("n");
     session.says("object 1: its name: ");
     session.answer("");
     session.says("the name is empty");
@@ -103,18 +111,18 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
     session.says("its level, 1 (hard)");
     session.answer("7");
     session.says("there is no level");
-    session.answer("4");
+    session.answer("Very-Soft");
     session.says("presses: 1");
-    session.answer("r");
+    session.press("r");
     session.says("again: Yoga mat");
     session.says("presses: 2");
-    session.answer("");
+    session.press("\r");
     session.says("object 2: its name: ");
     session.answer("a \"b\", c");
     session.says("its level");
     session.answer("0");
     session.says("presses: 1");
-    session.answer("q");
+    session.press("q");
     session.says("recorded 2 objects");
     assert_eq!(session.process.exit_code(), Some(0));
 
@@ -123,9 +131,9 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
     let [heading, first, second] = lines[..] else {
         panic!("{list}");
     };
-    assert_eq!(heading, "object,name,level,presses,file");
-    assert!(first.starts_with("1,\"Yoga mat\",4,"), "{first}");
-    assert!(second.starts_with("2,\"a \"\"b\"\", c\",0,"), "{second}");
+    assert_eq!(heading, "object,name,shore,level,presses,file");
+    assert!(first.starts_with("1,\"Yoga mat\",,4,"), "{first}");
+    assert!(second.starts_with("2,\"a \"\"b\"\", c\",,0,"), "{second}");
     let mut files: Vec<_> = fs::read_dir(&own)
         .unwrap()
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())
@@ -139,6 +147,8 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
 
     // The next session continues, and a session without a press leaves no file.
     let mut session = Session::start(&config, &own);
+    session.says("n: it asks for levels");
+    session.press("n");
     session.says("object 3: its name: ");
     session.answer("q");
     session.says("recorded 0 objects");
@@ -150,6 +160,8 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
     fs::write(own.join("007-sponge.mcap"), "theirs").unwrap();
     fs::remove_file(own.join("session.csv")).unwrap();
     let mut session = Session::start(&config, &own);
+    session.says("n: it asks for levels");
+    session.press("n");
     session.says("object 8: its name: ");
     session.answer("foam");
     session.says("its level");
@@ -160,6 +172,41 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
     for theirs in ["007-sponge.mcap", "008-foam.mcap"] {
         assert_eq!(fs::read(own.join(theirs)).unwrap(), b"theirs");
     }
+}
+
+#[test]
+fn a_reading_gives_the_level_and_no_line_of_the_log_cuts_through_a_question() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let own = bench.path("own");
+    let _sensor = bench.sensor(&[]);
+
+    let mut session = Session::record(&config, &["--sockets", "--session", own.to_str().unwrap()]);
+    session.says("y: it asks for readings");
+    session.press("y");
+    session.says("object 1: its name: ");
+    session.answer("foam");
+    session.says("its Shore OO reading: ");
+    session.answer("soft");
+    session.says("no level has the Shore OO reading \"soft\"");
+    session.answer("65.5");
+    session.says("level 2 (firm)");
+    session.says("presses: 0");
+    let mut subscriber = bench.subscriber();
+    session.says("presses: 1");
+    subscriber.until(&serde_json::json!({"type": "press", "state": "begin", "press": 2}));
+    // The recording ends in the middle of a press, and the log warns of that.
+    session.press("\r");
+    let before = session.says("object 2: its name: ");
+    assert!(before.contains("aborted"), "{before:?}");
+    session.answer("sponge");
+    let between = session.says("its Shore OO reading: ");
+    assert!(!between.contains("WARN"), "{between:?}");
+    session.answer("q");
+    session.says("recorded 1 object in");
+    assert_eq!(session.process.exit_code(), Some(0));
+    let list = fs::read_to_string(own.join("session.csv")).unwrap();
+    assert!(list.contains("\n1,\"foam\",65.5,2,"), "{list}");
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! `hardnessd record --session`: one recording for each object, labelled with the user's answers.
 //!
-//! It asks on the terminal for the object's name and level, counts the presses as they come, and
-//! continues with the next object. `hrn-train collect` takes the files as they are.
+//! It asks on the terminal for the object's name and its Shore hardness or level, counts the presses
+//! as they come, and continues with the next object. `hrn-train collect` takes the files as they are.
 
 use std::fs::{self, File};
 use std::future::Future;
@@ -10,58 +10,122 @@ use std::path::{Path, PathBuf};
 use std::pin::Pin;
 use std::time::Duration;
 
+use rustix::termios::{LocalModes, OptionalActions, Termios};
 use tokio::sync::{mpsc, watch};
 
-use super::{Error, check_level, clear, create, levels, record, said};
+use super::{Error, clear, create, levels, record, said};
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
+use crate::daemon::log::Log;
 use crate::daemon::record::Progress;
 use hardnessd_core::recording::{LabelError, Labels, check_label};
+use hardnessd_core::verdict::Level;
 
 /// The list of what was recorded, in the directory of a session.
 const LIST: &str = "session.csv";
 /// The first line of the list.
-const HEADING: &str = "object,name,level,presses,file\n";
+const HEADING: &str = "object,name,shore,level,presses,file\n";
 
 /// The time between two updates of the progress.
 const SHOWN_EVERY: Duration = Duration::from_millis(200);
 
 /// The user at the terminal.
 struct User<'a> {
-    lines: mpsc::Receiver<String>,
+    input: mpsc::Receiver<Vec<u8>>,
+    /// The input that no answer has used.
+    unused: Vec<u8>,
     shutdown: Pin<&'a mut dyn Future<Output = ()>>,
     has_gone: bool,
 }
 
+/// A terminal that passes single keys on and does not show them. It passes lines on again when this
+/// is dropped.
+struct Keys {
+    before: Option<Termios>,
+}
+
+impl Keys {
+    fn begin() -> Self {
+        let stdin = rustix::stdio::stdin();
+        let before = rustix::termios::tcgetattr(stdin).ok();
+        if let Some(before) = &before {
+            let mut keys = before.clone();
+            keys.local_modes -= LocalModes::ICANON | LocalModes::ECHO;
+            let _ = rustix::termios::tcsetattr(stdin, OptionalActions::Now, &keys);
+        }
+        Self { before }
+    }
+}
+
+impl Drop for Keys {
+    fn drop(&mut self) {
+        if let Some(before) = &self.before {
+            // A key that was pressed twice must not answer the next question.
+            let _ =
+                rustix::termios::tcsetattr(rustix::stdio::stdin(), OptionalActions::Flush, before);
+        }
+    }
+}
+
+/// Ctrl-D where it is a key.
+const END_OF_INPUT: u8 = 4;
+
 impl User<'_> {
     /// Reads stdin on a thread of its own, which ends with the process.
     fn at_terminal<'a>(shutdown: Pin<&'a mut dyn Future<Output = ()>>) -> User<'a> {
-        let (sender, lines) = mpsc::channel(1);
+        let (sender, input) = mpsc::channel(1);
         std::thread::spawn(move || {
-            for line in io::stdin().lines().map_while(Result::ok) {
-                if sender.blocking_send(line).is_err() {
+            let mut bytes = [0; 1024];
+            while let Ok(read @ 1..) = rustix::io::read(rustix::stdio::stdin(), &mut bytes) {
+                if sender.blocking_send(bytes[..read].to_vec()).is_err() {
                     return;
                 }
             }
         });
         User {
-            lines,
+            input,
+            unused: Vec::new(),
             shutdown,
             has_gone: false,
         }
     }
 
-    /// The next line, without the blanks around it. `None` if no more lines come.
-    async fn line(&mut self) -> Option<String> {
+    /// Waits for input. Returns `false` if no more comes.
+    async fn wait(&mut self) -> bool {
         if self.has_gone {
-            return None;
+            return false;
         }
-        let line = tokio::select! {
-            line = self.lines.recv() => line,
+        let input = tokio::select! {
+            input = self.input.recv() => input,
             () = &mut self.shutdown => None,
         };
-        self.has_gone = line.is_none();
-        line.map(|line| line.trim().to_owned())
+        self.has_gone = input.is_none();
+        self.unused.extend(input.into_iter().flatten());
+        !self.has_gone
+    }
+
+    /// The next line, without the blanks around it. `None` if no more lines come.
+    async fn line(&mut self) -> Option<String> {
+        loop {
+            if let Some(end) = self.unused.iter().position(|&byte| byte == b'\n') {
+                let line: Vec<u8> = self.unused.drain(..=end).collect();
+                return Some(String::from_utf8_lossy(&line).trim().to_owned());
+            }
+            if !self.wait().await {
+                return None;
+            }
+        }
+    }
+
+    /// The next key. `None` if no more keys come. The terminal must pass [`Keys`] on.
+    async fn key(&mut self) -> Option<char> {
+        while self.unused.is_empty() {
+            if !self.wait().await {
+                return None;
+            }
+        }
+        let key = self.unused.remove(0);
+        (key != END_OF_INPUT).then(|| char::from(key).to_ascii_lowercase())
     }
 
     /// Asks until the answer is usable. Returns `None` if the answer is `q` or no more answers
@@ -94,13 +158,16 @@ enum Unusable {
     Name(#[from] LabelError),
     #[error("there is no level {0:?}")]
     Level(String),
+    #[error("no level has the Shore OO reading {0:?}: expected a number from 0 to 100")]
+    Shore(String),
 }
 
 /// An object to press.
 struct Object {
     number: u32,
     name: String,
-    level: String,
+    shore: Option<String>,
+    level: u8,
 }
 
 /// What to do with a recording that the user has ended.
@@ -120,6 +187,7 @@ pub(super) async fn run(
     labels: &Labels,
     setup: Setup,
     sockets: Sockets,
+    log: &Log,
     shutdown: Pin<&mut dyn Future<Output = ()>>,
 ) -> Result<(), Error> {
     if !(io::stdin().is_terminal() && io::stderr().is_terminal()) {
@@ -129,14 +197,25 @@ pub(super) async fn run(
     let mut list = List::open(directory)?;
     let mut user = User::at_terminal(shutdown);
     say("One recording for each object. `q` ends the session.\n");
-    while let Some(object) = ask_for_object(&mut user, list.next()?, &setup).await {
-        if !record_object(
+    let levels = setup.hrn.card().levels.clone();
+    let has_limits = levels
+        .iter()
+        .all(|level| !upper_limit(&level.shore).is_nan());
+    let mut asked = if has_limits {
+        ask_for_durometer(&mut user).await
+    } else {
+        Some(false)
+    };
+    while let Some(has_durometer) = asked
+        && let Some(object) = ask_for_object(&mut user, list.next()?, has_durometer, &levels).await
+    {
+        let is_next = record_object(
             &mut user, &object, directory, labels, &setup, sockets, &mut list,
         )
-        .await?
-        {
-            break;
-        }
+        .await?;
+        // A late line would cut through the next question.
+        log.flush();
+        asked = asked.filter(|_| is_next);
     }
     let directory = said(directory);
     say(&format!(
@@ -147,7 +226,28 @@ pub(super) async fn run(
     Ok(())
 }
 
-async fn ask_for_object(user: &mut User<'_>, number: u32, setup: &Setup) -> Option<Object> {
+/// Whether the levels come from a durometer. `None` if the user quits.
+async fn ask_for_durometer(user: &mut User<'_>) -> Option<bool> {
+    say("\nDo you have a Shore OO durometer? y: it asks for readings, n: it asks for levels ");
+    let _keys = Keys::begin();
+    loop {
+        let answer = match user.key().await? {
+            'y' => Some(true),
+            'n' => Some(false),
+            'q' => None,
+            _ => continue,
+        };
+        say("\n");
+        return answer;
+    }
+}
+
+async fn ask_for_object(
+    user: &mut User<'_>,
+    number: u32,
+    has_durometer: bool,
+    levels: &[Level],
+) -> Option<Object> {
     let name = user
         .ask(&format!("\nobject {number}: its name"), |name| {
             if name.is_empty() {
@@ -157,20 +257,70 @@ async fn ask_for_object(user: &mut User<'_>, number: u32, setup: &Setup) -> Opti
             Ok(name.to_owned())
         })
         .await?;
-    let known = &setup.hrn.card().levels;
-    let question = format!("its level, {}, or 0 if you do not know", levels(known));
-    let level = user
-        .ask(&question, |level| {
-            let label = [("level".to_owned(), level.to_owned())];
-            check_level(&label, known).map_err(|_| Unusable::Level(level.to_owned()))?;
-            Ok(level.to_owned())
-        })
-        .await?;
+    let (shore, level) = if has_durometer {
+        let (shore, level) = user
+            .ask("its Shore OO reading", |reading| {
+                let level = level_of_reading(reading, levels);
+                let level = level.ok_or_else(|| Unusable::Shore(reading.to_owned()))?;
+                Ok((reading.to_owned(), level))
+            })
+            .await?;
+        say(&format!("level {} ({})\n", level.level, level.label));
+        (Some(shore), level.level)
+    } else {
+        let question = format!(
+            "its level, {}, or 0 if you do not know",
+            self::levels(levels)
+        );
+        let level = user
+            .ask(&question, |level| {
+                level_named(level, levels).ok_or_else(|| Unusable::Level(level.to_owned()))
+            })
+            .await?;
+        (None, level)
+    };
     Some(Object {
         number,
         name,
+        shore,
         level,
     })
+}
+
+/// A level by its number or its name; 0 means that it is unknown.
+fn level_named(text: &str, levels: &[Level]) -> Option<u8> {
+    let is_meant =
+        |level: &&Level| level.label.eq_ignore_ascii_case(text) || level.level.to_string() == text;
+    match text {
+        "0" => Some(0),
+        _ => levels.iter().find(is_meant).map(|level| level.level),
+    }
+}
+
+/// The level of a durometer's reading: the one with the least upper limit that is not below the
+/// reading. So 60.5 belongs to `61-70`. `None` if the text is no reading.
+fn level_of_reading<'a>(text: &str, levels: &'a [Level]) -> Option<&'a Level> {
+    let reading: f64 = text.parse().ok()?;
+    if !(0.0..=100.0).contains(&reading) {
+        return None;
+    }
+    let limits = levels
+        .iter()
+        .map(|level| (upper_limit(&level.shore), level));
+    let fitting = limits.filter(|&(limit, _)| limit >= reading);
+    let least = fitting.min_by(|one, other| one.0.total_cmp(&other.0));
+    least.map(|(_, level)| level)
+}
+
+/// The upper limit of an interval such as `>70`, `61-70` or `<=50`.
+fn upper_limit(shore: &str) -> f64 {
+    if shore.starts_with('>') {
+        return f64::INFINITY;
+    }
+    let last = shore
+        .rsplit(|c: char| !(c.is_ascii_digit() || c == '.'))
+        .next();
+    last.and_then(|last| last.parse().ok()).unwrap_or(f64::NAN)
 }
 
 /// Records presses of one object, and again if the user asks for it. Returns `false` if the user
@@ -190,8 +340,10 @@ async fn record_object(
     labels.extend([
         ("object".to_owned(), object.number.to_string()),
         ("name".to_owned(), object.name.clone()),
-        ("level".to_owned(), object.level.clone()),
+        ("level".to_owned(), object.level.to_string()),
     ]);
+    let shore = object.shore.clone();
+    labels.extend(shore.map(|shore| ("shore".to_owned(), shore)));
     loop {
         // From here on the file is this session's own, so it may be removed.
         let file = create(&path)?;
@@ -234,8 +386,10 @@ async fn record_object(
     }
 }
 
-/// Counts presses in one line until the user decides what to do next.
+/// Counts presses in one line until the user presses a key that says what to do next.
 async fn wait_for_user(user: &mut User<'_>, counted: &mut watch::Receiver<Progress>) -> Next {
+    let _keys = Keys::begin();
+    user.unused.clear();
     loop {
         let Progress {
             frames,
@@ -251,10 +405,10 @@ async fn wait_for_user(user: &mut User<'_>, counted: &mut watch::Receiver<Progre
         };
         say(&format!("\r\x1b[K{line} "));
         tokio::select! {
-            line = user.line() => match line.as_deref() {
-                Some("") => return Next::Keep,
-                Some("r") => return Next::Redo,
-                Some("q") | None => return Next::KeepAndQuit,
+            key = user.key() => match key {
+                Some('\n') => return Next::Keep,
+                Some('r') => return Next::Redo,
+                Some('q') | None => return Next::KeepAndQuit,
                 Some(_) => {}
             },
             () = tokio::time::sleep(SHOWN_EVERY) => {}
@@ -332,10 +486,12 @@ impl List {
         let Object {
             number,
             name,
+            shore,
             level,
         } = object;
         let name = name.replace('"', "\"\"");
-        let line = format!("{number},\"{name}\",{level},{presses},{file}\n");
+        let shore = shore.as_deref().unwrap_or_default();
+        let line = format!("{number},\"{name}\",{shore},{level},{presses},{file}\n");
         let written = File::options()
             .append(true)
             .open(&self.path)
@@ -370,6 +526,46 @@ mod tests {
     }
 
     #[test]
+    fn a_reading_and_a_name_have_a_level() {
+        let level = |level, label: &str, shore: &str| Level {
+            level,
+            label: label.to_owned(),
+            shore: shore.to_owned(),
+        };
+        let levels = [
+            level(1, "hard", ">70"),
+            level(2, "firm", "61-70"),
+            level(3, "soft", "51-60"),
+            level(4, "very-soft", "<=50"),
+        ];
+        for (reading, expected) in [
+            ("100", Some(1)),
+            ("70.5", Some(1)),
+            ("70", Some(2)),
+            ("60.5", Some(2)),
+            ("60", Some(3)),
+            ("50", Some(4)),
+            ("0", Some(4)),
+            ("101", None),
+            ("-1", None),
+            ("NaN", None),
+            ("soft", None),
+        ] {
+            let found = level_of_reading(reading, &levels).map(|level| level.level);
+            assert_eq!(found, expected, "{reading}");
+        }
+        for (name, expected) in [
+            ("0", Some(0)),
+            ("4", Some(4)),
+            ("Very-Soft", Some(4)),
+            ("5", None),
+            ("", None),
+        ] {
+            assert_eq!(level_named(name, &levels), expected, "{name}");
+        }
+    }
+
+    #[test]
     fn a_session_goes_on_with_the_numbers_of_the_one_before() {
         let directory = tempfile::tempdir().unwrap();
         let mut list = List::open(directory.path()).unwrap();
@@ -377,7 +573,8 @@ mod tests {
         let object = Object {
             number: 1,
             name: "a \"b\", c".to_owned(),
-            level: "2".to_owned(),
+            shore: Some("63.5".to_owned()),
+            level: 2,
         };
         list.add(&object, 20, "001-a.mcap").unwrap();
         assert_eq!(list.next().unwrap(), 2);
@@ -392,7 +589,7 @@ mod tests {
         let text = fs::read_to_string(directory.path().join(LIST)).unwrap();
         assert_eq!(
             text,
-            format!("{HEADING}1,\"a \"\"b\"\", c\",2,20,001-a.mcap\n")
+            format!("{HEADING}1,\"a \"\"b\"\", c\",63.5,2,20,001-a.mcap\n")
         );
         fs::write(directory.path().join(LIST), "x,y\n").unwrap();
         assert!(List::open(directory.path()).is_err());
