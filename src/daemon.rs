@@ -386,12 +386,16 @@ fn short(setup: &Setup) -> &str {
 
 fn about(setup: &Setup, hello: &Hello) -> About {
     let sensors = setup.sensors.iter();
+    let mut labels = Labels::new();
+    if setup.config.sensors.iter().any(|one| one.port.is_simulated()) {
+        labels.insert("simulated".to_owned(), "true".to_owned());
+    }
     About {
         robot: hello.robot.clone(),
         run: hello.run.clone(),
         boot_id: hello.boot_id.clone(),
         reason: None,
-        labels: Labels::new(),
+        labels,
         sensors: sensors
             .map(|sensor| RecordedSensor::new(sensor, &setup.hrn))
             .collect(),

@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
+use rustix::fs::{Mode, OFlags};
 use serde::{Deserialize, Serialize, Serializer};
 
 /// A port, as `port` of a configuration names it.
@@ -35,7 +36,24 @@ impl Port {
             Self::Tcp(_) | Self::Udp(_) => None,
         }
     }
+
+    /// Whether `hardnessd simulate` plays at the port now. No other port is opened for this.
+    pub(crate) fn is_simulated(&self) -> bool {
+        let is_pty = |path: &PathBuf| path.starts_with("/dev/pts");
+        let device = self.device().and_then(|path| path.canonicalize().ok());
+        let Some(device) = device.filter(is_pty) else {
+            return false;
+        };
+        let flags = OFlags::RDONLY | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
+        let opened = rustix::fs::open(&device, flags, Mode::empty());
+        let size = opened.and_then(rustix::termios::tcgetwinsize);
+        size.is_ok_and(|size| (size.ws_xpixel, size.ws_ypixel) == SIMULATED)
+    }
 }
+
+/// The pixels of the window of a pty at which `hardnessd simulate` plays. A port has no window, so this
+/// marks it for every process, whatever else it sets.
+pub(crate) const SIMULATED: (u16, u16) = (0x6864, 0x7369);
 
 impl From<PathBuf> for Port {
     fn from(path: PathBuf) -> Self {

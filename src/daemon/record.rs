@@ -206,11 +206,14 @@ pub(crate) struct Recorder {
 impl Recorder {
     /// Starts the thread.
     pub(crate) fn start(target: Target, mut about: About) -> Result<Self, Error> {
-        let (labels, frames) = match &target {
-            Target::File { labels, .. } => (labels.clone(), true),
-            Target::Directory(settings) => (Labels::new(), settings.continuous),
+        let frames = match &target {
+            Target::File { labels, .. } => {
+                about.labels.extend(labels.clone());
+                true
+            }
+            Target::Directory(settings) => settings.continuous,
         };
-        about.labels = labels.clone();
+        let labels = about.labels.clone();
         let (sender, inbox) = sync_channel(QUEUED);
         let dropped = Arc::new(AtomicU64::new(0));
         let (stopping, stop) = oneshot::channel();

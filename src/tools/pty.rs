@@ -13,10 +13,11 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use rustix::io::Errno;
-use rustix::termios::{OptionalActions, QueueSelector};
+use rustix::termios::{OptionalActions, QueueSelector, Winsize};
 use tokio::time::Instant;
 
 use self::pair::Pair;
+use crate::daemon::port::SIMULATED;
 
 /// If bytes stay unread for this long, there is no reader. The bytes are dropped, and a lock that a
 /// killed reader left is released: TIOCEXCL outlives the reader, because the pair stays open here.
@@ -55,6 +56,14 @@ impl Pty {
         let mut settings = rustix::termios::tcgetattr(&device)?;
         settings.make_raw();
         rustix::termios::tcsetattr(&device, OptionalActions::Now, &settings)?;
+        let (ws_xpixel, ws_ypixel) = SIMULATED;
+        let mark = Winsize {
+            ws_row: 0,
+            ws_col: 0,
+            ws_xpixel,
+            ws_ypixel,
+        };
+        rustix::termios::tcsetwinsize(&device, mark)?;
         if let Some(link) = link {
             place(&path, link)?;
         }

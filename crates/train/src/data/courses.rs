@@ -3,13 +3,14 @@
 //! In: files, or the simulator's courses. Out: [`Courses`], with a row per kept frame and a row per
 //! press. `docs/formats.md` has the arrays.
 
+use std::collections::BTreeSet;
 use std::io::{self, Seek, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use super::dataset::file::{self, FORCES_N, File, SHORE};
 use super::dataset::{
-    Dataset, DatasetError, Object, Sample, Source, levels, object_in_both_splits, objects_after,
+    self, Dataset, DatasetError, Kind, Object, Sample, Source, levels, object_in_both_splits, objects_after,
     pitch_mm, warn_of_object_in_both_splits,
 };
 use super::npz::Writer;
@@ -168,6 +169,14 @@ impl Courses {
         }
     }
 
+    /// The kinds of the labelled test presses, of files from `sources`, whose objects were not learnt.
+    pub fn validated(&self, sources: &[Source]) -> BTreeSet<Kind> {
+        let presses = self.presses.iter();
+        let presses = presses.filter(|press| press.reference.is_none());
+        let judged = |press: &Press| (sources, Some(press.pressed()), press.level, press.split);
+        dataset::validated(presses.map(judged))
+    }
+
     /// Indices of a split's presses whose level is known.
     pub fn labelled(&self, split: Split) -> impl Iterator<Item = usize> {
         let presses = self.presses.iter().enumerate();
@@ -235,6 +244,9 @@ impl Courses {
                 press.sensor = press.sensor.saturating_add(first_sensor);
             }
             first_sensor = sensors.map_or(0, |last| last.saturating_add(first_sensor + 1));
+            if let Some(source) = sources.last_mut() {
+                source.shift_objects(before);
+            }
             all.append(part, before);
         }
         Ok((all, sources))

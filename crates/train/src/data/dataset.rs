@@ -221,6 +221,9 @@ pub struct Source {
     /// The levels that the file states, if a model can state them.
     #[serde(skip)]
     pub levels: Option<Vec<Level>>,
+    /// The kind of the presses of recorded objects, by number and level.
+    #[serde(skip)]
+    pub recorded: BTreeMap<(u32, u8), Kind>,
 }
 
 /// The name of our simulator in `meta.generator`.
@@ -229,7 +232,7 @@ pub const SIMULATOR: &str = "hardnessd simulator";
 pub const COLLECTOR: &str = "hrn-train collect";
 
 /// The kind of samples in a file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
     /// Samples of our simulator.
     Simulated,
@@ -250,6 +253,54 @@ impl Source {
         let generators = self.generator.as_deref().unwrap_or_default().split(", ");
         generators.map(kind).collect()
     }
+
+    /// Adds `before` to the numbers of recorded objects, as to those of the file's presses.
+    pub(super) fn shift_objects(&mut self, before: u32) {
+        let recorded = std::mem::take(&mut self.recorded).into_iter();
+        self.recorded = recorded
+            .map(|((object, level), kind)| ((object + before, level), kind))
+            .collect();
+    }
+}
+
+/// The possible kinds of a press of an object in one of the files.
+fn kinds_of(sources: &[Source], object: Option<Object>) -> Vec<Kind> {
+    let known = object.and_then(|of| {
+        let mut recorded = sources.iter().map(|source| &source.recorded);
+        recorded.find_map(|recorded| recorded.get(&(of.number, of.level)))
+    });
+    if let Some(kind) = known {
+        return vec![*kind];
+    }
+    let mut kinds: Vec<Kind> = sources.iter().flat_map(Source::kinds).collect();
+    if kinds.iter().any(|&kind| kind != Kind::Recorded) {
+        kinds.retain(|&kind| kind != Kind::Recorded);
+    }
+    kinds
+}
+
+/// A press as far as its validation is concerned: the files that it may be from, its object if that
+/// is known, its level and its split.
+pub(super) type Judged<'a> = (&'a [Source], Option<Object>, u8, Split);
+
+/// The kinds of the labelled test presses whose objects were not learnt.
+pub(super) fn validated<'a>(presses: impl Iterator<Item = Judged<'a>> + Clone) -> BTreeSet<Kind> {
+    let learnt = presses.clone().filter(|press| press.3 == Split::Train);
+    let learnt: BTreeSet<Object> = learnt.filter_map(|press| press.1).collect();
+    let is_learnt = |object: &Object| learnt.iter().any(|other| other.is_same_as(object));
+    // An object has many presses.
+    let mut seen = BTreeSet::new();
+    let mut kinds = BTreeSet::new();
+    for (sources, object, level, split) in presses {
+        if split == Split::Train || level == 0 {
+            continue;
+        }
+        let is_new = object.is_none_or(|object| seen.insert(object));
+        if is_new && !object.as_ref().is_some_and(is_learnt) {
+            kinds.extend(kinds_of(sources, object));
+        }
+    }
+    kinds
 }
 
 /// Samples of one or several files.
@@ -418,10 +469,22 @@ impl Dataset {
                     source,
                     ..sample
                 }));
-            all.sources.extend(part.sources);
+            all.sources.extend(part.sources.into_iter().map(|mut source| {
+                source.shift_objects(before);
+                source
+            }));
             all.paths.extend(part.paths);
         }
         Ok(all)
+    }
+
+    /// The kinds of the labelled test samples whose objects were not learnt.
+    pub fn validated(&self) -> BTreeSet<Kind> {
+        let judged = |sample: &Sample| {
+            let source = std::slice::from_ref(&self.sources[sample.source]);
+            (source, sample.pressed(), sample.level, sample.split)
+        };
+        validated(self.samples.iter().map(judged))
     }
 
     /// Distance between the taxels of the sensor that was pressed, in mm.

@@ -22,7 +22,7 @@ use hardnessd_simulator::Split;
 pub struct Stated {
     /// The value of `hrn.method`.
     pub method: String,
-    /// The value of `hrn.validation`. `None` derives it from the origin of the data.
+    /// The value of `hrn.validation`. `None` derives it from the presses that judge it.
     pub validation: Option<String>,
 }
 
@@ -69,7 +69,7 @@ pub fn adopt(
         validation: stated
             .validation
             .clone()
-            .unwrap_or_else(|| export::validation(&dataset.sources).to_owned()),
+            .unwrap_or_else(|| export::validation(&dataset.validated()).to_owned()),
         range: export::range(learnt),
         conformal: None,
     };

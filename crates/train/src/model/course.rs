@@ -77,7 +77,7 @@ pub fn finish(
         method: description.method.clone(),
         data: data(&description.data)?,
         metrics,
-        validation: validation(&description.data).to_owned(),
+        validation: validation(&courses.validated(&description.data)).to_owned(),
         range: range(train.iter().map(best_frame)).with_presses(of_presses),
         conformal: (threshold > 0.0).then_some(Conformal {
             alpha: ALPHA,

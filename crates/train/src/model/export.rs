@@ -4,6 +4,8 @@
 //! probabilities as training does. Out: `hrn.onnx`, which carries check frames that the daemon must
 //! reproduce, and `evaluation.json`, which is measured on the exported file.
 
+use std::collections::BTreeSet;
+
 use anyhow::ensure;
 use serde_json::json;
 
@@ -61,7 +63,7 @@ pub fn finish(
         method: description.method.clone(),
         data: data(&description.data)?,
         metrics: metrics(description, recogniser.temperature, recogniser.force_factor),
-        validation: validation(&description.data).to_owned(),
+        validation: validation(&dataset.validated()).to_owned(),
         range: range(train.iter().map(|&index| dataset.samples[index].frame)),
         conformal: None,
     };
@@ -200,12 +202,13 @@ pub(super) fn data(sources: &[Source]) -> serde_json::Result<String> {
     }
 }
 
-/// The value of `hrn.validation`.
-pub(super) fn validation(sources: &[Source]) -> &'static str {
-    let kinds: Vec<Kind> = sources.iter().flat_map(Source::kinds).collect();
+/// The value of `hrn.validation`. `kinds` are those of the labelled presses that were judged and
+/// whose objects were not learnt.
+pub(super) fn validation(kinds: &BTreeSet<Kind>) -> &'static str {
     let [simulated, recorded, unknown] =
         [Kind::Simulated, Kind::Recorded, Kind::Unknown].map(|kind| kinds.contains(&kind));
     match (simulated, recorded, unknown) {
+        (false, false, false) => "not validated",
         (true, false, false) => "simulated data only",
         (true, true, false) => "simulated and recorded data",
         (false, true, false) => "recorded data",
@@ -236,48 +239,70 @@ pub(super) fn range(frames: impl Iterator<Item = ModelFrame>) -> Range {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use super::*;
+    use crate::data::dataset::Sample;
 
     #[test]
-    fn a_model_is_said_to_be_of_what_is_told_of_its_data() {
-        for (generators, expected) in [
+    fn a_model_is_validated_by_what_judged_it_and_it_did_not_learn() {
+        let sample = |object: Option<u32>, level, split| Sample {
+            frame: ModelFrame::default(),
+            level,
+            object,
+            material: None,
+            force_n: None,
+            split,
+            shore: None,
+            source: 0,
+        };
+        let (train, test) = (Split::Train, Split::Test);
+        let learnt = sample(Some(1), 1, train);
+        let recorded = BTreeMap::from([((2, 1), Kind::Recorded), ((3, 1), Kind::Simulated)]);
+        let both = Some("hardnessd simulator 0.2.0, hrn-train collect 0.2.0");
+        for (generator, judged, expected) in [
+            (both, vec![], "not validated"),
+            (both, vec![sample(Some(4), 0, test)], "not validated"),
+            (both, vec![sample(Some(1), 1, test)], "not validated"),
+            (both, vec![sample(Some(4), 1, test)], "simulated data only"),
+            (both, vec![sample(Some(3), 1, test)], "simulated data only"),
+            (both, vec![sample(Some(2), 1, test)], "recorded data"),
             (
-                &[Some("hardnessd simulator 0.1.0")][..],
-                "simulated data only",
-            ),
-            (&[Some("hrn-train collect 0.1.0")], "recorded data"),
-            (
-                &[Some("hardnessd simulator 0.1.0, hrn-train collect 0.2.0")],
+                both,
+                vec![sample(Some(2), 1, test), sample(Some(4), 1, test)],
                 "simulated and recorded data",
             ),
             (
-                &[
-                    Some("hardnessd simulator 0.1.0"),
-                    Some("hrn-train collect 0.1.0"),
-                ],
-                "simulated and recorded data",
+                Some("hrn-train collect 0.2.0"),
+                vec![sample(None, 1, test)],
+                "recorded data",
             ),
-            (&[None], "data of unknown origin"),
-            (&[Some("finite elements")], "data of unknown origin"),
+            (None, vec![sample(None, 1, test)], "data of unknown origin"),
             (
-                &[Some("hrn-train collect 0.1.0"), None],
-                "data partly of unknown origin",
+                Some("finite elements"),
+                vec![sample(None, 1, test)],
+                "data of unknown origin",
             ),
             (
-                &[Some("unknown, hrn-train collect 0.1.0")],
+                None,
+                vec![sample(Some(2), 1, test), sample(None, 1, test)],
                 "data partly of unknown origin",
             ),
         ] {
-            let source = |generator: &Option<&str>| Source {
-                name: String::new(),
-                seed: None,
-                sha256: String::new(),
-                generator: generator.map(str::to_owned),
-                pitch_mm: None,
-                levels: None,
+            let dataset = Dataset {
+                samples: [vec![learnt.clone()], judged].concat(),
+                sources: vec![Source {
+                    name: String::new(),
+                    seed: None,
+                    sha256: String::new(),
+                    generator: generator.map(str::to_owned),
+                    pitch_mm: None,
+                    levels: None,
+                    recorded: recorded.clone(),
+                }],
+                paths: Vec::new(),
             };
-            let sources: Vec<Source> = generators.iter().map(source).collect();
-            assert_eq!(validation(&sources), expected, "{generators:?}");
+            assert_eq!(validation(&dataset.validated()), expected, "{generator:?}");
         }
     }
 }

@@ -23,6 +23,7 @@ fn description(name: &str, sha256: &str) -> Description {
             generator: None,
             pitch_mm: None,
             levels: None,
+            recorded: std::collections::BTreeMap::new(),
         }],
     }
 }

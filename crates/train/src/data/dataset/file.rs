@@ -1,5 +1,6 @@
 //! Data sets as `.npz` files: arrays with the names, types and shapes of `docs/formats.md`.
 
+use std::collections::BTreeMap;
 use std::io::{self, Cursor, Read, Seek, Write};
 use std::ops::RangeInclusive;
 use std::os::unix::fs::FileTypeExt as _;
@@ -8,7 +9,7 @@ use std::path::Path;
 use zip::ZipArchive;
 use zip::result::ZipError;
 
-use super::{Dataset, DatasetError, Sample, Source, levels};
+use super::{Dataset, DatasetError, Kind, Sample, Source, levels};
 use crate::data::npz::{Element, Writer};
 use hardnessd_core::npy::{Header, NpyError};
 use hardnessd_core::verdict::{COLS, Level, ModelFrame, ROWS, TAXELS, check_levels, sha256_hex};
@@ -157,7 +158,23 @@ pub(in crate::data) fn source(
         generator: meta["generator"].as_str().map(str::to_owned),
         pitch_mm,
         levels: stated.filter(|of| of.len() == levels().len()),
+        recorded: recorded(&meta["captures"]),
     })
+}
+
+/// The objects of recordings, and whether `hardnessd simulate` played them.
+fn recorded(captures: &serde_json::Value) -> BTreeMap<(u32, u8), Kind> {
+    let captures = captures.as_array().into_iter().flatten();
+    let object = |capture: &serde_json::Value| {
+        let number = u32::try_from(capture["object"].as_u64()?).ok()?;
+        let level = u8::try_from(capture["level"].as_u64()?).ok()?;
+        let kind = match capture["labels"]["simulated"].as_str() {
+            Some("true") => Kind::Simulated,
+            _ => Kind::Recorded,
+        };
+        Some(((number, level), kind))
+    };
+    captures.filter_map(object).collect()
 }
 
 /// The description that an `.npz` file carries as `meta`. Null if it has none.

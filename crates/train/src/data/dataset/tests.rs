@@ -380,6 +380,7 @@ fn a_model_states_the_levels_of_its_data() {
         generator: None,
         pitch_mm: None,
         levels,
+        recorded: BTreeMap::new(),
     };
     assert_eq!(levels_of(&[source(None)]), levels());
     let several = [
