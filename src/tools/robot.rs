@@ -15,6 +15,7 @@ use tokio::sync::watch;
 use tokio::time::{Instant, MissedTickBehavior};
 
 use crate::daemon::now;
+use hardnessd_core::wording;
 use hardnessd_simulator::Approach;
 
 /// The time between two positions.
@@ -54,14 +55,21 @@ pub(crate) struct Robot {
 }
 
 impl Robot {
-    /// Sends positions for ever. Prints the first refusal of a daemon on stderr.
+    /// Sends positions for ever. Prints the first refusal of a daemon on stderr, and that there is no
+    /// daemon yet.
     pub(crate) async fn run(self) {
         let mut complained = false;
         loop {
-            if let Err(Ended::Refused(message)) = self.tell().await
-                && !complained
-            {
-                hardnessd_core::say!("warning: {}: {message}", self.socket.display());
+            let complaint = match self.tell().await {
+                Err(Ended::Refused(message)) => Some(message),
+                Err(Ended::Absent(error)) => Some(format!(
+                    "{}: no daemon takes positions there yet, and they are sent as soon as one does",
+                    wording::line(&error)
+                )),
+                Ok(()) | Err(Ended::Gone) => None,
+            };
+            if let Some(complaint) = complaint.filter(|_| !complained) {
+                hardnessd_core::say!("warning: {}: {complaint}", self.socket.display());
                 complained = true;
             }
             tokio::time::sleep(RETRY).await;
@@ -70,10 +78,15 @@ impl Robot {
 
     /// Sends positions to one daemon until the daemon ends or refuses them.
     async fn tell(&self) -> Result<(), Ended> {
-        let (input, mut output) = UnixStream::connect(&self.socket).await?.into_split();
+        let daemon = UnixStream::connect(&self.socket).await;
+        let (input, mut output) = daemon.map_err(Ended::Absent)?.into_split();
         let mut lines = BufReader::new(input).lines();
         let hello = lines.next_line().await?.ok_or(Ended::Gone)?;
         let hello: Value = serde_json::from_str(&hello).unwrap_or_default();
+        if hello["type"] != "hello" {
+            let foreign = "what answers there is no hardnessd: name the control socket of a daemon";
+            return Err(Ended::Refused(foreign.to_owned()));
+        }
         let first = hello["sensors"][0]["name"].as_str().map(str::to_owned);
         let sensor = self.sensor.clone().or(first).ok_or(Ended::Gone)?;
         // The robot needs no events.
@@ -111,7 +124,9 @@ impl Robot {
 
 /// The reason why no more positions are sent to a daemon.
 enum Ended {
-    /// The daemon is not running, or has ended.
+    /// Nothing answers at the socket.
+    Absent(io::Error),
+    /// The daemon has ended.
     Gone,
     /// The daemon refused the positions with this message.
     Refused(String),

@@ -78,6 +78,15 @@ pub enum Error {
         /// A description of the line that came instead.
         found: String,
     },
+    /// The other end is a web server.
+    #[error(
+        "{address}: a web server answers there, such as the live page's: name the address of \
+         [publish.tcp]"
+    )]
+    Web {
+        /// The address.
+        address: Address,
+    },
     /// The daemon refused the connection: it has too many subscribers.
     #[error("{address}: the daemon says: {message}")]
     Refused {
@@ -97,6 +106,7 @@ impl Coded for Error {
             Error::Connect(_)
             | Error::Mute { .. }
             | Error::Foreign { .. }
+            | Error::Web { .. }
             | Error::Refused { .. } => UNAVAILABLE,
             Error::Timeout { .. } => FAILED,
             Error::Print(_) => IO,
@@ -199,6 +209,10 @@ async fn next(daemon: &mut Connection) -> Result<(String, Value), Error> {
     let line = daemon.next().await?;
     match serde_json::from_str(&line) {
         Ok(event) => Ok((line, event)),
+        Err(_) if line.starts_with("HTTP/") => {
+            let address = daemon.address().clone();
+            Err(Error::Web { address })
+        }
         Err(_) => Err(Error::Foreign {
             address: daemon.address().clone(),
             found: "a line that is no JSON".to_owned(),

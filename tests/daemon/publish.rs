@@ -206,6 +206,10 @@ fn tail_does_not_wait_for_a_hello_that_does_not_come_nor_take_another_protocol()
         ),
         ("{\"type\":\"ok\"}\n", ["\"ok\"", "expected the hello"]),
         ("SSH-2.0\n", ["no JSON", "events.sock"]),
+        (
+            "HTTP/1.1 400 Bad Request\r\n",
+            ["a web server answers", "[publish.tcp]"],
+        ),
     ] {
         let stderr = says_first(line);
         for part in parts {

@@ -24,6 +24,7 @@ use crate::compare::sets::MATCHED;
 use crate::compare::table::Table;
 use crate::compare::tables;
 use crate::judge::metrics::{Bin, Evaluation};
+use crate::settings::Profile;
 
 const STYLE: &str = include_str!("report/style.css");
 
@@ -31,6 +32,10 @@ const STYLE: &str = include_str!("report/style.css");
 const CURVES: &str = "A line for each run. Blue: loss and accuracy on the training samples (of a GAN, \
                       the discriminator's loss). Orange: on held-out objects, the generator's loss, or \
                       within a component. Dashed: real frames.";
+
+/// What a run of the profile `smoke` is worth.
+const SMOKE: &str = "Profile smoke: it tries the commands in seconds and learnt nothing. The figures say nothing of \
+                     the method.";
 
 /// The page of the comparison or run in `directory`.
 ///
@@ -52,6 +57,10 @@ pub fn of(directory: &Path) -> anyhow::Result<String> {
 /// Fails if a picture of a run cannot be read.
 pub fn comparison(comparison: &Comparison) -> anyhow::Result<String> {
     let mut page = Page::default();
+    let mut entries = comparison.entries.iter();
+    if entries.any(|entry| entry.profile == Profile::Smoke) {
+        page.note(SMOKE);
+    }
     page.section("tables", "Tables");
     for table in tables::all(comparison) {
         page.subtitle(&table.title);
@@ -89,6 +98,9 @@ pub fn run(details: &Details) -> anyhow::Result<String> {
     let run = details.description.as_ref();
     let run = run.with_context(|| format!("{directory}: holds neither a comparison nor a run"))?;
     let mut page = Page::default();
+    if run.profile == Profile::Smoke {
+        page.note(SMOKE);
+    }
     let path = details.directory.join("evaluation.json");
     if let Ok(bytes) = std::fs::read(&path) {
         let evaluation: Evaluation =

@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 
 use super::dataset::file::{self, FORCES_N, File, SHORE};
 use super::dataset::{
-    self, Dataset, DatasetError, Kind, Object, Sample, Source, levels, object_in_both_splits, objects_after,
-    pitch_mm, warn_of_object_in_both_splits,
+    self, Dataset, DatasetError, Kind, Object, Sample, Source, levels, object_in_both_splits,
+    objects_after, pitch_mm, warn_of_object_in_both_splits,
 };
 use super::npz::Writer;
 use hardnessd_core::verdict::{COLS, COURSE_FRAMES, ModelFrame, ROWS, TAXELS};

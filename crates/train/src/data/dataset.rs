@@ -469,10 +469,11 @@ impl Dataset {
                     source,
                     ..sample
                 }));
-            all.sources.extend(part.sources.into_iter().map(|mut source| {
-                source.shift_objects(before);
-                source
-            }));
+            all.sources
+                .extend(part.sources.into_iter().map(|mut source| {
+                    source.shift_objects(before);
+                    source
+                }));
             all.paths.extend(part.paths);
         }
         Ok(all)

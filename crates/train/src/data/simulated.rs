@@ -3,11 +3,12 @@
 //! In: the simulator's settings. Out: `.npz` files that carry the settings in `meta.settings`, so
 //! that the same objects can be pressed again under other conditions.
 
+use std::fmt::Write;
 use std::io::Cursor;
 use std::path::Path;
 
 use anyhow::{Context as _, ensure};
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 use serde_json::json;
 
 use crate::data::courses::Courses;
@@ -38,12 +39,21 @@ pub fn all_cores() -> usize {
 }
 
 fn with_bar<T>(total: u64, what: &str, make: impl FnOnce(&(dyn Fn(usize) + Sync)) -> T) -> T {
-    let style = format!("{{bar:30}} {{pos}}/{{len}} {what}, {{per_sec}}, {{eta}} left");
-    let style = ProgressStyle::with_template(&style).expect("the template is right");
-    let bar = ProgressBar::new(total).with_style(style);
+    let style = format!("{{bar:30}} {{pos}}/{{len}} {what}, {{rate}} a second, {{eta}} left");
+    let bar = ProgressBar::new(total).with_style(with_rate(&style));
     let made = make(&|done| bar.set_position(done as u64));
     bar.finish_and_clear();
     made
+}
+
+/// A bar's style, with `{rate}`: steps a second in as many digits as mean something.
+pub(crate) fn with_rate(template: &str) -> ProgressStyle {
+    let style = ProgressStyle::with_template(template).expect("the template is right");
+    style.with_key("rate", |state: &ProgressState, out: &mut dyn Write| {
+        let rate = state.per_sec();
+        let digits = if rate < 10.0 { 1 } else { 0 };
+        let _ = write!(out, "{rate:.digits$}");
+    })
 }
 
 /// The levels with their intervals of Shore. Those of the named materials are the paper's.
