@@ -387,7 +387,12 @@ fn short(setup: &Setup) -> &str {
 fn about(setup: &Setup, hello: &Hello) -> About {
     let sensors = setup.sensors.iter();
     let mut labels = Labels::new();
-    if setup.config.sensors.iter().any(|one| one.port.is_simulated()) {
+    if setup
+        .config
+        .sensors
+        .iter()
+        .any(|one| one.port.is_simulated())
+    {
         labels.insert("simulated".to_owned(), "true".to_owned());
     }
     About {
@@ -428,6 +433,9 @@ fn hello(setup: &Setup, run: String) -> Hello {
             sha256: setup.hrn.sha256().to_owned(),
             validation: card.validation.clone(),
             levels: card.levels.clone(),
+            name: setup.model_name(),
+            needs: setup.model_needs().to_owned(),
+            without_effect: setup.without_effect(),
         },
     }
 }

@@ -30,7 +30,7 @@ use self::read::Until;
 use super::log;
 use super::port::Port;
 use hardnessd_core::sensor::{Description, Sensor};
-use hardnessd_core::verdict::Hrn;
+use hardnessd_core::verdict::{Format, Hrn};
 use hardnessd_core::{motion, press, tare, trial, wire};
 
 /// The whole configuration file.
@@ -367,6 +367,53 @@ pub struct Setup {
 }
 
 impl Setup {
+    /// The name of the model's file, or `built in`.
+    pub fn model_name(&self) -> String {
+        let path = self.config.model.path.as_ref();
+        let name = path.map(|path| path.file_name().unwrap_or(path.as_os_str()));
+        name.map_or("built in".to_owned(), |name| {
+            name.to_string_lossy().into_owned()
+        })
+    }
+
+    /// What the model judges, and what it needs beside the sensor.
+    pub fn model_needs(&self) -> &'static str {
+        match self.hrn.format() {
+            Format::Frame => "judges single frames, needs no arm",
+            Format::Course { .. } => {
+                "judges whole presses, needs the arm's positions or sensor.arm.speed_mm_s"
+            }
+        }
+    }
+
+    /// The keys of the configuration that are set and change no verdict of this model.
+    pub fn without_effect(&self) -> Vec<String> {
+        let Config { press, model, .. } = &self.config;
+        let (press_default, model_default) = (press::Settings::default(), Model::default());
+        match self.hrn.format() {
+            Format::Frame => {
+                let described = |sensor: &&SensorTable| sensor.arm != motion::Settings::default();
+                let arms = self.config.sensors.iter().filter(described);
+                let arms = arms.map(|sensor| format!("sensor.arm of {:?}", sensor.name));
+                let early = model.early_confidence != model_default.early_confidence;
+                let early = early.then(|| "model.early_confidence".to_owned());
+                arms.chain(early).collect()
+            }
+            Format::Course { .. } => {
+                let settle = press.early_settle_s != press_default.early_settle_s;
+                let force = press.early_min_force_n != press_default.early_min_force_n;
+                [
+                    settle.then_some("press.early_settle_s"),
+                    force.then_some("press.early_min_force_n"),
+                ]
+                .into_iter()
+                .flatten()
+                .map(str::to_owned)
+                .collect()
+            }
+        }
+    }
+
     /// Reads a configuration and its model. `model` replaces the configuration's own.
     ///
     /// # Errors

@@ -87,6 +87,13 @@ pub fn run(args: &Args) -> Result<(), Error> {
         warn_of_pitch(sensor, setup.hrn.card(), path);
     }
     lines += &model(&setup);
+    for key in setup.without_effect() {
+        hardnessd_core::say!(
+            "warning: {}: {key}: changes no verdict, because the model {}",
+            path.display(),
+            setup.model_needs()
+        );
+    }
     let unix = &setup.config.publish.unix;
     if unix.enabled {
         for (key, socket) in [
@@ -295,8 +302,9 @@ fn model(setup: &Setup) -> String {
         .map(|level| format!("{} {}", level.level, level.label))
         .collect();
     format!(
-        "model {}, sha256 {}, validated on {}, pitch {} mm, levels: {}\n",
+        "model {}: {}, sha256 {}, validation: {}, pitch {} mm, levels: {}\n",
         path.map_or("built in".to_owned(), |path| path.display().to_string()),
+        setup.model_needs(),
         setup.hrn.sha256(),
         card.validation,
         card.pitch_mm,

@@ -86,6 +86,30 @@ fn check_warns_of_a_pitch_that_the_model_does_not_know() {
 }
 
 #[test]
+fn check_names_what_the_model_needs_and_what_changes_no_verdict_of_it() {
+    let bench = Bench::new();
+    let config = bench.path("arm.toml");
+    let models = concat!(env!("CARGO_MANIFEST_DIR"), "/models");
+    for (model, needs, ignored) in [
+        ("hrn.onnx", "judges single frames, needs no arm", true),
+        (
+            "course.onnx",
+            "judges whole presses, needs the arm's",
+            false,
+        ),
+    ] {
+        let sensor = "[[sensor]]\nport = \"port\"\n[sensor.arm]\nspeed_mm_s = 5.0\n";
+        let model = format!("[model]\npath = \"{models}/{model}\"\n");
+        fs::write(&config, format!("{sensor}{model}")).unwrap();
+        let output = hardnessd(&["check", "--config", config.to_str().unwrap()]);
+        assert!(text(&output.stdout).contains(needs), "{output:?}");
+        let said = text(&output.stderr);
+        let warned = said.contains("sensor.arm of \"sensor\": changes no verdict");
+        assert_eq!(warned, ignored, "{said}");
+    }
+}
+
+#[test]
 fn sniff_writes_a_configuration_that_check_takes() {
     let bench = Bench::new();
     let _sensor = bench.sensor(&[]);

@@ -22,6 +22,9 @@ pub(in crate::daemon) fn hello() -> Hello {
             sha256: String::new(),
             validation: String::new(),
             levels: Vec::new(),
+            name: String::new(),
+            needs: String::new(),
+            without_effect: Vec::new(),
         },
     }
 }

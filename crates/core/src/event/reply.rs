@@ -86,6 +86,9 @@ impl Reply {
 ///         sha256: "0123456789ab".to_owned(),
 ///         validation: "simulated data only".to_owned(),
 ///         levels: Vec::new(),
+///         name: "built in".to_owned(),
+///         needs: "judges single frames, needs no arm".to_owned(),
+///         without_effect: Vec::new(),
 ///     },
 /// };
 /// let line = Reply::Hello(hello).to_line();
@@ -135,4 +138,10 @@ pub struct ModelCard {
     pub validation: String,
     /// The model's levels.
     pub levels: Vec<crate::verdict::Level>,
+    /// The name of the model's file, or `built in`.
+    pub name: String,
+    /// What the model judges, and what it needs beside the sensor.
+    pub needs: String,
+    /// The keys of the configuration that are set and change no verdict of this model.
+    pub without_effect: Vec<String>,
 }

@@ -235,10 +235,13 @@ fn replies_are_frozen() {
                 label: "hard".to_owned(),
                 shore: ">70".to_owned(),
             }],
+            name: "built in".to_owned(),
+            needs: "judges single frames, needs no arm".to_owned(),
+            without_effect: vec!["sensor.arm of \"forearm\"".to_owned()],
         },
     };
     check(
         &Reply::Hello(hello).to_line(),
-        r#"{"type":"hello","protocol":1,"server":"hardnessd","version":"0.1.0","robot":"arm-7","run":"r","boot_id":"b","seq":0,"sensors":[{"name":"forearm","rows":28,"cols":28,"pitch_mm":3.5}],"model":{"sha256":"00","validation":"simulated data only","levels":[{"level":1,"label":"hard","shore":">70"}]}}"#,
+        r#"{"type":"hello","protocol":1,"server":"hardnessd","version":"0.1.0","robot":"arm-7","run":"r","boot_id":"b","seq":0,"sensors":[{"name":"forearm","rows":28,"cols":28,"pitch_mm":3.5}],"model":{"sha256":"00","validation":"simulated data only","levels":[{"level":1,"label":"hard","shore":">70"}],"name":"built in","needs":"judges single frames, needs no arm","without_effect":["sensor.arm of \"forearm\""]}}"#,
     );
 }
