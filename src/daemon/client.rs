@@ -28,7 +28,7 @@ use super::lines::{LineRead, Lines};
 use super::record::NoBlackbox;
 use super::request::motion::{Positions, ReportedPoint};
 use super::request::{self, Change, Request, Subscription, motion};
-use super::sensor::{Command, Sensors};
+use super::sensor::{Command, SensorHandle, Sensors};
 use super::snapshot::Snapshots;
 use hardnessd_core::event::{Reply, Tared};
 use hardnessd_core::motion::StepBack;
@@ -330,6 +330,13 @@ async fn read<I: AsyncRead + Unpin>(
                 lines.push(answer(Ok(Done::default()), id));
                 Asked::Answer(lines)
             }
+            Ok(Request::History(sensor)) => {
+                let history = service.hub.history(sensor.clone()).await?;
+                let done = find(&service.sensors, "history", &sensor).map(|_| Done::default());
+                let mut lines: Vec<Line> = history.into_iter().collect();
+                lines.push(answer(done, id));
+                Asked::Answer(lines)
+            }
             // A command may take long, because it may wait for frames or for a file to be written.
             Ok(Request::Change(change)) => {
                 Asked::Answer(vec![answer(service.change(change).await, id)])
@@ -464,16 +471,19 @@ async fn tell(
     name: &str,
     command: Command,
 ) -> Result<(), Refused> {
-    let sensors = sensors.current();
-    let Some(sensor) = sensors.iter().find(|sensor| sensor.name == name) else {
-        return Err(Refused::NoSensor {
-            key,
-            found: request::short(name),
-            names: sensors.iter().map(|s| s.name.clone()).collect(),
-        });
-    };
+    let sensor = find(sensors, key, name)?;
     let stopping = |_| Refused::Stopping(key);
     sensor.commands.send(command).await.map_err(stopping)
+}
+
+fn find(sensors: &Sensors, key: &'static str, name: &str) -> Result<SensorHandle, Refused> {
+    let sensors = sensors.current();
+    let found = sensors.iter().find(|sensor| sensor.name == name).cloned();
+    found.ok_or_else(|| Refused::NoSensor {
+        key,
+        found: request::short(name),
+        names: sensors.iter().map(|s| s.name.clone()).collect(),
+    })
 }
 
 /// Passes positions of the arm on to the task of `sensor`, which also records them. Positions from

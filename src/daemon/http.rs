@@ -117,13 +117,14 @@ impl Http {
             .route("/", get(async || page))
             .route("/events", get(events::answer))
             .route("/api/status", get(status))
+            .route("/api/history", get(history))
             .route("/metrics", get(metrics))
             .route("/livez", get(live))
             .route("/readyz", get(ready))
             .fallback(async || {
                 refusal(
                     StatusCode::NOT_FOUND,
-                    "not found: the paths are /, /events, /api/status, /metrics, /livez and /readyz",
+                    "not found: the paths are /, /events, /api/status, /api/history, /metrics, /livez and /readyz",
                 )
             })
             .with_state(Sources {
@@ -227,10 +228,7 @@ fn shared(
     let made = place.get_or_init(|| Text::new(encode(snapshot), text_bytes).map(Bytes::from_owner));
     match made {
         Some(text) => ([(header::CONTENT_TYPE, content_type)], text.clone()).into_response(),
-        None => refusal(
-            StatusCode::SERVICE_UNAVAILABLE,
-            "too many answers wait to be read: try later",
-        ),
+        None => full(),
     }
 }
 
@@ -244,6 +242,35 @@ async fn status(State(of): State<Sources>) -> Result<Response, Closed> {
         encode,
         &of.text_bytes,
     ))
+}
+
+/// The force and contact area of one sensor in the last two minutes. The query names the sensor.
+async fn history(
+    State(of): State<Sources>,
+    request: axum::extract::Request,
+) -> Result<Response, Closed> {
+    let query = request.uri().query().unwrap_or_default();
+    let mut pairs = form_urlencoded::parse(query.as_bytes());
+    let sensor = pairs.find(|(key, _)| key == "sensor");
+    let sensor = sensor.map_or(String::new(), |(_, sensor)| sensor.into_owned());
+    let Some(line) = of.hub.history(sensor.clone()).await? else {
+        let why = format!("sensor: found {sensor:?}, expected the name of a sensor");
+        return Ok(refusal(StatusCode::NOT_FOUND, why));
+    };
+    let text = Text::new(line.json.to_string(), &of.text_bytes).map(Bytes::from_owner);
+    let content_type = [(header::CONTENT_TYPE, "application/json")];
+    Ok(match text {
+        Some(text) => (content_type, text).into_response(),
+        None => full(),
+    })
+}
+
+/// The refusal when the connections keep too many texts waiting.
+fn full() -> Response {
+    refusal(
+        StatusCode::SERVICE_UNAVAILABLE,
+        "too many answers wait to be read: try later",
+    )
 }
 
 async fn metrics(State(of): State<Sources>) -> Result<Response, Closed> {

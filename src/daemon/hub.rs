@@ -6,6 +6,7 @@
 //! oldest event is dropped and counted, and a `gap` reports the number before the next event. This
 //! file has no clock and no channel: [`task`] has both.
 
+mod history;
 mod subscriber;
 mod tally;
 mod task;
@@ -14,6 +15,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
+use self::history::History;
 use self::subscriber::Subscriber;
 pub(crate) use self::tally::{Counts, Tally, Verdicts};
 pub(crate) use self::task::{Closed, Handle, start};
@@ -95,6 +97,8 @@ struct Hub {
     forgotten: [u64; Kinds::NUMBERED.len()],
     /// The last final verdict of each sensor.
     finals: BTreeMap<String, Line>,
+    /// The force and contact area of each sensor.
+    histories: BTreeMap<String, History>,
     tally: Tally,
     recorder: EventRecorder,
     subscribers: BTreeMap<u64, Subscriber>,
@@ -108,6 +112,7 @@ impl Hub {
             held: VecDeque::new(),
             forgotten: [0; Kinds::NUMBERED.len()],
             finals: BTreeMap::new(),
+            histories: BTreeMap::new(),
             tally: Tally::default(),
             recorder: EventRecorder::default(),
             subscribers: BTreeMap::new(),
@@ -133,6 +138,16 @@ impl Hub {
             event.number(self.hello.seq);
         }
         self.recorder.event(&event);
+        if let Event::Frame(frame) = &event {
+            match self.histories.get_mut(&frame.sensor) {
+                Some(history) => history.add(frame),
+                None => self
+                    .histories
+                    .entry(frame.sensor.clone())
+                    .or_default()
+                    .add(frame),
+            }
+        }
         let mut subscribers = self.subscribers.values();
         if kind == Kind::Frame && !subscribers.any(|subscriber| subscriber.wants(kind)) {
             return false;
@@ -169,6 +184,7 @@ impl Hub {
         let sensors = &self.hello.sensors;
         let is_there = |name: &str| sensors.iter().any(|sensor| sensor.name == name);
         self.finals.retain(|name, _| is_there(name));
+        self.histories.retain(|name, _| is_there(name));
         self.tally.sensors.retain(|name, _| is_there(name));
     }
 
@@ -237,6 +253,19 @@ impl Hub {
         );
         subscriber.replay(held.map(|(seq, held)| (seq, held.kind)), missing);
         Ok(())
+    }
+
+    /// The line with the force and contact area of a sensor in the last two minutes. `None` if there is
+    /// no such sensor.
+    fn history(&self, sensor: &str) -> Option<Line> {
+        let known = self.hello.sensors.iter().any(|one| one.name == sensor);
+        let none = History::default();
+        let history = self.histories.get(sensor).unwrap_or(&none);
+        known.then(|| Line {
+            seq: None,
+            json: history.line(sensor).into(),
+            event: None,
+        })
     }
 
     /// Whether lines wait for a subscriber.

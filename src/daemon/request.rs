@@ -21,6 +21,8 @@ pub(crate) enum Request {
     Status,
     /// Get every sensor's last final verdict.
     Last,
+    /// Get the force and contact area of a sensor in the last two minutes.
+    History(String),
     /// Change something. Of all sockets, only the control socket may do this.
     Change(Change),
 }
@@ -176,6 +178,7 @@ enum Written {
 enum Queried {
     Status,
     Last,
+    History(String),
 }
 
 impl From<Written> for Request {
@@ -184,6 +187,7 @@ impl From<Written> for Request {
             Written::Subscribe(subscription) => Request::Subscribe(subscription),
             Written::Get(Queried::Status) => Request::Status,
             Written::Get(Queried::Last) => Request::Last,
+            Written::Get(Queried::History(sensor)) => Request::History(sensor),
             Written::Tare(sensor) => Request::Change(Change::Tare { sensor }),
             Written::Context(Context { sensor, context }) => {
                 Request::Change(Change::Context { sensor, context })

@@ -193,6 +193,7 @@ fn only_this_machine_by_its_address_is_served() {
         "/",
         "/events",
         "/api/status",
+        "/api/history",
         "/metrics",
         "/livez",
         "/readyz",
@@ -228,6 +229,7 @@ fn no_route_changes_anything() {
         "/",
         "/events",
         "/api/status",
+        "/api/history",
         "/metrics",
         "/livez",
         "/readyz",
@@ -385,6 +387,14 @@ fn readiness_follows_the_sensors_and_liveness_does_not() {
         (&json!("other"), &json!(0))
     );
     assert!(process["memory_locked"].is_boolean(), "{process}");
+
+    // A page that opens now has the curve of the press that is over.
+    let history = get(address, "/api/history?sensor=forearm");
+    let history: Value = serde_json::from_str(&history.body).unwrap();
+    let forces = history["points"].as_array().unwrap().iter();
+    let forces = forces.map(|point| point[1].as_f64().unwrap());
+    assert!(forces.fold(0.0, f64::max) > 5.0, "{history}");
+    assert_eq!(get(address, "/api/history?sensor=palm").code, 404);
 }
 
 #[test]

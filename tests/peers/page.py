@@ -6,7 +6,8 @@
     venv/bin/python tests/peers/page.py target/debug/hardnessd [--pictures DIRECTORY]
 
 Claims: events arrive and are drawn; a silent and a lost sensor show within 1 s, on their tabs too, and
-no old value stands as a current one: map and verdict are grey, and the scale stays; what comes late,
+no old value stands as a current one: map and verdict are grey, and the scale stays; a reload loses no
+curve, press or verdict; what comes late,
 after a connection broke, is shown as old as it is, whatever the browser's clock says; force against
 approach is drawn where an arm's positions come, and hidden elsewhere; sensors can be chosen; a phone of
 360 px is wide enough, and presses are numbered on it; no console error and no breach of the page's
@@ -198,10 +199,32 @@ def fits_a_phone(page):
     page.look(width=360, height=1500, scheme="light")
     wide = page.run("return document.documentElement.scrollWidth")
     assert wide <= 360, f"{wide} px wide"
+    top = "document.getElementById('{}').getBoundingClientRect().top"
+    assert page.run(f"return {top.format('verdict')} < {top.format('heat')}"), "the verdict does not come first"
     page.run(LABELS)
     wait_for("numbers above presses", lambda: page.run("return labels_drawn.size") > 1)
     page.picture("live-narrow")
     page.look()
+
+
+def a_reload_loses_nothing(page):
+    known = """
+        const s = sensors.get(chosen);
+        return s && s.trace.length && s.verdicts.length
+          ? [s.trace[0].t, s.verdicts.map((v) => v.event.press), s.presses.map((p) => p.number)] : null;"""
+    first, verdicts, presses = page.run(known)
+    page.driver.refresh()
+
+    def is_all_there():
+        now = page.run(known)
+        # A point of the daemon's curve is of 0.1 s.
+        return now and now[0] < first + 0.2 and verdicts[-1] in now[1] and set(presses) <= set(now[2])
+
+    wait_for("what was there before the reload", is_all_there)
+    page.driver.find_element(By.ID, "span").click()
+    assert page.text("span") == "2 min", page.text("span")
+    page.look()
+    page.picture("two-minutes-dark")
 
 
 def loss_shows_at_once(page, bench, sensors):
@@ -319,6 +342,7 @@ def main(binary, pictures):
             a_verdict_in_words(page)
             force_against_approach_is_drawn(page)
             fits_a_phone(page)
+            a_reload_loses_nothing(page)
             what_comes_late_is_as_old_as_it_is(page, bench, sensors)
             delays = loss_shows_at_once(page, bench, sensors)
             sensors_can_be_chosen(page)

@@ -37,6 +37,10 @@ enum Command {
     Survey {
         reply: oneshot::Sender<Survey>,
     },
+    History {
+        sensor: String,
+        reply: oneshot::Sender<Option<Line>>,
+    },
     Leave {
         id: u64,
     },
@@ -108,6 +112,12 @@ impl Handle {
     /// The state of the hub.
     pub(crate) async fn survey(&self) -> Result<Survey, Closed> {
         self.ask(|reply| Command::Survey { reply }).await
+    }
+
+    /// The force and contact area of a sensor in the last two minutes, as a line. `None` if there is no
+    /// such sensor.
+    pub(crate) async fn history(&self, sensor: String) -> Result<Option<Line>, Closed> {
+        self.ask(|reply| Command::History { sensor, reply }).await
     }
 
     /// Removes a subscriber.
@@ -206,6 +216,9 @@ async fn serve(mut hub: Hub, mut inbox: mpsc::Receiver<Command>) {
                     tally: hub.tally.clone(),
                     subscribers: hub.subscribers.len(),
                 });
+            }
+            Command::History { sensor, reply } => {
+                let _ = reply.send(hub.history(&sensor));
             }
             Command::Leave { id } => {
                 hub.subscribers.remove(&id);

@@ -532,6 +532,22 @@ fn a_soft_touch_is_seen_after_a_hard_one() {
 }
 
 #[test]
+fn curves_begin_with_what_was_before_the_connection() {
+    let history = json!({"type": "history", "sensor": "forearm", "time": null,
+        "points": [[2.0, 10.0, 20], [1.0, 5.0, 9], [0.0, 8.0, 15]]});
+    let view = told(&[
+        (0, hello("a", &["forearm"])),
+        (0, status("forearm", "live")),
+        (9_000, frame("forearm", 1.5, 8)),
+        (10_000, history),
+    ]);
+    // The point of 9 s is known better by its frame, and that of 10 s is after it.
+    let sensor = view.sensor().unwrap();
+    let forces = sensor.curve(at(10_000).mono, 30, |load| load.force_n);
+    assert_eq!(forces[27..], [None, Some(10.0), Some(12.0)]);
+}
+
+#[test]
 fn what_was_before_is_asked_for_and_stands_in_order() {
     let mut view = View::new();
     let mut first = hello("a", &["forearm"]);
@@ -543,6 +559,7 @@ fn what_was_before_is_asked_for_and_stands_in_order() {
         .collect();
     assert_eq!(asked[0], json!({"get": "last"}));
     assert_eq!(asked[1]["since"], "a:0");
+    assert_eq!(asked[2], json!({"get": {"history": "forearm"}}));
     assert!(
         asked[1]["subscribe"]
             .as_array()

@@ -19,6 +19,9 @@ use hardnessd_core::wording;
 /// the state changes.
 pub(super) const QUESTION: Duration = Duration::from_secs(1);
 
+/// The curves of more sensors begin with the connection: the answers would take long.
+const MOST_HISTORIES: usize = 16;
+
 /// After three questions without an answer, the daemon counts as dead.
 const SILENCE: Duration = Duration::from_secs(3);
 
@@ -232,11 +235,14 @@ impl View {
         self.daemon = Daemon::Met;
         let types = ["hardness", "press", "status", "frame"];
         // The last verdict may be older than the events that the daemon holds.
-        let requests = [
+        let mut requests = vec![
             json!({"get": "last"}),
             json!({"subscribe": types, "since": since}),
         ];
-        Some(requests.map(|request| request.to_string()).join("\n"))
+        let histories = self.sensors.iter().take(MOST_HISTORIES);
+        requests.extend(histories.map(|sensor| json!({"get": {"history": sensor.name}})));
+        let requests: Vec<String> = requests.iter().map(Value::to_string).collect();
+        Some(requests.join("\n"))
     }
 
     /// Takes in that the daemon has gone or cannot be reached.

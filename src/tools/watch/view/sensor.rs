@@ -142,6 +142,7 @@ impl Sensor {
             }
             "hardness" => self.judge(event, at, labels),
             "frame" => self.show(event, at),
+            "history" => self.recall(event, at),
             _ => {}
         }
     }
@@ -176,6 +177,24 @@ impl Sensor {
         if !self.verdicts.get(place).is_some_and(is_known) {
             self.verdicts.insert(place, verdict);
             self.verdicts.truncate(VERDICTS);
+        }
+    }
+
+    /// Puts the curves of earlier frames before those that are known. The newest of them is of `at`.
+    fn recall(&mut self, event: &Value, at: Duration) {
+        let first = self.trace.front().map_or(Duration::MAX, |load| load.at);
+        let load = |point: &Value| {
+            let age = Duration::try_from_secs_f64(point[0].as_f64()?).ok()?;
+            Some(Load {
+                at: at.checked_sub(age)?,
+                force_n: point[1].as_f64()? as f32,
+                contact_area_taxels: u32::try_from(point[2].as_u64()?).ok()?,
+            })
+        };
+        let past = items(event, "points").filter_map(load);
+        let past: Vec<Load> = past.filter(|load| load.at < first).collect();
+        for load in past.into_iter().rev() {
+            self.trace.push_front(load);
         }
     }
 
