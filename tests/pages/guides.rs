@@ -208,10 +208,12 @@ fn the_readmes_demonstration_has_the_verdicts_that_it_shows() {
         .map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap())
         .filter(|event| event["phase"] == "final")
         .map(|event| {
+            let confidence = event["confidence"].as_f64().unwrap();
             format!(
-                "{} {:.0} % {:.1} N",
+                "{}{} {:.0} % {:.1} N",
                 event["label"].as_str().unwrap(),
-                100.0 * event["confidence"].as_f64().unwrap(),
+                if confidence < 0.7 { "?" } else { "" },
+                100.0 * confidence,
                 event["force_n"].as_f64().unwrap()
             )
         })
