@@ -129,7 +129,7 @@ def for_tail(hello, endless):
     frame = line({"type": "frame", "sensor": "a", "rows": 64, "cols": 64, "newtons": [0.0] * 4096})
     yield b"", {"endless": endless}, 69, "longer than 1048576 bytes"
     yield hello, {"endless": endless}, 69, "longer than 1048576 bytes"
-    yield b"HTTP/1.1 400 Bad Request\r\n\r\n", {}, 69, not_json
+    yield b"HTTP/1.1 400 Bad Request\r\n\r\n", {}, 69, "a web server answers there"
     yield b"\xff\xfe\x00\n", {}, 69, not_json
     yield hello + b"[" * 500_000 + b"\n", {}, 69, not_json
     yield hello + b'{"type":"status","x":' + b"9" * 500_000 + b"}\n", {}, 69, not_json
