@@ -333,7 +333,8 @@ async fn read<I: AsyncRead + Unpin>(
             Ok(Request::History(sensor)) => {
                 let history = service.hub.history(sensor.clone()).await?;
                 let done = find(&service.sensors, "history", &sensor).map(|_| Done::default());
-                let mut lines: Vec<Line> = history.into_iter().collect();
+                let lines = history.iter().map(|history| history.line(&sensor));
+                let mut lines: Vec<Line> = lines.collect();
                 lines.push(answer(done, id));
                 Asked::Answer(lines)
             }

@@ -253,11 +253,13 @@ async fn history(
     let mut pairs = form_urlencoded::parse(query.as_bytes());
     let sensor = pairs.find(|(key, _)| key == "sensor");
     let sensor = sensor.map_or(String::new(), |(_, sensor)| sensor.into_owned());
-    let Some(line) = of.hub.history(sensor.clone()).await? else {
+    let _turn = of.turns.acquire().await;
+    let Some(history) = of.hub.history(sensor.clone()).await? else {
         let why = format!("sensor: found {sensor:?}, expected the name of a sensor");
         return Ok(refusal(StatusCode::NOT_FOUND, why));
     };
-    let text = Text::new(line.json.to_string(), &of.text_bytes).map(Bytes::from_owner);
+    let line = history.line(&sensor).json.to_string();
+    let text = Text::new(line, &of.text_bytes).map(Bytes::from_owner);
     let content_type = [(header::CONTENT_TYPE, "application/json")];
     Ok(match text {
         Some(text) => (content_type, text).into_response(),

@@ -15,7 +15,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use self::history::History;
+pub(crate) use self::history::History;
 use self::subscriber::Subscriber;
 pub(crate) use self::tally::{Counts, Tally, Verdicts};
 pub(crate) use self::task::{Closed, Handle, start};
@@ -255,17 +255,11 @@ impl Hub {
         Ok(())
     }
 
-    /// The line with the force and contact area of a sensor in the last two minutes. `None` if there is
-    /// no such sensor.
-    fn history(&self, sensor: &str) -> Option<Line> {
+    /// The force and contact area of a sensor in the last two minutes. `None` if there is no such
+    /// sensor.
+    fn history(&self, sensor: &str) -> Option<History> {
         let known = self.hello.sensors.iter().any(|one| one.name == sensor);
-        let none = History::default();
-        let history = self.histories.get(sensor).unwrap_or(&none);
-        known.then(|| Line {
-            seq: None,
-            json: history.line(sensor).into(),
-            event: None,
-        })
+        known.then(|| self.histories.get(sensor).cloned().unwrap_or_default())
     }
 
     /// Whether lines wait for a subscriber.

@@ -5,6 +5,7 @@ use std::collections::VecDeque;
 use jiff::{SignedDuration, Timestamp};
 use serde_json::json;
 
+use super::Line;
 use hardnessd_core::event::FrameEvent;
 
 /// How far back a history goes.
@@ -14,10 +15,10 @@ const SPAN: SignedDuration = SignedDuration::from_secs(120);
 const STEP_MS: i64 = 100;
 
 /// One sensor's history, the oldest point first.
-#[derive(Debug, Default)]
-pub(super) struct History(VecDeque<Point>);
+#[derive(Debug, Default, Clone)]
+pub(crate) struct History(VecDeque<Point>);
 
-#[derive(Debug)]
+#[derive(Debug, Clone, Copy)]
 struct Point {
     at: Timestamp,
     force_n: f32,
@@ -56,7 +57,7 @@ impl History {
     }
 
     /// The line of the history. A point has its age at `time` in seconds, newtons and taxels.
-    pub(super) fn line(&self, sensor: &str) -> String {
+    pub(crate) fn line(&self, sensor: &str) -> Line {
         let newest = self.0.back().map(|point| point.at);
         let rounded = |number: f64| (number * 1e3).round() / 1e3;
         let point = |point: &Point| {
@@ -73,7 +74,11 @@ impl History {
             "time": newest.map(|time| format!("{time:.6}")),
             "points": self.0.iter().map(point).collect::<Vec<_>>(),
         });
-        format!("{line}\n")
+        Line {
+            seq: None,
+            json: format!("{line}\n").into(),
+            event: None,
+        }
     }
 }
 
@@ -98,7 +103,7 @@ mod tests {
     }
 
     fn points(history: &History) -> Value {
-        let line: Value = serde_json::from_str(&history.line("forearm")).unwrap();
+        let line: Value = serde_json::from_str(&history.line("forearm").json).unwrap();
         line["points"].clone()
     }
 

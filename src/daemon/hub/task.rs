@@ -7,7 +7,7 @@ use std::collections::HashMap;
 
 use tokio::sync::{mpsc, oneshot};
 
-use super::{Ahead, Hub, Line, Survey};
+use super::{Ahead, History, Hub, Line, Survey};
 use crate::daemon::now;
 use crate::daemon::record::EventRecorder;
 use crate::daemon::request::Subscription;
@@ -39,7 +39,7 @@ enum Command {
     },
     History {
         sensor: String,
-        reply: oneshot::Sender<Option<Line>>,
+        reply: oneshot::Sender<Option<History>>,
     },
     Leave {
         id: u64,
@@ -114,9 +114,9 @@ impl Handle {
         self.ask(|reply| Command::Survey { reply }).await
     }
 
-    /// The force and contact area of a sensor in the last two minutes, as a line. `None` if there is no
-    /// such sensor.
-    pub(crate) async fn history(&self, sensor: String) -> Result<Option<Line>, Closed> {
+    /// The force and contact area of a sensor in the last two minutes. `None` if there is no such
+    /// sensor. Its line is made by the caller, because the hub has no time for it.
+    pub(crate) async fn history(&self, sensor: String) -> Result<Option<History>, Closed> {
         self.ask(|reply| Command::History { sensor, reply }).await
     }
 
