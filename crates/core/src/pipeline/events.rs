@@ -123,6 +123,9 @@ impl Pipeline {
             return;
         }
         let peak = known.frames[known.best].clone();
+        if peak.force_n < self.sensor.description().press.early_min_force_n {
+            return;
+        }
         let Some(Event::Hardness(verdict)) = self.judge(Phase::Early, &so_far, &peak) else {
             return;
         };

@@ -263,9 +263,19 @@ fn a_press_unlike_those_of_training_is_noted() {
 }
 
 #[test]
-fn an_early_verdict_comes_once_and_only_if_it_is_sure() {
-    for (early_confidence, expected) in [(0.0, Some(7)), (0.8, Some(8)), (0.99, None)] {
-        let mut pipeline = tared(&[], |d| d.early_confidence = early_confidence);
+fn an_early_verdict_comes_once_and_only_if_it_is_sure_and_on_enough_force() {
+    // The frames 5 to 8 have 7.2 to 28.8 N.
+    for (early_confidence, min_force_n, expected) in [
+        (0.0, 1.0, Some(7)),
+        (0.0, 22.0, Some(8)),
+        (0.0, 30.0, None),
+        (0.8, 1.0, Some(8)),
+        (0.99, 1.0, None),
+    ] {
+        let mut pipeline = tared(&[], |described| {
+            described.early_confidence = early_confidence;
+            described.press.early_min_force_n = min_force_n;
+        });
         let found = judged(&mut pipeline, |_| Vec::new());
         let early: Vec<u64> = found
             .iter()
