@@ -67,12 +67,18 @@ impl SolvedPress {
         // The contact is largest at the end of the hold, when everything has crept.
         let (mut window, _, _) = bench.press(specimen, force_n, 1.0, hold_s);
         loop {
-            let mut run = Run::new(bench, specimen, arm, window);
+            let mut at = State::new(specimen, window);
+            let mut run = Run {
+                bench,
+                specimen,
+                arm,
+                at: &mut at,
+            };
             run.load(force_n, levels);
-            let (top_mm, load_s) = (run.travel_mm, run.time_s);
+            let (top_mm, load_s) = (run.at.travel_mm, run.at.time_s);
             run.hold(hold_s);
             run.unload(levels);
-            let Run { moments, fits, .. } = run;
+            let State { moments, fits, .. } = at;
             match window.wider(specimen, force_n) {
                 Some(wider) if !fits => window = wider,
                 _ => {
@@ -123,19 +129,24 @@ impl FeltPress {
     }
 }
 
-/// The state of a press while it is computed.
-struct Run<'a> {
-    bench: &'a mut Bench,
-    specimen: &'a Specimen,
-    arm: Arm,
-    window: Window,
+/// A press while it is computed, step by step.
+pub(super) struct Run<'a> {
+    pub(super) bench: &'a mut Bench,
+    pub(super) specimen: &'a Specimen,
+    pub(super) arm: Arm,
+    pub(super) at: &'a mut State,
+}
+
+/// How far a press has come.
+pub(super) struct State {
+    pub(super) window: Window,
     gap_mm: Vec<f32>,
     /// State of each Kelvin element, MPa.
     crept: Vec<Vec<f32>>,
     /// The displacement left by flow, mm; empty if there is none.
     flowed_mm: Vec<f32>,
-    pressure: Vec<f32>,
-    force_n: f64,
+    pub(super) pressure: Vec<f32>,
+    pub(super) force_n: f64,
     /// Position z of the sensor's carrier, mm.
     travel_mm: f64,
     time_s: f64,
@@ -152,8 +163,9 @@ struct Trial {
     radius_mm: f64,
 }
 
-impl<'a> Run<'a> {
-    fn new(bench: &'a mut Bench, specimen: &'a Specimen, arm: Arm, window: Window) -> Self {
+impl State {
+    /// Before the touch.
+    pub(super) fn new(specimen: &Specimen, window: Window) -> Self {
         let cells = window.width * window.width;
         let touch = SolvedStep {
             time_s: 0.0,
@@ -161,9 +173,6 @@ impl<'a> Run<'a> {
             pressure: Vec::new(),
         };
         Self {
-            bench,
-            specimen,
-            arm,
             window,
             gap_mm: specimen.gap_on(window),
             crept: specimen
@@ -180,35 +189,37 @@ impl<'a> Run<'a> {
             fits: true,
         }
     }
+}
 
+impl Run<'_> {
     fn load(&mut self, force_n: f64, levels: u32) {
         // Of the first step we only know that it is short. The later guesses are the length of the
         // step before.
         let mut guess_s = 0.05;
         for level in 1..=levels {
             let goal = force_n * (f64::from(level) / f64::from(levels)).powf(SPACING);
-            let before_s = self.time_s;
+            let before_s = self.at.time_s;
             self.step_to_force(goal, guess_s, 1.0);
-            guess_s = self.time_s - before_s;
+            guess_s = self.at.time_s - before_s;
         }
     }
 
     fn unload(&mut self, levels: u32) {
-        let top = self.force_n;
+        let top = self.at.force_n;
         let mut guess_s = 0.05;
         for level in (1..levels).rev() {
             let goal = top * (f64::from(level) / f64::from(levels)).powf(SPACING);
-            let before_s = self.time_s;
+            let before_s = self.at.time_s;
             self.step_to_force(goal, guess_s, -1.0);
-            guess_s = self.time_s - before_s;
+            guess_s = self.at.time_s - before_s;
         }
         // The press ends where the sensor leaves the surface, with its creep and dents at that
         // time.
         let (gap, _) = self.effective_gap(0.0);
         let end_mm = f64::from(gap.iter().copied().fold(f32::INFINITY, f32::min));
-        let last_s = ((self.travel_mm - end_mm) / self.arm.speed_mm_s).max(LEAST_STEP_S);
-        self.moments.push(SolvedStep {
-            time_s: self.time_s + last_s,
+        let last_s = ((self.at.travel_mm - end_mm) / self.arm.speed_mm_s).max(LEAST_STEP_S);
+        self.at.moments.push(SolvedStep {
+            time_s: self.at.time_s + last_s,
             force_n: 0.0,
             pressure: Vec::new(),
         });
@@ -220,7 +231,8 @@ impl<'a> Run<'a> {
         let mut time_s = guess_s.max(LEAST_STEP_S);
         for round in 1.. {
             let trial = self.attempt(goal_n, time_s);
-            let needed_s = (direction * (trial.travel_mm - self.travel_mm) / self.arm.speed_mm_s)
+            let needed_s = (direction * (trial.travel_mm - self.at.travel_mm)
+                / self.arm.speed_mm_s)
                 .max(LEAST_STEP_S);
             if round == 3 || (needed_s - time_s).abs() < 0.05 * needed_s {
                 return self.take(Trial {
@@ -234,17 +246,17 @@ impl<'a> Run<'a> {
 
     /// Keeps z for `hold_s`, with forces from the secant method on `z(F)`.
     fn hold(&mut self, hold_s: f64) {
-        let keep_mm = self.travel_mm;
-        let start_s = self.time_s;
-        let count = self.moments.len();
+        let keep_mm = self.at.travel_mm;
+        let start_s = self.at.time_s;
+        let count = self.at.moments.len();
         let mut slope = {
-            let (a, b) = (&self.moments[count - 2], &self.moments[count - 1]);
+            let (a, b) = (&self.at.moments[count - 2], &self.at.moments[count - 1]);
             self.arm.speed_mm_s * (b.time_s - a.time_s) / (b.force_n - a.force_n)
         };
         let until = HOLD_S.iter().copied().take_while(|&at| at < hold_s - 0.01);
         for at in until.chain([hold_s]) {
-            let time_s = start_s + at - self.time_s;
-            let mut trial = self.attempt(self.force_n, time_s);
+            let time_s = start_s + at - self.at.time_s;
+            let mut trial = self.attempt(self.at.force_n, time_s);
             for _ in 0..4 {
                 let off = trial.travel_mm - keep_mm;
                 if (off / slope).abs() < HOLD_TOLERANCE * trial.force_n {
@@ -262,6 +274,74 @@ impl<'a> Run<'a> {
         }
     }
 
+    /// Moves the carrier to `goal_mm` in `time_s`, into the object or away from it. Keeps no moment.
+    pub(super) fn move_to(&mut self, goal_mm: f64, time_s: f64) {
+        let (gap, _) = self.effective_gap(time_s);
+        let touch_mm = f64::from(gap.iter().copied().fold(f32::INFINITY, f32::min));
+        let depth_mm = goal_mm - touch_mm;
+        if depth_mm > 0.0 {
+            let trial = self.force_at_depth(touch_mm, depth_mm, time_s);
+            if touches_border(&trial.pressure, self.at.window.width)
+                && let Some(wider) = self.at.window.wider(self.specimen, trial.force_n)
+            {
+                self.widen(wider);
+                return self.move_to(goal_mm, time_s);
+            }
+            self.take(trial);
+        } else if self.at.time_s > 0.0 {
+            self.take(Trial {
+                force_n: 0.0,
+                time_s,
+                pressure: vec![0.0; self.at.pressure.len()],
+                travel_mm: goal_mm,
+                radius_mm: 0.0,
+            });
+        }
+        self.at.moments.clear();
+    }
+
+    /// Seeks the force that brings the carrier `depth_mm` beyond `touch_mm`, where the object would be
+    /// touched: by the secant method on ln F against the logarithm of the depth, where the contact is
+    /// nearly a power law.
+    fn force_at_depth(&mut self, touch_mm: f64, depth_mm: f64, time_s: f64) -> Trial {
+        let depth_of = |trial: &Trial| (trial.travel_mm - touch_mm).max(LEAST_DEPTH_MM);
+        let before_mm = self.at.travel_mm - touch_mm;
+        let mut power = 1.5;
+        let mut next_n = if self.at.force_n > 0.0 && before_mm > LEAST_DEPTH_MM {
+            self.at.force_n * (depth_mm / before_mm).powf(power)
+        } else {
+            0.3 * self.arm.n_per_mm * depth_mm
+        };
+        let mut trial = self.attempt(next_n.max(LEAST_FORCE_N), time_s);
+        for _ in 0..MOST_TRIALS {
+            let off = (depth_mm / depth_of(&trial)).ln();
+            next_n = (trial.force_n * (power * off).clamp(-2.0, 2.0).exp()).max(LEAST_FORCE_N);
+            if (next_n / trial.force_n).ln().abs() < FORCE_TOLERANCE {
+                break;
+            }
+            let before = trial;
+            trial = self.attempt(next_n, time_s);
+            let seen =
+                (trial.force_n / before.force_n).ln() / (depth_of(&trial) / depth_of(&before)).ln();
+            if (0.2..5.0).contains(&seen) {
+                power = seen;
+            }
+        }
+        trial
+    }
+
+    /// Goes on with the same press on a wider window.
+    fn widen(&mut self, window: Window) {
+        let from = std::mem::replace(&mut self.at.window, window);
+        self.at.gap_mm = self.specimen.gap_on(window);
+        let crept = self.at.crept.iter_mut();
+        for field in crept.chain([&mut self.at.flowed_mm, &mut self.at.pressure]) {
+            if !field.is_empty() {
+                *field = window.relaid(field, from);
+            }
+        }
+    }
+
     /// Solves a step of `time_s` that ends at `force_n`.
     fn attempt(&mut self, force_n: f64, time_s: f64) -> Trial {
         let (gap, history) = self.effective_gap(time_s);
@@ -272,16 +352,20 @@ impl<'a> Run<'a> {
                 .creep()
                 .map(|c| c.j * share(time_s, c.tau_s))
                 .sum::<f64>();
-        let mut pressure = self.pressure.clone();
+        let mut pressure = self.at.pressure.clone();
         let step = Step {
             force_n,
             factor,
             history_mpa: &history,
             time_s,
         };
-        let contact = self
-            .bench
-            .solve(self.specimen, self.window.width, &gap, step, &mut pressure);
+        let contact = self.bench.solve(
+            self.specimen,
+            self.at.window.width,
+            &gap,
+            step,
+            &mut pressure,
+        );
         let travel_mm = contact.approach_mm + force_n / self.arm.n_per_mm;
         Trial {
             force_n,
@@ -295,25 +379,26 @@ impl<'a> Run<'a> {
     /// The gap with the creep and flow that earlier steps leave after another `time_s`, and the
     /// remaining part of the effective pressure, which the foam's law needs separately.
     fn effective_gap(&mut self, time_s: f64) -> (Vec<f32>, Vec<f32>) {
-        let mut gap = self.gap_mm.clone();
-        for (gap, &flowed) in gap.iter_mut().zip(&self.flowed_mm) {
+        let mut gap = self.at.gap_mm.clone();
+        for (gap, &flowed) in gap.iter_mut().zip(&self.at.flowed_mm) {
             *gap += flowed;
         }
-        if self.moments.len() == 1 {
+        if self.at.time_s == 0.0 {
             return (gap, Vec::new());
         }
         let mut history = vec![0.0_f32; gap.len()];
-        for (creep, crept) in self.specimen.substance.creep().zip(&self.crept) {
+        for (creep, crept) in self.specimen.substance.creep().zip(&self.at.crept) {
             let (kept, old) = left(time_s, creep.tau_s);
             let (kept, old) = ((creep.j * kept) as f32, (creep.j * old) as f32);
-            for ((history, &crept), &pressure) in history.iter_mut().zip(crept).zip(&self.pressure)
+            for ((history, &crept), &pressure) in
+                history.iter_mut().zip(crept).zip(&self.at.pressure)
             {
                 *history += kept * crept + old * pressure;
             }
         }
         let displacement = self
             .bench
-            .displacement(self.specimen, self.window.width, &history);
+            .displacement(self.specimen, self.at.window.width, &history);
         for (gap, u) in gap.iter_mut().zip(displacement) {
             *gap += u;
         }
@@ -321,35 +406,44 @@ impl<'a> Run<'a> {
     }
 
     fn take(&mut self, trial: Trial) {
-        for (creep, crept) in self.specimen.substance.creep().zip(&mut self.crept) {
+        for (creep, crept) in self.specimen.substance.creep().zip(&mut self.at.crept) {
             let (kept, old) = left(trial.time_s, creep.tau_s);
             let new = share(trial.time_s, creep.tau_s) as f32;
             let (kept, old) = (kept as f32, old as f32);
             for ((crept, &before), &now) in
-                crept.iter_mut().zip(&self.pressure).zip(&trial.pressure)
+                crept.iter_mut().zip(&self.at.pressure).zip(&trial.pressure)
             {
                 *crept = kept * *crept + old * before + new * now;
             }
         }
         if let Law::Plastic { .. } = self.specimen.substance.law {
-            self.flowed_mm.resize(trial.pressure.len(), 0.0);
+            self.at.flowed_mm.resize(trial.pressure.len(), 0.0);
             let flow = self.specimen.flow(trial.time_s);
-            for (flowed, &pressure) in self.flowed_mm.iter_mut().zip(&trial.pressure) {
+            for (flowed, &pressure) in self.at.flowed_mm.iter_mut().zip(&trial.pressure) {
                 *flowed += flow.displacement_mm(pressure, trial.radius_mm);
             }
         }
-        self.fits &= self.window.is_whole() || !touches_border(&trial.pressure, self.window.width);
-        self.pressure = trial.pressure;
-        self.force_n = trial.force_n;
-        self.travel_mm = trial.travel_mm;
-        self.time_s += trial.time_s;
-        self.moments.push(SolvedStep {
-            time_s: self.time_s,
-            force_n: self.force_n,
-            pressure: self.pressure.clone(),
+        self.at.fits &=
+            self.at.window.is_whole() || !touches_border(&trial.pressure, self.at.window.width);
+        self.at.pressure = trial.pressure;
+        self.at.force_n = trial.force_n;
+        self.at.travel_mm = trial.travel_mm;
+        self.at.time_s += trial.time_s;
+        self.at.moments.push(SolvedStep {
+            time_s: self.at.time_s,
+            force_n: self.at.force_n,
+            pressure: self.at.pressure.clone(),
         });
     }
 }
+
+/// The least force of a contact, N, and the least depth that its power law is followed to, mm.
+const LEAST_FORCE_N: f64 = 1e-3;
+const LEAST_DEPTH_MM: f64 = 1e-5;
+/// Tolerance of the force that belongs to a position, as a part of the force, and the most solves after the
+/// first to reach it.
+const FORCE_TOLERANCE: f64 = 3e-3;
+const MOST_TRIALS: u32 = 5;
 
 /// The least length of a step, so that time advances even where creep runs ahead of the motion.
 const LEAST_STEP_S: f64 = 1e-3;

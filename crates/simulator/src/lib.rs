@@ -2,8 +2,8 @@
 //!
 //! In: settings and a seed. Out: [`dataset`], the labelled samples of the paper's Table 1 (force
 //! prescribed), `courses`, whole presses with the arm's motion, on one kind of sensor or on many,
-//! and [`Sequence`], raw frames as a sensor would send them (motion prescribed). Everything follows
-//! from the seed. Nothing here reads a clock, does I/O or keeps global state. The head of each part
+//! [`Sequence`], raw frames as a sensor would send them (motion prescribed), and [`Rig`], the same
+//! while somebody else moves the arm. Everything follows from the seed. Nothing here reads a clock, does I/O or keeps global state. The head of each part
 //! says what it models and what it does not.
 //!
 //! Two results differ from the intended values. The durometer gives the three foams mean moduli 10
@@ -29,6 +29,7 @@ mod rigid;
 mod sensor;
 mod settings;
 mod sequence;
+mod rig;
 mod subject;
 mod substance;
 mod texture;
@@ -42,6 +43,7 @@ pub use level::{Borders, LEVELS, LevelRange, borders, level_of};
 pub use material::{Material, Split, UnknownMaterial};
 pub use motion::{ARM_N_PER_MM, Approach, Motion};
 pub use object::{Shapes, UnknownShapes};
+pub use rig::{Rig, Touched};
 pub use sensor::FULL_SCALE_COUNTS;
 pub use sensor::{SensorProfile, UnknownProfile};
 pub use sequence::{REST_S, Sequence, SequenceFrame, SequenceSettings};

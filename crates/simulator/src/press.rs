@@ -222,6 +222,21 @@ impl Window {
         self.width == CELLS
     }
 
+    /// A field of the window `from`, laid onto this one. It is 0 where `from` has no cells.
+    pub(super) fn relaid(self, field: &[f32], from: Self) -> Vec<f32> {
+        let mut laid = vec![0.0; self.width * self.width];
+        for (k, &value) in field.iter().enumerate() {
+            let row = (from.corner.0 + k / from.width).checked_sub(self.corner.0);
+            let column = (from.corner.1 + k % from.width).checked_sub(self.corner.1);
+            if let (Some(row), Some(column)) = (row, column)
+                && row.max(column) < self.width
+            {
+                laid[row * self.width + column] = value;
+            }
+        }
+        laid
+    }
+
     /// The next wider window for the same contact, if there is one.
     pub(super) fn wider(self, specimen: &Specimen, force_n: f64) -> Option<Self> {
         let depth_mm = specimen.closing_depth_mm(force_n);

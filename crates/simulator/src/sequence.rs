@@ -193,15 +193,10 @@ impl Sequence {
         let drawn = draws.range(5.0, HIGHEST_FORCE_N);
         let in_turn = (self.made as usize - 1).checked_rem(self.settings.forces_n.len());
         let mut force_n = in_turn.map_or(drawn, |place| self.settings.forces_n[place].into());
-        let object = Object::draw(self.settings.shapes, material.level(), &mut draws.child(0));
-        let face = object.face(draws.below(POSTURES));
-        let body = Body::named(material, &mut draws.child(3));
-        let patch = draw_patch(&body.substance.texture, face.roughness, &mut draws.child(1));
-        let pose = Pose::draw(&face, &mut draws.child(2));
+        let (_, specimen) = presented(self.settings.shapes, material, &mut draws);
         let rate = self.settings.frame_rate_hz;
         let rest_s = self.settings.rest_s.max(REST_FRAMES / rate);
         let hold_s = draws.range(0.8, 1.5).max(HOLD_FRAMES / rate);
-        let specimen = Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch);
         for attempt in 1.. {
             let course =
                 SolvedPress::new(&mut self.bench, &specimen, Arm::default(), force_n, hold_s);
@@ -259,6 +254,21 @@ impl Sequence {
         }
         unreachable!("frame numbers do not run out before a press of seconds ends")
     }
+}
+
+/// Draws an object of the material, and one of its faces in a pose.
+pub(super) fn presented(
+    shapes: Shapes,
+    material: Material,
+    draws: &mut Stream,
+) -> (Body, Specimen) {
+    let object = Object::draw(shapes, material.level(), &mut draws.child(0));
+    let face = object.face(draws.below(POSTURES));
+    let body = Body::named(material, &mut draws.child(3));
+    let patch = draw_patch(&body.substance.texture, face.roughness, &mut draws.child(1));
+    let pose = Pose::draw(&face, &mut draws.child(2));
+    let specimen = Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch);
+    (body, specimen)
 }
 
 impl Iterator for Sequence {
