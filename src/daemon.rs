@@ -6,7 +6,7 @@
 //! reads requests and runs HTTP. The tasks share nothing but lines that are ready to be sent. The
 //! daemon starts without its sensors and waits for them.
 
-mod accept;
+pub(crate) mod accept;
 pub(crate) mod baud;
 pub mod busy;
 mod client;

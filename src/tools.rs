@@ -3,6 +3,7 @@
 
 mod answer;
 pub mod args;
+mod arm;
 pub mod calibrate;
 pub mod check;
 pub mod configuration;

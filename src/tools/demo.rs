@@ -27,7 +27,8 @@ use self::place::Place;
 pub(super) use self::place::sockets;
 use super::configuration::{ModelFile, NoModel};
 use super::faults::Faults;
-use super::player::{Pace, Player};
+use super::player::{self, Pace, Player};
+use super::robot::Robot;
 use super::simulate::{OutOfRange, within};
 use crate::daemon::baud::BITS_A_BYTE;
 use crate::daemon::config::{Config, Http, SensorTable, Setup};
@@ -152,7 +153,11 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let socket = place.socket();
     let mut config = hastened(sensor, &socket, args.speed);
     config.http = Some(Http { listen: args.http });
-    let robot = player.robot(config.publish.unix.control_path(), None);
+    let robot = Robot {
+        socket: config.publish.unix.control_path(),
+        sensor: None,
+        position: Box::new(player.position()),
+    };
     let daemon = Daemon::bind(Setup::of(
         config.with_model(args.model.path()?.as_deref()),
         Path::new("demo"),
@@ -259,7 +264,7 @@ async fn print_events(
     let mut finals = 0;
     // Whether a slow reader missed events. Verdicts may be among them.
     let mut missed = false;
-    let mut played = std::pin::pin!(player.play(sequence));
+    let mut played = std::pin::pin!(player.play(player::sequence(sequence), Instant::now()));
     let mut shutdown = std::pin::pin!(shutdown);
     let mut last_byte: Option<Instant> = None;
     // The line that is being written. The sensor and the daemon do not wait for the reader of

@@ -1,7 +1,7 @@
-//! A simulated sensor on a pty: presses in real time, bytes at the speed of the line.
+//! A simulated sensor on a pty: frames in real time, bytes at the speed of the line.
 //!
-//! Frames are computed on a thread of their own, a little ahead, so that the physics never delays a
-//! byte. The player does not wait for a reader, because a sensor does not know whether anybody
+//! The frames of a sequence are computed on a thread of their own, a little ahead, so that the physics
+//! never delays a byte. The player does not wait for a reader, because a sensor does not know whether anybody
 //! reads.
 
 use std::io;
@@ -13,10 +13,10 @@ use tokio::time::Instant;
 
 use super::faults::{Faults, Line};
 use super::pty::Pty;
-use super::robot::{Moving, Robot};
 use crate::daemon::baud::BITS_A_BYTE;
+use hardnessd_core::frame::RawFrame;
 use hardnessd_core::wire::Layout;
-use hardnessd_simulator::{Approach, Sequence, SequenceFrame, SequenceSettings};
+use hardnessd_simulator::{Approach, Sequence, SequenceSettings};
 
 /// The time between two writes: shorter than the time in which a UART's FIFO is emptied, yet long
 /// enough to be cheap.
@@ -55,7 +55,7 @@ pub(crate) struct Player {
     layout: Layout,
     pace: Pace,
     faults: Faults,
-    /// Sends the motion of the arm to the robot.
+    /// The motion of the arm, for the robot.
     moving: watch::Sender<Option<Moving>>,
 }
 
@@ -90,37 +90,38 @@ impl Player {
             .path()
     }
 
-    /// The robot whose arm presses. It sends its motion to the daemon at `socket`.
-    pub(crate) fn robot(&self, socket: PathBuf, sensor: Option<String>) -> Robot {
-        Robot {
-            socket,
-            sensor,
-            moving: self.moving.subscribe(),
-        }
+    /// Where the arm of a sequence is at a moment, for the robot that reports it. `None` before the
+    /// first frame.
+    pub(crate) fn position(&self) -> impl Fn(Instant) -> Option<f64> + use<> {
+        let moving = self.moving.subscribe();
+        move |at| Some((*moving.borrow())?.mm(at))
     }
 
-    /// Plays to the end of the sequence. Afterwards the port is gone.
+    /// Plays the frames, the first of them at `start`. Afterwards the port is gone.
     ///
     /// # Errors
     ///
     /// Fails if the pty fails, or cannot be made again after an unplug.
-    pub(crate) async fn play(mut self, settings: SequenceSettings) -> io::Result<()> {
-        let mut frames = compute(settings);
-        let start = Instant::now();
+    pub(crate) async fn play(
+        mut self,
+        mut frames: mpsc::Receiver<Played>,
+        start: Instant,
+    ) -> io::Result<()> {
         let mut bytes = Vec::with_capacity(self.layout.max_frame_bytes());
-        let mut index = 0_u32;
         // The time at which the line is free again. A long frame delays the next one.
         let mut free = start;
-        while let Some((frame, approach)) = frames.recv().await {
-            let due = start + self.pace.period * index;
+        while let Some(frame) = frames.recv().await {
+            let since = self.pace.period * frame.number;
+            let due = start + since;
             tokio::time::sleep_until(due).await;
             let speed = self.pace.speed;
-            self.moving.send_replace(Some(Moving {
-                start,
-                speed,
-                approach,
-            }));
-            let time_s = (self.pace.period * index).as_secs_f64() * self.pace.speed;
+            self.moving
+                .send_replace(frame.approach.map(|approach| Moving {
+                    start,
+                    speed,
+                    approach,
+                }));
+            let time_s = since.as_secs_f64() * self.pace.speed;
             let layout = &self.layout;
             let line = self.faults.encode(time_s, frame.raw, layout, &mut bytes);
             if matches!(line, Line::Up | Line::AtOnce) && self.pty.is_none() {
@@ -132,7 +133,6 @@ impl Player {
                 Line::Silent => {}
                 Line::Unplugged => self.pty = None,
             }
-            index += 1;
         }
         match &self.pty {
             Some(pty) => pty.linger().await,
@@ -176,17 +176,53 @@ impl Player {
     }
 }
 
-/// The frames, each with the motion of the arm until the next frame.
-fn compute(settings: SequenceSettings) -> mpsc::Receiver<(SequenceFrame, Approach)> {
+/// A frame to play.
+#[derive(Debug)]
+pub(crate) struct Played {
+    /// Its number: frame n is taken n periods after the first one.
+    pub(crate) number: u32,
+    pub(crate) raw: RawFrame,
+    /// The motion of the arm until the next frame, if it is known in advance.
+    pub(crate) approach: Option<Approach>,
+}
+
+/// The frames of a sequence.
+pub(crate) fn sequence(settings: SequenceSettings) -> mpsc::Receiver<Played> {
     let (frames, played) = mpsc::channel(AHEAD);
     std::thread::spawn(move || {
         let mut sequence = Sequence::new(settings).peekable();
-        while let Some(frame) = sequence.next() {
+        for number in 0.. {
+            let Some(frame) = sequence.next() else {
+                return;
+            };
             let approach = sequence.peek().unwrap_or(&frame).approach;
-            if frames.blocking_send((frame, approach)).is_err() {
+            let frame = Played {
+                number,
+                raw: frame.raw,
+                approach: Some(approach),
+            };
+            if frames.blocking_send(frame).is_err() {
                 return;
             }
         }
     });
     played
+}
+
+/// The present motion of the arm.
+#[derive(Debug, Clone, Copy)]
+struct Moving {
+    /// The time of the sensor's first frame.
+    start: Instant,
+    /// Seconds of the sensor per second.
+    speed: f64,
+    /// The path of the arm around this moment.
+    approach: Approach,
+}
+
+impl Moving {
+    fn mm(&self, at: Instant) -> f64 {
+        self.approach
+            .mm((at - self.start).as_secs_f64() * self.speed)
+    }
 }

@@ -11,12 +11,10 @@ use std::time::Duration;
 use serde_json::{Value, json};
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
 use tokio::net::UnixStream;
-use tokio::sync::watch;
 use tokio::time::{Instant, MissedTickBehavior};
 
 use crate::daemon::now;
 use hardnessd_core::wording;
-use hardnessd_simulator::Approach;
 
 /// The time between two positions.
 const STEP: Duration = Duration::from_millis(10);
@@ -25,33 +23,14 @@ const POINTS: usize = 2;
 /// How long the robot waits before it looks for the daemon again.
 const RETRY: Duration = Duration::from_millis(200);
 
-/// The present motion of the arm.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Moving {
-    /// The time of the sensor's first frame.
-    pub(crate) start: Instant,
-    /// Seconds of the sensor per second.
-    pub(crate) speed: f64,
-    /// The path of the arm around this moment.
-    pub(crate) approach: Approach,
-}
-
-impl Moving {
-    fn mm(&self, at: Instant) -> f64 {
-        self.approach
-            .mm((at - self.start).as_secs_f64() * self.speed)
-    }
-}
-
 /// The robot.
-#[derive(Debug)]
 pub(crate) struct Robot {
     /// The daemon's control socket.
     pub(crate) socket: PathBuf,
     /// The sensor on the arm. `None` means the daemon's first sensor.
     pub(crate) sensor: Option<String>,
-    /// The motion of the arm. `None` before the first frame.
-    pub(crate) moving: watch::Receiver<Option<Moving>>,
+    /// Where the arm is at a moment, in mm. `None` while it does not move yet.
+    pub(crate) position: Box<dyn Fn(Instant) -> Option<f64>>,
 }
 
 impl Robot {
@@ -106,11 +85,11 @@ impl Robot {
                     }
                 }
                 _ = tick.tick() => {
-                    let Some(moving) = *self.moving.borrow() else {
+                    let Some(mm) = (self.position)(Instant::now()) else {
                         continue;
                     };
                     let mono_ns = u64::try_from(now().mono.as_nanos()).unwrap_or(u64::MAX);
-                    points.push((mono_ns, moving.mm(Instant::now())));
+                    points.push((mono_ns, mm));
                     if points.len() == POINTS {
                         let motion = json!({"motion": {"sensor": sensor, "at": points}});
                         output.write_all(format!("{motion}\n").as_bytes()).await?;

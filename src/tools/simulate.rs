@@ -12,11 +12,14 @@ use clap::Args as ClapArgs;
 use serde::Deserialize;
 use serde::de::IntoDeserializer;
 use serde::de::value::Error as NameError;
+use tokio::time::Instant;
 
+use super::arm::{self, Arm};
 use super::faults::{self, Faults, Line};
-use super::player::{Pace, Player};
+use super::player::{self, Pace, Player};
 use super::robot::Robot;
 use crate::daemon::baud::BITS_A_BYTE;
+use crate::daemon::socket;
 use crate::maybe;
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
@@ -70,6 +73,9 @@ pub struct Args {
     /// The daemon's sensor on the arm [default: its first]
     #[arg(long, value_name = "NAME", requires = "motion")]
     motion_sensor: Option<String>,
+    /// Play no presses: move the arm as a controller says on this new Unix socket
+    #[arg(long, value_name = "SOCKET", conflicts_with_all = ["to", "speed", "presses", "forces", "rest"])]
+    arm: Option<PathBuf>,
     /// Script of faults; --help shows its format
     #[arg(long, value_name = "FILE")]
     faults: Option<PathBuf>,
@@ -106,6 +112,9 @@ pub enum Error {
         /// The system's error.
         source: std::io::Error,
     },
+    /// The arm's socket cannot be made.
+    #[error(transparent)]
+    Arm(#[from] socket::Error),
     /// The pty or its link failed.
     #[error("{what}: {source}")]
     Pty {
@@ -122,7 +131,7 @@ impl Coded for Error {
             Error::Faults(error) if error.is_unreadable() => NO_INPUT,
             Error::Faults(_) => FAILED,
             Error::Layout(_) | Error::Baud { .. } => USAGE,
-            Error::Recording { .. } | Error::Pty { .. } => IO,
+            Error::Recording { .. } | Error::Pty { .. } | Error::Arm(_) => IO,
         }
     }
 }
@@ -186,18 +195,32 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let player = Player::new(args.link.as_deref(), layout, pace, faults).map_err(failed)?;
     let line = format!("{}\n", player.path().display());
     let settings = sequence(&args);
-    let robot = args
-        .motion
-        .map(|socket| player.robot(socket, args.motion_sensor));
+    let arm = args.arm.as_deref().map(Arm::bind).transpose()?;
+    let position: Box<dyn Fn(Instant) -> Option<f64>> = match &arm {
+        Some(arm) => Box::new(arm.position()),
+        None => Box::new(player.position()),
+    };
+    let robot = args.motion.map(|socket| Robot {
+        socket,
+        sensor: args.motion_sensor,
+        position,
+    });
     let robot = maybe::wait(robot.map(Robot::run));
+    let start = Instant::now();
+    let (frames, start) = match &arm {
+        Some(arm) => (arm.frames(settings, start), start + arm::SCAN),
+        None => (player::sequence(settings), start),
+    };
+    let serving = maybe::wait(arm.map(Arm::serve));
     let play = async {
         // It is no error if nobody reads the path, because the link shows it too.
         let told = super::print_apart(line.into_bytes());
-        tokio::try_join!(told, player.play(settings)).map(|_| ())
+        tokio::try_join!(told, player.play(frames, start)).map(|_| ())
     };
     tokio::select! {
         played = play => played.map_err(failed),
         () = robot => Ok(()),
+        () = serving => Ok(()),
         () = shutdown => Ok(()),
     }
 }
