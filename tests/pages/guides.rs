@@ -49,8 +49,10 @@ fn follow(guide: &str) {
     // This machine may be busier than the reader's.
     let text = text.replace("sleep 1\n", "sleep 3\n");
     let place = tempfile::tempdir().unwrap();
-    let client = root().join("clients/python/hardnessd.py");
-    fs::copy(client, place.path().join("hardnessd.py")).unwrap();
+    for file in ["clients/python/hardnessd.py", "examples/gentle_press.py"] {
+        let file = root().join(file);
+        fs::copy(&file, place.path().join(file.file_name().unwrap())).unwrap();
+    }
     let mut script = String::from("exec 2>&1\n");
     let mut expected: Vec<(String, String)> = Vec::new();
     for (kind, block) in blocks(&text) {
