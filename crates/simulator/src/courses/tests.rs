@@ -1,0 +1,254 @@
+use super::super::object::Shapes;
+use super::super::sensor::Design;
+use super::super::settings::Materials;
+use super::*;
+use hardnessd_core::verdict::{self, Course, Hrn, ModelFrame};
+
+fn small() -> CourseSettings {
+    CourseSettings {
+        objects: DatasetSettings {
+            seed: 4,
+            materials: Materials::Broad,
+            shapes: Shapes::Wide,
+            objects: 1,
+            test_objects: 1,
+            presses: 4,
+            ..DatasetSettings::default()
+        },
+        ..CourseSettings::default()
+    }
+}
+
+/// The total force that the best frame reads, in newtons.
+fn force_read_n(course: &LabelledCourse) -> f64 {
+    let taxels = course.moments[course.best].millinewtons.iter();
+    1e-3 * taxels.map(|&taxel| f64::from(taxel)).sum::<f64>()
+}
+
+#[test]
+fn threads_do_not_show_and_courses_are_whole() {
+    let settings = small();
+    let made = courses(&settings, 2, |_| ());
+    assert!(made == courses(&settings, 1, |_| ()), "threads show");
+    assert!(made.len() >= 8 * 4 - 2, "{} presses begin", made.len());
+    for course in &made {
+        let times: Vec<f32> = course.moments.iter().map(|m| m.time_s).collect();
+        assert!(times.is_sorted_by(|a, b| a < b), "{times:?}");
+        let begin = times.iter().position(|&time_s| time_s == 0.0).unwrap();
+        assert!(begin <= BEFORE && times.len() - begin <= MOST_FRAMES);
+        let area = |place: usize| {
+            let taxels = course.moments[place].millinewtons.iter();
+            let contact = taxels.filter(|&&taxel| taxel >= 70);
+            contact.count()
+        };
+        assert!(area(begin) >= 3 && (0..begin).all(|place| area(place) < 3));
+        assert!((0..times.len()).all(|place| area(place) <= area(course.best)));
+        // The approach is 0 at the begin, and stays within bounds.
+        let approach: Vec<f32> = course.moments.iter().map(|m| m.approach_mm).collect();
+        assert_eq!(approach[begin], 0.0);
+        assert!(course.moments.iter().all(|moment| moment.known));
+        assert!(
+            approach.iter().all(|mm| (-15.0..30.0).contains(mm)),
+            "{approach:?}"
+        );
+        let most = approach.iter().copied().fold(0.0, f32::max);
+        assert!(most <= course.speed_mm_s * times.last().unwrap() + 1e-3);
+        assert!((3.0..=30.0).contains(&course.arm_n_per_mm));
+        let ratio = force_read_n(course) / f64::from(course.force_n);
+        assert!((0.1..1.6).contains(&ratio), "reads {ratio} of the force");
+    }
+    // Test presses of the same number are paired over the objects, except those that never
+    // begin.
+    let motion = |object: u32| {
+        let own = made.iter().filter(move |course| course.object == object);
+        own.map(|course| (course.speed_mm_s, course.frame_rate_hz))
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(motion(5), motion(7));
+}
+
+#[test]
+fn an_arm_goes_as_deep_as_force_and_stiffness_say() {
+    // In the hold, z = d + F / k. Slow presses at high frame rates begin near the touch, so
+    // nearly all of z is reported. On a stiff object the arm takes nearly all of z.
+    let settings = CourseSettings {
+        frame_rate_hz: [50.0, 100.0],
+        speed_mm_s: [2.0, 4.0],
+        ..small()
+    };
+    for course in courses(&settings, 2, |_| ()) {
+        let most = course
+            .moments
+            .iter()
+            .map(|m| m.approach_mm)
+            .fold(0.0, f32::max);
+        let arm_mm = course.force_n / course.arm_n_per_mm;
+        let begin_mm = 0.5;
+        assert!(
+            most > arm_mm - begin_mm,
+            "{most} mm, of which the arm takes {arm_mm}"
+        );
+        if course.young_mpa > 100.0 {
+            assert!(most < arm_mm + 1.0, "{most} mm, the arm takes {arm_mm}");
+        }
+    }
+}
+
+#[test]
+fn errors_are_in_what_is_told_and_nowhere_else() {
+    let truth = courses(&small(), 2, |_| ());
+    let wrong = courses(
+        &CourseSettings {
+            position_error: 0.1,
+            arm_error: 0.3,
+            clock_error_frames: 1.0,
+            unknown_share: 0.3,
+            ..small()
+        },
+        2,
+        |_| (),
+    );
+    assert_eq!(truth.len(), wrong.len());
+    let mut unknown = 0;
+    for (truth, wrong) in truth.iter().zip(&wrong) {
+        let frames = |course: &LabelledCourse| {
+            let moments = course.moments.iter();
+            moments
+                .map(|m| (m.millinewtons.clone(), m.time_s))
+                .collect::<Vec<_>>()
+        };
+        assert!(frames(truth) == frames(wrong));
+        if wrong.arm_n_per_mm == 0.0 {
+            unknown += 1;
+            assert!(
+                wrong
+                    .moments
+                    .iter()
+                    .all(|m| !m.known && m.approach_mm == 0.0)
+            );
+            continue;
+        }
+        let off = wrong.arm_n_per_mm / truth.arm_n_per_mm - 1.0;
+        assert!(off != 0.0 && off.abs() <= 0.3, "{off}");
+        let most = |course: &LabelledCourse| {
+            course
+                .moments
+                .iter()
+                .map(|m| m.approach_mm)
+                .fold(0.0, f32::max)
+        };
+        let slack = 0.1 * most(truth) + 2.2 * truth.speed_mm_s / truth.frame_rate_hz;
+        assert!((most(wrong) - most(truth)).abs() <= slack);
+    }
+    assert!((2..20).contains(&unknown), "{unknown} of {}", wrong.len());
+}
+
+#[test]
+#[ignore = "judges some hundred presses four times, half a minute: run it after a change of laying or models"]
+fn print_levels_by_pitch() {
+    let frame_model = Hrn::load(hardnessd_core::verdict::BUILT_IN).unwrap();
+    let course_model = std::fs::read("../../models/course.onnx").unwrap();
+    let course_model = Hrn::load(&course_model).unwrap();
+    // The second is what another sensor of the same design gives.
+    let pitches = [3.5, 3.5, 1.75, 7.0];
+    for (materials, shapes) in [
+        (Materials::Named, Shapes::Matched),
+        (Materials::Broad, Shapes::Matched),
+        (Materials::Broad, Shapes::Wide),
+    ] {
+        let settings = CourseSettings {
+            objects: DatasetSettings {
+                seed: 411,
+                materials,
+                shapes,
+                objects: 0,
+                test_objects: 10,
+                presses: 6,
+                ..DatasetSettings::default()
+            },
+            ..CourseSettings::default()
+        };
+        let of = &settings.objects;
+        let sensors: Vec<Sensor> = (0_u64..)
+            .zip(pitches)
+            .map(|(k, pitch_mm)| {
+                let design = Design::jx255n(of.profile).at_pitch(pitch_mm);
+                Sensor::draw(design, &Stream::new(of.seed, "pitches").child(k))
+            })
+            .collect();
+        let mut bench = Bench::default();
+        let (mut alike, mut count) = ([[0; 4]; 2], 0);
+        for unit in units(of) {
+            let subject = Subject::draw(of, unit, &[]);
+            for press in 0..of.presses.into() {
+                let mut paired = subject.draws.geometry.child(3).child(press);
+                let plan = Plan::draw(&settings, &mut paired);
+                let read = subject.pressed(&mut bench, &plan, press, |solved, _, noise| {
+                    let read = |sensor| read_press(sensor, solved, &plan.reading, noise);
+                    sensors.iter().map(read).collect::<Option<Vec<_>>>()
+                });
+                let Some(read) = read else { continue };
+                count += 1;
+                let levels = |press: &ReadPress| {
+                    let course = course_of(press, plan.reported_n_per_mm(&plan.reading));
+                    let best = frame_of(&press.moments[press.best]);
+                    [
+                        frame_model.judge(&best).unwrap().level,
+                        course_model.judge_course(&course).unwrap().level,
+                    ]
+                };
+                let expected = levels(&read[0]);
+                for (sensor, press) in read.iter().enumerate() {
+                    for (model, level) in levels(press).into_iter().enumerate() {
+                        alike[model][sensor] += i32::from(level == expected[model]);
+                    }
+                }
+            }
+        }
+        for (model, alike) in ["built-in", "course"].into_iter().zip(alike) {
+            let [_, again, fine, coarse] = alike.map(|n| 100.0 * f64::from(n) / f64::from(count));
+            println!(
+                "{materials:?} {shapes:?}, {model} model, {count} presses: the level of a 3.5 mm \
+                 array again {again:.0} %, at 1.75 mm {fine:.0} %, at 7 mm {coarse:.0} %"
+            );
+        }
+    }
+}
+
+fn frame_of(moment: &CourseMoment) -> ModelFrame {
+    ModelFrame {
+        newtons: std::array::from_fn(|k| 1e-3 * f32::from(moment.millinewtons[k])),
+    }
+}
+
+fn course_of(press: &ReadPress, arm_n_per_mm: f32) -> Course {
+    let moments = press.moments.iter().filter(|moment| moment.time_s >= 0.0);
+    Course {
+        moments: moments
+            .map(|moment| verdict::CourseMoment {
+                time_s: moment.time_s,
+                approach_mm: Some(moment.approach_mm),
+                frame: frame_of(moment),
+            })
+            .collect(),
+        arm_n_per_mm,
+    }
+}
+
+#[test]
+#[ignore = "measures speed: cargo test --release"]
+fn print_rate() {
+    for materials in [Materials::Named, Materials::Broad] {
+        let mut settings = small();
+        settings.objects.materials = materials;
+        settings.objects.objects = 10;
+        let began = std::time::Instant::now();
+        let made = courses(&settings, 1, |_| ());
+        let frames: usize = made.iter().map(|course| course.moments.len()).sum();
+        println!(
+            "{materials:?}: {} presses, {frames} frames: {:.0} presses a minute on a thread",
+            made.len(),
+            60.0 * made.len() as f64 / began.elapsed().as_secs_f64()
+        );
+    }
+}
