@@ -3,8 +3,8 @@
 
     gentle_press.py ARM [SENSOR] [--limit N]
 
-ARM is the socket of `hardnessd simulate --arm`. For a robot of yours, replace the class `Arm`.
-`hardnessd.py` must be beside this file or installed. docs/motion.md shows how to start the daemon and the arm.
+ARM is the socket of `hardnessd simulate --arm`; docs/motion.md shows how to start it. For a robot of yours, replace
+the class `Arm`. `hardnessd.py` must be beside this file or installed.
 """
 
 import argparse
@@ -14,8 +14,7 @@ import time
 
 import hardnessd
 
-FAR_MM, SPEED_MM_S = 20.0, 5.0
-LONGEST_S = 20.0
+FAR_MM, SPEED_MM_S, LONGEST_S = 20.0, 5.0, 20.0
 
 
 class Arm:
@@ -37,23 +36,26 @@ class Arm:
 def press(arm, events, sensor, limit_n=15.0, sure=0.0):
     """Presses once. Returns the early verdict that ended the loading, or None; the final verdict; and the greatest
     force that the sensor read, in N. Early verdicts of a confidence below `sure` do not count."""
-    early, greatest_n, loading = None, 0.0, True
-    start = time.monotonic()
-    arm.order(to_mm=FAR_MM, speed_mm_s=SPEED_MM_S)
+    early, greatest_n, loading, goal_mm = None, 0.0, True, 0.0
+    start, live = time.monotonic(), False
     for event in events:
-        is_blind = event["type"] == "disconnected" or event.get("state") in ("stale", "lost")
         if event.get("sensor", sensor) != sensor:
             continue
-        if event["type"] == "frame":
-            greatest_n = max(greatest_n, sum(event["newtons"]))
+        if event["type"] in ("status", "disconnected"):
+            live = event.get("state") == "live"
+        elif event["type"] == "frame":
+            live, greatest_n = True, max(greatest_n, sum(event["newtons"]))
         elif event["type"] == "hardness" and event["phase"] == "final":
             return early, event, greatest_n
         elif event["type"] == "hardness" and loading and event["confidence"] >= sure:
             early = event
         seconds = time.monotonic() - start
-        if loading and (early or greatest_n >= limit_n or is_blind or seconds > LONGEST_S):
-            loading = False
-            arm.order(to_mm=0.0)
+        loading = loading and not early and greatest_n < limit_n and seconds < LONGEST_S
+        # While nothing is known of the sensor, the arm goes back.
+        wanted_mm = FAR_MM if loading and live else 0.0
+        if wanted_mm != goal_mm:
+            goal_mm = wanted_mm
+            arm.order(to_mm=goal_mm, speed_mm_s=SPEED_MM_S)
         if event["type"] == "press" and event["state"] == "aborted" or seconds > 2 * LONGEST_S:
             raise RuntimeError("no verdict: the arm did not touch the object, or too lightly, or the sensor was lost")
 

@@ -10,6 +10,7 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::thread::ScopedJoinHandle;
 use std::time::Duration;
 
 use clap::Parser;
@@ -104,7 +105,7 @@ fn main() {
         std::thread::scope(|scope| {
             let parts = (0..threads).map(|thread| scope.spawn(move || work(thread)));
             let parts: Vec<_> = parts.collect();
-            let done = parts.into_iter().map(|part| part.join());
+            let done = parts.into_iter().map(ScopedJoinHandle::join);
             done.flat_map(|part| part.expect("no press panics"))
                 .collect()
         })
@@ -115,10 +116,10 @@ fn main() {
         args.presses
     );
     println!(
-        "| Withdraws at | Right | Named | Right if named | Greatest force | 90 % below | In contact | \
+        "| Withdraws at | Right | Named | Right if named | Greatest force, median | mean | 90 % below | In contact | \
          At an early verdict |"
     );
-    println!("|---|---|---|---|---|---|---|---|");
+    println!("|---|---|---|---|---|---|---|---|---|");
     row("15 N", &presses(None));
     for &confidence in &args.confidences {
         for &min_force_n in &args.min_forces_n {
@@ -232,11 +233,12 @@ fn row(name: &str, presses: &[Press]) {
         count(|press| press.is_named && press.found == press.level),
     );
     println!(
-        "| {name} | {:.1} % | {:.1} % | {:.1} % | {:.1} N | {:.1} N | {:.2} s | {:.1} % |",
+        "| {name} | {:.1} % | {:.1} % | {:.1} % | {:.1} N | {:.1} N | {:.1} N | {:.2} s | {:.1} % |",
         percent(count(right)),
         percent(named),
         100.0 * both / named,
         quantile(|press| press.greatest_n, 0.5),
+        presses.iter().map(|press| press.greatest_n).sum::<f64>() / presses.len() as f64,
         quantile(|press| press.greatest_n, 0.9),
         quantile(|press| press.contact_s, 0.5),
         percent(count(|press| press.is_early)),
