@@ -79,8 +79,8 @@ fn until(course: &Course, frames: usize) -> Course {
 /// Judges presses before their end. `finals` are the final verdicts on the same presses.
 ///
 /// An early verdict comes as the daemon gives it: the press is judged at the same numbers of frames,
-/// and a verdict that is ambiguous does not count. The frames are those of the data, which has at
-/// most 48 of each press, so a daemon judges a longer press more often than this.
+/// and a verdict that is ambiguous does not count. Here the force may be any. The frames are those of
+/// the data, which has at most 48 of each press, so a daemon judges a longer press more often than this.
 ///
 /// # Errors
 ///
