@@ -148,10 +148,19 @@ class Recording:
     def _messages(self, topics: Sequence[str]) -> Iterator[Tuple[str, str, Any]]:
         """Sensor, topic and message."""
         names = [f"/tactile/{sensor}/{topic}" for sensor in self.sensors for topic in topics]
+        count = 0
         with self._reading():
             for _, channel, _, message in self._reader.iter_decoded_messages(names):
                 _, _, sensor, topic = channel.topic.split("/")
+                count += 1
                 yield sensor, topic, message
+            # The library takes a chunk of zeros, as a power failure leaves it, for an empty one.
+            summary = self._reader.get_summary()
+            if summary is not None and summary.statistics is not None:
+                counts = summary.statistics.channel_message_counts
+                expected = sum(counts.get(id, 0) for id, channel in summary.channels.items() if channel.topic in names)
+                if count != expected:
+                    raise ValueError(f"{count} messages, expected {expected}")
 
     @contextlib.contextmanager
     def _reading(self) -> Iterator[None]:
