@@ -1,0 +1,382 @@
+#!/usr/bin/env python3
+"""Exports of recordings, read by pandas, DuckDB and pyarrow.
+
+    python3 -m venv venv && venv/bin/pip install './clients/python[export]' pandas duckdb
+    venv/bin/python tests/peers/export_peer.py target/debug/hardnessd
+
+Claims: the tables have every event that a subscriber read, every field of it, every frame and every position of the
+arm; a data set for LeRobot has the files and columns of v3.0, whose episodes are recordings or presses, with the
+verdicts that were known at each frame; memory does not grow with the number of recordings; a bad file is one line, and
+nothing of the output stays. `lerobot_peer.py` reads the data sets with LeRobot itself.
+"""
+
+import datetime
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+
+import duckdb
+import hardnessd
+import numpy as np
+import pandas
+import pyarrow.parquet as pq
+from bench import Bench
+from hardnessd import export, observation, recording
+
+UTC = datetime.timezone.utc
+
+
+def take(binary, directory):
+    """A recording of three presses, and what a subscriber read meanwhile."""
+    more = '[record]\ndir = "rec"\nkeep_free_mb = 0\n'
+    with Bench(binary, more=more) as bench:
+        daemon = bench.daemon()
+        client = hardnessd.Client(bench.path("events.sock"), types=hardnessd.TYPES)
+        live = []
+        reader = threading.Thread(target=lambda: live.extend(client))
+        reader.start()
+        motion = ["--motion", bench.path("control.sock")]
+        bench.sensor("forearm", "--presses", "3", "--force", "15", "--seed", "3", *motion).wait(timeout=60)
+        time.sleep(0.5)
+        daemon.terminate()
+        daemon.wait(timeout=10)
+        client.close()
+        reader.join()
+        (path,) = pathlib.Path(bench.path("rec")).glob("hardnessd-*.mcap")
+        copy = directory / "take.mcap"
+        copy.write_bytes(path.read_bytes())
+    return copy, live
+
+
+def run(*arguments, code=0):
+    command = [sys.executable, "-m", "hardnessd.export", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == code, done
+    assert len(done.stderr.splitlines()) == 1 or code == 2, done.stderr
+    return done.stderr.strip()
+
+
+def moment(text):
+    return datetime.datetime.fromisoformat(text.replace("Z", "+00:00")).astimezone(UTC)
+
+
+def tables(path, live, directory):
+    out = directory / "tables"
+    run(path, "--to", "parquet", "--out", out)
+    assert sorted(file.stem for file in out.iterdir()) == sorted(export.TABLES)
+    read = {name: pq.read_table(out / f"{name}.parquet").to_pylist() for name in export.TABLES}
+    for kind, fields in (("press", hardnessd.Press), ("hardness", hardnessd.Hardness)):
+        columns = {"recording", *fields.__annotations__, "seq"} - {"type"}
+        assert set(export.TABLES[kind].names) == columns, columns ^ set(export.TABLES[kind].names)
+        expected = {event["seq"]: event for event in live if event["type"] == kind}
+        found = {row["seq"]: row for row in read[kind]}
+        assert list(found) == list(expected) and len(found) >= 3, (kind, list(found), list(expected))
+        for seq, event in expected.items():
+            for key, value in event.items():
+                same(key, found[seq].get(key), value)
+    frames = {event["frame"]: event for event in live if event["type"] == "frame"}
+    contact = {row["frame"]: row for row in read["contact"]}
+    recorded = {row["frame"]: row for row in read["frames"]}
+    assert set(contact) == set(recorded) and set(frames) <= set(recorded) and len(frames) > 100, len(frames)
+    for number, event in frames.items():
+        row, touched = recorded[number], contact[number]
+        assert (row["rows"], row["cols"]) == (28, 28) and row["time"] == touched["time"] == moment(event["time"])
+        assert np.allclose(row["newtons"], event["newtons"], atol=0.0006), number
+        assert np.isclose(touched["force_n"], sum(event["newtons"]), atol=0.4)
+        for key in ("contact_area_taxels", "tared", "approach_mm"):
+            same(key, touched[key], event[key])
+    assert any(event["approach_mm"] is not None for event in frames.values())
+    with recording.open(path) as opened:
+        points = [point for _, _, line in opened._messages(["motion"]) for point in zip(line.at_ns, line.approach_mm)]
+        labels = opened.labels
+    assert [(row["mono_ns"], row["approach_mm"]) for row in read["motion"]] == points and len(points) > 100
+    (about,) = read["recording"]
+    assert about["robot"] == "arm-7" and dict(about["labels"]) == labels and "forearm" in json.loads(about["sensors"])
+    # An arm's position and a frame of the same time lie near each other in the tables too.
+    times = [row["time"] for row in read["motion"]]
+    assert read["frames"][0]["time"] - datetime.timedelta(seconds=5) < times[0] < times[-1]
+    by_duckdb(out, recorded)
+    hardness = pandas.read_parquet(out / "hardness.parquet")
+    assert list(hardness["level"]) == [row["level"] for row in read["hardness"]]
+    assert str(hardness["time"].dtype) == "datetime64[us, UTC]", hardness.dtypes
+    return {name: len(rows) for name, rows in read.items()}
+
+
+def same(key, found, expected):
+    if key == "type":
+        return
+    if key == "time":
+        expected = moment(expected)
+    elif key == "context" and expected is not None:
+        found = json.loads(found)
+    elif key == "shore" and expected:
+        found, expected = list(found.values()), [expected[end] for end in ("value", "low", "high")]
+    if isinstance(expected, (float, list)) and key != "notes":
+        # JSON rounds, ROS has float32.
+        assert np.allclose(found, expected, rtol=1e-5, atol=0.0006), (key, found, expected)
+    else:
+        assert found == expected, (key, found, expected)
+
+
+def by_duckdb(out, recorded):
+    joined = duckdb.sql(
+        f"select frame, force_n, list_sum(newtons) from '{out}/contact.parquet' "
+        f"join '{out}/frames.parquet' using (recording, sensor, frame) order by frame"
+    ).fetchall()
+    assert [row[0] for row in joined] == sorted(recorded)
+    assert all(np.isclose(force, total, atol=1e-4) for _, force, total in joined)
+
+
+def data_set(path, live, directory, episodes):
+    out = directory / episodes
+    run(path, "--to", "lerobot", "--episodes", episodes, "--out", out)
+    files = sorted(str(file.relative_to(out)) for file in out.rglob("*") if file.is_file())
+    assert files == [
+        "data/chunk-000/file-000.parquet",
+        "meta/episodes/chunk-000/file-000.parquet",
+        "meta/info.json",
+        "meta/stats.json",
+        "meta/tasks.parquet",
+    ], files
+    info = json.loads((out / "meta/info.json").read_text())
+    assert (info["codebase_version"], info["fps"], info["total_tasks"]) == ("v3.0", 20, 1), info
+    assert info["data_path"].format(chunk_index=0, file_index=0) == files[0]
+    newtons, state = "observation.tactile.forearm.newtons", "observation.tactile.forearm.state"
+    assert info["features"][newtons] == {"dtype": "float32", "shape": [28, 28], "names": ["rows", "cols"]}
+    names = info["features"][state]["names"]
+    assert [newtons.rsplit(".", 1)[1], *names] == list(observation.KEYS), names
+    # The task is the index of this table, as pandas writes one.
+    tasks = pandas.read_parquet(out / "meta/tasks.parquet")
+    assert list(tasks.index) == ["press an object"] and list(tasks["task_index"]) == [0]
+    rows = pq.read_table(out / files[0]).to_pylist()
+    assert list(rows[0]) == list(info["features"]) and len(rows) == info["total_frames"] > 90
+    described = pq.read_table(out / files[1]).to_pylist()
+    assert len(described) == info["total_episodes"] and info["splits"] == {"train": f"0:{len(described)}"}
+    frames = {event["frame"]: event for event in live if event["type"] == "frame" and event["tared"]}
+    verdicts = [event for event in live if event["type"] == "hardness"]
+    at = 0
+    for number, episode in enumerate(described):
+        assert (episode["episode_index"], episode["dataset_from_index"], episode["tasks"]) == (number, at, ["press an object"])
+        at += episode["length"]
+        assert (episode["dataset_to_index"], episode["data/chunk_index"], episode["data/file_index"]) == (at, 0, 0)
+        part = rows[at - episode["length"] : at]
+        begin = moment(frames[part[0]["hardnessd.frame"]]["time"])
+        assert episode["hardnessd/recording"] == "take.mcap" and episode["hardnessd/time"] == begin
+        for index, row in enumerate(part):
+            event = frames[row["hardnessd.frame"]]
+            assert (row["frame_index"], row["episode_index"], row["task_index"]) == (index, number, 0)
+            assert row["index"] == at - episode["length"] + index and np.isclose(row["timestamp"], index / 20)
+            since_begin = (moment(event["time"]) - begin).total_seconds()
+            assert np.isclose(row["hardnessd.time_s"], since_begin, atol=1e-5)
+            assert np.allclose(row[newtons], np.reshape(event["newtons"], (28, 28)), atol=0.0006)
+            known(dict(zip(names, row[state])), event, verdicts)
+    if episodes == "presses":
+        of_presses(described, rows, live)
+    elif not any(event["type"] == "status" and event["state"] == "stale" for event in live):
+        assert len(described) == 1 and len(rows) == len(frames), (len(described), len(rows), len(frames))
+    stats = json.loads((out / "meta/stats.json").read_text())
+    forces = np.array([row[state] for row in rows])
+    for name, expected in (("min", forces.min(0)), ("max", forces.max(0)), ("mean", forces.mean(0)), ("std", forces.std(0))):
+        assert np.allclose(stats[state][name], expected, atol=1e-4), (name, stats[state][name], expected)
+    assert stats[state]["count"] == [len(rows)] and np.shape(stats[newtons]["mean"]) == (28,)
+    return len(described), len(rows)
+
+
+def known(found, event, verdicts):
+    """What a policy could know at a frame."""
+    now = moment(event["time"])
+    assert np.isclose(found["force_n"], sum(event["newtons"]), atol=0.4)
+    assert found["contact_area_taxels"] == event["contact_area_taxels"]
+    assert found["approach_known"] == (event["approach_mm"] is not None)
+    assert np.isclose(found["approach_mm"], event["approach_mm"] or 0, atol=1e-3)
+    published = [(moment(v["time"]) + datetime.timedelta(milliseconds=v["age_at_publish_ms"]), v) for v in verdicts]
+    # JSON rounds the age to a microsecond or so: at that very moment both answers are right.
+    before = [(when, v) for when, v in published if when <= now + datetime.timedelta(milliseconds=0.1)]
+    if not before:
+        assert (found["level"], found["confidence"], found["verdict_age_s"]) == (0, 0, 60), found
+        return
+    when, verdict = max(before, key=lambda pair: pair[0])
+    assert found["level"] == (verdict["level"] or 0), (found, verdict)
+    assert np.isclose(found["confidence"], verdict["confidence"], atol=1e-5)
+    assert np.isclose(found["verdict_age_s"], (now - when).total_seconds(), atol=0.01)
+
+
+def of_presses(described, rows, live):
+    """Each episode is the frames of a press, with its final verdict."""
+    for kind, state in (("begin", "begin"), ("end", "end")):
+        events = [event for event in live if event["type"] == "press" and event["state"] == state]
+        assert [event["press"] for event in events] == [episode["hardnessd/press"] for episode in described]
+        edge = 0 if kind == "begin" else -1
+        for event, episode in zip(events, described):
+            part = rows[episode["dataset_from_index"] : episode["dataset_to_index"]]
+            assert part[edge]["hardnessd.frame"] == event["frame"], (event, part[edge]["hardnessd.frame"])
+    finals = [event for event in live if event["type"] == "hardness" and event["phase"] == "final"]
+    told = [(event["level"], event["label"]) for event in finals]
+    assert [(episode["hardnessd/level"], episode["hardnessd/label"]) for episode in described] == told
+
+
+def keys(path, directory):
+    """Quantities go to the features that are named, or to none."""
+    out = directory / "keys"
+    chosen = ["newtons=touch.array", "force_n=touch.force", "level=", "approach_mm=", "approach_known="]
+    options = [word for key in chosen for word in ("--key", key)]
+    run(path, "--to", "lerobot", "--out", out, "--task", "press it", *options)
+    features = json.loads((out / "meta/info.json").read_text())["features"]
+    assert features["touch.array"]["shape"] == [28, 28] and features["touch.force"]["shape"] == [1]
+    state = features["observation.tactile.forearm.state"]
+    assert state["names"] == ["contact_area_taxels", "confidence", "verdict_age_s"] and state["shape"] == [3]
+    rows = pq.read_table(out / "data/chunk-000/file-000.parquet").to_pylist()
+    assert np.isclose(rows[50]["touch.force"], np.sum(rows[50]["touch.array"]), atol=1e-4)
+
+
+SMALL = """
+import sys
+from hardnessd import export
+export.FILE_BYTES, export.FILES_IN_A_FOLDER, export.EPISODES_AT_ONCE = 15_000, 2, 2
+sys.exit(export.main(sys.argv[1:]))
+"""
+
+
+def files_that_are_full(path, directory):
+    """Episodes go on in another file when one is full, and in another folder."""
+    out = directory / "files"
+    options = ["--to", "lerobot", "--episodes", "presses", "--out", out]
+    subprocess.run([sys.executable, "-c", SMALL, *links(path, directory, 5), *options], check=True, capture_output=True)
+    described = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    places = sorted({(episode["data/chunk_index"], episode["data/file_index"]) for episode in described})
+    assert len(described) == 15 and places[:3] == [(0, 0), (0, 1), (1, 0)], places
+    for chunk, file in places:
+        rows = pq.read_table(out / f"data/chunk-{chunk:03}/file-{file:03}.parquet").to_pylist()
+        inside = [e for e in described if (e["data/chunk_index"], e["data/file_index"]) == (chunk, file)]
+        assert [row["index"] for row in rows] == [
+            index for e in inside for index in range(e["dataset_from_index"], e["dataset_to_index"])
+        ]
+    return len(places)
+
+
+def two_sensors(binary, directory):
+    """A recording of two sensors has both in its tables. A data set is of one."""
+    with Bench(binary, sensors=("forearm", "palm")) as bench:
+        for seed, name in enumerate(("forearm", "palm")):
+            bench.sensor(name, "--force", "15", "--seed", str(seed))
+        path = directory / "two.mcap"
+        command = [binary, "record", "--config", bench.path("hardnessd.toml"), "--out", path, "--seconds", "8"]
+        subprocess.run(command, check=True, capture_output=True)
+    run(path, "--to", "parquet", "--out", directory / "two")
+    frames = pq.read_table(directory / "two/frames.parquet").to_pandas()
+    contact = pq.read_table(directory / "two/contact.parquet").to_pandas()
+    for name in ("forearm", "palm"):
+        ours, touched = frames[frames.sensor == name], contact[contact.sensor == name]
+        assert list(ours.frame) == list(touched.frame) == list(range(len(ours))) and len(ours) > 100, name
+        assert np.allclose([newtons.sum() for newtons in ours.newtons], touched.force_n, atol=1e-3), name
+    assert "--sensor" in run(path, "--to", "lerobot", "--out", directory / "one", code=2)
+    run(path, "--to", "lerobot", "--sensor", "palm", "--out", directory / "one")
+    rows = pq.read_table(directory / "one/data/chunk-000/file-000.parquet").to_pandas()
+    untared = contact[(contact.sensor == "palm") & ~contact.tared]
+    assert len(rows) == len(ours) - len(untared), (len(rows), len(ours), len(untared))
+    forces = [state[0] for state in rows["observation.tactile.palm.state"]]
+    assert np.allclose(forces, touched[touched.tared].force_n, atol=1e-3)
+    return len(frames)
+
+
+def refusals(path, directory):
+    """One line, the exit code, and no output."""
+    out = directory / "refused"
+    broken, other = directory / "broken.mcap", directory / "other.mcap"
+    whole = path.read_bytes()
+    broken.write_bytes(whole[: len(whole) // 2])
+    other.write_text("something else")
+    for to in ("parquet", "lerobot"):
+        assert "hardnessd recover" in run(path, broken, "--to", to, "--out", out, code=1)
+        assert "no MCAP recording" in run(other, "--to", to, "--out", out, code=1)
+        assert "missing.mcap" in run(directory / "missing.mcap", "--to", to, "--out", out, code=66)
+        # Damage in the middle shows only when the file is read.
+        content = bytearray(whole)
+        content[len(content) // 2 : len(content) // 2 + 4096] = bytes(4096)
+        broken.write_bytes(content)
+        assert "hardnessd recover" in run(path, broken, "--to", to, "--out", out / "below", code=1)
+        assert not out.exists()
+        broken.write_bytes(whole[: len(whole) // 2])
+    assert "press" in run(path, "--to", "lerobot", "--key", "wrong=x", "--out", out, code=2)
+    assert "'palm'" in run(path, "--to", "lerobot", "--sensor", "palm", "--out", out, code=1)
+    out.mkdir()
+    (out / "mine.txt").write_text("mine")
+    assert "not an empty folder" in run(path, "--to", "parquet", "--out", out, code=74)
+    assert [file.name for file in out.iterdir()] == ["mine.txt"]
+    (out / "mine.txt").unlink()
+    run(path, "--to", "parquet", "--out", out)
+    return stopped(path, directory)
+
+
+def stopped(path, directory):
+    """SIGTERM in the middle leaves an empty folder as it was."""
+    many = links(path, directory, 200)
+    out = directory / "stopped"
+    out.mkdir()
+    command = [sys.executable, "-m", "hardnessd.export", *many, "--to", "parquet", "--out", out]
+    running = subprocess.Popen(command, stderr=subprocess.PIPE)
+    while not any(out.iterdir()):
+        time.sleep(0.01)
+        assert running.poll() is None, running.stderr.read()
+    time.sleep(0.5)
+    running.send_signal(signal.SIGTERM)
+    assert running.wait(timeout=20) == 143 and not any(out.iterdir())
+
+
+def links(path, directory, count):
+    folder = directory / "many"
+    folder.mkdir(exist_ok=True)
+    names = [folder / f"take-{number:04}.mcap" for number in range(count)]
+    for name in names:
+        if not name.exists():
+            os.link(path, name)
+    return names
+
+
+PEAK = """
+import sys
+from hardnessd import export
+code = export.main(sys.argv[1:])
+# ru_maxrss would count what the parent held when it started this process.
+print(next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")))
+sys.exit(code)
+"""
+
+
+def memory(path, directory):
+    """The most memory that many recordings need, beside few, in MB."""
+    peaks = {}
+    for count in (20, 200):
+        for how in ("parquet", "lerobot --episodes presses"):
+            out = directory / f"memory-{count}-{how[:7]}"
+            options = ["--to", *how.split(), "--out", out]
+            command = [sys.executable, "-c", PEAK, *links(path, directory, count), *options]
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+            peaks[count, how] = int(done.stdout) // 1024
+    for (count, how), peak in peaks.items():
+        assert peak < peaks[20, how] + 60, peaks
+    return {f"{count} recordings to {how}": f"{peak} MB" for (count, how), peak in peaks.items()}
+
+
+def main(binary):
+    with tempfile.TemporaryDirectory() as name:
+        directory = pathlib.Path(name)
+        path, live = take(binary, directory)
+        print("tables:", tables(path, live, directory))
+        for episodes in ("recordings", "presses"):
+            print("a data set of %d episodes and %d frames" % data_set(path, live, directory, episodes))
+        keys(path, directory)
+        print("episodes in %d files" % files_that_are_full(path, directory))
+        print("two sensors: %d frames" % two_sensors(binary, directory))
+        refusals(path, directory)
+        print("memory:", memory(path, directory))
+
+
+if __name__ == "__main__":
+    main(os.path.abspath(sys.argv[1]))
