@@ -189,7 +189,12 @@ fn pages() -> Vec<(String, String)> {
         .find(|folder| folder.join("Cargo.lock").exists());
     let root = root.expect("the tests run in the repository");
     let folders = ["", "docs", "models", "fixtures", "clients/python"];
-    let more = ["clients/ros2", "clients/foxglove", "clients/grafana"];
+    let more = [
+        "clients/ros2",
+        "clients/lerobot",
+        "clients/foxglove",
+        "clients/grafana",
+    ];
     let mut pages: Vec<PathBuf> = folders
         .iter()
         .chain(&more)
