@@ -128,7 +128,7 @@ impl Log {
         self.lines.clear_progress();
     }
 
-    /// Waits until all lines so far are written, but not longer than [`LAST_LINES`].
+    /// Waits until all lines so far are written, but not longer than `LAST_LINES`.
     pub fn flush(&self) {
         self.lines.flush(LAST_LINES);
     }
